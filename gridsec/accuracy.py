@@ -1,8 +1,8 @@
-"""What meters promise, and how far an honest reading may be from the truth.
+"""Accuracy of meters and the largest error of a consistent reading.
 
 References
 ----------
-IEC 62053 for what a class is; docs/theory-detection.md.
+IEC 62053 for accuracy classes; docs/theory-detection.md.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from gridsec.errors import Problem, refuse
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeterAccuracy:
-    """What the data sheets promise about the voltage meters. p meters.
+    """Accuracy of the voltage meters by their data sheets. p meters.
 
     A reading is ``v (1 + c) + r + n`` with a fixed unknown relative bias ``|c| <= class_fraction``,
     rounding ``|r| <= resolution / 2`` and white jitter ``n`` of standard deviation ``jitter``.
@@ -70,43 +70,36 @@ class MeterAccuracy:
 
 
 def steady_rounding(accuracy: MeterAccuracy) -> Floats:
-    """Largest error of rounding that lasts as long as the voltage: what jitter does not average away.
+    """Largest rounding error that persists while the voltage is constant and that jitter does not average.
 
     To steps D, ``round(x) - x`` is ``sum_k (-1)^k D / (pi k) sin(2 pi k x / D)``; in the mean over jitter of
     standard deviation s its k-th harmonic shrinks by ``exp(-2 pi^2 k^2 s^2 / D^2)``. So the error is at most
     ``D / pi sum_k exp(-2 pi^2 k^2 s^2 / D^2) / k``, and never more than half a step.
 
-    Parameters
-    ----------
-    accuracy
-        The meters.
-
     Returns
     -------
     (p,)
-        In pu of the nominal voltage; no more than rounding of numbers for 0.1 V and 0.05 %.
+        Bounds, pu of the nominal voltage; at the level of floating-point rounding for 0.1 V and 0.05 %.
     """
     step = accuracy.resolution
     ratio = accuracy.jitter / np.where(step > 0.0, step, 1.0)
-    # Where more of them matter their sum is beyond half a step.
+    # Where further harmonics matter, the sum exceeds half a step anyway.
     k = np.arange(1.0, 13.0)
     harmonics = (np.exp(-2.0 * (np.pi * np.multiply.outer(ratio, k)) ** 2) / (np.pi * k)).sum(axis=-1)
     return np.asarray(step * np.minimum(0.5, harmonics))
 
 
 def reading_error(accuracy: MeterAccuracy, v2: Floats, sigmas: float) -> Floats:
-    """Largest honest error of a squared reading, per meter.
+    """Largest error of a squared reading without manipulation, per meter.
 
     `(v + e)^2 - v^2 = 2 v e + e^2` with `e = class v + resolution / 2 + sigmas jitter`.
 
     Parameters
     ----------
-    accuracy
-        The meters.
     v2 : (p,)
-        The largest squared voltage that the meter may be at, pu.
+        Largest possible squared voltage at the meter, pu.
     sigmas
-        How many standard deviations of jitter an honest reading may be off.
+        Jitter allowance in standard deviations.
 
     Returns
     -------
@@ -119,23 +112,21 @@ def reading_error(accuracy: MeterAccuracy, v2: Floats, sigmas: float) -> Floats:
 
 
 def busbar_error(accuracy: MeterAccuracy, v0_squared: float, sigmas: float) -> float:
-    """Largest honest error of the squared busbar voltage.
+    """Largest error of the squared busbar voltage without manipulation.
 
-    The class is a part of the truth, and only the reading r is known: `r = v (1 + c) + n` gives
+    The class is relative to the true voltage, and only the reading r is known: `r = v (1 + c) + n` gives
     `|r - v| = |c r + n| / (1 + c) <= e = (class |r| + resolution / 2 + sigmas jitter) / (1 - class)`,
     and `|r^2 - v^2| <= e (2 r + e)`.
 
     Parameters
     ----------
-    accuracy
-        The meters.
     v0_squared
-        The squared reading, pu.
+        Squared reading, pu.
     sigmas
         As in `reading_error`.
     """
     if accuracy.busbar_class >= 1.0:
-        return float("inf")  # such a reading says nothing
+        return float("inf")  # no bound from a class of 100 % or more
     v = float(np.sqrt(max(v0_squared, 0.0)))
     e = accuracy.busbar_class * v + 0.5 * accuracy.busbar_resolution + sigmas * accuracy.busbar_jitter
     e /= 1.0 - accuracy.busbar_class
@@ -143,37 +134,35 @@ def busbar_error(accuracy: MeterAccuracy, v0_squared: float, sigmas: float) -> f
 
 
 def told_error(accuracy: MeterAccuracy, y: Floats, sigmas: float) -> Floats:
-    """Largest distance of the truth from a squared reading, per meter: `busbar_error` for the others.
+    """Largest distance of the true voltage from a squared reading, per meter; compare `busbar_error`.
 
     Parameters
     ----------
-    accuracy
-        The meters.
     y : (p,)
-        The squared readings, pu.
+        Squared readings, pu.
     sigmas
         As in `reading_error`.
 
     Returns
     -------
     (p,)
-        Bounds, squared pu; beyond any voltage where a class says nothing.
+        Bounds, squared pu; larger than any voltage for a class of 100 % or more.
     """
     return ToldError.over(accuracy, np.arange(y.size), sigmas).of(y)
 
 
-# Error of a voltage whose class says nothing, pu.
+# Voltage error assumed for an accuracy class of 100 % or more, pu.
 _NOTHING = 4.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ToldError:
-    """How far the truth may be from readings of some meters, prepared; k meters.
+    """Bound of the true voltage around readings, prepared for repeated use; k meters.
 
     Attributes
     ----------
     slope, floor : (k,)
-        Error of a voltage, pu: `slope v + floor` for a reading v.
+        Voltage error in pu: `slope v + floor` for a reading v.
     """
 
     slope: Floats
@@ -181,14 +170,14 @@ class ToldError:
 
     @classmethod
     def over(cls, accuracy: MeterAccuracy, which: Ints, sigmas: float) -> ToldError:
-        """Prepare some meters.
+        """Prepare the bound for a selection of meters.
 
         Parameters
         ----------
         accuracy, sigmas
             As in `told_error`.
         which : (k,)
-            The meters, each as often as wanted.
+            Indices of meters; repetitions allowed.
         """
         part = accuracy.class_fraction[which]
         even = 0.5 * accuracy.resolution[which] + sigmas * accuracy.jitter[which]
@@ -197,13 +186,7 @@ class ToldError:
         return cls(np.where(told, part / rest, 0.0), np.where(told, even / rest, _NOTHING))
 
     def of(self, y: Floats) -> Floats:
-        """Bounds for squared readings, squared pu.
-
-        Parameters
-        ----------
-        y : (k,)
-            The squared readings.
-        """
+        """Bounds, squared pu, for squared readings `y` (k,), pu."""
         v = np.sqrt(np.maximum(y, 0.0))
         e = self.slope * v + self.floor
         return np.asarray(e * (2.0 * v + e))

@@ -1,6 +1,6 @@
-"""Array types and the small numerics that several modules share.
+"""Array types and numerical functions shared by several modules.
 
-Nothing here has a hidden tolerance: where a number decides, it is an argument.
+Nothing here has a hidden tolerance: every number that decides is an argument.
 """
 
 from __future__ import annotations
@@ -17,40 +17,21 @@ Phasors = NDArray[np.complex128]
 
 
 def frozen(values: Floats) -> Floats:
-    """Copy of `values` as contiguous, read-only doubles.
-
-    Parameters
-    ----------
-    values : (…)
-        Anything that converts to an array of doubles.
-
-    Returns
-    -------
-    Floats
-        Same shape; writing into it raises ValueError.
-    """
+    """Copy of `values` as contiguous, read-only doubles of the same shape."""
     out = np.array(values, dtype=np.float64, order="C")
     out.flags.writeable = False
     return out
 
 
 def frozen_ints(values: Ints) -> Ints:
-    """Copy of `values` as contiguous, read-only indices.
+    """Copy of `values` as contiguous, read-only indices of the same shape.
 
-    Parameters
-    ----------
-    values : (…)
-        Integers. Doubles and booleans are refused, because a rounded index is a wrong index.
-
-    Returns
-    -------
-    Ints
-        Same shape; writing into it raises ValueError.
+    Doubles and booleans are refused, because a rounded index is a wrong index.
 
     Raises
     ------
     TypeError
-        If `values` are no integers.
+        If `values` are not integers.
     """
     given = np.asarray(values)
     if given.size and given.dtype.kind not in "iu":
@@ -61,12 +42,12 @@ def frozen_ints(values: Ints) -> Ints:
 
 
 def not_negative(name: str, values: Floats | float) -> Floats:
-    """`values` as doubles, if none of them is negative or no number; infinity passes.
+    """`values` as doubles; negative values and NaN are refused, infinity passes.
 
     Parameters
     ----------
     name
-        What they are called where one of them is refused.
+        Name of the quantity in the error message.
     values : (…)
         The numbers.
 
@@ -85,52 +66,24 @@ def not_negative(name: str, values: Floats | float) -> Floats:
 
 
 def any_of(mask: Bools | Ints | Floats) -> bool:
-    """``mask.any()``, in a fifth of the time where the array is small.
-
-    Parameters
-    ----------
-    mask : (…)
-        What is looked through.
-    """
+    """``mask.any()``, in a fifth of the time where the array is small."""
     return bool(np.count_nonzero(mask))
 
 
 def indices(mask: Bools | Ints) -> Ints:
-    """``np.flatnonzero(mask)``, in a third of the time where the array is small.
-
-    Parameters
-    ----------
-    mask : (n,)
-        What is looked through.
-    """
+    """``np.flatnonzero(mask)`` for one dimension, in a third of the time where the array is small."""
     return mask.nonzero()[0]
 
 
 def all_of(mask: Bools) -> bool:
-    """``mask.all()``, in a fifth of the time where the array is small.
-
-    Parameters
-    ----------
-    mask : (…)
-        What is looked through.
-    """
+    """``mask.all()``, in a fifth of the time where the array is small."""
     return bool(np.count_nonzero(mask) == mask.size)
 
 
 def submatrix(matrix: Floats, rows: Ints, columns: Ints) -> Floats:
     """``matrix[np.ix_(rows, columns)]``, several times as fast where most of a matrix is picked.
 
-    Parameters
-    ----------
-    matrix : (n, m)
-        Any matrix.
-    rows, columns : (k,), (l,)
-        What to pick, in any order and with repetitions.
-
-    Returns
-    -------
-    (k, l)
-        A copy, row by row.
+    The indices `rows` (k,) and `columns` (l,) may have any order and repetitions. Returns a copy (k, l).
     """
     n, m = matrix.shape
     if rows.size * m <= n * columns.size:
@@ -139,15 +92,13 @@ def submatrix(matrix: Floats, rows: Ints, columns: Ints) -> Floats:
 
 
 def unit_rows(matrix: Floats, *, tol: float) -> Floats:
-    """Rows scaled to length one; those that are rounding errors are zero instead.
+    """Rows scaled to length one; rows at the level of rounding are set to zero.
 
     Parameters
     ----------
-    matrix : (k, n)
-        Any matrix.
     tol
-        Rows up to this part of the longest are zero. A row that should be zero comes out of a decomposition
-        as some 1e-17, and scaled to length one it would point anywhere.
+        Rows up to this fraction of the longest are zero. An exact zero row comes out of a decomposition at
+        about 1e-17; scaled to length one it would have an arbitrary direction.
 
     Returns
     -------
@@ -160,13 +111,7 @@ def unit_rows(matrix: Floats, *, tol: float) -> Floats:
 
 
 def symmetry_defect(matrix: Floats) -> float:
-    """Largest `|M - M^T|`, relative to the largest `|M|`; 0 for the zero matrix.
-
-    Parameters
-    ----------
-    matrix : (n, n)
-        Any square matrix.
-    """
+    """Largest `|M - M^T|` of a square matrix, relative to the largest `|M|`; 0 for the zero matrix."""
     scale = float(np.max(np.abs(matrix), initial=0.0))
     if scale == 0.0:
         return 0.0
@@ -174,13 +119,7 @@ def symmetry_defect(matrix: Floats) -> float:
 
 
 def spectral_radius(matrix: Floats) -> float:
-    """Largest modulus of an eigenvalue; 0 for an empty matrix.
-
-    Parameters
-    ----------
-    matrix : (n, n)
-        Any square matrix, not necessarily symmetric.
-    """
+    """Largest modulus of an eigenvalue of any square matrix; 0 for an empty matrix."""
     if matrix.size == 0:
         return 0.0
     return float(np.max(np.abs(np.linalg.eigvals(matrix))))
@@ -189,7 +128,7 @@ def spectral_radius(matrix: Floats) -> float:
 def exponential_integrals(y: Floats) -> tuple[Floats, Floats, Floats]:
     """`exp(y)`, `(exp(y) - 1) / y` and `(exp(y) - 1 - y) / y^2`, entry by entry.
 
-    The latter two by their power series near 0, where the formulas cancel.
+    The latter two use their power series near 0, where the formulas cancel.
 
     Parameters
     ----------
@@ -217,15 +156,13 @@ def exponential_integrals(y: Floats) -> tuple[Floats, Floats, Floats]:
 def perron_bound(matrix: Floats, rounds: int) -> float:
     """Upper bound of the spectral radius of `|M|`, hence of every `M` with smaller entries.
 
-    The quotient of Collatz and Wielandt, `max_i (|M| v)_i / v_i`, is a bound for every positive v;
-    power iteration only makes it tighter.
+    The quotient of Collatz and Wielandt, `max_i (|M| v)_i / v_i`, is a bound for every positive v; power
+    iteration only tightens it.
 
     Parameters
     ----------
     matrix : (n, n)
         Any square matrix; signs are ignored.
-    rounds
-        Number of power iterations.
     """
     if matrix.size == 0:
         return 0.0
@@ -238,6 +175,6 @@ def perron_bound(matrix: Floats, rounds: int) -> float:
         top = float(image.max())
         if top == 0.0:
             return 0.0
-        # The floor keeps v positive in rows that nothing feeds.
+        # The floor keeps v positive in rows without entries.
         v = image / top + 1e-3
     return best

@@ -1,13 +1,12 @@
-"""Attack signals: what a manipulated meter reports instead of what it measured.
+"""Attack signals: reported values of a manipulated meter in place of the measured ones.
 
-An attack is a frozen value. It names its meters and the interval ``[t_on, t_off)`` in which it lies, and
-`apply` turns honest reports into manipulated ones. Time is an argument and nothing is remembered: an
-attack that needs the past (a stuck or a replaying meter) asks the caller for it, so that one tick, a whole
-day at once, and a second run all give the same numbers. Attacks are for simulation; no estimator reads
-this module.
+An attack is a frozen value. It names its meters and its active interval ``[t_on, t_off)``, and `apply` turns
+unmanipulated reports into manipulated ones. Time is an argument and no state is kept: an attack that needs
+the past (a stuck or a replaying meter) requests it from the caller. So one tick, a whole day at once and a
+second run give the same numbers. Attacks are for simulation; no estimator reads this module.
 
 Voltages are magnitudes per unit of the nominal voltage, as a meter displays them (not squared). Powers are
-in whatever unit the reports use; imports are positive, as on the wire.
+in the unit of the reports; imports are positive, as on the wire.
 """
 
 from __future__ import annotations
@@ -23,14 +22,14 @@ from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import InputInvalid, Problem
 
 Past: TypeAlias = Callable[[Floats], Floats]
-"""Honest reports of all p meters at earlier times: (T,) s -> (T, p) pu."""
+"""Unmanipulated reports of all p meters at earlier times: (T,) s -> (T, p) pu."""
 
 _Bits: TypeAlias = NDArray[np.uint64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reports:
-    """What p meters report at T times.
+    """Reports of p meters at T times.
 
     Attributes
     ----------
@@ -49,14 +48,14 @@ class Reports:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Attack:
-    """What every attack has.
+    """Common fields of all attacks.
 
     Attributes
     ----------
     meters : (k,)
-        Index of each manipulated meter, every one once.
+        Indices of the manipulated meters, each once.
     t_on, t_off
-        The attack lies while t_on <= t < t_off, Unix s.
+        The attack is active while t_on <= t < t_off, Unix s.
     """
 
     meters: Ints
@@ -69,7 +68,7 @@ class _Attack:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bias(_Attack):
-    """A constant is added: v~ = v + size.
+    """Constant bias: v~ = v + size.
 
     Attributes
     ----------
@@ -86,7 +85,7 @@ class Bias(_Attack):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scaling(_Attack):
-    """The reading is stretched: v~ = (1 + factor) v.
+    """Scaled reading: v~ = (1 + factor) v.
 
     Attributes
     ----------
@@ -103,7 +102,7 @@ class Scaling(_Attack):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drift(_Attack):
-    """The reading creeps away: v~ = v + sign(rate) min(abs(rate) (t - t_on), limit).
+    """Drifting reading: v~ = v + sign(rate) min(abs(rate) (t - t_on), limit).
 
     Attributes
     ----------
@@ -115,7 +114,7 @@ class Drift(_Attack):
     Raises
     ------
     ValueError
-        If meters, times or numbers do not fit, or a limit is negative.
+        If meters, times or numbers are inconsistent, or a limit is negative.
     """
 
     rate: Floats
@@ -132,22 +131,22 @@ class Drift(_Attack):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stuck(_Attack):
-    """The reading freezes at what the meter said when the attack began: v~(t) = v(t_on)."""
+    """Reading frozen at its value at the begin of the attack: v~(t) = v(t_on)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Replay(_Attack):
-    """An earlier stretch is played again: v~(t) = v(t - delay_s).
+    """Replay of an earlier interval: v~(t) = v(t - delay_s).
 
     Attributes
     ----------
     delay_s
-        How far back the played stretch lies, s, > 0.
+        Delay of the replayed interval, s, > 0.
 
     Raises
     ------
     ValueError
-        If meters or times do not fit, or the delay is not positive.
+        If meters or times are inconsistent, or the delay is not positive.
     """
 
     delay_s: float
@@ -162,21 +161,21 @@ class Replay(_Attack):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Random(_Attack):
-    """A random displacement, drawn anew every `hold_s`: v~ = v + s u with s = +-1 and low <= u <= high.
+    """Random displacement, redrawn every `hold_s`: v~ = v + s u with s = +-1 and low <= u <= high.
 
     Attributes
     ----------
     low, high : (k,)
         Smallest and largest magnitude of the displacement, pu.
     hold_s
-        How long one draw stays, s, > 0.
+        Duration of one draw, s, > 0.
     seed
-        Chooses the draws.
+        Seed of the draws.
 
     Raises
     ------
     ValueError
-        If meters, times or numbers do not fit, or not 0 <= low <= high, or `hold_s` is not positive.
+        If meters, times or numbers are inconsistent, not 0 <= low <= high, or `hold_s` is not positive.
     """
 
     low: Floats
@@ -197,7 +196,7 @@ class Random(_Attack):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Coordinated(_Attack):
-    """Several meters tell one consistent story: the pattern that a load would leave which is not there.
+    """Consistent displacement of several meters: the voltage pattern of a load that does not exist.
 
     ``v~ = v + shift``, ``p~ = p + p_shift``, ``q~ = q + q_shift``. `coordinate` sizes the pattern.
 
@@ -206,7 +205,7 @@ class Coordinated(_Attack):
     shift : (k,)
         Signed displacement of the voltage, pu; negative for a fake load.
     p_shift, q_shift : (k,)
-        Displacement of the reported import, unit of the reports; zero when only voltages lie.
+        Displacement of the reported import, unit of the reports; zero if only voltages are manipulated.
     """
 
     shift: Floats
@@ -223,21 +222,21 @@ Attack: TypeAlias = Bias | Scaling | Drift | Stuck | Replay | Random | Coordinat
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InverterAttack:
-    """Inverters inject a wrong reactive power, `x + q` instead of what their droop curves say.
+    """Wrong reactive injection of inverters: `x + q` in place of the droop curve's x.
 
     Attributes
     ----------
     inverters : (k,)
-        Index of each manipulated inverter, every one once.
+        Indices of the manipulated inverters, each once.
     q : (k,)
-        What each injects in addition, pu.
+        Additional injection of each, pu.
     t_on, t_off
-        While t_on <= t < t_off, Unix s.
+        Active while t_on <= t < t_off, Unix s.
 
     Raises
     ------
     ValueError
-        If inverters or times do not fit, or q is not one finite number for each.
+        If inverters or times are inconsistent, or q is not one finite number for each.
 
     References
     ----------
@@ -263,18 +262,16 @@ class InverterAttack:
 
 
 def apply(attack: Attack, t: Floats, honest: Reports, past: Past) -> Reports:
-    """Reports under one attack.
+    """Apply one attack to reports.
 
     Parameters
     ----------
-    attack
-        The attack.
     t : (T,)
         Time of each report, Unix s.
     honest
         Reports without this attack; not modified.
     past
-        The honest voltage reports at earlier times, pu. Called by `Stuck` and `Replay` only, never for a
+        Unmanipulated voltage reports at earlier times, pu. Called for `Stuck` and `Replay` only, never for a
         time after the newest of `t`.
 
     Returns
@@ -292,12 +289,12 @@ def apply(attack: Attack, t: Floats, honest: Reports, past: Past) -> Reports:
         return replace(honest, v=v)
     p, q = honest.p.copy(), honest.q.copy()
     p[cells] += attack.p_shift
-    q[cells] += attack.q_shift  # NaN stays NaN: a meter that reports no q does not begin to
+    q[cells] += attack.q_shift  # NaN stays NaN: a meter without reported q gets none
     return Reports(v=v, p=p, q=q)
 
 
 def apply_all(attacks: Sequence[Attack], t: Floats, honest: Reports, past: Past) -> Reports:
-    """Reports under several attacks, applied in their order; see `apply`."""
+    """Apply several attacks to reports, in their order; see `apply`."""
     reports = honest
     for attack in attacks:
         reports = apply(attack, t, reports, past)
@@ -305,17 +302,15 @@ def apply_all(attacks: Sequence[Attack], t: Floats, honest: Reports, past: Past)
 
 
 def active(attack: Attack, t: Floats) -> Bools:
-    """Whether the attack lies at each time: t_on <= t < t_off, (T,)."""
+    """Mask of the times (T,) at which the attack is active: t_on <= t < t_off."""
     return (t >= attack.t_on) & (t < attack.t_off)
 
 
 def manipulated(attacks: Sequence[Attack], t: Floats, meters: int) -> Bools:
-    """Which of p meters are under some attack at each time.
+    """Mask of the manipulated meters at each time.
 
     Parameters
     ----------
-    attacks
-        The attacks.
     t : (T,)
         Times, Unix s.
     meters
@@ -324,8 +319,7 @@ def manipulated(attacks: Sequence[Attack], t: Floats, meters: int) -> Bools:
     Returns
     -------
     (T, p)
-        True where a meter is manipulated. A manipulated meter need not be displaced: one that is stuck at
-        the true voltage is manipulated all the same.
+        True where a meter is manipulated, displaced or not: a meter stuck at the true voltage counts too.
     """
     out = np.zeros((t.size, meters), dtype=np.bool_)
     for attack in attacks:
@@ -334,7 +328,7 @@ def manipulated(attacks: Sequence[Attack], t: Floats, meters: int) -> Bools:
 
 
 def reach(attack: Attack, t: float) -> float:
-    """How far into the past the attack looks at time t, s; 0 for attacks without memory."""
+    """Time span into the past that the attack needs at time t, s; 0 for attacks without memory."""
     match attack:
         case Stuck():
             return max(t - attack.t_on, 0.0)
@@ -345,7 +339,7 @@ def reach(attack: Attack, t: float) -> float:
 
 
 def load_pattern(R: Floats, X: Floats, target: int, ratio: float, v: Floats) -> Floats:
-    """Voltage change at every customer per unit of extra load at one of them, to first order.
+    """Voltage change at every customer per unit of extra load at one customer, to first order.
 
     From v^2 = v0^2 + 2 R p + 2 X q with a load P + j ratio P at customer k:
     dv_i / dP = -(R_ik + ratio X_ik) / v_i.
@@ -355,7 +349,7 @@ def load_pattern(R: Floats, X: Floats, target: int, ratio: float, v: Floats) -> 
     R, X : (N, N)
         Shared path resistance and reactance of LinDistFlow, pu.
     target
-        The customer k with the extra load.
+        Customer k with the extra load.
     ratio
         Reactive over active power of that load, 1.
     v : (N,)
@@ -375,7 +369,7 @@ def most_affected(pattern: Floats, count: int) -> Ints:
     Raises
     ------
     ValueError
-        If there are fewer entries than that, or none is asked for.
+        If `count` exceeds the number of entries or is not positive.
     """
     if not 0 < count <= pattern.size:
         raise InputInvalid([Problem("out-of-range", f"cannot choose {count} of {pattern.size} meters")])
@@ -384,35 +378,35 @@ def most_affected(pattern: Floats, count: int) -> Ints:
 
 
 def coordinate(pattern: Floats, meters: Ints, size: float) -> float:
-    """Scale at which a pattern moves every chosen meter by at least `size`.
+    """Scale at which a pattern displaces every chosen meter by at least `size`.
 
     Parameters
     ----------
     pattern : (p,)
-        Voltage change at each meter per unit of what is faked, pu.
+        Voltage change at each meter per unit of the fake quantity, pu.
     meters : (k,)
-        The meters that will lie.
+        The meters to manipulate.
     size
-        Smallest displacement asked for, pu, > 0.
+        Smallest displacement required, pu, > 0.
 
     Returns
     -------
     float
-        ``size / min_j |pattern_j|``, so that the least affected of the meters moves by just `size`.
+        ``size / min_j |pattern_j|``; the least affected meter is displaced by exactly `size`.
 
     Raises
     ------
     ValueError
-        When a chosen meter is not affected at all: no size of load would move it.
+        If a chosen meter is not affected by any load size.
     """
     weakest = float(np.min(np.abs(pattern[meters])))
     if not weakest > 0.0:
-        raise InputInvalid([Problem("no-effect", "a chosen meter does not feel the fake load at all")])
+        raise InputInvalid([Problem("no-effect", "a chosen meter is not affected by the fake load at all")])
     return size / weakest
 
 
 def _voltage(attack: Attack, t: Floats, v: Floats, past: Past) -> Floats:
-    """Reported voltage (T, k) of the attack's meters while it is on, from the honest one (T, k)."""
+    """Reported voltage (T, k) of the attack's meters while active, from the unmanipulated one (T, k)."""
     lie: Floats
     match attack:
         case Bias():
@@ -437,8 +431,8 @@ def _random(attack: Random, t: Floats) -> Floats:
     """Displacement (T, k) of a random attack."""
     draw = np.floor((t - attack.t_on) / attack.hold_s).astype(np.uint64)[:, None]
     meter = attack.meters.astype(np.uint64)[None, :]
-    # A hash of (seed, meter, draw) instead of a generator: any stretch of time can be asked for, in any
-    # order and any chunks, and gives the same numbers.
+    # A hash of (seed, meter, draw) in place of a generator: any time interval can be computed in any order
+    # and any chunks, with the same numbers.
     start = np.full((1, 1), attack.seed % 2**64, dtype=np.uint64)
     bits = _scramble(_scramble(_scramble(start) ^ meter) ^ draw)
     sign = np.where(bits & np.uint64(1), 1.0, -1.0)
@@ -447,7 +441,7 @@ def _random(attack: Random, t: Floats) -> Floats:
 
 
 def _scramble(bits: _Bits) -> _Bits:
-    """Mix 64 bits thoroughly: the output function of the SplitMix64 generator, arithmetic modulo 2^64.
+    """Mix 64 bits: the output function of the SplitMix64 generator, arithmetic modulo 2^64.
 
     References
     ----------

@@ -1,9 +1,9 @@
 """The exact observer bank of chong2020: one observer for every set of N - M and of N - 2M meters.
 
-If at most M of p > 2M meters lie, one large set S contains no liar, and every large set contains a
-small one without liars. The estimate of the S that agrees best with its small subsets is therefore
-close to the truth, whatever the liars say (Theorem 2). `step` moves all observers at once; there is no
-loop over observers.
+If at most M of p > 2M meters are manipulated, one large set S contains none of them, and every large set
+contains a small set without manipulated meters. The estimate of the S that agrees best with its small
+subsets is therefore close to the true state under any attack (Theorem 2). `step` advances all observers at
+once; there is no loop over observers.
 
 References
 ----------
@@ -51,27 +51,27 @@ BankState = SlotState | StackedState
 
 MOST_OBSERVERS = 200_000
 POLICY = StepPolicy(substep=1.0, settled=1e-6, tol=1e-10, max_iter=60)
-"""Time steps of the bank: coarser than the simulation's, see docs/theory-detection.md."""
+"""Time steps of the bank: coarser than those of the simulation, see docs/theory-detection.md."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bank:
-    """Both banks of observers for one plant. p meters, M liars at most, o observers.
+    """Both banks of observers for one plant. p meters, at most M manipulated, o observers.
 
     Attributes
     ----------
     lure
         The plant.
     sets
-        Sensor subsets and who is compared to whom.
+        Sensor subsets and the pairs that are compared.
     masks : (o, p)
-        Meters that each observer listens to; the C(p, M) large sets first.
+        Meters used by each observer; the C(p, M) large sets first.
     sizes : (o,)
-        Their numbers.
+        Number of meters of each observer.
     direct
-        Whether the gains are direct injection.
+        True for direct injection.
     gains
-        Stacked gains; None for direct injection in its structured form.
+        Stacked gains; None for direct injection.
     layout, base
         The structured form of direct injection; None otherwise.
     policy
@@ -105,26 +105,26 @@ def design(
     lure
         The plant with p meters.
     max_attacked
-        M, how many meters may lie at the same time.
+        M, largest number of simultaneously manipulated meters.
     gains
         `direct`, or gains of all observers in the order of `subsets(p, M).masks()`.
     reactive : (l, p), optional
-        What one pu of reactive injection at each meter's customer does to u; direct injection only.
+        Change of u per pu of reactive injection at each meter's customer; direct injection only.
         Needed where net reactive power is metered at customers without an inverter.
     policy
         Accuracy of the time steps.
     most
-        Largest number of observers that is acceptable.
+        Largest acceptable number of observers.
 
     Raises
     ------
     NotObservable
         Unless p > 2M.
     DesignInfeasible
-        If there would be too many observers, or if an observer listens to none of its meters: the
-        degenerate gains L = K = 0 satisfy every convergence condition here and detect nothing.
+        If there are more than `most` observers, or an observer uses none of its meters: the degenerate gains
+        L = K = 0 satisfy every convergence condition here and detect nothing.
     ValueError
-        If M is negative, or `gains` is another text: `lmi_gains` makes gains by matrix inequality.
+        If M is negative, or `gains` is another text; `lmi_gains` computes gains by matrix inequality.
     TypeError, ValueError
         With `direct`, if the plant is not the loop of a feeder, from `close_loop`.
 
@@ -174,7 +174,7 @@ def lmi_gains(
 
 
 def _check_gains(lure: Lure, masks: Bools, gains: Gains) -> None:
-    """Refuse gains of the wrong shape, gains from meters outside the set, and gains that do nothing."""
+    """Refuse gains of the wrong shape, gains from meters outside the set, and gains without effect."""
     o, p = masks.shape
     n, m = lure.A.shape[0], lure.slope.size
     if gains.L.shape != (o, n, p) or gains.K.shape != (o, m, p):
@@ -192,30 +192,29 @@ def _check_gains(lure: Lure, masks: Bools, gains: Gains) -> None:
     if (gains.L * outside).any() or (gains.K * outside).any():
         raise InputInvalid([Problem("wrong-design", "an observer has gains from a meter outside its set")])
     deaf = ~(gains.L.any(axis=(1, 2)) | gains.K.any(axis=(1, 2)))
-    # A set whose meters sit at no inverter has nothing to inject into; its silence is no degeneracy.
+    # A set with meters at no inverter has no injection; zero gains are no degeneracy there.
     reach = (direct_gains(lure, masks).K != 0).any(axis=(1, 2))
     if (deaf & reach).any() and n:
         raise DesignInfeasible(
             "observer bank",
             f"{np.count_nonzero(deaf & reach)} of {o} observers have L = K = 0: they converge because the "
-            "plant does, listen to no meter, agree with each other under any attack, and so detect nothing",
+            "plant does, use no meter, agree with each other under any attack, and so detect nothing",
             code="degenerate",
         )
 
 
 def init(bank: Bank, y: Floats, u: Floats, seen: Bools, *, net: Floats | None = None) -> BankState:
-    """All observers at the equilibrium that the first readings suggest.
+    """All observers at the equilibrium of the first readings.
 
     Parameters
     ----------
-    bank
-        The design.
     y : (p,)
-        Readings as `z = vbar^2 - v^2`, pu; anything where not seen. One that is no finite number is not seen.
+        Readings as `z = vbar^2 - v^2`, pu; arbitrary where not seen. A reading that is not finite is not
+        seen.
     u : (l,)
         Known input w, pu.
     seen : (p,)
-        Live meters.
+        Available meters.
     net : (p,), optional
         As in `step`.
     """
@@ -239,29 +238,27 @@ def step(  # noqa: PLR0917  # design and state, then the four inputs that every 
     net: Floats | None = None,
     adopt: Floats | None = None,
 ) -> BankState:
-    """All observers a time h later, under inputs that are held.
+    """All observers a time h later, under constant inputs.
 
     Parameters
     ----------
-    bank, state
-        Design and state.
     y : (p,)
-        Readings as `z = vbar^2 - v^2`, pu; anything where not seen. One that is no finite number is not seen.
+        Readings as `z = vbar^2 - v^2`, pu; arbitrary where not seen. A reading that is not finite is not
+        seen.
     u : (l,)
         Known input w, pu.
     seen : (p,)
-        Live meters. A silent meter is trusted by nobody; the observers go on. With 2M or fewer live
-        meters the banks rest, and only an observer that trusts no meter goes on.
+        Available meters. No observer trusts an unavailable meter; the observers continue. With 2M or fewer
+        available meters the banks rest, and only an observer without meters continues.
     h
         Length of the step, s, not negative.
     net : (p,), optional
-        Metered net reactive injection of each meter's customer minus what u assumes for its load, pu;
-        NaN where not reported. An observer uses it exactly if it trusts the meter. Direct injection
-        only.
+        Metered net reactive injection of each meter's customer minus the load assumed in u, pu; NaN where not
+        reported. An observer uses it exactly if it trusts the meter. Direct injection only.
     adopt : (n,), optional
-        Injections from which inverters start whose meter has just returned. Direct injection only.
+        Initial injections of inverters with a meter that has just returned. Direct injection only.
     """
-    # Equal steps that differ by rounding share their coefficients.
+    # Rounded, so that equal steps share their coefficients.
     h = round(h, 6)
     seen = np.asarray(seen & np.isfinite(y))
     if isinstance(state, StackedState):
@@ -286,30 +283,19 @@ def _gains(bank: Bank) -> Gains:
 
 
 def decided(bank: Bank, state: BankState) -> bool:
-    """Whether enough meters are alive for the bank's guarantee: more than 2M.
-
-    Parameters
-    ----------
-    bank, state
-        Design and state.
-    """
+    """True while more than 2M meters are available, which the bank's guarantee needs."""
     return int(np.count_nonzero(state.seen)) > 2 * bank.sets.max_attacked
 
 
 def consistency(bank: Bank, state: BankState) -> Floats:
-    """How much each large set disagrees with its small subsets.
+    """Disagreement of each large set with its small subsets.
 
     `pi_S = max over P within S of max_i |x_S,i - x_P,i|`
-
-    Parameters
-    ----------
-    bank, state
-        Design and state.
 
     Returns
     -------
     (C(p, M),)
-        pi, pu of reactive power. Empty while 2M or fewer meters are alive.
+        pi, pu of reactive power. Empty while 2M or fewer meters are available.
 
     References
     ----------
@@ -328,7 +314,7 @@ def consistency(bank: Bank, state: BankState) -> Floats:
 def select(
     pi: Floats, *, allowed: Bools | None = None, penalty: Floats | None = None, tie: float = 0.0
 ) -> int:
-    """The large set to believe: smallest pi, ties by smallest penalty, then by number.
+    """The large set to trust: smallest pi, ties by smallest penalty, then by number.
 
     Parameters
     ----------
@@ -337,14 +323,14 @@ def select(
     allowed : (s,), optional
         Sets that may be chosen; all by default.
     penalty : (s,), optional
-        What decides between equals. Inside deadbands all observers coincide and every pi is zero.
+        Criterion for ties. Inside deadbands all observers coincide and every pi is zero.
     tie
-        Sets whose pi is at most the smallest one plus this are equals, pu.
+        Sets with a pi up to the smallest pi plus this are ties, pu.
 
     Returns
     -------
     int
-        Number of the set, -1 if there is none to choose from.
+        Number of the set; -1 if no set is allowed.
 
     References
     ----------
@@ -361,17 +347,12 @@ def select(
 
 
 def believe(bank: Bank, state: BankState) -> tuple[Floats, Bools]:
-    """The estimate of the large set that agrees best with its small subsets, and its meters.
-
-    Parameters
-    ----------
-    bank, state
-        Design and state.
+    """Estimate and meters of the large set that agrees best with its small subsets.
 
     Returns
     -------
     x, trusted : (n,), (p,)
-        NaN and nobody while 2M or fewer meters are alive.
+        NaN and no meters while 2M or fewer meters are available.
 
     References
     ----------
@@ -389,8 +370,6 @@ def spread(bank: Bank, state: BankState, index: int) -> Floats:
 
     Parameters
     ----------
-    bank, state
-        Design and state.
     index
         Number of S.
 
@@ -406,15 +385,14 @@ def spread(bank: Bank, state: BankState, index: int) -> Floats:
 
 
 def estimate(bank: Bank, state: BankState, index: int) -> Floats:
-    """Reactive injections (n,) that one observer believes in.
+    """Reactive injections (n,) estimated by one observer.
 
     Parameters
     ----------
-    bank, state
-        Design and state.
     index
-        Number of the observer as in `Bank.masks`. -1: with direct injection, the observer that trusts
-        every live meter, and none while 2M or fewer are alive; with other gains, the median of all.
+        Number of the observer as in `Bank.masks`. -1: with direct injection, the observer that trusts every
+        available meter, or no meter while 2M or fewer are available; with other gains, the median of all
+        observers.
     """
     if isinstance(state, SlotState):
         return slot_steps.estimate(_structure(bank)[0], bank.sets, state, index)

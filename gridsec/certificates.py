@@ -1,12 +1,12 @@
-"""Closed-form proofs that the direct-injection observer forgets its errors, for all meter sets at once.
+"""Closed-form proofs that the direct-injection observer converges, for all meter sets at once.
 
 The plant is `T x' = -x + K(z)`, `z = w - S x`, `S = -H`. The observer runs the same equations; the
-inverter of a trusted meter is driven by that meter's reading instead of the model. With Pi the
-projection on the inverters that are not, and Delta(t) the unknown slopes, `0 <= Delta_i <= d_i`,
+inverter of a trusted meter is driven by that meter's reading in place of the model. With Pi the
+projection on the other inverters, and Delta(t) the unknown slopes, `0 <= Delta_i <= d_i`,
 
     T e' = -(I + Delta Pi S) e + Delta u,     u_i = load error of z_i, or minus noise and attack of meter i.
 
-Which meters are trusted may change at any moment; every statement here holds for all of it. Proofs:
+The set of trusted meters may change at any moment; every statement here holds for all of it. Proofs:
 docs/theory-certificates.md.
 
 References
@@ -29,15 +29,15 @@ from gridsec.lure_form import Readout
 
 # Shares of 1 / slope on the diagonal of P that `reactance` tries, see Theorem 1.
 SHARES = (0.01, 0.03, 0.1, 0.3, 0.6, 1.0)
-# Part of the best rate that is given away, so that what is claimed has slack. The weights of the
-# small-gain norm need more of it: at the best rate itself, weakly coupled inverters have weight zero.
+# Fraction of the best rate that is given up for slack in the claims. The weights of the small-gain norm
+# need more: at the best rate itself, weakly coupled inverters have weight zero.
 BACKOFF = 0.01
 WEIGHT_BACKOFF = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Certificate:
-    """Why the error of the direct-injection observer decays, and how much disturbances hold it up.
+    """Decay of the direct-injection observer's error and its steady level under disturbances.
 
     Attributes
     ----------
@@ -48,16 +48,16 @@ class Certificate:
     rate
         Without disturbances the error decays in that norm at least like `exp(-rate t)`, 1/s.
     noise, load, attack
-        Steady error in that norm for each pu in the largest entry of the meter noise, of the error of
-        the known input w, and of the attack.
+        Steady error in that norm per pu of the largest entry of the meter noise, of the error of the known
+        input w, and of the attack.
     margin
-        Slack of the condition at the claimed rate, as recomputed by `verify`, relative to the rate of
-        the slowest inverter; positive: it holds.
+        Slack of the condition at the claimed rate, as recomputed by `verify`, relative to the rate of the
+        slowest inverter; a positive margin proves the claim.
     status
-        One sentence about how the certificate came about.
+        Origin of the certificate, one sentence.
     saturation
-        Steady error in that norm whatever the attack, because droop curves saturate; infinite where
-        they do not.
+        Steady error in that norm under any attack, by saturation of the droop curves; infinite without
+        saturation.
     multiplier : (m,) or (0,)
         The multipliers Lambda of the quadratic kinds.
     """
@@ -79,7 +79,7 @@ class Certificate:
 
 
 def reactance(lure: Lure) -> Certificate:
-    """The certificate that rests on the reactance matrix being symmetric.
+    """Certificate from the symmetry of the reactance matrix.
 
     `V = e^T P e`, `P = (S + S^T) / 2 + kappa D^-1`, `Lambda = T^-1`. With
     `b = P T^-1 - S^T Lambda`, V falls at the rate 2 alpha for every trusted set, every switching and
@@ -89,7 +89,7 @@ def reactance(lure: Lure) -> Certificate:
 
     For symmetric S and one common tau this always holds, with `alpha = (1 - kappa / 2) / tau`; kappa
     makes P positive definite where S is singular (customers on one bus or on the busbar). Other
-    systems are tried with the shares `SHARES`; what asymmetry there is costs margin.
+    systems are tried with the shares `SHARES`; asymmetry costs margin.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def reactance(lure: Lure) -> Certificate:
     if form.tau.size == 0:
         return _nothing("reactance")
     S, slope, multiplier = form.S, form.slope, 1.0 / form.tau
-    # A larger bound on a slope is still a bound; it keeps D^-1 finite for inverters that do nothing.
+    # A larger bound on a slope is still a bound; it keeps D^-1 finite for inverters of slope zero.
     top = float(np.max(slope, initial=0.0)) or 1.0
     floor = np.maximum(slope, 1e-3 * top)
     best, chosen = -np.inf, np.zeros_like(S)
@@ -126,7 +126,7 @@ def reactance(lure: Lure) -> Certificate:
 
 
 def small_gain(lure: Lure) -> Certificate:
-    """The certificate that rests on the loop gain being below 1.
+    """Certificate from a loop gain below 1.
 
     In the norm `max_i |e_i| / c_i` the error decays at the rate alpha for every trusted set, every
     switching and every slope if, entry by entry,
@@ -170,10 +170,10 @@ def small_gain(lure: Lure) -> Certificate:
 def quadratic(
     lure: Lure, P: Floats, multiplier: Floats, rate: float, *, kind: str, status: str
 ) -> Certificate:
-    """A certificate for a given norm matrix, multiplier and rate, verified and with its gains.
+    """Certificate for a given norm matrix, multiplier and rate, verified and with its gains.
 
-    This is how a solution of the linear matrix inequality for *no* trusted meter becomes a
-    certificate for all sets at once (docs/theory-certificates.md, Theorem 1).
+    Turns a solution of the linear matrix inequality for *no* trusted meter into a certificate for all sets at
+    once (docs/theory-certificates.md, Theorem 1).
 
     Parameters
     ----------
@@ -191,7 +191,7 @@ def quadratic(
     Raises
     ------
     DesignInfeasible
-        If it does not survive its verification.
+        If the verification fails.
     """
     form = _droop_form(lure, f"{kind} certificate")
     none, one = np.zeros(form.tau.size), np.ones(form.tau.size)
@@ -204,7 +204,7 @@ def quadratic(
 
 
 def certify(lure: Lure) -> Certificate:
-    """The closed-form certificate with the highest rate.
+    """Closed-form certificate with the highest rate.
 
     Parameters
     ----------
@@ -214,7 +214,7 @@ def certify(lure: Lure) -> Certificate:
     Raises
     ------
     DesignInfeasible
-        If none holds; the reasons of all are in the message.
+        If none holds; the message lists the reasons.
     """
     found: list[Certificate] = []
     failed: list[DesignInfeasible] = []
@@ -236,25 +236,23 @@ def verify(certificate: Certificate, lure: Lure, trusted: Bools | None = None) -
 
     Parameters
     ----------
-    certificate
-        Any kind.
     lure
-        The closed loop it is claimed for.
+        The closed loop of the claim.
     trusted : (p,)
-        Verify for this set only; by default for all sets at once, which is the harder claim: trusting
-        a meter only takes terms out of the condition.
+        Verify for this set only; by default for all sets at once. That claim is stronger: a trusted meter
+        only removes terms from the condition.
 
     Returns
     -------
     float
-        Slack of the condition at the claimed rate, relative to the rate of the slowest inverter and
-        less the rounding error of the computation. Positive: the certificate holds. Minus infinity where
-        the claimed rate is not positive and finite.
+        Slack of the condition at the claimed rate, relative to the rate of the slowest inverter and less the
+        rounding error of the computation. A positive slack proves the certificate. Minus infinity if the
+        claimed rate is not positive and finite.
 
     Raises
     ------
     DesignInfeasible
-        If the kind is unknown, or the system is not of the form that the certificates are about.
+        If the kind is unknown, or the system does not have the form of the certificates.
     """
     form = _droop_form(lure, f"{certificate.kind} certificate")
     if trusted is not None:
@@ -273,12 +271,7 @@ def verify(certificate: Certificate, lure: Lure, trusted: Bools | None = None) -
 
 
 def feeds(lure: Readout) -> Bools:
-    """Which meter can drive which inverter of the observer: those that see the same voltage.
-
-    Parameters
-    ----------
-    lure
-        The closed loop.
+    """Incidence of meters that can drive inverters of the observer, by equal voltages.
 
     Returns
     -------
@@ -299,35 +292,34 @@ def error_bound(
     z: Floats | None = None,
     certificate: Certificate | None = None,
 ) -> Floats:
-    """How far the observer's state can be from the plant's, inverter by inverter.
+    """Bound of the distance of the observer's state from the plant's, inverter by inverter.
 
-    Every entry of `e` is a first-order lag of what drives it, so that the monotone map
+    Every entry of `e` is a first-order lag of its input, so that the monotone map
 
         bound_i <- min(span_i, k_i(u_i + free_i sum_j |S_ij| bound_j)),     k_i(r) = d_i r
 
-    takes bounds to bounds; it starts from the saturation of the curves, at most `2 limit`, and every
-    iterate is valid after the transient. Without `certificate` the bound also holds for all times if
-    it holds at the beginning. Under attack, put the size of the attack into `y_error`, infinity
-    included.
+    maps bounds to bounds. It starts from the saturation of the curves, at most `2 limit`; every iterate is
+    valid after the transient. Without `certificate` the bound also holds for all times if it holds at the
+    beginning. Under attack, `y_error` contains the size of the attack, infinity included.
 
     Parameters
     ----------
     lure
         The closed loop, from `close_loop`.
     trusted : (…, p)
-        The meters that drive their inverters.
+        Meters that drive their inverters.
     y_error : (…, p)
         Largest error of each reading (noise and attack), squared pu.
     u_error : (…, l)
         Largest error of each entry of the known input w, squared pu.
     z : (…, m)
-        The observer's own outputs. If given, `k_i(r)` is what the curve itself does within r of
-        `z_i`, nothing inside the deadband, and the bound is for observer and plant at rest, or
-        moving slowly against the time constants. It presumes that some certificate holds.
+        The observer's own outputs. If given, `k_i(r)` is the variation of the curve within r of `z_i`, zero
+        inside the deadband. The bound then holds for observer and plant at rest, or moving slowly against the
+        time constants, provided that a certificate holds.
     certificate
-        A certificate of the system. If it is a quadratic one with its multiplier, its norm gives a
-        start of the iteration that may be tighter than saturation; others are not used. That start is
-        an ellipsoid's box: an error in a corner of it can leave it for a while.
+        A certificate of the system. The norm of a quadratic one with its multiplier gives a start of the
+        iteration that may be tighter than saturation; other kinds are not used. That start is the box around
+        an ellipsoid: an error in a corner of the box can leave it temporarily.
 
     Returns
     -------
@@ -351,7 +343,7 @@ def error_bound(
     def drive(bound: Floats) -> Floats:
         known = np.isfinite(bound)
         through = np.where(known, bound, 0.0) @ coupling
-        # Unbounded entries only matter where they couple: infinity times zero is no coupling.
+        # Unbounded entries matter only where they couple: infinity times zero is zero here.
         through[~known @ (coupling > 0)] = np.inf
         return _reach(lure, np.where(free, direct + through, direct), z, span)
 
@@ -365,7 +357,7 @@ def error_bound(
 
 
 def _from_below(drive: Callable[[Floats], Floats], span: Floats) -> Floats:
-    """The smallest bound that the monotone map cannot leave; infinite where none is found.
+    """Smallest bound that the monotone map cannot leave; infinite where none is found.
 
     At rest, and with any certificate in force, the error depends continuously on the size of the
     disturbances and starts from zero with them: it cannot pass a bound that the map takes below itself.
@@ -377,22 +369,22 @@ def _from_below(drive: Callable[[Floats], Floats], span: Floats) -> Floats:
         bound = larger
         if settled:
             break
-    # Room for the map to be strictly inside; what is claimed is checked, whatever the loop did.
+    # Room for the map to be strictly inside; the claim is checked in every case.
     bound = (1.0 + 10.0 * _TIGHTENING) * bound + np.finfo(np.float64).tiny
     inside = np.all(drive(bound) < bound, axis=-1, keepdims=True)
     return np.where(inside, bound, np.inf)
 
 
-# Rounds of the monotone iteration, and the relative gain below which another round is not worth it.
-# Both trade tightness for time only: every iterate is a bound.
+# Rounds of the monotone iteration, and the relative gain below which it stops. Both trade tightness for time
+# only: every iterate is a bound.
 _ROUNDS = 200
 _TIGHTENING = 1e-4
 
 
 def _reach(lure: Lure, radius: Floats, z: Floats | None, span: Floats) -> Floats:
-    """How far the set-points can move when their arguments move by `radius` (around `z`, if given)."""
+    """Largest change of the set-points for arguments within `radius` (around `z`, if given)."""
     if z is None:
-        # A curve of slope zero does not move, not even for an unbounded attack.
+        # A curve of slope zero has a constant value, even under an unbounded attack.
         return np.minimum(
             span, np.multiply(lure.slope, radius, out=np.zeros_like(radius), where=lure.slope > 0)
         )
@@ -402,7 +394,7 @@ def _reach(lure: Lure, radius: Floats, z: Floats | None, span: Floats) -> Floats
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Form:
-    """The numbers of `T x' = -x + phi(w - S x)`."""
+    """Coefficients of `T x' = -x + phi(w - S x)`."""
 
     tau: Floats
     S: Floats
@@ -420,7 +412,7 @@ def _droop_form(lure: Lure, what: str) -> _Form:
 
 
 def _nothing(kind: str) -> Certificate:
-    """Without inverters there is no state, and no error of it."""
+    """Certificate of a system without inverters: no state and no error."""
     empty = np.zeros((0, 0) if kind == "reactance" else 0)
     return Certificate(kind, empty, np.inf, 0.0, 0.0, 0.0, 1.0, "no droop inverter, nothing to estimate", 0.0)
 
@@ -482,12 +474,10 @@ def _level(certificate: Certificate, form: _Form, kick: Floats, load: Floats) ->
     ----------
     certificate
         A quadratic certificate: P, Lambda and alpha.
-    form
-        The system.
     kick : (…, n)
-        Largest entries of what acts on `e'` directly, pu/s: `N^2 = kick^T |P| kick`.
+        Largest entries of the direct terms of `e'`, pu/s: `N^2 = kick^T |P| kick`.
     load : (…, m)
-        Largest load errors at the inverters that run on the model: `L^2 = sum d_i lambda_i load_i^2`.
+        Largest load errors at the inverters without a trusted meter: `L^2 = sum d_i lambda_i load_i^2`.
     """
     rate = certificate.rate
     known = np.isfinite(kick)
@@ -499,11 +489,11 @@ def _level(certificate: Certificate, form: _Form, kick: Floats, load: Floats) ->
 
 
 def _checked(certificate: Certificate) -> Certificate:
-    """The certificate, if its margin is positive."""
+    """Return the certificate; refuse it unless its margin is positive."""
     if not certificate.margin > 0:
         raise DesignInfeasible(
             f"{certificate.kind} certificate",
-            "it fails its verification",
+            "the verification fails",
             certificate.margin,
             code="not-verified",
         )

@@ -1,4 +1,4 @@
-"""Choices out of a few: a member of an enumeration, or its text; or one of the texts of a `Literal`."""
+"""Choices: members of an enumeration or their texts, or texts of a `Literal`."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ Choice = TypeVar("Choice", bound=StrEnum)
 
 
 def no_choice(name: str, kind: Iterable[str], *values: str) -> list[str]:
-    """Return what is wrong with values that are to be out of a few, one sentence each.
+    """Return one problem for each value that is not among the allowed ones.
 
     Parameters
     ----------
-    name, kind
-        What is chosen, and out of what: an enumeration, or `typing.get_args` of a `Literal`.
-    values
-        What was given.
+    name
+        Name of the quantity in the message.
+    kind
+        Allowed values: an enumeration, or `typing.get_args` of a `Literal`.
     """
     known = tuple(kind)
     return [
@@ -32,19 +32,12 @@ def no_choice(name: str, kind: Iterable[str], *values: str) -> list[str]:
 
 
 def each_choice(name: str, kind: type[Choice], values: Iterable[str]) -> tuple[Choice, ...]:
-    """Return the members that are meant.
-
-    Parameters
-    ----------
-    name, kind
-        What is chosen, and out of what.
-    values
-        Members, or their texts.
+    """Return the members for members or their texts.
 
     Raises
     ------
     ValueError
-        If there is no such member.
+        If a value is not a member; the message contains `name`.
     """
     given = tuple(values)
     problems = no_choice(name, kind, *given)
@@ -53,16 +46,11 @@ def each_choice(name: str, kind: type[Choice], values: Iterable[str]) -> tuple[C
 
 
 def choice(name: str, kind: type[Choice], value: str) -> Choice:
-    """Return the member that is meant.
-
-    Parameters
-    ----------
-    name, kind, value
-        As in `each_choice`.
+    """Return the member for a member or its text.
 
     Raises
     ------
     ValueError
-        If there is no such member.
+        If `value` is not a member; the message contains `name`.
     """
     return each_choice(name, kind, (value,))[0]

@@ -1,7 +1,7 @@
-"""Designs that are kept: a key by content, an exact round trip through bytes, proof before reuse.
+"""Stored designs: a key by content, an exact round trip through bytes, verification before reuse.
 
-What a design cache is made of: `cached` asks a store, proves again what it gets, and designs what is
-missing or damaged. Files are the store's business; nothing here reads or writes one.
+Building blocks of a design cache: `cached` queries a store, verifies the stored designs again, and designs
+missing or damaged ones. Files belong to the store; nothing here reads or writes a file.
 """
 
 from __future__ import annotations
@@ -31,18 +31,7 @@ _Arrays = dict[str, NDArray[Any]]
 
 
 def design_key(lure: Lure, subsets: Sequence[Sequence[int]], options: CircleOptions) -> str:
-    """Name of a design by content: equal exactly if plant, trusted sets and options are equal.
-
-    Parameters
-    ----------
-    lure, subsets, options
-        What the designs are made from.
-
-    Returns
-    -------
-    str
-        64 hexadecimal digits.
-    """
+    """Key of a design by content, 64 hexadecimal digits; equal exactly for equal plant, sets and options."""
     digest = hashlib.sha256(_FORMAT.encode())
     arrays = [lure.A, lure.G, lure.H, lure.F, lure.B, lure.C, lure.D, lure.slope]
     arrays += [options.noise, options.load, options.weight, np.array([options.rate, options.floor])]
@@ -57,17 +46,8 @@ def design_key(lure: Lure, subsets: Sequence[Sequence[int]], options: CircleOpti
 def to_bytes(gains: Sequence[CircleGains], options: CircleOptions) -> bytes:
     """Write designs of one plant, all with the same options, into bytes: a digest and an NPZ archive.
 
-    Parameters
-    ----------
-    gains
-        The designs, in the order in which they are wanted back.
-    options
-        What they were designed for.
-
-    Returns
-    -------
-    bytes
-        No pickled objects inside; `from_bytes` gives every number back exactly.
+    The archive keeps the order of `gains` and contains no pickled objects; `from_bytes` restores every number
+    exactly.
     """
     arrays: _Arrays = {
         "format": np.array(_FORMAT),
@@ -87,17 +67,12 @@ def to_bytes(gains: Sequence[CircleGains], options: CircleOptions) -> bytes:
 
 
 def from_bytes(blob: bytes) -> tuple[CircleGains, ...]:
-    """Read what `to_bytes` wrote. The margins are the stored ones: recompute before trusting them.
-
-    Parameters
-    ----------
-    blob
-        The bytes.
+    """Read the bytes of `to_bytes`. The margins are the stored ones: recompute before trusting them.
 
     Raises
     ------
     DesignInfeasible
-        If the bytes are no such archive, or damaged.
+        If the bytes are damaged or not such an archive.
     """
     digest, content = blob[:_DIGEST], blob[_DIGEST:]
     if hashlib.sha256(content).digest() != digest:
@@ -155,25 +130,24 @@ def cached(
     workers: int,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[tuple[CircleGains, ...], str]:
-    """Designs from a store if it has them and they still hold, new ones otherwise.
+    """Designs from a store if they are present and still valid, new ones otherwise.
 
-    What the store returns is proven again: readable, the right sets, every margin recomputed and
-    positive, no blind design. Otherwise the bank is designed anew and put into the store.
+    Stored designs are verified again: readable, the right sets, every margin recomputed and positive, no
+    blind design. Otherwise the bank is redesigned and put into the store.
 
     Parameters
     ----------
     lure, subsets, options, workers, progress
         As in `solve_many`.
     get
-        Bytes stored under a key, or None.
+        Returns the bytes stored under a key, or None.
     put
         Stores bytes under a key.
 
     Returns
     -------
     designs, origin
-        `origin` says where they came from: "stored", "new", or "redesigned: " with what was wrong
-        with the stored ones.
+        `origin` is "stored", "new", or "redesigned: " with the fault of the stored designs.
 
     Raises
     ------
@@ -196,7 +170,7 @@ def cached(
 def _proven(
     lure: Lure, subsets: Sequence[Sequence[int]], options: CircleOptions, stored: tuple[CircleGains, ...]
 ) -> tuple[CircleGains, ...]:
-    """The stored designs with margins recomputed, or DesignInfeasible."""
+    """The stored designs with recomputed margins, or DesignInfeasible."""
     what = "stored design"
     wanted = [tuple(int(j) for j in subset) for subset in subsets]
     if [tuple(one.J.tolist()) for one in stored] != wanted:
@@ -207,7 +181,7 @@ def _proven(
         n, m, k = len(lure.A), len(lure.slope), len(one.J)
         if shapes != ((n, k), (m, k), (n, n), (m,), options.load.shape):
             raise DesignInfeasible(what, "made for a plant of another size", code="wrong-design")
-        # A relaxed rate is part of a design; anything beyond the stated back-off is damage.
+        # A relaxed rate is part of a design; a rate outside the stated back-off is damage.
         honest = (1.0 - BACKOFF[-1]) * options.rate <= one.alpha <= options.rate * (1.0 + 1e-12)
         same = np.array_equal(one.noise, options.noise[one.J]) and np.array_equal(one.load, options.load)
         if not (honest and same):

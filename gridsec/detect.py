@@ -1,9 +1,9 @@
-"""Residual thresholds: how far an honest meter may be from the reconstructed voltage.
+"""Residual thresholds: largest distance of an unmanipulated reading from the reconstructed voltage.
 
-A meter is named manipulated when its output residual leaves the largest value that honest meters,
-loads known within stated intervals, the observers' own error and the model's can produce together. No
-term is a matter of taste: each comes from a stated accuracy, and the sum is a worst case, because the
-errors of loads and meters may be systematic. docs/theory-detection.md has the derivation and the proof.
+A meter is named as manipulated if its output residual exceeds the largest value that unmanipulated meters,
+loads within stated intervals, the observers' own error and the model's error can produce together. Every
+term comes from a stated accuracy. The sum is a worst case, because the errors of loads and meters may be
+systematic. docs/theory-detection.md has the derivation and the proof.
 
 References
 ----------
@@ -23,7 +23,7 @@ from gridsec.feeder import LinDistFlow
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Majorant:
-    """Entrywise bounds that hold for the observers of all sets, any of their meters silent.
+    """Entrywise bounds for the observers of all sets, with any of their meters unavailable.
 
     Attributes
     ----------
@@ -32,7 +32,7 @@ class Majorant:
     F : (m, N)
         `|F - K_J D|`.
     K, L : (m, p)
-        `|K_J|`, and `T |L_J|`: what one pu of output error adds to the target of each state.
+        `|K_J|`, and `T |L_J|`: change of each state's target per pu of output error.
     """
 
     H: Floats
@@ -43,20 +43,20 @@ class Majorant:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ErrorModel:
-    """How errors travel through the feeder and the observers. N customers, m inverters, p meters.
+    """Propagation of errors through feeder and observers. N customers, m inverters, p meters.
 
     Attributes
     ----------
     droop
         The inverters.
     quota
-        2M: how many meters an observer without liars may leave out.
+        2M: largest number of meters left out by an observer without manipulated meters.
     R2, X2 : (N, N)
         `2 |R|`, `2 |X|`.
     inverters, reach : (N, m), (N, p)
-        Columns of X2 of the inverters' customers and of the meters' customers.
+        Columns of X2 at the customers of inverters and of meters.
     inverters_own, reach_own : (m, m), (m, p)
-        Their rows at the inverters' customers.
+        Rows of these at the inverters' customers.
     meters : (p,)
         Customer of each meter.
     meter_of : (m,)
@@ -64,7 +64,7 @@ class ErrorModel:
     span : (m,)
         Distance between the saturated values of each curve, pu.
     mismatch : (m,)
-        How far the curve that a real inverter runs, linear in v, can be from K, linear in z, pu.
+        Largest distance of a real inverter's curve, linear in v, from K, linear in z, pu.
     majorant
         For gains other than direct injection.
     """
@@ -85,19 +85,7 @@ class ErrorModel:
 
 
 def error_model(droop: Droop, model: LinDistFlow, meters: Ints, max_attacked: int) -> ErrorModel:
-    """Collect what the bounds need.
-
-    Parameters
-    ----------
-    droop
-        The inverters.
-    model
-        Linear power flow of the feeder.
-    meters : (p,)
-        Customer of each meter.
-    max_attacked
-        M.
-    """
+    """Coefficients of the bounds for p meters at the customers `meters` (p,) and M = `max_attacked`."""
     at = {int(c): j for j, c in reversed(list(enumerate(meters)))}
     own, X2 = droop.customer, 2.0 * np.abs(model.X)
     return ErrorModel(
@@ -120,13 +108,8 @@ def curve_mismatch(droop: Droop) -> Floats:
     """Largest distance between the curve in v and its model in z, per inverter; (m,).
 
     Both agree at the breakpoints. Between two of them, v as a function of z is a parabola against its
-    chord: the distance is largest in the middle of the interval of v, `(dv)^2 / 4` in z, and what that
-    is in reactive power is computed there, not approximated.
-
-    Parameters
-    ----------
-    droop
-        The inverters.
+    chord: the distance is largest in the middle of the interval of v, `(dv)^2 / 4` in z. Its reactive power
+    is computed there, not approximated.
     """
     worst = np.zeros(droop.tau.shape)
     for left in range(3):
@@ -139,21 +122,21 @@ def curve_mismatch(droop: Droop) -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Uncertainty:
-    """What is not known at one tick.
+    """Uncertainty at one tick.
 
     Attributes
     ----------
     base : (N,)
-        Error of each customer's squared voltage if all injections of inverters were known: busbar,
-        loads, model; squared pu.
+        Error of each customer's squared voltage for known injections of inverters: busbar, loads, model;
+        squared pu.
     reading : (p,)
-        Honest error of each reading, squared pu.
+        Error of each unmanipulated reading, squared pu.
     live : (p,)
         Meters with a usable reading.
     told : (p,)
-        Live meters whose customer's net reactive power is metered and used.
+        Available meters at customers with metered net reactive power in use.
     extra : (p,)
-        By how much the assumed load of such a customer is less certain than the metered net, pu.
+        Excess of the assumed load's uncertainty over that of the metered net at such a customer, pu.
     """
 
     base: Floats
@@ -165,15 +148,15 @@ class Uncertainty:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ErrorBound:
-    """Bounds on the observers' error, inverter by inverter; honest at every time. m inverters.
+    """Bounds of the observers' error, inverter by inverter; valid at every time. m inverters.
 
     Attributes
     ----------
     driven : (m,)
-        For inverters that their own honest meter drives, pu.
+        For inverters driven by their own unmanipulated meter, pu.
     free : (m,)
-        For inverters that run on the model, in every observer that leaves out at most 2M meters and
-        trusts only honest ones, pu.
+        For inverters that run on the model, in every observer without manipulated meters that leaves out at
+        most 2M meters, pu.
     """
 
     driven: Floats
@@ -181,15 +164,13 @@ class ErrorBound:
 
 
 def widest(model: ErrorModel, x: Floats | None = None) -> ErrorBound:
-    """The bound when nothing is known: the true injections lie between the saturated values.
+    """Bound without any knowledge: the true injections lie between the saturated values.
 
     Parameters
     ----------
-    model
-        The plant.
     x : (…, m), optional
-        The observers' states, where they can leave the range of the curves (gains L); without, they
-        are taken to lie in it as well.
+        The observers' states, needed where they can leave the range of the curves (gains L); by default they
+        lie in it.
     """
     if x is None:
         return ErrorBound(model.span.copy(), model.span.copy())
@@ -198,17 +179,15 @@ def widest(model: ErrorModel, x: Floats | None = None) -> ErrorBound:
 
 
 def gap(model: ErrorModel, now: Uncertainty, bound: ErrorBound, *, own: bool = False) -> Floats:
-    """Error of the squared voltages that any liar-free observer with at most 2M meters left out sees.
+    """Error of squared voltages in any observer without manipulated meters and at most 2M meters left out.
 
     `base_i + sum over undriven inverters 2 X_ik free_k + sum over meters 2 X_ij driven_j
-    + the 2M largest of 2 X_ij (free_j - driven_j)`: whichever 2M meters are left out, these cost most.
+    + the 2M largest of 2 X_ij (free_j - driven_j)`: the worst choice of 2M omitted meters.
 
     Parameters
     ----------
-    model, now, bound
-        Plant, what is not known, and the bound on the observers' error.
     own
-        At the customers of the inverters instead of all.
+        Restrict to the customers of the inverters.
 
     Returns
     -------
@@ -222,22 +201,14 @@ def gap(model: ErrorModel, now: Uncertainty, bound: ErrorBound, *, own: bool = F
     p, at = now.live.size, model.meter_of[metered]
     driven = np.bincount(at, weights=bound.driven[metered], minlength=p)
     free = np.bincount(at, weights=bound.free[metered], minlength=p)
-    # While the net is metered and trusted, the inverter's own state does not matter to the voltage.
+    # While the net is metered and trusted, the inverter's own state has no effect on the voltage.
     driven = np.where(now.told, 0.0, driven)
     swing = np.maximum(np.where(now.told, free + now.extra, free) - driven, 0.0)
     return np.asarray(out + column @ driven + largest(column * swing, model.quota))
 
 
 def largest(values: Floats, count: int) -> Floats:
-    """Sum of the `count` largest entries of each row; (r,).
-
-    Parameters
-    ----------
-    values : (r, p)
-        Entries, not negative.
-    count
-        How many.
-    """
+    """Sum of the `count` largest entries of each row of `values` (r, p), which are not negative; (r,)."""
     p = values.shape[1]
     if count >= p:
         return np.asarray(values.sum(axis=1))
@@ -248,19 +219,19 @@ def largest(values: Floats, count: int) -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """Where the estimate was and is, over one step.
+    """Estimate before and after one step.
 
     Attributes
     ----------
     before, after : (m,)
         Estimated z at the inverters at the beginning and the end, pu.
     offset : (m,)
-        How far the selected estimate's z may be from that of a liar-free observer, pu.
+        Largest distance of the selected estimate's z from that of an observer without manipulated meters, pu.
     h
         Length of the step, s.
     lag : (m,)
-        How far the injections of inverters moved that the observers' step takes for slower than they
-        are (`lure.transition`), pu; 0 for the others.
+        Motion of the inverters that the observers' step treats as slower than they are (`lure.transition`),
+        pu; 0 for the others.
     """
 
     before: Floats
@@ -271,15 +242,13 @@ class Motion:
 
 
 def settled(model: ErrorModel, now: Uncertainty, motion: Motion, start: ErrorBound) -> ErrorBound:
-    """Level towards which the bounds go, given that they never exceed `start`.
+    """Level to which the bounds converge, given that they never exceed `start`.
 
-    Iterates the monotone map of `docs/theory-detection.md` downwards from `start`; every iterate is a
-    bound, so that the iteration may stop at any time.
+    Iterates the monotone map of `docs/theory-detection.md` downwards from `start`. Every iterate is a bound;
+    the iteration may stop at any time.
 
     Parameters
     ----------
-    model, now, motion
-        Plant, what is not known, and where the estimate was.
     start
         An upper bound that the map does not exceed.
     """
@@ -295,10 +264,10 @@ def settled(model: ErrorModel, now: Uncertainty, motion: Motion, start: ErrorBou
 
 
 def _image(model: ErrorModel, now: Uncertainty, motion: Motion, bound: ErrorBound) -> ErrorBound:
-    """What errors of the size `bound` drive the curves' values to differ by."""
+    """Largest difference of the curves' values for errors within `bound`."""
     droop = model.droop
-    # Readings and loads are held over the step; how far they moved in it is part of their error. It may
-    # all have been just before the reading, so a long step is not let off any of it.
+    # Readings and loads are held over the step; their motion within it is part of the error. All of it may
+    # have occurred just before the reading, so a long step gets no discount.
     hold = np.abs(motion.after - motion.before)
     around = gap(model, now, bound, own=True) + hold
     injected: Floats | float = 0.0
@@ -308,7 +277,7 @@ def _image(model: ErrorModel, now: Uncertainty, motion: Motion, bound: ErrorBoun
     else:
         big = model.majorant
         through = own = big.H @ bound.free + big.F @ now.base + big.K @ now.reading + hold
-        # What meters see moves within the step no more than what the inverters' places see.
+        # Voltages at meters change within the step by at most the largest change at the inverters.
         seen = now.base[model.meters] + now.reading + np.max(hold, initial=0.0)
         injected = big.L @ (model.inverters[model.meters] @ bound.free + seen)
     low = np.minimum(motion.before, motion.after) - motion.offset - around
@@ -321,31 +290,28 @@ def _image(model: ErrorModel, now: Uncertainty, motion: Motion, bound: ErrorBoun
     return ErrorBound(driven, free)
 
 
-# Rounds of the iteration and the relative gain below which another round is not worth it. Both trade
-# tightness for time only.
+# Rounds of the iteration, and the relative gain below which it stops. Both trade tightness for time only.
 _ROUNDS = 40
 _TIGHTENING = 1e-3
-# How far above the last bound the next one is looked for before starting again from saturation.
+# Factor on the last bound for the first guess of the next, before a restart from saturation.
 _ROOM = 1.05
 
 
 def advance(
     model: ErrorModel, now: Uncertainty, motion: Motion, bound: ErrorBound, last: ErrorBound
 ) -> tuple[ErrorBound, ErrorBound]:
-    """The bounds at the end of a step.
+    """Bounds at the end of a step.
 
-    Every error is a first-order lag of what drives it, `tau |e|' <= -|e| + reach(e)`, and reach is
+    Every error is a first-order lag of its input, `tau |e|' <= -|e| + reach(e)`, and reach is
     monotone: with any G that is at least the present bound and at least its own image, the error stays
     below G during the step, and `bound+ = exp(-h/tau) bound + (1 - exp(-h/tau)) reach(G)`.
 
     Parameters
     ----------
-    model, now, motion
-        Plant, what is not known, and the step.
     bound
         Bound at the beginning.
     last
-        The G of the previous step: a good first guess.
+        The G of the previous step, as first guess.
 
     Returns
     -------
@@ -366,7 +332,7 @@ def advance(
         )
         done = np.all(lower.free >= (1.0 - _TIGHTENING) * top.free)
         top = lower
-        # The image of the level before serves as well: it is not below that of the lower one.
+        # The image of the level before is a bound too: it is not below that of the lower level.
         if done:
             break
         image = _image(model, now, motion, top)
@@ -379,16 +345,16 @@ def advance(
 def ceiling(model: ErrorModel, now: Uncertainty, motion: Motion, floor: ErrorBound) -> ErrorBound:
     """A level above `floor` that the map of the bounds does not exceed.
 
-    Without output injection that is where the curves saturate. With it, the map is at most
-    `r + A bound` with a matrix A whose spectral radius is below 1 (the certificate), and
-    `(I - A)^-1 r` plus any multiple of `(I - A)^-1 1` is such a level.
+    Without output injection, the saturation of the curves. With it, the map is at most `r + A bound` with a
+    matrix A of spectral radius below 1 (the certificate), and `(I - A)^-1 r` plus any multiple of
+    `(I - A)^-1 1` is such a level.
 
     Parameters
     ----------
     model, now, motion
         As in `advance`.
     floor
-        What it must not be below.
+        Lower limit of the level.
     """
     big = model.majorant
     if big is None or not big.L.any():

@@ -1,9 +1,9 @@
 """Droop inverters: the curves, their slope in the squared voltage, standard presets, capability limits.
 
-An inverter injects reactive power by a piecewise linear curve with four breakpoints and saturation at
-both ends. Inverters measure v, so their curve is linear in v between the breakpoints (`voltage_curve`).
-The model runs on `z = vbar^2 - v^2`, where the curve K of chong2020 (17) is linear between the *mapped*
-breakpoints (`Droop.__call__`). The two agree at the breakpoints; docs/theory-model.md bounds the rest.
+An inverter injects reactive power by a piecewise linear curve with four breakpoints and saturation at both
+ends. Inverters measure v, so their curve is linear in v between the breakpoints (`voltage_curve`). The model
+runs on `z = vbar^2 - v^2`, where the curve K of chong2020 (17) is linear between the *mapped* breakpoints
+(`Droop.__call__`). The two agree at the breakpoints; docs/theory-model.md bounds the difference between them.
 
 References
 ----------
@@ -33,7 +33,7 @@ class Droop:
     Attributes
     ----------
     customer : (m,)
-        Index of the customer each inverter belongs to.
+        Customer of each inverter.
     v : (m, 4)
         Breakpoints of the voltage, ascending, pu.
     q : (m, 4)
@@ -43,8 +43,8 @@ class Droop:
     vbar
         Reference voltage, pu; `z = vbar^2 - v^2`.
     rating : (m,), or one number for all
-        The most that an inverter can inject when it does not follow its curve: its rated apparent power, pu
-        of the feeder's base; infinite where it is not told.
+        Largest injection of an inverter that does not follow its curve: its rated apparent power, pu of the
+        feeder's base; infinite where not stated.
     slope : (m,)
         Derived. Largest slope of K, the d of chong2020 (18) as corrected.
     limit : (m,)
@@ -96,8 +96,7 @@ class Droop:
         z : (…, m), or the shape of `rows`
             `vbar^2 - v^2` at each inverter, pu.
         rows : (…)
-            Index of the inverter each entry of `z` belongs to; by default the last axis of `z` runs
-            over all inverters.
+            Inverter of each entry of `z`; by default the last axis of `z` runs over all inverters.
 
         Returns
         -------
@@ -123,36 +122,16 @@ class Droop:
         return np.asarray(self.q[:, 0] - self.q[:, 3])
 
     def per_customer(self, of_inverters: Floats, customers: int) -> Floats:
-        """Sums over the inverters of each customer, (N,).
-
-        Parameters
-        ----------
-        of_inverters : (m,)
-            What is summed.
-        customers
-            N.
-        """
+        """Sums of values (m,) of the inverters over the inverters of each of N customers, (N,)."""
         return np.asarray(np.bincount(self.customer, weights=of_inverters, minlength=customers), np.float64)
 
     def saturated(self, customers: int) -> tuple[Floats, Floats]:
-        """The least and the most that each customer's inverters inject, (N,) each, in pu.
-
-        Parameters
-        ----------
-        customers
-            N.
-        """
+        """Smallest and largest total injection of each customer's inverters, (N,) each, in pu."""
         return self.per_customer(self.q[:, 3], customers), self.per_customer(self.q[:, 0], customers)
 
     def take(self, rows: Ints) -> Droop:
-        """The droop of the inverters `rows`, in that order and with repetitions.
-
-        Parameters
-        ----------
-        rows : (k,)
-            Indices of inverters.
-        """
-        # What was derived and found right is so for some of the inverters too.
+        """The droop of the inverters `rows` (k,), in that order and with repetitions."""
+        # Derived and checked values of the fleet hold for any selection.
         out: Droop = object.__new__(Droop)
         own = {name: getattr(self, name)[rows] for name in ("v", "q", "tau", "rating", "slope", "limit")}
         ramps = tuple(ramp.take(rows) for ramp in self._ramps)
@@ -183,7 +162,7 @@ class _Ramp:
 
 
 def _compact(values: Floats) -> Floats:
-    """One entry instead of m equal ones, so that a gathered evaluation need not gather it."""
+    """One entry for m equal ones; a gathered evaluation then skips the gather."""
     if values.size > 1 and np.all(values == values[0]):
         return frozen(values[:1])
     return frozen(values)
@@ -194,7 +173,7 @@ def _pick(values: Floats, rows: Ints | None) -> Floats:
 
 
 def _ramps(z: Floats, q: Floats) -> tuple[list[_Ramp], Floats]:
-    """The ramps whose sum is K, and the value K has between its two middle breakpoints.
+    """Ramps with sum K, and the value of K between its two middle breakpoints.
 
     Parameters
     ----------
@@ -203,7 +182,7 @@ def _ramps(z: Floats, q: Floats) -> tuple[list[_Ramp], Floats]:
     q : (m, 4)
         Values at the breakpoints, non-increasing.
     """
-    # (upper breakpoint, lower breakpoint, where the ramp is zero): injecting, middle, absorbing.
+    # (upper breakpoint, lower breakpoint, zero of the ramp): injecting, middle, absorbing.
     ramps = []
     for left, right, zero in ((0, 1, 1), (1, 2, 2), (2, 3, 2)):
         rise = q[:, left] - q[:, right]
@@ -216,7 +195,7 @@ def _ramps(z: Floats, q: Floats) -> tuple[list[_Ramp], Floats]:
 
 
 def _problems(droop: Droop) -> list[Problem]:
-    """Every reason why the fields of `droop` do not describe a fleet."""
+    """Problems of the fields of `droop`."""
     count = droop.customer.size
     shapes = (
         ("v", droop.v.shape, (count, 4)),
@@ -243,11 +222,11 @@ def _problems(droop: Droop) -> list[Problem]:
 
 
 def _row_problems(droop: Droop) -> tuple[tuple[Bools, Problem], ...]:
-    """Which inverters' breakpoints, time constants or ratings are wrong, and why."""
+    """Masks of inverters with wrong breakpoints, time constants or ratings, each with its problem."""
     v, q, tau = droop.v, droop.q, droop.tau
     most = np.abs(q).max(axis=1, initial=0.0)
     finite = np.all(np.isfinite(v), axis=1) & np.all(np.isfinite(q), axis=1)
-    # Infinite entries are named as such, and not again for what their differences are.
+    # Infinite entries are reported as such, and not again for their differences.
     steps = np.diff(np.where(finite[:, None], v, 1.0), axis=1)
     falls = np.diff(np.where(finite[:, None], q, 0.0), axis=1)
     return (
@@ -274,12 +253,10 @@ def _row_problems(droop: Droop) -> tuple[tuple[Bools, Problem], ...]:
 
 @dataclass(frozen=True, slots=True)
 class DroopCurve:
-    """One preset, in the units of standards.
+    """Preset curve in the units of standards.
 
     Attributes
     ----------
-    name
-        Name of the preset.
     v
         Breakpoints of the voltage, pu of nominal.
     q
@@ -287,7 +264,7 @@ class DroopCurve:
     tau
         Time constant of the first-order response, s.
     source
-        Where the numbers come from.
+        Source of the numbers.
     """
 
     name: str
@@ -298,7 +275,7 @@ class DroopCurve:
 
 
 def _volts(*volts: float) -> tuple[float, float, float, float]:
-    """AS/NZS 4777.2 writes volts of a 230 V system."""
+    """Voltages in pu from volts of a 230 V system, as in AS/NZS 4777.2."""
     a, b, c, d = volts
     return (a / 230.0, b / 230.0, c / 230.0, d / 230.0)
 
@@ -306,7 +283,7 @@ def _volts(*volts: float) -> tuple[float, float, float, float]:
 # A first-order response reaches 90 % of its final value, the 'open loop response time' of IEEE 1547,
 # after tau ln 10.
 _NINETY_PERCENT = log(10.0)
-# VDE-AR-N 4105 asks for a PT1 with 3 tau = 10 s. AS/NZS 4777.2 wants the response complete within 10 s;
+# VDE-AR-N 4105 requires a PT1 with 3 tau = 10 s. AS/NZS 4777.2 requires the complete response within 10 s;
 # 'complete' is read as the same 95 %.
 _THREE_TAU = 3.0
 
@@ -335,13 +312,12 @@ PRESETS: tuple[str, ...] = tuple(curve.name for curve in _CURVES)
 
 
 def preset(name: str) -> DroopCurve:
-    """A standard's default curve by name.
+    """Default curve of a standard by name.
 
-    The numbers come from secondary sources, named in `DroopCurve.source`; nobody here has read the
-    standards themselves. `vde4105` is for inverters above 4.6 kVA, `vde4105-small` for the others.
-    Open-loop response times T (90 %) become `tau = T / ln 10`; a PT1 of 10 s in VDE-AR-N 4105 means
-    `3 tau = 10 s`; AS/NZS 4777.2 wants the response complete within 10 s, read here as 95 %, the
-    same `3 tau = 10 s`.
+    The numbers come from secondary sources, listed in `DroopCurve.source`, not from the standards themselves.
+    `vde4105` is for inverters above 4.6 kVA, `vde4105-small` for the others. Open-loop response times T (90
+    %) become `tau = T / ln 10`; a PT1 of 10 s in VDE-AR-N 4105 means `3 tau = 10 s`; AS/NZS 4777.2 requires
+    the complete response within 10 s, read here as 95 %, the same `3 tau = 10 s`.
 
     Parameters
     ----------
@@ -351,7 +327,7 @@ def preset(name: str) -> DroopCurve:
     Raises
     ------
     FeederInvalid
-        If there is no such preset.
+        If `name` is not a preset.
     """
     for curve in _CURVES:
         if curve.name == name:
@@ -372,12 +348,12 @@ def fleet(
     p_gen: Floats | None = None,
     vbar: float = 1.0,
 ) -> Droop:
-    """A fleet of inverters with standard curves.
+    """Fleet of inverters with standard curves.
 
     Parameters
     ----------
     customer : (m,)
-        Index of the customer of each inverter.
+        Customer of each inverter.
     names : (m,) or one
         Preset of each inverter.
     rated_kva : (m,)
@@ -385,10 +361,10 @@ def fleet(
     base_kva
         Three-phase base power of the feeder, kVA.
     tau : (m,)
-        Time constants, s; NaN or no array at all: the preset's.
+        Time constants, s; those of the presets for NaN or without the array.
     capability
-        `fixed`: the preset's limits always hold. `circular`: the output is capped at
-        `sqrt(s^2 - p_gen^2)`, chong2020 after (17); the slopes stay.
+        `fixed`: limits of the preset. `circular`: the output is capped at `sqrt(s^2 - p_gen^2)`, chong2020
+        after (17); the slopes stay.
     p_gen : (m,)
         Active power that each inverter generates, pu of the feeder's base; required for `circular`.
     vbar
@@ -447,17 +423,15 @@ def fleet(
 
 
 def capped(droop: Droop, limit: Floats) -> Droop:
-    """The same fleet with `|q|` capped; the curve keeps its slopes in v and saturates earlier.
+    """The same fleet with capped `|q|`; the curve keeps its slopes in v and saturates earlier.
 
     Parameters
     ----------
-    droop
-        The fleet.
     limit : (m,)
         Largest `|q|` of each inverter, pu, not negative.
     """
     v, q = droop.v.copy(), np.clip(droop.q, -limit[:, None], limit[:, None])
-    # Breakpoints 0 and 3 move inwards to where the outer ramps meet the cap.
+    # Breakpoints 0 and 3 move inwards to the intersection of the outer ramps with the cap.
     for outer, inner in ((0, 1), (3, 2)):
         rise = droop.q[:, outer] - droop.q[:, inner]
         kept = q[:, outer] - q[:, inner]
@@ -467,12 +441,10 @@ def capped(droop: Droop, limit: Floats) -> Droop:
 
 
 def voltage_curve(droop: Droop, v: Floats) -> Floats:
-    """The curves as inverters run them, piecewise linear in the voltage.
+    """Reactive set-points of real inverters: curves piecewise linear in the voltage.
 
     Parameters
     ----------
-    droop
-        The fleet.
     v : (…, m)
         Voltage at each inverter, pu.
 
@@ -490,16 +462,11 @@ def voltage_curve(droop: Droop, v: Floats) -> Floats:
 
 
 def curve_gap(droop: Droop) -> Floats:
-    """How far K(z) and `voltage_curve` can be apart, for every inverter.
+    """Largest distance of K(z) from `voltage_curve`, for every inverter.
 
-    Between breakpoints `v_a < v_b` with values `q_a >= q_b`, both interpolate linearly, one in `v^2` and
-    one in v; they differ by `(q_a - q_b) t (1 - t) (v_b - v_a) / (v_b + v_a)` with t the fraction of the
-    way in v, hence by at most a quarter of the factor of `t (1 - t)`.
-
-    Parameters
-    ----------
-    droop
-        The fleet.
+    Between breakpoints `v_a < v_b` with values `q_a >= q_b`, both interpolate linearly, one in `v^2` and one
+    in v; they differ by `(q_a - q_b) t (1 - t) (v_b - v_a) / (v_b + v_a)` with t the fraction of the interval
+    in v, hence by at most a quarter of the factor of `t (1 - t)`.
 
     Returns
     -------

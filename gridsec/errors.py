@@ -1,4 +1,4 @@
-"""The error tree. Offline code raises these; online code returns outcomes as values instead.
+"""Exceptions. Offline code raises these; online code returns outcomes as values.
 
 Every problem has a stable code beside its sentence. Programs and tests compare codes; sentences may change.
 """
@@ -10,21 +10,21 @@ from typing import Any, Self
 
 
 class Problem(str):
-    """One problem of an input: a sentence with a stable code.
+    """Problem of an input: a sentence with a stable code.
 
     Parameters
     ----------
     code
-        Lower case words joined by hyphens: the rule that is broken, such as `shape` or `not-finite`.
+        Violated rule, lower case words joined by hyphens, such as `shape` or `not-finite`.
     text
-        Where, what, and what would be right.
+        Place, fault, and expected value.
     """
 
     __slots__ = ("code",)
     code: str
 
     def __new__(cls, code: str, text: str) -> Self:
-        """Return the sentence, with its code beside it."""
+        """Return the sentence with its code."""
         self = super().__new__(cls, text)
         self.code = code
         return self
@@ -75,7 +75,7 @@ class GridsecError(_Pickled, Exception):
 
 
 class Problems(_Pickled):
-    """Problems of an error, all at once."""
+    """All problems of an error."""
 
     problems: tuple[str, ...]
 
@@ -86,12 +86,12 @@ class Problems(_Pickled):
 
 
 class FeederInvalid(Problems, GridsecError):
-    """A feeder's description is wrong; `problems` names everything that is wrong with it at once.
+    """Invalid description of a feeder; `problems` lists every fault at once.
 
     Parameters
     ----------
     problems
-        One sentence each, complete: where, what, and what would be right.
+        One complete sentence each: place, fault, and expected value.
     """
 
     def __init__(self, problems: Iterable[str]) -> None:
@@ -102,12 +102,12 @@ class FeederInvalid(Problems, GridsecError):
 
 
 class InputInvalid(Problems, ValueError):
-    """Arguments are wrong; `problems` names everything that is wrong with them at once.
+    """Invalid arguments; `problems` lists every fault at once.
 
     Parameters
     ----------
     problems
-        One clause each: what is wrong, and what would be right.
+        One clause each: fault and expected value.
     """
 
     def __init__(self, problems: Iterable[str]) -> None:
@@ -116,16 +116,16 @@ class InputInvalid(Problems, ValueError):
 
 
 class NotObservable(GridsecError):
-    """A set of meters is too small for what was asked of it.
+    """A set of meters is too small for the purpose.
 
     Parameters
     ----------
     subset
-        Indices of the meters in question.
+        Indices of the meters.
     rank
-        What they do determine: a rank, or the number of meters when counting is the obstacle.
+        Rank that they determine, or the number of meters if the number is too small.
     why
-        The condition that fails, in words.
+        The violated condition, in words.
     code
         Code of the condition: lower case words joined by hyphens.
     """
@@ -137,16 +137,16 @@ class NotObservable(GridsecError):
 
 
 class DesignInfeasible(GridsecError):
-    """A design could not be found or did not survive its verification.
+    """A design was not found, or its verification failed.
 
     Parameters
     ----------
     what
-        The design that failed, with the condition it had to meet.
+        The design and its condition.
     status
-        What the solver said, or which check failed. A solver's word is never proof by itself.
+        Status of the solver, or the failed check. A solver's status is never a proof.
     margin
-        The recomputed margin of the failed condition (negative: violated), if there is one.
+        The recomputed margin of the failed condition, if any; negative if violated.
     code
         Code of the reason: lower case words joined by hyphens.
     """
@@ -162,17 +162,17 @@ class DesignInfeasible(GridsecError):
 
 
 def refuse(problems: Iterable[str]) -> None:
-    """Raise one error that names all problems of an input; nothing if there are none.
+    """Raise one error with all problems of an input; return if there are none.
 
     Parameters
     ----------
     problems
-        One clause each: what is wrong, and what would be right.
+        One clause each: fault and expected value.
 
     Raises
     ------
     InputInvalid
-        If there is any.
+        If `problems` is not empty.
     """
     found = tuple(problems)
     if found:

@@ -1,4 +1,4 @@
-"""A radial feeder in per unit, its linear power flow, and what the linear power flow leaves out.
+"""Radial feeder in per unit, its linear power flow, and the correction for losses and charging.
 
 Everything is balanced three-phase, per phase, in per unit of the base voltage (phase to neutral) and
 of the three-phase base power, so that powers in kW of all phases together divide by `base_kva`.
@@ -25,7 +25,7 @@ from gridsec.trees import below, from_root, shrinking, walk
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Feeder:
-    """A radial feeder: a tree of b branches and b + 1 buses, rooted at the metered busbar (bus 0).
+    """Radial feeder: a tree of b branches and b + 1 buses, rooted at the metered busbar (bus 0).
 
     Attributes
     ----------
@@ -46,26 +46,26 @@ class Feeder:
     base_kva
         Three-phase base power (1 pu), kVA.
     charging : (b,)
-        Total shunt susceptance of the branch into bus k + 1, pu; half of it sits at each end.
+        Total shunt susceptance of the branch into bus k + 1, pu; half of it at each end.
     start, stop : (b + 1,)
-        Derived. Depth-first numbering: the buses fed through bus k, itself included, are those whose
-        `start` lies in `[start[k], stop[k])`.
+        Derived. Depth-first numbering: bus k and the buses fed through it are those with `start` in
+        `[start[k], stop[k])`.
     order : (b + 1,)
         Derived. The buses by these numbers.
     depth : (b + 1,)
         Derived. Number of branches between bus k and the busbar.
     enter, leave : (b + 1,)
-        Derived. When a walk around the tree comes to a bus first, and when it has left it.
+        Derived. Steps of a walk around the tree at which it reaches a bus first, and has left it.
     inside : (b + 1, b + 1) or None
         Derived. 1 where the bus of the row is fed through that of the column; None for large trees.
     half : (b + 1,)
         Derived. Shunt susceptance at the buses, pu.
     charges
-        Derived. Whether there is any.
+        Derived. True if any bus has charging.
     squared : (b,)
         Derived. ``r^2 + x^2``, pu.
     alone
-        Derived. Whether no two customers are at the same bus.
+        Derived. True if no two customers share a bus.
 
     Raises
     ------
@@ -116,7 +116,7 @@ class Feeder:
 
 
 def _problems(feeder: Feeder) -> list[Problem]:
-    """Every reason why the fields of `feeder` do not describe a radial feeder."""
+    """Problems of the fields of `feeder`."""
     out = _shape_problems(feeder)
     if out:
         return out
@@ -160,7 +160,7 @@ def _problems(feeder: Feeder) -> list[Problem]:
 
 
 def _shape_problems(feeder: Feeder) -> list[Problem]:
-    """Fields whose lengths do not fit together; nothing else can be said before these are right."""
+    """Problems of array lengths; all other checks require that there are none."""
     branches = feeder.parent.size
     expected = (
         ("parent", feeder.parent.shape, (branches,)),
@@ -179,7 +179,7 @@ def _shape_problems(feeder: Feeder) -> list[Problem]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinDistFlow:
-    """The linear power flow `v^2 = v0^2 + 2 R p + 2 X q` of one feeder.
+    """Linear power flow `v^2 = v0^2 + 2 R p + 2 X q` of one feeder.
 
     Attributes
     ----------
@@ -198,17 +198,12 @@ class LinDistFlow:
 def lindistflow(feeder: Feeder) -> LinDistFlow:
     """Matrices of the linear power flow of a feeder.
 
-    `R_bus[k, j] = sum of r over the branches that lie on both paths to the busbar`, from bus k and
-    from the bus of customer j.
-
-    Parameters
-    ----------
-    feeder
-        The feeder.
+    `R_bus[k, j] = sum of r over the branches on both paths to the busbar`, from bus k and from the bus of
+    customer j.
 
     References
     ----------
-    chong2020, equation (15), for any tree instead of a line.
+    chong2020, equation (15), for any tree.
     """
     R_bus = common_paths(feeder, feeder.r, feeder.bus)
     X_bus = common_paths(feeder, feeder.x, feeder.bus)
@@ -218,17 +213,15 @@ def lindistflow(feeder: Feeder) -> LinDistFlow:
 
 
 def common_paths(feeder: Feeder, branch: Floats, buses: Ints) -> Floats:
-    """Sum of a branch quantity over what the paths of two buses to the busbar have in common; O(n k).
+    """Sum of a branch quantity over the common part of the paths of two buses to the busbar; O(n k).
 
-    In depth-first order that is the least of what consecutive buses between the two have in common: the sum
-    up to the parent of the later one.
+    In depth-first order it is the minimum over consecutive buses between the two of their common sum: the sum
+    up to the parent of the later bus.
 
     Parameters
     ----------
-    feeder
-        The feeder.
     branch : (b,)
-        Of each branch, not negative; for example `feeder.r`.
+        Quantity of each branch, not negative; for example `feeder.r`.
     buses : (k,)
         The second bus of each pair.
 
@@ -255,19 +248,17 @@ def common_paths(feeder: Feeder, branch: Floats, buses: Ints) -> Floats:
     return out.T
 
 
-# Entries that are made together: as many as a processor has at hand.
+# Entries per block, chosen for the processor's cache.
 _TOGETHER = 16384
 
 
 def path_sums(feeder: Feeder, branch: Floats) -> Floats:
-    """Sum of a branch quantity over the path from the busbar to each bus, without rounding it twice.
+    """Sum of a branch quantity over the path from the busbar to each bus, with one rounding per branch.
 
     Parameters
     ----------
-    feeder
-        The feeder.
     branch : (b,)
-        Of each branch.
+        Quantity of each branch.
 
     Returns
     -------
@@ -304,21 +295,19 @@ def squared_voltages(model: LinDistFlow, p: Floats, q: Floats, v0_squared: Float
 def loss_correction(
     feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 1
 ) -> Floats:
-    """What the branch losses and the charging add to the linear squared voltage of every bus.
+    """Correction of the linear squared voltage of every bus for branch losses and charging.
 
     From the linear flows `P, Q` (towards the child, at its end of the branch) and the linear `v^2`:
     the squared current `l = (P^2 + Q^2) / v^2`, the losses `r l`, `x l`, and
 
         v_child^2 = v_parent^2 - 2 (r P + x Q) - (r^2 + x^2) l
 
-    with the losses of the branches below added to `P` and `Q`. That is one step of the fixed-point
-    iteration whose limit solves the AC power flow of a balanced radial feeder; `steps` repeats it.
-    O(b) for each operating point.
+    with the losses of the branches below added to `P` and `Q`. This is one step of the fixed-point iteration
+    with the AC power flow of a balanced radial feeder as its limit; `steps` repeats it. O(b) for each
+    operating point.
 
     Parameters
     ----------
-    feeder
-        The feeder.
     p, q : (…, N)
         Net active and reactive injection of each customer (generation positive, droop inverters
         included), pu.
@@ -350,12 +339,12 @@ def loss_correction(
 def bus_voltages(
     feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 1
 ) -> Floats:
-    """Squared voltage of every bus, losses and charging corrected; O(b), without the N x N matrices.
+    """Squared voltage of every bus, corrected for losses and charging; O(b), without the N x N matrices.
 
     Parameters
     ----------
     feeder, p, q, v0_squared, steps
-        As in `loss_correction`; with no steps LinDistFlow alone.
+        As in `loss_correction`; `steps` = 0 gives LinDistFlow.
 
     Returns
     -------
@@ -369,7 +358,7 @@ def bus_voltages(
 def corrected(
     feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 1
 ) -> tuple[Floats, Floats]:
-    """`loss_correction` and `model_error_bound` of the same operating points, in less time than apart.
+    """`loss_correction` and `model_error_bound` of the same operating points, faster than separately.
 
     Parameters
     ----------
@@ -379,7 +368,7 @@ def corrected(
     Returns
     -------
     (…, b + 1), (…, N)
-        Additive correction of `v^2`, and a bound on what it leaves after its first step, pu.
+        Additive correction of `v^2`, and a bound on the error that remains after its first step, pu.
 
     Raises
     ------
@@ -394,25 +383,24 @@ def corrected(
 
 
 def _lossy(feeder: Feeder, flows: _Flows, now: _Flows, steps: int) -> _Flows:
-    """The linear power flow with the losses of another, and so on."""
+    """The linear power flow with the losses of the flows `now`, repeated `steps` times."""
     for _ in range(steps):
         current = (now.P * now.P + now.charged * now.charged) / now.v2[..., 1:]
         charge = feeder.half * now.v2 if feeder.charges else now.v2
         loss_p, loss_q, drop = _losses(feeder, current, charge, sign=-1.0)
-        # Charging is one of the losses here.
+        # The losses include charging.
         Q = flows.Q + loss_q
         now = _Flows(flows.P + loss_p, Q, Q, flows.v2 - from_root(feeder, drop))
     return now
 
 
 def model_error_bound(feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats | float) -> Floats:
-    """How far `v^2` after one loss correction can be from the AC power flow, for every customer.
+    """Bound of the error of `v^2` after one loss correction against the AC power flow, for every customer.
 
-    Twice the size of the second fixed-point step, summed up without regard to signs: the steps shrink
-    geometrically, and twice the next one bounds the sum of all that follow while each is at most half
-    its predecessor (in practice a few hundredths). Heavy loads make the quotients grow from step to step, so
-    the second step has to be below a fifth of the first. Where it is not, towards voltage collapse, the bound
-    is infinite.
+    Twice the size of the second fixed-point step, with magnitudes summed: the steps shrink geometrically, and
+    twice the next step bounds the sum of all later ones while each is at most half its predecessor (in
+    practice a few hundredths). Under heavy loads the quotients grow from step to step, so the second step
+    must be below a fifth of the first. Otherwise, towards voltage collapse, the bound is infinite.
 
     Parameters
     ----------
@@ -430,19 +418,17 @@ def model_error_bound(feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats |
 
 
 def reach(feeder: Feeder, p: Floats, q: Floats) -> Floats:
-    """Largest change of the squared voltages that powers of some sizes can make: ``2 |R| p + 2 |X| q``; O(b).
+    """Largest change of the squared voltages by powers of given sizes: ``2 |R| p + 2 |X| q``; O(b).
 
     Parameters
     ----------
-    feeder
-        The feeder.
     p, q : (…, N)
         Sizes of the customers' active and reactive powers, not negative, pu.
 
     Returns
     -------
     (…, b + 1)
-        Of every bus, pu.
+        Change at every bus, pu.
     """
     both = np.empty((2, *np.broadcast(p, q).shape))
     both[0], both[1] = p, q
@@ -452,7 +438,7 @@ def reach(feeder: Feeder, p: Floats, q: Floats) -> Floats:
 
 def _remainder(feeder: Feeder, flows: _Flows, once: _Flows) -> Floats:
     with np.errstate(all="ignore"):
-        # What the first step adds, and the second to that.
+        # Increments of the first and of the second step.
         current, charge = np.empty((2, *flows.v2[..., 1:].shape)), np.empty((2, *flows.v2.shape))
         np.divide(flows.P**2 + flows.charged**2, flows.v2[..., 1:], out=current[0])
         np.subtract((once.P**2 + once.Q**2) / once.v2[..., 1:], current[0], out=current[1])
@@ -467,9 +453,9 @@ def _remainder(feeder: Feeder, flows: _Flows, once: _Flows) -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Flows:
-    """The linear power flow.
+    """Linear power flow.
 
-    P, Q: flows at the end of the branches, (…, b). charged: Q less what the charging below supplies.
+    P, Q: flows at the end of the branches, (…, b). charged: Q less the supply from charging below.
     v2: squared voltages (…, b + 1).
     """
 
@@ -480,7 +466,7 @@ class _Flows:
 
 
 def _linear_flows(feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats | float) -> _Flows:
-    """The linear power flow, from the injections of the customers."""
+    """Linear power flow from the injections of the customers."""
     both = np.empty((2, *np.broadcast(p, q).shape))
     both[0], both[1] = p, q
     P, Q = -below(feeder, _at_buses(feeder, both))[..., 1:]
@@ -491,7 +477,7 @@ def _linear_flows(feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats | flo
 
 
 def _losses(feeder: Feeder, current: Floats, charge: Floats, *, sign: float) -> tuple[Floats, Floats, Floats]:
-    """What squared currents (…, b) and charging powers (…, b + 1) add to P, Q and to the drop of v^2."""
+    """Contributions of squared currents (…, b) and charging (…, b + 1) to P, Q and to the drop of v^2."""
     own = np.zeros((2, *current.shape[:-1], current.shape[-1] + 1))
     np.multiply(feeder.r, current, out=own[0, ..., 1:])
     np.multiply(feeder.x, current, out=own[1, ..., 1:])

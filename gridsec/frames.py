@@ -1,4 +1,4 @@
-"""One frame made fit for the observers: no NaN gets past here, and every error has a size."""
+"""Preparation of one frame for the observers: no NaN passes, and every error has a bound."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from gridsec.plant import Plant, Setting
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Inputs:
-    """One frame, cleaned. No NaN gets past here."""
+    """Prepared inputs of one frame, without NaN except in `net`."""
 
     live: Bools  # (p,)
-    y: Floats  # (p,) 0 where not live
+    y: Floats  # (p,) 0 where unavailable
     z: Floats  # (p,)
     w: Floats  # (N,)
-    net: Floats | None  # (p,) metered net reactive injection minus the assumed load's; NaN where unused
-    q: Floats  # (N,) without the inverters, whatever is metered
+    net: Floats | None  # (p,) metered net reactive injection minus the assumed load; NaN where unused
+    q: Floats  # (N,) without the inverters and without metered net powers
     v0_squared: Floats | float  # in three phases (3,)
     busbar: bool
     correction: Floats  # (n,) at the last estimate
@@ -34,7 +34,7 @@ class Inputs:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Past:
-    """What the last step left that the next frame is cleaned with. m inverters, p meters.
+    """State of the last step that prepares the next frame. m inverters, p meters.
 
     Attributes
     ----------
@@ -53,14 +53,14 @@ class Past:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reconstruction:
-    """The voltages that a set of injections explains. N customers, n places.
+    """Voltages reconstructed from a set of injections. N customers, n places.
 
     Attributes
     ----------
     v2_bus, v2 : (n,), (N,)
-        Squared voltages of all places, and of the customers', pu.
+        Squared voltages of all places and of the customers, pu.
     correction : (n,)
-        What losses add to the linear model in them, squared pu.
+        Part of the loss correction in them, squared pu.
     """
 
     v2_bus: Floats
@@ -68,7 +68,7 @@ class Reconstruction:
     correction: Floats
 
 
-def nothing_new(  # noqa: PLR0917  # what there was, and what there is to say without it
+def nothing_new(  # noqa: PLR0917  # the last answer, and the values without one
     plant: Plant,
     frame: Frame,
     t: float,
@@ -76,18 +76,16 @@ def nothing_new(  # noqa: PLR0917  # what there was, and what there is to say wi
     v0_squared: Floats | float,
     x: Floats,
 ) -> tuple[Estimate, Verdict]:
-    """The answer to a frame that is not later than the last one: nothing new, and certainly not CLEAN.
+    """Answer to a frame that is not later than the last one: the last answer, never CLEAN.
 
     Parameters
     ----------
-    plant, frame
-        What is watched, and the frame.
     t
         Time of the last frame that was used, Unix s.
     last
-        What was answered then; None: there was none.
+        Last answer; None before the first.
     v0_squared, x
-        Squared busbar voltage (or one for each phase) and injections, pu, to be answered without one.
+        Squared busbar voltage (or one for each phase) and injections, pu, for the answer without a last one.
     """
     reason = f"A frame of time {frame.t} is not later than the last one, {t}; it was not used."
     if last is not None:
@@ -102,13 +100,7 @@ def nothing_new(  # noqa: PLR0917  # what there was, and what there is to say wi
 
 
 def known(frame: Frame) -> Frame:
-    """The frame with powers that are numbers: of all others nothing is known, and their errors say so.
-
-    Parameters
-    ----------
-    frame
-        Everything known at one tick.
-    """
+    """The frame with finite powers: others are replaced, with the largest error as their interval."""
     p, p_error = _power(frame.p, frame.p_error)
     q, q_error = _power(frame.q, frame.q_error)
     told = (np.abs(frame.q_net) <= NO_POWER) & (frame.q_net_error >= 0.0) & (frame.q_net_error <= NO_POWER)
@@ -119,15 +111,10 @@ def known(frame: Frame) -> Frame:
 
 
 def usual(frame: Frame) -> Frame:
-    """The frame for estimators that take deviations from intervals: each as wide as is usual.
+    """The frame for estimators that derive deviations from intervals: widths by the usual deviations.
 
-    Reactive power that is reported, although the active one is not, keeps the whole interval: readings are
-    to be compared with everything that is possible.
-
-    Parameters
-    ----------
-    frame
-        Everything known at one tick.
+    A reactive power reported without the active one keeps its whole interval: readings are compared with
+    everything that is possible.
     """
     if frame.p_std is None or frame.q_std is None:
         return frame
@@ -148,12 +135,10 @@ def _power(power: Floats, error: Floats) -> tuple[Floats, Floats]:
 
 
 def reconstruct(setting: Setting, frame: Frame, inputs: Inputs, q: Floats) -> Reconstruction:
-    """Voltages for given injections, with the loss correction at just these; chong2020 (19).
+    """Voltages for given injections, with the loss correction at these; chong2020 (19).
 
     Parameters
     ----------
-    setting, frame, inputs
-        What the frame was cleaned with, the frame, and what came of it.
     q : (N,)
         Net reactive injections, pu; see `injections`.
     """
@@ -170,24 +155,14 @@ def reconstruct(setting: Setting, frame: Frame, inputs: Inputs, q: Floats) -> Re
 
 
 def clean(setting: Setting, past: Past, frame: Frame) -> Inputs:
-    """Clean one frame, and say how uncertain what is left of it is.
-
-    Parameters
-    ----------
-    setting
-        The feeder, and the numbers that decide.
-    past
-        What the last step left.
-    frame
-        Everything known at one tick.
-    """
+    """Prepare one frame and compute the uncertainty of the result."""
     plant, model, options = setting.plant, setting.model, setting.options
     at = plant.meters
     live = frame.seen & np.isfinite(frame.y)
     y = np.where(live, np.clip(frame.y, 0.0, NO_VOLTAGE), 0.0)
     given, there = _busbar(plant.feeder, frame, options.v2_limits)
     busbar = bool(np.all(there))
-    # Without a busbar voltage the meters have to imply it, and then nobody's reactive power is believed.
+    # Without a busbar voltage the meters have to imply it, and then no reported reactive power is used.
     told = live & _credible(setting, frame) & busbar
     net = np.where(told, frame.q_net[at] - frame.q[at], np.nan) if told.any() else None
     q_all = injections(plant, frame, past.x, told)
@@ -215,23 +190,21 @@ def clean(setting: Setting, past: Past, frame: Frame) -> Inputs:
 def _busbar(
     feeder: Network, frame: Frame, limits: tuple[float, float]
 ) -> tuple[Floats | float, Bools | bool]:
-    """Squared voltage of the busbar as given, and whether that can be used; in three phases (3,) each."""
+    """Squared voltage of the busbar as given, and its validity; in three phases (3,) each."""
     low, high = limits
     if not isinstance(feeder, InPhases):
         return frame.v0_squared, bool(np.isfinite(frame.v0_squared) and low <= frame.v0_squared <= high)
     if frame.v0_phases is None:
-        # A mean says nothing of any phase.
+        # A mean determines no phase.
         return np.full(3, np.nan), np.zeros(3, dtype=np.bool_)
     return frame.v0_phases, (frame.v0_phases >= low) & (frame.v0_phases <= high)
 
 
 def busbar_errors(plant: Plant, v0_squared: Floats | float, sigmas: float) -> Floats | float:
-    """Largest honest error of the squared busbar voltage; in three phases (3,) each.
+    """Largest error of the squared busbar voltage without manipulation; in three phases (3,) each.
 
     Parameters
     ----------
-    plant
-        The feeder, and what its meters promise.
     v0_squared, sigmas
         As in `gridsec.accuracy.busbar_error`.
     """
@@ -242,20 +215,20 @@ def busbar_errors(plant: Plant, v0_squared: Floats | float, sigmas: float) -> Fl
 
 
 def _of_customers(feeder: Network, of_busbar: Floats | float) -> Floats:
-    """What the busbar has, for every customer, (N,)."""
+    """Value of the busbar, repeated for every customer, (N,)."""
     return np.asarray(by_place(feeder, of_busbar)[feeder.bus])
 
 
-# Room for what inverters did since the last estimate, where only a meter's accuracy depends on it.
+# Room for the motion of inverters since the last estimate, in the voltage that scales a meter's accuracy.
 _ROOM = 0.05
-# Errors of squared voltages end here: no voltage is above 2 pu.
+# Limit of errors of squared voltages: no voltage is above 2 pu.
 NO_VOLTAGE = 4.0
-# Powers beyond this many pu are none.
+# Largest valid power, pu.
 NO_POWER = 1e4
 
 
 def _credible(setting: Setting, frame: Frame) -> Bools:
-    """Whose net reactive power is what its load and its inverter can produce together; (p,)."""
+    """Mask (p,) of net reactive powers that load and inverter can produce together."""
     plant = setting.plant
     if not setting.believes_q:
         return np.zeros(plant.meters.size, dtype=np.bool_)
@@ -267,7 +240,7 @@ def _credible(setting: Setting, frame: Frame) -> Bools:
 
 
 def injections(plant: Plant, frame: Frame, x: Floats, told: Bools) -> Floats:
-    """Net reactive injection of every customer: metered where told, otherwise load plus inverter; (N,)."""
+    """Net reactive injection of every customer: metered in `told`, otherwise load plus inverter; (N,)."""
     q = frame.q + plant.droop.per_customer(x, frame.q.size)
     at = plant.meters[told]
     q[at] = frame.q_net[at]
@@ -277,37 +250,36 @@ def injections(plant: Plant, frame: Frame, x: Floats, told: Bools) -> Floats:
 def losses(
     plant: Plant, p: Floats, q: Floats, v0: Floats | float, *, p_error: Floats, q_error: Floats
 ) -> tuple[Floats, Floats]:
-    """Loss correction, and how far it can be from the truth for powers within intervals.
+    """Loss correction and a bound of its error for powers within intervals.
 
     Parameters
     ----------
-    plant
-        The feeder, and how often the linear model is corrected.
     p, q : (N,)
         Net injections, pu.
     v0
         Squared busbar voltage, pu; in three phases one or (3,).
     p_error, q_error : (N,)
-        How far the injections may be off, pu.
+        Largest errors of the injections, pu.
 
     Returns
     -------
     (n,), (N,)
-        What is to be added to the linear model at every place, and the bound at every customer, squared pu.
+        Correction of the linear model at every place, and the bound at every customer, squared pu.
     """
     feeder, steps = plant.feeder, plant.loss_correction
     if isinstance(feeder, Feeder):
-        # The correction is nearly quadratic in the loads: its ends are where all of them err the same way.
+        # The correction is nearly quadratic in the loads: extremes lie where all errors have the same sign.
         ends = np.array([0.0, -1.0, 1.0])[:, None]
         with np.errstate(all="ignore"):
             three, left = corrected(feeder, p + ends * p_error, q + ends * q_error, v0, steps=max(steps, 1))
-        # What is left grows with the cube of the load, so the centre says nothing about the ends.
+        # The remainder grows with the cube of the load, so the centre does not bound the ends.
         rest = left.max(axis=0)
         three = _finite(three, 0.0)
         moved = np.abs(three[1:] - three[0]).max(axis=0)[feeder.bus]
         once = three[0]
     else:
-        # Loads on other phases, or around a loop, may lift as well as lower: no end is the worst.
+        # Loads on other phases, or around a loop, may raise as well as lower voltages: no corner is the
+        # worst.
         with np.errstate(all="ignore"):
             once = loss_correction(feeder, p, q, v0, steps=max(steps, 1))
         once = _finite(once, 0.0)
@@ -322,7 +294,7 @@ def losses(
 
 
 def _finite(values: Floats, instead: float) -> Floats:
-    """The values, with others for those that are none; seldom there are such."""
+    """The values, with `instead` in place of those that are not finite; the copy is rarely needed."""
     finite = np.isfinite(values)
     return values if all_of(finite) else np.where(finite, values, instead)
 
@@ -334,13 +306,13 @@ def _implied(
     implied: Floats,
     busbar: tuple[Floats | float, Floats | float, Bools | bool],
 ) -> tuple[Floats | float, Floats | float]:
-    """Squared busbar voltage and its error, where it is not metered those that the meters imply.
+    """Squared busbar voltage and its error; an unmetered one is the median of the values implied by meters.
 
-    The median lies between honest values as long as liars are fewer than half, and then its error is
-    at most the largest honest one. Of a phase only its own meters say anything.
+    The median lies between unmanipulated values while fewer than half are manipulated; then its error is
+    at most the largest unmanipulated one. A phase is determined by its own meters only.
     """
     feeder, at = setting.plant.feeder, setting.plant.meters
-    # The estimate of the injections is that of the last frame; in between each may have moved by its span.
+    # Estimated injections are those of the last frame; each may have moved by its span since.
     stale = detect.gap(setting.errors, now, detect.widest(setting.errors))[at]
     v0, error, there = (np.atleast_1d(np.array(value)) for value in busbar)
     heard = np.equal.outer(feeder.bus[at] % 3, np.arange(3)) if there.size > 1 else np.ones((at.size, 1))

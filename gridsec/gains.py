@@ -1,8 +1,7 @@
-"""Gains of circle-criterion observers: what they are and the inequality that they obey.
+"""Gains of circle-criterion observers and their matrix inequality.
 
-Everything about a design that needs no solver: the corrected inequality (12) of chong2020 rebuilt
-as a plain matrix, its margin, the error bounds that follow from it, and how strongly the observer
-listens to its meters.
+The parts of a design that need no solver: the corrected inequality (12) of chong2020 rebuilt as a plain
+matrix, its margin, the error bounds that follow from it, and the sensitivity of the observer to its meters.
 
 References
 ----------
@@ -20,32 +19,32 @@ from gridsec.arrays import Floats, Ints, frozen
 from gridsec.errors import DesignInfeasible, InputInvalid, Problem, refuse
 from gridsec.lure import Lure
 
-# A meter that moves the observer by less than this part of what it could is not listened to.
+# Sensitivity below which a meter counts as ignored.
 _BLIND = 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CircleOptions:
-    """What a design is asked for. n states, p meters, l inputs, r directions of uncertainty.
+    """Specification of a design. n states, p meters, l inputs, r directions of uncertainty.
 
     Attributes
     ----------
     rate
         alpha, certified decay rate of the error, 1/s.
     noise : (p,)
-        Scale of each meter's error n_j, squared pu. The attack enters where the noise does.
+        Scale of each meter's error n_j, squared pu. The attack enters like the noise.
     load : (l, r)
-        Shape of the error of the known input, u - u_hat = load @ delta with |delta_i| about 1.
-        Correlations between customers live here; a diagonal matrix has none.
+        Shape of the error of the known input, u - u_hat = load @ delta with |delta_i| about 1. It contains
+        correlations between customers; a diagonal matrix has none.
     weight : (n, n)
-        Q, what an error costs: e^T Q e.
+        Q, weight of an error: e^T Q e.
     floor
-        Smallest gain, 0 … 1, from a trusted meter to the curve of an inverter that it sits at.
+        Smallest gain, 0 … 1, from a trusted meter to the curve of an inverter at the same place.
 
     Raises
     ------
     ValueError
-        If a number is none, negative or out of its range, or no meter has noise; names every problem.
+        If a number is NaN, negative or out of its range, or no meter has noise; lists every problem.
     """
 
     rate: float
@@ -55,7 +54,7 @@ class CircleOptions:
     floor: float
 
     def __post_init__(self) -> None:
-        """Freeze the arrays and refuse what cannot be meant."""
+        """Freeze the arrays and refuse invalid values."""
         for name in ("noise", "load", "weight"):
             object.__setattr__(self, name, frozen(getattr(self, name)))
         problems = [
@@ -106,13 +105,13 @@ class CircleGains:
     load, weight : (l, r), (n, n)
         As in `CircleOptions`.
     margin
-        Of the rebuilt inequality, see `margin`; positive: it holds.
+        Margin of the rebuilt inequality, see `margin`; positive if it holds.
     sensitivity : (k,)
-        How strongly each trusted meter moves the observer, see `sensitivity`.
+        Influence of each trusted meter on the observer, see `sensitivity`.
     backoff
-        By which part alpha, nu, mu and mu_delta were relaxed after the solver; 0 if not at all.
+        Fraction by which alpha, nu, mu and mu_delta were relaxed after the solver.
     status
-        What the solver said. Not proof of anything.
+        Status of the solver; not a proof.
     """
 
     J: Ints
@@ -162,7 +161,7 @@ def options_for(
     Raises
     ------
     ValueError
-        As `CircleOptions`, or if shapes do not fit the plant.
+        As `CircleOptions`, or if shapes are inconsistent with the plant.
     """
     load = np.asarray(load, dtype=np.float64)
     options = CircleOptions(
@@ -204,10 +203,8 @@ def circle_matrix(lure: Lure, J: Ints | Sequence[int], gains: CircleGains) -> Fl
     lure
         Plant; n states, m nonlinearities, p meters, l inputs.
     J : (k',)
-        Meters whose injection is counted, a subset of `gains.J`. Leaving some out gives the matrix
-        of the same observer while those meters are silent.
-    gains
-        The design.
+        Meters with injection, a subset of `gains.J`. A smaller set gives the matrix of the same observer
+        while the other meters are unavailable.
 
     Returns
     -------
@@ -217,7 +214,7 @@ def circle_matrix(lure: Lure, J: Ints | Sequence[int], gains: CircleGains) -> Fl
     Raises
     ------
     ValueError
-        If `J` is no subset of the design's meters.
+        If `J` is not a subset of the design's meters.
 
     References
     ----------
@@ -226,7 +223,7 @@ def circle_matrix(lure: Lure, J: Ints | Sequence[int], gains: CircleGains) -> Fl
     keep = np.isin(gains.J, np.asarray(J, dtype=np.intp))
     if np.count_nonzero(keep) != len(J):
         raise InputInvalid(
-            [Problem("wrong-design", f"{list(J)} is no subset of the design's meters {gains.J.tolist()}")]
+            [Problem("wrong-design", f"{list(J)} is not a subset of the design's meters {gains.J.tolist()}")]
         )
     rows, L, K, N = gains.J[keep], gains.L[:, keep], gains.K[:, keep], gains.noise[keep]
     live = lure.slope > 0.0
@@ -248,12 +245,12 @@ def circle_matrix(lure: Lure, J: Ints | Sequence[int], gains: CircleGains) -> Fl
 
 
 def negativity(matrix: Floats) -> float:
-    """How clearly a symmetric matrix is negative definite: positive if it is, whatever its scaling.
+    """Scale-free margin of negative definiteness of a symmetric matrix; positive if negative definite.
 
-    Minus the largest eigenvalue of `S M S`, with the diagonal `S` that makes the diagonal of `M`
-    minus one, minus a bound on what rounding can have added. By Sylvester's law `S M S` has the
-    signs of `M`; its entries are of order one, so that the answer does not drown when the blocks
-    of `M` differ by many orders of magnitude. A diagonal entry that is not negative settles it.
+    Minus the largest eigenvalue of `S M S`, with the diagonal `S` that makes the diagonal of `M` minus one,
+    minus a bound on the rounding error. By Sylvester's law `S M S` has the signs of `M`. Its entries are of
+    order one, so that the result stays accurate when the blocks of `M` differ by many orders of magnitude. A
+    diagonal entry that is not negative disproves definiteness.
 
     Parameters
     ----------
@@ -272,14 +269,14 @@ def negativity(matrix: Floats) -> float:
     with np.errstate(over="ignore", invalid="ignore"):
         scaled = scale[:, None] * matrix * scale
     if not np.isfinite(scaled).all():
-        return -np.inf  # an entry that is so large beside its two on the diagonal has a positive direction
+        return -np.inf  # an entry this large beside its two diagonal entries gives a positive direction
     eigenvalues = np.linalg.eigvalsh(0.5 * (scaled + scaled.T))
     rounding = 4.0 * len(matrix) * np.finfo(np.float64).eps * float(np.max(np.abs(eigenvalues)))
     return float(-eigenvalues[-1]) - rounding
 
 
 def margin(lure: Lure, J: Ints | Sequence[int], gains: CircleGains) -> float:
-    """Margin of everything that the proof needs; positive: the certificate holds.
+    """Margin of all conditions of the proof; the certificate holds if it is positive.
 
     The smallest of: the negativity of `circle_matrix`, the positivity of P, and the signs of
     Lambda, mu, mu_delta, nu and alpha.
@@ -297,15 +294,13 @@ def margin(lure: Lure, J: Ints | Sequence[int], gains: CircleGains) -> float:
 
 
 def sensitivity(lure: Lure, L: Floats, K: Floats) -> Floats:
-    """How strongly each meter moves an observer: 0 not at all, 1 as directly as possible.
+    """Influence of each meter on an observer: 0 for none, 1 for the most direct one.
 
-    `s_j = max(max_i |K_ij|, max_i |L_ij| / (|G| d)_i)`: the part of a meter's lie that reaches the
-    argument of some curve, or the push on some state relative to what the curves can push.
+    `s_j = max(max_i |K_ij|, max_i |L_ij| / (|G| d)_i)`: the part of a meter's error that reaches the argument
+    of some curve, or its effect on some state relative to the largest effect of the curves.
 
     Parameters
     ----------
-    lure
-        Plant.
     L, K : (n, k), (m, k)
         Gains.
 
@@ -317,7 +312,7 @@ def sensitivity(lure: Lure, L: Floats, K: Floats) -> Floats:
     drive = np.abs(lure.G) @ lure.slope
     live = lure.slope > 0.0
     through_K = np.max(np.abs(K[live]), axis=0, initial=0.0)
-    # A state that no curve drives is compared with its own decay over one unit of output.
+    # A state without input from a curve is compared with its own decay over one unit of output.
     reference = np.where(drive > 0.0, drive, np.abs(np.diagonal(lure.A)))
     with np.errstate(divide="ignore", invalid="ignore"):
         pushed = np.where(L == 0.0, 0.0, np.abs(L) / reference[:, None])
@@ -337,13 +332,13 @@ def refuse_blind(J: Ints, heard: Floats) -> None:
     Raises
     ------
     DesignInfeasible
-        If no meter is heard, with the reason and the remedies.
+        If every sensitivity is below `_BLIND`; the message states reason and remedies.
     """
     if np.max(heard, initial=0.0) < _BLIND:
         raise DesignInfeasible(
             f"circle-criterion observer of the meters {J.tolist()}",
             "degenerate: the best gains are L = K = 0, an observer that ignores its meters. The plant "
-            "converges by itself, so listening to a meter only costs when noise or attacks are large against "
+            "converges by itself, so using a meter only costs when noise or attacks are large against "
             "the load uncertainty. Every observer of such a bank gives the same estimate and no attack is "
             "visible in it. State the uncertainty of the loads (`load`), or smaller meter noise, or demand a "
             "smallest gain (`floor`)",
@@ -361,9 +356,9 @@ def state_bound(gains: CircleGains, rows: Floats, noise: float, delta: float) ->
     Parameters
     ----------
     gains
-        A design whose margin is positive.
+        A design with a positive margin.
     rows : (k, n)
-        The functions c^T of the error that are asked for, for example the rows of H.
+        Functions c^T of the error, for example the rows of H.
     noise
         s_n, supremum over time of the Euclidean norm of (n + a)_J / noise.
     delta
@@ -380,7 +375,7 @@ def state_bound(gains: CircleGains, rows: Floats, noise: float, delta: float) ->
 
 
 def stacked(gains: Sequence[CircleGains], meters: int) -> tuple[Floats, Floats]:
-    """Gains of many observers on a leading axis, with zero columns for the meters each one ignores.
+    """Gains of several observers on a leading axis, with zero columns for the meters that each one ignores.
 
     Parameters
     ----------
@@ -392,7 +387,7 @@ def stacked(gains: Sequence[CircleGains], meters: int) -> tuple[Floats, Floats]:
     Returns
     -------
     L, K : (B, n, p), (B, m, p)
-        So that every observer of the bank injects `L @ r` and `K @ r` with one and the same r.
+        Every observer of the bank injects `L @ r` and `K @ r` with the same r.
     """
     first = gains[0]
     L = np.zeros((len(gains), len(first.L), meters))

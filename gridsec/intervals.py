@@ -1,10 +1,9 @@
-"""How far the sweeps of a power flow lead for *all* powers within intervals, not only for those at hand.
+"""Bounds of the sweeps of a power flow for *all* powers within intervals.
 
-A sweep sends voltages V to ``W + Z conj(s / V)``, less what charging draws. From the start ``V0 = W`` the
-first, V1, is linear in the powers s, and V2 is what estimators take the loss correction from. For other
-powers s', ``|s' - s| <= e``, everything that changes is bounded by sums of magnitudes: no sign of R or X is
-needed and no symmetry, of which three phases have neither and loops only one. Derivation:
-docs/theory-three-phase.md.
+A sweep maps voltages V to ``W + Z conj(s / V)``, less the drop by charging. From the start ``V0 = W`` the
+first, V1, is linear in the powers s; estimators take the loss correction from the second, V2. For other
+powers s', ``|s' - s| <= e``, every change is bounded by sums of magnitudes. This needs no sign of R or X
+and no symmetry: three phases have neither, loops only one. Derivation: docs/theory-three-phase.md.
 """
 
 from __future__ import annotations
@@ -28,10 +27,9 @@ class Sweeps:
     power
         |s| of each place, pu.
     reach
-        From the magnitudes of currents to the largest change of the voltages that they can make.
+        Maps magnitudes of currents to the largest voltage changes that they can cause.
     charge
-        From changes of voltages to those of the currents that charge the lines, as far as `reach` has no
-        charging in it.
+        Maps voltage changes to changes of the charging currents, as far as `reach` does not contain them.
     """
 
     flat: Phasors
@@ -43,22 +41,20 @@ class Sweeps:
 
 
 def bounds(sweeps: Sweeps, error: Floats) -> tuple[Floats, Floats]:
-    """How far the correction moves within the intervals, and how far it stays from the AC power flow there.
+    """Bounds of the loss correction's change within the intervals and of its distance from the AC power flow.
 
-    With ``d = Z (e / |V0|)``, which bounds ``|V1' - V1|`` and is linear in the powers, and
-    ``l = |V1| - d``, the rest of what V2 moves is at most
+    With ``d = Z (e / |V0|)``, which bounds ``|V1' - V1|`` and is linear in the powers, and ``l = |V1| - d``,
+    the nonlinear part of the change of V2 is at most
 
         c = Z (e (|V1 - V0| + d) / (l |V0|) + |s| d / (l |V1|)),
 
-    and its square moves, apart from what is linear, by ``2 |V2 - V0| d + 2 |V2| c + (d + c)^2``. All further
-    sweeps are within ``m = 0.9 (|V2| - d - c)`` of no voltage: each changes by at most
-    ``M = Z (|s| + e) / (m min(m, l))`` times the change before it, the first of them by ``|V2 - V1| + c``. If
-    M shrinks every change, their sum is finite, and the AC power flow is where they end (Banach).
+    and its square changes, apart from the linear part, by ``2 |V2 - V0| d + 2 |V2| c + (d + c)^2``. All
+    further sweeps have magnitudes of at least ``m = 0.9 (|V2| - d - c)``: each changes by at most ``M = Z
+    (|s| + e) / (m min(m, l))`` times the change before it, the first of them by ``|V2 - V1| + c``. If M
+    shrinks every change, their sum is finite, and the AC power flow is their limit (Banach).
 
     Parameters
     ----------
-    sweeps
-        The operating point.
     error
         e, the largest change of the power of each place, pu.
 
@@ -99,7 +95,7 @@ def bounds(sweeps: Sweeps, error: Floats) -> tuple[Floats, Floats]:
     return np.asarray(correction), np.asarray(rest)
 
 
-# How near to V2, as a part of it, the power flow is looked for.
+# Radius around V2, as a fraction of it, within which the power flow is located.
 _NEAR = 0.1
-# Sweeps that are summed up place by place before the largest change anywhere bounds all that follow.
+# Number of sweeps summed place by place before the largest change anywhere bounds all later ones.
 _TERMS = 4

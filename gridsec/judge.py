@@ -1,4 +1,4 @@
-"""From residuals to a verdict: who is named, and what the answer is. Pure bookkeeping, no physics."""
+"""Decision logic: from residuals to named meters and a verdict, without physics."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from gridsec.online import Cause, Decision
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tally:
-    """What each meter's latest readings were like. p meters.
+    """Counters of each meter's latest readings. p meters.
 
     Attributes
     ----------
     above : (p,)
-        Readings above the threshold since the meter fell under suspicion; 0: it is under none.
+        Readings above the threshold since the meter became suspect; 0 for meters not suspect.
     below : (p,)
-        Readings in a row not above the threshold.
+        Consecutive readings not above the threshold.
     named : (p,)
         Meters named as manipulated.
     """
@@ -30,24 +30,22 @@ class Tally:
 
 
 def count(tally: Tally, over: Bools, live: Bools, *, confirm: int, release: int) -> Tally:
-    """Take the residuals of one frame into account.
+    """Update the counters with the residuals of one frame.
 
-    A reading above the threshold puts a meter under suspicion; only `release` readings in a row below it
-    end that. The meter is named with the `confirm`-th reading above, whether or not there were others in
-    between: who lies on every second reading only is not better off. A silent meter stays what it
-    was: who was named and then falls silent has not been cleared.
+    A reading above the threshold makes a meter suspect; only `release` consecutive readings below it end
+    that. The meter is named with the `confirm`-th reading above, with or without others in between: attacking
+    every second reading does not avoid detection. An unavailable meter keeps its state: a named meter is not
+    cleared by silence.
 
     Parameters
     ----------
-    tally
-        So far.
     over : (p,)
-        Whose residual is above the threshold.
+        Meters with a residual above the threshold.
     live : (p,)
-        Who has a residual at all.
+        Meters with a residual.
     confirm, release
-        Readings above the threshold after which a meter is named, and readings in a row below it after
-        which it is neither named nor suspected any more.
+        Readings above the threshold until a meter is named, and consecutive readings below it until it is
+        neither named nor suspect.
     """
     below = np.where(live, np.where(over, 0, tally.below + 1), tally.below)
     above = np.where(below >= release, 0, tally.above + (live & over))
@@ -57,20 +55,20 @@ def count(tally: Tally, over: Bools, live: Bools, *, confirm: int, release: int)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Situation:
-    """What a verdict depends on. p meters.
+    """Inputs of a verdict. p meters.
 
     Attributes
     ----------
     names : (p,)
-        How to call the meters in sentences.
+        Names of the meters in sentences.
     max_attacked
         M.
     live, suspected, named : (p,)
-        Who reports, who was above the threshold lately, who is named.
+        Meters that are available, suspect, and named.
     wide : (p,)
-        Whose threshold is too wide for an answer, or is none.
+        Meters with a threshold that is too wide for an answer or not finite.
     valid, settled, busbar
-        Whether the design holds, the initial state is forgotten, and the busbar voltage is known.
+        True if the design holds, if the initial transient has decayed, and if the busbar voltage is known.
     """
 
     names: tuple[str, ...]
@@ -87,13 +85,7 @@ class Situation:
 def decide(now: Situation) -> tuple[Decision, Cause, str]:
     """The answer, its cause, and one sentence for an operator.
 
-    In this order: what makes every other answer worthless comes first, and CLEAN is what is left when
-    nothing speaks against it.
-
-    Parameters
-    ----------
-    now
-        The situation.
+    Causes that invalidate every other answer come first; CLEAN is the answer if no other cause applies.
     """
     blind = _blind(now)
     if blind is not None:
@@ -108,8 +100,8 @@ def decide(now: Situation) -> tuple[Decision, Cause, str]:
 
 
 def _blind(now: Situation) -> tuple[Cause, str] | None:
-    """What keeps anybody from being named."""
-    # Who is silent, named or not, neither says anything nor contradicts anybody.
+    """Cause and reason that prevent naming any meter; None if there are none."""
+    # Unavailable meters, named or not, count neither for nor against others.
     live, named = int(np.count_nonzero(now.live)), int(np.count_nonzero(now.named & now.live))
     need = 2 * now.max_attacked + 1
     if not now.valid:
@@ -137,12 +129,12 @@ def _blind(now: Situation) -> tuple[Cause, str] | None:
 
 
 def _doubt(now: Situation) -> tuple[Cause, str] | None:
-    """What keeps the feeder from being called clean though nobody is named."""
+    """Cause and reason against CLEAN while no meter is named; None if there are none."""
     silent, pending = ~now.live, now.suspected & ~now.named
     if any_of(silent):
         return Cause.SILENT_METERS, f"No reading from {_list(now, silent)}."
     if not now.settled:
-        return Cause.SETTLING, "The observers have not forgotten their initial state yet."
+        return Cause.SETTLING, "The observers have not settled yet."
     if any_of(pending):
         reason = f"{_list(now, pending)}: further off than allowed lately, but not often enough to be named."
         return Cause.AMBIGUOUS, reason
@@ -161,7 +153,7 @@ _SHOWN = 5
 
 
 def _list(now: Situation, which: Bools) -> str:
-    """The meters' names, the first few of many."""
+    """Names of the meters, at most `_SHOWN` of them."""
     if not any_of(which):
         return ""
     names = [now.names[j] for j in np.flatnonzero(which).tolist()]
@@ -170,14 +162,14 @@ def _list(now: Situation, which: Bools) -> str:
 
 
 def residual_excess(score: Floats, threshold: Floats, live: Bools) -> Floats:
-    """How far residuals are above their thresholds, in thresholds; 0 where they are not.
+    """Relative excess of residuals over their thresholds; 0 below them.
 
     Parameters
     ----------
     score, threshold : (p,)
         Residuals and thresholds, squared pu.
     live : (p,)
-        Who has a residual.
+        Meters with a residual.
     """
     ratio = np.divide(score, threshold, out=np.zeros_like(threshold), where=live & (threshold > 0))
     return np.asarray(np.maximum(ratio - 1.0, 0.0))

@@ -2,9 +2,9 @@
 
     x' = A x + G phi(H x + F u) + B u,     y = C x + D u
 
-phi acts entry by entry, and its slopes lie in `[0, slope]`. For a feeder, x is the reactive injection of
-the inverters, `z = H x + F u` and y are `vbar^2 - v^2` at inverters and meters, and u = w collects what
-the rest of the feeder does to z (`known_input`).
+phi acts entry by entry, and its slopes lie in `[0, slope]`. For a feeder, x is the reactive injection of the
+inverters, `z = H x + F u` and y are `vbar^2 - v^2` at inverters and meters, and u = w is the contribution of
+the rest of the feeder to z (`known_input`).
 
 References
 ----------
@@ -51,7 +51,7 @@ class Lure:
     Raises
     ------
     ValueError
-        If shapes do not fit, an entry is not finite, or a slope is negative; names every problem.
+        If shapes are inconsistent, an entry is not finite, or a slope is negative; lists every problem.
     """
 
     A: Floats
@@ -70,7 +70,7 @@ class Lure:
             wrong.append(
                 Problem(
                     "order",
-                    "an upper slope is below its lower one, which is 0 unless `Lure.of` is told another",
+                    "an upper slope is below its lower one, which is 0 by default; `Lure.of` takes another",
                 )
             )
         refuse(wrong)
@@ -90,20 +90,20 @@ class Lure:
         B: ArrayLike | None = None,
         D: ArrayLike | None = None,
     ) -> Lure:
-        """A system from nested lists or arrays; inputs do nothing where no matrix says what.
+        """System from nested lists or arrays; a missing input matrix is zero.
 
         Parameters
         ----------
         A, C, G, H, phi, F, B, D
             As in the class. Without any of F, B and D there are no inputs, l = 0.
         slope, lower
-            Bounds of the slopes of each entry of phi, or one number for all. Where `lower` is not 0, it moves
-            into the linear part: A, B, `slope` and phi of what is returned are those of `without_lower`.
+            Bounds of the slopes of each entry of phi, or one number for all. A `lower` other than 0 moves
+            into the linear part: A, B, `slope` and phi of the result are those of `without_lower`.
 
         Raises
         ------
         ValueError
-            If shapes do not fit, an entry is not finite, or a lower slope exceeds its upper one; names
+            If shapes are inconsistent, an entry is not finite, or a lower slope exceeds its upper one; lists
             every problem.
 
         References
@@ -119,7 +119,7 @@ class Lure:
 
 
 def close_loop(feeder: Network | ThreePhaseFeeder, droop: Droop, meters: Ints) -> Lure:
-    """The Lur'e system of a feeder with droop inverters and voltage meters.
+    """Lur'e system of a feeder with droop inverters and voltage meters.
 
     With `z = vbar^2 - v^2` as the output everywhere and `u = w` from `known_input`:
     `A = -T^-1`, `G = T^-1`, `H = -2 X[inverters, inverters]`, `C = -2 X[meters, inverters]`, `F` and `D`
@@ -130,8 +130,6 @@ def close_loop(feeder: Network | ThreePhaseFeeder, droop: Droop, meters: Ints) -
     ----------
     feeder
         The feeder, balanced or not.
-    droop
-        The inverters.
     meters : (p,)
         Customer of each meter.
 
@@ -169,7 +167,7 @@ def close_loop(feeder: Network | ThreePhaseFeeder, droop: Droop, meters: Ints) -
 
 
 def _reactances(feeder: Network | ThreePhaseFeeder, own: Ints) -> Floats:
-    """From the reactive powers of the customers `own` to the squared voltage of everybody, (N, m)."""
+    """Reactances from the reactive powers of the customers `own` to all squared voltages, (N, m)."""
     if isinstance(feeder, ThreePhaseFeeder):
         return per_customer(feeder, lindist3flow(feeder)).X[:, own]
     return 0.5 * columns(feeder, Power.REACTIVE, own)[feeder.bus]
@@ -183,7 +181,7 @@ def known_input(  # noqa: PLR0917  # every argument is a term of chong2020 (19),
     v0_squared: Floats | float,
     correction: Floats | float = 0.0,
 ) -> Floats:
-    """The input w of the Lur'e system: z with all droop inverters at zero.
+    """Input w of the Lur'e system: z with all droop inverters at zero.
 
     `w = vbar^2 - v0^2 - 2 R p - 2 X q - correction`, chong2020 before (19), where q is the reactive
     injection without the inverters (`q = -q_c`).
@@ -199,7 +197,7 @@ def known_input(  # noqa: PLR0917  # every argument is a term of chong2020 (19),
     v0_squared : (…) or scalar
         Squared busbar voltage, pu.
     correction : (…, N) or scalar
-        What to add to the squared voltages of the linear model: `loss_correction` at the customers.
+        Correction of the linear model's squared voltages: `loss_correction` at the customers.
 
     Returns
     -------
@@ -212,7 +210,7 @@ def known_input(  # noqa: PLR0917  # every argument is a term of chong2020 (19),
 
 @dataclass(frozen=True, slots=True)
 class StepPolicy:
-    """How `advance` divides a step, and when it takes the equilibrium instead.
+    """Substeps of `advance`, and its criterion for steps that end in the equilibrium.
 
     Attributes
     ----------
@@ -221,11 +219,11 @@ class StepPolicy:
         second-order scheme falls with its square.
     settled
         A step is long when every open-loop mode has decayed to this fraction; it then ends in the
-        equilibrium. Where only some have, these are slowed down to just that (`rest`). 0: never.
+        equilibrium. If only some have, these are slowed down to exactly that decay (`rest`). 0 disables both.
     tol
         Residual of the equilibrium, relative to `unit`.
     max_iter
-        Newton steps allowed for the equilibrium.
+        Largest number of Newton steps for the equilibrium.
     """
 
     substep: float
@@ -235,51 +233,37 @@ class StepPolicy:
 
 
 POLICY = StepPolicy(substep=0.1, settled=1e-6, tol=1e-10, max_iter=200)
-"""What `advance` does unless told otherwise; docs/theory-model.md says what accuracy it gives."""
+"""Default of `advance`; docs/theory-model.md states its accuracy."""
 
 
 def unit(phi: Nonlinearity) -> float:
-    """Size of the states that phi drives: the largest limit of the curves, 1 where nothing is known.
+    """Scale of the states driven by phi: the largest limit of the curves, 1 without known limits.
 
-    Per-unit injections may be of any size, since the base power is anybody's choice.
-
-    Parameters
-    ----------
-    phi
-        Nonlinearity of a `Lure`.
+    Per-unit injections may be of any size, since the base power is free.
     """
     return (float(np.max(phi.limit, initial=0.0)) if isinstance(phi, Droop) else 0.0) or 1.0
 
 
 def rest(h: float, policy: StepPolicy) -> float:
-    """Rate, 1/s, at which a mode decays to `policy.settled` within a step; faster ones are at rest.
-
-    Parameters
-    ----------
-    h
-        Length of the step, s.
-    policy
-        How to divide it.
-    """
+    """Rate, 1/s, of a mode that decays to `policy.settled` within a step of h s; faster modes are at rest."""
     return float(-np.log(policy.settled) / h) if policy.settled > 0 and h > 0 else np.inf
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Transition:
-    """Everything about one step of length h that does not depend on x and u.
+    """Quantities of a step of length h that do not depend on x and u.
 
     Attributes
     ----------
     h
         Length of the step, s.
     substeps
-        Into how many equal substeps it is divided; 0: the step is long and ends in the equilibrium.
+        Number of equal substeps; 0 for a long step that ends in the equilibrium.
     decay, first, second : (n,) or (n, n)
-        `exp(A s)`, `s phi_1(A s)`, `s phi_2(A s)` for the substep s; diagonals where A is diagonal. States
-        that are slowed down have their row of G and B slowed down as well, and that is in `first` and
-        `second`.
+        `exp(A s)`, `s phi_1(A s)`, `s phi_2(A s)` for the substep s; diagonals where A is diagonal. `first`
+        and `second` include the slowed rows of G and B of slowed states.
     policy
-        The policy it was made by.
+        Policy of the step.
     """
 
     h: float
@@ -294,18 +278,14 @@ def transition(lure: Lure, h: float, policy: StepPolicy = POLICY) -> Transition:
     """Prepare steps of a fixed length.
 
     The number of substeps follows the fastest rate. A state of a diagonal A that is faster than `rest` is
-    treated as if it were just that fast: it ends the step as settled as any other, and a feeder that
-    mixes milliseconds with hours costs no more than one that does not. What the others see of it within
-    the step comes late by up to `h / ln(1 / settled)`, 7 % of the step.
+    treated as exactly that fast: it ends the step as settled as any other, and a feeder that mixes
+    milliseconds with hours costs no more. Its effect on other states within the step is delayed by up to
+    `h / ln(1 / settled)`, 7 % of the step.
 
     Parameters
     ----------
-    lure
-        The system.
     h
         Length of the step, s, not negative.
-    policy
-        How to divide it.
 
     Raises
     ------
@@ -318,7 +298,7 @@ def transition(lure: Lure, h: float, policy: StepPolicy = POLICY) -> Transition:
     """
     if not (np.isfinite(h) and h >= 0):
         raise InputInvalid(
-            [Problem("negative", f"a step of {h} s is no step; expected a number that is not negative")]
+            [Problem("negative", f"h is {h} s; it must be a finite number that is not negative")]
         )
     own = np.diagonal(lure.A)
     diagonal = np.count_nonzero(lure.A) == np.count_nonzero(own)
@@ -343,7 +323,7 @@ def transition(lure: Lure, h: float, policy: StepPolicy = POLICY) -> Transition:
         decay, one, two = exponential_integrals(own * s)
         return Transition(h, count, decay, slowed * s * one, slowed * s * two, policy)
     n = own.size
-    # One exponential of a block matrix carries both integrals in its first row.
+    # One exponential of a block matrix contains both integrals in its first row.
     block = np.zeros((3 * n, 3 * n))
     block[:n, :n] = s * lure.A
     block[:n, n : 2 * n] = s * np.eye(n)
@@ -356,14 +336,12 @@ _PERRON_ROUNDS = 8
 
 
 def step(prepared: Transition, lure: Lure, x: Floats, u: Floats) -> Floats:
-    """The state after one prepared step, with u held constant.
+    """State after one prepared step, with u constant.
 
     Parameters
     ----------
     prepared
         From `transition`, for the same system.
-    lure
-        The system.
     x : (…, n)
         State at the beginning.
     u : (…, l)
@@ -395,30 +373,26 @@ def _times(matrix: Floats, x: Floats) -> Floats:
 
 
 def advance(lure: Lure, x: Floats, u: Floats, h: float, policy: StepPolicy = POLICY) -> Floats:
-    """The state a time h later, with u held constant, for any h from milliseconds to hours.
+    """State a time h later, with u constant.
 
     Short steps: exponential Runge-Kutta of second order,
 
         a  = exp(A s) x + s phi_1(A s) N(x),     N(x) = G phi(H x + F u) + B u
         x+ = a + s phi_2(A s) (N(a) - N(x)),
 
-    in as many substeps s as the fastest closed-loop rate asks for, so that a loop gain above 1 is as
-    stable as any other. Steps after which every open-loop mode has decayed to `policy.settled` end in
-    the equilibrium, which presumes that it attracts (for droop inverters: proved in
-    docs/theory-model.md). Where many steps of one length follow, prepare them with `transition`.
+    with the number of substeps s from the fastest closed-loop rate, so that loop gains above 1 are stable
+    too. Steps after which every open-loop mode has decayed to `policy.settled` end in the equilibrium,
+    provided that it is attractive (proved for droop inverters in docs/theory-model.md). For many steps of one
+    length, prepare them with `transition`.
 
     Parameters
     ----------
-    lure
-        The system.
     x : (…, n)
         State at the beginning.
     u : (…, l)
         Input during the step.
     h
         Length of the step, s.
-    policy
-        How to divide it.
 
     Returns
     -------
@@ -428,13 +402,13 @@ def advance(lure: Lure, x: Floats, u: Floats, h: float, policy: StepPolicy = POL
     Raises
     ------
     DesignInfeasible
-        If a long step finds no equilibrium.
+        If the equilibrium of a long step is not found.
     """
     return step(transition(lure, h, policy), lure, x, u)
 
 
 def equilibrium(lure: Lure, u: Floats, x0: Floats | None = None, *, tol: float, max_iter: int) -> Floats:
-    """The state in which the system rests, `A x + G phi(H x + F u) + B u = 0`.
+    """Equilibrium of the system, `A x + G phi(H x + F u) + B u = 0`.
 
     Parameters
     ----------
@@ -443,16 +417,11 @@ def equilibrium(lure: Lure, u: Floats, x0: Floats | None = None, *, tol: float, 
     u : (…, l)
         Input.
     x0 : (…, n)
-        Where to start; 0 by default.
+        Initial value; 0 by default.
     tol
         Largest entry of the residual `x + A^-1 (G phi + B u)`, in the unit of x.
     max_iter
-        Newton steps allowed.
-
-    Returns
-    -------
-    (…, n)
-        The equilibrium.
+        Largest number of Newton steps.
 
     Raises
     ------

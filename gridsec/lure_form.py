@@ -1,4 +1,4 @@
-"""What systems in Lur'e form have in common, in continuous and in discrete time.
+"""Common parts of systems in Lur'e form, in continuous and in discrete time.
 
     x' or x+ = A x + G phi(H x + F u) + B u,     y = C x + D u
 
@@ -22,7 +22,7 @@ _MATRICES = ("A", "G", "H", "F", "B", "C", "D")
 
 
 class Readout(Protocol):
-    """What `z = H x + F u` and `y = C x + D u` are read from: a system in either time."""
+    """Matrices of `z = H x + F u` and `y = C x + D u`, in continuous or discrete time."""
 
     @property
     def H(self) -> Floats: ...  # noqa: D102, N802
@@ -35,7 +35,7 @@ class Readout(Protocol):
 
 
 class Form(Readout, Protocol):
-    """A whole system in Lur'e form, in either time."""
+    """Complete system in Lur'e form, in continuous or discrete time."""
 
     @property
     def A(self) -> Floats: ...  # noqa: D102, N802
@@ -55,14 +55,12 @@ def as_floats(*given: ArrayLike) -> tuple[Floats, ...]:
 def input_matrices(
     heights: tuple[int, int, int], F: ArrayLike | None, B: ArrayLike | None, D: ArrayLike | None
 ) -> tuple[Floats, ...]:
-    """F, B and D as arrays, zero where they are not given; all of them decide on l.
+    """F, B and D as arrays, zero where not given; the given ones determine l.
 
     Parameters
     ----------
     heights
-        Their rows: the numbers of nonlinearities, states and meters.
-    F, B, D
-        Matrices or nested lists, or None.
+        Their numbers of rows: nonlinearities, states and meters.
     """
     found = [None if one is None else np.asarray(one, dtype=np.float64) for one in (F, B, D)]
     inputs = max((one.shape[-1] for one in found if one is not None and one.ndim), default=0)
@@ -71,19 +69,19 @@ def input_matrices(
 
 
 def freeze(system: object, *slopes: str) -> list[Problem]:
-    """Freeze the arrays of a system that is being made, and return what is wrong with them.
+    """Freeze the arrays of a new system and return their problems.
 
     Parameters
     ----------
     system
-        With the seven matrices and the bounds of the slopes as attributes.
+        Object with the seven matrices and the bounds of the slopes as attributes.
     slopes
-        Names of these bounds, (m,).
+        Attribute names of these bounds, (m,).
 
     Returns
     -------
     list of str
-        One clause for every shape that does not fit, and one if an entry is not finite.
+        One clause for every inconsistent shape, and one if an entry is not finite.
     """
     given: dict[str, Floats] = {name: frozen(getattr(system, name)) for name in (*_MATRICES, *slopes)}
     for name, array in given.items():
@@ -110,20 +108,20 @@ def freeze(system: object, *slopes: str) -> list[Problem]:
 def without_lower(system: Form, lower: Floats) -> tuple[Floats, Floats, Nonlinearity]:
     """Loop transform: the lower slopes of phi move into the linear part.
 
-    `phi(z) = lower z + phi~(z)`, where the slopes of phi~ lie in [0, upper - lower], and
-    `A~ = A + G diag(lower) H`, `B~ = B + G diag(lower) F`. Trajectories do not change.
+    `phi(z) = lower z + phi~(z)`, with slopes of phi~ in [0, upper - lower], and `A~ = A + G diag(lower) H`,
+    `B~ = B + G diag(lower) F`. Trajectories do not change.
 
     Parameters
     ----------
     system
-        With slopes of phi from `lower` on.
+        System with slopes of phi from `lower` on.
     lower : (m,)
         The lower slopes.
 
     Returns
     -------
     A~, B~, phi~
-        Of the same system; phi itself where there is nothing to move.
+        Of the same system; phi itself if `lower` is zero.
     """
     if not np.any(lower):
         return system.A, system.B, system.phi

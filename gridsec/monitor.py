@@ -1,17 +1,17 @@
-"""The whole online chain for one feeder: from a frame of readings to an estimate and a verdict.
+"""Exact bank monitor of one feeder: from a frame of readings to an estimate and a verdict.
 
 Offline, `design` turns a plant into a bank of observers with a certificate; online, `init` and `step`
 run it. A step never raises on data: outcomes are values.
 
 1. The known input w comes from the busbar voltage, the loads, and the loss correction at the last
    estimate; chong2020 (19).
-2. The bank takes one step; chong2020 (5). The set whose estimate agrees best with those of its subsets
-   is selected, (6) and (7), among the sets without a named meter.
-3. The residuals of *all* meters against the selected estimate are compared with the largest value an
-   honest meter can reach (`gridsec.detect`). Lies inside a droop curve's deadband do not move any
-   estimate, so that agreement alone would not find them.
-4. A meter is named with its `confirm`-th reading above the threshold and stays so until `release` readings
-   in a row were below it; the selection is repeated without the accused.
+2. The bank takes one step; chong2020 (5). The set with the best agreement between its estimate and those
+   of its subsets is selected, (6) and (7), among the sets without a named meter.
+3. The residuals of *all* meters against the selected estimate are compared with the largest value of an
+   unmanipulated meter (`gridsec.detect`). Attacks inside a droop curve's deadband do not move any
+   estimate, so that agreement alone would not detect them.
+4. A meter is named with its `confirm`-th reading above the threshold, and until `release` consecutive
+   readings are below it; the selection is repeated without the named meters.
 """
 
 from __future__ import annotations
@@ -50,26 +50,22 @@ def design(
     options: Options | None = None,
     certificate: Certificate | None = None,
 ) -> MonitorDesign:
-    """Prepare to watch a feeder.
+    """Design the bank, its certificate and its error bounds for one feeder.
 
     Parameters
     ----------
-    plant
-        What is watched.
     max_attacked
-        M, how many meters may be manipulated at the same time.
+        M, largest number of simultaneously manipulated meters.
     step_s
-        Expected interval between frames, s. Other intervals work, too; above 30 s four honest readings
-        in a row clear a meter instead of six, unless `options` say otherwise.
+        Expected interval between frames, s. Other intervals work too. Above 30 s, four consecutive readings
+        below the threshold clear a meter in place of six, unless `options` are given.
     gains
         `direct`: the inverter of a trusted meter is driven by that meter's reading. Or stacked gains
         of circle-criterion observers in the order of `bank.subsets(p, M).masks()`; an entrywise
         majorant of all of them must then satisfy the small-gain condition.
-    options
-        The numbers that decide.
     certificate
-        A proof made elsewhere; by default the best closed form, or the solver's where none applies. It
-        is verified here.
+        An external proof; by default the best closed form, or the solver's where none applies. It is verified
+        here.
 
     Raises
     ------
@@ -82,7 +78,7 @@ def design(
 
     References
     ----------
-    chong2020, Corollary 1, for any feeder and with what its errata ask for.
+    chong2020, Corollary 1, for any feeder and with the corrections of its errata.
     """
     meters = plant.meters
     check_plant(plant, max_attacked=max_attacked, step_s=step_s)
@@ -103,7 +99,7 @@ def design(
     margin = verify(proof, proven)
     if not margin > 0:
         raise DesignInfeasible(
-            f"{proof.kind} certificate", "it fails its verification", margin, code="not-verified"
+            f"{proof.kind} certificate", "the verification fails", margin, code="not-verified"
         )
     return MonitorDesign(plant, model, bank, errors, proof, proven, step_s, options)
 
@@ -112,12 +108,12 @@ def _reactive(model: LinDistFlow, meters: Ints, gains: object) -> Floats | None:
     return -2.0 * model.X[:, meters] if isinstance(gains, str) else None
 
 
-# Decay rate asked of the solver, as a part of the slowest inverter's.
+# Decay rate requested from the solver, as a fraction of the slowest inverter's rate.
 _RATE = 0.1
 
 
 def _proof(lure: Lure) -> Certificate:
-    """The best closed form, or the solver's certificate where none applies."""
+    """The best closed-form certificate, or the solver's where none applies."""
     try:
         return certify(lure)
     except DesignInfeasible:
@@ -134,13 +130,13 @@ def _majorant(lure: Lure, gains: banks.Gains) -> Majorant:
 
 
 def _loop(lure: Lure, big: Majorant) -> Floats:
-    """The feedback whose small-gain condition covers all observers: what L adds counts like H / slope."""
+    """Feedback with a small-gain condition that covers all observers: the effect of L counts as H / slope."""
     through = big.L @ np.abs(lure.C)
     deaf = lure.slope <= 0
     if through[deaf].any():
         raise DesignInfeasible(
             "observer bank",
-            "gains inject into the state of an inverter that does nothing",
+            "gains inject into the state of an inverter with slope 0",
             None,
             code="wrong-form",
         )
@@ -148,20 +144,19 @@ def _loop(lure: Lure, big: Majorant) -> Floats:
 
 
 def _extreme(M: Floats, K: Floats, N: Floats) -> Floats:
-    """Largest `|M - K N|`, entry by entry, over all ways to drop columns of K."""
+    """Largest `|M - K N|`, entry by entry, over all choices of columns of K set to zero."""
     terms = -K[:, :, None] * N
     high, low = np.maximum(terms, 0.0).sum(axis=1), np.minimum(terms, 0.0).sum(axis=1)
     return np.asarray(np.maximum(np.abs(M + high), np.abs(M + low)))
 
 
 def init(design: MonitorDesign, t: float) -> MonitorState:
-    """Begin to watch; the observers start with the first frame.
+    """Initial state; the observers start with the first frame.
 
     Parameters
     ----------
     design
-        From `design`. Its certificate is verified once more: a design that was stored, or put
-        together by hand, is not believed.
+        From `design`. Its certificate is verified again, because a stored or hand-made design may be wrong.
     t
         Unix time, s.
     """
@@ -188,15 +183,13 @@ def init(design: MonitorDesign, t: float) -> MonitorState:
 
 
 def step(design: MonitorDesign, state: MonitorState, frame: Frame) -> tuple[MonitorState, Estimate, Verdict]:
-    """Take one frame in.
+    """Process one frame.
 
     Parameters
     ----------
-    design, state
-        From `design`, and from `init` or the last step.
     frame
-        Everything known at one tick. A frame that is not later than the last one changes nothing: it
-        gets the last estimate again, and UNDECIDED.
+        Data of one tick. A frame that is not later than the last one changes nothing: it returns the last
+        estimate and UNDECIDED.
 
     Returns
     -------
@@ -218,7 +211,7 @@ def step(design: MonitorDesign, state: MonitorState, frame: Frame) -> tuple[Moni
             design.bank, state.bank, inputs.z, inputs.w, inputs.live, h, net=inputs.net, adopt=state.x
         )
         if banks.decided(design.bank, bank) and not banks.decided(design.bank, state.bank):
-            # The observers start anew, from one that trusted nobody.
+            # The observers restart from one without trusted meters.
             unknown = _unknown(design, bank)
             state = replace(state, bound=unknown, level=unknown, settled=False)
         else:
@@ -232,20 +225,20 @@ def _unknown(design: MonitorDesign, bank: banks.BankState) -> ErrorBound:
 
 
 def _handed_over(design: MonitorDesign, state: MonitorState, live: Bools) -> ErrorBound:
-    """The bounds when meters fall silent or return: each inverter takes over the other way's error."""
+    """The bounds when meters become unavailable or return: each inverter takes the other mode's error."""
     meter_of, bound = design.errors.meter_of, state.bound
     if state.bank is None or not live.size:
         return bound
     was, now = state.bank.seen[meter_of], live[meter_of]
     silenced, returned = (meter_of >= 0) & was & ~now, (meter_of >= 0) & ~was & now
     free = np.where(silenced, np.maximum(bound.free, bound.driven), bound.free)
-    # A returning meter's inverter starts from the selected estimate.
+    # The inverter of a returning meter starts from the selected estimate.
     return ErrorBound(np.where(returned, bound.free + state.spread, bound.driven), free)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _View:
-    """The feeder as one selected set of meters sees it."""
+    """Estimate of the feeder from one selected set of meters, with residuals and bounds."""
 
     index: int
     x: Floats
@@ -257,11 +250,11 @@ class _View:
     v2: Floats
     v2_bus: Floats
     error: Floats  # (N,)
-    score: Floats  # (p,) NaN where not live
+    score: Floats  # (p,) NaN where unavailable
     threshold: Floats  # (p,)
 
 
-def _conclude(  # noqa: PLR0917  # the chain's three values, then what this step added
+def _conclude(  # noqa: PLR0917  # design, state and frame, then the results of this step
     design: MonitorDesign,
     state: MonitorState,
     frame: Frame,
@@ -294,7 +287,7 @@ def _conclude(  # noqa: PLR0917  # the chain's three values, then what this step
         trusted = design.bank.masks[view.index] & live & ~tally.named
     error = view.error
     if np.count_nonzero(tally.named) > design.bank.sets.max_attacked:
-        # More liars than the bank can take: only saturation bounds what they did to the estimate.
+        # More manipulated meters than the bank covers: only saturation bounds their effect on the estimate.
         error = _saturated(design, inputs, frame, view.x)
     estimate = Estimate(t=frame.t, v2=view.v2, bound=error, v2_bus=view.v2_bus, trusted=trusted, x=view.x)
     accused = tally.named & live
@@ -325,7 +318,7 @@ def _select(  # noqa: PLR0917  # as _conclude
     bank: banks.BankState,
     h: float,
 ) -> _View:
-    """Select a set, look for meters above their thresholds, and select again without them."""
+    """Select a set, detect meters above their thresholds, and select again without them."""
     sets, live = design.bank.sets, inputs.live
     pi = banks.consistency(design.bank, bank)
     tie = design.options.tie * float(np.max(design.plant.droop.limit, initial=0.0))
@@ -370,7 +363,7 @@ def _view(  # noqa: PLR0917  # as _conclude
     seen = reconstruct(design.setting, frame, inputs, injections(plant, frame, x, told))
     v2 = seen.v2
     z = plant.droop.vbar**2 - v2[own]
-    # What the selected set takes from its meters and a liar-free subset may not: the estimate differs by
+    # Difference of the selected set to a subset without manipulated meters: the estimates differ by
     # `spread`, and metered reactive power of at most M meters is replaced.
     offset = errors.inverters @ spread
     if told.any():
@@ -401,14 +394,14 @@ def _view(  # noqa: PLR0917  # as _conclude
 
 
 def _slowed(design: MonitorDesign, h: float) -> Bools:
-    """Inverters that the step takes for slower than they are: `lure.transition`, `rest`; (m,)."""
+    """Mask (m,) of inverters that the step treats as slower than they are: `lure.transition`, `rest`."""
     fast = design.plant.droop.tau * rest(h, design.bank.policy) < 1.0
-    # Where all are that fast, the step ends in the equilibrium.
+    # If all are that fast, the step ends in the equilibrium.
     return fast & ~fast.all()
 
 
 def _saturated(design: MonitorDesign, inputs: Inputs, frame: Frame, x: Floats) -> Floats:
-    """Error of the estimate (N,) that holds whoever lies: inverters saturate, and reports are credible."""
+    """Error of the estimate (N,) under any attack: inverters saturate, and used reports are plausible."""
     errors = design.errors
     told = np.where(inputs.now.told, 2.0 * frame.q_error[design.plant.meters], 0.0)
     far = detect.widest(errors, None if design.bank.direct else x).free

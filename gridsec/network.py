@@ -1,10 +1,10 @@
-"""What estimators ask of a feeder, in the same words whether it is radial, meshed or in three phases.
+"""Network model of estimators, uniform for radial, meshed and three-phase feeders.
 
 A *place* has one squared voltage: a bus of a balanced feeder, a phase of a bus of another. The linear power
 flow is ``v^2 = v0^2 + 2 R p + 2 X q`` with rows for places and columns for customers. On a balanced radial
-feeder its entries are those of common paths, and everything is a sum over the tree. On a meshed one it is
-still symmetric between customers, but may have negative entries; in three phases, meshed or not, it is not
-symmetric either.
+feeder its entries are those of common paths, and all results are sums over the tree. On a meshed feeder it
+is still symmetric between customers, but may have negative entries. In three phases, meshed or not, it is
+not symmetric either.
 """
 
 from __future__ import annotations
@@ -24,96 +24,60 @@ InPhases = PhasedFeeder | PhasedMesh
 """A feeder in three phases, with three voltages of the busbar."""
 
 Network = Feeder | Meshed | InPhases
-"""A feeder that an estimator can watch."""
+"""A feeder supported by the estimators."""
 
 
 class Power(StrEnum):
-    """Which power moves a voltage: active through resistances, reactive through reactances."""
+    """Power that changes a voltage: active through resistances, reactive through reactances."""
 
     ACTIVE = "p"
     REACTIVE = "q"
 
 
 def busbar_places(feeder: Network) -> slice:
-    """Places of the busbar: one, or one for each phase.
-
-    Parameters
-    ----------
-    feeder
-        The feeder.
-    """
+    """Places of the busbar: one, or one for each phase."""
     return slice(0, 3 if isinstance(feeder, InPhases) else 1)
 
 
 def one_busbar(feeder: Network, some: Ints, others: Ints) -> Floats | float:
-    """1 where two places hang on the same voltage of the busbar, else 0; (j, k), or 1 for all.
-
-    Parameters
-    ----------
-    feeder
-        The feeder.
-    some, others : (j,), (k,)
-        The places.
-    """
+    """1 for places with the same busbar voltage, else 0; (j, k), or 1 for all."""
     if not isinstance(feeder, InPhases):
         return 1.0
     return np.equal.outer(some % 3, others % 3).astype(np.float64)
 
 
 def hangs_on(feeder: Network) -> Floats:
-    """1 where a customer hangs on a phase of the busbar, else 0; (N, 3), or (N, 1) of one voltage.
-
-    Parameters
-    ----------
-    feeder
-        The feeder.
-    """
+    """1 where a customer is connected to a phase of the busbar, else 0; (N, 3), or (N, 1) when balanced."""
     if not isinstance(feeder, InPhases):
         return np.ones((feeder.bus.size, 1))
     return np.equal.outer(feeder.bus % 3, np.arange(3)).astype(np.float64)
 
 
 def by_place(feeder: Network, of_busbar: Floats | float) -> Floats:
-    """What the busbar has, for every place that hangs on it, (n,).
-
-    Parameters
-    ----------
-    feeder
-        The feeder.
-    of_busbar
-        One number, or in three phases one for each.
-    """
+    """Busbar value (one number, or in three phases one for each) repeated for every place, (n,)."""
     if not isinstance(feeder, InPhases):
         return np.full(len(feeder.buses), of_busbar)
     return np.tile(np.broadcast_to(np.asarray(of_busbar, dtype=np.float64), 3), len(feeder.tree.buses))
 
 
 def over_places(feeder: Network, of_busbar: Floats | float) -> Floats | float:
-    """As `by_place`, but one number where all places have the same.
-
-    Parameters
-    ----------
-    feeder, of_busbar
-        As in `by_place`.
-    """
+    """As `by_place`, but one number where all places have the same."""
     return by_place(feeder, of_busbar) if isinstance(feeder, InPhases) else of_busbar
 
 
 def bus_voltages(
     feeder: Network, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 1
 ) -> Floats:
-    """Squared voltage of every place, losses corrected; O(n), on a meshed feeder O(n N).
+    """Squared voltage of every place, corrected for losses; O(n), on a meshed feeder O(n N).
 
     Parameters
     ----------
-    feeder
-        The feeder.
     p, q : (…, N)
         Net active and reactive injection of each customer (generation positive), pu.
     v0_squared
         Squared busbar voltage, pu; in three phases scalar or (3,).
     steps
-        Corrections of the linear power flow; with none it alone.
+        Corrections of the linear power flow; 0 gives the linear one.
 
     Returns
     -------
@@ -128,13 +92,7 @@ def bus_voltages(
 
 
 def model_error_bound(feeder: Network, p: Floats, q: Floats, v0_squared: Floats | float) -> Floats:
-    """How far `v^2` after one correction can be from the AC power flow, for every customer, (…, N).
-
-    Parameters
-    ----------
-    feeder, p, q, v0_squared
-        As in `bus_voltages`.
-    """
+    """Bound (…, N) of the error of `v^2` after one correction against the AC power flow, by customer."""
     if isinstance(feeder, Feeder):
         return balanced.model_error_bound(feeder, p, q, v0_squared)
     if isinstance(feeder, Meshed):
@@ -143,12 +101,10 @@ def model_error_bound(feeder: Network, p: Floats, q: Floats, v0_squared: Floats 
 
 
 def reach(feeder: Network, p: Floats, q: Floats) -> Floats:
-    """Largest change of the squared voltages that powers of some sizes can make: ``2 |R| p + 2 |X| q``, (n,).
+    """Largest change of the squared voltages by powers of given sizes: ``2 |R| p + 2 |X| q``, (n,).
 
     Parameters
     ----------
-    feeder
-        The feeder.
     p, q : (N,)
         Sizes of the customers' active and reactive powers, not negative, pu.
     """
@@ -158,13 +114,7 @@ def reach(feeder: Network, p: Floats, q: Floats) -> Floats:
 
 
 def linear(feeder: Network) -> LinDistFlow:
-    """Matrices of the linear power flow, rows for places in `R_bus` and `X_bus`.
-
-    Parameters
-    ----------
-    feeder
-        The feeder.
-    """
+    """Matrices of the linear power flow, rows for places in `R_bus` and `X_bus`."""
     if isinstance(feeder, Feeder):
         return lindistflow(feeder)
     return LinDistFlow(frozen(feeder.R[feeder.bus]), frozen(feeder.X[feeder.bus]), feeder.R, feeder.X)
@@ -173,7 +123,7 @@ def linear(feeder: Network) -> LinDistFlow:
 def loss_correction(
     feeder: Network, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int
 ) -> Floats:
-    """What has to be added to the linear power flow at every place, (…, n).
+    """Correction of the linear power flow at every place, (…, n).
 
     Parameters
     ----------
@@ -197,7 +147,7 @@ def interval_bounds(
     p_error: Floats,
     q_error: Floats,
 ) -> tuple[Floats, Floats]:
-    """How wrong `loss_correction` can be for powers within intervals, see `gridsec.intervals`.
+    """Error bounds of `loss_correction` for powers within intervals, see `gridsec.intervals`.
 
     Parameters
     ----------
@@ -206,15 +156,15 @@ def interval_bounds(
     v0_squared
         As in `bus_voltages`.
     p_error, q_error : (N,)
-        How far the powers may be off, pu.
+        Largest errors of the powers, pu.
 
     Returns
     -------
     (N,), (N,)
-        How far the correction moves, and what its first step leaves of the AC power flow, pu; infinite where
-        there is no bound, as with a busbar voltage that is none.
+        Change of the correction, and distance of its first step from the AC power flow, pu; infinite without
+        a bound, as for an invalid busbar voltage.
     """
-    with np.errstate(all="ignore"):  # what is no number gets no finite bound, and no complaint
+    with np.errstate(all="ignore"):  # NaN gets an infinite bound without a warning
         if isinstance(feeder, Meshed):
             moved, rest = mesh.interval_bounds(feeder, p, q, v0_squared, p_error=p_error, q_error=q_error)
         else:
@@ -223,14 +173,9 @@ def interval_bounds(
 
 
 def columns(feeder: Network, power: Power, customers: Ints) -> Floats:
-    """What some customers' powers do to the squared voltage of every place: columns of 2 R or 2 X, (n, k).
+    """Sensitivity of every place's squared voltage to the powers of k customers: columns of 2 R or 2 X.
 
-    Parameters
-    ----------
-    feeder, power
-        The feeder, and which power.
-    customers : (k,)
-        The customers.
+    Shape (n, k).
     """
     if isinstance(feeder, Feeder):
         return 2.0 * common_paths(feeder, _branch(feeder, power), feeder.bus[customers])
@@ -238,29 +183,15 @@ def columns(feeder: Network, power: Power, customers: Ints) -> Floats:
 
 
 def between(feeder: Network, power: Power) -> Floats:
-    """R or X from every customer's power to every customer's voltage, (N, N).
-
-    Parameters
-    ----------
-    feeder, power
-        The feeder, and which power.
-    """
+    """R or X from every customer's power to every customer's voltage, (N, N)."""
     return 0.5 * columns(feeder, power, np.arange(feeder.bus.size))[feeder.bus]
 
 
 def along(feeder: Network, power: Power, customers: Ints, weights: Floats) -> Floats:
-    """What each customer's power does to the weighted sum of some customers' voltages, (N,).
-
-    Parameters
-    ----------
-    feeder, power
-        The feeder, and which power.
-    customers, weights : (p,)
-        The customers whose voltages are summed, each once, and their weights.
-    """
+    """Sensitivity of a weighted sum of p different customers' voltages to every customer's power, (N,)."""
     if not isinstance(feeder, Feeder):
         return 2.0 * (weights @ _matrix(feeder, power)[feeder.bus[customers]])
-    # What a power here does there it does here if it is there.
+    # R and X are symmetric on a radial feeder.
     injected = np.zeros((2, feeder.bus.size))
     injected[0, customers] = weights
     p, q = injected if power is Power.ACTIVE else injected[::-1]
@@ -268,15 +199,7 @@ def along(feeder: Network, power: Power, customers: Ints, weights: Floats) -> Fl
 
 
 def sizes(feeder: Network, power: Power, customers: Ints) -> Floats:
-    """Sum over some customers' voltages of the squares of what each customer's power does there, (N,).
-
-    Parameters
-    ----------
-    feeder, power
-        The feeder, and which power.
-    customers : (p,)
-        The customers whose voltages count.
-    """
+    """Sum over the voltages at `customers` (p,) of squared sensitivities to each customer's power, (N,)."""
     if not isinstance(feeder, Feeder):
         return np.asarray(4.0 * (_matrix(feeder, power)[feeder.bus[customers]] ** 2).sum(axis=0))
     weight = np.zeros(feeder.bus.size)
@@ -285,13 +208,7 @@ def sizes(feeder: Network, power: Power, customers: Ints) -> Floats:
 
 
 def own(feeder: Network, power: Power) -> Floats:
-    """Resistance or reactance that a customer's own power meets: the diagonal of R or X, (N,).
-
-    Parameters
-    ----------
-    feeder, power
-        The feeder, and which power.
-    """
+    """Sensitivity of a customer's voltage to its own power: the diagonal of R or X, (N,)."""
     if isinstance(feeder, Feeder):
         return path_sums(feeder, _branch(feeder, power))[feeder.bus]
     return np.asarray(_matrix(feeder, power)[feeder.bus, np.arange(feeder.bus.size)])
@@ -300,14 +217,12 @@ def own(feeder: Network, power: Power) -> Floats:
 def covariance(feeder: Network, power: Power, at: Ints, variance: Floats) -> Floats:
     """Columns `at` of ``4 R V R^T``, or of ``4 X V X^T``, for diagonal V, (n, p).
 
-    On a balanced radial feeder O(n p): a voltage is that of the bus above less what the branch between takes
-    off, and this depends on the flow, the sum of the powers below. So covariances with flows are summed up
-    the tree, those with voltages down.
+    On a balanced radial feeder O(n p): a voltage is that of the bus above less the drop on the branch
+    between. The drop depends on the flow, the sum of the powers below. So covariances with flows are summed
+    up the tree, those with voltages down.
 
     Parameters
     ----------
-    feeder, power
-        The feeder, and which power.
     at : (p,)
         Places.
     variance : (N,)
@@ -330,16 +245,9 @@ def covariance(feeder: Network, power: Power, at: Ints, variance: Floats) -> Flo
 
 
 def variances(feeder: Network, power: Power, variance: Floats) -> Floats:
-    """Diagonal of ``4 R V R^T``, or of ``4 X V X^T``, for diagonal V, (n,).
+    """Diagonal of ``4 R V R^T``, or of ``4 X V X^T``, for diagonal V (N,), (n,).
 
-    On a balanced radial feeder O(n): whoever is below a bus shares all of its path.
-
-    Parameters
-    ----------
-    feeder, power
-        The feeder, and which power.
-    variance : (N,)
-        Diagonal of V.
+    On a balanced radial feeder O(n): a power below a bus shares all of that bus's path.
     """
     if not isinstance(feeder, Feeder):
         return np.asarray(4.0 * (_matrix(feeder, power) ** 2 @ variance))

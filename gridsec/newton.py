@@ -1,4 +1,4 @@
-"""A damped semismooth Newton method for `x = gain phi(H x + drive) + bias`, many problems at once."""
+"""Damped semismooth Newton method for `x = gain phi(H x + drive) + bias`, batched."""
 
 from __future__ import annotations
 
@@ -27,32 +27,27 @@ def settle(
 ) -> Floats:
     """Solve `x = gain phi(H x + drive) + bias` by a damped semismooth Newton method.
 
-    The Jacobian `I - gain Delta H` takes Delta, the slopes of phi, from difference quotients, which
-    are elements of the generalised Jacobian except within a hair of a kink. The step is halved until
-    the residual falls. Plain iteration would need a loop gain below 1; this does not.
+    The Jacobian `I - gain Delta H` takes Delta, the slopes of phi, from difference quotients, which are
+    elements of the generalised Jacobian except within rounding of a kink. The step is halved until the
+    residual falls. Plain iteration would need a loop gain below 1; this method does not.
 
     Parameters
     ----------
     phi
         Nonlinearity, entry by entry, non-decreasing.
     gain : (n, m)
-        What phi feeds into.
+        Gain behind phi.
     H : (m, n) or (…, m, n)
-        Feedback, possibly another one for every leading index (one observer each).
+        Feedback, possibly one for every leading index (one observer each).
     drive : (…, m)
     bias : (…, n)
         Constant parts.
     x0 : (…, n)
-        Where to start.
+        Initial value.
     tol
         Largest entry of the residual, in the unit of x.
     max_iter
-        Newton steps allowed.
-
-    Returns
-    -------
-    (…, n)
-        The solution.
+        Largest number of Newton steps.
 
     Raises
     ------
@@ -109,7 +104,7 @@ class _Loop:
         return np.asarray(x - self.phi(self.outputs(x)) @ self.gain.T - self.bias)
 
     def newton(self, x: Floats, residual: Floats) -> Floats:
-        """One damped Newton step from `x` (k, n), where the equation leaves `residual`."""
+        """One damped Newton step from `x` (k, n) with residual `residual`."""
         z = self.outputs(x)
         width = _QUOTIENT * np.maximum(1.0, np.abs(z))
         slopes = (self.phi(z + width) - self.phi(z - width)) / (2.0 * width)

@@ -1,4 +1,4 @@
-"""The online vocabulary: what goes into and what comes out of every estimator's `step`.
+"""Interface of the estimators: inputs and outputs of every `step`.
 
 Every estimator family is three functions with these types at their borders::
 
@@ -6,7 +6,7 @@ Every estimator family is three functions with these types at their borders::
     init(design, t)             -> State
     step(design, state, frame)  -> (State, Estimate, Verdict)  online; never raises on data
 
-Outcomes are values. UNDECIDED is an answer of its own: no answer must never look like no attack.
+Outcomes are values. UNDECIDED is a separate answer: a missing answer must never look like CLEAN.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Ints = NDArray[np.intp]
 
 
 class Decision(StrEnum):
-    """The three answers."""
+    """Answers of an estimator."""
 
     CLEAN = "clean"
     ATTACKED = "attacked"
@@ -32,7 +32,7 @@ class Decision(StrEnum):
 
 
 class Cause(StrEnum):
-    """Why a verdict is what it is, for programs; `Verdict.reason` says it for people."""
+    """Cause of a verdict, for programs; `Verdict.reason` is the sentence for operators."""
 
     AGREEMENT = "agreement"
     RESIDUALS = "residuals"
@@ -49,7 +49,7 @@ class Cause(StrEnum):
 
 
 class Kind(StrEnum):
-    """What a manipulation looks like, where the data tell."""
+    """Class of a manipulation, where the data show it."""
 
     OFFSET = "offset"
     DRIFT = "drift"
@@ -67,9 +67,9 @@ class PowerOrigin(IntEnum):
     UNREAD = 1
     """No usable reading: a range, or a forecast."""
     BEYOND = 2
-    """A reading beyond the declared load or generation, believed in part or not at all."""
+    """A reading beyond the declared load or generation, used in part or not at all."""
     LATE = 3
-    """A reading older than the voltage beside it, and than the files state."""
+    """A reading older than the voltage beside it, and than stated in the files."""
 
 
 def _none() -> Bools:
@@ -82,20 +82,20 @@ def _nothing() -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
-    """One way to explain the readings. p meters, m inverters, N customers.
+    """One explanation of the readings. p meters, m inverters, N customers.
 
     Attributes
     ----------
     meters : (p,)
-        Who would be manipulated.
+        Meters manipulated in it.
     inverters : (m,)
-        Which inverters would be.
+        Inverters manipulated in it.
     probability
-        Its share among the explanations given, from 0 to 1.
+        Its probability among the given explanations, from 0 to 1.
     powers : (N,)
-        Whose powers would not be what they are said to be; empty where that is never supposed.
+        Customers with wrong stated powers in it; empty from estimators that trust all powers.
     busbar : (b,)
-        Phases of the busbar, one on a balanced feeder, whose meter would be manipulated; empty likewise.
+        Phases of the busbar, one on a balanced feeder, with a manipulated meter in it; empty likewise.
     """
 
     meters: Bools
@@ -107,22 +107,22 @@ class Explanation:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """Everything that is known at one tick, in per unit. N customers, p meters.
+    """Data of one tick, in per unit. N customers, p meters.
 
     Attributes
     ----------
     t
         Unix time of the tick, s.
     y : (p,)
-        Squared voltage that each meter reports, pu; NaN where `seen` is False.
+        Squared voltage reported by each meter, pu; NaN where `seen` is False.
     seen : (p,)
-        Whether a usable reading of the meter belongs to this tick.
+        True if the tick has a usable reading of the meter.
     v0_squared
-        Squared busbar voltage as metered, pu; NaN if there is none. In three phases the mean of them.
+        Metered squared busbar voltage, pu; NaN if there is none. In three phases their mean.
     p : (N,)
         Net active injection of each customer (generation positive), pu; always finite.
     p_error : (N,)
-        Half-width of the interval around `p` that holds the truth, pu.
+        Half-width of the interval around `p` that contains the true value, pu.
     q : (N,)
         Reactive injection of each customer *without* its droop inverter, pu; always finite.
     q_error : (N,)
@@ -132,17 +132,17 @@ class Frame:
     q_net_error : (N,)
         Half-width for `q_net`, pu; ignored where `q_net` is NaN.
     v0_phases : (3,) or None
-        Squared busbar voltage of each phase, pu, NaN where there is none; None on a balanced feeder.
+        Squared busbar voltage of each phase, pu, NaN where missing; None on a balanced feeder.
     p_std, q_std : (N,) or None
-        Standard deviation of the truth about `p` and `q` where it is known apart from the intervals, as that
-        of forecasts is, pu; NaN, or None for all, where it is that of a uniform distribution in the interval.
+        Standard deviation of the true values about `p` and `q` where known independently of the intervals, as
+        for forecasts, pu; NaN, or None for all, where it is that of a uniform distribution in the interval.
     p_origin : (N,) or None
-        `PowerOrigin` of `p`; None: `READ` everywhere. A voltage reading beside an unread power of the same
-        meter is not checked by that power.
+        `PowerOrigin` of `p`; None means `READ` everywhere. An unread power does not check the voltage reading
+        of the same meter.
     clock_offset : (p,) or None
-        By how much each meter's clock is ahead, s; NaN, or None for all, where that is not measurable.
+        Lead of each meter's clock, s; NaN, or None for all, where not measurable.
     busbar_offset
-        By how much the clock of the busbar's meter is ahead, s; NaN where that is not measurable.
+        Lead of the clock of the busbar's meter, s; NaN where not measurable.
     """
 
     t: float
@@ -165,7 +165,7 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """The reconstructed state of the feeder. N customers, m inverters, b + 1 buses.
+    """Reconstructed state of the feeder. N customers, m inverters, b + 1 buses.
 
     Attributes
     ----------
@@ -174,17 +174,17 @@ class Estimate:
     v2 : (N,)
         Reconstructed squared voltage of each customer, pu.
     bound : (N,)
-        Half-width of the interval around `v2` that holds the truth while the design's assumptions
+        Half-width of the interval around `v2` that contains the true value while the design's assumptions
         hold, pu.
     v2_bus : (b + 1,)
         Reconstructed squared voltage of every bus, the busbar first, pu. In three phases (3 (b + 1),), the
         phases of a bus side by side.
     trusted : (p,)
-        The meters that the estimate rests on.
+        Meters used by the estimate.
     x : (m,)
         Estimated reactive injection of the droop inverters, pu.
     std : (N,)
-        Standard deviation of `v2`, squared pu; (0,) from estimators that only bound.
+        Standard deviation of `v2`, squared pu; (0,) from estimators with bounds only.
     """
 
     t: float
@@ -198,7 +198,7 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Who lies. p meters.
+    """Verdict on meters and inverters at one tick. p meters.
 
     Attributes
     ----------
@@ -207,32 +207,31 @@ class Verdict:
     cause
         AGREEMENT goes with CLEAN, RESIDUALS with ATTACKED, every other cause with UNDECIDED.
     reason
-        Why, in one sentence, ready to be shown to an operator.
+        One sentence for the operator.
     suspects : (p,)
-        The meters named as manipulated. May be non-empty with UNDECIDED, when more meters disagree
-        than the design can tell apart.
+        Meters named as manipulated. May be non-empty with UNDECIDED, if more meters disagree than the design
+        can tell apart.
     score : (p,)
         Absolute output residual |y - y_hat|, squared pu; NaN for unseen meters.
     threshold : (p,)
-        The largest score an honest meter can reach, squared pu: `score > threshold` is evidence.
+        Largest possible score of an unmanipulated meter, squared pu; `score > threshold` is evidence.
     attack : (p,)
-        Reconstructed additive attack on the squared voltage, pu; 0 for meters that are no suspects.
+        Reconstructed additive attack on the squared voltage, pu; 0 for meters that are not suspects.
     inverters : (m,)
-        The droop inverters named as manipulated; (0,) from estimators that do not judge inverters.
+        Droop inverters named as manipulated; (0,) from estimators that do not judge inverters.
     inverter_attack : (m,)
-        Reconstructed wrong part of their set points, pu of reactive power; (0,) likewise.
+        Reconstructed error of their set points, pu of reactive power; (0,) likewise.
     kinds : (p,)
-        What each suspect's manipulation looks like, None where nobody can tell; () from estimators that
-        do not ask.
+        Class of each suspect's manipulation, None where unknown; () from estimators that do not classify.
     explanations
-        Where several explanations fit the data about equally well, those, the likeliest first.
+        Explanations that fit the data about equally well, likeliest first; () from estimators without any.
     unjudged : (m,)
-        Inverters about which the data say nothing though inverters are judged; (0,) for none.
+        Inverters that the data do not determine although inverters are judged; (0,) for none.
     busbar : (b,)
-        Phases of the busbar, one on a balanced feeder, whose meter is named as manipulated; (0,) from
-        estimators that believe it or do without.
+        Phases of the busbar, one on a balanced feeder, with a meter named as manipulated; (0,) from
+        estimators that trust it or do not use it.
     busbar_attack : (b,)
-        What it reads too much, squared pu; 0 where it is not named; (0,) likewise.
+        Excess of its reading, squared pu; 0 where not named; (0,) likewise.
     """
 
     decision: Decision

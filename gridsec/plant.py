@@ -1,4 +1,4 @@
-"""What is watched, what was prepared for it, and what is carried from frame to frame."""
+"""Plant, options, design and state of the exact bank monitor."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from gridsec.online import Estimate, Verdict
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plant:
-    """The feeder as it stands in the street. N customers, m inverters, p meters.
+    """Physical feeder of an estimator. N customers, m inverters, p meters.
 
     Attributes
     ----------
@@ -32,16 +32,16 @@ class Plant:
     droop
         The customers' inverters and their curves.
     meters : (p,)
-        Index of the customer at which each voltage meter sits; at most one meter per customer.
+        Customer of each voltage meter; at most one meter per customer.
     accuracy
-        What the meters promise.
+        Accuracy of the meters by their data sheets.
     loss_correction
         DistFlow fixed-point steps that correct LinDistFlow for branch losses; 0 leaves it linear.
 
     Raises
     ------
     ValueError
-        With every problem found; whether meters, feeder and accuracy fit is for `check_plant`.
+        With every problem found; `check_plant` checks that meters, feeder and accuracy are consistent.
     """
 
     feeder: Network
@@ -66,28 +66,28 @@ class Plant:
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """Numbers that decide; none is hidden.
+    """Tuning parameters.
 
     Attributes
     ----------
     sigmas
-        Standard deviations of jitter that an honest reading may be off. One reading in 16 000 is
-        further off at 4, and then only matters for a meter at the very limit of its class.
+        Jitter allowance of an unmanipulated reading in standard deviations. At 4, one reading in 16 000
+        exceeds it, which matters only for a meter at the limit of its class.
     confirm
-        Readings above the threshold before a meter is named.
+        Readings above the threshold until a meter is named.
     release
-        Readings in a row below it before a meter is neither named nor suspected any more. A lie on at
-        least every `release`-th reading is named; docs/theory-detection.md, section 5.
+        Consecutive readings below it until a meter is neither named nor suspect. An attack on at least every
+        `release`-th reading is named; docs/theory-detection.md, section 5.
     settled
-        The verdict is SETTLING until what is left of the unknown initial state is less than this part
+        The verdict is SETTLING until the remaining effect of the unknown initial state is below this fraction
         of every threshold.
     tie
-        Sets whose disagreement pi differs by no more than this part of the largest saturation limit
-        count as equal; residuals decide between them.
+        Sets count as equal if their disagreements pi differ by at most this fraction of the largest
+        saturation limit; residuals decide between them.
     widest
-        A meter whose threshold is above this cannot be judged, squared pu: 0.1 is 5 % of the voltage.
+        Largest threshold of a meter that is judged, squared pu: 0.1 is 5 % of the voltage.
     v2_limits
-        Squared voltages outside these are no supply: a busbar reading there is not used, pu.
+        Range of valid squared busbar voltages, pu; a reading outside it is not used.
 
     Raises
     ------
@@ -127,13 +127,7 @@ class Options:
 
 
 def judging_problems(settled: float, widest: float, v2_limits: tuple[float, float]) -> list[Problem]:
-    """What is wrong with the numbers that say when a verdict can be given at all.
-
-    Parameters
-    ----------
-    settled, widest, v2_limits
-        As in `Options`.
-    """
+    """Problems of the options `settled`, `widest` and `v2_limits`, see `Options`."""
     problems = []
     if not 0.0 < settled <= 1.0:
         problems.append(
@@ -153,23 +147,21 @@ def judging_problems(settled: float, widest: float, v2_limits: tuple[float, floa
 
 
 def _whole(value: object, least: int) -> bool:
-    """Whether a value is a whole number, and not below the least."""
+    """True for a whole number that is not below `least`."""
     return isinstance(value, int | np.integer) and int(value) >= least
 
 
 def check_plant(plant: Plant, *, max_attacked: int, step_s: float, more: Iterable[Problem] = ()) -> None:
-    """Refuse what no estimator can watch, before anything is computed.
+    """Refuse a plant that no estimator supports, before anything is computed.
 
     Parameters
     ----------
-    plant
-        What is to be watched.
     max_attacked
-        M, how many meters may be manipulated at the same time.
+        M, largest number of simultaneously manipulated meters.
     step_s
         Expected interval between frames, s.
     more
-        Further problems that the caller has found.
+        Further problems, found by the caller.
 
     Raises
     ------
@@ -203,22 +195,18 @@ def check_plant(plant: Plant, *, max_attacked: int, step_s: float, more: Iterabl
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Setting:
-    """What every estimator of a feeder needs to make sense of a frame.
+    """Plant with its derived models, common to all estimators of a feeder.
 
     Attributes
     ----------
-    plant
-        What is watched.
     model
-        Its linear power flow.
+        Linear power flow of the plant.
     errors
-        How errors travel.
-    options
-        The numbers that decide.
+        Propagation of errors.
     max_attacked
         M.
     believes_q
-        Whether metered net reactive power replaces the load's and the inverter's.
+        True if metered net reactive power replaces that of load and inverter.
     """
 
     plant: Plant
@@ -232,13 +220,7 @@ class Setting:
 def setting(
     plant: Plant, *, max_attacked: int, options: Options | None = None, believes_q: bool = False
 ) -> Setting:
-    """Put a plant's setting together.
-
-    Parameters
-    ----------
-    plant, max_attacked, options, believes_q
-        As in `Setting`; the options' defaults by default.
-    """
+    """Compute the setting of a plant; `options` are the defaults if None."""
     model = linear(plant.feeder)
     errors = error_model(plant.droop, model, plant.meters, max_attacked)
     return Setting(plant, model, errors, Options() if options is None else options, max_attacked, believes_q)
@@ -246,26 +228,22 @@ def setting(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MonitorDesign:
-    """Everything that is prepared offline.
+    """Design of the exact bank monitor.
 
     Attributes
     ----------
-    plant
-        What is watched.
     model
-        Its linear power flow.
+        Linear power flow of the plant.
     bank
         The observers.
     errors
-        How errors travel.
+        Propagation of errors.
     certificate
-        Why the observers converge, for all sensor sets at once.
+        Proof that the observers converge, for all sensor sets at once.
     proven
-        The system the certificate is about: the closed loop, or one that majorises all observers.
+        System of the certificate: the closed loop, or a majorant of all observers.
     step_s
         Expected interval between frames, s.
-    options
-        The numbers that decide.
     """
 
     plant: Plant
@@ -279,7 +257,7 @@ class MonitorDesign:
 
     @property
     def setting(self) -> Setting:
-        """What a frame is cleaned with."""
+        """Setting for the preparation of frames."""
         return Setting(
             self.plant,
             self.model,
@@ -291,20 +269,20 @@ class MonitorDesign:
 
     @property
     def observers(self) -> int:
-        """How many observers run."""
+        """Number of observers."""
         return len(self.bank.masks)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MonitorState:
-    """What is carried from frame to frame.
+    """State between frames.
 
     Attributes
     ----------
     t
-        Time of the last frame that was used, s; of `init` before the first one.
+        Time of the last used frame, s; that of `init` before the first one.
     valid
-        Whether the certificate survived its verification.
+        True if the certificate was verified.
     bank
         The observers; None before the first frame.
     x : (m,)
@@ -312,17 +290,17 @@ class MonitorState:
     z : (m,)
         Its z at the inverters, pu.
     spread : (m,)
-        How far it may be from that of a liar-free observer, pu.
+        Largest distance of it from that of an observer without manipulated meters, pu.
     bound, level
-        Bounds on the observers' error, and the level they stayed below during the last step.
+        Bounds on the observers' error, and their upper level during the last step.
     settled
-        Whether the unknown initial state is forgotten.
+        True once the initial transient has decayed.
     tally
-        Who was above the threshold for how long, and who is named.
+        Counters of readings above and below the thresholds, and the named meters.
     v0_squared
         Last squared busbar voltage, pu; in three phases (3,).
     last
-        The last estimate and verdict, for frames that cannot be used; None before the first one.
+        Last estimate and verdict, returned for unusable frames; None before the first one.
     """
 
     t: float

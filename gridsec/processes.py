@@ -1,4 +1,4 @@
-"""Processes of a pool and signals: an interruption is the first process's own, and its pool ends with it."""
+"""Worker pools and signals: only the first process handles interruptions, and it ends its pool."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from typing import Final
 
 __all__ = ["deaf", "listen", "stop"]
 
-# What ends a command. At a terminal all of its processes are interrupted at once.
+# Signals that end a command. A terminal sends SIGINT to all processes of the command.
 _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
 
 
 @contextmanager
 def deaf() -> Iterator[None]:
-    """Begin processes undisturbed: signals to this one come after it, and theirs when they `listen`.
+    """Start worker processes with signals blocked; this process handles late signals afterwards.
 
-    One that is interrupted before it knows what to do would tell of it at length.
+    The workers unblock theirs in `listen`. A worker interrupted before that would print a traceback.
     """
     if sys.platform == "win32" or threading.current_thread() is not threading.main_thread():
         yield
@@ -43,22 +43,17 @@ def deaf() -> Iterator[None]:
 
 
 def listen() -> None:
-    """In a process that was begun `deaf`: leave interruptions to the first process, and end when told to."""
+    """In a worker started under `deaf`: ignore SIGINT, handled by the first process, and accept SIGTERM."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if sys.platform != "win32":
         signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
 
 
 def stop(pool: ProcessPoolExecutor) -> None:
-    """End a pool at once: what its processes have in hand is not wanted any more.
+    """Kill the processes of a pool at once and discard their work.
 
-    Where all is done, too: processes that are asked to end wait for ever where one of them was killed while
-    it waited for work.
-
-    Parameters
-    ----------
-    pool
-        The pool.
+    Use it after normal completion too: a graceful shutdown hangs if a process was killed while it waited
+    for work.
     """
     for process in list(pool._processes.values()) if pool._processes else []:
         process.kill()

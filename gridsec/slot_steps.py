@@ -20,19 +20,10 @@ _RELAX = 2000
 
 
 def advance(lay: Layout, state: SlotState, inputs: Drive, h: float, policy: StepPolicy) -> SlotState:
-    """All observers a time h later, inputs held.
+    """All observers a time h later, under constant inputs.
 
-    The same exponential Runge-Kutta substeps, and the same equilibrium after long steps, as
-    `gridsec.lure.advance` would take for each observer alone.
-
-    Parameters
-    ----------
-    lay, state, inputs
-        Units, state, inputs of the step.
-    h
-        Length, s.
-    policy
-        Accuracy of the time step.
+    The same exponential Runge-Kutta substeps, and the same equilibrium after long steps, as those of
+    `gridsec.lure.advance` for each observer alone.
     """
     prepared = state.prepared
     if prepared.h != h:
@@ -63,7 +54,7 @@ def advance(lay: Layout, state: SlotState, inputs: Drive, h: float, policy: Step
 
 
 def _gather(values: Floats, n: int, units: Ints) -> Floats:
-    """`values[units]`, or one number where all inverters share it (padding needs none: it stays zero)."""
+    """`values[units]`, or one number if all inverters share it; padding stays zero with any factor."""
     if n and np.all(values[:n] == values[0]):
         return values[:1]
     return np.asarray(values[units])
@@ -112,13 +103,7 @@ def _scatter(lay: Layout, units: Ints, apart: Floats) -> Floats:
 
 
 def settle(lay: Layout, state: SlotState, inputs: Drive, policy: StepPolicy) -> SlotState:
-    """All observers in their equilibria.
-
-    Parameters
-    ----------
-    lay, state, inputs, policy
-        As in `advance`.
-    """
+    """All observers in their equilibria."""
     n = lay.driver.size
     driven = state.driven.copy()
     if n:
@@ -141,7 +126,7 @@ def settle(lay: Layout, state: SlotState, inputs: Drive, policy: StepPolicy) -> 
 def _equilibrium(
     lay: Layout, block: Block, inputs: Drive, x: Floats, *, driven: Floats, policy: StepPolicy
 ) -> Floats:
-    """Slots (k, n) with `x = K(z(x))`, a few thousand observers at a time."""
+    """Slots (k, n) with `x = K(z(x))`, computed in parts of a few thousand observers."""
     k, n = x.shape
     s = inputs.reference(driven).copy()
     z = lay.H @ s + inputs.base
@@ -180,7 +165,7 @@ class _Loops:
         return np.asarray(x - self.curve(self.outputs(x)))
 
     def solve(self, x: Floats, policy: StepPolicy) -> Floats:
-        """Damped semismooth Newton, as in `gridsec.newton.settle`; then, if need be, plain integration."""
+        """Damped semismooth Newton, as in `gridsec.newton.settle`; then, if necessary, plain integration."""
         x = x.copy()
         left = np.arange(x.shape[0])
         tol = policy.tol * unit(self.lay.droop)
@@ -192,7 +177,7 @@ class _Loops:
             if not left.size:
                 return x
             x[left] = loops.take(np.flatnonzero(rough)).newton(now[rough], residual[rough])
-        # An online step may not fail. Every loop of droop inverters attracts, so following it gets there.
+        # An online step may not fail. Every loop of droop inverters is attractive, so integration converges.
         loops, now = self.take(left), x[left]
         shrink = 1.0 / (1.0 + np.abs(self.H[left]).sum(axis=2).max(axis=1) * self.lay.droop.slope.max())
         for _ in range(_RELAX):
@@ -218,13 +203,7 @@ class _Loops:
 
 
 def consistency(lay: Layout, sets: Subsets, state: SlotState) -> Floats:
-    """pi_S of every large set; chong2020 (6). Empty while too few meters are alive.
-
-    Parameters
-    ----------
-    lay, sets, state
-        Units, subsets, state.
-    """
+    """pi_S of every large set; chong2020 (6). Empty while too few meters are available."""
     plan = state.plan
     if plan is None:
         return np.zeros(0)
@@ -243,15 +222,7 @@ def consistency(lay: Layout, sets: Subsets, state: SlotState) -> Floats:
 
 
 def spread(lay: Layout, sets: Subsets, state: SlotState, index: int) -> Floats:
-    """Largest deviation of the compared estimates from that of one S, inverter by inverter; (n,).
-
-    Parameters
-    ----------
-    lay, sets, state
-        Units, subsets, state.
-    index
-        Number of the S.
-    """
+    """Largest deviation of the compared estimates from that of one S, inverter by inverter; (n,)."""
     n = lay.driver.size
     plan = state.plan
     if plan is None:
@@ -267,15 +238,7 @@ def spread(lay: Layout, sets: Subsets, state: SlotState, index: int) -> Floats:
 
 
 def estimate(lay: Layout, sets: Subsets, state: SlotState, index: int) -> Floats:
-    """Estimate (n,) of one observer: large sets first, then small ones; -1 for the driven observer.
-
-    Parameters
-    ----------
-    lay, sets, state
-        Units, subsets, state.
-    index
-        Number of the observer.
-    """
+    """Estimate (n,) of one observer: large sets first, then small ones; -1 for the driven observer."""
     x = state.driven.copy()
     if index >= 0 and state.plan is not None:
         block, slots, i = (

@@ -1,19 +1,19 @@
-"""Direct-injection observers of all sensor subsets at once, stored by what tells them apart.
+"""Direct-injection observers of all sensor subsets at once, stored by their differences.
 
 The observer of the set J of trusted meters is `tau_i x_i' = -x_i + K_i(zeta_i)`, with zeta_i the
 reading of the inverter's own meter if that meter is in J, and `z_i = H_i x + F_i u` otherwise. An
 inverter with a trusted meter therefore moves the same way in *every* observer that trusts the meter: one
-common `driven` trajectory serves all of them, and observer J is described by the few inverters whose
-meter it leaves out, or that have none, its *slots*:
+common `driven` trajectory serves all of them. Observer J is described by its *slots*, the few inverters
+with an omitted meter or without a meter:
 
     z_i^J = z_i + sum over slots k of H_ik (x_k^J - s_k),     z = H s + F u,
 
 where s is the driven trajectory. One step of n observers with k slots each costs O(n k^2) instead of
 O(n m^2). docs/theory-detection.md proves the identity.
 
-A customer whose net reactive power is metered adds one twist: while its meter is trusted, s_k is the
-metered value minus the load's assumed one instead of the observer's x_k. A customer without an inverter
-whose meter reports reactive power gets a slot whose state is always zero, for that correction alone.
+Metered net reactive power modifies this: while the customer's meter is trusted, s_k is the metered value
+minus the assumed load in place of the observer's x_k. A customer without an inverter, but with a meter that
+reports reactive power, gets a slot with state zero for that correction alone.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from gridsec.errors import InputInvalid, Problem
 from gridsec.lure import Lure, StepPolicy, Transition, transition
 from gridsec.subsets import Subsets
 
-# Above this many bytes the gathered feedback blocks are not kept, and a dense product replaces them.
+# Size limit of stored feedback blocks, bytes; larger ones are replaced by a dense product.
 _BLOCK_BYTES = 64 << 20
 _KEPT_PLANS = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layout:
-    """What can be in a slot. Units 0 … n-1 are the inverters, then come meters without one; e in all.
+    """Units of the slots: inverters 0 … n-1, then meters without an inverter; e units in all.
 
-    Index e is the padding: its row, its column and its state are zero.
+    Index e is the padding: row, column and state are zero.
 
     Attributes
     ----------
@@ -48,17 +48,17 @@ class Layout:
     of_meter : (p, r)
         Units behind each meter, padded with e.
     free : (f,)
-        Inverters that no meter sees.
+        Inverters without a meter.
     driver : (n,)
-        The meter of each inverter; 0 where there is none (see `metered`).
+        Meter of each inverter; 0 where there is none (see `metered`).
     metered : (n,)
-        Whether the inverter has a meter.
+        True where the inverter has a meter.
     H : (e + 1, e + 1)
         Effect of each unit's injection on z at each inverter.
     rows : (e + 1,)
-        Inverter whose curve each unit evaluates; 0 for units without a curve.
+        Inverter of each unit's curve; 0 for units without a curve.
     real : (e + 1,)
-        Whether the unit is an inverter.
+        True where the unit is an inverter.
     """
 
     lure: Lure
@@ -78,9 +78,9 @@ class Layout:
 
 
 def layout(lure: Lure, reactive: Floats | None) -> Layout:
-    """Find out which meter drives which inverter.
+    """Assign meters to the inverters that they drive.
 
-    A meter sits at an inverter's customer exactly if its output is that inverter's:
+    A meter is at an inverter's customer exactly if its output is that inverter's:
     `(C_j, D_j) = (H_i, F_i)`.
 
     Parameters
@@ -88,8 +88,8 @@ def layout(lure: Lure, reactive: Floats | None) -> Layout:
     lure
         A plant made by `close_loop`: `A = -T^-1`, `G = T^-1`, `B = 0`, phi a Droop.
     reactive : (l, p), optional
-        What one pu of reactive injection at each meter's customer does to u. Needed where net reactive
-        power may be metered at customers without an inverter.
+        Change of u per pu of reactive injection at each meter's customer. Needed where net reactive power may
+        be metered at customers without an inverter.
 
     Raises
     ------
@@ -98,7 +98,7 @@ def layout(lure: Lure, reactive: Floats | None) -> Layout:
     """
     droop = lure.phi
     if not isinstance(droop, Droop):
-        raise TypeError("direct injection needs a plant whose nonlinearity is a Droop; see close_loop")
+        raise TypeError("direct injection needs a plant with a Droop as nonlinearity; see close_loop")
     rate = 1.0 / droop.tau
     if not (
         np.allclose(lure.A, -np.diag(rate), rtol=1e-12, atol=0.0)
@@ -142,18 +142,18 @@ def layout(lure: Lure, reactive: Floats | None) -> Layout:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Block:
-    """One bank's slots. n observers, k slots each.
+    """Slots of one bank. n observers, k slots each.
 
     Attributes
     ----------
     units : (k, n)
-        Which unit is in each slot.
+        Unit of each slot.
     rows : (k, n)
-        Whose curve it evaluates.
+        Inverter of its curve.
     real : (k, n) or None
-        Where the slot holds an inverter; None: everywhere.
+        True where the slot is an inverter; None if all are.
     H : (k, k, n) or None
-        Feedback between the slots; None: too large to keep.
+        Feedback between the slots; None if above `_BLOCK_BYTES`.
     """
 
     units: Ints
@@ -164,21 +164,21 @@ class Block:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plan:
-    """All index arrays for one pattern of live meters.
+    """Index arrays for one pattern of available meters.
 
     Attributes
     ----------
     seen : (p,)
-        The live meters.
+        The available meters.
     driven : (n,)
-        Inverters that a live meter drives.
+        Inverters driven by an available meter.
     trailing : (t,)
-        Units that no observer can drive: their meter is silent, or there is none.
+        Units that no observer can drive, for lack of an available meter.
     large, small
         The two banks.
     compare
-        For each choice of `Subsets.choices`: the slots of P that S drives; the slots that must be
-        looked up in S; and where they stand in a table (number of S, e + 1), flattened.
+        For each choice of `Subsets.choices`: the slots of P that S drives; the slots to look up in S; and
+        their positions in a table (number of S, e + 1), flattened.
     """
 
     seen: Bools
@@ -190,20 +190,12 @@ class Plan:
 
 
 def make_plan(lay: Layout, sets: Subsets, seen: Bools) -> Plan:
-    """Index arrays for one pattern of live meters.
-
-    Parameters
-    ----------
-    lay, sets
-        Units and sensor subsets.
-    seen : (p,)
-        Live meters.
-    """
+    """Index arrays for one pattern of available meters, `seen` (p,)."""
     silent = lay.of_meter[~seen]
     quiet = silent[silent < lay.units]
     trailing = np.concatenate([lay.free, quiet]).astype(np.intp)
-    # Which meter is behind a trailing unit; -1 for none. A silent meter that an observer leaves out
-    # anyway already has its slot there, and must not get a second one.
+    # Meter behind a trailing unit; -1 for none. An unavailable meter that an observer leaves out anyway
+    # already has its slot there, and must not get a second one.
     of_unit = np.full(lay.units + 1, -1, dtype=np.intp)
     meters, _ = np.nonzero(lay.of_meter < lay.units)
     of_unit[lay.of_meter[lay.of_meter < lay.units]] = meters
@@ -241,13 +233,13 @@ def _block(lay: Layout, units: Ints) -> Block:
 def _comparisons(
     lay: Layout, sets: Subsets, units: Ints, *, all_slots: bool
 ) -> tuple[tuple[Ints, Ints, Ints], ...]:
-    """Where equation (6) has to look, for each choice of the meters that S leaves out as well."""
+    """Lookups of equation (6) for each choice of the meters that S leaves out as well."""
     width = lay.of_meter.shape[1]
     places = 2 * sets.max_attacked
     last = np.arange(places * width, units.shape[0])
     out = []
     for pick, parent in zip(sets.choices, sets.parent, strict=True):
-        # A slot whose meter S trusts shows the driven value there, unless that meter is silent.
+        # S has the driven value for a slot with a meter that it trusts, unless that meter is unavailable.
         chosen = np.zeros(places, dtype=np.bool_)
         chosen[pick] = True
         mine = np.repeat(chosen, width)
@@ -266,13 +258,13 @@ class SlotState:
     Attributes
     ----------
     driven : (e + 1,)
-        The observer that trusts every live meter; padded.
+        The observer that trusts every available meter; padded.
     large, small : (k, n)
-        The slots of the two banks; empty while too few meters are alive.
+        The slots of the two banks; empty while too few meters are available.
     plan
-        Index arrays of the current pattern of live meters; None while too few are alive.
+        Index arrays of the current pattern of available meters; None while there are too few.
     plans
-        Plans of the patterns seen last, newest first.
+        Plans of the latest patterns, newest first.
     seen : (p,)
         The current pattern.
     prepared
@@ -289,15 +281,7 @@ class SlotState:
 
 
 def start(lay: Layout, sets: Subsets, base: Plan, policy: StepPolicy) -> SlotState:
-    """All observers at zero injection, all meters live.
-
-    Parameters
-    ----------
-    lay, sets, base
-        Units, subsets, and the plan for all meters live.
-    policy
-        Accuracy of the time step.
-    """
+    """All observers at zero injection with all meters available, for the plan `base` of all meters."""
     return SlotState(
         driven=np.zeros(lay.units + 1),
         large=np.zeros(base.large.units.shape),
@@ -310,20 +294,18 @@ def start(lay: Layout, sets: Subsets, base: Plan, policy: StepPolicy) -> SlotSta
 
 
 def follow(lay: Layout, sets: Subsets, state: SlotState, seen: Bools, adopt: Floats | None) -> SlotState:
-    """The same observers under another pattern of live meters.
+    """The same observers under another pattern of available meters.
 
-    A meter that falls silent frees its inverter in every observer, from the value it had. A meter that
-    returns drives its inverter again, from `adopt` in all observers at once. With 2M or fewer live
-    meters only the driven observer goes on, on the model alone.
+    A meter that becomes unavailable frees its inverter in every observer, from its last value. A meter that
+    returns drives its inverter again, from `adopt` in all observers at once. With 2M or fewer available
+    meters only the driven observer continues, on the model alone.
 
     Parameters
     ----------
-    lay, sets, state
-        Units, subsets, state.
     seen : (p,)
         The new pattern.
     adopt : (n,), optional
-        Injection from which returning meters' inverters start; by default the driven observer's own.
+        Initial injections of inverters with a returning meter; by default those of the driven observer.
     """
     if np.array_equal(seen, state.seen):
         return state
@@ -350,7 +332,7 @@ def follow(lay: Layout, sets: Subsets, state: SlotState, seen: Bools, adopt: Flo
 
 
 def _carry(before: Plan | None, after: Plan, block: Block, x: Floats, driven: Floats) -> Floats:
-    """Slots of `x` under the plan `before`, moved to where `block` of the plan `after` wants them."""
+    """Slots of `x` under the plan `before`, in the order of `block` of the plan `after`."""
     fresh = np.asarray(driven[block.units])
     if before is None:
         return fresh
@@ -365,20 +347,20 @@ def _carry(before: Plan | None, after: Plan, block: Block, x: Floats, driven: Fl
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drive:
-    """The inputs of one step, cleaned: no NaN survives here.
+    """Prepared inputs of one step, without NaN.
 
     Attributes
     ----------
     base : (e + 1,)
         F u at each inverter.
     reading : (n,)
-        Reading of each inverter's meter as z; 0 where no live meter drives it.
+        Reading of each inverter's meter as z; 0 without an available meter.
     driven : (n,)
-        Where a live meter does.
+        True where an available meter drives the inverter.
     net_unit : (c,)
-        First unit of each live meter that reports net reactive power.
+        First unit of each available meter with reported net reactive power.
     net : (c,)
-        Its metered net reactive injection minus the load's assumed one.
+        Its metered net reactive injection minus the assumed load.
     net_rest : (c, r - 1)
         The other units behind these meters.
     """
@@ -391,7 +373,7 @@ class Drive:
     net_rest: Ints
 
     def reference(self, driven: Floats) -> Floats:
-        """s, the injections as an observer that trusts every live meter sees them; (e + 1,)."""
+        """s, the injections in an observer that trusts every available meter; (e + 1,)."""
         if not self.net_unit.size:
             return driven
         s = driven.copy()
@@ -400,20 +382,18 @@ class Drive:
 
 
 def drive(lay: Layout, y: Floats, u: Floats, seen: Bools, net: Floats | None) -> Drive:
-    """Collect the inputs of a step.
+    """Prepare the inputs of a step.
 
     Parameters
     ----------
-    lay
-        Units.
     y : (p,)
-        Readings as z; anything where not seen.
+        Readings as z; arbitrary where not seen.
     u : (l,)
         Known input.
     seen : (p,)
-        Live meters.
+        Available meters.
     net : (p,), optional
-        Metered net reactive injection minus the load's assumed one; NaN where not reported.
+        Metered net reactive injection minus the assumed load; NaN where not reported.
     """
     n = lay.driver.size
     base = np.zeros(lay.units + 1)

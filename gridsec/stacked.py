@@ -3,7 +3,7 @@
     x_J' = A x_J + G phi(zeta_J) + B u + L_J e_J,   zeta_J = H x_J + F u + K_J e_J,   e_J = y - C x_J - D u
 
 with the columns of L_J and K_J outside J equal to zero. Direct injection is the special case L = 0 and
-K_J = 1 from a meter to the inverters at its customer; `gridsec.slots` does that one faster.
+K_J = 1 from a meter to the inverters at its customer; `gridsec.slots` computes it faster.
 
 References
 ----------
@@ -43,17 +43,9 @@ class Gains:
 
 
 def direct_gains(lure: Lure, masks: Bools) -> Gains:
-    """Direct injection as explicit gains: L = 0, K = 1 from a trusted meter to the inverters it sits at.
-
-    Parameters
-    ----------
-    lure
-        The plant.
-    masks : (o, p)
-        Sensor subsets.
-    """
+    """Direct injection as explicit gains for subsets (o, p): L = 0, K = 1 to the inverters of a meter."""
     same = feeds(lure)
-    # One meter drives an inverter, even if two of them sit there.
+    # One meter drives an inverter, even if there are two.
     first = same & (np.cumsum(same, axis=1) == 1)
     return Gains(
         L=np.zeros((masks.shape[0], lure.A.shape[0], masks.shape[1])),
@@ -70,7 +62,7 @@ class StackedState:
     x : (o, n)
         Estimates.
     seen : (p,)
-        The live meters of the last step.
+        Available meters of the last step.
     prepared
         Coefficients of the last step's length.
     """
@@ -81,15 +73,7 @@ class StackedState:
 
 
 def start(lure: Lure, gains: Gains, policy: StepPolicy) -> StackedState:
-    """All observers at zero, all meters live.
-
-    Parameters
-    ----------
-    lure, gains
-        Plant and gains.
-    policy
-        Accuracy of the time step.
-    """
+    """All observers at zero, with all meters available."""
     o, n, p = gains.L.shape
     return StackedState(np.zeros((o, n)), np.ones(p, dtype=np.bool_), transition(lure, 0.0, policy))
 
@@ -119,18 +103,16 @@ def advance(
     h: float,
     policy: StepPolicy,
 ) -> StackedState:
-    """All observers a time h later, inputs held.
+    """All observers a time h later, under constant inputs.
 
     Parameters
     ----------
-    lure, gains, state
-        Plant, gains, state.
     y : (p,)
-        Readings; anything where not seen.
+        Readings; arbitrary where not seen.
     u : (l,)
         Known input.
     seen : (p,)
-        Live meters.
+        Available meters.
     h
         Length of the step, s.
     policy
@@ -167,10 +149,7 @@ def settle(
 ) -> StackedState:
     """All observers in their equilibria, by a damped semismooth Newton method.
 
-    Parameters
-    ----------
-    lure, gains, state, y, u, seen, policy
-        As in `advance`. Observers that do not converge keep their last iterate.
+    Observers that do not converge keep their last iterate.
     """
     inputs = _inputs(lure, gains, y, u, seen)
     x = state.x.copy()
@@ -191,7 +170,7 @@ def _newton(
     lure: Lure, x: Floats, *, A: Floats, H: Floats, zeta: Floats, push: Floats, policy: StepPolicy
 ) -> Floats:
     """Solve `A x + G phi(H x + zeta) + push = 0` for a batch of observers."""
-    # In units of the state: divide by the open loop, as `lure.equilibrium` does.
+    # In units of the state: divided by the open loop, as in `lure.equilibrium`.
     scale = np.abs(np.diagonal(lure.A))
     scale = np.where(scale > 0, scale, 1.0)
     tol = policy.tol * unit(lure.phi)
@@ -223,11 +202,11 @@ def _newton(
 
 
 def _solve(matrices: Floats, rest: Floats) -> Floats:
-    """`matrices[o]^-1 rest[o]` for every observer o, by least squares if one of them has no inverse."""
+    """`matrices[o]^-1 rest[o]` for every observer o, by least squares if a matrix is singular."""
     try:
         return np.asarray(np.linalg.solve(matrices, rest[..., None])[..., 0])
     except np.linalg.LinAlgError:
-        # An observer that hears too little of an integrator may rest anywhere, or nowhere.
+        # An observer with too little information about an integrator may have many equilibria or none.
         return _times(np.asarray(np.linalg.pinv(matrices), dtype=np.float64), rest)
 
 

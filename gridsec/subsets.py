@@ -1,6 +1,6 @@
-"""Index arithmetic of the two banks: which meters each observer leaves out, and who is compared to whom.
+"""Index tables of the two banks: omitted meters of each observer, and the compared pairs.
 
-A set of meters is written by what it leaves *out*: chong2020's S leaves out M of p meters, P leaves out
+A set of meters is represented by the meters it *omits*: chong2020's S leaves out M of p meters, P leaves out
 2M, and P lies within S exactly if S leaves out M of the 2M meters that P leaves out. That makes both the
 sets and all their comparisons plain tables, computed once.
 """
@@ -20,7 +20,7 @@ from gridsec.errors import DesignInfeasible, InputInvalid, NotObservable, Proble
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Subsets:
-    """The sensor subsets of chong2020's two banks. p meters, M attacked at most.
+    """Sensor subsets of chong2020's two banks. p meters, at most M attacked.
 
     Attributes
     ----------
@@ -33,11 +33,11 @@ class Subsets:
     out_small : (C(p, 2M), 2M)
         Meters that each small set P leaves out, ascending.
     choices : (C(2M, M), M)
-        The ways to pick M of the 2M places of `out_small`.
+        The choices of M of the 2M places of `out_small`.
     parent : (C(2M, M), C(p, 2M))
         `parent[c, P]`: the S that leaves out those of P's meters that choice c picks.
     pairs : (C(p, M), C(p - M, M))
-        For each S, where its comparisons stand in an array of shape `parent.shape`, flattened.
+        For each S, positions of its comparisons in an array of shape `parent.shape`, flattened.
     """
 
     meters: int
@@ -69,23 +69,23 @@ class Subsets:
 
 
 def subsets(meters: int, max_attacked: int, *, most: int) -> Subsets:
-    """The tables for p meters of which M may lie.
+    """Tables for p meters with at most M manipulated.
 
     Parameters
     ----------
     meters
         p, number of meters.
     max_attacked
-        M, number of meters that may be manipulated at the same time.
+        M, largest number of simultaneously manipulated meters.
     most
-        Largest number of observers that is acceptable.
+        Largest acceptable number of observers.
 
     Raises
     ------
     NotObservable
         Unless p > 2M.
     DesignInfeasible
-        If the banks would hold more than `most` observers.
+        If the banks need more than `most` observers.
     ValueError
         If M is negative.
 
@@ -99,15 +99,15 @@ def subsets(meters: int, max_attacked: int, *, most: int) -> Subsets:
         raise NotObservable(
             range(meters),
             meters,
-            f"{meters} meters cannot be told apart when {max_attacked} of them may lie: "
+            f"{meters} meters cannot be told apart when {max_attacked} of them may be manipulated: "
             f"more than {2 * max_attacked} meters are needed (chong2020, Theorem 1), because two groups of "
-            f"{max_attacked} liars could otherwise tell two different stories that are equally credible",
+            f"{max_attacked} manipulated meters could otherwise give two different, equally credible states",
             code="too-few-meters",
         )
     count = comb(meters, max_attacked) + comb(meters, 2 * max_attacked)
     if count > most:
         raise DesignInfeasible(
-            f"exact bank for {meters} meters of which {max_attacked} may lie",
+            f"exact bank for {meters} meters, {max_attacked} of them manipulated",
             f"it needs {count} observers, and at most {most} are allowed; allow fewer manipulated meters",
             code="too-many",
         )
@@ -120,22 +120,22 @@ def subsets(meters: int, max_attacked: int, *, most: int) -> Subsets:
 
 
 def most_attacked(meters: int, works: Callable[[Ints], bool]) -> int:
-    """Largest M such that every set of at least p - 2M > 0 meters works: the q of the papers.
+    """Largest M such that every set of at least p - 2M > 0 meters suffices: the q of the papers.
 
-    They are tried, the largest first, until one does not. Where a set works if the pair (A, C_J) is
-    observable, `index.dynamic_index(A, C).correctable` says the same without trying.
+    All sets are tried, the largest first, until one fails. If the criterion is observability of the pair (A,
+    C_J), `index.dynamic_index(A, C).correctable` gives the same result without trials.
 
     Parameters
     ----------
     meters
         p, number of meters.
     works
-        Whether the meters J, ascending, are enough: there is an observer for them, or it can be designed.
+        Criterion for the meters J, ascending: True if an observer exists or can be designed for them.
 
     Returns
     -------
     int
-        M; -1 if not even all meters are enough.
+        M; -1 if not even all meters suffice.
 
     References
     ----------
@@ -157,8 +157,8 @@ def _combinations(n: int, k: int) -> Ints:
 def _rank(rows: Ints, n: int) -> Ints:
     """Position of each ascending row among `_combinations(n, k)`; (r,).
 
-    `C(n, k) - 1 - sum_i C(n - 1 - row_i, k - i)`: after a row come those that exceed it in its first,
-    second, … differing place.
+    `C(n, k) - 1 - sum_i C(n - 1 - row_i, k - i)`: the rows after a row exceed it in the first place in which
+    they differ.
     """
     k = rows.shape[1]
     after = np.zeros(rows.shape[0], dtype=np.intp)

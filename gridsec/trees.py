@@ -1,6 +1,6 @@
 """Sums over the subtrees and the paths of a radial feeder, as running sums along a walk around its tree.
 
-Bus 0 is the root, and bus k + 1 hangs from bus `parent[k] <= k`.
+Bus 0 is the root, and bus `parent[k] <= k` feeds bus k + 1.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Walked(Protocol):
 
 
 class Named(Protocol):
-    """A feeder by its names and its per unit."""
+    """Names and per-unit bases of a feeder."""
 
     @property
     def name(self) -> str: ...  # noqa: D102
@@ -46,7 +46,7 @@ class Named(Protocol):
 
 
 class OnTree:
-    """A feeder that has its customers and its per unit from a radial one, its `tree`."""
+    """A feeder with the customers and the per-unit bases of a radial one, its `tree`."""
 
     __slots__ = ()
     tree: Named
@@ -79,16 +79,16 @@ class Walk:
     Attributes
     ----------
     start, stop : (b + 1,)
-        Depth-first numbering: the subtree of bus k is the buses whose `start` lies in `[start[k], stop[k])`.
+        Depth-first numbering: the subtree of bus k is the buses with `start` in `[start[k], stop[k])`.
     order : (b + 1,)
         The buses by these numbers.
     depth : (b + 1,)
         Number of branches between bus k and the root.
     enter, leave : (b + 1,)
-        When the walk comes to a bus first, and when it has left it.
+        Steps at which the walk reaches a bus first, and has left it.
     inside : (b + 1, b + 1) or None
-        1 where the bus of the row lies in the subtree of that of the column, else 0; None where the tree is
-        so large that sums along the walk cost less than a product with this.
+        1 where the bus of the row lies in the subtree of that of the column, else 0; None for trees so large
+        that sums along the walk cost less than a product with this matrix.
     """
 
     start: Ints
@@ -100,7 +100,8 @@ class Walk:
     inside: Floats | None
 
 
-# Buses up to which sums of one operating point are products with a matrix, and numbers of one for each bus.
+# _DENSE: largest number of buses for sums as matrix products. _FEW: largest number of values per bus for
+# them.
 _DENSE, _FEW = 200, 8
 
 
@@ -110,7 +111,7 @@ def walk(parent: Ints) -> Walk:
     Parameters
     ----------
     parent : (b,)
-        Bus from which bus k + 1 hangs, at most k.
+        Bus that feeds bus k + 1, at most k.
     """
     count = parent.size + 1
     size = np.ones(count, dtype=np.intp)
@@ -118,7 +119,7 @@ def walk(parent: Ints) -> Walk:
         size[parent[k - 1]] += size[k]
     start = np.zeros(count, dtype=np.intp)
     depth = np.zeros(count, dtype=np.intp)
-    free = np.ones(count, dtype=np.intp)  # next number to hand out among the children of a bus
+    free = np.ones(count, dtype=np.intp)  # next free number among the children of a bus
     for k in range(1, count):
         above = parent[k - 1]
         start[k] = free[above]
@@ -155,7 +156,7 @@ def from_root(tree: Walked, values: Values) -> Values:
     inside = _dense(tree, values)
     if inside is not None:
         return np.asarray(values @ inside[:, 1:].T)
-    # A branch counts from when its bus is entered until it is left.
+    # A branch counts from the step that enters its bus to the step that leaves it.
     tour = np.zeros((*values.shape[:-1], 2 * tree.enter.size), dtype=values.dtype)
     tour[..., tree.enter[1:]] = values
     tour[..., tree.leave[1:]] = -values
@@ -163,7 +164,7 @@ def from_root(tree: Walked, values: Values) -> Values:
 
 
 def _dense(tree: Walked, values: Values) -> Floats | None:
-    """The matrix that sums few real values of a small tree in the least time; None for others."""
+    """Summation matrix for few real values of a small tree; None where the walk is faster."""
     inside = tree.inside
     if inside is None or values.dtype != np.float64 or values.size > _FEW * len(inside):
         return None
@@ -177,15 +178,13 @@ def meetings(parent: Ints, tree: Walked, buses: Ints) -> Ints:
     ----------
     parent : (b,)
         See `walk`.
-    tree
-        Its walk.
     buses : (k,)
         The second bus of each pair.
 
     Returns
     -------
     (b + 1, k)
-        The lowest bus that both have on their path, themselves included.
+        The lowest bus on both paths, themselves included.
     """
     out = np.zeros((parent.size + 1, buses.size), dtype=np.intp)
     at = tree.start[buses]
@@ -194,17 +193,17 @@ def meetings(parent: Ints, tree: Walked, buses: Ints) -> Ints:
     return out
 
 
-# Where a second step is more than this part of the first, later ones may shrink by less than half.
+# Largest ratio of the second to the first step for which all later ones shrink by half or more.
 _SHRINK = 0.2
 
 
 def shrinking(first: Floats, second: Floats, axis: tuple[int, ...]) -> Bools:
-    """Whether the steps of a sweep get small fast enough for all later ones to be at most the second.
+    """Mask of sweeps with steps that shrink fast enough for all later ones to be at most the second.
 
     Parameters
     ----------
     first, second : (…)
-        How far the first two steps move.
+        Changes in the first two steps.
     axis
         Axes of the buses; kept, with one entry.
     """

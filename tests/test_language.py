@@ -27,7 +27,7 @@ PERSON = re.compile(
 
 # Indirect questions as titles, and personal pronouns for equipment.
 LIMITS = {
-    "gridsec": (197, 285),
+    "gridsec": (0, 0),
     "default monitor": (166, 220),
     "feeders": (223, 250),
     "service": (96, 192),

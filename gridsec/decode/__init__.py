@@ -1,6 +1,6 @@
 """Error correction over the reals for stacked vectors (lee2018, chapter 2).
 
-Modules: `stacks` (what can be detected and corrected at all), `search` (l0 decoding over a finite set),
+Modules: `stacks` (detectability and correctability), `search` (l0 decoding over a finite set),
 `noise` (bounded noise, all constants), `gaussian` (minimum variance, chi-square, hypotheses), `probability`
 (from Gaussian to bounded), `sparse` (basis pursuit, orthogonal matching pursuit).
 """

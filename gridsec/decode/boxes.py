@@ -1,16 +1,16 @@
-"""l0 decoding where every row has its own bound and some rows cannot be attacked: all sets, in closed form.
+"""l0 decoding with a bound for every row and rows that cannot be attacked: all sets, in closed form.
 
     s = B xi + v + e,     |xi_i| <= 1,     |v_k| <= 1,     e zero in all but q blocks
 
-xi is the state in units of what is known about it by itself: rows of an identity that nobody attacks, a
+xi is the state in units of its prior intervals: rows of an identity that cannot be attacked, such as a
 model's own prediction and loads within their intervals. For every set of q blocks the least-squares fit to
 all others is made. With W = (I + B B^T)^-1, Lambda the rows that are kept, D the others and
 ``g = W_DD^-1 W_D s``,
 
     residual_Lambda = W_Lambda s - W_LambdaD g,     residual_D = g,
 
-and both are known matrices times (xi, v). What a row of honest blocks can reach at most is therefore the sum
-of absolute values of its coefficients, attained by some xi and v; no norm is estimated on the way.
+and both are known matrices times (xi, v). The largest value of a row of blocks without attack is therefore
+the sum of absolute values of its coefficients, attained by some xi and v; no norm is estimated.
 
 References
 ----------
@@ -30,23 +30,23 @@ from gridsec.decode.stacks import MOST_SUBSETS, subsets
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fits:
-    """Every fit that leaves q blocks out. S sets, p blocks, A rows, n unknowns, F functionals.
+    """Fits that leave q blocks out, for all sets. S sets, p blocks, A rows, n unknowns, F functionals.
 
     Attributes
     ----------
     left_out : (S, p)
-        The blocks that each fit ignores.
+        The blocks left out by each fit.
     residual, limit : (S, A)
-        ``s - B xi_hat`` and the largest value it can have if all blocks outside the set are honest and, for
-        rows of the set, these as well.
+        ``s - B xi_hat`` and its largest value if all blocks outside the set are unmanipulated and, for rows
+        of the set, these as well.
     reach : (A,)
-        The largest value of ``|s|`` that an honest row can have: the limit of the fit that rests on nobody.
+        Largest value of ``|s|`` of an unmanipulated row: the limit of the fit without blocks.
     disagree : (S, p)
-        Blocks with a residual above its limit, or a value out of reach.
+        Blocks with a residual above its limit, or a value above `reach`.
     xi : (S, n)
         Fitted unknowns.
     error : (S, F)
-        Bound of ``|f (xi - xi_hat)|`` for each functional, if all blocks outside the set are honest.
+        Bound of ``|f (xi - xi_hat)|`` for each functional, if all blocks outside the set are unmanipulated.
     """
 
     left_out: Bools
@@ -59,29 +59,29 @@ class Fits:
 
     @property
     def credible(self) -> Bools:
-        """Fits that explain every block they rest on; (S,). A set of honest blocks always does."""
+        """Fits that explain every block in them; (S,). A set of unmanipulated blocks always does."""
         return np.asarray(~(self.disagree & ~self.left_out).any(axis=1))
 
     @property
     def certain(self) -> Bools:
-        """Blocks that every credible fit leaves out; (p,). Nobody where no fit is credible.
+        """Blocks left out by every credible fit; (p,). None if no fit is credible.
 
-        If at most q blocks are attacked, an honest block j belongs to some set of p - q honest ones, whose
-        fit is credible and does not leave j out: who is certain is attacked.
+        If at most q blocks are attacked, an unmanipulated block j belongs to some set of p - q unmanipulated
+        ones. The fit of that set is credible and does not leave j out: a certain block is attacked.
         """
         fine = self.credible
         return np.asarray(self.left_out[fine].all(axis=0) & fine.any())
 
     @property
     def contradicted(self) -> Bools:
-        """Blocks that some fit rests on and does not explain; (p,). Where there is one, some block lies."""
+        """Blocks that some fit uses and does not explain; (p,). If there is one, some block is attacked."""
         return np.asarray((self.disagree & ~self.left_out).any(axis=0))
 
 
-def fits(  # noqa: PLR0917  # the terms of s = B xi + v, then what is asked of them
+def fits(  # noqa: PLR0917  # the terms of s = B xi + v, then the requested bounds
     B: Floats, s: Floats, block: Ints, blocks: int, q: int, functionals: Floats, *, most: int = MOST_SUBSETS
 ) -> Fits:
-    """Fit the unknowns without every set of q blocks, and say what honest rows can be off.
+    """Fit the unknowns without every set of q blocks, with the limits of unmanipulated rows.
 
     Parameters
     ----------
@@ -90,15 +90,13 @@ def fits(  # noqa: PLR0917  # the terms of s = B xi + v, then what is asked of t
     s : (A,)
         Their values.
     block : (A,)
-        Block of each row. A block without rows can be left out, too, and never disagrees.
+        Block of each row. A block without rows can be left out too, and never disagrees.
     blocks
         p.
     q
-        How many blocks each fit leaves out; of fewer blocks with rows, all.
+        Number of blocks that each fit leaves out; all of them if fewer have rows.
     functionals : (F, n)
-        What else to bound.
-    most
-        Largest number of sets.
+        Functionals to bound.
 
     Raises
     ------
@@ -129,7 +127,7 @@ _ROUNDING = 1.0 + 1e-9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Whole:
-    """The fit to all rows, which the others are updates of."""
+    """Fit to all rows, the base of the updates."""
 
     W: Floats  # (A, A)
     P: Floats  # (A, n) W B
@@ -145,7 +143,7 @@ def _without(whole: _Whole, out: Bools, functionals: Floats) -> tuple[Floats, Fl
         limit = np.abs(P).sum(axis=1) + np.abs(W).sum(axis=1)
         return whole.ws, limit, np.abs(whole.by_xi).sum(axis=1) + np.abs(whole.by_v).sum(axis=1)
     WD = W[out]
-    # (rows of D, [value | by xi | by v]): what the kept rows leave unexplained in D.
+    # (rows of D, [value | by xi | by v]): part of D not explained by the kept rows.
     solved = np.linalg.solve(WD[:, out], np.column_stack([whole.ws[out], P[out], WD * kept]))
     g, by_xi, by_v = solved[:, 0], solved[:, 1 : 1 + P.shape[1]], solved[:, 1 + P.shape[1] :]
     residual, limit = np.empty(out.size), np.empty(out.size)

@@ -1,4 +1,4 @@
-"""Logarithms of the chi-square density and of its tail, also where both are too small for a double."""
+"""Logarithms of the chi-square density and of its tail, also where both underflow."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from scipy.special import chdtr, chdtrc, gammaln, xlogy
 
 from gridsec.arrays import Floats
 
-# Terms of the continued fraction; beyond the largest double's logarithm two would do.
+# Terms of the continued fraction; for arguments beyond the largest double's logarithm two would suffice.
 _TERMS = 20
-# Whatever is beyond is as unlikely as this.
+# Upper limit of the argument.
 _MOST = 1e300
 
 
@@ -19,7 +19,7 @@ def log_density(g: Floats, k: Floats) -> Floats:
     Parameters
     ----------
     g : (…)
-        Where, >= 0.
+        Argument, >= 0.
     k : (…)
         Degrees of freedom.
 
@@ -45,7 +45,7 @@ def log_tail(g: Floats, k: Floats) -> Floats:
     Returns
     -------
     (…)
-        Where the probability itself underflows, by the continued fraction of the incomplete gamma function.
+        If the probability itself underflows, by the continued fraction of the incomplete gamma function.
 
     References
     ----------

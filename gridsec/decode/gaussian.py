@@ -3,9 +3,9 @@
     z = Phi x + v + e,    v ~ N(0, P)
 
 The residual of the minimum-variance estimate has the *singular* covariance
-`P - Phi (Phi^T P^-1 Phi)^-1 Phi^T`, of rank N - n. Its standardised square sum g is therefore chi-square
-with N - n degrees of freedom. lee2018 prints N, with which the test raises far fewer false alarms than
-asked for and lets attacks pass: docs/errata/lee2018-chapter-2.md.
+`P - Phi (Phi^T P^-1 Phi)^-1 Phi^T`, of rank N - n. Its standardised square sum g is therefore chi-square with
+N - n degrees of freedom. lee2018 prints N, which gives far fewer false alarms than specified and misses
+attacks: docs/errata/lee2018-chapter-2.md.
 
 References
 ----------
@@ -56,7 +56,7 @@ class Test:
         return int(self.standardise.shape[0])
 
     def threshold(self, false_alarm: float) -> float:
-        """Delta_TH: what g exceeds with this probability if there is no error.
+        """Delta_TH: the value that g exceeds with this probability without an error.
 
         Parameters
         ----------
@@ -66,7 +66,7 @@ class Test:
         Raises
         ------
         ValueError
-            If it is not.
+            If `false_alarm` is outside (0, 1).
         """
         if not 0.0 < false_alarm < 1.0:
             raise InputInvalid(
@@ -77,7 +77,7 @@ class Test:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Verdicts:
-    """Outcome of the chi-square test for a batch of measurements.
+    """Result of the chi-square test for a batch of measurements.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ class Verdicts:
     g : (…)
         Square sums of the standardised residuals.
     alarm : (…)
-        Whether g exceeds the threshold, or is no number.
+        True if g exceeds the threshold or is NaN.
     """
 
     x: Floats
@@ -96,12 +96,12 @@ class Verdicts:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hypotheses:
-    """The C(p, q) tests of Algorithm 2.3: in hypothesis i, only the sensors in `kept[i]` are free of error.
+    """The C(p, q) tests of Algorithm 2.3; in hypothesis i, only the sensors in `kept[i]` are free of error.
 
     Attributes
     ----------
     kept : (S, p - q)
-        Sensors that each hypothesis trusts.
+        Sensors trusted in each hypothesis.
     estimators : (S, n, N)
     standardise : (S, largest freedom, N)
         As in `Test`, filled up with zero rows.
@@ -117,7 +117,7 @@ class Hypotheses:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chosen:
-    """The hypothesis chosen for each of a batch of measurements.
+    """Chosen hypothesis for each of a batch of measurements.
 
     Attributes
     ----------
@@ -153,8 +153,8 @@ def design_test(stack: Stack, P: Floats, kept: Ints | None = None) -> Test:
     Raises
     ------
     NotObservable
-        If these sensors do not determine x, or do so without any redundancy, so that no reading could
-        speak against it.
+        If these sensors do not determine x, or determine it without redundancy, so that no reading could
+        contradict it.
     DesignInfeasible
         If P is not positive definite.
 
@@ -204,7 +204,7 @@ def _least_squares(stack: Stack, P: Floats, kept: Ints | None = None) -> Test:
 
 
 def residual_covariance(stack: Stack, P: Floats) -> Floats:
-    """`P - Phi (Phi^T P^-1 Phi)^-1 Phi^T`: covariance of the residual; of rank N - n, so not invertible.
+    """Covariance of the residual, `P - Phi (Phi^T P^-1 Phi)^-1 Phi^T`, of rank N - n, so not invertible.
 
     Parameters
     ----------
@@ -251,15 +251,13 @@ def design_hypotheses(stack: Stack, P: Floats, q: int, *, most: int = MOST_SUBSE
     stack, P
         As in `design_test`.
     q
-        Number of sensors that may be in error.
-    most
-        Largest number of sets.
+        Largest number of sensors in error.
 
     Raises
     ------
     NotObservable
-        If a set of p - q sensors does not determine x, or does so without any redundancy, so that no
-        reading could speak against it.
+        If a set of p - q sensors does not determine x, or determines it without redundancy, so that no
+        reading could contradict it.
     DesignInfeasible
         If there are more than `most` sets, or P is not positive definite.
     """
@@ -274,7 +272,7 @@ def design_hypotheses(stack: Stack, P: Floats, q: int, *, most: int = MOST_SUBSE
 
 
 def choose(hypotheses: Hypotheses, z: Floats, *, rule: Rule, freedom: Ints | None = None) -> Chosen:
-    """Choose the set of sensors that is taken to be free of error, and its estimate.
+    """Choose the set of sensors assumed free of error, and its estimate.
 
     Parameters
     ----------
@@ -283,17 +281,16 @@ def choose(hypotheses: Hypotheses, z: Floats, *, rule: Rule, freedom: Ints | Non
     z : (…, N)
         Measurements.
     rule
-        "density": the paper's, the largest chi-square density at g; it mistrusts residuals that are too
-        small (its Remark 2.2.3). "tail": the largest probability of a g at least this large; for equal
-        degrees of freedom the smallest g, which is the maximum of the likelihood of z itself over x, e
-        and the hypothesis.
+        "density": the paper's, the largest chi-square density at g; it penalises residuals that are too small
+        (its Remark 2.2.3). "tail": the largest probability of a g at least this large; for equal degrees of
+        freedom the smallest g, the maximum likelihood of z itself over x, e and the hypothesis.
     freedom : (S,)
-        Degrees of freedom to use instead of the right ones; for comparisons with the paper's.
+        Degrees of freedom in place of the correct ones; for comparisons with the paper's.
 
     Raises
     ------
     ValueError
-        If there is no such rule.
+        If `rule` is unknown.
 
     References
     ----------
@@ -304,7 +301,7 @@ def choose(hypotheses: Hypotheses, z: Floats, *, rule: Rule, freedom: Ints | Non
     flat = np.asarray(z, dtype=np.float64) @ hypotheses.standardise.reshape(S * width, N).T
     g = np.square(flat).reshape(*flat.shape[:-1], S, width).sum(axis=-1)
     k = (hypotheses.freedom if freedom is None else freedom).astype(np.float64)
-    # Logarithms, because for a real attack every wrong hypothesis underflows.
+    # Logarithms, because under a real attack every wrong hypothesis underflows.
     score = log_density(g, k) if rule == "density" else log_tail(g, k)
     best = np.argmax(score, axis=-1)
     x = np.einsum("...nj,...j->...n", hypotheses.estimators[best], z)

@@ -1,14 +1,14 @@
-"""Bounded noise: how far detection and correction can be trusted, with every constant.
+"""Bounded noise: guarantees of detection and correction, with every constant.
 
 Every block of the noise has norm at most v_max. Then, for errors in at most q blocks:
 
-- `detect` never alarms without an error; while it is silent, errors and estimate are within
+- `detect` never alarms without an error; without an alarm, errors and estimate are within
   `kappa_e v_max` and `kappa_d v_max`;
-- `correct` is within `kappa_c v_max` whatever the errors are.
+- `correct` is within `kappa_c v_max` for any errors.
 
 References
 ----------
-lee2018, section 2.2.3.1. Proofs and what is corrected: docs/theory-decoding.md.
+lee2018, section 2.2.3.1. Proofs and corrections: docs/theory-decoding.md.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from gridsec.errors import InputInvalid, Problem
 
 @dataclass(frozen=True, slots=True)
 class DetectionConstants:
-    """Constants of Theorem 2.2.9, for p blocks of which q may be in error.
+    """Constants of Theorem 2.2.9, for p blocks with at most q in error.
 
     Attributes
     ----------
@@ -57,15 +57,15 @@ class CorrectionConstants:
     rho
         `rho_(p,2q)`.
     eta
-        `eta'_(p,q,r)`: over the sets of p - q blocks, the worst that even the best subset of p - r
-        blocks predicts the others; 0 for r = q.
+        `eta'_(p,q,r)`: over the sets of p - q blocks, the worst prediction of the others by the best subset
+        of p - r blocks; 0 for r = q.
     theta
         `max(eta sqrt(p - r) + 1, sqrt(p - r))`: a block is explained up to `theta v_max`.
     kappa_c
         `(theta + 1) sqrt(p - 2q) / rho`: bound of the decoded estimate's error, over v_max.
     kappa_far
-        `kappa^c'`, `(theta - 1) / max |Phi_i|`: an estimate that leaves more than q blocks unexplained
-        is at least this far off, over v_max.
+        `kappa^c'`, `(theta - 1) / max |Phi_i|`: smallest error of an estimate with more than q unexplained
+        blocks, over v_max.
     """
 
     rho: float
@@ -77,7 +77,7 @@ class CorrectionConstants:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Detected:
-    """Outcome of the detection for a batch of measurements.
+    """Result of the detection for a batch of measurements.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ class Detected:
     residuals : (…, p)
         Norms of the blocks of the residual.
     alarm : (…)
-        Whether there certainly is an error.
+        True if there certainly is an error.
     """
 
     x: Floats
@@ -102,11 +102,9 @@ def detection_constants(stack: Stack, q: int, *, tol: float, most: int = MOST_SU
     stack
         Phi; must be q-error detectable.
     q
-        Number of blocks that may be in error.
+        Largest number of blocks in error.
     tol
-        What counts as zero in deciding that.
-    most
-        Largest number of subsets.
+        Tolerance of that test.
 
     Raises
     ------
@@ -195,7 +193,7 @@ def detect(stack: Stack, z: Floats, *, v_max: Floats | float) -> Detected:
     Raises
     ------
     ValueError
-        If a `v_max` is negative or no number.
+        If a `v_max` is negative or NaN.
 
     References
     ----------
@@ -204,7 +202,7 @@ def detect(stack: Stack, z: Floats, *, v_max: Floats | float) -> Detected:
     sizes = stack.norms(residual(stack, z))
     x = z @ np.linalg.pinv(stack.matrix).T
     limit = np.sqrt(stack.count) * not_negative("v_max", v_max)[..., None]
-    # Written so that a residual that is no number alarms.
+    # Negated comparison: a residual of NaN alarms.
     return Detected(np.asarray(x), sizes, np.any(~(sizes <= limit), axis=-1))
 
 
@@ -225,7 +223,7 @@ def correct(decoder: Decoder, constants: CorrectionConstants, z: Floats, *, v_ma
     Raises
     ------
     ValueError
-        If a `v_max` is negative or no number.
+        If a `v_max` is negative or NaN.
 
     References
     ----------
@@ -246,8 +244,8 @@ def _subset_norms(stack: Stack, kept: Ints) -> tuple[Floats, Floats]:
 def _best_prediction(stack: Stack, q: int, r: int, most: int) -> float:
     """eta'_(p,q,r): max over |Lambda| = p - q of min over its subsets of p - r of max over the rest.
 
-    Written from the side of what is left out: Lambda ignores a set of q, its subset ignores r, and the
-    rest is what lies between.
+    In terms of omitted blocks: Lambda ignores a set of q, its subset ignores r, and the rest is the
+    difference.
     """
     p = stack.count
     if r == q:
@@ -257,7 +255,7 @@ def _best_prediction(stack: Stack, q: int, r: int, most: int) -> float:
     outside = np.ones((len(ignored), p), dtype=bool)
     np.put_along_axis(outside, ignored, values=False, axis=1)
     _, predicted = _subset_norms(stack, everything[outside].reshape(len(ignored), p - r))
-    # Of the r ignored blocks, q stay ignored by Lambda and r - q lie between.
+    # Of the r ignored blocks, q stay ignored by Lambda and r - q form the rest.
     between = subsets(r, r - q, most)
     stay = np.stack([np.setdiff1d(np.arange(r), b) for b in between])
     worst = np.take_along_axis(predicted, ignored, axis=1)[:, between].max(axis=2)

@@ -1,6 +1,6 @@
-"""From Gaussian to bounded noise: how likely every block of the noise keeps within v_max.
+"""From Gaussian to bounded noise: probability that every block of the noise is within v_max.
 
-With that probability, and not less, the guarantees for bounded noise hold.
+The guarantees for bounded noise hold with at least that probability.
 
 References
 ----------
@@ -17,25 +17,26 @@ from gridsec.arrays import Floats, not_negative
 from gridsec.decode.stacks import Stack
 from gridsec.errors import DesignInfeasible, InputInvalid, Problem
 
-# Of Ruben's series: its longest, and the index in parts of the spread by which nothing is left of it.
+# Ruben's series: largest number of terms, and its index in units of the spread beyond which the rest is
+# negligible.
 _TERMS = 2000
 _SPREAD = 30.0
-# Numbers of nodes on the contour; more of them for more weights.
+# Numbers of nodes on the contour; more for more weights.
 _NODES = (24, 32, 40, 48, 64, 96, 128, 192, 256)
 _ROUNDING = 1e-15
 _DOUBLINGS = 64
 
 
 def bound_probability(stack: Stack, P: Floats, v_max: float, *, tol: float) -> float:
-    """A lower bound of `p_v = Pr(|v_i| <= v_max for all i)`, exact up to `tol` for independent blocks.
+    """Lower bound of `p_v = Pr(|v_i| <= v_max for all i)`, exact up to `tol` for independent blocks.
 
     The product of the blocks' own probabilities, which by the Gaussian correlation inequality (the
-    events are symmetric and convex) never exceeds p_v, whatever the correlation between blocks.
+    events are symmetric and convex) never exceeds p_v, for any correlation between blocks.
 
     Parameters
     ----------
     stack
-        Gives the blocks.
+        Defines the blocks.
     P : (N, N)
         Covariance of the noise.
     v_max
@@ -46,9 +47,9 @@ def bound_probability(stack: Stack, P: Floats, v_max: float, *, tol: float) -> f
     Raises
     ------
     ValueError
-        If `v_max` is negative or no number, or P is no covariance.
+        If `v_max` is negative or NaN, or P is not a covariance.
     DesignInfeasible
-        If the probability of a block cannot be had as closely as `tol`.
+        If the probability of a block cannot be computed within `tol`.
 
     References
     ----------
@@ -72,14 +73,14 @@ def bound_for(stack: Stack, P: Floats, probability: float, *, tol: float) -> flo
     stack, P, tol
         As in `bound_probability`; `tol` should be well below `1 - probability`.
     probability
-        Wanted p_v, strictly between 0 and 1.
+        Required p_v, strictly between 0 and 1.
 
     Raises
     ------
     ValueError
-        If `probability` is not.
+        If `probability` is outside (0, 1).
     DesignInfeasible
-        If it is not reached, because `tol` is too coarse for it.
+        If it is not reached, because `tol` is too coarse.
     """
     if not 0.0 < probability < 1.0:
         raise InputInvalid([Problem("out-of-range", f"probability is {probability}; it must lie in (0, 1)")])
@@ -97,19 +98,19 @@ def bound_for(stack: Stack, P: Floats, probability: float, *, tol: float) -> flo
     found, result = brentq(
         lambda v: bound_probability(stack, P, v, tol=tol) - probability, 0.0, high, full_output=True
     )
-    # A hair upwards, so that rounding falls on the safe side.
+    # Slightly upwards, so that rounding is on the safe side.
     return float(found) * (1.0 + 1e-9) if result.converged else high
 
 
 def quadratic_probability(values: Floats, limit: float, *, tol: float) -> float:
-    """`Pr(sum_j values_j u_j^2 <= limit)` for independent standard normal u, from below.
+    """Lower bound of `Pr(sum_j values_j u_j^2 <= limit)` for independent standard normal u.
 
-    By Ruben's series where it ends soon, else by the inverse of the Laplace transform.
+    By Ruben's series if it is short, else by the inverse of the Laplace transform.
 
     Parameters
     ----------
     values : (k,)
-        Weights: the eigenvalues of a covariance. Those that are zero, up to rounding, add nothing.
+        Weights: the eigenvalues of a covariance. Zeros, up to rounding, have no effect.
     limit
         Not negative.
     tol
@@ -118,9 +119,9 @@ def quadratic_probability(values: Floats, limit: float, *, tol: float) -> float:
     Raises
     ------
     ValueError
-        If a weight is negative or not finite, or the limit is negative or no number.
+        If a weight is negative or not finite, or the limit is negative or NaN.
     DesignInfeasible
-        If neither method comes as close as `tol`.
+        If neither method reaches `tol`.
     """
     top = float(np.max(values, initial=0.0))
     if not np.all(np.isfinite(values) & (values >= -_ROUNDING * top)):
@@ -138,8 +139,8 @@ def quadratic_probability(values: Floats, limit: float, *, tol: float) -> float:
 def _series(values: Floats, limit: float, tol: float) -> float | None:
     """Ruben's mixture of chi-square distributions; None if it does not end within `_TERMS`.
 
-    Weights are positive and sum to one: a partial sum errs downwards, by at most the weight left out times
-    the next distribution's value.
+    Weights are positive and sum to one: a partial sum is a lower bound, with an error of at most the omitted
+    weight times the next distribution's value.
 
     References
     ----------
@@ -164,10 +165,10 @@ def _series(values: Floats, limit: float, tol: float) -> float | None:
 
 
 def _integral(values: Floats, limit: float, tol: float) -> float:
-    """The Laplace transform `prod (1 + 2 values p)^(-1/2) / p` inverted, less the error.
+    """Inverse of the Laplace transform `prod (1 + 2 values p)^(-1/2) / p`, less the error.
 
-    All its singularities lie on the negative half axis. On a parabola around that the midpoint rule
-    converges geometrically, whatever the spread of the weights; two rules in a row tell the error.
+    All its singularities lie on the negative half axis. On a parabola around it the midpoint rule converges
+    geometrically, for any spread of the weights; two successive rules estimate the error.
 
     References
     ----------

@@ -1,9 +1,9 @@
-"""l0 decoding: the x that leaves the fewest blocks unexplained, searched in a finite set.
+"""l0 decoding: the x with the fewest unexplained blocks, searched in a finite set.
 
     F_(p,r)(z) = {Phi_Lambda^+ z_Lambda : |Lambda| = p - r},   q <= r <= 2q
 
 always contains a good answer, so C(p, r) candidates take the place of R^n. One pass serves the
-noiseless decoder and the one for bounded noise; they differ in what counts as explained.
+noiseless decoder and the one for bounded noise; they differ in the criterion for an explained block.
 
 References
 ----------
@@ -24,7 +24,7 @@ from gridsec.errors import InputInvalid, Problem
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Decoder:
-    """Everything about l0 decoding that does not depend on the measurements.
+    """Part of l0 decoding that does not depend on the measurements.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class Decoder:
     left_out
         r, number of blocks that each candidate ignores.
     kept : (S, p - r)
-        The blocks that each candidate is computed from.
+        The blocks used by each candidate.
     inverses : (S, n, N)
         Pseudo-inverses of `Phi_Lambda`; zero in the columns of ignored blocks.
     """
@@ -49,7 +49,7 @@ class Decoder:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Decoded:
-    """The answer for a batch of measurements.
+    """Result for a batch of measurements.
 
     Attributes
     ----------
@@ -58,8 +58,8 @@ class Decoded:
     in_error : (…, p)
         Blocks that x does not explain.
     credible : (…)
-        Whether these are at most q, as assumed. If not, more than q blocks are in error or the noise
-        exceeds its bound, and x means nothing.
+        True if these are at most q, as assumed. Otherwise more than q blocks are in error or the noise
+        exceeds its bound, and x is invalid.
     residuals : (…, p)
         Norms of `z_i - Phi_i x`.
     """
@@ -71,7 +71,7 @@ class Decoded:
 
 
 def cheapest(p: int, q: int) -> int:
-    """The r in q … 2q with the fewest candidates C(p, r); of several the smallest, which averages most.
+    """The r in q … 2q with the fewest candidates C(p, r); of several the smallest, with most averaging.
 
     References
     ----------
@@ -92,16 +92,14 @@ def design(
     max_attacked
         q.
     tol
-        What counts as zero in deciding that, relative to blocks of norm one.
+        Tolerance of that test, relative to blocks of norm one.
     left_out
         r between q and 2q; by default the cheapest.
-    most
-        Largest number of candidates.
 
     Raises
     ------
     NotObservable
-        If Phi is not q-error correctable; names sensors whose loss shows it.
+        If Phi is not q-error correctable; the message lists sensors with a loss that proves it.
     DesignInfeasible
         If there would be more than `most` candidates.
     ValueError
@@ -129,8 +127,6 @@ def exact(decoder: Decoder, z: Floats, *, tol: float) -> Decoded:
 
     Parameters
     ----------
-    decoder
-        From `design`.
     z : (…, N)
         Measurements, finite.
     tol
@@ -147,12 +143,10 @@ def exact(decoder: Decoder, z: Floats, *, tol: float) -> Decoded:
 
 
 def bounded(decoder: Decoder, z: Floats, *, limit: Floats | float) -> Decoded:
-    """l0 decoding with bounded noise: fewest blocks whose residual exceeds a limit.
+    """l0 decoding with bounded noise: fewest blocks with a residual above a limit.
 
     Parameters
     ----------
-    decoder
-        From `design`.
     z : (…, N)
         Measurements, finite.
     limit : scalar or (…, 1) or (…, p)
@@ -161,12 +155,12 @@ def bounded(decoder: Decoder, z: Floats, *, limit: Floats | float) -> Decoded:
     Returns
     -------
     Decoded
-        Of several minimisers the one whose explained blocks fit best; the bound holds for all.
+        Of several minimisers the one with the best fit of the explained blocks; the bound holds for all.
 
     Raises
     ------
     ValueError
-        If a limit is negative or no number.
+        If a limit is negative or NaN.
 
     References
     ----------
@@ -177,7 +171,7 @@ def bounded(decoder: Decoder, z: Floats, *, limit: Floats | float) -> Decoded:
 
 
 def _candidates(decoder: Decoder, z: Floats) -> Floats:
-    """All candidates, (…, S, n). One product for the whole batch."""
+    """All candidates, (…, S, n), by one product for the whole batch."""
     S, n, N = decoder.inverses.shape
     flat = np.asarray(z, dtype=np.float64) @ decoder.inverses.reshape(S * n, N).T
     return flat.reshape(*flat.shape[:-1], S, n)
@@ -186,7 +180,7 @@ def _candidates(decoder: Decoder, z: Floats) -> Floats:
 def _vote(decoder: Decoder, z: Floats, x: Floats, limit: Floats) -> Decoded:
     stack = decoder.stack
     sizes = stack.norms(np.asarray(z)[..., None, :] - x @ stack.matrix.T)
-    # Written so that a residual that is no number counts as unexplained.
+    # Negated comparison: a residual of NaN counts as unexplained.
     unexplained = ~(sizes <= limit)
     count = np.count_nonzero(unexplained, axis=-1)
     misfit = np.where(unexplained, 0.0, sizes).sum(axis=-1)

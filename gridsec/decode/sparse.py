@@ -1,7 +1,7 @@
 """Sparse recovery without enumeration: basis pursuit and orthogonal matching pursuit.
 
-Both recover the error from `F z = F e`, F an annihilator of Phi, fast and under conditions that are stronger
-than correctability; where those fail so may they. `gridsec.decode.search` has no such conditions.
+Both recover the error from `F z = F e`, F an annihilator of Phi, fast, but under stronger conditions than
+correctability; otherwise they may fail. `gridsec.decode.search` has no such conditions.
 
 References
 ----------
@@ -20,7 +20,7 @@ from gridsec.lmi.pursuit import group_pursuit
 
 
 def restricted_isometry(F: Floats, k: int, *, most: int = MOST_SUBSETS) -> float:
-    """delta_k: `(1 - delta) |e|^2 <= |F e|^2 <= (1 + delta) |e|^2` for all k-sparse e, at its smallest.
+    """Smallest delta_k with `(1 - delta) |e|^2 <= |F e|^2 <= (1 + delta) |e|^2` for all k-sparse e.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def basis_pursuit(F: Floats, y: Floats) -> Floats:
     Raises
     ------
     DesignInfeasible
-        If no e gives y.
+        If no e satisfies the constraint.
 
     References
     ----------
@@ -96,7 +96,7 @@ def matching_pursuit(F: Floats, y: Floats, q: int, *, heights: Ints | None = Non
     e : (N,)
         Least squares on the chosen blocks, zero elsewhere.
     chosen : (q,)
-        The blocks, in the order of their choice. Fewer if the residual vanishes or all are chosen before.
+        The blocks, in the order of their choice; fewer if the residual vanishes or all are chosen earlier.
 
     References
     ----------
@@ -109,7 +109,7 @@ def matching_pursuit(F: Floats, y: Floats, q: int, *, heights: Ints | None = Non
     e, rest = np.zeros(F.shape[1]), y
     while len(chosen) < min(q, len(parts)) and np.any(rest):
         match = np.array([np.linalg.norm(b.T @ rest) for b in bases])
-        # Rounding must not make it choose a block twice.
+        # Prevents a second choice of a block by rounding.
         match[chosen] = -1.0
         chosen.append(int(np.argmax(match)))
         at = np.concatenate([parts[i] for i in chosen])
@@ -123,7 +123,7 @@ def decode_by_pursuit(stack: Stack, z: Floats, *, tol: float) -> Floats:
     """Decode by basis pursuit: rows as single errors, or whole blocks by their Euclidean norms.
 
     A stack of single rows is solved as a linear program; otherwise `sum_i |e_i|_2` is minimised, a
-    second-order cone program, because an attack fills the block of its sensor without pattern.
+    second-order cone program, because an attack has no pattern within the block of its sensor.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ def decode_by_pursuit(stack: Stack, z: Floats, *, tol: float) -> Floats:
 
 
 def decode_by_matching(stack: Stack, z: Floats, q: int, *, tol: float) -> tuple[Floats, Ints]:
-    """Decode by orthogonal matching pursuit; x and the blocks taken to be in error.
+    """Decode by orthogonal matching pursuit; x and the blocks assumed in error.
 
     Parameters
     ----------

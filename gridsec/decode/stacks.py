@@ -1,13 +1,13 @@
-"""Stacked coding matrices: what errors in a few blocks of a redundant measurement can hide.
+"""Stacked coding matrices: detectability and correctability of errors in a few blocks.
 
     z = Phi x + v + e,      Phi = [Phi_1; …; Phi_p],    e zero in all but q blocks
 
-Block i is what sensor i contributes: one row of an output matrix, an observability matrix, the rows of a
-partial observer. Blocks may have different heights, and none at all.
+Block i belongs to sensor i: one row of an output matrix, an observability matrix, the rows of a
+partial observer. Blocks may have different heights, and may be empty.
 
 References
 ----------
-lee2018, sections 2.1, 2.2.1 and 2.2.2. What is corrected there: docs/errata/lee2018-chapter-2.md.
+lee2018, sections 2.1, 2.2.1 and 2.2.2. Corrections: docs/errata/lee2018-chapter-2.md.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from gridsec.errors import DesignInfeasible, InputInvalid, NotObservable, Proble
 from gridsec.index import Sparsest, fewest, kernel, row_space
 
 MOST_SUBSETS = 200_000
-"""Subsets of sensors that a design enumerates at most, unless told otherwise."""
+"""Default limit of enumerated subsets of sensors in a design."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,7 +76,7 @@ class Stack:
 
     @classmethod
     def of_rows(cls, C: Floats) -> Stack:
-        """A stack whose blocks are the single rows of a matrix: usual vectors, n = 1 in the paper's terms."""
+        """A stack with the single rows of a matrix as blocks: usual vectors, n = 1 in the paper's terms."""
         return cls(C, np.ones(len(C), dtype=np.intp))
 
     @property
@@ -94,7 +94,7 @@ class Stack:
         return np.flatnonzero(self.membership[:, list(kept)].any(axis=1))
 
     def blocks(self) -> Floats:
-        """The blocks as one array, short ones filled up with zero rows; (p, largest height, n)."""
+        """The blocks as one array, short ones padded with zero rows; (p, largest height, n)."""
         tall = int(np.max(self.heights, initial=0))
         out = np.zeros((self.count, tall, self.unknowns))
         for i, at in enumerate(np.split(self.matrix, np.cumsum(self.heights)[:-1])):
@@ -106,7 +106,7 @@ class Stack:
         return np.sqrt(np.square(z) @ self.membership)
 
     def support(self, z: Floats, tol: float) -> Ints:
-        """Blocks of a stacked vector whose norm exceeds `tol`; the stacked support, ascending."""
+        """Blocks of a stacked vector with a norm above `tol`; the stacked support, ascending."""
         return np.flatnonzero(self.norms(z) > tol)
 
 
@@ -118,7 +118,7 @@ def cospark(stack: Stack, *, tol: float, below: float = 0.0) -> Sparsest:
     stack
         Phi. Every block is scaled to norm one first, which changes no support.
     tol
-        What counts as zero then; blocks shorter than this, relative to the longest, count as zero.
+        Tolerance of zero after that; blocks shorter than this, relative to the longest, count as zero.
     below
         As in `gridsec.index.fewest`.
 
@@ -141,7 +141,7 @@ def spark(F: Floats, *, tol: float) -> Sparsest:
     F : (m, p)
         Sensing matrix. Columns are scaled to norm one first.
     tol
-        What counts as zero then; columns shorter than this, relative to the longest, count as zero.
+        Tolerance of zero after that; columns shorter than this, relative to the longest, count as zero.
 
     Returns
     -------
@@ -161,7 +161,7 @@ def spark(F: Floats, *, tol: float) -> Sparsest:
 
 
 def error_detectable(stack: Stack, q: int, *, tol: float) -> bool:
-    """Whether no error in q blocks can pass for a change of x: `cospark > q`.
+    """True if no error in q blocks equals the effect of a change of x: `cospark > q`.
 
     Parameters
     ----------
@@ -178,12 +178,7 @@ def error_detectable(stack: Stack, q: int, *, tol: float) -> bool:
 
 
 def error_correctable(stack: Stack, q: int, *, tol: float) -> bool:
-    """Whether x is determined whatever happens to q blocks: `cospark > 2 q`.
-
-    Parameters
-    ----------
-    stack, q, tol
-        As in `error_detectable`.
+    """True if x is determined under any errors in q blocks: `cospark > 2 q`.
 
     References
     ----------
@@ -198,7 +193,7 @@ def require(stack: Stack, lost: int, tol: float, purpose: str) -> None:
     Raises
     ------
     NotObservable
-        If it is not; names the sensors whose loss shows it.
+        If it is not; the message lists sensors with a loss that proves it.
     """
     found = cospark(stack, tol=tol, below=lost + 1)
     if found.count > lost:
@@ -215,7 +210,7 @@ def require(stack: Stack, lost: int, tol: float, purpose: str) -> None:
 
 
 def subsets(p: int, size: int, most: int) -> Ints:
-    """All subsets of that size, each ascending, in lexicographic order; (C(p, size), size).
+    """All subsets of a size, each ascending, in lexicographic order; (C(p, size), size).
 
     Raises
     ------
@@ -234,7 +229,7 @@ def subsets(p: int, size: int, most: int) -> Ints:
 
 
 def masked(stack: Stack, kept: Ints) -> Floats:
-    """Phi with all rows outside of some blocks set to zero, for many sets at once.
+    """Phi with all rows outside some blocks set to zero, for several sets at once.
 
     Parameters
     ----------
@@ -246,7 +241,7 @@ def masked(stack: Stack, kept: Ints) -> Floats:
     Returns
     -------
     (S, N, n)
-        The paper's `Phi_Lambda` (whose pseudo-inverse has zero columns for all other rows).
+        The paper's `Phi_Lambda`; its pseudo-inverse has zero columns for all other rows.
     """
     keep = np.zeros((len(kept), stack.count))
     np.put_along_axis(keep, kept, 1.0, axis=1)
@@ -254,7 +249,7 @@ def masked(stack: Stack, kept: Ints) -> Floats:
 
 
 def annihilator(matrix: Floats, *, tol: float) -> Floats:
-    """Orthonormal rows F with `F C = 0` that vanish on nothing but the range of C.
+    """Orthonormal rows F with `F C = 0` and the range of C as kernel.
 
     Parameters
     ----------
@@ -266,18 +261,18 @@ def annihilator(matrix: Floats, *, tol: float) -> Floats:
     Returns
     -------
     (N - rank C, N)
-        N - n rows where C has full column rank: n (p - 1) for p blocks of n rows, not (n - 1) p.
+        N - n rows for C of full column rank: n (p - 1) for p blocks of n rows, not (n - 1) p.
 
     References
     ----------
-    lee2018 (2.1.2) and Corollary 2.2.5, whose dimensions are corrected: docs/errata/lee2018-chapter-2.md.
+    lee2018 (2.1.2) and Corollary 2.2.5, with corrected dimensions: docs/errata/lee2018-chapter-2.md.
     """
     size = float(np.linalg.norm(matrix, 2)) if matrix.size else 0.0
     return np.ascontiguousarray(kernel(matrix.T / (size or 1.0), tol).T)
 
 
 def residual(stack: Stack, z: Floats) -> Floats:
-    """`z - Phi Phi^+ z`, what no x explains.
+    """Residual `z - Phi Phi^+ z`, not explained by any x.
 
     Parameters
     ----------
@@ -300,7 +295,7 @@ def residual(stack: Stack, z: Floats) -> Floats:
 
 
 def clean(stack: Stack, z: Floats, *, tol: float) -> Bools:
-    """Whether noiseless measurements are free of error, if at most `cospark - 1` blocks can be in error.
+    """Test that noiseless measurements are free of error, for at most `cospark - 1` blocks in error.
 
     Parameters
     ----------
@@ -312,7 +307,7 @@ def clean(stack: Stack, z: Floats, *, tol: float) -> Bools:
     Returns
     -------
     (…)
-        True where nothing is wrong. `Phi^+ z` is then x.
+        True without an error. `Phi^+ z` is then x.
 
     References
     ----------
@@ -323,10 +318,10 @@ def clean(stack: Stack, z: Floats, *, tol: float) -> Bools:
 
 
 def sensors_in_error(stack: Stack, z: Floats, x: Floats, limit: Floats | float) -> Ints:
-    """`|{i : |z_i - Phi_i x| > limit}|`, the number of blocks that an x does not explain.
+    """Number of blocks that an x does not explain: `|{i : |z_i - Phi_i x| > limit}|`.
 
-    With at most q blocks in error and a q-error correctable Phi, an x is right if and only if this is
-    at most q: exactly for noiseless z and limit 0, approximately for limit `theta v_max`.
+    With at most q blocks in error and a q-error correctable Phi, an x is correct if and only if this is at
+    most q: exactly for noiseless z and limit 0, approximately for limit `theta v_max`.
 
     Parameters
     ----------
@@ -341,5 +336,5 @@ def sensors_in_error(stack: Stack, z: Floats, x: Floats, limit: Floats | float) 
     ----------
     lee2018, Lemma 2.2.8 and Theorem 2.2.12.
     """
-    # Written so that a residual that is no number counts.
+    # Negated comparison: a residual of NaN counts.
     return np.asarray(np.count_nonzero(~(stack.norms(z - x @ stack.matrix.T) <= limit), axis=-1))

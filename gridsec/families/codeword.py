@@ -1,6 +1,6 @@
-"""What each meter says by itself: scalar observers, and everything of one frame as a code word.
+"""Scalar observers of single meters, and one frame as a code word.
 
-The other half of `gridsec.families.partial`, which explains both.
+Part of `gridsec.families.partial`, which explains both.
 
 References
 ----------
@@ -27,27 +27,27 @@ from gridsec.online import Frame
 from gridsec.plant import Setting
 
 _LONG_S = 3600.0
-# Bound of a row at least, pu: below rounding, for meters without any error.
+# Smallest bound of a row, pu: below rounding, for meters without any error.
 _SMALLEST = 1e-9
-# What is not known at most, pu, and how far off anything said can be: more than any feeder carries, and few
-# enough digits for squares and sums to remain numbers.
+# Largest uncertainty of an unknown, and largest deviation of a value, pu: more than any feeder has, and small
+# enough for finite squares and sums.
 _LARGEST, _FARTHEST = 1e4, 1e8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Parts:
-    """Where the observers stand. m inverters.
+    """State of the observers. m inverters.
 
     Attributes
     ----------
     x, z : (m,)
-        Injections of the observer that hears no meter, and z at its inverters, pu.
+        Injections of the observer without meters, and z at its inverters, pu.
     driven : (m,)
-        Injections of the scalar observers; those of `x` where no meter drives.
+        Injections of the scalar observers; those of `x` without a driving meter.
     bound
-        `free` bounds the error of x, `driven` that of the scalar observers of honest meters.
+        `free` bounds the error of x, `driven` that of the scalar observers of unmanipulated meters.
     level
-        What the bounds stayed below during the last step.
+        Upper level of the bounds during the last step.
     """
 
     x: Floats
@@ -64,17 +64,17 @@ class CodeWord:
     Attributes
     ----------
     B, s, block : (A, n), (A,), (A,)
-        Rows, their values, and the meter that each belongs to.
+        Rows, their values, and the meter of each.
     unit : (A,)
-        What one unit of each row is, squared pu or pu.
+        Unit of each row, squared pu or pu.
     scale : (n,)
-        What one unit of each unknown is, pu: x, p, q, squared busbar voltage.
+        Unit of each unknown, pu: x, p, q, squared busbar voltage.
     reading : (A,)
-        Which rows are readings.
+        True for rows that are readings.
     voltage : (N, n)
-        What one unit of each unknown does to the customers' squared voltages, pu.
+        Sensitivity of the customers' squared voltages to one unit of each unknown, pu.
     rest : (N,)
-        What these may be off besides, pu.
+        Their remaining error, pu.
     """
 
     B: Floats
@@ -88,40 +88,30 @@ class CodeWord:
 
 
 def start(setting: Setting) -> Parts:
-    """Before the first frame: nothing is known but that inverters saturate.
-
-    Parameters
-    ----------
-    setting
-        The feeder.
-    """
+    """State before the first frame: only the saturation of the inverters is known."""
     zero, widest = np.zeros(setting.plant.droop.tau.size), detect.widest(setting.errors)
     return Parts(zero, zero, zero, widest, widest)
 
 
-def observe(  # noqa: PLR0917  # the observers, where they were, and what came in
+def observe(  # noqa: PLR0917  # the observers, their state, and the inputs
     setting: Setting, model: CircleDesign, before: Parts, frame: Frame, inputs: Inputs, h: float
 ) -> tuple[Uncertainty, Reconstruction, Parts, bool]:
     """Advance all observers and their bounds to a frame.
 
     Parameters
     ----------
-    setting
-        The feeder.
     model
-        The observer that hears no meter.
-    before
-        The observers' state.
+        The observer without meters.
     frame, inputs
-        The frame, as it came and cleaned.
+        The frame, received and prepared.
     h
-        Time since the last frame, s; 0: there was none.
+        Time since the last frame, s; 0 for the first one.
 
     Returns
     -------
     Uncertainty, Reconstruction, Parts, bool
-        What is not known without any meter, the voltages that the unheard observer explains, the observers'
-        new state, and whether what is left of their unknown initial state no longer counts.
+        Uncertainty without any meter, voltages by the observer without meters, new state of the observers,
+        and True once their initial transient is negligible.
     """
     plant, errors = setting.plant, setting.errors
     own, nobody = plant.droop.customer, np.zeros_like(inputs.live)
@@ -135,7 +125,7 @@ def observe(  # noqa: PLR0917  # the observers, where they were, and what came i
     alone = replace(inputs.now, base=base, live=nobody, told=nobody)
     z = plant.droop.vbar**2 - seen.v2[own]
     fast = plant.droop.tau * rest(h, POLICY) < 1.0
-    # Where all are that fast, the step ends in the equilibrium.
+    # If all are that fast, the step ends in the equilibrium.
     lag = np.where(fast & ~fast.all(), np.abs(x - before.x), 0.0)
     motion = Motion(before.z if h > 0 else z, z, np.zeros(x.shape), h, lag)
     bound, level = detect.advance(errors, alone, motion, before.bound, before.level)
@@ -146,7 +136,7 @@ def observe(  # noqa: PLR0917  # the observers, where they were, and what came i
         keep = np.exp(-h / plant.droop.tau)
         was = before.driven if h > 0 else x
         aim = plant.droop(inputs.z[errors.meter_of])
-        # Without a reading a scalar observer is the unheard one, and so is its error.
+        # Without a reading a scalar observer equals the one without meters, and so does its error.
         driven = np.where(heard, keep * was + (1.0 - keep) * aim, x)
     bound = ErrorBound(np.where(heard, bound.driven, bound.free), bound.free)
     return alone, seen, Parts(x, z, driven, bound, level), _settled(setting, alone, motion, bound)
@@ -170,16 +160,16 @@ def code_word(  # noqa: PLR0917  # as _conclude
     alone: Uncertainty,
     model: Reconstruction,
 ) -> CodeWord:
-    """What the meters say, row by row, each in units of its own bound.
+    """Rows of all meters, each in units of its own bound.
 
     Parameters
     ----------
     setting, parts, frame, inputs
-        The feeder, its observers after this frame, and the frame, as it came and cleaned.
+        The feeder, its observers after this frame, and the frame, received and prepared.
     alone
-        What is not known without any meter.
+        Uncertainty without any meter.
     model
-        The voltages that the unheard observer explains.
+        Voltages by the observer without meters.
     """
     plant, errors, lines = setting.plant, setting.errors, setting.model
     own, n, m = plant.droop.customer, frame.p.size, parts.x.size
@@ -191,7 +181,7 @@ def code_word(  # noqa: PLR0917  # as _conclude
     where = plant.meters[at]
     driven = inputs.live[errors.meter_of] if at.size else np.zeros(m, dtype=np.bool_)
     inverters = np.flatnonzero(driven & (errors.meter_of >= 0))
-    # What an inverter injects is not its meter's word.
+    # A net power with an inverter behind it is not determined by its meter alone.
     net = np.flatnonzero(_told(setting, frame, inputs) & ~np.isin(plant.meters, own))
     of_x, of_q = np.eye(m, scale.size), np.eye(n, scale.size, k=m + n)
     rows = np.vstack([voltage[where], of_x[inverters], of_q[plant.meters[net]]])
@@ -217,19 +207,14 @@ def code_word(  # noqa: PLR0917  # as _conclude
 
 
 def _told(setting: Setting, frame: Frame, inputs: Inputs) -> Bools:
-    """Whose net reactive power is reported, with a known error; (p,)."""
+    """Mask (p,) of meters that report net reactive power with a known error."""
     return np.asarray(inputs.live & np.isfinite(frame.q_net + frame.q_net_error)[setting.plant.meters])
 
 
 def disputed(setting: Setting, parts: Parts, frame: Frame, inputs: Inputs) -> Bools:
-    """Meters that report a reactive power which their inverters, on their curves, cannot have; (p,).
+    """Mask (p,) of meters with a reported reactive power that their inverters cannot have on their curves.
 
-    Either lies, the meter or its inverter, and nothing here can tell which.
-
-    Parameters
-    ----------
-    setting, parts, frame, inputs
-        As in `code_word`.
+    Either the meter or its inverter is manipulated; these data do not tell which.
     """
     droop, n = setting.plant.droop, frame.q.size
     honest = droop.per_customer(parts.x, n) + frame.q
@@ -239,13 +224,13 @@ def disputed(setting: Setting, parts: Parts, frame: Frame, inputs: Inputs) -> Bo
 
 
 def _split(setting: Setting, frame: Frame, inputs: Inputs, alone: Uncertainty) -> tuple[Floats, Floats]:
-    """Error of the busbar voltage, which all (of a phase) share, and what else loads do not explain; (N,)."""
+    """Error of the busbar voltage, common to all (of a phase), and the error not explained by loads, (N,)."""
     errors, feeder = setting.errors, setting.plant.feeder
     p_error, q_error = np.minimum(frame.p_error, _LARGEST), np.minimum(frame.q_error, _LARGEST)
     rest_ = np.maximum(alone.base - errors.R2 @ p_error - errors.X2 @ q_error, 0.0)
     rest_ = np.where(alone.base >= NO_VOLTAGE, NO_VOLTAGE, rest_)
     if not inputs.busbar:
-        # What the meters imply of it is not told apart from the rest: count it in both.
+        # The implied busbar voltage has no separate error: count the rest in both.
         return np.full(busbar_places(feeder).stop, rest_.max(initial=0.0)), rest_
     shared = np.atleast_1d(busbar_errors(setting.plant, inputs.v0_squared, setting.options.sigmas))
     own = by_place(feeder, shared)[feeder.bus]
@@ -253,16 +238,10 @@ def _split(setting: Setting, frame: Frame, inputs: Inputs, alone: Uncertainty) -
 
 
 def constants(word: CodeWord, meters: int, max_attacked: int, *, tol: float) -> CorrectionConstants:
-    """Theta and kappa_c of lee2018 for a frame: block j is what meter j and the model know together.
+    """Theta and kappa_c of lee2018 for a frame: block j is the rows of meter j with the model.
 
     Parameters
     ----------
-    word
-        From `code_word`.
-    meters
-        p.
-    max_attacked
-        M.
     tol
         As in `gridsec.decode.noise.correction_constants`.
 

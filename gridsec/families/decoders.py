@@ -1,8 +1,8 @@
-"""The papers' ways to tell who lies, as decoders of one tick of a feeder.
+"""The papers' methods to identify manipulated meters, as decoders of one tick of a feeder.
 
-They share the model ``m = w + e + a`` of `gridsec.sequential`: w is what the loads' errors do to all
-voltages, known by its covariance S (the pseudo-measurements "this load draws what its meter says", which
-nobody attacks); e are the meters' honest errors; a is the attack, in as few entries as possible.
+They share the model ``m = w + e + a`` of `gridsec.sequential`: w is the effect of the loads' errors on all
+voltages, known by its covariance S (pseudo-measurements of the loads, which cannot be attacked); e are the
+errors of unmanipulated meters; a is the attack, in as few entries as possible.
 
 References
 ----------
@@ -22,17 +22,12 @@ from gridsec.sequential.decoder import Accused, Evidence
 
 
 def least_squares(evidence: Evidence) -> tuple[Accused, ...]:
-    """Weighted least squares, the chi-square test, and the largest normalised residual, again and again.
-
-    Parameters
-    ----------
-    evidence
-        One tick.
+    """Weighted least squares with the chi-square test; remove the largest normalised residual and repeat.
 
     Returns
     -------
     tuple of Accused
-        At most `most` meters, in the order of their residuals; it never takes a meter back.
+        At most `most` meters, in the order of their residuals; a removed meter never returns.
 
     References
     ----------
@@ -56,16 +51,11 @@ def least_squares(evidence: Evidence) -> tuple[Accused, ...]:
 def fewest(evidence: Evidence) -> tuple[Accused, ...]:
     """The smallest set of meters without which every other one is within its limits.
 
-    Parameters
-    ----------
-    evidence
-        One tick.
-
     Returns
     -------
     tuple of Accused
-        The set with the smallest misfit of all those of the smallest size, and its rivals; the best of the
-        largest size, where none leaves everybody within the limits.
+        The set with the smallest misfit among those of the smallest size, and its rivals; the best set of the
+        largest size if no set leaves all others within the limits.
 
     References
     ----------
@@ -89,12 +79,7 @@ def pursue(evidence: Evidence) -> tuple[Accused, ...]:
     """Basis pursuit: the attack and load errors of smallest weighted sum that explain the readings exactly.
 
     ``min |a / sigma|_1 + |c|_1`` subject to ``a + V c = m`` with ``S = V V^T``: the stack of readings and
-    pseudo-measurements, annihilated. Meters whose share is beyond their limit are accused.
-
-    Parameters
-    ----------
-    evidence
-        One tick.
+    pseudo-measurements, annihilated. Meters with a share beyond their limit are accused.
 
     References
     ----------
@@ -106,12 +91,7 @@ def pursue(evidence: Evidence) -> tuple[Accused, ...]:
 
 
 def match(evidence: Evidence) -> tuple[Accused, ...]:
-    """Orthogonal matching pursuit on the readings, whitened: column after column, never taken back.
-
-    Parameters
-    ----------
-    evidence
-        One tick.
+    """Orthogonal matching pursuit on the whitened readings: column after column, without removal.
 
     References
     ----------
@@ -126,7 +106,7 @@ def match(evidence: Evidence) -> tuple[Accused, ...]:
 
 
 def _stack(evidence: Evidence) -> tuple[Ints, Floats, Floats]:
-    """Columns of unit weight: the meters' own, then the principal directions of the loads' covariance."""
+    """Columns of unit weight: those of the meters, then the principal directions of the loads' covariance."""
     at = np.flatnonzero(evidence.live)
     prior = evidence.whole.prior
     S = prior.among(at)
@@ -137,7 +117,7 @@ def _stack(evidence: Evidence) -> tuple[Ints, Floats, Floats]:
 
 
 def _beyond(evidence: Evidence, at: Ints, attack: Floats) -> Accused:
-    """Accuse the meters whose share of the attack no honest meter has."""
+    """Accuse the meters with a share of the attack beyond their limit."""
     now = judge(evidence.whole, evidence.m)
     accused = np.zeros(evidence.live.size, dtype=np.bool_)
     accused[at] = np.abs(attack) > evidence.limits.of(now.std)[at]

@@ -1,4 +1,4 @@
-"""What is carried from tick to tick, and one tick as every pair of `unknown_input` sees it."""
+"""Design and state of `unknown_input`, and one tick in the form used by every pair."""
 
 from __future__ import annotations
 
@@ -19,22 +19,20 @@ from gridsec.plant import Setting
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UnknownInputDesign:
-    """Everything that is prepared offline. N customers, m inverters, p meters.
+    """Design of the unknown-input estimator. N customers, m inverters, p meters.
 
     Attributes
     ----------
-    setting
-        The feeder, and the numbers that decide.
     max_inverters
-        How many inverters may be attacked at the same time, q_1 of yang2021.
+        Largest number of simultaneously attacked inverters, q_1 of yang2021.
     pairs
         The candidates.
     within : (c, c)
-        Whether the first of two candidates suspects nobody whom the second does not.
+        True if the suspects of the first candidate are a subset of those of the second.
     missing
-        Pairs whose inverters voltages alone do not tell apart; they are tried as well.
+        Pairs with inverters that voltages alone do not distinguish; they are tried as well.
     doubt
-        How many may be attacked, and how far.
+        Assumed number and size of attacks.
     gain : (N, m)
         2X from inverters to all customers.
     """
@@ -49,30 +47,30 @@ class UnknownInputDesign:
 
     @property
     def observers(self) -> int:
-        """How many pairs are tried."""
+        """Number of pairs."""
         return len(self.pairs.meters)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UnknownInputState:
-    """What is carried from frame to frame. m inverters, p meters.
+    """State between frames. m inverters, p meters.
 
     Attributes
     ----------
     t, began
-        Time of the last frame that was used, and of the first one, s; of `init` before.
+        Time of the last used frame, and of the first one, s; that of `init` before.
     tubes
-        What is known of honest inverters; None before the first frame.
+        Intervals of unmanipulated inverters; None before the first frame.
     contradicted
-        Which pairs were contradicted lately; those named there are refuted.
+        Counters of contradictions of each pair; pairs named there are refuted.
     x : (m,)
-        Estimated injections, wrong parts included, pu.
+        Estimated injections including attacks, pu.
     v0_squared
         Last squared busbar voltage, pu; in three phases (3,).
     named, inverters : (p,), (m,)
         Meters and inverters named as manipulated.
     last
-        The last estimate and verdict, for frames that cannot be used.
+        Last estimate and verdict, returned for unusable frames.
     """
 
     t: float
@@ -88,18 +86,18 @@ class UnknownInputState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tick:
-    """One tick as linear relations: who is suspected decides which intervals hold for inverters.
+    """One tick as linear relations; the suspected meters determine the intervals of inverters.
 
     Attributes
     ----------
     design, frame, inputs
-        What watches, what came, and that cleaned.
+        Design, received frame, and prepared frame.
     tubes
-        What is known of honest inverters.
+        Intervals of unmanipulated inverters.
     v2, error : (N,)
-        Squared voltages if no inverter injected, and how far they may be off, squared pu.
+        Squared voltages without injections of inverters, and their error, squared pu.
     rest : (N,)
-        The part of that error that is nobody's load and not the busbar's.
+        The part of that error from neither loads nor busbar.
     """
 
     design: UnknownInputDesign
@@ -111,13 +109,7 @@ class Tick:
     rest: Floats
 
     def tube(self, meters: Bools) -> Tube:
-        """Where honest inverters are if these meters lie.
-
-        Parameters
-        ----------
-        meters : (p,)
-            Who.
-        """
+        """Intervals of unmanipulated inverters if the meters in the mask (p,) are manipulated."""
         meter = self.design.setting.errors.meter_of
         believed = self.tubes.metered.copy()
         if meters.size:
@@ -125,13 +117,7 @@ class Tick:
         return self.tubes.driven.where(believed, self.tubes.free)
 
     def relation(self, meters: Bools) -> Relation:
-        """The readings if these meters lie.
-
-        Parameters
-        ----------
-        meters : (p,)
-            Who.
-        """
+        """Relation of the readings if the meters in the mask (p,) are manipulated."""
         now, frame, inputs = self.design.setting, self.frame, self.inputs
         plant, tube = now.plant, self.tube(meters)
         live = np.flatnonzero(inputs.live)
@@ -184,47 +170,27 @@ class Tick:
         return Relation(r, np.vstack([gain, own]), E, half, np.concatenate([live, told]), voltage)
 
     def believe(self, meters: Bools) -> Believed:
-        """The readings of all but these meters.
-
-        Parameters
-        ----------
-        meters : (p,)
-            Who.
-        """
+        """Readings of all meters outside the mask (p,)."""
         return believe(self.relation(meters), meters)
 
     def room(self, tube: Tube) -> Floats:
-        """Largest wrong injection of each inverter; (m,).
-
-        Parameters
-        ----------
-        tube
-            Where honest ones are.
-        """
+        """Largest wrong injection of each inverter (m,), for unmanipulated ones within `tube`."""
         return self.design.doubt.reach + np.abs(tube.middle) + tube.half
 
     def trial(self, meters: Bools, inverters: Bools) -> Trial:
-        """What a pair makes of the tick.
-
-        Parameters
-        ----------
-        meters, inverters : (p,), (m,)
-            Who is suspected.
-        """
+        """Result of the pair of suspected meters (p,) and inverters (m,) for the tick."""
         return try_pair(self.believe(meters), inverters, self.room(self.tube(meters)))
 
 
-# Readings are never more exact than this, pu.
+# Smallest error of a reading, pu.
 _EXACT = 1e-9
 
 
 def observe(design: UnknownInputDesign, state: UnknownInputState, frame: Frame) -> Tick:
-    """Clean a frame, and move on what is known of honest inverters.
+    """Prepare a frame, and advance the intervals of unmanipulated inverters.
 
     Parameters
     ----------
-    design, state
-        What watches, and where it stands.
     frame
         Later than the last one.
     """
@@ -239,13 +205,13 @@ def observe(design: UnknownInputDesign, state: UnknownInputState, frame: Frame) 
 def _without_inverters(
     design: UnknownInputDesign, state: UnknownInputState, frame: Frame, inputs: Inputs
 ) -> tuple[Floats, Floats, Floats]:
-    """Squared voltages if no inverter injected (N,), their error (N,), and its part from the model (N,)."""
+    """Squared voltages (N,) without injections of inverters, their error, and its part from the model."""
     now, plant = design.setting, design.setting.plant
     rest = inputs.now.base - now.errors.R2 @ frame.p_error - now.errors.X2 @ frame.q_error
     moved = np.zeros(rest.shape)
     if plant.loss_correction and state.x.size:
         moved = _with_inverters(design, state, frame, inputs)
-    # The busbar moves all (of a phase) alike, and has an error of its own.
+    # The busbar shifts all places (of a phase) alike, and has an error of its own.
     busbar = by_place(plant.feeder, busbar_errors(plant, inputs.v0_squared, now.options.sigmas))
     rest = rest - busbar[plant.feeder.bus]
     rest = np.where(inputs.now.base < NO_VOLTAGE, np.maximum(rest, 0.0), NO_VOLTAGE)
@@ -256,7 +222,7 @@ def _without_inverters(
 def _with_inverters(
     design: UnknownInputDesign, state: UnknownInputState, frame: Frame, inputs: Inputs
 ) -> Floats:
-    """How far the loss correction moves with what inverters may inject, honest or not; (N,)."""
+    """Largest change of the loss correction by possible injections, attacked or not; (N,)."""
     plant, reach = design.setting.plant, design.doubt.reach
     feeder, droop, steps = plant.feeder, plant.droop, plant.loss_correction
     if not isinstance(feeder, Feeder):
@@ -267,7 +233,7 @@ def _with_inverters(
             feeder, frame.p, q, inputs.v0_squared, p_error=frame.p_error, q_error=frame.q_error + room
         )
         return np.minimum(far[0] + 3.0 * far[1], NO_VOLTAGE)
-    # Losses depend on what inverters inject: all at either end, one beyond.
+    # Losses depend on the injections of inverters: all at either end, one beyond.
     ends = np.vstack([droop.limit, -droop.limit, state.x + np.diag(reach), state.x - np.diag(reach)])
     customers = np.zeros((droop.customer.size, frame.q.size))
     customers[np.arange(droop.customer.size), droop.customer] = 1.0
@@ -279,7 +245,7 @@ def _with_inverters(
 
 
 def _seen(design: UnknownInputDesign, inputs: Inputs, believed: Bools, v2: Floats, error: Floats) -> Seen:
-    """The inverters' places. A named meter's word would go on to mislead after it was cleared."""
+    """Tick at the inverters' places; readings of named meters would mislead even after their clearance."""
     now, own = design.setting, design.setting.plant.droop.customer
     meter = now.errors.meter_of
     if not inputs.live.size:

@@ -1,4 +1,4 @@
-"""What the pairs that are left mean: the decision, and one sentence for an operator."""
+"""Decision and operator sentence from the pairs that remain possible."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ Answer = tuple[Decision, Cause, str]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """What one tick's pairs say. p meters, m inverters.
+    """Result of the pairs of one tick. p meters, m inverters.
 
     Attributes
     ----------
     meters, inverters : (p,), (m,)
-        Who is in every pair that is possible.
+        Members of every possible pair.
     threshold : (p,)
-        Largest honest score of each meter, squared pu.
+        Largest score of each meter without manipulation, squared pu.
     trial
-        What the likeliest pair makes of the tick.
+        Result of the likeliest pair.
     explanations
         The smallest possible pairs where there are several.
     """
@@ -42,17 +42,7 @@ _SHOWN = 8
 
 
 def explain(pairs: Pairs, trials: dict[int, Trial], order: list[int]) -> tuple[Explanation, ...]:
-    """The smallest pairs that are possible, with their likelihoods for normal errors of the same spread.
-
-    Parameters
-    ----------
-    pairs
-        All candidates.
-    trials
-        What those make of the tick.
-    order
-        The likeliest first.
-    """
+    """The smallest possible pairs, likeliest first, with probabilities for normal errors."""
     best = trials[order[0]].misfit
     weights = np.exp([-0.5 * (trials[k].misfit - best) for k in order])
     shares = weights / weights.sum()
@@ -63,13 +53,7 @@ def explain(pairs: Pairs, trials: dict[int, Trial], order: list[int]) -> tuple[E
 
 
 def deaf_inverters(design: UnknownInputDesign, trial: Trial) -> Bools:
-    """Inverters whose wrong injections may be as large as their curves reach without being seen; (m,).
-
-    Parameters
-    ----------
-    design, trial
-        What watches, and what a pair makes of the tick.
-    """
+    """Mask (m,) of inverters with possible undetected wrong injections above their curve's span."""
     return np.asarray(trial.attack_error > design.setting.plant.droop.span)
 
 
@@ -79,15 +63,7 @@ def answer(
     tick: Tick,
     found: Found,
 ) -> Answer:
-    """The decision, its cause, and one sentence; what every estimator says of meters is `gridsec.judge`'s.
-
-    Parameters
-    ----------
-    design, state, tick
-        What watches, where it stands, and what came.
-    found
-        Who is accused.
-    """
+    """Decision, cause and one sentence; `gridsec.judge` decides on meters as for every estimator."""
     now, live = design.setting, tick.inputs.live
     plant = now.plant
     meters, inverters, explanations = found.meters, found.inverters, found.explanations
@@ -119,20 +95,20 @@ def answer(
         )
         base = Decision.UNDECIDED, Cause.TOO_MANY_SUSPECTS, reason
     elif explanations:
-        texts = [_who(e.meters, e.inverters, names, owners) for e in explanations[:_NAMED]]
+        texts = [_list(e.meters, e.inverters, names, owners) for e in explanations[:_NAMED]]
         more = f" or {len(explanations) - _NAMED} more" if len(explanations) > _NAMED else ""
         base = *ambiguous, f"Manipulated is {' or else '.join(texts)}{more}."
     elif meters.any() or inverters.any():
-        who = _who(meters, inverters, names, owners)
-        reason = f"Manipulated: {who}; further off than meter accuracy and load uncertainty allow."
+        accused = _list(meters, inverters, names, owners)
+        reason = f"Manipulated: {accused}; further off than meter accuracy and load uncertainty allow."
         base = Decision.ATTACKED, Cause.RESIDUALS, reason
     elif base[0] is Decision.CLEAN and pending.any():
         base = *ambiguous, "Readings were further off than allowed lately, but not often enough."
     elif base[0] is Decision.CLEAN:
         deaf = deaf_inverters(design, found.trial)
-        who = _who(np.zeros_like(live), deaf, names, owners)
+        unjudged = _list(np.zeros_like(live), deaf, names, owners)
         base = (
-            (*ambiguous, f"No meter disagrees, but readings are too coarse to judge {who}.")
+            (*ambiguous, f"No meter disagrees, but readings are too coarse to judge {unjudged}.")
             if deaf.any()
             else (*base[:2], _agreement(design, found.trial, owners))
         )
@@ -144,7 +120,7 @@ _NAMED = 4
 
 
 def _agreement(design: UnknownInputDesign, trial: Trial, owners: list[str]) -> str:
-    """What CLEAN says, and how much it leaves open: an injection of twice its error is seen for certain."""
+    """Sentence of CLEAN with the undetectable remainder: injections above twice their error are detected."""
     said = "All meters and inverters agree with the feeder"
     if not owners:
         return f"{said}."
@@ -153,7 +129,7 @@ def _agreement(design: UnknownInputDesign, trial: Trial, owners: list[str]) -> s
     return f"{said}; up to {unseen[most]:.0f} kvar of the inverter of {owners[most]} could go unseen."
 
 
-def _who(meters: Bools, inverters: Bools, names: list[str], owners: list[str]) -> str:
+def _list(meters: Bools, inverters: Bools, names: list[str], owners: list[str]) -> str:
     parts = [names[j] for j in np.flatnonzero(meters)]
     parts += [f"the inverter of {owners[i]}" for i in np.flatnonzero(inverters)]
     rest = f" and {len(parts) - _NAMED} more" if len(parts) > _NAMED else ""

@@ -1,17 +1,18 @@
-"""Pairs of suspected meters and suspected inverters, and whether one explains all other readings.
+"""Pairs of suspected meters and suspected inverters, and the test of a pair against all other readings.
 
-Everything that a tick says is one linear relation,
+One tick is one linear relation,
 
     r = C a + E d,      |d_k| <= h_k,
 
-r being the readings (voltages, and net reactive powers where reported) minus what the model explains with
-honest inverters in the middle of their intervals, a the wrong injections, and d everything that honest
-readings may be off by: meters, loads, the busbar, the model, the inverters' intervals. A pair drops the
-rows of its meters and takes the injections of its inverters for unknown inputs, whose columns U of C
+where r are the readings (voltages, and net reactive powers where reported) minus the model with unmanipulated
+inverters in the middle of their intervals, a the wrong injections, and d all errors of unmanipulated
+readings: meters, loads, the busbar, the model, the inverters' intervals. A pair drops the rows of its meters
+and takes the injections of its inverters as unknown inputs. Their columns U of C are removed by
 
     Q = S^-1 - S^-1 U (U^T S^-1 U)^-1 U^T S^-1,       S = E diag(h^2 / 3) E^T,
 
-removes: Q U = 0. Every row f of Q, and of C^T Q, is a test that no honest rest can fail: |f r| <= |f E| h.
+since Q U = 0. Every row f of Q, and of C^T Q, is a test that the rest passes if unmanipulated:
+|f r| <= |f E| h.
 
 References
 ----------
@@ -31,36 +32,36 @@ from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import DesignInfeasible
 
 MOST_WORK = 2_000_000
-"""Pairs times squared meters beyond which a tick would take seconds."""
+"""Limit of pairs times squared meters; beyond it a tick would take seconds."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pairs:
-    """The candidates; nobody comes first, then in the order of their size. c pairs, p meters, m inverters.
+    """Candidates: the empty pair first, then in the order of their size. c pairs, p meters, m inverters.
 
     Attributes
     ----------
     meters, inverters : (c, p), (c, m)
-        Who is suspected.
+        Suspected meters and inverters.
     """
 
     meters: Bools
     inverters: Bools
 
     def within(self) -> Bools:
-        """Whether the first of two pairs suspects nobody whom the second does not; (c, c)."""
+        """True where the suspects of the first of two pairs are a subset of those of the second; (c, c)."""
         both = np.hstack([self.meters, self.inverters]).astype(np.float64)
         return np.asarray(both @ (1.0 - both.T) == 0.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Unseen:
-    """A pair that has no unknown-input observer by voltages alone.
+    """A pair without an unknown-input observer by voltages alone.
 
     Attributes
     ----------
     meters, inverters
-        Who would be suspected.
+        Suspected meters and inverters.
     rank
         Rank of `C_Js b_Ju`, less than the number of inverters.
     """
@@ -71,10 +72,10 @@ class Unseen:
 
 
 def pairs(gain: Floats, most_meters: int, most_inverters: int) -> tuple[Pairs, tuple[Unseen, ...]]:
-    """All pairs, and those of them whose inverters voltages alone do not tell apart.
+    """All pairs, and those with inverters that voltages alone do not distinguish.
 
-    These are tried like all others: reported reactive powers may tell them apart, and two inverters together
-    reach farther than either.
+    These are tried like all others: reported reactive powers may distinguish them, and two inverters together
+    have a larger range than either.
 
     Parameters
     ----------
@@ -86,7 +87,7 @@ def pairs(gain: Floats, most_meters: int, most_inverters: int) -> tuple[Pairs, t
     Raises
     ------
     DesignInfeasible
-        If there are too many to be tried within a tick.
+        If the pairs cannot be tried within a tick.
     """
     p, m = gain.shape
     count = sum(comb(p, k) for k in range(most_meters + 1))
@@ -119,7 +120,7 @@ def _subsets(count: int, most: int) -> list[tuple[int, ...]]:
     return list(chain.from_iterable(combinations(range(count), k) for k in range(most + 1)))
 
 
-# Singular values below this part of the largest entry are rounding.
+# Singular values below this fraction of the largest entry are rounding.
 _RANK = 1e-9
 
 
@@ -138,15 +139,15 @@ class Relation:
     r : (R,)
         Residuals, squared pu and pu.
     C : (R, m)
-        What wrong injections do to them.
+        Sensitivity to wrong injections.
     E : (R, K)
-        What errors do.
+        Sensitivity to errors.
     h : (K,)
-        How large these are at most.
+        Largest magnitudes of the errors.
     meter : (R,)
-        Whose reading each row is.
+        Meter of each row.
     voltage : (R,)
-        Which rows are voltages.
+        True for rows of voltages.
     """
 
     r: Floats
@@ -159,20 +160,20 @@ class Relation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trial:
-    """What one pair makes of a tick. p meters, m inverters.
+    """Result of one pair for a tick. p meters, m inverters.
 
     Attributes
     ----------
     fits
-        Whether all that it does not suspect may be honest.
+        True if all meters and inverters outside the pair may be unmanipulated.
     misfit
         `r^T Q r`.
     score, threshold : (p,)
-        How far each voltage is from what all others say, and the most that an honest one can be, squared
-        pu; NaN and infinite for meters without one or suspected.
+        Distance of each voltage from its value by all others, and its largest value without manipulation,
+        squared pu; NaN and infinite for suspected or unavailable meters.
     attack, attack_error : (m,)
-        Wrong injection that the rows show for each inverter by itself, with the suspected ones unknown as
-        well, and its error, pu; infinite error where they show nothing.
+        Wrong injection of each inverter by the rows, with the suspected inverters unknown as well, and its
+        error, pu; infinite error where not determined.
     """
 
     fits: bool
@@ -185,18 +186,18 @@ class Trial:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Believed:
-    """A relation without the rows of suspected meters, ready for any set of inverters. k rows, m inverters.
+    """A relation without the rows of suspected meters, for any set of inverters. k rows, m inverters.
 
     Attributes
     ----------
     size
-        p, how many meters there are.
+        p, number of meters.
     meter, voltage : (k,)
-        Of the rows that are left.
+        Of the remaining rows.
     C : (k, m)
-        Of the rows that are left.
+        Of the remaining rows.
     tests : (k + m, k)
-        P = S^-1 and C^T P: the tests if nobody but these meters is suspected.
+        P = S^-1 and C^T P: the tests if only these meters are suspected.
     r, E, C_ : (k + m,), (k + m, K), (k + m, m)
         Those tests of r, E and C.
     plain : (k,)
@@ -218,15 +219,7 @@ class Believed:
 
 
 def believe(relation: Relation, meters: Bools) -> Believed:
-    """Drop the rows of suspected meters.
-
-    Parameters
-    ----------
-    relation
-        The tick.
-    meters : (p,)
-        Who is suspected.
-    """
+    """Drop the rows of the meters in the mask (p,)."""
     keep = ~meters[relation.meter]
     r, C, E, h = relation.r[keep], relation.C[keep], relation.E[keep], relation.h
     P = np.linalg.inv((E * h) @ (E * h).T / 3.0)
@@ -246,7 +239,7 @@ def believe(relation: Relation, meters: Bools) -> Believed:
 
 
 def try_pair(believed: Believed, inverters: Bools, room: Floats) -> Trial:
-    """Ask whether a pair explains a tick.
+    """Test if a pair explains a tick.
 
     With `G = U^T P U` its tests are those of its meters alone minus `T U G^-1 U^T P`, a matrix of rank |J_u|.
 
@@ -254,10 +247,8 @@ def try_pair(believed: Believed, inverters: Bools, room: Floats) -> Trial:
     ----------
     believed
         The tick, without the rows of the pair's meters.
-    inverters : (m,)
-        The pair's inverters.
     room : (m,)
-        Largest wrong injection that there can be, pu.
+        Largest possible wrong injection, pu.
     """
     k, h = believed.plain.size, believed.h
     chosen = np.flatnonzero(inverters)
@@ -271,7 +262,7 @@ def try_pair(believed: Believed, inverters: Bools, room: Floats) -> Trial:
     before = np.concatenate([np.diagonal(believed.tests), np.diagonal(believed.C_[k:])])
     taken = np.vstack([(inverse @ believed.tests[own]).T, left_C.T])
     norm = before - np.einsum("tw,tw->t", TU, taken)
-    # What the unknown inputs take away entirely is rounding, and no test.
+    # Rows removed entirely by the unknown inputs are rounding, and no test.
     known = norm > _ROUNDING * before
     real = known.copy()
     real[own] = False
@@ -283,7 +274,7 @@ def try_pair(believed: Believed, inverters: Bools, room: Floats) -> Trial:
     at = believed.meter[rows]
     score[at], threshold[at] = np.abs(offset[rows]), most[rows]
     attack, attack_error = np.where(known[k:], offset[k:], 0.0), most[k:]
-    # Meters that are silent now may be those without which an inverter cannot be seen.
+    # An inverter may be unobservable without the meters that are unavailable now.
     seen = np.abs(np.diagonal(left_C[:, chosen]) - 1.0) < _ROUNDING
     attack[chosen], attack_error[chosen] = left_r, np.where(seen, np.abs(left_E) @ h, np.inf)
     beyond = np.any((np.abs(attack) - attack_error > room)[chosen])
@@ -291,11 +282,11 @@ def try_pair(believed: Believed, inverters: Bools, room: Floats) -> Trial:
     return Trial(fits and not beyond, misfit, score, threshold, attack, attack_error)
 
 
-# What is smaller than this part of what it was computed from.
+# Relative level of rounding.
 _ROUNDING = 1e-6
 
 
-# Inverters whose columns differ by less, as a part of their squared lengths, are one and the same.
+# Columns that differ by less, relative to their squared lengths, count as equal.
 _ALIKE = 1e-10
 
 
@@ -303,7 +294,7 @@ def _pseudo_inverse(G: Floats) -> Floats:
     """F with G F G = G, any of which decouples; G is positive semidefinite, most often of one entry."""
     size = np.sqrt(np.diagonal(G))
     unit = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
-    # What reactive powers say of one inverter may be orders sharper than what voltages say of the next.
+    # Reactive powers may determine one inverter orders of magnitude better than voltages another.
     scale = np.multiply.outer(unit, unit)
     if size.size <= 1:
         return scale

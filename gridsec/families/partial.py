@@ -1,33 +1,34 @@
-"""Partial observers on a feeder: what each meter says by itself, stacked and decoded; lee2018, Algorithm 4.1.
+"""Partial observers on a feeder: observers of single meters, stacked and decoded; lee2018, Algorithm 4.1.
 
-What a meter sees without the others is little. The part of the state x (the injections of the inverters)
-that belongs to meter j is
+A single meter determines little. The part of the state x (the injections of the inverters) that belongs
+to meter j is
 
-- ``x_i`` of the inverter that it sits at: a scalar observer that its own reading drives,
-  ``tau x_hat_i' = -x_hat_i + K_i(vbar^2 - v_j^2)``, whose honest error is bounded by its reading's;
+- ``x_i`` of the inverter at its place: a scalar observer driven by its own reading,
+  ``tau x_hat_i' = -x_hat_i + K_i(vbar^2 - v_j^2)``, with an error bounded by that of the unmanipulated
+  reading;
 - the reading, one linear combination of all injections and loads;
-- its customer's net reactive power, where it reports that and there is no inverter: what an inverter injects
-  is not its meter's word. Where both cannot be honest, nothing is CLEAN, but neither is named for it.
+- its customer's net reactive power, where reported and without an inverter: an injection is not determined
+  by its meter alone. If meter and inverter cannot both be unmanipulated, the answer is not CLEAN, but
+  neither is named for it.
 
-Everything else of x fades without it (section 4.2.1, the detectable part): an observer that hears no meter
-at all, the same for everybody and out of every liar's reach. Likewise the loads and the busbar voltage are
-known within intervals. So the code word is
+Everything else of x decays without it (section 4.2.1, the detectable part): an observer without any meter,
+common to all and out of reach of an attack. Likewise the loads and the busbar voltage are known within
+intervals. So the code word is
 
     s = B xi + v + e,    xi = ((x - x_0) / free, d_p / p_error, d_q / q_error, d_v0 / error),    |xi| <= 1,
 
 with the rows of meter j as block j, each in units of its own worst-case bound from `gridsec.detect`. All
-C(p, M) fits without M meters are made at every frame (`gridsec.decode.boxes`). Shared errors are one
-unknown, not one for every meter: that is where the evidence comes from.
+C(p, M) fits without M meters are computed at every frame (`gridsec.decode.boxes`). Shared errors are one
+unknown, not one for every meter; this provides the evidence.
 
-A fit is credible if it explains every meter it rests on, as the unheard observer must by itself. A meter is
-named if no credible fit rests on it. An honest meter belongs to some set of p - M honest ones, and that
-set's fit is credible; so, as long as at most M lie, no honest meter is ever named, and the truth is within
-the union of what the credible fits allow. The price is power: the more liars are allowed, the more fits can
-explain a small lie differently.
-Then the answer is UNDECIDED, with these explanations.
+A fit is credible if it explains every meter in it, as the observer without meters must by itself. A meter is
+named if it is in no credible fit. An unmanipulated meter belongs to some set of p - M unmanipulated ones, and
+that set's fit is credible. So, with at most M manipulated meters, no unmanipulated meter is ever named, and
+the true state is within the union of the credible fits. The price is power: with more allowed manipulations,
+more fits can explain a small attack differently. Then the answer is UNDECIDED, with these explanations.
 
-The paper's own constants (theta, kappa) are available from `constants`; on feeders they promise less than is
-known without any meter. docs/theory-partial-observers.md, section 8, has the proof and the numbers.
+The paper's own constants (theta, kappa) are available from `constants`; on feeders they guarantee less than
+is known without any meter. docs/theory-partial-observers.md, section 8, has the proof and the numbers.
 
 References
 ----------
@@ -62,21 +63,20 @@ from gridsec.plant import Options, Plant, Setting, check_plant, setting
 __all__ = ["PartialDesign", "PartialState", "constants", "design", "init", "step"]
 
 MOST_WORK = 3e7
-"""Entries of all fits together that a design may ask for in a second: about half of what one core does."""
+"""Limit of the entries of all fits together per second of interval: about half of the capacity of one core.
+"""
 
 _SHOWN = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PartialDesign:
-    """Everything that is prepared offline.
+    """Design of the partial-observer estimator.
 
     Attributes
     ----------
-    setting
-        The feeder, how errors travel in it, and the numbers that decide.
     model
-        The observer that hears no meter.
+        The observer without meters.
     step_s
         Expected interval between frames, s.
     """
@@ -87,32 +87,32 @@ class PartialDesign:
 
     @property
     def observers(self) -> int:
-        """How many observers run: one per inverter with a meter, and the one that hears none."""
+        """Number of observers: one per inverter with a meter, and the one without meters."""
         return 1 + int(np.count_nonzero(self.setting.errors.meter_of >= 0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PartialState:
-    """What is carried from frame to frame. m inverters.
+    """State between frames.
 
     Attributes
     ----------
     t
-        Time of the last frame that was used, s; of `init` before the first one.
+        Time of the last used frame, s; that of `init` before the first one.
     valid
-        Whether the certificate survived its verification.
+        True if the certificate was verified.
     started
-        Whether there was a frame.
+        True after the first frame.
     parts
         The observers.
     settled
-        Whether the unknown initial state is forgotten.
+        True once the initial transient has decayed.
     tally
-        Who was accused for how long, and who is named.
+        Counters of accusations, and the named meters.
     v0_squared
         Last squared busbar voltage, pu.
     last
-        The last estimate and verdict; None before the first one.
+        Last estimate and verdict; None before the first one.
     """
 
     t: float
@@ -128,32 +128,28 @@ class PartialState:
 def design(
     plant: Plant, *, max_attacked: int, step_s: float, options: Options | None = None
 ) -> PartialDesign:
-    """Prepare to watch a feeder.
+    """Design the observers and fits for one feeder.
 
     Parameters
     ----------
-    plant
-        What is watched.
     max_attacked
-        M, how many meters may be manipulated at the same time.
+        M, largest number of simultaneously manipulated meters.
     step_s
         Expected interval between frames, s; others work, too.
-    options
-        The numbers that decide.
 
     Raises
     ------
     NotObservable
         Unless there are more than 2M meters.
     DesignInfeasible
-        If the feeder does not forget its initial state, or there are too many sets of M meters.
+        If the initial transient does not decay, or there are too many sets of M meters.
     ValueError
         As `plant.check_plant`.
     """
     meters, p = plant.meters, plant.meters.size
     check_plant(plant, max_attacked=max_attacked, step_s=step_s)
     if p <= 2 * max_attacked:
-        why = f"{p} meters, of which {max_attacked} may lie; more than {2 * max_attacked} are needed"
+        why = f"{p} meters, {max_attacked} of them manipulated; more than {2 * max_attacked} are needed"
         raise NotObservable(range(p), p, why, code="too-few-meters")
     sets, rows = comb(p, max_attacked), 3 * p
     unknowns = plant.droop.tau.size + 2 * len(plant.feeder.customers) + busbar_places(plant.feeder).stop
@@ -167,14 +163,9 @@ def design(
 
 
 def init(design: PartialDesign, t: float) -> PartialState:
-    """Begin to watch; the observers start with the first frame.
+    """Initial state at Unix time t, s; the observers start with the first frame.
 
-    Parameters
-    ----------
-    design
-        From `design`. Its certificate is verified once more.
-    t
-        Unix time, s.
+    The certificate of the design is verified again.
     """
     plant, proof = design.setting.plant, design.model.certificate
     p = plant.meters.size
@@ -195,22 +186,20 @@ def init(design: PartialDesign, t: float) -> PartialState:
 
 
 def step(design: PartialDesign, state: PartialState, frame: Frame) -> tuple[PartialState, Estimate, Verdict]:
-    """Take one frame in.
+    """Process one frame.
 
     Parameters
     ----------
-    design, state
-        From `design`, and from `init` or the last step.
     frame
-        Everything known at one tick. A frame that is not later than the last one changes nothing: it
-        gets the last estimate again, and UNDECIDED.
+        Data of one tick. A frame that is not later than the last one changes nothing: it returns the last
+        estimate and UNDECIDED.
 
     Returns
     -------
     PartialState, Estimate, Verdict
-        As every estimator's step; see `gridsec.online`. Score and threshold are those of the readings in
-        the fit that the estimate is from, or of the observer that hears nobody where that says more. Who
-        is named is decided by all fits and all rows: a small lie may be named below this threshold.
+        As every estimator's step; see `gridsec.online`. Score and threshold are those of the readings in the
+        fit of the estimate, or of the observer without meters where that is stricter. All fits and all rows
+        decide on named meters: a small attack may be named below this threshold.
     """
     if (state.started and not frame.t > state.t) or not np.isfinite(frame.t):
         plant = design.setting.plant
@@ -255,7 +244,7 @@ def _conclude(  # noqa: PLR0917  # the chain's values, in the order in which the
     tally = after.tally
     if np.count_nonzero(live) > 2 * most:
         tally = count(tally, accused & live, live, confirm=options.confirm, release=options.release)
-    # A contradiction has somebody behind it, even if nobody in particular: never CLEAN.
+    # A contradiction has a cause, even if no single meter can be named: never CLEAN.
     doubtful = contradicted if not found.certain.any() else np.zeros_like(live)
     decision, cause, reason = decide(
         Situation(
@@ -272,7 +261,7 @@ def _conclude(  # noqa: PLR0917  # the chain's values, in the order in which the
     )
     if hopeless and decision is Decision.ATTACKED:
         decision, cause = Decision.UNDECIDED, Cause.TOO_MANY_SUSPECTS
-        reason = f"No {live.size - most} meters agree with each other: more lie than the {most} allowed for."
+        reason = f"No {live.size - most} meters agree with each other: more than {most} are manipulated."
     torn = disputed(setting, after.parts, frame, inputs)
     if decision is Decision.CLEAN and torn.any():
         decision, cause = Decision.UNDECIDED, Cause.AMBIGUOUS
@@ -293,14 +282,14 @@ def _conclude(  # noqa: PLR0917  # the chain's values, in the order in which the
 
 
 def _either(names: list[str]) -> str:
-    who = ", ".join(names[:_SHOWN]) + (f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else "")
+    shown = ", ".join(names[:_SHOWN]) + (f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else "")
     return (
-        f"{who}: the reactive power reported is off the inverter's curve; either of the two is manipulated."
+        f"{shown}: the reactive power reported is off the inverter's curve; either of the two is manipulated."
     )
 
 
 def _choose(found: Fits, word: CodeWord, named: Bools) -> int:
-    """The fit that is given out: credible, few disagreeing, without the named, and close."""
+    """The fit of the estimate: credible, with few disagreeing and named meters, and small residuals."""
     misfit = np.where(found.left_out[:, word.block], 0.0, found.residual) @ word.s
     order = np.lexsort(
         (
@@ -323,7 +312,7 @@ def _estimate(  # noqa: PLR0917  # as _conclude
     found: Fits,
     index: int,
 ) -> Estimate:
-    """The voltages of one fit, and how far the truth can be from them."""
+    """The voltages of one fit, and the largest distance of the true ones from them."""
     plant, lines, m = design.setting.plant, design.setting.model, after.parts.x.size
     own, n = plant.droop.customer, frame.p.size
     step_ = word.scale * found.xi[index]
@@ -331,7 +320,7 @@ def _estimate(  # noqa: PLR0917  # as _conclude
     dq = dq + np.bincount(own, weights=dx, minlength=n)
     v2_bus = model.v2_bus + 2.0 * (lines.R_bus @ dp + lines.X_bus @ dq) + by_place(plant.feeder, d0)
     v2 = v2_bus[plant.feeder.bus]
-    # Whoever lies, the unheard observer's own bound holds; and so does one of the credible fits'.
+    # Under any attack, the bound of the observer without meters holds; and so does that of one credible fit.
     gap = detect.gap(design.setting.errors, alone, after.parts.bound)
     low, high = model.v2 - gap, model.v2 + gap
     fine = found.credible
@@ -339,7 +328,8 @@ def _estimate(  # noqa: PLR0917  # as _conclude
         fitted, error = model.v2 + found.xi[fine] @ word.voltage.T, found.error[fine] + word.rest
         low = np.maximum(low, (fitted - error).min(axis=0))
         high = np.minimum(high, (fitted + error).max(axis=0))
-    # Nothing between them: more lie than assumed, and only the unheard observer is left.
+    # Empty intersection: more meters are manipulated than assumed, and only the observer without meters
+    # holds.
     bound = np.where(low <= high, np.maximum(high - v2, v2 - low), gap + np.abs(v2 - model.v2))
     trusted = np.zeros(plant.meters.size, dtype=np.bool_)
     trusted[word.block] = True
@@ -355,7 +345,7 @@ def _scores(  # noqa: PLR0917  # as _conclude
     index: int,
     estimate: Estimate,
 ) -> tuple[Floats, Floats]:
-    """Residuals of the readings in one fit, or without any, and what honest ones can be at most; (p,)."""
+    """Residuals of the readings in one fit, or without any, and their limits without manipulation; (p,)."""
     plant, options = design.setting.plant, design.setting.options
     around = estimate.bound[plant.meters]
     top = np.maximum(estimate.v2[plant.meters], 0.0) + around
@@ -370,7 +360,7 @@ def _scores(  # noqa: PLR0917  # as _conclude
 
 
 def _explanations(found: Fits) -> tuple[Explanation, ...]:
-    """The sets of meters whose lies alone would explain everything; worst-case bounds know no odds."""
+    """Sets of manipulated meters that explain all readings; worst-case bounds imply no probabilities."""
     sets = found.left_out[found.credible]
     if not 1 < len(sets) <= _SHOWN:
         return ()

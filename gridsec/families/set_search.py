@@ -1,27 +1,27 @@
 """One switched observer that searches for another set of meters when its own test fails.
 
-kim2018 and lee2018, chapter 5, do not run an observer for every set. They believe one set of meters as long
-as all of its readings agree with its estimate, and look for another one only when they do not:
+kim2018 and lee2018, chapter 5, do not run an observer for every set. They trust one set of meters while
+all of its readings agree with its estimate, and search for another one only if they do not:
 
-1. *One observer.* Inverters with a believed meter are driven by that meter's reading, all others by the
+1. *One observer.* Inverters with a trusted meter are driven by that meter's reading, all others by the
    model; the set may change at any moment (`gridsec.certificates`).
-2. *Test.* `|y_j - yhat_j| <= threshold_j(t)` for every believed meter j. The threshold is the worst case of
-   `gridsec.detect` for just this set. After a switch it starts from what saturation allows and falls, as the
-   observer forgets.
-3. *Search.* Where the test fails, every set D of at most M dropped meters is tried, the smallest first, and
-   of equals the one that leaves the smallest residuals. D passes if all other meters are within
-   `threshold_j(D)`, which takes nothing for granted but their own readings: an inverter whose meter is in
-   D, or that has none, may be anywhere within saturation. Who was named is left out as long as possible.
-4. *Dwell.* A dropped meter is believed again once it was within its limit for a time Delta, and for `release`
-   readings in a row.
+2. *Test.* `|y_j - yhat_j| <= threshold_j(t)` for every trusted meter j. The threshold is the worst case of
+   `gridsec.detect` for exactly this set. After a switch it starts from the saturation bound and falls as the
+   transient of the observer decays.
+3. *Search.* If the test fails, every set D of at most M dropped meters is tried, the smallest first, and
+   among equals the one with the smallest residuals. D passes if all other meters are within `threshold_j(D)`,
+   which uses only their own readings: an inverter with a meter in D, or without one, may be anywhere within
+   saturation. Named meters stay dropped as long as possible.
+4. *Dwell.* A dropped meter is trusted again once it was within its limit for a time Delta, and for `release`
+   consecutive readings.
 
-The true liars, if they are at most M, are one of the sets that pass. So a meter that *every* passing set
-holds lies, whatever else is true, and only such meters are named. Where several smallest sets pass, all of
-them are given as explanations, and nobody is named whom one of them acquits.
+If at most M meters are manipulated, they are one of the sets that pass. So a meter in *every* passing set is
+manipulated, and only such meters are named. If several smallest sets pass, all of them are given as
+explanations, and no meter outside one of them is named.
 
-The papers' sets come with their own partial observers, whose estimates can be compared at once. Here a
-candidate is judged by what its members' readings alone imply for their inverters, which costs no observer.
-Metered net reactive power is not used: a dropped meter's would have to be forgotten, too.
+The papers' sets have partial observers of their own, with estimates that can be compared at once. Here a
+candidate is judged by the injections that its members' readings alone imply, which needs no observer.
+Metered net reactive power is not used: that of a dropped meter would have to be removed, too.
 
 References
 ----------
@@ -58,15 +58,13 @@ __all__ = ["SetSearchDesign", "SetSearchState", "design", "init", "step"]
 def step(
     design: SetSearchDesign, state: SetSearchState, frame: Frame
 ) -> tuple[SetSearchState, Estimate, Verdict]:
-    """Take one frame in.
+    """Process one frame.
 
     Parameters
     ----------
-    design, state
-        From `design`, and from `init` or the last step.
     frame
-        Everything known at one tick. A frame that is not later than the last one changes nothing: it
-        gets the last estimate again, and UNDECIDED.
+        Data of one tick. A frame that is not later than the last one changes nothing: it returns the last
+        estimate and UNDECIDED.
 
     Returns
     -------
@@ -88,16 +86,16 @@ def step(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Found:
-    """What a search came to. p meters."""
+    """Result of a search. p meters."""
 
-    dropped: Bools  # (p,) whom not to believe
-    accused: Bools  # (p,) who lies for sure
+    dropped: Bools  # (p,) meters not to trust
+    accused: Bools  # (p,) meters that are certainly manipulated
     rivals: tuple[Bools, ...]  # several smallest sets
     torn: bool  # no set passes
 
 
 def _search(design: SetSearchDesign, inputs: Inputs, view: View, state: SetSearchState) -> _Found:
-    """Try all sets of at most M dropped meters against what their own readings imply."""
+    """Test all sets of at most M dropped meters by the injections that their own readings imply."""
     errors, at, live = design.errors, design.setting.plant.meters, inputs.live
     sets = design.dropped[~(design.dropped & ~live).any(axis=1)]
     error = (view.base + errors.inverters @ view.sure)[at] + sets @ lost(errors, view.sure)[at].T
@@ -113,11 +111,11 @@ def _search(design: SetSearchDesign, inputs: Inputs, view: View, state: SetSearc
     smallest = pool[sizes == sizes[0]]
     best = sets[smallest[np.argmin(excess[smallest])]]
     rivals = tuple(sets[smallest]) if smallest.size > 1 else ()
-    # Silence is no acquittal: who was dropped and reports no more stays so.
+    # A missing reading does not clear a meter: dropped and unavailable meters stay dropped.
     return _Found(best | (state.dropped & ~live), accused, rivals, False)
 
 
-def _conclude(  # noqa: PLR0917  # the chain's three values, then what this step added
+def _conclude(  # noqa: PLR0917  # design, state and frame, then the results of this step
     design: SetSearchDesign, state: SetSearchState, frame: Frame, inputs: Inputs, view: View, found: _Found
 ) -> tuple[SetSearchState, Estimate, Verdict]:
     options, live = design.setting.options, inputs.live
@@ -131,7 +129,8 @@ def _conclude(  # noqa: PLR0917  # the chain's three values, then what this step
     dropped = found.dropped & ~back
     tally = replace(tally, named=tally.named & dropped, above=np.where(back, 0, tally.above))
     switched = bool((dropped & ~state.dropped).any())
-    # What a liar did to its own inverter and, through the model, to those without a believed meter.
+    # Effect of an attack on the meter's own inverter and, through the model, on those without a trusted
+    # meter.
     driven = driven_by(design, live & ~dropped)
     free = np.where(driven, view.bound.free, design.errors.span)
     estimate = Estimate(
@@ -159,7 +158,7 @@ def _conclude(  # noqa: PLR0917  # the chain's three values, then what this step
 
 
 def _error(design: SetSearchDesign, view: View, torn: bool) -> Floats:
-    """Half-width of the estimate that holds whichever M meters lie, found out or not; (N,)."""
+    """Half-width of the estimate for any M manipulated meters, detected or not; (N,)."""
     errors = design.errors
     if torn:
         return np.asarray(view.base + errors.inverters @ errors.span)
@@ -167,7 +166,7 @@ def _error(design: SetSearchDesign, view: View, torn: bool) -> Floats:
     return np.asarray(view.base + errors.inverters @ view.sure + most)
 
 
-def _verdict(  # noqa: PLR0917  # everything one tick brought
+def _verdict(  # noqa: PLR0917  # all results of one tick
     design: SetSearchDesign,
     inputs: Inputs,
     view: View,
@@ -193,7 +192,7 @@ def _verdict(  # noqa: PLR0917  # everything one tick brought
     if found.torn and cause not in {Cause.TOO_FEW_METERS, Cause.NO_BUSBAR}:
         decision, cause = Decision.UNDECIDED, Cause.TOO_MANY_SUSPECTS
         reason = (
-            f"Whichever {design.setting.max_attacked} meters are left out, the others contradict each other: "
+            f"Without any {design.setting.max_attacked} meters, the others contradict each other: "
             "more are manipulated, or the busbar reading, a switch or a line in the model is wrong."
         )
     attack = np.where(tally.named & live, inputs.y - view.v2[plant.meters], 0.0)

@@ -1,11 +1,11 @@
-"""All sets of a few liars at once: what leaving each out would explain, by one small solve each.
+"""Misfits without every small set of meters at once, by one small solve each.
 
-With ``Q = (S + D)^-1`` the inverse covariance of the readings m if nobody lies, leaving out the meters of a
-set s leaves
+With ``Q = (S + D)^-1`` the inverse covariance of the readings m without manipulation, leaving out the meters
+of a set s gives
 
     misfit(s) = m^T Q m - b^T G^-1 b,      b = (Q m)_s,    G = Q_ss
 
-and the normalised residuals of the meters that are left follow from the same solve.
+and the normalised residuals of the remaining meters follow from the same solve.
 
 References
 ----------
@@ -36,9 +36,9 @@ class Outcome:
     members : (c, k)
         Meters of each set.
     misfit : (c,)
-        What each leaves unexplained.
+        Misfit without each set.
     excess : (c,)
-        Largest offset of a meter that is left, in parts of what is honest.
+        Largest offset of a remaining meter relative to its limit.
     """
 
     members: Ints
@@ -52,7 +52,7 @@ def check(candidates: int, most: int) -> None:
     Parameters
     ----------
     candidates, most
-        How many meters there are, and how many of them a set may hold.
+        Number of meters, and largest size of a set.
 
     Raises
     ------
@@ -70,15 +70,7 @@ def check(candidates: int, most: int) -> None:
 
 
 def outcomes(evidence: Evidence, size: int) -> Outcome:
-    """Try every set of one size.
-
-    Parameters
-    ----------
-    evidence
-        What a decoder gets.
-    size
-        k.
-    """
+    """Evaluate every set of `size` meters."""
     Q, m = evidence.whole.Q, evidence.m
     weights = Q @ m
     sets = list(combinations(np.flatnonzero(evidence.live).tolist(), size))

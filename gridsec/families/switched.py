@@ -1,6 +1,6 @@
-"""One observer whose believed meters may change at any moment, with bounds on its error.
+"""One observer with trusted meters that may change at any moment, and bounds on its error.
 
-It belongs to `gridsec.families.set_search`, which decides who is believed.
+Part of `gridsec.families.set_search`, which selects the trusted meters.
 
 References
 ----------
@@ -32,18 +32,16 @@ from gridsec.plant import Options, Plant, Setting, check_plant, setting
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SetSearchDesign:
-    """Everything that is prepared offline. p meters, c candidate sets.
+    """Design of the switched observer. p meters, c candidate sets.
 
     Attributes
     ----------
-    setting
-        What a frame is cleaned with.
     bank
-        The observer; a bank for no liar at all, whose live meters are the believed ones.
+        The observer: a bank for M = 0, with the trusted meters as its available meters.
     errors
-        How errors travel in an observer whose meters are all honest.
+        Propagation of errors in an observer without manipulated meters.
     certificate
-        Why the observer converges for every set and every switching.
+        Proof that the observer converges for every set and every switching.
     dropped : (c, p)
         Sets of dropped meters, the smallest first.
     dwell_s
@@ -59,44 +57,44 @@ class SetSearchDesign:
 
     @property
     def observers(self) -> int:
-        """How many observers run."""
+        """Number of observers."""
         return 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SetSearchState:
-    """What is carried from frame to frame. m inverters, p meters.
+    """State between frames. m inverters, p meters.
 
     Attributes
     ----------
     t
-        Time of the last frame that was used, s; of `init` before the first one.
+        Time of the last used frame, s; that of `init` before the first one.
     bank
         The observer; None before the first frame.
     x : (m,)
         Its estimate, pu.
     z : (m,)
-        What it says at the inverters, squared pu.
+        Its z at the inverters, squared pu.
     y : (p,)
-        Last readings as z, squared pu; NaN where there was none.
+        Last readings as z, squared pu; NaN where missing.
     bound, level
-        Bounds on its error if all believed meters are honest, see `detect.advance`.
+        Bounds on its error if no trusted meter is manipulated, see `detect.advance`.
     sure : (m,)
-        Bound on the error of inverters whose own meter is honest, whoever else lies, pu.
+        Bound on the error of inverters with an unmanipulated own meter, under any other attack, pu.
     settled
-        Whether what was unknown at the start, or at the last switch, is forgotten.
+        True once the transient of the start, or of the last switch, has decayed.
     dropped : (p,)
-        Meters that are not believed.
+        Meters that are not trusted.
     innocent : (p,)
-        Since when a dropped meter has been within its limit, s; infinite where it has not.
+        Time since which a dropped meter is within its limit, s; infinite where it is not.
     readings : (p,)
-        For how many readings.
+        Number of these readings.
     tally
-        Who is suspected, and who is named.
+        Counters of accusations, and the named meters.
     v0_squared
         Last squared busbar voltage, pu.
     last
-        The last estimate and verdict; None before the first frame.
+        Last estimate and verdict; None before the first frame.
     """
 
     t: float
@@ -124,21 +122,17 @@ def design(
     dwell_s: float | None = None,
     options: Options | None = None,
 ) -> SetSearchDesign:
-    """Prepare to watch a feeder.
+    """Design the observer and the candidate sets for one feeder.
 
     Parameters
     ----------
-    plant
-        What is watched.
     max_attacked
-        M, how many meters may be manipulated at the same time.
+        M, largest number of simultaneously manipulated meters.
     step_s
         Expected interval between frames, s. Other intervals work, too.
     dwell_s
-        Delta, s; by default the time in which the observer forgets all but the part `options.settled` of
-        what it did not know.
-    options
-        The numbers that decide.
+        Delta, s; by default the time in which the observer's transient decays to the fraction
+        `options.settled`.
 
     Raises
     ------
@@ -158,7 +152,7 @@ def design(
     )
     check_plant(plant, max_attacked=max_attacked, step_s=step_s, more=more)
     if p <= 2 * max_attacked:
-        what = f"{p} meters cannot be told apart when {max_attacked} of them may lie"
+        what = f"{p} meters cannot be told apart when {max_attacked} of them may be manipulated"
         raise NotObservable(range(p), p, what, code="too-few-meters")
     sets = sum(comb(p, k) for k in range(1, max_attacked + 1))
     if sets > MOST_SETS:
@@ -182,15 +176,7 @@ def design(
 
 
 def init(design: SetSearchDesign, t: float) -> SetSearchState:
-    """Begin to watch; the observer starts with the first frame, and believes all meters.
-
-    Parameters
-    ----------
-    design
-        From `design`.
-    t
-        Unix time, s.
-    """
+    """Initial state at Unix time t, s; the observer starts with the first frame and trusts all meters."""
     plant, widest = design.setting.plant, detect.widest(design.errors)
     m, p = plant.droop.tau.size, plant.meters.size
     nobody, zero = np.zeros(p, dtype=np.bool_), np.zeros(p, dtype=np.intp)
@@ -215,7 +201,7 @@ def init(design: SetSearchDesign, t: float) -> SetSearchState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """The feeder as the believed set sees it. N customers, p meters, m inverters.
+    """Estimate of the feeder from the trusted set. N customers, p meters, m inverters.
 
     Attributes
     ----------
@@ -224,11 +210,11 @@ class View:
     v2, v2_bus : (N,), (b + 1,)
         Reconstructed squared voltages, pu.
     base : (N,)
-        Error of `v2` if all injections were known, squared pu.
+        Error of `v2` for known injections, squared pu.
     score, threshold : (p,)
-        Residuals, NaN where there is no reading, and their limits if all believed meters are honest.
+        Residuals, NaN without a reading, and their limits if no trusted meter is manipulated.
     over : (p,)
-        Whose residual is above its limit.
+        Meters with a residual above its limit.
     """
 
     bank: banks.BankState
@@ -247,15 +233,7 @@ class View:
 
 
 def advance(design: SetSearchDesign, state: SetSearchState, frame: Frame, inputs: Inputs) -> View:
-    """Move the observer to a frame, and compare all meters with it.
-
-    Parameters
-    ----------
-    design, state
-        Design and state.
-    frame, inputs
-        The frame, and what came of it when it was cleaned.
-    """
+    """Advance the observer to a frame, and compare all meters with it."""
     watched, errors, at = design.setting, design.errors, design.setting.plant.meters
     plant, droop = watched.plant, watched.plant.droop
     J = inputs.live & ~state.dropped
@@ -296,27 +274,19 @@ def advance(design: SetSearchDesign, state: SetSearchState, frame: Frame, inputs
 
 
 def _slowed(design: SetSearchDesign, h: float) -> Bools:
-    """Inverters that the step takes for slower than they are: `lure.transition`, `rest`; (m,)."""
+    """Mask (m,) of inverters that the step treats as slower than they are: `lure.transition`, `rest`."""
     fast = design.setting.plant.droop.tau * rest(h, design.bank.policy) < 1.0
     return fast & ~fast.all()
 
 
 def driven_by(design: SetSearchDesign, J: Bools) -> Bools:
-    """Inverters that a believed meter drives, (m,).
-
-    Parameters
-    ----------
-    design
-        Design.
-    J : (p,)
-        The believed meters.
-    """
+    """Mask (m,) of inverters driven by a trusted meter, for the trusted meters J (p,)."""
     meter = design.errors.meter_of
     return (meter >= 0) & J[meter]
 
 
 def _handed_over(design: SetSearchDesign, state: SetSearchState, J: Bools) -> ErrorBound:
-    """The bounds when meters fall silent or return: each inverter takes over the other way's error."""
+    """The bounds when meters become unavailable or return: each inverter takes the other mode's error."""
     if state.bank is None:
         return state.bound
     was, now = driven_by(design, state.bank.seen), driven_by(design, J)
@@ -325,7 +295,7 @@ def _handed_over(design: SetSearchDesign, state: SetSearchState, J: Bools) -> Er
 
 
 def _sure(design: SetSearchDesign, state: SetSearchState, inputs: Inputs, J: Bools, motion: Motion) -> Floats:
-    """Error of each inverter that follows from its own honest meter alone; the span where it has none.
+    """Error of each inverter that follows from its own unmanipulated meter alone; the span without one.
 
     During the step its argument was between two readings, each within its accuracy.
     """
@@ -340,16 +310,14 @@ def _sure(design: SetSearchDesign, state: SetSearchState, inputs: Inputs, J: Boo
 
 
 def threshold_of(design: SetSearchDesign, v2: Floats, error: Floats) -> Floats:
-    """Largest residual of an honest meter where the estimate is off by no more than `error`.
+    """Largest residual of an unmanipulated meter for an estimate with an error of at most `error`.
 
     Parameters
     ----------
-    design
-        Design.
     v2 : (p,)
         Reconstructed squared voltages at the meters, pu.
     error : (…, p)
-        How far these may be off, squared pu.
+        Their error bounds, squared pu.
     """
     plant, sigmas = design.setting.plant, design.setting.options.sigmas
     return np.asarray(reading_error(plant.accuracy, v2 + error, sigmas) + error)
@@ -358,7 +326,7 @@ def threshold_of(design: SetSearchDesign, v2: Floats, error: Floats) -> Floats:
 def _settled(
     design: SetSearchDesign, now: Uncertainty, motion: Motion, error: Floats, threshold: Floats
 ) -> bool:
-    """Whether what is left of the transient does not matter to any threshold."""
+    """True once the remaining transient is negligible against every threshold."""
     none, at = np.zeros(motion.after.shape), design.setting.plant.meters
     top = detect.ceiling(design.errors, now, motion, ErrorBound(none, none))
     rest_ = detect.gap(design.errors, now, detect.settled(design.errors, now, motion, top))
@@ -366,12 +334,10 @@ def _settled(
 
 
 def lost(errors: ErrorModel, sure: Floats) -> Floats:
-    """What is lost at every customer without the word of one meter, (N, p): its inverter may be anywhere.
+    """Additional error at every customer without one meter, (N, p): its inverter may inject anything.
 
     Parameters
     ----------
-    errors
-        How errors travel.
     sure : (m,)
         Error of each inverter that follows from its own meter, pu.
     """

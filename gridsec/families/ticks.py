@@ -1,4 +1,4 @@
-"""A feeder watched tick by tick, with one of `gridsec.families.decoders` to tell who lies."""
+"""Tick-by-tick estimator with one of `gridsec.families.decoders` as identification step."""
 
 from __future__ import annotations
 
@@ -21,29 +21,27 @@ def design(
     max_attacked: int,
     alarms_per_year: float = 1.0,
 ) -> SequentialDesign:
-    """Prepare to watch a feeder with a decoder; `gridsec.sequential.init` and `step` run it.
+    """Design with a decoder; `gridsec.sequential.init` and `step` run it.
 
     Parameters
     ----------
-    plant
-        What is watched.
     decoder
-        From `gridsec.families.decoders`, or one's own.
+        From `gridsec.families.decoders`, or a custom one.
     doubt
-        How wrong the powers of the frames may be.
+        Uncertainty of the powers of the frames.
     step_s
         Expected interval between frames, s.
     max_attacked
         M, the largest number of accusations.
     alarms_per_year
-        False alarms by chance in a year.
+        Expected false alarms per year.
 
     Raises
     ------
     NotObservable, ValueError
         As `gridsec.sequential.design`.
     DesignInfeasible
-        If no certificate holds, or the decoder would have to try too many sets.
+        If no certificate holds, or the decoder has too many sets to try.
     """
     options = SequentialOptions(alarms_per_year=alarms_per_year, scales_s=(0.0,), commission_s=0.0)
     made = sequential_design(plant, doubt=doubt, step_s=step_s, options=options, max_attacked=max_attacked)

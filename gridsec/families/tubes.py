@@ -1,17 +1,17 @@
-"""Intervals that hold what honest inverters inject, whoever lies: the observers of `unknown_input`.
+"""Intervals of unmanipulated inverters' injections under any attack: the observers of `unknown_input`.
 
 An inverter follows ``tau x' = -x + K(z)`` with K non-decreasing, so that an interval for z over a step gives
 one for x after it:
 
     x in [keep low + (1 - keep) K(z_low), keep high + (1 - keep) K(z_high)],    keep = exp(-h / tau)
 
-for any h; it never needs an integrator, a gain or a certificate. Two such intervals travel with every
-inverter: `driven` by the customer's own meter, which holds as long as that meter is honest, and `free` of
-it, from what the feeder says, which always holds.
+for any h, without an integrator, a gain or a certificate. Every inverter has two such intervals: `driven` by
+the customer's own meter, valid while that meter is unmanipulated, and `free` of it, from the feeder model,
+always valid.
 
 References
 ----------
-yang2021 (2) and (17), whose innovation vanishes for direct injection; docs/theory-unknown-input.md, 6.
+yang2021 (2) and (17), with zero innovation under direct injection; docs/theory-unknown-input.md, 6.
 """
 
 from __future__ import annotations
@@ -26,13 +26,7 @@ from gridsec.detect import ErrorModel, largest
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tube:
-    """Intervals. m inverters.
-
-    Attributes
-    ----------
-    low, high : (m,)
-        Ends.
-    """
+    """Intervals [low, high] of m inverters, (m,) each."""
 
     low: Floats
     high: Floats
@@ -48,40 +42,26 @@ class Tube:
         return np.asarray(0.5 * (self.high - self.low))
 
     def hull(self, other: Tube) -> Tube:
-        """Everything in either and between both.
-
-        Parameters
-        ----------
-        other
-            The other intervals.
-        """
+        """Hull of these and the other intervals."""
         return Tube(np.minimum(self.low, other.low), np.maximum(self.high, other.high))
 
     def where(self, this: Bools, other: Tube) -> Tube:
-        """These intervals where `this`, the others elsewhere.
-
-        Parameters
-        ----------
-        this : (m,)
-            Which.
-        other
-            The others.
-        """
+        """These intervals where `this` (m,) is True, the others elsewhere."""
         return Tube(np.where(this, self.low, other.low), np.where(this, self.high, other.high))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tubes:
-    """What is known of honest inverters at one tick.
+    """Intervals of unmanipulated inverters at one tick.
 
     Attributes
     ----------
     driven, free : Tube
-        Their injections if their own meter is honest, and in any case, pu.
+        Their injections if their own meter is unmanipulated, and in any case, pu.
     z_driven, z_free : Tube
         The same of `vbar^2 - v^2` at their customers, squared pu.
     metered : (m,)
-        Whose own meter has a reading; elsewhere `driven` is `free`.
+        Inverters with a reading of their own meter; elsewhere `driven` is `free`.
     """
 
     driven: Tube
@@ -93,16 +73,16 @@ class Tubes:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seen:
-    """What one tick says about the places of inverters. m inverters, p meters.
+    """One tick at the places of inverters. m inverters, p meters.
 
     Attributes
     ----------
     z : (m,)
-        By the own meters; anything where not metered.
+        By the own meters; arbitrary where not metered.
     z_error : (m,)
-        How far an honest meter may be off.
+        Error of an unmanipulated meter.
     metered : (m,)
-        Whose own meter has a reading.
+        Inverters with a reading of their own meter.
     rest, rest_error : (m,)
         `vbar^2 - v^2` without any inverter, and its error.
     """
@@ -116,14 +96,14 @@ class Seen:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Doubt:
-    """How many may be attacked, and how far.
+    """Assumed number and size of attacks.
 
     Attributes
     ----------
     meters, inverters
-        How many of each at once.
+        Largest numbers of simultaneous attacks.
     reach : (m,)
-        Largest injection that an inverter can be made to have: its rating, pu.
+        Largest injection of an attacked inverter: its rating, pu.
     coupling : (m, m)
         2X between the inverters' customers.
     """
@@ -135,30 +115,22 @@ class Doubt:
 
 
 def saturated(errors: ErrorModel) -> Tube:
-    """Between the ends of the curves, where honest inverters always are.
-
-    Parameters
-    ----------
-    errors
-        The plant.
-    """
+    """Intervals between the ends of the curves, valid for all unmanipulated inverters."""
     return Tube(errors.droop.q[:, 3].copy(), errors.droop.q[:, 0].copy())
 
 
 def spread(errors: ErrorModel, doubt: Doubt, known: Tube, free: Tube, gain: Floats) -> Floats:
-    """How far voltages may be from those with the middle injections, whoever lies; (r,).
+    """Largest distance of voltages from those with the middle injections, under any attack; (r,).
 
-    Honest inverters are in `known`; those of the worst M meters in `free`; the worst of all inverters
-    inject what they are told.
+    Unmanipulated inverters are in `known`; those of the worst M meters in `free`; the worst of all inverters
+    inject up to their rating.
 
     Parameters
     ----------
-    errors, doubt
-        The plant, and how many lie.
     known, free
-        What is known of all inverters if their own meters are honest, and in any case.
+        Intervals of all inverters if their own meters are unmanipulated, and in any case.
     gain : (r, m)
-        |2X| from inverters to the voltages asked for.
+        |2X| from inverters to the r voltages.
     """
     swing = np.maximum(free.high - known.middle, known.middle - free.low) - known.half
     far = doubt.reach + np.abs(known.middle) - known.half
@@ -174,23 +146,19 @@ def spread(errors: ErrorModel, doubt: Doubt, known: Tube, free: Tube, gain: Floa
     )
 
 
-# Each round is an interval that holds the truth; more rounds only make it narrower.
+# Every round gives a valid interval; more rounds only narrow it.
 _ROUNDS = 4
 
 
 def advance(errors: ErrorModel, doubt: Doubt, before: Tubes | None, seen: Seen, h: float) -> Tubes:
-    """The intervals after a step.
+    """Intervals after a step.
 
-    Voltages between two ticks are taken to lie between the extremes of what they may be at both.
+    Voltages between two ticks are assumed within the extremes of their intervals at both.
 
     Parameters
     ----------
-    errors, doubt
-        The plant, and how many lie.
     before
-        The last tick's; None at the first one, where inverters may be anywhere on their curves.
-    seen
-        What this tick says.
+        Intervals of the last tick; None at the first one, with inverters anywhere on their curves.
     h
         Length of the step, s.
     """
@@ -212,7 +180,7 @@ def advance(errors: ErrorModel, doubt: Doubt, before: Tubes | None, seen: Seen, 
 
 
 def _z_free(errors: ErrorModel, doubt: Doubt, seen: Seen, known: Tube, free: Tube) -> Tube:
-    """`z = rest - 2X x` at the inverters' customers, without their own meters' word."""
+    """`z = rest - 2X x` at the inverters' customers, without their own meters."""
     z = seen.rest - doubt.coupling @ known.middle
     wide = seen.rest_error + spread(errors, doubt, known, free, errors.inverters_own)
     return Tube(z - wide, z + wide)

@@ -1,21 +1,21 @@
-"""Inverters that inject a wrong reactive power and meters that lie, at once: yang2021 on a feeder.
+"""Simultaneous attacks on inverters and on meters: yang2021 on a feeder.
 
-A candidate is a pair (suspected meters, suspected inverters) of bounded size. Its unknown-input observer
-rests on neither: honest inverters follow their curves (`gridsec.families.tubes`), what the suspected ones
-inject is an unknown input, up to their rating, that the trusted readings reveal through 2X, and what is left
-over must be possible for honest readings (`gridsec.families.pairs`). Thresholds are worst cases of everything
-that is not known, so that honest readings never contradict the pair that is true. Hence:
+A candidate is a pair (suspected meters, suspected inverters) of bounded size. Its unknown-input observer uses
+neither. Unmanipulated inverters follow their curves (`gridsec.families.tubes`). The injections of the
+suspected inverters are unknown inputs, up to their rating, determined by the trusted readings through 2X. The
+remainder must be possible for unmanipulated readings (`gridsec.families.pairs`). Thresholds are worst cases
+of all uncertainties, so that unmanipulated readings never contradict the true pair. Hence:
 
-1. The pair that is true is never refuted, as long as no more meters and inverters are attacked than assumed.
-2. Who is in every pair that is not refuted is attacked: *named*.
-3. If the named alone are such a pair, the answer is ATTACKED, or CLEAN if they are nobody. Otherwise meters
+1. The true pair is never refuted while no more meters and inverters are attacked than assumed.
+2. Members of every pair that is not refuted are attacked: *named*.
+3. If the named members alone are such a pair, the answer is ATTACKED, or CLEAN without any. Otherwise meters
    and inverters explain the readings alike: UNDECIDED, with the smallest pairs as explanations.
 4. If all pairs are refuted, more is attacked than assumed: UNDECIDED.
 
-A pair is refuted by its `confirm`-th contradiction and until `release` ticks in a row did not contradict it.
-Active powers are believed, as by all banks. An inverter that moves the readings by less than they may
-honestly be off cannot be judged, and then nothing is CLEAN. Meters of class 0.5 alone judge only the
-largest inverters; where customers' net reactive power is reported, most.
+A pair is refuted by its `confirm`-th contradiction, until `release` consecutive ticks do not contradict it.
+Active powers are trusted, as in all banks. An inverter with an effect on the readings below their errors
+cannot be judged, and then the answer is not CLEAN. Meters of class 0.5 alone judge only the largest
+inverters; with reported net reactive power of customers, most are judged.
 
 References
 ----------
@@ -50,18 +50,14 @@ def design(
     max_inverters: int = 1,
     options: Options | None = None,
 ) -> UnknownInputDesign:
-    """Prepare to watch a feeder.
+    """Design the pairs for one feeder.
 
     Parameters
     ----------
-    plant
-        What is watched.
     max_attacked, max_inverters
-        How many meters and inverters may be attacked at the same time, q_2 and q_1.
+        Largest numbers of simultaneously attacked meters and inverters, q_2 and q_1.
     step_s
-        Expected interval between frames, s; it only chooses the options' default, others work as well.
-    options
-        The numbers that decide.
+        Expected interval between frames, s; it only selects the default options, others work as well.
 
     Raises
     ------
@@ -70,8 +66,8 @@ def design(
     DesignInfeasible
         If there are too many pairs.
     ValueError
-        As `plant.check_plant`, or if `max_inverters` is negative, or if inverters have no rating: how far an
-        attacked one can go is what decides whether it can be the explanation.
+        As `plant.check_plant`, if `max_inverters` is negative, or if inverters have no rating, the largest
+        injection of an attacked one.
     """
     p, m = plant.meters.size, plant.droop.tau.size
     more = (
@@ -80,12 +76,10 @@ def design(
         else []
     )
     untold = np.flatnonzero(~np.isfinite(plant.droop.rating)).tolist()
-    more += (
-        [Problem("missing", f"inverters {untold} have no rating; `Droop.rating` tells it")] if untold else []
-    )
+    more += [Problem("missing", f"inverters {untold} have no rating; set `Droop.rating`")] if untold else []
     check_plant(plant, max_attacked=max_attacked, step_s=step_s, more=more)
     if p <= 2 * max_attacked:
-        why = f"{p} meters of which {max_attacked} may lie: more than {2 * max_attacked} are needed"
+        why = f"{p} meters, {max_attacked} of them manipulated: more than {2 * max_attacked} are needed"
         raise NotObservable(range(p), p, why + " (yang2021, Assumption 3)", code="too-few-meters")
     if options is None:
         options = Options() if step_s <= 30.0 else Options(release=4)
@@ -99,15 +93,7 @@ def design(
 
 
 def init(design: UnknownInputDesign, t: float) -> UnknownInputState:
-    """Begin to watch.
-
-    Parameters
-    ----------
-    design
-        From `design`.
-    t
-        Unix time, s.
-    """
+    """Initial state at Unix time t, s."""
     plant, c = design.setting.plant, design.observers
     none = np.zeros(c, dtype=np.intp)
     return UnknownInputState(
@@ -126,15 +112,13 @@ def init(design: UnknownInputDesign, t: float) -> UnknownInputState:
 def step(
     design: UnknownInputDesign, state: UnknownInputState, frame: Frame
 ) -> tuple[UnknownInputState, Estimate, Verdict]:
-    """Take one frame in.
+    """Process one frame.
 
     Parameters
     ----------
-    design, state
-        From `design`, and from `init` or the last step.
     frame
-        Everything known at one tick. A frame that is not later than the last one changes nothing: it gets
-        the last estimate again, and UNDECIDED.
+        Data of one tick. A frame that is not later than the last one changes nothing: it returns the last
+        estimate and UNDECIDED.
     """
     if not np.isfinite(frame.t) or (state.tubes is not None and not frame.t > state.t):
         plant = design.setting.plant
@@ -155,13 +139,13 @@ def step(
 
 
 def _contradicted(design: UnknownInputDesign, state: UnknownInputState, tick: Tick) -> Tally:
-    """Try the pairs, as far as there is a need, and count contradictions."""
+    """Test the pairs, as far as necessary, and count contradictions."""
     options, both, tally = design.setting.options, design.pairs, state.contradicted
     over = np.zeros(design.observers, dtype=np.bool_)
     few = np.count_nonzero(tick.inputs.live) <= 2 * design.setting.max_attacked
     if few or not tick.inputs.busbar:
         return tally
-    # Whatever nobody explains by honesty, all others explain as well.
+    # Readings that the empty pair explains are explained by all other pairs as well.
     nobody = tick.trial(both.meters[0], both.inverters[0])
     if not nobody.fits:
         over[0] = True
@@ -173,7 +157,7 @@ def _contradicted(design: UnknownInputDesign, state: UnknownInputState, tick: Ti
             meters = both.meters[group[0]]
             believed, room = tick.believe(meters), tick.room(tick.tube(meters))
             over[group] = [not try_pair(believed, both.inverters[k], room).fits for k in group]
-    # What was found against a pair is not taken back while those whom it spares cannot be judged.
+    # Evidence against a pair stays while members outside the pair cannot be judged.
     deaf = deaf_inverters(design, nobody)
     silent = state.named & ~tick.inputs.live
     hold = (silent & ~both.meters).any(axis=1) | (state.inverters & deaf & ~both.inverters).any(axis=1)
@@ -218,7 +202,7 @@ def _conclude(
 def _estimate(
     design: UnknownInputDesign, tick: Tick, trial: Trial, chosen: int | None, *, certain: bool
 ) -> tuple[Floats, Estimate]:
-    """What the chosen pair makes of the feeder, with a bound that holds whichever pair is true."""
+    """Estimate of the chosen pair, with a bound that holds for every possible pair."""
     now, inputs, both = design.setting, tick.inputs, design.pairs
     plant, doubt = now.plant, design.doubt
     meters = both.meters[0 if chosen is None else chosen]
@@ -232,7 +216,7 @@ def _estimate(
     if chosen is None:
         bound = gain @ (doubt.reach + np.abs(x))
     else:
-        # Others may be attacked as well, without being seen; then what was found may be theirs.
+        # Further undetected attacks are possible; the reconstructed one may then be due to them.
         more = Doubt(
             doubt.meters - (int(meters.sum()) if certain else 0),
             doubt.inverters - (int(accused.sum()) if certain else 0),
@@ -255,7 +239,7 @@ def _estimate(
 
 
 def _scores(tick: Tick, meters: Bools, inverters: Bools, trial: Trial) -> tuple[Floats, Floats]:
-    """Each meter against all others of the chosen pair; suspected ones against those that are not."""
+    """Scores of meters against all others of the chosen pair; of suspected ones against the trusted ones."""
     score, threshold = trial.score.copy(), trial.threshold.copy()
     for j in np.flatnonzero(meters & tick.inputs.live).tolist():
         others = meters.copy()

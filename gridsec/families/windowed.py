@@ -1,24 +1,24 @@
 """Windows of consistency, yang2019, on a feeder.
 
-One observer with direct injection trusts all meters, one every p - M of them, one every p - 2M. As long as
-no meter of theirs lies, two observers J and S differ at inverter i by no more than what their errors may be:
+One observer with direct injection trusts all meters, one every p - M of them, one every p - 2M. Without
+manipulated meters in either, two observers J and S differ at inverter i by at most the sum of their errors:
 
-    |x_J,i - x_S,i| <= level_J,i + level_S,i,    level_J,i = driven_i if J holds the meter of i, else free_i.
+    |x_J,i - x_S,i| <= level_J,i + level_S,i,    level_J,i = driven_i if J has the meter of i, else free_i.
 
 `driven` and `free` are the worst-case bounds of `gridsec.detect`: meters at the limits of their class, loads
-anywhere in their intervals, what losses and sampling leave, and the transient. They belong to the frame, so
-that the thresholds of yang2019 (10) and (19), one number each, become one for every inverter and tick;
-pi and pi_J are measured in them, and evidence is a value above 1. A window of N readings then
+anywhere in their intervals, remainders of losses and sampling, and the transient. They belong to the frame,
+so that the thresholds of yang2019 (10) and (19), one number each, become one for every inverter and tick; pi
+and pi_J are measured in them, and evidence is a value above 1. A window of N readings then
 
 - detects if pi exceeded 1 at any of them (Algorithm 1), and
-- names the meters that no set J holds which passes (Algorithm 2, or its sound variant "survivors").
+- names the meters outside every set J that passes (Algorithm 2, or its sound variant "survivors").
 
-The estimate is that of the J with the smallest disagreement. The lags of the inverters are discretised anew
+The estimate is that of the J with the smallest disagreement. The lags of the inverters are discretised again
 for every interval, so that readings may be 1 s or 15 min apart; a window counts readings, not seconds.
 
-A lie inside the dead band of a curve, beyond its saturation, or at a meter without an inverter moves no
-injection: windows cannot see it, whatever its size. Output residuals can, and where they contradict, the
-answer is UNDECIDED. CLEAN needs the word of both.
+An attack inside the dead band of a curve, beyond its saturation, or on a meter without an inverter moves no
+injection: windows cannot detect it, at any size. Output residuals can. If they contradict the windows, the
+answer is UNDECIDED. CLEAN needs both.
 
 References
 ----------
@@ -47,19 +47,22 @@ LENGTHS = (50, 100, 200)
 """Readings in a window, as in the paper's example."""
 
 LENGTH = LENGTHS[0]
-"""The shortest: a window answers at its end only, so that an operator hears of a lie up to two lengths after
-it began, 100 s at one reading a second. Longer windows name the same meters later (`benchmarks.windowed`):
-worst-case thresholds do not become finer with time."""
+"""Default length: the shortest.
+
+A window answers at its end only, so that an attack is reported up to two lengths after its begin, 100 s at
+one reading a second. Longer windows name the same meters later (`benchmarks.windowed`): worst-case
+thresholds do not tighten with time.
+"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WindowedDesign:
-    """Everything that is prepared offline.
+    """Design of the windowed estimator.
 
     Attributes
     ----------
     chain
-        The observers, their certificate, and what frames are cleaned and voltages reconstructed with.
+        Design of the exact bank: observers, certificate, preparation of frames, reconstruction.
     length
         N, readings in a window.
     rule
@@ -72,24 +75,24 @@ class WindowedDesign:
 
     @property
     def observers(self) -> int:
-        """How many observers run: those of both banks, and the one that trusts all meters."""
+        """Number of observers: those of both banks, and the one that trusts all meters."""
         return 1 + self.chain.observers
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Window:
-    """What one full window says. p meters.
+    """Result of one full window. p meters.
 
     Attributes
     ----------
     judged
-        Whether enough meters were alive at every reading.
+        True if enough meters were available at every reading.
     detected
-        Algorithm 1: whether pi exceeded its threshold.
+        Algorithm 1: True if pi exceeded its threshold.
     decided
-        Algorithm 2: whether there is an answer.
+        Algorithm 2: True if there is an answer.
     suspects : (p,)
-        It.
+        Algorithm 2: its answer.
     """
 
     judged: bool
@@ -100,18 +103,18 @@ class Window:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WindowedState:
-    """What is carried from frame to frame. s large sets.
+    """State between frames. s large sets.
 
     Attributes
     ----------
     chain
-        Of the chain.
+        State of the exact bank.
     pi : (i,)
-        pi of the window's readings so far, in thresholds; NaN where it could not be judged.
+        pi of the window's readings so far, in thresholds; NaN where not judged.
     pi_sets : (i, s)
         Likewise pi_J.
     said
-        Of the last full window; None before the first one.
+        Result of the last full window; None before the first one.
     """
 
     chain: MonitorState
@@ -123,12 +126,10 @@ class WindowedState:
 def design(
     plant: Plant, *, max_attacked: int, step_s: float, length: int = LENGTH, rule: Rule = "survivors"
 ) -> WindowedDesign:
-    """Prepare to watch a feeder.
+    """Design the observers and windows for one feeder.
 
     Parameters
     ----------
-    plant
-        What is watched.
     max_attacked
         M, at least 1.
     step_s
@@ -136,28 +137,29 @@ def design(
     length
         N, readings in a window; one of `LENGTHS`, or any other.
     rule
-        How a window isolates. The thresholds are bounds, so that one exceedance counts: "survivors". The
-        paper's vote, "majority", wants the lie to be seen at more than half of the readings.
+        Isolation rule of a window. The thresholds are bounds, so that one exceedance counts: "survivors". The
+        paper's vote, "majority", requires exceedances at more than half of the readings.
 
     Raises
     ------
     NotObservable
         Unless there are more than 2M meters.
     DesignInfeasible
-        If no certificate holds, the bank would be too large, there is no droop inverter whose injection
-        could be estimated, or nobody may lie.
+        If no certificate holds, the bank would be too large, there is no droop inverter, or M is 0.
     ValueError
-        If a window would be empty, or there is no such rule.
+        If `length` is below 1, or `rule` is unknown.
     """
     if not plant.droop.tau.size:
         raise DesignInfeasible(
             "windows of consistency",
-            "no droop inverter whose injection is estimated",
+            "no droop inverter to estimate",
             code="nothing-to-design",
         )
     if max_attacked < 1:
         raise DesignInfeasible(
-            "windows of consistency", "without a possible liar nothing is isolated", code="nothing-to-design"
+            "windows of consistency",
+            "with no manipulated meter assumed, nothing is isolated",
+            code="nothing-to-design",
         )
     wrong = [Problem("out-of-range", "a window has at least one reading")] if length < 1 else []
     refuse((*wrong, *no_choice("rule", get_args(Rule), rule)))
@@ -165,15 +167,7 @@ def design(
 
 
 def init(design: WindowedDesign, t: float) -> WindowedState:
-    """Begin to watch; the observers start with the first frame.
-
-    Parameters
-    ----------
-    design
-        From `design`.
-    t
-        Unix time, s.
-    """
+    """Initial state at Unix time t, s; the observers start with the first frame."""
     return WindowedState(monitor.init(design.chain, t), *_empty(design), None)
 
 
@@ -184,24 +178,22 @@ def _empty(design: WindowedDesign) -> tuple[Floats, Floats]:
 def step(
     design: WindowedDesign, state: WindowedState, frame: Frame
 ) -> tuple[WindowedState, Estimate, Verdict]:
-    """Take one frame in.
+    """Process one frame.
 
     Parameters
     ----------
-    design, state
-        From `design`, and from `init` or the last step.
     frame
-        Everything known at one tick. A frame that is not later than the last one changes nothing: it
-        gets the last estimate again, and UNDECIDED.
+        Data of one tick. A frame that is not later than the last one changes nothing: it returns the last
+        estimate and UNDECIDED.
 
     Returns
     -------
     WindowedState, Estimate, Verdict
-        As every estimator's step. What a window says holds until the next one is full.
+        As every estimator's step. The result of a window holds until the next one is full.
     """
     before = state.chain
     if state.said is not None:
-        # No estimate rests on whom a window named.
+        # No estimate uses a meter named by a window.
         tally = replace(before.tally, named=before.tally.named | state.said.suspects)
         before = replace(before, tally=tally)
     chain, estimate, verdict = monitor.step(design.chain, before, frame)
@@ -228,17 +220,13 @@ def consistency(
 
     Parameters
     ----------
-    design
-        The observers.
-    bank
-        Where they are.
     bound
-        What is known about the error of those that no liar moves.
+        Error bounds of observers without manipulated meters.
 
     Returns
     -------
     pi, pi_J : scalar, (s,)
-        Above 1 is evidence. NaN while 2M or fewer meters are alive.
+        Values above 1 are evidence. NaN while 2M or fewer meters are available.
 
     References
     ----------
@@ -279,19 +267,19 @@ def _judge(design: WindowedDesign, pi: Floats, pi_sets: Floats) -> Window:
 
 
 def _answer(verdict: Verdict, said: Window | None, names: tuple[str, ...]) -> tuple[Decision, Cause, str]:
-    """The windows' answer, where the residuals' leaves one; what comes first makes the rest worthless."""
+    """Answer of the windows, where that of the residuals leaves one; earlier entries override later ones."""
     undecided, open_ = Decision.UNDECIDED, verdict.decision is Decision.UNDECIDED
     first = verdict.cause in {Cause.DESIGN_INVALID, Cause.TOO_FEW_METERS, Cause.NO_BUSBAR}
     known = Window(True, False, True, np.zeros(len(names), dtype=np.bool_)) if said is None else said
-    who = ", ".join(name for name, bad in zip(names, known.suspects, strict=True) if bad)
+    named = ", ".join(name for name, bad in zip(names, known.suspects, strict=True) if bad)
     answers = (
         (first or (said is None and open_), undecided, verdict.cause, verdict.reason),
         (said is None, undecided, Cause.SETTLING, "The first window of readings is not full yet."),
         (
-            bool(who),
+            bool(named),
             Decision.ATTACKED,
             Cause.RESIDUALS,
-            f"Manipulated: {who}; no set of meters that holds them agreed over a window of readings.",
+            f"Manipulated: {named}; no set of meters that holds them agreed over a window of readings.",
         ),
         (
             not known.judged,
@@ -309,7 +297,7 @@ def _answer(verdict: Verdict, said: Window | None, names: tuple[str, ...]) -> tu
             verdict.decision is Decision.ATTACKED,
             undecided,
             Cause.AMBIGUOUS,
-            f"{verdict.reason} No window of readings says so, and windows decide who is named.",
+            f"{verdict.reason} No window of readings confirms it, and only windows name meters.",
         ),
         (open_, undecided, verdict.cause, verdict.reason),
         (
@@ -326,7 +314,7 @@ def _answer(verdict: Verdict, said: Window | None, names: tuple[str, ...]) -> tu
 
 
 def _combine(design: WindowedDesign, verdict: Verdict, said: Window | None, off: Floats) -> Verdict:
-    """The windows' verdict; `off` is how far each reading is from the reconstruction, signed."""
+    """Verdict of the windows; `off` is the signed distance of each reading from the reconstruction."""
     plant = design.chain.plant
     names = tuple(plant.feeder.customers[c] for c in plant.meters)
     decision, cause, reason = _answer(verdict, said, names)

@@ -1,8 +1,8 @@
-"""The direction that the fewest blocks of rows see: one exact search behind cospark, spark and every index.
+"""Direction seen by the fewest blocks of rows: one exact search behind cospark, spark and every index.
 
 A block is a matrix with n columns; it *sees* a direction x unless it maps x to zero. With single rows as
-blocks the answer is the cospark of a matrix; with the observability matrices of single sensors as
-blocks it is the dynamic security index; within an eigenspace, what Proposition 3.2.2 of lee2018 needs.
+blocks the result is the cospark of a matrix; with the observability matrices of single sensors as
+blocks it is the dynamic security index; within an eigenspace, the minimum of Proposition 3.2.2 of lee2018.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Matrix = NDArray[np.inexact[Any]]
 Scalar = TypeVar("Scalar", bound=np.inexact[Any])
 
 MOST_NODES = 1_000_000
-"""Nodes of the search after which it gives up with an error instead of running for hours."""
+"""Largest number of nodes of a search; beyond it the search stops with an error."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,11 +31,11 @@ class Sparsest:
     Attributes
     ----------
     count
-        Number of those blocks; infinite if there was no direction to choose from.
+        Number of those blocks; infinite without any direction.
     blocks : (count,)
-        Which they are, ascending; empty if there was no direction.
+        Indices of these blocks, ascending; empty without any direction.
     direction : (n,)
-        Unit vector; empty if there was none. Complex only where the blocks or the space are.
+        Unit vector; empty if there is none. Complex only if the blocks or the space are.
     """
 
     count: float
@@ -87,7 +87,7 @@ def kernel(matrix: NDArray[Scalar], tol: float) -> NDArray[Scalar]:
 
 
 def span(columns: NDArray[Scalar], tol: float) -> NDArray[Scalar]:
-    """Orthonormal basis of the range of a matrix whose columns have norms near one or zero.
+    """Orthonormal basis of the range of a matrix with column norms near one or zero.
 
     Parameters
     ----------
@@ -113,10 +113,10 @@ def fewest(
 ) -> Sparsest:
     """Minimise, over the x != 0 of a space, the number of blocks that see x.
 
-    Exact branch and bound over flats. At a node the directions left are a subspace N; blocks that
-    vanish on all of N are free, and a generic x of N is seen by every other block, which gives an upper
-    bound. One of the others is then either made to vanish (N shrinks) or paid for. At most n of the
-    former follow each other, and fewer of the latter than the best count so far.
+    Exact branch and bound over flats. At a node the remaining directions are a subspace N; blocks that vanish
+    on all of N are free, and a generic x of N is seen by every other block, which gives an upper bound. One
+    of the others is then either made to vanish (N shrinks) or counted. A path has at most n of the former,
+    and fewer of the latter than the best count so far.
 
     Parameters
     ----------
@@ -125,14 +125,12 @@ def fewest(
     space : (n, d)
         Orthonormal basis of the space in its columns.
     tol
-        A block whose product with a unit vector has norm up to this does not see it.
-    most
-        Largest number of nodes.
+        A block does not see a unit vector if the norm of their product is at most this.
     below
-        Only answer whether fewer blocks than this see some direction: the count found is below it if so,
-        and otherwise any upper bound. Takes at most C(n + below, n) nodes. 0: find the minimum.
+        Decide only if fewer blocks than this see some direction: if so, the count is below it, otherwise any
+        upper bound. Takes at most C(n + below, n) nodes. 0 for the minimum.
     must
-        Only directions that this block sees; if there are none, the count is infinite. None: all.
+        Restrict to directions that this block sees; if there are none, the count is infinite.
 
     Returns
     -------
@@ -142,7 +140,7 @@ def fewest(
     Raises
     ------
     DesignInfeasible
-        If more than `most` nodes would be needed. The general problem is NP-hard.
+        If more than `most` nodes are needed. The general problem is NP-hard.
     """
     blocks = _padded(rows, space.shape[0])
     if space.shape[1] == 0 or not _sees(blocks, must, space, tol):
@@ -185,16 +183,16 @@ def fewest(
 
 
 def _sees(blocks: Matrix, block: int | None, space: Matrix, tol: float) -> bool:
-    """Whether a block, if one is given, sees anything of a space."""
+    """True if no block is given, or the block sees a direction of the space."""
     return block is None or bool(np.linalg.norm(blocks[block] @ space, 2) > tol)
 
 
 def _generic(blocks: Matrix, space: Matrix, tol: float) -> Sparsest:
-    """A direction of the space that lies in no block's kernel unless the whole space does."""
+    """A direction of the space outside every block's kernel, unless the kernel contains the whole space."""
     if space.shape[1] == 1:
         x = space[:, 0]
     else:
-        # Any fixed generic mixture serves; the draw is part of the algorithm and always the same.
+        # Any fixed generic mixture serves; the fixed seed makes the search reproducible.
         mixture = np.random.default_rng(0).standard_normal(space.shape[1])
         x = space @ (mixture / np.linalg.norm(mixture))
     where = np.flatnonzero(np.linalg.norm(blocks @ x, axis=1) > tol)
@@ -202,7 +200,7 @@ def _generic(blocks: Matrix, space: Matrix, tol: float) -> Sparsest:
 
 
 def _padded(rows: Sequence[Matrix], n: int) -> Matrix:
-    """The blocks as one array, short ones filled up with zero rows; (p, largest k_i, n)."""
+    """The blocks as one array, short ones padded with zero rows; (p, largest k_i, n)."""
     tall = max((len(r) for r in rows), default=0)
     out = np.zeros((len(rows), max(tall, 1), n), dtype=np.result_type(np.float64, *(r.dtype for r in rows)))
     for i, r in enumerate(rows):

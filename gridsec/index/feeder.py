@@ -18,7 +18,7 @@ from gridsec.lure import Lure
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FeederIndex:
-    """How many meters must lie in concert to stay invisible to anyone who knows the loads exactly.
+    """Smallest numbers of meters in an invisible coordinated attack, for exactly known loads.
 
     Attributes
     ----------
@@ -27,9 +27,9 @@ class FeederIndex:
     dynamic
         From the readings of all time.
     asymptotic
-        As `dynamic`, for lies that do not die away; infinite where the closed loop is stable.
+        As `dynamic`, for attacks that do not decay; infinite for a stable closed loop.
     A, C : (n, n), (p, n)
-        The linearisation they belong to.
+        The linearisation.
     """
 
     static: Index
@@ -44,13 +44,11 @@ def slopes(lure: Lure, z: Floats, *, step: float) -> Floats:
 
     Parameters
     ----------
-    lure
-        The system.
     z : (m,)
         Arguments of the nonlinearities.
     step
-        Half the width of the difference, in the unit of z. Where a curve has a kink closer than this,
-        the result is a mixture of the slopes on its two sides.
+        Half the width of the difference, in the unit of z. Near a kink closer than this, the result is a
+        mixture of the slopes on both sides.
     """
     return np.asarray((lure.phi(z + step) - lure.phi(z - step)) / (2.0 * step))
 
@@ -60,8 +58,6 @@ def linearise(lure: Lure, slope: Floats) -> tuple[Floats, Floats]:
 
     Parameters
     ----------
-    lure
-        The system.
     slope : (m,)
         Slope of each nonlinearity, from `slopes`; `lure.slope` for the steepest; 0 in deadband.
     """
@@ -71,9 +67,9 @@ def linearise(lure: Lure, slope: Floats) -> tuple[Floats, Floats]:
 def feeder_index(lure: Lure, slope: Floats, *, tol: float) -> FeederIndex:
     """Static, dynamic and asymptotic security index of a feeder's linearised closed loop.
 
-    States and meters are scaled to order one first, which changes no index. Inverters of slope zero
-    all decay by themselves; those of equal time constants then share one eigenspace, and over that the
-    dynamic index falls to the static one of their columns.
+    States and meters are scaled to order one first, which changes no index. Inverters of slope zero decay
+    independently; those with equal time constants share one eigenspace, on which the dynamic index falls to
+    the static one of their columns.
 
     Parameters
     ----------

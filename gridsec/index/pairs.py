@@ -1,11 +1,11 @@
 """Redundant observability and detectability of a pair (A, C), and the security indices.
 
-Everything comes in two independent forms: by ranks of observability matrices, and by eigenvectors. The
-latter minimise over each whole eigenspace, so repeated eigenvalues, defective or not, are no exception.
+Everything has two independent forms: by ranks of observability matrices, and by eigenvectors. The
+latter minimise over each whole eigenspace, which covers repeated eigenvalues, defective or not.
 
 References
 ----------
-lee2018, chapter 3. What is corrected there: docs/errata/lee2018-chapter-3.md.
+lee2018, chapter 3. Corrections: docs/errata/lee2018-chapter-3.md.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ By = Literal["eigenvectors", "rank"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Index:
-    """How many sensors an attacker must control to stay invisible, and how he would do it.
+    """Smallest set of sensors of an invisible attack, and its direction.
 
     Attributes
     ----------
@@ -37,8 +37,8 @@ class Index:
     sensors : (count,)
         A smallest set of sensors; empty if there is none.
     direction : (n,)
-        What he makes the state appear to be off by; empty if there is none. Complex directions stand
-        for their real part, which the same sensors see and whose norm is at least sqrt(1/2).
+        Apparent displacement of the state; empty if there is none. Complex directions stand for their real
+        part, which is seen by the same sensors and has a norm of at least sqrt(1/2).
     """
 
     count: float
@@ -47,15 +47,15 @@ class Index:
 
     @property
     def correctable(self) -> float:
-        """Largest number of manipulated sensors that can be undone: `ceil(count / 2) - 1`.
+        """Largest number of correctable manipulated sensors: `ceil(count / 2) - 1`.
 
-        For a system that is not even observable this is -1; for an infinite index it is infinite.
+        It is -1 for a system that is not observable, and infinite for an infinite index.
         """
         return float(np.ceil(self.count / 2.0) - 1.0)
 
     @property
     def detectable(self) -> float:
-        """Largest number of manipulated sensors that cannot hide: `count - 1`."""
+        """Largest number of manipulated sensors that are always detectable: `count - 1`."""
         return self.count - 1.0
 
 
@@ -91,15 +91,15 @@ def observability(A: Floats, C: Floats, steps: int | None = None) -> Floats:
 def observable_rows(A: Floats, C: Floats, *, tol: float) -> tuple[Floats, ...]:
     """Orthonormal rows that span the rows of each sensor's observability matrix.
 
-    By Arnoldi's method on A^T, which does not form powers of A, so that ranks stay decidable where
-    G_i itself is hopelessly scaled. The kernel is the unobservable subspace of the pair (A, c_i).
+    By Arnoldi's method on A^T, which does not form powers of A, so that ranks stay decidable if G_i itself is
+    badly scaled. The kernel is the unobservable subspace of the pair (A, c_i).
 
     Parameters
     ----------
     A, C : (n, n), (p, n)
         The pair.
     tol
-        A new row shorter than this times |A| counts as nothing new. A sensor whose row is up to this part of
+        A new row shorter than this times |A| counts as dependent. A sensor with a row up to this fraction of
         the longest measures nothing.
 
     Returns
@@ -117,14 +117,14 @@ def _arnoldi(step: Floats, row: Floats, tol: float) -> Floats:
     while np.linalg.norm(row) > tol and len(basis) < row.size:
         basis = np.vstack([basis, row / np.linalg.norm(row)])
         row = step @ basis[-1]
-        # Twice: once leaves rounding errors that a third of the rows would inherit.
+        # Twice: a single pass leaves rounding errors that a third of the rows would inherit.
         for _ in range(2):
             row = row - basis.T @ (basis @ row)
     return basis
 
 
 def _sensors(C: Floats, tol: float) -> list[Matrix]:
-    """Each sensor's row, scaled to length one: the unit of a sensor is no property of the system."""
+    """Row of each sensor, scaled to length one: the unit of a sensor is not a property of the system."""
     rows = unit_rows(np.asarray(C, dtype=np.float64), tol=tol)
     return [row_space(row[None, :], 0.0) for row in rows]
 
@@ -137,8 +137,8 @@ def static_index(C: Floats, *, tol: float) -> Index:
     C : (p, n)
         Output matrix.
     tol
-        A sensor whose unit row has a product with a unit state up to this does not see it. A sensor whose row
-        is up to this part of the longest measures nothing.
+        A product of a sensor's unit row with a unit state up to this counts as zero. A sensor with a row up
+        to this fraction of the longest measures nothing.
 
     References
     ----------
@@ -149,7 +149,7 @@ def static_index(C: Floats, *, tol: float) -> Index:
 
 
 def dynamic_index(A: Floats, C: Floats, *, tol: float, by: By = "eigenvectors") -> Index:
-    """alpha_d(A, C): fewest sensors by which an attack stays invisible for all time.
+    """Smallest number of sensors of an attack that stays invisible for all time, alpha_d(A, C).
 
         min over x != 0 of |G x|_{0^n}   =   min over eigenvectors v of A of |C v|_0
 
@@ -160,7 +160,7 @@ def dynamic_index(A: Floats, C: Floats, *, tol: float, by: By = "eigenvectors") 
     A, C : (n, n), (p, n)
         The pair.
     tol
-        What counts as zero, relative to unit vectors, |A| and the longest row of C.
+        Tolerance of zero, relative to unit vectors, |A| and the longest row of C.
     by
         "eigenvectors": over every eigenspace, (3.2.4). "rank": over all states, (3.2.3).
 
@@ -181,7 +181,7 @@ def dynamic_index(A: Floats, C: Floats, *, tol: float, by: By = "eigenvectors") 
 
 
 def asymptotic_index(A: Floats, C: Floats, *, discrete: bool, tol: float, by: By = "eigenvectors") -> Index:
-    """alpha_a(A, C): as `dynamic_index`, for attacks whose effect does not die away by itself.
+    """`dynamic_index` for attacks with an effect that does not decay, alpha_a(A, C).
 
         min over x outside X_s(A) of |G x|_{0^n}   =   min over unstable eigenvectors v of |C v|_0
 
@@ -190,10 +190,10 @@ def asymptotic_index(A: Floats, C: Floats, *, discrete: bool, tol: float, by: By
     A, C : (n, n), (p, n)
         The pair.
     discrete
-        Whether A is the matrix of a sampled system (unstable: |lambda| >= 1) or of a differential
-        equation (Re lambda >= 0).
+        True if A is the matrix of a sampled system (unstable: |lambda| >= 1), False for that of a
+        differential equation (Re lambda >= 0).
     tol
-        What counts as zero. An eigenvalue within this of the border counts as unstable.
+        Tolerance of zero. An eigenvalue within this of the border counts as unstable.
     by
         As in `dynamic_index`.
 
@@ -213,7 +213,7 @@ def asymptotic_index(A: Floats, C: Floats, *, discrete: bool, tol: float, by: By
     """
     refuse(no_choice("by", get_args(By), by))
     if by == "rank":
-        # An invariant kernel is the sum of its stable and its unstable part: X_u is all there is to search.
+        # An invariant kernel is the sum of its stable and its unstable part: searching X_u suffices.
         space = unstable_subspace(A, discrete=discrete, tol=tol)
         found = fewest(observable_rows(A, C, tol=tol), space, tol=tol)
         return Index(found.count, frozen_ints(found.blocks), found.direction)
@@ -232,13 +232,13 @@ def _over(spaces: Sequence[Matrix], C: Floats, tol: float, *, below: float = 0.0
 
 
 def _turned(direction: Matrix) -> Matrix:
-    """The same direction with its real part as long as possible: an eigenvector's phase is arbitrary."""
+    """The same direction with the longest possible real part: an eigenvector's phase is arbitrary."""
     square = np.sum(direction * direction)
     return direction if square == 0.0 else direction * np.exp(-0.5j * np.angle(square))
 
 
 def redundant_observable(A: Floats, C: Floats, q: int, *, tol: float, by: By = "eigenvectors") -> bool:
-    """Whether (A, C) stays observable after the loss of any q sensors.
+    """True if (A, C) stays observable after the loss of any q sensors.
 
     Parameters
     ----------
@@ -270,7 +270,7 @@ def redundant_observable(A: Floats, C: Floats, q: int, *, tol: float, by: By = "
 def redundant_detectable(
     A: Floats, C: Floats, q: int, *, discrete: bool, tol: float, by: By = "eigenvectors"
 ) -> bool:
-    """Whether (A, C) stays detectable after the loss of any q sensors.
+    """True if (A, C) stays detectable after the loss of any q sensors.
 
     Parameters
     ----------
@@ -298,14 +298,14 @@ def redundant_detectable(
 
 
 def unobservable_subspace(A: Floats, C: Floats, q: int = 0, *, tol: float) -> Floats:
-    """The q-redundant unobservable subspace: what some q lost sensors would make unobservable.
+    """The q-redundant unobservable subspace: span of all states made unobservable by the loss of q sensors.
 
         sum over |Lambda| = p - q of N(G_Lambda)
 
     Parameters
     ----------
     A, C, q, tol
-        As in `redundant_observable`. q >= p: the whole space. Costs C(p, q) kernels.
+        As in `redundant_observable`. The whole space for q >= p. Costs C(p, q) kernels.
 
     Returns
     -------
@@ -346,7 +346,7 @@ def _summed(A: Floats, C: Floats, q: int, space: Floats, tol: float) -> Floats:
     total = np.zeros((A.shape[0], 0))
     for kept in _survivors(len(rows), q):
         lost = _lost(rows, kept, A.shape[0], tol, space)
-        # Only what is new is added, so that the basis never exceeds n columns.
+        # Only new directions are added, so that the basis never exceeds n columns.
         total = np.asarray(span(np.hstack([total, lost]), np.sqrt(tol)))
         if total.shape[1] == space.shape[1]:
             break
@@ -360,7 +360,7 @@ def _survivors(p: int, q: int) -> list[tuple[int, ...]]:
 def _lost(
     rows: Sequence[Floats], kept: Sequence[int], n: int, tol: float, space: Floats | None = None
 ) -> Floats:
-    """Basis of the directions of a space that none of the kept sensors sees."""
+    """Basis of the directions of a space that are invisible to all kept sensors."""
     start = np.eye(n) if space is None else space
     if not kept:
         return start

@@ -1,9 +1,9 @@
-"""The direction that the fewest single rows see, in spaces of few dimensions: all flats at once.
+"""Direction seen by the fewest single rows, in spaces of few dimensions: all flats at once.
 
-In n dimensions a direction that the fewest rows see is alone in the kernel of the rows that do not see it:
-otherwise one more of them could be made not to. So it is among the kernels of all choices of n - 1 rows, and
-where these are not too many, linear algebra on all of them together is faster than the branch and bound of
-`gridsec.index.blocks`, which pays for every row that sees the answer.
+In n dimensions a direction seen by the fewest rows is alone in the kernel of the rows that do not see it:
+otherwise one more of them could be made not to. So it is among the kernels of all choices of n - 1 rows. If
+these are not too many, linear algebra on all of them together is faster than the branch and bound of
+`gridsec.index.blocks`, with its cost for every row that sees the result.
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ from gridsec.index.blocks import Matrix, Sparsest
 __all__ = ["MOST_CHOICES", "fewest_rows"]
 
 MOST_CHOICES = 200_000
-"""Choices of rows that are looked at; where there are more, branch and bound is left to do it."""
+"""Largest number of choices of rows; above it, branch and bound is used."""
 
 _TOGETHER = 4096
 
 
 def fewest_rows(seen: Matrix, *, tol: float, must: int | None = None) -> Sparsest | None:
-    """Minimise the number of rows that see a direction; None where there are too many choices.
+    """Minimise the number of rows that see a direction; None if there are too many choices.
 
-    Of several answers that which `gridsec.index.fewest` comes to first: where two differ first, it does not
-    see the earlier row.
+    Of several minimisers the first one of `gridsec.index.fewest`: where two differ first, it does not see the
+    earlier row.
 
     Parameters
     ----------
     seen : (p, n)
-        What each row sees of a basis; together they see everything, n >= 2.
+        Image of a basis in each row; together the rows see everything, n >= 2.
     tol
-        Products of unit vectors up to this are zero.
+        Products of unit vectors up to this count as zero.
     must
-        A row that is to see the direction; one that sees something. None: any.
+        A row, not zero, that must see the direction; None for any.
 
     References
     ----------
@@ -70,6 +70,6 @@ def _choices(count: int, size: int) -> Iterator[Ints]:
 
 
 def _earlier(sees: Bools, other: Bools) -> bool:
-    """Whether of two directions this one is not seen where they differ first."""
+    """True if, of two directions, this one is not seen where they differ first."""
     apart = np.flatnonzero(sees != other)
     return bool(apart.size and not sees[apart[0]])

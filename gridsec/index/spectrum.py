@@ -1,9 +1,9 @@
-"""Eigenspaces that stay right when eigenvalues repeat: clusters found by what they do, not by distance alone.
+"""Eigenspaces that stay correct for repeated eigenvalues, by clusters of eigenvalues.
 
 In floating point a repeated eigenvalue comes back as a cluster. An m-fold one of a Jordan block spreads by
-`eps^(1/m)`, far more than distinct ones may lie apart, so no threshold on distances tells the two apart.
-The restriction of A to the invariant subspace of a cluster does: minus its mean eigenvalue it is nilpotent
-and singular if the cluster is one eigenvalue, and not if it is several.
+`eps^(1/m)`, far more than the distance of distinct ones can be, so no threshold on distances separates the
+two. The restriction of A to the invariant subspace of a cluster does: minus its mean eigenvalue it is
+nilpotent and singular if the cluster is one eigenvalue, and not if it is several.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class Eigenspace:
     Attributes
     ----------
     value
-        The eigenvalue: the mean of its cluster, which is accurate also where the members are not.
+        The eigenvalue: the mean of its cluster, which is more accurate than its members.
     vectors : (n, g)
         Orthonormal basis of the eigenspace; g is the geometric multiplicity.
     invariant : (n, m)
@@ -39,7 +39,7 @@ class Eigenspace:
     invariant: Complexes
 
     def unstable(self, *, discrete: bool, tol: float) -> bool:
-        """Whether the eigenvalue is unstable: `|value| >= 1`, or `Re value >= 0` in continuous time.
+        """True for an unstable eigenvalue: `|value| >= 1`, or `Re value >= 0` in continuous time.
 
         Parameters
         ----------
@@ -59,8 +59,8 @@ def eigenspaces(A: Floats, *, tol: float) -> tuple[Eigenspace, ...]:
 
         |N^m| <= tol |N|^(m-1)   and   the smallest singular value of N is at most tol |A|,
 
-    or N itself is that small. That holds, up to the constant, for whatever lies within tol of a matrix
-    with an m-fold eigenvalue, and fails for several distinct eigenvalues further apart.
+    or N itself is that small. That holds, up to the constant, for any matrix within tol of one with an m-fold
+    eigenvalue, and fails for several distinct eigenvalues further apart.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ def unstable_subspace(A: Floats, *, discrete: bool, tol: float) -> Floats:
 def stable_subspace(A: Floats, *, discrete: bool, tol: float) -> Floats:
     """X_s(A): the span of the generalised eigenvectors of all other eigenvalues.
 
-    Parameters and result as `unstable_subspace`.
+    Parameters and result as in `unstable_subspace`.
     """
     return _part(A, discrete=discrete, tol=tol, unstable=False)
 
@@ -148,7 +148,7 @@ class _Schur:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Cluster:
-    """Eigenvalues that are one; `rest` is A restricted to their space, minus their mean, over |A|."""
+    """Eigenvalues that count as one; `rest` is A restricted to their space, minus their mean, over |A|."""
 
     members: Ints
     mean: complex

@@ -1,4 +1,4 @@
-"""Strong observability and detectability: what an unknown input can hide.
+"""Strong observability and detectability: subspaces hidden by an unknown input.
 
 For `x(k+1) = A x + B a`, `y = C x + D a` with an unknown a. With B = 0 and D the identity on the
 manipulated sensors this is a system under attack, which ties chapter 3 of lee2018 to the geometric theory.
@@ -18,17 +18,17 @@ from gridsec.index.blocks import kernel, span
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hidden:
-    """What a system with an unknown input cannot tell from rest.
+    """Motions of a system with an unknown input that cannot be distinguished from rest.
 
     Attributes
     ----------
     weakly_unobservable : (n, d)
-        Basis of the initial states for which some input keeps the output zero for ever.
+        Basis of the initial states with an input that keeps the output zero for ever.
     controllable : (n, c)
-        Basis of those among them that are reached from rest with zero output: there the input stays
-        hidden without any footprint in the initial state.
+        Basis of those among them that are reached from rest with zero output: the input stays hidden there
+        without any effect on the initial state.
     zeros : (d - c,)
-        Invariant zeros: the eigenvalues of the motion left over, which no input can change.
+        Invariant zeros: the eigenvalues of the remaining motion, which no input can change.
     """
 
     weakly_unobservable: Floats
@@ -37,11 +37,11 @@ class Hidden:
 
     @property
     def strongly_observable(self) -> bool:
-        """Zero output means zero state, whatever the input."""
+        """True if zero output implies zero state, for any input."""
         return bool(self.weakly_unobservable.shape[1] == 0)
 
     def strongly_detectable(self, *, discrete: bool, tol: float) -> bool:
-        """Zero output means a state that vanishes in time, whatever the input.
+        """True if zero output implies a state that decays, for any input.
 
         Parameters
         ----------
@@ -67,7 +67,7 @@ def hidden(A: Floats, B: Floats, C: Floats, D: Floats, *, tol: float) -> Hidden:
     Parameters
     ----------
     A, B, C, D : (n, n), (n, m), (p, n), (p, m)
-        The system, best in units in which entries are of order one.
+        The system, preferably in units with entries of order one.
     tol
         Singular values up to this, times the largest of the system's, count as zero.
 
@@ -96,7 +96,7 @@ def hidden(A: Floats, B: Floats, C: Floats, D: Floats, *, tol: float) -> Hidden:
 
 
 def under_attack(A: Floats, C: Floats, manipulated: Sequence[int], *, tol: float) -> Hidden:
-    """`hidden` for the pair (A, C) whose sensors in `manipulated` report anything.
+    """`hidden` for the pair (A, C) with arbitrary reports of the sensors in `manipulated`.
 
     The system `x+ = A x`, `y = C x + I_manipulated a` of the paper's (3.1.6).
 
@@ -107,13 +107,13 @@ def under_attack(A: Floats, C: Floats, manipulated: Sequence[int], *, tol: float
     manipulated
         Sensors under the attacker's control.
     tol
-        As in `hidden`. A sensor whose row is up to this part of the longest measures nothing.
+        As in `hidden`. A sensor with a row up to this fraction of the longest measures nothing.
 
     References
     ----------
     lee2018 (3.1.6), Propositions 3.1.3 and 3.1.10.
     """
-    # Everything the size of A, so that one tolerance fits all: units change no subspace.
+    # All blocks scaled to the size of A, so that one tolerance suffices: units change no subspace.
     size = float(np.linalg.norm(A, 2)) or 1.0
     unit = unit_rows(C, tol=tol) * size
     D = size * np.eye(C.shape[0])[:, list(manipulated)]

@@ -1,8 +1,8 @@
-"""Who lies, inputs and sensors at once: banks of unknown-input observers, selection, reconstruction.
+"""Isolation of attacked inputs and sensors: banks of unknown-input observers, selection, reconstruction.
 
-A bank compares every large observer, that distrusts q_1 inputs and q_2 sensors, with all those that
-distrust more, twice as many of each. The one that agrees best with its company is believed; the attacks
-follow from its estimate, and whoever is attacked by more than the estimate's error is named.
+A bank compares every large observer, which distrusts q_1 inputs and q_2 sensors, with all those that
+distrust twice as many of each. The observer in best agreement with its company is selected. The attacks
+follow from its estimate; inputs and sensors with an attack above the estimate's error are named.
 
     design(plant, ...) -> IsolationDesign
     init(design, t) -> IsolationState

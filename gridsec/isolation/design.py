@@ -1,4 +1,4 @@
-"""Which observers a bank consists of, and who is compared with whom.
+"""Observers of a bank, and their comparisons.
 
 References
 ----------
@@ -33,24 +33,24 @@ class IsolationDesign:
     family
         All observers that exist.
     large : (a,)
-        Which of them are large, J of (5) or (22).
+        Indices of the large ones, J of (5) or (22).
     company : (a, b)
         For each large observer the small ones within it, padded by repetition.
     alone : (a,)
-        Large observers whose company does not exist at all: nothing can confirm them.
+        Large observers without any existing company: they cannot be confirmed.
     max_inputs, max_sensors
         q_1 and q_2. A complete bank distrusts all inputs: max_inputs = r.
     missing
-        Members that the bank should have and has not. Unless empty, the theorems do not apply.
+        Members missing from the bank. Unless empty, the theorems do not apply.
     measure
-        What "agree" means. "distance": the Euclidean norm of (5) and (22), and (6), (23) select. "bounds":
-        the largest difference of an entry relative to the sum of both observers' error bounds, which
-        does not let an observer that is bad at one state drown the others' news; selected is the
-        observer whose estimate is certified best.
+        Measure of disagreement. "distance": the Euclidean norm of (5) and (22), with the selection (6), (23).
+        "bounds": the largest difference of an entry relative to the sum of both observers' error bounds, in
+        which a poorly observed state does not mask others; the observer with the best certified estimate is
+        selected.
     left : (r, n)
         Left inverse of the inputs' matrix.
     from_now, from_before, from_drift : (r, n), (r, n), (r,)
-        How bounds of the estimates bound the error of the reconstructed input attack.
+        Gains from the bounds of the estimates to that of the reconstructed input attack.
     """
 
     family: UnknownInputDesign
@@ -68,7 +68,7 @@ class IsolationDesign:
 
     @property
     def guaranteed(self) -> bool:
-        """Whether every member exists, as Assumptions 2 and 3 ask."""
+        """True if every member exists, as required by Assumptions 2 and 3."""
         return not self.missing
 
 
@@ -80,7 +80,7 @@ def members(inputs: int, sensors: int, max_inputs: int, max_sensors: int) -> tup
     inputs, sensors
         r and p.
     max_inputs, max_sensors
-        q_1 and q_2. `max_inputs = inputs` asks for the complete bank, in which both distrust all inputs.
+        q_1 and q_2. `max_inputs = inputs` selects the complete bank, in which both distrust all inputs.
 
     Returns
     -------
@@ -101,13 +101,13 @@ def members(inputs: int, sensors: int, max_inputs: int, max_sensors: int) -> tup
         if count < 0
     )
     if sensors <= 2 * max_sensors:
-        why = f"{sensors} sensors of which {max_sensors} may lie: more than {2 * max_sensors} are needed"
+        why = f"{sensors} sensors, {max_sensors} of them attacked: more than {2 * max_sensors} are needed"
         raise NotObservable(
             range(sensors), sensors, why + " (yang2021, Assumptions 2 and 3)", code="too-few-meters"
         )
     complete = max_inputs == inputs
     if not complete and inputs <= 2 * max_inputs:
-        why = f"{inputs} inputs of which {max_inputs} may lie: more than {2 * max_inputs} are needed"
+        why = f"{inputs} inputs, {max_inputs} of them attacked: more than {2 * max_inputs} are needed"
         raise NotObservable(
             range(inputs),
             inputs,
@@ -134,14 +134,13 @@ def design(
     tolerance: float = 1e-9,
     rounding: float = 1e-9,
 ) -> IsolationDesign:
-    """Design a bank, with its missing members named.
+    """Design a bank and list its missing members.
 
     Parameters
     ----------
-    plant
-        The plant; r inputs, p sensors.
     max_inputs, max_sensors
-        How many inputs and sensors may be attacked, q_1 and q_2; `max_inputs = r` is the complete bank.
+        Largest numbers of attacked inputs and sensors, q_1 and q_2; `max_inputs = r` is the complete
+        bank.
     measure
         See `IsolationDesign`. yang2021: "distance".
     rates, multiplier, tolerance, rounding
@@ -154,12 +153,12 @@ def design(
     DesignInfeasible
         If no member exists at all.
     ValueError
-        If a count is negative, no rate is given, or there is no such measure or multiplier.
+        If a count is negative, `rates` is empty, or `measure` or `multiplier` is unknown.
     """
     refuse(no_choice("measure", get_args(Measure), measure))
     r, p = plant.inputs.shape[1], plant.noise.size
     wide, narrow = members(r, p, max_inputs, max_sensors)
-    # With nothing to tolerate both banks are the same: one observer, compared with itself.
+    # With zero counts both banks are the same: one observer, compared with itself.
     asked = wide + [pair for pair in narrow if pair not in set(wide)]
     family = design_family(
         plant, asked, rates=rates, multiplier=multiplier, tolerance=tolerance, rounding=rounding

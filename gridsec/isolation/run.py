@@ -1,4 +1,4 @@
-"""Tick by tick: the attacks that follow from the believed estimate, and who is named.
+"""Online isolation: attacks by the selected estimate, and named inputs and sensors.
 
 References
 ----------
@@ -22,7 +22,7 @@ from gridsec.online import Cause, Decision
 
 @dataclass(frozen=True, slots=True, eq=False)
 class IsolationState:
-    """What is carried from tick to tick. n states, r inputs, p sensors, l known inputs.
+    """State between ticks. n states, r inputs, p sensors, l known inputs.
 
     Attributes
     ----------
@@ -33,7 +33,7 @@ class IsolationState:
     u : (l,) or None
         Known input of the last tick.
     inputs, sensors : (r,), (p,)
-        Named so far: Assumption 1 says that attacked sets do not change.
+        Named so far: by Assumption 1 the attacked sets do not change.
     """
 
     family: UnknownInputState
@@ -46,26 +46,25 @@ class IsolationState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Isolation:
-    """The answer of one tick. n states, r inputs, p sensors, a large observers.
+    """Result of one tick. n states, r inputs, p sensors, a large observers.
 
     Attributes
     ----------
     t
         Time of the tick, s.
     decision, cause, reason
-        As in `gridsec.online.Verdict`. Without all members of the bank: UNDECIDED, whatever is named.
+        As in `gridsec.online.Verdict`. UNDECIDED if members of the bank are missing.
     x, bound : (n,)
         Estimate (7), (24) and a bound of its error, valid under the theorems' assumptions.
     selected
-        (J_u, J_s) of the observer believed.
+        (J_u, J_s) of the selected observer.
     disagreement : (a,)
-        pi of (5) or (22) for each large observer, infinite where nothing can confirm it. With "bounds",
-        a value above 1 proves that the observer or one of its company is deceived.
+        pi of (5) or (22) for each large observer, infinite if it cannot be confirmed. With "bounds", a value
+        above 1 proves that an attack affects the observer or one of its company.
     input_attack, input_threshold : (r,)
-        (42), of the *last* tick, and the most that an honest input could show. NaN and infinite at
-        the first tick.
+        (42), of the *last* tick, and its largest value without attack. NaN and infinite at the first tick.
     sensor_attack, sensor_threshold : (p,)
-        (43), NaN where unseen, and the most that an honest sensor could show.
+        (43), NaN where unseen, and its largest value without attack.
     inputs_now, sensors_now : (r,), (p,)
         (46), (47) with these thresholds, for this tick alone.
     inputs, sensors : (r,), (p,)
@@ -93,17 +92,14 @@ class Isolation:
 def init(
     design: IsolationDesign, t: float, x: Floats | None = None, radius: Floats | None = None
 ) -> IsolationState:
-    """Start a bank.
+    """Initial state of a bank.
 
     Parameters
     ----------
-    design
-        The bank.
     t
         Time of the first readings, s.
     x, radius : (n,)
-        Where all observers start, and how far the truth may be from it, see
-        `observers.unknown_input.init`.
+        Initial estimate of all observers, and the bound of its error, see `observers.unknown_input.init`.
     """
     r, p = len(design.left), len(design.family.plant.noise)
     nobody = np.zeros(r, dtype=np.bool_), np.zeros(p, dtype=np.bool_)
@@ -115,8 +111,6 @@ def input_attack(design: IsolationDesign, x: Floats, before: Floats, u: Floats) 
 
     Parameters
     ----------
-    design
-        The bank.
     x, before : (n,)
         Estimates at this tick and at the last.
     u : (l,)
@@ -133,16 +127,16 @@ def input_attack(design: IsolationDesign, x: Floats, before: Floats, u: Floats) 
 
 
 def support(attack: Floats, threshold: Floats | float) -> Bools:
-    """Who is attacked, (46) and (47): entries of a reconstructed attack above their threshold.
+    """Attacked entries, (46) and (47): those of a reconstructed attack above their threshold.
 
-    The printed `supp` asks for exact zeros, which no estimate has after finitely many steps.
+    The printed `supp` requires exact zeros, which no estimate has after finitely many steps.
 
     Parameters
     ----------
     attack : (…)
-        From (42) or (43); NaN is nobody.
+        From (42) or (43); NaN counts as not attacked.
     threshold : (…) or scalar
-        What an honest one can show.
+        Largest value without attack.
     """
     return np.asarray(np.abs(np.nan_to_num(attack)) > threshold)
 
@@ -150,18 +144,16 @@ def support(attack: Floats, threshold: Floats | float) -> Bools:
 def step(
     design: IsolationDesign, state: IsolationState, y: Floats, u: Floats, seen: Bools
 ) -> tuple[IsolationState, Isolation]:
-    """Take in one tick, and say who lies.
+    """Process one tick and name attacked inputs and sensors.
 
     Parameters
     ----------
-    design, state
-        The bank and what it remembers.
     y : (p,)
-        Readings; anything where unseen.
+        Readings; arbitrary where unseen.
     u : (l,)
         Known input of this tick; finite.
     seen : (p,)
-        Which readings exist.
+        True for existing readings.
 
     Returns
     -------
@@ -185,7 +177,7 @@ def step(
     evidence = _Evidence(
         torn=torn,
         contradicted=bool(np.any(told & (excess > 1.0))),
-        # At the first tick no observer has used a reading yet, whatever the caller knew before.
+        # At the first tick no observer has used a reading yet, for any prior knowledge.
         confirmed=state.x is not None and bool(np.any(told)),
         settled=bool(np.all(bound < plant.span)),
         silent=~heard,
@@ -216,7 +208,7 @@ def step(
 def _inputs(
     design: IsolationDesign, state: IsolationState, x: Floats, bound: Floats
 ) -> tuple[Floats, Floats]:
-    """The reconstructed input attack of the last tick, and what an honest input could show."""
+    """Reconstructed input attack of the last tick, and its largest value without attack."""
     if state.x is None or state.bound is None or state.u is None:
         return np.full(len(design.left), np.nan), np.full(len(design.left), np.inf)
     threshold = _times(design.from_now, bound) + _times(design.from_before, state.bound) + design.from_drift
@@ -224,7 +216,7 @@ def _inputs(
 
 
 def _times(matrix: Floats, bound: Floats) -> Floats:
-    """`matrix @ bound` for a non-negative matrix and a bound that may be infinite; 0 times infinity is 0."""
+    """`matrix @ bound` for a non-negative matrix and a possibly infinite bound; 0 times infinity is 0."""
     endless = ~np.isfinite(bound)
     reached = np.any((matrix > 0.0) & endless, axis=1)
     return np.where(reached, np.inf, matrix @ np.where(endless, 0.0, bound))
@@ -232,18 +224,18 @@ def _times(matrix: Floats, bound: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Evidence:
-    """What an answer rests on beside who is named.
+    """Evidence for an answer besides the named inputs and sensors.
 
     Attributes
     ----------
     torn
-        Whether the large observers' intervals do not intersect.
+        True if the large observers' intervals do not intersect.
     contradicted
-        Whether some observer differs from its company by more than both bounds allow.
+        True if an observer differs from its company by more than the sum of both bounds.
     confirmed
-        Whether some observer has used readings, and its company has as well.
+        True if an observer and its company have used readings.
     settled
-        Whether the estimate's bound says more than what is known anyway.
+        True if the estimate's bound is below the prior one.
     silent : (p,)
         Sensors without a reading.
     """
@@ -274,20 +266,20 @@ def _decide(
 
 
 def _quiet(evidence: _Evidence) -> tuple[Decision, Cause, str]:
-    """The answer where nobody is named."""
+    """Answer without named inputs or sensors."""
     silent = np.flatnonzero(evidence.silent).tolist()
     if evidence.contradicted:
-        reason = "observers contradict each other, and nobody can be named"
+        reason = "observers contradict each other, and no attack can be isolated"
         reason += f"; sensors {silent} are silent" if silent else ""
         return Decision.UNDECIDED, Cause.AMBIGUOUS, reason
     if not evidence.confirmed:
-        reason = "no observer and its company have heard all their sensors at two ticks in a row"
+        reason = "no observer and its company have readings of all their sensors at two consecutive ticks"
         reason += f"; sensors {silent} are silent" if silent else ""
         return Decision.UNDECIDED, Cause.SETTLING, reason
     if not evidence.settled:
-        reason = "the estimate's error bound is not below what is known anyway"
+        reason = "the estimate's error bound is not below the prior bound"
         return Decision.UNDECIDED, Cause.SETTLING, reason
     reason = "every input and sensor is within its bounds"
     if silent:
-        reason = f"all that is heard is within its bounds; sensors {silent} are silent"
+        reason = f"all available sensors are within their bounds; sensors {silent} are silent"
     return Decision.CLEAN, Cause.AGREEMENT, reason

@@ -1,4 +1,4 @@
-"""Which observer of a bank is believed, and how far the truth may be from what it says.
+"""Selection of a bank's observer, and the error bound of its estimate.
 
 References
 ----------
@@ -15,14 +15,7 @@ from gridsec.observers.unknown_input import UnknownInputState
 
 
 def disagreement(design: IsolationDesign, state: UnknownInputState) -> Floats:
-    """Disagreement pi of every large observer, (5) and (22); infinite where no member is left to confirm it.
-
-    Parameters
-    ----------
-    design
-        The bank.
-    state
-        Where its observers stand.
+    """Disagreement pi of every large observer, (5) and (22); infinite without a member to confirm it.
 
     Returns
     -------
@@ -36,24 +29,17 @@ def disagreement(design: IsolationDesign, state: UnknownInputState) -> Floats:
 
 
 def contradiction(design: IsolationDesign, state: UnknownInputState) -> Floats:
-    """The largest difference of an entry from that of its company, in parts of the sum of both bounds.
-
-    Parameters
-    ----------
-    design
-        The bank.
-    state
-        Where its observers stand.
+    """Largest difference of an entry from that of the company, relative to the sum of both bounds.
 
     Returns
     -------
     Floats
-        (a,); infinite where no member is left to confirm it. A finite value above 1 proves that the
-        observer or one of its company is deceived.
+        (a,); infinite without a member to confirm it. A finite value above 1 proves that an attack affects
+        the observer or one of its company.
     """
     gap = _gap(design, state)
     allowed = state.box[design.large][:, None, :] + state.box[design.company]
-    # Equal estimates agree even where both are known exactly.
+    # Equal estimates agree even if both are known exactly.
     pi = np.where(gap > 0.0, gap / np.maximum(allowed, np.finfo(np.float64).tiny), 0.0).max(axis=(1, 2))
     return np.where(_dead(design, state), np.inf, pi)
 
@@ -64,24 +50,17 @@ def _gap(design: IsolationDesign, state: UnknownInputState) -> Floats:
 
 
 def _dead(design: IsolationDesign, state: UnknownInputState) -> Bools:
-    """Large observers that nothing can confirm, (a,)."""
+    """Mask (a,) of large observers that cannot be confirmed."""
     dead = design.alone | ~state.live[design.large] | ~state.live[design.company].all(axis=1)
     return np.asarray(dead)
 
 
 def bounds(design: IsolationDesign, state: UnknownInputState) -> Floats:
-    """Bounds of the errors of all large observers, whoever lies.
+    """Bounds of the errors of all large observers, under any attack.
 
     Some small observer S within J is free of attacks, by Lemmas 1 to 3, so
-    `|e_J,i| <= max_S (|x_hat_J,i - x_hat_S,i| + box_S,i)`, for every J: those that trust a liar are told by
-    their company. Nor is an error above what the plant's span leaves possible.
-
-    Parameters
-    ----------
-    design
-        The bank.
-    state
-        Where its observers stand.
+    `|e_J,i| <= max_S (|x_hat_J,i - x_hat_S,i| + box_S,i)`, for every J: the company also bounds observers
+    with attacked sensors. The plant's span limits every error.
 
     Returns
     -------
@@ -96,23 +75,20 @@ def bounds(design: IsolationDesign, state: UnknownInputState) -> Floats:
 def estimate(design: IsolationDesign, state: UnknownInputState, index: int) -> tuple[Floats, Floats, bool]:
     """Estimate (7), (24) of one large observer with a bound of its error.
 
-    The truth is within the bounds of every large observer, so in the intersection of all these intervals.
+    The true state is within the bounds of every large observer, so in the intersection of all these
+    intervals.
 
     Parameters
     ----------
-    design
-        The bank.
-    state
-        Where its observers stand.
     index
-        Place among the large observers.
+        Index among the large observers.
 
     Returns
     -------
     x, bound : (n,)
     torn
-        Whether intervals do not intersect: then more is attacked than assumed, and the bound is infinite
-        where they do not.
+        True if intervals do not intersect: then more is attacked than assumed, and the bound is infinite
+        there.
     """
     x, wide = state.x[design.large], bounds(design, state)
     low, high = np.max(x - wide, axis=0), np.min(x + wide, axis=0)
@@ -121,16 +97,12 @@ def estimate(design: IsolationDesign, state: UnknownInputState, index: int) -> t
 
 
 def select(design: IsolationDesign, state: UnknownInputState, pi: Floats) -> int:
-    """Which large observer is believed, its place among them: (6), (23), or the one that is certified best.
+    """Index of the selected large observer: by (6), (23), or the one with the best certified estimate.
 
     Parameters
     ----------
-    design
-        The bank.
-    state
-        Where its observers stand.
     pi : (a,)
-        Their disagreement.
+        Disagreement of the large observers.
     """
     if design.measure == "distance":
         return int(np.argmin(pi))

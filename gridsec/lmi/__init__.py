@@ -1,7 +1,7 @@
-"""Design by optimisation over matrices, the only place that knows a solver.
+"""Design by optimisation over matrices, the only package that uses a solver.
 
-One module is one problem: `circle_criterion` (chong2020), `unknown_input` (yang2021) and more beside
-them. Whatever a solver says is rebuilt in NumPy before it is believed.
+One module is one problem: `circle_criterion` (chong2020), `unknown_input` (yang2021) and others.
+Every result of a solver is rebuilt in NumPy before it is used.
 """
 
 from gridsec.gains import (

@@ -4,8 +4,8 @@ The observer of the trusted meters J is
 
     x_hat' = A x_hat + G phi(zeta) + B u + L r,   zeta = H x_hat + F u + K r,   r = (y - C x_hat - D u)_J
 
-and `circle` finds the L and K, with their proof, that keep the error small when the known input is
-off by `load @ delta` and the meters by `noise * n`. Solvers are believed nothing: the inequality is
+and `circle` finds the L and K, with their proof, that keep the error small under errors `load @ delta` of
+the known input and `noise * n` of the meters. The solver's result is not trusted: the inequality is
 rebuilt from the gains in NumPy, in the plant's own units, before a design leaves this module.
 
 References
@@ -39,10 +39,10 @@ from gridsec.processes import deaf, listen, stop
 
 __all__ = ["BACKOFF", "circle", "contraction", "prove", "settle", "solve_many"]
 
-# Slack of the scaled inequality, whose entries are of order one: a hundred times the solver's
-# tolerance, so that its last digits cannot decide the sign of the margin.
+# Slack of the scaled inequality, with entries of order one: a hundred times the solver's tolerance, so that
+# its last digits cannot decide the sign of the margin.
 _SLACK = 1e-6
-# Relaxations tried, in order, when the rebuilt inequality is violated all the same.
+# Relaxations tried, in order, if the rebuilt inequality is violated.
 BACKOFF = (0.0, 1e-4, 1e-3, 1e-2, 5e-2)
 # Subsets per task of `solve_many`: enough to share one canonicalisation, few enough for steady progress.
 _CHUNK = 5
@@ -60,28 +60,21 @@ def circle(
 ) -> CircleGains:
     """Design the circle-criterion observer of one set of trusted meters.
 
-    Minimises `k mu + r mu_delta`, a bound on the mean of e^T Q e while every signal has its stated
-    size, over (P, P L, Lambda, Lambda K, mu, mu_delta) subject to the corrected (12) with nu = 1.
+    Minimises `k mu + r mu_delta`, a bound on the mean of e^T Q e for signals of their stated sizes, over (P,
+    P L, Lambda, Lambda K, mu, mu_delta) subject to the corrected (12) with nu = 1.
 
     Parameters
     ----------
-    lure
-        Plant.
     J : (k,)
         Trusted meters.
     rate, noise, load, weight, floor
         See `options_for`.
 
-    Returns
-    -------
-    CircleGains
-        With a positive margin.
-
     Raises
     ------
     DesignInfeasible
-        If there is no such observer, if the inequality does not survive being rebuilt, or if the
-        optimum is the blind L = K = 0.
+        If there is no such observer, if the rebuilt inequality is violated, or if the optimum is the blind L
+        = K = 0.
 
     References
     ----------
@@ -92,7 +85,7 @@ def circle(
 
 
 def prove(lure: Lure, J: Sequence[int] | Ints, L: Floats, K: Floats, options: CircleOptions) -> CircleGains:
-    """Certificate for an observer whose gains are given: the corrected (12) in P and Lambda only.
+    """Certificate for an observer with given gains: the corrected (12) in P and Lambda only.
 
     Parameters
     ----------
@@ -101,19 +94,19 @@ def prove(lure: Lure, J: Sequence[int] | Ints, L: Floats, K: Floats, options: Ci
     J : (k,)
         Trusted meters.
     L, K : (n, k), (m, k)
-        Gains. For nonlinearities of slope bound 0 no gain matters.
+        Gains. Those of nonlinearities of slope bound 0 have no effect.
     options
-        From `options_for`. Its `floor` has no meaning here.
+        From `options_for`. Its `floor` is ignored.
 
     Returns
     -------
     CircleGains
-        With exactly these gains and a positive margin. Blind gains are accepted: they were asked for.
+        With exactly these gains and a positive margin. Blind gains are accepted.
 
     Raises
     ------
     DesignInfeasible
-        If the inequality has no solution, or does not survive being rebuilt.
+        If the inequality has no solution, or is violated when rebuilt.
     """
     given = (np.asarray(L, dtype=np.float64), np.asarray(K, dtype=np.float64))
     template = _Template(lure, replace(options, floor=0.0), len(J), given=given)
@@ -121,16 +114,16 @@ def prove(lure: Lure, J: Sequence[int] | Ints, L: Floats, K: Floats, options: Ci
 
 
 def contraction(lure: Lure, *, rate: float) -> Certificate:
-    """Certificate of direct injection for every trusted set at once, where no closed form applies.
+    """Certificate of direct injection for every trusted set at once, for plants without a closed form.
 
     Finds P > 0 and a diagonal Lambda > 0 with
 
         [ P A + A^T P + 2 alpha P   P G + H^T Lambda ]
         [ *                         -Lambda d^-1     ]  <=  0,
 
-    the corrected (12) for no trusted meter, with half of the multiplier's term kept back to pay for
-    errors of the load. Trusting meters only removes columns of H in it, and by
-    Theorem 1 of docs/theory-certificates.md this proves every set.
+    the corrected (12) for no trusted meter, with half of the multiplier's term reserved for errors of the
+    load. Trusted meters only remove columns of H in it, and by Theorem 1 of docs/theory-certificates.md this
+    proves every set.
 
     Parameters
     ----------
@@ -142,19 +135,19 @@ def contraction(lure: Lure, *, rate: float) -> Certificate:
     Raises
     ------
     DesignInfeasible
-        If there is no such P at this rate, or it does not survive its verification in NumPy.
+        If there is no such P at this rate, or its verification in NumPy fails.
     """
     cp = cvxpy_late()
     what = f"certificate of direct injection for all sets of meters at rate {rate:g}/s"
-    # Units as in _Template: every slope bound becomes 1. An inverter of slope bound 0 is given a
-    # small one, which is still a bound.
+    # Units as in _Template: every slope bound becomes 1. An inverter of slope bound 0 gets a small one, which
+    # is still a bound.
     slope = np.maximum(lure.slope, 1e-3 * (float(np.max(lure.slope, initial=0.0)) or 1.0))
     clock, n = float(np.linalg.norm(lure.A, 2)), len(lure.A)
     A, G, H = lure.A * slope / slope[:, None] / clock, lure.G * slope / slope[:, None] / clock, lure.H * slope
     P, lam = cp.Variable((n, n), symmetric=True), cp.Variable(n)
     half, cross = P @ (A + rate / clock * np.eye(n)), P @ G + (cp.diag(lam) @ H).T
     whole = cp.bmat([[half + half.T, cross], [cross.T, -cp.diag(lam)]])
-    # Homogeneous in (P, Lambda): the trace fixes the scale, and the slack is made as large as it gets.
+    # Homogeneous in (P, Lambda): the trace fixes the scale, and the slack is maximised.
     slack = cp.Variable()
     constraints = [whole << -slack * np.eye(2 * n), P >> slack * np.eye(n), cp.trace(P) == n]
     problem = cp.Problem(cp.Maximize(slack), constraints)
@@ -182,24 +175,19 @@ def solve_many(
     workers: int,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[CircleGains, ...]:
-    """Design the observers of many trusted sets, in several processes.
+    """Design the observers of several trusted sets, in several processes.
 
-    Processes are spawned, so a script that calls this needs the `if __name__ == "__main__"` guard;
-    each runs its linear algebra on one thread. With one worker everything happens in this process.
+    Processes are spawned, so a calling script needs the `if __name__ == "__main__"` guard; each runs its
+    linear algebra on one thread. One worker means this process.
 
     Parameters
     ----------
     lure
-        Plant. Its matrices travel to the workers; its nonlinearity, which no inequality needs,
-        stays here.
-    subsets
-        Trusted sets, of any sizes, in any order.
+        Plant. Its matrices are sent to the workers; its nonlinearity, which no inequality needs, is not.
     options
         From `options_for`.
-    workers
-        Number of processes.
     progress
-        Called in this process with (done, total) whenever designs are finished.
+        Called in this process with (done, total) after finished designs.
 
     Returns
     -------
@@ -209,7 +197,7 @@ def solve_many(
     Raises
     ------
     DesignInfeasible
-        For the first set whose design fails; work not begun is dropped.
+        For the first set with a failed design; pending work is dropped.
     """
     chunks = _chunks(subsets)
     results: dict[int, CircleGains] = {}
@@ -243,7 +231,7 @@ def solve_many(
 
 @dataclass(frozen=True, slots=True)
 class _Failure:
-    """A DesignInfeasible on its way between processes: exceptions with several arguments do not pickle."""
+    """A DesignInfeasible in transit between processes: exceptions with several arguments do not pickle."""
 
     what: str
     status: str
@@ -258,7 +246,7 @@ def _chunks(subsets: Sequence[Sequence[int]]) -> list[tuple[list[int], list[Ints
         sizes.setdefault(len(subset), []).append(index)
     parts = [
         indices[start : start + _CHUNK]
-        # The largest sets take longest: first, so that no worker is left with them at the end.
+        # The largest sets take longest and come first, so that no worker is left with them at the end.
         for _, indices in sorted(sizes.items(), reverse=True)
         for start in range(0, len(indices), _CHUNK)
     ]
@@ -266,7 +254,7 @@ def _chunks(subsets: Sequence[Sequence[int]]) -> list[tuple[list[int], list[Ints
 
 
 def _one_thread() -> None:
-    """Pin the linear algebra of a worker; several processes with several threads each only fight."""
+    """Pin the linear algebra of a worker to one thread; threads of several processes would compete."""
     listen()
     import scipy.linalg  # noqa: F401  # loads the libraries that are to be limited
     from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]  # has no stubs
@@ -275,7 +263,7 @@ def _one_thread() -> None:
 
 
 def _no_curve(z: Floats) -> Floats:
-    """Stands in for the nonlinearity where only its slope bounds matter."""
+    """Placeholder of the nonlinearity where only its slope bounds matter."""
     raise AssertionError(f"a design evaluated the nonlinearity, shape {z.shape}")
 
 
@@ -289,12 +277,11 @@ def _solve_chunk(lure: Lure, options: CircleOptions, group: Sequence[Ints]) -> l
 
 
 class _Template:
-    """The scaled inequality for sets of one size, canonicalised once and solved for many sets.
+    """The scaled inequality for sets of one size, canonicalised once and solved for several sets.
 
-    Units: time in `1 / |A|`, z and y in `z_unit` (a typical load error), nonlinearity i in
-    `slope_i z_unit` (so that every slope bound becomes 1), states in what the nonlinearities can
-    push in one unit of time, noise in its root mean square. All entries are then of order one,
-    whatever the feeder's base power.
+    Units: time in `1 / |A|`, z and y in `z_unit` (a typical load error), nonlinearity i in `slope_i z_unit`
+    (so that every slope bound becomes 1), states in the effect of the nonlinearities in one unit of time,
+    noise in its root mean square. All entries are then of order one, for any base power of the feeder.
     """
 
     def __init__(
@@ -394,7 +381,7 @@ class _Template:
         return settle(lure, self._in_plant_units(J), what, blind=self.given is not None)
 
     def _in_plant_units(self, J: Ints) -> CircleGains:
-        """Undo the scaling; nu = 1 fixes the scale that an inequality leaves free."""
+        """Undo the scaling; nu = 1 fixes the free scale of the inequality."""
         lure, options, live = self.lure, self.options, self.live
         P, Y, lam, Gamma, mu, mu_delta = (np.asarray(v.value, dtype=np.float64) for v in self.variables)
         x, z = self.x_unit, self.z_unit
@@ -428,27 +415,23 @@ class _Template:
 
 
 def settle(lure: Lure, found: CircleGains, what: str, *, blind: bool = False) -> CircleGains:
-    """Turn a solver's answer into a proven design, or refuse it.
+    """Turn a solver's result into a proven design, or refuse it.
 
     The margin is recomputed in the plant's own units. If it is not positive, alpha, nu are shrunk
     and mu, mu_delta grown together by the stated steps (at most 5 %), which makes every diagonal
-    block but that of psi more negative; the gains stay. The step used is kept in `backoff`.
+    block but that of psi more negative; the gains stay. `backoff` stores the step.
 
     Parameters
     ----------
-    lure
-        Plant.
-    found
-        The solver's gains.
     what
-        Names the design in errors.
+        Name of the design in errors.
     blind
-        Accept gains that listen to no meter.
+        Accept gains that use no meter.
 
     Raises
     ------
     DesignInfeasible
-        If no step helps, or if the design listens to no meter.
+        If every step fails, or if the design uses no meter.
     """
     best = -np.inf
     for step in BACKOFF:

@@ -4,8 +4,8 @@ The observer of the trusted meters J is
 
     x_hat+ = A x_hat + G phi(zeta) + B u + L r,   zeta = H x_hat + F u + K r,   r = (y - C x_hat - D u)_J
 
-Slopes may lie anywhere in [lower, upper]; a loop transform brings them to [0, upper - lower]. As
-everywhere here, the solver's answer is rebuilt in NumPy, in the plant's own units, before it is believed.
+Slopes may lie anywhere in [lower, upper]; a loop transform moves them to [0, upper - lower]. The solver's
+result is rebuilt in NumPy, in the plant's own units, before it is used.
 
 References
 ----------
@@ -36,24 +36,24 @@ from gridsec.lmi.sampled import DiscreteLure, shift
 
 # Slack of the scaled inequality, as in circle_criterion: far above the solver's tolerance.
 _SLACK = 1e-7
-# Enlargements of mu and mu_delta tried, in order, when the rebuilt inequality is violated.
+# Enlargements of mu and mu_delta tried, in order, if the rebuilt inequality is violated.
 _BACKOFF = (0.0, 1e-4, 1e-3, 1e-2, 5e-2)
-# A meter that moves the observer by less than this part of what it could is not listened to.
+# Relative influence on the observer below which a meter counts as ignored.
 _BLIND = 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DiscreteOptions:
-    """What a design is asked for. n states, p meters.
+    """Specification of a design. n states, p meters.
 
     Attributes
     ----------
     decays
-        Candidates for lambda, each in (0, 1), per step. The one with the smallest bound is kept.
+        Candidates for lambda, each in (0, 1), per step. The one with the smallest bound is used.
     noise : (p,)
         Scale of each meter's error.
     unknown
-        What else is unknown.
+        Further unknowns.
     weight : (n, n)
         Q > 0: the bound minimised is the one on `e^T Q e`.
 
@@ -61,7 +61,7 @@ class DiscreteOptions:
     ------
     ValueError
         If a candidate is not inside (0, 1), a scale of noise not positive, or the weight not positive
-        definite; names every problem.
+        definite; lists every problem.
     """
 
     decays: tuple[float, ...]
@@ -94,14 +94,12 @@ def discrete_options(
 
     Parameters
     ----------
-    system
-        Plant.
     decays
         One candidate for lambda or several.
     noise : (p,) or scalar
         Scale of the meters' errors.
     unknown
-        Nothing by default. A plant that settles by itself needs it, or the best design is blind.
+        None by default. Required for a plant that settles by itself; otherwise the best design is blind.
     weight : (n, n)
         Identity by default.
 
@@ -127,17 +125,10 @@ def discrete_circle(system: DiscreteLure, J: Sequence[int] | Ints, options: Disc
 
     Parameters
     ----------
-    system
-        Plant.
     J : (k,)
         Trusted meters.
     options
         From `discrete_options`.
-
-    Returns
-    -------
-    DiscreteGains
-        With a positive margin.
 
     Raises
     ------
@@ -150,14 +141,12 @@ def discrete_circle(system: DiscreteLure, J: Sequence[int] | Ints, options: Disc
 def discrete_circles(
     system: DiscreteLure, subsets: Sequence[Sequence[int] | Ints], options: DiscreteOptions
 ) -> tuple[DiscreteGains, ...]:
-    """`discrete_circle` for many sets; sets of one size share one stated problem.
+    """`discrete_circle` for several sets; sets of one size share one stated problem.
 
     Parameters
     ----------
     system, options
         As there.
-    subsets
-        Sets of trusted meters.
 
     Raises
     ------
@@ -185,14 +174,14 @@ def discrete_circles(
 def discrete_prove(
     system: DiscreteLure, J: Sequence[int] | Ints, L: Floats, K: Floats, options: DiscreteOptions
 ) -> DiscreteGains:
-    """The best proof for given gains: the same inequality in P, Lambda, mu and mu_delta only.
+    """Best proof for given gains: the same inequality in P, Lambda, mu and mu_delta only.
 
     Parameters
     ----------
     system, J, options
         As in `discrete_circle`.
     L, K : (n, k), (m, k)
-        Gains. Blind ones are accepted: they were asked for.
+        Gains; blind ones are accepted.
 
     Raises
     ------
@@ -204,22 +193,20 @@ def discrete_prove(
 
 
 def discrete_contraction(system: DiscreteLure, *, decays: Sequence[float] | float) -> DirectProof:
-    """One proof of direct injection for all sets of meters: the inequality without any meter.
+    """One proof of direct injection for all sets of meters: the inequality without meters.
 
-    Trusting a meter replaces a slope of the loop by zero, which is one of the slopes that the proof
-    covers anyway. It needs `lower <= 0 <= upper`.
+    A trusted meter replaces a slope of the loop by zero, which the proof covers. It needs
+    `lower <= 0 <= upper`.
 
     Parameters
     ----------
-    system
-        Plant.
     decays
-        Candidates for lambda. The one with the smallest `sqrt(cond P) / (1 - lambda)` is kept.
+        Candidates for lambda. The one with the smallest `sqrt(cond P) / (1 - lambda)` is used.
 
     Raises
     ------
     DesignInfeasible
-        If there is none.
+        If there is no proof.
 
     References
     ----------
@@ -257,8 +244,8 @@ def _refuse_blind(system: DiscreteLure, gains: DiscreteGains) -> None:
     if max(through, pushed) < _BLIND:
         raise DesignInfeasible(
             f"discrete circle-criterion observer of the meters {gains.J.tolist()}",
-            "degenerate: the best gains are L = K = 0. The plant settles by itself, and nothing but the "
-            "meters was said to be uncertain: listening only costs. State what else is unknown "
+            "degenerate: the best gains are L = K = 0. The plant settles by itself, and only the "
+            "meters are stated as uncertain: using them only costs. State further unknowns "
             "(`unknown`), or smaller meter noise",
             code="degenerate",
         )
@@ -269,7 +256,7 @@ _TINY = 1e-300
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """An inaccurate solution is judged by its margin, not by a warning that nobody reads."""
+    """Suppress the warning about inaccurate solutions; the margin of a design decides."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Solution may be inaccurate", category=UserWarning)
         yield
@@ -283,11 +270,11 @@ def _cvxpy() -> Any:
 
 
 class _Template:
-    """The scaled inequality for sets of one size, stated once and solved for many sets and decays.
+    """The scaled inequality for sets of one size, stated once and solved for several sets and decays.
 
-    Units: arguments in `z_unit` (a typical unknown), nonlinearity i in `slope_i z_unit`, states in what
-    the nonlinearities can push in one step, outputs in what such states show there, noise in its root
-    mean square. Where nothing but the meters is unknown, the noise sets the scale of all.
+    Units: arguments in `z_unit` (a typical unknown), nonlinearity i in `slope_i z_unit`, states in the effect
+    of the nonlinearities in one step, outputs in the effect of such states, noise in its root mean square.
+    Without further unknowns, the noise sets all scales.
     """
 
     def __init__(
@@ -356,7 +343,7 @@ class _Template:
         Q = x[:, None] * options.weight * x / self.q_unit
         constraints = [whole << -_SLACK * np.eye(n + sum(sizes)), P >> Q]
         loud = min((self.noise_unit / y) ** 2, 1e4)
-        # Where nothing disturbs, the roundest P bounds best whatever comes.
+        # Without disturbances, the best conditioned P gives the best bound in general.
         cost = k * loud * mu + r * mu_delta if k or r else cp.lambda_max(P)
         self.problem = cp.Problem(cp.Minimize(cost), constraints)
         self.variables = (P, Y, lam, Gamma, mu, mu_delta)
@@ -441,7 +428,7 @@ class _Template:
 def _blocks(
     sizes: list[int], diagonal: list[Any], argument: list[Any], ahead: list[Any], last: Any
 ) -> list[list[Any]]:
-    """The whole symmetric block matrix from its nonzero parts, blocks of no size left out."""
+    """The whole symmetric block matrix from its nonzero parts, without blocks of size zero."""
     count = len(sizes)
     rows: list[list[Any]] = [[np.zeros((a, b)) for b in sizes] for a in sizes]
     for i in range(count):
@@ -455,7 +442,7 @@ def _blocks(
 
 
 def _settle(system: DiscreteLure, found: DiscreteGains, what: str) -> DiscreteGains:
-    """Turn a solver's answer into a proven design, or refuse it.
+    """Turn a solver's result into a proven design, or refuse it.
 
     If the margin in plant units is not positive, mu and mu_delta are enlarged by the stated steps.
     """

@@ -1,6 +1,6 @@
 """Discrete-time circle-criterion observers: their inequality as a plain matrix, margins, error bounds.
 
-Everything about a design that needs no solver.
+The parts of a design that need no solver.
 
 References
 ----------
@@ -22,7 +22,7 @@ from gridsec.lmi.sampled import DiscreteLure, shift
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Uncertainty:
-    """Where the unknown delta (r,) enters besides the meters.
+    """Input matrices of the unknown delta (r,) besides the meters.
 
     `x+ = … + state @ delta`, `z = H x + F u + argument @ delta`, `y = … + output @ delta`.
 
@@ -53,19 +53,13 @@ class Uncertainty:
 
 
 def nothing_unknown(system: DiscreteLure) -> Uncertainty:
-    """No uncertainty but that of the meters; r = 0.
-
-    Parameters
-    ----------
-    system
-        The plant.
-    """
+    """No uncertainty but that of the meters; r = 0."""
     sizes = (len(system.A), len(system.lower), len(system.C))
     return Uncertainty(*(np.zeros((size, 0)) for size in sizes))
 
 
 def input_error(system: DiscreteLure, load: Floats, held: Floats | None = None) -> Uncertainty:
-    """An input that is known up to `load @ delta`, and arguments that move by `held` within a step.
+    """Uncertainty of an input known up to `load @ delta`, with arguments that move by `held` within a step.
 
     Parameters
     ----------
@@ -74,7 +68,7 @@ def input_error(system: DiscreteLure, load: Floats, held: Floats | None = None) 
     load : (l, r) or (l,)
         Shape of the error of the known input; a vector means independent entries.
     held : (m,), optional
-        Error of each argument from `sampled.held_error`, independent of everything else.
+        Error of each argument from `sampled.held_error`, independent of all others.
     """
     given = np.asarray(load, dtype=np.float64)
     W = np.diag(given) if given.ndim == 1 else given
@@ -108,13 +102,13 @@ class DiscreteGains:
     noise : (k,)
         Scale of each trusted meter's error.
     unknown
-        The other uncertainty.
+        Further uncertainty.
     margin
-        Of the rebuilt inequality; positive: it holds.
+        Margin of the rebuilt inequality; it holds if positive.
     backoff
-        By which part mu and mu_delta were enlarged after the solver.
+        Fraction by which mu and mu_delta were enlarged after the solver.
     status
-        What the solver said. Not proof of anything.
+        Status of the solver; not a proof.
     """
 
     J: Ints
@@ -147,17 +141,13 @@ def discrete_matrix(system: DiscreteLure, J: Ints | Sequence[int], gains: Discre
 
     Parameters
     ----------
-    system
-        The plant.
     J : (k',)
-        Meters whose injection is counted, a subset of `gains.J`: the observer while others are silent.
-    gains
-        The design.
+        Meters with injection, a subset of `gains.J`: the observer while others are unavailable.
 
     Raises
     ------
     ValueError
-        If `J` is no subset of the design's meters.
+        If `J` is not a subset of the design's meters.
 
     References
     ----------
@@ -166,7 +156,7 @@ def discrete_matrix(system: DiscreteLure, J: Ints | Sequence[int], gains: Discre
     keep = np.isin(gains.J, np.asarray(J, dtype=np.intp))
     if np.count_nonzero(keep) != len(J):
         raise InputInvalid(
-            [Problem("wrong-design", f"{list(J)} is no subset of the design's meters {gains.J.tolist()}")]
+            [Problem("wrong-design", f"{list(J)} is not a subset of the design's meters {gains.J.tolist()}")]
         )
     rows, L, K, N = gains.J[keep], gains.L[:, keep], gains.K[:, keep], gains.noise[keep]
     moved, lower = shift(system), system.G * system.lower
@@ -191,7 +181,7 @@ def discrete_matrix(system: DiscreteLure, J: Ints | Sequence[int], gains: Discre
 
 
 def discrete_margin(system: DiscreteLure, J: Ints | Sequence[int], gains: DiscreteGains) -> float:
-    """Margin of everything that the proof needs; positive: it holds.
+    """Margin of all conditions of the proof; it holds if positive.
 
     The smaller one of the negativity of `discrete_matrix` and the positivity of P; minus infinity if a
     sign is wrong.
@@ -216,7 +206,7 @@ def growth(gains: DiscreteGains) -> float:
     Parameters
     ----------
     gains
-        A design whose margin is positive.
+        A design with a positive margin.
     """
     values = np.linalg.eigvalsh(gains.P)
     return float(np.sqrt(values[-1] / values[0]))
@@ -230,7 +220,7 @@ def noise_gain(gains: DiscreteGains) -> float:
     Parameters
     ----------
     gains
-        A design whose margin is positive.
+        A design with a positive margin.
     """
     quietest = float(np.min(gains.noise))
     if quietest == 0.0:
@@ -240,12 +230,12 @@ def noise_gain(gains: DiscreteGains) -> float:
 
 
 def unknown_gain(gains: DiscreteGains) -> float:
-    """Likewise for delta: `|e| <= … + gain sup |delta|`; 0 where there is none.
+    """Gain of delta: `|e| <= … + gain sup |delta|`; 0 without delta.
 
     Parameters
     ----------
     gains
-        A design whose margin is positive.
+        A design with a positive margin.
     """
     if not gains.unknown.state.shape[1]:
         return 0.0
@@ -255,7 +245,7 @@ def unknown_gain(gains: DiscreteGains) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DirectProof:
-    """Why direct injection forgets its errors, for every set of trusted meters and every switching.
+    """Proof that the errors of direct injection decay, for every set of trusted meters and every switching.
 
     Attributes
     ----------
@@ -266,9 +256,9 @@ class DirectProof:
     decay
         Per step.
     margin
-        Of the inequality without any meter; positive: it holds.
+        Margin of the inequality without meters; it holds if positive.
     status
-        How it came about.
+        Origin of the proof.
     """
 
     P: Floats
@@ -282,7 +272,7 @@ def direct_gain_bound(system: DiscreteLure, proof: DirectProof, rows: Floats) ->
     """Ultimate bound of direct injection: `|e| <= … + bound sup |s|` in Euclidean norms.
 
     `|P^(1/2) G diag(slope)|_2 |rows|_2 / ((1 - decay) sqrt(lambda_min(P)))`, over the nonlinearities
-    that s reaches: beside what the proof covers, `|psi_i| <= slope_i |(rows s)_i|`.
+    that s reaches: besides the part covered by the proof, `|psi_i| <= slope_i |(rows s)_i|`.
 
     Parameters
     ----------
@@ -291,7 +281,7 @@ def direct_gain_bound(system: DiscreteLure, proof: DirectProof, rows: Floats) ->
     proof
         From `discrete.discrete_contraction`.
     rows : (m, s)
-        How the disturbance s enters the arguments of the observer's or the plant's nonlinearities.
+        Matrix from the disturbance s to the arguments of the observer's or the plant's nonlinearities.
 
     References
     ----------

@@ -35,7 +35,7 @@ def group_pursuit(F: Floats, y: Floats, heights: Ints) -> Floats:
     Raises
     ------
     DesignInfeasible
-        If the solver finds none, or what it finds does not satisfy `F e = y` to 1e-6 of y.
+        If the solver finds no solution, or its solution does not satisfy `F e = y` to 1e-6 of y.
     """
     import cvxpy
 

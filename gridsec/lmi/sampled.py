@@ -2,7 +2,7 @@
 
     x(k+1) = A x(k) + G phi(H x(k) + F u(k)) + B u(k),      y(k) = C x(k) + D u(k)
 
-It stands in this package because the inequalities are about it; no solver is used here.
+The module is in this package because the inequalities use these systems; no solver is used here.
 
 References
 ----------
@@ -48,8 +48,8 @@ class DiscreteLure:
     Raises
     ------
     ValueError
-        If shapes do not fit, an entry is not finite, a lower slope exceeds its upper one, or h is not
-        positive; names every problem.
+        If shapes are inconsistent, an entry is not finite, a lower slope exceeds its upper one, or h is not
+        positive; lists every problem.
     """
 
     A: Floats
@@ -88,7 +88,7 @@ class DiscreteLure:
         D: ArrayLike | None = None,
         h: float = 1.0,
     ) -> DiscreteLure:
-        """A system from nested lists or arrays; inputs do nothing where no matrix says what.
+        """System from nested lists or arrays; a missing input matrix is zero.
 
         Parameters
         ----------
@@ -114,24 +114,16 @@ class DiscreteLure:
 
 
 def shift(system: DiscreteLure) -> DiscreteLure:
-    """The same system with slopes in [0, upper - lower]: `gridsec.lure_form.without_lower`.
-
-    Parameters
-    ----------
-    system
-        Any.
-    """
+    """The same system with slopes in [0, upper - lower]: `gridsec.lure_form.without_lower`."""
     A, B, phi = without_lower(system, system.lower)
     return replace(system, A=A, B=B, lower=np.zeros(system.lower.shape), upper=system.slope, phi=phi)
 
 
 def advance(system: DiscreteLure, x: Floats, u: Floats) -> Floats:
-    """The state one step later.
+    """State one step later.
 
     Parameters
     ----------
-    system
-        The system.
     x : (…, n)
         State.
     u : (…, l)
@@ -142,28 +134,20 @@ def advance(system: DiscreteLure, x: Floats, u: Floats) -> Floats:
 
 
 def measure(system: DiscreteLure, x: Floats, u: Floats) -> Floats:
-    """Noiseless outputs `C x + D u`, (…, p).
-
-    Parameters
-    ----------
-    system, x, u
-        As in `advance`.
-    """
+    """Noiseless outputs `C x + D u`, (…, p), for arguments as in `advance`."""
     return np.asarray(x @ system.C.T + u @ system.D.T)
 
 
 def sample(lure: Lure, h: float) -> DiscreteLure:
-    """A continuous Lur'e system at steps of length h, inputs held, nonlinearity frozen over a step.
+    """Continuous Lur'e system at steps of length h, with constant inputs and nonlinearity over a step.
 
-    The exponential Euler step `x+ = exp(A h) x + h phi_1(A h) (G phi(H x + F u) + B u)`. It is exact
-    where z stands still over the step. For a droop loop it is exact in general if the argument of
-    inverter i is taken at some value that z_i has *during* the step; `held_error` bounds how far that
-    is from the value at its beginning.
+    The exponential Euler step `x+ = exp(A h) x + h phi_1(A h) (G phi(H x + F u) + B u)`. It is exact for z
+    constant over the step. For a droop loop it is exact in general if the argument of inverter i is taken at
+    some value of z_i *during* the step; `held_error` bounds the distance of that value from the one at its
+    beginning.
 
     Parameters
     ----------
-    lure
-        The continuous system.
     h
         Length of a step, s, positive.
 
@@ -197,11 +181,11 @@ def sample(lure: Lure, h: float) -> DiscreteLure:
 
 
 def held_error(lure: Lure, h: float, away: Floats) -> Floats:
-    """How far z can move within one step of a droop loop whose input is held.
+    """Largest motion of z within one step of a droop loop with constant input.
 
     Inverter j obeys `tau_j x_j' = -x_j + K_j(z_j)`, so `|x_j(s) - x_j(0)| <= q_j sup |K_j(z_j) - x_j(0)|`
-    with `q_j = 1 - exp(-h / tau_j)`. With `away_j >= |K_j(z_j(0)) - x_j(0)|`, movement m solves
-    `m = q (away + d |H| m)`, as far as the spectral radius of `diag(q d) |H|` is below 1.
+    with `q_j = 1 - exp(-h / tau_j)`. With `away_j >= |K_j(z_j(0)) - x_j(0)|`, the motion m solves
+    `m = q (away + d |H| m)`, if the spectral radius of `diag(q d) |H|` is below 1.
 
     Parameters
     ----------
@@ -210,12 +194,12 @@ def held_error(lure: Lure, h: float, away: Floats) -> Floats:
     h
         Length of the step, s.
     away : (m,)
-        How far each inverter is from its set point at the beginning of the step, pu.
+        Distance of each inverter from its set point at the beginning of the step, pu.
 
     Returns
     -------
     (m,)
-        Bound on `|z_i(s) - z_i(0)|`, 0 <= s <= h, squared pu; infinite where nothing follows.
+        Bound on `|z_i(s) - z_i(0)|`, 0 <= s <= h, squared pu; infinite without a bound.
 
     References
     ----------
@@ -231,10 +215,10 @@ def held_error(lure: Lure, h: float, away: Floats) -> Floats:
 
 
 def drift_error(lure: Lure, h: float, jump: Floats) -> Floats:
-    """The same for a loop that was at rest once, and whose input jumps little from step to step.
+    """Largest motion of z for a loop that was at rest once, with small input jumps between steps.
 
-    With `|F (u(k+1) - u(k))| <= jump` the inverters follow: their movement m within any step obeys
-    `m <= d ((1 + 2 q) |H| m + jump)`, as far as the spectral radius of `(1 + 2 q) diag(d) |H|` is below 1.
+    With `|F (u(k+1) - u(k))| <= jump` the motion m of the inverters within any step obeys
+    `m <= d ((1 + 2 q) |H| m + jump)`, if the spectral radius of `(1 + 2 q) diag(d) |H|` is below 1.
 
     Parameters
     ----------
@@ -246,7 +230,7 @@ def drift_error(lure: Lure, h: float, jump: Floats) -> Floats:
     Returns
     -------
     (m,)
-        Bound on `|z_i(s) - z_i(0)|`, 0 <= s <= h, squared pu; infinite where nothing follows.
+        Bound on `|z_i(s) - z_i(0)|`, 0 <= s <= h, squared pu; infinite without a bound.
 
     References
     ----------

@@ -1,4 +1,4 @@
-"""What all designs share about the solver's library."""
+"""Common use of the solver's library."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 @contextmanager
 def solver_warnings_as_status() -> Iterator[None]:
-    """An inaccurate solution is judged by its margin, not by a warning that nobody reads."""
+    """Suppress the warning about inaccurate solutions; the margin of a design decides."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Solution may be inaccurate", category=UserWarning)
         yield

@@ -1,11 +1,11 @@
 """Design of discrete-time unknown-input observers by linear matrix inequalities.
 
-An observer that is blind to its unknown inputs leaves the error system
+An observer that is decoupled from its unknown inputs has the error system
 
     e+ = (M - K C) e + S psi + W w + K N n,     |psi_i| <= half_i |(H e)_i|
 
 and `unknown_input` finds the K, with its proof, for which the error contracts by `rate` at every step,
-whatever the nonlinearity does inside its bounds, and for which `(w, n)` move it least. The proof is the
+for any nonlinearity within its bounds, with the smallest effect of `(w, n)`. The proof is the
 quadratic `V = e^T P e` with
 
     V+ <= rate^2 V + mu (|w|^2 + |n|^2).
@@ -33,38 +33,38 @@ from gridsec.lmi.solver import cvxpy_late, solver_warnings_as_status
 
 Multiplier = Literal["diagonal", "scalar"]
 
-# Slack of the scaled inequality, whose entries are of order one: a hundred times the solver's tolerance.
+# Slack of the scaled inequality, with entries of order one: a hundred times the solver's tolerance.
 _SLACK = 1e-6
-# Relaxations of mu tried, in order, when the rebuilt inequality is violated all the same.
+# Relaxations of mu tried, in order, if the rebuilt inequality is violated.
 _BACKOFF = (0.0, 1e-3, 1e-2, 1e-1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ErrorSystem:
-    """Error of an unknown-input observer before its gain is chosen. n states, m bounds, k sensors.
+    """Error of an unknown-input observer without its gain. n states, m bounds, k sensors.
 
     Attributes
     ----------
     M : (n, n)
         Error map without gain, at the middle of the slopes.
     S : (n, m)
-        How the rest of the nonlinearity, psi, enters.
+        Input matrix of psi, the rest of the nonlinearity.
     H : (m, n)
-        What psi depends on.
+        Argument matrix of psi.
     half : (m,)
         Half-width of the slopes: `|psi_i| <= half_i |(H e)_i|`. With the "scalar" multiplier:
         `|psi| <= |half * H e|`, which is yang2021 (34) for H = I and half = gamma.
     C : (k, n)
         The sensors' rows.
     W : (n, d)
-        How errors of size one enter that no gain weighs: next readings, drift of the plant.
+        Input matrix of errors of size one that the gain does not weigh: next readings, drift of the plant.
     N : (k,)
         Size of the error of each sensor's reading, positive.
 
     Raises
     ------
     ValueError
-        If shapes do not fit, an error scale is not positive, or a half-width negative.
+        If shapes are inconsistent, an error scale is not positive, or a half-width negative.
     """
 
     M: Floats
@@ -76,7 +76,7 @@ class ErrorSystem:
     N: Floats
 
     def __post_init__(self) -> None:
-        """Freeze the arrays and check that they fit together."""
+        """Freeze the arrays and check that their shapes are consistent."""
         for name in ("M", "S", "H", "half", "C", "W", "N"):
             object.__setattr__(self, name, frozen(getattr(self, name)))
         n, m, k, d = len(self.M), self.half.size, self.N.size, self.W.shape[-1]
@@ -110,9 +110,9 @@ class UnknownInputGains:
     rate
         Certified contraction of sqrt(V) per step.
     margin
-        Of the rebuilt inequality, see `unknown_input_margin`; positive: it holds.
+        Margin of the rebuilt inequality, see `unknown_input_margin`; it holds if positive.
     status
-        What the solver said. Not proof of anything.
+        Status of the solver; not a proof.
     """
 
     K: Floats
@@ -125,21 +125,14 @@ class UnknownInputGains:
 
 
 def unknown_input_matrix(system: ErrorSystem, gains: UnknownInputGains) -> Floats:
-    """The design inequality as a plain matrix: it holds where the largest eigenvalue is not positive.
+    """The design inequality as a plain matrix: it holds if the largest eigenvalue is not positive.
 
     With `Mc = M - K C`, `J = [Mc, S, W, K N]` and `T = (half H)^T Lambda (half H)`, the matrix is
 
         J^T P J + blockdiag(T - rate^2 P, -Lambda, -mu I, -mu I),
 
-    the increment of V minus its bound, plus the multiplier times `|half H e|^2 - |psi|^2 >= 0`. No Schur
-    complement is involved: this is the statement itself, not the form given to the solver.
-
-    Parameters
-    ----------
-    system
-        The error system.
-    gains
-        Gain and proof.
+    the increment of V minus its bound, plus the multiplier times `|half H e|^2 - |psi|^2 >= 0`. Without a
+    Schur complement, this is the statement itself, not the form given to the solver.
 
     Returns
     -------
@@ -158,11 +151,11 @@ def unknown_input_matrix(system: ErrorSystem, gains: UnknownInputGains) -> Float
 
 
 def unknown_input_margin(system: ErrorSystem, gains: UnknownInputGains) -> float:
-    """How far the design inequality is from violation; positive: it is proven.
+    """Margin of the design inequality; proven if positive.
 
-    Smallest eigenvalue of the negated matrix after every row and column is divided by the size of what
-    it is a difference of, so that units do not decide; negative infinity where P is not positive definite
-    or a multiplier is negative. Bounds of half-width zero do not count: their psi is zero.
+    Smallest eigenvalue of the negated matrix, with rows and columns scaled by its subtracted diagonal terms
+    (rate^2 P, Lambda, mu), so that units have no effect. Negative infinity if P is not positive definite or a
+    multiplier is negative. Bounds of half-width zero do not count: their psi is zero.
 
     Parameters
     ----------
@@ -188,10 +181,10 @@ def unknown_input_margin(system: ErrorSystem, gains: UnknownInputGains) -> float
 
 
 class UnknownInputTemplate:
-    """The scaled inequality for error systems of one shape, canonicalised once and solved for many.
+    """The scaled inequality for error systems of one shape, canonicalised once and solved for several.
 
-    Units: readings in their error scales N, states in what moves the readings by one such unit, psi_i in
-    what it can be at most for an error of one unit. All entries are then of order one.
+    Units: readings in their error scales N, states in the change that moves the readings by one such unit,
+    psi_i in its largest value for an error of one unit. All entries are then of order one.
 
     Parameters
     ----------
@@ -204,7 +197,7 @@ class UnknownInputTemplate:
     Raises
     ------
     ValueError
-        If there is no such multiplier.
+        If `multiplier` is unknown.
     """
 
     def __init__(self, states: int, sensors: int, bounds: int, multiplier: Multiplier) -> None:
@@ -251,14 +244,14 @@ class UnknownInputTemplate:
         system
             The error system, of the shape of this template.
         rate
-            Contraction asked for, in (0, 1).
+            Required contraction, in (0, 1).
         what
-            Names the design in errors.
+            Name of the design in errors.
 
         Raises
         ------
         DesignInfeasible
-            If the inequality has no solution, or does not survive being rebuilt.
+            If the inequality has no solution, or is violated when rebuilt.
         ValueError
             If the rate is not inside (0, 1).
         """
@@ -312,20 +305,14 @@ class UnknownInputTemplate:
 
 
 def state_units(system: ErrorSystem) -> Floats:
-    """Unit of each state, (n,): what moves the readings by one error scale; 1 where nothing reads it.
-
-    Parameters
-    ----------
-    system
-        The error system.
-    """
+    """Unit of each state, (n,): change that moves the readings by one error scale; 1 for unread states."""
     heard = np.linalg.norm(system.C / system.N[:, None], axis=0)
     deaf = heard <= _DEAF * np.max(heard, initial=0.0)
     loudest = np.max(heard, initial=0.0)
     return np.asarray(1.0 / np.where(deaf, loudest if loudest > 0.0 else 1.0, heard))
 
 
-# A state whose reading is smaller than this part of the best-read one has no unit of its own.
+# Relative reading below which a state has no unit of its own.
 _DEAF = 1e-6
 
 
@@ -343,19 +330,17 @@ def unknown_input(
 
     Parameters
     ----------
-    system
-        The error system.
     rate
-        Contraction of sqrt(V) per step that is asked for, in (0, 1).
+        Required contraction of sqrt(V) per step, in (0, 1).
     multiplier
         See `UnknownInputTemplate`.
     what
-        Names the design in errors.
+        Name of the design in errors.
 
     Raises
     ------
     DesignInfeasible
-        If there is no such gain, or the inequality does not survive being rebuilt.
+        If there is no such gain, or the rebuilt inequality is violated.
     """
     shape = (len(system.M), system.N.size, int(np.count_nonzero(system.half > 0.0)))
     return UnknownInputTemplate(*shape, multiplier).solve(system, rate, what)

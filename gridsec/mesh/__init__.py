@@ -1,6 +1,6 @@
 """Feeders with closed ties, balanced or in three phases.
 
-`MeshedFeeder` and `PhasedMesh` are a tree and the lines that close loops in it; both are seen through the
+`MeshedFeeder` and `PhasedMesh` are a tree and the lines that close loops in it. Both are represented by the
 inverse of their admittances, so that `bus_voltages`, `model_error_bound` and `interval_bounds` are the same.
 """
 

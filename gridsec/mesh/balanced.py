@@ -1,12 +1,12 @@
-"""A balanced feeder with closed ties: a radial feeder and the lines that close loops in it, in its per unit.
+"""Balanced feeder with closed ties: a radial feeder and the lines that close loops in it, in its per unit.
 
-With W the busbar's voltage as it arrives without load, and ``Z = R + j X`` the inverse of the admittance
+With W the voltage without load by the busbar, and ``Z = R + j X`` the inverse of the admittance
 matrix without the busbar, powers s and voltages V of the other buses obey
 
     V = W + Z conj(s / V).
 
 To first order in s, and without charging, ``|V|^2 = v0^2 + 2 Re(Z conj(s)) = v0^2 + 2 R p + 2 X q``. On a
-tree Z holds the sums of common paths, so that this is LinDistFlow; with ties its entries may be negative, but
+tree Z has the sums of common paths, so that this is LinDistFlow. With ties its entries may be negative, but
 it stays symmetric, and both parts positive semidefinite. Derivations: docs/theory-mesh.md.
 
 References
@@ -33,26 +33,26 @@ from gridsec.trees import OnTree
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeshedFeeder(OnTree):
-    """A feeder whose closed lines form loops. N customers, b + 1 buses, t ties.
+    """Feeder with closed loops. N customers, b + 1 buses, t ties.
 
     Attributes
     ----------
     tree
-        Everything but the ties: a radial feeder that reaches every bus.
+        The feeder without the ties: a radial feeder that reaches every bus.
     ends : (t, 2)
         Buses at both ends of each tie.
     r, x : (t,)
         Series resistance and reactance of each tie, pu.
     charging : (t,)
-        Total shunt susceptance of each tie, pu; half of it sits at each end.
+        Total shunt susceptance of each tie, pu; half of it at each end.
     half : (b + 1,)
         Derived. Shunt susceptance at the buses, pu.
     R, X : (b + 1, N)
         Derived. The linear power flow ``v^2 = v0^2 + 2 R p + 2 X q``, from a customer's power to every bus.
     idle : (b + 1,)
-        Derived. Voltage of every bus without load, by that of the busbar: 1 without charging.
+        Derived. Voltage of every bus without load, per voltage of the busbar; 1 without charging.
     transfer : (b + 1, N)
-        Derived. From a current that a customer injects to the voltage of every bus, charging included, pu.
+        Derived. From an injected current of a customer to the voltage of every bus, charging included, pu.
     between : (N, N)
         Derived. The same to the customers' voltages.
     size : (N, N)
@@ -111,7 +111,7 @@ class MeshedFeeder(OnTree):
 
 
 def _problems(feeder: MeshedFeeder) -> list[Problem]:
-    """Every reason why the ties do not fit the tree."""
+    """Problems of the ties against the tree."""
     count, buses = feeder.r.size, len(feeder.tree.buses)
     expected = (
         ("ends", feeder.ends.shape, (count, 2)),
@@ -149,18 +149,16 @@ def impedances(feeder: MeshedFeeder, buses: Ints) -> Phasors:
     """Columns of the inverse of the reduced admittance matrix, without charging; O(b k t).
 
     The ties, with ends C (+1 at one, -1 at the other) and impedances z, add ``C z^-1 C^T`` to the admittances
-    of the tree, whose inverse T are the common paths. The inverse of the sum is (Woodbury)
+    of the tree, with the common paths T as inverse. The inverse of the sum is (Woodbury)
 
         Z = T - T C (z + C^T T C)^-1 C^T T,
 
-    with the impedances of the t loops in the middle: no linear system of the size of the feeder is solved.
+    with the impedances of the t loops in the middle: no linear system of the feeder's size is solved.
 
     Parameters
     ----------
-    feeder
-        The feeder.
     buses : (k,)
-        Where a current is injected.
+        Buses of injected currents.
 
     Returns
     -------
@@ -182,13 +180,7 @@ def impedances(feeder: MeshedFeeder, buses: Ints) -> Phasors:
 
 
 def admittance(feeder: MeshedFeeder) -> csc_array:
-    """Admittance matrix of all buses, charging included, (b + 1, b + 1), pu.
-
-    Parameters
-    ----------
-    feeder
-        The feeder.
-    """
+    """Admittance matrix of all buses, charging included, (b + 1, b + 1), pu."""
     tree = feeder.tree
     lines = np.vstack([np.column_stack([tree.parent, np.arange(1, len(tree.buses))]), feeder.ends])
     z = np.concatenate([tree.r, feeder.r]) + 1j * np.concatenate([tree.x, feeder.x])
@@ -199,7 +191,7 @@ def admittance(feeder: MeshedFeeder) -> csc_array:
 
 
 def _charged(feeder: MeshedFeeder) -> tuple[Phasors, Phasors]:
-    """Voltages without load, and what currents of the customers do, charging included."""
+    """Voltages without load, and effects of the customers' currents, charging included."""
     Y = admittance(feeder)
     below = splu(csc_array(Y[1:, 1:]))
     idle = np.ones(len(feeder.buses), dtype=np.complex128)

@@ -1,8 +1,8 @@
-"""The power flow of a meshed feeder through the inverse of its admittances, balanced or in three phases.
+"""Power flow of a meshed feeder through the inverse of its admittances, balanced or in three phases.
 
 ``V = W + Z conj(s / V)`` holds for the places of three phases as for the buses of a balanced feeder, with W
-what the busbar's phases make of them without load. Nothing below asks how many phases there are, whether Z is
-symmetric, or for any sign in it. Derivations: docs/theory-mesh.md.
+the voltages without load by the busbar's phases. Nothing below depends on the number of phases, or needs Z
+to be symmetric or of any sign. Derivations: docs/theory-mesh.md.
 
 References
 ----------
@@ -24,13 +24,13 @@ from gridsec.mesh.phased import PhasedMesh
 from gridsec.phases.feeder import PHASES, ROTATION
 
 Meshed = MeshedFeeder | PhasedMesh
-"""A feeder whose closed lines form loops."""
+"""A feeder with closed loops."""
 
 
 def bus_voltages(
     feeder: Meshed, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 1
 ) -> Floats:
-    """Squared voltage of every place, losses and charging corrected; in three phases unequal ones, too.
+    """Squared voltage of every place, corrected for losses, charging and, in three phases, unequal phases.
 
     The fixed-point iteration ``V <- W + Z conj(s / V)`` from ``V = W``: its first iterate has the voltages of
     the linear power flow and the square of its drops, and every step after it gains one order in the load, as
@@ -38,14 +38,12 @@ def bus_voltages(
 
     Parameters
     ----------
-    feeder
-        The feeder.
     p, q : (…, N)
         Net active and reactive injection of each customer (generation positive), pu.
     v0_squared : (…) or scalar
         Squared busbar voltage, pu; in three phases (3,), one for each, or scalar.
     steps
-        Steps after the first iterate; with none the linear power flow alone.
+        Steps after the first iterate; 0 gives the linear power flow.
 
     Returns
     -------
@@ -68,9 +66,9 @@ def bus_voltages(
 def sensitivities(
     feeder: Meshed, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 4
 ) -> LinDistFlow:
-    """Derivatives of squared voltages at an operating point, halved: R and X where there is load.
+    """Derivatives of squared voltages at an operating point, halved: R and X under load.
 
-    A power that changes by ds at one customer changes what all draw, because their powers are constant. The
+    A change ds of one customer's power changes all currents, because powers are constant. The
     differential of the fixed point,
 
         dV + Z diag(conj(s / V^2)) conj(dV) = Z conj(ds / V),
@@ -80,8 +78,6 @@ def sensitivities(
 
     Parameters
     ----------
-    feeder
-        The feeder.
     p, q : (N,)
         Net active and reactive injection of each customer at the operating point, pu.
     v0_squared
@@ -111,14 +107,14 @@ def sensitivities(
 
 
 def model_error_bound(feeder: Meshed, p: Floats, q: Floats, v0_squared: Floats | float) -> Floats:
-    """How far `v^2` after one correction can be from the AC power flow, for every customer.
+    """Bound of the error of `v^2` after one correction against the AC power flow, for every customer.
 
-    V1 and V2 are the iterates of `bus_voltages`, ``d = |V2 - V1|``, and
-    ``M_ij = |Z_ij| |s_j| / (c_j min(|V1_j|, c_j))`` with ``c = 0.9 |V2|``. A step sends whatever is within
-    ``rho <= 0.1 |V2|`` of V2 no further than ``M (rho + d)`` from V2. So if ``M M d <= theta M d`` for a
-    theta below 1, and ``rho = M d / (1 - theta)``, the disks of radius rho around V2 are sent into
-    themselves: they hold a solution of the AC power flow (Brouwer), and only one, because theta also bounds
-    the contraction there. Where theta is 1 or more, or rho above 0.1 |V2|, the bound is infinite.
+    V1 and V2 are the iterates of `bus_voltages`, ``d = |V2 - V1|``, and ``M_ij = |Z_ij| |s_j| / (c_j
+    min(|V1_j|, c_j))`` with ``c = 0.9 |V2|``. A step maps all voltages within ``rho <= 0.1 |V2|`` of V2 to a
+    distance of at most ``M (rho + d)`` from V2. So if ``M M d <= theta M d`` for a theta below 1, and ``rho =
+    M d / (1 - theta)``, the disks of radius rho around V2 are mapped into themselves. They contain a solution
+    of the AC power flow (Brouwer), and only one, because theta also bounds the contraction there. If theta is
+    1 or more, or rho above 0.1 |V2|, the bound is infinite.
 
     Parameters
     ----------
@@ -158,19 +154,19 @@ def interval_bounds(
     p_error: Floats,
     q_error: Floats,
 ) -> tuple[Floats, Floats]:
-    """How wrong the correction of `bus_voltages` can be for powers within intervals.
+    """Error bounds of the correction of `bus_voltages` for powers within intervals.
 
     Parameters
     ----------
     feeder, p, q : (N,), v0_squared
         As in `bus_voltages`, one operating point.
     p_error, q_error : (N,)
-        How far the powers may be off, pu.
+        Largest errors of the powers, pu.
 
     Returns
     -------
     (N,), (N,)
-        How far the correction moves, and what its first step leaves of the AC power flow, pu:
+        Change of the correction, and distance of its first step from the AC power flow, pu:
         `gridsec.intervals.bounds`.
     """
     with np.errstate(all="ignore"):
@@ -180,20 +176,21 @@ def interval_bounds(
     error = np.hypot(p_error, q_error)
     sweeps = Sweeps(idle, first, second, np.abs(s), lambda current: feeder.size @ current, np.zeros_like)
     moved, rest = bounds(sweeps, error)
-    # The linear power flow has no charging and equal phases of the busbar, the first sweep those there are.
+    # The linear power flow assumes no charging and equal phases of the busbar; the first sweep has the actual
+    # ones.
     linear = (feeder.R + 1j * feeder.X)[feeder.bus]
     apart = np.abs(np.conj(idle)[:, None] * feeder.between / np.conj(idle) - linear)
     return np.asarray(moved + 2.0 * (apart @ error)), rest
 
 
-# How near to the second iterate, as a part of it, a solution is looked for.
+# Radius around the second iterate, as a fraction of it, within which a solution is located.
 _NEAR = 0.1
 
 
 def _start(
     feeder: Meshed, p: Floats, q: Floats, v0_squared: Floats | float
 ) -> tuple[Phasors, Phasors, Phasors]:
-    """Powers of the customers (…, N), and voltages without load of all places (…, n) and of theirs."""
+    """Powers of the customers (…, N), and voltages without load of all places (…, n) and of the customers."""
     v0 = np.sqrt(np.asarray(v0_squared, dtype=np.float64))
     idle = feeder.idle @ (v0 * ROTATION) if isinstance(feeder, PhasedMesh) else v0[..., None] * feeder.idle
     return np.asarray(p + 1j * q), np.asarray(idle), np.asarray(idle[..., feeder.bus])

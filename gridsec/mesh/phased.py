@@ -1,9 +1,9 @@
-"""A feeder in three phases with closed ties: a tree of 3x3 blocks and the lines that close loops in it.
+"""Feeder in three phases with closed ties: a tree of 3x3 blocks and the lines that close loops in it.
 
 The voltages of its places are ``V = W + Z conj(s / V)`` as on a balanced mesh, with Z the inverse of the
 admittances between phases of buses. With the busbar's phases a third of a turn apart, a = 1, e^{-j 2 pi / 3},
 e^{j 2 pi / 3}, the derivative of ``|V|^2`` at no load is ``2 Re(Z_kl a_l / a_k conj(s_l))``: on a tree
-LinDist3Flow. Z is symmetric; what the rotation makes of it is not. Derivations: docs/theory-mesh.md.
+LinDist3Flow. Z is symmetric; the rotated matrix is not. Derivations: docs/theory-mesh.md.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from gridsec.trees import OnTree
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PhasedMesh(OnTree):
-    """A feeder of single-phase customers with closed ties. N customers, t ties, n = 3 (b + 1) places.
+    """Feeder of single-phase customers with closed ties. N customers, t ties, n = 3 (b + 1) places.
 
     Attributes
     ----------
     tree
-        Everything but the ties, customers of one phase: it brings every phase of every bus.
+        The feeder without the ties, with customers of one phase; it contains every phase of every bus.
     ends : (t, 2)
         Buses at both ends of each tie.
     phases : (t, 3)
@@ -37,7 +37,7 @@ class PhasedMesh(OnTree):
     z : (t, 3, 3)
         Series impedance of each tie, pu; symmetric, rows and columns of absent phases are 0.
     charging : (t, 3, 3)
-        Total shunt susceptance of each tie, pu; half of it sits at each end.
+        Total shunt susceptance of each tie, pu; half of it at each end.
     bus : (N,)
         Derived. Place of each customer.
     buses : (n,)
@@ -46,13 +46,13 @@ class PhasedMesh(OnTree):
         Derived. Shunt susceptance at the buses, pu.
     R, X : (n, N)
         Derived. The linear power flow ``v^2 = v0^2 + 2 R p + 2 X q``: from a customer's power, in units of
-        the three-phase base S, to the squared voltage of every place, pu. Where a phase is absent, it is that
-        of its end in the tree.
+        the three-phase base S, to the squared voltage of every place, pu. For an absent phase, that of its
+        end in the tree.
     idle : (n, 3)
-        Derived. Voltage of every place without load, by those of the busbar: those of its phase without
-        charging.
+        Derived. Voltage of every place without load, per voltage of the busbar; without charging that of its
+        phase.
     transfer : (n, N)
-        Derived. From a current that a customer injects, in units of S, to the voltage of every place,
+        Derived. From an injected current of a customer, in units of S, to the voltage of every place,
         charging included, pu.
     between : (N, N)
         Derived. The same to the customers' voltages.
@@ -112,7 +112,7 @@ class PhasedMesh(OnTree):
 
 
 def _problems(feeder: PhasedMesh) -> list[Problem]:
-    """Every reason why the ties do not fit the tree."""
+    """Problems of the ties against the tree."""
     count, tree = len(feeder.ends), feeder.tree
     expected = (
         ("ends", feeder.ends.shape, (count, 2)),
@@ -153,7 +153,7 @@ def _problems(feeder: PhasedMesh) -> list[Problem]:
 
 
 def _impedances(feeder: PhasedMesh) -> Phasors:
-    """From the customers' currents to all places by the inverse of the admittances, without charging, (n, N).
+    """Matrix (n, N) from the customers' currents to all places, the inverse admittances without charging.
 
     As `gridsec.mesh.impedances`, with a loop for every phase of every tie: ``Z = T - T C (z + C^T T C)^-1 C^T
     T``, T the sums of common paths in the tree. Three times that, as 1 pu of the power of a phase is S / 3.
@@ -173,22 +173,17 @@ def _impedances(feeder: PhasedMesh) -> Phasors:
         loops = own + across[3 * one + phase] - across[3 * other + phase]
         size = np.sqrt(np.abs(np.diagonal(loops)))
         if not size.all() or np.linalg.cond(loops / np.outer(size, size)) > _SINGULAR:
-            raise FeederInvalid([Problem("singular", "ties: the impedances around a loop add up to nothing")])
+            raise FeederInvalid([Problem("singular", "ties: the impedances around a loop add up to zero")])
         Z = Z - across @ np.linalg.solve(loops, across[feeder.bus].T)
     return np.asarray(3.0 * Z)
 
 
-# Impedances of passive lines do not cancel; tables of them may.
+# Impedances of passive lines do not cancel, but those in a faulty table may.
 _SINGULAR = 1e13
 
 
 def admittance(feeder: PhasedMesh) -> csc_array:
     """Admittance matrix of all places, charging included, (n, n), pu; rows of absent phases are empty.
-
-    Parameters
-    ----------
-    feeder
-        The feeder.
 
     Raises
     ------
@@ -204,7 +199,7 @@ def admittance(feeder: PhasedMesh) -> csc_array:
         if np.linalg.cond(z[some]) > _SINGULAR:
             where = f"branch {k}" if k < len(tree.z) else f"tie {k - len(tree.z)}"
             raise FeederInvalid(
-                [Problem("singular", f"{where}: z is singular; with charging every current has to meet some")]
+                [Problem("singular", f"{where}: z is singular; with charging it must be regular")]
             )
         out[some] = np.linalg.inv(z[some])
     one, other = lines.T
@@ -220,7 +215,7 @@ def admittance(feeder: PhasedMesh) -> csc_array:
 
 
 def _charged(feeder: PhasedMesh) -> tuple[Phasors, Phasors]:
-    """Voltages without load, and what currents of the customers do, charging included."""
+    """Voltages without load, and effects of the customers' currents, charging included."""
     Y, tree = admittance(feeder).tocsr(), feeder.tree
     free = np.flatnonzero(tree.phases.ravel())
     free = free[free >= len(PHASES)]
@@ -231,7 +226,7 @@ def _charged(feeder: PhasedMesh) -> tuple[Phasors, Phasors]:
     transfer, injected = np.zeros((2, len(idle), feeder.bus.size), dtype=np.complex128)
     injected[feeder.bus, np.arange(feeder.bus.size)] = 3.0
     transfer[free] = solver.solve(injected[free])
-    # Where a phase ends, from there on outwards.
+    # Beyond the end of a phase, its voltage is that at the end.
     stands = np.arange(len(idle)).reshape(-1, 3)
     for k, above in enumerate(tree.parent.tolist(), 1):
         stands[k] = np.where(tree.phases[k], stands[k], stands[above])

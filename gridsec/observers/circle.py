@@ -2,11 +2,9 @@
 
     x_hat' = A x_hat + G phi(zeta) + B u + L r,   zeta = H x_hat + F u + K r,   r = (y - C x_hat - D u)_J
 
-Readings are held over a step. Whatever the gains, the observer between two readings is itself a
-Lur'e system, with `A - L C` and `H - K C` in the place of A and H, so that one exponential
-integrator (and one equilibrium, for steps far above every time constant) serves plant and observers.
-
-Everything is in z coordinates: `y = vbar^2 - v^2`.
+Readings are held over a step. For any gains, the observer between two readings is itself a Lur'e system, with
+`A - L C` and `H - K C` in the place of A and H. So one exponential integrator (and one equilibrium, for steps
+far above every time constant) serves plant and observers. Everything is in z coordinates: `y = vbar^2 - v^2`.
 
 References
 ----------
@@ -45,8 +43,8 @@ class CircleDesign:
     rate
         Certified decay rate of the error without disturbances, 1/s, in `error_norm`.
     sensitivity : (p,)
-        How strongly each meter moves the estimate, see `gains.sensitivity`. A trusted meter without
-        an inverter has 0 under direct injection: its lies show in its output residual only.
+        Influence of each meter on the estimate, see `gains.sensitivity`. A trusted meter without an inverter
+        has 0 under direct injection: attacks on it appear in its output residual only.
     certificate
         The proof: for direct injection a `Certificate` of all trusted sets at once, otherwise the
         design by LMI itself.
@@ -63,7 +61,7 @@ class CircleDesign:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CircleState:
-    """Where an observer stands.
+    """State of an observer.
 
     Attributes
     ----------
@@ -85,8 +83,6 @@ def direct_gain(lure: Readout, trusted: Bools) -> Floats:
 
     Parameters
     ----------
-    lure
-        Plant.
     trusted : (p,)
         J as a mask.
 
@@ -109,24 +105,22 @@ def design(
     gains: Literal["direct", "lmi"] | CircleGains = "direct",
     options: CircleOptions | None = None,
 ) -> CircleDesign:
-    """Design one observer, with a proof that holds.
+    """Design one observer, with a verified proof.
 
     Parameters
     ----------
-    lure
-        Plant.
     trusted : (p,)
         J as a mask.
     gains
         "direct": K = E_J, L = 0, proven for every J at once, in closed form or by `lmi.contraction`.
-        "lmi": gains and proof by `lmi.circle`. Or a design that was made before; it is verified again.
+        "lmi": gains and proof by `lmi.circle`. Or an existing design; it is verified again.
     options
-        What an LMI design is asked for; required by "lmi".
+        Specification of an LMI design; required by "lmi".
 
     Raises
     ------
     DesignInfeasible
-        If there is no certificate, or if the design listens to no meter.
+        If there is no certificate, or if the design uses no meter.
     ValueError
         If `trusted` has the wrong length, or contradicts the given design, or `gains` is another text.
     """
@@ -186,13 +180,13 @@ def _direct(lure: Lure, trusted: Bools, options: CircleOptions | None) -> Circle
 
 
 def _fallback_rate(lure: Lure, options: CircleOptions | None) -> float:
-    """Rate to ask the solver for where no closed form applies; NaN where the plant is no droop loop."""
+    """Rate requested from the solver without a closed form; NaN if the plant is not a droop loop."""
     if lure.A.shape != lure.G.shape or not np.array_equal(lure.G, -lure.A):
         return np.nan
     return options.rate if options is not None else _MODEST * float(np.min(np.diagonal(lure.G)))
 
 
-# Part of the slowest inverter's rate that direct injection is proven for when a solver has to do it.
+# Fraction of the slowest inverter's rate that the solver is asked to prove for direct injection.
 _MODEST = 0.1
 
 
@@ -210,12 +204,10 @@ def _mask(trusted: Bools) -> Bools:
 
 
 def error_norm(design: CircleDesign, e: Floats) -> Floats:
-    """Norm in which the proof makes the error fall at least like `exp(-rate t)`.
+    """Norm in which the proof guarantees a decay of the error at least like `exp(-rate t)`.
 
     Parameters
     ----------
-    design
-        The observer.
     e : (…, n)
         Errors `x - x_hat`.
 
@@ -231,37 +223,25 @@ def error_norm(design: CircleDesign, e: Floats) -> Floats:
 
 
 def init(design: CircleDesign, t: float, x: Floats | None = None) -> CircleState:
-    """Start an observer.
-
-    Parameters
-    ----------
-    design
-        The observer.
-    t
-        Time, s.
-    x : (n,)
-        Where the estimate starts; by default all inverters at zero.
-    """
+    """Initial state at t, s; the estimate starts at x (n,), by default with all inverters at zero."""
     start = np.zeros(len(design.lure.A)) if x is None else np.array(x, dtype=np.float64)
     return CircleState(float(t), start)
 
 
 def between_readings(design: CircleDesign, y: Floats, u: Floats, seen: Bools) -> tuple[Lure, Floats]:
-    """The observer between two readings as a Lur'e system with a constant input.
+    """Observer between two readings as a Lur'e system with a constant input.
 
     `A - L C` and `H - K C` with the columns of unseen meters removed; the input is
     `(c, b) = (F u + K (y - D u), B u + L (y - D u))`.
 
     Parameters
     ----------
-    design
-        The observer.
     y : (p,)
-        Readings; where unseen, any value, also NaN.
+        Readings; arbitrary where unseen, also NaN.
     u : (l,)
         Known input.
     seen : (p,)
-        Which readings exist.
+        True for existing readings.
 
     Returns
     -------
@@ -303,20 +283,14 @@ def step(  # noqa: PLR0917  # the border that all observer families share
 
     Parameters
     ----------
-    design
-        The observer.
-    state
-        Where it stands.
     y : (p,)
         Readings `vbar^2 - v^2`, held over the step; ignored where unseen or not finite.
     u : (l,)
         Known input w, held over the step; finite.
     seen : (p,)
-        Which readings exist. The rest has exactly no influence: the observer runs on its model there.
+        True for existing readings. The others have no influence: the observer runs on its model there.
     h
         Length of the step, s.
-    policy
-        How the integrator divides it.
 
     Returns
     -------
@@ -327,19 +301,17 @@ def step(  # noqa: PLR0917  # the border that all observer families share
     try:
         x = advance(system, state.x, held, h, policy)
     except DesignInfeasible:
-        # No equilibrium found for a long step (possible only without a certificate for the meters
-        # that are left): then walk through it.
+        # No equilibrium found for a long step (possible only without a certificate for the remaining meters):
+        # integrate through it.
         x = advance(system, state.x, held, h, replace(policy, settled=0.0))
     return CircleState(state.t + h, x)
 
 
 def outputs(design: CircleDesign, state: CircleState, u: Floats) -> Floats:
-    """What every meter of the plant should read, `C x_hat + D u`; trusted or not.
+    """Expected reading of every meter of the plant, trusted or not: `C x_hat + D u`.
 
     Parameters
     ----------
-    design, state
-        The observer.
     u : (l,)
         Known input.
 
@@ -352,14 +324,12 @@ def outputs(design: CircleDesign, state: CircleState, u: Floats) -> Floats:
 
 
 def margin_without(design: CircleDesign, silent: Ints) -> float:
-    """Margin of the proof while some trusted meters are silent; positive: the rate still holds.
+    """Margin of the proof while some trusted meters are unavailable; the rate still holds if positive.
 
     Direct injection is proven for every set of meters, so its margin does not depend on them.
 
     Parameters
     ----------
-    design
-        The observer.
     silent : (s,)
         Meters without readings.
     """
@@ -370,15 +340,13 @@ def margin_without(design: CircleDesign, silent: Ints) -> float:
 
 
 def residual_bound(design: CircleDesign, y_error: Floats, u_error: Floats) -> Floats:
-    """How far an honest meter can be from the settled observer's `outputs`.
+    """Largest distance of an unmanipulated meter from the settled observer's `outputs`.
 
     `|y - y_hat| <= |C e| + |D| |u - u_hat| + |n|`, with the ultimate bound on C e from the proof:
     the ellipsoid of the LMI, or the componentwise bounds of direct injection.
 
     Parameters
     ----------
-    design
-        The observer.
     y_error : (p,)
         Largest error of each meter, squared pu.
     u_error : (l,)
@@ -387,7 +355,7 @@ def residual_bound(design: CircleDesign, y_error: Floats, u_error: Floats) -> Fl
     Returns
     -------
     Floats
-        (p,); infinite where the design says nothing about such errors.
+        (p,); infinite where the design gives no bound for such errors.
     """
     lure, proof = design.lure, design.certificate
     rest = np.abs(lure.D) @ u_error + y_error
@@ -405,7 +373,7 @@ def _sizes(gains: CircleGains, y_error: Floats, u_error: Floats) -> tuple[float,
         return np.inf, np.inf
     noise = float(np.linalg.norm(own[~quiet] / gains.noise[~quiet]))
     # |delta| over the box |u_i| <= u_error_i is at most the sum over its edges, provided that
-    # `load` reaches every direction of the box.
+    # `load` spans every direction of the box.
     inverse = np.linalg.pinv(gains.load)
     box = np.diag(u_error)
     missed = np.max(np.abs(gains.load @ (inverse @ box) - box), initial=0.0)
@@ -414,5 +382,5 @@ def _sizes(gains: CircleGains, y_error: Floats, u_error: Floats) -> tuple[float,
     return noise, float(np.sum(np.linalg.norm(inverse, axis=0) * u_error))
 
 
-# Relative part of a load error that `load` may leave out by rounding.
+# Largest relative part of a load error outside the span of `load` that counts as rounding.
 _REACH = 1e-9

@@ -1,12 +1,12 @@
-"""Discrete-time circle-criterion observers: one observer, or a stack of them moved at once.
+"""Discrete-time circle-criterion observers: one observer, or a stack of them advanced at once.
 
     x_hat+ = A x_hat + G phi(zeta) + B u + L r,   zeta = H x_hat + F u + K r,   r = y - C x_hat - D u
 
-with zero columns of L and K for meters outside the trusted set J. Every design carries the constants of
+with zero columns of L and K for meters outside the trusted set J. Every design has proven constants of
 
-    |e(k)| <= c lambda^k |e(0)| + gamma sup |n_J| + gamma_delta sup |delta|          (yang2019 (5)),
+    |e(k)| <= c lambda^k |e(0)| + gamma sup |n_J| + gamma_delta sup |delta|          (yang2019 (5)).
 
-proven, not simulated; `monte_carlo` simulates them as the paper does, and says what such numbers are worth.
+`monte_carlo` simulates them as the paper does, with a statement on the validity of such numbers.
 
 References
 ----------
@@ -77,7 +77,7 @@ class DiscreteDesign:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DiscreteState:
-    """Where an observer stands.
+    """State of an observer.
 
     Attributes
     ----------
@@ -98,19 +98,17 @@ def design(
     gains: Literal["lmi"] | DiscreteGains | DirectProof = "lmi",
     options: DiscreteOptions | None = None,
 ) -> DiscreteDesign:
-    """Design one observer, with a proof that holds.
+    """Design one observer, with a verified proof.
 
     Parameters
     ----------
-    system
-        Plant.
     trusted : (p,)
         J as a mask.
     gains
-        "lmi": by `discrete_circle`. `DiscreteGains`: made before, verified again. `DirectProof` from
-        `discrete_contraction`: direct injection, for which that one proof serves every set.
+        "lmi": by `discrete_circle`. `DiscreteGains`: an existing design, verified again. `DirectProof` from
+        `discrete_contraction`: direct injection, with one proof for every set.
     options
-        What an LMI design is asked for; required by "lmi".
+        Specification of an LMI design; required by "lmi".
 
     Raises
     ------
@@ -201,17 +199,7 @@ def _direct(system: DiscreteLure, trusted: Bools, proof: DirectProof) -> Discret
 
 
 def init(design: DiscreteDesign, t: float, x: Floats | None = None) -> DiscreteState:
-    """Start an observer.
-
-    Parameters
-    ----------
-    design
-        The observer.
-    t
-        Time, s.
-    x : (n,)
-        Where the estimate starts; zero by default.
-    """
+    """Initial state at t, s; the estimate starts at x (n,), by default at zero."""
     start = np.zeros(len(design.system.A)) if x is None else np.array(x, dtype=np.float64)
     return DiscreteState(float(t), start)
 
@@ -221,31 +209,19 @@ def step(design: DiscreteDesign, state: DiscreteState, y: Floats, u: Floats, see
 
     Parameters
     ----------
-    design
-        The observer.
-    state
-        Where it stands.
     y : (p,)
         Readings at the beginning of the step; ignored where unseen or not finite.
     u : (l,)
         Known input during the step.
     seen : (p,)
-        Which readings exist. The rest has exactly no influence.
+        True for existing readings. The others have no influence.
     """
     x = _ahead(design.system, design.L, design.K, state.x, y=y, u=u, seen=seen)
     return DiscreteState(state.t + design.system.h, x)
 
 
 def outputs(design: DiscreteDesign, state: DiscreteState, u: Floats) -> Floats:
-    """What every meter of the plant should read, `C x_hat + D u`, (p,); trusted or not.
-
-    Parameters
-    ----------
-    design, state
-        The observer.
-    u : (l,)
-        Known input.
-    """
+    """Expected reading of every meter of the plant, trusted or not: `C x_hat + D u`, (p,)."""
     return measure(design.system, state.x, u)
 
 
@@ -254,10 +230,6 @@ def error_bound(design: DiscreteDesign, k: int, *, start: float, noise: float, u
 
     Parameters
     ----------
-    design
-        The observer.
-    k
-        Number of steps.
     start
         |e(0)|.
     noise
@@ -274,17 +246,15 @@ def settling_steps(design: DiscreteDesign, *, start: float, epsilon: float) -> i
 
     Parameters
     ----------
-    design
-        The observer.
     start
-        Bound on |e(0)|; 0: it starts in the true state.
+        Bound on |e(0)|; 0 for a start in the true state.
     epsilon
-        What may be left of it.
+        Its largest remainder.
 
     Raises
     ------
     ValueError
-        If `epsilon` is not positive and not everything is known at the start.
+        If `epsilon` is not positive and the start is not the true state.
     """
     if design.growth * start <= epsilon:
         return 0
@@ -297,7 +267,7 @@ def settling_steps(design: DiscreteDesign, *, start: float, epsilon: float) -> i
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stack:
-    """Many observers of one plant, on a leading axis. o observers.
+    """Several observers of one plant, on a leading axis. o observers.
 
     Attributes
     ----------
@@ -343,8 +313,6 @@ def advance(stack: Stack, x: Floats, y: Floats, u: Floats, seen: Bools) -> Float
 
     Parameters
     ----------
-    stack
-        The observers.
     x : (…, o, n)
         Their estimates.
     y : (…, p)
@@ -352,7 +320,7 @@ def advance(stack: Stack, x: Floats, y: Floats, u: Floats, seen: Bools) -> Float
     u : (…, l)
         Known input.
     seen : (p,)
-        Which readings exist.
+        True for existing readings.
 
     Returns
     -------
@@ -375,7 +343,7 @@ def _ahead(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MonteCarlo:
-    """Gains by simulation: the largest seen, which is a lower bound of the true gain.
+    """Gains by simulation: the largest observed ones, lower bounds of the true gains.
 
     Attributes
     ----------
@@ -384,11 +352,11 @@ class MonteCarlo:
     runs
         Number of independent runs.
     exceedance
-        With the stated confidence, one more run of the same kind exceeds a given entry of `gains` with
-        at most this probability: `1 - (1 - confidence)^(1 / runs)`. It says nothing about noise of
-        another kind; see docs/theory-discrete.md, section 4.
+        With the stated confidence, one more run of the same kind exceeds a given entry of `gains` with at
+        most this probability: `1 - (1 - confidence)^(1 / runs)`. It does not cover noise of another kind; see
+        docs/theory-discrete.md, section 4.
     confidence
-        As asked for.
+        Requested confidence.
     """
 
     gains: Floats
@@ -406,30 +374,26 @@ def monte_carlo(
     seed: int,
     confidence: float = 0.99,
 ) -> MonteCarlo:
-    """ISS gains with respect to noise by simulation, as yang2019's example obtains them.
+    """ISS gains with respect to noise by simulation, as in yang2019's example.
 
     Noise is independent and uniform between plus and minus `half_width`; every observer starts in the
     plant's state.
 
     Parameters
     ----------
-    stack
-        The observers.
     half_width : (p,) or scalar
-        Of each meter's noise.
+        Half-width of each meter's noise.
     start : (R, n)
         Initial states, one for each run.
     u : (T, l)
         Known input of the T steps.
-    seed
-        Of the random numbers.
     confidence
-        Of the statement `exceedance`.
+        Confidence of `exceedance`.
 
     Raises
     ------
     ValueError
-        With every number out of range; an observer that hears no noise has no gain.
+        With every number out of range; an observer without noisy meters has no gain.
     """
     system, rng = stack.system, np.random.default_rng(seed)
     runs, p = len(start), len(system.C)
@@ -445,7 +409,7 @@ def monte_carlo(
         problems.append(
             Problem(
                 "not-positive",
-                "every observer needs a meter with noise: half_width is 0 for all that some trust",
+                "every observer needs a meter with noise: half_width is 0 for all meters of some observer",
             )
         )
     refuse(problems)

@@ -1,17 +1,16 @@
-"""Partial Kalman filters: each sensor's own filter, with the covariances between all of them.
+"""Partial Kalman filters: one filter per sensor, with the covariances between all of them.
 
-The filters do not hear of each other, but one disturbance moves all of them and noise may be shared, so
-their errors are correlated. Whoever fuses or compares them needs the joint covariance
+The filters do not exchange data, but one disturbance drives all of them and noise may be common, so
+their errors are correlated. Fusion and comparison need the joint covariance
 
     P = E[v v^T],    z_hat = Phi x + v + e,
 
-with all blocks P_ij. It obeys one recursion for all blocks at once: with S, T block diagonal and K block
-diagonal in its turn,
+with all blocks P_ij. One recursion gives all blocks at once: with S, T and K block diagonal,
 
     P(k+1|k)   = S P(k|k) S^T + Phi Q Phi^T
     P(k+1|k+1) = (I - K T) P(k+1|k) (I - K T)^T + K R K^T,
 
-whose diagonal blocks are the usual covariances because each K_i is optimal for its own sensor.
+with the usual covariances as diagonal blocks, because each K_i is optimal for its own sensor.
 
 References
 ----------
@@ -30,19 +29,19 @@ from gridsec.errors import DesignInfeasible, Problem, refuse
 from gridsec.observers.parts import Stack, decompose, heard, riccati, stack
 
 RESIDUAL = 1e-8
-"""Largest relative residual of a Riccati equation whose solution counts."""
+"""Largest accepted relative residual of a Riccati equation."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KalmanDesign:
-    """p partial filters as one. mu stacked states, p sensors, m inputs.
+    """p partial filters, stacked. mu stacked states, p sensors, m inputs.
 
     Attributes
     ----------
     stack
         The decomposition.
     process : (mu, mu)
-        Phi Q Phi^T, covariance of the disturbance as the filters feel it.
+        Phi Q Phi^T, covariance of the disturbance of the filters.
     noise : (p, p)
         R, covariance of the sensors' noise; need not be diagonal.
     own : (mu, p)
@@ -60,7 +59,7 @@ class KalmanDesign:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KalmanState:
-    """Where the filters stand.
+    """State of the filters.
 
     Attributes
     ----------
@@ -69,7 +68,7 @@ class KalmanState:
     z : (…, mu)
         Stacked estimates; leading axes are independent runs with the same covariance.
     P : (mu, mu)
-        Joint covariance of their errors while nobody attacks.
+        Joint covariance of their errors without attack.
     K : (mu, p)
         Gain of the last correction; zero for sensors without a reading.
     """
@@ -82,7 +81,7 @@ class KalmanState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Steady:
-    """Where covariance and gain end up when every reading arrives.
+    """Stationary covariance and gain with every reading available.
 
     Attributes
     ----------
@@ -110,7 +109,7 @@ def design(
     tol: float,
     period: float = 1.0,
 ) -> KalmanDesign:
-    """Prepare one filter for each sensor.
+    """Design one filter for each sensor.
 
     Parameters
     ----------
@@ -126,7 +125,7 @@ def design(
     Raises
     ------
     ValueError
-        If Q or R has the wrong shape or is no covariance.
+        If Q or R has the wrong shape or is not a covariance.
 
     References
     ----------
@@ -144,7 +143,7 @@ def design(
         elif not symmetry_defect(M) <= 1e-12 or float(np.linalg.eigvalsh(M)[0]) < -1e-12 * scale:
             problems.append(
                 Problem(
-                    "not-definite", f"{name} is no covariance: not symmetric, or not positive semidefinite"
+                    "not-definite", f"{name} is not a covariance: not symmetric, or not positive semidefinite"
                 )
             )
     refuse(problems)
@@ -155,12 +154,10 @@ def design(
 
 
 def init(design: KalmanDesign, t: float, mean: Floats, covariance: Floats) -> KalmanState:
-    """Before the first reading: z(0|-1) = Phi x_0, P(0|-1) = Phi P_0 Phi^T.
+    """State before the first reading: z(0|-1) = Phi x_0, P(0|-1) = Phi P_0 Phi^T.
 
     Parameters
     ----------
-    design
-        From `design`.
     t
         Time, s.
     mean : (…, n)
@@ -178,12 +175,10 @@ def init(design: KalmanDesign, t: float, mean: Floats, covariance: Floats) -> Ka
 
 
 def predict(design: KalmanDesign, state: KalmanState, u: Floats) -> KalmanState:
-    """From (k|k) to (k+1|k).
+    """Prediction from (k|k) to (k+1|k).
 
     Parameters
     ----------
-    design, state
-        Filters, and where they stand.
     u : (…, m)
         Input during the step.
 
@@ -197,17 +192,15 @@ def predict(design: KalmanDesign, state: KalmanState, u: Floats) -> KalmanState:
 
 
 def correct(design: KalmanDesign, state: KalmanState, y: Floats, seen: Bools | None = None) -> KalmanState:
-    """From (k|k-1) to (k|k): each filter uses its own sensor's reading.
+    """Correction from (k|k-1) to (k|k): each filter uses its own sensor's reading.
 
     Parameters
     ----------
-    design, state
-        Filters, and where they stand.
     y : (…, p)
-        Readings; ignored where not seen or not finite. Runs share their covariance: a sensor that lacks
-        the reading of one of them is not used in any.
+        Readings; ignored where not seen or not finite. Runs share their covariance: a sensor without a
+        reading in one run is not used in any.
     seen : (p,)
-        Which readings there are; all by default.
+        True for existing readings; all by default.
 
     References
     ----------
@@ -227,12 +220,10 @@ def correct(design: KalmanDesign, state: KalmanState, y: Floats, seen: Bools | N
 def step(
     design: KalmanDesign, state: KalmanState, y: Floats, u: Floats, seen: Bools | None = None
 ) -> KalmanState:
-    """From (k|k) to (k+1|k+1), with the input u(k) and the readings y(k+1).
+    """Step from (k|k) to (k+1|k+1), with the input u(k) and the readings y(k+1).
 
     Parameters
     ----------
-    design, state
-        Filters, and where they stand.
     y : (…, p)
         Readings at the end of the step; ignored where not seen or not finite.
     u : (…, m)
@@ -250,12 +241,12 @@ def step(
 def step_steady(
     design: KalmanDesign, steady: Steady, state: KalmanState, y: Floats, u: Floats
 ) -> KalmanState:
-    """`step` with the gain and covariance of `steady`; for filters that have long been running.
+    """`step` with the stationary gain and covariance of `steady`.
 
     Parameters
     ----------
     design, state, y, u
-        As in `step`; every reading is there.
+        As in `step`, with every reading available.
     steady
         From `steady`.
     """
@@ -267,17 +258,12 @@ def step_steady(
 def steady(design: KalmanDesign) -> Steady:
     """Stationary gain and joint covariance.
 
-    The gains by one Riccati equation for each sensor, the joint covariance by one Lyapunov equation.
-
-    Parameters
-    ----------
-    design
-        From `design`.
+    The gains solve one Riccati equation for each sensor, the joint covariance one Lyapunov equation.
 
     Raises
     ------
     DesignInfeasible
-        If a filter has no stable stationary gain: a mode on the unit circle feels no disturbance.
+        If a filter has no stable stationary gain: a mode on the unit circle has no disturbance.
 
     References
     ----------

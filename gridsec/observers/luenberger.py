@@ -1,9 +1,9 @@
-"""Partial Luenberger observers: each sensor estimates the part of the state that it can see by itself.
+"""Partial Luenberger observers: each estimates the part of the state observable by one sensor.
 
-One sensor's reading reaches one observer only, so an attack on q sensors spoils q estimates and leaves
+One sensor's reading reaches one observer only, so an attack on q sensors corrupts q estimates and leaves
 the others exact. The estimates of all sensors, stacked, are a code word of the state,
 
-    z_hat = Phi x + v + e,    Phi = [Z_1 … Z_p]^T,    e_i = 0 for honest sensors,   |v_i| <= bound_i,
+    z_hat = Phi x + v + e,    Phi = [Z_1 … Z_p]^T,    e_i = 0 without attack on i,   |v_i| <= bound_i,
 
 which `gridsec.decode.partial` decodes. Sampled time: x(k+1) = A x(k) + B u(k) + d(k), y(k) = C x(k) + n(k).
 
@@ -26,15 +26,15 @@ from gridsec.errors import DesignInfeasible, InputInvalid, Problem, refuse
 from gridsec.observers.parts import Part, Stack, decompose, heard, riccati, stack
 
 LONGEST = 1 << 17
-"""Largest number of steps after which an observer's error must have halved for good."""
+"""Largest number of steps within which an observer's error must have halved for good."""
 
 RESIDUAL = 1e-6
-"""Largest relative residual of a Riccati equation; its gain is then verified by itself."""
+"""Largest accepted relative residual of a Riccati equation; its gain is then verified separately."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bounds:
-    """What disturbances and noise can be at most (lee2018, Assumption 4.3.2).
+    """Largest disturbances and noise (lee2018, Assumption 4.3.2).
 
     Attributes
     ----------
@@ -43,7 +43,7 @@ class Bounds:
     noise : (p,)
         n_max of each sensor: `|n_i(k)| <= noise[i]`, in the sensor's unit.
     E : (n, l)
-        How disturbances enter; the identity in the paper.
+        Input matrix of disturbances; the identity in the paper.
     """
 
     process: float
@@ -53,7 +53,7 @@ class Bounds:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Envelope:
-    """Bound of one observer's honest error: |v(k)| <= |F^k| |v(0)| + limit.
+    """Bound of one observer's error without attack: |v(k)| <= |F^k| |v(0)| + limit.
 
     Attributes
     ----------
@@ -81,7 +81,7 @@ class Envelope:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LuenbergerDesign:
-    """p partial observers as one. mu stacked states, p sensors, m inputs.
+    """p partial observers, stacked. mu stacked states, p sensors, m inputs.
 
     Attributes
     ----------
@@ -92,11 +92,11 @@ class LuenbergerDesign:
     F : (mu, mu)
         S - L T, block diagonal and Schur stable.
     bounds
-        Disturbances and noise that the envelopes hold for.
+        Disturbances and noise of the envelopes.
     envelopes
         One for each sensor.
     step_norm : (p,)
-        |S_i|_2: by how much a step without a reading can enlarge an error.
+        |S_i|_2: largest growth of an error in a step without a reading.
     period
         Sampling time, s.
     """
@@ -112,7 +112,7 @@ class LuenbergerDesign:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LuenbergerState:
-    """Where the observers stand.
+    """State of the observers.
 
     Attributes
     ----------
@@ -121,7 +121,7 @@ class LuenbergerState:
     z : (…, mu)
         Stacked estimates; leading axes are independent runs.
     origin : (p,)
-        Bound of |z_i - Z_i^T x| when sensor i was last started; infinite if unknown.
+        Bound of |z_i - Z_i^T x| at the last start of sensor i; infinite if unknown.
     age : (p,)
         Steps since then.
     """
@@ -133,10 +133,10 @@ class LuenbergerState:
 
 
 def riccati_gain(part: Part, process: Floats, noise: float, *, rate: float) -> Floats:
-    """L of the stationary Kalman predictor, with a prescribed decay of what the sensor sees.
+    """L of the stationary Kalman predictor, with a prescribed decay of the observable part.
 
     With rate 1 the Riccati equation is that of (S, t). Below 1 it is that of the observable block over
-    `rate`, whose error then decays at least like rate^k; fading modes keep their own decay and get no gain.
+    `rate`, with an error decay of at least rate^k; fading modes keep their own decay and get no gain.
 
     Parameters
     ----------
@@ -201,7 +201,7 @@ def design(
     A, B, C : (n, n), (n, m), (p, n)
         Plant, sampled.
     bounds
-        Of disturbance and noise; also the weights of the Riccati gains.
+        Bounds of disturbance and noise; also the weights of the Riccati gains.
     slowest, tol
         As in `decompose`.
     gains
@@ -215,11 +215,11 @@ def design(
     Raises
     ------
     DesignInfeasible
-        If some F_i = S_i - L_i t_i is not Schur stable, or so slow that errors may not have halved for
-        good after `LONGEST` steps.
+        If some F_i = S_i - L_i t_i is not Schur stable, or errors may not have halved for good after
+        `LONGEST` steps.
     ValueError
-        If shapes do not fit, a bound is negative or no number, or `gains` is another text, or "riccati"
-        without noise.
+        If shapes are inconsistent, a bound is negative or NaN, `gains` is another text, or "riccati" without
+        noise.
 
     References
     ----------
@@ -278,14 +278,14 @@ def design(
 
 
 def envelope(part: Part, gain: Floats, process: float, noise: float, E: Floats) -> Envelope:
-    """Bound of the honest error of one partial observer.
+    """Bound of one partial observer's error without attack.
 
     Parameters
     ----------
     part, gain
         The sensor's part and L_i (mu_i,).
     process, noise, E
-        As in `Bounds`, noise of this sensor.
+        As in `Bounds`, with the noise of this sensor.
 
     Raises
     ------
@@ -323,7 +323,7 @@ def _powers(F: Floats) -> tuple[Floats, Floats]:
 
 
 def geometric(part: Part, gain: Floats, process: float, noise: float, E: Floats, *, beta: float) -> Envelope:
-    """The paper's own bound, with the smallest constants eta_F, eta_L, eta_Z that fit a given beta.
+    """The paper's own bound, with the smallest constants eta_F, eta_L, eta_Z for a given beta.
 
     Parameters
     ----------
@@ -340,7 +340,7 @@ def geometric(part: Part, gain: Floats, process: float, noise: float, E: Floats,
     Raises
     ------
     DesignInfeasible
-        If beta is so close to the spectral radius that the constants cannot be found in `LONGEST` steps.
+        If beta is too close to the spectral radius to find the constants in `LONGEST` steps.
     ValueError
         If beta is not between the spectral radius of F and 1.
 
@@ -362,18 +362,16 @@ def geometric(part: Part, gain: Floats, process: float, noise: float, E: Floats,
 
 
 def init(design: LuenbergerDesign, t: float, x: Floats, error: float = np.inf) -> LuenbergerState:
-    """Start all observers from a guess of the state.
+    """Initial state of all observers from a guess of the state.
 
     Parameters
     ----------
-    design
-        From `design`.
     t
         Time, s.
     x : (…, n)
         Guess; leading axes are independent runs.
     error
-        Bound of |guess - x|_2. Infinite: unknown, then bounds stay infinite for ever.
+        Bound of |guess - x|_2. Without it all bounds stay infinite.
     """
     p = len(design.stack.parts)
     # |Z_i^T| = 1 unless the part is empty.
@@ -384,22 +382,20 @@ def init(design: LuenbergerDesign, t: float, x: Floats, error: float = np.inf) -
 def step(
     design: LuenbergerDesign, state: LuenbergerState, y: Floats, u: Floats, seen: Bools | None = None
 ) -> LuenbergerState:
-    """From z_hat(k), with the readings y(k) and the input u(k), to z_hat(k+1).
+    """Step from z_hat(k), with the readings y(k) and the input u(k), to z_hat(k+1).
 
         z_hat_i(k+1) = S_i z_hat_i(k) + Z_i^T B u(k) + L_i (y_i(k) - t_i z_hat_i(k))
 
     Parameters
     ----------
-    design, state
-        Observers, and where they stand.
     y : (…, p)
-        Readings; ignored where not seen or not finite. Runs share their bounds: a sensor that lacks the
-        reading of one of them is not used in any.
+        Readings; ignored where not seen or not finite. Runs share their bounds: a sensor without a
+        reading in one run is not used in any.
     u : (…, m)
         Inputs.
     seen : (p,)
-        Which readings there are; all by default. An observer without a reading predicts, and the bound
-        of its error starts anew from the enlarged one.
+        True for existing readings; all by default. An observer without a reading predicts, and the bound of
+        its error restarts from the enlarged one.
 
     References
     ----------
@@ -419,12 +415,7 @@ def step(
 
 
 def bound(design: LuenbergerDesign, state: LuenbergerState) -> Floats:
-    """Bound of |z_hat_i - Z_i^T x|_2 for every honest sensor, (p,); the largest is v_max(k).
-
-    Parameters
-    ----------
-    design, state
-        Observers, and where they stand.
+    """Bound of |z_hat_i - Z_i^T x|_2 for every sensor without attack, (p,); the largest is v_max(k).
 
     References
     ----------
@@ -432,6 +423,6 @@ def bound(design: LuenbergerDesign, state: LuenbergerState) -> Floats:
     """
     out = np.empty(state.origin.size)
     for i, (env, origin, age) in enumerate(zip(design.envelopes, state.origin, state.age, strict=True)):
-        # An unknown start stays unknown, also where the growth has underflowed to zero.
+        # An unknown start stays unknown, even if the growth underflows to zero.
         out[i] = env.growth(int(age)) * origin + env.limit if np.isfinite(origin) else np.inf
     return out

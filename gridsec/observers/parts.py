@@ -1,4 +1,4 @@
-"""What each sensor sees of the state by itself: Kalman's decomposition, sensor by sensor.
+"""Observable part of the state by single sensors: Kalman's decomposition, sensor by sensor.
 
     z_i = Z_i^T x,    z_i(k+1) = S_i z_i(k) + Z_i^T B u(k) + Z_i^T d(k),    y_i(k) = t_i z_i(k) + n_i(k)
 
@@ -23,16 +23,16 @@ from gridsec.errors import DesignInfeasible, InputInvalid, Problem
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Part:
-    """What one sensor sees of an n-dimensional state: an orthonormal basis in three pieces.
+    """Decomposition of an n-dimensional state for one sensor: an orthonormal basis in three pieces.
 
     Attributes
     ----------
     observable : (n, nu)
         Z^o, basis of the orthogonal complement of the unobservable subspace N(G_i).
     fading : (n, mu - nu)
-        Z^d, basis of what the sensor does not see but a model predicts ever better by itself.
+        Z^d, basis of the unobservable part that a model predicts with decaying error.
     hidden : (n, n - mu)
-        W, basis of the rest: unseen and not predictable.
+        W, basis of the rest: unobservable and not predictable.
     S : (mu, mu)
         Motion of z = Z^T x with Z = [Z^o Z^d]; block lower triangular.
     t : (mu,)
@@ -58,21 +58,21 @@ class Part:
 def decompose(A: Floats, C: Floats, *, slowest: float, tol: float) -> tuple[Part, ...]:
     """Kalman decomposition for every single sensor.
 
-    The motion that a sensor does not see has eigenvalues of its own. Modes below `slowest` in modulus go
-    into `fading`, the others into `hidden`. Hence `slowest=0` gives the Kalman observability
-    decomposition (nothing unseen is kept), and `slowest=1` the detectability decomposition.
+    The unobservable motion has eigenvalues of its own. Modes below `slowest` in modulus go into `fading`, the
+    others into `hidden`. Hence `slowest=0` gives the Kalman observability decomposition (no unobservable mode
+    is kept), and `slowest=1` the detectability decomposition.
 
     Parameters
     ----------
     A, C : (n, n), (p, n)
         The pair, sampled.
     slowest
-        In [0, 1]. A little below 1 is wise: a mode that fades in 1e6 steps helps nobody, and a repeated
-        eigenvalue on the unit circle comes out of rounding a little inside.
+        In [0, 1], preferably slightly below 1: a mode that decays in 1e6 steps is useless, and rounding moves
+        a repeated eigenvalue on the unit circle slightly inside.
     tol
-        A row of the observability matrix, made orthogonal to those before it, counts as new if longer than
-        this times |A|. Too large a value only makes parts smaller; too small a one promises what noise
-        then has to deliver. A sensor whose row is up to this part of the longest measures nothing.
+        A row of the observability matrix, orthogonalised against those before it, counts as new if longer
+        than this times |A|. A large value makes parts smaller; a small one keeps directions that only noise
+        determines. A sensor with a row up to this fraction of the longest measures nothing.
 
     Returns
     -------
@@ -104,12 +104,12 @@ def decompose(A: Floats, C: Floats, *, slowest: float, tol: float) -> tuple[Part
 
 
 def _part(A: Floats, c: Floats, row: Floats, slowest: float, tol: float) -> Part:
-    """Of the sensor with row c, of length one in `row`."""
+    """Decomposition for the sensor with row c, of length one in `row`."""
     seen, unseen = _krylov(A, row, tol)
     hidden_count, turn = 0, np.zeros((0, 0))
     if unseen.shape[1]:
-        # N(G) is invariant: the leading Schur vectors of its slow modes are invariant in their turn,
-        # and the others complete them orthogonally.
+        # N(G) is invariant: the leading Schur vectors of its slow modes are invariant too, and the others
+        # complete them orthogonally.
         _, turn, hidden_count = schur(
             unseen.T @ A @ unseen, output="real", sort=lambda re, im: np.hypot(re, im) >= slowest
         )
@@ -127,7 +127,7 @@ def _krylov(A: Floats, row: Floats, tol: float) -> tuple[Floats, Floats]:
     while basis.shape[1] < n and (length := float(np.linalg.norm(row))) > tol:
         basis = np.column_stack([basis, row / length])
         row = A.T @ basis[:, -1] / size
-        # Twice, because once leaves errors of rounding that later rows would inherit.
+        # Twice, because later rows would inherit the rounding errors of a single pass.
         for _ in range(2):
             row = row - basis @ (basis.T @ row)
     full, _ = np.linalg.qr(basis, mode="complete") if basis.shape[1] else (np.eye(n), None)
@@ -136,16 +136,16 @@ def _krylov(A: Floats, row: Floats, tol: float) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stack:
-    """All parts side by side. mu is the sum of the parts' sizes.
+    """All parts, stacked. mu is the sum of the parts' sizes.
 
     Attributes
     ----------
     parts
         One for each sensor.
     first : (p + 1,)
-        Sensor i has the rows `first[i]:first[i + 1]` of everything stacked.
+        Sensor i has the rows `first[i]:first[i + 1]` of the stacked arrays.
     phi : (mu, n)
-        Phi = [Z_1 … Z_p]^T, without the rows of zeros that the paper appends.
+        Phi = [Z_1 … Z_p]^T, without the zero rows of the paper.
     S, T : (mu, mu), (p, mu)
         Motion and outputs of the stacked z; block diagonal.
     G : (mu, m)
@@ -164,7 +164,7 @@ class Stack:
     G: Floats
 
     def rows(self, sensor: int) -> slice:
-        """The rows of one sensor."""
+        """Rows of one sensor."""
         return slice(int(self.first[sensor]), int(self.first[sensor + 1]))
 
     @property
@@ -174,14 +174,14 @@ class Stack:
 
 
 def stack(parts: Sequence[Part], B: Floats) -> Stack:
-    """Put the parts side by side.
+    """Stack the parts.
 
     Parameters
     ----------
     parts
         From `decompose`.
     B : (n, m)
-        How inputs enter the state.
+        Input matrix.
     """
     phi = np.vstack([part.basis.T for part in parts])
     first = np.concatenate([[0], np.cumsum([part.t.size for part in parts])])
@@ -204,7 +204,7 @@ def riccati(S: Floats, t: Floats, Q: Floats, r: float, *, tol: float) -> Floats:
     S, t : (mu, mu), (mu,)
         The sensor's part.
     Q : (mu, mu)
-        Covariance of what moves z.
+        Covariance of the disturbance of z.
     r
         Variance of the sensor's noise, > 0.
     tol
@@ -213,11 +213,11 @@ def riccati(S: Floats, t: Floats, Q: Floats, r: float, *, tol: float) -> Floats:
     Raises
     ------
     DesignInfeasible
-        If no stabilising solution is found that solves the equation.
+        If no stabilising solution within `tol` is found.
     """
     best, worst, said = S, np.inf, "no stabilising solution"
-    # SciPy's balancing goes wrong by orders of magnitude where t has zeros, as it does for fading modes;
-    # without it badly scaled plants suffer. The residual tells.
+    # SciPy's balancing fails by orders of magnitude for zeros in t, as with fading modes; without it badly
+    # scaled plants are inaccurate. The residual decides.
     for balanced in (False, True):
         try:
             M = np.asarray(solve_discrete_are(S.T, t[:, None], Q, np.array([[r]]), balanced=balanced))
@@ -236,14 +236,14 @@ def riccati(S: Floats, t: Floats, Q: Floats, r: float, *, tol: float) -> Floats:
 
 
 def heard(y: Floats, seen: Bools | None) -> Bools:
-    """Sensors whose readings can be used, (p,): seen, and finite in all runs.
+    """Sensors with usable readings, (p,): seen, and finite in all runs.
 
     Parameters
     ----------
     y : (…, p)
         Readings; leading axes are independent runs.
     seen : (p,)
-        Which readings there are; None: all.
+        True for existing readings; all if None.
     """
     finite = np.isfinite(y)
     live = finite.all(axis=tuple(range(finite.ndim - 1)))

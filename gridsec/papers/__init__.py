@@ -1,1 +1,1 @@
-"""The examples of the papers: their numbers and figures beside ours. Each module has a `reproduce`."""
+"""Examples of the papers: printed numbers and figures beside computed ones, by `reproduce` of each module."""

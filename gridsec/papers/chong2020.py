@@ -36,7 +36,7 @@ CUSTOMERS = 5
 LIARS = 2
 TIMES = np.linspace(0.0, 40.0, 401)
 RATE = 0.25
-"""Certified decay rate asked of (12), 1/s; the inverters' own rate is 0.46 1/s."""
+"""Certified decay rate requested from (12), 1/s; the inverters' own rate is 0.46 1/s."""
 METER_ERROR, LOAD_ERROR = 2e-4, 2e-3
 """Meter noise and load error in the objective of (12), squared pu; without load errors it gives L = K = 0."""
 SETTLED = 1e-6
@@ -50,14 +50,14 @@ GAINS = {"(12)": "L, K of (12)", "direct": "L = 0, K = E_J"}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Setting:
-    """The feeder of the paper's Figure 2, per unit on 100 kVA and 230 V.
+    """Feeder of the paper's Figure 2, per unit on 100 kVA and 230 V.
 
     Attributes
     ----------
     feeder
         Main line and service drops.
     droop
-        One inverter at each customer, all of the same time constant.
+        One inverter at each customer, all with the same time constant.
     lure
         The closed loop (9), outputs and arguments in z.
     w : (N,)
@@ -72,13 +72,7 @@ class Setting:
 
 @cache
 def setting(customers: int = CUSTOMERS) -> Setting:
-    """A line of customers on an overhead line, the busbar at 0.97 pu, 6 kW and 2 kvar drawn by each.
-
-    Parameters
-    ----------
-    customers
-        N.
-    """
+    """Line of N customers on an overhead line, busbar at 0.97 pu, 6 kW and 2 kvar drawn by each."""
     base_volt, base_kva = 230.0, 100.0
     ohm = 3.0 * base_volt**2 / (1e3 * base_kva)
     main, drop = np.full(customers, 0.03), np.full(customers, 0.01)
@@ -102,7 +96,7 @@ def setting(customers: int = CUSTOMERS) -> Setting:
 
 
 def reported(z: Floats, vbar: float, alpha: Floats) -> Floats:
-    """What meters that add alpha to their voltage report, as `vbar^2 - (v + alpha)^2`.
+    """Reports `vbar^2 - (v + alpha)^2` of meters with the attack alpha on their voltage.
 
     `y = z + a`, `a = -2 v alpha - alpha^2`; the paper prints `2 v alpha - alpha^2`.
 
@@ -124,7 +118,7 @@ def reported(z: Floats, vbar: float, alpha: Floats) -> Floats:
 
 
 def attack(t: float) -> Floats:
-    """Meter 2 drifts away without bound; meter 5 swings by 8 % of the nominal voltage."""
+    """Attack at time t: meter 2 drifts without bound; meter 5 swings by 8 % of the nominal voltage."""
     alpha = np.zeros(CUSTOMERS)
     alpha[1], alpha[4] = 0.04 + 0.02 * t, 0.08 * np.sin(t)
     return alpha
@@ -147,7 +141,7 @@ class Run:
     pi : (T, s)
         (6).
     v2, v2_estimate, v2_reported : (T, N)
-        Squared voltages: true, by (19) corrected, and as the meters say.
+        Squared voltages: true, by (19) corrected, and reported.
     """
 
     t: Floats
@@ -175,7 +169,7 @@ class Observers:
     bank
         Sets and gains.
     P : (o, N, N)
-        `e_J^T P_J e_J` falls at least like `exp(-2 rate_J t)` while no meter of J is manipulated.
+        `e_J^T P_J e_J` decays at least like `exp(-2 rate_J t)` while no meter of J is manipulated.
     rate : (o,)
         1/s.
     """
@@ -189,7 +183,7 @@ class Observers:
 def solutions(customers: int = CUSTOMERS, liars: int = LIARS) -> dict[tuple[int, ...], CircleGains]:
     """Solve the corrected (12) for every set J of at least N - 2M meters.
 
-    The solver's word is not used: `margin` rebuilds the inequality in NumPy.
+    The solver's status is not used: `margin` rebuilds the inequality in NumPy.
 
     Parameters
     ----------
@@ -256,10 +250,6 @@ def observe(
 
     Parameters
     ----------
-    of
-        The feeder.
-    made
-        Its observers.
     alpha
         Attack on the voltages at time t, (N,).
     x : (N,)
@@ -267,7 +257,7 @@ def observe(
     start : (o, N)
         Initial states of the observers, in the order of `bank.subsets(N, M).masks()`.
     times : (T,)
-        Where the run is recorded, s, from 0.
+        Recorded times, s, from 0.
     """
     lure, w, vbar = of.lure, of.w, of.droop.vbar
     count, bank = len(w), made.bank
@@ -314,7 +304,7 @@ def observe(
 
 
 def _consistency(bank: banks.Bank, estimates: Floats) -> Floats:
-    """(6) for many times at once, (T, s)."""
+    """Consistency (6) for several times at once, (T, s)."""
     sets = bank.sets
     large, small = estimates[:, : sets.count_large], estimates[:, sets.count_large :]
     gaps = np.stack([np.abs(small - large[:, parent]).max(axis=-1) for parent in sets.parent], axis=1)
@@ -325,12 +315,10 @@ def envelope(made: Observers, errors: Floats, t: Floats) -> Floats:
     """Right side of (8) with constants: `3 max_J sqrt(cond P_J) exp(-rate_J t) |e_J(0)|_2`.
 
     An observer without manipulated meters stays within a third of it, the selected estimate within all of it:
-    docs/theory-detection.md, claim 1. The maximum runs over all observers; (8) as printed leaves it out.
+    docs/theory-detection.md, claim 1. The maximum is over all observers; (8) as printed omits it.
 
     Parameters
     ----------
-    made
-        The observers.
     errors : (o, N)
         Initial errors of all observers.
     t : (T,)
@@ -343,14 +331,10 @@ def envelope(made: Observers, errors: Floats, t: Floats) -> Floats:
 
 @cache
 def under_attack(of: Design = "(12)") -> tuple[Run, Floats, Floats]:
-    """The paper's setting with two of five meters manipulated; the run and the envelopes of (8) and (20).
+    """The paper's setting with two of five meters manipulated: run, and envelopes of (8) and (20).
 
-    The plant starts near its rest, every observer at random within the inverters' limits, both designs alike.
-
-    Parameters
-    ----------
-    of
-        Gains of the observers.
+    The plant starts near its equilibrium, every observer at random within the inverters' limits, equally for
+    both designs.
     """
     at, made = setting(), observers(of)
     rng = np.random.default_rng(2020)
@@ -362,15 +346,10 @@ def under_attack(of: Design = "(12)") -> tuple[Run, Floats, Floats]:
 
 
 def exact_start(of: Design = "(12)") -> Run:
-    """Counterexample to (8) as printed: the selected estimate starts exact, and errs later.
+    """Counterexample to (8) as printed: the selected estimate starts exact, and has an error later.
 
     Three meters; meter 1 is manipulated from the start. The observers of {1, 2}, {1} and {2} start in the
     true state, so that {1, 2} is selected with error zero. The others start 0.05 pu off.
-
-    Parameters
-    ----------
-    of
-        Gains of the observers.
     """
     at, made = setting(3), observers(of, 3, 1)
     x = equilibrium(at.lure, at.w, tol=1e-12, max_iter=200)
@@ -404,7 +383,8 @@ def _design_claims(of: Design) -> list[Claim]:
     """Return (8), (20), Theorem 2 and the counterexample to (8) as printed, for one design."""
     run, state, voltage = under_attack(of)
     off = np.abs(run.v2 - run.v2_estimate).max(axis=1)
-    # The set of all meters is no member of the bank; the largest ones with liars stand for not selecting.
+    # The set of all meters is not a member of the bank; the largest sets with manipulated meters represent an
+    # estimate without selection.
     large = run.pi.shape[1]
     masks = observers(of).bank.masks[:large]
     deceived = masks[:, 1] & masks[:, 4]
@@ -419,7 +399,7 @@ def _design_claims(of: Design) -> list[Claim]:
             f"selected error after 35 s, {named}, pu",
             "Theorem 2",
             "converges",
-            f"{tail:.0e}; deceived observers {worst:.3f}",
+            f"{tail:.0e}; observers with attacked meters {worst:.3f}",
             tail < SETTLED < worst,
         ),
         Claim(

@@ -1,4 +1,4 @@
-"""What a reproduction hands back: claims with the paper's numbers beside ours, and the data of figures.
+"""Results of a reproduction: claims with the paper's numbers beside the computed ones, and data of figures.
 
 Every module of this package has `reproduce() -> Reproduction`. Nothing here draws or prints.
 """
@@ -18,7 +18,7 @@ Style = Literal["solid", "dashed", "dotted", "dashdot", "points", "steps"]
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """One statement of a paper beside what we get.
+    """One statement of a paper beside the computed result.
 
     Attributes
     ----------
@@ -27,16 +27,16 @@ class Claim:
     where
         Its place in the paper: equation, section, table, figure.
     printed
-        What the paper says.
+        The printed value or statement.
     ours
-        What is computed here.
+        The computed value or statement.
     met
-        Whether the two agree, to the printed digits where they are numbers.
+        True if the two agree, numbers to the printed digits.
     why
-        Where they do not agree and we know the reason: an erratum, or a choice that the paper leaves open.
-        A claim that is not met and has no reason is a failure of ours.
+        Known reason of a disagreement: an erratum, or a choice that the paper leaves open. A claim that is
+        not met and has no reason is a failure of this project.
     relation
-        How ours should stand to the printed number: equal to the digits, or at most it.
+        Required relation of `ours` to the printed number: equal to the digits, or at most it.
     """
 
     what: str
@@ -55,7 +55,7 @@ class Line:
     Attributes
     ----------
     label
-        For the legend; empty: none.
+        For the legend; empty for none.
     x, y : (k,)
         Its points; NaN in `y` interrupts it.
     style
@@ -102,14 +102,14 @@ class Panel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Figure:
-    """Panels that belong together, drawn one below the other.
+    """Panels of one figure, drawn one below the other.
 
     Attributes
     ----------
     name
         File stem, for example "kim2018-figure-1"; letters, digits and hyphens.
     caption
-        What it shows, in one sentence.
+        Content in one sentence.
     panels
         From top to bottom.
     """
@@ -121,14 +121,14 @@ class Figure:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reproduction:
-    """Everything that one paper's examples give.
+    """Results of one paper's examples.
 
     Attributes
     ----------
     paper
         Short name, for example "kim2018".
     claims
-        Its numbers and statements beside ours.
+        Its numbers and statements beside the computed ones.
     figures
         Data of its figures.
     """
@@ -139,17 +139,17 @@ class Reproduction:
 
     @property
     def unmet(self) -> tuple[Claim, ...]:
-        """The claims that did not come out."""
+        """Claims that are not met."""
         return tuple(claim for claim in self.claims if not claim.met)
 
     @property
     def unexplained(self) -> tuple[Claim, ...]:
-        """The claims that should have come out and did not: not met, for no stated reason."""
+        """Claims that are not met, without a stated reason."""
         return tuple(claim for claim in self.unmet if not claim.why)
 
 
 def number(what: str, where: str, printed: float, ours: float, *, unit: float) -> Claim:
-    """Claim about a printed number, met when ours rounds to it.
+    """Claim about a printed number, met if `ours` rounds to it.
 
     Parameters
     ----------
@@ -172,7 +172,7 @@ def number(what: str, where: str, printed: float, ours: float, *, unit: float) -
 
 
 def statement(what: str, where: str, printed: str, ours: str, why: str = "") -> Claim:
-    """Claim in words, met when both texts are the same.
+    """Claim in words, met if both texts are the same.
 
     Parameters
     ----------
@@ -187,7 +187,7 @@ def statement(what: str, where: str, printed: str, ours: str, why: str = "") -> 
 
 
 def rounded_up(what: str, where: str, printed: float, ours: float, *, unit: float) -> Claim:
-    """Claim about a printed upper bound, met when ours, rounded up, is it.
+    """Claim about a printed upper bound, met if `ours`, rounded up, equals it.
 
     Parameters
     ----------
@@ -207,11 +207,5 @@ def rounded_up(what: str, where: str, printed: float, ours: float, *, unit: floa
 
 
 def at_most(what: str, where: str, printed: float, ours: float) -> Claim:
-    """Claim that a number is an upper bound, met when ours does not exceed it.
-
-    Parameters
-    ----------
-    what, where, printed, ours
-        As in `Claim`.
-    """
+    """Claim that a number is an upper bound, met if `ours` does not exceed it."""
     return Claim(what, where, printed, float(ours), bool(ours <= printed), relation="<=")

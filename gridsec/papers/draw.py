@@ -1,7 +1,7 @@
-"""Draws the data of a figure with matplotlib; nothing is imported from it before something is drawn.
+"""Drawing of a figure's data with matplotlib, which is imported only on use.
 
-No state of pyplot is used, the caller's settings are neither read nor changed, and nothing is written: the
-caller gets a matplotlib figure, or the bytes of a PNG. Both need the extra `plot`.
+No state of pyplot is used, the caller's settings are neither read nor changed, and no file is written: the
+result is a matplotlib figure, or the bytes of a PNG. Both need the extra `plot`.
 """
 
 from __future__ import annotations
@@ -25,9 +25,10 @@ if TYPE_CHECKING:
 
 DPI: Final = 150
 WIDTH: Final = 7.4  # inches, with room for legends beside the axes
-# Okabe and Ito's colours, which every eye tells apart; a dark red for their yellow, too pale on white.
+# Okabe and Ito's colours, distinguishable with any colour vision; a dark red in place of their yellow, which
+# is too pale on white.
 PALETTE: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#882255")
-FAINT: Final = "#9A9A9A"  # curves without a label, beside others that have one
+FAINT: Final = "#9A9A9A"  # curves without a label, beside labelled ones
 INK: Final = "#262626"
 DASHES: Final[dict[str, str]] = {
     "solid": "-",
@@ -103,7 +104,7 @@ SETTINGS: Final[dict[str, Any]] = {
 
 
 def available() -> bool:
-    """Whether figures can be drawn: matplotlib is installed."""
+    """True if figures can be drawn: matplotlib is installed."""
     return find_spec("matplotlib") is not None
 
 
@@ -115,7 +116,7 @@ def draw(figure: Figure) -> Canvas:
     Parameters
     ----------
     figure
-        What to draw.
+        Data of the figure.
 
     Returns
     -------
@@ -152,11 +153,6 @@ def draw(figure: Figure) -> Canvas:
 def png(figure: Figure) -> bytes:
     """Draw a figure as a PNG; the same data give the same bytes.
 
-    Parameters
-    ----------
-    figure
-        What to draw.
-
     Raises
     ------
     ModuleNotFoundError
@@ -183,13 +179,13 @@ def sheet(
     Parameters
     ----------
     width, height
-        Of the sheet, px; a px is a hundredth of an inch for whoever draws.
+        Size of the sheet, px; a px is a hundredth of an inch in `marks`.
     marks
         Draws on axes that cover the sheet, in px from its upper left corner.
     scale
         Dots per px.
     about
-        Kept in the file.
+        Metadata of the file.
 
     Raises
     ------
@@ -214,7 +210,7 @@ def sheet(
 
 @contextmanager
 def _settings() -> Iterator[None]:
-    """Our settings on top of matplotlib's own defaults, whatever the user's are; undone afterwards."""
+    """Own settings on top of matplotlib's defaults, independent of the user's; undone afterwards."""
     from matplotlib import rc_context, rcdefaults, rcParams
 
     with rc_context():
@@ -224,13 +220,13 @@ def _settings() -> Iterator[None]:
 
 
 def _height(panel: Panel, count: int) -> float:
-    """Inches of a panel: more where it is alone, or where its legend is long."""
+    """Height of a panel, inches: larger for a single panel and for a long legend."""
     labelled = sum(bool(line.label) for line in panel.lines)
     return float(max({1: 3.4, 2: 2.4}.get(count, 1.85), 0.6 + 0.19 * labelled))
 
 
 def _typeset(text: str) -> str:
-    """Write Greek letters, subscripts and signs of a plain text as they are printed."""
+    """Greek letters, subscripts and signs of a plain text in print."""
     if "$" in text:
         return text
     text = re.sub(rf"(?<![A-Za-z])({'|'.join(GREEK)})(?![A-Za-z])", lambda name: GREEK[name[1]], text)
@@ -244,7 +240,7 @@ def _typeset(text: str) -> str:
 def _looks(panels: tuple[Panel, ...]) -> list[dict[str, tuple[Any, str]]]:
     """Colour and dashes of each label, per panel.
 
-    Panels that share a label share all as long as the palette is long enough; others begin anew.
+    Panels with a common label have a common assignment while the palette suffices; others start afresh.
     """
     families: list[dict[str, None]] = []
     for panel in panels:
@@ -269,7 +265,7 @@ def _shades(labels: list[str]) -> dict[str, tuple[Any, str]]:
         return {label: (PALETTE[k % most], ROUNDS[k // most]) for k, label in enumerate(labels)}
     from matplotlib import colormaps
 
-    # cividis without its palest end: ordered, and read the same by every eye.
+    # cividis without its palest end: ordered, and the same with any colour vision.
     return {
         label: (colour, "-")
         for label, colour in zip(labels, colormaps["cividis"](np.linspace(0.0, 0.85, count)), strict=True)
@@ -281,7 +277,7 @@ def _panel(axes: Axes, panel: Panel, looks: dict[str, tuple[Any, str]]) -> None:
 
     alone = len(panel.lines) == 1
     for k, (line, width) in enumerate(zip(panel.lines, _widths(panel), strict=True)):
-        # Without a label: the only curve, a crowd behind the others, or a broken partner in front of them.
+        # Without a label: the only curve, a group behind the others, or a dashed partner in front of them.
         crowd = line.style in {"solid", "steps"}
         colour, dashes = looks.get(line.label, (PALETTE[0] if alone else FAINT if crowd else INK, "-"))
         points = line.style == "points"
@@ -316,7 +312,7 @@ def _panel(axes: Axes, panel: Panel, looks: dict[str, tuple[Any, str]]) -> None:
 
 
 def _share(rows: list[Axes], panels: tuple[Panel, ...]) -> None:
-    """Give neighbours over the same abscissa the same ends, and the numbers to the lowest of them."""
+    """Give neighbours over the same abscissa the same limits, and tick labels to the lowest of them."""
     first = 0
     for k in range(1, len(rows) + 1):
         if k < len(rows) and _same_abscissa(panels[k - 1], panels[k]):
@@ -330,7 +326,7 @@ def _share(rows: list[Axes], panels: tuple[Panel, ...]) -> None:
 
 
 def _ends(low: float, high: float, left: float, right: float) -> tuple[float, float]:
-    """Ends of an abscissa: those of the axes, or the round number that the data all but reach."""
+    """Limits of an abscissa: those of the axes, or the round number just beyond the data."""
     span = high - low
     if span > 0.0:
         step = 10.0 ** np.floor(np.log10(span)) / 2.0
@@ -342,7 +338,7 @@ def _ends(low: float, high: float, left: float, right: float) -> tuple[float, fl
 
 
 def _widths(panel: Panel) -> list[float]:
-    """Each curve thinner than the one before it, so that one that runs under another still shows."""
+    """Line widths in descending order, so that a curve under another one stays visible."""
     count = sum(bool(line.label) for line in panel.lines)
     if len(panel.lines) == 1:
         return [1.4]
@@ -351,13 +347,13 @@ def _widths(panel: Panel) -> list[float]:
 
 
 def _counts(values: list[Any]) -> bool:
-    """Whether an axis counts something: few whole numbers, so that ticks between them have no meaning."""
+    """True for an axis of few whole numbers, with ticks at whole numbers only."""
     every = np.concatenate([v[np.isfinite(v)] for v in values]) if values else np.empty(0)
     return bool(every.size and np.all(every == np.round(every)) and np.ptp(every) <= 25.0)
 
 
 def _same_abscissa(upper: Panel, lower: Panel) -> bool:
-    """Whether two panels run over the same abscissa, so that one set of numbers serves both."""
+    """True if two panels have the same abscissa, so that one set of tick labels suffices."""
     if upper.x_label != lower.x_label:
         return False
     a, b = _span(upper.lines), _span(lower.lines)

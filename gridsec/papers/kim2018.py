@@ -123,7 +123,7 @@ def _simulation_claims(made: HighGainDesign, run: Run) -> list[Claim]:
 
 
 def _third(made: HighGainDesign, run: Run) -> Floats:
-    """Error of the estimate that always uses the third set, (k,)."""
+    """Error of the estimate by the third set alone, (k,)."""
     inverse = made.inverses[2]
     estimate = inverse(run.z[:, made.system.pick(inverse.sensors)])
     return np.asarray(np.max(np.abs(estimate - run.x), axis=1))

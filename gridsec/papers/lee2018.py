@@ -187,7 +187,7 @@ def _figure(run: Run) -> Figure:
     )
     return Figure(
         "lee2018-figures-4-9-to-4-12",
-        f"Three inertias: sensor 1 lies from {ATTACK_START:g} s on, the reference steps at "
+        f"Three inertias: sensor 1 is manipulated from {ATTACK_START:g} s on, the reference steps at "
         f"{REFERENCE_START:g} s; the resilient estimate stays with the state, one on all sensors does not",
         panels,
     )

@@ -34,20 +34,12 @@ FLOOR = 0.05
 # White noise of density 1e-8, held over a sampling time of 0.02 s (kim2018's; the dissertation has none).
 DEVIATION = float(np.sqrt(1e-8 / STEP))
 # The size of the attack is not in the text. The threshold is 5391 * 0.05 = 270, and a step of size a
-# raises the estimated derivative to theta a / e = 5.9 a for a moment: less than 46 is never noticed.
+# raises the estimated derivative to theta a / e = 5.9 a for a moment: less than 46 is never detected.
 ATTACK = 60.0
 
 
 def attack(t: Floats, size: float = ATTACK) -> Floats:
-    """Sensor 2 from 4 s on; (…, 4).
-
-    Parameters
-    ----------
-    t : (…)
-        Times, s.
-    size
-        Height.
-    """
+    """Attack on sensor 2 from 4 s on, for times t (…) in s; (…, 4)."""
     out = np.zeros((*t.shape, 4))
     out[..., 1] = size * (t >= 4.0)
     return out
@@ -60,13 +52,7 @@ def phi_printed(x: Sequence[Any]) -> list[Any]:
 
 
 def estimator(search: Literal["all", "one"] = "one") -> HighGainDesign:
-    """The dissertation's estimator; it has no reset rule.
-
-    Parameters
-    ----------
-    search
-        See `HighGainDesign`.
-    """
+    """Estimator of the dissertation, without a reset rule; `search` as in `HighGainDesign`."""
     model = system()
     decays = [decay_lee(part.size, THETA, FLOOR, printed=True) for part in model.partials]
     return design(
@@ -85,14 +71,14 @@ def estimator(search: Literal["all", "one"] = "one") -> HighGainDesign:
 
 
 def smallest_noticed(*, low: float = 1.0, high: float = 100.0, tolerance: float = 0.1) -> float:
-    """Smallest step on sensor 2 that the printed threshold notices, by bisection over simulations.
+    """Smallest step on sensor 2 that the printed threshold detects, by bisection over simulations.
 
     Parameters
     ----------
     low, high
-        A size that passes unnoticed, and one that does not.
+        An undetected and a detected size.
     tolerance
-        Of the answer.
+        Tolerance of the result.
     """
     made = estimator()
     while high - low > tolerance:
@@ -103,7 +89,7 @@ def smallest_noticed(*, low: float = 1.0, high: float = 100.0, tolerance: float 
 
 
 def reproduce() -> Reproduction:
-    """The constant of the threshold, the switching, and Figures 5.1 to 5.4."""
+    """Constant of the threshold, switching, and Figures 5.1 to 5.4."""
     run = simulate(estimator(), attack, seconds=10.0, deviation=DEVIATION)
     decay = decay_lee(2, THETA, 0.0, printed=True)
     proven = decay_componentwise(2, THETA, 0.0)

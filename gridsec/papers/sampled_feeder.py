@@ -1,4 +1,4 @@
-"""Algorithms 1 and 2 of yang2019 on a feeder whose meters are read at regular times.
+"""Algorithms 1 and 2 of yang2019 on a feeder with readings at regular times.
 
 References
 ----------
@@ -27,12 +27,12 @@ JUMP = 3e-4
 
 
 def points(suspects: Bools) -> tuple[Floats, Floats]:
-    """Points (window, meter), both from 1; meter 0 for a window that names nobody.
+    """Points (window, meter), both from 1; meter 0 for a window without named meters.
 
     Parameters
     ----------
     suspects : (w, p)
-        Who is named in each window.
+        Named meters of each window.
     """
     with_nobody = np.hstack([~suspects.any(axis=1, keepdims=True), suspects])
     window, meter = np.nonzero(with_nobody)
@@ -41,14 +41,14 @@ def points(suspects: Bools) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FeederStudy:
-    """The two algorithms on a sampled feeder.
+    """Results of the two algorithms on a sampled feeder.
 
     Attributes
     ----------
     design
         Bank and proven thresholds.
     error, bound : (T, o), (o,)
-        Error of every observer, and what is proven about it, pu of reactive power.
+        Error of every observer, and its proven bound, pu of reactive power.
     verdicts
         One for each window.
     """
@@ -73,11 +73,10 @@ def on_feeder(
     seed: int,
     rule: Rule = "majority",
 ) -> FeederStudy:
-    """Bank by direct injection on a feeder sampled every h seconds; truth by the continuous model.
+    """Bank by direct injection on a feeder sampled every h seconds, with the continuous model as plant.
 
-    The observers run on the exponential Euler step. What the continuous plant does otherwise within a
-    step is an error of the arguments of at most `held` and part of the thresholds, so that nothing
-    about the discretisation is left out.
+    The observers run on the exponential Euler step. The deviation of the continuous plant within a step is an
+    error of the arguments of at most `held` and part of the thresholds, which thus cover the discretisation.
 
     Parameters
     ----------
@@ -86,20 +85,18 @@ def on_feeder(
     h
         Time between readings, s.
     u : (T, l)
-        Known input, held from reading to reading.
+        Known input, constant between readings.
     noise
         Half-width of the meters' uniform noise, squared pu.
     held : (m,)
-        Bound on the movement of each inverter's argument within a step, squared pu: `sampled.held_error`
+        Bound on the motion of each inverter's argument within a step, squared pu: `sampled.held_error`
         or `sampled.drift_error`.
     limit : (m,)
         Largest injection of each inverter, pu.
     lie : (T, p)
         Attack, squared pu (in z).
     max_attacked, length, rule
-        q, N, and how windows isolate.
-    seed
-        Of the noise.
+        q, N, and the isolation rule of windows.
     """
     plant = sample(lure, h)
     slowest = spectral_radius(plant.A)
@@ -137,11 +134,11 @@ def on_feeder(
 def figure() -> Figure:
     """Algorithms 1 and 2 on a sampled feeder: the line of chong2020, section VII, read once a second.
 
-    Meter 3 begins to lie by 0.04 squared pu (2.1 % of the voltage) after 150 s; windows have 20 steps.
+    Meter 3 has a bias of 0.04 squared pu (2.1 % of the voltage) from 150 s on; windows have 20 steps.
     """
     of, T = chong2020.setting(), 300
     rng = np.random.default_rng(4)
-    # Loads wander: no argument jumps by more than JUMP from one reading to the next.
+    # Loads drift: no argument jumps by more than JUMP from one reading to the next.
     u = of.w + np.cumsum(rng.uniform(-JUMP, JUMP, (T, 1)), axis=0)
     lie = np.zeros((T, chong2020.CUSTOMERS))
     lie[150:, 2] = 0.04
@@ -171,5 +168,5 @@ def figure() -> Figure:
             "Named", "t in s", "meter (0: none)", (Line("", t[window.astype(np.intp) - 1], meter, "points"),)
         ),
     )
-    caption = "Sampled line feeder, five meters with noise, one lying from 150 s on; proven thresholds."
+    caption = "Sampled line feeder, five meters with noise, one manipulated from 150 s on; proven thresholds."
     return Figure("yang2019-feeder", caption, panels)

@@ -1,7 +1,7 @@
 """The three-inertia system of lee2018, section 4.5: three wheels on two springs, under integral control.
 
-What the dissertation does not print is chosen here and said so: the attack's course, the reference, the
-initial state, the gains of the observers.
+Values that the dissertation does not print are chosen here and marked: the attack's course, the reference,
+the initial state, the gains of the observers.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ ROWS_PRINTED = np.array(
 )
 """C_c as printed: six rows for five outputs. The third repeats the second; y has no such entry."""
 
-# Ours, where the dissertation prints nothing.
+# Chosen here; not printed in the dissertation.
 REFERENCE, REFERENCE_START = 1.0, 0.5
 X_START = np.array([0.02, 0.0, -0.01, 0.0, 0.02, 0.0])
 START_ERROR = 0.05
@@ -58,7 +58,7 @@ RATE, SLOWEST, TOL = 0.998, 1.0 - 1e-6, 1e-9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plant:
-    """A sampled plant and where it comes from.
+    """A sampled plant and its continuous origin.
 
     Attributes
     ----------
@@ -67,7 +67,7 @@ class Plant:
     A, B, C : (6, 6), (6, 1), (5, 6)
         Sampled with zero-order hold.
     E : (6, 6)
-        What a disturbance w, held over a step, adds to the state: d = E w.
+        Input matrix of a disturbance w that is constant over a step: d = E w.
     """
 
     A_c: Floats
@@ -84,8 +84,8 @@ def plant(disturbance: Literal["continuous", "sampled"] = "continuous") -> Plant
     Parameters
     ----------
     disturbance
-        What d_max bounds. "continuous": d(t) of (4.5.1), held over each step. "sampled": d(k) of (4.1.1),
-        which is a thousand times as much.
+        Quantity bounded by d_max. "continuous": d(t) of (4.5.1), constant over each step. "sampled": d(k) of
+        (4.1.1), a thousand times as large.
 
     References
     ----------
@@ -112,8 +112,6 @@ def estimator(model: Plant, *, slowest: float = SLOWEST) -> BoundedDesign:
 
     Parameters
     ----------
-    model
-        From `plant`.
     slowest
         0 for the observability decomposition; the detectability decomposition by default.
     """
@@ -137,7 +135,7 @@ def gaussian_estimator(model: Plant, *, false_alarm: float = 1e-4) -> GaussianDe
 
 
 def conventional_gain(model: Plant) -> Floats:
-    """L of one observer (4.2.1) that listens to all sensors: the stationary Kalman predictor.
+    """L of one observer (4.2.1) on all sensors, the stationary Kalman predictor.
 
     Returns
     -------
@@ -149,13 +147,13 @@ def conventional_gain(model: Plant) -> Floats:
 
 
 def attack(t: Floats) -> Floats:
-    """a_1(t), rad: from 2 s on, half a radian with a swing of 2 Hz on top. The course is ours."""
+    """a_1(t), rad: from 2 s on, half a radian with a swing of 2 Hz on top. The course is chosen here."""
     lie = 0.5 + 0.3 * np.sin(4.0 * np.pi * (t - ATTACK_START))
     return np.where(t >= ATTACK_START - 0.5 * PERIOD, lie, 0.0)
 
 
 def reference(t: Floats) -> Floats:
-    """theta_3,ref(t), rad: one radian from 0.5 s on. Amplitude and time are ours."""
+    """theta_3,ref(t), rad: one radian from 0.5 s on. Amplitude and time are chosen here."""
     return np.where(t >= REFERENCE_START - 0.5 * PERIOD, REFERENCE, 0.0)
 
 
@@ -200,7 +198,7 @@ class Run:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _World:
-    """Everything random or prescribed, drawn before the loop."""
+    """Random and prescribed signals, drawn before the loop."""
 
     d: Floats
     n: Floats
@@ -237,18 +235,14 @@ def simulate(
 
     Parameters
     ----------
-    model
-        From `plant`.
     design
         From `estimator` or `gaussian_estimator`.
-    seconds
-        Length.
     seed
-        Of disturbance and noise: uniform within their bounds, or Gaussian of the same variance.
+        Seed of disturbance and noise: uniform within their bounds, or Gaussian of the same variance.
     attacked
-        Whether sensor 1 lies from 2 s on.
+        Attack sensor 1 from 2 s on.
     feedback
-        Which of the two estimates drives the controller.
+        Estimate used by the controller.
     """
     t: Floats = np.arange(round(seconds / PERIOD), dtype=np.float64) * PERIOD
     world = _world(model, t, seed, attacked=attacked, normal=isinstance(design, GaussianDesign))
@@ -272,7 +266,7 @@ def simulate(
         used = hats[k] if feedback == "resilient" else plain
         u = FEEDBACK @ used + INTEGRAL * total
         us[k] = u[0]
-        # The controller has estimates only: what it integrates is the estimated theta_3.
+        # The controller has estimates only and integrates the estimated theta_3.
         total += world.wanted[k] - used[4]
         plain = model.A @ plain + model.B @ u + gain @ (y - model.C @ plain)
         x = model.A @ x + model.B @ u + world.d[k]

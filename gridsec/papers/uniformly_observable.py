@@ -1,8 +1,8 @@
 """The uniformly observable example of kim2018, section IV, and lee2018, section 5.5.
 
-With `a = x1 - x2^3`, `b = x2`, `c = x3 - sin x2` the example is linear: `a' = -2 a + u`, `b' = -b + u`,
-`c' = -c`, and `h = (a + b + c, a - c, b - a, c - b)`. Everything here can therefore be checked by hand,
-and the truth is known in closed form.
+With `a = x1 - x2^3`, `b = x2`, `c = x3 - sin x2` the example is linear: `a' = -2 a + u`, `b' = -b + u`, `c' =
+-c`, and `h = (a + b + c, a - c, b - a, c - b)`. Everything here can therefore be checked by hand, and the
+true state is known in closed form.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ STEP = 0.02
 LIP_PHI = 7.0
 LIP_INVERSE = 770.0
 SIZES = (2, 2, 2, 1)
-# The figure that shows the attacks is not in the text that we have: these sizes are ours. A constant
+# The figure of the attacks is not in the available text; these sizes are chosen here. A constant
 # attack of 5 on an output of size 1 keeps the residual above 5391 * 4.74e-4 = 2.56 while it lasts.
 ATTACK = 5.0
 START = (0.1, 0.1, -0.1)
@@ -76,7 +76,7 @@ def u(t: Floats | float) -> Floats:
 
 
 def phi(x: Sequence[Any]) -> list[Any]:
-    """The seven entries of Phi as they follow from (3); the printed list has one of them wrong."""
+    """The seven entries of Phi by (3); one entry of the printed list is wrong."""
     a, b, c = x
     s, cube = np.sin(b), b**3
     first = [a + b - cube - s + c, -2.0 * a + s - b + 2.0 * cube - c]
@@ -86,7 +86,7 @@ def phi(x: Sequence[Any]) -> list[Any]:
 
 
 def phi_printed(x: Sequence[Any]) -> list[Any]:
-    """Phi as printed: `L_f h_2` stands in the place of `h_2` too (erratum)."""
+    """Phi as printed: `L_f h_2` also takes the place of `h_2` (erratum)."""
     rows = phi(x)
     return [*rows[:2], rows[3], *rows[3:]]
 
@@ -163,13 +163,7 @@ ROWS: tuple[Floats, ...] = tuple(
 
 
 def inverse_rows(k: int) -> Callable[[Sequence[Any]], list[list[Any]]]:
-    """Jacobian of the k-th left inverse of Table I over components, for interval bounds.
-
-    Parameters
-    ----------
-    k
-        0 to 3.
-    """
+    """Jacobian of the k-th left inverse of Table I, k = 0 to 3, over components, for interval bounds."""
     a, b, c = ROWS[k].tolist()
 
     def rows(z: Sequence[Any]) -> list[list[Any]]:
@@ -219,13 +213,7 @@ def _linear_blocks() -> list[Floats]:
 
 
 def printed_inverses(model: System) -> tuple[Inverse, ...]:
-    """Table I, extended by saturation, with the paper's factor `1 + 7 * 770`.
-
-    Parameters
-    ----------
-    model
-        `system()`.
-    """
+    """Table I, extended by saturation, with the paper's factor `1 + 7 * 770`, for `model` = `system()`."""
     factor = 1.0 + LIP_PHI * LIP_INVERSE
     return tuple(
         given(model, group, function, factor=factor, z_bound=Z_BOUND)
@@ -266,7 +254,7 @@ def sharp_design(noise: float = NOISE) -> HighGainDesign:
         Measurement error that the thresholds allow for, interpolation between samples included.
     """
     model = system()
-    # Below every threshold of this design, so that it only saves time.
+    # Below every threshold of this design, so that it affects time only.
     enough = decay_componentwise(2, THETA, noise).epsilon
     return design(
         model,
@@ -306,14 +294,14 @@ def trajectory(t: Floats, start: Sequence[float] = START) -> Floats:
 
 
 def attacks(t: Floats, size: float = ATTACK) -> Floats:
-    """The scenario of Figure 1(a): sensor 3 on [6, 8], then sensor 2 on [17, 20]; (…, 4).
+    """Scenario of Figure 1(a): attack on sensor 3 in [6, 8], then on sensor 2 in [17, 20]; (…, 4).
 
     Parameters
     ----------
     t : (…)
         Times, s.
     size
-        Height of the two waves; the paper's is not in the text.
+        Height of the two pulses; the paper's is not in the text.
     """
     out = np.zeros((*t.shape, 4))
     out[..., 2] = size * ((t >= 6.0) & (t <= 8.0))
@@ -334,9 +322,9 @@ class Run:
     z : (k, 7)
         Estimates of the partial observers.
     attack : (k, 4)
-        What was added to the outputs.
+        Attack on the outputs.
     outcomes
-        Answers, one for each instant.
+        Results, one for each instant.
     """
 
     t: Floats
@@ -352,7 +340,7 @@ class Run:
 
     @property
     def estimates(self) -> Floats:
-        """(k, 3)."""
+        """Estimated states, (k, 3)."""
         return np.array([outcome.x for outcome in self.outcomes])
 
 
@@ -368,14 +356,8 @@ def simulate(
 
     Parameters
     ----------
-    made
-        The estimator.
     attack
         Attacks (k, 4) as a function of the times (k,).
-    seconds
-        Duration.
-    seed
-        Of the noise.
     deviation
         If given, the noise is Gaussian with this standard deviation (lee2018).
     """
@@ -404,8 +386,6 @@ def switching(run: Run, start: float, stop: float) -> str:
 
     Parameters
     ----------
-    run
-        A simulation.
     start, stop
         Times, s.
     """
@@ -415,5 +395,5 @@ def switching(run: Run, start: float, stop: float) -> str:
 
 
 def constants() -> Decay:
-    """eta, eps and rate of the sensors of order 2, as the paper derives them."""
+    """eta, eps and rate of the sensors of order 2, by the paper's derivation."""
     return decay_kim(2, THETA, NOISE)

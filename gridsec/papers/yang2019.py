@@ -2,7 +2,7 @@
 
 The paper prints neither the gains of its observers nor numbers for its figures. Here the observers have the
 smallest proven noise gain. With them the paper's own recipe, (10) and (19) with simulated gains, detects and
-isolates nothing in the settings of Figures 1 to 4. `reproduce` prints its rates beside those of calibrated
+isolates no attack in the settings of Figures 1 to 4. `reproduce` prints its rates beside those of calibrated
 thresholds and of another voting rule, which are this project's.
 
 References
@@ -41,7 +41,7 @@ RUNS = 500
 DETECTION = (0.7, 1.0)
 ISOLATION = (2.0, 5.0)
 OTHER_DECAYS = (0.6, 0.8, 0.9, 0.95)
-"""Further banks, each with one decay for all observers: no rate hangs on the choice of `DECAYS`."""
+"""Further banks, each with one decay for all observers: the rates do not depend on the choice of `DECAYS`."""
 OTHER_RUNS = 100
 """Simulated runs behind the thresholds of each further bank."""
 RECIPE_FAILS = (
@@ -69,7 +69,7 @@ def system() -> DiscreteLure:
 
 
 def every_observer() -> tuple[DiscreteGains, ...]:
-    """A circle-criterion observer for each of the 15 non-empty sets of sensors, largest sets first."""
+    """Circle-criterion observers for each of the 15 non-empty sets of sensors, largest sets first."""
     sets = [J for size in (4, 3, 2, 1) for J in combinations(range(4), size)]
     return discrete_circles(system(), sets, discrete_options(system(), decays=DECAYS, noise=1.0))
 
@@ -90,14 +90,12 @@ def bank(decays: tuple[float, ...] = DECAYS) -> tuple[DiscreteDesign, ...]:
 def simulated_gains(
     observers: Sequence[DiscreteDesign], *, runs: int, seed: int
 ) -> circle_discrete.MonteCarlo:
-    """Gains by simulation, as the paper obtains them: normal initial states, uniform noise, u = 0.
+    """Gains by simulation, as in the paper: normal initial states, uniform noise, u = 0.
 
     Parameters
     ----------
-    observers
-        The bank.
     runs, seed
-        Number of runs of 1000 steps, and where the random numbers begin.
+        Number of runs of 1000 steps, and seed of the random numbers.
     """
     start = np.random.default_rng(seed).standard_normal((runs, 2))
     return circle_discrete.monte_carlo(
@@ -106,7 +104,7 @@ def simulated_gains(
 
 
 def _still() -> Floats:
-    """The input; the paper leaves it open, and it cancels in the linear part of every error."""
+    """The input; the paper does not state it, and it cancels in the linear part of every error."""
     return np.zeros((STEPS, 1))
 
 
@@ -115,14 +113,12 @@ def trial(design: WindowDesign, *, sensor: int | None, size: float, runs: int, s
 
     Parameters
     ----------
-    design
-        The bank.
     sensor
-        Which one, from 0; None: nobody.
+        Attacked sensor, from 0; None for no attack.
     size
         Size of the attack.
     runs, seed
-        How many, and where the random numbers begin.
+        Number of runs, and seed of the random numbers.
     """
     rng = np.random.default_rng(seed)
     start = rng.standard_normal((runs, 2))
@@ -134,7 +130,7 @@ def trial(design: WindowDesign, *, sensor: int | None, size: float, runs: int, s
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Levels:
-    """The three kinds of thresholds, for one bank.
+    """Three kinds of thresholds for one bank.
 
     Attributes
     ----------
@@ -143,9 +139,9 @@ class Levels:
     simulated
         (10) and (19) with simulated gains, as in the paper.
     calibrated
-        The largest pi and pi_J of simulated honest runs.
+        The largest pi and pi_J of simulated runs without attack.
     exceedance
-        Probability with which, at 99 % confidence, one more honest run of this kind exceeds a given
+        Probability, at 99 % confidence, that one more run without attack of this kind exceeds a given
         simulated gain or calibrated threshold.
     """
 
@@ -164,7 +160,7 @@ def levels(decays: tuple[float, ...] = DECAYS, runs: int = RUNS) -> Levels:
     decays
         Candidates for the observers' decay.
     runs
-        Simulated runs.
+        Number of simulated runs.
     """
     observers = bank(decays)
     proven = windows.design(observers, 1, noise=NOISE, length=LENGTHS[0])
@@ -175,38 +171,20 @@ def levels(decays: tuple[float, ...] = DECAYS, runs: int = RUNS) -> Levels:
 
 
 def large_sets(design: WindowDesign) -> Bools:
-    """Masks (s, p) of the sets of p - q sensors, in the order of pi_J.
-
-    Parameters
-    ----------
-    design
-        The bank.
-    """
+    """Masks (s, p) of the sets of p - q sensors, in the order of pi_J."""
     return design.observers.masks[1 : 1 + design.sets.count_large]
 
 
 def detection_rates(design: WindowDesign, trace: windows.Trace) -> Floats:
-    """Part of the windows that Algorithm 1 finds attacked, for N = 50, 100, 200.
-
-    Parameters
-    ----------
-    design
-        Thresholds.
-    trace
-        Simulated runs.
-    """
+    """Fraction of the windows found attacked by Algorithm 1, for N = 50, 100, 200."""
     return np.array([windows.detection(trace.pi, design.detect_above, N).mean() for N in LENGTHS])
 
 
 def isolation_rates(design: WindowDesign, trace: windows.Trace, sensor: int, rule: Rule) -> Floats:
-    """Part of the windows that name exactly the attacked sensor, for N = 50, 100, 200.
+    """Fraction of the windows that name exactly the attacked sensor, for N = 50, 100, 200.
 
     Parameters
     ----------
-    design
-        Thresholds.
-    trace
-        Simulated runs.
     sensor
         The attacked sensor, from 0.
     rule
@@ -221,7 +199,7 @@ def isolation_rates(design: WindowDesign, trace: windows.Trace, sensor: int, rul
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Setting:
-    """The setting of one of the paper's four figures.
+    """Setting of one of the paper's four figures.
 
     Attributes
     ----------
@@ -242,28 +220,18 @@ class Setting:
 
     @property
     def text(self) -> str:
-        """The attack, in the paper's letters."""
+        """The attack, in the paper's notation."""
         return f"a_{self.sensor + 1} in ±{self.size:g}"
 
     def rates(self, design: WindowDesign, trace: windows.Trace, rule: Rule = "majority") -> Floats:
-        """Part of the windows that the algorithm decides as it should, for N = 50, 100, 200.
-
-        Parameters
-        ----------
-        design
-            Thresholds.
-        trace
-            Simulated runs.
-        rule
-            Of Algorithm 2.
-        """
+        """Fraction of windows with the correct decision, for N = 50, 100, 200; `rule` of Algorithm 2."""
         if self.isolates:
             return isolation_rates(design, trace, self.sensor, rule)
         return detection_rates(design, trace)
 
 
 DETECTED, ISOLATED = 1, 2
-"""Sensors that the paper attacks for Algorithms 1 and 2, from 0."""
+"""Attacked sensors for Algorithms 1 and 2, from 0."""
 SETTINGS = (
     *(Setting(k, DETECTED, size) for k, size in enumerate(DETECTION, start=1)),
     *(Setting(k, ISOLATED, size) for k, size in enumerate(ISOLATION, start=3)),
@@ -271,14 +239,9 @@ SETTINGS = (
 
 
 def figure(of: Setting) -> Figure:
-    """Data in the setting of one of Figures 1 to 4: every window's answer in one run, for N = 50, 100, 200.
+    """Result of every window in one run in the setting of Figures 1 to 4, for N = 50, 100, 200.
 
-    Detection is 0 or 1; isolation the numbers of the named sensors, 0 where none is.
-
-    Parameters
-    ----------
-    of
-        The setting.
+    Detection is 0 or 1; isolation the numbers of the named sensors, 0 if there are none.
     """
     at = levels()
     trace = trial(at.proven, sensor=of.sensor, size=of.size, runs=1, seed=10 + of.figure)
@@ -313,7 +276,7 @@ def _threshold(of: Setting) -> str:
 
 
 def deadbeat_bank() -> tuple[DiscreteDesign, ...]:
-    """A bank for x+ = x / 2, five sensors y_i = x, two of them attacked: every observer forgets in a step.
+    """Bank for x+ = x / 2, five sensors y_i = x, two of them attacked, with error decay in one step.
 
     `L_J` has the entries `1 / (2 |J|)`, so that `e_J(k+1) = -sum over J of (n_i + a_i) / (2 |J|)`.
     """
@@ -340,10 +303,10 @@ def deadbeat_bank() -> tuple[DiscreteDesign, ...]:
 
 
 def alternating_attack() -> tuple[WindowDesign, windows.Trace]:
-    """Counterexample to Proposition 4: two attackers who take turns, one window of 100 steps.
+    """Counterexample to Proposition 4: two alternating attacks, one window of 100 steps.
 
-    Every attacked set of three sensors exceeds its threshold in at least half of the steps, as (23)
-    asks, but never all of them at once. Neither attack is ever zero.
+    Every attacked set of three sensors exceeds its threshold in at least half of the steps, as required by
+    (23), but never all of them at once. Neither attack is ever zero.
     """
     design = windows.design(deadbeat_bank(), 2, noise=0.1, length=100)
     attack = np.zeros((101, 5))
@@ -353,7 +316,7 @@ def alternating_attack() -> tuple[WindowDesign, windows.Trace]:
 
 
 def reproduce() -> Reproduction:
-    """Everything that the paper's example states, beside what comes out here."""
+    """Statements of the paper's example beside the computed results."""
     at = levels()
     made, bank_size = every_observer(), at.proven.observers.masks.sum(axis=1)
     traces = [
@@ -384,7 +347,7 @@ def _no_false_alarm(at: Levels) -> Claim:
 
 
 def _figure_claim(at: Levels, of: Setting, trace: windows.Trace) -> Claim:
-    """Return the rates of the paper's recipe; beside them those of this project's thresholds and rule."""
+    """Return the rates of the paper's recipe, beside those of this project's thresholds and rule."""
     task = "windows naming sensor 3 alone" if of.isolates else "windows found attacked"
     recipe = f"Algorithm {1 + of.isolates}, {_threshold(of)} with simulated gains"
     what = f"{task}, {of.text}: {recipe}, N = 50, 100, 200"
@@ -418,12 +381,12 @@ def _shown(rates: Floats) -> str:
 
 
 def fast_levels() -> Levels:
-    """Thresholds for observers with decay 0.6 throughout: faster and noisier than need be."""
+    """Thresholds for observers with decay 0.6 throughout: faster and noisier than necessary."""
     return levels((0.6,), OTHER_RUNS)
 
 
 def _remark_2() -> Claim:
-    """Longer windows make Algorithm 2 worse where most steps believe everybody."""
+    """Longer windows degrade Algorithm 2 if most steps trust all sensors."""
     at = fast_levels()
     rates = isolation_rates(
         at.calibrated, trial(at.proven, sensor=ISOLATED, size=5.0, runs=60, seed=60), ISOLATED, "majority"

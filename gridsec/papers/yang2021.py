@@ -1,9 +1,9 @@
-"""yang2021, Examples 1 to 4: which observers exist, Figures 1 to 12, as printed and corrected.
+"""yang2021, Examples 1 to 4: existence of the observers, Figures 1 to 12, as printed and corrected.
 
-As printed, neither bank is complete: Assumptions 2 and 3 do not hold, and Theorems 1 and 2 say nothing
-about the examples. The figures come out all the same, because the attacks that they show spare the
-missing members. The corrections are the smallest that make every member exist: fewest entries of C, then
-least change (docs/errata/yang2021.md).
+As printed, neither bank is complete: Assumptions 2 and 3 do not hold, and Theorems 1 and 2 do not cover the
+examples. The figures are reproduced nevertheless, because their attacks spare the missing members. The
+corrections are the smallest that make every member exist: fewest entries of C, then least change
+(docs/errata/yang2021.md).
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from gridsec.papers import yang2021_feeder
 from gridsec.papers.claims import Claim, Figure, Line, Panel, Reproduction, number, statement
 
 TOLERANCE = 1e-3
-"""What counts as zero in (46), (47) after the steps of the figures."""
+"""Tolerance of zero in (46), (47) after the steps of the figures."""
 STEPS = 20
 """k = 0 … 19, "19 time-steps"."""
 CORRECTION_1 = (1, 1, 2.0)
-"""Example 1: sensor 2 reads `x_1 + 2 x_2` instead of `x_1 + x_2`, which sensor 1 reads already."""
+"""Example 1: sensor 2 reads `x_1 + 2 x_2` in place of `x_1 + x_2`, the reading of sensor 1."""
 CORRECTION_2 = (1, 2, 0.4)
-"""Example 2: sensor 2 reads `x_1 + x_2 + 0.4 x_3` instead of `x_1 + x_2 + x_3`."""
+"""Example 2: sensor 2 reads `x_1 + x_2 + 0.4 x_3` in place of `x_1 + x_2 + x_3`."""
 
 
 def plant(example: int, *, corrected: bool = False) -> UnknownInputPlant:
@@ -40,12 +40,12 @@ def plant(example: int, *, corrected: bool = False) -> UnknownInputPlant:
     example
         1 (also of Example 3) or 2 (also of Example 4).
     corrected
-        With the one entry of C changed that makes all members of the bank exist.
+        Change the one entry of C that makes all members of the bank exist.
 
     Raises
     ------
     ValueError
-        If there is no such example.
+        If `example` is not 1 or 2.
     """
     if example == 1:
         A, B = np.array([[0.2, 0.5], [0.2, 0.7]]), np.eye(2)
@@ -112,7 +112,7 @@ class Run:
     bound : (T, n)
         Bound of the estimate's error; proven only where no member is missing.
     answers
-        Everything the bank said.
+        Results of the bank.
     """
 
     x: Floats
@@ -125,13 +125,7 @@ class Run:
     answers: tuple[Isolation, ...]
 
     def named(self, last: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        """Inputs and sensors (from 1) whose reconstructed attack exceeds `TOLERANCE` in the last steps.
-
-        Parameters
-        ----------
-        last
-            How many steps at the end count.
-        """
+        """Inputs and sensors (from 1) with a reconstructed attack above `TOLERANCE` in the `last` steps."""
         inputs = support(self.a_u_hat[-last - 1 : -1], TOLERANCE).any(axis=0)
         sensors = support(self.a_y_hat[-last:], TOLERANCE).any(axis=0)
         return tuple(int(i) + 1 for i in np.flatnonzero(inputs)), tuple(
@@ -158,11 +152,10 @@ def simulate(
     amplitude
         Attacks are uniform in (-amplitude, amplitude).
     inputs, sensors
-        Attacked ones, from 0. By default both inputs (Example 1) or the third (Example 4's text).
-    steps
-        Number of steps.
+        Attacked inputs and sensors, from 0. By default both inputs (Example 1) or the third (Example 4's
+        text).
     seed
-        Of the random numbers; the paper does not give its own.
+        Seed of the random numbers; the paper does not state its own.
     """
     made = bank(example, corrected=corrected)
     model = made.family.plant
@@ -200,7 +193,7 @@ class Doubt:
     Attributes
     ----------
     y : (T, p)
-        What the sensors report, in both.
+        Reports of the sensors in both.
     u : (T, r)
         Known input of both.
     x : (2, T, n)
@@ -216,10 +209,10 @@ class Doubt:
 
 
 def doubt(example: int, size: float, steps: int = STEPS) -> Doubt:
-    """Why the printed examples are hopeless: what nobody could tell apart, with q = 1 or q_1 = q_2 = 1.
+    """Two indistinguishable histories of a printed example, with q = 1 or q_1 = q_2 = 1.
 
-    Example 1: sensors 1 and 2 read the same, so that states that differ along (1, -1) differ in sensors
-    3 and 4 only. In one history sensor 3 lies, in the other sensor 4; both inputs are attacked anyway.
+    Example 1: sensors 1 and 2 read the same, so that states that differ along (1, -1) differ in sensors 3 and
+    4 only. In one history sensor 3 is attacked, in the other sensor 4; both inputs are attacked in either.
     Example 2: `b_1 - b_2` moves neither sensor 1 nor sensor 2. Input 1 and sensor 3 are attacked in one
     history, input 2 and sensor 4 in the other, and the states differ by `size (b_1 - b_2)` at the end.
 
@@ -228,7 +221,7 @@ def doubt(example: int, size: float, steps: int = STEPS) -> Doubt:
     example
         1 or 2, as printed.
     size
-        How far the states are apart, in multiples of (1, -1) or b_1 - b_2.
+        Distance of the states, in multiples of (1, -1) or b_1 - b_2.
     steps
         Length of the histories.
     """
@@ -244,7 +237,7 @@ def doubt(example: int, size: float, steps: int = STEPS) -> Doubt:
         x[0, -1], x[1, -1] = size * model.inputs[:, 0], size * model.inputs[:, 1]
         attacked = (((0,), (2,)), ((1,), (3,)))
     honest = x @ model.system.C.T
-    # Sensor 3 reports what it would read in the second history, sensor 4 what it would in the first.
+    # Sensor 3 reports its reading of the second history, sensor 4 that of the first.
     y = honest[0].copy()
     y[:, 2] = honest[1][:, 2]
     return Doubt(y, u, x, attacked)
@@ -311,28 +304,24 @@ def _simulation_claims() -> list[Claim]:
                 what = f"(inputs, sensors) named, attacks in ±{amplitude:g}, {how}"
                 out.append(statement(what, f"Example {place}", str(expected), str(found)))
     worst = doubt_error(1)
-    why = "sensors 3 and 4 cannot accuse each other while 1 and 2 read the same: docs/errata/yang2021.md"
+    why = (
+        "attacks on sensors 3 and 4 cannot be told apart while 1 and 2 read the same: docs/errata/yang2021.md"
+    )
     claim = Claim(
-        "any one sensor may lie", "Example 1, q = 1", "error -> 0", f"error {worst:.3g}", worst < 1e-6
+        "attack on any one sensor", "Example 1, q = 1", "error -> 0", f"error {worst:.3g}", worst < 1e-6
     )
     out.append(replace(claim, why=why))
     worst = doubt_error(2)
     why = "b_1 - b_2 is invisible to sensors 1 and 2: docs/errata/yang2021.md"
     claim = Claim(
-        "any one input and sensor may lie", "Example 2", "error -> 0", f"error {worst:.3g}", worst < 1e-6
+        "attack on any one input and sensor", "Example 2", "error -> 0", f"error {worst:.3g}", worst < 1e-6
     )
     out.append(replace(claim, why=why))
     return out
 
 
 def doubt_error(example: int, size: float = 2.0) -> float:
-    """Error of the printed bank in the worse of the two histories of `doubt`, at the end.
-
-    Parameters
-    ----------
-    example, size
-        As in `doubt`.
-    """
+    """Error of the printed bank in the worse of the two histories of `doubt`, at the end."""
     story, made = doubt(example, size), bank(example)
     state = init(made, 0.0)
     for y, u in zip(story.y, story.u, strict=True):

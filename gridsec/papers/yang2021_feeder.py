@@ -1,8 +1,8 @@
-"""yang2021 on a feeder: an inverter that injects the wrong reactive power and a meter that lies, at once.
+"""yang2021 on a feeder: simultaneous attacks on an inverter's reactive power and on a meter.
 
 The feeder is the overhead line of Kerber's rural network, 13 customers at equal distances; three
-inverters with a droop curve, eight meters. docs/papers/yang2021.md says for which inverters the bank
-exists, and how exact readings have to be.
+inverters with a droop curve, eight meters. docs/papers/yang2021.md states for which inverters the bank
+exists, and the required accuracy of readings.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def loop(at: tuple[int, ...], meters: tuple[int, ...]) -> Lure:
 
 
 def plant(at: tuple[int, ...], meters: tuple[int, ...], reading_error: float) -> UnknownInputPlant:
-    """The sampled loop with every inverter open to attack.
+    """The sampled loop with attacks possible on every inverter.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def plant(at: tuple[int, ...], meters: tuple[int, ...], reading_error: float) ->
         reading_error=np.full(len(meters), reading_error),
         u_error=np.zeros(CUSTOMERS),
         curve_error=np.zeros(len(at)),
-        # Beyond its droop an inverter can be made to inject; not beyond twice as much.
+        # An attacked inverter may inject beyond its droop, up to twice its limit.
         span=2.0 * _droop(at).limit,
     )
 
@@ -93,13 +93,7 @@ METERS = (0, 2, 4, 6, 8, 10, 11, 12)
 
 @lru_cache(maxsize=1)
 def bank(reading_error: float = 1e-6) -> IsolationDesign:
-    """Bank for one wrong inverter among three and one lying meter among eight: all 108 members exist.
-
-    Parameters
-    ----------
-    reading_error
-        As in `plant`.
-    """
+    """Bank for one attacked inverter of three and one attacked meter of eight: all 108 members exist."""
     return design(plant(AT, METERS, reading_error), max_inputs=1, max_sensors=1)
 
 
@@ -114,7 +108,7 @@ class Run:
     a_y : (T, p)
         Attacks on the meters, squared pu.
     answers
-        What the bank said.
+        Results of the bank.
     """
 
     x: Floats
@@ -124,18 +118,14 @@ class Run:
 
 
 def simulate(made: IsolationDesign, *, inverter: int, meter: int, ticks: int = 80, seed: int = 1) -> Run:
-    """The loop under attack: from `ONSET_S` on the inverter absorbs instead of injecting, the meter lies.
+    """Simulate the loop under attack from `ONSET_S` on: the inverter absorbs, the meter is biased.
 
     Parameters
     ----------
-    made
-        The bank.
     inverter, meter
-        Who is attacked, from 0.
-    ticks
-        Length.
+        Attacked inverter and meter, from 0.
     seed
-        Of the meters' errors, which are uniform inside their bounds.
+        Seed of the meters' errors, which are uniform inside their bounds.
     """
     model = made.family.plant
     m, p = model.inputs.shape[1], len(model.noise)
@@ -162,18 +152,18 @@ def figure() -> Figure:
     found = np.array([a.x for a in run.answers])
     late = np.array([a.input_attack for a in run.answers])
     lies = np.array([a.sensor_attack for a in run.answers])
-    # Before the bounds have settled, the reconstruction means nothing.
+    # Before the bounds have settled, the reconstruction is meaningless.
     known = np.array([[np.all(a.bound < _droop(AT).limit)] for a in run.answers])
     late, lies = np.where(known, late, np.nan), np.where(known, lies, np.nan)
     ahead = np.vstack([late[1:], np.full((1, late.shape[1]), np.nan)])
     panels = (
         _panel("Reactive injection", "pu", t, (run.x, found), [f"inverter at c{i + 1:02d}" for i in AT]),
         _panel("Wrong part of the set point", "pu", t, (run.a_u, ahead), [f"c{i + 1:02d}" for i in AT]),
-        _panel("Lie of the meter", "squared pu", t, (run.a_y, lies), [f"c{i + 1:02d}" for i in METERS]),
+        _panel("Attack on the meter", "squared pu", t, (run.a_y, lies), [f"c{i + 1:02d}" for i in METERS]),
     )
     return Figure(
         "yang2021-feeder",
-        "One inverter absorbs and one meter lies from 40 s on; both are named, nobody else is",
+        "One inverter and one meter are attacked from 40 s on; both are named, and no others",
         panels,
     )
 

@@ -1,7 +1,7 @@
 """Unbalanced feeders: three phases with mutual impedance, customers on one phase or on all.
 
 `ThreePhaseFeeder` is the radial tree of 3x3 blocks in per unit, `lindist3flow` its linear power flow of
-squared phase voltages, `loss_correction` what that leaves out, and `PhasedFeeder` what monitors run on.
+squared phase voltages, `loss_correction` the correction of that, and `PhasedFeeder` the form for estimators.
 """
 
 from gridsec.phases.feeder import PHASES, ROTATION, ThreePhaseFeeder, sequence_matrix

@@ -1,9 +1,9 @@
-"""A radial feeder of three phases in per unit.
+"""Radial feeder of three phases in per unit.
 
 1 pu of voltage is the nominal phase-to-neutral voltage V; 1 pu of power is a *third* of the three-phase
 base power S, because powers are those of single phases here; 1 pu of impedance is ``3 V^2 / S`` as on a
-balanced feeder, whose per-unit voltages, impedances and flows come out the same. Neutral and earth return
-are in the 3x3 blocks (Kron's reduction): voltages are phase to neutral, and the neutral is grounded well.
+balanced feeder, so that its per-unit voltages, impedances and flows are the same. Neutral and earth return
+are in the 3x3 blocks (Kron's reduction): voltages are phase to neutral, with a well grounded neutral.
 
 References
 ----------
@@ -27,13 +27,13 @@ ROTATION: Phasors = np.exp(-2j * np.pi / 3.0 * np.arange(3))
 """Phasors of a balanced system: phase b lags a by a third of a turn, and c lags b."""
 ROTATION.flags.writeable = False
 
-# Reciprocity and passivity hold up to the rounding of the tables that impedances come from.
+# Rounding of impedance tables, within which reciprocity and passivity hold.
 _ROUNDING = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ThreePhaseFeeder:
-    """A radial feeder of up to three phases: b branches, b + 1 buses, rooted at the metered busbar (bus 0).
+    """Radial feeder of up to three phases: b branches, b + 1 buses, rooted at the metered busbar (bus 0).
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class ThreePhaseFeeder:
     bus : (N,)
         Bus of each customer. Several customers may share one; bus 0 is allowed.
     connected : (N, 3)
-        Phases each customer is connected to, between phase and neutral.
+        Connected phases of each customer, between phase and neutral.
     customers : (N,)
         Identifiers of the customers.
     buses : (b + 1,)
@@ -59,11 +59,11 @@ class ThreePhaseFeeder:
     base_kva
         Three-phase base power S, kVA; 1 pu of the power of a phase is a third of it.
     charging : (b, 3, 3)
-        Total shunt susceptance of the branch into bus k + 1, pu; half of it sits at each end.
+        Total shunt susceptance of the branch into bus k + 1, pu; half of it at each end.
     of, at, phase : (C,)
         Derived. The connections, customer by customer, phase by phase: customer, bus, and phase 0, 1, 2.
     share : (C,)
-        Derived. Part of its customer's power in each connection: 1 on a single phase, 1/3 on all three.
+        Derived. Share of the customer's power in each connection: 1 on a single phase, 1/3 on all three.
     start, stop, order, depth, enter, leave : (b + 1,); inside : (b + 1, b + 1) or None
         Derived. The walk around the tree, see `gridsec.trees.Walk`.
     half : (b + 1, 3, 3)
@@ -132,9 +132,9 @@ class ThreePhaseFeeder:
 
 
 def sequence_matrix(positive: Phasors | Floats, zero: Phasors | Floats) -> Phasors:
-    """3x3 matrix of an element whose phases are interchangeable, from its sequence values.
+    """3x3 matrix of an element with interchangeable phases, from its sequence values.
 
-    ``Z_self = (Z_0 + 2 Z_1) / 3`` on the diagonal and ``Z_mutual = (Z_0 - Z_1) / 3`` beside it.
+    ``Z_self = (Z_0 + 2 Z_1) / 3`` on the diagonal and ``Z_mutual = (Z_0 - Z_1) / 3`` off the diagonal.
 
     Parameters
     ----------
@@ -155,7 +155,7 @@ def sequence_matrix(positive: Phasors | Floats, zero: Phasors | Floats) -> Phaso
 
 
 def _shape_problems(feeder: ThreePhaseFeeder) -> list[Problem]:
-    """Fields whose lengths do not fit together; nothing else can be said before these are right."""
+    """Problems of array lengths; all other checks require that there are none."""
     branches, customers = feeder.parent.size, len(feeder.customers)
     expected = (
         ("parent", feeder.parent.shape, (branches,)),
@@ -203,14 +203,14 @@ def _branch_problems(feeder: ThreePhaseFeeder) -> list[Problem]:
 
 
 def line_problems(z: Phasors, charging: Floats, present: Bools) -> list[Problem]:
-    """What is wrong with the impedances and susceptances of a line.
+    """Problems of the impedances and susceptances of a line.
 
     Parameters
     ----------
     z, charging : (3, 3)
         Series impedance and total shunt susceptance, pu.
     present : (3,)
-        Phases that the line has.
+        Phases of the line.
     """
     blocks = (("z", z), ("charging", charging))
     out = [
@@ -222,7 +222,7 @@ def line_problems(z: Phasors, charging: Floats, present: Bools) -> list[Problem]
 
 
 def _block_problems(block: Phasors | Floats, here: Bools) -> list[Problem]:
-    """What is wrong with a 3x3 block, of impedances or of susceptances."""
+    """Problems of a 3x3 block, of impedances or of susceptances."""
     if not np.isfinite(block).all():
         return [Problem("not-finite", "is not finite")]
     out = []
@@ -239,7 +239,7 @@ def _impedance_problems(z: Phasors, here: Bools) -> list[Problem]:
     own = z[np.ix_(here, here)]
     if (np.diagonal(own) == 0).any():
         return [Problem("zero-impedance", "a phase without self-impedance; fuse the two buses")]
-    # Only the losses of a passive line are never negative, and only their matrix is semidefinite.
+    # Only the losses of a passive line are never negative: only the matrix of resistances is semidefinite.
     if own.size and np.linalg.eigvalsh(0.5 * (own.real + own.real.T))[0] < -_ROUNDING * np.abs(own).max():
         return [
             Problem(

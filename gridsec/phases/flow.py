@@ -1,4 +1,4 @@
-"""LinDist3Flow: the linear power flow of an unbalanced radial feeder, and what it leaves out.
+"""LinDist3Flow: linear power flow of an unbalanced radial feeder, and its correction.
 
 Along a branch with impedance Z, ``V_parent = V + Z i`` and ``i_psi = conj(S_psi / V_psi)``. The squared
 moduli, with the ratios of the phases' voltages taken as those of a balanced system, ``V_phi / V_psi = a_phi /
@@ -6,12 +6,12 @@ a_psi`` (a = 1, e^{-j 2 pi / 3}, e^{j 2 pi / 3}), and without the ``|Z i|^2`` of
 
     v_phi^2 = v_parent,phi^2 - 2 sum_psi Re( W_phi,psi conj(S_psi) ),    W_phi,psi = Z_phi,psi a_psi / a_phi
 
-with ``S_psi = P_psi + j Q_psi`` what arrives in phase psi: per branch the matrices Re W and Im W are what r
-and x are on a balanced feeder. They are not symmetric, though Z is: through a mutual reactance active power
-that is injected in phase b raises phase a, and in phase a lowers phase b.
+with ``S_psi = P_psi + j Q_psi`` the power that arrives in phase psi: per branch the matrices Re W and Im W
+take the place of r and x on a balanced feeder. They are not symmetric, though Z is: through a mutual
+reactance, active power injected in phase b raises phase a, and in phase a lowers phase b.
 
 Powers, voltages and their axes: connections (…, C) of the feeder; buses (…, 3, b + 1), phase before bus.
-A voltage of a phase that a bus lacks is that of the place where the phase ends.
+The voltage of a phase absent at a bus is that at the end of the phase.
 
 References
 ----------
@@ -37,9 +37,9 @@ from gridsec.trees import below, from_root, meetings, shrinking
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinDist3Flow:
-    """The linear power flow `v^2 = v0^2 + 2 R p + 2 X q` of squared phase voltages.
+    """Linear power flow `v^2 = v0^2 + 2 R p + 2 X q` of squared phase voltages.
 
-    R and X are neither symmetric nor nonnegative: phases that share a path couple with signs.
+    R and X are neither symmetric nor nonnegative: phases on a common path couple with signs.
 
     Attributes
     ----------
@@ -58,13 +58,8 @@ class LinDist3Flow:
 def lindist3flow(feeder: ThreePhaseFeeder) -> LinDist3Flow:
     """Matrices of the linear power flow of an unbalanced feeder.
 
-    Entry (phi at bus k, connection to psi at bus l): ``W_phi,psi`` summed over the branches that the paths of
-    k and l to the busbar share, its real part in R and its imaginary part in X. O(b C).
-
-    Parameters
-    ----------
-    feeder
-        The feeder.
+    Entry (phi at bus k, connection to psi at bus l): ``W_phi,psi`` summed over the common branches of the
+    paths of k and l to the busbar, its real part in R and its imaginary part in X. O(b C).
 
     References
     ----------
@@ -76,14 +71,12 @@ def lindist3flow(feeder: ThreePhaseFeeder) -> LinDist3Flow:
 
 
 def common_paths(feeder: ThreePhaseFeeder, blocks: Phasors, at: Ints, phase: Ints) -> Phasors:
-    """Entries of the branches' blocks, summed over the path that every bus shares with each of some others.
+    """Entries of the branches' blocks, summed over the common path of every bus with each of some others.
 
     Parameters
     ----------
-    feeder
-        The feeder.
     blocks : (b, 3, 3)
-        What is summed; for the series impedances ``z``, the sums are voltages that a current makes.
+        Summed blocks; for the series impedances ``z``, the sums are voltages per current.
     at, phase : (k,)
         Buses, and the columns of the blocks.
 
@@ -102,20 +95,18 @@ def common_paths(feeder: ThreePhaseFeeder, blocks: Phasors, at: Ints, phase: Int
 def sensitivities(
     feeder: ThreePhaseFeeder, p: Floats, q: Floats, v0_squared: Floats, *, steps: int = 2
 ) -> LinDist3Flow:
-    """Derivatives of squared voltages at an operating point, halved: `lindist3flow` where there is load.
+    """Derivatives of squared voltages at an operating point, halved: `lindist3flow` under load.
 
-    A power that changes by ds at one connection changes what all draw, because their powers are constant:
+    A change ds of the power at one connection changes all currents, because powers are constant:
 
         dv_k = -(sum of Z di over the path of k),   di = -conj(ds / v) + conj(s dv / v^2) + j B dv
 
     Sweeps solve that by iteration, `steps` times after the first, which is the term in ds alone: every step
     gains one order in the load. Re(conj(v) dv) is then half the derivative of v^2. Without load and charging
-    the first term is all, and is `lindist3flow`. O(b C) for each step.
+    only the first term remains, which is `lindist3flow`. O(b C) for each step.
 
     Parameters
     ----------
-    feeder
-        The feeder.
     p, q : (C,)
         Net active and reactive injection of each connection at the operating point, pu.
     v0_squared : (3,)
@@ -153,7 +144,7 @@ def sensitivities(
     return LinDist3Flow(*(frozen(part) for part in (R_bus[here], X_bus[here], R_bus, X_bus)))
 
 
-# Entries that are made together: as many as stay at hand for several sweeps.
+# Entries per block, chosen for the processor's cache over several sweeps.
 _TOGETHER = 65536
 
 _NOTHING: Phasors = np.zeros((3, 1), dtype=np.complex128)
@@ -161,7 +152,7 @@ _NOTHING: Phasors = np.zeros((3, 1), dtype=np.complex128)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CustomerFlow:
-    """The linear power flow customer by customer, in the per unit of balanced feeders.
+    """Linear power flow customer by customer, in the per unit of balanced feeders.
 
     Attributes
     ----------
@@ -174,17 +165,14 @@ class CustomerFlow:
 
 
 def per_customer(feeder: ThreePhaseFeeder, model: LinDist3Flow) -> CustomerFlow:
-    """Matrices between customers instead of connections.
+    """Matrices between customers in place of connections.
 
-    A customer's power is split evenly over his phases, and his voltage is the mean of their squares. Powers
-    are in kW / S as on a balanced feeder, so that droop curves and meters of `base_kva` fit: on a cable
-    without mutual impedance, a single-phase customer feels three times the impedance that one on all phases
-    does.
+    A customer's power is split evenly over the phases, and the voltage is the mean of their squares. Powers
+    are in kW / S as on a balanced feeder, so that droop curves and meters of `base_kva` apply. On a cable
+    without mutual impedance, a single-phase customer has three times the impedance of one on all phases.
 
     Parameters
     ----------
-    feeder
-        The feeder.
     model
         From `lindist3flow` or `sensitivities`.
     """
@@ -226,7 +214,7 @@ def bus_voltages(
     Parameters
     ----------
     feeder, p, q, v0_squared, steps
-        As in `loss_correction`; with no steps LinDist3Flow alone.
+        As in `loss_correction`; `steps` = 0 gives LinDist3Flow.
 
     Returns
     -------
@@ -240,23 +228,21 @@ def bus_voltages(
 def loss_correction(
     feeder: ThreePhaseFeeder, p: Floats, q: Floats, v0_squared: Floats, *, steps: int = 1
 ) -> Floats:
-    """What losses, charging and unequal phases add to the linear squared voltage of every bus.
+    """Correction of the linear squared voltage of every bus for losses, charging and unequal phases.
 
     LinDist3Flow is the squared voltage after one backward and forward sweep from the flat start, linearised:
-    ``v_k = v_parent - Z i_k`` with i_k the sum of ``conj(-s / v)`` over what bus k feeds. One step is one
-    more sweep, with the currents at the voltages so found; its error is of third order in the powers.
-    `steps` repeats it, and its limit is the AC power flow. Unlike on a balanced feeder the angles matter,
-    since they turn the voltages that other phases' currents induce: hence phasors instead of squares. O(b)
-    for each operating point.
+    ``v_k = v_parent - Z i_k`` with i_k the sum of ``conj(-s / v)`` over the buses fed by bus k. One step is
+    one more sweep, with the currents at these voltages; its error is of third order in the powers. `steps`
+    repeats it, and its limit is the AC power flow. Unlike on a balanced feeder the angles matter, since they
+    turn the voltages induced by currents of other phases: hence phasors in place of squares. O(b) for each
+    operating point.
 
     Parameters
     ----------
-    feeder
-        The feeder.
     p, q : (…, C)
         Net active and reactive injection of each connection (generation positive), pu.
     v0_squared : (…, 3)
-        Squared busbar voltage of each phase, pu; their angles are taken as balanced.
+        Squared busbar voltage of each phase, pu, with balanced angles.
     steps
         Number of sweeps, at least 1.
 
@@ -275,14 +261,13 @@ def loss_correction(
 
 
 def model_error_bound(feeder: ThreePhaseFeeder, p: Floats, q: Floats, v0_squared: Floats) -> Floats:
-    """How far `v^2` after one correction can be from the AC power flow, for every connection.
+    """Bound of the error of `v^2` after one correction against the AC power flow, for every connection.
 
     The next sweep changes the voltages by at most ``e``: the changed currents times the impedances on the
-    path, summed up without regard to sign or angle. The sweeps shrink geometrically, and ``2 e`` bounds the
-    sum of all that follow while each is at most half its predecessor (in practice a few hundredths); on the
-    squares that is ``2 e (2 |v| + 2 e)``. Heavy loads make the quotients grow, so where this sweep is *not*
-    below a fifth of the one before, towards voltage collapse, the bound is infinite. Busbar angles that are
-    not balanced are not in it.
+    path, with magnitudes summed. The sweeps shrink geometrically, and ``2 e`` bounds the sum of all later
+    ones while each is at most half its predecessor (in practice a few hundredths); on the squares that is ``2
+    e (2 |v| + 2 e)``. Heavy loads make the quotients grow, so if this sweep is *not* below a fifth of the one
+    before, towards voltage collapse, the bound is infinite. It does not cover unbalanced busbar angles.
 
     Parameters
     ----------
@@ -301,7 +286,7 @@ def model_error_bound(feeder: ThreePhaseFeeder, p: Floats, q: Floats, v0_squared
 def corrected(
     feeder: ThreePhaseFeeder, p: Floats, q: Floats, v0_squared: Floats, *, steps: int = 1
 ) -> tuple[Floats, Floats]:
-    """`loss_correction` and `model_error_bound` of the same operating points, in less time than apart.
+    """`loss_correction` and `model_error_bound` of the same operating points, faster than separately.
 
     Parameters
     ----------
@@ -311,7 +296,7 @@ def corrected(
     Returns
     -------
     (…, 3, b + 1), (…, C)
-        Additive correction of `v^2`, and a bound on what it leaves after its first step, pu.
+        Additive correction of `v^2`, and a bound on the error that remains after its first step, pu.
     """
     _check(steps)
     start = _Start.of(feeder, p, q, v0_squared)
@@ -325,20 +310,20 @@ def corrected(
 def interval_bounds(
     feeder: ThreePhaseFeeder, p: Floats, q: Floats, v0_squared: Floats, *, p_error: Floats, q_error: Floats
 ) -> tuple[Floats, Floats]:
-    """`corrected` for all powers within intervals: how far it moves, and what its first step leaves.
+    """Change of the correction, and error of its first step, for all powers within intervals.
 
     Parameters
     ----------
     feeder, p, q : (C,), v0_squared : (3,)
         As in `loss_correction`, one operating point.
     p_error, q_error : (C,)
-        How far the powers may be off, pu.
+        Largest errors of the powers, pu.
 
     Returns
     -------
     (C,), (C,)
-        As `gridsec.intervals.bounds`; with phases of the busbar that are not alike, less exact by what
-        LinDist3Flow leaves of it.
+        As `gridsec.intervals.bounds`; with unequal phases of the busbar, wider by the error of LinDist3Flow
+        for them.
     """
     start = _Start.of(feeder, p, q, v0_squared)
     error = np.asarray(_at_buses(feeder, np.hypot(p_error, q_error) + 0j).real)
@@ -358,7 +343,7 @@ def interval_bounds(
     )
     moved, rest = bounds(sweeps, error)
     v0 = np.sqrt(np.asarray(v0_squared, dtype=np.float64))
-    # `linear` takes the phases of the busbar as equal.
+    # `linear` assumes equal phases of the busbar.
     apart = np.abs(feeder.z) * np.abs(v0[:, None] / v0 - 1.0)
     moved = moved + 2.0 * from_root(feeder, np.einsum("bij,jb->ib", apart, below(feeder, error)[..., 1:]))
     here = (feeder.phase, feeder.at)
@@ -391,7 +376,7 @@ class _Start:
 
     @classmethod
     def of(cls, feeder: ThreePhaseFeeder, p: Floats, q: Floats, v0_squared: Floats) -> _Start:
-        with np.errstate(all="ignore"):  # what is no number gets no finite bound, and no complaint
+        with np.errstate(all="ignore"):  # NaN gets an infinite bound without a warning
             s = _at_buses(feeder, p + 1j * np.asarray(q))
             squared = np.asarray(v0_squared, dtype=np.float64)[..., None]
             v0 = np.sqrt(squared) * ROTATION[:, None]
@@ -415,12 +400,12 @@ def _sweep(feeder: ThreePhaseFeeder, start: _Start, phasors: Phasors) -> Phasors
 
 
 def _drawn(feeder: ThreePhaseFeeder, s: Phasors, phasors: Phasors) -> Phasors:
-    """Currents that customers and charging draw from the buses, (…, 3, b + 1)."""
+    """Currents drawn from the buses by customers and charging, (…, 3, b + 1)."""
     return np.asarray(_charged(feeder, phasors) - np.conj(s / phasors))
 
 
 def _charged(feeder: ThreePhaseFeeder, phasors: Phasors) -> Phasors | float:
-    """Currents that the charging draws from the buses."""
+    """Currents drawn from the buses by the charging."""
     return 1j * np.einsum("kij,...jk->...ik", feeder.half, phasors) if feeder.half.any() else 0.0
 
 
@@ -441,7 +426,7 @@ def _remainder(feeder: ThreePhaseFeeder, start: _Start, once: Phasors) -> Floats
 
 
 def _reach(feeder: ThreePhaseFeeder, change: Phasors | Floats) -> Floats:
-    """Largest change of the voltages that currents changed at the buses can make."""
+    """Largest change of the voltages by changed currents at the buses."""
     current = below(feeder, np.abs(change))[..., 1:]
     return np.asarray(from_root(feeder, np.einsum("bij,...jb->...ib", np.abs(feeder.z), current)))
 

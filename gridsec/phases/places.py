@@ -1,6 +1,6 @@
-"""A three-phase feeder as monitors see it: customers of one phase, and a place for each phase of each bus.
+"""Three-phase feeder in the form for estimators: single-phase customers, and a place per phase of each bus.
 
-What `gridsec.feeder` says of the buses of a balanced feeder is said here of places, in the same per unit:
+Places take the role of the buses in `gridsec.feeder`, in the same per unit:
 powers in units of the three-phase base S. Place ``3 k + phi`` is phase phi of bus k, and the busbar has the
 first three. R and X are not symmetric, and their entries have either sign.
 """
@@ -21,7 +21,7 @@ from gridsec.trees import OnTree
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PhasedFeeder(OnTree):
-    """A feeder of single-phase customers. N customers, b + 1 buses, n = 3 (b + 1) places.
+    """Feeder of single-phase customers. N customers, b + 1 buses, n = 3 (b + 1) places.
 
     Attributes
     ----------
@@ -33,12 +33,12 @@ class PhasedFeeder(OnTree):
         Derived. Identifiers of the places, the busbar's three first.
     R, X : (n, N)
         Derived. The linear power flow ``v^2 = v0^2 + 2 R p + 2 X q``: from a customer's power, in units of
-        S, to the squared voltage of every place, pu. Where a phase is absent, it is that of its end.
+        S, to the squared voltage of every place, pu. For an absent phase, that of its end.
 
     Raises
     ------
     FeederInvalid
-        If a customer has several phases; names them all.
+        If customers have several phases; lists them all.
     """
 
     tree: ThreePhaseFeeder
@@ -72,18 +72,16 @@ class PhasedFeeder(OnTree):
 def bus_voltages(
     feeder: PhasedFeeder, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 1
 ) -> Floats:
-    """Squared voltage of every place, losses, charging and unequal phases corrected.
+    """Squared voltage of every place, corrected for losses, charging and unequal phases.
 
     Parameters
     ----------
-    feeder
-        The feeder.
     p, q : (…, N)
         Net active and reactive injection of each customer (generation positive), pu.
     v0_squared : (…, 3) or scalar
         Squared busbar voltage of each phase, pu.
     steps
-        As in `gridsec.phases.loss_correction`; with no steps LinDist3Flow alone.
+        As in `gridsec.phases.loss_correction`; 0 gives LinDist3Flow.
 
     Returns
     -------
@@ -97,18 +95,7 @@ def bus_voltages(
 
 
 def model_error_bound(feeder: PhasedFeeder, p: Floats, q: Floats, v0_squared: Floats | float) -> Floats:
-    """How far `v^2` after one correction can be from the AC power flow, for every customer.
-
-    Parameters
-    ----------
-    feeder, p, q, v0_squared
-        As in `bus_voltages`.
-
-    Returns
-    -------
-    (…, N)
-        `gridsec.phases.model_error_bound`, pu.
-    """
+    """Bound (…, N) of the error of `v^2` after one correction against the AC power flow, by customer, pu."""
     v0 = np.broadcast_to(np.asarray(v0_squared, dtype=np.float64), len(PHASES))
     return flow.model_error_bound(feeder.tree, 3.0 * p, 3.0 * q, v0)
 
@@ -129,12 +116,12 @@ def interval_bounds(
     feeder, p, q : (N,), v0_squared
         As in `bus_voltages`, one operating point.
     p_error, q_error : (N,)
-        How far the powers may be off, pu.
+        Largest errors of the powers, pu.
 
     Returns
     -------
     (N,), (N,)
-        How far the correction moves, and what its first step leaves of the AC power flow, pu.
+        Change of the correction, and distance of its first step from the AC power flow, pu.
     """
     v0 = np.broadcast_to(np.asarray(v0_squared, dtype=np.float64), len(PHASES))
     return flow.interval_bounds(

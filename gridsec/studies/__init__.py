@@ -1,1 +1,1 @@
-"""What offline studies of a feeder compute: arrays in, frozen results out."""
+"""Computations of the offline studies of a feeder: arrays in, frozen results out."""

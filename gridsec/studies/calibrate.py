@@ -1,17 +1,16 @@
-"""Which error of a feeder's files do recorded readings speak for: mixed regression and Bayes factors.
+"""Evidence of recorded readings for errors of a feeder's files: mixed regression and Bayes factors.
 
-Whitened readings are ``y = A b + n`` with white n of variance 1 and independent coefficients
-``b_k ~ N(0, s_k^2)``: biases within the class of their meters, gains within the class of the registers, power
-factors within their limits, lengths within their tolerance. A hypothesis adds a column z: an error of the
-files, either with the coefficient 1 (a customer is at another bus) or with one of a prior spread (a line is
-longer, a meter's error has changed). With ``P = I - A S (I + S A^T A S)^-1 S A^T`` and
+Whitened readings are ``y = A b + n`` with white n of variance 1 and independent coefficients ``b_k ~ N(0,
+s_k^2)``: biases within the class of their meters, gains within the class of the registers, power factors
+within their limits, lengths within their tolerance. A hypothesis adds a column z: an error of the files,
+either with the coefficient 1 (a customer is at another bus) or with a prior spread (a line is longer, a
+meter's error has changed). With ``P = I - A S (I + S A^T A S)^-1 S A^T`` and
 
     g = z^T P y,   h = z^T P z
 
-its logarithmic Bayes factor against files without that error is ``g - h / 2``, or for a spread s
-``(g^2 / (h + 1 / s^2) - log(1 + h s^2)) / 2``. Without any error the expectation of a Bayes factor is 1: that
-a mean of M of them exceeds ``1 / risk`` anywhere has at most the probability `risk`, whatever their
-dependence.
+its logarithmic Bayes factor against files without that error is ``g - h / 2``, or for a spread s ``(g^2 / (h
++ 1 / s^2) - log(1 + h s^2)) / 2``. Without any error the expectation of a Bayes factor is 1. So a mean of M
+factors exceeds ``1 / risk`` with at most the probability `risk`, for any dependence between them.
 
 References
 ----------
@@ -34,7 +33,7 @@ __all__ = ["Evidence", "Fit", "Weighed", "evidence", "explain", "fit", "weigh"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """The regression without any error of the files. n readings, K coefficients.
+    """Regression without any error of the files. n readings, K coefficients.
 
     Attributes
     ----------
@@ -46,7 +45,7 @@ class Fit:
     estimate, std : (K,)
         Coefficients and their standard errors, the prior included.
     scale
-        ``y^T P y / n``, at least 1: residuals larger than the noise explains weaken all evidence.
+        ``y^T P y / n``, at least 1: residuals above the noise weaken all evidence.
     """
 
     explained: Floats
@@ -57,7 +56,7 @@ class Fit:
 
 
 def fit(y: Floats, columns: Floats, spread: Floats, count: int) -> Fit:
-    """Regress.
+    """Fit the regression without any error of the files.
 
     Parameters
     ----------
@@ -68,7 +67,7 @@ def fit(y: Floats, columns: Floats, spread: Floats, count: int) -> Fit:
     spread : (K,)
         Standard deviation of each coefficient before any reading.
     count
-        How many readings there are; missing ones are zeros in `y` and `columns`.
+        Number of readings; missing ones are zeros in `y` and `columns`.
     """
     A = columns * spread
     normal = A.T @ A
@@ -88,7 +87,7 @@ def fit(y: Floats, columns: Floats, spread: Floats, count: int) -> Fit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evidence:
-    """What readings say about H hypotheses.
+    """Evidence of the readings for H hypotheses.
 
     Attributes
     ----------
@@ -104,16 +103,14 @@ class Evidence:
 
 
 def evidence(given: Fit, z: Floats, spread: Floats) -> Evidence:
-    """Weigh hypotheses one by one.
+    """Compute the Bayes factor of each hypothesis.
 
     Parameters
     ----------
-    given
-        From `fit`.
     z : (n, H)
-        Whitened effect of each.
+        Whitened effect of each hypothesis.
     spread : (H,)
-        Standard deviation of its coefficient before any reading; 0: the coefficient is 1.
+        Prior standard deviation of its coefficient; 0 for the coefficient 1.
     """
     projected = given.explained.T @ z
     g = z.T @ given.residual / given.scale
@@ -126,17 +123,17 @@ def evidence(given: Fit, z: Floats, spread: Floats) -> Evidence:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Weighed:
-    """What hypotheses of several kinds together say.
+    """Joint evidence of hypotheses of several kinds.
 
     Attributes
     ----------
     confidence : (H,)
-        Probability of each, if some error and none are as likely before any reading.
+        Probability of each, for equal prior probabilities of some error and of none.
     any
-        Mean of the Bayes factors, logarithm: above ``log(1 / risk)`` there is an error; without any
-        hypothesis minus infinity.
+        Logarithm of the mean Bayes factor: above ``log(1 / risk)`` there is an error; minus infinity without
+        any hypothesis.
     kept : (k,)
-        The best hypotheses, best first, that share all but `risk` of the probability.
+        The best hypotheses, best first, with all but `risk` of the probability.
     """
 
     confidence: Floats
@@ -145,14 +142,14 @@ class Weighed:
 
 
 def weigh(log_factor: Floats, kind: Ints, risk: float) -> Weighed:
-    """Compare hypotheses; every kind has the same weight, and within it each hypothesis.
+    """Compare hypotheses; all kinds have equal weight, and within a kind all hypotheses.
 
     Parameters
     ----------
     log_factor : (H,)
         From `evidence`.
     kind : (H,)
-        Number of each one's kind.
+        Kind of each, as a number.
     risk
         Probability of a proposal for files without errors.
     """
@@ -166,25 +163,23 @@ def weigh(log_factor: Floats, kind: Ints, risk: float) -> Weighed:
 
 
 def explain(given: Fit, z: Floats, own: Floats, like: float) -> tuple[Floats, Floats, Bools]:
-    """Estimate each coefficient alone, and say whose effects cannot be told apart.
+    """Estimate each coefficient alone, and mark effects that cannot be distinguished.
 
     Parameters
     ----------
-    given
-        From `fit`.
     z : (n, H)
         Whitened effects.
     own : (H,)
-        Standard deviation that the coefficient already has among the regressors; it is taken out.
+        Standard deviation of the coefficient among the regressors; it is removed.
     like
-        Correlation of two effects, 1, from which on they are the same.
+        Smallest correlation of two effects, 1, that count as equal.
 
     Returns
     -------
     estimate, std : (H,)
-        Least squares without prior for this coefficient; infinite errors where nothing is known.
+        Least squares without prior for this coefficient; infinite errors where not determined.
     same : (H, H)
-        Pairs whose effects, less what the other regressors explain, are alike.
+        Pairs with equal effects after projection on the other regressors' complement.
     """
     projected = given.explained.T @ z
     inner = z.T @ z - projected.T @ projected

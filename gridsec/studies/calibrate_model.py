@@ -1,23 +1,21 @@
-"""How readings would change if a meter, a load, a line or a customer's place were other than the files say.
+"""Changes of the readings by errors of meters, loads, lines and customers' places in the files.
 
 Squared voltages at Q places (a bus, or a phase of a bus), from power flow with the losses, and linear
-sensitivities from powers at one place to the voltage at another. One class for balanced feeders and for
-those of three phases: a customer is connected to places with weights that add up to 1.
+sensitivities from powers at one place to the voltage at another. One class serves balanced feeders and those
+of three phases: a customer is connected to places with weights that add up to 1.
 
-With U the squared voltages that the files and the metered powers give, the readings less U are to first
-order
+With U the squared voltages by the files and the metered powers, the readings less U are to first order
 
     2 y_j b_j                       bias b_j of meter j, relative to the busbar's
     -(drop of U along branch l)     per unit of its length, at the places behind it
     A_ji p_i, B_ji q_i              errors of the gain of power registers
-    -B_ji load_i                    error of tan(phi) where q is not metered; -B_ji: what q is at p = 0
-    -B_ji roof_i (1, cos, sin, ...) load that generation hides, with its daily course
+    -B_ji load_i                    error of tan(phi) where q is not metered; -B_ji: q at p = 0
+    -B_ji roof_i (1, cos, sin, ...) load hidden by generation, with its daily course
 
 and for customers at other places, exactly in the linear flow, ``W'(U + dU) - W U`` with W, W' the weights.
-On closed loops a line's drop has a complex share at every place instead of being behind it or not.
-
-Behind transformers places have bases of their own, and a meter's readings are in that of its place in the
-files: a customer who is elsewhere in truth reads the volts of there. Means of phases weigh each by its base.
+On closed loops a place has a complex share of a line's drop, rather than being behind the line or not.
+Behind transformers places have bases of their own. A meter's readings are in the base of its place in the
+files: a customer at another place reads the volts of that place. Means of phases weigh each by its base.
 
 References
 ----------
@@ -38,18 +36,18 @@ __all__ = ["Doubts", "Places", "Regressors", "Series", "regressors", "steps"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Places:
-    """A feeder as readings see it. Q places, N customers, p meters, L branches, F phases (1 or 3).
+    """Model of a feeder for readings. Q places, N customers, p meters, L branches, F phases (1 or 3).
 
     Attributes
     ----------
     active, reactive : (Q, Q)
-        Change of the squared voltage at a place per power injected at another, pu; the 2 is in it.
+        Change of the squared voltage at a place per power injected at another, pu, the factor 2 included.
     phase : (Q,)
         Phase of each place, 0 to F - 1.
     share : (Q, L)
-        What of a line's drop a place has: 1 behind a branch of a tree and 0 elsewhere, complex in loops.
+        Share of a line's drop at a place: 1 behind a branch of a tree and 0 elsewhere, complex in loops.
     weight : (N, Q)
-        Where each customer is connected; rows add up to 1.
+        Connections of each customer; rows add up to 1.
     meters : (p,)
         Customer of each meter.
     volt : (Q,)
@@ -68,7 +66,7 @@ class Places:
     unit: Floats
 
     def read(self, weight: Floats) -> Floats:
-        """From the places' squared voltages to those read by meters that are connected so, (p, Q) both.
+        """Matrix from the places' squared voltages to the readings of meters with these weights, (p, Q) both.
 
         ``(mean of a v)^2 / unit^2`` with a the bases, linear in v^2 near 1 pu.
         """
@@ -77,7 +75,7 @@ class Places:
 
     @property
     def of_phases(self) -> Floats:
-        """What a squared voltage of each phase everywhere is at the meters, (p, F)."""
+        """Effect of a squared voltage of each phase, common to all places, at the meters, (p, F)."""
         W = self.read(self.weight[self.meters])
         return np.stack([W[:, self.phase == f].sum(axis=1) for f in range(self.phase.max() + 1)], axis=1)
 
@@ -88,14 +86,12 @@ class Places:
         return W @ self.active @ self.weight.T, W @ self.reactive @ self.weight.T
 
     def moved(self, series: Series, change: Mapping[int, Floats]) -> Floats:
-        """How the meters' squared voltages change when customers are elsewhere, (T, p).
+        """Change of the meters' squared voltages for customers at other places, (T, p).
 
         Parameters
         ----------
-        series
-            Voltages and powers.
         change
-            New weights (Q,) of each customer that moves.
+            New weights (Q,) of each moved customer.
         """
         weight = self.weight[self.meters]
         before = self.read(weight)
@@ -116,17 +112,15 @@ class Places:
         return away
 
     def rephased(self, series: Series, parts: Sequence[tuple[Ints, int, int]]) -> Floats:
-        """Change of the meters' squared voltages when parts of one phase are on another phase, (T, p).
+        """Change of the meters' squared voltages for parts of one phase that are on another phase, (T, p).
 
-        The customers' powers leave the place that feeds a part and come to another phase of its bus. The drop
+        The customers' powers move from the place that feeds a part to another phase of its bus. The drop
         along the part stays, and so do the ratios of its bases. Several parts change together.
 
         Parameters
         ----------
-        series
-            Voltages and powers.
         parts
-            Of each part all its customers, the place that feeds it, and the place on the other phase.
+            For each part: its customers, the place that feeds it, and the place on the other phase.
         """
         W = self.read(self.weight[self.meters])
         shift: Floats = np.zeros_like(series.places)
@@ -145,22 +139,22 @@ class Places:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Series:
-    """What was read, and what the files make of it. T frames.
+    """Readings and the files' model of them. T frames.
 
     Attributes
     ----------
     t : (T,)
         Times, s.
     y : (T, p)
-        Squared voltages read, pu; any number where not seen.
+        Squared voltages read, pu; arbitrary where not seen.
     seen : (T, p)
-        Which there are.
+        True where there is a reading.
     p, q : (T, N)
         Net injections, pu.
     load : (T, N)
-        What draws reactive power by its power factor, pu.
+        Loads with reactive power by a power factor, pu.
     roof : (T, N)
-        Reactive power of the load that generation may hide, where only their difference is metered, pu.
+        Reactive power of the load that generation may hide, where only the difference is metered, pu.
     steep : (T, N)
         Derivative of the inverter's q in the squared voltage read; 0 without one, or with q metered.
     places : (T, Q)
@@ -181,14 +175,14 @@ class Series:
     drop: Floats | Phasors
 
     def residual(self, places: Places) -> Floats:
-        """Readings less power flow, (T, p); 0 where there is none."""
+        """Readings less power flow, (T, p); 0 without a reading."""
         model = self.places @ places.read(places.weight[places.meters]).T
         return np.where(self.seen, self.y - model, 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Doubts:
-    """Standard deviations of what is not known exactly, before any reading; 0: known.
+    """Prior standard deviations of uncertain quantities; 0 for known ones.
 
     Attributes
     ----------
@@ -199,11 +193,11 @@ class Doubts:
     tan : (N,)
         Error of tan(phi) where q is not metered, 1.
     roof : (N,)
-        Share of `Series.roof` that is there, its mean and its daily course, 1.
+        Actual share of `Series.roof`, its mean and its daily course, 1.
     p_level, q_level : (N,)
         Constant error of the powers, pu.
     length : (L,)
-        Relative error of a branch's length that is no mistake, 1.
+        Relative tolerance of a branch's length, 1.
     """
 
     bias: Floats
@@ -218,7 +212,7 @@ class Doubts:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Regressors:
-    """Columns by kind, one after the other.
+    """Regressors by kind, one after the other.
 
     Attributes
     ----------
@@ -227,7 +221,7 @@ class Regressors:
     spread : (K,)
         Prior standard deviations.
     where : kind -> (k,)
-        Which columns; the names are those of `Doubts`. As many as the feeder has of the kind.
+        Indices of columns by the names of `Doubts`; k depends on the kind.
     """
 
     columns: Floats
@@ -236,17 +230,7 @@ class Regressors:
 
 
 def regressors(places: Places, series: Series, doubts: Doubts) -> Regressors:
-    """All regressors of a feeder whose files are right.
-
-    Parameters
-    ----------
-    places
-        The feeder.
-    series
-        What was read.
-    doubts
-        Their priors.
-    """
+    """All regressors of a feeder with correct files."""
     A, B = places.at_meters
     seen = series.seen[:, :, None]
 
@@ -257,7 +241,7 @@ def regressors(places: Places, series: Series, doubts: Doubts) -> Regressors:
     bias = np.zeros((T, p, p))
     twice = np.where(series.seen, 2.0 * series.y, 0.0)
     bias[:, np.arange(p), np.arange(p)] = twice
-    # What an inverter's reactive power is taken to be follows its own meter's reading.
+    # The assumed reactive power of an inverter follows its own meter's reading.
     bias -= spatial(B[:, places.meters], twice * series.steep[:, places.meters])
     parts = {
         "bias": bias,
@@ -278,13 +262,13 @@ def regressors(places: Places, series: Series, doubts: Doubts) -> Regressors:
 
 
 def _day(t: Floats) -> list[Floats]:
-    """Mean and daily course in two harmonics, (T, 1) each: enough for the bell that the sun makes."""
+    """Mean and daily course in two harmonics, (T, 1) each: sufficient for the course of solar generation."""
     turn = 2.0 * np.pi / 86400.0 * t[:, None]
     return [np.ones_like(turn), *(wave(k * turn) for k in (1.0, 2.0) for wave in (np.cos, np.sin))]
 
 
 def lengthened(places: Places, series: Series) -> Floats:
-    """What the meters' squared voltages lose if a line is longer by its own length, negative, (T, p, L)."""
+    """Change of the meters' squared voltages if a line's length doubles, negative, (T, p, L)."""
     W = places.read(places.weight[places.meters])
     phases = series.drop.shape[1]
     by_phase = [W[:, places.phase == f] @ places.share[places.phase == f] for f in range(phases)]
@@ -295,21 +279,17 @@ def lengthened(places: Places, series: Series) -> Floats:
 
 
 def steps(series: Series, meter: int, pieces: int) -> tuple[Floats, list[tuple[float, float]]]:
-    """Times in which one meter's error may differ from its usual: pieces of the recording, and its rest.
+    """Intervals in which one meter's error may differ from its usual: parts of the recording, and rests.
 
     Parameters
     ----------
-    series
-        What was read.
-    meter
-        The meter.
     pieces
-        Into how many stretches of equally many readings time is cut.
+        Number of intervals with equally many frames.
 
     Returns
     -------
     (T, p, H), [H pairs]
-        Effect of a relative error in it, and its beginning and end, s.
+        Effect of a relative error in each interval, and its begin and end, s.
     """
     T, p = series.y.shape
     cuts = np.linspace(0, T, pieces + 1).astype(np.intp)

@@ -1,9 +1,9 @@
-"""What is left of readings when the model is right: errors of loads, correlated in time and place; noise.
+"""Noise of readings under a correct model: errors of loads, correlated in time and place, and meter noise.
 
-The powers of N customers err by independent Ornstein-Uhlenbeck processes of correlation time tau. At the
-p meters that is a field of covariance ``S exp(-abs(dt) / tau)``, ``S = k_p S_p + k_q S_q + S_0``; meters add
-white noise, that of the busbar the same to all on its phase. A Kalman filter over the few modes of S that
-stand out of the meters' noise whitens readings and regressors alike, readings that are missing left out
+The errors of the powers of N customers are independent Ornstein-Uhlenbeck processes of correlation time tau.
+At the p meters they give a field of covariance ``S exp(-abs(dt) / tau)``, ``S = k_p S_p + k_q S_q + S_0``.
+Meters add white noise; that of the busbar is common to all meters on its phase. A Kalman filter over the few
+modes of S above the meters' noise whitens readings and regressors alike; missing readings are left out
 exactly.
 
 References
@@ -24,15 +24,15 @@ from gridsec.arrays import Bools, Floats
 
 __all__ = ["Field", "Increments", "LoadErrors", "Whitening", "increments", "learn", "whitening"]
 
-# Modes of the field whose variance is less than this share of the meters' own are white noise.
+# Modes of the field with a variance below this share of the meters' own count as white noise.
 _FAINT = 1e-3
-# Lags of increments, in frames, and blocks of time whose scores are compared.
+# Lags of increments, in frames, and number of time blocks with separate scores.
 _LAGS = (1, 2, 4, 8, 16, 32)
 _BLOCKS = 8
 # Step of the derivative of the score, in logarithms.
 _DIFFERENCE = 1e-3
-# Prior of the logarithms: powers within a factor e^3 of what was expected, the correlation time within e^2,
-# and the noise of the meters within e^0.5.
+# Prior standard deviations of the logarithms: powers within a factor e^3 of their prior, the correlation time
+# within e^2, and the noise of the meters within e^0.5.
 _SPREAD = np.array([3.0, 3.0, 2.0, 0.5])
 
 
@@ -45,7 +45,7 @@ class Field:
     active, reactive : (p, p)
         Of unit errors of all customers' powers: ``4 R R^T`` and ``4 X X^T``.
     known : (p, p)
-        Of errors whose size is known.
+        Of errors of known size.
     """
 
     active: Floats
@@ -55,7 +55,7 @@ class Field:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadErrors:
-    """Errors of the customers' powers, and how far the meters' noise is from what they promise.
+    """Errors of the customers' powers, and factor on the stated noise of the meters.
 
     Attributes
     ----------
@@ -82,7 +82,7 @@ class LoadErrors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Whitening:
-    """The filter of T frames, made once and applied to any number of columns.
+    """Whitening filter of T frames, computed once and applied to any number of columns.
 
     Attributes
     ----------
@@ -105,7 +105,7 @@ class Whitening:
     log_det: float
 
     def __call__(self, columns: Floats) -> Floats:
-        """Whiten columns (T, p, k): what each adds to the expected next reading, in standard deviations."""
+        """Whiten columns (T, p, k): normalised innovations, in standard deviations."""
         out = np.empty_like(columns)
         state: Floats = np.zeros((self.modes.shape[1], columns.shape[2]))
         for k, column in enumerate(columns):
@@ -126,14 +126,14 @@ def whitening(
     common: Floats,
     gaps: Sequence[Floats],
 ) -> Whitening:
-    """Make the filter.
+    """Compute the whitening filter.
 
     Parameters
     ----------
     t : (T,)
         Times of the frames, s, ascending.
     seen : (T, p)
-        Readings there are.
+        True where there is a reading.
     S : (p, p)
         Covariance of the field, squared pu^2.
     time_s
@@ -141,10 +141,10 @@ def whitening(
     white : (T, p)
         Variance of each reading's own noise.
     common : (T, p, f)
-        What readings of a frame have in common, one column each, in standard deviations: the noise of the
+        Common errors of a frame's readings, one column each, in standard deviations: the noise of the
         busbar's f voltages.
     gaps : T times (p, g)
-        What unknown powers of single frames do, one column each, in standard deviations.
+        Effects of unknown powers of single frames, one column each, in standard deviations.
     """
     L = _modes(S, white.mean(axis=0))
     p, m = L.shape
@@ -171,7 +171,7 @@ def whitening(
 
 
 def _modes(S: Floats, white: Floats) -> Floats:
-    """L with ``L L^T = S`` up to what does not stand out of the noise."""
+    """L with ``L L^T = S`` up to modes below the noise."""
     scale = np.sqrt(white)
     values, vectors = np.linalg.eigh(S / np.outer(scale, scale))
     kept = values > _FAINT
@@ -180,7 +180,7 @@ def _modes(S: Floats, white: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Increments:
-    """Mean products of increments over some lags, by blocks of time. B blocks, H lags.
+    """Sums of products of increments over some lags, by blocks of time. B blocks, H lags.
 
     Attributes
     ----------
@@ -189,7 +189,7 @@ class Increments:
     total : (B, H, p, p)
         Sums of products of increments.
     count : (B, H, p, p)
-        How many products there are.
+        Numbers of products.
     """
 
     dt: Floats
@@ -198,14 +198,14 @@ class Increments:
 
 
 def increments(t: Floats, seen: Bools, residual: Floats) -> Increments:
-    """Products of increments of residuals; what is constant in time drops out of them.
+    """Products of increments of residuals, free of constants in time.
 
     Parameters
     ----------
     t : (T,)
         Times, s.
     seen : (T, p)
-        Readings there are.
+        True where there is a reading.
     residual : (T, p)
         Readings minus model, squared pu.
     """
@@ -235,27 +235,23 @@ def learn(
     errors: bool = True,
     start: LoadErrors | None = None,
 ) -> LoadErrors:
-    """Sizes and correlation time of the loads' errors: the composite likelihood of the increments.
+    """Sizes and correlation time of the loads' errors by the composite likelihood of the increments.
 
     The increment over a lag h has the covariance ``2 (1 - exp(-h / tau)) S + 2 D``; its Gaussian likelihood,
     summed over the lags, is maximised over ``k_p, k_q, tau`` and a factor on D.
 
     Parameters
     ----------
-    given
-        From `increments`.
-    field
-        What unit errors do.
     white : (p,)
-        Variance of the meters' noise as promised, squared pu^2.
+        Stated variance of the meters' noise, squared pu^2.
     common : (p, p)
-        Covariance of what the busbar's noise does at the meters, squared pu^2.
+        Covariance of the busbar noise's effect at the meters, squared pu^2.
     guess
-        The middle of the prior.
+        Centre of the prior.
     errors
-        Whether standard errors are wanted.
+        Compute standard errors.
     start
-        Where to begin, if not there.
+        Initial value of the search; by default `guess`.
     """
     base, begin = (np.log([n.p, n.q, n.time_s, n.white]) for n in (guess, start or guess))
     problem = _Composite(given.dt, field, white, common, base)
@@ -289,7 +285,7 @@ def _errors(problem: _Composite, x: Floats, given: Increments) -> Floats:
     for total, some in zip(given.total, given.count, strict=True):
         scores.append(problem.value(x, total / np.maximum(some, 1.0), some)[1] - x / _SPREAD**2)
     J = np.cov(np.array(scores).T, ddof=1) * len(scores)
-    # A flat likelihood may curve the wrong way a little: no direction is known less than before.
+    # A flat likelihood may have slightly negative curvature: no direction is less certain than in the prior.
     values, vectors = np.linalg.eigh(0.5 * (H + H.T))
     inverse = (vectors / np.maximum(values, (1.0 / _SPREAD**2).min())) @ vectors.T
     return np.asarray(np.sqrt((inverse @ (J + np.diag(1.0 / _SPREAD**2)) @ inverse).diagonal()))

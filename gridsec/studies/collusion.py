@@ -1,16 +1,16 @@
-"""The furthest that a few liars can move something while many linear tests stay within their bounds.
+"""Largest displacement by a few manipulated meters while linear tests stay within their bounds.
 
     maximise  g a   subject to  |R a| <= 1,  a of at most M entries.
 
-For given liars J that is a linear program in |J| unknowns, and every set B of |J| rows with independent
-columns of J bounds it: ``y`` with ``R_BJ' y = g_J`` gives ``g a <= |y|_1``, since rows are bounded from both
-sides alike. So any basis is dual feasible, and dual simplex steps lead to the optimum, for thousands of sets
-of liars at once. Others who join are bounded by what the same multipliers leave of g:
+For given manipulated meters J this is a linear program in |J| unknowns. Every set B of |J| rows with
+independent columns of J bounds it: ``y`` with ``R_BJ' y = g_J`` gives ``g a <= |y|_1``, since rows are
+bounded from both sides alike. So any basis is dual feasible, and dual simplex steps lead to the optimum, for
+thousands of sets at once. Further meters are bounded by the remainder of g under the same multipliers:
 
     g a <= |y|_1 + sum of the M - |J| largest |g_k - (R_B' y)_k| reach_k,
 
-``reach_k`` the furthest that k can lie in any collusion. Branch and bound over J with that is exact, and
-decides most pairs without looking at them.
+``reach_k`` being the largest attack on meter k in any collusion. Branch and bound over J with this bound is
+exact, and prunes most pairs.
 
 References
 ----------
@@ -28,30 +28,30 @@ from gridsec.arrays import Floats, Ints
 __all__ = ["GAP", "WORK", "Corridor", "Shift", "corridor", "furthest"]
 
 GAP = 1e-6
-"""What a set of liars has to be better by to be looked at, relative."""
+"""Smallest relative improvement for which a set of meters is examined."""
 
 WORK = 2e8
-"""Entries of tests that a search may look at: beyond, the bound is what was proven until then."""
+"""Largest number of entries of tests in a search; beyond it the bound is the one proven so far."""
 
-# A test counts as within its bound up to this.
+# A test counts as within its bound up to this excess.
 _WITHIN = 1e-9
-# Sets of liars that are worked on together, and simplex steps at most for each unknown.
+# _TOGETHER: sets of meters per batch. _STEPS: largest number of simplex steps per unknown.
 _TOGETHER, _STEPS = 512, 50
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Corridor:
-    """Tests that all have to stay within their bounds. r tests, p meters.
+    """Tests with bounds, all of which must hold. r tests, p meters.
 
     Attributes
     ----------
     rows : (r, p)
-        R, and ``1 / reach`` of each meter; tests that M liars can then never bring to their bounds are left
+        R, and ``1 / reach`` of each meter; tests that M meters then cannot bring to their bounds are left
         out.
     reach : (p,)
-        No meter can lie further than this in any collusion; 0 where it cannot lie.
+        Largest attack on each meter in any collusion; 0 for protected meters.
     liars
-        M.
+        M, largest number of manipulated meters.
     """
 
     rows: Floats
@@ -61,14 +61,14 @@ class Corridor:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shift:
-    """Lies that move something furthest while all tests stay within their bounds. p meters.
+    """Attack with the largest displacement while all tests stay within their bounds. p meters.
 
     Attributes
     ----------
     size
-        How far; reached by `lies`.
+        Displacement, reached by `lies`.
     bound
-        Nothing moves it further; larger than `size` by more than GAP only where the search was cut short.
+        Upper bound of the displacement; above `size` by more than GAP only after an incomplete search.
     lies : (p,)
         a.
     """
@@ -79,7 +79,7 @@ class Shift:
 
 
 def corridor(rows: Floats, liars: int, *, reach: Floats) -> Corridor:
-    """Tighten what each meter can do, and leave out tests that cannot matter.
+    """Tighten the largest attack on each meter, and leave out tests without effect.
 
     Parameters
     ----------
@@ -88,12 +88,12 @@ def corridor(rows: Floats, liars: int, *, reach: Floats) -> Corridor:
     liars
         M, at least 1.
     reach : (p,)
-        A bound of each meter's lie, whoever lies; 0 where it cannot.
+        A bound of the attack on each meter in any collusion; 0 for protected meters.
     """
     size, liars = np.abs(rows), min(liars, reach.size)
     for _ in range(_ROUNDS):
         load = size * reach
-        # What the M - 1 strongest others add at most to each test.
+        # Largest contribution of the M - 1 strongest other meters to each test.
         top = -np.sort(-load, axis=1)[:, :liars]
         few = top[:, : liars - 1].sum(axis=1)[:, None]
         last = top[:, [liars - 2]] if liars > 1 else np.inf
@@ -110,23 +110,21 @@ def corridor(rows: Floats, liars: int, *, reach: Floats) -> Corridor:
     return Corridor(np.vstack([rows[most.sum(axis=1) > 1.0 + _WITHIN], own]), reach, liars)
 
 
-# Rounds of tightening, and what is not worth another one.
+# _ROUNDS: rounds of tightening. _WORTH: smallest relative gain for another round.
 _ROUNDS, _WORTH = 50, 1e-3
 
 
 def furthest(given: Corridor, along: Floats, *, must: int | None = None, work: float = WORK) -> Shift:
-    """Search all sets of at most M liars.
+    """Search all sets of at most M manipulated meters.
 
     Parameters
     ----------
-    given
-        The tests.
     along : (p,) or (d, p)
-        g; of several rows, whichever is moved furthest.
+        g; of several rows, the one with the largest displacement.
     must
-        A meter that lies in any case.
+        A meter that is manipulated in any case.
     work
-        Entries of tests that may be looked at.
+        Limit of examined entries of tests.
     """
     search = _Search(given, np.zeros(given.reach.size), work)
     for row in np.atleast_2d(along):
@@ -136,7 +134,7 @@ def furthest(given: Corridor, along: Floats, *, must: int | None = None, work: f
 
 @dataclass(slots=True)
 class _Search:
-    """Branch and bound, depth first, in batches; the best so far is common to all directions."""
+    """Branch and bound, depth first, in batches; the best value so far is common to all directions."""
 
     given: Corridor
     lies: Floats
@@ -154,7 +152,7 @@ class _Search:
             self._below(g, alone, value, left, np.delete(np.arange(p), must))
 
     def _below(self, g: Floats, sets: Ints, value: Floats, left: Floats, free: Ints) -> None:
-        """Go on from the first sets: whoever may join those, ordered by what they promise."""
+        """Expand the first sets by further meters, ordered by their bounds."""
         if sets.shape[1] >= self.given.liars:
             return
         promise = np.abs(left[0, free]) * self.given.reach[free]
@@ -162,10 +160,10 @@ class _Search:
         free = free[self.given.reach[free] > 0.0]
         self._expand(g, sets, value, left, free, np.zeros(len(sets), dtype=np.intp))
 
-    def _expand(  # noqa: PLR0917  # a batch of nodes: sets, what is known of them, and who may join
+    def _expand(  # noqa: PLR0917  # a batch of nodes: sets, their values, and further meters
         self, g: Floats, sets: Ints, value: Floats, left: Floats, free: Ints, begin: Ints
     ) -> None:
-        """Sets of liars, each with one more; `begin`: who may join, as places in `free`."""
+        """Expand sets by one meter each; `begin`: first candidate of each set, as a place in `free`."""
         more = self.given.liars - sets.shape[1] - 1
         gain = np.abs(left[:, free]) * self.given.reach[free]
         gain[np.arange(free.size) < begin[:, None]] = -np.inf
@@ -189,7 +187,7 @@ class _Search:
                 self._expand(g, grown, found, rest, free, place[some] + 1)
 
     def _solve(self, g: Floats, sets: Ints) -> tuple[Floats, Floats]:
-        """The best for each set alone, and what multipliers leave of g, (n, p); the best of all is kept."""
+        """Optimum for each set alone, and remainders of g, (n, p); updates the best of all sets."""
         n, m = sets.shape
         rows = self.given.rows
         part = np.moveaxis(rows[:, sets], 0, 1)
@@ -212,14 +210,14 @@ class _Search:
             value[todo] = np.abs(y).sum(axis=1)
             left[todo] = g - np.einsum("nm,nmp->np", y, rows[at])
             self._keep(sets[todo], value[todo] / most, a / most[:, None])
-            # Whoever enters goes to its bound; who leaves is whose multiplier is first at zero.
+            # The entering test goes to its bound; the test with the first multiplier at zero leaves.
             enter = np.take_along_axis(tests, worst[:, None, None], axis=1)[:, 0]
             slope = sign * np.sign(over)[:, None] * np.einsum("nij,ni->nj", inverse, enter)
             with np.errstate(divide="ignore", invalid="ignore"):
                 ratio = np.where(slope > _WITHIN, np.abs(y) / slope, np.inf)
             leave = np.argmin(ratio, axis=1)
             go = (most > 1.0 + _WITHIN) & np.isfinite(ratio.min(axis=1))
-            # At the last level nobody needs what cannot be the best any more.
+            # At the last level, sets that cannot become the best are dropped.
             if m == self.given.liars:
                 go &= value[todo] > self.size * (1.0 + GAP)
             basis[todo[go], leave[go]] = worst[go]
@@ -239,7 +237,7 @@ class _Search:
 
 
 def _independent(part: Floats) -> Ints:
-    """As many tests as unknowns, (n, m), by elimination with row pivots; `part` is (n, r, m)."""
+    """Rows of m independent tests for m unknowns, (n, m), by elimination with pivots; `part` is (n, r, m)."""
     n, _, m = part.shape
     work, every = part.copy(), np.arange(n)
     chosen = np.zeros((n, m), dtype=np.intp)

@@ -1,15 +1,15 @@
 """Errors of a feeder's files that explain the readings as well as a manipulation does.
 
-The readings of a window are compared under two hypotheses. H_a: each accused meter is off by an offset, a
-slope and a gain of its own. H_b: customers and their meters are at other places than the files say. With e
-the squared voltages read minus those of the files, T blocks by p meters, and d what the change of places
-adds to them,
+The readings of a window are compared under two hypotheses. H_a: each accused meter has an offset, a slope and
+a gain of its own. H_b: customers and their meters are at other places than stated in the files. With e the
+squared voltages read minus those of the files, T blocks by p meters, and d the change by other places,
 
     H_a: e_j = c_j + s_j t + g_j m_j + n for accused j,    H_b: e = d + n,
 
 where m_j is the voltage of the model and n has the covariance of loads and meters. The slopes and the gains
-of H_a are used where they pay for themselves, ln T each. H_b has no free number: it must explain the size of
-the deviation as well as its changes with the loads. A window whose loads do not change decides nothing.
+of H_a are used if they improve the fit by more than their price, ln T each. H_b has no free number: it must
+explain the size of the deviation as well as its changes with the loads. A window with constant loads decides
+nothing.
 
 References
 ----------
@@ -39,7 +39,7 @@ from gridsec.plant import Plant
 __all__ = ["DataError", "DataErrorDesign", "DataErrorKind", "Window", "accused", "begin", "design", "follow"]
 
 BLOCK_S: Final = 60.0
-"""Least duration of a block, s: the mean of a minute hides jitter and keeps the changes of the loads."""
+"""Smallest duration of a block, s: the mean of a minute removes jitter and keeps the changes of the loads."""
 
 FEWEST_BLOCKS: Final = 10
 """Blocks before the first comparison: ten minutes of one-second readings."""
@@ -48,36 +48,41 @@ MOST_BLOCKS: Final = 60
 """Blocks of the window: one hour of one-second readings, 15 hours of quarter-hours."""
 
 MOST_PLACES: Final = 400
-"""Places up to which the comparison runs: it takes 0.4 s once in a block then. In feeders of more
-places, those of the customers' buses are the candidates."""
+"""Largest number of places for the comparison, which then takes 0.4 s per block.
+
+With more places, those of the customers' buses are the candidates.
+"""
 
 MOST_ACCUSED: Final = 12
-"""Accused meters with places of their own to try, the furthest off first: it bounds the time of a block."""
+"""Accused meters with candidate places of their own, largest deviation first; it bounds the time of a block.
+"""
 
 COMPARED: Final = 32
-"""Changes of places that are compared on all meters, the most promising at the moved ones first."""
+"""Changes of places compared on all meters, the most promising ones first."""
 
 SOLVED: Final = 4
-"""Changes of places whose power flow is solved with losses, the most likely of the linear model first."""
+"""Changes of places with a power flow with losses, the most likely of the linear model first."""
 
 RISK: Final = 1e-4
-"""Probability of a hint by chance, and of a misfit beyond its limit if the hint is right."""
+"""Probability of a hint by chance, and of a misfit beyond its limit for a correct hint."""
 
 COMMON: Final = 0.5
-"""Share of the variance of unknown powers that all customers have in common, as in `feeders.doubts`."""
+"""Share of the variance of unknown powers that is common to all customers, as in `feeders.doubts`."""
 
 MODEL_STD: Final = 2e-4
-"""Error of the power flow that is not of the loads, squared pu: what the loss correction leaves."""
+"""Error of the power flow independent of the loads, squared pu: the remainder of the loss correction."""
 
 PLAUSIBLE_V2: Final = (0.25, 2.25)
-"""Squared voltages of half and of one and a half of nominal, pu. Beyond them a claimed power is absurd, and
-the block decides nothing."""
+"""Squared voltages of half and of one and a half of nominal, pu.
+
+Beyond them a reported power is absurd, and the block decides nothing.
+"""
 
 KEPT_FACTORS: Final = 4
 """Pairs of Cholesky factors in memory: 10 MB at `MOST_PLACES`."""
 
 FAR_SIGMAS: Final = 4.0
-"""Standard deviations beyond which a change of places does not explain an accused meter."""
+"""Deviation in standard deviations beyond which a change of places does not explain an accused meter."""
 
 
 class DataErrorKind(StrEnum):
@@ -98,7 +103,7 @@ class DataError:
     kind
         Kind.
     customers
-        Indices of the customers at other places than the files say: one or two.
+        Indices of the one or two customers at other places than in the files.
     places
         Place of each of them that explains the readings, as in `gridsec.network`.
     meters
@@ -126,7 +131,7 @@ class DataErrorDesign:
     at : (N,)
         Index of each customer's place in `places`.
     unit : (C,)
-        1 pu of each place, V: customers are exchanged only between equal ones.
+        1 pu of each place, V; customers are exchanged only between equal ones.
     active, reactive : (C, C)
         From a power at one place to the squared voltage at another, pu.
     block_s
@@ -199,14 +204,14 @@ class _Mean:
         return _Mean(self.told + other.told, self.told_count + other.told_count, self.every + other.every)
 
     def value(self, count: int) -> Floats:
-        """Power and variance (2, N): of the readings where there is one, for a lost one is no change."""
+        """Power and variance (2, N): of the readings if there are any, since a lost reading is no change."""
         some = self.told_count > 0.0
         return np.where(some, self.told / np.where(some, self.told_count, 1.0), self.every / count)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Sums:
-    """Sums over the frames of the block that is not complete."""
+    """Sums over the frames of the incomplete block."""
 
     block: int
     count: int
@@ -220,14 +225,14 @@ class _Sums:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Window:
-    """Readings since meters are accused, and what they say. Empty while no meter is.
+    """Readings since the first accusation, and their result. Empty while no meter is accused.
 
     Attributes
     ----------
     rows
         Complete blocks, at most `MOST_BLOCKS`; None before the first one.
     error
-        Error of the files that explains accused meters; None: none does.
+        Error of the files that explains accused meters; None if there is none.
     t
         Time of the last frame, s; None without one.
     """
@@ -249,8 +254,6 @@ def design(plant: Plant, base_volt: Floats, step_s: float) -> DataErrorDesign | 
 
     Parameters
     ----------
-    plant
-        Feeder, inverters and meters.
     base_volt : (n,)
         1 pu of every place, V.
     step_s
@@ -277,13 +280,7 @@ def design(plant: Plant, base_volt: Floats, step_s: float) -> DataErrorDesign | 
 
 
 def accused(verdict: Verdict) -> Bools:
-    """Return the meters that a verdict accuses, (p,): named, or part of one of several explanations.
-
-    Parameters
-    ----------
-    verdict
-        Of one tick.
-    """
+    """Return the meters (p,) accused by a verdict: named, or part of one of several explanations."""
     out = verdict.suspects.copy()
     for explanation in verdict.explanations:
         out |= explanation.meters
@@ -316,15 +313,15 @@ def _at(feeder: Network, places: Ints) -> Network:
 
 
 def follow(design: DataErrorDesign, window: Window, frame: Frame, x: Floats, accused: Bools) -> Window:
-    """Take one frame into the window; compare at the end of each block.
+    """Add one frame to the window; compare at the end of each block.
 
     Parameters
     ----------
     design, window
         The preparation, and the window so far.
     frame
-        Everything known at one tick. One that is not later than the last, or later than the last by more
-        than a window, begins the window anew.
+        Data of one tick. A frame that is not later than the last, or later by more than a window, restarts
+        the window.
     x : (m,)
         Estimated injections of the inverters, pu.
     accused : (p,)
@@ -434,7 +431,7 @@ def _solved(design: DataErrorDesign, at: Ints, p: Floats, q: Floats, *, v0: Floa
 
 
 _LOSS_STEPS: Final = 3
-"""Corrections of the linear power flow: the third changes less than a meter can show."""
+"""Corrections of the linear power flow: the third changes less than the resolution of a meter."""
 
 
 def _joined(rows: Rows, more: Rows) -> Rows:
@@ -477,7 +474,7 @@ def _some(rows: Rows, which: Bools) -> Rows:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Scene:
-    """A window that can be compared. T blocks, k meters heard in all of them."""
+    """A window prepared for comparison. T blocks, k meters with readings in all of them."""
 
     design: DataErrorDesign
     rows: Rows
@@ -487,11 +484,11 @@ class _Scene:
     accused: Bools  # (k,)
     fixed: Floats  # (k, k) covariance of the means
     varying: Floats  # (k, k) covariance of the changes
-    attacked: dict[bytes, float] = field(default_factory=dict)  # misfit of H_a, by the meters compared
+    attacked: dict[bytes, float] = field(default_factory=dict)  # misfit of H_a, by the compared meters
     factors: dict[bytes, tuple[Floats, Floats]] = field(default_factory=dict)  # of both covariances, likewise
 
     def factored(self, use: Ints) -> tuple[Floats, Floats]:
-        """Lower Cholesky factors of `fixed` and `varying` of some meters; most changes compare the same."""
+        """Lower Cholesky factors of `fixed` and `varying` for `use`; most changes compare the same meters."""
         key = use.tobytes()
         if key not in self.factors:
             if len(self.factors) == KEPT_FACTORS:
@@ -511,7 +508,7 @@ def compare(design: DataErrorDesign, rows: Rows, held: DataError | None = None) 
     design, rows
         The preparation, and the blocks of a window.
     held
-        Error found before: it stays unless another one is likelier by more than chance.
+        Error found before; it stays unless another one is likelier by more than `_STAYS`.
     """
     scene = _scene(design, rows)
     if scene is None or not scene.accused.any():
@@ -528,11 +525,11 @@ def compare(design: DataErrorDesign, rows: Rows, held: DataError | None = None) 
 
 
 _STAYS: Final = -2.0 * math.log(RISK)
-"""Twice the log-likelihood by which another error must be likelier than the one found before."""
+"""Twice the log-likelihood by which another error must be likelier than the previous one."""
 
 
 def _scene(design: DataErrorDesign, rows: Rows) -> _Scene | None:
-    """The blocks and meters without gaps; None if they are too few."""
+    """Blocks and meters without gaps; None if they are too few."""
     plant = design.plant
     heard = np.isfinite(rows.y)
     k = np.flatnonzero(heard.mean(axis=0) >= _HEARD)
@@ -566,7 +563,7 @@ _HEARD: Final = 0.8
 
 
 def _load_covariance(design: DataErrorDesign, rows: Rows, at: Ints) -> Floats:
-    """Covariance (k, k) of the errors that the powers' errors make at some places, squared pu^2."""
+    """Covariance (k, k) of the voltage errors at some places by errors of the powers, squared pu^2."""
     out = np.zeros((at.size, at.size))
     for matrix, variance in ((design.active, rows.p_var), (design.reactive, rows.q_var)):
         effect = matrix[np.ix_(at, design.at)] * np.sqrt(variance.mean(axis=0))
@@ -588,12 +585,12 @@ class _Move:
         return tuple(int(design.places[k]) for k in self.to)
 
     def same(self, design: DataErrorDesign, error: DataError | None) -> bool:
-        """The change of places is that of an error."""
+        """True if the change of places is that of an error."""
         now = (self.kind, self.customers, self.places(design))
         return error is not None and now == (error.kind, error.customers, error.places)
 
     def shifted(self, scene: _Scene) -> Floats:
-        """d: what the change adds to the voltages of all meters, losses included, (T, k)."""
+        """d: effect of the change on the voltages of all meters, losses included, (T, k)."""
         design, rows = scene.design, scene.rows
         at = design.at.copy()
         at[list(self.customers)] = self.to
@@ -603,7 +600,7 @@ class _Move:
 
 
 def _moves(scene: _Scene) -> Iterator[_Move]:
-    """All single errors of the files at the accused meters that are furthest off."""
+    """All single errors of the files at the accused meters with the largest deviations."""
     design, seen = scene.design, set[tuple[tuple[int, int], ...]]()
     off = np.abs(scene.e.mean(axis=0)) / np.sqrt(np.diagonal(scene.fixed))
     far = sorted(np.flatnonzero(scene.accused).tolist(), key=lambda j: -off[j])[:MOST_ACCUSED]
@@ -644,7 +641,7 @@ def _of_customer(design: DataErrorDesign, i: int) -> Iterator[_Move]:
 
 
 def _shift(scene: _Scene, move: _Move, which: Ints) -> Floats:
-    """d: what a change of places adds to the voltages of the model at some of the meters, (T, w)."""
+    """d: effect of a change of places on the voltages of the model at some of the meters, (T, w)."""
     design, rows = scene.design, scene.rows
     customer = design.plant.meters[scene.meters[which]]
     now = scene.at[which].copy()
@@ -679,7 +676,7 @@ def _promising(scene: _Scene, moves: list[_Move], held: DataError | None) -> lis
 
 
 def _alone(rest: Floats, fixed: Floats, varying: Floats) -> float:
-    """Misfit of meters taken apart: of their means, and of the changes."""
+    """Misfit of independent meters: of their means, and of the changes."""
     mean = rest.mean(axis=0)
     return float((mean**2 / fixed).sum() + ((rest - mean) ** 2 / varying).sum())
 
@@ -687,10 +684,10 @@ def _alone(rest: Floats, fixed: Floats, varying: Floats) -> float:
 def _gain(
     scene: _Scene, shift: Floats, customers: tuple[int, ...], limit: float, *, sure: bool = True
 ) -> tuple[float, tuple[int, ...]]:
-    """Misfit that a change of places saves beside a manipulation, and the accused meters explained.
+    """Misfit that a change of places saves against a manipulation, and the accused meters explained.
 
-    With `sure` a change that leaves a misfit beyond its limit explains none. Errors of the loads may last for
-    the whole window: a block's misfit is compared with the limit of one block.
+    With `sure` a change with a misfit beyond its limit explains none. Errors of the loads may last for the
+    whole window: a block's misfit is compared with the limit of one block.
     """
     rest = scene.e - shift
     mean = rest.mean(axis=0)
@@ -720,7 +717,7 @@ def _squared(factor: Floats, rest: Floats) -> float:
 
 
 def _manipulated(scene: _Scene, use: Ints) -> float:
-    """Least misfit of the changes where accused meters have slopes, gains, both or none; ln T for each.
+    """Least misfit of the changes with slopes, gains, both or neither at accused meters; price ln T each.
 
     With weights W, regressors r_a(t) at meters j_a and changes e, the normal equations have the entries
     ``W[j_a, j_b] sum_t r_a r_b`` and ``sum_t r_a (W e)_a``.

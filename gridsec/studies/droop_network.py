@@ -1,15 +1,15 @@
-"""The AC power flow of a feeder, and a proven range of its sensitivities over a box of powers.
+"""AC power flow of a feeder, and a proven range of its sensitivities over a box of powers.
 
 With the complex impedances Z between customers and the no-load profile E (charging included), the AC
 equations are `V = E v0 + Z conj(s / V)`. From a solution V*, s* in the middle of a box follow, in closed
-form, how far any other solution in the box can be away, and how far its sensitivities `d|V|/dp`, `d|V|/dq`:
-no linear model and no sampling stands between the bound and the AC power flow.
+form, bounds of the distance of any other solution in the box and of its sensitivities `d|V|/dp`, `d|V|/dq`.
+The bounds hold for the AC power flow itself, without a linear model or sampling.
 
 In three phases V is turned back by the angles of the busbar, `V_i / a_i` with a = (1, e^{-j 2 pi / 3},
 e^{j 2 pi / 3}) by phase, and `Z_ij a_j / a_i` takes the place of Z_ij: the equation is the same, magnitudes
 are those of the phases, and without charging Z is `R + j X` of `gridsec.phases`. With closed loops Z is the
-inverse of the admittance matrix without the busbar (`gridsec.mesh`). Nothing here asks Z to be symmetric, its
-parts not to be negative, or the feeder to be a tree.
+inverse of the admittance matrix without the busbar (`gridsec.mesh`). Z need not be symmetric, its parts may
+be negative, and the feeder need not be a tree.
 
 References
 ----------
@@ -50,20 +50,20 @@ __all__ = [
 Complex = NDArray[np.complex128]
 
 _TOL = 1e-13
-"""Largest change of a voltage at which the fixed-point iteration has arrived, pu."""
+"""Largest change of a voltage in a converged fixed-point iteration, pu."""
 
 _ROUNDS = 400
 
 _GROWTH = 1e-3
-"""What is added to a radius, relatively, so that the box it spans is mapped strictly into itself."""
+"""Relative increase of a radius, so that its box is mapped strictly into itself."""
 
 _SLACK = 1e-9
-"""Room for the rounding of a solved power flow in a proven voltage, pu."""
+"""Rounding allowance of a solved power flow in a proven voltage, pu."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Network:
-    """`V = E v0 + Z conj(s / V)` at the customers, and at all places. N customers, n places.
+    """Coefficients of `V = E v0 + Z conj(s / V)` at the customers, and at all places. N customers, n places.
 
     A place is a bus, or in three phases a phase of one. The busbar has k voltages, 1 or 3.
 
@@ -85,17 +85,12 @@ class Network:
 
 
 def network(feeder: Feeder | Meshed | PhasedFeeder) -> Network:
-    """The impedances of a feeder, `(I + j Z0 B)^-1 Z0` with Z0 from the series impedances and B the charging.
-
-    Parameters
-    ----------
-    feeder
-        The feeder.
+    """Impedances of a feeder, `(I + j Z0 B)^-1 Z0` with series impedances Z0 and charging B.
 
     Raises
     ------
     DesignInfeasible
-        If three phases are charged so much that their voltage without load is not found.
+        If the no-load voltage of three phases is not found because of too much charging.
     """
     if isinstance(feeder, PhasedFeeder):
         return _phased(feeder)
@@ -112,7 +107,7 @@ def network(feeder: Feeder | Meshed | PhasedFeeder) -> Network:
 
 
 def _meshed(feeder: Meshed) -> Network:
-    """The inverses that a meshed feeder has, in three phases turned back by the angles of the busbar."""
+    """Inverses of a meshed feeder, in three phases turned back by the angles of the busbar."""
     idle, Z_bus = feeder.idle.reshape(len(feeder.buses), -1), feeder.transfer
     if isinstance(feeder, PhasedMesh):
         back = np.conj(ROTATION)[np.arange(len(idle)) % 3][:, None]
@@ -122,7 +117,7 @@ def _meshed(feeder: Meshed) -> Network:
 
 
 def _phased(feeder: PhasedFeeder) -> Network:
-    """By sweeps: of each customer's current, and of each voltage of the busbar, the charging repeated."""
+    """Impedances by sweeps for each customer's current and each busbar voltage, iterated for the charging."""
     tree, count = feeder.tree, feeder.bus.size
     idle: Complex = np.zeros((count + 3, 3, len(tree.buses)), dtype=np.complex128)
     idle[count:] = np.eye(3)[:, :, None]
@@ -139,9 +134,7 @@ def _phased(feeder: PhasedFeeder) -> Network:
             if not change > _TOL:
                 break
     if tree.half.any() and not change <= _TOL:
-        raise DesignInfeasible(
-            "voltages of the feeder without load", "its charging is too much", code="no-solution"
-        )
+        raise DesignInfeasible("voltages of the feeder without load", "too much charging", code="no-solution")
     source = np.concatenate([ROTATION[tree.phase], ROTATION])
     turned = source[:, None, None] * V / ROTATION[:, None]
     every = turned.transpose(2, 1, 0).reshape(len(feeder.buses), count + 3)
@@ -151,7 +144,7 @@ def _phased(feeder: PhasedFeeder) -> Network:
 
 
 def solve(net: Network, s: Complex, v0: Floats | float) -> Complex:
-    """Voltages of the customers by AC power flow; NaN where the iteration finds none.
+    """Voltages of the customers by AC power flow; NaN where the iteration does not converge.
 
     Parameters
     ----------
@@ -210,13 +203,7 @@ def currents(
 
 
 def lines(feeder: Feeder | MeshedFeeder) -> tuple[Ints, Complex, Floats]:
-    """Ends (L, 2), impedance (L,) and charging (L,) of every branch, and then of every tie, pu.
-
-    Parameters
-    ----------
-    feeder
-        A balanced feeder.
-    """
+    """Ends (L, 2), impedance (L,) and charging (L,) of every branch, and then of every tie, pu."""
     tree = feeder if isinstance(feeder, Feeder) else feeder.tree
     ends, z = np.column_stack([tree.parent, np.arange(1, len(tree.buses))]), tree.r + 1j * tree.x
     if isinstance(feeder, Feeder):
@@ -229,7 +216,7 @@ def lines(feeder: Feeder | MeshedFeeder) -> tuple[Ints, Complex, Floats]:
 
 
 def _phase_currents(feeder: PhasedFeeder, injected: Complex, at: Complex) -> Floats:
-    """`currents` of the phases, from what customers inject (…, N) and the voltages of the places (…, n)."""
+    """`currents` of the phases, from the injections (…, N) and the voltages of the places (…, n)."""
     tree = feeder.tree
     V = ROTATION[:, None] * np.moveaxis(at.reshape(*at.shape[:-1], len(tree.buses), 3), -1, -2)
     drawn = 1j * np.einsum("kij,...jk->...ik", tree.half, V)
@@ -264,14 +251,14 @@ def _mesh_currents(feeder: PhasedMesh, at: Complex) -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sensitivity:
-    """The linearised AC power flow at a solution, relative voltages `xi = dV / V`.
+    """Linearised AC power flow at a solution, relative voltages `xi = dV / V`.
 
     Attributes
     ----------
     a, b : (N, N)
         `xi = a c + b conj(c)` for a change c of the conjugate injections.
     busbar : (N, k)
-        xi for 1 pu more at each voltage of the busbar.
+        xi per pu of each voltage of the busbar.
     v : (N,)
         Voltage magnitudes, pu.
     """
@@ -283,17 +270,17 @@ class Sensitivity:
 
     @property
     def p(self) -> Complex:
-        """Relative voltages xi for 1 pu more of active injection, (N, N)."""
+        """Relative voltages xi per pu of active injection, (N, N)."""
         return self.a + self.b
 
     @property
     def q(self) -> Complex:
-        """Relative voltages xi for 1 pu more of reactive injection, (N, N)."""
+        """Relative voltages xi per pu of reactive injection, (N, N)."""
         return -1j * (self.a - self.b)
 
     @property
     def dv_dq(self) -> Floats:
-        """Voltage magnitudes for 1 pu more of reactive injection, (N, N)."""
+        """Voltage magnitudes per pu of reactive injection, (N, N)."""
         return np.asarray(self.v[:, None] * self.q.real)
 
 
@@ -311,11 +298,13 @@ def sensitivity(net: Network, s: Complex, V: Complex) -> Sensitivity:
     Raises
     ------
     DesignInfeasible
-        If there is no solution there.
+        If there is no solution at this point.
     """
     if not np.isfinite(V).all():
         raise DesignInfeasible(
-            "sensitivities of the feeder", "the AC power flow has no solution there", code="no-solution"
+            "sensitivities of the feeder",
+            "the AC power flow has no solution at this point",
+            code="no-solution",
         )
     relative = net.Z / V[:, None] / np.conj(V)
     M = relative * np.conj(s)
@@ -331,14 +320,14 @@ def sensitivity(net: Network, s: Complex, V: Complex) -> Sensitivity:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Box:
-    """Injections and busbar voltages between limits, pu.
+    """Box of injections and busbar voltages, pu.
 
     Attributes
     ----------
     p_low, p_high, q_low, q_high : (N,)
         Limits of the net injections (generation positive), inverters included.
     v0_low, v0_high
-        Limits of the busbar's voltage; in three phases of each of the three, which move as they like.
+        Limits of the busbar's voltage; in three phases of each of the three, independently.
     """
 
     p_low: Floats
@@ -351,17 +340,17 @@ class Box:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Region:
-    """What the AC power flow can do in a box.
+    """Bounds of the AC power flow in a box.
 
     Every chord of the AC power flow in the box, `v - v' = Jp (p - p') + Jq (q - q') + J0 (v0 - v0')`, has
-    coefficients within the errors of those given here.
+    coefficients within the given errors of the given ones.
 
     Attributes
     ----------
     dv_dp, dv_dq : (N, N)
         Sensitivities of the voltage magnitudes in the middle of the box.
     p_error, q_error : (N, N)
-        How far those anywhere in the box are off, entry by entry.
+        Largest differences of those anywhere in the box, entry by entry.
     dv_dv0, v0_error : (N, k)
         The same for the voltages of the busbar.
     low, high : (N,)
@@ -381,17 +370,10 @@ class Region:
 def region(net: Network, box: Box) -> Region:
     """Bound voltages and sensitivities of the AC power flow over a box of injections.
 
-    Parameters
-    ----------
-    net
-        From `network`.
-    box
-        The injections.
-
     Raises
     ------
     DesignInfeasible
-        If the box is so large, or so near collapse, that nothing can be said of all of it.
+        If the box is too large, or too near collapse, for a bound.
     """
     middle, half = _split(box)
     s, v0 = middle[0] + 1j * middle[1], 0.5 * (box.v0_low + box.v0_high)
@@ -404,7 +386,7 @@ def region(net: Network, box: Box) -> Region:
     tilt = gain * (r / (1.0 - r))
 
     def error(xi: Complex, own: Floats) -> Floats:
-        # The change of d xi, and the turn of the direction in which a voltage's magnitude grows.
+        # Change of d xi, and rotation of the direction in which a voltage's magnitude grows.
         change = own + feedback @ (amplify @ (np.abs(xi) + own))
         turned = (1.0 - np.sqrt(1.0 - r**2))[:, None] * np.abs(xi.real) + r[:, None] * np.abs(xi.imag)
         return np.asarray(at.v[:, None] * (change + turned))
@@ -470,7 +452,7 @@ def _neumann(feedback: Floats) -> Floats:
 
 
 def _limits(net: Network, box: Box, middle: Floats, J: Floats, off: Floats) -> tuple[Floats, Floats]:
-    """The better of two bounds: from the middle, and from the corner that is extreme if no J is negative."""
+    """Better of two bounds: from the middle, and from the corner that is extreme without negative J."""
     swing = np.full(net.of_busbar.shape[1], box.v0_high - box.v0_low)
     width = np.concatenate([box.p_high - box.p_low, box.q_high - box.q_low, swing])
     spread = (np.abs(J) + off) @ (0.5 * width)

@@ -1,4 +1,4 @@
-"""Where a fleet of droop inverters rests on the AC feeder, and the voltages it can have there and on the way.
+"""Equilibrium of a fleet of droop inverters on the AC feeder, and voltage bounds at rest and at all times.
 
 References
 ----------
@@ -21,22 +21,20 @@ from gridsec.studies.droop_stability import Loop, reach, slopes
 __all__ = ["Band", "Share", "always", "at_rest", "injected", "rest", "shares", "shares_of_gain"]
 
 _TOL: Final = 1e-11
-"""How far set-points may be from injections at rest, pu of the largest limit."""
+"""Largest distance of set-points from injections at rest, relative to the largest limit."""
 
 _ROUNDS: Final = 60
 _NEWTON: Final = 40
 _SLACK: Final = 1e-9
 _BESIDE: Final = 1e-7
-"""Voltages this near to a breakpoint have the slopes of both sides, pu."""
+"""Distance from a breakpoint within which the slopes of both sides count, pu."""
 
 
 def injected(droop: Droop, s: Complex, x: Floats) -> Complex:
-    """The customers' injections with those of their inverters, (…, N).
+    """Injections of the customers with those of their inverters, (…, N).
 
     Parameters
     ----------
-    droop
-        The fleet.
     s : (…, N)
         Complex injections without the inverters, pu.
     x : (…, m)
@@ -47,17 +45,15 @@ def injected(droop: Droop, s: Complex, x: Floats) -> Complex:
 
 
 def rest(net: Network, droop: Droop, s: Complex, v0: Floats | float) -> tuple[Floats, Complex]:
-    """Injections and voltages at which every inverter gives what its curve asks for; NaN where none is found.
+    """Injections and voltages with every inverter on its curve; NaN where no equilibrium is found.
 
-    Plain iteration for all operating points together, as damped as the loop gain without load asks for, and
-    Newton's method for those that it leaves open.
+    Plain iteration for all operating points together, with damping from the no-load loop gain, and Newton's
+    method for points without convergence.
 
     Parameters
     ----------
     net
         From `gridsec.studies.droop_network.network`.
-    droop
-        The fleet.
     s : (…, N)
         Complex injections without the inverters, pu.
     v0 : (…) or scalar
@@ -88,7 +84,7 @@ def rest(net: Network, droop: Droop, s: Complex, v0: Floats | float) -> tuple[Fl
 
 
 def _newton(net: Network, droop: Droop, s: Complex, v0: float, tol: float) -> tuple[Floats, Complex]:
-    """One point by damped Newton steps with the slopes at the present voltages."""
+    """Solve one point by damped Newton steps with the slopes at the present voltages."""
     own = droop.customer
 
     def miss(x: Floats) -> tuple[Floats, Complex, float]:
@@ -116,12 +112,12 @@ def _newton(net: Network, droop: Droop, s: Complex, v0: float, tol: float) -> tu
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Band:
-    """Proven limits of every customer's voltage while loads stay in a box, pu.
+    """Proven limits of every customer's voltage for loads in a box, pu.
 
     Attributes
     ----------
     low, high : (N,)
-        No voltage is beyond.
+        Lower and upper limit.
     """
 
     low: Floats
@@ -129,19 +125,17 @@ class Band:
 
 
 def always(net: Network, droop: Droop, loads: Box) -> Band:
-    """Limits at all times, however fast and often loads move in their box, from any state within reach.
+    """Limits at all times, for any motion of the loads in their box, from any reachable state.
 
     Parameters
     ----------
-    net, droop
-        The feeder and the fleet.
     loads
         Injections without the droop inverters.
 
     Raises
     ------
     DesignInfeasible
-        If nothing can be said of so large a box.
+        If the box is too large for a bound.
     """
     found = reach(net, droop, loads).region
     return Band(found.low, found.high)
@@ -150,8 +144,8 @@ def always(net: Network, droop: Droop, loads: Box) -> Band:
 def at_rest(net: Network, droop: Droop, loads: Box) -> Band:
     """Limits while the fleet is at rest: loads in the box that move slowly against the time constants.
 
-    The AC equilibria of the two corners, less what a sensitivity of the closed loop with the wrong sign could
-    add. Two equilibria differ by `dv = Jw dw - Jq Delta dv`; with `|dv| <= U |dw|`,
+    The AC equilibria of the two corners, widened by the largest effect of closed-loop sensitivities of the
+    wrong sign. Two equilibria differ by `dv = Jw dw - Jq Delta dv`; with `|dv| <= U |dw|`,
     `U = (I - |Jq| D)^-1 |Jw|`, the lower end of every sensitivity is `L = Jw - |Jq| D U`.
 
     Parameters
@@ -162,7 +156,7 @@ def at_rest(net: Network, droop: Droop, loads: Box) -> Band:
     Raises
     ------
     DesignInfeasible
-        If nothing can be said of so large a box, or the loop gain is 1 or more.
+        If the box is too large for a bound, or the loop gain is 1 or more.
     """
     found, own = reach(net, droop, loads), droop.customer
     given = found.region
@@ -178,7 +172,7 @@ def at_rest(net: Network, droop: Droop, loads: Box) -> Band:
         raise DesignInfeasible(
             "voltages of the fleet at rest", "the loop gain may be 1 or more", code="unstable"
         )
-    # A busbar that rises lifts all voltages; how much of it the fleet takes back is counted like a load's.
+    # A rise of the busbar lifts all voltages; the fleet's reaction to it counts like that to a load.
     busbar_high = np.abs(given.dv_dv0) + given.v0_error
     U = np.maximum(inverse, 0.0) @ np.column_stack([np.abs(J) + off, busbar_high])
     L = np.column_stack([J - off, given.dv_dv0 - given.v0_error]) - back @ U
@@ -196,14 +190,14 @@ def at_rest(net: Network, droop: Droop, loads: Box) -> Band:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Share:
-    """Who makes the loop gain. One entry for each inverter of a `Loop`.
+    """Shares of the inverters in the loop gain. One entry for each inverter of a `Loop`.
 
     Attributes
     ----------
     part : (m,)
-        Part of the gain that is an inverter's: its squared entry in the leading mode; together 1.
+        Share of each inverter: its squared entry in the leading mode; the sum is 1.
     factor : (m,)
-        What its slope alone may be multiplied with until the gain is what is allowed; infinity if any.
+        Largest factor on its slope alone within the allowed gain; infinity if any.
     """
 
     part: Floats
@@ -211,17 +205,17 @@ class Share:
 
 
 def shares(given: Loop, allowed: float) -> Share:
-    """Attribute the gain of a loop, and say how much steeper each inverter alone may become.
+    """Attribute the gain of a loop to its inverters, with the largest factor on each slope alone.
 
-    `lambda_max(D^1/2 S D^1/2) <= a` is `a D^-1 - S >= 0`. A larger d_i takes a multiple of `e_i e_i'`
-    off that, so with `w_i = [(a I - D^1/2 S D^1/2)^-1]_ii` the largest factor is `1 / (1 - 1 / (a w_i))`.
+    `lambda_max(D^1/2 S D^1/2) <= a` is `a D^-1 - S >= 0`. A larger d_i subtracts a multiple of `e_i e_i'`, so
+    with `w_i = [(a I - D^1/2 S D^1/2)^-1]_ii` the largest factor is `1 / (1 - 1 / (a w_i))`.
 
     Parameters
     ----------
     given
         The loop; S enters by its symmetric part.
     allowed
-        a, the gain allowed.
+        a, the allowed gain.
     """
     S = 0.5 * (given.S + given.S.T)
     if not S.size:
@@ -237,21 +231,16 @@ def shares(given: Loop, allowed: float) -> Share:
 
 
 def shares_of_gain(given: Loop) -> Share:
-    """The same for loops of any sign and symmetry, by the small-gain certificate.
+    """Attribute the gain of loops of any sign and symmetry, by the small-gain certificate.
 
     With `M = |S| + error`, the gain `rho(M)` below 1 and `w_i = [(I - M)^-1]_ii`, a column i of M that is
     multiplied by f leaves it below 1 up to `f = 1 / (1 - 1 / w_i)`. The part is the product of an inverter's
-    entries in the leading left and right vectors: what the gain grows by with its slope alone.
-
-    Parameters
-    ----------
-    given
-        The loop.
+    entries in the leading left and right vectors: the growth of the gain with its slope alone.
 
     Returns
     -------
     Share
-        Factors are NaN where the gain may be 1 or more, so that the certificate says nothing.
+        Factors are NaN where the gain may be 1 or more, so that there is no certificate.
     """
     M = np.abs(given.S) + given.error
     if not M.size:

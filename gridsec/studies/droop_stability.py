@@ -1,4 +1,4 @@
-"""Proofs that a fleet of droop inverters settles, whatever state it starts from, on the AC feeder.
+"""Proofs that a fleet of droop inverters settles from every initial state on the AC feeder.
 
 Inverters sample their voltage every h seconds, with d whole intervals of dead time, and hold their set-point:
 
@@ -45,7 +45,7 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class Update:
-    """When inverters act.
+    """Timing of the inverters' updates.
 
     Attributes
     ----------
@@ -57,7 +57,8 @@ class Update:
     Raises
     ------
     ValueError
-        If the interval or the dead time is negative or none, or a continuous filter has a dead time.
+        If the interval is negative or not finite, the dead time is negative, or a continuous filter has a
+        dead time.
     """
 
     interval_s: float = 1.0
@@ -88,31 +89,31 @@ class Update:
             )
 
     def share(self, tau: Floats) -> Floats:
-        """`alpha`, the share of the way to the set-point that an inverter goes in one interval, (m,)."""
+        """`alpha`, the fraction of the step to the set-point in one interval, (m,)."""
         return np.asarray(-np.expm1(-self.interval_s / tau))
 
 
-# --- where the fleet ends up ----------------------------------------------------------------------------
+# --- reachable set ----------------------------------------------------------------------------------------
 
 _SHRINKS: Final = 0.98
-"""Another round of `reach` must shrink the injections at least by this factor."""
+"""Factor by which another round of `reach` must shrink the injections at least."""
 
 _REACH_ROUNDS: Final = 12
 
 _ROOM: Final = 1e-6
-"""What injections keep of their old range, so that a smaller box is entered in finite time."""
+"""Fraction of the old range added to injections, so that a smaller box is entered in finite time."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reach:
-    """A box of injections that every trajectory enters and none leaves.
+    """Box of injections that every trajectory enters and does not leave.
 
     Attributes
     ----------
     x_low, x_high : (m,)
         Injections of the inverters, pu.
     region
-        What the AC power flow can do there.
+        Bounds of the AC power flow in it.
     """
 
     x_low: Floats
@@ -121,23 +122,21 @@ class Reach:
 
 
 def reach(net: Network, droop: Droop, loads: Box, *, rounds: int = _REACH_ROUNDS) -> Reach:
-    """Shrink the box of what inverters inject: voltages bound set-points, and set-points voltages.
+    """Shrink the box of the inverters' injections: voltages bound set-points, and set-points voltages.
 
     Parameters
     ----------
     net
         From `gridsec.studies.droop_network.network`.
-    droop
-        The fleet.
     loads
-        Injections without the droop inverters; a point, or a box in which they move as they like.
+        Injections without the droop inverters; a point, or a box in which they move arbitrarily.
     rounds
-        How often to shrink at most; 0: the saturation of the curves.
+        Largest number of rounds; 0 for the saturation of the curves.
 
     Raises
     ------
     DesignInfeasible
-        If nothing can be said of so large a box.
+        If the box is too large for a bound.
     """
     low, high = droop.q[:, 3], droop.q[:, 0]
     found = region(net, _with(loads, droop, low, high))
@@ -154,7 +153,7 @@ def reach(net: Network, droop: Droop, loads: Box, *, rounds: int = _REACH_ROUNDS
 
 
 def _with(loads: Box, droop: Droop, low: Floats, high: Floats) -> Box:
-    """The box with the inverters' reactive power added to the loads'."""
+    """The box with the inverters' reactive power added to that of the loads."""
     q_low, q_high = loads.q_low.copy(), loads.q_high.copy()
     np.add.at(q_low, droop.customer, low)
     np.add.at(q_high, droop.customer, high)
@@ -162,12 +161,10 @@ def _with(loads: Box, droop: Droop, low: Floats, high: Floats) -> Box:
 
 
 def slopes(droop: Droop, low: Floats, high: Floats) -> Floats:
-    """Steepest part of every curve between two voltages, `-dq/dv`, pu.
+    """Steepest slope of every curve between two voltages, `-dq/dv`, pu.
 
     Parameters
     ----------
-    droop
-        The fleet.
     low, high : (m,)
         Voltages at the inverters, pu.
     """
@@ -178,22 +175,20 @@ def slopes(droop: Droop, low: Floats, high: Floats) -> Floats:
 
 
 def steepened(droop: Droop, times: float) -> Droop:
-    """The fleet with all its ramps so many times as steep; limits stay, and so does the deadband.
+    """Fleet with all ramps steeper by a factor, with the same limits and deadband.
 
     Outer ramps are compressed towards the inner breakpoints; where those do not enclose a deadband, the
     whole curve is compressed towards the middle between them.
 
     Parameters
     ----------
-    droop
-        The fleet.
     times
         Factor, above 0.
 
     Raises
     ------
     FeederInvalid
-        If a curve would begin at a voltage that is not positive.
+        If the first breakpoint of a curve would not be positive.
     """
     v = droop.v.copy()
     flat = (droop.q[:, 1] == droop.q[:, 2])[:, None]
@@ -206,16 +201,8 @@ def steepened(droop: Droop, times: float) -> Droop:
 
 
 def enlarged(droop: Droop, times: float) -> Droop:
-    """The fleet with all its limits, and with them all slopes, so many times as large: larger inverters.
-
-    Parameters
-    ----------
-    droop
-        The fleet.
-    times
-        Factor, not negative.
-    """
-    # What nobody told stays untold, also of inverters of no size.
+    """Fleet with all limits, and with them all slopes, scaled by `times` (not negative): larger inverters."""
+    # An infinite rating stays infinite, also for `times` = 0.
     rating = np.multiply(times, droop.rating, out=droop.rating.copy(), where=np.isfinite(droop.rating))
     return replace(droop, q=times * droop.q, rating=rating)
 
@@ -225,20 +212,20 @@ def enlarged(droop: Droop, times: float) -> Droop:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Loop:
-    """The closed loop in units in which every slope lies between 0 and 1. m inverters that react at all.
+    """Closed loop in units with all slopes between 0 and 1. m inverters that react to voltages.
 
     Attributes
     ----------
     S : (m, m)
         `D^1/2 J D^1/2`.
     error : (m, m)
-        Entry by entry, how far S can be off.
+        Largest error of S, entry by entry.
     tau : (m,)
         Time constants, s.
     update
-        When inverters act.
+        Timing of the updates.
     rows : (m,)
-        Which inverters of the fleet these are; the others do not react to the voltages within reach.
+        Their indices in the fleet; the other inverters do not react to the voltages within reach.
     """
 
     S: Floats
@@ -249,16 +236,16 @@ class Loop:
 
     @property
     def gain(self) -> float:
-        """Largest gain of the loop at rest that its bounds allow."""
+        """Largest gain of the loop at rest within its bounds."""
         return spectral_radius(np.abs(self.S) + self.error) if self.tau.size else 0.0
 
     @property
     def covers_shorter(self) -> bool:
-        """Whether a certificate of inverters that jump to their set-points is one for every interval.
+        """True if a certificate for inverters that jump to their set-points holds for every interval.
 
-        All responses lie in the unit disk then, on whose rim those of inverters that jump are. The circle
-        criterion is linear in a response that all have in common, so that the rim decides; responses of their
-        own need `|S| < 1` besides, and the small-gain certificate knows of no interval at all.
+        All responses then lie in the unit disk, with those of jumping inverters on its rim. The circle
+        criterion is linear in a response that is common to all, so that the rim decides. Different responses
+        need `|S| < 1` besides. The small-gain certificate does not depend on the interval.
         """
         alike = bool(np.all(self.tau == self.tau[:1]))
         size = float(np.linalg.norm(self.S, 2) + np.linalg.norm(self.error, 2)) if self.tau.size else 0.0
@@ -266,15 +253,7 @@ class Loop:
 
 
 def loop(droop: Droop, within: Reach, update: Update) -> Loop:
-    """Build the loop of a fleet in a box.
-
-    Parameters
-    ----------
-    droop, update
-        The fleet, and when it acts.
-    within
-        From `reach`.
-    """
+    """Loop of a fleet in the box `within`."""
     own = droop.customer
     slope = slopes(droop, within.region.low[own], within.region.high[own])
     rows = np.flatnonzero(slope > 0.0)
@@ -286,22 +265,17 @@ def loop(droop: Droop, within: Reach, update: Update) -> Loop:
 
 
 _ANGLES: Final = 97
-"""Frequencies at which the circle criterion is looked at before it is proven."""
+"""Frequencies of the circle criterion before its proof."""
 
 _LOPSIDED: Final = 0.2
-"""A loop that differs more from its transpose is looked at everywhere: its phase decides as well."""
+"""Relative asymmetry above which all frequencies are examined, because the loop's phase matters as well."""
 
 
 def factor(given: Loop) -> float:
-    """Largest factor on all slopes, in the same box, with which the circle criterion still holds.
+    """Largest factor on all slopes, in the same box, that keeps the circle criterion satisfied.
 
     For all `|z| = 1`, with `H = diag(alpha_i z^-d / (z - 1 + alpha_i))` and eps the norm of the error:
     `2 I + k (S H + H* S^T - eps (I + H* H)) > 0`. It is linear in k, so every frequency gives its largest k.
-
-    Parameters
-    ----------
-    given
-        The loop.
     """
     if not given.tau.size:
         return np.inf
@@ -324,31 +298,29 @@ def _responses(given: Loop) -> list[Complex]:
     angles = np.pi * np.linspace(0.0, 1.0, _ANGLES * (1 + given.update.dead))
     lopsided = np.linalg.norm(given.S - given.S.T) > _LOPSIDED * np.linalg.norm(given.S)
     if np.all(alpha == alpha[:1]) and alpha.size and not lopsided:
-        # One response for all: where it reaches furthest to the left decides, or where errors weigh most.
+        # A common response: its leftmost points decide, or those with the largest weight of errors.
         h = alpha[0] * np.exp(-1j * angles * given.update.dead) / (np.exp(1j * angles) - 1.0 + alpha[0])
         angles = angles[[0, *np.argsort(h.real)[:3], *np.argsort(h.real - np.abs(h) ** 2)[:3]]]
     return [alpha * np.exp(-1j * w * given.update.dead) / (np.exp(1j * w) - 1.0 + alpha) for w in angles]
 
 
 _SIGMA: Final = 1e-6
-"""Room that the Riccati equation leaves in the inequality, relative to its scale."""
+"""Slack of the Riccati equation in the inequality, relative to its scale."""
 
 
 def verified(given: Loop, times: float = 1.0) -> bool:
-    """Prove that the loop contracts with all slopes so many times as large.
+    """Prove that the loop contracts with all slopes scaled by a factor.
 
-    With state e and what is on its way, `w+ = F w + G psi`, `e = C w`, and eps the norm of the error, it is
-    proven by a norm P > 0, from a Riccati equation, with
+    With a state w of e and delayed set-points, `w+ = F w + G psi`, `e = C w`, and eps the norm of the error,
+    contraction follows from a norm P > 0, found by a Riccati equation, with
 
         [F' P F - P + eps C'C      F' P G - C' S'     ]
         [*                         G' P G - (2 - eps) ]  <  0,
 
-    which is checked here on the numbers, however they were found.
+    which is verified here on the numbers.
 
     Parameters
     ----------
-    given
-        The loop.
     times
         Factor on all slopes.
     """
@@ -382,7 +354,7 @@ def verified(given: Loop, times: float = 1.0) -> bool:
 
 
 def _realised(given: Loop) -> tuple[Floats, Floats, Floats]:
-    """F, G, C of the inverters with what is on its way to them."""
+    """F, G, C of the inverters with their delayed set-points."""
     m, d = given.tau.size, given.update.dead
     if given.update.interval_s == 0.0:
         return -np.diag(1.0 / given.tau), np.diag(1.0 / given.tau), np.eye(m)
@@ -390,7 +362,7 @@ def _realised(given: Loop) -> tuple[Floats, Floats, Floats]:
     F, G = np.zeros((m * (1 + d), m * (1 + d))), np.zeros((m * (1 + d), m))
     F[:m, :m] = np.diag(1.0 - alpha)
     if d:
-        # The youngest set-point enters the last block, the oldest leaves from the one after e.
+        # The newest set-point enters the last block, the oldest leaves from the one after e.
         F[:m, m : 2 * m] = np.diag(alpha)
         F[m:-m, 2 * m :] = np.eye(m * (d - 1))
         G[-m:] = np.eye(m)
@@ -401,17 +373,17 @@ def _realised(given: Loop) -> tuple[Floats, Floats, Floats]:
 
 @dataclass(frozen=True, slots=True)
 class Proof:
-    """Why a fleet settles.
+    """Proof that a fleet settles.
 
     Attributes
     ----------
     kind
-        `deadband`: nothing reacts within reach; `small-gain`: for every interval and dead time; `circle`;
-        empty: nothing is proven.
+        `deadband`: no inverter reacts within reach; `small-gain`: for every interval and dead time; `circle`;
+        empty without a proof.
     gain
         Largest gain of the loop at rest, 1.
     factor
-        What all slopes may be multiplied with in the same box of voltages before the certificates end.
+        Largest proven factor on all slopes in the same box of voltages.
     """
 
     kind: str
@@ -420,23 +392,17 @@ class Proof:
 
 
 _MOST: Final = 1e6
-"""Factors beyond this are not told apart."""
+"""Largest factor; larger ones are not distinguished."""
 
 _SURE: Final = 1e-9
-"""A gain is below 1 if it is by this much, more than it is rounded by."""
+"""Margin by which a gain must be below 1, larger than its rounding."""
 
 _BACKOFF: Final = (0.999, 0.99, 0.95, 0.8)
-"""Shares of the factor found at the frequencies that are tried in its proof."""
+"""Fractions of the factor from the frequencies that are tried in its proof."""
 
 
 def proof(given: Loop) -> Proof:
-    """Prove that a loop contracts, in the simplest way that works.
-
-    Parameters
-    ----------
-    given
-        From `loop`.
-    """
+    """Prove that a loop contracts, by the simplest certificate that holds."""
     if not given.tau.size:
         return Proof("deadband", 0.0, np.inf)
     gain = given.gain
@@ -453,7 +419,7 @@ def proof(given: Loop) -> Proof:
 
 
 def growth(J: Floats, slope: Floats, tau: Floats, update: Update) -> float:
-    """Largest factor by which a small deviation from rest grows in one update; above 1: unstable.
+    """Largest factor by which a small deviation from rest grows in one update; above 1 the loop is unstable.
 
     Parameters
     ----------
@@ -464,7 +430,7 @@ def growth(J: Floats, slope: Floats, tau: Floats, update: Update) -> float:
     tau : (m,)
         Time constants, s.
     update
-        When inverters act. Continuous filters: growth in the smallest time constant.
+        Timing. For continuous filters: growth in the smallest time constant.
     """
     if not tau.size:
         return 0.0

@@ -1,11 +1,12 @@
-"""The largest lies of meters that report false powers with false voltages.
+"""Largest attacks of meters that report false powers with false voltages.
 
-As in `gridsec.studies.lies`, but what a customer draws is known within its meter's errors only while that
-meter is honest: the powers of a liar are anywhere in the customer's range, in truth and in what it tells,
+As in `gridsec.studies.lies`, but a customer's powers are known within the meter's errors only while that
+meter is unmanipulated. The powers of a manipulated meter are anywhere in the customer's range, the true ones
+and the reported ones:
 
-    |b_j c| <= e_j  for all meters j outside J,    |c_i| <= n_i  for unknowns i whose meter is outside J.
+    |b_j c| <= e_j  for all meters j outside J,    |c_i| <= n_i  for unknowns i with a meter outside J.
 
-With a binary for every meter that is a mixed-integer program again.
+With a binary for every meter this is a mixed-integer program again.
 
 References
 ----------
@@ -25,22 +26,22 @@ from gridsec.studies.lies import Box, Fit, largest_lie
 
 __all__ = ["FalsePowers", "largest_of", "largest_story"]
 
-# What is this little beyond an honest share is the solver's rounding.
+# Excess over an unmanipulated share that counts as the solver's rounding.
 _HONEST = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FalsePowers:
-    """What meters and customers can be off by, honest or not. k unknowns, p meters.
+    """Errors of meters and customers, manipulated or not. k unknowns, p meters.
 
     Attributes
     ----------
     box
-        Unknowns at the ends of the ranges that they have while their meters lie.
+        Unknowns at the ends of their ranges under manipulated meters.
     owner : (k,)
-        Meter by which each unknown is known; -1 for none.
+        Meter that determines each unknown; -1 for none.
     honest : (k,)
-        Share of that range within which it is while its meter is honest, 0 to 1.
+        Share of that range while its meter is unmanipulated, 0 to 1.
     """
 
     box: Box
@@ -48,20 +49,18 @@ class FalsePowers:
     honest: Floats
 
     def told(self, liars: Bools) -> Box:
-        """The box while these meters, (p,), may report any powers."""
+        """The box while the meters in the mask (p,) may report any powers."""
         free = (self.owner >= 0) & liars[self.owner]
         return replace(self.box, effect=self.box.effect * np.where(free, 1.0, self.honest))
 
 
 def largest_story(given: FalsePowers, meter: int, liars: int, *, honest: Bools | None = None) -> Fit:
-    """The largest lie of a meter that some honest feeder would tell, if liars' powers are false as well.
+    """Largest attack on a meter consistent with an unmanipulated feeder, with false powers of such meters.
 
     Parameters
     ----------
-    given
-        What all can be off by.
     meter, liars, honest
-        As in `gridsec.studies.lies.largest_lie`. Whoever is protected reports true powers, too.
+        As in `gridsec.studies.lies.largest_lie`. Protected meters report true powers, too.
 
     Raises
     ------
@@ -77,7 +76,7 @@ def largest_story(given: FalsePowers, meter: int, liars: int, *, honest: Bools |
     found = largest_lie(box, meter, liars, honest=honest | ~chosen)
     if honest[meter] or liars < 1:
         return found
-    # Whoever tells false powers lies, whatever its voltage. Powers that move nothing are not told.
+    # A meter with false powers is manipulated at any voltage. Powers without effect are not false.
     free = (given.owner >= 0) & chosen[given.owner] & box.effect.any(axis=0)
     false = free & (np.abs(found.unknowns) > given.honest + _HONEST)
     who = np.union1d(found.liars, given.owner[false]).astype(np.intp)
@@ -85,20 +84,14 @@ def largest_story(given: FalsePowers, meter: int, liars: int, *, honest: Bools |
 
 
 def largest_of(given: Box | FalsePowers, meter: int, liars: int, *, honest: Bools | None = None) -> Fit:
-    """`largest_lie` of a box, and `largest_story` where powers may be false as well.
-
-    Parameters
-    ----------
-    given, meter, liars, honest
-        As there.
-    """
+    """`largest_lie` of a box, and `largest_story` of false powers."""
     if isinstance(given, FalsePowers):
         return largest_story(given, meter, liars, honest=honest)
     return largest_lie(given, meter, liars, honest=honest)
 
 
 def _choose(given: FalsePowers, meter: int, liars: int, honest: Bools) -> tuple[Bools, float]:
-    """Who lies, by HiGHS, and its bound of the meter's lie."""
+    """Choice of manipulated meters by HiGHS, and its bound of the meter's attack."""
     box = given.box
     p, k = box.meters.size, box.effect.shape[1]
     row = box.effect[box.meters[meter]]
@@ -119,11 +112,11 @@ def _choose(given: FalsePowers, meter: int, liars: int, honest: Bools) -> tuple[
         + [LinearConstraint(np.concatenate([np.zeros(k), np.ones(p)])[None, :], ub=float(liars))],
         bounds=Bounds(np.concatenate([-most[:k], least]), most),
         integrality=np.concatenate([np.zeros(k), np.ones(p)]),
-        # Nothing in it can be left out, and what HiGHS finds without presolve needs no translation back.
+        # Presolve has nothing to remove, and a solution without it needs no postsolve.
         options={"mip_rel_gap": 1e-6, "presolve": False},
     )
     if found.x is None:
         raise DesignInfeasible(
-            "largest lie with false powers that fits to an honest feeder", found.message, code="no-solution"
+            "largest attack with false powers consistent with the feeder", found.message, code="no-solution"
         )
     return found.x[k:] > 0.5, 2.0 * size * float(-found.mip_dual_bound) + own

@@ -1,14 +1,14 @@
-"""The largest lies that fit to honest meters: what no test without false alarms can notice.
+"""Largest attacks consistent with unmanipulated meters: undetectable by any test without false alarms.
 
-Squared voltages are off the model by ``w = B c``, c in the box [-1, 1]^k, and honest readings by at most e.
-Lies ``a`` of the meters J stay unnoticed if some other c', e' of an honest feeder give the same readings;
-halving the differences,
+Squared voltages differ from the model by ``w = B c``, c in the box [-1, 1]^k, and unmanipulated readings by
+at most e. Attacks ``a`` on the meters J stay undetected if some other c', e' of an unmanipulated feeder give
+the same readings; halving the differences,
 
     a_k / 2 = b_k c + e_k (-1 .. 1),    |b_j c| <= e_j  for all meters j outside J.
 
-So the largest lie of meter k that fits is ``2 max (b_k c + e_k)`` over c and over J with k in J, |J| <= M: a
-mixed-integer program whose big-M constants, ``sum |b_j| - e_j``, are tight. What it lets a customer's voltage
-be off by is the same program with ``2 max b_i c``.
+So the largest consistent attack on meter k is ``2 max (b_k c + e_k)`` over c and over J with k in J and
+|J| <= M: a mixed-integer program with tight big-M constants, ``sum |b_j| - e_j``. The resulting error of a
+customer's voltage is the same program with ``2 max b_i c``.
 
 References
 ----------
@@ -30,16 +30,16 @@ __all__ = ["Box", "Fit", "largest_lie", "worst_error"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Box:
-    """What honest customers and meters can be off by. N customers, k unknowns, p meters.
+    """Errors of unmanipulated customers and meters. N customers, k unknowns, p meters.
 
     Attributes
     ----------
     effect : (N, k)
-        B: what each unknown, at the end of its interval, does to the squared voltages, pu.
+        B: effect of each unknown, at the end of its interval, on the squared voltages, pu.
     meters : (p,)
         Customer of each meter.
     reading : (p,)
-        e: largest error of an honest squared reading, pu; positive.
+        e: largest error of an unmanipulated squared reading, pu; positive.
 
     Raises
     ------
@@ -70,16 +70,16 @@ class Box:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """The largest lie, or error, that fits to an honest feeder.
+    """Largest attack, or error, consistent with an unmanipulated feeder.
 
     Attributes
     ----------
     size
-        Squared pu; reached by `liars` with the unknowns at `unknowns`. 0 where nobody may lie.
+        Squared pu; reached by `liars` with the unknowns at `unknowns`. 0 without possible attacks.
     bound
-        Nothing larger fits, by the solver's bound; at least `size`.
+        Upper bound of the solver; at least `size`.
     liars
-        Who must lie for it.
+        Meters that must be manipulated for it.
     unknowns : (k,)
         c.
     """
@@ -91,18 +91,14 @@ class Fit:
 
 
 def largest_lie(box: Box, meter: int, liars: int, *, honest: Bools | None = None) -> Fit:
-    """The largest lie of a meter in collusion with others that fits to an honest feeder.
+    """Largest attack on a meter, in collusion with others, that is consistent with an unmanipulated feeder.
 
     Parameters
     ----------
-    box
-        What honest ones can be off by.
-    meter
-        The meter.
     liars
-        How many lie at most, this one among them.
+        Largest number of manipulated meters, this one among them.
     honest : (p,), optional
-        Protected meters: they cannot lie.
+        Protected meters: they cannot be manipulated.
 
     Raises
     ------
@@ -118,32 +114,30 @@ def largest_lie(box: Box, meter: int, liars: int, *, honest: Bools | None = None
 
 
 def worst_error(box: Box, customer: int, liars: int, *, honest: Bools | None = None) -> Fit:
-    """How far a customer's voltage can be from another that fits to the same readings.
+    """Largest difference of a customer's voltage between two states with the same readings.
 
     Parameters
     ----------
     box, liars, honest
-        As in `largest_lie`; with no liars, what honest meters leave open.
-    customer
-        The customer.
+        As in `largest_lie`; with `liars` = 0, the uncertainty under unmanipulated meters.
     """
     honest = np.zeros(box.meters.size, dtype=np.bool_) if honest is None else honest
     return _most(box, box.effect[customer], liars, honest, None)
 
 
-# What is this little beyond its own error needs no lie: the solver's rounding.
+# Relative excess over its own error that counts as the solver's rounding, not as an attack.
 _HONEST = 1e-6
 
 
 def _most(box: Box, row: Floats, liars: int, honest: Bools, must: int | None) -> Fit:
-    """Maximise ``2 row c``; solved with integers, and again with the liars fixed, so that it is reached."""
+    """Maximise ``2 row c`` with integers, then again with fixed meters, so that the maximum is attained."""
     scaled = box.effect[box.meters] / box.reading[:, None]
     slack = np.maximum(np.abs(scaled).sum(axis=1) - 1.0, 0.0)
     able = ~honest & (slack > 0.0)
     if must is not None:
         able[must] = True
     size = float(np.abs(row).sum())
-    # Whoever can never be beyond its own error needs no binary, and without any it is a linear program.
+    # Meters that cannot exceed their own error need no binary; without binaries it is a linear program.
     if not size:
         liar = np.zeros(0, dtype=np.intp) if must is None else np.array([must], dtype=np.intp)
         return Fit(0.0, 0.0, liar, np.zeros(row.size))
@@ -161,7 +155,7 @@ def _most(box: Box, row: Floats, liars: int, honest: Bools, must: int | None) ->
 def _choose(
     scaled: Floats, slack: Floats, row: Floats, liars: int, able: Bools, *, must: int | None
 ) -> tuple[Bools, float]:
-    """Who lies, by HiGHS, and its bound of the maximum of ``row c``."""
+    """Choice of manipulated meters by HiGHS, and its bound of the maximum of ``row c``."""
     p, k = scaled.shape
     who = np.flatnonzero(able)
     open_ = np.zeros((p, who.size))
@@ -179,14 +173,14 @@ def _choose(
         options={"mip_rel_gap": 1e-6},
     )
     if found.x is None:
-        raise DesignInfeasible("largest lie that fits to an honest feeder", found.message, code="no-solution")
+        raise DesignInfeasible("largest attack consistent with the feeder", found.message, code="no-solution")
     chosen = np.zeros(p, dtype=np.bool_)
     chosen[who] = found.x[k:] > 0.5
     return chosen, float(-found.mip_dual_bound)
 
 
 def _reach(scaled: Floats, row: Floats) -> Floats:
-    """The c that reaches the maximum while these meters are honest."""
+    """The c that attains the maximum while the rows `scaled` are unmanipulated."""
     if not row.size:
         return row
     found = linprog(
@@ -196,5 +190,5 @@ def _reach(scaled: Floats, row: Floats) -> Floats:
         bounds=(-1.0, 1.0),
     )
     if found.x is None:
-        raise DesignInfeasible("largest lie that fits to an honest feeder", found.message, code="no-solution")
+        raise DesignInfeasible("largest attack consistent with the feeder", found.message, code="no-solution")
     return np.asarray(found.x)

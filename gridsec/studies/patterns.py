@@ -1,12 +1,12 @@
-"""Where lies can hide: the unknown part of a feeder's voltages as a pair (A, C).
+"""Patterns that hide attacks: the unknown part of a feeder's voltages as a pair (A, C).
 
-Powers that nobody knows move all squared voltages by ``W c``, c constant while it is looked at. The inverters
+Unknown powers change all squared voltages by ``W c``, with c constant during the analysis. The inverters
 react. About a trajectory with slopes d of the droop curves,
 
     x' = A x + G diag(d) (H x - W_inverters c),   c' = 0,   y = C x - W_meters c
 
-is a pair whose eigenvalue 0 holds what stays, a *persistent pattern*, and whose other eigenvalues hold what
-the inverters forget by themselves. Lies are hidden while they look like such a pattern.
+is a pair. Its eigenvalue 0 belongs to *persistent patterns*, its other eigenvalues to decaying transients of
+the inverters. Attacks are hidden while they equal such a pattern.
 
 References
 ----------
@@ -34,16 +34,16 @@ __all__ = ["Patterns", "fewest_meters", "from_busbar", "patterns", "unknown_pair
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Patterns:
-    """The directions in which lies can hide: eigenspaces of a pair. n states, p meters.
+    """Directions of hidden attacks: eigenspaces of a pair. n states, p meters.
 
     Attributes
     ----------
     spaces : (n, g) each
         Orthonormal bases of the eigenspaces to search.
     seen : (p, g) each
-        What the meters see of them, each meter's row of C scaled to length one, or zero.
+        Their images at the meters, each meter's row of C scaled to length one, or zero.
     tol
-        Products of unit vectors up to this are zero.
+        Products of unit vectors up to this count as zero.
     """
 
     spaces: tuple[Matrix, ...]
@@ -52,11 +52,11 @@ class Patterns:
 
     @property
     def dimension(self) -> int:
-        """Of all spaces together."""
+        """Dimension of all spaces together."""
         return sum(space.shape[1] for space in self.spaces)
 
     def blind(self, live: Bools) -> Floats:
-        """Basis of what none of the live meters sees, real and imaginary parts side by side, (n, k)."""
+        """Basis of the part invisible to all available meters, real and imaginary columns, (n, k)."""
         lost = [
             space @ kernel(seen[live], self.tol) for space, seen in zip(self.spaces, self.seen, strict=True)
         ]
@@ -65,23 +65,21 @@ class Patterns:
 
 
 def unknown_voltages(feeder: Network, unknown: Ints, *, busbar: bool, tol: float) -> Floats:
-    """Orthonormal basis W of what unknown powers can do to the customers' squared voltages, (N, d).
+    """Orthonormal basis W of the effects of unknown powers on the customers' squared voltages, (N, d).
 
     The range of ``[2 R_U, 2 X_U]``, and where the busbar's voltage is unknown too, of a column of ones; in
-    three phases of a column for each, ones where its customers are. Powers that move no customer's voltage
-    are no unknowns: they harm nobody.
+    three phases of a column for each, ones where its customers are. Powers without effect on any customer's
+    voltage are not counted.
 
     Parameters
     ----------
-    feeder
-        The feeder.
     unknown : (k,)
-        Customers whose active and reactive powers nobody knows.
+        Customers with unknown active and reactive powers.
     busbar
-        Whether the busbar's voltage is unknown as well.
+        True if the busbar's voltage is unknown as well.
     tol
-        A power moves nothing if its column is up to this part of the longest. Singular values up to this
-        part of the largest, of columns of unit length, are zero.
+        Columns up to this fraction of the longest have no effect. Singular values up to this fraction of the
+        largest, of columns of unit length, are zero.
     """
     powers = np.hstack([between(feeder, power)[:, unknown] for power in Power])
     columns = unit_rows(powers.T, tol=tol).T
@@ -91,26 +89,20 @@ def unknown_voltages(feeder: Network, unknown: Ints, *, busbar: bool, tol: float
         return np.zeros((feeder.bus.size, 0))
     _, s, vh = np.linalg.svd(columns, full_matrices=False)
     some = s > tol * s[0]
-    # The left singular vectors, but every row as exact as that of its customer: those of the decomposition
-    # are as exact as the longest, and of a customer beside the busbar nothing would be left but rounding.
+    # The left singular vectors, with every row as exact as that of its customer. Those of the decomposition
+    # are only as exact as the longest row; a row beside the busbar would be rounding.
     return np.asarray(columns @ (vh[some].T / s[some]))
 
 
 def from_busbar(feeder: Network) -> Floats:
-    """What each voltage of the busbar does to the customers' squared voltages, (N, 1), or (N, 3) in phases.
-
-    Parameters
-    ----------
-    feeder
-        The feeder.
-    """
+    """Effect of each busbar voltage on the customers' squared voltages, (N, 1), or (N, 3) in phases."""
     first = busbar_places(feeder)
     of_each = one_busbar(feeder, feeder.bus, np.arange(first.stop))
     return np.array(np.broadcast_to(of_each, (feeder.bus.size, first.stop)))
 
 
 def unknown_pair(lure: Lure, slope: Floats, W: Floats) -> tuple[Floats, Floats]:
-    """The pair (A, C) of the module's head, its states scaled to like size.
+    """The pair (A, C) of the module's head, with states scaled to similar size.
 
     Parameters
     ----------
@@ -122,8 +114,8 @@ def unknown_pair(lure: Lure, slope: Floats, W: Floats) -> tuple[Floats, Floats]:
         From `unknown_voltages`.
     """
     A, C = linearise(lure, slope)
-    # Injections in units of the voltages that they make: no subspace changes, and ranks become decidable.
-    # What inverters do to each other is in it, since meters may see none of them.
+    # Injections in units of the voltages that they cause: subspaces stay, and ranks become decidable. Effects
+    # of inverters on each other are included, since meters may see none of the inverters.
     unit = float(np.linalg.norm(np.vstack([lure.C, lure.H]), 2)) or 1.0
     d = W.shape[1]
     whole = np.block([[A, -unit * (lure.G * slope) @ lure.F @ W], [np.zeros((d, A.shape[0] + d))]])
@@ -131,17 +123,17 @@ def unknown_pair(lure: Lure, slope: Floats, W: Floats) -> tuple[Floats, Floats]:
 
 
 def patterns(A: Floats, C: Floats, *, persistent: bool, tol: float) -> Patterns:
-    """The eigenspaces in which an attack can stay invisible for ever.
+    """Eigenspaces in which an attack can stay invisible for ever.
 
     Parameters
     ----------
     A, C : (n, n), (p, n)
         A pair in continuous time.
     persistent
-        Only of eigenvalues that do not decay: attacks that die away by themselves are left out, and
-        observability becomes detectability.
+        Only those of eigenvalues that do not decay: decaying attacks are left out, and observability becomes
+        detectability.
     tol
-        As in `gridsec.index.dynamic_index`: rows of C up to this part of the longest see nothing, too.
+        As in `gridsec.index.dynamic_index`; rows of C up to this fraction of the longest count as zero, too.
     """
     found = eigenspaces(A, tol=tol) if A.size else ()
     if persistent:
@@ -164,34 +156,32 @@ def fewest_meters(
     below: float = 0.0,
     most: int = MOST_NODES,
 ) -> Index:
-    """The fewest meters that must lie to imitate a pattern that any of the live meters sees.
+    """Smallest number of manipulated meters that imitate a pattern visible to an available meter.
 
-    Patterns that nobody sees (`Patterns.blind`) need no lies and are left out.
+    Patterns invisible to all meters (`Patterns.blind`) need no attack and are left out.
 
     Parameters
     ----------
-    given
-        The patterns.
     honest : (p,), optional
-        Meters that cannot lie: only patterns that none of them sees are left.
+        Meters that cannot be manipulated: only patterns invisible to them remain.
     silent : (p,), optional
-        Meters that are not there.
+        Unavailable meters.
     must
-        A meter that is to be among the liars.
+        A meter that is among the manipulated ones.
     below, most
         As in `gridsec.index.fewest`.
 
     Returns
     -------
     Index
-        Infinite where there is no pattern to imitate.
+        Infinite without a pattern to imitate.
 
     Raises
     ------
     DesignInfeasible
         After `most` nodes.
     ValueError
-        If a meter must lie that is honest or silent.
+        If `must` is protected or unavailable.
     """
     p = given.seen[0].shape[0] if given.seen else 0
     none = np.zeros(p, dtype=np.bool_)
@@ -199,7 +189,9 @@ def fewest_meters(
     bound = none if honest is None else honest[:p] & ~silent
     free = np.flatnonzero(~bound & ~silent)
     if must is not None and p and must not in free:
-        raise InputInvalid([Problem("inconsistent", f"meter {must} must lie, but is honest or silent")])
+        raise InputInvalid(
+            [Problem("inconsistent", f"meter {must} must be manipulated, but is protected or unavailable")]
+        )
     at = None if must is None else int(np.searchsorted(free, must))
     best = Index(np.inf, np.zeros(0, dtype=np.intp), np.zeros(0))
     for space, seen in zip(given.spaces, given.seen, strict=True):
@@ -213,7 +205,7 @@ def fewest_meters(
 
 def _fewest(seen: Matrix, must: int | None, tol: float, *, below: float, most: int) -> Sparsest:
     if seen.shape[1] == 1:
-        # One direction: there is nothing to choose.
+        # One direction leaves no choice.
         who = np.flatnonzero(np.abs(seen[:, 0]) > tol)
         if must is None or must in who:
             return Sparsest(float(who.size), who, np.ones(1))
@@ -225,7 +217,7 @@ def _fewest(seen: Matrix, must: int | None, tol: float, *, below: float, most: i
 
 
 def _components(seen: Matrix, tol: float) -> list[Matrix]:
-    """Split what is seen into subspaces that share no meter: a sparsest direction lies in one of them.
+    """Split the images into subspaces without common meters: a sparsest direction lies in one of them.
 
     In a basis that is the identity at as many meters as it has directions, these are the connected components
     of the bipartite graph of its entries: those of the matroid of the rows.
@@ -233,16 +225,16 @@ def _components(seen: Matrix, tol: float) -> list[Matrix]:
     Parameters
     ----------
     seen : (p, g)
-        What each meter sees of a basis.
+        Image of a basis at each meter.
     tol
-        What counts as zero.
+        Largest entry that counts as zero.
 
     Returns
     -------
     (g, k) each
-        Orthonormal bases; what nobody sees is left out.
+        Orthonormal bases; directions invisible to all meters are left out.
     """
-    # Counts do not depend on what nobody sees, so its complement will do.
+    # Counts do not depend on invisible directions, so their complement suffices.
     _, sizes, vh = np.linalg.svd(seen, full_matrices=False)
     basis = np.asarray(vh[: int(np.count_nonzero(sizes > tol))].conj().T)
     if basis.shape[1] <= 1:

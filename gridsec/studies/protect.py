@@ -1,8 +1,8 @@
-"""The fewest meters to protect, by constraint generation: exact, or greedy with a bound of what is lost.
+"""Smallest set of meters to protect, by constraint generation: exact, or greedy with a bound of the loss.
 
-Every attack that succeeds is a set S of liars; a protection withstands it if and only if it protects one of
-S. So the fewest meters are a smallest hitting set, of which rows are made as they are needed: protect what
-hits all attacks known so far, ask for an attack on that, until there is none.
+Every successful attack is a set S of manipulated meters; a protection withstands it if and only if it
+protects a meter of S. So the solution is a smallest hitting set with rows generated on demand: protect a set
+that hits all attacks known so far, search for an attack against it, and repeat until there is none.
 
 References
 ----------
@@ -27,12 +27,12 @@ __all__ = ["Attacker", "Protection", "Unprotectable", "fewest_protected", "hides
 
 
 class Unprotectable(DesignInfeasible):
-    """An attack succeeds whatever is protected.
+    """An attack succeeds against every possible protection.
 
     Parameters
     ----------
     liars
-        Who it needs: none of them can be protected.
+        Meters of the attack, none of which can be protected.
     """
 
     def __init__(self, liars: Ints) -> None:
@@ -45,21 +45,21 @@ class Unprotectable(DesignInfeasible):
 
 
 Attacker = Callable[[Bools], Ints | None]
-"""The liars of an attack that succeeds while these meters, (p,), are protected; None if there is none."""
+"""Meters of a successful attack while the meters in the mask (p,) are protected; None if there is none."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Protection:
-    """Meters that suffice, and how many are needed at least.
+    """Sufficient set of meters, and the smallest necessary number.
 
     Attributes
     ----------
     meters
-        Which to protect, ascending.
+        Meters to protect, ascending.
     least
-        No fewer suffice; equal to their number where they are proven the fewest.
+        Lower bound of their number; equal to it if they are proven minimal.
     attacks
-        Sets of liars that rule out everything cheaper.
+        Sets of manipulated meters that rule out every smaller protection.
     """
 
     meters: Ints
@@ -68,20 +68,18 @@ class Protection:
 
     @property
     def gap(self) -> int:
-        """How many more than necessary there can be."""
+        """Upper bound of the number of unnecessary meters."""
         return int(self.meters.size) - self.least
 
 
 def hides(given: Patterns, liars: int) -> Attacker:
-    """An attacker who imitates a pattern with at most so many liars.
+    """Attacker that imitates a pattern with at most `liars` meters.
 
     Parameters
     ----------
-    given
-        The patterns.
     liars
-        2M, if M liars are to be identified: two explanations of M liars each differ by such an attack. M,
-        if they are to be noticed only.
+        2M to identify M manipulated meters: two explanations of M meters each differ by such an attack. M to
+        detect them only.
     """
 
     def attack(protected: Bools) -> Ints | None:
@@ -92,19 +90,19 @@ def hides(given: Patterns, liars: int) -> Attacker:
 
 
 def lies_beyond(box: Box | FalsePowers, liars: int, size: Floats | float) -> Attacker:
-    """An attacker whose largest lie is larger than a bound and fits to an honest feeder.
+    """Attacker with an attack above a bound that is consistent with an unmanipulated feeder.
 
     Parameters
     ----------
     box, liars
         As in `gridsec.studies.lies.largest_lie`, or in `gridsec.studies.false_powers.largest_story`.
     size : float or (p,)
-        The bound of each meter's lie, squared pu.
+        Bound of the attack on each meter, squared pu.
     """
     p = (box.box if isinstance(box, FalsePowers) else box).meters.size
     limit = np.broadcast_to(size, p)
-    # Protection only lowers lies: whoever is below the bound without any need not be asked again, and who
-    # is furthest above it refutes soonest.
+    # Protection only reduces attacks: meters below the bound without any are skipped, and the one furthest
+    # above it refutes first.
     alone = np.array([largest_of(box, j, liars).bound for j in range(p)]) - limit
     order = [int(j) for j in np.argsort(-alone) if alone[j] > 0.0]
 
@@ -131,21 +129,21 @@ def fewest_protected(
     Parameters
     ----------
     attacker
-        Knows an attack on every protection that is not enough.
+        Returns an attack on every insufficient protection.
     count
         p.
     never : (p,), optional
         Meters that cannot be protected.
     exact
-        Solve each hitting set to optimality; otherwise take, of all meters, the one in most attacks that are
-        not met yet, and leave out in the end what is not needed.
+        Solve each hitting set to optimality; otherwise repeatedly take the meter in most of the remaining
+        attacks, and remove unnecessary meters at the end.
     progress
-        Told how many attacks are known and how many meters are protected against them.
+        Called with the number of known attacks and the number of meters protected against them.
 
     Raises
     ------
     Unprotectable
-        If an attack needs none but meters that cannot be protected.
+        If no meter of an attack can be protected.
     DesignInfeasible
         If a solver fails.
     """
@@ -173,7 +171,7 @@ def _matrix(attacks: list[Ints], count: int) -> Floats:
 
 
 def _hit(attacks: list[Ints], never: Bools) -> Bools:
-    """A smallest set of meters that meets all attacks, by HiGHS."""
+    """Smallest set of meters that hits all attacks, by HiGHS."""
     p = never.size
     found = milp(
         np.ones(p),
@@ -199,7 +197,7 @@ def _hit_greedily(attacks: list[Ints], never: Bools) -> Bools:
 
 
 def _pruned(protected: Bools, attacker: Attacker) -> Bools:
-    """Leave out, one after the other, what is not needed."""
+    """Remove unnecessary meters, one after the other."""
     out = protected.copy()
     for j in np.flatnonzero(protected):
         out[j] = False
@@ -209,7 +207,7 @@ def _pruned(protected: Bools, attacker: Attacker) -> Bools:
 
 
 def _least(attacks: list[Ints], never: Bools) -> int:
-    """How many meters the known attacks ask for at least, by linear programming."""
+    """Lower bound of the number of meters that hit the known attacks, by linear programming."""
     if not attacks:
         return 0
     matrix = _matrix(attacks, never.size)

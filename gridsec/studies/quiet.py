@@ -1,15 +1,17 @@
-"""What the sequential monitor cannot see, must see, and must name: its decision rule as inequalities.
+"""Detectability under the sequential monitor's decision rule, as inequalities: hidden, noticed, named.
 
-Lies a of trusted meters move the leave-one-out residual of meter j by ``(Q a)_j / Q_jj``. Honest residuals
-are sub-Gaussian with variance ``1 / Q_jj`` (Gaussian and uniform parts alike), so that at one moment, on s
-scales and at p meters together, all are within ``H_j`` with probability at least 1 - risk. Hence
+Attacks a on trusted meters move the leave-one-out residual of meter j by ``(Q a)_j / Q_jj``. Residuals
+without attack are sub-Gaussian with variance ``1 / Q_jj`` (Gaussian and uniform parts alike). So at one
+moment, on s scales and at p meters together, all are within ``H_j`` with probability at least 1 - risk. Hence
 
-- hidden:  ``|(Q a)_j| <= (limit_j - H_j) Q_jj`` on all scales: nobody is beyond the limit;
-- noticed: a lie for which no ``|(Q a)_j| <= (limit_j + H_j) Q_jj`` holds everywhere: somebody is;
-- named:   every explanation that believes meter k leaves a misfit of at least ``m_k^2 / (S_kk + d_k)``,
-  whatever all other meters say; where that exceeds what the truth costs by 2 ln(like), none is a rival.
+- hidden:  ``|(Q a)_j| <= (limit_j - H_j) Q_jj`` on all scales: no meter is beyond its limit;
+- noticed: an attack without ``|(Q a)_j| <= (limit_j + H_j) Q_jj`` everywhere: some meter is beyond it;
+- named:   every explanation that trusts meter k has a misfit of at least ``m_k^2 / (S_kk + d_k)``,
+  for any readings of all other meters; if that exceeds the cost of the true one by 2 ln(like), there is no
+  rival.
 
-The first two are linear in a but for the number of liars: `gridsec.studies.collusion` searches them.
+The first two are linear in a but for the number of manipulated meters: `gridsec.studies.collusion` searches
+them.
 
 References
 ----------
@@ -34,24 +36,22 @@ __all__ = ["Rule", "Shift", "largest_shift", "named_size", "rule", "within"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rule:
-    """The monitor's rule before fixed errors are learned, everybody trusted. s scales, p meters, n buses.
+    """The monitor's rule before biases are learned, with all meters trusted. s scales, p meters, n buses.
 
     Attributes
     ----------
-    design
-        The monitor.
     risk
-        Probability that honest residuals are beyond `honest` somewhere, at one moment.
+        Probability that residuals without attack are beyond `honest` somewhere, at one moment.
     deviations
-        What that is in standard deviations of a sub-Gaussian variable: ``sqrt(2 ln(2 s p / risk))``.
+        The corresponding standard deviations of a sub-Gaussian variable: ``sqrt(2 ln(2 s p / risk))``.
     inverse : (s, p, p)
         Q on each scale.
     limit, honest : (s, p)
-        Largest offset that is no evidence, and H, squared pu.
+        Largest offset without evidence, and H, squared pu.
     noise : (s, p)
         Variance d of each meter's mean.
     model : (p,)
-        What the model may be off, squared pu.
+        Error of the model, squared pu.
     """
 
     design: SequentialDesign
@@ -64,11 +64,11 @@ class Rule:
     model: Floats
 
     def weights(self, bus: int) -> Floats:
-        """What each meter's lie moves the reconstruction of a bus by, on each scale, (s, p)."""
+        """Effect of each meter's attack on the reconstruction of a bus, on each scale, (s, p)."""
         return np.asarray(self.inverse @ self.design.prior.of_meters[bus])
 
     def spread(self, bus: int) -> float:
-        """What honest readings leave open at a bus, with the same probability on any scale, squared pu."""
+        """Uncertainty of a bus without attack, with the same probability on any scale, squared pu."""
         prior = self.design.prior
         row = prior.of_meters[bus]
         left = prior.variance[bus] - np.einsum("p,spq,q->s", row, self.inverse, row)
@@ -76,12 +76,12 @@ class Rule:
 
 
 def rule(design: SequentialDesign, *, risk: float, model: Floats) -> Rule:
-    """Write a monitor's rule down.
+    """Compute the rule of a monitor.
 
     Parameters
     ----------
     design
-        The monitor, with its own search.
+        The monitor, with its default search.
     risk
         As in `Rule`.
     model : (p,)
@@ -99,7 +99,7 @@ def rule(design: SequentialDesign, *, risk: float, model: Floats) -> Rule:
             for sigmas, row in zip(design.sigmas, std, strict=True)
         ]
     )
-    # One's own fixed error is in its residual as it is, and within the class.
+    # A meter's own fixed error is fully in its residual, and within the class.
     rest = np.sqrt(np.maximum(std**2 - design.fixed, 0.0))
     honest = np.minimum(t * std, design.allowed + t * rest)
     assert prior.meters.size == model.size  # noqa: S101  # both are of the meters
@@ -107,19 +107,17 @@ def rule(design: SequentialDesign, *, risk: float, model: Floats) -> Rule:
 
 
 def within(given: Rule, liars: int, *, seen: bool, honest: Bools | None = None) -> Corridor:
-    """What lies of at most M meters must keep to, so that no residual is beyond its bound.
+    """Constraints on attacks of at most M meters with all residuals within their bounds.
 
     Parameters
     ----------
-    given
-        The rule.
     liars
         M.
     seen
-        The bound: False for limit - H (certainly within the limit: hidden), True for limit + H + what the
-        model may be off on both sides (beyond which somebody is certainly over the limit).
+        The bound: False for limit - H (certainly within the limit: hidden), True for limit + H + the
+        model error on both sides (beyond it, some meter certainly exceeds its limit).
     honest : (p,), optional
-        Meters that cannot lie.
+        Meters that cannot be manipulated.
     """
     s, p = given.limit.shape
     width = given.limit + given.honest + 2.0 * given.model if seen else given.limit - given.honest
@@ -143,40 +141,39 @@ def largest_shift(
     must: int | None = None,
     honest: Bools | None = None,
 ) -> Shift:
-    """The furthest that lies of at most M meters move something, while no residual is beyond its bound.
+    """Largest displacement by attacks on at most M meters with all residuals within their bounds.
 
     Parameters
     ----------
     given, liars, seen, honest
         As in `within`.
     along : (p,) or (d, p)
-        What is moved by each lie; a unit vector for the lie of one meter itself. Of several rows, whichever
-        is moved furthest.
+        Displacement per attack on each meter; a unit vector for the attack on one meter itself. Of several
+        rows, the one with the largest displacement.
     must
-        A meter that lies in any case.
+        A meter that is manipulated in any case.
     """
     return furthest(within(given, liars, seen=seen, honest=honest), along, must=must)
 
 
 def named_size(given: Rule, meter: int, liars: int, *, claims: Floats) -> float:
-    """From which lie on no explanation that believes a meter is a rival, whatever other liars do, squared pu.
+    """Smallest attack on a meter above which no explanation that trusts it is a rival, squared pu.
 
-    The truth, with at most M liars, costs at most ``p + 2 sqrt(p t) + 2 t + 2 ln binom(p, M)``, t = -ln risk,
-    but for the risk (Hsu, Kakade and Zhang 2012, for sub-Gaussian residuals). Believing k, accusing n others
-    and loosening directions D costs at least ``m_k^2 / (S_kk + d_k + sum_D s^2 b_k^2) + 2 ln binom(p, n)``
-    and what D is charged then; the best D is bounded by a knapsack whose items may be cut, for every n from
-    which on charges are lower. Without k, its offset is evidence.
+    It holds for any attacks on other meters. The true explanation, with at most M manipulated meters, costs
+    at most ``p + 2 sqrt(p t) + 2 t + 2 ln binom(p, M)``, t = -ln risk, except with probability risk (Hsu,
+    Kakade and Zhang 2012, for sub-Gaussian residuals). Trusting k, accusing n others and freeing directions D
+    costs at least ``m_k^2 / (S_kk + d_k + sum_D s^2 b_k^2) + 2 ln binom(p, n)`` plus the charges of D. The
+    best D is bounded by a fractional knapsack, for every n from which charges are lower. Without k, its
+    offset is evidence.
 
     Parameters
     ----------
-    given
-        The rule.
     meter
         k.
     liars
         M.
     claims : (N,)
-        Size of each customer's powers that may be false, as in the monitor's dictionary, pu.
+        Size of each customer's possibly false powers, as in the monitor's dictionary, pu.
     """
     design, (_, p) = given.design, given.limit.shape
     bus = np.array([design.prior.meters[meter]])
@@ -184,8 +181,8 @@ def named_size(given: Rule, meter: int, liars: int, *, claims: Floats) -> float:
     std = np.concatenate([claims, book.std[design.customers :]])
     at = book.columns(np.arange(std.size))[bus[0]]
     loose = (std * at) ** 2
-    # A power is charged least while its customer's meter is not believed, and the less the more are accused:
-    # with the next such number of them.
+    # The charge of a power is lowest while its customer's meter is not trusted, and falls with the number of
+    # accused meters: use the next number with a lower charge.
     numbers = [0, *(k for k in range(1, p) if of_a_liar(k) < of_a_liar(k - 1))]
     of_customers = np.arange(std.size) < design.customers
     ways = [

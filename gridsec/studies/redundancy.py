@@ -1,4 +1,4 @@
-"""How many lying meters a feeder withstands, meter by meter and part by part.
+"""Number of manipulated meters that a feeder withstands, meter by meter and part by part.
 
 References
 ----------
@@ -26,16 +26,16 @@ __all__ = ["Meter", "Part", "meter_redundancy", "part_redundancy", "parts", "tre
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Meter:
-    """What one meter means for all.
+    """Redundancy with and without one meter.
 
     Attributes
     ----------
     own
-        The fewest liars, this meter among them, that imitate a pattern: its security index.
+        Smallest set of manipulated meters, this one among them, that imitates a pattern: its security index.
     without
-        The index of all other meters, this one silent.
+        Index of all other meters, with this one unavailable.
     critical
-        Without it some pattern is invisible to all others: its own index is 1, its lies cannot be detected.
+        True if a pattern is invisible to all others: the own index is 1, and attacks on it are undetectable.
     """
 
     own: Index
@@ -45,14 +45,12 @@ class Meter:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Part:
-    """A part of a feeder: what is fed through one bus, and by no way around it.
+    """Part of a feeder: everything fed through one bus alone.
 
     Attributes
     ----------
-    bus
-        The bus.
     branch
-        Whether a line leads from it to the busbar.
+        True if a line leads from `bus` to the busbar.
     meters : (k,)
         The meters there.
     """
@@ -67,12 +65,10 @@ def meter_redundancy(given: Patterns, meter: int, silent: Bools) -> Meter:
 
     Parameters
     ----------
-    given
-        The patterns.
     meter
-        The meter; not a silent one.
+        An available meter.
     silent : (p,)
-        Meters that are not there.
+        Unavailable meters.
     """
     own = fewest_meters(given, silent=silent, must=meter)
     gone = silent.copy()
@@ -81,18 +77,17 @@ def meter_redundancy(given: Patterns, meter: int, silent: Bools) -> Meter:
 
 
 def part_redundancy(given: Patterns, part: Part, silent: Bools) -> Index:
-    """The fewest liars inside one part that imitate a pattern, all meters outside being honest.
+    """Smallest set of manipulated meters inside one part that imitates a pattern.
 
-    Up to `Index.correctable` liars, all of them in the part, are identified, and no more in general.
+    All meters outside are unmanipulated. Up to `Index.correctable` manipulated meters, all of them in the
+    part, are identified, and no more in general.
 
     Parameters
     ----------
-    given
-        The patterns.
     part
         From `parts`.
     silent : (p,)
-        Meters that are not there.
+        Unavailable meters.
     """
     honest = np.ones(silent.size, dtype=np.bool_)
     honest[part.meters] = False
@@ -100,18 +95,12 @@ def part_redundancy(given: Patterns, part: Part, silent: Bools) -> Index:
 
 
 def tree_bus(feeder: Network) -> Ints:
-    """Bus of each customer in the feeder's tree, whatever its phase, (N,).
-
-    Parameters
-    ----------
-    feeder
-        The feeder.
-    """
+    """Bus of each customer in the feeder's tree, for any phase, (N,)."""
     return feeder.tree.at if isinstance(feeder, InPhases) else feeder.bus
 
 
 def parts(feeder: Feeder | ThreePhaseFeeder, buses: Ints, ties: Ints) -> Sequence[Part]:
-    """All parts of a feeder that differ in their meters, those nearest the busbar first.
+    """All parts of a feeder with different sets of meters, those nearest the busbar first.
 
     A part has all phases of its buses.
 
@@ -122,7 +111,7 @@ def parts(feeder: Feeder | ThreePhaseFeeder, buses: Ints, ties: Ints) -> Sequenc
     buses : (p,)
         Bus of each meter.
     ties : (t, 2)
-        Buses at both ends of the lines that close loops in it.
+        Buses at both ends of the lines that close loops.
     """
     found: dict[tuple[int, ...], Part] = {}
     lines = np.vstack([np.column_stack([feeder.parent, np.arange(1, len(feeder.buses))]), ties])
@@ -135,7 +124,7 @@ def parts(feeder: Feeder | ThreePhaseFeeder, buses: Ints, ties: Ints) -> Sequenc
 
 
 def _fed_through(feeder: Feeder | ThreePhaseFeeder, lines: Ints, bus: int) -> Bools:
-    """Buses that lose the busbar with one, itself among them; on a tree all that are behind it."""
+    """Buses that lose the busbar if one is removed, that bus included; on a tree all behind it."""
     if len(lines) < len(feeder.buses):
         return np.asarray((feeder.start >= feeder.start[bus]) & (feeder.start < feeder.stop[bus]))
     left = lines[(lines != bus).all(axis=1)]

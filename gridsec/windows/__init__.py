@@ -1,12 +1,13 @@
 """Detection and isolation over windows: a bank of discrete-time observers checked for consistency.
 
-One observer for all p meters, one for every set of p - q, one for every set of p - 2q. As long as no meter
-lies, all of them stay within a known distance of the truth, hence of each other:
+One observer for all p meters, one for every set of p - q, one for every set of p - 2q. Without manipulated
+meters all of them stay within a known distance of the true state, hence of each other:
 
     pi(k)   = max over J of |x_hat - x_hat_J|                 <= 2 (epsilon + gamma m),
     pi_J(k) = max over S within J of |x_hat_J - x_hat_S|      <= 2 (epsilon + gamma_J m)
 
-the latter for every J without a liar. What exceeds its bound is evidence; a window of N steps collects it.
+the latter for every J without a manipulated meter. A value above its bound is evidence; a window of N steps
+collects it.
 
 References
 ----------

@@ -1,4 +1,4 @@
-"""The bank of discrete-time observers, its thresholds, and its consistency measures.
+"""Bank of discrete-time observers, its thresholds, and its consistency measures.
 
 References
 ----------
@@ -29,20 +29,20 @@ MOST_OBSERVERS = 20_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WindowDesign:
-    """The bank with its thresholds. p meters, q liars at most, s = C(p, q) large sets, o observers.
+    """Bank with its thresholds. p meters, at most q manipulated, s = C(p, q) large sets, o observers.
 
     Attributes
     ----------
     observers
         All o = 1 + C(p, q) + C(p, 2q) observers: of all meters, of the large sets J, of the small sets S.
     sets
-        J and S, and who is compared to whom.
+        J and S, and the compared pairs.
     gains : (o,)
         gamma of each observer.
     noise
         m, supremum over time of the Euclidean norm of all meters' noise.
     epsilon
-        What may be left of the initial error once windows begin.
+        Largest remainder of the initial error when windows begin.
     settling
         k*, first step of the first window.
     detect_above
@@ -52,7 +52,7 @@ class WindowDesign:
     length
         N, steps in a window.
     rule
-        How a window isolates: "majority" is Algorithm 2; "survivors" keeps the J that never failed.
+        Isolation rule of a window: "majority" is Algorithm 2; "survivors" keeps the J that never failed.
     """
 
     observers: Stack
@@ -77,7 +77,7 @@ def bank_masks(meters: int, max_attacked: int, *, most: int = MOST_OBSERVERS) ->
     max_attacked
         q.
     most
-        Largest number of observers that is acceptable.
+        Largest acceptable number of observers.
 
     Returns
     -------
@@ -105,18 +105,18 @@ def bank(
     max_attacked
         q, at least 1.
     options
-        For gains by matrix inequality. Either this
+        For gains by matrix inequality. Either `options` or `proof` is required.
     proof
-        or this: direct injection.
+        For direct injection.
     most
-        Largest number of observers that is acceptable.
+        Largest acceptable number of observers.
 
     Raises
     ------
     NotObservable
         Unless p > 2q.
     DesignInfeasible
-        If there would be too many, or if an observer cannot be designed.
+        If there are more than `most` observers, or an observer cannot be designed.
     ValueError
         If `max_attacked` is below 1, or not exactly one of `options` and `proof` is given.
     """
@@ -125,7 +125,7 @@ def bank(
             [
                 Problem(
                     "out-of-range",
-                    "max_attacked must be at least 1: without liars there is nothing to isolate",
+                    "max_attacked must be at least 1: otherwise there is nothing to isolate",
                 )
             ]
         )
@@ -173,23 +173,23 @@ def design(
     length
         N.
     start
-        Bound on every observer's initial error; 0: all start in the true state.
+        Bound on every observer's initial error; 0 for starts in the true state.
     epsilon
-        What may be left of it when windows begin.
+        Its largest remainder when windows begin.
     gains : (o,)
-        gamma of each observer; by default the proven ones. Simulated ones make thresholds that are
-        smaller and no bounds any more.
+        gamma of each observer; by default the proven ones. Simulated ones give smaller thresholds that are
+        not bounds.
     unknown
-        Supremum of the norm of what else is unknown; its share `gamma_delta unknown` is part of epsilon
+        Supremum of the norm of further unknowns; its share `gamma_delta unknown` is part of epsilon
         in (10) and (19), observer by observer.
     rule
-        How a window isolates.
+        Isolation rule of a window.
 
     Raises
     ------
     ValueError
-        With every number that is not finite or negative, or if the rule is unknown or the observers are not
-        those of a bank.
+        With every number that is not finite or is negative, if the rule is unknown, or if the observers are
+        not those of a bank.
 
     References
     ----------
@@ -203,7 +203,7 @@ def design(
             [
                 Problem(
                     "wrong-design",
-                    f"no bank for {p} meters and {max_attacked} liars, in the order of `bank_masks`",
+                    f"no bank for {p} meters and max_attacked {max_attacked}, in the order of `bank_masks`",
                 )
             ]
         )
@@ -218,7 +218,8 @@ def design(
         raise InputInvalid(
             [
                 Problem(
-                    "not-finite", "an observer has no finite bound of its error: nothing would ever exceed it"
+                    "not-finite",
+                    "an observer has no finite bound of its error: no value would ever exceed it",
                 )
             ]
         )
@@ -239,7 +240,7 @@ def design(
 
 
 def _problems(sizes: dict[str, float], gains: Floats, observers: int, length: int) -> list[Problem]:
-    """What is wrong with the numbers that thresholds are made of."""
+    """Problems of the numbers behind the thresholds."""
     numbers = {**{name: np.array(size) for name, size in sizes.items()}, "gains": gains}
     problems = [
         Problem("negative", f"{name} must be finite and not negative, got {value.tolist()}")
@@ -260,8 +261,6 @@ def consistency(design: WindowDesign, x: Floats) -> tuple[Floats, Floats]:
 
     Parameters
     ----------
-    design
-        The bank.
     x : (…, o, n)
         All estimates.
 

@@ -1,4 +1,4 @@
-"""What a window of consistency measures says: Algorithms 1 and 2 of yang2019 as pure functions.
+"""Algorithms 1 and 2 of yang2019 as pure functions of a window's consistency measures.
 
 References
 ----------
@@ -20,25 +20,25 @@ Rule = Literal["majority", "survivors"]
 
 
 def exceeds(measure: Floats, threshold: Floats | float) -> Bools:
-    """Whether measures are above their thresholds.
+    """True where measures are above their thresholds.
 
     Parameters
     ----------
     measure : (…)
-        pi or pi_J; NaN, which could not be judged, exceeds nothing.
+        pi or pi_J; NaN, a measure that was not judged, exceeds no threshold.
     threshold : (…) or scalar
-        A threshold that is no number is exceeded by whatever could be judged.
+        A threshold of NaN is exceeded by every judged measure.
     """
     return np.asarray(~np.isnan(measure) & ~(measure <= threshold))
 
 
 def detection(pi: Floats, threshold: float, length: int) -> Bools:
-    """Algorithm 1: whether pi exceeds its threshold anywhere in each window.
+    """Algorithm 1: True for windows in which pi exceeds its threshold anywhere.
 
     Parameters
     ----------
     pi : (…, T)
-        From step k* on; a last window that is not full is left out.
+        From step k* on; an incomplete last window is left out.
     threshold
         (10).
     length
@@ -60,14 +60,14 @@ def believed(passing: Bools, masks: Bools) -> Bools:
     Parameters
     ----------
     passing : (…, s)
-        Whether pi_J is within its threshold.
+        True where pi_J is within its threshold.
     masks : (s, p)
         The large sets.
 
     Returns
     -------
     (…, p)
-        Meters regarded as honest.
+        Meters regarded as unmanipulated.
 
     References
     ----------
@@ -78,17 +78,17 @@ def believed(passing: Bools, masks: Bools) -> Bools:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Isolation:
-    """What windows say. w windows, p meters.
+    """Result of windows. w windows, p meters.
 
     Attributes
     ----------
     suspects : (…, w, p)
         Meters regarded as attacked; none where `decided` is False.
     decided : (…, w)
-        Whether the window has an answer at all.
+        True if the window has an answer.
     share : (…, w)
-        Part of the window's steps that gave this very answer (majority), or part of the large sets that
-        survived (survivors).
+        Fraction of the window's steps with this answer (majority), or of the large sets that survived
+        (survivors).
     """
 
     suspects: Bools
@@ -99,32 +99,32 @@ class Isolation:
 def isolation(pi_sets: Floats, thresholds: Floats, masks: Bools, length: int, rule: Rule) -> Isolation:
     """Algorithm 2, or its sound variant, over consecutive windows.
 
-    "majority" takes the set that equals W-bar(k) most often in the window (steps at which nothing passes
-    do not vote; of sets with equally many votes the one seen first wins; no vote: undecided). "survivors"
-    drops a large set as soon as it fails once and believes the union of those that never did; if none is
-    left, the assumptions are wrong and the window is undecided.
+    "majority" takes the set that equals W-bar(k) most often in the window. Steps without a passing set do not
+    vote, the earlier set wins a tie, and a window without votes is undecided. "survivors" drops a large set
+    at its first failure and trusts the union of the others; without any, the assumptions are wrong and the
+    window is undecided.
 
     Parameters
     ----------
     pi_sets : (…, T, s)
-        pi_J from step k* on; NaN where J cannot be judged, which passes nothing and fails nothing.
+        pi_J from step k* on; NaN where J cannot be judged, neither passed nor failed.
     thresholds : (s,)
         (19).
     masks : (s, p)
         The large sets.
     length
-        N. A last window that is not full is left out.
+        N. An incomplete last window is left out.
     rule
-        Which of the two.
+        "majority" or "survivors".
 
     Raises
     ------
     ValueError
-        If it is neither.
+        If `rule` is unknown.
 
     References
     ----------
-    yang2019, Algorithm 2; docs/errata/yang2019.md for why there are two.
+    yang2019, Algorithm 2; docs/errata/yang2019.md on the two rules.
     """
     refuse(no_choice("rule", get_args(Rule), rule))
     count = pi_sets.shape[-2] // length
@@ -142,7 +142,7 @@ def isolation(pi_sets: Floats, thresholds: Floats, masks: Bools, length: int, ru
 
 
 def _majority(trusted: Bools, votes: Bools) -> Isolation:
-    """The most frequent set (…, w, N, p) among the steps that vote (…, w, N); of equals the first seen."""
+    """The most frequent set (…, w, N, p) among the steps that vote (…, w, N); the earlier one at a tie."""
     lead, (length, p) = trusted.shape[:-2], trusted.shape[-2:]
     rows = trusted.reshape(-1, p)
     if not rows.size:
@@ -154,7 +154,7 @@ def _majority(trusted: Bools, votes: Bools) -> Isolation:
     tally = np.bincount(code[voting], minlength=count * len(first)).reshape(count, -1)
     seen = np.full(count * len(first), length)
     np.minimum.at(seen, code[voting], np.tile(np.arange(length), count)[voting])
-    # Most votes first; `seen` is at most N and decides between equals only.
+    # Most votes first; `seen` is at most N and decides ties only.
     winner = np.argmax(tally * (length + 1) - seen.reshape(tally.shape), axis=1)
     share = tally[np.arange(count), winner] / length
     suspects = ~rows[first[winner]] & (share > 0.0)[:, None]

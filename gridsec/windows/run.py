@@ -17,13 +17,13 @@ from gridsec.online import Decision
 from gridsec.windows.design import WindowDesign, consistency
 from gridsec.windows.rules import exceeds, isolation
 
-# An observer whose error after a silence is not bounded by anything is never judged again.
+# Value for observers that are never judged again, since their error after a gap has no bound.
 _NEVER = np.iinfo(np.intp).max
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WindowState:
-    """Where the bank stands within its window.
+    """State of the bank within its window.
 
     Attributes
     ----------
@@ -34,9 +34,9 @@ class WindowState:
     k
         Steps since the start.
     stale : (o,)
-        Steps that each observer still needs to settle.
+        Steps until each observer has settled.
     pi : (i,)
-        pi of the window's steps so far; NaN where it could not be judged.
+        pi of the window's steps so far; NaN where not judged.
     pi_sets : (i, s)
         Likewise pi_J.
     """
@@ -51,19 +51,19 @@ class WindowState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WindowVerdict:
-    """What one window says.
+    """Result of one window.
 
     Attributes
     ----------
     t
         Time of its last step, s.
     detection
-        Algorithm 1: CLEAN, ATTACKED, or UNDECIDED if some step could not be judged and none exceeded.
+        Algorithm 1: CLEAN, ATTACKED, or UNDECIDED if a step was not judged and none exceeded.
     isolation
-        Algorithm 2: ATTACKED, CLEAN if no meter is suspect and every set could be judged at every step,
-        or UNDECIDED.
+        Algorithm 2: ATTACKED, CLEAN if no meter is suspect and every set was judged at every step, or
+        UNDECIDED.
     suspects : (p,)
-        The meters.
+        Meters named by Algorithm 2.
     score, threshold : (1 + s,)
         Largest pi and pi_J of the window beside their thresholds.
     """
@@ -77,17 +77,7 @@ class WindowVerdict:
 
 
 def init(design: WindowDesign, t: float, x: Floats) -> WindowState:
-    """Start the bank.
-
-    Parameters
-    ----------
-    design
-        The bank.
-    t
-        Time, s.
-    x : (n,)
-        Where every observer starts.
-    """
+    """Initial state of the bank at t, s; every observer starts at x (n,)."""
     count = len(design.observers.masks)
     start = np.repeat(np.asarray(x, dtype=np.float64)[None, :], count, axis=0)
     stale = np.full(count, design.settling, dtype=np.intp)
@@ -97,20 +87,18 @@ def init(design: WindowDesign, t: float, x: Floats) -> WindowState:
 def step(
     design: WindowDesign, state: WindowState, y: Floats, u: Floats, seen: Bools
 ) -> tuple[WindowState, WindowVerdict | None]:
-    """Judge the estimates that belong to this step, then move them with its readings.
+    """Judge the estimates of this step, then advance them with its readings.
 
     Parameters
     ----------
-    design, state
-        Bank and state.
     y : (p,)
         Readings; ignored where unseen or not finite.
     u : (l,)
         Known input.
     seen : (p,)
-        Which readings exist. An observer that trusts a silent meter runs on without it and is not judged
-        again until k* steps after the meter is back, which presumes that its error is then within
-        `start` of `design`. Without such a bound (`start` = 0) it is not judged again at all.
+        True for existing readings. An observer with an unavailable meter continues without it and is not
+        judged until k* steps after the meter is back, provided that its error is then within `start` of
+        `design`. Without such a bound (`start` = 0) it is not judged again at all.
 
     Returns
     -------
@@ -123,7 +111,7 @@ def step(
         now, now_sets = _judged(design, state)
         pi, pi_sets = np.append(pi, now), np.vstack([pi_sets, now_sets])
     silent = (design.observers.masks & ~here).any(axis=1)
-    # Steps that the next estimate is from being judged.
+    # Steps until the next estimate is judged.
     stale = np.maximum(state.stale - (state.stale < _NEVER), 0)
     stale = np.where(silent, design.settling if design.settling else _NEVER, stale)
     x = advance(design.observers, state.x, y, u, here)
@@ -143,7 +131,7 @@ def step(
 
 
 def _judged(design: WindowDesign, state: WindowState) -> tuple[float, Floats]:
-    """Both measures of the present estimates; NaN where an observer involved has not settled."""
+    """Both measures of the present estimates; NaN if an observer involved has not settled."""
     pi, pi_sets = consistency(design, state.x)
     sets, settled = design.sets, state.stale == 0
     large, small = settled[1 : 1 + sets.count_large], settled[1 + sets.count_large :]
@@ -159,7 +147,7 @@ def _verdict(design: WindowDesign, t: float, pi: Floats, pi_sets: Floats) -> Win
     exceeded = bool(exceeds(pi, design.detect_above).any())
     quiet = Decision.CLEAN if seen else Decision.UNDECIDED
     suspects = np.asarray(found.suspects[0])
-    # Nobody is cleared by the steps that could not be judged.
+    # Steps that were not judged clear no meter.
     whole = bool(found.decided[0] and np.isfinite(pi_sets).all())
     cleared = Decision.CLEAN if whole else Decision.UNDECIDED
     largest = np.concatenate([[_top(pi)], [_top(column) for column in pi_sets.T]])

@@ -1,4 +1,4 @@
-"""Simulated runs of plant and bank, and thresholds taken from honest ones.
+"""Simulated runs of plant and bank, and thresholds from runs without attack.
 
 References
 ----------
@@ -21,7 +21,7 @@ from gridsec.windows.design import WindowDesign, consistency
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trace:
-    """A simulated run, or several. T steps, R runs in front where there are several.
+    """One simulated run or several. T steps, R runs on a leading axis if there are several.
 
     Attributes
     ----------
@@ -40,12 +40,10 @@ class Trace:
 def simulate(
     design: WindowDesign, x: Floats, u: Floats, disturbance: Floats, apart: Floats | float = 0.0
 ) -> Trace:
-    """Plant and bank together: what the measures do under given noise and attacks.
+    """Simulate plant and bank together under given noise and attacks.
 
     Parameters
     ----------
-    design
-        The bank.
     x : (…, n)
         Initial states of the plant.
     u : (T, l)
@@ -72,23 +70,21 @@ def simulate(
 
 
 def calibrate(design: WindowDesign, honest: Trace) -> WindowDesign:
-    """Thresholds from honest runs: the largest pi and pi_J seen, instead of the triangle inequality.
+    """Thresholds from runs without attack: the largest observed pi and pi_J.
 
-    Of R independent runs, one more run of the same kind exceeds a given threshold with at most the
-    probability `1 - (1 - confidence)^(1/R)`, with that confidence. Noise of another kind may exceed them
-    at will: these thresholds are statistics and no bounds.
+    With R independent runs, one more run of the same kind exceeds a given threshold with at most the
+    probability `1 - (1 - confidence)^(1/R)`, with that confidence. Noise of another kind may exceed them:
+    these thresholds are statistics, not bounds.
 
     Parameters
     ----------
-    design
-        The bank.
     honest
         From `simulate` without attack.
 
     Raises
     ------
     ValueError
-        If the measures are not finite, or all of the runs end before windows begin.
+        If the measures are not finite, or all runs end before windows begin.
     """
     first = design.settling
     measures = {"pi": honest.pi[..., first:], "pi_sets": honest.pi_sets[..., first:, :]}

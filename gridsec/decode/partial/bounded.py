@@ -1,10 +1,10 @@
 """Partial Luenberger observers with a decoder for bounded noise: lee2018, Algorithm 4.1.
 
-At every step an estimate is made from the sensors trusted so far and then tested against all of them. It
-is kept while at most q sensors disagree; otherwise a new one is searched for. Either way the estimate
-given out has passed the test, so its error is at most `kappa_c v_max(k)` whoever was attacked.
+At every step an estimate is made from the trusted sensors and then tested against all of them. It
+is kept while at most q sensors disagree; otherwise a new one is searched for. In both cases the result
+has passed the test, so its error is at most `kappa_c v_max(k)` under any attack on q sensors.
 
-The printed algorithm tests the estimate of the step before and gives out another one, computed
+The printed algorithm tests the estimate of the step before and returns another one, computed
 afterwards, to which the bound does not apply: docs/errata/lee2018-chapter-4.md.
 
 References
@@ -41,7 +41,7 @@ class BoundedDesign:
     constants
         theta, kappa_c and the others, of the scaled blocks.
     scale : (p,)
-        What the error of each observer is measured in.
+        Unit of each observer's error.
     """
 
     observers: LuenbergerDesign
@@ -52,14 +52,14 @@ class BoundedDesign:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoundedState:
-    """Where observers and decoder stand.
+    """State of observers and decoder.
 
     Attributes
     ----------
     observers
         The observers' state.
     trusted : (p,)
-        Lambda: sensors that the last estimate agreed with.
+        Lambda: sensors in agreement with the last estimate.
     """
 
     observers: LuenbergerState
@@ -68,27 +68,27 @@ class BoundedState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoundedOutcome:
-    """What one step says.
+    """Result of one step.
 
     Attributes
     ----------
     t
-        Time of the state that is estimated, s.
+        Time of the estimated state, s.
     x : (n,)
         Estimate.
     bound
-        `kappa_c v_max(k)`: |estimate - state|_2 is at most this if at most q sensors are attacked.
+        `kappa_c v_max(k)`: bound of |estimate - state|_2 if at most q sensors are attacked.
     disagree : (p,)
-        Sensors whose observers the estimate does not explain; all of them are attacked or the bounds on
+        Sensors with observers that the estimate does not explain; all of them are attacked, or the bounds on
         disturbance and noise do not hold.
     searched
-        Whether the estimate had to be searched for.
+        True if the estimate was searched for.
     credible
-        Whether at most q sensors disagree. If not, an assumption is violated and the bound is void.
+        True if at most q sensors disagree. Otherwise an assumption is violated and the bound is void.
     residuals : (p,)
         |z_hat_i - Z_i^T x_hat|_2.
     limits : (p,)
-        What they were compared to, theta v_max(k), in the same unit.
+        Their limits, theta v_max(k), in the same unit.
     """
 
     t: float
@@ -123,19 +123,18 @@ def design(
     max_attacked
         q.
     tol
-        What counts as zero in deciding whether the state is determined without any 2q sensors.
+        Tolerance of the test that the state is determined without any 2q sensors.
     left_out
         r, between q and 2q; the cheapest by default.
     scale : (p,)
-        Positive; errors of observer i are measured in `scale[i]`, which lets good sensors count more. One
-        for all by default, as in the paper; the limits of the envelopes are a good choice where sensors
-        differ.
+        Positive; errors of observer i are measured in `scale[i]`, which gives accurate sensors more weight.
+        One for all by default, as in the paper; the limits of the envelopes suit sensors of different
+        accuracy.
 
     Raises
     ------
     NotObservable
-        Unless the pair is 2q-redundant detectable (lee2018, Proposition 4.3.1), as far as the parts of the
-        observers go.
+        Unless the pair is 2q-redundant detectable (lee2018, Proposition 4.3.1) by the parts of the observers.
     ValueError
         If `scale` is not one positive number for each sensor, or r is not from q to 2 q.
     """
@@ -150,12 +149,10 @@ def design(
 
 
 def init(design: BoundedDesign, t: float, x: Floats, error: float) -> tuple[BoundedState, BoundedOutcome]:
-    """Start from a guess of the state, trusting everybody.
+    """Initial state from a guess of the state, with all sensors trusted.
 
     Parameters
     ----------
-    design
-        From `design`.
     t
         Time, s.
     x : (n,)
@@ -170,12 +167,10 @@ def init(design: BoundedDesign, t: float, x: Floats, error: float) -> tuple[Boun
 def step(
     design: BoundedDesign, state: BoundedState, y: Floats, u: Floats, seen: Bools | None = None
 ) -> tuple[BoundedState, BoundedOutcome]:
-    """From the readings y(k) and the input u(k) to the estimate of x(k+1).
+    """Step from the readings y(k) and the input u(k) to the estimate of x(k+1).
 
     Parameters
     ----------
-    design, state
-        Observers and decoder, and where they stand.
     y, u, seen : (p,), (m,), (p,)
         As in `luenberger.step`.
     """
@@ -185,15 +180,10 @@ def step(
 
 
 def decode(design: BoundedDesign, state: BoundedState) -> tuple[BoundedState, BoundedOutcome]:
-    """The estimate from the observers as they stand.
+    """Estimate from the present state of the observers.
 
         x_hat = Phi_Lambda^+ z_hat_Lambda;  f = |{i : |z_hat_i - Z_i^T x_hat| > theta v_max(k)}|
         f <= q: keep x_hat.   f > q: x_hat = argmin f over F_(p,r)(z_hat).
-
-    Parameters
-    ----------
-    design, state
-        Observers and decoder, and where they stand.
 
     References
     ----------
@@ -205,14 +195,14 @@ def decode(design: BoundedDesign, state: BoundedState) -> tuple[BoundedState, Bo
     limit = design.constants.theta * v_max
     x = _fit(stacked, z, state.trusted)
     sizes = stacked.norms(z - stacked.matrix @ x)
-    # Written so that a residual that is no number disagrees.
+    # Negated comparison: a residual of NaN disagrees.
     disagree = ~(sizes <= limit)
     searched = np.count_nonzero(disagree) > design.decoder.max_attacked
     credible = True
     if searched:
         found = correct(design.decoder, design.constants, z, v_max=v_max)
         x, disagree, sizes, credible = found.x, found.in_error, found.residuals, bool(found.credible)
-    # Without enough agreement there is nobody to trust: start afresh from everybody.
+    # Without enough agreement no subset is trusted: restart with all sensors.
     trusted = ~disagree if credible else np.ones_like(disagree)
     outcome = BoundedOutcome(
         state.observers.t,

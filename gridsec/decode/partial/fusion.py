@@ -1,20 +1,20 @@
-"""Estimates and chi-square tests from correlated partial estimates, where covariances may be singular.
+"""Estimates and chi-square tests from correlated partial estimates, with possibly singular covariances.
 
     z = Phi x + v + e,    v ~ N(0, P),  P >= 0
 
-The joint covariance of partial filters is singular more often than not: at the start all of them are wrong
-by the same initial error, and modes that several sensors cannot see are predicted by all of them with
-exactly the same error. P^-1 then does not exist. In parity space nothing is missing: with N the
-annihilator of Phi, `N z` has covariance `V = N P N^T`, and
+The joint covariance of partial filters is usually singular: at the start all of them have the same initial
+error, and modes that several sensors cannot observe are predicted by all of them with exactly the same error.
+P^-1 then does not exist. Parity space avoids it: with N the annihilator of Phi, `N z` has covariance
+`V = N P N^T`, and
 
     g = (N z)^T V^+ (N z),     x_hat = Phi^+ (I - P N^T V^+ N) z
 
 are the test and the minimum-variance estimate of `gridsec.decode.gaussian` wherever P > 0. A parity with
-variance zero is no random number: it vanishes exactly, or somebody is attacked.
+variance zero is not random: it vanishes exactly unless there is an attack.
 
 References
 ----------
-lee2018, section 4.3.2, with what its errata correct; docs/theory-partial-observers.md, section 5.
+lee2018, section 4.3.2, with the corrections of its errata; docs/theory-partial-observers.md, section 5.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from gridsec.errors import NotObservable
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Parity:
-    """What fusing one set of sensors needs and no covariance changes. k rows are kept of N.
+    """Part of the fusion of one set of sensors that does not depend on covariances. k rows are kept of N.
 
     Attributes
     ----------
@@ -59,9 +59,9 @@ class Fused:
     estimator : (n, N)
         Psi: the estimate is `Psi z`.
     covariance : (n, n)
-        Of the estimate's error.
+        Covariance of the estimate's error.
     standardise : (k - n, N)
-        `g = |W z|^2`. Rows of parities that vanish exactly are divided by `sqrt(tol)` of their scale.
+        `g = |W z|^2`. Rows of exactly vanishing parities are divided by `sqrt(tol)` of their scale.
     freedom
         Degrees of freedom of g: rank of V.
     """
@@ -79,16 +79,14 @@ def parity(stack: Stack, kept: Ints, *, tol: float) -> Parity:
     ----------
     stack
         Phi.
-    kept
-        The sensors.
     tol
         Singular values up to this, times the largest, count as zero.
 
     Raises
     ------
     NotObservable
-        If these sensors do not determine x, or do so without redundancy, so that nothing could speak
-        against them.
+        If these sensors do not determine x, or determine it without redundancy, so that no reading could
+        contradict it.
     """
     rows = stack.rows(kept)
     phi = stack.matrix[rows]
@@ -110,13 +108,11 @@ def fuse(prepared: Parity, P: Floats, *, tol: float) -> Fused:
 
     Parameters
     ----------
-    prepared
-        From `parity`.
     P : (N, N)
         Covariance of v; positive semidefinite.
     tol
-        A parity whose variance is at most this, in units in which every row of z has variance one, counts
-        as exact. Also what an exact parity may be off by, squared, in the same units.
+        Largest variance of an exact parity, in units in which every row of z has variance one. Also the
+        squared allowance for an exact parity, in the same units.
 
     References
     ----------
@@ -130,7 +126,7 @@ def fuse(prepared: Parity, P: Floats, *, tol: float) -> Fused:
     # N z = (N D)(D^-1 z): the same parities, orthonormal in units in which rows have variance one.
     turn, _ = np.linalg.qr((prepared.checks * size).T)
     variances, axes = np.linalg.eigh(turn.T @ (part / np.outer(size, size)) @ turn)
-    # Flooring instead of dropping: violated exact parities must count, only not as degrees of freedom.
+    # Floored, not dropped: violated exact parities must count, but not as degrees of freedom.
     W = (turn @ (axes / np.sqrt(np.maximum(variances, tol)))).T / size
     gain = part @ W.T
     correction = prepared.inverse @ gain

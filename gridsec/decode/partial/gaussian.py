@@ -1,7 +1,7 @@
 """Partial Kalman filters with chi-square test and choice among hypotheses: lee2018, Algorithm 4.2.
 
-The sensors trusted so far are fused and tested at every step. While the test passes, nothing else is
-computed. When it alarms, every set of p - q sensors is tested, and the most likely one is trusted from
+The trusted sensors are fused and tested at every step. While the test passes, no other set is
+computed. After an alarm every set of p - q sensors is tested, and the most likely one is trusted from
 then on.
 
 Corrected: degrees of freedom are the rank of the residual's covariance, that covariance may be singular,
@@ -38,21 +38,21 @@ class GaussianDesign:
     filters
         The partial filters.
     steady
-        Their stationary gain and covariance, if they run with those; None: time-varying ones.
+        Their stationary gain and covariance, if used; None for time-varying ones.
     sets
         All sensors first, then every set of p - q.
     thresholds : (N + 1,)
-        Delta_TH for every number of degrees of freedom. Without any, the statistic is not random: a
+        Delta_TH for every number of degrees of freedom. With none, the statistic is not random, and a
         violation of size 1 alarms.
     rule
-        How the set is chosen after an alarm, see `gridsec.decode.gaussian.choose`. "density" is the paper's,
-        which prefers sets with few rows where sensors see different amounts; "tail" does not.
+        Choice of the set after an alarm, see `gridsec.decode.gaussian.choose`. "density" is the paper's,
+        which prefers sets with few rows if observable parts differ in size; "tail" does not.
     readmit
-        Steps in a row that all sensors together must pass their test, after an alarm, before all of them
-        are trusted again; 0: never, as printed.
+        Consecutive passed tests of all sensors together, after an alarm, until all of them are trusted again;
+        0 for never, as printed.
     refresh
-        The fusion is computed anew when an entry of the covariance has changed by more than this, times the
-        standard deviations of its row and column; 0: at every step.
+        Change of an entry of the covariance, relative to the standard deviations of its row and column, above
+        which the fusion is recomputed; 0 for every step.
     tol
         As in `fusion.fuse`.
     """
@@ -69,14 +69,14 @@ class GaussianDesign:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tables:
-    """The fusions that have been needed so far under one covariance.
+    """Fusions computed so far under one covariance.
 
     Attributes
     ----------
     P : (mu, mu)
-        That covariance.
+        The covariance.
     fused
-        One place for each set; None where it has not been needed.
+        One entry for each set; None until needed.
     """
 
     P: Floats
@@ -85,7 +85,7 @@ class Tables:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GaussianState:
-    """Where filters and decoder stand.
+    """State of filters and decoder.
 
     Attributes
     ----------
@@ -94,7 +94,7 @@ class GaussianState:
     current
         Index of the trusted set among the design's sets.
     passed
-        Steps in a row that all sensors together have passed since the last alarm.
+        Consecutive tests passed by all sensors together since the last alarm.
     tables
         Fusion in use.
     """
@@ -107,25 +107,25 @@ class GaussianState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GaussianOutcome:
-    """What one step says.
+    """Result of one step.
 
     Attributes
     ----------
     t
-        Time of the state that is estimated, s.
+        Time of the estimated state, s.
     x : (n,)
         Estimate.
     covariance : (n, n)
-        Of its error, if the trusted sensors are honest.
+        Covariance of its error, if the trusted sensors are unmanipulated.
     trusted : (p,)
-        The sensors it is made from.
+        The sensors in use.
     alarm
-        f: whether the set trusted before failed its test in this step.
+        f: True if the set trusted before failed its test in this step.
     g, threshold, freedom
-        Statistic of the set trusted *before* this step, what it was compared to, its degrees of freedom.
+        Statistic of the set trusted *before* this step, its threshold, its degrees of freedom.
     credible
-        Whether the set trusted now passes its own test. If not, more than q sensors are attacked, or this
-        step was one of the expected false alarms of all sets.
+        True if the set trusted now passes its own test. Otherwise more than q sensors are attacked, or this
+        step is one of the expected false alarms of all sets.
     """
 
     t: float
@@ -162,19 +162,17 @@ def design(
     false_alarm
         delta, in (0, 1).
     tol
-        As in `fusion.fuse`; its square root decides whether the state is determined.
+        As in `fusion.fuse`; its square root is the tolerance of observability.
     steady
-        From `kalman.steady`, for filters that have long been running.
+        From `kalman.steady`, for filters in steady state.
     rule, readmit, refresh
         As in `GaussianDesign`.
-    most
-        Largest number of sets.
 
     Raises
     ------
     NotObservable
         Unless the pair is 2q-redundant detectable (lee2018, Proposition 4.3.1) and every set of p - q
-        sensors has redundancy of its own.
+        sensors is redundant by itself.
     DesignInfeasible
         If there are more than `most` sets.
     ValueError
@@ -209,23 +207,21 @@ def init(
     *,
     seen: Bools | None = None,
 ) -> tuple[GaussianState, GaussianOutcome]:
-    """Start from what is known of the state and the first readings, trusting everybody.
+    """Initial state from the prior of the state and the first readings, with all sensors trusted.
 
     Parameters
     ----------
-    design
-        From `design`.
     t
         Time of those readings, s.
     mean, covariance : (n,), (n, n)
-        Of the state; the covariance is not used by stationary filters.
+        Prior of the state; the covariance is not used by stationary filters.
     y, seen : (p,), (p,)
         As in `kalman.correct`.
 
     Raises
     ------
     ValueError
-        If a stationary filter lacks a reading, or one is not finite.
+        If a stationary filter has no reading, or one is not finite.
     """
     first = kalman.init(design.filters, t, mean, covariance)
     if design.steady is None:
@@ -240,19 +236,17 @@ def init(
 def step(
     design: GaussianDesign, state: GaussianState, y: Floats, u: Floats, seen: Bools | None = None
 ) -> tuple[GaussianState, GaussianOutcome]:
-    """From the input u(k) and the readings y(k+1) to the estimate of x(k+1).
+    """Step from the input u(k) and the readings y(k+1) to the estimate of x(k+1).
 
     Parameters
     ----------
-    design, state
-        Filters and decoder, and where they stand.
     y, u, seen : (p,), (m,), (p,)
         As in `kalman.step`. Stationary filters need every reading.
 
     Raises
     ------
     ValueError
-        If a stationary filter lacks a reading, or one is not finite.
+        If a stationary filter has no reading, or one is not finite.
     """
     if design.steady is not None:
         _require_all(y, seen)
@@ -268,11 +262,6 @@ def step(
 def decode(design: GaussianDesign, state: GaussianState) -> tuple[GaussianState, GaussianOutcome]:
     """Test the trusted set, choose another if it fails, and estimate.
 
-    Parameters
-    ----------
-    design, state
-        Filters and decoder, and where they stand.
-
     References
     ----------
     lee2018, Algorithm 4.2.
@@ -280,7 +269,7 @@ def decode(design: GaussianDesign, state: GaussianState) -> tuple[GaussianState,
     z, now = state.filters.z, state.current
     tables, tested = _fused(design, state.tables, now)
     g, threshold = _score(tested, z), float(design.thresholds[tested.freedom])
-    # Written so that a statistic that is no number alarms.
+    # Negated comparison: a statistic of NaN alarms.
     alarm = not g <= threshold
     chosen, passed, used = now, state.passed, tested
     if alarm:
@@ -331,12 +320,12 @@ def _moved(P: Floats, old: Floats) -> float:
 
 
 def _none(design: GaussianDesign, P: Floats) -> Tables:
-    """Nothing fused yet under a new covariance."""
+    """Empty tables for a new covariance."""
     return Tables(P, (None,) * len(design.sets))
 
 
 def _fused(design: GaussianDesign, tables: Tables, index: int) -> tuple[Tables, Fused]:
-    """Fusion of one set, kept in the tables for the next time."""
+    """Fusion of one set, stored in the tables for later steps."""
     found = tables.fused[index]
     if found is not None:
         return tables, found
@@ -345,7 +334,7 @@ def _fused(design: GaussianDesign, tables: Tables, index: int) -> tuple[Tables, 
 
 
 def _hypotheses(design: GaussianDesign, tables: Tables) -> Hypotheses:
-    """The sets of p - q sensors, all of them fused, as `gridsec.decode.gaussian.choose` wants them."""
+    """The fused sets of p - q sensors in the form of `gridsec.decode.gaussian.choose`."""
     small = [f for f in tables.fused[1:] if f is not None]
     wide = np.zeros((len(small), max(len(f.standardise) for f in small), len(tables.P)))
     for i, f in enumerate(small):

@@ -44,10 +44,7 @@ def gain(n: int, theta: float) -> Floats:
 
     All eigenvalues of `A - K C` are -theta.
 
-    Parameters
-    ----------
-    n, theta
-        As in `riccati`.
+    Arguments as in `riccati`.
     """
     return np.array([comb(n, j) * theta**j for j in range(1, n + 1)], dtype=np.float64)
 
@@ -61,11 +58,11 @@ class Decay:
     eta
         Overshoot.
     epsilon
-        What noise leaves over.
+        Floor by noise.
     rate
         1/s.
     origin
-        Which derivation: "kim2018", "lee2018" or "componentwise".
+        Derivation: "kim2018", "lee2018" or "componentwise".
     """
 
     eta: float
@@ -109,7 +106,7 @@ def decay_kim(n: int, theta: float, noise: float) -> Decay:
 def decay_lee(n: int, theta: float, noise: float, *, printed: bool = False) -> Decay:
     """Bound in the form of lee2018 (5.2.8): rate theta / 4, a given floor in place of noise.
 
-    The dissertation says that some eta(theta) exists, without a formula.
+    The dissertation states that some eta(theta) exists, without a formula.
 
     Parameters
     ----------
@@ -119,7 +116,7 @@ def decay_lee(n: int, theta: float, noise: float, *, printed: bool = False) -> D
         delta of Remark 5.4.1, the floor of the bound.
     printed
         False: `eta = sqrt(n l2 / l1) theta^{n-1}`, by the steps of kim2018's appendix without noise. True:
-        without the factor sqrt(n). This gives the printed 168, has no derivation, and is inferred here.
+        without the factor sqrt(n). This gives the printed 168; it has no derivation and is inferred here.
 
     References
     ----------
@@ -131,7 +128,7 @@ def decay_lee(n: int, theta: float, noise: float, *, printed: bool = False) -> D
 
 
 def decay_componentwise(n: int, theta: float, noise: float) -> Decay:
-    """Our constants: the same Lyapunov function, no norm changed on the way.
+    """Own constants: the same Lyapunov function, without a change of norm.
 
     `|e_j| <= theta^{j-1} sqrt(S_jj V)` with S = Pt^{-1}, `V(t) <= V(0) e^{-theta t / 2} + 2 Mv^2`, and
     V(0) at most the largest value of `xi^T Pt xi` over the corners of the box of initial errors.
@@ -161,15 +158,15 @@ def _spectrum(n: int) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Slopes:
-    """Ranges of the partial derivatives of one sensor's alpha and beta u, over everything that occurs.
+    """Ranges of the partial derivatives of one sensor's alpha and beta u, over all arguments.
 
     Attributes
     ----------
     low, high : (n, n)
-        Entry (j, k): range of the derivative of row j with respect to z_k. Rows before the last hold
-        `beta_j u`, the last one `alpha + beta_n u`; zero above the diagonal.
+        Entry (j, k): range of the derivative of row j with respect to z_k. Rows before the last are those of
+        `beta_j u`, the last one that of `alpha + beta_n u`; zero above the diagonal.
     proven
-        Whether the ranges are rigorous; otherwise they come from samples.
+        True for rigorous ranges; False for samples.
     """
 
     low: Floats
@@ -178,10 +175,10 @@ class Slopes:
 
 
 def margin(slopes: Slopes, theta: float) -> float:
-    """How far the observer's Lyapunov inequality is from failing; positive: Lemma 1 holds at this theta.
+    """Margin of the observer's Lyapunov inequality; Lemma 1 holds at this theta if positive.
 
-    Largest mu with `Pt D + D^T Pt <= (theta/2 - mu) Pt` for every D whose entries `D_jk = theta^{k-j} s_jk`
-    have `s_jk` in its range. The inequality is affine in each s_jk, so that the corners decide.
+    Largest mu with `Pt D + D^T Pt <= (theta/2 - mu) Pt` for every D with entries `D_jk = theta^{k-j} s_jk`
+    and `s_jk` in its range. The inequality is affine in each s_jk, so that the corners decide.
 
     Parameters
     ----------
@@ -192,7 +189,7 @@ def margin(slopes: Slopes, theta: float) -> float:
 
     References
     ----------
-    docs/theory-high-gain.md, Theorem 1 (makes kim2018's "sufficiently large theta" a number).
+    docs/theory-high-gain.md, Theorem 1 (quantifies kim2018's "sufficiently large theta").
     """
     n = slopes.low.shape[0]
     base = riccati(n, 1.0)
@@ -213,12 +210,12 @@ def margin(slopes: Slopes, theta: float) -> float:
     return 0.5 * theta - worst
 
 
-# More uncertain entries than this, and the corners are replaced by a norm bound.
+# Number of uncertain entries above which a norm bound replaces the corners.
 _CORNERS = 12
 
 
 def _margin_by_norm(slopes: Slopes, theta: float) -> float:
-    """The same with `2 |Pt^{1/2} D Pt^{-1/2}|` bounded by centre and radius; more careful, never wrong."""
+    """`margin` with `2 |Pt^{1/2} D Pt^{-1/2}|` bounded by centre and radius; conservative."""
     n = slopes.low.shape[0]
     base = riccati(n, 1.0)
     root = np.linalg.cholesky(base)
@@ -234,7 +231,7 @@ def smallest_theta(slopes: Slopes, *, most: float = 1e6, tolerance: float = 1e-6
     """Smallest theta >= 1 that satisfies Theorem 1; every larger theta satisfies it too. Infinite if none.
 
     Below the diagonal `D_jk = theta^{k-j} s_jk` shrinks with theta. With zero in its range the set of all D
-    shrinks as well, so that `margin` rises. A range without zero is widened to zero.
+    shrinks as well, so that `margin` increases. A range without zero is widened to zero.
 
     The number is sufficient for Lemma 1, not necessary: (6) can hold at a smaller theta.
 
@@ -242,11 +239,9 @@ def smallest_theta(slopes: Slopes, *, most: float = 1e6, tolerance: float = 1e-6
     ----------
     slopes
         Ranges of the derivatives. An entry above the diagonal, which no uniformly observable system has,
-        makes the answer infinite.
+        gives infinity.
     most
         Largest theta to consider, 1/s.
-    tolerance
-        Relative.
 
     References
     ----------
@@ -272,7 +267,7 @@ def smallest_theta(slopes: Slopes, *, most: float = 1e6, tolerance: float = 1e-6
 
 
 def settling(decay: Decay, z_bound: float) -> tuple[float, float]:
-    """Delta_1 and Delta_2, s: how long an observer needs after an attack, without and after a reset.
+    """Delta_1 and Delta_2, s: settling times of an observer after an attack, without and after a reset.
 
     Parameters
     ----------

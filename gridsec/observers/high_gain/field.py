@@ -43,8 +43,6 @@ def gains(system: System, theta: Floats) -> Floats:
 
     Parameters
     ----------
-    system
-        The system.
     theta : (p,)
         High-gain parameters, 1/s.
     """
@@ -55,17 +53,7 @@ def gains(system: System, theta: Floats) -> Floats:
 
 
 def transition(system: System, K: Floats, h: float) -> Transition:
-    """Matrices of one step.
-
-    Parameters
-    ----------
-    system
-        The system.
-    K : (p, n_max)
-        Gains.
-    h
-        Length, s.
-    """
+    """Matrices of one step of length h, s, for the gains K (p, n_max)."""
     p, n = K.shape
     M = np.zeros((p, n, n))
     M[:, np.arange(n - 1), np.arange(1, n)] = system.mask[:, 1:]
@@ -81,13 +69,8 @@ def transition(system: System, K: Floats, h: float) -> Transition:
 def field(system: System) -> Field:
     """`e alpha(sat(z)) + beta(sat(z)) u` of all sensors as one function of z (p, n_max) and u (m,).
 
-    Where every alpha and beta is a `Polynomial`, all sensors share one table of monomials and one
+    If every alpha and beta is a `Polynomial`, all sensors share one table of monomials and one
     product; otherwise they are evaluated one after the other.
-
-    Parameters
-    ----------
-    system
-        The system.
     """
     functions = [
         *(partial.alpha for partial in system.partials),
@@ -156,8 +139,8 @@ def advance(
 ) -> Floats:
     """One step of the observers (5): exponential, of second order in the nonlinear part.
 
-    Readings and inputs run along straight lines between the two instants. The stiff linear part is
-    exact for every `theta h`.
+    Readings and inputs are interpolated linearly between the two instants. The stiff linear part is exact for
+    every `theta h`.
 
     Parameters
     ----------
@@ -177,7 +160,7 @@ def advance(
     Returns
     -------
     Floats
-        (p, n_max), estimates at the end; not finite where the readings are out of all bounds.
+        (p, n_max), estimates at the end; not finite on overflow by extreme readings.
 
     References
     ----------
@@ -186,7 +169,7 @@ def advance(
     before = right(z, u[0])
     forced = before + K * y[0][:, None]
     rise = K * (y[1] - y[0])[:, None]
-    # Row by row products: a sensor that overflows must not touch the others.
+    # Products row by row: the overflow of one sensor must not affect the others.
     trial = _apply(move.whole, z) + _apply(move.held, forced) + _apply(move.slope, rise)
     return trial + _apply(move.slope, right(trial, u[1]) - before)
 

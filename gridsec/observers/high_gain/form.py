@@ -1,12 +1,12 @@
-"""Uniform observability decomposition: what each sensor sees of the state, and how that part moves.
+"""Uniform observability decomposition: observable part of the state by each sensor, and its dynamics.
 
     z_i = Phi_i(x) = (h_i, L_f h_i, …, L_f^{n_i - 1} h_i)
     z_i' = A z_i + e alpha_i(z_i) + beta_i(z_i) u,    beta_ij depends on z_i1, …, z_ij only
     y_i = z_i1 + a_i + v_i
 
-All functions are written over *components*: they take a sequence of n entries and use NumPy's
-operations on them, so that the same function serves numbers, arrays and intervals.
-`linear` makes the decomposition of a linear system, `symbolic.decompose` that of a system in sympy.
+All functions are written over *components*: they take a sequence of n entries and use NumPy's operations on
+them, so that the same function serves numbers, arrays and intervals. `linear` computes the decomposition of a
+linear system, `symbolic.decompose` that of a system in sympy.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def at(function: Vector, points: Floats) -> Floats:
     function
         From n components to k.
     points : (…, n)
-        Where.
+        Points.
 
     Returns
     -------
@@ -45,7 +45,7 @@ def at(function: Vector, points: Floats) -> Floats:
     """
     points = np.asarray(points, dtype=np.float64)
     values = function([points[..., i] for i in range(points.shape[-1])])
-    # Assigned, for a stack of arrays that are broadcast first takes several times as long.
+    # Assigned to one array: a stack of arrays after broadcasting takes several times as long.
     made = np.empty((*points.shape[:-1], len(values)), dtype=np.float64)
     for k, value in enumerate(values):
         made[..., k] = value
@@ -60,7 +60,7 @@ def jacobian_at(function: Matrix, points: Floats) -> Floats:
     function
         From n components to k rows of m entries.
     points : (…, n)
-        Where.
+        Points.
     """
     points = np.asarray(points, dtype=np.float64)
     rows = function([points[..., i] for i in range(points.shape[-1])])
@@ -78,7 +78,7 @@ def sat(z: Floats, bound: Floats | float) -> Floats:
     Parameters
     ----------
     z : (…)
-        Anything, also infinite.
+        Arbitrary values, also infinite.
     bound
         Saturation level, scalar or broadcastable.
 
@@ -91,7 +91,7 @@ def sat(z: Floats, bound: Floats | float) -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Polynomial:
-    """A polynomial `sum_k c_k prod_j z_j^{e_kj}`; differentiable, and stackable over sensors.
+    """Polynomial `sum_k c_k prod_j z_j^{e_kj}`; differentiable, and stackable over sensors.
 
     Attributes
     ----------
@@ -127,13 +127,7 @@ class Polynomial:
 
 
 def affine(constant: float, slopes: Sequence[float]) -> Polynomial:
-    """`constant + sum_j slopes_j z_j` as a `Polynomial`.
-
-    Parameters
-    ----------
-    constant, slopes
-        Coefficients.
-    """
+    """`constant + sum_j slopes_j z_j` as a `Polynomial`."""
     n = len(slopes)
     exponents = np.concatenate([np.zeros((1, n), dtype=np.intp), np.eye(n, dtype=np.intp)])
     return Polynomial(exponents, np.array([constant, *slopes], dtype=np.float64))
@@ -141,7 +135,7 @@ def affine(constant: float, slopes: Sequence[float]) -> Polynomial:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Partial:
-    """One sensor's uniformly observable part.
+    """Uniformly observable part of one sensor.
 
     Attributes
     ----------
@@ -177,7 +171,7 @@ class Partial:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class System:
-    """A system seen through its sensors. n states, p sensors, N = n_1 + … + n_p.
+    """System with its sensors. n states, p sensors, N = n_1 + … + n_p.
 
     Attributes
     ----------
@@ -201,12 +195,12 @@ class System:
     def __post_init__(self) -> None:
         if not self.partials:
             raise NotObservable(
-                (), 0, "a system without sensors shows nothing of its state", code="too-few-meters"
+                (), 0, "a system without sensors has no observable state", code="too-few-meters"
             )
         widths = {partial.inputs for partial in self.partials}
         if len(widths) != 1:
             raise InputInvalid(
-                [Problem("shape", f"all sensors share the inputs, but they count {sorted(widths)} of them")]
+                [Problem("shape", f"all sensors share the inputs, but have {sorted(widths)} of them")]
             )
         object.__setattr__(self, "x_bound", np.atleast_1d(np.asarray(self.x_bound, dtype=np.float64)))
         sizes = np.array([partial.size for partial in self.partials])
@@ -234,40 +228,22 @@ class System:
 
         References
         ----------
-        kim2018 (9); lee2018 (5.3.2), without the zeros that only pad it.
+        kim2018 (9); lee2018 (5.3.2), without the zeros for padding.
         """
         return np.concatenate([at(self.partials[i].phi, x) for i in self._chosen(sensors)], axis=-1)
 
     def jacobian(self, x: Floats, sensors: Sequence[int] | None = None) -> Floats:
-        """Derivative of Phi_I, (…, N_I, n).
-
-        Parameters
-        ----------
-        x, sensors
-            As in `phi`.
-        """
+        """Derivative of Phi_I, (…, N_I, n); arguments as in `phi`."""
         parts = [jacobian_at(self.partials[i].jacobian, x) for i in self._chosen(sensors)]
         return np.concatenate(parts, axis=-2)
 
     def rows(self, sensors: Sequence[int] | None = None) -> Matrix:
-        """Derivative of Phi_I over components, for interval bounds.
-
-        Parameters
-        ----------
-        sensors
-            I, ascending.
-        """
+        """Derivative of Phi_I over components, for interval bounds; I ascending."""
         chosen = [self.partials[i].jacobian for i in self._chosen(sensors)]
         return lambda x: list(chain.from_iterable(part(x) for part in chosen))
 
     def pick(self, sensors: Sequence[int]) -> Bools:
-        """Which entries of the stacked z belong to the sensors I, (N,); kim2018 (8).
-
-        Parameters
-        ----------
-        sensors
-            I.
-        """
+        """Mask (N,) of the entries of the stacked z that belong to the sensors I; kim2018 (8)."""
         owner = np.nonzero(self.mask)[0]
         return np.isin(owner, np.asarray(sensors, dtype=np.intp))
 
@@ -285,7 +261,7 @@ def largest(phi: Vector, x_bound: Floats, *, gap: float = 1e-3) -> float:
     x_bound : (n,)
         Half-widths of the box.
     gap
-        Relative overestimation that is good enough.
+        Acceptable relative overestimation.
     """
     count = len(phi(list(np.zeros(len(x_bound)))))
     return max(supremum(_size(phi, j), -x_bound, x_bound, gap=gap).upper for j in range(count))
@@ -298,18 +274,16 @@ def _size(phi: Vector, j: int) -> Scalar:
 def slopes(partial: Partial, u_low: Floats, u_high: Floats, *, samples: int = 4000, seed: int = 0) -> Slopes:
     """Ranges of the derivatives of alpha and beta u for `constants.margin`.
 
-    Proven by intervals where alpha and beta are `Polynomial`; otherwise the ranges seen by central
-    differences at random points, widened by a tenth, and marked as not proven. Zero is always inside,
-    because beyond the saturation the functions are flat.
+    Proven by intervals for alpha and beta that are `Polynomial`; otherwise the ranges of central differences
+    at random points, widened by a tenth, and marked as not proven. Zero is always inside, because the
+    functions are constant beyond the saturation.
 
     Parameters
     ----------
-    partial
-        The sensor.
     u_low, u_high : (m,)
         Range of the inputs.
     samples, seed
-        Number and seed of the random points, where they are needed.
+        Number and seed of the random points.
     """
     n = partial.size
     low, high, proven = np.zeros((n, n)), np.zeros((n, n)), True
@@ -343,26 +317,24 @@ def _seen(function: Scalar, points: Floats, k: int) -> Interval:
 
 
 def defects(system: System, f: Vector, g: Matrix, h: Vector, points: Floats, *, step: float = 1e-5) -> Floats:
-    """How far given Phi, alpha, beta are from being the decomposition of `x' = f + g u, y = h`.
+    """Deviation of given Phi, alpha, beta from the decomposition of `x' = f + g u, y = h`.
 
     Central differences of Phi_i along f and the columns of g against `(z_2, …, alpha)` and `beta`, and
-    Phi_i1 against h_i. No derivative of the decomposition is trusted, so that this checks it.
+    Phi_i1 against h_i. The check uses no derivative of the decomposition itself.
 
     Parameters
     ----------
-    system
-        The decomposition.
     f, g, h
         The system over components; g has n rows of m entries.
     points : (k, n)
-        Where to look, inside the box of states.
+        Points inside the box of states.
     step
         Length of the differences, relative to the length of the direction.
 
     Returns
     -------
     Floats
-        (p,) largest absolute defect of every sensor; near `step^2` for a right decomposition.
+        (p,) largest absolute defect of every sensor; near `step^2` for a correct decomposition.
 
     References
     ----------
@@ -398,7 +370,7 @@ def _along(phi: Vector, points: Floats, direction: Floats, step: float) -> Float
 def linear(A: Floats, B: Floats, C: Floats, x_bound: Floats, *, tolerance: float = 1e-9) -> System:
     """Decomposition of `x' = A x + B u, y = C x`: for linear systems Assumption 2 always holds.
 
-    Phi_i is the observability matrix of (A, c_i) up to its rank n_i, and alpha_i follows from writing
+    Phi_i is the observability matrix of (A, c_i) up to its rank n_i, and alpha_i are the coefficients of
     `c_i A^{n_i}` in its rows.
 
     Parameters
@@ -408,7 +380,7 @@ def linear(A: Floats, B: Floats, C: Floats, x_bound: Floats, *, tolerance: float
     x_bound : (n,)
         Half-widths of the box of states.
     tolerance
-        Relative size of the part of a row outside the span of the rows before that counts as zero.
+        Largest relative part of a row outside the span of the rows before that counts as zero.
 
     Raises
     ------

@@ -39,23 +39,17 @@ class Interval(NDArrayOperatorsMixin):
         return f"Interval({self.lo!r}, {self.hi!r})"
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: object, **kwargs: object) -> Any:
-        """Dispatch of NumPy's functions; what is not covered is refused, never guessed."""
+        """Dispatch of NumPy's functions; unsupported functions are refused, never guessed."""
         rule = _RULES.get(ufunc)
         if rule is None or method != "__call__" or kwargs:
             return NotImplemented
-        # Domains end where bisection will split them: infinite bounds are legitimate answers.
+        # Infinite bounds at the ends of domains are legitimate results, since bisection splits there.
         with np.errstate(all="ignore"):
             return rule(*inputs)
 
 
 def interval(value: object) -> Interval:
-    """`value` as an interval; numbers and arrays become points.
-
-    Parameters
-    ----------
-    value : (…)
-        An Interval, a number or an array.
-    """
+    """`value` as an interval; numbers and arrays become points."""
     if isinstance(value, Interval):
         return value
     point = np.asarray(value, dtype=np.float64)
@@ -120,7 +114,7 @@ def _power(a: object, b: object) -> Interval:
         return _divide(1.0, _power(a, -k))
     if k % 2 == 0:
         p = _absolute(p)
-    # Integer powers are monotone on what is left, but NumPy's pow is only accurate to a few ulps.
+    # Integer powers are monotone on the remaining range, but NumPy's pow is only accurate to a few ulps.
     result = _outward(p.lo**k, p.hi**k)
     result = _outward(result.lo, result.hi)
     if k % 2 == 0:
@@ -137,7 +131,7 @@ def _rising(function: np.ufunc) -> Callable[[object], Interval]:
 
 
 def _wave(function: np.ufunc, peak: float) -> Callable[[object], Interval]:
-    """Sine or cosine, whose maximum 1 stands at `peak + 2 pi k`; turning points are found with a margin."""
+    """Sine or cosine with the maximum 1 at `peak + 2 pi k`; turning points are located with a margin."""
 
     def touches(p: Interval, at: float) -> Floats:
         slack = 1e-9 * (1.0 + np.maximum(np.abs(p.lo), np.abs(p.hi)))
@@ -147,7 +141,7 @@ def _wave(function: np.ufunc, peak: float) -> Callable[[object], Interval]:
     def rule(a: object) -> Interval:
         p = interval(a)
         ends = function(p.lo), function(p.hi)
-        # NaN ends (unbounded arguments) leave the whole range.
+        # NaN ends (unbounded arguments) give the whole range.
         out = _outward(np.nan_to_num(np.minimum(*ends), nan=-1.0), np.nan_to_num(np.maximum(*ends), nan=1.0))
         low = np.where(touches(p, peak + np.pi), -1.0, np.maximum(out.lo, -1.0))
         high = np.where(touches(p, peak), 1.0, np.minimum(out.hi, 1.0))
@@ -189,15 +183,15 @@ Boxed = Callable[[Sequence[Any]], Any]
 
 @dataclass(frozen=True, slots=True)
 class Bracket:
-    """A constant between two numbers.
+    """Bracket of a constant.
 
     Attributes
     ----------
     lower, upper
-        The constant lies in between; an end that is not known is infinite.
+        Ends of the bracket; an unknown end is infinite.
     method
-        How it was found: "interval bisection" is a proof (up to the correctness of the outward
-        rounding), "sampling" only shows that one side is not beaten by any point that was tried.
+        "interval bisection" is a proof (up to the correctness of the outward rounding); "sampling" shows only
+        that no tried point exceeds one side.
     """
 
     lower: float
@@ -208,10 +202,10 @@ class Bracket:
 def supremum(
     function: Boxed, lower: Floats, upper: Floats, *, gap: float = 1e-4, most: int = 200_000
 ) -> Bracket:
-    """Supremum of a function over a box, with proof.
+    """Proven supremum of a function over a box.
 
-    Boxes are evaluated all at once; those that cannot hold anything above the best value found at a
-    centre are dropped, and the rest halved along their longest side.
+    Boxes are evaluated all at once; those without values above the best value at a centre are dropped, and
+    the rest halved along their longest side.
 
     Parameters
     ----------
@@ -220,9 +214,9 @@ def supremum(
     lower, upper : (n,)
         The box.
     gap
-        Relative distance of `upper` and `lower` in the answer that is good enough.
+        Acceptable relative distance of `upper` and `lower`.
     most
-        Largest number of boxes at a time; beyond it the answer has a wider gap, but is still right.
+        Largest number of boxes at a time; beyond it the bracket is wider, but still valid.
 
     Returns
     -------
@@ -249,7 +243,7 @@ def supremum(
 
 
 def _at_corners(function: Boxed, lower: Floats, upper: Floats) -> float:
-    """Largest value at the corners of the box, where suprema of monotone functions stand."""
+    """Largest value at the corners of the box, the suprema of monotone functions."""
     n = len(lower)
     if n > _CORNERS:
         return -np.inf
@@ -258,7 +252,7 @@ def _at_corners(function: Boxed, lower: Floats, upper: Floats) -> float:
     return float(np.max(np.asarray(values, dtype=np.float64)))
 
 
-# Up to this many dimensions all corners are tried before the search starts.
+# Largest number of dimensions for which all corners are evaluated before the search.
 _CORNERS = 12
 
 

@@ -1,7 +1,7 @@
 """Left inverses of Phi_I: given in closed form and extended by saturation, or by the nearest point.
 
-A left inverse Psi^I maps every z_I to a state in the box, and Phi_I(x) back to x. How much a healthy
-set's residual `|z_I - Phi_I(Psi^I(z_I))|` can exceed the observers' error is its `factor`:
+A left inverse Psi^I maps every z_I to a state in the box, and Phi_I(x) back to x. Its `factor` bounds the
+ratio of the residual `|z_I - Phi_I(Psi^I(z_I))|` of a set without attack to the observers' error:
 
 - given: `1 + Lip^(Phi_I) Lip^(Psi^I)`, kim2018's bound on `Lip^(id - Phi_I Psi^I)`;
 - nearest point: `sqrt(N_I)`, because no state in the box, and so not the true one either, has a smaller
@@ -23,7 +23,7 @@ from gridsec.observers.high_gain.form import System, sat
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Inverse:
-    """A left inverse of Phi_I, defined everywhere.
+    """Left inverse of Phi_I, defined everywhere.
 
     Attributes
     ----------
@@ -59,8 +59,6 @@ def given(
 
     Parameters
     ----------
-    system
-        The system.
     sensors
         I, ascending.
     function
@@ -80,11 +78,11 @@ def given(
 
 
 def nearest(system: System, sensors: Sequence[int], *, accept: float = 0.0, iterations: int = 60) -> Inverse:
-    """Left inverse by least squares: the state of the box whose Phi_I is nearest to z_I.
+    """Left inverse by least squares: the state of the box with Phi_I nearest to z_I.
 
-    Damped Gauss-Newton (Levenberg-Marquardt) projected onto the box, from the centre; where that leaves
-    more than `accept`, also from the middles of the orthants (up to eight states), and the best answer
-    counts. The factor sqrt(N_I) rests on the minimum being global.
+    Damped Gauss-Newton (Levenberg-Marquardt) projected onto the box, from the centre; for residuals above
+    `accept` also from the middles of the orthants (up to eight states), with the best result. The factor
+    sqrt(N_I) presumes a global minimum.
 
     Parameters
     ----------
@@ -93,11 +91,8 @@ def nearest(system: System, sensors: Sequence[int], *, accept: float = 0.0, iter
     sensors
         I, ascending.
     accept
-        Residual (largest entry) that needs no second look. Any value up to the threshold it will be
-        compared to changes no decision: a set that passes with a local minimum would pass with the
-        global one.
-    iterations
-        Largest number of steps.
+        Residual (largest entry) without further starts. Values up to the threshold in use change no decision:
+        a set that passes with a local minimum would pass with the global one.
     """
     chosen = tuple(int(i) for i in sensors)
     bound = system.x_bound
@@ -129,7 +124,7 @@ def nearest(system: System, sensors: Sequence[int], *, accept: float = 0.0, iter
     return Inverse(chosen, function, float(np.sqrt(size)), "nearest")
 
 
-# Beyond this many states the orthants are too many to start from.
+# Largest number of states for starts from all orthants.
 _MANY = 8
 
 
@@ -144,7 +139,7 @@ def _descend(
     for _ in range(iterations):
         J = system.jacobian(x, sensors)
         slope = np.einsum("...ki,...k->...i", J, residual)
-        # At a face of the box only the coordinates that point inwards may move.
+        # At a face of the box only coordinates that point inwards may move.
         stuck = ((x >= bound) & (slope < 0.0)) | ((x <= -bound) & (slope > 0.0))
         J, slope = np.where(stuck[..., None, :], 0.0, J), np.where(stuck, 0.0, slope)
         normal = np.einsum("...ki,...kj->...ij", J, J)
@@ -164,7 +159,7 @@ def _descend(
     return x, residual
 
 
-# A step of this size, relative to the box, changes nothing that double precision can see.
+# Step, relative to the box, below the resolution of double precision.
 _SHORT = 1e-13
 
 
@@ -173,17 +168,15 @@ def check(system: System, inverse: Inverse, points: Floats, *, tolerance: float)
 
     Parameters
     ----------
-    system, inverse
-        What to compare.
     points : (k, n)
         States in the box.
     tolerance
-        What is still acceptable.
+        Largest acceptable error.
 
     Raises
     ------
     DesignInfeasible
-        If it is no left inverse.
+        If the error exceeds `tolerance`.
     """
     worst = float(np.max(np.abs(inverse(system.phi(points, inverse.sensors)) - points)))
     if not worst <= tolerance:
@@ -195,15 +188,7 @@ def check(system: System, inverse: Inverse, points: Floats, *, tolerance: float)
 
 
 def corners_and_interior(system: System, *, samples: int = 500, seed: int = 0) -> Floats:
-    """Points of the box of states for checks: random ones and (up to ten states) all corners.
-
-    Parameters
-    ----------
-    system
-        The system.
-    samples, seed
-        Random points.
-    """
+    """Points of the box of states for checks: random ones and (up to ten states) all corners."""
     inner = np.random.default_rng(seed).uniform(-system.x_bound, system.x_bound, (samples, system.n))
     if system.n > 10:
         return inner

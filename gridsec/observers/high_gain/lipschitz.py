@@ -22,8 +22,8 @@ Map = Callable[[Floats], Floats]
 def upper_proven(rows: Matrix, lower: Floats, upper: Floats, *, gap: float = 1e-4) -> Bracket:
     """`Lip^` of a map on a box: `sup_x max_r sum_c |J_rc(x)|`.
 
-    A box is convex, so that the mean value theorem along the segment gives "at most", and a segment
-    along the signs of the worst row "at least".
+    A box is convex: the mean value theorem along the segment gives "at most", and a segment along the signs
+    of the worst row "at least".
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ def upper_proven(rows: Matrix, lower: Floats, upper: Floats, *, gap: float = 1e-
     lower, upper : (n,)
         The box.
     gap
-        Relative width of the answer that is good enough.
+        Acceptable relative width of the bracket.
 
     References
     ----------
@@ -56,9 +56,9 @@ def _row_sum(rows: Matrix, r: int) -> Scalar:
 def upper_sampled(
     function: Map, lower: Floats, upper: Floats, *, samples: int = 20_000, seed: int = 0
 ) -> Bracket:
-    """What pairs of points show of `Lip^`: a number that it is not below. Never a proof from above.
+    """Lower bound of `Lip^` from pairs of points; never a proof from above.
 
-    Half of the pairs are far apart, half close together (where the steepest slopes of smooth maps are).
+    Half of the pairs are far apart, half close together, near the steepest slopes of smooth maps.
 
     Parameters
     ----------
@@ -76,13 +76,7 @@ def upper_sampled(
 def lower_sampled(
     function: Map, lower: Floats, upper: Floats, *, samples: int = 20_000, seed: int = 0
 ) -> Bracket:
-    """What pairs of points show of `Lip_`: a number that it is not above. Never a proof from below.
-
-    Parameters
-    ----------
-    function, lower, upper, samples, seed
-        As in `upper_sampled`.
-    """
+    """Upper bound of `Lip_` from pairs of points, as in `upper_sampled`; never a proof from below."""
     quotient = _quotients(function, lower, upper, samples, seed)
     return Bracket(0.0, float(np.min(quotient)), "sampling")
 
@@ -108,8 +102,7 @@ def lower_from_inverse(inverse: Bracket) -> Bracket:
     Parameters
     ----------
     inverse
-        Bracket of Lip^(psi) on a convex set that holds the image, or on a set where psi is defined
-        globally.
+        Bracket of Lip^(psi) on a convex set that contains the image, or on a set with a global psi.
     """
     return Bracket(1.0 / inverse.upper, np.inf, inverse.method)
 
@@ -117,9 +110,9 @@ def lower_from_inverse(inverse: Bracket) -> Bracket:
 def lower_proven(rows: Matrix, lower: Floats, upper: Floats) -> Bracket:
     """`Lip_` on a box from the interval matrix [J] of the Jacobian.
 
-    For any two points `phi(x) - phi(x') = M (x - x')` with a mean Jacobian M in [J]. With a left
-    inverse B of the middle of [J], `|B| |M d| >= |B M d| >= (1 - r) |d|` where r bounds |B M - I|. Useful
-    where the map is not too bent; otherwise the answer is 0, which is right but says nothing.
+    For any two points `phi(x) - phi(x') = M (x - x')` with a mean Jacobian M in [J]. With a left inverse B of
+    the middle of [J], `|B| |M d| >= |B M d| >= (1 - r) |d|` where r bounds |B M - I|. Useful for moderate
+    curvature; otherwise the bound is 0, which is valid but empty.
 
     Parameters
     ----------
@@ -138,20 +131,20 @@ def lower_proven(rows: Matrix, lower: Floats, upper: Floats) -> Bracket:
     left = 1.0 - float(np.max(np.sum(off, axis=1)))
     if left <= 0.0:
         return Bracket(0.0, np.inf, "interval")
-    # A part in 1e12 for the rounding of this last, well-conditioned step.
+    # Allowance of 1e-12 for the rounding of this well-conditioned step.
     return Bracket(left / float(np.max(np.sum(np.abs(B), axis=1))) * (1.0 - 1e-12), np.inf, "interval")
 
 
 def extend(points: Floats, values: Floats, constants: Floats) -> Map:
-    """Lipschitz extension of a function that is known at points, `min_y f(y) + L |z - y|`.
+    """Lipschitz extension of a function from its values at points, `min_y f(y) + L |z - y|`.
 
-    Every component keeps its constant on the whole space, in the largest-entry norm, and the given
-    values wherever they obey it. (McShane's formula; the papers call it Kirszbraun's.)
+    Every component keeps its constant on the whole space, in the largest-entry norm, and the given values
+    that satisfy it (McShane's formula; in the papers Kirszbraun's).
 
     Parameters
     ----------
     points : (k, N)
-        Where the function is known.
+        Points with known values.
     values : (k, n)
         Its values.
     constants : (n,)
@@ -178,7 +171,7 @@ def kappa_detect(factor: float, lowest: float) -> float:
     factor
         Lip^(id - Phi Psi), or the largest one over the sets for kappa^{n,c}.
     lowest
-        Smallest Lip_(Phi_J) over the sets J that can be free of attacks; 0: nothing is bounded.
+        Smallest Lip_(Phi_J) over the sets J that can be free of attacks; 0 gives no bound.
 
     References
     ----------
@@ -195,7 +188,7 @@ def kappa_error(factor: float, lowest: float, steepest: float) -> float:
     factor, lowest
         As in `kappa_detect`.
     steepest
-        Lip^(Phi) of the set that was tested.
+        Lip^(Phi) of the tested set.
 
     References
     ----------

@@ -1,7 +1,7 @@
 """Partial high-gain observers, detection with a time-varying threshold, and the switching search.
 
-Each sensor has an observer of its own, so that an attack stays where it is. A set of p - q sensors is
-trusted as long as its left inverse explains all its estimates; the search goes on only when it does not.
+Each sensor has an observer of its own, so that an attack affects only one. A set of p - q sensors is
+trusted while its left inverse explains all its estimates; the search continues only if it does not.
 
 References
 ----------
@@ -38,7 +38,7 @@ _DECAYS = {"componentwise": decay_componentwise, "kim2018": decay_kim, "lee2018"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HighGainDesign:
-    """Everything that is computed once. p sensors, s sets of p - q sensors.
+    """Design of the observers. p sensors, s sets of p - q sensors.
 
     Attributes
     ----------
@@ -47,31 +47,31 @@ class HighGainDesign:
     inverses
         Psi of the sets Lambda(1), …, Lambda(s), in the order of the search.
     whole
-        Psi of all sensors, for the test of Corollary 1; None: no such test, and no CLEAN unless `lowest`
-        is known.
+        Psi of all sensors, for the test of Corollary 1; without it there is no such test, and no CLEAN unless
+        `lowest` is known.
     theta : (p,)
         High-gain parameters, 1/s.
     decays
         Constants of every sensor's observer.
     margins : (p,)
-        Margin of every sensor's Lyapunov inequality; positive: Lemma 1 holds at this theta.
+        Margin of every sensor's Lyapunov inequality; Lemma 1 holds at this theta if positive.
     proven
-        Whether the margins rest on proven ranges of derivatives only.
+        True if the margins use proven ranges of derivatives only.
     limit : (p,)
         Size of an estimate at which it is reset (7).
     lowest
-        Lower bound on Lip_(Phi_J) over all sets of p - 2q sensors; NaN: unknown, and so is the bound.
+        Lower bound on Lip_(Phi_J) over all sets of p - 2q sensors; NaN if unknown, and so is the error bound.
     steep : (p,)
         Upper bounds on Lip^(Phi_i).
     search
-        "all": sets are tried at once until one passes. "one": one change of set per step, as a
-        controller with little time does it (the papers' simulations).
+        "all": sets are tried at once until one passes. "one": one change of set per step, for limited
+        computing time (the papers' simulations).
     K : (p, n_max)
         Gains.
     field, move
         Right-hand side, and matrices for the nominal step.
     substeps
-        Parts that a step is divided into.
+        Number of substeps of a step.
     """
 
     system: System
@@ -93,20 +93,20 @@ class HighGainDesign:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HighGainState:
-    """Where the observers stand.
+    """State of the observers.
 
     Attributes
     ----------
     t
         Time, s.
     z : (p, n_max)
-        Estimates; zero where a sensor has no such entry or is silent.
+        Estimates; zero where a sensor has no such entry or is unavailable.
     y : (p,)
-        Readings at t; NaN where silent.
+        Readings at t; NaN where unavailable.
     u : (m,)
         Input at t.
     age : (p,)
-        Time for which each observer has had readings without a gap, s.
+        Time of each observer with readings without a gap, s.
     sigma
         Place of the set in use, from 0.
     """
@@ -137,19 +137,17 @@ def design(
     substeps: int = 1,
     tolerance: float = 1e-6,
 ) -> HighGainDesign:
-    """Design observers, thresholds and search, and check what they rest on.
+    """Design observers, thresholds and search, and verify their conditions.
 
     Parameters
     ----------
-    system
-        The system and its decomposition.
     inverses
-        A left inverse for each set of p - q sensors, in the order of the search. None: the nearest
+        A left inverse for each set of p - q sensors, in the order of the search. By default the nearest
         points, for these sets and for `whole`.
     theta
         High-gain parameters, 1/s, at least 1; scalar or (p,).
     noise
-        M_v: largest measurement error of honest sensors, interpolation included; scalar or (p,).
+        M_v: largest measurement error of unmanipulated sensors, interpolation included; scalar or (p,).
     max_attacked
         q.
     u_low, u_high
@@ -159,16 +157,16 @@ def design(
     whole
         Left inverse of all sensors for the test of Corollary 1.
     decay
-        Which derivation of eta, epsilon and rate; or these constants, one for each sensor.
+        Derivation of eta, epsilon and rate; or these constants, one for each sensor.
     lowest
-        Lower bound on Lip_(Phi_J) for every set J of p - 2q sensors, at least 0; NaN: unknown. At 0 or
-        without it no bound of the estimate's error is known.
+        Lower bound on Lip_(Phi_J) for every set J of p - 2q sensors, at least 0; NaN if unknown. At 0 or NaN
+        the estimate has no error bound.
     search
         See `HighGainDesign`.
     reset
-        Whether the reset rule (7) applies; lee2018 has none. What is not finite is reset anyway.
+        Apply the reset rule (7); lee2018 has none. Estimates that are not finite are reset anyway.
     substeps
-        Parts that a step is divided into, for accuracy.
+        Number of substeps of a step, for accuracy.
     tolerance
         Largest error of a left inverse at its check points.
 
@@ -177,9 +175,9 @@ def design(
     NotObservable
         If p <= 2q, or the sets are not all sets of p - q sensors.
     DesignInfeasible
-        If theta is too small for Lemma 1, or a left inverse is none.
+        If theta is too small for Lemma 1, or a left inverse fails its check.
     ValueError
-        If `noise` or `lowest` is negative, or there is no such `decay` or `search`.
+        If `noise` or `lowest` is negative, or `decay` or `search` is unknown.
     """
     p, m = len(system.partials), system.partials[0].inputs
     if not p > 2 * max_attacked >= 0:
@@ -241,11 +239,11 @@ def _inverses(
     decays: tuple[Decay, ...],
     max_attacked: int,
 ) -> tuple[tuple[Inverse, ...], Inverse | None]:
-    """Left inverses of all sets of p - q sensors, and of all sensors: those given, or the nearest points."""
+    """Left inverses of all sets of p - q sensors and of all sensors: the given ones, or nearest points."""
     p = len(system.partials)
     wanted = groups(p, max_attacked)
     if given is None:
-        # Below every threshold that it will be compared to, so that it only saves time.
+        # Below every threshold in use, so that it affects time only.
         accept = min(one.epsilon for one in decays)
         whole = nearest(system, range(p), accept=accept) if whole is None else whole
         return tuple(nearest(system, group, accept=accept) for group in wanted), whole
@@ -300,21 +298,18 @@ def init(
     u: Floats | None = None,
     z: Floats | None = None,
 ) -> HighGainState:
-    """Start all observers.
+    """Initial state of all observers.
 
     Parameters
     ----------
-    design
-        The design.
     t
         Time, s.
     y : (p,)
-        Readings at t, NaN where there is none; without them every observer starts with its first
-        reading.
+        Readings at t, NaN where missing; without them every observer starts with its first reading.
     u : (m,)
         Input at t; zero by default.
     z : (p, n_max)
-        Where the estimates of the sensors with a reading start, at most M_z in size; zero by default.
+        Initial estimates of the sensors with a reading, at most M_z in size; zero by default.
     """
     system = design.system
     p, m = len(system.partials), system.partials[0].inputs
@@ -332,20 +327,16 @@ def init(
 def step(  # noqa: PLR0917  # the border that all observer families share
     design: HighGainDesign, state: HighGainState, y: Floats, u: Floats, seen: Bools, h: float
 ) -> tuple[HighGainState, Outcome]:
-    """Advance all observers to the next readings, and judge.
+    """Advance all observers to the next readings, and decide.
 
     Parameters
     ----------
-    design
-        The design.
-    state
-        Where the observers stand.
     y : (p,)
         Readings at `t + h`; ignored where unseen or not finite.
     u : (m,)
         Input at `t + h`; finite.
     seen : (p,)
-        Which readings exist. An unseen sensor leaves the game, and comes back as a new observer.
+        True for existing readings. An unseen sensor drops out, and returns with a new observer.
     h
         Length of the step, s.
 
@@ -361,7 +352,7 @@ def step(  # noqa: PLR0917  # the border that all observer families share
     live = np.asarray(seen, dtype=np.bool_) & np.isfinite(y)
     going = live & np.isfinite(state.y)
     now = np.atleast_1d(np.asarray(u, dtype=np.float64))
-    # An attack may be as large as it likes: whatever overflows is reset below.
+    # Attacks may have any size: overflowing estimates are reset below.
     with np.errstate(all="ignore"):
         z = _advance(design, state, np.where(going, y, 0.0), now, going=going, h=h)
         large = ~(np.max(np.abs(z), axis=1) <= design.limit) & going
@@ -390,14 +381,12 @@ def _advance(
 
 
 def error_bounds(design: HighGainDesign, age: Floats) -> Floats:
-    """Bound on every honest observer's error, (p,): `max(2 M_z eta e^{-rate age}, epsilon)`.
+    """Bound on the error of every observer without attack: `max(2 M_z eta e^{-rate age}, epsilon)`, (p,).
 
     Parameters
     ----------
-    design
-        The design.
     age : (p,)
-        Time for which each observer has had readings, s.
+        Time of each observer with readings, s.
 
     References
     ----------
@@ -429,7 +418,7 @@ def _test(design: HighGainDesign, inverse: Inverse, z: Floats, delta: Floats) ->
     return _Trial(x, residual, reach, inverse.factor * reach)
 
 
-def _judge(  # noqa: PLR0917  # one place that sees the whole state
+def _judge(  # noqa: PLR0917  # the whole state
     design: HighGainDesign, state: HighGainState, z: Floats, age: Floats, live: Bools, large: Bools, t: float
 ) -> tuple[int, Outcome]:
     delta = error_bounds(design, age)
@@ -438,7 +427,7 @@ def _judge(  # noqa: PLR0917  # one place that sees the whole state
     trusted[list(design.inverses[sigma].sensors)] = True
     nothing = np.full(design.system.n, np.nan)
     passed = trial is not None and trial.passed
-    # Lemma 1: an honest observer never reaches its limit.
+    # Lemma 1: an observer without attack never reaches its limit.
     bound, named, tested = np.inf, large.copy(), trusted
     if trial is not None and passed:
         bound = kappa_detect(design.inverses[sigma].factor, design.lowest) * trial.delta
@@ -479,10 +468,10 @@ def _rest(design: HighGainDesign) -> Floats:
     return np.array([decay.epsilon for decay in design.decays])
 
 
-def _search(  # noqa: PLR0917  # what a test needs, and where to begin
+def _search(  # noqa: PLR0917  # the inputs of a test, and the first set
     design: HighGainDesign, sigma: int, z: Floats, delta: Floats, live: Bools, large: Bools
 ) -> tuple[int, tuple[int, ...], _Trial | None, bool]:
-    """The update rule (20): on to the next set whenever the present one fails or is incomplete."""
+    """Update rule (20): next set whenever the present one fails or is incomplete."""
     visited, alarm, count = [sigma], False, len(design.inverses)
     changes = count - 1 if design.search == "all" else 1
     trial = _try(design, sigma, z, delta, live, large)
@@ -495,7 +484,7 @@ def _search(  # noqa: PLR0917  # what a test needs, and where to begin
     return sigma, tuple(visited), trial, alarm
 
 
-def _try(  # noqa: PLR0917  # what a test needs
+def _try(  # noqa: PLR0917  # the inputs of a test
     design: HighGainDesign, sigma: int, z: Floats, delta: Floats, live: Bools, large: Bools
 ) -> _Trial | None:
     inverse = design.inverses[sigma]
@@ -503,15 +492,15 @@ def _try(  # noqa: PLR0917  # what a test needs
     if not live[members].all():
         return None
     trial = _test(design, inverse, z, delta)
-    # A sensor that has just been reset is attacked, whatever its new estimate looks like.
+    # A sensor that has just been reset is attacked, for any new estimate.
     return replace(trial, residual=np.inf) if large[members].any() else trial
 
 
 def _unhealthy(design: HighGainDesign, z: Floats, x: Floats, delta: Floats, bound: float) -> Bools:
-    """Sensors that cannot be healthy: `|zhat_i - Phi_i(xhat)| > delta_i + Lip^(Phi_i) bound`."""
+    """Sensors that cannot be unmanipulated: `|zhat_i - Phi_i(xhat)| > delta_i + Lip^(Phi_i) bound`."""
     if not np.isfinite(bound):
         return np.zeros(len(delta), dtype=np.bool_)
     off = np.zeros(z.shape)
     off[design.system.mask] = z[design.system.mask] - design.system.phi(x)
-    with np.errstate(invalid="ignore"):  # a bound that is infinite, of a sensor that is constant
+    with np.errstate(invalid="ignore"):  # an infinite bound times the zero constant of a constant sensor
         return np.asarray(np.max(np.abs(off), axis=1) > delta + design.steep * bound)

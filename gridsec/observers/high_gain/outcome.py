@@ -1,4 +1,4 @@
-"""What the high-gain estimator answers at one instant.
+"""Result of the high-gain estimator at one instant.
 
 References
 ----------
@@ -18,30 +18,30 @@ Search = Literal["all", "one"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Outcome:
-    """Answer at one instant.
+    """Result at one instant.
 
     Attributes
     ----------
     t
         Time, s.
     x : (n,)
-        Estimate of the state; NaN where no set is complete.
+        Estimate of the state; NaN if no set is complete.
     bound
-        Bound on its largest error while at most q sensors are attacked; NaN if the design has no
-        `lowest`, infinite when no set passed.
+        Bound on its largest error while at most q sensors are attacked; NaN if the design has no `lowest`,
+        infinite if no set passed.
     sigma
-        Place of the set it rests on, from 0.
+        Index of the set in use, from 0.
     visited
-        The sets that were tried, in order; the last is `sigma`.
+        The tested sets, in order; the last is `sigma`.
     trusted : (p,)
         The sensors of that set.
     residual, threshold
-        Of that set; NaN where it was not tested.
+        Of that set; NaN if not tested.
     decision, cause, reason
-        As everywhere in this project: UNDECIDED is an answer of its own.
+        As in `gridsec.online`; UNDECIDED is an answer of its own.
     suspects : (p,)
-        Sensors that are named. If `bound` is known: those that cannot be healthy; otherwise, after an
-        alarm, those outside the trusted set.
+        Sensors named as manipulated. With a known `bound`: those that cannot be unmanipulated; otherwise,
+        after an alarm, those outside the trusted set.
     reset : (p,)
         Observers that were reset in this step.
     """
@@ -71,7 +71,7 @@ def verdict(
     untested: int,
     search: Search,
 ) -> tuple[Decision, Cause, str]:
-    """Decision, its cause, and one sentence.
+    """Decision, cause, and one sentence.
 
     Parameters
     ----------
@@ -80,13 +80,13 @@ def verdict(
     needed
         Number of sensors of a set.
     passed
-        Whether the last set passed its test; None: it was not complete, and not tested.
+        True if the last set passed its test; None if it was not complete, and not tested.
     alarm
-        Whether some test failed or some sensor is named.
+        True if a test failed or a sensor is named.
     settled
-        Whether the bounds of all observers that are heard have come to rest.
+        True if the bounds of all observers with readings have settled.
     untested
-        Number of sensors with a reading that no test has looked at.
+        Number of sensors with a reading but without a test.
     search
         As in the design: with "one", other sets may still pass later.
     """

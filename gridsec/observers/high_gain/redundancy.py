@@ -1,4 +1,4 @@
-"""Redundant observability of nonlinear systems: whether every group of sensors still sees the state.
+"""Redundant observability of nonlinear systems: observability by every group of sensors.
 
 A coding function Phi = (Phi_1, …, Phi_p) is *q-error detectable* if no two states differ in at most q
 blocks, *infinitesimally* so if the same holds for its Jacobians, *strongly* so if both; *correctable* is
@@ -28,9 +28,9 @@ def block_distance(codes: Floats, mask: Bools | None = None, *, tolerance: float
     codes : (k, p, n)
         k codes of p blocks.
     mask : (p, n)
-        Which entries count; by default all.
+        Entries that count; by default all.
     tolerance
-        Largest difference that counts as none.
+        Largest difference that counts as zero.
 
     Returns
     -------
@@ -48,16 +48,16 @@ def block_distance(codes: Floats, mask: Bools | None = None, *, tolerance: float
 
 
 def detectable(codes: Floats, errors: int, *, tolerance: float = 0.0) -> bool:
-    """Whether no two of finitely many codes differ in at most `errors` blocks.
+    """True if any two of finitely many codes differ in more than `errors` blocks.
 
     Parameters
     ----------
     codes : (k, p, n)
         Codes of different states.
     errors
-        q, number of blocks that may be wrong.
+        q, largest number of wrong blocks.
     tolerance
-        Largest difference that counts as none.
+        Largest difference that counts as zero.
 
     References
     ----------
@@ -68,12 +68,7 @@ def detectable(codes: Floats, errors: int, *, tolerance: float = 0.0) -> bool:
 
 
 def correctable(codes: Floats, errors: int, *, tolerance: float = 0.0) -> bool:
-    """Whether `errors` wrong blocks can always be put right: detectable for twice as many.
-
-    Parameters
-    ----------
-    codes, errors, tolerance
-        As in `detectable`.
+    """True if `errors` wrong blocks are always correctable: detectable for twice as many.
 
     References
     ----------
@@ -84,7 +79,7 @@ def correctable(codes: Floats, errors: int, *, tolerance: float = 0.0) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Redundancy:
-    """What k missing sensors leave, at the points that were tried.
+    """Redundancy without k sensors, at the sampled points.
 
     Attributes
     ----------
@@ -93,9 +88,9 @@ class Redundancy:
     weakest
         The group of p - k sensors with the smallest `singular`.
     singular
-        Smallest singular value of the Jacobian of any group at any point: zero means no immersion.
+        Smallest singular value of the Jacobian of any group at any point; zero for no immersion.
     injective
-        Smallest `|Phi_I(x) - Phi_I(x')| / |x - x'|` of any group and any pair: zero means not injective.
+        Smallest `|Phi_I(x) - Phi_I(x')| / |x - x'|` of any group and any pair; zero if not injective.
     """
 
     missing: int
@@ -105,15 +100,13 @@ class Redundancy:
 
 
 def redundancy(system: System, missing: int, *, samples: int = 2000, seed: int = 0) -> Redundancy:
-    """k-redundant observability, looked for a counterexample by sampling.
+    """Search for counterexamples of k-redundant observability by sampling.
 
-    A value of zero disproves it; positive values are evidence, and become a proof where
-    `lipschitz.lower_proven` or a left inverse gives a bound for each group.
+    A value of zero disproves it. Positive values are evidence, and a proof with a bound of
+    `lipschitz.lower_proven` or a left inverse for each group.
 
     Parameters
     ----------
-    system
-        The system.
     missing
         k.
     samples, seed
@@ -152,14 +145,7 @@ def redundancy(system: System, missing: int, *, samples: int = 2000, seed: int =
 
 
 def groups(sensors: int, attacked: int) -> list[tuple[int, ...]]:
-    """All sets of p - q sensors, in the order of the papers' tables: the first leaves out sensor 0.
-
-    Parameters
-    ----------
-    sensors
-        p.
-    attacked
-        q.
+    """All sets of p - q sensors in the order of the papers' tables: the first leaves out sensor 0.
 
     References
     ----------

@@ -1,11 +1,11 @@
 """Uniform observability decomposition of systems written in sympy.
 
-The only module that imports sympy, and only when it is called: sympy is optional.
+The only module that imports sympy, and only when called: sympy is optional.
 
-Lie derivatives are exact. The order n_i is the number of Lie derivatives whose differentials are
-independent; alpha_i and beta_ij are found by matching a polynomial in z_i against the exact expression,
-and accepted only if the difference vanishes. Where no polynomial of the given degree matches,
-`alpha_i` is evaluated at any state with the right z_i, which is what makes it a function of z_i.
+Lie derivatives are exact. The order n_i is the number of Lie derivatives with independent differentials;
+alpha_i and beta_ij are found by matching a polynomial in z_i against the exact expression, and accepted only
+if the difference vanishes. If no polynomial of the given degree matches, `alpha_i` is evaluated at any state
+with the given z_i, which makes it a function of z_i.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def _sympy() -> Any:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorForm:
-    """What sympy found for one sensor.
+    """Symbolic decomposition for one sensor.
 
     Attributes
     ----------
@@ -56,8 +56,8 @@ class SensorForm:
     alpha, beta
         `L_f^{n_i} h`, and for each row j the m expressions `L_g L_f^{j-1} h`, in x.
     polynomials
-        For alpha and each entry of beta (in this order, row by row) the polynomial in z_i that it
-        equals, or None where none of the degree tried does.
+        For alpha and each entry of beta (in this order, row by row) the equal polynomial in z_i, or None if
+        there is none of the given degree.
     """
 
     phi: tuple[Expression, ...]
@@ -93,14 +93,7 @@ class Symbolic:
 def lie(expression: Expression, field: Sequence[Expression], x: Sequence[Expression]) -> Expression:
     """Lie derivative `sum_k d(expression)/dx_k field_k`, simplified.
 
-    Parameters
-    ----------
-    expression
-        A function of x.
-    field
-        n expressions.
-    x
-        n symbols.
+    The field has n expressions for the n symbols x.
 
     References
     ----------
@@ -138,7 +131,7 @@ def decompose(
     x_bound
         Half-widths of the box of states; scalar or (n,).
     degree
-        Largest degree of the polynomials that are tried for alpha and beta.
+        Largest degree of the polynomials for alpha and beta.
     samples, seed
         Random points for ranks and for matching.
     tolerance
@@ -148,7 +141,7 @@ def decompose(
     ------
     NotObservable
         If a sensor has no uniformly observable part: the rank changes over the box, or beta_ij depends
-        on more than z_1 … z_j, so that some inputs hide what others show.
+        on more than z_1 … z_j, so that observability depends on the input.
     ImportError
         If sympy is missing.
 
@@ -190,7 +183,7 @@ def decompose(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Probe:
-    """Where ranks are looked at, and what counts as zero there."""
+    """Points for ranks, and the tolerance there."""
 
     x: tuple[Expression, ...]
     points: Floats
@@ -207,7 +200,7 @@ class _Probe:
 
 
 def _chain(i: int, output: Expression, drift: list[Expression], probe: _Probe) -> list[Expression]:
-    """`h, L_f h, …` up to and including the first whose differential adds nothing to the rank."""
+    """`h, L_f h, …` up to and including the first with a dependent differential."""
     chain = [output]
     while True:
         ranks = probe.ranks(chain)
@@ -239,7 +232,7 @@ def _check_triangular(
             if np.any(probe.ranks([*phi[: j + 1], entry]) > j + 1):
                 why = (
                     f"sensor {i} is not uniformly observable: row {j + 1} of beta depends on more than the "
-                    f"first {j + 1} entries of z, so that some inputs hide what others show"
+                    f"first {j + 1} entries of z, so that its observability depends on the input"
                 )
                 raise NotObservable((i,), len(phi), why, code="not-uniform")
 
@@ -247,7 +240,7 @@ def _check_triangular(
 def _match(
     target: Expression, phi: Sequence[Expression], probe: _Probe, degree: int, *, pad: int | None = None
 ) -> Polynomial | None:
-    """The polynomial P with `target = P(phi)`, exactly; None if there is none of this degree."""
+    """The polynomial P with exactly `target = P(phi)`; None if there is none of this degree."""
     sympy = _sympy()
     n = len(phi)
     powers = [
@@ -287,7 +280,7 @@ def _partial(form: SensorForm, x: tuple[Expression, ...], bound: Floats) -> Part
 
 
 def _section(phi: Vector, jacobian: Matrix, bound: Floats) -> Callable[[Floats], Floats]:
-    """From z (k, n_i) to a state (k, n) of the box that has this z, or nearly so outside the image."""
+    """Map z (k, n_i) to a state (k, n) of the box with this z, or nearly so outside the image."""
 
     def state(z: Floats) -> Floats:
         x = np.zeros((len(z), len(bound)))
@@ -300,7 +293,7 @@ def _section(phi: Vector, jacobian: Matrix, bound: Floats) -> Callable[[Floats],
 
 
 def _through(target: Expression, x: tuple[Expression, ...], section: Callable[[Floats], Floats]) -> Scalar:
-    """`target` at a state that has this z: a function of z exactly where `target` is one."""
+    """`target` at a state with this z: a function of z exactly if `target` is one."""
     value = _vector([target], x)
 
     def function(z: Sequence[Any]) -> Any:

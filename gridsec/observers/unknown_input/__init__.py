@@ -1,4 +1,4 @@
-"""Unknown-input observers for Lipschitz nonlinearities: many at once, in stacked arrays.
+"""Unknown-input observers for Lipschitz nonlinearities, batched in stacked arrays.
 
 References
 ----------

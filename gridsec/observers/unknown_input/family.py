@@ -1,12 +1,12 @@
-"""A family of unknown-input observers of one plant: designed with proofs, stepped together.
+"""Family of unknown-input observers of one plant: designed with proofs, stepped together.
 
-Observer i trusts the sensors J_s and believes nothing about the inputs J_u:
+Observer i trusts the sensors J_s and uses no knowledge of the inputs J_u:
 
     x_hat+ = Gbar (A x_hat + G phi(H x_hat + F u) + B u) + K (y - C x_hat - D u)_J + b H (y+ - D u+)_J
 
-Besides its estimate every observer carries two bounds of its error that hold as long as J_u contains all
+Besides its estimate every observer has two bounds of its error that hold while J_u contains all
 attacked inputs and J_s no attacked sensor: `level`, of `sqrt(e^T P e)` by the design's certificate, and
-`box`, entry by entry, by comparison with a non-negative system. Each is used where it is the smaller.
+`box`, entry by entry, by comparison with a non-negative system. The smaller one is used.
 
 References
 ----------
@@ -39,12 +39,10 @@ class UnknownInputDesign:
 
     Attributes
     ----------
-    plant
-        What they observe.
     pairs
         (J_u, J_s) of each observer.
     missing
-        What was asked for and does not exist or was not found.
+        Requested observers that do not exist or were not found.
     sensors : (c, p)
         J_s as masks.
     blind : (c, n, n)
@@ -79,7 +77,7 @@ class UnknownInputDesign:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UnknownInputState:
-    """Where the observers stand. c observers, n states, p sensors, l inputs.
+    """State of the observers. c observers, n states, p sensors, l inputs.
 
     Attributes
     ----------
@@ -92,7 +90,7 @@ class UnknownInputState:
     y, u, seen : (p,), (l,), (p,) or None
         The last readings; None before the first ones.
     live : (c,)
-        Whether an observer had all its readings in the last step.
+        True if the observer had all its readings in the last step.
     """
 
     t: float
@@ -114,37 +112,31 @@ def design(
     tolerance: float = 1e-9,
     rounding: float = 1e-9,
 ) -> UnknownInputDesign:
-    """Design the observers of many pairs; those that do not exist are reported, not invented.
+    """Design the observers of several pairs; impossible ones are reported in `missing`.
 
     Parameters
     ----------
-    plant
-        What is observed.
     pairs
         (J_u, J_s) of each observer, indices from 0.
     rates
-        Contractions per step that are tried, ascending; the first one for which there is a gain is taken.
+        Contractions per step to try, ascending; the first one with a gain is used.
     multiplier
-        "diagonal" uses that every nonlinearity has a slope of its own, "scalar" only the Lipschitz
-        constant of all together, as (34) does. The latter needs equal half-widths and `H = I`.
+        "diagonal" uses a slope for every nonlinearity, "scalar" only the common Lipschitz constant, as (34)
+        does. The latter needs equal half-widths and `H = I`.
     tolerance
         For the conditions of existence, see `obstruction`.
     rounding
-        Added to the bound of every entry at every step, in the unit of x: what floating point and the
-        solver's last digits may do.
+        Added to the bound of every entry at every step, in the unit of x: allowance for floating point and
+        the solver's accuracy.
 
     Raises
     ------
     DesignInfeasible
         If none of the observers exists.
     ValueError
-        If no rate is given, or there is no such multiplier.
+        If `rates` is empty, or `multiplier` is unknown.
     """
-    refuse(
-        []
-        if len(rates)
-        else [Problem("missing", "rates are empty; at least one contraction has to be tried")]
-    )
+    refuse([] if len(rates) else [Problem("missing", "rates are empty; at least one contraction is needed")])
     templates: dict[tuple[int, int], UnknownInputTemplate] = {}
     made: list[tuple[Pair, ErrorSystem, UnknownInputGains]] = []
     missing: list[Missing] = []
@@ -237,18 +229,16 @@ def _stack(
 def init(
     design: UnknownInputDesign, t: float, x: Floats | None = None, radius: Floats | None = None
 ) -> UnknownInputState:
-    """Start all observers at the same estimate.
+    """Initial state of all observers, at the same estimate.
 
     Parameters
     ----------
-    design
-        The observers.
     t
         Time, s.
     x : (n,)
-        Where they start; by default at zero.
+        Initial estimate; zero by default.
     radius : (n,)
-        How far the truth may be from it, entry by entry; by default |x| plus the plant's span.
+        Bound of its error, entry by entry; by default |x| plus the plant's span.
     """
     count, n = len(design.pairs), len(design.plant.span)
     start = np.zeros(n) if x is None else np.asarray(x, dtype=np.float64)
@@ -267,7 +257,7 @@ def init(
 
 
 def _levels(design: UnknownInputDesign, box: Floats) -> Floats:
-    """Largest `sqrt(e^T P e)` in each box, from above; (c,)."""
+    """Upper bound of `sqrt(e^T P e)` in each box; (c,)."""
     out = np.empty(len(box))
     for i, (gains, half) in enumerate(zip(design.gains, box, strict=True)):
         out[i] = np.sqrt(half @ np.abs(gains.P) @ half) if np.all(np.isfinite(half)) else np.inf
@@ -277,20 +267,18 @@ def _levels(design: UnknownInputDesign, box: Floats) -> Floats:
 def step(
     design: UnknownInputDesign, state: UnknownInputState, y: Floats, u: Floats, seen: Bools
 ) -> UnknownInputState:
-    """Take in the readings of one more tick. The first ones are only kept: an observer needs two.
+    """Process the readings of one tick. The first ones are only stored: an observer needs two.
 
     Parameters
     ----------
-    design, state
-        The observers and where they stand.
     y : (p,)
-        Readings at this tick; anything where unseen.
+        Readings at this tick; arbitrary where unseen.
     u : (l,)
-        Known input that holds from this tick on, and of this tick's readings; finite.
+        Known input from this tick on, and of this tick's readings; finite.
     seen : (p,)
-        Which readings exist. Unseen ones have exactly no influence; an observer that misses one of its
-        sensors, now or at the last tick, runs on the model with all attacks at zero, and knows nothing
-        about its error but the plant's span.
+        True for existing readings. Unseen ones have no influence. An observer without a reading of one of its
+        sensors, now or at the last tick, runs on the model with all attacks at zero; its error bound is then
+        the plant's span.
 
     Returns
     -------
@@ -333,12 +321,10 @@ def _grown(design: UnknownInputDesign, box: Floats) -> Floats:
 
 
 def outputs(design: UnknownInputDesign, state: UnknownInputState, u: Floats) -> Floats:
-    """What every sensor should read according to every observer, `C x_hat + D u`; (c, p).
+    """Expected reading of every sensor by every observer, `C x_hat + D u`; (c, p).
 
     Parameters
     ----------
-    design, state
-        The observers and where they stand.
     u : (l,)
         Known input of the tick.
     """

@@ -1,9 +1,9 @@
-"""Plants whose inputs may lie: which observers of them exist, and what is left of their error.
+"""Plants with attackable inputs: existence of their observers, and the error systems.
 
     x+ = A x + G phi(H x + F u) + B u + B_a a_u + E d,      y = C x + D u + a_y + n
 
-The attack a_u is an unknown input of any size. An observer that trusts the sensors J_s and believes
-nothing about the inputs J_u needs `rank(C_Js b_Ju) = |J_u|`, and its zeros inside the unit circle.
+The attack a_u is an unknown input of any size. An observer that trusts the sensors J_s and uses no knowledge
+of the inputs J_u needs `rank(C_Js b_Ju) = |J_u|`, and its zeros inside the unit circle.
 
 References
 ----------
@@ -26,7 +26,7 @@ from gridsec.lmi.unknown_input import ErrorSystem
 from gridsec.lure import Lure
 
 Pair = tuple[tuple[int, ...], tuple[int, ...]]
-"""(J_u, J_s): inputs that are not believed, sensors that are."""
+"""(J_u, J_s): distrusted inputs, trusted sensors."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,17 +40,17 @@ class UnknownInputPlant:
     inputs : (n, r)
         B_a, full column rank. For yang2021 (33) also the B of the known input.
     noise : (p,)
-        Largest error of each honest reading; either all positive or all zero.
+        Largest error of each unmanipulated reading; either all positive or all zero.
     drift : (n, d)
-        E: what the plant may do besides its model, with |d_i| <= 1.
+        E: deviation of the plant from its model, with |d_i| <= 1.
     span : (n,)
-        Largest |x_i| there can be, infinite if there is none. Nothing else is known at the start.
+        Largest possible |x_i|, or infinity. The only knowledge at the start.
 
     Raises
     ------
     ValueError
-        If shapes do not fit, the columns of `inputs` are dependent, or `noise` or `span` cannot be meant;
-        names every problem.
+        If shapes are inconsistent, the columns of `inputs` are dependent, or `noise` or `span` is invalid;
+        lists every problem.
     """
 
     system: DiscreteLure
@@ -60,7 +60,7 @@ class UnknownInputPlant:
     span: Floats
 
     def __post_init__(self) -> None:
-        """Freeze the arrays and refuse what cannot be meant."""
+        """Freeze the arrays and refuse invalid values."""
         for name in ("inputs", "noise", "drift", "span"):
             object.__setattr__(self, name, frozen(getattr(self, name)))
         n, p = len(self.system.A), len(self.system.C)
@@ -87,7 +87,7 @@ class UnknownInputPlant:
 
     @property
     def scale(self) -> Floats:
-        """Error scale of each sensor, (p,): its noise, or 1 for all where there is none."""
+        """Error scale of each sensor, (p,): its noise, or 1 for all without noise."""
         return self.noise if np.all(self.noise > 0.0) else np.ones(self.noise.size)
 
     @property
@@ -102,13 +102,7 @@ class UnknownInputPlant:
 
 
 def exact(system: DiscreteLure, inputs: Floats) -> UnknownInputPlant:
-    """A plant with exact readings and an exact model, as in yang2021.
-
-    Parameters
-    ----------
-    system, inputs
-        As in `UnknownInputPlant`.
-    """
+    """Plant with exact readings and an exact model, as in yang2021."""
     n, p = len(system.A), len(system.C)
     return UnknownInputPlant(system, inputs, np.zeros(p), np.zeros((n, 0)), np.full(n, np.inf))
 
@@ -125,11 +119,11 @@ def inverters(
     reports: Ints | None = None,
     report_error: Floats | None = None,
 ) -> UnknownInputPlant:
-    """A feeder's loop whose inverters may inject what they should not.
+    """Loop of a feeder with attackable set points of inverters.
 
-    An attacked inverter follows `tau x' = -x + K(z) + a_u`: a_u is the wrong part of its set point, and
-    any course of its reactive injection is one for some a_u. Sampled at h with `lmi.sampled.sample`.
-    Sensors are the voltage meters, then the reports of inverters that tell their reactive injection.
+    An attacked inverter follows `tau x' = -x + K(z) + a_u`: a_u is the error of its set point, and any course
+    of its reactive injection corresponds to some a_u. Sampled at h with `lmi.sampled.sample`. Sensors are the
+    voltage meters, then the reported reactive injections of inverters.
 
     Parameters
     ----------
@@ -138,26 +132,26 @@ def inverters(
     h
         Time between readings, s.
     attackable : (r,)
-        Inverters whose set point may be wrong.
+        Inverters with an attackable set point.
     reading_error : (p',)
         Largest error of each voltage meter, squared pu.
     u_error : (l,)
         Largest error of each entry of the known input, squared pu. It adds to the readings' errors
         through D and to the set points' through the steepest slope of the curve.
     curve_error : (m,)
-        Largest error of each inverter's set point besides, pu: movement of z within a step, difference
-        between the curve and the model's.
+        Largest further error of each inverter's set point, pu: motion of z within a step, difference between
+        the curve and the model's.
     span : (m,)
         Largest reactive injection of each inverter, attacked or not, pu.
     reports : (k,)
-        Inverters that report their reactive injection.
+        Inverters with a reported reactive injection.
     report_error : (k,)
         Largest error of each report, pu.
 
     Raises
     ------
     ValueError
-        As `UnknownInputPlant`; or if not every report has its error.
+        As `UnknownInputPlant`, or if reports and their errors differ in number.
     """
     system = sample(lure, h)
     n, inputs = system.B.shape
@@ -188,16 +182,16 @@ def inverters(
 
 @dataclass(frozen=True, slots=True)
 class Missing:
-    """An observer that a bank should have and has not.
+    """An observer missing from a bank.
 
     Attributes
     ----------
     pair
         (J_u, J_s).
     reason
-        "rank": the sensors do not see every unknown input. "zero": a zero outside the unit circle.
-        Either proves that no observer whatsoever does what (3) or (21) of yang2021 ask for. "design":
-        no gain was found; others may exist.
+        "rank": the sensors do not observe every unknown input. "zero": a zero outside the unit circle. Either
+        proves that no observer satisfies (3) or (21) of yang2021. "design": no gain was found; others may
+        exist.
     rank
         Rank of `C_Js b_Ju`.
     value
@@ -216,15 +210,13 @@ class Missing:
 def obstruction(plant: UnknownInputPlant, pair: Pair, *, tolerance: float) -> Missing | None:
     """Proof that the observer of (J_u, J_s) cannot exist, if one of the two necessary conditions fails.
 
-    Rank: `rank(C_Js b_Ju) = |J_u|`, by singular values of the sensors' rows in units of their errors.
-    Zeros: where J_s has as many sensors as J_u inputs, some slopes at the ends of their intervals give the
-    linearised plant a zero of modulus above 1. (Proofs: docs/theory-unknown-input.md, sections 2 and 3; the
-    latter presumes that the known input can hold the plant where its slopes are these.)
+    Rank: `rank(C_Js b_Ju) = |J_u|`, by singular values of the sensors' rows in units of their errors. Zeros:
+    if J_s has as many sensors as J_u inputs, some slopes at the ends of their intervals give the linearised
+    plant a zero of modulus above 1. (Proofs: docs/theory-unknown-input.md, sections 2 and 3; the latter
+    presumes that the known input can hold the plant where its slopes are these.)
 
     Parameters
     ----------
-    plant
-        The plant.
     pair
         (J_u, J_s).
     tolerance
@@ -233,7 +225,7 @@ def obstruction(plant: UnknownInputPlant, pair: Pair, *, tolerance: float) -> Mi
     Returns
     -------
     Missing or None
-        None if nothing speaks against it; it may still have no design.
+        None if both conditions hold; a design may still not exist.
     """
     unknown, sensors = list(pair[0]), list(pair[1])
     seen = plant.system.C[sensors] / plant.scale[sensors, None] @ plant.inputs[:, unknown]
@@ -256,13 +248,11 @@ def obstruction(plant: UnknownInputPlant, pair: Pair, *, tolerance: float) -> Mi
 def worst_zero(plant: UnknownInputPlant, pair: Pair) -> float:
     """Largest modulus of a zero from J_u to J_s over the corners of the slope intervals; 0 without zeros.
 
-    Only for as many sensors as unknown inputs: then the error that the sensors cannot see moves inside
+    Only for as many sensors as unknown inputs: then the error invisible to the sensors moves inside
     `ker C_Js` by `Gbar (A + G diag(d) H)`, and its eigenvalues there are the zeros.
 
     Parameters
     ----------
-    plant
-        The plant.
     pair
         (J_u, J_s), with `C_Js b_Ju` square and regular.
 
@@ -303,7 +293,7 @@ def projection(plant: UnknownInputPlant, pair: Pair) -> tuple[Floats, Floats]:
     Parameters
     ----------
     plant, pair
-        As in `obstruction`, which must have found nothing.
+        As in `obstruction`, which must return None.
 
     Returns
     -------
@@ -320,7 +310,7 @@ def projection(plant: UnknownInputPlant, pair: Pair) -> tuple[Floats, Floats]:
 
 
 def error_system(plant: UnknownInputPlant, pair: Pair) -> ErrorSystem:
-    """What is left of the error for the gain to deal with.
+    """Error system of the observer without its gain.
 
     `e+ = (Gbar (A + G mid H) - K C_J) e + Gbar G psi + [b H N, Gbar E] w + K N n` with `e = x_hat - x`.
 
@@ -344,13 +334,7 @@ def error_system(plant: UnknownInputPlant, pair: Pair) -> ErrorSystem:
 
 
 def pairs_text(pairs: Sequence[Pair]) -> str:
-    """Pairs with indices counted from 1, as papers do; for messages.
-
-    Parameters
-    ----------
-    pairs
-        Any.
-    """
+    """Pairs with indices counted from 1, as in the papers; for messages."""
     return "; ".join(
         "({" + ",".join(str(i + 1) for i in u) + "},{" + ",".join(str(j + 1) for j in s) + "})"
         for u, s in pairs

@@ -24,8 +24,8 @@ def test_every_claim_that_is_not_met_has_a_reason() -> None:
     assert [claim.what for claim in found.unmet] == [
         "… that exist",
         "partial observers that exist",
-        "any one sensor may lie",
-        "any one input and sensor may lie",
+        "attack on any one sensor",
+        "attack on any one input and sensor",
     ]
     assert all(claim.why for claim in found.unmet)
     names = [figure.name for figure in found.figures]
