@@ -1,7 +1,7 @@
-"""Powers that nobody reads: forecast from the library's profiles, and how far off that is, learned.
+"""Unread powers: forecasts from the library's profiles, and their learned errors.
 
-Three of the six customers of CIGRE's low-voltage benchmark have no meter. Loggers that are there for a
-week of June show what they draw; what forecasts were off goes into the feeder's files.
+Three of the six customers of CIGRE's low-voltage benchmark have no meter. Loggers measure their powers for a
+week of June; the errors of the forecasts go into the feeder's files.
 """
 
 from dataclasses import replace
