@@ -14,7 +14,7 @@ from feeders.studies.rehearsal import rehearse
 site = load("cigre-lv")
 found = detectable(site, max_attacked=2)
 
-# Up to `hidden` no meter is beyond its limit, beyond `noticed` one is, beyond `named` it is the manipulated one.
+# `hidden`: no meter beyond its limit up to here; `noticed`: one is from here on; `named`: the manipulated one.
 print(found.meters[["meter", "hidden", "noticed", "named", "fits"]].round(2))
 
 # Sizes with a second manipulated meter, relative to those of each meter alone.
