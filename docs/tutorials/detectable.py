@@ -14,7 +14,7 @@ from feeders.studies.rehearsal import rehearse
 site = load("cigre-lv")
 found = detectable(site, max_attacked=2)
 
-# `hidden`: no meter beyond its limit up to here; `noticed`: one is from here on; `named`: the manipulated one.
+# Up to `hidden` no limit is exceeded, beyond `noticed` one is, beyond `named` the manipulated meter is named.
 print(found.meters[["meter", "hidden", "noticed", "named", "fits"]].round(2))
 
 # Sizes with a second manipulated meter, relative to those of each meter alone.
