@@ -68,7 +68,9 @@ def test_broken_links_are_found() -> None:
 
 
 def test_the_glossary_is_in_alphabetical_order() -> None:
-    rows = re.findall(r"^\| ([^|]+?) \|", (ROOT / "docs/glossary.md").read_text(encoding="utf-8"), re.MULTILINE)
+    rows = re.findall(
+        r"^\| ([^|]+?) \|", (ROOT / "docs/glossary.md").read_text(encoding="utf-8"), re.MULTILINE
+    )
     terms = [term.lower() for term in rows[1:] if not term.startswith("---")]
     assert terms == sorted(terms)
     assert len(set(terms)) == len(terms) > 60

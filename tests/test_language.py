@@ -33,7 +33,7 @@ LIMITS = {
     "default monitor": (166, 220),
     "feeders": (223, 253),
     "service": (97, 194),
-    "documents": (0, 373),
+    "documents": (0, 0),
 }
 
 
