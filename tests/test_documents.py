@@ -67,6 +67,18 @@ def test_broken_links_are_found() -> None:
     assert broken(page, text) == ["docs/none.md", "docs/README.md#none"]
 
 
+@pytest.mark.parametrize("page", sorted((ROOT / "docs").glob("theory-*.md")), ids=lambda page: page.stem)
+def test_theory_pages_start_with_a_short_summary(page: Path) -> None:
+    """Problem, model, result, guarantee and what is only measured or not proven, in at most ten lines."""
+    title, label, summary = page.read_text(encoding="utf-8").split("\n\n")[:3]
+    assert title.startswith("# ")
+    assert label == "**Summary.**"
+    assert len(summary.splitlines()) <= 10
+    words = set(re.findall(r"^- \*([A-Za-z ]+)\.\*", summary, re.MULTILINE))
+    assert {"Problem", "Model", "Result", "Guarantee"} < words
+    assert words & {"Only measured", "Not proven"}
+
+
 def test_the_glossary_is_in_alphabetical_order() -> None:
     rows = re.findall(
         r"^\| ([^|]+?) \|", (ROOT / "docs/glossary.md").read_text(encoding="utf-8"), re.MULTILINE
