@@ -64,7 +64,7 @@ def main(lies: int, feeder: str, journal: Path | None) -> int:
         progress=lambda scenarios, _: done.append((time.monotonic(), scenarios // plan.together)),
     )
     for row in found.promises.to_dict("records"):
-        what = "with somebody named because of it" if row["promise"] == "hidden" else "with a liar missed"
+        what = "with a device named because of it" if row["promise"] == "hidden" else "with a liar missed"
         print(
             f"{feeder}: {row['lies']} lies to be {row['promise']}, {row['broken']} {what} "
             f"({row['by_chance']} with a liar named without it too, {row['honest_named']} with an honest one "

@@ -24,6 +24,8 @@ QUESTION = re.compile(r"(What|Who|Whom|Whose|Whether|How|Which|Where|When|Why|If
 PERSON = re.compile(
     r"\b(who|whom|whose|whoever|whomever|nobody|somebody|everybody|anybody|someone|everyone|anyone)\b", re.I
 )
+PUBLIC = re.compile(r"--[a-z-]+|[`\"]who[`\"]")
+"""Options of the command line and fields of REST: public words, not counted in documents."""
 
 # Indirect questions as titles, and personal pronouns for equipment.
 LIMITS = {
@@ -31,7 +33,7 @@ LIMITS = {
     "default monitor": (166, 220),
     "feeders": (223, 250),
     "service": (96, 192),
-    "documents": (0, 373),
+    "documents": (0, 0),
 }
 
 
@@ -73,7 +75,7 @@ def counts() -> dict[str, tuple[Counter[str], Counter[str]]]:
                 out[package][1][str(path.relative_to(ROOT))] += len(PERSON.findall(path.read_text()))
     for path in sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "docs").rglob("*.py")]):
         place = str(path.relative_to(ROOT))
-        out["documents"][1][place] += len(PERSON.findall(path.read_text()))
+        out["documents"][1][place] += len(PERSON.findall(PUBLIC.sub("", path.read_text())))
     return out
 
 

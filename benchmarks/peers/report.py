@@ -37,7 +37,7 @@ def _seen(score: Score) -> str:
 def tables(single: Scores, minute: Scores, *, drawn: bool = False) -> str:
     """Everything as Markdown; the figures, too, where they are drawn."""
     figures = (
-        [f"![Exactly identified liars, {what}]({name})" for what, name in _FIGURES] if drawn else ["", ""]
+        [f"![Exactly identified meters, {what}]({name})" for what, name in _FIGURES] if drawn else ["", ""]
     )
     parts = ["## Single snapshots", _exact(single), figures[0], _clean(single), _details(single)]
     if minute:
@@ -90,9 +90,9 @@ def _exact(scores: Scores) -> str:
         "ours",
         "ours, among explanations",
         "ours - best peer (only ours : only the peer)",
-        *([SERVED, "chi-square test sees it"] if SERVED in names else []),
+        *([SERVED, "detected by the chi-square test"] if SERVED in names else []),
     ]
-    return "Named exactly the liars, % of snapshots:\n\n" + _rows(head, rows)
+    return "Exactly the manipulated meters named, % of snapshots:\n\n" + _rows(head, rows)
 
 
 def _paired(here: dict[str, Score]) -> str:
@@ -115,7 +115,7 @@ def _clean(scores: Scores) -> str:
         for cell, here in scores.items()
         if cell.attack == "clean"
     ]
-    return "Somebody is named although nobody lies, % of clean snapshots:\n\n" + _rows(
+    return "At least one meter named without an attack, % of clean snapshots:\n\n" + _rows(
         ["feeder", "noise", *names, "ours, limits at 95 %"], rows
     )
 
@@ -141,10 +141,10 @@ def _details(scores: Scores) -> str:
         "method",
         "snapshots",
         "exact",
-        "a liar missed",
-        "somebody else named",
+        "manipulated meter missed",
+        "honest meter named",
         "no result",
-        "chi-square test sees it",
+        "detected by the chi-square test",
     ]
     return "All numbers, % of snapshots:\n\n" + _rows(head, rows)
 

@@ -1,8 +1,8 @@
 """Calibration: recorded readings against a feeder's files, on the European low-voltage benchmark of CIGRE.
 
-Four days of readings at 15 min are simulated by full AC power flow on the feeder as it is. The files that
-they are compared with have three errors: a customer at another bus, two customers with each other's meters,
-and a cable that is 30 % longer than the files say.
+Full AC power flow simulates four days of readings at 15 min on the true feeder. The compared files have three
+errors: a customer at another bus, two customers with each other's meters, and a cable that is 30 % longer in
+reality.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from feeders.studies.calibrate import calibrate
 from feeders.variation import Variation
 
 truth = load("cigre-lv")
-loads = Variation(hidden_kw=0.2, hidden_kvar=0.1)  # what customers draw beyond their meters' registers
+loads = Variation(hidden_kw=0.2, hidden_kvar=0.1)  # loads beyond the meters' registers
 days = Scenario(
     seed=1,
     duration_s=4 * 86400.0,
@@ -50,6 +50,6 @@ with tempfile.TemporaryDirectory() as folder:
     print(found.lines[["lines", "factor", "std", "same", "verdict"]].to_string())
     print(found.errors.to_string())
 
-    write(wrong, Path(folder) / "files")  # nothing is corrected unasked, and never in place
+    write(wrong, Path(folder) / "files")  # corrections are on request, and never in place
     found.corrected(Path(folder) / "files", Path(folder) / "corrected")
     print(read(Path(folder) / "corrected").customers == truth.tables.customers)

@@ -1,7 +1,7 @@
-"""A campaign: hundreds of simulated attacks on a feeder, and what its monitor made of them.
+"""A campaign: hundreds of simulated attacks on a feeder, and the results of its monitor.
 
 Six meters on the European low-voltage benchmark of CIGRE. A scene is a moment of the profiles, here of summer
-and winter, with its own errors of loads and meters; the truth is full AC power flow with all inverters.
+and winter, with its own errors of loads and meters. The truth is full AC power flow with all inverters.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ found = campaign(site, plan)  # on all cores: runner=Processes(4), under `if __n
 print(found.by_size[["kind", "size", "scenarios", "named", "named_low", "named_high", "delay_median_s"]])
 print(found.scenarios.query("kind == 'bias' and missed != ''")[["scenario", "size", "place", "missed"]])
 
-# The same attacks, watched by the observer banks of chong2020.
+# The same attacks with the observer banks of chong2020.
 other = campaign(site, replace(plan, estimator="exact-bank", settings=(("max_attacked", 2),)))
 both = found.by_size.merge(other.by_size, on=["kind", "size"], suffixes=("", " exact bank"))
 print(both[["kind", "size", "named", "named exact bank", "false", "false exact bank"]])

@@ -1,7 +1,7 @@
-"""Compare: which estimator names the liars, how soon, and at what cost; all watch the same attacks.
+"""Compare: named meters, delays and costs of estimators under the same attacks.
 
-Six meters on the European low-voltage benchmark of CIGRE, two of them lying. The truth is full AC power
-flow; meters and loads are as uncertain as the plan states, and all estimators are told so.
+Six meters on the European low-voltage benchmark of CIGRE, two of them manipulated. The truth is full AC power
+flow. All estimators have the uncertainty of meters and loads that the plan states.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ rows = compare(site, plan)
 shown = ["case", "family", "named", "liars", "falsely_named", "delay_s", "error_all", "step_ms", "observers"]
 print(pd.DataFrame(rows)[shown].round(3).to_string(index=False))
 
-# What cannot watch this feeder keeps its row, and says why.
+# An estimator that does not apply to this feeder keeps its row, with the reason.
 (refused,) = compare(site, replace(plan, max_attacked=3, families=("exact-bank",), cases=("clean",)))
 print(refused.reason)
 

@@ -1,6 +1,6 @@
-"""Detectable: the smallest lies that are surely named, the largest that stay unnoticed, in V.
+"""Detectable: the smallest attacks that are surely named, the largest that stay undetected, in V.
 
-Six meters on the European low-voltage benchmark of CIGRE, two of them lying together.
+Six meters on the European low-voltage benchmark of CIGRE, two of them colluding.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from feeders.studies.rehearsal import rehearse
 site = load("cigre-lv")
 found = detectable(site, max_attacked=2)
 
-# Up to `hidden` nobody is named, beyond `noticed` somebody is, beyond `named` it is the liar.
+# Up to `hidden` no limit is exceeded, beyond `noticed` one is, beyond `named` the manipulated meter is named.
 print(found.meters[["meter", "hidden", "noticed", "named", "fits"]].round(2))
 
-# A second liar helps: what each meter alone could do, beside that.
+# Sizes with a second manipulated meter, relative to those of each meter alone.
 print((found.meters["noticed"] / found.meters["noticed_alone"]).round(2).describe()[["min", "max"]])
 
-# How wrong the voltage shown of a customer can become without an alarm.
+# Largest error of a displayed voltage without an alarm.
 worst = found.customers.loc[int(np.argmax(found.customers["error"]))]
 print(f"{worst['customer']}: {worst['error']:.2f} V")
 
-# The monitor itself, with lies just below the one and just above the other size.
+# The monitor under attacks just below the one and just above the other size.
 print(rehearse(site, found, trials=10, seed=1))

@@ -1,4 +1,4 @@
-"""The droop fleet of a feeder: is it stable, does it keep the band, how much generation is hosted.
+"""The droop fleet of a feeder: stability, voltage band and hosting capacity.
 
 Thirteen customers of a rural feeder, seven with generation and inverters after IEEE 1547, category B.
 """
@@ -28,7 +28,7 @@ print(found.tables["stability"][["point", "verdict", "proof", "gain", "margin"]]
 print(found.tables["band"])
 print(found.tables["presets"][["preset", "verdict", "margin", "settling_s", "v_low_volt", "v_high_volt"]])
 
-# Loads that break the band, confirmed by AC power flow; none if it is proven that there are none.
+# Loads that break the band, confirmed by AC power flow; none if the band is proven.
 if "witness" in found.tables:
     print(found.tables["witness"].query("beyond")[["when", "customer", "v_volt"]])
 

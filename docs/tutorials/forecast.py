@@ -1,7 +1,7 @@
-"""Powers that nobody reads: forecast from the library's profiles, and how far off that is, learned.
+"""Unread powers: forecasts from the library's profiles, and their learned errors.
 
-Three of the six customers of CIGRE's low-voltage benchmark have no meter. Loggers that are there for a
-week of June show what they draw; what forecasts were off goes into the feeder's files.
+Three of the six customers of CIGRE's low-voltage benchmark have no meter. Loggers measure their powers for a
+week of June; the errors of the forecasts go into the feeder's files.
 """
 
 from dataclasses import replace
@@ -27,11 +27,11 @@ t = START + step_s * np.arange(7 * 96)
 drawn = Customers(site, Variation(), seed=1, start=START, profile_s=0.0).at(t)
 
 learned = from_history(*forecast_errors(site, t, drawn.p_kw, drawn.q_kvar), step_s)
-told = from_tables(tell(site.tables, learned, site.feeder.base_kva))
-write(told.tables, Path("with-forecasts"))
+updated = from_tables(tell(site.tables, learned, site.feeder.base_kva))
+write(updated.tables, Path("with-forecasts"))
 
 print("1 sigma, kW   no forecast  library  learned")
-stds = [site.feeder.base_kva * load_doubt(each).p for each in (plain, site, told)]
+stds = [site.feeder.base_kva * load_doubt(each).p for each in (plain, site, updated)]
 for k, row in enumerate(tables.customers):
     if row.customer in without:
         print(f"{row.customer:12s}" + "".join(f"{std[k]:10.1f}" for std in stds))

@@ -1,7 +1,7 @@
 """A report: studies of a feeder on one page, with figures and tables, without the command line.
 
-Six meters on the European low-voltage benchmark of CIGRE. A study that fails is part of the report: it says
-that there is no answer, and never looks as if there were nothing to fear.
+Six meters on the European low-voltage benchmark of CIGRE. A failed study is part of the report: it states
+that there is no answer, and never looks like a good result.
 """
 
 from __future__ import annotations
