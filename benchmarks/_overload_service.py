@@ -41,8 +41,8 @@ def timed(totals: dict[str, float], name: str, run: Callable[..., Any]) -> Calla
 
 def main() -> None:
     """Run the service."""
-    from service import cli
-    from service.rounds import Rounds
+    from service.cli import main as cli
+    from service.engine.engine import Rounds
 
     path, totals = Path(sys.argv[1]), {"round": 0.0, "keep_states": 0.0}
     for name in totals:

@@ -1,7 +1,7 @@
 """Scenes of the benchmarks about stealthy lies and false accusations: feeders, honest errors, learned meters.
 
 The truth is AC power flow with the droop inverters in closed loop. Loads, generation and the busbar vary as
-in `feeders.variation` without tap steps; meters have the errors that the feeder's files state.
+in `feeders.simulation.demand` without tap steps; meters have the errors that the feeder's files state.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, depth_first_order, dijkstra
 
-from feeders.doubts import unread
-from feeders.estimators import SEQUENTIAL, Watcher, design
-from feeders.load import Site, from_tables, load
-from feeders.scenario import START, Scenario
-from feeders.schema import CustomerRow, FeederMeta, FeederTables, LineRow
-from feeders.trials import LoadError, Meters, Trial, Truth, frames
-from feeders.variation import Variation
+from feeders.format.tables import CustomerRow, FeederMeta, FeederTables, LineRow
+from feeders.model.load_uncertainty import unread
+from feeders.model.site import Site, from_tables, load
+from feeders.registry.registry import SEQUENTIAL, Watcher, design
+from feeders.simulation.demand import Variation
+from feeders.simulation.scenario import START, Scenario
+from feeders.simulation.trial import LoadError, Meters, Trial, Truth, frames
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.attack import Attack
-from gridsec.network import InPhases
-from gridsec.online import Frame, PowerOrigin
-from gridsec.sequential import SequentialDesign, SequentialState, init, step
-from gridsec.sequential.commission import Learned
+from gridsec.estimators.sequential import SequentialDesign, SequentialState, init, step
+from gridsec.estimators.sequential.commission import Learned
+from gridsec.grid.network import InPhases
+from gridsec.interface import Frame, PowerOrigin
 
 ONSET_S = 20.0
 """Honest seconds before a manipulation."""

@@ -10,8 +10,8 @@ limit is the room of honest residuals.
 
 References
 ----------
-docs/theory-sequential.md, section 3; `gridsec.studies.quiet` has the same inequalities for small numbers of
-meters, with the smallest set as an unknown.
+docs/theory-sequential.md, section 3; `gridsec.planning.detectability` has the same inequalities for small
+numbers of meters, with the smallest set as an unknown.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from scipy.special import ndtr
 from scipy.stats import chi2
 
 from gridsec.arrays import Floats, Ints
-from gridsec.sequential import SequentialDesign, SequentialState
-from gridsec.sequential.conditional import Fit, fit
-from gridsec.sequential.scales import Scales
+from gridsec.estimators.sequential import SequentialDesign, SequentialState
+from gridsec.estimators.sequential.conditional import Fit, fit
+from gridsec.estimators.sequential.scales import Scales
 
 SHARE = 0.7
 """Part of every limit that a lie uses."""

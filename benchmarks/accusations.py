@@ -49,15 +49,15 @@ from benchmarks._scenes import (
     start,
     street,
 )
-from feeders.load import Site
-from feeders.scenario import START
-from feeders.trials import Truth
+from feeders.model.site import Site
+from feeders.simulation.scenario import START
+from feeders.simulation.trial import Truth
 from gridsec.arrays import Floats, Ints
 from gridsec.attack import Attack, Coordinated, Drift, Scaling
 from gridsec.attack import Bias as Shift
-from gridsec.network import InPhases
-from gridsec.online import Decision, Estimate, Frame, Verdict
-from gridsec.sequential import SequentialDesign, SequentialState, step
+from gridsec.estimators.sequential import SequentialDesign, SequentialState, step
+from gridsec.grid.network import InPhases
+from gridsec.interface import Decision, Estimate, Frame, Verdict
 
 T_ON = START + ONSET_S
 T_OFF = START + ONSET_S + WATCHED_S

@@ -22,11 +22,11 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 
 from benchmarks._arguments import arguments
-from feeders.campaign import NoSuchAttack
-from feeders.estimators import DIRECT, SEQUENTIAL, Watcher, choose, design
-from feeders.load import Site, load, to_frame
-from feeders.scenario import START, Scenario, random_attacks, simulate, snapshots
-from gridsec.online import Verdict
+from feeders.model.site import Site, load, to_frame
+from feeders.registry.registry import DIRECT, SEQUENTIAL, Watcher, choose, design
+from feeders.simulation.attacks import NoSuchAttack
+from feeders.simulation.scenario import START, Scenario, random_attacks, simulate, snapshots
+from gridsec.interface import Verdict
 
 FEEDERS = ("cigre-lv", "simbench-lv-rural1", "kerber-landnetz")
 KINDS = ("bias", "scaling", "coordinated")

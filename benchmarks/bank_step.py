@@ -21,14 +21,15 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 
-from gridsec import bank as banks
-from gridsec import monitor
-from gridsec.accuracy import MeterAccuracy
 from gridsec.arrays import Floats
-from gridsec.droop import fleet
-from gridsec.feeder import Feeder, lindistflow, squared_voltages
-from gridsec.lure import Lure, close_loop, transition
-from gridsec.online import Frame
+from gridsec.estimators import exact_bank
+from gridsec.estimators.exact_bank import bank as banks
+from gridsec.estimators.plant import Plant
+from gridsec.grid.droop import fleet
+from gridsec.grid.meter import MeterAccuracy
+from gridsec.grid.radial import Feeder, lindistflow, squared_voltages
+from gridsec.interface import Frame
+from gridsec.observers.lure import Lure, close_loop, transition
 
 FACTOR = 50.0
 TOLERANCE = 1e-12
@@ -46,7 +47,7 @@ class Case:
 CASES = (Case(13, 2, 0.5e-3), Case(30, 2, 20e-3), Case(57, 1, 5e-3), Case(146, 1, 10e-3))
 
 
-def street(customers: int) -> monitor.Plant:
+def street(customers: int) -> Plant:
     """A random tree with an inverter and a meter at every customer; curves and time constants differ."""
     rng = np.random.default_rng(customers)
     presets = ("ieee1547-a", "ieee1547-b", "vde4105")
@@ -67,7 +68,7 @@ def street(customers: int) -> monitor.Plant:
     accuracy = MeterAccuracy(
         np.full(customers, 0.005), np.full(customers, 4e-4), np.full(customers, 5e-4), 0.001, 4e-4, 1e-4
     )
-    return monitor.Plant(feeder, droop, every, accuracy)
+    return Plant(feeder, droop, every, accuracy)
 
 
 def fastest(run: Callable[[], object], *, least: int, longest: float) -> float:
@@ -165,13 +166,13 @@ def run(case: Case) -> bool:
     return equal and once <= case.limit and looped >= FACTOR * once
 
 
-def watched(plant: monitor.Plant, max_attacked: int) -> float:
+def watched(plant: Plant, max_attacked: int) -> float:
     """Seconds of one step of the whole chain."""
     n = plant.meters.size
-    design = monitor.design(plant, max_attacked=max_attacked, step_s=1.0)
+    design = exact_bank.design(plant, max_attacked=max_attacked, step_s=1.0)
     p, nothing = np.full(n, -0.3 / n), np.full(n, np.nan)
     y = squared_voltages(lindistflow(plant.feeder), p, 0.3 * p, 1.0)
-    state = monitor.init(design, 0.0)
+    state = exact_bank.init(design, 0.0)
 
     def frame(t: float) -> Frame:
         return Frame(
@@ -188,8 +189,8 @@ def watched(plant: monitor.Plant, max_attacked: int) -> float:
         )
 
     for k in range(30):
-        state, _, _ = monitor.step(design, state, frame(float(k)))
-    return fastest(lambda: monitor.step(design, state, frame(30.0)), least=20, longest=0.5)
+        state, _, _ = exact_bank.step(design, state, frame(float(k)))
+    return fastest(lambda: exact_bank.step(design, state, frame(30.0)), least=20, longest=0.5)
 
 
 def main() -> int:

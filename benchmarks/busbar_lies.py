@@ -25,11 +25,11 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 
 from benchmarks._arguments import arguments
-from feeders.estimators import design
-from feeders.lies import Lie, Trick
-from feeders.load import load
-from feeders.trials import Meters, Trial, frames
-from gridsec.online import Frame
+from feeders.model.site import load
+from feeders.registry.registry import design
+from feeders.simulation.attacks import Lie, Trick
+from feeders.simulation.trial import Meters, Trial, frames
+from gridsec.interface import Frame
 
 FEEDERS = ("simbench-lv-rural1", "kerber-dorfnetz", "kerber-vorstadtnetz", "ieee-european-lv")
 ONSET, TICKS, SETTLED = 20, 80, 40

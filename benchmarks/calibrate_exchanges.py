@@ -37,13 +37,13 @@ import numpy as np
 
 from benchmarks import calibrate_intervals as intervals
 from benchmarks._arguments import count, positive
-from feeders.equipment import find
-from feeders.load import from_tables
-from feeders.load_phases import three_phase
-from feeders.recording import Recording, record
-from feeders.schema import FeederTables
-from feeders.studies.calibrate import Calibrate, calibrate
-from feeders.studies.calibrate_corrections import Kind, apply, longer
+from feeders.format.tables import FeederTables
+from feeders.model.equipment import find
+from feeders.model.site import from_tables
+from feeders.model.three_phase import three_phase
+from feeders.simulation.recording import Recording, record
+from feeders.studies.calibrate.search import Kind, apply, longer
+from feeders.studies.calibrate.study import Calibrate, calibrate
 
 FEEDERS: Final = ("cigre-lv", "kerber-landnetz", "simbench-lv-rural1")
 ERRORS: Final = ("none", "phases", "rotated", "phase", "meters", "bus", "length")

@@ -23,12 +23,12 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 
 from benchmarks._arguments import count, positive
-from feeders.load import Site, load
-from feeders.meters import Channel, MeterErrors, Meters
-from feeders.recording import record
-from feeders.scenario import Scenario
-from feeders.studies.calibrate import calibrate
-from feeders.variation import Variation
+from feeders.model.site import Site, load
+from feeders.simulation.demand import Variation
+from feeders.simulation.meters import Channel, MeterErrors, Meters
+from feeders.simulation.recording import record
+from feeders.simulation.scenario import Scenario
+from feeders.studies.calibrate.study import calibrate
 from gridsec.arrays import Floats
 
 FEEDERS = ("cigre-lv", "simbench-lv-rural1")

@@ -26,10 +26,10 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 from distributed import LocalCluster
 
 from benchmarks._arguments import arguments
-from feeders.load import load
-from feeders.studies.campaign import Campaign, campaign
-from feeders.studies.campaign_plan import Plan
-from feeders.studies.campaign_run import Dask, Processes, Runner
+from feeders.model.site import load
+from feeders.studies.campaign.plan import Plan
+from feeders.studies.campaign.study import Campaign, campaign
+from feeders.studies.workers import Dask, Processes, Runner
 
 FEEDER, SCENES, FULL = "simbench-lv-rural3", 4, 10_000
 JOURNAL = Path("campaign-10000.journal")

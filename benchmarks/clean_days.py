@@ -5,10 +5,10 @@
 Thirty days by default, shared evenly between all feeders and the four seasons. Every run
 has its own seed (meters, loads, clouds, busbar) and begins at an hour of the season's profiles drawn at
 random, so that weekdays and weekends, days and nights are all seen. The truth is full AC power flow with the
-droop inverters; readings go through the whole chain of the service (`service.replay`), with the alarm delays
-of the feeder's file, every 10 s up to 50 customers and every 30 s above. In half of the runs, of all feeders
-and seasons, the meters' fixed errors are learned over `commission_s` as the file has it, in the others over
-a quarter of the run; the rest is watched with what was learned.
+droop inverters; readings go through the whole chain of the service (`service.engine.replay`), with the alarm
+delays of the feeder's file, every 10 s up to 50 customers and every 30 s above. In half of the runs, of all
+feeders and seasons, the meters' fixed errors are learned over `commission_s` as the file has it, in the
+others over a quarter of the run; the rest is watched with what was learned.
 
 Counted are the ticks' verdicts after two minutes, meters suspected at any tick, and alarms. An alarm is a
 false one unless it is about a voltage that truly is outside the limits. They are held against
@@ -34,15 +34,15 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 from scipy.stats import poisson
 
-from feeders.load import Site, from_tables, load, names
-from feeders.profiles import Season, library
-from feeders.scenario import START, Reading, Scenario, simulate
+from feeders.model.profiles import Season, library
+from feeders.model.site import Site, from_tables, load, names
+from feeders.simulation.scenario import START, Reading, Scenario, simulate
 from gridsec.arrays import Floats
-from gridsec.online import Decision
-from service.alarm import Change
-from service.conditions import AlarmKind
-from service.replay import Tally, replay
-from service.watch import TickResult
+from gridsec.interface import Decision
+from service.alarms.alarm import Change
+from service.alarms.conditions import AlarmKind
+from service.engine.feeder_monitor import TickResult
+from service.engine.replay import Tally, replay
 
 DAY_S, YEAR_S = 86_400.0, 365.25 * 86_400.0
 SETTLED_S = 120.0

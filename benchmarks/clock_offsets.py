@@ -28,10 +28,10 @@ import numpy as np
 
 from benchmarks._arguments import arguments
 from benchmarks.late_powers import LIE, LIES_S, site, watcher, world
-from feeders.load import Snapshot, to_frame
-from feeders.scenario import START
+from feeders.model.site import Snapshot, to_frame
+from feeders.simulation.scenario import START
 from gridsec.arrays import Floats
-from gridsec.online import Decision
+from gridsec.interface import Decision
 
 LEAST_S = 0.5
 """Smallest offset that is measured, s."""

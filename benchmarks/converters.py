@@ -35,10 +35,10 @@ from power_grid_model import ComponentType, DatasetType, initialize_array
 from power_grid_model.utils import json_serialize_to_file
 
 from benchmarks._arguments import arguments
-from feeders.convert import Conversion, convert
-from feeders.convert_changes import WHOLE, Change
-from feeders.load import load
-from feeders.schema import FeederTables, LineRow, read
+from feeders.convert.convert import Conversion, convert
+from feeders.convert.provenance import WHOLE, Change
+from feeders.format.tables import FeederTables, LineRow, read
+from feeders.model.site import load
 from gridsec.errors import GridsecError
 
 FEWEST, LARGE, FEWEST_LARGE = 12, 500, 3

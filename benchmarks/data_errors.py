@@ -30,14 +30,14 @@ import numpy as np
 
 from benchmarks._arguments import count
 from benchmarks.calibrate_exchanges import planted, truth_of
-from feeders import estimators
-from feeders.equipment import find
-from feeders.load import Site, Snapshot, from_tables, plant, to_frame
-from feeders.meters import Channel, MeterErrors
-from feeders.scenario import START, Scenario, simulate, snapshots
-from feeders.schema import FeederTables
+from feeders.format.tables import FeederTables
+from feeders.model.equipment import find
+from feeders.model.site import Site, Snapshot, from_tables, plant, to_frame
+from feeders.registry import registry
+from feeders.simulation.meters import Channel, MeterErrors
+from feeders.simulation.scenario import START, Scenario, simulate, snapshots
 from gridsec.attack import Attack, Bias, Drift, Random, Replay, Scaling, Stuck
-from gridsec.studies import data_errors
+from gridsec.estimators import data_errors
 
 FEEDERS: Final = ("cigre-lv:3", "kerber-landnetz:3", "simbench-lv-rural1:3", "cigre-lv", "simbench-lv-rural1")
 FILES: Final = ("phases", "phase", "meters", "bus")
@@ -128,7 +128,7 @@ def run(truth: FeederTables, files: FeederTables, seed: int, attacks: Sequence[A
         attacks=tuple(attacks),
     )
     order = [true.meter_ids.index(meter) for meter in site.meter_ids]
-    watcher = estimators.design(site)
+    watcher = registry.design(site)
     state, window = watcher.init(START), data_errors.begin()
     design = data_errors.design(plant(site), site.base_volt, STEP_S)
     assert design is not None  # these feeders are small

@@ -11,10 +11,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from benchmarks._arguments import arguments
-from feeders.load import load
-from feeders.studies.droop_fleets import Who, equip, point
-from feeders.studies.droop_verdict import Subject, edge
-from gridsec.studies.droop_stability import Update, enlarged
+from feeders.model.site import load
+from feeders.studies.droop.fleets import Who, equip, point
+from feeders.studies.droop.verdict import Subject, edge
+from gridsec.planning.droop.stability import Update, enlarged
 
 UPDATES = (Update(60.0), Update(60.0, 2), Update(1.0), Update(1.0, 1))
 

@@ -25,11 +25,10 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 
 from benchmarks._arguments import arguments
-from feeders.campaign import NoSuchAttack
-from feeders.estimators import SEQUENTIAL, Watcher, choose, design
-from feeders.lies import Lie, Trick, manipulations
-from feeders.load import Site, load, to_frame
-from feeders.scenario import START, Scenario, simulate, snapshots
+from feeders.model.site import Site, load, to_frame
+from feeders.registry.registry import SEQUENTIAL, Watcher, choose, design
+from feeders.simulation.attacks import Lie, NoSuchAttack, Trick, manipulations
+from feeders.simulation.scenario import START, Scenario, simulate, snapshots
 
 FEEDERS = ("cigre-lv", "simbench-lv-rural1", "kerber-landnetz", "simbench-lv-rural3")
 DURATION_S, ONSET_S, MOST = 90.0, 30.0, 2

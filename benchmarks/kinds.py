@@ -14,13 +14,13 @@ from time import process_time
 
 import numpy as np
 
-from feeders.campaign import NoSuchAttack
-from feeders.estimators import SEQUENTIAL, Watcher, choose, design
-from feeders.load import Site, load, to_frame
-from feeders.meters import MeterErrors
-from feeders.scenario import START, Scenario, random_attacks, simulate, snapshots
+from feeders.model.site import Site, load, to_frame
+from feeders.registry.registry import SEQUENTIAL, Watcher, choose, design
+from feeders.simulation.attacks import NoSuchAttack
+from feeders.simulation.meters import MeterErrors
+from feeders.simulation.scenario import START, Scenario, random_attacks, simulate, snapshots
 from gridsec.attack import Attack, Replay
-from gridsec.sequential import kinds
+from gridsec.estimators.sequential import kinds
 
 # Attack, number of liars, size in pu, begin and end in s. A clock's error is a replay since ever.
 ATTACKS: tuple[tuple[str, int, float, float, float], ...] = (

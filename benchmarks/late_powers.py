@@ -31,13 +31,13 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 
 from benchmarks._arguments import arguments
-from feeders.estimators import Watcher, design
-from feeders.load import Site, Snapshot, from_tables, load, to_frame
-from feeders.powerflow import PowerFlow
-from feeders.scenario import START
-from feeders.variation import Customers, Variation
+from feeders.model.site import Site, Snapshot, from_tables, load, to_frame
+from feeders.registry.registry import Watcher, design
+from feeders.simulation.demand import Customers, Variation
+from feeders.simulation.powerflow import PowerFlow
+from feeders.simulation.scenario import START
 from gridsec.arrays import Floats
-from gridsec.online import Decision
+from gridsec.interface import Decision
 
 LATE_S = 60.0
 """Age of late powers and interval of held ones, s."""

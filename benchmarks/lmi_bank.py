@@ -21,12 +21,12 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 
-from feeders.design_cache import bank_gains
-from gridsec.droop import fleet
-from gridsec.feeder import Feeder, lindistflow
-from gridsec.gains import CircleOptions, margin, options_for
-from gridsec.lmi import circle
-from gridsec.lure import Lure, close_loop
+from feeders.registry.design_cache import bank_gains
+from gridsec.grid.droop import fleet
+from gridsec.grid.radial import Feeder, lindistflow
+from gridsec.observers.gains import CircleOptions, margin, options_for
+from gridsec.observers.lmi import circle
+from gridsec.observers.lure import Lure, close_loop
 
 LIMIT_S = 120.0
 

@@ -23,13 +23,13 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 
 from benchmarks._arguments import arguments
-from feeders.estimators import design
-from feeders.lies import Lie, Trick
-from feeders.load import load
-from feeders.scenario import START
-from feeders.trials import LoadError, Meters, Trial, frames
+from feeders.model.site import load
+from feeders.registry.registry import design
+from feeders.simulation.attacks import Lie, Trick
+from feeders.simulation.scenario import START
+from feeders.simulation.trial import LoadError, Meters, Trial, frames
 from gridsec.arrays import Floats
-from gridsec.online import Decision
+from gridsec.interface import Decision
 
 FEEDERS = ("cigre-lv", "simbench-lv-rural1", "kerber-landnetz", "kerber-dorfnetz")
 SIZES_KW = (0.0, 3.0, 6.0, 15.0)

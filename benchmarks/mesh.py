@@ -15,15 +15,15 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 
-from feeders.estimators import design
-from feeders.lies import Lie, Trick
-from feeders.load import Site, from_tables, load
-from feeders.powerflow_unbalanced import power_flow
-from feeders.schema import FeederTables, LineRow
-from feeders.trials import LoadError, Trial, judge
+from feeders.format.tables import FeederTables, LineRow
+from feeders.model.site import Site, from_tables, load
+from feeders.registry.registry import design
+from feeders.simulation.attacks import Lie, Trick
+from feeders.simulation.powerflow_three_phase import power_flow
+from feeders.simulation.trial import LoadError, Trial, judge
 from gridsec.arrays import Floats
-from gridsec.mesh import Meshed, sensitivities
-from gridsec.network import bus_voltages, linear, model_error_bound
+from gridsec.grid.meshed import Meshed, sensitivities
+from gridsec.grid.network import bus_voltages, linear, model_error_bound
 
 LOADS = (0.25, 0.5, 1.0)
 SEEDS = range(5)

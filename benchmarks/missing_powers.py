@@ -30,11 +30,11 @@ import numpy as np
 from benchmarks import _stealthy
 from benchmarks._arguments import arguments
 from benchmarks._scenes import Model, Setting, neighbours, play, site, start, without
-from feeders.doubts import unread
-from feeders.scenario import START
+from feeders.model.load_uncertainty import unread
+from feeders.simulation.scenario import START
 from gridsec.arrays import Bools, Ints
-from gridsec.online import Decision
-from gridsec.sequential import step
+from gridsec.estimators.sequential import step
+from gridsec.interface import Decision
 
 FEEDERS = ("kerber-dorfnetz",)
 WITHHELD_S, LIE_S, END_S = 20.0, 95.0, 155.0

@@ -37,13 +37,13 @@ from pathlib import Path
 import httpx
 
 from benchmarks._arguments import arguments
-from feeders.load import Site, load
-from feeders.meters import BUSBAR
-from feeders.scenario import Scenario, simulate
-from feeders.schema import write
-from service.bus import BusConfig
-from service.ingest import Meters
-from service.simulate import key_of
+from feeders.format.tables import write
+from feeders.model.site import Site, load
+from feeders.simulation.meters import BUSBAR
+from feeders.simulation.scenario import Scenario, simulate
+from service.cli.simulate import key_of
+from service.ingest.queues import BusConfig
+from service.ingest.zenoh_bus import Meters
 
 FEEDER = "kerber-vorstadtnetz"
 STAGE_S, SETTLE_S, OVERLOAD_S, RECOVERY_S = 6.0, 2.0, 8.0, 10.0

@@ -13,18 +13,18 @@ from typing import Any
 
 import numpy as np
 
-from feeders.campaign import random_attacks
-from feeders.load import Site, load, plant, to_frame
-from feeders.scenario import START, Scenario, simulate, snapshots
-from gridsec import monitor
-from gridsec.decode import cospark
-from gridsec.decode.noise import correction_constants
-from gridsec.decode.stacks import Stack
+from feeders.model.site import Site, load, plant, to_frame
+from feeders.simulation.attacks import random_attacks
+from feeders.simulation.scenario import START, Scenario, simulate, snapshots
 from gridsec.errors import NotObservable
-from gridsec.families import codeword, partial
-from gridsec.families.codeword import CodeWord, Parts
-from gridsec.frames import Past, clean
-from gridsec.online import Frame
+from gridsec.estimators import exact_bank, partial
+from gridsec.estimators import partial as partial_observers
+from gridsec.estimators.inputs import Past, clean
+from gridsec.estimators.partial import CodeWord, Parts
+from gridsec.interface import Frame
+from gridsec.secure.decode import cospark
+from gridsec.secure.decode.noise import correction_constants
+from gridsec.secure.decode.stacks import Stack
 
 FEEDERS = ("cigre-lv", "simbench-lv-rural1")
 SEEDS = 8
@@ -50,8 +50,10 @@ def last_word(made: partial.PartialDesign, seen: list[Frame]) -> tuple[CodeWord,
         state, _, _ = partial.step(made, state, frame)
     inputs = clean(made.setting, Past(state.parts.x, state.v0_squared, state.tally.named), seen[-1])
     h = seen[-1].t - state.t
-    alone, model, parts, _ = codeword.observe(made.setting, made.model, state.parts, seen[-1], inputs, h)
-    word = codeword.code_word(made.setting, parts, seen[-1], inputs, alone, model)
+    alone, model, parts, _ = partial_observers.observe(
+        made.setting, made.model, state.parts, seen[-1], inputs, h
+    )
+    word = partial_observers.code_word(made.setting, parts, seen[-1], inputs, alone, model)
     _, estimate, _ = partial.step(made, state, seen[-1])
     return word, parts, alone.reading, float(estimate.bound.max())
 
@@ -109,14 +111,17 @@ def main() -> int:
         site = load(name)
         watched = plant(site)
         ours = partial.design(watched, max_attacked=1, step_s=1.0)
-        bank = monitor.design(watched, max_attacked=1, step_s=1.0)
+        bank = exact_bank.design(watched, max_attacked=1, step_s=1.0)
         print(f"{name}: {watched.meters.size} meters, {watched.droop.tau.size} inverters")
         knowledge(site, ours)
         head = f"{'named':>7} {'falsely':>8} {'threshold':>10} {'bound':>7} {'ms':>6}"
         print(f"  {'lie':>6} {'estimator':>18} {head}")
         for size in SIZES:
             runs = [frames(site, size, seed) for seed in range(SEEDS)]
-            for what, module, made in (("partial-observers", partial, ours), ("exact-bank", monitor, bank)):
+            for what, module, made in (
+                ("partial-observers", partial, ours),
+                ("exact-bank", exact_bank, bank),
+            ):
                 hits, false, top, bound, spent = 0, 0, [], [], []
                 for liar, seen in runs:
                     who, (estimate, verdict), ms = named(module.step, made, module.init(made, START), seen)

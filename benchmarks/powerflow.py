@@ -22,11 +22,11 @@ import numpy as np
 import pandapower as pp
 from power_grid_model import CalculationMethod
 
-from feeders import powerflow
-from feeders.load import Site, load, names
-from feeders.powerflow import Grid, PowerFlow
-from feeders.scenario import Scenario, simulate
-from feeders.variation import Variation
+from feeders.model.site import Site, load, names
+from feeders.simulation import powerflow
+from feeders.simulation.demand import Variation
+from feeders.simulation.powerflow import Grid, PowerFlow
+from feeders.simulation.scenario import Scenario, simulate
 
 SINGLE, BATCH, PANDAPOWER = 300, 2000, 10
 

@@ -23,12 +23,12 @@ from resource import RUSAGE_CHILDREN, RUSAGE_SELF, getrusage
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-from feeders.load import load
-from feeders.studies.campaign import campaign
-from feeders.studies.campaign_plan import Place, Plan
-from feeders.studies.campaign_promises import promised
-from feeders.studies.campaign_run import Here, Processes
+from feeders.model.site import load
+from feeders.studies.campaign.guarantees import promised
+from feeders.studies.campaign.plan import Place, Plan
+from feeders.studies.campaign.study import campaign
 from feeders.studies.detectable import detectable
+from feeders.studies.workers import Here, Processes
 
 FEEDER, LIES, LIARS = "simbench-lv-rural1", 10_000, 2
 PLAN = Plan(

@@ -18,9 +18,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from benchmarks._arguments import arguments
-from feeders.load import load
+from feeders.model.site import load
+from feeders.studies.campaign.guarantees import rehearse
 from feeders.studies.detectable import detectable
-from feeders.studies.rehearsal import rehearse
 
 FEEDERS, TRIALS, LIARS, TOGETHER = ("cigre-lv", "simbench-lv-rural1"), 10_000, 2, 1_000
 

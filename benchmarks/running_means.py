@@ -4,8 +4,8 @@
 
 Residual of one meter: white noise of variance 1, and a load error of variance S with correlation time
 600 s, one reading per second. The limit of a mean over L ticks is that of
-`gridsec.sequential.design._sigmas`: its two-sided probability at one tick is p = L q, with q the share per
-tick, as if the mean were new once in L ticks. Printed per scale, all in units of the share:
+`gridsec.estimators.sequential.design._sigmas`: its two-sided probability at one tick is p = L q, with q the
+share per tick, as if the mean were new once in L ticks. Printed per scale, all in units of the share:
 
 - ticks: expected ticks beyond the limit, L P / p, exact by linearity, with P from the mean's true variance;
 - runs: separate runs of such ticks;

@@ -31,15 +31,15 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 
 from benchmarks._arguments import count
-from gridsec import sequential
-from gridsec.accuracy import MeterAccuracy
 from gridsec.arrays import Floats
-from gridsec.droop import fleet
-from gridsec.feeder import Feeder, bus_voltages
-from gridsec.online import Frame
-from gridsec.plant import Plant
-from gridsec.sequential import LoadDoubt
-from service.designs import settle
+from gridsec.estimators import sequential
+from gridsec.estimators.plant import Plant
+from gridsec.estimators.sequential import LoadDoubt
+from gridsec.grid.droop import fleet
+from gridsec.grid.meter import MeterAccuracy
+from gridsec.grid.radial import Feeder, bus_voltages
+from gridsec.interface import Frame
+from service.engine.design_jobs import settle
 
 SIZES = (13, 30, 60, 146, 300, 600, 1000, 2000)
 STEADY_MS, ATTACK_MS, MEMORY_MB, POWER = 0.5, 5.0, 500.0, 2.0

@@ -18,9 +18,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from benchmarks._arguments import arguments
-from feeders.estimators import SEQUENTIAL, Watcher, choose, design
-from feeders.load import Site, Snapshot, from_tables, load, to_frame
-from feeders.scenario import Scenario, simulate, snapshots
+from feeders.model.site import Site, Snapshot, from_tables, load, to_frame
+from feeders.registry.registry import SEQUENTIAL, Watcher, choose, design
+from feeders.simulation.scenario import Scenario, simulate, snapshots
 from gridsec.arrays import Floats, Ints
 
 FEEDERS = ("cigre-lv", "kerber-dorfnetz")

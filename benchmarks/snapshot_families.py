@@ -21,11 +21,11 @@ from itertools import product
 
 import numpy as np
 
-from feeders.estimators import Watcher, choose, design
-from feeders.lies import Lie, Trick
-from feeders.load import load
-from feeders.trials import LoadError, Meters, Outcome, Trial, frames, judge
-from gridsec.sequential import SequentialDesign
+from feeders.model.site import load
+from feeders.registry.registry import Watcher, choose, design
+from feeders.simulation.attacks import Lie, Trick
+from feeders.simulation.trial import LoadError, Meters, Outcome, Trial, frames, judge
+from gridsec.estimators.sequential import SequentialDesign
 
 DECODERS = ("weighted-least-squares", "l0-decoder", "basis-pursuit", "matching-pursuit")
 TRICKS = (Trick.BIAS, Trick.TOGETHER, Trick.COORDINATED)

@@ -6,8 +6,8 @@ Kerber Vorstadtnetz with 146 customers unless another feeder is asked for, loads
 known within 0.6 kW and 0.2 kvar (600 s), meters with white noise of 0.2 %. A third of the meters that report
 at all lies by 3 % with random signs. Intervals of 1 s, 60 s and 900 s from a sunny noon on; all meters, half
 of them (chosen at random, silent from the start), or every meter at random moments of its own, on average at
-every second tick. Who is not read tells no powers either: they are what `feeders.load.to_frame` makes of a
-reading that is not there, the range of what the customer can draw and feed in, or the forecast from the
+every second tick. Who is not read tells no powers either: they are what `feeders.model.site.to_frame` makes
+of a reading that is not there, the range of what the customer can draw and feed in, or the forecast from the
 library's profiles. Customers follow the very profiles whose means over the season are their forecasts, as the
 files have them.
 
@@ -32,13 +32,13 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 
 from benchmarks._arguments import arguments
-from feeders.estimators import design
-from feeders.load import Site, from_tables, load
-from feeders.meters import Channel, Silence
-from feeders.scenario import START
-from feeders.trials import Trial, Truth, frames
+from feeders.model.site import Site, from_tables, load
+from feeders.registry.registry import design
+from feeders.simulation.meters import Channel, Silence
+from feeders.simulation.scenario import START
+from feeders.simulation.trial import Trial, Truth, frames
 from gridsec.arrays import Bools
-from gridsec.online import Frame
+from gridsec.interface import Frame
 
 FEEDER = "kerber-vorstadtnetz"
 INTERVALS_S = (1.0, 60.0, 900.0)

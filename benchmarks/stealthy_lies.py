@@ -30,11 +30,11 @@ from benchmarks import _stealthy
 from benchmarks._arguments import arguments
 from benchmarks._scenes import ONSET_S, Model, Setting, neighbours, play, site, squared_to_shift, start
 from benchmarks._stealthy import Stealthy
-from feeders.load import Site
-from feeders.scenario import START
+from feeders.model.site import Site
+from feeders.simulation.scenario import START
 from gridsec.attack import Bias
-from gridsec.online import Decision, Frame
-from gridsec.sequential import SequentialDesign, SequentialState, step
+from gridsec.estimators.sequential import SequentialDesign, SequentialState, step
+from gridsec.interface import Decision, Frame
 
 FEEDERS = ("kerber-dorfnetz", "simbench-lv-rural3", "kerber-vorstadtnetz")
 SETS = ("random", "contiguous", "greedy")

@@ -23,16 +23,16 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 
-from feeders.load import from_tables
-from feeders.load_phases import ThreePhaseSite, load_three_phase
-from feeders.powerflow_unbalanced import UnbalancedPowerFlow, sequence_ohm
-from gridsec import feeder as balanced
+from feeders.model.site import from_tables
+from feeders.model.three_phase import ThreePhaseSite, load_three_phase
+from feeders.simulation.powerflow_three_phase import UnbalancedPowerFlow, sequence_ohm
 from gridsec.arrays import Floats, Phasors, spectral_radius
-from gridsec.certificates import reactance, small_gain
-from gridsec.droop import fleet
 from gridsec.errors import DesignInfeasible
-from gridsec.lure import close_loop
-from gridsec.phases import bus_voltages, corrected, lindist3flow, model_error_bound, sensitivities
+from gridsec.grid import radial as balanced
+from gridsec.grid.droop import fleet
+from gridsec.grid.three_phase import bus_voltages, corrected, lindist3flow, model_error_bound, sensitivities
+from gridsec.observers.certificates import reactance, small_gain
+from gridsec.observers.lure import close_loop
 
 FEEDER = "ieee-european-lv"
 MULTIPLES = (0.25, 0.5, 1.0, 1.5)

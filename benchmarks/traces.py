@@ -34,15 +34,15 @@ import httpx
 import numpy as np
 
 from benchmarks._arguments import arguments
-from feeders.estimators import design
-from feeders.load import Snapshot, load, to_frame
-from feeders.scenario import Scenario, random_attacks, simulate
+from feeders.model.site import Snapshot, load, to_frame
+from feeders.registry.registry import design
+from feeders.simulation.scenario import Scenario, random_attacks, simulate
 from service.app import Running, serve
-from service.bus import BusConfig
-from service.cli import main as gridsec
-from service.ingest import Meters
+from service.cli.main import main as gridsec
+from service.cli.simulate import Pace, play
+from service.ingest.queues import BusConfig
+from service.ingest.zenoh_bus import Meters
 from service.settings import settings
-from service.simulate import Pace, play
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = tuple(str(ROOT / name) + os.sep for name in ("gridsec", "feeders", "service"))

@@ -27,13 +27,13 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 
 from benchmarks._arguments import arguments
-from feeders.estimators import Watcher, design
-from feeders.load import Site, from_tables, load
-from feeders.scenario import START
-from feeders.trials import Lie, LoadError, Meters, Outcome, Trial, Trick, frames, judge
-from gridsec import sequential
+from feeders.model.site import Site, from_tables, load
+from feeders.registry.registry import Watcher, design
+from feeders.simulation.scenario import START
+from feeders.simulation.trial import Lie, LoadError, Meters, Outcome, Trial, Trick, frames, judge
 from gridsec.arrays import Floats, Ints
-from gridsec.sequential.commission import Learned
+from gridsec.estimators import sequential
+from gridsec.estimators.sequential.commission import Learned
 
 FEEDER = "kerber-vorstadtnetz"
 LOAD_KW = 0.6

@@ -17,12 +17,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from feeders.estimators import Watcher, choose, design
-from feeders.load import Site, load, to_frame
-from feeders.meters import MeterErrors
-from feeders.scenario import START, Scenario, simulate, snapshots
+from feeders.model.site import Site, load, to_frame
+from feeders.registry.registry import Watcher, choose, design
+from feeders.simulation.meters import MeterErrors
+from feeders.simulation.scenario import START, Scenario, simulate, snapshots
 from gridsec.attack import Bias, InverterAttack
-from gridsec.online import Decision, Verdict
+from gridsec.interface import Decision, Verdict
 
 FEEDERS = ("cigre-lv", "simbench-lv-rural1", "kerber-landnetz")
 ON_S, END_S = 15.0, 40.0

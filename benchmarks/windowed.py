@@ -12,13 +12,13 @@ from itertools import product
 
 import numpy as np
 
-from feeders.campaign import random_attacks
-from feeders.load import load, plant, to_frame
-from feeders.scenario import START, Scenario, simulate, snapshots
-from gridsec.families import windowed
-from gridsec.families.windowed import LENGTHS
-from gridsec.online import Frame
-from gridsec.windows import Rule
+from feeders.model.site import load, plant, to_frame
+from feeders.simulation.attacks import random_attacks
+from feeders.simulation.scenario import START, Scenario, simulate, snapshots
+from gridsec.estimators import windowed
+from gridsec.estimators.windowed import LENGTHS
+from gridsec.interface import Frame
+from gridsec.secure.windows import Rule
 
 FEEDER = "simbench-lv-rural1"
 SEEDS = 8

@@ -1,4 +1,4 @@
-"""Exceptions. Offline code raises these; online code returns outcomes as values.
+"""Error tree with stable codes, and checks of enumerated arguments.
 
 Every problem has a stable code beside its sentence. Programs and tests compare codes; sentences may change.
 """
@@ -6,7 +6,22 @@ Every problem has a stable code beside its sentence. Programs and tests compare 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any, Self
+from enum import StrEnum
+from typing import Any, Self, TypeVar
+
+__all__ = [
+    "DesignInfeasible",
+    "FeederInvalid",
+    "GridsecError",
+    "InputInvalid",
+    "NotObservable",
+    "Problem",
+    "Problems",
+    "choice",
+    "each_choice",
+    "no_choice",
+    "refuse",
+]
 
 
 class Problem(str):
@@ -177,3 +192,49 @@ def refuse(problems: Iterable[str]) -> None:
     found = tuple(problems)
     if found:
         raise InputInvalid(found)
+
+
+Choice = TypeVar("Choice", bound=StrEnum)
+
+
+def no_choice(name: str, kind: Iterable[str], *values: str) -> list[str]:
+    """Return one problem for each value that is not among the allowed ones.
+
+    Parameters
+    ----------
+    name
+        Name of the quantity in the message.
+    kind
+        Allowed values: an enumeration, or `typing.get_args` of a `Literal`.
+    """
+    known = tuple(kind)
+    return [
+        Problem("unknown-name", f"{name} is {value!r}; expected one of {', '.join(known)}")
+        for value in values
+        if value not in known
+    ]
+
+
+def each_choice(name: str, kind: type[Choice], values: Iterable[str]) -> tuple[Choice, ...]:
+    """Return the members for members or their texts.
+
+    Raises
+    ------
+    ValueError
+        If a value is not a member; the message contains `name`.
+    """
+    given = tuple(values)
+    problems = no_choice(name, kind, *given)
+    refuse(problems)
+    return tuple(kind(value) for value in given)
+
+
+def choice(name: str, kind: type[Choice], value: str) -> Choice:
+    """Return the member for a member or its text.
+
+    Raises
+    ------
+    ValueError
+        If `value` is not a member; the message contains `name`.
+    """
+    return each_choice(name, kind, (value,))[0]

@@ -14,18 +14,18 @@ from typing import Any
 
 import structlog
 
-from feeders.estimators import choose
-from feeders.load import Site, from_tables, load
-from feeders.schema import from_json
+from feeders.format.tables import from_json
+from feeders.model.site import Site, from_tables, load
+from feeders.registry.registry import choose
 from gridsec.errors import FeederInvalid, GridsecError, Problem
-from service.align import Clock
-from service.api import MAX_STREAMS, create_api
-from service.bus import BusConfig
+from service.api.listener import BoundedServer, Shares, raise_limit
+from service.api.routes import MAX_STREAMS, create_api
+from service.engine.engine import RuntimeConfig
+from service.engine.runtime import Runtime
 from service.errors import prefixed
-from service.ingest import Bus
-from service.listener import BoundedServer, Shares, raise_limit
-from service.rounds import RuntimeConfig
-from service.runtime import Runtime
+from service.ingest.align import Clock
+from service.ingest.queues import BusConfig
+from service.ingest.zenoh_bus import Bus
 from service.settings import Settings, split_address
 from service.store import Store
 

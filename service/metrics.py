@@ -7,10 +7,10 @@ from functools import partial
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 
-from gridsec.sequential import LearningReason, LearningState
-from service.bus import BusCounts
+from gridsec.estimators.sequential import LearningReason, LearningState
+from service.ingest.queues import BusCounts
 from service.logs import LineLogger
-from service.report import FeederReport
+from service.report.report import FeederReport
 
 _STEP_BUCKETS = (0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 _DELAY_BUCKETS = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0, 60.0, 300.0)

@@ -14,9 +14,9 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ValidationError, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
-from feeders.columns import ESTIMATORS
+from feeders.format.columns import ESTIMATORS
 from gridsec.errors import GridsecError, InputInvalid, Problem
-from service.align import Clock
+from service.ingest.align import Clock
 
 ENV_PREFIX = "GRIDSEC_"
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"

@@ -30,8 +30,8 @@ SYSTEM_PARTS = {"browser", "postgresql"}
 
 TESTS = Path(__file__).parent
 MEASURED = (
-    *("gridsec/*", "contracts/*", "service/test_alarms.py"),
-    *("feeders/studies/test_calibrate*", "feeders/studies/test_droop*"),
+    *("gridsec/*", "contracts/*", "service/alarms/test_state_machine.py"),
+    *("feeders/studies/calibrate/*", "feeders/studies/droop/*"),
 )
 """Files of tests that coverage traces, except the tests that are marked `no_cover`."""
 

@@ -99,9 +99,9 @@ def columns(page: Path, word: str) -> list[tuple[str, set[str]]]:
 
 def test_names_are_told_from_inventions() -> None:
     code = (
-        "gridsec.bank.design",
+        "gridsec.estimators.exact_bank.bank.design",
         "bank.design",
-        "gridsec/bank.py",
+        "gridsec/estimators/exact_bank/bank.py",
         "bank.py",
         "Bank.masks",
         "design(lure)",
@@ -109,7 +109,7 @@ def test_names_are_told_from_inventions() -> None:
     )
     assert [name for name in code if not is_code(name)] == []
     bad = (
-        "gridsec.bank.dream",
+        "gridsec.estimators.exact_bank.bank.dream",
         "bank.dream",
         "gridsec/bench.py",
         "bench.py",

@@ -21,21 +21,21 @@ import numpy as np
 import pytest
 
 from benchmarks.mesh import european, landnetz
-from feeders import trials
-from feeders.estimators import Family, Job, Watcher
-from feeders.lies import Lie, Trick
-from feeders.load import Site, load
-from feeders.trials import Meters, Trial
-from gridsec.online import Decision
+from feeders.model.site import Site, load
+from feeders.registry.registry import Family, Job, Watcher
+from feeders.simulation import trial as trials
+from feeders.simulation.attacks import Lie, Trick
+from feeders.simulation.trial import Meters, Trial
+from gridsec.interface import Decision
 from tests.acceptance.live import serve
-from tests.feeders.test_bad_frames import BEFORE, frames, put
+from tests.feeders.registry.test_bad_frames import BEFORE, frames, put
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 BLOCK = re.compile(r"```python\n(.*?)```(?:\n```text\n(.*?)```)?", re.DOTALL)
 LINES, WIDTH = 10, 110
 GRIDSEC = """
 import sys
-from service.cli import main
+from service.cli.main import main
 for words in sys.argv[1:]:
     sys.argv = ["gridsec", *words.split()]
     try:

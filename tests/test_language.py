@@ -31,8 +31,8 @@ PUBLIC = re.compile(r"--[a-z-]+|[`\"]who[`\"]")
 LIMITS = {
     "gridsec": (0, 0),
     "default monitor": (166, 220),
-    "feeders": (223, 250),
-    "service": (96, 192),
+    "feeders": (206, 246),
+    "service": (87, 188),
     "documents": (0, 0),
 }
 

@@ -22,10 +22,10 @@ from scipy.special import chdtri
 
 from benchmarks.peers.answer import Answer
 from benchmarks.peers.scene import Reading, Scene
-from feeders import powerflow
+from feeders.simulation import powerflow
 from gridsec.arrays import Bools, Floats
-from gridsec.sequential.conditional import drop, fit
-from gridsec.sequential.loads import LoadDoubt, prior
+from gridsec.estimators.sequential.conditional import drop, fit
+from gridsec.estimators.sequential.loads import LoadDoubt, prior
 
 _SQRT3 = np.sqrt(3.0)
 

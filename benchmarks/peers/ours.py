@@ -9,15 +9,15 @@ import numpy as np
 from benchmarks.peers.answer import Answer
 from benchmarks.peers.scene import Reading, Scene
 from gridsec.arrays import Bools, Floats
-from gridsec.feeder import Feeder, lindistflow
-from gridsec.sequential.conditional import Prior
-from gridsec.sequential.snapshot import FalsePowers, Lies, identify
+from gridsec.estimators.sequential.conditional import Prior
+from gridsec.estimators.sequential.snapshot import FalsePowers, Lies, identify
+from gridsec.grid.radial import Feeder, lindistflow
 
 _STEPS = 2
 
 
 class Flow:
-    """`gridsec.feeder.bus_voltages` at the customers, by matrices made once: on few buses that is faster."""
+    """`grid.radial.bus_voltages` at the customers, by matrices made once: on few buses that is faster."""
 
     def __init__(self, feeder: Feeder) -> None:
         at = feeder.start

@@ -18,10 +18,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from feeders.load import load
-from feeders.powerflow import Grid, PowerFlow
+from feeders.model.site import load
+from feeders.simulation.powerflow import Grid, PowerFlow
 from gridsec.arrays import Bools, Floats
-from gridsec.feeder import Feeder
+from gridsec.grid.radial import Feeder
 
 SIZE = 0.03
 """Size of every attack, of the voltage."""

@@ -1,8 +1,8 @@
 """The monitor that `gridsec serve` runs, fed with the same readings one after the other.
 
 It watches: its false alarms are counted per year, not per snapshot, and it accuses powers only as a last
-resort. What one snapshot alone says is asked of `gridsec.sequential.snapshot`, which the service does not
-run.
+resort. What one snapshot alone says is asked of `gridsec.estimators.sequential.snapshot`, which the service
+does not run.
 """
 
 from __future__ import annotations
@@ -10,12 +10,12 @@ from __future__ import annotations
 import numpy as np
 
 from benchmarks.peers.scene import Scene, Snapshot
-from gridsec import sequential
-from gridsec.accuracy import MeterAccuracy
 from gridsec.arrays import Bools
-from gridsec.droop import Droop
-from gridsec.online import Frame
-from gridsec.plant import Plant
+from gridsec.estimators import sequential
+from gridsec.estimators.plant import Plant
+from gridsec.grid.droop import Droop
+from gridsec.grid.meter import MeterAccuracy
+from gridsec.interface import Frame
 
 # The powers' error is the same in all readings: it lasts much longer than they do.
 _LASTS_S = 3600.0

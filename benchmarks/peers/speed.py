@@ -18,7 +18,7 @@ from benchmarks.peers.grid_model import Greedy
 from benchmarks.peers.measure import cells
 from benchmarks.peers.ours import Ours
 from benchmarks.peers.scene import Scene, Snapshot, mean, scene, snapshot
-from gridsec import sequential
+from gridsec.estimators import sequential
 
 FEEDER = "rural3-behind"
 REPEATS, SNAPSHOTS, SECONDS, STEADY = 12, 15, 30, 5

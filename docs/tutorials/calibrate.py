@@ -11,13 +11,13 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
-from feeders.load import from_tables, load
-from feeders.meters import MeterErrors
-from feeders.recording import record
-from feeders.scenario import Scenario
-from feeders.schema import read, write
-from feeders.studies.calibrate import calibrate
-from feeders.variation import Variation
+from feeders.format.tables import read, write
+from feeders.model.site import from_tables, load
+from feeders.simulation.demand import Variation
+from feeders.simulation.meters import MeterErrors
+from feeders.simulation.recording import record
+from feeders.simulation.scenario import Scenario
+from feeders.studies.calibrate.study import calibrate
 
 truth = load("cigre-lv")
 loads = Variation(hidden_kw=0.2, hidden_kvar=0.1)  # loads beyond the meters' registers

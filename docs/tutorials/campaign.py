@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from feeders.lies import Trick
-from feeders.load import load
-from feeders.profiles import Season
-from feeders.studies.campaign import campaign
-from feeders.studies.campaign_plan import Kind, Place, Plan
+from feeders.model.profiles import Season
+from feeders.model.site import load
+from feeders.simulation.attacks import Trick
+from feeders.studies.campaign.plan import Kind, Place, Plan
+from feeders.studies.campaign.study import campaign
 
 site = load("cigre-lv")
 plan = Plan(

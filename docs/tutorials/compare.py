@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pandas as pd
 
-from feeders.comparison import Plan, compare, markdown, write_csv
-from feeders.load import load
-from feeders.trials import LoadError, Meters
+from feeders.model.site import load
+from feeders.simulation.trial import LoadError, Meters
+from feeders.studies.comparison import Plan, compare, markdown, write_csv
 
 site = load("cigre-lv")
 plan = Plan(

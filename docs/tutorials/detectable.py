@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from feeders.load import load
+from feeders.model.site import load
+from feeders.studies.campaign.guarantees import rehearse
 from feeders.studies.detectable import detectable
-from feeders.studies.rehearsal import rehearse
 
 site = load("cigre-lv")
 found = detectable(site, max_attacked=2)

@@ -5,8 +5,8 @@ Thirteen customers of a rural feeder, seven with generation and inverters after 
 
 from __future__ import annotations
 
-from feeders.load import load
-from feeders.studies.droop import DroopOptions, droop
+from feeders.model.site import load
+from feeders.studies.droop.study import DroopOptions, droop
 
 site = load("kerber-landnetz")
 found = droop(

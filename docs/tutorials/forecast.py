@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from feeders.doubts import forecast_errors, from_history, load_doubt, tell
-from feeders.load import from_tables, load
-from feeders.scenario import START
-from feeders.schema import write
-from feeders.variation import Customers, Variation
+from feeders.format.tables import write
+from feeders.model.load_uncertainty import forecast_errors, from_history, load_doubt, tell
+from feeders.model.site import from_tables, load
+from feeders.simulation.demand import Customers, Variation
+from feeders.simulation.scenario import START
 
 tables = load("cigre-lv").tables
 without = ("Load R15", "Load R16", "Load R17")

@@ -5,7 +5,7 @@ SimBench rural 1, and then the same feeder with two unknown loads.
 
 from __future__ import annotations
 
-from feeders.load import load
+from feeders.model.site import load
 from feeders.studies.protect import Goal, protect
 from gridsec.errors import GridsecError
 

@@ -5,7 +5,7 @@ Thirteen customers of SimBench rural 1 in four streets. The attacker has exact k
 
 from __future__ import annotations
 
-from feeders.load import load
+from feeders.model.site import load
 from feeders.studies.redundancy import redundancy
 
 site = load("simbench-lv-rural1")

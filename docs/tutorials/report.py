@@ -8,10 +8,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from feeders.load import load
-from feeders.report.book import report
-from feeders.report.page import About
-from feeders.report.sections import Outcome
+from feeders.model.site import load
+from feeders.report.build import report
+from feeders.report.html import About, Outcome
 from feeders.studies.protect import Goal, protect
 from feeders.studies.redundancy import redundancy
 

@@ -17,24 +17,24 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from feeders.doubts import load_doubt
-from feeders.load import from_tables, plant
-from feeders.schema import FeederTables
-from feeders.studies.campaign_run import Here, Runner, cores
-from feeders.studies.hidden import Curves
+from feeders.format.tables import FeederTables
+from feeders.model.load_uncertainty import load_doubt
+from feeders.model.site import from_tables, plant
 from feeders.studies.journal import Journal, Progress, Where
 from feeders.studies.operating import SHARE, box, volts_of_lie
+from feeders.studies.unobservable import Curves
+from feeders.studies.workers import Here, Runner, cores
 from gridsec.arrays import Floats
 from gridsec.errors import DesignInfeasible, InputInvalid, Problem
-from gridsec.network import model_error_bound
-from gridsec.sequential import SequentialOptions
-from gridsec.sequential import design as design_sequential
-from gridsec.studies.collusion import Corridor, furthest
-from gridsec.studies.lies import Box, largest_lie, worst_error
-from gridsec.studies.quiet import Rule, named_size, rule, within
+from gridsec.estimators.sequential import SequentialOptions
+from gridsec.estimators.sequential import design as design_sequential
+from gridsec.grid.network import model_error_bound
+from gridsec.planning.collusion import Corridor, furthest
+from gridsec.planning.detectability import Rule, named_size, rule, within
+from gridsec.planning.stealthy_attacks import Box, largest_lie, worst_error
 
 if TYPE_CHECKING:
-    from feeders.load import Site
+    from feeders.model.site import Site
 
 __all__ = ["MANY", "RISK", "Detectable", "detectable", "monitor_rule", "workers"]
 
@@ -111,7 +111,7 @@ def detectable(
     risk
         Probability with which honest errors may be beyond what the monitor's figures allow for.
     runner
-        Where: `campaign_run.Here`, `Processes` or `Dask`; the results are the same.
+        Where: `workers.Here`, `Processes` or `Dask`; the results are the same.
     journal
         File in which finished work is kept; an interrupted study goes on from it.
     progress

@@ -20,8 +20,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Protocol, Self
 
-from feeders.outside import GROUP
-from feeders.plain import plain
+from feeders.registry.plugins import GROUP
+from feeders.util import plain
 from gridsec.errors import GridsecError, Problem
 
 if sys.platform == "win32":

@@ -1,35 +1,109 @@
-"""What honest loads and meters of a feeder can be off by at an operating point, as a box."""
+"""Operating points of studies: volts per customer, and errors of honest loads and meters as a box.
+
+A limit or a curve is in parts of the nominal voltage, the model in parts of each place's own base
+(`feeders.model.equipment`).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Self
 
 import numpy as np
 
-from feeders.doubts import unread
-from feeders.forecast import always
-from feeders.load import Snapshot, to_frame
-from feeders.studies.hidden import Curves, customer_indices
-from gridsec.accuracy import busbar_error, reading_error
+from feeders.format.topology import Edge, tree
+from feeders.model.forecast import always
+from feeders.model.load_uncertainty import unread
+from feeders.model.site import Snapshot, to_frame
+from feeders.studies.unobservable import Curves, customer_indices
 from gridsec.arrays import Floats
-from gridsec.choices import choice
-from gridsec.network import Power, between
-from gridsec.online import Frame
-from gridsec.studies.false_powers import FalsePowers
-from gridsec.studies.lies import Box
-from gridsec.studies.patterns import from_busbar
+from gridsec.errors import choice
+from gridsec.grid.meter import busbar_error, reading_error
+from gridsec.grid.network import Power, between
+from gridsec.interface import Frame
+from gridsec.planning.redundancy import from_busbar
+from gridsec.planning.stealthy_attacks import Box, FalsePowers
 
 if TYPE_CHECKING:
-    from feeders.load import Site
+    from feeders.model.site import Site
+    from feeders.model.three_phase import ThreePhaseSite
 
-__all__ = ["SHARE", "SIGMAS", "box", "false_powers", "squared", "volts_of_lie"]
+__all__ = ["SHARE", "SIGMAS", "Bases", "box", "false_powers", "line_rows", "squared", "volts_of_lie"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bases:
+    """What 1 pu is, for N customers.
+
+    Attributes
+    ----------
+    volt : (N,)
+        1 pu at every customer, V.
+    nominal : (N,)
+        The nominal voltage there, V: 1 in limits and curves.
+    """
+
+    volt: Floats
+    nominal: Floats
+
+    @classmethod
+    def of(cls, site: Site) -> Self:
+        """The bases of a feeder."""
+        return cls(site.customer_volt, site.customer_nominal)
+
+    @property
+    def ratio(self) -> Floats:
+        """What 1 pu is of the nominal voltage, (N,): 1 but for taps."""
+        return np.asarray(self.volt / self.nominal)
+
+    def band(self, low: float, high: float) -> tuple[Floats, Floats]:
+        """Limits in parts of the nominal voltage as pu of every customer, (N,) each."""
+        return low / self.ratio, high / self.ratio
+
+    def extremes(self, v: Floats) -> tuple[float, float]:
+        """The voltages that are lowest and highest of their nominal voltage, V.
+
+        Parameters
+        ----------
+        v : (…, N)
+            Voltages, pu; NaN is that of both.
+        """
+        told = (v * self.ratio).reshape(-1, self.volt.size)
+        lows, highs = told.min(axis=0), told.max(axis=0)
+        lowest, highest = int(np.argmin(lows)), int(np.argmax(highs))
+        return (
+            float(lows[lowest] * self.nominal[lowest]),
+            float(highs[highest] * self.nominal[highest]),
+        )
+
+
+def line_rows(site: Site | ThreePhaseSite) -> list[int]:
+    """Row in lines.csv of every branch of the feeder's tree, and then of every line that closes a loop.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    """
+    rows, group = site.tables.lines, site.bus_of_file
+    closed = [k for k, line in enumerate(rows) if line.closed]
+    lines = [rows[k] for k in closed]
+    # Buses that are one for the model are joined by lines without impedance.
+    joins = [group[row.from_bus] == group[row.to_bus] for row in lines]
+    edges = [
+        Edge(row.line, row.from_bus, row.to_bus, zero, phases=len(row.phases))
+        for row, zero in zip(lines, joins, strict=True)
+    ]
+    found = tree(site.tables.meta.busbar, edges)
+    return [closed[k] for k in (*found.branch, *found.ties)]
+
 
 SHARE: Final = 0.5
 """Share of its peak that every load draws where nothing else is said; nothing is generated."""
 
 SIGMAS: Final = 4.0
-"""Standard deviations of jitter that an honest reading may be off, as in `gridsec.plant.Options`."""
+"""Standard deviations of jitter that an honest reading may be off, as in `estimators.plant.Options`."""
 
 
 def box(site: Site, *, share: float = SHARE, curves: Curves = Curves.DEADBAND) -> Box:

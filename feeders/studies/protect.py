@@ -17,19 +17,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from feeders.studies.hidden import Attack, Curves, knowledge, meter_mask, see_names
 from feeders.studies.journal import Journal, Where
 from feeders.studies.operating import SHARE, box, false_powers, squared, volts_of_lie
+from feeders.studies.unobservable import Attack, Curves, knowledge, meter_mask, see_names
 from gridsec.arrays import Bools, Ints
-from gridsec.choices import choice, no_choice
-from gridsec.errors import DesignInfeasible, Problem, refuse
-from gridsec.studies.false_powers import FalsePowers, largest_of
-from gridsec.studies.lies import Box, largest_lie
-from gridsec.studies.patterns import Patterns, fewest_meters
-from gridsec.studies.protect import Attacker, Unprotectable, fewest_protected, hides, lies_beyond
+from gridsec.errors import DesignInfeasible, Problem, choice, no_choice, refuse
+from gridsec.planning.protection import Attacker, Unprotectable, fewest_protected, hides, lies_beyond
+from gridsec.planning.redundancy import Patterns, fewest_meters
+from gridsec.planning.stealthy_attacks import Box, FalsePowers, largest_lie, largest_of
 
 if TYPE_CHECKING:
-    from feeders.load import Site
+    from feeders.model.site import Site
 
 __all__ = ["Goal", "Protect", "check", "protect"]
 

@@ -16,15 +16,21 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import pandas as pd
 
-from feeders.studies.hidden import Attack, Curves, Knowledge, knowledge, see_names
 from feeders.studies.journal import Progress, Where, worked
+from feeders.studies.unobservable import Attack, Curves, Knowledge, knowledge, see_names
 from gridsec.errors import DesignInfeasible
-from gridsec.index import Index
-from gridsec.studies.patterns import fewest_meters
-from gridsec.studies.redundancy import Part, meter_redundancy, part_redundancy, parts, tree_bus
+from gridsec.planning.redundancy import (
+    Part,
+    fewest_meters,
+    meter_redundancy,
+    part_redundancy,
+    parts,
+    tree_bus,
+)
+from gridsec.secure.index import Index
 
 if TYPE_CHECKING:
-    from feeders.load import Site
+    from feeders.model.site import Site
 
 __all__ = ["ALL", "SILENT", "Redundancy", "redundancy"]
 
@@ -106,7 +112,7 @@ def redundancy(
     site
         The feeder.
     unknown, silent, busbar_known, curves
-        As in `feeders.studies.hidden.knowledge`.
+        As in `feeders.studies.unobservable.knowledge`.
     journal
         File in which finished work is kept; an interrupted study goes on from it.
     progress

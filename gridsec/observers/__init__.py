@@ -1,1 +1,1 @@
-"""Observer families: one module is one family, with `design`, `init` and `step`."""
+"""State observers of any system: one module is one kind, with `design`, `init` and `step`."""

@@ -19,13 +19,11 @@ from typing import Literal
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, frozen
-from gridsec.certificates import Certificate, certify, error_bound, feeds
-from gridsec.choices import no_choice
-from gridsec.errors import DesignInfeasible, InputInvalid, Problem, refuse
-from gridsec.gains import CircleGains, CircleOptions, margin, sensitivity, state_bound
-from gridsec.lmi import circle, contraction
-from gridsec.lure import POLICY, Lure, StepPolicy, advance
-from gridsec.lure_form import Readout
+from gridsec.errors import DesignInfeasible, InputInvalid, Problem, no_choice, refuse
+from gridsec.observers.certificates import Certificate, certify, error_bound, feeds
+from gridsec.observers.gains import CircleGains, CircleOptions, margin, sensitivity, state_bound
+from gridsec.observers.lmi import circle, contraction
+from gridsec.observers.lure import POLICY, Lure, Readout, StepPolicy, advance
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -152,7 +150,9 @@ def design(
             )
         made = replace(made, margin=held)
     elif options is None:
-        raise InputInvalid([Problem("missing", 'gains="lmi" needs options: gridsec.lmi.options_for')])
+        raise InputInvalid(
+            [Problem("missing", 'gains="lmi" needs options: gridsec.observers.lmi.options_for')]
+        )
     else:
         made = circle(
             lure,

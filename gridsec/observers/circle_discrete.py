@@ -22,22 +22,22 @@ from typing import Literal
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, frozen
-from gridsec.choices import no_choice
-from gridsec.errors import DesignInfeasible, InputInvalid, Problem, refuse
-from gridsec.lmi.discrete import DiscreteOptions, discrete_circle
-from gridsec.lmi.discrete_bounds import (
+from gridsec.errors import DesignInfeasible, InputInvalid, Problem, no_choice, refuse
+from gridsec.observers.circle import direct_gain
+from gridsec.observers.lmi.discrete import (
     DirectProof,
     DiscreteGains,
+    DiscreteOptions,
     direct_gain_bound,
+    discrete_circle,
     discrete_margin,
     growth,
     noise_gain,
     nothing_unknown,
     unknown_gain,
 )
-from gridsec.lmi.sampled import DiscreteLure, measure
-from gridsec.lmi.sampled import advance as advance_plant
-from gridsec.observers.circle import direct_gain
+from gridsec.observers.lmi.sampled import DiscreteLure, measure
+from gridsec.observers.lmi.sampled import advance as advance_plant
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,7 +145,7 @@ def design(
             raise DesignInfeasible(what, "does not hold here", held, code="not-verified")
     elif options is None:
         raise InputInvalid(
-            [Problem("missing", 'gains="lmi" needs options: gridsec.lmi.discrete.discrete_options')]
+            [Problem("missing", 'gains="lmi" needs options: gridsec.observers.lmi.discrete.discrete_options')]
         )
     else:
         made = discrete_circle(system, meters, options)

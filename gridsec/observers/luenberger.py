@@ -5,7 +5,8 @@ the others exact. The estimates of all sensors, stacked, are a code word of the 
 
     z_hat = Phi x + v + e,    Phi = [Z_1 … Z_p]^T,    e_i = 0 without attack on i,   |v_i| <= bound_i,
 
-which `gridsec.decode.partial` decodes. Sampled time: x(k+1) = A x(k) + B u(k) + d(k), y(k) = C x(k) + n(k).
+which `gridsec.secure.decode.partial_bounded` decodes. Sampled time: x(k+1) = A x(k) + B u(k) + d(k), y(k) = C
+x(k) + n(k).
 
 References
 ----------
@@ -21,8 +22,7 @@ from typing import Literal
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, frozen, spectral_radius
-from gridsec.choices import no_choice
-from gridsec.errors import DesignInfeasible, InputInvalid, Problem, refuse
+from gridsec.errors import DesignInfeasible, InputInvalid, Problem, no_choice, refuse
 from gridsec.observers.parts import Part, Stack, decompose, heard, riccati, stack
 
 LONGEST = 1 << 17

@@ -20,16 +20,16 @@ from typing import Literal
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from gridsec import bank as banks
 from gridsec.arrays import Floats, Ints
-from gridsec.certificates import reactance
-from gridsec.droop import Droop, fleet
 from gridsec.errors import InputInvalid, Problem
-from gridsec.feeder import Feeder, lindistflow
-from gridsec.gains import CircleGains, margin, options_for
-from gridsec.gains import stacked as in_one
-from gridsec.lmi import solve_many
-from gridsec.lure import Lure, close_loop, equilibrium, known_input
+from gridsec.estimators.exact_bank import bank as banks
+from gridsec.grid.droop import Droop, fleet
+from gridsec.grid.radial import Feeder, lindistflow
+from gridsec.observers.certificates import reactance
+from gridsec.observers.gains import CircleGains, margin, options_for
+from gridsec.observers.gains import stacked as in_one
+from gridsec.observers.lmi import solve_many
+from gridsec.observers.lure import Lure, close_loop, equilibrium, known_input
 from gridsec.papers.claims import Claim, Figure, Line, Panel, Reproduction, at_most, number
 
 CUSTOMERS = 5
@@ -198,7 +198,7 @@ def solutions(customers: int = CUSTOMERS, liars: int = LIARS) -> dict[tuple[int,
     Raises
     ------
     DesignInfeasible
-        As `gridsec.lmi.solve_many`.
+        As `gridsec.observers.lmi.solve_many`.
 
     References
     ----------

@@ -1,32 +1,288 @@
 """lee2018: the three-inertia system under attack (section 4.5, Figures 4.9 to 4.12), and chapter 5's example.
 
+Values that the dissertation does not print are chosen here and marked: the attack's course, the reference,
+the initial state, the gains of the observers.
+
 Chapters 2 and 3 print no example.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Literal
+
 import numpy as np
+from scipy.linalg import expm, solve_discrete_are
 
 from gridsec.arrays import Floats, spectral_radius
-from gridsec.decode.partial.bounded import BoundedDesign
-from gridsec.index import asymptotic_index, dynamic_index, redundant_detectable
+from gridsec.observers import kalman, luenberger
+from gridsec.observers.luenberger import Bounds
 from gridsec.papers import lee2018_chapter5
 from gridsec.papers.claims import Claim, Figure, Line, Panel, Reproduction, at_most, number, statement
-from gridsec.papers.three_inertia import (
-    ATTACK_START,
-    PERIOD,
-    REFERENCE,
-    REFERENCE_START,
-    ROWS_PRINTED,
-    TOL,
-    Plant,
-    Run,
-    closed_loop,
-    estimator,
-    gaussian_estimator,
-    plant,
-    simulate,
+from gridsec.secure.decode import partial_bounded, partial_gaussian
+from gridsec.secure.decode.partial_bounded import BoundedDesign
+from gridsec.secure.decode.partial_gaussian import GaussianDesign
+from gridsec.secure.index import asymptotic_index, dynamic_index, redundant_detectable
+
+INERTIA, FRICTION, STIFFNESS = 0.01, 0.007, 1.37
+"""J in kg m^2, b in N m/(rad/s), k in N m/rad; the same for all wheels and springs."""
+
+PERIOD = 1e-3
+"""T_s, s."""
+
+D_MAX = N_MAX = 1e-3
+"""Bounds of disturbance and noise."""
+
+FEEDBACK = -np.array([[2.32, 0.25, -2.47, 0.04, 1.70, 0.12]])
+"""K of u = K x + K_I sum(reference - theta_3)."""
+
+INTEGRAL = 0.002
+"""K_I."""
+
+ATTACK_START = 2.0
+"""s."""
+
+ROWS_PRINTED = np.array(
+    [
+        [1.0, 0, 0, 0, 0, 0],
+        [0, 0, 1, 0, 0, 0],
+        [0, 0, 1, 0, 0, 0],
+        [0, 0, 0, 0, 1, 0],
+        [1, 0, -1, 0, 0, 0],
+        [0, 0, 1, 0, -1, 0],
+    ]
 )
+"""C_c as printed: six rows for five outputs. The third repeats the second; y has no such entry."""
+
+# Chosen here; not printed in the dissertation.
+REFERENCE, REFERENCE_START = 1.0, 0.5
+X_START = np.array([0.02, 0.0, -0.01, 0.0, 0.02, 0.0])
+START_ERROR = 0.05
+RATE, SLOWEST, TOL = 0.998, 1.0 - 1e-6, 1e-9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Plant:
+    """A sampled plant and its continuous origin.
+
+    Attributes
+    ----------
+    A_c, B_c : (6, 6), (6, 1)
+        Continuous time.
+    A, B, C : (6, 6), (6, 1), (5, 6)
+        Sampled with zero-order hold.
+    E : (6, 6)
+        Input matrix of a disturbance w that is constant over a step: d = E w.
+    """
+
+    A_c: Floats
+    B_c: Floats
+    A: Floats
+    B: Floats
+    C: Floats
+    E: Floats
+
+
+def plant(disturbance: Literal["continuous", "sampled"] = "continuous") -> Plant:
+    """The three-inertia system; states theta_1, its speed, theta_2, its speed, theta_3, its speed.
+
+    Parameters
+    ----------
+    disturbance
+        Quantity bounded by d_max. "continuous": d(t) of (4.5.1), constant over each step. "sampled": d(k) of
+        (4.1.1), a thousand times as large.
+
+    References
+    ----------
+    lee2018 (4.5.1), (4.5.2).
+    """
+    k, b = STIFFNESS / INERTIA, FRICTION / INERTIA
+    A_c = np.zeros((6, 6))
+    A_c[[0, 2, 4], [1, 3, 5]] = 1.0
+    A_c[1, :3] = [-k, -b, k]
+    A_c[3, [0, 2, 3, 4]] = [k, -2.0 * k, -b, k]
+    A_c[5, [2, 4, 5]] = [k, -k, -b]
+    B_c = np.zeros((6, 1))
+    B_c[1] = 1.0 / INERTIA
+    both = np.zeros((12, 12))
+    both[:6, :6], both[:6, 6:] = A_c, np.eye(6)
+    sampled = expm(both * PERIOD)
+    A, held = sampled[:6, :6], sampled[:6, 6:]
+    C = np.delete(ROWS_PRINTED, 2, axis=0)
+    return Plant(A_c, B_c, A, held @ B_c, C, held if disturbance == "continuous" else np.eye(6))
+
+
+def estimator(model: Plant, *, slowest: float = SLOWEST) -> BoundedDesign:
+    """Partial Luenberger observers and Algorithm 4.1 for one attacked sensor.
+
+    Parameters
+    ----------
+    slowest
+        0 for the observability decomposition; the detectability decomposition by default.
+    """
+    bounds = Bounds(D_MAX, np.full(len(model.C), N_MAX), model.E)
+    observers = luenberger.design(
+        model.A, model.B, model.C, bounds, slowest=slowest, tol=TOL, rate=RATE, period=PERIOD
+    )
+    return partial_bounded.design(observers, 1, tol=TOL)
+
+
+def gaussian_estimator(model: Plant, *, false_alarm: float = 1e-4) -> GaussianDesign:
+    """Partial Kalman filters and Algorithm 4.2, with the variances of the bounded signals.
+
+    A vector uniform in the ball of radius r in R^6 has the covariance `r^2 / 8 I`; a number uniform in
+    [-r, r] has the variance `r^2 / 3`.
+    """
+    Q = model.E @ model.E.T * D_MAX**2 / 8.0
+    R = np.eye(len(model.C)) * N_MAX**2 / 3.0
+    filters = kalman.design(model.A, model.B, model.C, Q, R, slowest=SLOWEST, tol=TOL, period=PERIOD)
+    return partial_gaussian.design(filters, 1, false_alarm=false_alarm, tol=1e-10, refresh=0.02)
+
+
+def conventional_gain(model: Plant) -> Floats:
+    """L of one observer (4.2.1) on all sensors, the stationary Kalman predictor.
+
+    Returns
+    -------
+    (6, 5)
+    """
+    Q, R = model.E @ model.E.T * D_MAX**2, np.eye(len(model.C)) * N_MAX**2
+    P = solve_discrete_are(model.A.T, model.C.T, Q, R)
+    return np.asarray(model.A @ P @ model.C.T @ np.linalg.inv(model.C @ P @ model.C.T + R))
+
+
+def attack(t: Floats) -> Floats:
+    """a_1(t), rad: from 2 s on, half a radian with a swing of 2 Hz on top. The course is chosen here."""
+    lie = 0.5 + 0.3 * np.sin(4.0 * np.pi * (t - ATTACK_START))
+    return np.where(t >= ATTACK_START - 0.5 * PERIOD, lie, 0.0)
+
+
+def reference(t: Floats) -> Floats:
+    """theta_3,ref(t), rad: one radian from 0.5 s on. Amplitude and time are chosen here."""
+    return np.where(t >= REFERENCE_START - 0.5 * PERIOD, REFERENCE, 0.0)
+
+
+def closed_loop(model: Plant) -> Floats:
+    """Motion of (x, sum of reference - theta_3) under u = K x + K_I sum, for a known state; (7, 7)."""
+    return np.block([[model.A + model.B @ FEEDBACK, model.B * INTEGRAL], [-model.C[[2]], np.eye(1)]])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Run:
+    """One simulation of T steps.
+
+    Attributes
+    ----------
+    t : (T,)
+        Time, s.
+    x, x_hat, x_conventional : (T, 6)
+        State; estimate in the loop; estimate of the conventional observer beside it.
+    bound : (T,)
+        Bound of |x_hat - x|; infinite for Gaussian noise.
+    disagree : (T, 5)
+        Sensors that the estimate does not use (Gaussian) or explain (bounded).
+    searched : (T,)
+        Steps with a search (bounded) or an alarm (Gaussian).
+    attack, reference : (T,)
+        a_1 and theta_3,ref, rad.
+    u : (T,)
+        Torque, N m.
+    """
+
+    t: Floats
+    x: Floats
+    x_hat: Floats
+    x_conventional: Floats
+    bound: Floats
+    disagree: Floats
+    searched: Floats
+    attack: Floats
+    reference: Floats
+    u: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _World:
+    """Random and prescribed signals, drawn before the loop."""
+
+    d: Floats
+    n: Floats
+    lie: Floats
+    wanted: Floats
+
+
+def _world(model: Plant, t: Floats, seed: int, *, attacked: bool, normal: bool) -> _World:
+    rng = np.random.default_rng(seed)
+    steps, p = t.size, len(model.C)
+    w = rng.standard_normal((steps, 6))
+    if normal:
+        w *= D_MAX / np.sqrt(8.0)
+        n = rng.standard_normal((steps, p)) * N_MAX / np.sqrt(3.0)
+    else:
+        w *= D_MAX * rng.uniform(0.0, 1.0, (steps, 1)) ** (1 / 6) / np.linalg.norm(w, axis=1, keepdims=True)
+        n = rng.uniform(-N_MAX, N_MAX, (steps, p))
+    lie = np.zeros((steps, p))
+    if attacked:
+        lie[:, 0] = attack(t)
+    return _World(w @ model.E.T, n, lie, reference(t))
+
+
+def simulate(
+    model: Plant,
+    design: BoundedDesign | GaussianDesign,
+    *,
+    seconds: float,
+    seed: int = 1,
+    attacked: bool = True,
+    feedback: Literal["resilient", "conventional"] = "resilient",
+) -> Run:
+    """The closed loop of Figures 4.1 and 4.8, with an estimator in it and a conventional observer beside it.
+
+    Parameters
+    ----------
+    design
+        From `estimator` or `gaussian_estimator`.
+    seed
+        Seed of disturbance and noise: uniform within their bounds, or Gaussian of the same variance.
+    attacked
+        Attack sensor 1 from 2 s on.
+    feedback
+        Estimate used by the controller.
+    """
+    t: Floats = np.arange(round(seconds / PERIOD), dtype=np.float64) * PERIOD
+    world = _world(model, t, seed, attacked=attacked, normal=isinstance(design, GaussianDesign))
+    gain = conventional_gain(model)
+    steps = t.size
+    x, total, plain = X_START.copy(), 0.0, np.zeros(6)
+    xs, hats, plains = np.empty((steps, 6)), np.empty((steps, 6)), np.empty((steps, 6))
+    bounds, us = np.full(steps, np.inf), np.empty(steps)
+    disagree, searched = np.zeros((steps, len(model.C))), np.zeros(steps)
+    y = model.C @ x + world.n[0] + world.lie[0]
+    if isinstance(design, BoundedDesign):
+        one, out = partial_bounded.init(design, 0.0, np.zeros(6), START_ERROR)
+    else:
+        two, seen = partial_gaussian.init(design, 0.0, np.zeros(6), np.eye(6) * START_ERROR**2 / 6.0, y)
+    for k in range(steps):
+        if isinstance(design, BoundedDesign):
+            hats[k], bounds[k], disagree[k], searched[k] = out.x, out.bound, out.disagree, out.searched
+        else:
+            hats[k], disagree[k], searched[k] = seen.x, ~seen.trusted, seen.alarm
+        xs[k], plains[k] = x, plain
+        used = hats[k] if feedback == "resilient" else plain
+        u = FEEDBACK @ used + INTEGRAL * total
+        us[k] = u[0]
+        # The controller has estimates only and integrates the estimated theta_3.
+        total += world.wanted[k] - used[4]
+        plain = model.A @ plain + model.B @ u + gain @ (y - model.C @ plain)
+        x = model.A @ x + model.B @ u + world.d[k]
+        if isinstance(design, BoundedDesign):
+            one, out = partial_bounded.step(design, one, y, u)
+        if k + 1 < steps:
+            y = model.C @ x + world.n[k + 1] + world.lie[k + 1]
+            if isinstance(design, GaussianDesign):
+                two, seen = partial_gaussian.step(design, two, y, u)
+    return Run(t, xs, hats, plains, bounds, disagree, searched, world.lie[:, 0], world.wanted, us)
+
 
 SECONDS = 6.0
 SETTLED = 4.5

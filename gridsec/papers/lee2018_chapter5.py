@@ -17,7 +17,7 @@ from gridsec.arrays import Floats
 from gridsec.observers.high_gain import HighGainDesign, design
 from gridsec.observers.high_gain.constants import decay_componentwise, decay_lee
 from gridsec.papers.claims import Claim, Figure, Line, Panel, Reproduction, number, rounded_up, statement
-from gridsec.papers.uniformly_observable import (
+from gridsec.papers.kim2018 import (
     STEP,
     Z_BOUND,
     Run,

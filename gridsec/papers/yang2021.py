@@ -16,11 +16,11 @@ import numpy as np
 
 from gridsec.arrays import Floats
 from gridsec.errors import InputInvalid, Problem
-from gridsec.isolation import Isolation, IsolationDesign, design, init, members, step, support
-from gridsec.lmi.sampled import DiscreteLure, advance
+from gridsec.observers.lmi.sampled import DiscreteLure, advance
 from gridsec.observers.unknown_input import Missing, UnknownInputPlant, exact, obstruction, pairs_text
 from gridsec.papers import yang2021_feeder
 from gridsec.papers.claims import Claim, Figure, Line, Panel, Reproduction, number, statement
+from gridsec.secure.isolation import Isolation, IsolationDesign, design, init, members, step, support
 
 TOLERANCE = 1e-3
 """Tolerance of zero in (46), (47) after the steps of the figures."""

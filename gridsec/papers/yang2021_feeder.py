@@ -13,13 +13,13 @@ from functools import lru_cache
 import numpy as np
 
 from gridsec.arrays import Floats
-from gridsec.droop import Droop, fleet
-from gridsec.feeder import Feeder
-from gridsec.isolation import Isolation, IsolationDesign, design, init, step
-from gridsec.lmi.sampled import advance, measure
-from gridsec.lure import Lure, close_loop
+from gridsec.grid.droop import Droop, fleet
+from gridsec.grid.radial import Feeder
+from gridsec.observers.lmi.sampled import advance, measure
+from gridsec.observers.lure import Lure, close_loop
 from gridsec.observers.unknown_input import UnknownInputPlant, inverters
 from gridsec.papers.claims import Figure, Line, Panel
+from gridsec.secure.isolation import Isolation, IsolationDesign, design, init, step
 
 CUSTOMERS = 13
 STEP_S = 1.0

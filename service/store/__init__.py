@@ -13,8 +13,8 @@ A call to PostgreSQL has a time limit. `OutcomeUnknown` is a commit without an a
 same key again tells or repeats it. After `WriterLost` a store writes nothing more.
 """
 
-from service.history import HistoryRules
-from service.store.records import Event, OutcomeUnknown, Rejected, StoreUnavailable, WriterLost
+from service.store.history import HistoryRules
+from service.store.schema import Event, OutcomeUnknown, Rejected, StoreUnavailable, WriterLost
 from service.store.writes import BAD_READINGS_KEPT, Store
 
 __all__ = [

@@ -9,12 +9,9 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from service.alarms import Alarm, AlarmState, Change, from_json
-from service.commissioning import Happened, Step
-from service.history import unpack
-from service.kept import Kept, Matter
+from service.alarms.state_machine import Alarm, AlarmState, Change, from_json
 from service.store.connect import Connections
-from service.store.records import Event, Rejected
+from service.store.history import unpack
 from service.store.schema import (
     ALARM,
     BAD,
@@ -26,7 +23,12 @@ from service.store.schema import (
     HISTORY,
     LAYOUT,
     OUTBOX,
+    Event,
+    Happened,
+    Rejected,
+    Step,
 )
+from service.store.state_codec import Kept, Matter
 
 
 class Reader:
@@ -118,7 +120,7 @@ class Reader:
             return int(connection.execute(query).scalar_one())
 
     def active(self, feeder: str | None = None, *, cleared_since: float | None = None) -> list[Alarm]:
-        """Return what `alarms.restore` needs.
+        """Return what `state_machine.restore` needs.
 
         Parameters
         ----------

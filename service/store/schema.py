@@ -1,13 +1,91 @@
-"""The tables, and how an older database becomes one of this version."""
+"""Tables of the database, their migration, and records beside alarms and reports."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
 
 import sqlalchemy as sa
 
-from service.store.records import StoreUnavailable
+from gridsec.errors import GridsecError
+from service.alarms.state_machine import Alarm, Change
+
+
+class Step(StrEnum):
+    """What happened to a commissioning."""
+
+    BEGUN = "begun"
+    LEARNED = "learned"
+    RECOMMISSIONED = "recommissioned"
+
+
+@dataclass(frozen=True, slots=True)
+class Happened:
+    """One entry of a feeder's record of commissioning.
+
+    Attributes
+    ----------
+    feeder
+        Whose.
+    t
+        Unix time, s.
+    change
+        What happened.
+    meters
+        To which meters.
+    who, reason
+        Who wanted it, if somebody did, and why.
+    """
+
+    feeder: str
+    t: float
+    change: Step
+    meters: tuple[str, ...]
+    who: str | None = None
+    reason: str = ""
+
+
+class StoreUnavailable(GridsecError):
+    """The database cannot be opened, read or written; the message says which one and why."""
+
+    code = "database-unavailable"
+
+
+class OutcomeUnknown(StoreUnavailable):
+    """The connection broke while a transaction was committed: it is stored as a whole, or not at all."""
+
+    code = "outcome-unknown"
+
+
+class WriterLost(StoreUnavailable):
+    """The lock of the one writer is lost: another process may have written, and this one must end."""
+
+    code = "writer-lost"
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """One stored transition. `seq` rises by the order of commits and is never used twice."""
+
+    seq: int
+    t: float
+    change: Change
+    who: str | None
+    comment: str | None
+    alarm: Alarm
+
+
+@dataclass(frozen=True, slots=True)
+class Rejected:
+    """A reading that could not be used: arrival time (Unix s), key, why, and the start of its bytes."""
+
+    t: float
+    key: str
+    reason: str
+    payload: bytes = b""
+
 
 META = sa.MetaData()
 SEQ = sa.BigInteger().with_variant(sa.Integer(), "sqlite")

@@ -11,14 +11,11 @@ from typing import Any
 import sqlalchemy as sa
 import structlog
 
-from service.alarms import Transition, to_json
-from service.commissioning import Happened
-from service.history import HistoryRules, Mark, mark, pack, rows, worth_keeping
-from service.kept import Kept, Matter
-from service.report import FeederReport
+from service.alarms.state_machine import Transition, to_json
+from service.report.report import FeederReport
 from service.store.connect import Connections
+from service.store.history import HistoryRules, Mark, mark, pack, rows, worth_keeping
 from service.store.reads import Reader
-from service.store.records import Rejected, StoreUnavailable, WriterLost
 from service.store.schema import (
     ALARM,
     BAD,
@@ -31,9 +28,14 @@ from service.store.schema import (
     LAYOUT,
     OUTBOX,
     WRITER,
+    Happened,
+    Rejected,
+    StoreUnavailable,
+    WriterLost,
     digest,
     migrate,
 )
+from service.store.state_codec import Kept, Matter
 
 BAD_READINGS_KEPT = 1000
 _PAYLOAD_KEPT = 256

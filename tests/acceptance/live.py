@@ -21,7 +21,7 @@ from typing import Any, Protocol, TypeVar
 import httpx
 import zenoh
 
-from feeders.scenario import Reading
+from feeders.simulation.scenario import Reading
 from tests.service.running import free_port
 
 START_S = 60.0

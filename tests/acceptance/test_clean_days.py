@@ -15,17 +15,17 @@ import numpy as np
 import pytest
 
 from benchmarks.clean_days import Run, main, plan, play
-from feeders.campaign import Kind, random_attacks
-from feeders.estimators import design
-from feeders.load import Snapshot, from_tables, load, to_frame
-from feeders.meters import MeterErrors
-from feeders.profiles import Season
-from feeders.scenario import START, Reading, Scenario, simulate
-from feeders.variation import Variation
+from feeders.model.profiles import Season
+from feeders.model.site import Snapshot, from_tables, load, to_frame
+from feeders.registry.registry import design
+from feeders.simulation.attacks import Kind, random_attacks
+from feeders.simulation.demand import Variation
+from feeders.simulation.meters import MeterErrors
+from feeders.simulation.scenario import START, Reading, Scenario, simulate
 from gridsec.arrays import Floats
-from gridsec.online import Decision
-from service.conditions import AlarmKind
-from service.replay import Tally, replay
+from gridsec.interface import Decision
+from service.alarms.conditions import AlarmKind
+from service.engine.replay import Tally, replay
 
 DAY_S = 86_400.0
 SETTLED_S = 120.0

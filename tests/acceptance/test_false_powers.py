@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from feeders.estimators import SEQUENTIAL, choose, design
-from feeders.lies import Lie, Trick, manipulations
-from feeders.load import load, to_frame
-from feeders.scenario import START, Scenario, simulate, snapshots
-from gridsec.online import Cause, Decision
+from feeders.model.site import load, to_frame
+from feeders.registry.registry import SEQUENTIAL, choose, design
+from feeders.simulation.attacks import Lie, Trick, manipulations
+from feeders.simulation.scenario import START, Scenario, simulate, snapshots
+from gridsec.interface import Cause, Decision
 
 ONSET_S = 30.0
 

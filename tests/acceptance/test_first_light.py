@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from feeders.load import Site, load
-from feeders.scenario import START, Scenario, random_attacks, simulate
+from feeders.model.site import Site, load
+from feeders.simulation.scenario import START, Scenario, random_attacks, simulate
 from tests.acceptance.live import Fleet, serve
 
 FEEDER = "simbench-lv-rural1"

@@ -25,9 +25,9 @@ import pytest
 import zenoh
 from pyarrow import ipc
 
-from feeders.load import Site, from_tables, load
-from feeders.scenario import START, Reading, Scenario, simulate
-from feeders.schema import write
+from feeders.format.tables import write
+from feeders.model.site import Site, from_tables, load
+from feeders.simulation.scenario import START, Reading, Scenario, simulate
 from gridsec.attack import Attack, Bias
 from tests.acceptance.live import Fleet, Live, serve
 from tests.service.running import free_port
@@ -331,7 +331,7 @@ def resident_mb(live: Live) -> float:
 
 @pytest.mark.acceptance
 def test_a_second_service_leaves_the_first_alone(tmp_path: Path) -> None:
-    """It wants the same database; what it says of all that may be taken is in tests/service/test_cli.py."""
+    """It wants the same database; messages of all such cases are in tests/service/cli/test_main.py."""
     samples = sampled(load(FEEDER), 25)
     with serve(FEEDER, tmp_path) as live, Fleet(live) as fleet:
         verdicts(fleet, samples[:10])

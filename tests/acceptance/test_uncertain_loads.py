@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.uncertain_loads import CELLS, LARGEST_ERROR_PERCENT, Cell, run
-from feeders.trials import Meters
+from feeders.simulation.trial import Meters
 
 # Learning takes six simulated hours: one seed of that has to do here.
 RUNS = [(cell, seed) for cell in CELLS for seed in range(1 if cell.learned else 3)]

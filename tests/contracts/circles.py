@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from gridsec import bank
 from gridsec.arrays import Bools, Floats
-from gridsec.gains import CircleOptions, options_for, stacked
-from gridsec.lmi import solve_many
-from gridsec.lure import Lure, StepPolicy
+from gridsec.estimators.exact_bank import bank
+from gridsec.estimators.exact_bank.bank import Gains
 from gridsec.observers import circle
-from gridsec.stacked import Gains
-from gridsec.subsets import subsets
+from gridsec.observers.gains import CircleOptions, options_for, stacked
+from gridsec.observers.lmi import solve_many
+from gridsec.observers.lure import Lure, StepPolicy
+from gridsec.secure.subsets import subsets
 from tests.contracts.member import Batch, Family, Member, Run, signs_or_anything
 from tests.gridsec.plants import Street, line, shared, tree
 

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 
 from gridsec.arrays import Floats
-from gridsec.lmi.discrete import discrete_contraction, discrete_options
-from gridsec.lmi.discrete_bounds import input_error
-from gridsec.lmi.sampled import DiscreteLure, advance, measure, sample
 from gridsec.observers import circle_discrete as observers
+from gridsec.observers.lmi.discrete import discrete_contraction, discrete_options, input_error
+from gridsec.observers.lmi.sampled import DiscreteLure, advance, measure, sample
 from gridsec.papers import yang2019
 from tests.contracts.member import Batch, Family, Member, Run, signs_or_anything, started_away
 from tests.gridsec.plants import Street, line, shared, tree

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from gridsec.arrays import Floats
-from gridsec.lmi.sampled import advance, measure
 from gridsec.observers import unknown_input as observers
+from gridsec.observers.lmi.sampled import advance, measure
 from gridsec.observers.unknown_input import Pair, UnknownInputPlant
 from gridsec.papers import yang2021, yang2021_feeder
 from tests.contracts.member import Batch, Family, Member, Run, signs_or_anything, started_away

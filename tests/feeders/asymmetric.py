@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from power_grid_model import ComponentType, DatasetType, PowerGridModel, initialize_array
 
-from feeders.load import find
-from feeders.schema import FeederTables
+from feeders.format.tables import FeederTables
+from feeders.model.site import find
 from gridsec.arrays import Floats
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from feeders.schema import CustomerRow, FeederMeta, FeederTables, LineRow
+from feeders.format.tables import CustomerRow, FeederMeta, FeederTables, LineRow
 
 MV, LV = 20_000.0 / 3**0.5, 400.0 / 3**0.5
 

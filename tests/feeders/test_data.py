@@ -10,15 +10,15 @@ import numpy as np
 import pandapower as pp
 import pytest
 
-from feeders import profiles
-from feeders.convert import RECIPES
-from feeders.load import Site, Snapshot, load, names, to_frame
-from feeders.load_phases import three_phase_names
-from feeders.profiles import Season
-from feeders.schema import examine, read
-from gridsec.certificates import certify, reactance, small_gain, verify
-from gridsec.feeder import lindistflow, loss_correction, model_error_bound, squared_voltages
-from gridsec.lure import close_loop
+from feeders.convert.convert import RECIPES
+from feeders.format.tables import examine, read
+from feeders.model import profiles
+from feeders.model.profiles import Season
+from feeders.model.site import Site, Snapshot, load, names, to_frame
+from feeders.model.three_phase import three_phase_names
+from gridsec.grid.radial import lindistflow, loss_correction, model_error_bound, squared_voltages
+from gridsec.observers.certificates import certify, reactance, small_gain, verify
+from gridsec.observers.lure import close_loop
 
 DATA = Path(str(profiles.data_root()))
 CUSTOMERS = {

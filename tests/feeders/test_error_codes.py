@@ -20,34 +20,33 @@ import pyarrow.parquet as pq
 import pytest
 
 import feeders
-from feeders import outside
-from feeders.campaign import Kind, random_attacks
-from feeders.convert import convert
-from feeders.convert_busbar import busbar_of
-from feeders.convert_network import Network, below
-from feeders.convert_simbench import envelope
-from feeders.doubts import from_history
-from feeders.estimators import Family, choose
-from feeders.inverters import ClosedLoop, Loads
-from feeders.load import from_tables, load
-from feeders.load_phases import three_phase
-from feeders.meters import Channel
-from feeders.powerflow import PowerFlow
-from feeders.recording import read_recording
-from feeders.scenario import Scenario, simulate
-from feeders.schema import CustomerRow, FeederTables, LineRow, from_json, read, to_json, write
-from feeders.studies.calibrate import Calibrate
-from feeders.studies.calibrate_readings import frames
-from feeders.studies.campaign import campaign
-from feeders.studies.campaign_run import Dask, Processes, agree
-from feeders.studies.droop import droop
+from feeders.convert.convert import convert
+from feeders.convert.from_simbench import envelope
+from feeders.convert.network import Network, below, busbar_of
+from feeders.format.tables import CustomerRow, FeederTables, LineRow, from_json, read, to_json, write
+from feeders.model.load_uncertainty import from_history
+from feeders.model.site import from_tables, load
+from feeders.model.three_phase import three_phase
+from feeders.registry import plugins
+from feeders.registry.registry import Family, choose
+from feeders.simulation.attacks import Kind, random_attacks
+from feeders.simulation.demand import Variation
+from feeders.simulation.meters import Channel
+from feeders.simulation.plant import ClosedLoop, Loads
+from feeders.simulation.powerflow import PowerFlow
+from feeders.simulation.recording import read_recording
+from feeders.simulation.scenario import Scenario, simulate
+from feeders.simulation.trial import LoadError
+from feeders.studies.calibrate.readings import frames
+from feeders.studies.calibrate.study import Calibrate
+from feeders.studies.campaign.study import campaign
+from feeders.studies.droop.study import droop
 from feeders.studies.journal import Journal
 from feeders.studies.protect import Goal, protect
-from feeders.trials import LoadError
-from feeders.variation import Variation
+from feeders.studies.workers import Dask, Processes, agree
 from gridsec.attack import Bias
 from tests.feeders import stations, villages
-from tests.feeders.studies.campaigns import PLAN, SITE
+from tests.feeders.studies.campaign.campaigns import PLAN, SITE
 from tests.feeders.villages import village, village_without_inverters
 from tests.sentences import golden, sentences, used
 
@@ -94,13 +93,13 @@ def backwards() -> Any:
 
 
 def limited() -> Any:
-    with patch("feeders.schema.MAX_PROBLEMS", 1):
+    with patch("feeders.format.tables.MAX_PROBLEMS", 1):
         return cells("lines", r_ohm=-1, x_ohm="much", closed="maybe")
 
 
 def large() -> Any:
     write(street(), "street")
-    with patch("feeders.raw.MAX_BYTES", 0):
+    with patch("feeders.format.reader.MAX_BYTES", 0):
         return read("street")
 
 
@@ -162,7 +161,7 @@ def opendss() -> Any:
 
 
 def foreign_worker() -> Any:
-    with patch("feeders.studies.campaign_run.versions", lambda: {"numpy": "2.0"}):
+    with patch("feeders.studies.workers.versions", lambda: {"numpy": "2.0"}):
         return agree("tcp://a:1", {"numpy": "1.0"})
 
 
@@ -197,13 +196,13 @@ def not_settled() -> Any:
     site = village()
     loop = ClosedLoop(PowerFlow(site), site.droop, site.feeder.base_kva, site.feeder.base_volt)
     nothing = np.zeros(len(site.feeder.customers))
-    with patch("feeders.inverters.MAX_ITERATIONS", 0):
+    with patch("feeders.simulation.plant.MAX_ITERATIONS", 0):
         return loop.equilibrium(Loads(nothing, nothing, 300.0))
 
 
 def unsolved() -> Any:
     failed = SimpleNamespace(success=False, x=None, message="infeasible")
-    with patch("feeders.convert_simbench.linprog", lambda *_, **__: failed):
+    with patch("feeders.convert.from_simbench.linprog", lambda *_, **__: failed):
         return envelope(np.array([0.1, 0.9, 0.5]), np.array([0.2, 0.3, 0.9]))
 
 
@@ -242,7 +241,7 @@ CALLS: dict[str, Callable[[], Any]] = {
     ),
     "three phases as a balanced feeder": lambda: load("ieee-european-lv").balanced,
     "no such estimator": lambda: choose(village(), estimator="oracle", max_attacked=-1),
-    "an estimator that no package offers": lambda: outside.load("nobody", Family),
+    "an estimator that no package offers": lambda: plugins.load("nobody", Family),
     "two sources": lambda: busbar_of(network(sources=("bb", "end")), [MAIN], None),
     "a second source": lambda: below(network(sources=("bb", "end")), "bb", ()),
     "no such bus": lambda: busbar_of(network(), [MAIN], "nowhere"),

@@ -28,8 +28,8 @@ from benchmarks.peers.measure import (
 from benchmarks.peers.ours import Covariance
 from benchmarks.peers.scene import SIZE, Cell, Scene, mean, scene, snapshot
 from benchmarks.peers.served import frame, suspects, watch
-from gridsec import sequential
-from gridsec.feeder import lindistflow
+from gridsec.estimators import sequential
+from gridsec.grid.radial import lindistflow
 
 FEEDER = "rural1-behind"
 Prepared = tuple[Scene, dict[str, Method]]

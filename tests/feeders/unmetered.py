@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from feeders.load import Site, from_tables, load, to_frame
-from feeders.scenario import Sample, Scenario, simulate, snapshots
+from feeders.model.site import Site, from_tables, load, to_frame
+from feeders.simulation.scenario import Sample, Scenario, simulate, snapshots
 from gridsec.arrays import Bools
-from gridsec.online import Frame
+from gridsec.interface import Frame
 
 HOURS = 3600.0 * np.array([3.0, 8.0, 12.5, 18.0, 21.0])
 

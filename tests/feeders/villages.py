@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 
-from feeders.load import Site, from_tables
-from feeders.schema import CustomerRow, FeederMeta, FeederTables, LineRow
+from feeders.format.tables import CustomerRow, FeederMeta, FeederTables, LineRow
+from feeders.model.site import Site, from_tables
 
 
 def tables() -> FeederTables:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from feeders.estimators import design
-from feeders.load import Site, to_frame
-from feeders.scenario import START, Scenario, random_attacks, simulate, snapshots
-from gridsec.online import Decision
+from feeders.model.site import Site, to_frame
+from feeders.registry.registry import design
+from feeders.simulation.scenario import START, Scenario, random_attacks, simulate, snapshots
+from gridsec.interface import Decision
 
 
 def names_the_liar_alone(site: Site) -> None:

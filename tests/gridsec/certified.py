@@ -5,7 +5,7 @@ from __future__ import annotations
 import hypothesis.strategies as st
 import numpy as np
 
-from gridsec.certificates import Certificate
+from gridsec.observers.certificates import Certificate
 
 seeds = st.integers(0, 100_000)
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from feeders.powerflow import Grid, PowerFlow
+from feeders.simulation.powerflow import Grid, PowerFlow
 from gridsec.arrays import Floats
-from gridsec.mesh import MeshedFeeder
+from gridsec.grid.meshed import MeshedFeeder
 from tests.gridsec.radial import random_feeder
 
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from gridsec.arrays import Floats, Ints
-from gridsec.droop import fleet
-from gridsec.feeder import Feeder, lindistflow
-from gridsec.lure import Lure, close_loop
+from gridsec.grid.droop import fleet
+from gridsec.grid.radial import Feeder, lindistflow
+from gridsec.observers.lure import Lure, close_loop
 
 
 @dataclass(frozen=True)

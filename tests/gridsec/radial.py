@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from gridsec.arrays import Floats
-from gridsec.droop import Droop, fleet
-from gridsec.feeder import Feeder
-from gridsec.lure import Lure, close_loop
+from gridsec.grid.droop import Droop, fleet
+from gridsec.grid.radial import Feeder
+from gridsec.observers.lure import Lure, close_loop
 
 
 def random_feeder(seed: int, *, customers: int | None = None, charging: float = 0.0) -> Feeder:

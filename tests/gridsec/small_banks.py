@@ -6,11 +6,11 @@ from itertools import combinations
 
 import numpy as np
 
-from gridsec import bank as banks
-from gridsec import lure as lures
-from gridsec.droop import Droop, fleet
-from gridsec.feeder import Feeder
-from gridsec.lure import Lure, close_loop
+from gridsec.estimators.exact_bank import bank as banks
+from gridsec.grid.droop import Droop, fleet
+from gridsec.grid.radial import Feeder
+from gridsec.observers import lure as lures
+from gridsec.observers.lure import Lure, close_loop
 
 PRESETS = ("ieee1547-a", "ieee1547-b", "vde4105")
 

@@ -10,11 +10,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gridsec.accuracy import MeterAccuracy
-from gridsec.droop import Droop, fleet
-from gridsec.feeder import Feeder
-from gridsec.monitor import Plant
-from gridsec.online import Frame
+from gridsec.estimators.plant import Plant
+from gridsec.grid.droop import Droop, fleet
+from gridsec.grid.meter import MeterAccuracy
+from gridsec.grid.radial import Feeder
+from gridsec.interface import Frame
 
 BASE_KVA = 100.0
 BASE_VOLT = 230.0

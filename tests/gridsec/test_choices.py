@@ -8,14 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gridsec import bank, isolation, windows
-from gridsec.decode import Stack, gaussian
 from gridsec.errors import InputInvalid
-from gridsec.index import asymptotic_index, dynamic_index, redundant_detectable, redundant_observable
-from gridsec.lmi.discrete import discrete_options
-from gridsec.lmi.sampled import DiscreteLure
+from gridsec.estimators.exact_bank import bank
 from gridsec.observers import circle, circle_discrete, high_gain, luenberger
+from gridsec.observers.lmi.discrete import discrete_options
+from gridsec.observers.lmi.sampled import DiscreteLure
 from gridsec.observers.unknown_input import exact
+from gridsec.secure import isolation, windows
+from gridsec.secure.decode import Stack, gaussian
+from gridsec.secure.index import asymptotic_index, dynamic_index, redundant_detectable, redundant_observable
 from tests.codes import refused
 from tests.gridsec.observers.bent import estimator
 from tests.gridsec.plants import street

@@ -13,36 +13,37 @@ import pytest
 
 import feeders
 import gridsec
-from gridsec import bank, monitor
 from gridsec.arrays import not_negative
 from gridsec.attack import Bias, Replay, Stuck, coordinate
-from gridsec.certificates import certify
-from gridsec.decode import Stack, gaussian, stacks
-from gridsec.decode.probability import bound_for
-from gridsec.designs import from_bytes
-from gridsec.droop import Droop, fleet, preset
-from gridsec.families import windowed
-from gridsec.feeder import Feeder, loss_correction
-from gridsec.gains import refuse_blind
-from gridsec.lmi import options_for
-from gridsec.lmi.discrete import discrete_contraction
-from gridsec.lmi.pursuit import group_pursuit
-from gridsec.lmi.sampled import DiscreteLure
-from gridsec.lure import close_loop
-from gridsec.mesh import MeshedFeeder
+from gridsec.estimators import exact_bank, windowed
+from gridsec.estimators.exact_bank import bank
+from gridsec.estimators.plant import Options
+from gridsec.estimators.sequential import LoadDoubt, SequentialOptions
+from gridsec.grid.droop import Droop, fleet, preset
+from gridsec.grid.meshed import MeshedFeeder
+from gridsec.grid.phased import PhasedFeeder
+from gridsec.grid.radial import Feeder, loss_correction
+from gridsec.grid.three_phase import ThreePhaseFeeder
 from gridsec.observers import circle, luenberger
+from gridsec.observers.certificates import certify
+from gridsec.observers.design_archive import from_bytes
+from gridsec.observers.gains import refuse_blind
 from gridsec.observers.high_gain import given as given_inverse
 from gridsec.observers.high_gain import linear
-from gridsec.observers.high_gain.inverse import check, corners_and_interior
-from gridsec.observers.high_gain.symbolic import decompose
+from gridsec.observers.high_gain.form import decompose
+from gridsec.observers.high_gain.redundancy import check, corners_and_interior
+from gridsec.observers.lmi import options_for
+from gridsec.observers.lmi.discrete import discrete_contraction
+from gridsec.observers.lmi.sampled import DiscreteLure
+from gridsec.observers.lmi.solver import group_pursuit
+from gridsec.observers.lure import close_loop
 from gridsec.observers.unknown_input import exact
-from gridsec.papers import uniformly_observable, yang2021
-from gridsec.phases import PhasedFeeder, ThreePhaseFeeder
-from gridsec.plant import Options
-from gridsec.sequential import LoadDoubt, SequentialOptions
-from gridsec.studies.droop_stability import Update
-from gridsec.studies.protect import fewest_protected
-from gridsec.subsets import subsets
+from gridsec.papers import kim2018, yang2021
+from gridsec.planning.droop.stability import Update
+from gridsec.planning.protection import fewest_protected
+from gridsec.secure.decode import Stack, gaussian, stacks
+from gridsec.secure.decode.noise import bound_for
+from gridsec.secure.subsets import subsets
 from tests.gridsec.plants import line
 from tests.gridsec.radial import random_feeder
 from tests.gridsec.street import accuracy, make_plant
@@ -177,7 +178,7 @@ def symbolic(kind: str) -> Any:
 
 
 def no_left_inverse() -> Any:
-    model = uniformly_observable.system()
+    model = kim2018.system()
     wrong = given_inverse(model, (1, 2, 3), lambda z: 0.0 * z[..., :3], factor=1.0)
     return check(model, wrong, corners_and_interior(model), tolerance=1e-6)
 
@@ -259,7 +260,7 @@ CALLS: dict[str, Callable[[], Any]] = {
     "line without impedance": lambda: MeshedFeeder(
         random_feeder(3), np.array([[0, 1]]), np.zeros(1), np.zeros(1), np.zeros(1)
     ),
-    "plant and numbers of a monitor": lambda: monitor.design(
+    "plant and numbers of a monitor": lambda: exact_bank.design(
         street(meters=np.array([-1, 3, 3])), max_attacked=-1, step_s=0.0
     ),
     "options of a monitor": lambda: Options(

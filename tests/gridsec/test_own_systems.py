@@ -8,18 +8,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gridsec import bank
 from gridsec.errors import DesignInfeasible, InputInvalid, NotObservable
-from gridsec.gains import CircleGains
-from gridsec.lmi import circle, options_for, prove
-from gridsec.lmi.sampled import DiscreteLure
-from gridsec.lmi.sampled import advance as advance_discrete
-from gridsec.lure import Lure, advance
+from gridsec.estimators.exact_bank import bank
+from gridsec.estimators.exact_bank.bank import StackedState
+from gridsec.interface import Cause, Decision
 from gridsec.observers import circle as observer
 from gridsec.observers import high_gain
+from gridsec.observers.gains import CircleGains
 from gridsec.observers.high_gain import groups, nearest
-from gridsec.online import Cause, Decision
-from gridsec.stacked import StackedState
+from gridsec.observers.lmi import circle, options_for, prove
+from gridsec.observers.lmi.sampled import DiscreteLure
+from gridsec.observers.lmi.sampled import advance as advance_discrete
+from gridsec.observers.lure import Lure, advance
 from tests.codes import refused
 from tests.gridsec.observers.bent import bent, truth
 

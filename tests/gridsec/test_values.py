@@ -7,9 +7,9 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 import pytest
 
-from gridsec import sequential
-from gridsec.values import changed
-from tests.gridsec.sequential.test_monitor import prepare
+from gridsec.arrays import changed
+from gridsec.estimators import sequential
+from tests.gridsec.estimators.sequential.test_monitor import prepare
 from tests.gridsec.street import make_plant
 
 

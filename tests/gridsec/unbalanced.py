@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from gridsec.arrays import Floats, Phasors
-from gridsec.mesh import PhasedMesh
-from gridsec.network import InPhases
-from gridsec.phases import ThreePhaseFeeder
+from gridsec.grid.meshed import PhasedMesh
+from gridsec.grid.network import InPhases
+from gridsec.grid.three_phase import ThreePhaseFeeder
 
 
 def random_three_phase(

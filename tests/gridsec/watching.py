@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from gridsec import monitor
-from gridsec.monitor import MonitorDesign, MonitorState
-from gridsec.online import Decision, Estimate, Verdict
+from gridsec.estimators import exact_bank
+from gridsec.estimators.exact_bank.step import MonitorDesign, MonitorState
+from gridsec.interface import Decision, Estimate, Verdict
 from tests.gridsec.street import Street
 
 Answers = list[tuple[Estimate, Verdict]]
@@ -25,14 +25,14 @@ def watch(
     sound: bool = True,
 ) -> tuple[MonitorState, Answers]:
     """Run the street and its monitor; check on every frame what must always hold."""
-    state = monitor.init(design, street.t) if state is None else state
+    state = exact_bank.init(design, street.t) if state is None else state
     answers = []
     for _ in range(frames):
         street.advance(h)
         frame = street.frame(lies, silent)
         if callable(change):
             frame = change(frame)
-        state, estimate, verdict = monitor.step(design, state, frame)
+        state, estimate, verdict = exact_bank.step(design, state, frame)
         assert estimate.t == frame.t
         for values in (
             estimate.v2,

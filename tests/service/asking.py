@@ -6,7 +6,7 @@ from typing import Any
 
 import httpx
 
-from service import models
+from service.api import models
 
 T0 = 1_795_212_000.0
 LIE = {"H3": 9.0}

@@ -9,7 +9,7 @@ from html import unescape
 
 import pytest
 
-from service.cli import main
+from service.cli.main import main
 
 Run = Callable[..., tuple[int, str, str]]
 

@@ -20,14 +20,22 @@ import uvicorn
 from playwright.sync_api import Browser, sync_playwright
 
 from gridsec.errors import FeederInvalid
-from gridsec.online import Cause, Decision
-from service.alarms import AlarmBook, AlarmRules, AlarmUnknown, acknowledge, advance, conditions, to_json
-from service.api import create_api
-from service.commissioning import Happened, Step
-from service.describe import revision
+from gridsec.interface import Cause, Decision
+from service.alarms.state_machine import (
+    AlarmBook,
+    AlarmRules,
+    AlarmUnknown,
+    acknowledge,
+    advance,
+    conditions,
+    to_json,
+)
+from service.api.routes import create_api
 from service.errors import FeederFixed, FeederUnknown, TooManyFeeders
-from service.report import FeederReport, MeterReport
+from service.report.feeder_info import revision
+from service.report.report import FeederReport, MeterReport
 from service.store import Store
+from service.store.schema import Happened, Step
 from tests.service.asking import T0, Setup
 from tests.service.databases import Cluster, find_postgresql
 from tests.service.looking import Site

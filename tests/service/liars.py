@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from feeders.load import Site
-from feeders.scenario import Scenario, by_arrival, random_attacks, simulate
-from service.align import Clock
-from service.bus import Sample
-from service.rounds import Rounds, RuntimeConfig
-from service.simulate import key_of, payload_of
+from feeders.model.site import Site
+from feeders.simulation.scenario import Scenario, by_arrival, random_attacks, simulate
+from service.cli.simulate import key_of, payload_of
+from service.engine.engine import Rounds, RuntimeConfig
+from service.engine.feeder_monitor import design
+from service.ingest.align import Clock
+from service.ingest.queues import Sample
 from service.store import Store
-from service.watch import design
 from tests.service.running import Outlet
 
 FEEDER = "simbench-lv-rural1"

@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from feeders.load import Site
-from feeders.recording import read_recording, record
-from feeders.scenario import Sample, Scenario
-from feeders.schema import write
-from service.replay import Tally, replay
-from service.report import FeederReport
-from service.simulate import Pace, play
+from feeders.format.tables import write
+from feeders.model.site import Site
+from feeders.simulation.recording import read_recording, record
+from feeders.simulation.scenario import Sample, Scenario
+from service.cli.simulate import Pace, play
+from service.engine.replay import Tally, replay
+from service.report.report import FeederReport
 from tests.service.running import service, until
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from gridsec.online import Cause, Decision
-from service.report import BusbarReport, FeederReport, InverterReport, MeterReport
+from gridsec.interface import Cause, Decision
+from service.report.report import BusbarReport, FeederReport, InverterReport, MeterReport
 from tests.service.asking import T0
 
 FEEDER = "village"

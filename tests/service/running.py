@@ -16,8 +16,8 @@ from typing import Any
 import httpx
 
 from service.app import Running, serve
-from service.bus import BusConfig, BusCounts
-from service.ingest import Meters
+from service.ingest.queues import BusConfig, BusCounts
+from service.ingest.zenoh_bus import Meters
 from service.settings import settings
 
 FEEDER = "simbench-lv-rural1"

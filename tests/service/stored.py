@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from gridsec.online import Cause, Decision
-from service.alarms import Alarm, AlarmKind, AlarmState, Change, Evidence, Severity, Transition
-from service.report import FeederReport, MeterReport
+from gridsec.interface import Cause, Decision
+from service.alarms.state_machine import Alarm, AlarmKind, AlarmState, Change, Evidence, Severity, Transition
+from service.report.report import FeederReport, MeterReport
 from tests.service.asking import T0
 
 

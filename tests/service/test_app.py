@@ -17,11 +17,11 @@ import httpx
 import numpy as np
 import pytest
 
-from feeders.load import Site, from_tables, load
-from feeders.meters import Channel, Silence
-from feeders.scenario import Sample, Scenario, random_attacks, simulate
-from feeders.schema import to_json, write
-from service.simulate import Pace, key_of, payload_of, play
+from feeders.format.tables import to_json, write
+from feeders.model.site import Site, from_tables, load
+from feeders.simulation.meters import Channel, Silence
+from feeders.simulation.scenario import Sample, Scenario, random_attacks, simulate
+from service.cli.simulate import Pace, key_of, payload_of, play
 from service.store import Store
 from tests.service.databases import both
 from tests.service.running import FEEDER, InProcess, service, until

@@ -24,29 +24,30 @@ import sqlalchemy as sa
 import zenoh
 
 import service
-from feeders.load import load
-from feeders.schema import to_json
+from feeders.format.tables import to_json
+from feeders.model.site import load
 from gridsec.errors import FeederInvalid, GridsecError, InputInvalid, Problem
-from gridsec.sequential import nobody
-from service import app, demo, ingest, keeper
-from service.alarms import AlarmBook, AlarmRules, acknowledge, acknowledged, restore
-from service.align import AlignRules
-from service.bus import BusConfig
-from service.cli_replay import _site_of
-from service.commissioning import Commissioning
-from service.designs import prepare
+from gridsec.estimators.sequential import nobody
+from service import app
+from service.alarms.state_machine import AlarmBook, AlarmRules, acknowledge, acknowledged, restore
+from service.cli import demo
+from service.cli.paths import see, write_tables
+from service.cli.replay import _site_of
+from service.cli.sources import converted
+from service.cli.study_report import STUDIES, Asked
+from service.engine.commissioning import Commissioning
+from service.engine.design_jobs import prepare
+from service.engine.runtime import Runtime
 from service.errors import FeederFixed, FeederNotLoaded, FeederUnknown, TooManyFeeders
-from service.foreign import converted
-from service.ingest import Meters
-from service.kept import decode, decode_distrust, encode, encode_distrust, fingerprint
-from service.places import see
-from service.runtime import Runtime
+from service.ingest import zenoh_bus
+from service.ingest.align import AlignRules
+from service.ingest.queues import BusConfig
+from service.ingest.zenoh_bus import Meters
 from service.settings import settings
-from service.store import Store, schema, writes
-from service.store.postgresql import NoAnswer, WriterSession
-from service.study_report import STUDIES, Asked
-from service.tables import write_tables
-from service.waiting import Batch
+from service.store import Store, committer, schema, writes
+from service.store.connect import NoAnswer, WriterSession
+from service.store.state_codec import decode, decode_distrust, encode, encode_distrust, fingerprint
+from service.store.write_queue import Batch
 from tests.service.stored import T0, an_alarm, raised
 
 PACKAGE = Path(service.__file__).parent
@@ -137,7 +138,7 @@ def test_the_page_lists_the_codes_of_the_source() -> None:
 
 
 def test_each_error_has_a_code_of_its_own() -> None:
-    assert len(MODULES) > 60
+    assert len(MODULES) > 50
     found = defaults()
     assert len(found) > 15
     assert len({code for _, code in found}) == len(found)
@@ -147,7 +148,7 @@ def test_each_error_has_a_code_of_its_own() -> None:
 def test_wrong_input_has_codes_but_for_words_of_the_command_line() -> None:
     plain = re.compile(r"raise (ValueError|GridsecError)\(")
     found = {path.name for path in PACKAGE.rglob("*.py") if plain.search(path.read_text("utf-8"))}
-    assert found == {"cli.py", "cli_campaign.py", "cli_report.py"}
+    assert found == {"main.py", "study_campaign.py", "study_report.py"}
 
 
 # ---------------------------------------------------------------------------------------------- sentences
@@ -264,7 +265,9 @@ def defect(_: Path, __: Patch) -> None:
     def check() -> None:
         raise ZeroDivisionError("a defect")
 
-    error = keeper._write(cast(Any, SimpleNamespace(check=check)), keeper.Job(1, Batch(), probe=True)).error
+    error = committer._write(
+        cast(Any, SimpleNamespace(check=check)), committer.Job(1, Batch(), probe=True)
+    ).error
     assert error is not None
     raise error
 
@@ -319,7 +322,7 @@ def no_bus(_: Path, patch: Patch) -> None:
         raise zenoh.ZError("no listener at /there")
 
     patch.setattr(zenoh, "open", refuse)
-    with ingest.session(BusConfig(listen=("tcp/127.0.0.1:7447",))):
+    with zenoh_bus.session(BusConfig(listen=("tcp/127.0.0.1:7447",))):
         pass
 
 
@@ -351,7 +354,7 @@ def unconverted(place: Path, patch: Patch) -> None:
     def refuse(*_: object, **__: object) -> None:
         raise FeederInvalid([Problem("not-radial", "a loop")])
 
-    patch.setattr("feeders.convert.convert", refuse)
+    patch.setattr("feeders.convert.convert.convert", refuse)
     one_problem(-1, lambda: converted("town.dss", place / "out"))
 
 
@@ -363,7 +366,7 @@ def another_name(_: Path, __: Patch) -> None:
 
 
 def put_nan(_: Path, __: Patch) -> None:
-    from service.api import put_feeder
+    from service.api.routes import put_feeder
 
     asyncio.run(put_feeder(cast(Any, None), "village", {"meta": math.nan}))
 
@@ -388,7 +391,7 @@ def not_writable(_: Path, patch: Patch) -> None:
     def deny(**_: object) -> None:
         raise PermissionError(13, "Permission denied")
 
-    patch.setattr("service.places.tempfile.TemporaryFile", deny)
+    patch.setattr("service.cli.paths.tempfile.TemporaryFile", deny)
     see(folders={"--out": Path("results")})
 
 
@@ -450,7 +453,7 @@ CALLS: dict[str, Call] = {
     "settings": wrong_settings,
     "zenoh file that is damaged": lambda place, _: (
         (place / "zenoh.json5").write_text("{ mode: "),
-        ingest._config(BusConfig(file=Path("zenoh.json5"))),
+        zenoh_bus._config(BusConfig(file=Path("zenoh.json5"))),
     ),
     "zenoh endpoint": no_bus,
     "zenoh session that is closed": lambda _, __: Meters(BusConfig(), "gridsec").put("key", b""),
@@ -492,7 +495,7 @@ CALLS: dict[str, Call] = {
     "removed lock": with_store(lock_removed),
     "second writer": with_store(another_writer),
     "session that the server ends": session_ended,
-    "command while writes fail": lambda _, __: keeper.Keeper._command(
+    "command while writes fail": lambda _, __: committer.Keeper._command(
         cast(Any, SimpleNamespace(problem="cannot write g.db: disk full")), cast(Any, None)
     ),
     "command while the service stops": lambda _, __: Runtime._go_on(

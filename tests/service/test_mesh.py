@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from benchmarks.mesh import baran_wu
-from feeders.scenario import Scenario, random_attacks, simulate
-from feeders.schema import to_json
-from gridsec.feeder import Feeder
-from service.describe import detail
-from service.models import FeederDetail, State
+from feeders.format.tables import to_json
+from feeders.simulation.scenario import Scenario, random_attacks, simulate
+from gridsec.grid.radial import Feeder
+from service.api.models import FeederDetail, State
+from service.report.feeder_info import detail
 from tests.service.played import replayed, served
 
 START = 1_795_212_000.0

@@ -20,13 +20,13 @@ import httpx
 import psycopg
 import pytest
 
-from feeders.load import Site, load
-from feeders.meters import BUSBAR
-from feeders.scenario import Reading, Scenario, simulate
-from feeders.schema import write
-from service.bus import BusConfig
-from service.ingest import Meters
-from service.simulate import key_of
+from feeders.format.tables import write
+from feeders.model.site import Site, load
+from feeders.simulation.meters import BUSBAR
+from feeders.simulation.scenario import Reading, Scenario, simulate
+from service.cli.simulate import key_of
+from service.ingest.queues import BusConfig
+from service.ingest.zenoh_bus import Meters
 from tests.service.databases import Cluster
 from tests.service.running import FEEDER, InProcess, free_port, service, until
 
@@ -160,7 +160,7 @@ def test_a_leap_of_two_hours_is_over_within_ten_seconds(tmp_path: Path, site: Si
 LEAPING = """
 import asyncio, os, sys, time
 from service.app import serve
-from service.designs import abandon
+from service.engine.design_jobs import abandon
 from service.settings import settings
 flag = sys.argv[1]
 wall = lambda: time.time() + (7200.0 if os.path.exists(flag) else 0.0)

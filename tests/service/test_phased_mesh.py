@@ -9,12 +9,12 @@ import pytest
 from typer.testing import CliRunner
 
 from benchmarks.mesh import european
-from feeders.scenario import Scenario, random_attacks, simulate
-from feeders.schema import write
-from gridsec.mesh import PhasedMesh
-from service.cli import app
-from service.describe import detail
-from service.models import FeederDetail, State
+from feeders.format.tables import write
+from feeders.simulation.scenario import Scenario, random_attacks, simulate
+from gridsec.grid.meshed import PhasedMesh
+from service.api.models import FeederDetail, State
+from service.cli.main import app
+from service.report.feeder_info import detail
 from tests.service.played import replayed, served
 
 START = 1_795_212_000.0

@@ -10,18 +10,18 @@ import msgspec
 import numpy as np
 import pytest
 
-from feeders.load import Site, from_tables, load, to_frame
-from feeders.recording import read_recording, record
-from feeders.scenario import Scenario, random_attacks, simulate
-from service.align import Tick
-from service.describe import detail
-from service.models import FeederDetail, State
-from service.reading import BadReason, Reading
-from service.replay import Tally, replay
-from service.simulate import Pace, payload_of, play
-from service.voltages import snapshot
-from service.watch import known_of
-from service.wire import Decoded, Wire
+from feeders.model.site import Site, from_tables, load, to_frame
+from feeders.simulation.recording import read_recording, record
+from feeders.simulation.scenario import Scenario, random_attacks, simulate
+from service.api.models import FeederDetail, State
+from service.cli.simulate import Pace, payload_of, play
+from service.engine.feeder_monitor import known_of
+from service.engine.replay import Tally, replay
+from service.ingest.align import Tick
+from service.ingest.decode import Decoded, Wire
+from service.ingest.reading import BadReason, Reading
+from service.report.feeder_info import detail
+from service.report.voltages import snapshot
 from tests.service.running import service, until
 
 EUROPEAN = "ieee-european-lv"

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from gridsec.errors import InputInvalid
-from service.align import Clock
+from service.ingest.align import Clock
 from service.settings import Settings, SettingsInvalid, settings, split_address, strangers
 from tests.codes import refused
 

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from feeders.load import Site, from_tables, load
-from feeders.scenario import Scenario, simulate
+from feeders.model.site import Site, from_tables, load
+from feeders.simulation.scenario import Scenario, simulate
 from gridsec.attack import Bias
-from gridsec.phases import PhasedFeeder
-from service.describe import detail
-from service.models import FeederDetail
+from gridsec.grid.phased import PhasedFeeder
+from service.api.models import FeederDetail
+from service.report.feeder_info import detail
 from tests.service.played import replayed
 
 START = 1_795_212_000.0

@@ -8,20 +8,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from feeders.load import Site, from_tables
-from feeders.scenario import Scenario, simulate
-from feeders.schema import to_json
+from feeders.format.tables import to_json
+from feeders.model.site import Site, from_tables
+from feeders.simulation.scenario import Scenario, simulate
 from gridsec.attack import Bias
-from gridsec.online import Cause
-from service.alarms import AlarmKind
-from service.conditions import conditions
-from service.describe import detail
-from service.models import FeederDetail, State
-from service.reading import BadReading
-from service.report import FeederReport
-from service.report import to_json as report_json
-from service.watch import known_of
-from service.wire import Wire
+from gridsec.interface import Cause
+from service.alarms.conditions import conditions
+from service.alarms.state_machine import AlarmKind
+from service.api.models import FeederDetail, State
+from service.engine.feeder_monitor import known_of
+from service.ingest.decode import Wire
+from service.ingest.reading import BadReading
+from service.report.feeder_info import detail
+from service.report.report import FeederReport
+from service.report.report import to_json as report_json
 from tests.feeders import stations
 from tests.feeders.stations import LV, MV
 from tests.service.played import replayed

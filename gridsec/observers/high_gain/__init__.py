@@ -1,17 +1,16 @@
 """Partial high-gain observers for uniformly observable nonlinear systems (kim2018; lee2018, chapter 5)."""
 
 from gridsec.observers.high_gain.form import Partial, Polynomial, System, affine, defects, linear
-from gridsec.observers.high_gain.inverse import Inverse, given, nearest
 from gridsec.observers.high_gain.observer import (
     HighGainDesign,
     HighGainState,
+    Outcome,
     design,
     error_bounds,
     init,
     step,
 )
-from gridsec.observers.high_gain.outcome import Outcome
-from gridsec.observers.high_gain.redundancy import groups, redundancy
+from gridsec.observers.high_gain.redundancy import Inverse, given, groups, nearest, redundancy
 
 __all__ = [
     "HighGainDesign",

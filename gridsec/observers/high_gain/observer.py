@@ -1,37 +1,303 @@
 """Partial high-gain observers, detection with a time-varying threshold, and the switching search.
 
+Sensor i occupies the first n_i of n_max places of its row; the rest stays zero.
+
 Each sensor has an observer of its own, so that an attack affects only one. A set of p - q sensors is
 trusted while its left inverse explains all its estimates; the search continues only if it does not.
 
 References
 ----------
+kim2018, section III; docs/theory-high-gain.md.
 kim2018, section III; lee2018, sections 5.2 and 5.4; docs/theory-high-gain.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
+from scipy.linalg import expm
 
 from gridsec.arrays import Bools, Floats, frozen, not_negative
-from gridsec.choices import no_choice
-from gridsec.errors import DesignInfeasible, NotObservable, Problem, refuse
+from gridsec.errors import DesignInfeasible, NotObservable, Problem, no_choice, refuse
+from gridsec.interface import Cause, Decision
 from gridsec.observers.high_gain.constants import (
     Decay,
     decay_componentwise,
     decay_kim,
     decay_lee,
+    gain,
     margin,
 )
-from gridsec.observers.high_gain.field import Field, Transition, advance, field, gains, transition
-from gridsec.observers.high_gain.form import System, slopes
-from gridsec.observers.high_gain.inverse import Inverse, check, corners_and_interior, nearest
-from gridsec.observers.high_gain.lipschitz import kappa_detect, upper_proven
-from gridsec.observers.high_gain.outcome import Outcome, Search, verdict
-from gridsec.observers.high_gain.redundancy import groups
+from gridsec.observers.high_gain.form import Partial, Polynomial, System, sat, slopes
+from gridsec.observers.high_gain.redundancy import (
+    Inverse,
+    check,
+    corners_and_interior,
+    groups,
+    kappa_detect,
+    nearest,
+    upper_proven,
+)
+
+Search = Literal["all", "one"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Outcome:
+    """Result at one instant.
+
+    Attributes
+    ----------
+    t
+        Time, s.
+    x : (n,)
+        Estimate of the state; NaN if no set is complete.
+    bound
+        Bound on its largest error while at most q sensors are attacked; NaN if the design has no `lowest`,
+        infinite if no set passed.
+    sigma
+        Index of the set in use, from 0.
+    visited
+        The tested sets, in order; the last is `sigma`.
+    trusted : (p,)
+        The sensors of that set.
+    residual, threshold
+        Of that set; NaN if not tested.
+    decision, cause, reason
+        As in `gridsec.interface`; UNDECIDED is an answer of its own.
+    suspects : (p,)
+        Sensors named as manipulated. With a known `bound`: those that cannot be unmanipulated; otherwise,
+        after an alarm, those outside the trusted set.
+    reset : (p,)
+        Observers that were reset in this step.
+    """
+
+    t: float
+    x: Floats
+    bound: float
+    sigma: int
+    visited: tuple[int, ...]
+    trusted: Bools
+    residual: float
+    threshold: float
+    decision: Decision
+    cause: Cause
+    reason: str
+    suspects: Bools
+    reset: Bools
+
+
+def verdict(
+    *,
+    heard: int,
+    needed: int,
+    passed: bool | None,
+    alarm: bool,
+    settled: bool,
+    untested: int,
+    search: Search,
+) -> tuple[Decision, Cause, str]:
+    """Decision, cause, and one sentence.
+
+    Parameters
+    ----------
+    heard
+        Number of sensors with a reading.
+    needed
+        Number of sensors of a set.
+    passed
+        True if the last set passed its test; None if it was not complete, and not tested.
+    alarm
+        True if a test failed or a sensor is named.
+    settled
+        True if the bounds of all observers with readings have settled.
+    untested
+        Number of sensors with a reading but without a test.
+    search
+        As in the design: with "one", other sets may still pass later.
+    """
+    if passed is None:
+        reason = f"{heard} sensors are heard and no set of {needed} is complete"
+        return Decision.UNDECIDED, Cause.TOO_FEW_METERS, reason
+    if not passed:
+        reason = "no set that was tried explains its own estimates"
+        cause = Cause.SETTLING if search == "one" else Cause.TOO_MANY_SUSPECTS
+        return Decision.UNDECIDED, cause, reason
+    if alarm:
+        return Decision.ATTACKED, Cause.RESIDUALS, "estimates disagree by more than honest sensors can"
+    if not settled:
+        return Decision.UNDECIDED, Cause.SETTLING, "the observers have not settled yet"
+    if untested:
+        reason = f"the sensors in use agree within their bounds; {untested} more were not tested"
+        return Decision.UNDECIDED, Cause.AMBIGUOUS, reason
+    return Decision.CLEAN, Cause.AGREEMENT, "all sensors agree within their bounds"
+
+
+Field = Callable[[Floats, Floats], Floats]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Transition:
+    """One step of the linear parts, exact for forcing that is linear in time.
+
+    Attributes
+    ----------
+    h
+        Length of the step, s.
+    whole : (p, n_max, n_max)
+        `e^{M h}` with `M = A - K C`.
+    held, slope : (p, n_max, n_max)
+        `z(h) = whole z(0) + held g(0) + slope (g(h) - g(0))`.
+    """
+
+    h: float
+    whole: Floats
+    held: Floats
+    slope: Floats
+
+
+def gains(system: System, theta: Floats) -> Floats:
+    """K of every sensor, padded with zeros; (p, n_max).
+
+    Parameters
+    ----------
+    theta : (p,)
+        High-gain parameters, 1/s.
+    """
+    out = np.zeros(system.mask.shape)
+    for i, partial in enumerate(system.partials):
+        out[i, : partial.size] = gain(partial.size, float(theta[i]))
+    return out
+
+
+def transition(system: System, K: Floats, h: float) -> Transition:
+    """Matrices of one step of length h, s, for the gains K (p, n_max)."""
+    p, n = K.shape
+    M = np.zeros((p, n, n))
+    M[:, np.arange(n - 1), np.arange(1, n)] = system.mask[:, 1:]
+    M[:, :, 0] -= K
+    block = np.zeros((p, 3 * n, 3 * n))
+    block[:, :n, :n] = M * h
+    block[:, :n, n : 2 * n] = np.eye(n) * h
+    block[:, n : 2 * n, 2 * n :] = np.eye(n)
+    out = np.asarray(expm(block), dtype=np.float64)
+    return Transition(h, out[:, :n, :n], out[:, :n, n : 2 * n], out[:, :n, 2 * n :])
+
+
+def field(system: System) -> Field:
+    """`e alpha(sat(z)) + beta(sat(z)) u` of all sensors as one function of z (p, n_max) and u (m,).
+
+    If every alpha and beta is a `Polynomial`, all sensors share one table of monomials and one
+    product; otherwise they are evaluated one after the other.
+    """
+    functions = [
+        *(partial.alpha for partial in system.partials),
+        *(entry for partial in system.partials for row in partial.beta for entry in row),
+    ]
+    if all(isinstance(function, Polynomial) for function in functions):
+        return _stacked(system)
+    return _looped(system)
+
+
+def _stacked(system: System) -> Field:
+    (p, n), m = system.mask.shape, system.partials[0].inputs
+    places: dict[tuple[int, ...], int] = {}
+    entries: list[tuple[int, int, int, int, float]] = []
+
+    def collect(i: int, row: int, column: int, function: object) -> None:
+        if not isinstance(function, Polynomial):
+            raise TypeError("only polynomials can be stacked")
+        for powers, factor in zip(function.exponents.tolist(), function.coefficients.tolist(), strict=True):
+            key = (*powers, *[0] * (n - len(powers)))
+            entries.append((i, places.setdefault(key, len(places)), row, column, factor))
+
+    for i, partial in enumerate(system.partials):
+        collect(i, partial.size - 1, 0, partial.alpha)
+        for row, functions in enumerate(partial.beta):
+            for column, function in enumerate(functions):
+                collect(i, row, column + 1, function)
+    table = np.zeros((p, len(places), n, m + 1))
+    for i, place, row, column, factor in entries:
+        table[i, place, row, column] += factor
+    powers = np.array(list(places), dtype=np.intp)
+    level = system.z_bound[:, None]
+
+    def evaluate(z: Floats, u: Floats) -> Floats:
+        monomials = np.prod(sat(z, level)[:, None, :] ** powers, axis=-1)
+        rows = np.einsum("pk,pknc->pnc", monomials, table)
+        return np.asarray(rows @ np.concatenate([[1.0], u]))
+
+    return evaluate
+
+
+def _looped(system: System) -> Field:
+    def one(partial: Partial, z: Floats, u: Floats) -> list[float]:
+        parts = list(sat(z[: partial.size], partial.bound))
+        rows = [sum(float(f(parts)) * v for f, v in zip(row, u, strict=True)) for row in partial.beta]
+        rows[-1] += float(partial.alpha(parts))
+        return rows
+
+    def evaluate(z: Floats, u: Floats) -> Floats:
+        out = np.zeros(z.shape)
+        for i, partial in enumerate(system.partials):
+            out[i, : partial.size] = one(partial, z[i], u)
+        return out
+
+    return evaluate
+
+
+def advance(
+    right: Field,
+    K: Floats,
+    move: Transition,
+    z: Floats,
+    *,
+    y: tuple[Floats, Floats],
+    u: tuple[Floats, Floats],
+) -> Floats:
+    """One step of the observers (5): exponential, of second order in the nonlinear part.
+
+    Readings and inputs are interpolated linearly between the two instants. The stiff linear part is exact for
+    every `theta h`.
+
+    Parameters
+    ----------
+    right
+        From `field`.
+    K : (p, n_max)
+        Gains.
+    move
+        From `transition`.
+    z : (p, n_max)
+        Estimates at the start.
+    y : pair of (p,)
+        Readings at the start and the end.
+    u : pair of (m,)
+        Inputs at the start and the end.
+
+    Returns
+    -------
+    Floats
+        (p, n_max), estimates at the end; not finite on overflow by extreme readings.
+
+    References
+    ----------
+    kim2018 (5); lee2018 (5.2.6).
+    """
+    before = right(z, u[0])
+    forced = before + K * y[0][:, None]
+    rise = K * (y[1] - y[0])[:, None]
+    # Products row by row: the overflow of one sensor must not affect the others.
+    trial = _apply(move.whole, z) + _apply(move.held, forced) + _apply(move.slope, rise)
+    return trial + _apply(move.slope, right(trial, u[1]) - before)
+
+
+def _apply(matrices: Floats, rows: Floats) -> Floats:
+    return np.asarray(np.einsum("pij,pj->pi", matrices, rows))
+
 
 _DECAYS = {"componentwise": decay_componentwise, "kim2018": decay_kim, "lee2018": decay_lee}
 

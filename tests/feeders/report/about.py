@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from feeders.report.page import About
+from feeders.report.html import About
 
 HOSTILE = "\"><script>alert('x')</script>&amp;<img src=x onerror=alert(1)>"
 ABOUT = About(

@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import pytest
 
-from feeders.lies import Trick
-from feeders.load import Site, from_tables, load
-from feeders.report.book import Report, report
-from feeders.report.sections import Outcome
-from feeders.studies.campaign import Campaign, campaign
-from feeders.studies.campaign_plan import Kind, Place, Plan
+from feeders.model.site import Site, from_tables, load
+from feeders.report.build import Report, report
+from feeders.report.html import Outcome
+from feeders.simulation.attacks import Trick
+from feeders.studies.campaign.plan import Kind, Place, Plan
+from feeders.studies.campaign.study import Campaign, campaign
 from feeders.studies.detectable import detectable
-from feeders.studies.droop import DroopOptions, DroopStudy, droop
+from feeders.studies.droop.study import DroopOptions, DroopStudy, droop
 from feeders.studies.protect import Goal, protect
 from feeders.studies.redundancy import redundancy
 from tests.feeders.report.about import ABOUT, HOSTILE

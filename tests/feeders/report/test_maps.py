@@ -13,11 +13,9 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from benchmarks.mesh import baran_wu, european, landnetz, rural3
-from feeders.load import Site, load, names
-from feeders.report.drawing import STEPS, Disc, Line, Text, width_of
-from feeders.report.figure import NARROW, WIDE
-from feeders.report.layout import has_places, place
-from feeders.report.maps import Shape, Spot, _crossed, draw_map, steps_of
+from feeders.model.site import Site, load, names
+from feeders.report.drawing import NARROW, STEPS, WIDE, Disc, Line, Text, width_of
+from feeders.report.maps import Shape, Spot, _crossed, draw_map, has_places, place, steps_of
 
 
 @pytest.fixture(scope="module", params=names())

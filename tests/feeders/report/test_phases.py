@@ -7,13 +7,12 @@ from collections import Counter
 
 import pytest
 
-from feeders.load import Site, from_tables
-from feeders.report.book import Report, report
-from feeders.report.drawing import Line
-from feeders.report.figure import NARROW, WIDE
+from feeders.model.site import Site, from_tables
+from feeders.report.build import Report, report
+from feeders.report.drawing import NARROW, WIDE, Line
+from feeders.report.html import Outcome
 from feeders.report.maps import LEGS, Shape, Spot, draw_map
-from feeders.report.sections import Outcome
-from feeders.studies.droop import DroopOptions, droop
+from feeders.studies.droop.study import DroopOptions, droop
 from feeders.studies.redundancy import redundancy
 from tests.feeders.report.about import ABOUT
 from tests.feeders.studies.three_phases import mixed

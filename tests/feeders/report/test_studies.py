@@ -10,24 +10,22 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from feeders.load import Site, from_tables
-from feeders.report import records
-from feeders.report.attacks import campaign as attacks
-from feeders.report.figure import NARROW, WIDE
-from feeders.report.fleet import droop as fleet
-from feeders.report.invisible import redundancy as invisible
-from feeders.report.meters import detectable as sizes
-from feeders.report.meters import protect as protection
-from feeders.report.section import Question, Section
-from feeders.report.sections import Outcome
-from feeders.report.words import Standing, said
-from feeders.studies.calibrate import Calibrate
-from feeders.studies.calibrate_tables import AS_FILED, EXCLUDED, PROPOSED, UNTOLD
-from feeders.studies.campaign import Campaign
+from feeders.model.site import Site, from_tables
+from feeders.report import section_calibrate
+from feeders.report.drawing import NARROW, WIDE
+from feeders.report.html import Outcome
+from feeders.report.section_campaign import campaign as attacks
+from feeders.report.section_droop import droop as fleet
+from feeders.report.section_meters import detectable as sizes
+from feeders.report.section_meters import protect as protection
+from feeders.report.section_meters import redundancy as invisible
+from feeders.report.text import Question, Section, Standing, said
+from feeders.studies.calibrate.study import AS_FILED, EXCLUDED, PROPOSED, UNTOLD, Calibrate
+from feeders.studies.campaign.study import Campaign
 from feeders.studies.detectable import Detectable
-from feeders.studies.droop import DroopStudy
-from feeders.studies.droop_safety import Kept
-from feeders.studies.droop_verdict import Verdict
+from feeders.studies.droop.limits import Kept
+from feeders.studies.droop.study import DroopStudy
+from feeders.studies.droop.verdict import Verdict
 from feeders.studies.protect import Goal, Protect, protect
 from feeders.studies.redundancy import Redundancy
 from tests.feeders import stations
@@ -98,7 +96,7 @@ def calibration(site: Site, *, sure: bool) -> Calibrate:
 
 @pytest.mark.parametrize("sure", [True, False])
 def test_what_cannot_be_told_is_neither_right_nor_wrong(site: Site, *, sure: bool) -> None:
-    section = records.calibrate(site, calibration(site, sure=sure))
+    section = section_calibrate.calibrate(site, calibration(site, sure=sure))
     text = told(section, Question.RECORDS)
     assert ("1 correction of the files is proposed" in text) == sure
     assert ("no correction that is sure" in text) == (not sure)
@@ -109,7 +107,12 @@ def test_what_cannot_be_told_is_neither_right_nor_wrong(site: Site, *, sure: boo
 
 
 def test_words_of_the_calibration_are_its_own() -> None:
-    words = (records.UNTOLD, records.PROPOSED, records.EXCLUDED, records.AS_FILED)
+    words = (
+        section_calibrate.UNTOLD,
+        section_calibrate.PROPOSED,
+        section_calibrate.EXCLUDED,
+        section_calibrate.AS_FILED,
+    )
     assert words == (UNTOLD, PROPOSED, EXCLUDED, AS_FILED)
 
 
@@ -289,7 +292,9 @@ def test_a_meter_that_seems_to_lie_is_said(site: Site) -> None:
     meter = str(site.meter_ids[0])
     row = {"what": [meter], "proposed": ["its error is another"], "verdict": [EXCLUDED]}
     customers = found.customers.assign(verdict=[EXCLUDED, *["as in the files"] * (len(found.customers) - 1)])
-    section = records.calibrate(site, replace(found, proposals=pd.DataFrame(row), customers=customers))
+    section = section_calibrate.calibrate(
+        site, replace(found, proposals=pd.DataFrame(row), customers=customers)
+    )
     text = told(section, Question.RECORDS)
     assert f"1 meter is off in a way that errors of the files explain less well: {meter}" in text
     drawing = section.figures[0].draw(WIDE)

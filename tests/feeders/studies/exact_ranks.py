@@ -9,8 +9,8 @@ from math import lcm
 
 import numpy as np
 
-from feeders.load import Site, from_tables, load
-from feeders.schema import CustomerRow, FeederTables, LineRow
+from feeders.format.tables import CustomerRow, FeederTables, LineRow
+from feeders.model.site import Site, from_tables, load
 from tests.gridsec.exact_pairs import exact_rank
 
 Row = list[Fraction]

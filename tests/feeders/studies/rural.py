@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 
-from feeders.load import load
+from feeders.model.site import load
 from feeders.studies.detectable import Detectable, detectable
 
 RURAL = load("simbench-lv-rural1")

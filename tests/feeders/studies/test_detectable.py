@@ -7,10 +7,10 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from feeders.load import load
-from feeders.studies.campaign_run import Here, Processes
+from feeders.model.site import load
+from feeders.studies.campaign.guarantees import Rehearsal, rehearse
 from feeders.studies.detectable import Detectable, detectable, workers
-from feeders.studies.rehearsal import Rehearsal, rehearse
+from feeders.studies.workers import Here, Processes
 from gridsec.errors import InputInvalid
 from tests.codes import refused
 from tests.feeders.studies.rural import RURAL, rural_sizes

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from feeders.load import Site, load
-from feeders.studies.hidden import Attack
+from feeders.model.site import Site, load
 from feeders.studies.redundancy import ALL, SILENT, redundancy
+from feeders.studies.unobservable import Attack
 from tests.feeders.studies.exact_ranks import Exact, two_streets
 
 CIGRE = load("cigre-lv")

@@ -14,11 +14,11 @@ from typing import Any
 
 import pytest
 
-from feeders.comparison import Plan, Row, compare
-from feeders.load import load
+from feeders.model.site import load
+from feeders.studies.campaign.guarantees import rehearse
+from feeders.studies.comparison import Plan, Row, compare
 from feeders.studies.detectable import detectable
 from feeders.studies.journal import InUse, Journal, OtherStudy, edition, remove, versions, worked
-from feeders.studies.rehearsal import rehearse
 from tests.codes import refused
 
 CIGRE = load("cigre-lv")

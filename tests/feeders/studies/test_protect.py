@@ -8,15 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from feeders.doubts import unread
-from feeders.load import from_tables, load
-from feeders.powerflow import PowerFlow
-from feeders.studies.hidden import Attack, Curves
+from feeders.model.load_uncertainty import unread
+from feeders.model.site import from_tables, load
+from feeders.simulation.powerflow import PowerFlow
 from feeders.studies.operating import box, false_powers, squared, volts_of_lie
 from feeders.studies.protect import Goal, protect
+from feeders.studies.unobservable import Attack, Curves
 from gridsec.errors import DesignInfeasible, InputInvalid
-from gridsec.studies.false_powers import largest_story
-from gridsec.studies.lies import largest_lie
+from gridsec.planning.stealthy_attacks import largest_lie, largest_story
 from tests.codes import refused
 from tests.feeders import stations
 

@@ -9,10 +9,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from feeders.load import load
-from feeders.studies.hidden import Attack, Curves
+from feeders.model.site import load
 from feeders.studies.journal import Journal, OtherStudy
 from feeders.studies.redundancy import ALL, SILENT, redundancy
+from feeders.studies.unobservable import Attack, Curves
 from gridsec.errors import InputInvalid
 from tests.codes import refused
 

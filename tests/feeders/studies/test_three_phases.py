@@ -6,13 +6,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from feeders.load import from_tables
+from feeders.model.site import from_tables
+from feeders.studies.campaign.guarantees import Rehearsal, rehearse
 from feeders.studies.detectable import detectable
 from feeders.studies.operating import box
 from feeders.studies.protect import Goal, protect
 from feeders.studies.redundancy import SILENT, Redundancy, redundancy
-from feeders.studies.rehearsal import Rehearsal, rehearse
-from gridsec.studies.lies import largest_lie, worst_error
+from gridsec.planning.stealthy_attacks import largest_lie, worst_error
 from tests.feeders.studies.three_phases import apart, mixed
 
 WHOLE, ALONE = apart("simbench-lv-rural1")

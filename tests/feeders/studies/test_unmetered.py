@@ -10,19 +10,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from feeders.doubts import unread
-from feeders.estimators import Watcher, design
-from feeders.load import Site, load
-from feeders.profiles import Season
-from feeders.scenario import START
-from feeders.studies.campaign import campaign
-from feeders.studies.campaign_plan import Kind, Place, Plan
+from feeders.model.load_uncertainty import unread
+from feeders.model.profiles import Season
+from feeders.model.site import Site, load
+from feeders.registry.registry import Watcher, design
+from feeders.simulation.scenario import START
+from feeders.simulation.trial import Meters, Trial, Trick, frames
+from feeders.studies.campaign.guarantees import Rehearsal, rehearse
+from feeders.studies.campaign.plan import Kind, Place, Plan
+from feeders.studies.campaign.study import campaign
 from feeders.studies.detectable import Detectable, detectable, monitor_rule
 from feeders.studies.operating import squared
-from feeders.studies.rehearsal import Rehearsal, rehearse
-from feeders.trials import Meters, Trial, Trick, frames
 from gridsec.arrays import Floats
-from gridsec.studies.quiet import largest_shift
+from gridsec.planning.detectability import largest_shift
 from tests.feeders.unmetered import CIGRE, played, unmetered
 
 HONEST, LYING = 2, 4

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from feeders.equipment import find
-from feeders.load import Site, from_tables
-from feeders.schema import FeederTables
+from feeders.format.tables import FeederTables
+from feeders.model.equipment import find
+from feeders.model.site import Site, from_tables
 
 PHASES = "abc"
 

@@ -7,9 +7,8 @@ from itertools import combinations
 
 import numpy as np
 
-from gridsec.lmi.discrete import DiscreteOptions, discrete_circles, discrete_options
-from gridsec.lmi.discrete_bounds import DiscreteGains
-from gridsec.lmi.sampled import DiscreteLure
+from gridsec.observers.lmi.discrete import DiscreteGains, DiscreteOptions, discrete_circles, discrete_options
+from gridsec.observers.lmi.sampled import DiscreteLure
 from gridsec.papers import yang2019
 
 EVERY = [J for size in (1, 2, 3, 4) for J in combinations(range(4), size)]

@@ -9,11 +9,11 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve
 
-from gridsec.certificates import Certificate, certify
 from gridsec.errors import DesignInfeasible, InputInvalid
-from gridsec.gains import CircleGains, options_for
-from gridsec.lure import advance, equilibrium
 from gridsec.observers import circle
+from gridsec.observers.certificates import Certificate, certify
+from gridsec.observers.gains import CircleGains, options_for
+from gridsec.observers.lure import advance, equilibrium
 from tests.codes import refused
 from tests.gridsec.plants import Street, line, shared, tree
 

@@ -13,23 +13,21 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from gridsec.errors import DesignInfeasible, InputInvalid
-from gridsec.lmi.discrete import (
+from gridsec.observers import circle_discrete as observers
+from gridsec.observers.lmi.discrete import (
+    DiscreteGains,
     discrete_circle,
     discrete_contraction,
-    discrete_options,
-    discrete_prove,
-)
-from gridsec.lmi.discrete_bounds import (
-    DiscreteGains,
     discrete_margin,
     discrete_matrix,
+    discrete_options,
+    discrete_prove,
     input_error,
     noise_gain,
 )
-from gridsec.lmi.sampled import advance, drift_error, held_error, measure, sample, shift
-from gridsec.lure import Lure, equilibrium
-from gridsec.lure import advance as continuous
-from gridsec.observers import circle_discrete as observers
+from gridsec.observers.lmi.sampled import advance, drift_error, held_error, measure, sample, shift
+from gridsec.observers.lure import Lure, equilibrium
+from gridsec.observers.lure import advance as continuous
 from gridsec.papers import yang2019
 from tests.codes import refused
 from tests.gridsec.observers.discrete_lures import EVERY, gains_of, mask, options, sine

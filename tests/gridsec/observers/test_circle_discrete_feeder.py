@@ -10,14 +10,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from feeders.load import load as load_site
+from feeders.model.site import load as load_site
 from gridsec.errors import DesignInfeasible, InputInvalid
-from gridsec.lmi.discrete import discrete_circle, discrete_contraction, discrete_options
-from gridsec.lmi.discrete_bounds import growth, input_error
-from gridsec.lmi.sampled import DiscreteLure, advance, held_error, measure, sample
-from gridsec.lure import Lure, close_loop
-from gridsec.lure import advance as continuous
 from gridsec.observers import circle_discrete as observers
+from gridsec.observers.lmi.discrete import (
+    discrete_circle,
+    discrete_contraction,
+    discrete_options,
+    growth,
+    input_error,
+)
+from gridsec.observers.lmi.sampled import DiscreteLure, advance, held_error, measure, sample
+from gridsec.observers.lure import Lure, close_loop
+from gridsec.observers.lure import advance as continuous
 from gridsec.papers import yang2019
 from tests.codes import refused
 from tests.gridsec.observers.discrete_lures import gains_of, mask, sine

@@ -27,8 +27,8 @@ from gridsec.observers.high_gain.constants import (
     settling,
     smallest_theta,
 )
-from gridsec.observers.high_gain.field import advance, field, gains, transition
 from gridsec.observers.high_gain.form import at, jacobian_at, largest, sat, slopes
+from gridsec.observers.high_gain.observer import advance, field, gains, transition
 from tests.codes import refused
 from tests.gridsec.observers.bent import bent, oscillator, oscillator_input
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from gridsec.errors import DesignInfeasible, NotObservable
+from gridsec.interface import Cause, Decision
 from gridsec.observers import high_gain
 from gridsec.observers.high_gain import groups, nearest
-from gridsec.online import Cause, Decision
 from tests.codes import refused
 from tests.gridsec.observers.bent import bent, estimator, truth
 

@@ -18,9 +18,14 @@ from gridsec.observers.high_gain import System, linear, nearest, redundancy
 from gridsec.observers.high_gain import given as given_inverse
 from gridsec.observers.high_gain.form import sat
 from gridsec.observers.high_gain.intervals import Interval, interval, supremum
-from gridsec.observers.high_gain.inverse import check, corners_and_interior
-from gridsec.observers.high_gain.lipschitz import (
+from gridsec.observers.high_gain.redundancy import (
+    block_distance,
+    check,
+    corners_and_interior,
+    correctable,
+    detectable,
     extend,
+    groups,
     kappa_detect,
     kappa_error,
     lower_from_inverse,
@@ -29,8 +34,7 @@ from gridsec.observers.high_gain.lipschitz import (
     upper_proven,
     upper_sampled,
 )
-from gridsec.observers.high_gain.redundancy import block_distance, correctable, detectable, groups
-from gridsec.papers import uniformly_observable as example
+from gridsec.papers import kim2018 as example
 from tests.codes import refused
 
 FUNCTIONS: list[Callable[[Any, Any], Any]] = [

@@ -11,9 +11,8 @@ import pytest
 from gridsec.errors import NotObservable
 from gridsec.observers.high_gain import defects, groups, nearest
 from gridsec.observers.high_gain import design as high_gain_design
-from gridsec.observers.high_gain.form import at
-from gridsec.observers.high_gain.symbolic import Symbolic, decompose, lie
-from gridsec.papers import uniformly_observable as example
+from gridsec.observers.high_gain.form import Symbolic, at, decompose, lie
+from gridsec.papers import kim2018 as example
 from tests.codes import refused
 
 

@@ -8,12 +8,12 @@ import pytest
 from hypothesis import given, settings
 from scipy.linalg import null_space
 
-from gridsec.decode import Stack, cospark
 from gridsec.errors import DesignInfeasible, InputInvalid
-from gridsec.index import asymptotic_index, dynamic_index, observable_rows, undetectable_subspace
 from gridsec.observers import luenberger
 from gridsec.observers.luenberger import Bounds, envelope, geometric, riccati_gain
 from gridsec.observers.parts import decompose, stack
+from gridsec.secure.decode import Stack, cospark
+from gridsec.secure.index import asymptotic_index, dynamic_index, observable_rows, undetectable_subspace
 from tests.codes import refused
 from tests.gridsec.observers.modal import modal
 

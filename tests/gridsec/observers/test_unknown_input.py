@@ -13,8 +13,8 @@ from scipy.linalg import eig
 
 from gridsec.arrays import Floats
 from gridsec.errors import DesignInfeasible, InputInvalid
-from gridsec.lmi.sampled import advance
-from gridsec.lmi.unknown_input import (
+from gridsec.observers.lmi.sampled import advance
+from gridsec.observers.lmi.unknown_input import (
     ErrorSystem,
     UnknownInputGains,
     unknown_input,

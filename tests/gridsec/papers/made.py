@@ -6,7 +6,7 @@ from functools import cache
 from importlib import import_module
 
 from gridsec.papers.claims import Reproduction
-from service.cli_reproduce import PAPERS
+from service.cli.reproduce import PAPERS
 
 REPRODUCE = {paper: import_module(f"gridsec.papers.{paper}").reproduce for paper in PAPERS}
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from gridsec import bank as banks
-from gridsec.feeder import lindistflow, squared_voltages
-from gridsec.gains import circle_matrix
-from gridsec.lmi import circle
-from gridsec.lure import advance, close_loop, equilibrium, known_input
+from gridsec.estimators.exact_bank import bank as banks
+from gridsec.grid.radial import lindistflow, squared_voltages
+from gridsec.observers.gains import circle_matrix
+from gridsec.observers.lmi import circle
+from gridsec.observers.lure import advance, close_loop, equilibrium, known_input
 from gridsec.papers import chong2020
 from gridsec.papers.chong2020 import DESIGNS, Design
 from gridsec.papers.claims import Reproduction

@@ -9,12 +9,12 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from gridsec.errors import InputInvalid
+from gridsec.interface import Decision
 from gridsec.observers.high_gain import groups
 from gridsec.observers.high_gain.constants import Slopes, decay_componentwise, decay_lee, margin, riccati
 from gridsec.observers.high_gain.form import at, jacobian_at
-from gridsec.online import Decision
+from gridsec.papers import kim2018 as example
 from gridsec.papers import lee2018_chapter5
-from gridsec.papers import uniformly_observable as example
 from gridsec.papers.claims import Line, at_most, number, rounded_up, statement
 from tests.codes import refused
 from tests.gridsec.papers.made import made

@@ -9,17 +9,16 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.stats import chi2
 
-from gridsec.decode import Stack, error_correctable
-from gridsec.decode.noise import correct
-from gridsec.decode.partial import bounded, fusion, gaussian
 from gridsec.errors import NotObservable
-from gridsec.index import asymptotic_index
 from gridsec.observers import kalman, luenberger
 from gridsec.observers.luenberger import Bounds
-from gridsec.papers import lee2018, three_inertia
+from gridsec.papers import lee2018
+from gridsec.secure.decode import Stack, error_correctable, partial_bounded, partial_gaussian
+from gridsec.secure.decode.noise import correct
+from gridsec.secure.index import asymptotic_index
 from tests.codes import refused
 
-PLANT = three_inertia.plant()
+PLANT = lee2018.plant()
 
 
 @pytest.mark.acceptance
@@ -65,20 +64,20 @@ def test_index_three_by_brute_force_over_sensors() -> None:
             for gone in combinations(range(5), lost)
         ]
         assert (min(left) > 0.1) == (lost == 2)
-    made = three_inertia.estimator(PLANT)
+    made = lee2018.estimator(PLANT)
     assert np.array_equal(np.diff(made.observers.stack.first), [6, 6, 6, 5, 5])
-    plain = three_inertia.estimator(PLANT, slowest=0.0)
+    plain = lee2018.estimator(PLANT, slowest=0.0)
     assert np.array_equal(np.diff(plain.observers.stack.first), [6, 4, 6, 4, 4])
     assert error_correctable(Stack.of(made.observers.stack.blocks), 1, tol=1e-6)
     assert not error_correctable(Stack.of(made.observers.stack.blocks), 2, tol=1e-6)
 
 
 @pytest.mark.canary("0.0")
-@pytest.mark.parametrize("slowest", [three_inertia.SLOWEST, 0.0])
+@pytest.mark.parametrize("slowest", [lee2018.SLOWEST, 0.0])
 def test_bound_holds_for_both_decompositions_and_several_seeds(slowest: float) -> None:
-    made = three_inertia.estimator(PLANT, slowest=slowest)
+    made = lee2018.estimator(PLANT, slowest=slowest)
     for seed in (2, 3):
-        run = three_inertia.simulate(PLANT, made, seconds=2.6, seed=seed)
+        run = lee2018.simulate(PLANT, made, seconds=2.6, seed=seed)
         error = np.linalg.norm(run.x_hat - run.x, axis=1)
         assert np.all(error <= run.bound)
         assert not np.any(run.disagree[run.t < 1.9995])
@@ -87,16 +86,16 @@ def test_bound_holds_for_both_decompositions_and_several_seeds(slowest: float) -
 
 
 def test_loop_over_an_observer_of_all_sensors_misses_its_reference() -> None:
-    made = three_inertia.estimator(PLANT)
-    fooled = three_inertia.simulate(PLANT, made, seconds=6.0, feedback="conventional")
+    made = lee2018.estimator(PLANT)
+    fooled = lee2018.simulate(PLANT, made, seconds=6.0, feedback="conventional")
     late = fooled.t > 5.0
     assert np.abs(fooled.x[late, 4] - 1.0).max() > 0.1
-    honest = three_inertia.simulate(PLANT, made, seconds=6.0, feedback="conventional", attacked=False)
+    honest = lee2018.simulate(PLANT, made, seconds=6.0, feedback="conventional", attacked=False)
     assert np.abs(honest.x[late, 4] - 1.0).max() < 0.01
 
 
 def test_erratum_printed_output_matrix_has_a_row_too_many() -> None:
-    rows = three_inertia.ROWS_PRINTED
+    rows = lee2018.ROWS_PRINTED
     assert rows.shape == (6, 6)
     assert np.array_equal(rows[1], rows[2])
     assert asymptotic_index(PLANT.A, rows, discrete=True, tol=1e-9).count == 4
@@ -105,12 +104,12 @@ def test_erratum_printed_output_matrix_has_a_row_too_many() -> None:
 
 
 def test_remark_integral_gain_is_that_of_a_sum() -> None:
-    slowest = np.max(np.abs(np.linalg.eigvals(three_inertia.closed_loop(PLANT))))
+    slowest = np.max(np.abs(np.linalg.eigvals(lee2018.closed_loop(PLANT))))
     assert -1e-3 / np.log(slowest) < 0.4
     # As an integral, K_I T_s sum, the loop needs more than ten minutes.
     loop = np.block(
         [
-            [PLANT.A + PLANT.B @ three_inertia.FEEDBACK, PLANT.B * three_inertia.INTEGRAL],
+            [PLANT.A + PLANT.B @ lee2018.FEEDBACK, PLANT.B * lee2018.INTEGRAL],
             [-1e-3 * PLANT.C[[2]], np.eye(1)],
         ]
     )
@@ -118,8 +117,8 @@ def test_remark_integral_gain_is_that_of_a_sum() -> None:
 
 
 def test_remark_disturbance_bound_of_the_sampled_state_would_make_the_guarantee_empty() -> None:
-    held = three_inertia.estimator(PLANT)
-    sampled = three_inertia.estimator(three_inertia.plant("sampled"))
+    held = lee2018.estimator(PLANT)
+    sampled = lee2018.estimator(lee2018.plant("sampled"))
     limits = [d.constants.kappa_c * max(e.limit for e in d.observers.envelopes) for d in (held, sampled)]
     assert limits[0] < 0.5
     assert limits[1] > 10.0
@@ -127,7 +126,7 @@ def test_remark_disturbance_bound_of_the_sampled_state_would_make_the_guarantee_
 
 def deadbeat(
     p: int, q: int, a: float = 1.0, noise: float = 1.0, left_out: int | None = None
-) -> bounded.BoundedDesign:
+) -> partial_bounded.BoundedDesign:
     """p sensors of one scalar state x+ = a x; every observer repeats the last reading, times a."""
     bounds = Bounds(0.0, np.full(p, noise), np.eye(1))
     # The basis of a part may be -1: the gain in its coordinates follows it.
@@ -141,17 +140,17 @@ def deadbeat(
         tol=1e-9,
         gains=[np.array([a / part.t[0]]) for part in parts],
     )
-    return bounded.design(observers, q, tol=1e-9, left_out=left_out)
+    return partial_bounded.design(observers, q, tol=1e-9, left_out=left_out)
 
 
 def test_dedicated_observers_decide_by_majority_and_two_of_them_cannot() -> None:
     """Section 4.4.1: every sensor observes everything, and r = p - 1."""
     made = deadbeat(3, 1, noise=0.01, left_out=2)
     for liar in range(3):
-        state, _ = bounded.init(made, 0.0, np.array([2.0]), 0.0)
+        state, _ = partial_bounded.init(made, 0.0, np.array([2.0]), 0.0)
         y = np.array([2.005, 2.0, 1.995])
         y[liar] = -40.0
-        _, out = bounded.step(made, state, y, np.zeros(1))
+        _, out = partial_bounded.step(made, state, y, np.zeros(1))
         assert np.flatnonzero(out.disagree).tolist() == [liar]
         assert abs(out.x[0] - 2.0) <= out.bound < 0.05
     with refused(NotObservable, "not-observable"):
@@ -162,8 +161,8 @@ def test_algorithm_4_1_compares_with_theta_v_max() -> None:
     """Five sensors of one constant, theta = 2, noise at most 1: a residual of 1.92 passes, 2.08 does not."""
     made = deadbeat(5, 2)
     for last, faults in ((2.4, 0), (2.6, 1)):
-        state, _ = bounded.init(made, 0.0, np.zeros(1), 0.0)
-        _, out = bounded.step(made, state, np.array([0.0, 0.0, 0.0, 0.0, last]), np.zeros(1))
+        state, _ = partial_bounded.init(made, 0.0, np.zeros(1), 0.0)
+        _, out = partial_bounded.step(made, state, np.array([0.0, 0.0, 0.0, 0.0, last]), np.zeros(1))
         assert np.allclose(out.limits, 2.0)
         assert np.isclose(out.residuals[4], 0.8 * last)
         assert out.faults == faults
@@ -173,7 +172,7 @@ def test_algorithm_4_1_compares_with_theta_v_max() -> None:
 class Printed:
     """Algorithm 4.1 to the letter: the estimate of the step before is tested, another one is given out."""
 
-    def __init__(self, made: bounded.BoundedDesign, z: np.ndarray) -> None:
+    def __init__(self, made: partial_bounded.BoundedDesign, z: np.ndarray) -> None:
         self.made, self.stacked = made, made.decoder.stack
         self.x = np.linalg.pinv(self.stacked.matrix) @ z
         self.faults = 0
@@ -207,9 +206,9 @@ def test_erratum_printed_algorithm_4_1_exceeds_its_bound() -> None:
     assert abs(given[0]) > kappa * 1.2
     assert np.isclose(abs(given[0]), 1.0 + 4.0 * theta / 3.0)
     # Ours, from the same readings.
-    state, _ = bounded.init(made, 0.0, np.zeros(1), 0.0)
-    state, _ = bounded.step(made, state, first, np.zeros(1))
-    _, out = bounded.step(made, state, second, np.zeros(1))
+    state, _ = partial_bounded.init(made, 0.0, np.zeros(1), 0.0)
+    state, _ = partial_bounded.step(made, state, first, np.zeros(1))
+    _, out = partial_bounded.step(made, state, second, np.zeros(1))
     assert np.isclose(out.bound, kappa)
     assert np.linalg.norm(out.x) <= out.bound
 
@@ -217,11 +216,11 @@ def test_erratum_printed_algorithm_4_1_exceeds_its_bound() -> None:
 def test_erratum_printed_test_compares_with_a_state_that_has_moved_on() -> None:
     made = deadbeat(3, 1, a=1.5, noise=0.01)
     signs, x = made.observers.stack.phi[:, 0], 1.0
-    state, _ = bounded.init(made, 0.0, np.array([x]), 0.0)
+    state, _ = partial_bounded.init(made, 0.0, np.array([x]), 0.0)
     printed = Printed(made, signs * x)
     searches, ours = 0, 0
     for _ in range(10):
-        state, out = bounded.step(made, state, np.full(3, x), np.zeros(1))
+        state, out = partial_bounded.step(made, state, np.full(3, x), np.zeros(1))
         x *= 1.5
         printed.step(state.observers.z, float(np.max(luenberger.bound(made.observers, state.observers))))
         searches += printed.faults > 1
@@ -234,7 +233,7 @@ def test_erratum_printed_test_compares_with_a_state_that_has_moved_on() -> None:
 
 
 def test_erratum_joint_covariance_of_the_example_is_singular() -> None:
-    made = three_inertia.gaussian_estimator(PLANT)
+    made = lee2018.gaussian_estimator(PLANT)
     P = kalman.steady(made.filters).P
     sizes = np.sqrt(np.diagonal(P))
     values = np.linalg.eigvalsh(P / np.outer(sizes, sizes))
@@ -255,9 +254,9 @@ def test_erratum_joint_covariance_of_the_example_is_singular() -> None:
 
 
 def test_erratum_degrees_of_freedom_on_the_example() -> None:
-    made = three_inertia.gaussian_estimator(PLANT)
+    made = lee2018.gaussian_estimator(PLANT)
     P = kalman.steady(made.filters).P
-    fused = fusion.fuse(made.sets[0], P, tol=1e-10)
+    fused = partial_gaussian.fuse(made.sets[0], P, tol=1e-10)
     # 28 rows, 6 unknowns, one exact parity: not 28.
     assert fused.freedom == 21
     rng = np.random.default_rng(0)
@@ -274,9 +273,9 @@ def test_erratum_degrees_of_freedom_on_the_example() -> None:
 
 def test_erratum_densities_of_different_degrees_of_freedom_are_not_comparable() -> None:
     """Without any attack, the printed rule prefers sets with few rows; by tails every set is as good."""
-    made = three_inertia.gaussian_estimator(PLANT)
+    made = lee2018.gaussian_estimator(PLANT)
     P = kalman.steady(made.filters).P
-    fused = [fusion.fuse(prepared, P, tol=1e-10) for prepared in made.sets[1:]]
+    fused = [partial_gaussian.fuse(prepared, P, tol=1e-10) for prepared in made.sets[1:]]
     freedom = np.array([f.freedom for f in fused])
     assert sorted(set(freedom.tolist())) == [15, 17]
     rng = np.random.default_rng(1)
@@ -294,23 +293,25 @@ def test_erratum_densities_of_different_degrees_of_freedom_are_not_comparable() 
 
 
 def test_erratum_printed_algorithm_4_2_gives_out_the_attacked_estimate_when_it_alarms() -> None:
-    made = three_inertia.gaussian_estimator(PLANT)
+    made = lee2018.gaussian_estimator(PLANT)
     rng = np.random.default_rng(2)
     noise = np.sqrt(made.filters.noise[0, 0])
     x, u = np.zeros(6), np.zeros(1)
-    state, _ = gaussian.init(made, 0.0, x, 1e-6 * np.eye(6), PLANT.C @ x + noise * rng.standard_normal(5))
+    state, _ = partial_gaussian.init(
+        made, 0.0, x, 1e-6 * np.eye(6), PLANT.C @ x + noise * rng.standard_normal(5)
+    )
     for _ in range(200):
         x = PLANT.A @ x
-        state, out = gaussian.step(made, state, PLANT.C @ x + noise * rng.standard_normal(5), u)
+        state, out = partial_gaussian.step(made, state, PLANT.C @ x + noise * rng.standard_normal(5), u)
         assert not out.alarm
     lie = np.array([3.0, 0.0, 0.0, 0.0, 0.0])
     x = PLANT.A @ x
     before = state.current
-    state, out = gaussian.step(made, state, PLANT.C @ x + noise * rng.standard_normal(5) + lie, u)
+    state, out = partial_gaussian.step(made, state, PLANT.C @ x + noise * rng.standard_normal(5) + lie, u)
     assert out.alarm
     assert np.array_equal(np.flatnonzero(~out.trusted), [0])
     # Line 2 of the printed algorithm: Psi of the old set on the attacked estimates.
-    printed = fusion.fuse(made.sets[before], state.filters.P, tol=1e-10).estimator @ state.filters.z
+    printed = partial_gaussian.fuse(made.sets[before], state.filters.P, tol=1e-10).estimator @ state.filters.z
     assert np.linalg.norm(printed - x) > 5.0 * np.linalg.norm(out.x - x)
     error = out.x - x
     assert error @ np.linalg.solve(out.covariance, error) < chi2.isf(1e-6, 6)
@@ -318,11 +319,11 @@ def test_erratum_printed_algorithm_4_2_gives_out_the_attacked_estimate_when_it_a
 
 def test_time_varying_filters_are_consistent_on_the_example() -> None:
     """NEES of the fused estimate over independent runs, with and without the attacked sensor."""
-    made = three_inertia.gaussian_estimator(PLANT)
+    made = lee2018.gaussian_estimator(PLANT)
     filters, runs = made.filters, 300
     rng = np.random.default_rng(3)
-    spread, scale = three_inertia.START_ERROR / np.sqrt(6.0), three_inertia.D_MAX / np.sqrt(8.0)
-    noise = three_inertia.N_MAX / np.sqrt(3.0)
+    spread, scale = lee2018.START_ERROR / np.sqrt(6.0), lee2018.D_MAX / np.sqrt(8.0)
+    noise = lee2018.N_MAX / np.sqrt(3.0)
     x = spread * rng.standard_normal((runs, 6))
     state = kalman.init(filters, 0.0, np.zeros((runs, 6)), spread**2 * np.eye(6))
     state = kalman.correct(filters, state, x @ PLANT.C.T + noise * rng.standard_normal((runs, 5)))
@@ -334,12 +335,12 @@ def test_time_varying_filters_are_consistent_on_the_example() -> None:
     low, high = chi2.ppf([5e-4, 1.0 - 5e-4], 6 * runs) / runs
     inside = []
     for prepared in made.sets[:2]:
-        fused = fusion.fuse(prepared, state.P, tol=1e-10)
+        fused = partial_gaussian.fuse(prepared, state.P, tol=1e-10)
         error = state.z @ fused.estimator.T - x
         nees = np.einsum("ri,ij,rj->r", error, np.linalg.inv(fused.covariance), error).mean()
         inside.append(bool(low < nees < high))
     # `sets[1]` are the sensors 0 … 3, `sets[5]` those without the attacked one.
-    fused = fusion.fuse(made.sets[5], state.P, tol=1e-10)
+    fused = partial_gaussian.fuse(made.sets[5], state.P, tol=1e-10)
     assert np.array_equal(made.sets[5].kept, [1, 2, 3, 4])
     error = state.z @ fused.estimator.T - x
     nees = np.einsum("ri,ij,rj->r", error, np.linalg.inv(fused.covariance), error).mean()

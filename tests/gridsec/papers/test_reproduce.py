@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from service.cli_reproduce import PAPERS
+from service.cli.reproduce import PAPERS
 from tests.gridsec.papers.made import made
 from tests.service.commands import command
 

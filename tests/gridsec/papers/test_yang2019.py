@@ -8,9 +8,10 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from gridsec import windows
-from gridsec.papers import sampled_feeder, yang2019
+from gridsec.papers import yang2019
+from gridsec.papers import yang2019 as sampled_feeder
 from gridsec.papers.claims import Reproduction
+from gridsec.secure import windows
 from tests.gridsec.papers.made import made
 
 

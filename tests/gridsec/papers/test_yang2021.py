@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from gridsec.errors import InputInvalid
-from gridsec.isolation import design
-from gridsec.lmi.sampled import advance
+from gridsec.observers.lmi.sampled import advance
 from gridsec.observers.unknown_input import obstruction
 from gridsec.papers import yang2021, yang2021_feeder
+from gridsec.secure.isolation import design
 from tests.codes import refused
 from tests.gridsec.papers.made import made
 
@@ -136,7 +136,7 @@ def test_certified_names_come_late_on_the_smallest_correction() -> None:
 
 
 def test_the_line_is_that_of_the_files() -> None:
-    from feeders.load import load
+    from feeders.model.site import load
 
     theirs, ours = load("kerber-landnetz").feeder, yang2021_feeder.feeder()
     np.testing.assert_array_equal(theirs.parent, ours.parent)

@@ -1,0 +1,1 @@
+"""Conversion of networks of other tools into feeder folders."""

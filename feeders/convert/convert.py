@@ -1,0 +1,574 @@
+"""Conversion of other formats into feeder folders.
+
+Sources: the name of a feeder that comes with the project (builds that folder again), `profiles` (builds
+the profile library again), `pandapower:<network>`, `simbench:<code>` or the code alone, the path of a
+pandapower JSON file, of an OpenDSS master file (.dss) or of a power-grid-model JSON file, or a feeder's
+folder. pandapower, simbench and OpenDSS are the optional extra `convert`.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import random
+import re
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import astuple, dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+from feeders.convert import from_simbench
+from feeders.convert.from_opendss import read_opendss
+from feeders.convert.from_pandapower import Fleet, from_pandapower
+from feeders.convert.from_power_grid_model import read_pgm
+from feeders.convert.network import Converted, feeder_of, opened_rows
+from feeders.convert.provenance import (
+    CHANGES_FILE,
+    SOURCE_FILE,
+    Change,
+    Origin,
+    SourceUnreadable,
+    changes_csv,
+    feeder_source,
+    origin,
+    profiles_source,
+    sentences,
+    versioned,
+)
+from feeders.convert.provenance import origin as origin_of
+from feeders.convert.round_trip import SourceCheck, compare
+from feeders.convert.transformers import EVERYTHING, Extent
+from feeders.format.reader import CUSTOMERS_FILE, LINES_FILE, META_FILE
+from feeders.format.tables import FeederTables, read, write
+from feeders.model.profiles import ENVELOPES, Season
+from feeders.model.site import from_tables
+from feeders.util import command_line, extra
+from gridsec.errors import FeederInvalid, GridsecError, Problem
+
+__all__ = [
+    "KERBER",
+    "PROFILES",
+    "RECIPES",
+    "SEED",
+    "SIMBENCH_CODE",
+    "WRITTEN",
+    "Conversion",
+    "Recipe",
+    "check_against_source",
+    "convert",
+    "from_folder",
+    "source_again",
+]
+
+
+UNCHECKED: Final = "it was a feeder's folder already"
+AGAIN: Final = "Before the folder was written again: "
+
+
+def from_folder(
+    folder: Path,
+    name: str,
+    *,
+    root: str | None = None,
+    opened: Sequence[str] = (),
+    droop: str | None = None,
+    one_voltage: bool = False,
+    meshed: bool = False,
+) -> Converted:
+    """Return a feeder of our own form, with all that an earlier conversion had changed.
+
+    Parameters
+    ----------
+    folder
+        The feeder's.
+    name
+        Its new name; empty: it keeps its own.
+    opened
+        Lines to take as open.
+    root, droop, one_voltage
+        As `feeders.convert.convert.convert` takes them: only for networks of other tools.
+    meshed
+        Whether loops stay closed, whatever it says itself.
+
+    Raises
+    ------
+    FeederInvalid
+        If it is no feeder, or with every option that makes nothing of one.
+    GridsecError
+        If its conversion.csv is none.
+    """
+    tables = read(folder)
+    given = {"root": root is not None, "droop": droop is not None, "one_voltage": one_voltage}
+    problems: list[str] = [
+        Problem(
+            "inconsistent", f"{option} is for networks of other tools; {folder} is a feeder's folder already"
+        )
+        for option, value in given.items()
+        if value
+    ]
+    changes: list[Change] = []
+    try:
+        lines = opened_rows(tables.lines, opened, changes)
+    except FeederInvalid as error:
+        problems += error.problems
+    if problems:
+        raise FeederInvalid(problems)
+    before = origin(folder)
+    earlier = [] if before is None else [Change(*row) for row in before.changes.itertuples(index=False)]
+    meta = tables.meta
+    if name:
+        meta = replace(meta, name=name, title=name if meta.title == meta.name else meta.title)
+    meta = replace(meta, meshed=meshed or meta.meshed)
+    tables = replace(tables, meta=meta, lines=tuple(lines))
+    return Converted(tables, (*earlier, *changes), None, UNCHECKED)
+
+
+def source_again(
+    before: Origin | None, tables: FeederTables, folder: Path, command: str, notes: tuple[str, ...]
+) -> str:
+    """Return the SOURCE.md of a feeder's folder that was written again.
+
+    Parameters
+    ----------
+    before
+        What the folder told of its source before it was written.
+    tables
+        The feeder.
+    folder, command
+        The folder, and the command line that wrote it again.
+    notes
+        What was left out, added or changed, earlier and now.
+    """
+    if before is None or not before.source:
+        about, source, package = "A feeder in the project's own form.", str(folder), versioned("gridsec")
+        check = f"Not checked: {UNCHECKED}"
+    else:
+        about, (source, _, package) = before.about, before.source.rpartition(", ")
+        told = before.check.removeprefix(AGAIN).removesuffix(".")
+        check = f"{AGAIN}{told or 'not told'}"
+        command = f"{before.command}`, then `{command}" if before.command else command
+    return feeder_source(
+        tables, about=about, origin=source, package=package, command=command, notes=notes, check=check
+    )
+
+
+PROFILES = "profiles"
+OPENDSS, PGM = "opendss", "power-grid-model"
+SIMBENCH_CODE = re.compile(r"[0-9]-[A-Za-z0-9.]+(-[A-Za-z0-9.]+)*--[0-9]-(no_)?sw")
+WRITTEN = (META_FILE, LINES_FILE, CUSTOMERS_FILE, CHANGES_FILE, SOURCE_FILE)
+"""What a converted feeder's folder has."""
+
+SEED = 1
+KERBER = "(G. Kerber, dissertation, TU Munich 2011)"
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """How one of the project's own feeders was made."""
+
+    source: str
+    title: str
+    about: str
+    root: str | None = None
+    fleet: Fleet | None = None
+    max_attacked: int = 1
+    mend: Callable[[Any], Change] | None = None
+    """Corrects what is wrong in the source, and says what."""
+
+
+def _reactive_powers(net: Any) -> Change:
+    """Bring the reactive powers of two phases to the unit of the third."""
+    net.asymmetric_load[["q_b_mvar", "q_c_mvar"]] *= 1000.0
+    return Change(
+        "the loads of phases b and c",
+        "reactive power",
+        "changed",
+        "a thousandth of what it should be in pandapower's file; taken 1000 times, which gives everybody the "
+        "power factor 0.95 that phase a has there",
+    )
+
+
+RECIPES: dict[str, Recipe] = {
+    "kerber-landnetz": Recipe(
+        "pandapower:create_kerber_landnetz_freileitung_1",
+        "Kerber rural network, overhead line 1",
+        f"A German rural low-voltage feeder, overhead lines, 13 customers {KERBER}.",
+        fleet=Fleet(2, 10.0),
+        max_attacked=2,
+    ),
+    "kerber-dorfnetz": Recipe(
+        "pandapower:create_kerber_dorfnetz",
+        "Kerber village network",
+        f"A German village low-voltage grid, cables, 57 customers {KERBER}.",
+        fleet=Fleet(2, 10.0),
+    ),
+    "kerber-vorstadtnetz": Recipe(
+        "pandapower:create_kerber_vorstadtnetz_kabel_1",
+        "Kerber suburban network, cable 1",
+        f"A German suburban low-voltage grid, cables, 146 customers {KERBER}.",
+        fleet=Fleet(2, 10.0),
+    ),
+    "cigre-lv": Recipe(
+        "pandapower:create_cigre_network_lv",
+        "CIGRE low-voltage benchmark, residential feeder",
+        "The residential feeder of the European low-voltage benchmark (CIGRE Task Force C6.04.02, 2014).",
+        root="Bus R1",
+        fleet=Fleet(1, 0.0),
+    ),
+    "case33bw": Recipe(
+        "pandapower:case33bw",
+        "Baran and Wu, 33 buses, 12.66 kV",
+        "The radial 12.66 kV test feeder of M. E. Baran and F. F. Wu, IEEE Trans. Power Delivery 4(2), 1989, "
+        "its five tie lines open.",
+        fleet=Fleet(2, 0.0),
+    ),
+    "ieee-european-lv": Recipe(
+        "pandapower:ieee_european_lv_asymmetric",
+        "IEEE European low-voltage test feeder",
+        "The European low-voltage test feeder of the IEEE PES Distribution Test Feeder Working Group\n"
+        "(2015): 55 customers of one phase each. load_kw is what they draw in the minute 566 of its day,\n"
+        "09:26, when the feeder carries the most; it is not the peak of each.",
+        fleet=Fleet(3, 4.6),
+        mend=_reactive_powers,
+    ),
+    "simbench-lv-rural1": Recipe(
+        "simbench:1-LV-rural1--0-sw",
+        "SimBench LV rural 1",
+        "A German rural low-voltage grid of the SimBench data set, 13 customers.",
+        fleet=Fleet(2, 5.0),
+        max_attacked=2,
+    ),
+    "simbench-lv-rural3": Recipe(
+        "simbench:1-LV-rural3--0-sw",
+        "SimBench LV rural 3",
+        "A German rural low-voltage grid of the SimBench data set, 118 customers.",
+        fleet=Fleet(4, 5.0),
+    ),
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Conversion:
+    """What became of a source.
+
+    Attributes
+    ----------
+    changes
+        What was left out, approximated, added or changed; also in conversion.csv beside the feeder.
+    check
+        The feeder's AC power flow beside the source's own; None if there is none.
+    unchecked
+        Why there is none.
+    """
+
+    changes: tuple[Change, ...]
+    check: SourceCheck | None
+    unchecked: str = ""
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """The changes in words, as in SOURCE.md."""
+        return sentences(self.changes)
+
+
+def convert(
+    source: str,
+    out: Path | str,
+    *,
+    root: str | None = None,
+    name: str | None = None,
+    droop: str | None = None,
+    opened: Sequence[str] = (),
+    meshed: bool = False,
+    one_voltage: bool = False,
+) -> Conversion:
+    """Convert a source into a feeder's folder (or the profile library) with its SOURCE.md.
+
+    Parameters
+    ----------
+    source
+        See the module.
+    out
+        Folder to write; made if it does not exist.
+    root
+        Bus that becomes the metered busbar, where the source leaves a choice.
+    name
+        Name of the feeder; default: the name of the folder, or that of a source that is a feeder's folder.
+    droop
+        Preset of the source's generators.
+    opened
+        Lines to take as open, so that a mesh becomes radial.
+    meshed
+        Whether loops stay closed, as `meshed = true` in feeder.toml.
+    one_voltage
+        Whether it ends where another nominal voltage begins: a transformer to that is then a customer.
+
+    Raises
+    ------
+    FeederInvalid
+        If the result is no feeder that can be loaded: a loop, an island, no zero sequence where one is
+        needed, ...; or with every option that makes nothing of a feeder's folder.
+    SourceUnreadable
+        If the source does not exist, or its own tool cannot read it.
+    GridsecError
+        If its own power flow fails where that is needed, or the extra `convert` is not installed.
+    FileExistsError
+        If the folder holds a feeder that no conversion has written.
+    """
+    folder = Path(out)
+    if source == PROFILES:
+        _convert_profiles(folder)
+        return Conversion((), None, "profiles have no power flow")
+    if (folder / META_FILE).exists() and not (folder / CHANGES_FILE).is_file():
+        raise FileExistsError(f"{folder}: a feeder that no conversion has written; expected another folder")
+    recipe = RECIPES.get(source)
+    again = recipe is None and Path(source).is_dir()  # such a feeder has a name, and tells where it is from
+    before = origin_of(source) if again else None
+    usual = "" if again else re.sub(r"[^A-Za-z0-9_-]+", "-", folder.resolve().name)
+    chosen = name or (source if recipe is not None else usual)
+    extent = Extent(one_voltage, meshed)
+    converted, package = _converted(source, chosen[:64], root=root, droop=droop, opened=opened, extent=extent)
+    problems = _problems(converted.tables)
+    if problems:
+        raise FeederInvalid(
+            [
+                *problems,
+                *(Problem("note", f"while converting: {note}") for note in sentences(converted.changes)),
+            ]
+        )
+    write(converted.tables, folder)
+    done = _checked(converted, folder)
+    (folder / CHANGES_FILE).write_text(changes_csv(done.changes), encoding="utf-8", newline="\n")
+    target = f"data/feeders/{chosen}" if recipe else str(out)
+    options = [*_options(root, name, droop, opened), *_flags(extent)]
+    command = command_line(["gridsec", "feeders", "convert", source, target, *options])
+    if again:
+        text = source_again(before, converted.tables, Path(source), command, done.notes)
+    else:
+        text = feeder_source(
+            converted.tables,
+            about=recipe.about if recipe else "A converted network.",
+            origin=recipe.source if recipe else source,
+            package=versioned(package),
+            command=command,
+            notes=done.notes,
+            check=done.check.sentence if done.check else f"Not checked: {done.unchecked}",
+        )
+    (folder / SOURCE_FILE).write_text(text, encoding="utf-8", newline="\n")
+    return done
+
+
+def _problems(tables: FeederTables) -> tuple[str, ...]:
+    """Everything that is wrong with a feeder: not every valid one can be loaded, and a folder must be."""
+    try:
+        from_tables(tables)
+    except FeederInvalid as error:
+        return error.problems
+    return ()
+
+
+def check_against_source(
+    source: str,
+    folder: Path | str,
+    *,
+    root: str | None = None,
+    opened: Sequence[str] = (),
+    one_voltage: bool = False,
+) -> SourceCheck:
+    """Compare a folder's AC power flow with that of the source it was made from, at the source's loads.
+
+    Parameters
+    ----------
+    source
+        As `convert` takes it.
+    folder
+        The feeder.
+    root, opened, one_voltage
+        As `convert` was given them.
+
+    Raises
+    ------
+    SourceUnreadable
+        If the source cannot be read.
+    GridsecError
+        If its own power flow fails.
+    PowerFlowDiverged
+        If the feeder's does.
+    """
+    tables = read(folder)
+    extent = Extent(one_voltage, tables.meta.meshed)
+    converted, _ = _converted(source, "check", root=root, opened=opened, extent=extent)
+    if converted.state is None:
+        raise GridsecError(converted.unchecked, code="not-converged")
+    return compare(converted.state, tables)
+
+
+def _checked(converted: Converted, folder: Path) -> Conversion:
+    """Compare what was written with the source's power flow."""
+    if converted.state is None:
+        return Conversion(converted.changes, None, converted.unchecked)
+    try:
+        return Conversion(converted.changes, compare(converted.state, read(folder)))
+    except GridsecError as error:
+        return Conversion(converted.changes, None, " ".join(str(error).split()))
+
+
+def _converted(
+    source: str,
+    name: str,
+    *,
+    root: str | None,
+    opened: Sequence[str] = (),
+    droop: str | None = None,
+    extent: Extent = EVERYTHING,
+) -> tuple[Converted, str]:
+    """Return a source as a feeder, and the package that holds its data or reads its file."""
+    recipe = RECIPES.get(source)
+    origin = recipe.source if recipe else source
+    path = Path(origin)
+    if recipe is None and path.is_dir():
+        one_voltage, meshed = extent.one_voltage, extent.meshed
+        again = from_folder(
+            path, name, root=root, opened=opened, droop=droop, one_voltage=one_voltage, meshed=meshed
+        )
+        return again, "gridsec"
+    kind = _kind(path) if path.is_file() else ""
+    if kind == OPENDSS:
+        network, package = read_opendss(path), "opendssdirect.py"
+        return feeder_of(network, name, root=root, opened=opened, droop=droop, extent=extent), package
+    if kind == PGM:
+        network, package = read_pgm(path), "power-grid-model"
+        return feeder_of(network, name, root=root, opened=opened, droop=droop, extent=extent), package
+    net, package = _open(origin)
+    mended = (recipe.mend(net),) if recipe and recipe.mend else ()
+    found = from_pandapower(
+        net,
+        name,
+        title=recipe.title if recipe else "",
+        root=root or (recipe.root if recipe else None),
+        opened=opened,
+        droop=droop,
+        extent=extent,
+        fleet=recipe.fleet if recipe else None,
+        max_attacked=recipe.max_attacked if recipe else 1,
+    )
+    return replace(found, changes=(*mended, *found.changes)), package
+
+
+def _kind(path: Path) -> str:
+    """Tell from a file's name and content which tool it is for.
+
+    Raises
+    ------
+    SourceUnreadable
+        If it is for none of them.
+    """
+    if path.suffix.lower() == ".dss":
+        return OPENDSS
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise SourceUnreadable(
+            f"{path}: no valid JSON ({error}); expected a pandapower or power-grid-model JSON file, "
+            "or an OpenDSS master file with the ending .dss"
+        ) from error
+    if isinstance(content, dict):
+        if content.get("_class") == "pandapowerNet":
+            return "pandapower"
+        if "data" in content and "version" in content:
+            return PGM
+    raise SourceUnreadable(
+        f"{path}: JSON, but neither a pandapower net (which says _class pandapowerNet) nor input data of "
+        "power-grid-model (which has version, type and data)"
+    )
+
+
+def _options(root: str | None, name: str | None, droop: str | None, opened: Sequence[str]) -> list[str]:
+    """Return the options of the command line that were given."""
+    given = (("--root", root), ("--name", name), ("--droop", droop), *(("--open", line) for line in opened))
+    return [word for option, value in given if value for word in (option, value)]
+
+
+def _flags(extent: Extent) -> list[str]:
+    given = (("--meshed", extent.meshed), ("--one-voltage", extent.one_voltage))
+    return [text for text, value in given if value]
+
+
+def _seeded(make: Callable[[], Any]) -> Any:
+    """Build a network whose maker draws cables at random; the caller's random state stays as it was."""
+    state = random.getstate()
+    random.seed(SEED)
+    try:
+        return make()
+    finally:
+        random.setstate(state)
+
+
+def _convert_profiles(folder: Path) -> None:
+    columns = from_simbench.year()
+    loads = from_simbench.load_profiles(columns)
+    stretches = [(season.file, *astuple(stretch)) for season, stretch in from_simbench.STRETCHES.items()]
+    text = profiles_source(stretches, len(loads), sum(name.startswith("PV") for name in columns))
+    folder.mkdir(parents=True, exist_ok=True)
+    for season in Season:
+        (folder / season.file).write_bytes(from_simbench.library_csv(columns, season))
+    (folder / ENVELOPES).write_text(from_simbench.envelopes_csv(columns), encoding="ascii", newline="\n")
+    (folder / SOURCE_FILE).write_text(text, encoding="utf-8", newline="\n")
+
+
+def _open(origin: str) -> tuple[Any, str]:
+    """Return the pandapower net of a source and the name of the package that holds its data."""
+    kind, _, rest = origin.partition(":")
+    path = Path(origin)
+    if path.suffix.lower() in (".json", ".dss") and not path.is_file():
+        raise SourceUnreadable(f"{origin}: there is no such file", code="missing")
+    try:
+        import pandapower
+        import pandapower.networks
+    except ImportError as error:
+        raise GridsecError(f"conversion needs {extra('convert')}", code="not-installed") from error
+    if (kind == "simbench" and rest) or SIMBENCH_CODE.fullmatch(origin):
+        return from_simbench.grid(rest or origin), "simbench"
+    if kind == "pandapower" and rest:
+        return _named(rest), "pandapower"
+    if not path.is_file():
+        raise SourceUnreadable(
+            f"{origin!r} is no source; expected {', '.join(RECIPES)}, pandapower:<network>, "
+            "simbench:<code>, a pandapower or power-grid-model JSON file, an OpenDSS master file (.dss), "
+            "or a feeder's folder",
+            code="unknown-name",
+        )
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            net = pandapower.from_json(str(path))
+    except Exception as error:  # whatever the foreign reader raises on a foreign file
+        raise SourceUnreadable(f"{origin}: pandapower cannot read it: {error}") from error
+    if not isinstance(net, pandapower.pandapowerNet):
+        raise SourceUnreadable(f"{origin}: holds no pandapower net")
+    return net, "pandapower"
+
+
+def _named(name: str) -> Any:
+    """Build one of pandapower's own networks."""
+    from pandapower import networks
+
+    found = [getattr(networks, maker, None) for maker in (name, f"create_{name}")]
+    makers: list[Callable[[], Any]] = [maker for maker in found if callable(maker)]
+    if not makers:
+        raise SourceUnreadable(f"pandapower has no network {name!r}", code="unknown-name")
+    talk = logging.getLogger("pandapower")
+    level = talk.level
+    talk.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            net = _seeded(makers[0])
+    except Exception as error:  # whatever a maker that needs arguments, or is none, raises
+        raise SourceUnreadable(f"pandapower cannot build {name!r} by itself: {error}") from error
+    finally:
+        talk.setLevel(level)
+    if not hasattr(net, "bus"):
+        raise SourceUnreadable(f"pandapower's {name!r} is no network")
+    return net

@@ -1,0 +1,315 @@
+"""Loads and generators of other tools as rows of customers.csv."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from feeders.convert.provenance import WHOLE, Change
+from feeders.format.tables import CustomerRow
+from feeders.model.profiles import envelopes
+from gridsec.arrays import Phasors
+
+HOUSEHOLDS: Final = ("H0-A", "H0-B", "H0-C", "H0-G", "H0-L")
+# Trade and agriculture whose reactive power follows the active power closely, as that of large loads does.
+TRADE: Final = ("G1-A", "G2-A", "G6-A", "L1-A", "L2-A")
+HOUSEHOLD_KW: Final = 30.0
+USUAL_POWER_FACTOR: Final = 0.93
+LEAST_POWER_FACTOR: Final = 0.01
+"""The least that customers.csv can say."""
+
+SMALL_KVA: Final = 4.6
+
+
+def rounded(value: float) -> float:
+    """Nine significant digits: enough for any cable, and free of the noise of the unit's conversion."""
+    return float(f"{value:.9g}")
+
+
+def usual_profile(number: int, *, household: bool) -> str:
+    """Profile of the load of this number, dealt out in the order of the loads."""
+    kinds = HOUSEHOLDS if household else TRADE
+    return kinds[number % len(kinds)]
+
+
+def reactive(customer: CustomerRow, power_factor: float | None) -> CustomerRow:
+    """Fill in what the load's profile is known to do to the reactive power.
+
+    Parameters
+    ----------
+    customer
+        With its load and its profile.
+    power_factor
+        At the peak, lagging; None: the usual one.
+    """
+    factor = USUAL_POWER_FACTOR if power_factor is None else max(round(power_factor, 4), LEAST_POWER_FACTOR)
+    tan = math.tan(math.acos(factor))
+    history = envelopes()[customer.load_profile]
+    # Rounded outwards, so that the interval still holds the history.
+    return replace(
+        customer,
+        power_factor=factor,
+        power_factor_min=min(
+            factor,
+            max(math.floor(1e4 * math.cos(math.atan(history.high * tan))) / 1e4, LEAST_POWER_FACTOR),
+        ),
+        power_factor_max=max(factor, math.ceil(1e4 * math.cos(math.atan(history.low * tan))) / 1e4),
+        q_floor_kvar=math.ceil(1e4 * history.floor * tan * customer.load_kw) / 1e4,
+    )
+
+
+def droop_preset(kva: float) -> str:
+    """Droop curve of an inverter of this size whose own is not known."""
+    return "vde4105" if kva > SMALL_KVA else "vde4105-small"
+
+
+def with_meters(rows: list[CustomerRow]) -> list[CustomerRow]:
+    """Give every customer a meter: m01, m02, ... in their order."""
+    digits = max(2, len(str(len(rows))))
+    return [replace(row, meter=f"m{k:0{digits}d}") for k, row in enumerate(rows, start=1)]
+
+
+def base_kva(volt: float, load_kw: float) -> float:
+    """Base power of the per-unit system that suits a feeder of this voltage and load."""
+    return 100.0 if volt < 1000.0 else 10.0 ** max(2, math.ceil(math.log10(max(load_kw, 1.0))))
+
+
+NO_POWER: Final = 1e-9
+"""Share of a load's power that is a solver's last digits."""
+
+UNSURE: Final = 0.5
+"""Part by which a transformer's no-load power is not known: without a reading a customer is taken at half."""
+
+SWITCHED_OFF: Final = (
+    "in service",
+    "changed",
+    "switched off in the source; a customer who is expected to draw nothing",
+)
+"""What becomes of a load that is switched off: property, what was done, effect."""
+
+ONLY_REACTIVE: Final = (
+    "reactive power",
+    "left out",
+    "draws no active power, to which what is expected of the reactive power is tied",
+)
+"""The same of a load that draws reactive power only."""
+
+BY_DROOP: Final = (
+    "reactive power",
+    "left out",
+    "its droop curve decides; in the check it is that of the source",
+)
+"""The same of the reactive power of a generator with an inverter."""
+
+EVEN: Final = 1e-6
+"""Spread of the phases' powers, as a share of the largest, below which a connection is of three phases."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Draw:
+    """A load or a generator at a bus.
+
+    Attributes
+    ----------
+    name, bus
+        Its name and where it is.
+    power_kva : (3,)
+        What it takes from each phase at the source's operating point, P + jQ, kVA.
+    even
+        It is one connection of all three phases.
+    rating_kva
+        Rating of a generator's inverter; 0: it has none; None: no generator.
+    idle
+        It is what a transformer takes without load, which no customer pays for and no meter reads.
+    peak_kw
+        Rated peak of a generator; what it feeds in now may be less.
+    phases
+        Those that it is connected to, whether it draws anything there or not.
+    noun
+        What it is called where it is told about; empty: load or generator.
+    """
+
+    name: str
+    bus: str
+    power_kva: Phasors
+    even: bool = True
+    rating_kva: float | None = None
+    idle: bool = False
+    peak_kw: float = 0.0
+    phases: str = "abc"
+    noun: str = ""
+
+    @property
+    def label(self) -> str:
+        """What it is called where it is told about."""
+        return f"{self.noun or ('load' if self.rating_kva is None else 'generator')} {self.name}"
+
+
+def is_even(power: Phasors) -> bool:
+    """Return whether all phases draw the same, and anything at all."""
+    size = float(np.abs(power).max())
+    return size > 0 and float(np.abs(power - power.mean()).max()) <= EVEN * size
+
+
+def as_it_stands(power: Phasors) -> str:
+    """Return in words what becomes of something that draws or feeds in by rules of its own.
+
+    Parameters
+    ----------
+    power : (3,)
+        What it takes from each phase at the source's operating point, kVA.
+    """
+    p, q = (round(float(part), 6) + 0.0 for part in (power.sum().real, power.sum().imag))
+    if p < 0:
+        return f"a customer that feeds in {-p:.4g} kW and draws {q:.4g} kvar in the check"
+    return f"a customer that draws {p:.4g} kW and {q:.4g} kvar"
+
+
+def customers_of(
+    draws: Iterable[Draw],
+    nominal: Mapping[str, float],
+    droop: str | None,
+    changes: list[Change],
+    taken: Collection[str] = (),
+) -> tuple[list[CustomerRow], dict[str, complex]]:
+    """Return rows of customers.csv, and what each draws at the source's operating point, kVA.
+
+    Parameters
+    ----------
+    draws
+        Loads and generators.
+    nominal
+        Nominal voltages of the buses, V.
+    droop
+        Preset of the generators' inverters; None: by their size.
+    changes
+        Takes what is not carried over exactly.
+    taken
+        Names that other customers have.
+    """
+    rows: list[CustomerRow] = []
+    power: dict[str, complex] = {}
+    own = (draw for draw in draws if not draw.idle)
+    for draw in sorted(own, key=lambda each: each.rating_kva is not None):
+        connections = _connections(draw)
+        if not connections:
+            effect = "draws nothing in the source's power flow"
+            changes.append(Change(draw.label, WHOLE, "left out", effect))
+        for phases, kva in connections:
+            row = CustomerRow(_unique(draw, phases, {*taken, *power}), draw.bus, 0.0, phases=phases)
+            power[row.customer] = kva
+            takes = kva.real > EVEN * max(abs(kva), draw.peak_kw)
+            if draw.rating_kva is None or takes:
+                noun, volt = draw.noun or "load", nominal[draw.bus]
+                row = _load(row, kva, len(rows), volt=volt, changes=changes, noun=noun)
+            if draw.rating_kva is not None:
+                row = _generator(row, kva, draw, len(rows), droop=droop, changes=changes)
+            rows.append(row)
+    return rows, power
+
+
+def _generator(
+    row: CustomerRow, kva: complex, draw: Draw, number: int, *, droop: str | None, changes: list[Change]
+) -> CustomerRow:
+    """Give a customer a generator's peak, and the inverter that it has."""
+    parts = len(_connections(draw))
+    rating = (draw.rating_kva or 0.0) / parts
+    peak = rounded(max(draw.peak_kw / parts, -kva.real, 0.0))
+    row = replace(row, pv_kw=peak, pv_profile=f"PV{number % 8 + 1}")
+    if not rating > 0:
+        effect = f"{row.pv_profile}, not in the source: a feeder's generation follows the sun"
+        changes.append(Change(draw.label, "profile", "added", effect))
+        return row
+    row = replace(row, inverter_kva=rounded(rating), droop=droop or droop_preset(rating))
+    changes.append(Change(draw.label, "droop curve", "added", f"{row.droop}, not in the source"))
+    if abs(kva.imag) > EVEN * rating:
+        changes.append(Change(draw.label, *BY_DROOP))
+    return row
+
+
+def idle_customers(
+    draws: Iterable[Draw], taken: Collection[str]
+) -> tuple[list[CustomerRow], dict[str, complex]]:
+    """Return what transformers take without load as customers without meters, and their powers, kVA.
+
+    Parameters
+    ----------
+    draws
+        Of which those are taken that are idle.
+    taken
+        Names that customers have.
+    """
+    rows: list[CustomerRow] = []
+    power: dict[str, complex] = {}
+    for draw in draws:
+        for phases, kva in _connections(draw) if draw.idle else ():
+            row = CustomerRow(_unique(draw, phases, {*taken, *power}), draw.bus, rounded(max(kva.real, 0.0)))
+            factor = max(kva.real / abs(kva), LEAST_POWER_FACTOR)
+            # What the power factor does not say: all of it where no active power is drawn.
+            beside = abs(kva.imag) - row.load_kw * math.tan(math.acos(factor))
+            row = replace(row, phases=phases, q_floor_kvar=rounded(max(beside, 0.0)))
+            one = rounded(factor)
+            row = replace(row, power_factor=one, power_factor_min=one, power_factor_max=one)
+            std = [rounded(UNSURE * abs(part)) for part in (kva.real, kva.imag)]
+            rows.append(replace(row, p_std_kw=std[0], q_std_kvar=std[1]))
+            power[row.customer] = kva
+    return rows, power
+
+
+def _connections(draw: Draw) -> list[tuple[str, complex]]:
+    if draw.even:
+        return [("abc", complex(draw.power_kva.sum()))]
+    least = EVEN * float(np.abs(draw.power_kva).max())
+    return [
+        (phase, complex(kva))
+        for phase, kva in zip("abc", draw.power_kva, strict=True)
+        if abs(kva) > least or (draw.peak_kw > 0 and phase in draw.phases)
+    ]
+
+
+def in_star(pairs: Phasors, volts: Phasors) -> Phasors:
+    """Return what a load between phases draws from each phase, kVA.
+
+    Between the phases k and k + 1 flows ``conj(S_k / (V_k - V_k+1))``; each phase gives what flows out of it
+    less what flows back into it.
+
+    Parameters
+    ----------
+    pairs : (3,)
+        Powers between a and b, b and c, c and a, kVA.
+    volts : (3,)
+        Voltages of the phases, V.
+    """
+    between = np.conj(pairs / (volts - np.roll(volts, -1)))
+    return np.asarray(volts * np.conj(between - np.roll(between, 1)), dtype=np.complex128)
+
+
+def _unique(draw: Draw, phases: str, taken: Collection[str]) -> str:
+    several = phases != "abc" and len(_connections(draw)) > 1
+    name = (f"{draw.name}-{phases}" if several else draw.name)[:120]
+    while name in taken:
+        name += "'"
+    return name
+
+
+def _load(
+    row: CustomerRow, kva: complex, number: int, *, volt: float, changes: list[Change], noun: str
+) -> CustomerRow:
+    p, q = kva.real, kva.imag
+    if p < 0:
+        changes.append(
+            Change(f"{noun} {row.customer}", "p_kw", "changed", "feeds in; its expected load is taken as 0")
+        )
+    if q < -NO_POWER * abs(kva):
+        changes.append(
+            Change(f"{noun} {row.customer}", "power factor", "approximated", "leading; expected to be 1")
+        )
+    if p <= 0.0 and q > NO_POWER:
+        changes.append(Change(f"{noun} {row.customer}", *ONLY_REACTIVE))
+    household = volt < 1000.0 and p <= HOUSEHOLD_KW
+    row = replace(row, load_kw=rounded(max(p, 0.0)), load_profile=usual_profile(number, household=household))
+    return reactive(row, p / math.hypot(p, q) if p > 0 and q > 0 else None)

@@ -1,0 +1,649 @@
+"""Network of any tool, and the feeder below one of its buses.
+
+The readers of other tools' files make a `Network` in SI; here it becomes a feeder's tables: the busbar is
+found, the rest of the network cut off, parallel lines become one, and transformers below the busbar become
+customers that draw what flows into them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Final, TypeVar
+
+import numpy as np
+
+from feeders.convert.customers import (
+    USUAL_POWER_FACTOR,
+    Draw,
+    base_kva,
+    customers_of,
+    idle_customers,
+    is_even,
+    with_meters,
+)
+from feeders.convert.lines import (
+    Coupling,
+    above_busbar,
+    as_rows,
+    balanced_charging,
+    fused_with,
+    merged,
+    reached,
+    turned,
+)
+from feeders.convert.provenance import WHOLE, BusbarUnclear, Change
+from feeders.convert.round_trip import SourceState
+from feeders.convert.transformers import EVERYTHING, Extent, levels_of, transformed
+from feeders.format.columns import SUSPICIONS
+from feeders.format.tables import FeederMeta, FeederTables, LineRow, LoadDefaults, validate
+from feeders.format.validation import loops
+from gridsec.arrays import Phasors
+from gridsec.errors import FeederInvalid, GridsecError, Problem
+from gridsec.grid.droop import preset
+from gridsec.grid.three_phase import ROTATION
+
+__all__ = [
+    "BEYOND",
+    "UNFED",
+    "Converted",
+    "Network",
+    "Part",
+    "accepting",
+    "angles_of",
+    "below",
+    "below_source",
+    "busbar_of",
+    "chosen",
+    "feeder_of",
+    "finished",
+    "named_bus",
+    "one_busbar",
+    "opened_rows",
+]
+
+
+Busbar = TypeVar("Busbar")
+
+TURNED: Final = 1.0
+"""Degrees up to which the angles between a busbar's phases may be others than those of a feeder."""
+
+
+def chosen(network: Network, find: Callable[[], Busbar], opened: Sequence[str], droop: str | None) -> Busbar:
+    """Return the busbar that was chosen, unless something else that was chosen does not exist either.
+
+    Parameters
+    ----------
+    network
+        The network.
+    find
+        Finds the busbar; raises a GridsecError if there is none.
+    opened, droop
+        As `feeder_of` takes them.
+
+    Raises
+    ------
+    FeederInvalid
+        With all that does not exist.
+    GridsecError
+        As `find`, if nothing else is wrong.
+    """
+    problems = _unknown(network.lines, opened)
+    try:
+        if droop is not None:
+            preset(droop)
+    except FeederInvalid as error:
+        problems += error.problems
+    try:
+        busbar = find()
+    except GridsecError as error:
+        if not problems:
+            raise
+        raise FeederInvalid([Problem(error.code, str(error)), *problems]) from error
+    if problems:
+        raise FeederInvalid(problems)
+    return busbar
+
+
+def opened_rows(lines: Iterable[LineRow], opened: Sequence[str], changes: list[Change]) -> list[LineRow]:
+    """Open the lines that were asked for.
+
+    Parameters
+    ----------
+    lines
+        Rows of lines.csv.
+    opened
+        Names of lines.
+    changes
+        Takes what was opened.
+
+    Raises
+    ------
+    FeederInvalid
+        With every line that does not exist.
+    """
+    rows = list(lines)
+    if unknown := _unknown(rows, opened):
+        raise FeederInvalid(unknown)
+    changes.extend(
+        Change(f"line {line}", "closed", "changed", "open, as asked for; the check shows what that does")
+        for line in opened
+    )
+    return [replace(row, closed=False) if row.line in opened else row for row in rows]
+
+
+def busbar_of(network: Network, rows: list[LineRow], root: str | None) -> str:
+    """Return the bus asked for, or the first from the source on that has lines.
+
+    Parameters
+    ----------
+    network
+        The network.
+    rows
+        Its lines, with those open that shall be.
+    root
+        The bus asked for.
+
+    Raises
+    ------
+    GridsecError
+        If there is no such bus.
+    BusbarUnclear
+        If none was asked for, and it is not clear which one is meant.
+    """
+    if root is not None:
+        return named_bus(network, root)
+    if len(network.sources) != 1:
+        names = ", ".join(network.sources) or "none"
+        raise BusbarUnclear(f"the busbar is not clear, voltage sources at: {names}; name it with root")
+    way = _way_down(network, rows)
+    if not _has_lines(way[-1], rows):
+        beyond = ", ".join(sorted(_beyond(network, way))) or "none"
+        raise BusbarUnclear(f"the busbar is not clear, candidates: {beyond}; name it with root")
+    return way[-1]
+
+
+def named_bus(network: Network, root: str) -> str:
+    """Return the bus asked for.
+
+    Parameters
+    ----------
+    network, root
+        The network, and the bus's name.
+
+    Raises
+    ------
+    GridsecError
+        If there is no such bus, or more than one that could be meant.
+    """
+    hits = [bus for bus in network.nominal if bus == root] or [
+        bus for bus in network.nominal if bus.lower() == root.lower()
+    ]
+    if len(hits) != 1:
+        raise GridsecError(f"there is no bus {root!r}", code="unknown-name")
+    return hits[0]
+
+
+def _unknown(lines: Iterable[LineRow], opened: Sequence[str]) -> list[str]:
+    return [
+        Problem("unknown-name", f"there is no line {line!r} to open")
+        for line in sorted(set(opened) - {row.line for row in lines})
+    ]
+
+
+def below_source(network: Network) -> str | None:
+    """Return the bus of the only source's only transformer on its other side; None if there is no such bus.
+
+    Parameters
+    ----------
+    network
+        The network.
+    """
+    way = _way_down(network, network.lines) if len(network.sources) == 1 else []
+    return way[-1] if len(way) > 1 and _has_lines(way[-1], network.lines) else None
+
+
+def angles_of(volts: Phasors, busbar: str, changes: list[Change]) -> Phasors:
+    """Return the busbar's voltages as the feeder can have them.
+
+    The busbar's meter reads magnitudes; simulations and monitors take angles of 0, -120 and 120 degrees.
+
+    Parameters
+    ----------
+    volts : (3,)
+        The source's, V; NaN where a phase is absent.
+    busbar
+        The bus.
+    changes
+        Takes a row where phases are turned otherwise against each other.
+
+    Returns
+    -------
+    (3,)
+        The same, turned where they have to be.
+    """
+    there = np.isfinite(volts)
+    if not there.any():
+        return volts
+    first = volts[there][0]
+    of_feeder = ROTATION / ROTATION[there][0]
+    if np.ptp(np.angle((volts / first / of_feeder)[there], deg=True)) <= TURNED:
+        return volts
+    theirs, ours = (_degrees(each[there]) for each in (volts / first, of_feeder))
+    effect = f"{ours} degrees, in the source {theirs}; the check shows what that does"
+    changes.append(Change(f"bus {busbar}", "angles between its phases", "approximated", effect))
+    return np.asarray(np.abs(volts) * of_feeder)
+
+
+def _degrees(phasors: Phasors) -> str:
+    angles = np.round(np.angle(phasors, deg=True), 1) + 0.0
+    return " and ".join(", ".join(f"{angle:g}" for angle in angles).rsplit(", ", 1))
+
+
+def one_busbar(buses: Collection[str], rows: Iterable[LineRow]) -> bool:
+    """Return whether buses are one, joined by closed switches.
+
+    Parameters
+    ----------
+    buses
+        Some buses.
+    rows
+        The network's lines.
+    """
+    return bool(buses) and fused_with(min(buses), rows).keys() >= set(buses)
+
+
+def _way_down(network: Network, rows: list[LineRow]) -> list[str]:
+    """Follow transformers from the source, as long as there is only one way and no line."""
+    way = [network.sources[0]]
+    while not _has_lines(way[-1], rows):
+        beyond = _beyond(network, way)
+        if not one_busbar(beyond, rows):
+            break
+        way.append(min(beyond))
+    return way
+
+
+def _has_lines(bus: str, rows: list[LineRow]) -> bool:
+    return any(row.closed and bus in (row.from_bus, row.to_bus) for row in rows)
+
+
+def _beyond(network: Network, way: list[str]) -> set[str]:
+    return {bus for each in network.couplings if way[-1] in each.buses for bus in each.buses} - set(way)
+
+
+UNFED: Final = "not supplied in the source"
+BEYOND: Final = "supplied in the source, but not through what the feeder has: see what is left out or opened"
+"""Why somebody below the busbar is no customer."""
+
+
+@dataclass(slots=True)
+class Network:
+    """A network in SI, with the state its own tool found.
+
+    Attributes
+    ----------
+    tool
+        The source's tool and its version.
+    sources
+        Buses with a voltage source.
+    nominal
+        Nominal voltage of each bus, phase to neutral, V.
+    lines
+        Rows of lines.csv, in any direction.
+    draws, couplings
+        What is connected to the buses besides.
+    xy
+        Positions.
+    volts : (3,)
+        Complex voltages of the buses, V; NaN where a phase is absent. Loads of constant power.
+    as_found : (3,)
+        The same with the loads' dependence on the voltage; empty if there is none.
+    changes
+        What could not be carried over so far.
+    of_bus
+        Changes that matter if their bus is in the feeder.
+    connected
+        Buses and labels of loads and generators that are no draws: the reader makes them customers itself.
+    unsolved
+        Why the source's own power flow gave no voltages.
+    """
+
+    tool: str
+    sources: list[str]
+    nominal: dict[str, float]
+    lines: list[LineRow] = field(default_factory=list)
+    draws: list[Draw] = field(default_factory=list)
+    couplings: list[Coupling] = field(default_factory=list)
+    xy: dict[str, tuple[float, float]] = field(default_factory=dict)
+    volts: dict[str, Phasors] = field(default_factory=dict)
+    as_found: dict[str, Phasors] = field(default_factory=dict)
+    changes: list[Change] = field(default_factory=list)
+    of_bus: list[tuple[str, Change]] = field(default_factory=list)
+    connected: list[tuple[str, str]] = field(default_factory=list)
+    unsolved: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Converted:
+    """A feeder made from another tool's network.
+
+    Attributes
+    ----------
+    tables
+        The feeder.
+    changes
+        What could not be carried over as it was.
+    state
+        What the source's tool found at its own loads.
+    unchecked
+        Why there is no state.
+    """
+
+    tables: FeederTables
+    changes: tuple[Change, ...]
+    state: SourceState | None
+    unchecked: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Part:
+    """What a busbar feeds.
+
+    Attributes
+    ----------
+    busbar
+        Its bus.
+    inside
+        The buses, nearest first, and how many lines away each is.
+    lines
+        Rows of lines.csv, pointing away from the busbar.
+    draws
+        Loads and generators, and what flows into transformers.
+    changes
+        What could not be carried over as it was.
+    """
+
+    busbar: str
+    inside: dict[str, int]
+    lines: list[LineRow]
+    draws: list[Draw]
+    changes: list[Change]
+
+
+def feeder_of(
+    network: Network,
+    name: str,
+    *,
+    root: str | None = None,
+    opened: Sequence[str] = (),
+    droop: str | None = None,
+    extent: Extent = EVERYTHING,
+) -> Converted:
+    """Return the feeder below a bus of a network.
+
+    Parameters
+    ----------
+    network
+        The network.
+    name
+        Of the feeder.
+    root
+        Bus that becomes the metered busbar; None: the first below the source that has lines.
+    opened
+        Lines to take as open, so that the feeder is radial.
+    droop
+        Preset of the generators' inverters; None: by their size.
+    extent
+        How far down it goes.
+
+    Raises
+    ------
+    FeederInvalid
+        With every reason why there is no feeder.
+    """
+    busbar = chosen(network, lambda: None if root is None else named_bus(network, root), opened, droop)
+    part = below(network, busbar, opened, extent)
+    volt = network.nominal[part.busbar]
+    rows, power = customers_of(part.draws, network.nominal, droop, part.changes)
+    idle, taken = idle_customers(part.draws, power)
+    rows, power = [*with_meters(rows), *idle], power | taken
+    lines = part.lines
+    if all(row.phases == "abc" for row in rows):
+        lines = balanced_charging(lines, part.changes)
+    meta = FeederMeta(
+        format=1,
+        name=name,
+        title=name,
+        voltage_volt=round(volt, 6),
+        base_kva=base_kva(volt, sum(row.load_kw for row in rows)),
+        busbar=part.busbar,
+        busbar_xy=network.xy.get(part.busbar),
+        meshed=extent.meshed,
+        load=LoadDefaults(power_factor=USUAL_POWER_FACTOR, power_factor_min=0.85),
+    )
+    tables = FeederTables(meta, tuple(lines), tuple(rows))
+    return finished(network, part, tables, power)
+
+
+def below(network: Network, root: str | None, opened: Sequence[str], extent: Extent = EVERYTHING) -> Part:
+    """Cut the part below a bus out of a network.
+
+    Parameters
+    ----------
+    network, root, opened, extent
+        As `feeder_of` takes them.
+
+    Raises
+    ------
+    FeederInvalid
+        If something else feeds it too, or its lines join buses of different nominal voltages.
+    GridsecError
+        If there is no such bus, or more than one that could be meant.
+    """
+    changes = list(network.changes)
+    rows = opened_rows(network.lines, opened, changes)
+    busbar = busbar_of(network, rows, root)
+    network, rows = transformed(network, rows, busbar, extent, changes)
+    inside = reached(busbar, rows)
+    problems = _infeeds(network, rows, busbar, inside)
+    kept = _kept(network, rows, inside, changes)
+    problems += levels_of(kept, network.nominal)
+    if problems:
+        lines = merged(kept, busbar, [], network.nominal)
+        raise FeederInvalid([*problems, *(() if extent.meshed else loops(busbar, lines))])
+    draws = [draw for draw in network.draws if draw.bus in inside]
+    sums, summed = _behind(network, rows, inside, changes)
+    draws += sums
+    elsewhere = above_busbar(busbar, network.sources, rows, network.couplings) | summed | inside.keys()
+    changes.extend(_not_fed(network, elsewhere))
+    changes.extend(change for bus, change in network.of_bus if bus in inside)
+    return Part(busbar, inside, merged(kept, busbar, changes, network.nominal), draws, changes)
+
+
+def finished(network: Network, part: Part, tables: FeederTables, power: Mapping[str, complex]) -> Converted:
+    """Put a conversion together.
+
+    Parameters
+    ----------
+    network, part
+        Where it is from.
+    tables
+        The feeder.
+    power
+        What each customer draws in the source's power flow, kVA.
+
+    Raises
+    ------
+    FeederInvalid
+        If values are doubtful, and no power flow of the source speaks for them.
+    """
+    unchecked = "" if network.volts else network.unsolved
+    given = network.volts.get(part.busbar, np.full(3, np.nan + 0j))
+    of_rows = (*(row.phases for row in tables.customers), *(row.phases for row in tables.lines))
+    if (
+        network.volts
+        and not np.isfinite(given[["abc".index(phase) for phase in set("".join(of_rows))]]).all()
+    ):
+        unchecked = f"the source's power flow has no voltage at the busbar {part.busbar!r}"
+    given = angles_of(given, part.busbar, part.changes)
+    accepted = accepting(tables, part.changes, unchecked)
+    changes = tuple(dict.fromkeys(part.changes))
+    if unchecked:
+        return Converted(accepted, changes, None, unchecked)
+    state = SourceState(
+        tool=network.tool,
+        power_kva=power,
+        busbar_volt=given,
+        volts={bus: np.abs(network.volts[bus]) for bus in part.inside if bus in network.volts},
+        as_found={bus: np.abs(network.as_found[bus]) for bus in part.inside if bus in network.as_found},
+    )
+    return Converted(accepted, changes, state)
+
+
+def accepting(tables: FeederTables, changes: list[Change], unchecked: str) -> FeederTables:
+    """Accept what is doubtful only because it might be in the wrong unit: the source's tool knows its units.
+
+    Parameters
+    ----------
+    tables
+        A feeder.
+    changes
+        Takes every value that was doubted.
+    unchecked
+        Why the source's power flow says nothing of the feeder; empty if it has a solution. Without one,
+        somebody may have given the source itself a wrong unit.
+
+    Raises
+    ------
+    FeederInvalid
+        If there are doubts and no solution, with all that is wrong besides.
+    """
+    doubts: set[str] = set()
+    problems = []
+    for problem in validate(tables):
+        sentence, found, doubt = problem.partition(' (if it is right: accept = ["')
+        problems.append(Problem(problem.code, sentence))
+        if found:
+            doubts.add(doubt.partition('"')[0])
+            changes.append(Change("feeder", sentence, "accepted", "as the source has it"))
+    if doubts and unchecked:
+        raise FeederInvalid(
+            [*problems, Problem("doubtful", f"{unchecked}; nothing else speaks for what is doubtful")]
+        )
+    accept = tuple(name for name in SUSPICIONS if name in doubts)
+    return replace(tables, meta=replace(tables.meta, accept=accept)) if accept else tables
+
+
+def _infeeds(network: Network, rows: list[LineRow], busbar: str, inside: Mapping[str, int]) -> list[Problem]:
+    """Return what else feeds the feeder besides its busbar."""
+    problems = []
+    everything = [*rows, *as_rows(network.couplings)]
+    fused = fused_with(busbar, rows)
+    for source in network.sources:
+        if source in inside and source != busbar:
+            problems.append(
+                Problem(
+                    "several-sources",
+                    f"bus {source!r} has another voltage source; the feeder is fed by its busbar "
+                    f"{busbar!r} alone",
+                )
+            )
+        elif source != busbar:
+            above = reached(source, everything, without=fused)
+            ways = [bus for bus in inside if bus not in fused and bus in above]
+            if ways:
+                problems.append(
+                    Problem(
+                        "several-sources",
+                        f"{len(ways)} of the feeder's buses can be reached from the source {source!r} "
+                        f"not only through the busbar {busbar!r}, among them {', '.join(ways[:5])}: a mesh; "
+                        "open a line of it, or name another busbar with root",
+                    )
+                )
+    return problems
+
+
+def _kept(
+    network: Network, rows: list[LineRow], inside: Mapping[str, int], changes: list[Change]
+) -> list[LineRow]:
+    """Lines of the feeder, each pointing away from the busbar, with positions."""
+    kept = []
+    for row in rows:
+        a, b = row.from_bus in inside, row.to_bus in inside
+        if a and b:
+            back = inside[row.to_bus] < inside[row.from_bus]
+            away = turned(row, network.nominal) if back else row
+            place = network.xy.get(away.to_bus)
+            kept.append(replace(away, to_x=place[0], to_y=place[1]) if place else away)
+        elif a or b:
+            changes.append(
+                Change(f"line {row.line}", WHOLE, "left out", "open towards what the busbar does not feed")
+            )
+    outside = len(network.nominal.keys() - inside.keys())
+    if outside:
+        changes.append(
+            Change(
+                _buses(outside),
+                WHOLE,
+                "left out",
+                "above the busbar, behind a transformer or without supply",
+            )
+        )
+    return kept
+
+
+def _not_fed(network: Network, elsewhere: Collection[str]) -> Iterator[Change]:
+    """Name who is connected neither to the feeder nor, as far as can be seen, `elsewhere`."""
+    everybody = [(draw.bus, draw.label) for draw in network.draws if not draw.idle]
+    for bus, label in dict.fromkeys([*network.connected, *everybody]):
+        if bus not in elsewhere:
+            fed = bool(np.isfinite(network.volts.get(bus, np.nan)).any())
+            yield Change(label, WHOLE, "left out", BEYOND if fed else UNFED)
+
+
+def _buses(count: int) -> str:
+    return f"{count} bus{'es' if count != 1 else ''}"
+
+
+def _behind(
+    network: Network, rows: list[LineRow], inside: Mapping[str, int], changes: list[Change]
+) -> tuple[list[Draw], set[str]]:
+    """Couplings below the busbar, as what flows into them, and the buses whose powers that sums up."""
+    everything = [*rows, *as_rows(network.couplings)]
+    above = above_busbar(next(iter(inside)), network.sources, rows, network.couplings)
+    draws: list[Draw] = []
+    summed: set[str] = set()
+    for each in network.couplings:
+        ends = [k for k, bus in enumerate(each.buses) if bus in inside]
+        if not ends or any(bus in above and bus not in inside for bus in each.buses):
+            continue
+        far = {
+            bus
+            for end in each.buses
+            if end not in inside
+            for bus in reached(
+                end, [row for row in everything if not {row.from_bus, row.to_bus} & inside.keys()]
+            )
+        }
+        if not np.isfinite(np.array([each.power_kva[k] for k in ends])).all():
+            effect = f"{_buses(len(far))}; what flows there is not known"
+            changes.append(Change(each.name, "load side", "left out", effect))
+            continue
+        summed |= far
+        for k in ends:
+            power = each.power_kva[k]
+            name = each.name if len(ends) == 1 else f"{each.name} {each.buses[k]}"
+            draws.append(Draw(name, each.buses[k], power, even=is_even(power)))
+        total = sum((each.power_kva[k].sum() for k in ends), start=0j)
+        what = f"{_buses(len(far))} became a customer that draws" if far else "in a loop; customers draw"
+        changes.append(
+            Change(
+                each.name,
+                "load side",
+                "changed",
+                f"{what} what flows there, "
+                f"{total.real:.4g} kW and {total.imag:.4g} kvar; exact at these loads only",
+            )
+        )
+    return draws, summed

@@ -1,0 +1,320 @@
+"""Transformers of other tools as lines: two-ports, regulators, stations.
+
+However a tool describes a transformer (short-circuit tests, tables of taps, equivalent circuits), balanced it
+is a linear two-port. Two power flows of it alone say everything: one with nothing behind it, one with an
+impedance. The same two-port is a shunt at its first end, an ideal transformer of complex ratio t and a series
+impedance behind that::
+
+    V_1 = t (V_2 + z I_2),    I_1 = y V_1 + I_2 / t
+
+so that nothing is left out: t makes the line's tap and the turn of its phases, z its impedance, and what y
+takes is a customer. The angle of t that comes from y rather than from the vector group has no lossless
+transformer; at a known operating point the customer takes what balances the powers.
+
+A transformer is a line where no phase of it meets another, its ratio with a fixed tap and, if the voltage is
+another one, `to_volt`. The vector group of a balanced feeder's transformer turns all phases alike, which
+nothing in a radial feeder notices. Where a transformer closes a loop, it becomes two customers that draw what
+flows there, unless the loop is asked for and the transformers around it drive no current by themselves.
+"""
+
+from __future__ import annotations
+
+import cmath
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from feeders.convert.customers import Draw, is_even, rounded
+from feeders.convert.lines import VOLT_DIGITS, Coupling, above_busbar, as_rows, fused_with, reached, turned
+from feeders.convert.provenance import WHOLE, Change
+from feeders.format.tables import LineRow
+from feeders.format.validation import same_level
+from gridsec.arrays import Phasors
+from gridsec.errors import Problem
+
+if TYPE_CHECKING:
+    from feeders.convert.network import Network
+
+
+TAP_DIGITS: Final = 9
+"""Decimals of a ratio: the same for transformers that are the same."""
+
+TURN_DIGITS: Final = 6
+"""The same of the degrees by which phases are turned."""
+
+NO_LOAD_KVA: Final = 1e-6
+"""Power below which a transformer takes nothing without load."""
+
+
+@dataclass(frozen=True, slots=True)
+class TwoPort:
+    """A transformer, balanced.
+
+    Attributes
+    ----------
+    ratio
+        Complex ratio t of the voltage at its first end to that behind it, without load.
+    series
+        z behind it, ohm.
+    """
+
+    ratio: complex
+    series: complex
+
+    @classmethod
+    def measured(cls, idle: tuple[complex, complex], loaded: tuple[complex, complex, complex]) -> TwoPort:
+        """Identify it by two power flows.
+
+        Parameters
+        ----------
+        idle
+            Voltages at both ends, V, with nothing behind.
+        loaded
+            Voltages at both ends, V, and current out of the second one, A.
+        """
+        ratio = idle[0] / idle[1]
+        return cls(ratio, (loaded[0] / ratio - loaded[1]) / loaded[2])
+
+    @property
+    def turn(self) -> float:
+        """Degrees by which it turns the phases."""
+        return round(math.degrees(cmath.phase(self.ratio)), TURN_DIGITS)
+
+    def line(self, name: str, ends: tuple[str, str], nominal: tuple[float, float]) -> LineRow | None:
+        """Return it as a line, its tap relative to the nominal voltages of its ends; None if it is none.
+
+        Parameters
+        ----------
+        name, ends
+            Of the transformer.
+        nominal
+            Nominal voltages at its ends, V.
+        """
+        r, x = rounded(self.series.real), rounded(self.series.imag)
+        if not (math.isfinite(r) and math.isfinite(x)) or min(r, x) < 0 or r == x == 0:
+            return None
+        tap = round(abs(self.ratio) * nominal[1] / nominal[0], TAP_DIGITS)
+        return LineRow(name, *ends, r, x, tap=tap)
+
+    def idle(self, name: str, bus: str, flows: tuple[Phasors, Phasors], volts: Phasors) -> Draw | None:
+        """Return what it takes beside the losses in z as a draw at its first end; None if that is nothing.
+
+        Parameters
+        ----------
+        name, bus
+            Of the transformer, and its first end.
+        flows : (3,)
+            What flows into it from each end, by phase, kVA.
+        volts : (3,)
+            Voltages behind it, V.
+        """
+        into, back = flows
+        power: Phasors = into + back - np.abs(back) ** 2 / np.abs(volts) ** 2 * self.series * 1e3
+        if not np.isfinite(power).all() or np.abs(power).sum() < NO_LOAD_KVA:
+            return None
+        return Draw(f"{name} no-load", bus, power, even=is_even(power), idle=True)
+
+
+def coupling_of(
+    name: str,
+    buses: tuple[str, ...],
+    power_kva: tuple[Phasors, ...],
+    *,
+    port: TwoPort | None,
+    rating_a: float,
+    network: Network,
+) -> Coupling:
+    """Return a transformer, and the line that it may be.
+
+    Parameters
+    ----------
+    name, buses, power_kva
+        As in `Coupling`.
+    port
+        What it does to its first two buses; None: not known.
+    rating_a
+        Rated current at the second, A.
+    network
+        Has nominal voltages, and voltages if there are any.
+    """
+    if port is None:
+        return Coupling(name, buses, power_kva)
+    here, there = network.nominal[buses[0]], network.nominal[buses[1]]
+    line = port.line(name, (buses[0], buses[1]), (here, there))
+    if line is None:
+        return Coupling(name, buses, power_kva)
+    limit = rounded(rating_a) if math.isfinite(rating_a) and rating_a > 0 else None
+    behind = network.volts.get(buses[1])
+    idle = None if behind is None else port.idle(name, buses[0], (power_kva[0], power_kva[1]), behind)
+    return Coupling(name, buses, power_kva, replace(line, rating_a=limit), idle, port.turn)
+
+
+@dataclass(frozen=True, slots=True)
+class Extent:
+    """How far down a feeder goes.
+
+    Attributes
+    ----------
+    one_voltage
+        Only as far as its busbar's nominal voltage: a transformer to another one is a customer.
+    meshed
+        Transformers may close loops.
+    """
+
+    one_voltage: bool = False
+    meshed: bool = False
+
+
+EVERYTHING: Final = Extent()
+
+AROUND: Final = 1e-9
+"""Part by which the ratios around a loop may differ from 1: the feeder format's own."""
+
+HERE: Final = "a line with the fixed ratio {} that the source's power flow left it at"
+THERE: Final = "a line to {:.6g} V, its ratio {} of the nominal one as the source's power flow left it"
+
+
+def transformed(
+    network: Network, rows: list[LineRow], busbar: str, extent: Extent, changes: list[Change]
+) -> tuple[Network, list[LineRow]]:
+    """Take transformers below the busbar as the lines that they are, where they are such.
+
+    Parameters
+    ----------
+    network, rows
+        The network, and its lines as they are opened.
+    busbar
+        The busbar.
+    extent
+        How far down.
+    changes
+        Takes what was done.
+    """
+    fused = fused_with(busbar, rows)
+    above = above_busbar(busbar, network.sources, rows, network.couplings)
+    left: list[Coupling] = []
+    lines: list[LineRow] = []
+    draws: list[Draw] = []
+    joined = _Joined(rows, loops=extent.meshed)
+    away = reached(busbar, [*rows, *as_rows(network.couplings)])
+    for each in network.couplings:
+        if each.line is None or not above.isdisjoint(set(each.buses) - fused.keys()):
+            left.append(each)
+            continue
+        here, there = (network.nominal[bus] for bus in each.buses)
+        line = each.line if same_level(here, there) else replace(each.line, to_volt=round(there, VOLT_DIGITS))
+        if line.to_volt is not None:
+            wanted = not extent.one_voltage and _leads_on(network, rows, each, busbar)
+            turn = cmath.exp(1j * math.radians(each.turn))
+            if not (wanted and joined.takes(line, line.tap * turn * here / there)):
+                left.append(each)
+                continue
+        lines.append(line)
+        draws += [] if each.idle is None else [each.idle]
+        backwards = away.get(line.from_bus, 0) > away.get(line.to_bus, 0)
+        changes.append(_told(each, turned(line, network.nominal) if backwards else line))
+        if each.idle is None and not network.volts:
+            effect = "without the source's power flow not known"
+            changes.append(Change(each.name, "no-load current", "left out", effect))
+    return replace(network, couplings=left, draws=[*network.draws, *draws]), [*rows, *lines]
+
+
+def _told(each: Coupling, line: LineRow) -> Change:
+    ratios = " ".join(f"{tap:.6g}" for tap in dict.fromkeys(line.taps))
+    effect = HERE.format(ratios) if line.to_volt is None else THERE.format(line.to_volt, ratios)
+    return Change(each.name, "tap" if line.to_volt is None else WHOLE, "changed", effect)
+
+
+def _leads_on(network: Network, rows: Iterable[LineRow], each: Coupling, busbar: str) -> bool:
+    """Whether lines begin behind a transformer: without any, its customers are one load at its terminals."""
+    beside = set(each.buses)
+    others = [*rows, *as_rows(other for other in network.couplings if set(other.buses) != beside)]
+    ways = [reached(bus, others) for bus in each.buses]
+    behind = next((way for way in ways if busbar not in way), None)
+    if behind is None:  # it closes a loop
+        return True
+    return any(row.closed and (row.r_ohm or row.x_ohm) and row.from_bus in behind for row in rows)
+
+
+class _Joined:
+    """Which buses are joined already, and by which complex ratios of their voltages.
+
+    Parameters
+    ----------
+    rows
+        Lines; without any ratio but their taps.
+    loops
+        Whether a transformer may close one.
+    """
+
+    def __init__(self, rows: Iterable[LineRow], *, loops: bool) -> None:
+        self._loops = loops
+        self._all, self._solid = _Groups(), _Groups()
+        self._pairs: set[frozenset[str]] = set()
+        for row in rows:
+            if row.closed:
+                self._all.join(row.from_bus, row.to_bus, 1.0 / row.tap + 0j)
+            if row.closed and row.r_ohm == row.x_ohm == 0.0:
+                self._solid.join(row.from_bus, row.to_bus, 1.0 + 0j)
+
+    def takes(self, line: LineRow, ratio: complex) -> bool:
+        """Add a transformer, ``V_from = ratio V_to``; return whether it fits to what is joined."""
+        pair = frozenset(self._solid.at(bus)[0] for bus in (line.from_bus, line.to_bus))
+        (one, here), (other, there) = self._all.at(line.from_bus), self._all.at(line.to_bus)
+        if one == other:
+            return (self._loops or pair in self._pairs) and abs(there / here * ratio - 1.0) <= AROUND
+        self._pairs.add(pair)
+        self._all.join(line.from_bus, line.to_bus, 1.0 / ratio)
+        return True
+
+
+class _Groups:
+    """Buses that are joined, each with the ratio of its voltage to that of its group's first bus."""
+
+    def __init__(self) -> None:
+        self._at: dict[str, tuple[str, complex]] = {}
+        self._members: dict[str, list[str]] = {}
+
+    def at(self, bus: str) -> tuple[str, complex]:
+        """The first bus of its group, and the ratio to it."""
+        if bus not in self._at:
+            self._at[bus], self._members[bus] = (bus, 1.0 + 0j), [bus]
+        return self._at[bus]
+
+    def join(self, near: str, far: str, ratio: complex) -> None:
+        """Join two groups by ``V_far = ratio V_near``; the smaller one joins the larger."""
+        (one, here), (other, there) = self.at(near), self.at(far)
+        step = ratio * here / there
+        if one == other:
+            return
+        if len(self._members[one]) < len(self._members[other]):
+            one, other, step = other, one, 1.0 / step
+        for bus in self._members.pop(other):
+            self._at[bus] = one, self._at[bus][1] * step
+            self._members[one].append(bus)
+
+
+def levels_of(rows: Iterable[LineRow], nominal: Mapping[str, float]) -> list[Problem]:
+    """Return what is wrong with the nominal voltages that lines join.
+
+    Parameters
+    ----------
+    rows
+        The feeder's lines.
+    nominal
+        Nominal voltages of the buses, V.
+    """
+    return [
+        Problem(
+            "inconsistent",
+            f"line {row.line!r} joins the buses {row.from_bus!r} of {nominal[row.from_bus]:.6g} V and "
+            f"{row.to_bus!r} of {nominal[row.to_bus]:.6g} V nominal voltage; expected one voltage",
+        )
+        for row in rows
+        if row.to_volt is None
+        and {row.from_bus, row.to_bus} <= nominal.keys()
+        and not same_level(nominal[row.from_bus], nominal[row.to_bus])
+    ]

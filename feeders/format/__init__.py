@@ -1,0 +1,1 @@
+"""Feeder format: columns, tables, checks, and matrices of lines."""

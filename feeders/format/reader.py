@@ -1,0 +1,265 @@
+"""Input of a feeder before and after parsing cell by cell."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+import tomllib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from feeders.format.columns import shown
+from gridsec.errors import Problem
+
+SHOWN = 10
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """One row: the sentence that names its place, and the cells that could be parsed."""
+
+    where: str
+    cells: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Parsed:
+    """An input after parsing; what could not be read at all is None.
+
+    Attributes
+    ----------
+    place
+        Name of the file or object that holds the feeder's own keys.
+    meta
+        Cells of each section of feeder.toml; "" is the top.
+    lines, customers
+        The tables' rows.
+    """
+
+    place: str
+    meta: dict[str, dict[str, Any]] | None
+    lines: list[Record] | None
+    customers: list[Record] | None
+
+    def top(self, key: str) -> Any:
+        """Return a key of feeder.toml's top, None where it is bad or absent."""
+        return None if self.meta is None else self.meta[""].get(key)
+
+    def accepted(self, suspicion: str) -> bool:
+        """Return whether feeder.toml says that this suspicion was checked."""
+        return suspicion in (self.top("accept") or ())
+
+
+@dataclass(slots=True)
+class Report:
+    """What the checks found so far."""
+
+    problems: list[Problem] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+def rows(records: list[Record] | None, *columns: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield place and cells of the rows whose cells in these columns could be parsed."""
+    for record in records or ():
+        if all(column in record.cells for column in columns):
+            yield record.where, record.cells
+
+
+def some(items: list[str]) -> str:
+    """Return a list of ids for a message, cut where it is long."""
+    tail = f" and {len(items) - SHOWN} more" if len(items) > SHOWN else ""
+    return ", ".join(items[:SHOWN]) + tail
+
+
+META_FILE, LINES_FILE, CUSTOMERS_FILE = "feeder.toml", "lines.csv", "customers.csv"
+FOREIGN = re.compile(r".+\.(json|dss)|(pandapower|simbench):.+|.+--[0-9]-(no_)?sw", re.IGNORECASE)
+"""Names of what holds a network of another tool."""
+MAX_BYTES = 64 * 1024 * 1024
+
+# Rows with their numbers as a person counts them.
+Rows = list[tuple[int, Mapping[str, Any]]]
+
+
+@dataclass(slots=True)
+class Raw:
+    """Cells before parsing; tables that could not be had at all are None."""
+
+    meta_name: str
+    meta: Mapping[str, Any] | None
+    lines_name: str
+    lines: Rows | None
+    customers_name: str
+    customers: Rows | None
+    problems: list[Problem]
+
+
+def advice(source: object) -> str:
+    """Return how to make a feeder of a network of another tool; nothing for any other source."""
+    name = str(source)
+    return f"; make one by: gridsec feeders convert {name} FOLDER" if FOREIGN.fullmatch(name) else ""
+
+
+def from_folder(folder: Path) -> Raw:
+    """Read the files of a feeder; what cannot be read is a problem, never an exception."""
+    raw = Raw(META_FILE, None, LINES_FILE, None, CUSTOMERS_FILE, None, [])
+    if not folder.is_dir():
+        there = folder.exists()
+        what = "is a file, not a folder" if there else "does not exist"
+        raw.problems.append(
+            Problem(
+                "wrong-type" if there else "missing",
+                f"{folder} {what}; expected a folder with {META_FILE}, {LINES_FILE}, {CUSTOMERS_FILE}"
+                f"{advice(folder)}",
+            )
+        )
+        return raw
+    text = _file_text(folder / META_FILE, raw.problems)
+    if text is not None:
+        try:
+            raw.meta = tomllib.loads(text)
+        except (tomllib.TOMLDecodeError, RecursionError) as error:
+            raw.problems.append(Problem("unreadable", f"{META_FILE}: no valid TOML: {error}"))
+    text = _file_text(folder / LINES_FILE, raw.problems)
+    if text is not None:
+        raw.lines = _csv_rows(LINES_FILE, text, raw.problems)
+    text = _file_text(folder / CUSTOMERS_FILE, raw.problems)
+    if text is not None:
+        raw.customers = _csv_rows(CUSTOMERS_FILE, text, raw.problems)
+    return raw
+
+
+def _file_text(path: Path, problems: list[Problem]) -> str | None:
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            problems.append(
+                Problem(
+                    "too-many", f"{path.name}: larger than {MAX_BYTES // 1024**2} MiB; is it the right file?"
+                )
+            )
+            return None
+        data = path.read_bytes()
+    except FileNotFoundError:
+        problems.append(Problem("missing", f"{path.name}: the file is missing"))
+        return None
+    except OSError as error:
+        problems.append(Problem("unreadable", f"{path.name}: cannot be read: {error.strerror}"))
+        return None
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        row = data[: error.start].count(b"\n") + 1
+        problems.append(
+            Problem(
+                "unreadable",
+                f"{path.name}, row {row}: byte 0x{data[error.start]:02x} is not UTF-8; save it as UTF-8",
+            )
+        )
+        return None
+    if not text.strip():
+        problems.append(Problem("missing", f"{path.name}: the file is empty"))
+        return None
+    return text
+
+
+def _csv_rows(name: str, text: str, problems: list[Problem]) -> Rows | None:
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+    rows: Rows = []
+    try:
+        header = [cell.strip() for cell in next(reader)]
+        twice = sorted({cell for cell in header if header.count(cell) > 1})
+        if twice:
+            problems.append(
+                Problem(
+                    "duplicate",
+                    f"{name}, row 1: column {', '.join(map(shown, twice))} is there more than once",
+                )
+            )
+            return None
+        if len(header) == 1 and (";" in header[0] or "\t" in header[0]):
+            problems.append(
+                Problem(
+                    "shape",
+                    f"{name}, row 1: one single column {shown(header[0])}; separate columns by commas",
+                )
+            )
+            return None
+        for cells in reader:
+            if not any(cell.strip() for cell in cells):
+                continue
+            if len(cells) != len(header):
+                problems.append(
+                    Problem(
+                        "shape",
+                        f"{name}, row {reader.line_num}: {len(cells)} cells under {len(header)} columns",
+                    )
+                )
+                continue
+            rows.append((reader.line_num, dict(zip(header, cells, strict=True))))
+    except csv.Error as error:
+        problems.append(Problem("unreadable", f"{name}, row {reader.line_num}: no valid CSV: {error}"))
+        return None
+    if not rows:
+        problems.append(Problem("missing", f"{name}: there is no row below the header"))
+        return None
+    return rows
+
+
+def from_object(obj: object) -> Raw:
+    """Take the JSON form apart, already decoded; a table is a list of rows or an object of columns."""
+    raw = Raw("feeder", None, "lines", None, "customers", None, [])
+    if not isinstance(obj, Mapping):
+        raw.problems.append(
+            Problem(
+                "wrong-type",
+                f"{shown(obj)} is no feeder; expected an object with feeder, lines and customers",
+            )
+        )
+        return raw
+    raw.problems.extend(
+        Problem("missing", f"{name}: is missing; expected feeder, lines and customers")
+        for name in ("feeder", "lines", "customers")
+        if obj.get(name) is None
+    )
+    meta = obj.get("feeder")
+    if isinstance(meta, Mapping):
+        raw.meta = meta
+    elif meta is not None:
+        raw.problems.append(Problem("wrong-type", f"feeder: {shown(meta)} is no object"))
+    raw.lines = _json_rows("lines", obj.get("lines"), raw.problems)
+    raw.customers = _json_rows("customers", obj.get("customers"), raw.problems)
+    return raw
+
+
+def _json_rows(name: str, table: object, problems: list[Problem]) -> Rows | None:
+    if table is None:
+        return None
+    if isinstance(table, Mapping):
+        if not all(isinstance(cells, (list, tuple)) for cells in table.values()):
+            problems.append(
+                Problem(
+                    "wrong-type", f"{name}: expected a list of rows, or an object whose columns are lists"
+                )
+            )
+            return None
+        lengths = {column: len(cells) for column, cells in table.items()}
+        if len(set(lengths.values())) > 1:
+            problems.append(Problem("shape", f"{name}: columns of different length: {shown(lengths)}"))
+            return None
+        count = next(iter(lengths.values()), 0)
+        table = [{column: cells[k] for column, cells in table.items()} for k in range(count)]
+    if not isinstance(table, (list, tuple)):
+        problems.append(Problem("wrong-type", f"{name}: {shown(table)} is no table; expected a list of rows"))
+        return None
+    if not table:
+        problems.append(Problem("missing", f"{name}: there is no row"))
+        return None
+    rows: Rows = []
+    for number, row in enumerate(table, start=1):
+        if isinstance(row, Mapping):
+            rows.append((number, row))
+        else:
+            problems.append(Problem("wrong-type", f"{name}, row {number}: {shown(row)} is no object"))
+    return rows

@@ -1,0 +1,581 @@
+"""Checks between cells: duplicates, references, graph, nominal voltages, doubtful units.
+
+`to_volt` of a line is the nominal voltage of its `to_bus` where that of its `from_bus` is another one. It is
+stated on the way from the busbar; a line that closes a loop must find it at both its ends.
+
+Each doubt has a name; `accept = ["<name>"]` in feeder.toml says that the value was checked and is right.
+
+Each takes the cells that could be parsed and returns sentences. A row with a bad cell takes part
+wherever that cell does not matter, so that one run names everything there is to mend.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Final
+
+from feeders.format import matrices
+from feeders.format.reader import Parsed, Report, rows, some
+from feeders.format.topology import Edge, Tree, tree
+from feeders.model import profiles
+from gridsec.errors import Problem
+from gridsec.grid.droop import PRESETS
+
+if TYPE_CHECKING:
+    from feeders.format.tables import LineRow
+    from gridsec.arrays import Floats
+
+
+SAME_LEVEL: Final = 1e-6
+"""Part by which two nominal voltages may differ and still be one: 230.94 and 400 / sqrt(3)."""
+
+
+def same_level(one: float, other: float) -> bool:
+    """Return whether two nominal voltages are one."""
+    return abs(one - other) <= SAME_LEVEL * max(one, other)
+
+
+def told(nominal_volt: Floats, form: str = ".1f") -> str:
+    """Return a feeder's nominal voltages in words: "11547.0 V and 230.9 V".
+
+    Parameters
+    ----------
+    nominal_volt : (n,)
+        Of its places, V, the busbar first.
+    form
+        How numbers are written.
+    """
+    several = dict.fromkeys(f"{volt:{form}} V" for volt in nominal_volt.tolist())
+    return " and ".join(several)
+
+
+def nominal_volts(found: Tree, edges: Sequence[Edge | LineRow], volt: float) -> list[float]:
+    """Return the nominal voltage of every bus, V, phase to neutral.
+
+    Parameters
+    ----------
+    found, edges
+        The tree, and the closed lines that it was made of.
+    volt
+        That of the busbar, V.
+    """
+    nominal = _found(found, edges, volt)
+    for k, above in enumerate(found.parent):  # only what `problems` tells is not known by now
+        nominal.setdefault(k + 1, nominal[above])
+    return [nominal[k] for k in range(len(found.buses))]
+
+
+def _found(found: Tree, edges: Sequence[Edge | LineRow], volt: float) -> dict[int, float]:
+    """Return the nominal voltages that a way from the busbar leads to, which passes transformers forwards."""
+    near: dict[int, list[tuple[int, float | None]]] = defaultdict(list)
+    for line in edges:
+        if line.from_bus in found.group:
+            here, there = found.group[line.from_bus], found.group[line.to_bus]
+            near[here].append((there, line.to_volt))
+            if line.to_volt is None:
+                near[there].append((here, None))
+    nominal, order = {0: volt}, [0]
+    for bus in order:
+        for other, changed in near[bus]:
+            if other not in nominal:
+                nominal[other] = nominal[bus] if changed is None else changed
+                order.append(other)
+    return nominal
+
+
+def problems(found: Tree, edges: Sequence[Edge | LineRow], volt: float) -> Iterator[tuple[int, Problem]]:
+    """Yield every line whose `to_volt` cannot be, with what is wrong; arguments as of `nominal_volts`."""
+    nominal, known = nominal_volts(found, edges, volt), _found(found, edges, volt).keys()
+    above = dict(zip(found.branch, found.parent, strict=True))
+    for k, line in enumerate(edges):
+        if line.from_bus not in found.group:
+            continue
+        here, there = found.group[line.from_bus], found.group[line.to_bus]
+        told = nominal[here] if line.to_volt is None else line.to_volt
+        backwards = line.to_volt is not None and above.get(k) == there
+        if here == there and not same_level(told, nominal[here]):
+            yield (
+                k,
+                Problem(
+                    "zero-impedance",
+                    f"{told:g} on a line without impedance; expected the transformer's r_ohm and x_ohm",
+                ),
+            )
+        elif backwards and (here not in known or not same_level(told, nominal[there])):
+            yield (
+                k,
+                Problem("backwards", f"{told:g}, but {line.to_bus!r} is on the side of the busbar; {_TURN}"),
+            )
+        elif not same_level(told, nominal[there]):
+            yield (
+                k,
+                Problem(
+                    "inconsistent",
+                    f"{told:g} V at {line.to_bus!r}, {nominal[there]:g} V around the loop; expected the same",
+                ),
+            )
+
+
+_TURN: Final = (
+    "expected from_bus and to_bus exchanged, with the impedances of the other side: a transformer leads away "
+    "from the busbar"
+)
+
+
+LOW_VOLTAGE = 1000.0
+# Nominal voltages between phases; nobody's voltage to neutral is called like that.
+PHASE_TO_PHASE = (
+    380.0, 400.0, 415.0, 3300.0, 6000.0, 6600.0, 10000.0, 11000.0, 12470.0, 12660.0, 13200.0, 13800.0,
+    15000.0, 20000.0, 22000.0, 24900.0, 30000.0, 33000.0, 34500.0,
+)  # fmt: skip
+# Resistance and reactance per km of the low-voltage lines that grid data sets use most (VDE cable
+# tables; pandapower's standard types). A column full of them is a column per km, not per line.
+PER_KM = (
+    (0.642, 0.083), (0.6417, 0.0848), (0.225, 0.08), (0.2067, 0.0804), (0.208, 0.08), (0.868, 0.086),
+    (0.443, 0.069), (0.868, 0.079), (1.2, 0.088), (0.32, 0.08), (0.253, 0.08), (0.164, 0.08), (0.125, 0.08),
+    (1.15, 0.08), (0.524, 0.08), (0.5939, 0.372), (1.4824, 0.4),
+)  # fmt: skip
+
+LINE_XR, TRANSFORMER_XR = 20.0, 100.0
+"""Reactance by resistance beyond which a line, or a large transformer, has neither."""
+
+Doubts = Iterator[tuple[str, str]]
+
+
+def check_units(parsed: Parsed, edges: Sequence[Edge], found: Tree | None, report: Report) -> None:
+    """Report every doubtful value, as a problem or, where feeder.toml accepts it, as a note.
+
+    Parameters
+    ----------
+    parsed
+        The tables.
+    edges, found
+        The closed lines and their tree, or None where the graph could not be had.
+    report
+        Takes the sentences.
+    """
+    volt = parsed.top("voltage_volt")
+    level: dict[str, float] = {}
+    if found is not None and volt is not None:
+        nominal = nominal_volts(found, edges, volt)
+        level = {bus: nominal[k] for bus, k in found.group.items()}
+    doubts = [*_voltage(parsed)]
+    if volt is not None:
+        doubts += [*_impedances(parsed, level, volt), *_per_km(parsed, level, volt)]
+    doubts += [
+        *_line_extras(parsed),
+        *_powers(parsed, level, math.inf if volt is None else volt),
+        *_classes(parsed),
+    ]
+    if found is not None:
+        doubts += _drop(parsed, edges, found, level)
+    for name, sentence in doubts:
+        _doubt(parsed, report, name, sentence)
+
+
+def _doubt(parsed: Parsed, report: Report, name: str, sentence: str) -> None:
+    if parsed.accepted(name):
+        report.notes.append(f"accepted: {sentence}")
+    else:
+        report.problems.append(
+            Problem("doubtful", f'{sentence} (if it is right: accept = ["{name}"] in feeder.toml)')
+        )
+
+
+def _voltage(parsed: Parsed) -> Doubts:
+    places = [(f"{parsed.place}, key voltage_volt", parsed.top("voltage_volt"))]
+    places += [
+        (f"{where}, column to_volt", cells["to_volt"]) for where, cells in rows(parsed.lines, "to_volt")
+    ]
+    for where, volt in places:
+        if volt is None:
+            continue
+        if volt < 50:
+            yield "voltage", f"{where}: {volt:g} V looks like kilovolts; expected volts"
+        if any(abs(volt - pair) < 1e-3 * pair for pair in PHASE_TO_PHASE):
+            yield (
+                "voltage",
+                f"{where}: {volt:g} V looks like a phase-to-phase voltage; expected phase to neutral, "
+                f"{volt / math.sqrt(3):.2f}",
+            )
+
+
+def _impedances(parsed: Parsed, level: Mapping[str, float], volt: float) -> Doubts:
+    """A line's impedance is that of its `to_bus`'s side, at the nominal voltage there."""
+    for where, cells in rows(parsed.lines, "r_ohm", "x_ohm"):
+        r, x = cells["r_ohm"], cells["x_ohm"]
+        transformer = cells.get("to_volt") is not None
+        here = cells["to_volt"] if transformer else level.get(cells.get("to_bus", ""), volt)
+        largest = 5.0 if here < LOW_VOLTAGE else 100.0
+        steep = TRANSFORMER_XR if transformer else LINE_XR
+        for name, value in (("r_ohm", r), ("x_ohm", x)):
+            if value > largest:
+                yield (
+                    "impedance",
+                    f"{where}, column {name}: {value:g} ohm is very large; in milliohm, perhaps?",
+                )
+        if x > steep * r:
+            yield (
+                "ratio",
+                f"{where}: x_ohm {x:g} is above {steep:g} times r_ohm {r:g}; columns or units mixed up?",
+            )
+        elif 0 < x < 0.005 * r:
+            yield "ratio", f"{where}: r_ohm {r:g} is above 200 times x_ohm {x:g}; columns or units mixed up?"
+
+
+def _per_km(parsed: Parsed, level: Mapping[str, float], volt: float) -> Doubts:
+    pairs = [
+        (cells["r_ohm"], cells["x_ohm"])
+        for _, cells in rows(parsed.lines, "r_ohm", "x_ohm")
+        if cells.get("to_volt") is None and level.get(cells.get("to_bus", ""), volt) < LOW_VOLTAGE
+    ]
+    pairs = [(r, x) for r, x in pairs if r > 0 or x > 0]
+    standard = all(
+        any(abs(r - a) <= 0.005 * a and abs(x - b) <= 0.02 * b for a, b in PER_KM) for r, x in pairs
+    )
+    if parsed.lines and len(pairs) >= 2 and standard:
+        place = parsed.lines[0].where.partition(",")[0]
+        yield (
+            "impedance",
+            f"{place}, columns r_ohm and x_ohm: every row holds a standard cable's values per kilometre; "
+            "expected those of the whole line",
+        )
+
+
+def _line_extras(parsed: Parsed) -> Doubts:
+    for where, cells in rows(parsed.lines, "rating_a"):
+        rating = cells["rating_a"]
+        if rating is not None and rating < 1.0:
+            yield "rating", f"{where}, column rating_a: {rating:g} A is very small; in kA, perhaps?"
+    for where, cells in rows(parsed.lines, "b_us"):
+        if cells["b_us"] > 1e5:
+            yield "impedance", f"{where}, column b_us: {cells['b_us']:g} microsiemens is very large; in nS?"
+    for name in ("tap", "tap_a", "tap_b", "tap_c"):
+        for where, cells in rows(parsed.lines, name):
+            if cells[name] is not None and not 0.5 <= cells[name] <= 2.0:
+                yield "ratio", f"{where}, column {name}: {cells[name]:g} is no ratio near 1; 5 % up is 0.95"
+
+
+def _powers(parsed: Parsed, level: Mapping[str, float], volt: float) -> Doubts:
+    for column in ("load_kw", "pv_kw", "inverter_kva"):
+        for where, cells in rows(parsed.customers, column):
+            largest = 1000.0 if level.get(cells.get("bus", ""), volt) < LOW_VOLTAGE else 1e5
+            if cells[column] > largest:
+                yield "load", f"{where}, column {column}: {cells[column]:g} is very large; in W or VA?"
+
+
+def _classes(parsed: Parsed) -> Doubts:
+    meters = {} if parsed.meta is None else parsed.meta["meters"]
+    places = [
+        (f"{parsed.place}, [meters], key class_percent", meters.get("class_percent")),
+        (f"{parsed.place}, key busbar_class_percent", parsed.top("busbar_class_percent")),
+    ]
+    places += [
+        (f"{where}, column class_percent", cells["class_percent"])
+        for where, cells in rows(parsed.customers, "class_percent")
+    ]
+    for where, value in places:
+        if value is not None and not 0.02 <= value <= 10.0:
+            hint = "a fraction instead of percent?" if value < 0.02 else "no voltage meter is that bad"
+            yield "class", f"{where}: {value:g} % is doubtful; {hint}"
+
+
+def _drop(parsed: Parsed, edges: Sequence[Edge], found: Tree, level: Mapping[str, float]) -> Doubts:
+    """Whether the lines could carry the loads at all: ``sum of r p / (3 V^2)`` along the worst path."""
+    ohm = {cells["line"]: cells["r_ohm"] for _, cells in rows(parsed.lines, "line", "r_ohm")}
+    if not level or found.loops or any(edges[k].line not in ohm for k in found.branch):
+        return
+    below = [0.0] * len(found.buses)
+    for _, cells in rows(parsed.customers, "bus", "load_kw"):
+        if cells["bus"] in found.group:
+            below[found.group[cells["bus"]]] += cells["load_kw"] * 1000.0
+    for k in range(len(found.parent) - 1, -1, -1):
+        below[found.parent[k]] += below[k + 1]
+    drop = [0.0] * len(found.buses)
+    for k, above in enumerate(found.parent):
+        line = edges[found.branch[k]]
+        drop[k + 1] = drop[above] + ohm[line.line] * below[k + 1] / (3.0 * level[line.to_bus] ** 2)
+    worst = max(range(len(drop)), key=drop.__getitem__)
+    if drop[worst] > 1.0:
+        yield (
+            "impedance",
+            f"with every load at load_kw the voltage at bus {found.buses[worst]!r} would fall by "
+            f"{100 * drop[worst]:.0f} %; expected far below 100; r_ohm per km or in milliohm? load_kw in W?",
+        )
+
+
+RESERVED_METER = "substation"
+"""What the busbar meter is called on the wire and in alarms."""
+
+
+def feeder(parsed: Parsed) -> tuple[list[Problem], list[str]]:
+    """Return every problem between cells, and notes on what is right but worth knowing."""
+    report = Report()
+    for check in (_duplicates, _reserved, _limits, _power_factors, _presets, _profiles, _positions, _taps):
+        check(parsed, report)
+    matrices.check(parsed, report)
+    edges, found = _graph(parsed, report)
+    check_units(parsed, edges, found, report)
+    return report.problems, report.notes
+
+
+# --- ids and references -------------------------------------------------------------------------
+
+
+def _duplicates(parsed: Parsed, report: Report) -> None:
+    for records, column in (
+        (parsed.lines, "line"),
+        (parsed.customers, "customer"),
+        (parsed.customers, "meter"),
+    ):
+        first: dict[str, str] = {}
+        for where, cells in rows(records, column):
+            key = cells[column]
+            if key == "":
+                continue
+            if key in first:
+                report.problems.append(
+                    Problem(
+                        "duplicate",
+                        f"{where}, column {column}: {key!r} is already the id of {first[key]}; "
+                        "every id must be unique",
+                    )
+                )
+            else:
+                first[key] = where
+    bare = [
+        cells["customer"] for _, cells in rows(parsed.customers, "customer", "meter") if cells["meter"] == ""
+    ]
+    if bare:
+        report.notes.append(f"{len(bare)} customer(s) without a meter: {some(bare)}")
+
+
+def _reserved(parsed: Parsed, report: Report) -> None:
+    for where, cells in rows(parsed.customers, "meter"):
+        if cells["meter"] == RESERVED_METER:
+            report.problems.append(
+                Problem(
+                    "duplicate",
+                    f"{where}, column meter: {RESERVED_METER!r} is what the busbar meter is called; "
+                    "expected another id",
+                )
+            )
+
+
+def _limits(parsed: Parsed, report: Report) -> None:
+    limits = {} if parsed.meta is None else parsed.meta["limits"]
+    low, high = limits.get("v_min_pu"), limits.get("v_max_pu")
+    if low is not None and high is not None and low >= high:
+        report.problems.append(
+            Problem(
+                "order",
+                f"{parsed.place}, [limits]: v_min_pu {low:g} is not below v_max_pu {high:g}; "
+                "expected for example 0.9 and 1.1",
+            )
+        )
+
+
+def _power_factors(parsed: Parsed, report: Report) -> None:
+    load = {} if parsed.meta is None else parsed.meta["load"]
+    names = ("power_factor_min", "power_factor", "power_factor_max")
+    places: list[tuple[str, dict[str, Any], dict[str, Any]]]
+    places = [(f"{parsed.place}, [load]", load, {})] if parsed.meta is not None else []
+    places += [(where, cells, load) for where, cells in rows(parsed.customers)]
+    for where, cells, defaults in places:
+        if defaults and all(cells.get(name) is None for name in names):
+            continue
+        low, mid, high = (cells[n] if cells.get(n) is not None else defaults.get(n) for n in names)
+        if low is not None and mid is not None and high is not None and not low <= mid <= high:
+            report.problems.append(
+                Problem(
+                    "order",
+                    f"{where}: power_factor {mid:g} is not between power_factor_min {low:g} "
+                    f"and power_factor_max {high:g}",
+                )
+            )
+
+
+def _presets(parsed: Parsed, report: Report) -> None:
+    for where, cells in rows(parsed.customers, "droop"):
+        preset, rating = cells["droop"], cells.get("inverter_kva")
+        if preset and preset not in PRESETS:
+            report.problems.append(
+                Problem(
+                    "unknown-name",
+                    f"{where}, column droop: {preset!r} is not known; expected one of {', '.join(PRESETS)}",
+                )
+            )
+        if rating and not preset:
+            report.problems.append(
+                Problem(
+                    "missing",
+                    f"{where}, column droop: is missing although inverter_kva is {rating:g}; "
+                    f"expected one of {', '.join(PRESETS)}",
+                )
+            )
+        if preset and rating == 0:
+            report.notes.append(f"{where}: droop {preset!r} has no effect, inverter_kva is 0")
+
+
+def _profiles(parsed: Parsed, report: Report) -> None:
+    known = {"load_profile": profiles.load_names(), "pv_profile": profiles.pv_names()}
+    for column, names in known.items():
+        for where, cells in rows(parsed.customers, column):
+            if cells[column] and cells[column] not in names:
+                report.problems.append(
+                    Problem(
+                        "unknown-name",
+                        f"{where}, column {column}: {cells[column]!r} is not known; "
+                        f"expected one of {', '.join(names)}, or nothing",
+                    )
+                )
+
+
+# --- the graph ----------------------------------------------------------------------------------
+
+
+def loops(busbar: str, lines: Iterable[LineRow]) -> list[Problem]:
+    """Return what is wrong with the loops of a radial feeder's lines.
+
+    Parameters
+    ----------
+    busbar, lines
+        The busbar, and rows of lines.csv.
+    """
+    edges = [
+        Edge(row.line, row.from_bus, row.to_bus, row.r_ohm == row.x_ohm == 0.0, phases=len(row.phases))
+        for row in lines
+        if row.closed
+    ]
+    report = Report()
+    _loops(tree(busbar, edges), edges, meshed=False, report=report)
+    return report.problems
+
+
+def _graph(parsed: Parsed, report: Report) -> tuple[list[Edge], Tree | None]:
+    """Check the graph; return its closed lines and its tree, None if its buses are not all known."""
+    busbar = parsed.top("busbar")
+    known: dict[str, None] = {} if busbar is None else {busbar: None}
+    edges: list[Edge] = []
+    for where, cells in rows(parsed.lines, "from_bus", "to_bus"):
+        one, other = cells["from_bus"], cells["to_bus"]
+        known.update({one: None, other: None})
+        if one == other:
+            report.problems.append(
+                Problem("self-loop", f"{where}: from_bus and to_bus are both {one!r}; a line needs two buses")
+            )
+        elif cells.get("closed", False):
+            zero = cells.get("r_ohm") == 0 and cells.get("x_ohm") == 0
+            phases = len(cells.get("phases") or "abc")
+            edges.append(Edge(cells.get("line", "?"), one, other, zero, cells.get("to_volt"), phases=phases))
+    found = tree(busbar if busbar is not None else next(iter(known), ""), edges, known)
+    _loops(found, edges, parsed.top("meshed") is True, report)
+    whole = all({"from_bus", "to_bus", "closed"} <= row.cells.keys() for row in parsed.lines or ())
+    if parsed.lines is None or busbar is None or not whole:
+        return edges, None
+    for where, cells in rows(parsed.customers, "bus"):
+        if cells["bus"] not in known:
+            report.problems.append(
+                Problem(
+                    "unknown-name",
+                    f"{where}, column bus: {cells['bus']!r} is not known; no line leads there, "
+                    f"and it is not the busbar {busbar!r}",
+                )
+            )
+    if any(busbar in (edge.from_bus, edge.to_bus) for edge in edges):
+        _islands(found, parsed, report)
+    else:
+        report.problems.append(
+            Problem("not-connected", f"{parsed.place}, key busbar: no closed line is connected to {busbar!r}")
+        )
+    _fused(found, report)
+    _levels(found, edges, parsed, report)
+    return edges, found
+
+
+def _levels(found: Tree, edges: list[Edge], parsed: Parsed, report: Report) -> None:
+    volt = parsed.top("voltage_volt")
+    places = {cells["line"]: where for where, cells in rows(parsed.lines, "line")}
+    for k, problem in problems(found, edges, volt) if volt is not None else ():
+        where = places.get(edges[k].line, "lines")
+        report.problems.append(Problem(problem.code, f"{where}, column to_volt: {problem}"))
+
+
+def _loops(found: Tree, edges: list[Edge], meshed: bool, report: Report) -> None:
+    for loop in found.loops:
+        names = some([edges[k].line for k in loop])
+        if len(loop) == 1:
+            report.problems.append(
+                Problem(
+                    "self-loop",
+                    f"lines: {names} is short-circuited, lines without impedance join its two buses; "
+                    "set closed to false on one of them",
+                )
+            )
+        elif meshed:
+            report.notes.append(f"lines: {names} form a loop; {edges[loop[0]].line!r} is drawn as a tie")
+        else:
+            report.problems.append(
+                Problem(
+                    "not-radial",
+                    f"lines: {names} form a loop; the feeder must be radial: set closed to false on "
+                    "one of them (or merge parallel lines into one row), or meshed to true in feeder.toml "
+                    "(converters: --meshed) if the loop is really closed",
+                )
+            )
+
+
+def _islands(found: Tree, parsed: Parsed, report: Report) -> None:
+    loads: dict[str, list[str]] = defaultdict(list)
+    for _, cells in rows(parsed.customers, "bus", "customer"):
+        loads[cells["bus"]].append(cells["customer"])
+    ends: dict[str, list[str]] = defaultdict(list)
+    for _, cells in rows(parsed.lines, "closed", "line", "from_bus", "to_bus"):
+        if not cells["closed"]:
+            ends[cells["from_bus"]].append(cells["line"])
+            ends[cells["to_bus"]].append(cells["line"])
+    for island in found.islands:
+        customers = [customer for bus in island for customer in loads[bus]]
+        ties = list(dict.fromkeys(line for bus in island for line in ends[bus]))
+        text = f"lines: no closed line connects {'bus' if len(island) == 1 else 'buses'} {some(list(island))}"
+        text += f" (with {some(customers)})" if customers else ""
+        text += f" to the busbar {parsed.top('busbar')!r}"
+        text += f"; open here: {some(ties)}" if ties else ""
+        report.problems.append(Problem("not-connected", text))
+
+
+def _fused(found: Tree, report: Report) -> None:
+    members: dict[int, list[str]] = defaultdict(list)
+    for bus, index in found.group.items():
+        members[index].append(bus)
+    for buses in members.values():
+        if len(buses) > 1:
+            report.notes.append(f"buses {some(buses)} are one: lines without impedance join them")
+
+
+def _positions(parsed: Parsed, report: Report) -> None:
+    for where, cells in rows(parsed.lines, "to_x", "to_y"):
+        if (cells["to_x"] is None) != (cells["to_y"] is None):
+            report.problems.append(
+                Problem(
+                    "missing",
+                    f"{where}, columns to_x and to_y: one of them is missing; expected both or none",
+                )
+            )
+
+
+def _taps(parsed: Parsed, report: Report) -> None:
+    names = {phase: f"tap_{phase}" for phase in "abc"}
+    for where, cells in rows(parsed.lines, "phases", "tap", *names.values()):
+        given = [name for name in names.values() if cells[name] is not None]
+        wanted = [name for phase, name in names.items() if phase in cells["phases"]]
+        if given and (given != wanted or cells["tap"] != 1.0):
+            report.problems.append(
+                Problem(
+                    "inconsistent",
+                    f"{where}, columns {', '.join(given)}: expected {', '.join(wanted)}, those of phases "
+                    f"{cells['phases']!r}, and no tap beside them; or tap alone, of all of them",
+                )
+            )

@@ -1,0 +1,1 @@
+"""Models of a feeder in per unit, made from its tables."""

@@ -1,0 +1,384 @@
+"""Equipment of a feeder: accuracies, loads, taps and transformers.
+
+Powers in units of the three-phase base.
+
+Behind a tap t, ``V_from = t V``, every voltage has another base: ``a_k V_k`` with V_k the nominal voltage of
+bus k, which transformers may have changed on the way, and a_k the product of ``1 / t`` over the taps between
+the busbar and bus k. With the impedances in the base of their own side, ``3 (a V)^2 / (1000 S)``, the ideal
+transformer is gone: in per unit this is a feeder without it. Each phase may have a tap of its own; a mutual
+impedance is then in ``3 a_φ a_ψ V^2 / (1000 S)``, so that matrices stay symmetric. Only what goes between
+volts and per unit, customer by customer, needs a_k V_k; what is standardised in parts of the nominal voltage
+needs V_k.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from importlib.resources.abc import Traversable
+from pathlib import Path
+
+import numpy as np
+
+from feeders.format.columns import PHASE_NAMES
+from feeders.format.reader import CUSTOMERS_FILE, LINES_FILE, META_FILE, advice
+from feeders.format.tables import CustomerRow, FeederTables, LineRow, read, to_json
+from feeders.format.topology import Tree
+from feeders.format.validation import nominal_volts
+from feeders.model.profiles import data_root
+from gridsec.arrays import Bools, Floats, Ints, frozen, frozen_ints
+from gridsec.errors import FeederInvalid, Problem
+from gridsec.grid.droop import Droop, fleet
+from gridsec.grid.meter import MeterAccuracy
+
+# An active power this far beyond what a customer can draw or feed in is no measurement of it.
+CREDIBLE_FACTOR = 10.0
+CREDIBLE_KW = 50.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoadModel:
+    """What is known of the customers' powers without and with a reading, pu. N customers.
+
+    Attributes
+    ----------
+    load_peak, pv_peak : (N,)
+        Largest load and largest generation.
+    tan_min, tan_max : (N,)
+        Limits of the load's q / p (lagging).
+    q_floor : (N,)
+        Reactive power of the load that does not follow p.
+    p_fraction, p_floor : (N,)
+        A metered p is within ``p_fraction |reading| + p_floor`` of the truth.
+    q_error : (N,)
+        Half-width of a metered q: a fraction of the customer's range.
+    q_fraction : (N,)
+        The same fraction, for readings beyond that range.
+    credible : (N,)
+        Largest |p| that is taken for a measurement.
+    p_unread, q_unread : (N,)
+        Half-width of what is known of p without a reading, and limit of that of q: the range, or what the
+        files say of the powers of a customer that has no meter.
+    """
+
+    load_peak: Floats
+    pv_peak: Floats
+    tan_min: Floats
+    tan_max: Floats
+    q_floor: Floats
+    p_fraction: Floats
+    p_floor: Floats
+    q_error: Floats
+    q_fraction: Floats
+    credible: Floats
+    p_unread: Floats
+    q_unread: Floats
+
+
+def names(*, balanced: bool = True) -> list[str]:
+    """Return the feeders that come with the project.
+
+    Parameters
+    ----------
+    balanced
+        Only those that are not in three phases, which every study and estimator takes.
+    """
+    folder = data_root() / "feeders"
+    found = (entry for entry in folder.iterdir() if (entry / META_FILE).is_file())
+    return sorted(entry.name for entry in found if not (balanced and _names_phases(entry)))
+
+
+def _names_phases(folder: Traversable) -> bool:
+    """Whether a folder of ours is in three phases: the writer leaves out default columns."""
+    tables = ((folder / name).read_text(encoding="utf-8") for name in (LINES_FILE, CUSTOMERS_FILE))
+    columns = {column for table in tables for column in table.partition("\n")[0].split(",")}
+    return not columns.isdisjoint({"phases", *PHASE_NAMES})
+
+
+def folder_of(path_or_name: Path | str) -> Path | None:
+    """Return a feeder's folder, or that of a feeder that comes with the project; None if there is neither."""
+    path = Path(path_or_name)
+    if path.is_dir():
+        return path
+    bundled = data_root() / "feeders" / str(path_or_name)
+    if len(path.parts) == 1 and path.name not in (".", "..") and bundled.is_dir():
+        return Path(str(bundled))
+    return None
+
+
+def find(path_or_name: Path | str) -> FeederTables:
+    """Read the tables of a feeder's folder, or of a feeder that comes with the project.
+
+    Raises
+    ------
+    FeederInvalid
+        As `load`.
+    """
+    folder = folder_of(path_or_name)
+    if folder is not None:
+        return read(folder)
+    why = "there is neither such a folder nor such a feeder"
+    if Path(path_or_name).is_file():
+        why = "a file; expected a feeder's folder, or the name of a feeder"
+    there, advised = ", ".join(names(balanced=False)), advice(path_or_name)
+    raise FeederInvalid([Problem("unknown-name", f"{path_or_name}: {why}; there are {there}{advised}")])
+
+
+def indices(values: Sequence[int]) -> Ints:
+    """Return indices as an array."""
+    return frozen_ints(np.array(values, dtype=np.intp))
+
+
+def _either(rows: list[CustomerRow], column: str, default: float) -> Floats:
+    """One column of customers.csv, with the default of feeder.toml where it is empty."""
+    cells = (getattr(row, column) for row in rows)
+    return np.array([default if cell is None else cell for cell in cells], dtype=np.float64)
+
+
+def digest(tables: FeederTables) -> str:
+    """Return the SHA-256 of a feeder's content, see `Site`."""
+    text = json.dumps(to_json(tables), sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def metered_customers(tables: FeederTables) -> Ints:
+    """Return the indices of the customers with a meter, ascending."""
+    return indices([k for k, row in enumerate(tables.customers) if row.meter])
+
+
+def inverters(tables: FeederTables, ratio: Floats) -> Droop:
+    """Return the inverters with a droop curve, in the order of the customers.
+
+    Parameters
+    ----------
+    tables
+        The feeder's tables.
+    ratio : (N,)
+        Of each customer's voltage base and its nominal voltage, in which curves are standardised.
+    """
+    own = [k for k, row in enumerate(tables.customers) if row.inverter_kva > 0]
+    rows = [tables.customers[k] for k in own]
+    made = fleet(
+        indices(own),
+        [row.droop for row in rows],
+        np.array([row.inverter_kva for row in rows], dtype=np.float64),
+        tables.meta.base_kva,
+        tau=np.array([np.nan if row.tau_s is None else row.tau_s for row in rows], dtype=np.float64),
+    )
+    base = ratio[own]
+    return made if (base == 1.0).all() else replace(made, v=made.v / base[:, None])
+
+
+def accuracy(tables: FeederTables, base_volt: Floats, nominal_volt: Floats) -> MeterAccuracy:
+    """Return what the meters promise, in the voltage base of each.
+
+    Parameters
+    ----------
+    tables
+        The feeder's tables.
+    base_volt, nominal_volt : (N,)
+        1 pu at each customer, and its nominal voltage, V.
+    """
+    meta = tables.meta
+    metered = metered_customers(tables)
+    rows, base = [tables.customers[k] for k in metered], base_volt[metered]
+    return MeterAccuracy(
+        class_fraction=frozen(_either(rows, "class_percent", meta.meters.class_percent) / 100.0),
+        resolution=frozen(_either(rows, "resolution_volt", meta.meters.resolution_volt) / base),
+        jitter=frozen(
+            _either(rows, "jitter_percent", meta.meters.jitter_percent)
+            / 100.0
+            / (base / nominal_volt[metered])
+        ),
+        busbar_class=meta.busbar_class_percent / 100.0,
+        busbar_resolution=meta.busbar_resolution_volt / meta.voltage_volt,
+        busbar_jitter=meta.busbar_jitter_percent / 100.0,
+    )
+
+
+def load_model(tables: FeederTables) -> LoadModel:
+    """Return what is known of the customers' powers, in units of `base_kva`."""
+    meta, rows = tables.meta, list(tables.customers)
+    base = meta.base_kva
+    load = _either(rows, "load_kw", 0.0)
+    pv = _either(rows, "pv_kw", 0.0)
+    inverter = _either(rows, "inverter_kva", 0.0)
+    tan = {
+        name: np.tan(np.arccos(_either(rows, name, getattr(meta.load, name))))
+        for name in ("power_factor_min", "power_factor_max")
+    }
+    given = _either(rows, "q_floor_kvar", np.nan)
+    floor = np.where(np.isnan(given), meta.load.q_floor_percent / 100.0 * load, given)
+    q_fraction = _either(rows, "q_error_percent", meta.meters.q_error_percent) / 100.0
+    # A register within f |p| + h of the truth p shows r: |p| <= (|r| + h) / (1 - f), so the error is at
+    # most (f |r| + h) / (1 - f).
+    p_fraction = _either(rows, "p_error_percent", meta.meters.p_error_percent) / 100.0
+    # The range of the reactive register: the largest apparent power at the connection point.
+    span = np.maximum.reduce([load * np.hypot(1.0, tan["power_factor_min"]), pv, inverter])
+    fields = {
+        "load_peak": load / base,
+        "pv_peak": pv / base,
+        "tan_min": tan["power_factor_max"],
+        "tan_max": tan["power_factor_min"],
+        "q_floor": floor / base,
+        "p_fraction": p_fraction / (1.0 - p_fraction),
+        "p_floor": 0.5 * meta.meters.p_resolution_kw / base / (1.0 - p_fraction),
+        "q_error": q_fraction * span / base,
+        "q_fraction": q_fraction,
+        "p_unread": _unread(rows, "p_std_kw", 0.5 * (load + pv)) / base,
+        "q_unread": _unread(rows, "q_std_kvar", load * tan["power_factor_min"] + floor) / base,
+        "credible": np.maximum(CREDIBLE_FACTOR * (load + pv + inverter), CREDIBLE_KW) / base,
+    }
+    return LoadModel(**{name: frozen(values) for name, values in fields.items()})
+
+
+def _unread(rows: list[CustomerRow], column: str, most: Floats) -> Floats:
+    """Half-width of a uniform error with the standard deviation of the files, where there is no meter."""
+    told = [None if row.meter else getattr(row, column) for row in rows]
+    width = [np.inf if std is None else np.sqrt(3.0) * std for std in told]
+    return np.minimum(most, np.array(width, dtype=np.float64))
+
+
+def positions(tables: FeederTables, found: Tree) -> Floats | None:
+    """Return where the buses are (b + 1, 2), or None unless the files place every one of them."""
+    xy = np.full((len(found.buses), 2), np.nan)
+    for line in tables.lines:
+        if line.to_x is not None and line.to_y is not None:
+            xy[found.group[line.to_bus]] = line.to_x, line.to_y
+    if tables.meta.busbar_xy is not None:
+        xy[0] = tables.meta.busbar_xy
+    return frozen(xy) if np.isfinite(xy).all() else None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Referred:
+    """A feeder's tree with its voltages. N customers, b + 1 buses.
+
+    Attributes
+    ----------
+    lines
+        The line that feeds bus k + 1.
+    ties
+        The t lines that close loops.
+    nominal : (b + 1,)
+        Nominal voltage of every bus, V.
+    bus : (b + 1, 3)
+        Voltage base of every phase of every bus, V.
+    branch : (b, 3)
+        That of each line's impedance and charging, which are behind its tap as seen from `from_bus`.
+    tie : (t, 3)
+        The same of each tie.
+    customer, customer_nominal : (N,)
+        Voltage base of every customer, the mean of its phases, and its nominal voltage, V.
+    """
+
+    lines: list[LineRow]
+    ties: list[LineRow]
+    nominal: Floats
+    bus: Floats
+    branch: Floats
+    tie: Floats
+    customer: Floats
+    customer_nominal: Floats
+
+
+def refer(tables: FeederTables, closed: Sequence[LineRow], found: Tree) -> Referred:
+    """Refer a feeder to its busbar.
+
+    Parameters
+    ----------
+    tables
+        The feeder.
+    closed, found
+        Its closed lines, and their tree.
+
+    Raises
+    ------
+    FeederInvalid
+        If a tap is where it cannot be.
+    """
+    lines, ties = [closed[k] for k in found.branch], [closed[k] for k in found.ties]
+    nominal = np.array(nominal_volts(found, closed, tables.meta.voltage_volt))
+    bus, branch = _factors(lines, found)
+    tie = np.array([bus[found.group[line.from_bus]] / line.taps for line in ties]).reshape(-1, 3)
+    there = np.array([bus[found.group[line.to_bus]] for line in ties]).reshape(-1, 3)
+    problems = [*_problems(closed), *_around(ties, tie / there)]
+    if problems:
+        raise FeederInvalid(problems)
+    at = np.array([found.group[row.bus] for row in tables.customers], dtype=np.intp)
+    own_phases = [[phase in row.phases for phase in "abc"] for row in tables.customers]
+
+    def own(rows: Sequence[LineRow]) -> Floats:
+        return nominal[[found.group[line.to_bus] for line in rows], None]
+
+    base = bus * nominal[:, None]
+    customer = of_customers(base[at], np.array(own_phases, dtype=np.bool_).reshape(-1, 3))
+    return Referred(lines, ties, nominal, base, branch * own(lines), tie * own(ties), customer, nominal[at])
+
+
+def of_customers(base: Floats, connected: Bools) -> Floats:
+    """Return what 1 pu of each customer is, V, (N,): the mean of its phases, which is what its meter reads.
+
+    Parameters
+    ----------
+    base : (N, 3)
+        Voltage bases of the phases of their buses, V.
+    connected : (N, 3)
+        Which phases they have.
+    """
+    first = np.take_along_axis(base, connected.argmax(axis=1)[:, None], axis=1)
+    # Where all are the same the mean is, to the last bit.
+    apart = np.where(connected, base - first, 0.0).sum(axis=1) / connected.sum(axis=1)
+    return np.asarray(first[:, 0] + apart)
+
+
+def _factors(lines: Sequence[LineRow], found: Tree) -> tuple[Floats, Floats]:
+    """The products of taps, ``a`` of every bus and of every line's impedance, in each phase."""
+    bus, branch = np.ones((len(found.buses), 3)), np.ones((len(lines), 3))
+    for k, (line, above) in enumerate(zip(lines, found.parent, strict=True)):
+        if found.group[line.from_bus] == above:
+            bus[k + 1] = branch[k] = bus[above] / line.taps
+        else:
+            branch[k] = bus[above]
+            bus[k + 1] = bus[above] * line.taps
+    return bus, branch
+
+
+def _problems(closed: Sequence[LineRow]) -> list[Problem]:
+    out = []
+    for line in (line for line in closed if set(line.taps) != {1.0}):
+        where = (
+            f"lines, line {line.line!r}, column tap: {' '.join(f'{tap:g}' for tap in sorted({*line.taps}))}"
+        )
+        if line.r_ohm == line.x_ohm == 0.0:
+            out.append(
+                Problem(
+                    "zero-impedance",
+                    f"{where} on a line without impedance; expected the transformer's r_ohm and x_ohm",
+                )
+            )
+    return out
+
+
+def _around(ties: Sequence[LineRow], ratio: Floats) -> list[Problem]:
+    """Loops whose taps drive a current around without any load, which the model does not have."""
+    return [
+        Problem(
+            "inconsistent",
+            f"lines, line {line.line!r} closes a loop around which the taps multiply to {far:.6g}; "
+            "expected 1",
+        )
+        for line, own in zip(ties, ratio, strict=True)
+        if abs((far := _farthest(own[["abc".index(phase) for phase in line.phases]])) - 1.0) > _ROUNDING
+    ]
+
+
+def _farthest(ratio: Floats) -> float:
+    """The one that is the least 1."""
+    return float(ratio[np.abs(ratio - 1.0).argmax()])
+
+
+# Ratios around a loop are products of a few numbers of the files.
+_ROUNDING = 1e-9

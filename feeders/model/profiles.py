@@ -1,0 +1,144 @@
+"""The library of load and generation profiles: some days of every season at 15 min, relative to the peak."""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import io
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import cache
+from importlib import resources
+from importlib.resources.abc import Traversable
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from gridsec.errors import choice
+from gridsec.interface import Floats
+
+ENVELOPES = "envelopes.csv"
+TIME = "t_s"
+
+PROFILE_STEP_S: Final = 900.0
+"""Interval between two samples, s."""
+
+
+class Season(StrEnum):
+    """The time of the year that profiles are from."""
+
+    WINTER = "winter"
+    SPRING = "spring"
+    SUMMER = "summer"
+    AUTUMN = "autumn"
+
+    @property
+    def file(self) -> str:
+        """Name of the season's file in data/profiles."""
+        return f"{self}.csv.gz"
+
+
+def data_root() -> Traversable:
+    """Return the folder of the data: beside the packages in a checkout, inside them in a wheel."""
+    packaged = resources.files("feeders") / "data"
+    return packaged if packaged.is_dir() else Path(__file__).resolve().parents[2] / "data"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Profiles:
+    """Profiles over time; between two samples they are meant to be interpolated.
+
+    Attributes
+    ----------
+    t_s : (T,)
+        Time since the first sample, s; the first sample is at 00:00 of a Monday.
+    load_p, load_q : name -> (T,)
+        Active and reactive power of a load, as a fraction of its peak `load_kw` and of the reactive
+        power that belongs to `load_kw` at its expected power factor.
+    pv : name -> (T,)
+        Generation, fraction of its peak `pv_kw`.
+    """
+
+    t_s: Floats
+    load_p: dict[str, Floats]
+    load_q: dict[str, Floats]
+    pv: dict[str, Floats]
+
+
+@dataclass(frozen=True, slots=True)
+class Envelope:
+    """Limits of a load profile's reactive power, known from its history.
+
+    With p and q as fractions of `load_kw` and of the reactive power that belongs to `load_kw` at the
+    expected power factor: ``low p - floor <= q <= high p + floor``.
+    """
+
+    low: float
+    high: float
+    floor: float
+
+
+@cache
+def envelopes() -> dict[str, Envelope]:
+    """Return the envelope of every load profile; see data/profiles/SOURCE.md."""
+    text = (data_root() / "profiles" / ENVELOPES).read_text(encoding="ascii")
+    rows = csv.DictReader(io.StringIO(text))
+    return {
+        row["load_profile"]: Envelope(float(row["q_low"]), float(row["q_high"]), float(row["q_floor"]))
+        for row in rows
+    }
+
+
+def library(season: Season = Season.SUMMER) -> Profiles:
+    """Return one season of the library that comes with the project; see data/profiles/SOURCE.md.
+
+    Parameters
+    ----------
+    season
+        Which; summer has two weeks, the others have one.
+
+    Raises
+    ------
+    ValueError
+        If there is no such season.
+    """
+    return _read(choice("season", Season, season))
+
+
+@cache
+def _read(season: Season) -> Profiles:
+    text = gzip.decompress((data_root() / "profiles" / season.file).read_bytes()).decode("ascii")
+    header = next(csv.reader(io.StringIO(text)))
+    table = np.loadtxt(io.StringIO(text), delimiter=",", skiprows=1, dtype=np.float64)
+    table.setflags(write=False)
+    columns = dict(zip(header, table.T, strict=True))
+    return Profiles(
+        columns[TIME],
+        {name[:-2]: column for name, column in columns.items() if name.endswith("_p")},
+        {name[:-2]: column for name, column in columns.items() if name.endswith("_q")},
+        {name: column for name, column in columns.items() if name.startswith("PV")},
+    )
+
+
+def profile(curves: dict[str, Floats], name: str) -> Floats:
+    """One profile; without a name the mean of all of them.
+
+    Parameters
+    ----------
+    curves
+        `Profiles.load_p`, `load_q` or `pv`.
+    name
+        Which.
+    """
+    return curves[name] if name else np.asarray(np.mean(list(curves.values()), axis=0))
+
+
+def load_names() -> tuple[str, ...]:
+    """Names that `load_profile` may hold."""
+    return tuple(library().load_p)
+
+
+def pv_names() -> tuple[str, ...]:
+    """Names that `pv_profile` may hold."""
+    return tuple(library().pv)

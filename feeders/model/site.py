@@ -1,0 +1,718 @@
+"""Feeder model in per unit from tables, and frames from readings in SI.
+
+A load follows a first-order process with the standard deviation sigma of its range, or of its forecast, and
+the correlation time tau = `[load] correlation_s`. Single devices switch the whole difference J between the
+reading and the farther end of the range at once. The change over an age a > 0 has the standard deviation
+
+    s(a) = sqrt(2 sigma^2 (1 - exp(-a / tau)) + (J / SWITCHED)^2).
+
+A power with s of sigma and more is worth no more than no reading.
+
+The only place where SI and per unit meet, and where the wire's sign (net import positive) turns into
+the model's (injection positive).
+
+References
+----------
+docs/theory-sequential.md, section 7.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from feeders.format.columns import CUSTOMER_COLUMNS, parse
+from feeders.format.tables import CustomerRow, FeederTables, validate
+from feeders.format.topology import Edge, Tree, tree
+from feeders.model.equipment import (
+    LoadModel,
+    Referred,
+    accuracy,
+    digest,
+    find,
+    indices,
+    inverters,
+    load_model,
+    metered_customers,
+    names,
+    positions,
+    refer,
+)
+from feeders.model.forecast import Forecast, forecast
+from feeders.model.three_phase import spanned, unsupported
+from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, frozen
+from gridsec.errors import FeederInvalid, Problem
+from gridsec.estimators.plant import Plant
+from gridsec.grid.droop import Droop
+from gridsec.grid.meshed import Meshed, MeshedFeeder, PhasedMesh
+from gridsec.grid.meter import MeterAccuracy
+from gridsec.grid.network import Network, Power, model_error_bound, own
+from gridsec.grid.phased import PhasedFeeder
+from gridsec.grid.radial import Feeder
+from gridsec.grid.three_phase import PHASES, ThreePhaseFeeder
+from gridsec.interface import Frame, PowerOrigin
+
+__all__ = [
+    "ABSURD_PU",
+    "SWITCHED",
+    "Late",
+    "LoadModel",
+    "Registered",
+    "Site",
+    "Snapshot",
+    "change",
+    "expected",
+    "find",
+    "from_tables",
+    "late",
+    "load",
+    "names",
+    "plant",
+    "registered",
+    "spread",
+    "to_frame",
+    "volts",
+]
+
+
+SWITCHED: Final = 5.0
+"""Standard deviations that switching the whole difference to the end of the range amounts to.
+
+The limits of one meter begin at 5.2: no single device exceeds them. A larger value names honest meters, a
+smaller one hides lies.
+"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Late:
+    """Late powers of one tick. N customers.
+
+    Attributes
+    ----------
+    which : (N,)
+        Customers with a late power that is worth something.
+    useless : (N,)
+        Customers with a power that is worth no more than none.
+    stated : (N,)
+        Customers with a power no older than `[meters] p_interval_s`.
+    std : (N,)
+        Standard deviation of the change of the active power, pu; 0 elsewhere.
+    reach : (N,)
+        Largest change, pu.
+    """
+
+    which: Bools
+    useless: Bools
+    stated: Bools
+    std: Floats
+    reach: Floats
+
+    def widen(self, site: Site, frame: Frame) -> Frame:
+        """The frame with the uncertainty of the late powers.
+
+        Intervals reach to the ends of what is possible. Metered reactive powers are as old, and are not used.
+
+        Parameters
+        ----------
+        site
+            The feeder.
+        frame
+            The frame of the readings, as if all were of the same moment.
+        """
+        loads, which, none = site.loads, self.which, np.full(self.std.size, np.nan)
+        root, tan = np.sqrt(3.0), np.maximum(np.abs(loads.tan_min), np.abs(loads.tan_max))
+        low, high = -loads.q_floor, loads.load_peak * loads.tan_max + loads.q_floor
+        q = -frame.q
+        p_std = np.hypot(frame.p_error / root, self.std)
+        q_std = np.hypot(frame.q_error / root, tan * np.minimum(self.std, loads.load_peak))
+        told = (none if std is None else std for std in (frame.p_std, frame.q_std))
+        origin = np.zeros(q.size, dtype=np.intp) if frame.p_origin is None else frame.p_origin
+        late = which & ~self.stated & (origin == PowerOrigin.READ)
+        return replace(
+            frame,
+            p_error=np.where(which, np.maximum(frame.p_error, self.reach), frame.p_error),
+            q_error=np.where(which, np.maximum(frame.q_error, np.maximum(q - low, high - q)), frame.q_error),
+            q_net=np.where(which, np.nan, frame.q_net),
+            p_std=np.where(which, p_std, next(told)),
+            q_std=np.where(which, q_std, next(told)),
+            p_origin=np.where(late, PowerOrigin.LATE, origin).astype(np.intp),
+        )
+
+
+def late(site: Site, snapshot: Snapshot) -> Late | None:
+    """Late powers of a tick; None: all are of the moment of their voltage.
+
+    Parameters
+    ----------
+    site
+        The feeder; `[meters] p_interval_s` of its file is the age of powers without a time of their own.
+    snapshot
+        The readings.
+    """
+    interval = site.tables.meta.meters.p_interval_s
+    if snapshot.p_age_s is None and interval == 0.0:
+        return None
+    told = np.full(site.meters.size, np.nan) if snapshot.p_age_s is None else snapshot.p_age_s
+    age = np.where(np.isnan(told), interval, np.maximum(told, 0.0))
+    aged = (age > 0.0) & np.isfinite(snapshot.p_kw)
+    if not any_of(aged):
+        return None
+    ages, p = np.zeros((2, site.loads.load_peak.size))
+    ages[site.meters] = np.where(aged, age, 0.0)
+    p[site.meters] = np.where(aged, snapshot.p_kw / site.feeder.base_kva, 0.0)
+    reach = np.maximum(site.loads.load_peak - p, p + site.loads.pv_peak)
+    std = change(site, ages, reach)
+    useless = (ages > 0.0) & (std >= spread(site))
+    which = (ages > 0.0) & ~useless
+    return Late(which, useless, ages <= interval, np.where(which, std, 0.0), np.where(which, reach, 0.0))
+
+
+def change(site: Site, age_s: Floats | float, reach: Floats) -> Floats:
+    """Standard deviation of the change of each customer's active power, (N,), pu; 0 at age 0.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    age_s : (N,)
+        Age, s.
+    reach : (N,)
+        Distance to the farther end of the range, pu.
+    """
+    slow = -2.0 * np.expm1(-np.asarray(age_s) / site.tables.meta.load.correlation_s)
+    moved = np.hypot(np.sqrt(slow) * spread(site), reach / SWITCHED)
+    return np.asarray(np.where(np.asarray(age_s) > 0.0, moved, 0.0))
+
+
+def spread(site: Site) -> Floats:
+    """Standard deviation of each customer's active power without a reading, (N,), pu."""
+    if site.forecast is not None:
+        return site.forecast.p_std
+    return np.asarray((site.loads.load_peak + site.loads.pv_peak) / np.sqrt(12.0))
+
+
+def expected(site: Site) -> Floats:
+    """Standard deviation of the change over `[meters] p_interval_s` that the design supposes, (N,), pu."""
+    if site.tables.meta.meters.p_interval_s == 0.0:
+        return np.zeros(site.loads.load_peak.size)
+    reach = site.loads.load_peak + site.loads.pv_peak
+    return np.minimum(change(site, site.tables.meta.meters.p_interval_s, reach), spread(site))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Registered:
+    """Load powers of one tick, consumption positive, pu. N customers.
+
+    Attributes
+    ----------
+    p, p_error : (N,)
+        Centre and half-width of the interval of the net active power.
+    q, q_error : (N,)
+        The same of the load's reactive power.
+    known : (N,)
+        The interval rests on a reading.
+    origin : (N,)
+        `PowerOrigin` of `p`.
+    excess : (N,)
+        Part of the reading beyond the declared load or generation.
+    """
+
+    p: Floats
+    p_error: Floats
+    q: Floats
+    q_error: Floats
+    known: Bools
+    origin: Ints
+    excess: Floats
+
+
+def registered(site: Site, metered: Floats) -> Registered:
+    """Return the powers that the frame states.
+
+    A reading is used up to ``LoadModel.credible``. Readings beyond the declared range are used only while
+    the model error has a finite bound with all of them. Otherwise those with the largest voltage effect
+    ``R_ii excess_i`` are replaced by the declared range, the fewest that restore the bound. The busbar has
+    its nominal voltage there: no meter of the busbar decides on powers.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    metered : (N,)
+        Net active power that each register shows, pu; NaN: no usable reading.
+    """
+    known = np.abs(metered) <= site.loads.credible  # False for NaN
+    found = _intervals(site.loads, metered, known)
+    over = np.flatnonzero(known & (found.excess > 0.0))
+    if not over.size or _bounded(site, found):
+        return found
+    effect = own(site.feeder, Power.ACTIVE)[over] * found.excess[over]
+    over = over[np.argsort(-effect, kind="stable")]
+
+    def without(count: int) -> Registered:
+        used = known.copy()
+        used[over[:count]] = False
+        return _intervals(site.loads, metered, used)
+
+    few, enough = 0, over.size
+    while enough - few > 1:
+        middle = (few + enough) // 2
+        few, enough = (few, middle) if _bounded(site, without(middle)) else (middle, enough)
+    return without(enough)
+
+
+def _bounded(site: Site, powers: Registered) -> bool:
+    """Existence of a finite error bound of the loss-corrected model, at nominal busbar voltage."""
+    with np.errstate(all="ignore"):
+        bound = model_error_bound(site.feeder, -powers.p, -powers.q, site.droop.vbar**2)
+    return all_of(np.isfinite(bound))
+
+
+def _intervals(model: LoadModel, metered: Floats, known: Bools) -> Registered:
+    """Intervals of the powers, `feeders.model.site.to_frame`; the declared range where not `known`."""
+    p = np.where(known, metered, 0.5 * (model.load_peak - model.pv_peak))
+    excess = np.maximum(p - model.load_peak, 0.0) + np.maximum(-p - model.pv_peak, 0.0)
+    doubt = np.minimum(2.0 * excess, np.abs(p))
+    p_error = np.where(known, model.p_fraction * np.abs(p) + model.p_floor + doubt, model.p_unread)
+    low = np.maximum(p - p_error, 0.0)
+    most = np.minimum(p + p_error + model.pv_peak, model.load_peak)
+    high = np.maximum(np.maximum(most, p + p_error), 0.0)
+    q_low = low * model.tan_min - model.q_floor
+    q_high = high * model.tan_max + model.q_floor
+    q_error = 0.5 * (q_high - q_low)
+    beyond = (known & (excess > 0.0)) | (np.isfinite(metered) & ~known)
+    origin = np.where(known, PowerOrigin.READ, PowerOrigin.UNREAD)
+    return Registered(
+        p=p,
+        p_error=p_error,
+        q=0.5 * (q_low + q_high),
+        q_error=np.where(known, q_error, np.minimum(q_error, model.q_unread)),
+        known=known,
+        origin=np.where(beyond, PowerOrigin.BEYOND, origin).astype(np.intp),
+        excess=excess,
+    )
+
+
+# A reading is evidence even when it is absurd, but its square must stay a number.
+ABSURD_PU = 100.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Site:
+    """A feeder ready to be watched or simulated. N customers, p meters, b + 1 buses.
+
+    With single-phase lines or customers or lines that are not transposed, it is one in three phases, all of
+    whose customers have one phase: a customer of three is three, see `one_phase_each`.
+
+    Attributes
+    ----------
+    tables
+        The feeder in SI, as its files say it; in three phases with customers of one phase.
+    feeder
+        The radial tree, pu; or with closed ties, or in three phases.
+    droop
+        The inverters with a droop curve, in the order of the customers.
+    meters : (p,)
+        Index of each meter's customer, ascending.
+    meter_ids : (p,)
+        Ids of the meters.
+    accuracy
+        What the meters promise, pu.
+    bus_of_file
+        Fused bus index of every bus id of the files.
+    xy : (b + 1, 2)
+        Positions of the buses, or None unless the files place every one of them.
+    loads
+        What is known of the customers' powers.
+    base_volt : (n,)
+        1 pu of every place, V: the nominal voltage, but behind taps its part, see `feeders.model.equipment`.
+    nominal_volt : (n,)
+        Nominal voltage of every place, V: another one than the busbar's behind a transformer.
+    digest
+        SHA-256 of the content: key of design caches. It changes with every value and with the order of
+        the rows (which is the order of all arrays), not with layout, comments or unknown columns.
+    forecast
+        Of powers that nobody reads; None: all that is known of them is their range.
+    """
+
+    tables: FeederTables
+    feeder: Network
+    droop: Droop
+    meters: Ints
+    meter_ids: tuple[str, ...]
+    accuracy: MeterAccuracy
+    bus_of_file: Mapping[str, int]
+    xy: Floats | None
+    loads: LoadModel
+    base_volt: Floats
+    nominal_volt: Floats
+    digest: str
+    forecast: Forecast | None = None
+
+    @property
+    def customer_volt(self) -> Floats:
+        """1 pu at every customer, V, (N,)."""
+        return np.asarray(self.base_volt[self.feeder.bus])
+
+    @property
+    def customer_nominal(self) -> Floats:
+        """Nominal voltage of every customer, V, (N,)."""
+        return np.asarray(self.nominal_volt[self.feeder.bus])
+
+    @property
+    def spanning(self) -> Feeder | ThreePhaseFeeder:
+        """A tree that reaches all its buses, whatever the number of their phases: all lines but the ties."""
+        return self.feeder if isinstance(self.feeder, Feeder) else self.feeder.tree
+
+    @property
+    def ties(self) -> Ints:
+        """Buses at both ends of the lines that close loops in `spanning`, (t, 2)."""
+        return self.feeder.ends if isinstance(self.feeder, Meshed) else np.zeros((0, 2), dtype=np.intp)
+
+    @property
+    def tree(self) -> Feeder | ThreePhaseFeeder:
+        """The tree of its buses, for what takes radial feeders only.
+
+        Raises
+        ------
+        FeederInvalid
+            If closed lines form loops.
+        """
+        if isinstance(self.feeder, Meshed):
+            raise FeederInvalid(
+                [Problem("not-radial", "lines: closed lines form loops, and this takes radial feeders only")]
+            )
+        return self.spanning
+
+    @property
+    def balanced(self) -> Feeder:
+        """The radial tree, for what only takes balanced feeders.
+
+        Raises
+        ------
+        FeederInvalid
+            In three phases, or if closed lines form loops.
+        """
+        if isinstance(self.tree, Feeder):
+            return self.tree
+        raise FeederInvalid(
+            [
+                Problem(
+                    "not-balanced", "lines, customers: in three phases, and this takes balanced feeders only"
+                )
+            ]
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Snapshot:
+    """Readings of one tick in SI, as on the wire: net import positive. p meters.
+
+    Attributes
+    ----------
+    t
+        Unix time, s.
+    v_volt : (p,)
+        Phase-to-neutral voltages, V; NaN where missing.
+    p_kw : (p,)
+        Net active import of the customer, kW; NaN where missing.
+    q_kvar : (p,)
+        Net reactive import, the inverter included, kvar; NaN where not reported.
+    v0_volt
+        Busbar voltage, V; NaN where missing. In three phases (3,).
+    p_age_s : (p,) or None
+        Age of the powers at the voltage readings beside them, s; NaN, or None for all, where not stated.
+    clock_offset_s : (p,) or None
+        By how much each meter's clock is ahead, s; NaN, or None for all, where that is not measurable.
+    busbar_offset_s
+        By how much the clock of the busbar's meter is ahead, s; NaN where that is not measurable.
+    """
+
+    t: float
+    v_volt: Floats
+    p_kw: Floats
+    q_kvar: Floats
+    v0_volt: Floats | float
+    p_age_s: Floats | None = None
+    clock_offset_s: Floats | None = None
+    busbar_offset_s: float = math.nan
+
+
+def load(path_or_name: Path | str) -> Site:
+    """Load a feeder.
+
+    Parameters
+    ----------
+    path_or_name
+        A folder, or the name of a feeder that comes with the project (`names()`).
+
+    Raises
+    ------
+    FeederInvalid
+        With every problem of the files, or if there is no such feeder.
+    """
+    return from_tables(find(path_or_name))
+
+
+def from_tables(tables: FeederTables) -> Site:
+    """Turn a feeder's tables into the per-unit model.
+
+    With ``z_base = 3 V^2 / (1000 S)`` ohm for V volts phase to neutral and S kVA of all three phases:
+    ``r = r_ohm / z_base``, ``b = 1e-6 b_us z_base``, and powers in kW divide by S. Behind taps V is that of
+    `feeders.model.equipment`.
+
+    Raises
+    ------
+    FeederInvalid
+        If the tables are not valid, or need what the model cannot do yet.
+    """
+    if tables.in_phases:
+        try:
+            return _in_phases(one_phase_each(tables))
+        except FeederInvalid as error:
+            # Rows and ids are those of the files, not of the channels.
+            problems = validate(tables) or _channels(tables) or unsupported(tables) or error.problems
+            raise FeederInvalid(problems) from error
+    problems = validate(tables) or _unsupported(tables)
+    if problems:
+        raise FeederInvalid(problems)
+    meta = tables.meta
+    closed = [line for line in tables.lines if line.closed]
+    found = tree(
+        meta.busbar,
+        [Edge(row.line, row.from_bus, row.to_bus, row.r_ohm == row.x_ohm == 0.0) for row in closed],
+    )
+    base = refer(tables, closed, found)
+    feeder, loads = _feeder(tables, base, found), load_model(tables)
+    metered = metered_customers(tables)
+    return Site(
+        tables=tables,
+        feeder=_meshed(tables, feeder, base, found) if base.ties else feeder,
+        droop=inverters(tables, base.customer / base.customer_nominal),
+        meters=metered,
+        meter_ids=tuple(tables.customers[k].meter for k in metered),
+        accuracy=accuracy(tables, base.customer, base.customer_nominal),
+        bus_of_file=found.group,
+        xy=positions(tables, found),
+        loads=loads,
+        base_volt=frozen(base.bus[:, 0]),
+        nominal_volt=frozen(base.nominal),
+        digest=digest(tables),
+        forecast=forecast(tables, loads),
+    )
+
+
+def one_phase_each(tables: FeederTables) -> FeederTables:
+    """The same feeder with a customer and a meter for every phase, each with its part of the power.
+
+    A meter of three phases reads three voltages and three powers; they are the channels "X-a", "X-b" and
+    "X-c". Standard deviations of what is not known are parted as those of independent phases, and an
+    inverter of three phases into three that follow their own phase's voltage.
+
+    Parameters
+    ----------
+    tables
+        The feeder's tables.
+    """
+    rows = [part for row in tables.customers for part in (_parts(row) if row.phases == "abc" else [row])]
+    return replace(tables, customers=tuple(rows))
+
+
+def _parts(row: CustomerRow) -> list[CustomerRow]:
+    def part(value: float | None, divisor: float) -> float | None:
+        return None if value is None else value / divisor
+
+    return [
+        replace(
+            row,
+            customer=f"{row.customer}-{phase}",
+            phases=phase,
+            meter=row.meter and f"{row.meter}-{phase}",
+            load_kw=row.load_kw / 3.0,
+            pv_kw=row.pv_kw / 3.0,
+            inverter_kva=row.inverter_kva / 3.0,
+            q_floor_kvar=part(row.q_floor_kvar, 3.0),
+            p_std_kw=part(row.p_std_kw, 3.0**0.5),
+            q_std_kvar=part(row.q_std_kvar, 3.0**0.5),
+        )
+        for phase in PHASES
+    ]
+
+
+def _channels(tables: FeederTables) -> list[Problem]:
+    """Ids that customers or meters of three phases give to their phases and that cannot be."""
+    problems = []
+    for column in (column for column in CUSTOMER_COLUMNS if column.name in {"customer", "meter"}):
+        first: dict[str, str] = {}
+        for number, row in enumerate(tables.customers, start=1):
+            where = f"customers, row {number} ({row.customer})"
+            ids = [getattr(part, column.name) for part in (_parts(row) if row.phases == "abc" else [row])]
+            wrong = [problem for problem in (parse(column, own)[1] for own in ids) if problem]
+            wrong += [
+                Problem(
+                    "duplicate",
+                    f"{own!r} is already the id of {first[own]}; every id must be unique, as those of "
+                    "the phases of three-phase customers",
+                )
+                for own in ids
+                if own in first
+            ]
+            if wrong:
+                problems.append(Problem(wrong[0].code, f"{where}, column {column.name}: {wrong[0]}"))
+            first.update({own: where for own in ids if own})
+    return problems
+
+
+def _in_phases(tables: FeederTables) -> Site:
+    """The site of a feeder whose customers have one phase each."""
+    found, ties = spanned(tables)
+    parts = {f.name: getattr(found, f.name) for f in fields(found)}
+    feeder = PhasedMesh(found.feeder, *ties) if ties.ends.size else PhasedFeeder(found.feeder)
+    places = {
+        "feeder": feeder,
+        "base_volt": frozen(found.base_volt.ravel()),
+        "nominal_volt": frozen(np.repeat(found.nominal_volt, len(PHASES))),
+        "forecast": forecast(found.tables, found.loads),
+    }
+    return Site(**parts | places)
+
+
+def plant(site: Site) -> Plant:
+    """Return the site as the monitor's design takes it."""
+    return Plant(site.feeder, site.droop, site.meters, site.accuracy, 1)
+
+
+def volts(base_volt: Floats, v2_pu: Floats) -> Floats:
+    """Return voltages from squared voltages: ``v = base_volt sqrt(v2)``.
+
+    Parameters
+    ----------
+    base_volt : (n,)
+        1 pu of each, V: `Site.base_volt` or `Site.customer_volt`.
+    v2_pu : (…, n)
+        Squared voltages, pu; a negative one (no voltage has it) gives 0.
+    """
+    return np.asarray(base_volt * np.sqrt(np.maximum(v2_pu, 0.0)), dtype=np.float64)
+
+
+def to_frame(site: Site, snapshot: Snapshot) -> Frame:
+    """Turn one tick's readings into what an estimator takes; total on any readings, absurd ones too.
+
+    Voltages: ``y = v |v|`` in pu, so that a negative reading stays a bad one.
+
+    Active power: a register of f = `p_error_percent` and steps of 2 h shows r; the truth is within
+    ``(f |r| + h) / (1 - f)`` of it. Beyond the customer's largest load or generation it is believed less and
+    less, and at twice of that not at all: a load that is not there is the cover of colluding voltage meters,
+    and a connection limits what it can pretend. Without a finite bound of the model error it is not used
+    (`feeders.model.site`). Where there is no reading, or one that is not finite or
+    beyond anything the customer could draw, all that is known is the interval from full generation without
+    load to full load without generation. Its middle is p; `p_std_kw` of a customer without a meter says how
+    far from that the truth is, and the half-width is `sqrt(3)` of it if that is less. With
+    `forecast = "profiles"` p and q are those of `feeders.model.forecast`, with the whole range as interval
+    about them. A power older than its voltage reading is widened by what loads do meanwhile
+    (`feeders.model.site`).
+
+    Reactive power of the load (the inverter's is the observer's business): with net import P, the load
+    alone lies in ``[max(P, 0), max(P, min(P + pv, load_kw))]``, each end widened by the error of P;
+    its reactive power in ``[load_low tan_min - floor, load_high tan_max + floor]``. Without generation
+    the load is P itself. Centre and half-width of that interval go into the frame; `q_std_kvar` of a customer
+    without a meter narrows it as `p_std_kw` does.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    snapshot
+        The readings.
+    """
+    base_volt, base_kva, model = site.customer_volt[site.meters], site.feeder.base_kva, site.loads
+    seen = np.isfinite(snapshot.v_volt)
+    v = np.clip(snapshot.v_volt / base_volt, -ABSURD_PU, ABSURD_PU)
+    y = np.where(seen, v * np.abs(v), np.nan)
+    v0_squared, v0_phases = _busbar(snapshot.v0_volt, site.feeder.base_volt)
+    metered = np.full(model.load_peak.size, np.nan)
+    metered[site.meters] = snapshot.p_kw / base_kva
+    aged = late(site, snapshot)
+    if aged is not None:
+        metered[aged.useless] = np.nan
+    load = registered(site, metered)
+    q_net = np.full(model.load_peak.size, np.nan)
+    q_net[site.meters] = -snapshot.q_kvar / base_kva
+    q_net[~(np.abs(q_net) <= model.credible)] = np.nan
+    size = np.where(np.isnan(q_net), 0.0, np.abs(q_net))
+    frame = Frame(
+        t=snapshot.t,
+        y=y,
+        seen=seen,
+        v0_squared=v0_squared,
+        p=-load.p,
+        p_error=load.p_error,
+        q=-load.q,
+        q_error=load.q_error,
+        q_net=q_net,
+        q_net_error=np.maximum(model.q_error, model.q_fraction * size),
+        v0_phases=v0_phases,
+        p_origin=load.origin,
+        clock_offset=snapshot.clock_offset_s,
+        busbar_offset=snapshot.busbar_offset_s,
+    )
+    frame = frame if site.forecast is None else site.forecast.fill(frame, ~load.known)
+    return frame if aged is None else aged.widen(site, frame)
+
+
+def _busbar(v0_volt: Floats | float, base_volt: float) -> tuple[float, Floats | None]:
+    """Squared busbar voltage, the mean of the phases, pu; and that of each phase where there are several."""
+    with np.errstate(invalid="ignore"):
+        v0 = np.clip(np.where(np.isfinite(v0_volt), v0_volt, np.nan) / base_volt, 0.0, ABSURD_PU) ** 2
+    return (float(v0), None) if v0.ndim == 0 else (float(v0.mean()), v0)
+
+
+# --- building -----------------------------------------------------------------------------------
+
+
+def _unsupported(tables: FeederTables) -> tuple[Problem, ...]:
+    """What the format can say and the model cannot do yet."""
+    problems = []
+    closed = [line for line in tables.lines if line.closed]
+    if all(line.r_ohm == line.x_ohm == 0.0 for line in closed):
+        problems.append(
+            Problem(
+                "nothing-to-design",
+                "lines: no closed line has an impedance; there is nothing to watch below the busbar",
+            )
+        )
+    return tuple(problems)
+
+
+def _feeder(tables: FeederTables, base: Referred, found: Tree) -> Feeder:
+    meta, lines = tables.meta, base.lines
+    z_base = 3.0 * base.branch[:, 0] ** 2 / (1000.0 * meta.base_kva)
+    return Feeder(
+        name=meta.name,
+        parent=indices(found.parent),
+        r=np.array([line.r_ohm for line in lines]) / z_base,
+        x=np.array([line.x_ohm for line in lines]) / z_base,
+        bus=indices([found.group[row.bus] for row in tables.customers]),
+        customers=tuple(row.customer for row in tables.customers),
+        buses=found.buses,
+        base_volt=meta.voltage_volt,
+        base_kva=meta.base_kva,
+        charging=np.array([line.b_us for line in lines]) * (1e-6 * z_base),
+    )
+
+
+def _meshed(tables: FeederTables, feeder: Feeder, base: Referred, found: Tree) -> MeshedFeeder:
+    meta, ties = tables.meta, base.ties
+    z_base = 3.0 * base.tie[:, 0] ** 2 / (1000.0 * meta.base_kva)
+    return MeshedFeeder(
+        tree=feeder,
+        ends=np.array([(found.group[tie.from_bus], found.group[tie.to_bus]) for tie in ties], dtype=np.intp),
+        r=np.array([tie.r_ohm for tie in ties]) / z_base,
+        x=np.array([tie.x_ohm for tie in ties]) / z_base,
+        charging=np.array([tie.b_us for tie in ties]) * (1e-6 * z_base),
+    )

@@ -1,0 +1,1 @@
+"""Estimators by name, plug-ins, and the cache of designs."""

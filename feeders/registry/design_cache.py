@@ -1,0 +1,190 @@
+"""A folder of finished designs, so that a bank is designed once per feeder and not once per start.
+
+Entries are named by the content of plant, meter sets and options
+(`gridsec.observers.design_archive.design_key`), and nothing that comes out of the folder is used before its
+proofs have been recomputed: a damaged or foreign entry costs time, never correctness. Where the folder cannot
+be written, the design is returned all the same, together with the reason.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gridsec.errors import InputInvalid, Problem
+from gridsec.estimators.exact_bank.bank import MOST_OBSERVERS, Gains
+from gridsec.observers.design_archive import cached
+from gridsec.observers.gains import CircleGains, CircleOptions, stacked
+from gridsec.observers.lure import Lure
+from gridsec.secure.subsets import subsets
+
+_SUFFIX = ".gains"
+# Entries kept; the ones unused for longest go first. A bank of 255 observers takes half a megabyte.
+_KEEP = 64
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BankGains:
+    """Gains of a whole bank and where they came from.
+
+    Attributes
+    ----------
+    gains
+        Stacked, in the order of `gridsec.secure.subsets.Subsets.masks`: what
+        `gridsec.estimators.exact_bank.bank.design` takes.
+    designs
+        The single designs with their proofs, in the same order.
+    origin
+        "stored", "new", or "redesigned: …" with what was wrong with the stored ones.
+    problem
+        Why the designs could not be read or kept; empty if all went well.
+    """
+
+    gains: Gains
+    designs: tuple[CircleGains, ...]
+    origin: str
+    problem: str
+
+
+def folder(environment: Mapping[str, str] = os.environ, platform: str = sys.platform) -> Path:
+    """Where designs are kept: `GRIDSEC_CACHE_DIR`, or the platform's place for caches.
+
+    Parameters
+    ----------
+    environment
+        Environment variables.
+    platform
+        As `sys.platform`.
+    """
+    if chosen := environment.get("GRIDSEC_CACHE_DIR"):
+        return Path(chosen)
+    home = Path(environment.get("HOME") or environment.get("USERPROFILE") or tempfile.gettempdir())
+    if platform == "darwin":
+        return home / "Library" / "Caches" / "gridsec"
+    if platform == "win32":
+        return Path(environment.get("LOCALAPPDATA") or home / "AppData" / "Local") / "gridsec" / "Cache"
+    # The XDG specification ignores relative paths.
+    xdg = Path(environment.get("XDG_CACHE_HOME", ""))
+    return (xdg if xdg.is_absolute() else home / ".cache") / "gridsec"
+
+
+class DesignCache:
+    """Bytes under keys in one folder. Failures are remembered in `problems`, not raised.
+
+    Parameters
+    ----------
+    where
+        The folder; made when first written to.
+    """
+
+    def __init__(self, where: Path) -> None:
+        self.where = where
+        self.problems: list[str] = []
+
+    def get(self, key: str) -> bytes | None:
+        """Bytes under a key, None if there are none or they cannot be read.
+
+        Parameters
+        ----------
+        key
+            Hexadecimal digits.
+        """
+        path = self._path(key)
+        try:
+            blob = path.read_bytes()
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            self.problems.append(f"stored designs cannot be read: {error}")
+            return None
+        try:
+            os.utime(path)  # a read counts as use when old entries are removed
+        except OSError as error:
+            self.problems.append(f"stored designs cannot be marked as used: {error}")
+        return blob
+
+    def put(self, key: str, blob: bytes) -> None:
+        """Keep bytes under a key, whole or not at all, and drop what was unused for longest.
+
+        Parameters
+        ----------
+        key
+            Hexadecimal digits.
+        blob
+            The bytes.
+        """
+        path = self._path(key)
+        try:
+            self.where.mkdir(parents=True, exist_ok=True)
+            # Beside its goal, so that the rename stays within one file system.
+            handle, draft = tempfile.mkstemp(dir=self.where, prefix=".")
+            try:
+                with os.fdopen(handle, "wb") as file:
+                    file.write(blob)
+                Path(draft).replace(path)
+            except OSError:
+                Path(draft).unlink()
+                raise
+            self._prune()
+        except OSError as error:
+            self.problems.append(f"designs cannot be kept: {error}")
+
+    def _path(self, key: str) -> Path:
+        if not (key.isalnum() and key.isascii()):
+            raise InputInvalid([Problem("wrong-text", f"{key!r} is no key of a design")])
+        return self.where / (key + _SUFFIX)
+
+    def _prune(self) -> None:
+        entries = sorted(self.where.glob(f"*{_SUFFIX}"), key=lambda path: path.stat().st_mtime_ns)
+        for old in entries[:-_KEEP]:
+            old.unlink(missing_ok=True)
+
+
+def bank_gains(
+    lure: Lure,
+    max_attacked: int,
+    options: CircleOptions,
+    *,
+    workers: int,
+    where: Path | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> BankGains:
+    """Gains by LMI for both banks of chong2020, from the cache if they are there and still hold.
+
+    Parameters
+    ----------
+    lure
+        Plant with p meters.
+    max_attacked
+        M; p > 2M.
+    options
+        From `gridsec.observers.gains.options_for`.
+    workers
+        Number of processes, see `gridsec.observers.lmi.solve_many`.
+    where
+        Folder of the cache; by default `folder()`.
+    progress
+        Called with (done, total) while designing.
+
+    Raises
+    ------
+    NotObservable
+        Unless p > 2M.
+    DesignInfeasible
+        If some observer does not exist, or there would be too many.
+    """
+    meters = len(lure.C)
+    masks = subsets(meters, max_attacked, most=MOST_OBSERVERS).masks()
+    sets = [np.flatnonzero(mask).tolist() for mask in masks]
+    cache = DesignCache(folder() if where is None else where)
+    designs, origin = cached(
+        lure, sets, options, get=cache.get, put=cache.put, workers=workers, progress=progress
+    )
+    L, K = stacked(designs, meters)
+    return BankGains(Gains(L=L, K=K), designs, origin, "; ".join(cache.problems))

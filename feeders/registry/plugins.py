@@ -1,0 +1,108 @@
+"""Estimators of other packages: entry points of the group `gridsec.estimators`.
+
+The name of an entry point is the estimator's name; what it points to is a `feeders.registry.registry.Family`
+of that name. Names are known without running anybody's code; a family is loaded when it is asked for.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Collection
+from importlib.metadata import EntryPoint, entry_points
+from typing import TYPE_CHECKING, Any, Final
+
+from gridsec.errors import DesignInfeasible, GridsecError, NotObservable
+
+if TYPE_CHECKING:
+    from feeders.model.site import Site
+    from feeders.registry.estimator import Job
+
+GROUP: Final = "gridsec.estimators"
+
+
+class EstimatorUnusable(GridsecError):
+    """Another package offers an estimator that cannot be used."""
+
+    code = "estimator-unusable"
+
+
+_NAME: Final = re.compile(r"[a-z0-9][a-z0-9-]{0,63}")
+
+
+def names(own: Collection[str]) -> tuple[str, ...]:
+    """Names of all estimators of other packages, in alphabetic order.
+
+    Parameters
+    ----------
+    own
+        Names that are taken. Entry points of such a name, or of one that is not made of small letters,
+        digits and hyphens, are passed over.
+    """
+    found = {point.name for point in entry_points(group=GROUP)}
+    return tuple(sorted(name for name in found - set(own) if _NAME.fullmatch(name)))
+
+
+def load(name: str, kind: type) -> Any:
+    """The estimator of that name.
+
+    Parameters
+    ----------
+    name
+        One of `names`.
+    kind
+        What it has to be.
+
+    Raises
+    ------
+    EstimatorUnusable
+        If there is none or more than one, if its code fails, or if it is something else.
+    """
+    points = tuple(entry_points(group=GROUP, name=name))
+    if len(points) != 1:
+        raise EstimatorUnusable(f"estimator {name!r}: {len(points)} packages offer it; expected one")
+    try:
+        made = points[0].load()
+    except Exception as failure:  # the code of others may do anything
+        raise EstimatorUnusable(
+            f"estimator {name!r} ({_where(points[0])}) cannot be loaded: {failure}"
+        ) from failure
+    if not isinstance(made, kind) or getattr(made, "name", None) != name:
+        raise EstimatorUnusable(
+            f"estimator {name!r} ({_where(points[0])}) is no {kind.__name__} of that name"
+        )
+    return made
+
+
+def design(name: str, make: Callable[[Site, Job], Any], site: Site, job: Job) -> Any:
+    """What an estimator of another package prepares for a feeder.
+
+    Parameters
+    ----------
+    name
+        The estimator's name.
+    make
+        Its function.
+    site, job
+        What it is given.
+
+    Raises
+    ------
+    NotObservable, DesignInfeasible
+        If it says so.
+    EstimatorUnusable
+        If it raises anything else.
+    """
+    try:
+        return make(site, job)
+    except (NotObservable, DesignInfeasible):
+        raise
+    except Exception as failure:  # the code of others may do anything
+        why = " ".join(f"{type(failure).__name__}: {failure}".split())
+        raise EstimatorUnusable(
+            f"estimator {name!r} cannot be designed for {site.feeder.name}: {why}"
+        ) from failure
+
+
+def _where(point: EntryPoint) -> str:
+    package = "" if point.dist is None else f" of {point.dist.name}"
+    return f"{point.value}{package}"

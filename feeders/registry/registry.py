@@ -1,0 +1,352 @@
+"""The estimators that a feeder can be watched with, by the names that `feeder.toml` uses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from feeders.format.columns import ESTIMATORS, OWN_ESTIMATORS
+from feeders.model.load_uncertainty import load_doubt, unread
+from feeders.model.site import Site, from_tables, plant
+from feeders.registry import plugins
+from feeders.registry.design_cache import bank_gains
+from feeders.registry.estimator import Family, Job, Learner, Memory, Watcher
+from gridsec.arrays import Floats
+from gridsec.errors import FeederInvalid, Problem
+from gridsec.estimators import (
+    exact_bank,
+    partial,
+    sequential,
+    set_search,
+    single_tick,
+    unknown_input,
+    windowed,
+)
+from gridsec.estimators.sequential.decoder import Decoder
+from gridsec.grid.network import linear
+from gridsec.observers.certificates import certify
+from gridsec.observers.gains import CircleOptions, options_for
+from gridsec.observers.lure import Lure, close_loop
+
+__all__ = [
+    "DIRECT",
+    "FAMILIES",
+    "LMI",
+    "SEQUENTIAL",
+    "Family",
+    "Job",
+    "Learner",
+    "Memory",
+    "Watcher",
+    "choose",
+    "design",
+    "lmi_options",
+]
+
+SEQUENTIAL: Final = "sequential"
+"""One observer, a decoder that knows how loads are correlated, evidence on several time scales."""
+
+DIRECT: Final = "exact-bank"
+"""The two banks of chong2020 with direct injection and a closed-form certificate for all sets at once."""
+
+LMI: Final = "exact-bank-lmi"
+"""The same banks with gains from the corrected matrix inequality (12), one design for every set."""
+
+RATE_PART: Final = 0.25
+"""Decay asked of every observer, as a part of the rate that the feeder has by itself."""
+
+FLOOR: Final = 0.5
+"""Least sensitivity to its own meter that an observer must keep, see `observers.gains.CircleOptions`."""
+
+
+def design(
+    site: Site,
+    *,
+    workers: int = 1,
+    where: Path | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Watcher:
+    """Design the estimator that the feeder's file names.
+
+    Parameters
+    ----------
+    site
+        The feeder; `[monitor] estimator`, `max_attacked` and `tick_s` of its file decide.
+    workers, where, progress
+        As in `Job`.
+
+    Raises
+    ------
+    NotObservable, DesignInfeasible
+        If the feeder cannot be watched as its file asks for.
+    EstimatorUnusable
+        If the estimator is another package's, and its code fails.
+    """
+    settings = site.tables.meta.monitor
+    family, job = FAMILIES[settings.estimator], Job(workers, where, progress)
+    if family.name in OWN_ESTIMATORS:
+        return Watcher(family, family.design(site, job), settings.max_attacked)
+    return Watcher(family, plugins.design(family.name, family.design, site, job), settings.max_attacked)
+
+
+def _sequential(site: Site, _: Job) -> sequential.SequentialDesign:
+    settings = site.tables.meta.monitor
+    options = sequential.SequentialOptions(
+        alarms_per_year=settings.alarms_per_year,
+        commission_s=settings.commission_s,
+        unread_std_percent=settings.unread_std_percent,
+    )
+    return sequential.design(plant(site), doubt=load_doubt(site), step_s=settings.tick_s, options=options)
+
+
+def _direct_bank(site: Site, _: Job) -> exact_bank.MonitorDesign:
+    settings = site.tables.meta.monitor
+    return exact_bank.design(plant(site), max_attacked=settings.max_attacked, step_s=settings.tick_s)
+
+
+def _lmi_bank(site: Site, job: Job) -> exact_bank.MonitorDesign:
+    settings = site.tables.meta.monitor
+    lure = close_loop(site.feeder, site.droop, site.meters)
+    found = bank_gains(
+        lure,
+        settings.max_attacked,
+        lmi_options(site, lure),
+        workers=job.workers,
+        where=job.where,
+        progress=job.progress,
+    )
+    return exact_bank.design(
+        plant(site), max_attacked=settings.max_attacked, step_s=settings.tick_s, gains=found.gains
+    )
+
+
+def _certificate(
+    design: exact_bank.MonitorDesign | sequential.SequentialDesign | set_search.SetSearchDesign,
+) -> str:
+    proof = design.certificate
+    return f"{proof.kind} certificate, margin {proof.margin:.3g}, decay at least {proof.rate:.3g} 1/s"
+
+
+def _bank(name: str, summary: str, make: Callable[[Site, Job], exact_bank.MonitorDesign]) -> Family:
+    return Family(
+        name, summary, make, exact_bank.init, exact_bank.step, lambda d: int(d.observers), _certificate
+    )
+
+
+def choose(site: Site, *, estimator: str | None = None, max_attacked: int | None = None) -> Site:
+    """The same feeder, watched differently from what its file says.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    estimator
+        Name of the estimator; None: as in the file.
+    max_attacked
+        M; None: as in the file.
+
+    Raises
+    ------
+    FeederInvalid
+        If there is no such estimator, or M is negative.
+    """
+    meta = site.tables.meta
+    problems = []
+    if estimator is not None and estimator not in ESTIMATORS:
+        problems.append(
+            Problem(
+                "unknown-name", f"estimator {estimator!r} does not exist; there are {', '.join(ESTIMATORS)}"
+            )
+        )
+    if max_attacked is not None and max_attacked < 0:
+        problems.append(Problem("negative", f"max_attacked is {max_attacked}; it cannot be negative"))
+    if problems:
+        raise FeederInvalid(problems)
+    changed = replace(
+        meta.monitor,
+        estimator=meta.monitor.estimator if estimator is None else estimator,
+        max_attacked=meta.monitor.max_attacked if max_attacked is None else max_attacked,
+    )
+    if changed == meta.monitor:
+        return site
+    return from_tables(replace(site.tables, meta=replace(meta, monitor=changed)))
+
+
+def lmi_options(site: Site, lure: Lure) -> CircleOptions:
+    """What the observers of a feeder are designed against: its meters' noise and its loads' uncertainty.
+
+    Noise is what changes from reading to reading, jitter and rounding; the fixed bias inside the class is
+    no noise and is dealt with by the thresholds. The load error has one column for every customer's p and
+    one for its q, each with the largest error that the file allows at the customer's peak, or without any
+    reading where there is no meter.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    lure
+        Its Lur'e system.
+
+    References
+    ----------
+    docs/theory-observers.md, on designing against the load error and the noise together.
+    """
+    own = certify(lure).rate
+    jitter, step = site.accuracy.jitter, site.accuracy.resolution
+    return options_for(
+        lure,
+        rate=RATE_PART * own,
+        noise=2.0 * np.hypot(jitter, step / np.sqrt(12.0)),
+        load=_load_columns(site),
+        floor=FLOOR,
+    )
+
+
+def _load_columns(site: Site) -> Floats:
+    """Error of w for unit errors of all powers, (N, 2N): `2 R dp` and `2 X dq`."""
+    model, loads = linear(site.feeder), site.loads
+    dp = loads.p_fraction * loads.load_peak + loads.p_floor
+    dq = 0.5 * (loads.tan_max - loads.tan_min) * loads.load_peak + loads.q_floor
+    silent, unmetered = unread(site), np.ones(dp.size, dtype=np.bool_)
+    unmetered[site.meters] = False
+    dp, dq = np.where(unmetered, silent.p_error, dp), np.where(unmetered, silent.q_error, dq)
+    return np.hstack([2.0 * model.R * dp, 2.0 * model.X * dq])
+
+
+def _windowed(site: Site, _: Job) -> windowed.WindowedDesign:
+    settings = site.tables.meta.monitor
+    return windowed.design(plant(site), max_attacked=settings.max_attacked, step_s=settings.tick_s)
+
+
+def _set_search(site: Site, _: Job) -> set_search.SetSearchDesign:
+    settings = site.tables.meta.monitor
+    return set_search.design(plant(site), max_attacked=settings.max_attacked, step_s=settings.tick_s)
+
+
+def _partial(site: Site, _: Job) -> partial.PartialDesign:
+    settings = site.tables.meta.monitor
+    return partial.design(plant(site), max_attacked=settings.max_attacked, step_s=settings.tick_s)
+
+
+def _ticks(name: str, summary: str, decoder: Decoder) -> Family:
+    """A family that judges every tick by itself."""
+
+    def make(site: Site, _: Job) -> sequential.SequentialDesign:
+        settings = site.tables.meta.monitor
+        return single_tick.design(
+            plant(site),
+            decoder,
+            doubt=load_doubt(site),
+            step_s=settings.tick_s,
+            max_attacked=settings.max_attacked,
+            alarms_per_year=settings.alarms_per_year,
+        )
+
+    return Family(
+        name, summary, make, sequential.init, sequential.step, lambda d: int(d.observers), _certificate
+    )
+
+
+def _unknown_input(site: Site, _: Job) -> unknown_input.UnknownInputDesign:
+    settings = site.tables.meta.monitor
+    return unknown_input.design(plant(site), max_attacked=settings.max_attacked, step_s=settings.tick_s)
+
+
+class Families(Mapping[str, Family]):
+    """Our families, and those of other packages, each loaded when it is first asked for.
+
+    Parameters
+    ----------
+    own
+        Ours.
+    """
+
+    def __init__(self, own: Iterable[Family]) -> None:
+        self._known = {family.name: family for family in own}
+
+    def __getitem__(self, name: str) -> Family:
+        if name not in self._known and name in ESTIMATORS:
+            self._known[name] = plugins.load(name, Family)
+        return self._known[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(ESTIMATORS)
+
+    def __len__(self) -> int:
+        return len(ESTIMATORS)
+
+
+FAMILIES: Final = Families(
+    (
+        Family(
+            SEQUENTIAL,
+            "one switched observer, correlated loads, evidence on several time scales",
+            _sequential,
+            sequential.init,
+            sequential.step,
+            lambda d: int(d.observers),
+            _certificate,
+            lambda d: int(d.most),
+            Learner(
+                needed_s=lambda d: float(d.options.commission_s),
+                init=lambda d, t, known: sequential.init(d, t, known.learned, known.learning),
+                commission=lambda state: state.commission,
+                renew=sequential.renew,
+                read=sequential.from_arrays,
+                progress=sequential.progress,
+            ),
+            Memory(sequential.distrusted, sequential.restore),
+        ),
+        _bank(DIRECT, "banks of circle-criterion observers, direct injection (chong2020)", _direct_bank),
+        _bank(LMI, "the same banks, gains by matrix inequality (chong2020)", _lmi_bank),
+        Family(
+            "windowed-bank",
+            "windows of consistency of discrete-time observers (yang2019)",
+            _windowed,
+            windowed.init,
+            windowed.step,
+            lambda d: int(d.observers),
+            lambda d: _certificate(d.chain),
+        ),
+        _ticks(
+            "weighted-least-squares",
+            "chi-square test and largest normalised residual (lee2018, 2)",
+            single_tick.least_squares,
+        ),
+        _ticks("l0-decoder", "the smallest set that explains a tick (lee2018, 2)", single_tick.fewest),
+        _ticks("basis-pursuit", "the attack of smallest l1 norm (lee2018, 2)", single_tick.pursue),
+        _ticks("matching-pursuit", "orthogonal matching pursuit (lee2018, 2)", single_tick.match),
+        Family(
+            "partial-observers",
+            "one observer per meter, l0 decoding of their stack (lee2018, 4)",
+            _partial,
+            partial.init,
+            partial.step,
+            lambda d: int(d.observers),
+            lambda d: _certificate(d.model),
+        ),
+        Family(
+            "set-search",
+            "one switched observer, a new set when its test fails (kim2018, lee2018, 5)",
+            _set_search,
+            set_search.init,
+            set_search.step,
+            lambda d: int(d.observers),
+            _certificate,
+        ),
+        Family(
+            "unknown-input",
+            "meters and inverters at once; suspected injections are unknown inputs (yang2021)",
+            _unknown_input,
+            unknown_input.init,
+            unknown_input.step,
+            lambda d: int(d.observers),
+            lambda d: f"intervals of honest inverters; {len(d.missing)} pairs need reported q",
+        ),
+    )
+)
+"""All families by name; the same names as `feeders.format.columns.ESTIMATORS`."""

@@ -1,0 +1,638 @@
+"""Report as one self-contained HTML page, with one section for each study.
+
+A section is made by `function(site, result) -> Section`. Results are those of `feeders.studies`: they have
+`feeder` and `tables`.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from importlib.resources import files
+from typing import TYPE_CHECKING, Any, Final, Protocol
+
+import numpy as np
+
+from feeders.report import section_calibrate, section_campaign, section_droop, section_meters
+from feeders.report.drawing import NARROW, WIDE, Figure, style, svg
+from feeders.report.text import Finding, Question, Section, Standing, Value, number, plural
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from feeders.convert.provenance import Origin
+    from feeders.model.site import Site
+
+__all__ = [
+    "ANSWERS",
+    "CONVERSION",
+    "FEEDER",
+    "SECTIONS",
+    "About",
+    "Chapter",
+    "Markup",
+    "Outcome",
+    "Result",
+    "el",
+    "join",
+    "page",
+    "section",
+]
+
+
+class Result(Protocol):
+    """What every study returns."""
+
+    @property
+    def feeder(self) -> str:
+        """The feeder's name."""
+
+    @property
+    def tables(self) -> Mapping[str, pd.DataFrame]:
+        """All numbers, by name of the table."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Outcome:
+    """What became of a study.
+
+    Attributes
+    ----------
+    study
+        Its name, as on the command line.
+    result
+        What it found; None if it failed.
+    problem
+        Why it failed; empty if it did not.
+    command
+        Runs it again, alone.
+    seconds
+        How long it took.
+    resumed
+        Whether some of the work was kept from before, and is not in `seconds`.
+    absent
+        Whether there is nothing on this feeder that it could study; `problem` says what.
+    """
+
+    study: str
+    result: Result | None
+    problem: str = ""
+    command: str = ""
+    seconds: float = 0.0
+    resumed: bool = False
+    absent: bool = False
+
+
+SECTIONS: Final[dict[str, Callable[[Site, Any], Section]]] = {
+    "redundancy": section_meters.redundancy,
+    "protect": section_meters.protect,
+    "detectable": section_meters.detectable,
+    "droop": section_droop.droop,
+    "campaign": section_campaign.campaign,
+    "calibrate": section_calibrate.calibrate,
+}
+
+ANSWERS: Final[dict[str, tuple[Question, ...]]] = {
+    "redundancy": (Question.INVISIBLE,),
+    "protect": (Question.PROTECT,),
+    "detectable": (Question.LIES, Question.PICTURE),
+    "droop": (Question.FLEET,),
+    "campaign": (Question.MONITOR,),
+    "calibrate": (Question.RECORDS,),
+}
+"""What a study answers: asked although it failed, or was not run."""
+
+
+TITLES: Final = {
+    "redundancy": "Who can lie without ever being noticed",
+    "protect": "Which meters to protect",
+    "detectable": "How large a lie must be",
+    "droop": "The inverters",
+    "campaign": "Simulated attacks",
+    "calibrate": "What the readings say about the files",
+}
+"""Headings of sections that could not be made."""
+
+
+def section(site: Site, outcome: Outcome) -> Section:
+    """The section of a study, whatever became of it.
+
+    Parameters
+    ----------
+    site, outcome
+        The feeder, and what became of the study.
+    """
+    if outcome.result is None:
+        questions = ANSWERS.get(outcome.study, (Question.OTHER,))
+        if outcome.absent:
+            nothing = Finding(Standing.ABSENT, ((f"{outcome.problem[:1].upper()}{outcome.problem[1:]}.",),))
+            return Section(_title(outcome.study), dict.fromkeys(questions, nothing))
+        problem = outcome.problem or "it ended without a result"
+        finding = Finding(
+            Standing.FAILED,
+            ((f"No answer: {problem}. ", "This says nothing about whether there is a danger."),),
+        )
+        return Section(_title(outcome.study), dict.fromkeys(questions, finding))
+    make = SECTIONS.get(outcome.study, _generic(outcome.study))
+    return make(site, outcome.result)
+
+
+def _generic(study: str) -> Callable[[Site, Result], Section]:
+    def make(_: Site, found: Result) -> Section:
+        sizes: list[str | Value] = []
+        for name, table in found.tables.items():
+            rows = Value(len(table), str(len(table)), f"{study}-{name}:rows")
+            sizes += [", " if sizes else "", f"{name} (", rows, f" {plural(len(table), 'row')})"]
+        lead = f"The study {study} left {len(found.tables)} {plural(len(found.tables), 'table')}: "
+        end = ". They are below as they are; nothing is concluded from them here."
+        told = Finding(Standing.MEASURED, ((lead, *sizes, end),))
+        where = ANSWERS.get(study, (Question.OTHER,))
+        return Section(_title(study), {where[0]: told}, tables=dict(found.tables))
+
+    return make
+
+
+def _title(study: str) -> str:
+    return TITLES.get(study, f"Study: {study}")
+
+
+_VOID: Final = {"meta", "br"}
+
+
+class Markup(str):
+    """Text that is markup already; only this module and drawings make it."""
+
+    __slots__ = ()
+
+
+Child = str | Iterable[str] | None
+
+
+def el(tag: str, *children: Child, **attributes: str | bool | None) -> Markup:
+    """Write an element.
+
+    Parameters
+    ----------
+    tag
+        Its name.
+    children
+        Text, which is escaped; markup, which is not; or several of either. None: nothing.
+    attributes
+        A trailing underscore goes, the others become hyphens. None and False: not there.
+    """
+    parts = [tag]
+    for name, value in attributes.items():
+        if value is None or value is False:
+            continue
+        key = name.rstrip("_").replace("_", "-")
+        parts.append(key if value is True else f'{key}="{_text(value)}"')
+    head = f"<{' '.join(parts)}>"
+    return Markup(head if tag in _VOID else f"{head}{join(children)}</{tag}>")
+
+
+def join(children: Iterable[Child]) -> Markup:
+    """Write children one after the other."""
+    out = []
+    for child in children:
+        if child is None:
+            continue
+        every = [child] if isinstance(child, str) else child
+        out += [each if isinstance(each, Markup) else _text(each) for each in every]
+    return Markup("".join(out))
+
+
+def _text(text: str) -> str:
+    """Escape; control characters become visible, directions cannot be turned around."""
+    return escape("".join(c if _harmless(c) else "\ufffd" for c in text))
+
+
+def _harmless(letter: str) -> bool:
+    return (letter >= " " or letter == "\n") and not (
+        "\x7f" <= letter <= "\x9f" or letter in "\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069"
+    )
+
+
+FEEDER: Final = "feeder"
+CONVERSION: Final = "conversion"
+"""Where the table of what a conversion did not carry over belongs, and its name."""
+
+MOST_COLUMNS: Final = 13
+"""It shows so many columns at most, and more than FEW_COLUMNS in small print."""
+FEW_COLUMNS: Final = 8
+OPEN_ROWS: Final = 14
+"""Tables up to this many rows are open, and printed."""
+LOST_ROWS: Final = 40
+"""The same of what a conversion did not carry over."""
+LONG_WORD: Final = 24
+"""Words of tables that are longer may be broken on paper."""
+DIGITS: Final = 4
+"""Numbers of tables have so many significant digits, and decimals, at most."""
+MOST_ROWS: Final = 500
+HEAD_ROWS: Final = 60
+"""Of tables with more than MOST_ROWS rows the page shows the first ones; the files beside it have all."""
+
+MEANING: Final = (
+    "Proved: follows from the feeder's model under the assumptions that each section states. Partly proved: "
+    "some of it does, or follows from the linear model only; the answer says what. Measured: seen in "
+    "simulation or in readings. Not proved, no answer, not studied: it may be either way."
+)
+
+UNKNOWN: Final = "not known, or nothing to be known: it was not asked, or there was no case of it"
+
+MARK: Final = Markup(
+    '<svg viewBox="0 0 24 24" aria-hidden="true"><path d="M3 4v16M3 8h11M3 16h7"/>'
+    '<circle cx="17" cy="8" r="2.6"/><circle class="bang" cx="14" cy="16" r="2.8"/></svg>'
+)
+
+
+@dataclass(frozen=True, slots=True)
+class About:
+    """What the report says of itself.
+
+    Attributes
+    ----------
+    made
+        When it was made, as it is to be written.
+    command
+        Makes it again.
+    versions
+        Of gridsec and of what computes in it.
+    seeds
+        Everything random began with these.
+    folder
+        Name of the folder beside the page with figures and tables; empty: there is none.
+    """
+
+    made: str
+    command: str
+    versions: Mapping[str, str]
+    seeds: Mapping[str, int]
+    folder: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chapter:
+    """A section, and the study it is about."""
+
+    outcome: Outcome
+    section: Section
+
+
+def page(
+    title: str,
+    facts: Mapping[str, str],
+    chart: Figure,
+    chapters: Sequence[Chapter],
+    about: About,
+    *,
+    origin: Origin | None,
+) -> str:
+    """Write the page.
+
+    Parameters
+    ----------
+    title
+        The feeder's.
+    facts
+        What there is to say of the feeder in general.
+    chart
+        Its map.
+    chapters
+        What its studies found.
+    about
+        What the report says of itself.
+    origin
+        Where the feeder is from, if it was converted.
+    """
+    script = _file("sort.js")
+    seal = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    policy = (
+        "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'; "
+        f"script-src 'sha256-{seal}'"
+    )
+    head = el(
+        "head",
+        el("meta", charset="utf-8"),
+        el("meta", http_equiv="Content-Security-Policy", content=policy),
+        el("meta", name="viewport", content="width=device-width, initial-scale=1"),
+        el("meta", name="color-scheme", content="light dark"),
+        el("title", f"{title}: how far its meters can be trusted"),
+        el("style", Markup(_file("style.css") + style("figure svg"))),
+    )
+    body = el(
+        "main",
+        _front(title, facts, chapters, about),
+        _contents(chapters),
+        _feeder(facts, chart, [] if origin is None else _origin(origin, about.folder)),
+        [_chapter(each, about.folder) for each in chapters],
+        _made(about, chapters),
+    )
+    document = el("html", head, el("body", body, el("script", Markup(script))), lang="en")
+    return f"<!DOCTYPE html>\n{document}\n"
+
+
+def _file(name: str) -> str:
+    return (files("feeders.report") / name).read_text(encoding="utf-8")
+
+
+# --- the first page -----------------------------------------------------------------------------
+
+
+def _front(title: str, facts: Mapping[str, str], chapters: Sequence[Chapter], about: About) -> Markup:
+    few = " · ".join(facts[name] for name in ("customers", "meters", "inverters") if name in facts)
+    return el(
+        "section",
+        el("div", MARK, "gridsec", class_="brand"),
+        el("h1", title),
+        el(
+            "p",
+            f"How far its meters can be trusted. {few}. ",
+            el("span", about.made, class_="once"),
+            class_="lead",
+        ),
+        el("ul", [_answer(*each) for each in _answers(chapters)], class_="answers"),
+        el("p", MEANING, class_="meaning"),
+        class_="card front",
+        id="summary",
+    )
+
+
+def _answers(chapters: Sequence[Chapter]) -> list[tuple[Question, str, Finding]]:
+    """What every question of a committee gets: an answer, or that there is none."""
+    out: list[tuple[Question, str, Finding]] = []
+    for question in Question:
+        given = [
+            (chapter.outcome.study, chapter.section.answers[question])
+            for chapter in chapters
+            if question in chapter.section.answers
+        ]
+        out += [(question, study, finding) for study, finding in given]
+        asked = [study for study, questions in ANSWERS.items() if question in questions]
+        if not given and asked and question is not Question.RECORDS:
+            words = f"This report does not answer it; gridsec study {asked[0]} does."
+            out.append((question, "", Finding(Standing.ABSENT, ((words,),))))
+    return out
+
+
+def _answer(question: Question, study: str, finding: Finding) -> Markup:
+    asked: Markup | str = el("a", question.value, href=f"#{_id(study)}") if study else question.value
+    return el(
+        "li",
+        el("div", el("span", asked), _standing(finding), class_="question"),
+        el("div", _sentences(finding), class_="answer"),
+    )
+
+
+def _standing(finding: Finding) -> Markup:
+    return el("span", finding.standing.value, class_="standing", data_standing=finding.standing.value)
+
+
+def _sentences(finding: Finding) -> list[Markup]:
+    return [el("p", [_part(part) for part in sentence]) for sentence in finding.sentences]
+
+
+def _part(part: str | Value) -> str:
+    if isinstance(part, str):
+        return part
+    return el("data", part.shown, value=repr(float(part.value)), data_source=part.source)
+
+
+def _contents(chapters: Sequence[Chapter]) -> Markup:
+    links = [(FEEDER, "The feeder"), *((_id(c.outcome.study), c.section.title) for c in chapters)]
+    links.append(("made", "How this was made"))
+    items = [el("li", el("a", name, href=f"#{key}")) for key, name in links]
+    return el("nav", el("ul", items), class_="card", aria_label="Contents")
+
+
+def _id(study: str) -> str:
+    return "study-" + "".join(c if c.isascii() and (c.isalnum() or c == "-") else "-" for c in study)
+
+
+# --- sections -----------------------------------------------------------------------------------
+
+
+def _feeder(facts: Mapping[str, str], chart: Figure, source: Sequence[Markup]) -> Markup:
+    told = [el("div", el("dt", name), el("dd", value)) for name, value in facts.items()]
+    return el(
+        "section",
+        el("div", el("h2", "The feeder"), class_="head"),
+        el("dl", told, class_="facts"),
+        _figure(chart),
+        source,
+        class_="card",
+        id=FEEDER,
+    )
+
+
+def _origin(origin: Origin, folder: str) -> list[Markup]:
+    """What a conversion did not carry over, and what that does to the voltages."""
+    fates = [f"{count} {fate}" for fate, count in origin.changes["done"].value_counts(sort=False).items()]
+    table = _table(FEEDER, CONVERSION, origin.changes, folder, (), most_open=LOST_ROWS)
+    return [
+        el("h3", "What was not carried over from its source"),
+        el(
+            "p",
+            f"Converted from {origin.source or 'a network of another tool'}: "
+            f"{', '.join(fates) or 'nothing was changed'}.",
+        ),
+        table,
+        el("h3", "Checked against the source's power flow"),
+        el("p", origin.check or "Nothing is told of a check."),
+    ]
+
+
+def _chapter(chapter: Chapter, folder: str) -> Markup:
+    outcome, told = chapter.outcome, chapter.section
+    alone = len(told.answers) == 1
+    answers = [
+        join(
+            [
+                None if alone else el("div", question.value, _standing(finding), class_="question"),
+                el("div", _sentences(finding), class_="answer"),
+            ]
+        )
+        for question, finding in told.answers.items()
+    ]
+    pill = [_standing(finding) for finding in told.answers.values()] if alone else None
+    columns = {**told.columns, **({"?": UNKNOWN} if _has_gaps(told.tables) else {})}
+    meanings = [join([el("dt", name), el("dd", text)]) for name, text in columns.items()]
+    return el(
+        "section",
+        el("div", el("h2", told.title), pill, class_="head"),
+        answers,
+        [_figure(figure) for figure in told.figures],
+        el("h3", "Numbers") if told.tables else None,
+        [
+            _table(outcome.study, name, table, folder, told.shown.get(name, ()))
+            for name, table in told.tables.items()
+        ],
+        el("dl", meanings, class_="columns") if meanings else None,
+        el("h3", "What was assumed") if told.assumptions else None,
+        el("ul", [el("li", each) for each in told.assumptions], class_="plain") if told.assumptions else None,
+        el("h3", "To run it again") if outcome.command else None,
+        _command(outcome.command) if outcome.command else None,
+        class_="card",
+        id=_id(outcome.study),
+    )
+
+
+def _figure(figure: Figure) -> Markup:
+    """Twice, for two widths; the style sheet shows one."""
+    drawings = [
+        el(
+            "div",
+            Markup(
+                svg(figure.draw(width), title=figure.title, text=figure.text, key=f"{figure.name}-{kind}")
+            ),
+            class_=kind,
+        )
+        for kind, width in (("wide", WIDE), ("narrow", NARROW))
+    ]
+    caption = el("figcaption", el("b", figure.title), figure.text)
+    return el("figure", caption, drawings, id=figure.name)
+
+
+def _table(
+    study: str,
+    name: str,
+    table: pd.DataFrame,
+    folder: str,
+    chosen: Sequence[str],
+    *,
+    most_open: int = OPEN_ROWS,
+) -> Markup:
+    """A table; long ones are closed, and what is too long or too wide for a page stays in its file."""
+    own = [column for column in table.columns if column != FEEDER]  # the page is about one
+    said = [column for column in own if table.empty or not table[column].map(_silent).all()]
+    kept = [column for column in chosen or said if column in said][:MOST_COLUMNS]
+    shown = table[kept].head(len(table) if len(table) <= MOST_ROWS else HEAD_ROWS)
+    numeric = {column: _numeric(shown[column]) for column in kept}
+    head = [
+        el(
+            "th",
+            el("button", str(column).replace("_", " "), type="button"),
+            class_="n" if numeric[column] else None,
+            scope="col",
+        )
+        for column in kept
+    ]
+    decimals = [_decimals(shown[column]) for column in kept]
+    body = [
+        el("tr", [_td(*each) for each in zip(row, decimals, strict=True)])
+        for row in shown.itertuples(index=False, name=None)
+    ]
+    crowded = "wide" if len(kept) > FEW_COLUMNS else None
+    rows = el("table", el("thead", el("tr", head)), el("tbody", body), class_=crowded)
+    grid = el("div", rows, class_="scroll", tabindex="0")
+    size = f"{name.replace('_', ' ')}: {len(table)} row{'s' * (len(table) != 1)}"
+    where = f"{folder}/tables/{study}-{name}.csv" if folder else ""
+    note = el("span", f" · {where}", class_="quiet") if where else None
+    parts = [f"{len(kept)} of {len(said)} columns"] * (len(kept) < len(said))
+    parts += [f"the first {len(shown)} of {len(table)} rows"] * (len(shown) < len(table))
+    part = el("p", f"Shown: {', '.join(parts)}.", class_="quiet part") if parts else None
+    long = "long" if len(table) > OPEN_ROWS else None
+    is_open = 0 < len(table) <= most_open
+    return el("details", el("summary", size, note), grid, part, class_=long, open=is_open)
+
+
+def _has_gaps(tables: Mapping[str, pd.DataFrame]) -> bool:
+    return any(bool(table.select_dtypes("number").isna().to_numpy().any()) for table in tables.values())
+
+
+def _silent(cell: Any) -> bool:
+    return cell is None or cell == ""
+
+
+def _numeric(column: pd.Series[Any]) -> bool:
+    kind = column.dtype
+    return bool(kind != np.bool_ and np.issubdtype(kind, np.number)) if isinstance(kind, np.dtype) else False
+
+
+def _decimals(column: pd.Series[Any]) -> int:
+    """How many decimals a column needs: all its numbers have as many, so that their points stand in line."""
+    if not _numeric(column):
+        return 0
+    sizes = [abs(v) for v in column.astype(float).tolist() if math.isfinite(v) and not v.is_integer()]
+    needed = [min(max(DIGITS - 1 - math.floor(math.log10(v)), 0), DIGITS) for v in sizes]
+    written = [f"{v:.{digits}f}" for v, digits in zip(sizes, needed, strict=True)]
+    digits = max((len(text.rstrip("0").partition(".")[2]) for text in written), default=0)
+    return digits or DIGITS * any(v < 0.5 * 10.0**-DIGITS for v in sizes)
+
+
+def _td(cell: Any, decimals: int) -> Markup:
+    if isinstance(cell, bool | np.bool_):
+        return el("td", "yes" if cell else "no")
+    if isinstance(cell, float | np.floating):
+        key = "" if math.isnan(cell) else repr(float(cell)).replace("inf", "Infinity")
+        return el("td", _written(float(cell), decimals), class_="n", data_key=key)
+    if isinstance(cell, int | np.integer):
+        return el("td", str(cell).replace("-", "−"), class_="n", data_key=str(cell))
+    text = "–" if cell is None or cell == "" else str(cell)
+    long = any(len(word) > LONG_WORD for word in text.split())
+    return el("td", text, class_="long" if long else None)
+
+
+def _written(value: float, decimals: int) -> str:
+    """A number of a table; what is there but too small for its column does not become nothing."""
+    if not math.isfinite(value) or value == 0.0:
+        return number(value)
+    least = 10.0**-decimals
+    if abs(value) < 0.5 * least:
+        return f"<{least:.{decimals}f}" if value > 0.0 else f">−{least:.{decimals}f}"
+    return f"{value:.{decimals}f}".replace("-", "−")
+
+
+# --- the last page ------------------------------------------------------------------------------
+
+
+def _made(about: About, chapters: Sequence[Chapter]) -> Markup:
+    seeds = ", ".join(f"{name} {seed}" for name, seed in about.seeds.items()) or "nothing is random"
+    took = [
+        el(
+            "li",
+            f"{c.outcome.study}: {_seconds(c.outcome.seconds)}",
+            ", with work kept from before" * c.outcome.resumed,
+        )
+        for c in chapters
+    ]
+    files_ = (
+        el(
+            "p",
+            f"Beside this page, in {about.folder}: every table as CSV and Parquet, every figure as SVG, and "
+            "as PNG where matplotlib was installed.",
+        )
+        if about.folder
+        else None
+    )
+    return el(
+        "section",
+        el("div", el("h2", "How this was made"), class_="head"),
+        el("h3", "The whole report again"),
+        _command(about.command),
+        el("h3", "Versions"),
+        el("p", ", ".join(f"{name} {version}" for name, version in about.versions.items())),
+        el("h3", "Seeds"),
+        el("p", seeds),
+        el("h3", "Duration"),
+        el("ul", took, class_="plain"),
+        el("h3", "Files") if files_ else None,
+        files_,
+        class_="card",
+        id="made",
+    )
+
+
+def _command(text: str) -> Markup:
+    """A command whose options are not broken at their hyphens."""
+    words = [join([" " if k else "", el("span", word)]) for k, word in enumerate(text.split(" "))]
+    return el("pre", words)
+
+
+def _seconds(seconds: float) -> str:
+    if seconds < 99.5:
+        return f"{seconds:.1f} s" if seconds < 9.95 else f"{seconds:.0f} s"
+    return f"{seconds / 60.0:.0f} min"

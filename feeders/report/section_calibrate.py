@@ -1,0 +1,166 @@
+"""Section of the calibration: what recorded readings say against the files."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import TYPE_CHECKING
+
+from feeders.report.charts import Bar, Row, rows
+from feeders.report.drawing import Drawing, Figure
+from feeders.report.maps import Shape, Spot, draw_map, legend_of
+from feeders.report.text import Finding, Question, Section, Sentence, Standing, Value, listed, number, plural
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from feeders.model.site import Site
+    from feeders.studies.calibrate.study import Calibrate
+
+__all__ = ["calibrate"]
+
+ROWS = 40
+"""So many meters a chart has at most: those that are off most."""
+
+UNTOLD, PROPOSED, EXCLUDED, AS_FILED = "cannot be told", "proposed", "excluded", "as in the files"
+# Words of `feeders.studies.calibrate.study`; `tests/feeders/report` holds them together.
+
+
+def calibrate(site: Site, found: Calibrate) -> Section:
+    """What recorded readings say against the files.
+
+    Parameters
+    ----------
+    site, found
+        The feeder, and what was found.
+    """
+    known = found.meters[[math.isfinite(v) for v in found.meters["std_percent"]]]
+    figures = [
+        Figure(
+            "calibrate-map",
+            "Whose place is in doubt",
+            "Diamonds: the files should be corrected. Triangles: the readings cannot tell, or not all of it "
+            "was looked for. Discs: as in the files.",
+            partial(_doubt_map, site, found.customers),
+        )
+    ]
+    if len(known):
+        shown = " Those that are off most." if len(known) > ROWS else ""
+        figures.append(
+            Figure(
+                "calibrate-bias",
+                "By how much meters are off",
+                f"Error of each meter's voltage against the busbar's meter, %, with 95 % intervals.{shown}",
+                partial(_bias_chart, known),
+            )
+        )
+    return Section(
+        title="What the readings say about the files",
+        answers={Question.RECORDS: _said(found)},
+        figures=tuple(figures),
+        tables=found.tables,
+        columns={
+            "confidence": "probability that it is this correction and no other that explains as much",
+            "log factor": "gain of the log-likelihood",
+            "alternatives": "corrections that explain the readings as well: then nothing is proposed as sure",
+            "bias percent": "of the voltage; an error that all meters have in common cannot be told",
+            "factor": "of the length in the files",
+            "verdict": "'cannot be told' is neither right nor wrong: the readings are silent about it",
+        },
+        assumptions=(
+            f"{found.frames} moments over {number(found.span_h, 1)} h were compared; if the files are right, "
+            f"there is any proposal with a probability of {100.0 * found.risk:g} %.",
+            "Nothing was changed in the files.",
+            *_left_out(found),
+        ),
+    )
+
+
+def _left_out(found: Calibrate) -> list[str]:
+    if not found.unread:
+        return []
+    return [f"The busbar has no voltages of phase {listed(found.unread)}: the meters on it were left out."]
+
+
+def _said(found: Calibrate) -> Finding:
+    sure = found.proposals[found.proposals["verdict"] == PROPOSED]
+    vague = found.proposals[found.proposals["verdict"] == UNTOLD]
+    sentences: list[Sentence] = []
+    if len(sure):
+        what = [f"{row['what']}: {row['proposed']}" for row in sure.to_dict("records")]
+        count = Value(len(sure), str(len(sure)), f"calibrate-proposals:verdict:count {PROPOSED}")
+        verb = plural(len(sure), "correction of the files is", "corrections of the files are")
+        sentences.append((count, f" {verb} proposed: {listed(what)}."))
+    else:
+        sentences.append(("The readings ask for no correction that is sure.",))
+    if len(vague):
+        count = Value(len(vague), str(len(vague)), f"calibrate-proposals:verdict:count {UNTOLD}")
+        noun = plural(len(vague), "error")
+        sentences.append((count, f" {noun} shown by the readings could be one of several."))
+    changing = found.proposals[found.proposals["verdict"] == EXCLUDED]
+    if len(changing):
+        count = Value(len(changing), str(len(changing)), f"calibrate-proposals:verdict:count {EXCLUDED}")
+        what = [f"{row['what']}: {row['proposed']}" for row in changing.to_dict("records")]
+        verb = plural(len(changing), "meter is", "meters are")
+        sentences.append(
+            (
+                count,
+                f" {verb} off in a way that errors of the files explain less well: {listed(what)}. "
+                "A lie looks like that. The voltages were left out of account.",
+            )
+        )
+    outside = found.meters[found.meters["verdict"] == "outside its class"]["meter"].tolist()
+    if outside:
+        count = Value(len(outside), str(len(outside)), "calibrate-meters:verdict:count outside its class")
+        verb = plural(len(outside), "meter is", "meters are")
+        sentences.append((count, f" {verb} outside the class: {listed(outside)}."))
+    silent: list[str | Value] = []
+    for name in ("lines", "customers", "meters"):
+        table = found.tables[name]
+        untold = int((table["verdict"] == UNTOLD).sum())
+        if untold:
+            silent += [
+                ", " if silent else "Not told by the readings: ",
+                Value(untold, str(untold), f"calibrate-{name}:verdict:count {UNTOLD}"),
+                f" of {len(table)} {name}",
+            ]
+    if silent:
+        sentences.append((*silent, ". About these nothing is known, right or wrong."))
+    return Finding(Standing.MEASURED, tuple(sentences))
+
+
+def _doubt_map(site: Site, customers: pd.DataFrame, width: float) -> Drawing:
+    verdicts = dict(zip(customers["customer"].astype(str), customers["verdict"].astype(str), strict=True))
+    shapes = {PROPOSED: Shape.ALARM, AS_FILED: Shape.METER}
+    spots = []
+    for name in site.feeder.customers:
+        verdict = verdicts.get(name, UNTOLD)
+        shape = shapes.get(verdict, Shape.OPEN)
+        spots.append(Spot(shape, name if shape is Shape.ALARM else "", f"{name}: {verdict}"))
+    meanings = {"to be corrected": Shape.ALARM, "cannot be told": Shape.OPEN, AS_FILED: Shape.METER}
+    return draw_map(site, spots, width, legend=legend_of(meanings, spots))
+
+
+def _bias_chart(meters: pd.DataFrame, width: float) -> Drawing:
+    order = meters["bias_percent"].abs().sort_values(ascending=False).index[:ROWS]
+    table = meters.loc[order]
+    mark = 0.006 * float(table["high_percent"].max() - table["low_percent"].min())
+    data = [
+        Row(
+            str(row["meter"]),
+            (
+                Bar(
+                    float(row["low_percent"]),
+                    float(row["high_percent"]),
+                    "fill-wire",
+                    "95 % interval",
+                    inset=7.0,
+                ),
+                Bar(row["bias_percent"] - mark, row["bias_percent"] + mark, "fill-a", "estimate"),
+            ),
+            f"{number(float(row['bias_percent']))} %",
+        )
+        for row in table.to_dict("records")
+    ]
+    start = min(0.0, float(table["low_percent"].min()))
+    return rows(data, width, axis="error of the meter, %", start=start)

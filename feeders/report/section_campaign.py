@@ -1,0 +1,282 @@
+"""Section of the campaign: how the monitor behaved in simulated attacks."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from feeders.report.charts import LINES, Bar, Curve, Row, curves, rows
+from feeders.report.drawing import Drawing, Figure
+from feeders.report.text import Finding, Question, Section, Sentence, Standing, Value, listed, number, plural
+from feeders.simulation.attacks import Trick
+from feeders.simulation.trial import Meters
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from feeders.model.site import Site
+    from feeders.simulation.trial import LoadError
+    from feeders.studies.campaign.plan import Plan
+    from feeders.studies.campaign.study import Campaign
+
+__all__ = ["campaign"]
+
+# What a page has room for; the files have all.
+_BY = {"by_kind": "kind", "by_size": "size", "by_place": "place", "by_liars": "liars"}
+_SIZES = (
+    "bias, scaling: % of nominal; drift: % of nominal a minute; replay: how old reports are, s; coordinated: "
+    "% of nominal by which the load that liars pretend moves the least affected of them; stuck: none"
+)
+_UNITS = {
+    **dict.fromkeys((Trick.BIAS, Trick.TOGETHER, Trick.SCALING, Trick.COORDINATED), " %"),
+    **{Trick.DRIFT: " %/min", Trick.REPLAY: " s", Trick.CLOCK_SHIFT: " s", Trick.INVERTER: " %"},
+}
+_ERRORS = {
+    Meters.SITE: "as the feeder's files say",
+    Meters.WHITE: "white noise of 0.2 %, nothing fixed",
+    Meters.REAL: "fixed within 0.5 %, and jitter of 0.05 %",
+}
+_SHOWN = (
+    *("scenarios", "exact", "named", "named_low", "named_high", "false", "delay_median_s"),
+    *("error_liars_worst", "error_others_worst", "undecided"),
+)
+_SCENARIOS = (
+    *("scenario", "kind", "size", "liars", "named", "missed", "falsely_named", "delay_s"),
+    *("undecided_s", "clean_lying_s", "error_liars", "error_others", "reason"),
+)
+
+
+def campaign(_: Site, found: Campaign) -> Section:
+    """How the monitor behaved in simulated attacks.
+
+    Parameters
+    ----------
+    found
+        What was found.
+    """
+    plan = found.plan
+    rate = min(plan.alarms_per_year)
+    return Section(
+        title="Simulated attacks",
+        answers={Question.MONITOR: _behaved(found, rate)},
+        figures=_figures(found, rate) if len(found.liars) else (),
+        tables=found.tables,
+        shown={name: (by, *_SHOWN) if by == "kind" else ("kind", by, *_SHOWN) for name, by in _BY.items()}
+        | {"scenarios": _SCENARIOS},
+        columns={
+            "size": _SIZES,
+            "exact": "share of scenarios in which all liars and nobody else were named",
+            "named": "share of the liars that were named",
+            "false": "share of scenarios in which somebody honest was named",
+            "… low, … high": "limits that hold the true share in 95 of 100 cases",
+            "delay": "from the beginning of a lie until the liar was named, s; ∞: never; "
+            "medians are of those that were named",
+            "error": "of the reconstructed voltage, % of nominal",
+            "undecided": "share of the time in which the monitor said that it cannot tell",
+            "clean lying s": "for how long it said CLEAN although somebody lied",
+            "reason": "why a scenario could not be played",
+            "per year": "false names a year, from so many hours without a lie; with limits for these few",
+        },
+        assumptions=(
+            f"{plan.scenarios} scenarios of {plan.duration_s:g} s at {plan.step_s:g} s on days of profiles, "
+            f"seed {plan.seed}; the truth is full AC power flow with the inverters in closed loop.",
+            f"Watched by the {plan.estimator} monitor, set for {rate:g} {plural(rate, 'false alarm')} a "
+            f"year; powers known {_known(plan.load_error)}; errors of meters: {_ERRORS[plan.meters]}.",
+            "A simulated attack is one that somebody thought of: others may fare differently.",
+        ),
+    )
+
+
+def _known(error: LoadError | None) -> str:
+    if error is None:
+        return "as well as the feeder's files say, of registers, power factors and customers without a meter"
+    return f"within {error.p_kw:g} kW and {error.q_kvar:g} kvar (1 sigma)"
+
+
+def _figures(found: Campaign, rate: float) -> tuple[Figure, ...]:
+    return (
+        Figure(
+            "campaign-named",
+            "Who is named, by what they do and how much",
+            "Share of the liars that were named, with the interval that holds the true share in 95 of "
+            "100 cases; on the right how many of how many. Percentages on the left are of nominal voltage.",
+            partial(_named_chart, found.plan, _at(found.by_size, rate)),
+        ),
+        Figure(
+            "campaign-delay",
+            "How soon",
+            "Share of the liars named within some time of the beginning of their lie, by kind. A curve "
+            "that stays below 100 % has liars that were never named.",
+            partial(_delay_chart, _at(found.liars, rate)),
+        ),
+        Figure(
+            "campaign-error",
+            "How wrong the voltage shown was",
+            "Largest error of the reconstructed voltage, % of nominal, by kind; liars' own voltages / those "
+            "of the others.",
+            partial(_error_chart, _at(found.by_kind, rate)),
+        ),
+    )
+
+
+def _at(table: pd.DataFrame, rate: float) -> pd.DataFrame:
+    return table[table["alarms_per_year"] == rate] if len(table) else table
+
+
+def _behaved(found: Campaign, rate: float) -> Finding:
+    seen, liars = _at(found.scenarios, rate), _at(found.liars, rate)
+    played = seen[seen["reason"] == ""]
+    impossible = len(seen) - len(played)
+    row = _at(found.false_names, rate)
+    sentences: list[Sentence] = []
+    if len(liars):
+        share, low, high = (float(row[name].iloc[0]) for name in ("named", "named_low", "named_high"))
+        sentences.append(
+            (
+                "Of ",
+                Value(len(liars), str(len(liars)), "campaign-liars:rows"),
+                " lying meters in ",
+                Value(len(played), str(len(played)), "campaign-scenarios:reason:empty"),
+                " simulated scenarios, the monitor named ",
+                Value(share, _percent(share), "campaign-false_names:named:row 0"),
+                f" (true share with 95 % confidence: {_percent(low)} to {_percent(high)}).",
+            )
+        )
+        sentences += _missed(found, rate)
+    else:
+        sentences.append(("Nobody lied in any scenario: nothing was learned about attacks.",))
+    wronged = int((played["falsely_named"] != "").sum())
+    sentences.append(
+        (
+            "Somebody honest was named in ",
+            Value(wronged, str(wronged), "campaign-scenarios:falsely_named:filled"),
+            f" {plural(wronged, 'scenario')}.",
+            *_worst(played),
+        )
+    )
+    sentences += _open(played, impossible)
+    return Finding(Standing.MEASURED if len(liars) else Standing.OPEN, tuple(sentences))
+
+
+def _missed(found: Campaign, rate: float) -> list[Sentence]:
+    """Who was not named; and how soon the others were."""
+    liars = _at(found.liars, rate)
+    never = liars[~np.isfinite(liars["delay_s"].to_numpy())]
+    delay = liars["delay_s"][np.isfinite(liars["delay_s"].to_numpy())]
+    soon = (
+        f" Of the others, half were named within {number(float(delay.median()), 1)} s." if len(delay) else ""
+    )
+    if never.empty:
+        return [(f"None was missed.{soon.replace('Of the others, half', 'Half')}",)]
+    total = liars.groupby("kind").size()
+    kinds = [f"{kind} ({count} of {total[kind]})" for kind, count in never.groupby("kind").size().items()]
+    missed = Value(len(never), str(len(never)), "campaign-liars:delay_s:infinite")
+    return [(missed, f" {plural(len(never), 'was', 'were')} missed: {listed(kinds)}.{soon}")]
+
+
+def _worst(played: pd.DataFrame) -> Sentence:
+    lied = played[
+        np.isfinite(played["error_others"].to_numpy()) | np.isfinite(played["error_liars"].to_numpy())
+    ]
+    if lied.empty or not (played["error_liars"].notna()).any():
+        return ()
+    worst = played["error_liars"].max()
+    shown = f"{number(float(worst))} %" if math.isfinite(worst) else "without bound"
+    return (
+        " The voltage shown for lying meters was wrong by at most ",
+        Value(float(worst), shown, "campaign-scenarios:error_liars:max"),
+        " of nominal.",
+    )
+
+
+def _open(played: pd.DataFrame, impossible: int) -> list[Sentence]:
+    """What the monitor did not say, and what could not be tried."""
+    out: list[Sentence] = []
+    total, clean = float(played["undecided_s"].sum()), float(played["clean_lying_s"].sum())
+    watched = float(played["watched_s"].sum())
+    out.append(
+        (
+            "Of ",
+            Value(watched, f"{number(watched, 0)} s", "campaign-scenarios:watched_s:sum"),
+            " watched, it said UNDECIDED for ",
+            Value(total, f"{number(total, 0)} s", "campaign-scenarios:undecided_s:sum"),
+            ", and CLEAN for ",
+            Value(clean, f"{number(clean, 0)} s", "campaign-scenarios:clean_lying_s:sum"),
+            " in which somebody lied who was not noticed yet, or never.",
+        )
+    )
+    if impossible:
+        count = Value(impossible, str(impossible), "campaign-scenarios:reason:filled")
+        noun = plural(impossible, "scenario", "scenarios")
+        out.append(
+            (
+                count,
+                f" {noun} could not be played: nothing is known about them.",
+            )
+        )
+    return out
+
+
+def _percent(share: float) -> str:
+    if math.isnan(share):
+        return "?"
+    text = f"{100.0 * share:.1f}".removesuffix(".0")
+    if text == "100" and share < 1.0:
+        text = "99.9"
+    return f"{text} %"
+
+
+def _named_chart(plan: Plan, table: pd.DataFrame, width: float) -> Drawing:
+    tricks = {kind.name: kind for kind in plan.kinds}
+    data = []
+    for row in table[table["liars_told"] > 0].to_dict("records"):
+        share, low, high = (100.0 * float(row[name]) for name in ("named", "named_low", "named_high"))
+        bars = (
+            Bar(0.0, share, "fill-a", "named"),
+            Bar(low, high, "fill-ink", "95 % interval", f"{low:.0f} to {high:.0f} %", inset=8.4),
+        )
+        told = int(row["liars_told"])
+        kind = tricks.get(row["kind"])
+        # Sizes of kinds in volts are factors.
+        unit = "" if kind is None or kind.volts or kind.together else _UNITS.get(kind.trick, "")
+        size = "" if kind is not None and kind.trick is Trick.STUCK else f" {row['size']:g}{unit}"
+        data.append(Row(f"{row['kind']}{size}", bars, f"{round(share * told / 100.0)} of {told}"))
+    return rows(data, width, axis="liars named, %")
+
+
+def _delay_chart(liars: pd.DataFrame, width: float) -> Drawing:
+    finite = liars["delay_s"][np.isfinite(liars["delay_s"].to_numpy())]
+    last = max(float(finite.max()) if len(finite) else 1.0, 10.0)
+    drawn = []
+    for k, (kind, group) in enumerate(liars.groupby("kind", sort=True)):
+        delays = np.sort(np.maximum(group["delay_s"].to_numpy(dtype=np.float64), 1.0))
+        x, y = [0.0], [0.0]
+        for j, delay in enumerate(delays[np.isfinite(delays)]):
+            x += [math.log10(delay)] * 2
+            y += [100.0 * j / delays.size, 100.0 * (j + 1) / delays.size]
+        x.append(math.log10(last))
+        y.append(y[-1])
+        drawn.append(Curve(tuple(x), tuple(y), LINES[k % len(LINES)], str(kind)))
+    return curves(
+        drawn, width, x="s after the beginning of the lie", y="liars named, %", high=100.0, decades=True
+    )
+
+
+def _error_chart(table: pd.DataFrame, width: float) -> Drawing:
+    data = []
+    for row in table.to_dict("records"):
+        liars, others = (float(row[f"error_{who}_worst"]) for who in ("liars", "others"))
+        bars = [
+            Bar(0.0, value, look, meaning, f"{number(value)} %", inset)
+            for value, look, meaning, inset in (
+                (liars, "fill-b", "liars", 3.0),
+                (others, "fill-a", "others", 6.5),
+            )
+            if math.isfinite(value)
+        ]
+        shown = " / ".join(number(v) for v in (liars, others) if not math.isnan(v))
+        data.append(Row(str(row["kind"]), tuple(bars), shown))
+    return rows(data, width, axis="largest error of the voltage shown, % of nominal")

@@ -1,0 +1,294 @@
+"""Section of the droop fleet: whether it is stable, keeps the voltage band, and what it hosts."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import TYPE_CHECKING
+
+from feeders.format.validation import told
+from feeders.report.charts import LINES, Bar, Curve, Row, curves, rows
+from feeders.report.drawing import Drawing, Figure
+from feeders.report.maps import comparable, single_phase
+from feeders.report.text import (
+    Finding,
+    Question,
+    Section,
+    Sentence,
+    Side,
+    Standing,
+    Value,
+    least,
+    listed,
+    number,
+)
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from feeders.model.site import Site
+    from feeders.studies.droop.study import DroopOptions, DroopStudy
+
+__all__ = ["droop"]
+
+ROWS = 30
+"""So many customers a chart has at most: those whose voltage can move most."""
+
+STABLE, UNSTABLE, KEPT, VIOLATED, UNDECIDED = "stable", "unstable", "kept", "violated", "undecided"
+
+
+def droop(site: Site, found: DroopStudy) -> Section:
+    """Whether the inverters are stable and keep the voltage band.
+
+    Parameters
+    ----------
+    site, found
+        The feeder, and what was found.
+    """
+    given, own = found.options, site.tables.meta.limits
+    low, high = (
+        mine if asked is None else asked
+        for asked, mine in ((given.v_min, own.v_min_pu), (given.v_max, own.v_max_pu))
+    )
+    volt = site.feeder.base_volt
+    one = bool((site.nominal_volt == volt).all())
+    band = f"{number(low * volt, 1)} to {number(high * volt, 1)} V" if one else f"{low:g} to {high:g} pu"
+    ends = given.v0_low, given.v0_high
+    busbar = f"at {ends[0]:g} pu" if ends[0] == ends[1] else f"from {ends[0]:g} to {ends[1]:g} pu"
+    alone = "" if ends[0] == ends[1] or single_phase(site) else ", each phase on its own"
+    every = "continuously" if not given.interval_s else f"every {given.interval_s:g} s"
+    delay = f", with a dead time of {given.dead} intervals" if given.dead else ""
+    hosts = "hosting" in found.tables
+    return Section(
+        title="The inverters",
+        answers={Question.FLEET: _fleet(site, found, band, busbar)},
+        figures=_figures(site, found, (low, high), band),
+        tables=found.tables,
+        columns={
+            "verdict": "stable: proved to come to one rest from every state; unstable: leaves its rest, "
+            "proved and simulated; undecided: neither is proved",
+            "gain, growth": "of the loop at rest; factor of a small deviation in one update",
+            "margin": "all curves stay proved stable up to this factor on their slopes",
+            "certified, unstable": "the same for these curves made steeper: proved up to the one, unstable "
+            "from the other on",
+            "longest interval s": "longest sampling interval found that is proved stable; ∞: every one",
+            "rest, always": "is the band kept while loads move slowly, and however they move",
+            "low volt, high volt": "proved limits of the voltage",
+            "part, alone": "share of the loop gain; what one inverter's slope may be multiplied with",
+            "point": "evening: full loads, no sun; noon: a fifth of the loads, full sun; half: half of both",
+            "settling, overshoot": "until the change is over but for 2 %; % of the change",
+            "change volt": "how far the inverters move the voltage after the step, V",
+            "tau factor": "all time constants multiplied with it",
+            **({"capacity kw": "most generation in all; the limit is what breaks next"} if hosts else {}),
+            **({"confirmed volt": "difference from a second power flow there, V"} if hosts else {}),
+        },
+        assumptions=(
+            f"Inverters: {given.preset or 'as in the files'}; they act {every}{delay}. "
+            f"{'Balanced' if single_phase(site) else 'Three-phase'} power flow.",
+            f"Any loads up to {100.0 * given.load_high:g} % and generation up to {100.0 * given.pv_high:g} % "
+            f"of their peaks; busbar {busbar}{alone}; band {band}.",
+            *((_conditions(given),) if hosts else ()),
+        ),
+    )
+
+
+def _conditions(given: DroopOptions) -> str:
+    """What generation is hosted under."""
+    return (
+        f"Hosting: loads at {100.0 * given.hosting_load:g} % of their peaks, the busbar at "
+        f"{given.v0_high:g} pu, all generation at its peak and with new inverters. In random orders, units "
+        f"of {given.unit_kw:g} kW come to one customer after the other."
+    )
+
+
+# --- sentences ----------------------------------------------------------------------------------
+
+
+def _fleet(site: Site, found: DroopStudy, band: str, busbar: str) -> Finding:
+    stability, kept = found.tables["stability"], found.tables["band"].to_dict("records")
+    fleet = {str(name): value for name, value in kept[0].items()}
+    verdict, rest, always = str(found.verdict), str(fleet["rest"]), str(fleet["always"])
+    limits, broken = _limits(site, fleet, always), _witness(site, found.tables.get("witness"))
+    kept_or_not = _band((rest, always), band, busbar, limits=limits, broken=broken)
+    sentences = [_stability(stability, verdict, busbar), kept_or_not]
+    without = [row for row in kept if row["case"] == "without"]
+    if without and (rest, always) != (str(without[0]["rest"]), str(without[0]["always"])):
+        bare = str(without[0]["always"])
+        word = "not proved to be kept, nor broken" if bare == UNDECIDED else bare
+        sentences.append((f"Without the inverters' reactive power the band is {word}.",))
+    sentences += _hosting(found)
+    open_ = [verdict == UNDECIDED, UNDECIDED in (rest, always)]
+    standing = Standing.OPEN if all(open_) else Standing.PART if any(open_) else Standing.PROVED
+    return Finding(standing, tuple(sentences))
+
+
+def _stability(stability: pd.DataFrame, verdict: str, busbar: str) -> Sentence:
+    name = "droop-stability"
+    if verdict == STABLE:
+        margin: Sentence = ()
+        if math.isfinite(float(stability["margin"].min())):
+            times = least(stability, name, "margin", digits=1, side=Side.BELOW)
+            margin = (" All curves could be ", times, " times as steep and still be proved stable.")
+        lead = f"Stable: proved for constant loads anywhere within their limits, the busbar {busbar}."
+        return (lead, *margin)
+    which = [str(p) for p, v in zip(stability["point"], stability["verdict"], strict=True) if v == verdict]
+    count = Value(len(which), str(len(which)), f"{name}:verdict:count {verdict}")
+    where: Sentence = (" (", count, f" of {len(stability)} cases: {listed(which)})")
+    if verdict == UNSTABLE:
+        return ("Unstable: the fleet leaves its rest, in the proof and in AC simulation", *where, ".")
+    why = listed(list(dict.fromkeys(str(w) for w in stability["why"].dropna() if w)))
+    reason = f": {why}" if why else ""
+    return ("Whether the fleet is stable is not proved", *where, f"{reason}. It may oscillate.")
+
+
+def _band(kept: tuple[str, str], band: str, busbar: str, *, limits: Sentence, broken: Sentence) -> Sentence:
+    rest, always = kept
+    if always == KEPT:
+        lead = f"The band from {band} is kept, however loads move within their limits, the busbar {busbar}"
+        return (lead, *limits, ".")
+    if rest == KEPT:
+        sudden = (
+            "sudden changes can break it"
+            if always == VIOLATED
+            else "during sudden changes that is not proved"
+        )
+        lead = f"The band from {band} is kept while loads move slowly, the busbar {busbar}; {sudden}"
+        return (lead, *limits, *broken, ".")
+    if VIOLATED in (rest, always):
+        when = "at rest" if rest == VIOLATED else "while loads change"
+        return (f"The band from {band} can be broken {when}, the busbar {busbar}", *broken, ".")
+    return (f"Whether the band from {band} is kept is not proved, and no loads that break it were found.",)
+
+
+def _witness(site: Site, table: pd.DataFrame | None) -> Sentence:
+    """How far beyond the band loads were found that AC power flow confirms."""
+    if table is None or not table["beyond"].any():
+        return ()
+    nominal = dict(zip(site.feeder.customers, site.customer_nominal, strict=True))
+    away = (table["v_volt"] / table["customer"].map(nominal) - 1.0).abs()
+    k = int(away.where(table["beyond"]).fillna(-1.0).to_numpy().argmax())
+    row = table.iloc[k]
+    size = float(row["v_volt"])
+    volt = Value(size, f"{number(size, 1)} V", f"droop-witness:v_volt:row {k}")
+    return ("; loads among the tables (witness) lead to ", volt, f" at {row['customer']}, by AC power flow")
+
+
+def _limits(site: Site, fleet: dict[str, object], always: str) -> Sentence:
+    """Proved limits: at all times where that keeps the band, at rest otherwise."""
+    which = "" if always == KEPT else "_rest"
+    low, high = (float(str(fleet[f"{end}{which}_volt"])) for end in ("low", "high"))
+    if not (math.isfinite(low) and math.isfinite(high)):
+        return ()
+    several = bool((site.nominal_volt != site.nominal_volt[0]).any())
+    there = f" where that is nearest to the band's ends (nominal: {told(site.nominal_volt)}):"
+    return (
+        f"; proved limits{there if several else ''} ",
+        Value(low, f"{number(low, 1, Side.BELOW)} V", f"droop-band:low{which}_volt:row 0"),
+        " and ",
+        Value(high, f"{number(high, 1, Side.ABOVE)} V", f"droop-band:high{which}_volt:row 0"),
+    )
+
+
+def _hosting(found: DroopStudy) -> list[Sentence]:
+    table = found.tables.get("hosting")
+    if table is None:
+        return []
+    words: list[str | Value] = [
+        "Generation that the feeder hosts, placed like its own, before a limit breaks: "
+    ]
+    for k, row in enumerate(table.to_dict("records")):
+        kw = float(row["capacity_kw"])
+        name = "without reactive power" if row["preset"] == "none" else f"with {row['preset']}"
+        size = Value(kw, f"{number(kw, 0, Side.BELOW)} kW", f"droop-hosting:capacity_kw:row {k}")
+        words += ["; " if k else "", size]
+        unsure = {UNDECIDED: "; that the fleet is stable there is not proved", UNSTABLE: "; unstable there"}
+        limit = row["limit"] or "no limit found"
+        words.append(f" {name} ({limit}{unsure.get(str(row.get('verdict')), '')})")
+    return [(*words, ".")]
+
+
+# --- figures ------------------------------------------------------------------------------------
+
+
+def _figures(site: Site, found: DroopStudy, limits: tuple[float, float], band: str) -> tuple[Figure, ...]:
+    (customers, unit), tables = comparable(site, found.tables["customers"]), found.tables
+    whole = site.feeder.base_volt if unit == "V" else 100.0
+    ends = limits[0] * whole, limits[1] * whole
+    out = []
+    known = customers[[math.isfinite(v) for v in customers["low_volt"] + customers["high_volt"]]]
+    if len(known):
+        some = f" The {ROWS} widest of {len(known)}." if len(known) > ROWS else ""
+        out.append(
+            Figure(
+                "droop-band",
+                "Proved limits of every customer's voltage",
+                f"With any loads and generation within their limits. The band is {band}.{some}",
+                partial(_band_chart, known, unit, ends),
+            )
+        )
+    if {"steps", "trajectories"} <= tables.keys() and len(tables["trajectories"]):
+        steps = [f"{row['step']}: {row['outcome']}" for row in tables["steps"].to_dict("records")]
+        out.append(
+            Figure(
+                "droop-steps",
+                "What the inverters do after a step",
+                "AC simulation from right after the step on, at the customer whose voltage is worst in the "
+                "end. Load: from 20 to 80 % of its peak; cloud: generation from its peak to 20 %; tap: the "
+                f"busbar up by 0.025 pu. {'; '.join(steps)}.",
+                partial(_steps_chart, tables["steps"], *comparable(site, tables["trajectories"])),
+            )
+        )
+    if "hosting_probability" in tables:
+        out.append(
+            Figure(
+                "droop-hosting",
+                "How much generation the feeder hosts",
+                "Share of random orders of units in which so much generation breaks a limit, by preset.",
+                partial(_hosting_chart, tables["hosting_probability"]),
+            )
+        )
+    return tuple(out)
+
+
+def _band_chart(customers: pd.DataFrame, unit: str, ends: tuple[float, float], width: float) -> Drawing:
+    wide = (customers["high_volt"] - customers["low_volt"]).sort_values(ascending=False, kind="stable")
+    data = []
+    for row in customers.loc[wide.index[:ROWS]].to_dict("records"):
+        low, high, low_rest, high_rest = (
+            float(row[k]) for k in ("low_volt", "high_volt", "low_rest_volt", "high_rest_volt")
+        )
+        bars = [Bar(low, high, "band1", "at all times")]
+        if math.isfinite(low_rest + high_rest):
+            bars.append(Bar(low_rest, high_rest, "fill-a", "while loads move slowly", inset=6.0))
+        data.append(
+            Row(
+                f"{row['customer']}, {row['phase']}" if "phase" in row else str(row["customer"]),
+                tuple(bars),
+                f"{number(low, 1, Side.BELOW)} to {number(high, 1, Side.ABOVE)} {unit[0]}",
+            )
+        )
+    span = float(customers["high_volt"].max() - customers["low_volt"].min())
+    start = float(customers["low_volt"].min()) - 0.05 * span
+    return rows(data, width, axis=f"voltage, {unit}", start=start, limits={"limit of the band": ends})
+
+
+def _steps_chart(steps: pd.DataFrame, runs: pd.DataFrame, unit: str, width: float) -> Drawing:
+    drawn = []
+    for k, row in enumerate(steps.to_dict("records")):
+        own = runs[(runs["step"] == row["step"]) & (runs["customer"] == row["worst_customer"])]
+        x, y = (tuple(float(v) for v in own[name]) for name in ("t_s", "v_volt"))
+        meaning = f"{row['step']}: {row['outcome']}"
+        drawn.append(Curve(x, y, LINES[k % len(LINES)], meaning))
+    return curves(drawn, width, x="s after the step", y=f"voltage, {unit}")
+
+
+def _hosting_chart(table: pd.DataFrame, width: float) -> Drawing:
+    drawn = []
+    for k, (preset, some) in enumerate(table.groupby("preset", sort=False)):
+        x, y = [0.0], [0.0]
+        for kw, share in zip(some["capacity_kw"], some["probability"], strict=True):
+            x += [float(kw)] * 2
+            y += [y[-1], 100.0 * float(share)]
+        name = "without reactive power" if preset == "none" else str(preset)
+        drawn.append(Curve(tuple(x), tuple(y), LINES[k % len(LINES)], name))
+    return curves(drawn, width, x="generation, kW", y="orders in which a limit is broken, %", high=100.0)

@@ -1,0 +1,1 @@
+"""Simulated feeders: AC power flow, demand, meters, attacks, recordings, trials."""

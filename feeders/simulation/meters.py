@@ -1,0 +1,302 @@
+"""Meters with the errors that data sheets promise, and the channel that carries their readings.
+
+An honest voltage reading is ``round(v (1 + c) + n)``: a fixed bias c inside the accuracy class, drawn once
+per meter, white jitter n, and the step of the register. Powers carry a fixed gain error. Then a reading may
+be lost, late, duplicated, or stamped by a clock that is off.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from feeders.simulation.demand import Stream, generator
+from gridsec.arrays import Floats, Ints
+from gridsec.errors import InputInvalid, Problem
+from gridsec.grid.network import InPhases
+
+if TYPE_CHECKING:
+    from feeders.model.site import Site
+
+BUSBAR: Final = ""
+"""Meter id of the busbar's meter. No customer's meter can have it: ids have at least one character."""
+
+NOISE_TICKS: Final = 256
+"""Ticks that share one draw of random numbers."""
+
+EARLIEST_TICK: Final = 2**40
+"""Ticks from minus this number on have random numbers of their own."""
+
+
+@dataclass(frozen=True, slots=True)
+class MeterErrors:
+    """How much of the errors that the feeder's files promise the simulated meters have; 0: none.
+
+    Attributes
+    ----------
+    bias
+        Fixed biases are uniform within plus or minus this times the class, 1.
+    jitter
+        Factor on the jitter, 1.
+    resolution
+        Factor on the registers' steps, 1.
+    power
+        Fixed gain errors of p and q are uniform within plus or minus this times the promised error, 1.
+    report_q
+        Whether meters report reactive power.
+    """
+
+    bias: float = 1.0
+    jitter: float = 1.0
+    resolution: float = 1.0
+    power: float = 1.0
+    report_q: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Silence:
+    """A meter sends nothing while t_on <= t < t_off.
+
+    Attributes
+    ----------
+    meter
+        Id of the meter; BUSBAR for the busbar's.
+    t_on, t_off
+        Unix time, s.
+    """
+
+    meter: str
+    t_on: float
+    t_off: float
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """What happens to readings on their way.
+
+    Attributes
+    ----------
+    loss
+        Probability that a reading never arrives, 1.
+    delay_s
+        Shortest delay, s.
+    delay_mean_s
+        Mean of the exponentially distributed delay on top of it, s.
+    late, late_s
+        Probability (1) that a reading takes `late_s` longer; with more than a tick this reorders readings.
+    duplicate
+        Probability that a reading arrives twice, 1; the copy takes a delay of its own.
+    clock_s
+        Each meter's clock is off by a constant, uniform within plus or minus this, s.
+    silences
+        Intervals in which a meter says nothing. Its sequence numbers count on.
+
+    Raises
+    ------
+    ValueError
+        If a probability is outside [0, 1], or a time negative or not finite.
+    """
+
+    loss: float = 0.0
+    delay_s: float = 0.0
+    delay_mean_s: float = 0.0
+    late: float = 0.0
+    late_s: float = 0.0
+    duplicate: float = 0.0
+    clock_s: float = 0.0
+    silences: tuple[Silence, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("loss", "late", "duplicate"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise InputInvalid(
+                    [Problem("out-of-range", f"{name} is a probability, got {getattr(self, name)}")]
+                )
+        for name in ("delay_s", "delay_mean_s", "late_s", "clock_s"):
+            if not 0.0 <= getattr(self, name) < np.inf:
+                raise InputInvalid(
+                    [
+                        Problem(
+                            "negative", f"{name} must be finite and not negative, got {getattr(self, name)}"
+                        )
+                    ]
+                )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Registers:
+    """What meters read at T ticks, before any manipulation. p meters.
+
+    Attributes
+    ----------
+    v_volt : (T, p)
+        Voltage, V.
+    p_kw, q_kvar : (T, p)
+        Net import, kW and kvar; q is NaN unless reported.
+    v0_volt : (T,) or (T, 3)
+        Busbar voltage, V; in three phases that of each.
+    """
+
+    v_volt: Floats
+    p_kw: Floats
+    q_kvar: Floats
+    v0_volt: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Delivery:
+    """When readings arrive. p meters and, as the last column, the busbar's.
+
+    Attributes
+    ----------
+    stamp : (T, p + 1)
+        Time that the meter's clock shows, Unix s.
+    arrival : (T, p + 1)
+        Unix time, s; infinite for a reading that never arrives.
+    copy : (T, p + 1)
+        Arrival of a duplicate; infinite where there is none.
+    """
+
+    stamp: Floats
+    arrival: Floats
+    copy: Floats
+
+
+class Meters:
+    """All meters of a feeder and their channel.
+
+    Parameters
+    ----------
+    site
+        The feeder, whose files say how accurate the meters are.
+    errors, channel
+        What of that is simulated, and what happens on the way.
+    seed
+        Chooses everything random. What one tick draws depends on the tick's number alone.
+
+    Attributes
+    ----------
+    bias : (p,)
+        Fixed relative bias of each voltage register, 1.
+    busbar_bias
+        The same for the busbar's; in three phases (3,).
+    p_gain, q_gain : (p,)
+        Fixed relative errors of the power registers, 1: the truth is the reading times 1 + gain, because
+        data sheets state the error as a fraction of the reading.
+
+    Raises
+    ------
+    ValueError
+        If a meter is silent that there is not.
+    """
+
+    def __init__(self, site: Site, errors: MeterErrors, channel: Channel, seed: int) -> None:
+        accuracy, customer = site.accuracy, site.meters
+        self.count = customer.size
+        self._busbars = 3 if isinstance(site.feeder, InPhases) else 1
+        self._channel = channel
+        self._errors = errors
+        self._seed = seed
+        self._customer = customer
+        self._ids = (*site.meter_ids, BUSBAR)
+        unknown = {silence.meter for silence in channel.silences} - set(self._ids)
+        if unknown:
+            raise InputInvalid(
+                [Problem("unknown-name", f"silences of unknown meters: {', '.join(sorted(unknown))}")]
+            )
+
+        random = generator(seed, Stream.METER)
+        draw = random.uniform(-1.0, 1.0, (3, self.count))
+        self.bias = errors.bias * accuracy.class_fraction * draw[0]
+        self.p_gain = errors.power * site.loads.p_fraction[customer] * draw[1]
+        self.q_gain = errors.power * site.loads.q_fraction[customer] * draw[2]
+        self.busbar_bias = errors.bias * accuracy.busbar_class * random.uniform(-1.0, 1.0, self._busbars)
+        self._clock = channel.clock_s * random.uniform(-1.0, 1.0, self.count + 1)
+
+        base = np.append(site.customer_volt[customer], [site.tables.meta.voltage_volt] * self._busbars)
+        self._jitter = (
+            errors.jitter * base * np.append(accuracy.jitter, [accuracy.busbar_jitter] * self._busbars)
+        )
+        self._step = (
+            errors.resolution
+            * base
+            * np.append(accuracy.resolution, [accuracy.busbar_resolution] * self._busbars)
+        )
+        self._p_step = errors.resolution * site.tables.meta.meters.p_resolution_kw
+
+    def read(self, ticks: Ints, v_volt: Floats, p_kw: Floats, q_kvar: Floats, v0_volt: Floats) -> Registers:
+        """Read all registers.
+
+        Parameters
+        ----------
+        ticks : (T,)
+            Numbers of the ticks, consecutive.
+        v_volt, p_kw, q_kvar : (T, N)
+            The truth at every customer, V, kW, kvar (net imports).
+        v0_volt : (T,) or (T, 3)
+            The truth at the busbar, V.
+        """
+        true = np.column_stack(
+            [
+                v_volt[:, self._customer] * (1.0 + self.bias),
+                v0_volt.reshape(-1, self._busbars) * (1.0 + self.busbar_bias),
+            ]
+        )
+        shown = _round(true + self._jitter * self._normal(ticks), self._step)
+        p = _round(p_kw[:, self._customer] / (1.0 + self.p_gain), np.full(self.count, self._p_step))
+        if self._errors.report_q:
+            q = _round(q_kvar[:, self._customer] / (1.0 + self.q_gain), np.full(self.count, self._p_step))
+        else:
+            q = np.full(p.shape, np.nan)
+        return Registers(shown[:, : self.count], p, q, shown[:, self.count :].reshape(v0_volt.shape))
+
+    def deliver(self, ticks: Ints, t: Floats) -> Delivery:
+        """When the readings of some ticks arrive.
+
+        Parameters
+        ----------
+        ticks : (T,)
+            Numbers of the ticks, consecutive.
+        t : (T,)
+            Their times, Unix s.
+        """
+        channel, width = self._channel, self.count + 1
+        uniform = self._draws(Stream.CHANNEL, ticks, 5 * width).reshape(ticks.size, 5, width)
+        lost = uniform[:, 0] < channel.loss
+        for silence in channel.silences:
+            lost[(t >= silence.t_on) & (t < silence.t_off), self._ids.index(silence.meter)] = True
+        late = np.where(uniform[:, 1] < channel.late, channel.late_s, 0.0)
+        waits = -channel.delay_mean_s * np.log1p(-uniform[:, 2:4])  # exponential
+        arrival = t[:, None] + channel.delay_s + late + waits[:, 0]
+        copy = arrival + waits[:, 1]
+        return Delivery(
+            stamp=t[:, None] + self._clock,
+            arrival=np.where(lost, np.inf, arrival),
+            copy=np.where(lost | (uniform[:, 4] >= channel.duplicate), np.inf, copy),
+        )
+
+    def _normal(self, ticks: Ints) -> Floats:
+        """Standard normal numbers of each tick, one for each voltage register."""
+        return self._draws(Stream.JITTER, ticks, self.count + self._busbars)
+
+    def _draws(self, stream: Stream, ticks: Ints, width: int) -> Floats:
+        """Numbers of each tick: normal for JITTER, uniform on [0, 1) otherwise."""
+        block, row = np.divmod(ticks + EARLIEST_TICK, NOISE_TICKS)
+        out = np.empty((ticks.size, width))
+        for number in np.unique(block):
+            random = generator(self._seed, stream, int(number))
+            shape = (NOISE_TICKS, width)
+            draw = random.standard_normal(shape) if stream is Stream.JITTER else random.random(shape)
+            out[block == number] = draw[row[block == number]]
+        return out
+
+
+def _round(values: Floats, step: Floats) -> Floats:
+    """To the nearest multiple of each column's step; unchanged where the step is 0."""
+    rounded = values.copy()
+    some = step > 0.0
+    # The second rounding only removes the last bits: 230.1 instead of 230.10000000000002.
+    rounded[:, some] = np.round(np.round(values[:, some] / step[some]) * step[some], 9)
+    return rounded

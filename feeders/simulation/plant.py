@@ -1,0 +1,469 @@
+"""Simulated plant: AC power flow and droop inverters in closed loop, tick by tick.
+
+    tau_i dx_i/dt = -x_i + K_i(v_i),   v from AC power flow with the injections x
+
+The reactive set-point is taken as linear in time over a step of length h, which gives the implicit
+exponential trapezoid
+
+    x+ = e^(-h/tau) x + (1 - e^(-h/tau) - c) K(v) + c K(v+),   c = 1 - (1 - e^(-h/tau)) tau / h.
+
+It is of second order for h << tau and turns into the quasi-static answer x+ = K(v+) for h >> tau, without a
+limit on h for stability. A step and an equilibrium are the same problem, x = a + c K(v(x)), the latter with
+a = 0 and c = 1; `ClosedLoop.settle` solves it, by plain iteration while that contracts and by Newton's
+method with the feeder's measured sensitivities where it does not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from feeders.simulation.demand import Customers, Demand
+from feeders.simulation.powerflow import PowerFlow, PowerFlowDiverged
+from feeders.simulation.powerflow_three_phase import PlacesFlow, power_flow
+from gridsec.arrays import Floats, Ints
+from gridsec.attack import InverterAttack
+from gridsec.errors import GridsecError
+from gridsec.grid.droop import Droop
+
+if TYPE_CHECKING:
+    from feeders.model.site import Site
+    from feeders.simulation.scenario import Scenario
+
+
+TOLERANCE_PU: Final = 1e-7
+"""How far x may be from solving its equation, pu of the base power: 0.01 var of 100 kVA."""
+
+MAX_ITERATIONS: Final = 200
+
+CONTRACTS: Final = 0.3
+"""Plain iteration goes on while the residual falls at least by this factor from one solve to the next."""
+
+SMALLEST_SHARE: Final = 2.0**-7
+"""A Newton step is not shortened below this share of itself."""
+
+PROBE_PU: Final = 1e-3
+"""Reactive power by which the sensitivities are measured, pu of the base power."""
+
+
+class NoEquilibrium(GridsecError):
+    """The inverters and the feeder found no common answer."""
+
+    code = "not-converged"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Loads:
+    """What customers draw without their inverters' reactive power. N customers.
+
+    Attributes
+    ----------
+    p_kw : (N,)
+        Net active import, kW.
+    q_kvar : (N,)
+        Reactive import, kvar.
+    v0_volt
+        Busbar voltage, V; in three phases (3,).
+    """
+
+    p_kw: Floats
+    q_kvar: Floats
+    v0_volt: Floats | float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Point:
+    """The feeder at one instant. N customers, b + 1 buses, m inverters.
+
+    Attributes
+    ----------
+    x : (m,)
+        Reactive injection of each inverter, pu.
+    setpoint : (m,)
+        What each inverter's curve asks for at this voltage, K(v), pu.
+    v_volt : (N,)
+        Voltage at each customer, V.
+    v_bus_volt : (b + 1,)
+        Voltage at each bus, V.
+    """
+
+    x: Floats
+    setpoint: Floats
+    v_volt: Floats
+    v_bus_volt: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Trial:
+    """A point, by how much it misses x = kept + new K(v), and the largest entry of that, pu."""
+
+    point: Point
+    defect: Floats
+    size: float
+
+
+class ClosedLoop:
+    """A feeder with its droop inverters.
+
+    Parameters
+    ----------
+    flow
+        AC power flow of the feeder.
+    droop
+        The inverters; their curves are evaluated here as piecewise linear functions of the voltage.
+    base_kva, base_volt
+        What 1 pu means for `droop`; the voltage as one number, or for each customer, (N,).
+    """
+
+    def __init__(
+        self, flow: PowerFlow | PlacesFlow, droop: Droop, base_kva: float, base_volt: Floats | float
+    ) -> None:
+        self.flow = flow
+        self.tau = droop.tau
+        self.count = droop.tau.size
+        self._base_kva = base_kva
+        self._base_volt = np.broadcast_to(base_volt, flow.grid.customer_bus.shape)[droop.customer]
+        self._customer = droop.customer
+        self._owner = np.eye(flow.grid.customer_bus.size)[droop.customer]
+        # One ramp between each pair of neighbouring breakpoints, (m, 3).
+        self._low, self._high = droop.v[:, :-1], droop.v[:, 1:]
+        self._start = droop.q[:, 0]
+        width = self._high - self._low
+        self._ramp = np.divide(np.diff(droop.q, axis=1), width, out=np.zeros_like(width), where=width > 0.0)
+        self._sensitivity: Floats | None = None
+
+    def reactive(self, q_kvar: Floats, x: Floats) -> Floats:
+        """Net reactive import (…, N), kvar: the loads' q (…, N) minus what inverters inject, x (…, m)."""
+        return q_kvar - self._base_kva * (x @ self._owner)
+
+    def setpoint(self, v_volt: Floats) -> Floats:
+        """K(v) of every inverter (…, m), pu, from the customers' voltages (…, N), V."""
+        v = (v_volt[..., self._customer] / self._base_volt)[..., None]
+        climbed: Floats = ((np.clip(v, self._low, self._high) - self._low) * self._ramp).sum(axis=-1)
+        return self._start + climbed
+
+    def point(self, loads: Loads, x: Floats) -> Point:
+        """The feeder with given injections x, pu, whatever the inverters would like."""
+        v_volt, v_bus_volt = self.flow.solve(loads.p_kw, self.reactive(loads.q_kvar, x), loads.v0_volt)
+        return Point(x, self.setpoint(v_volt), v_volt, v_bus_volt)
+
+    def held(self, demand: Demand, rows: slice, x: Floats) -> tuple[Floats, Floats, Floats]:
+        """The feeder at many instants at once with given injections x (T, m), pu.
+
+        Returns
+        -------
+        v_volt (T, N), v_bus_volt (T, b + 1)
+            Voltages, V.
+        setpoint (T, m)
+            K(v), pu.
+        """
+        q = self.reactive(demand.q_kvar[rows], x)
+        v_volt, v_bus_volt = self.flow.solve_batch(demand.p_kw[rows], q, demand.v0_volt[rows])
+        return v_volt, v_bus_volt, self.setpoint(v_volt)
+
+    def equilibrium(self, loads: Loads, start: Floats | None = None) -> Point:
+        """The point where every inverter injects what its curve asks for: x = K(v(x)).
+
+        Parameters
+        ----------
+        loads
+            What the customers draw.
+        start : (m,)
+            Where to begin, pu; zero by default.
+        """
+        zero, one = np.zeros(self.count), np.ones(self.count)
+        return self.settle(loads, zero, one, zero if start is None else start)
+
+    def advance(self, loads: Loads, now: Point, before: Point | None, h: float) -> Point:
+        """The feeder one step later.
+
+        Parameters
+        ----------
+        loads
+            What the customers draw at the end of the step.
+        now
+            The feeder at its beginning.
+        before
+            One equal step earlier, if known. Only helps to guess.
+        h
+            Length of the step, s, > 0.
+        """
+        decay, old, new = self.weights(h)
+        kept = decay * now.x + old * now.setpoint
+        ahead = now.setpoint if before is None else 2.0 * now.setpoint - before.setpoint
+        return self.settle(loads, kept, new, kept + new * ahead)
+
+    def weights(self, h: float) -> tuple[Floats, Floats, Floats]:
+        """Weights of x, K(v) and K(v+) in a step of h seconds; each (m,), together 1."""
+        decay = np.exp(-h / self.tau)
+        new = 1.0 + np.expm1(-h / self.tau) * self.tau / h
+        return decay, 1.0 - decay - new, new
+
+    def settle(self, loads: Loads, kept: Floats, new: Floats, guess: Floats) -> Point:
+        """Solve x = kept + new K(v(x)).
+
+        Parameters
+        ----------
+        loads
+            What the customers draw.
+        kept, new : (m,)
+            The coefficients: pu, and 1 between 0 and 1.
+        guess : (m,)
+            First x, pu.
+
+        Raises
+        ------
+        NoEquilibrium
+            When no x solves it within TOLERANCE_PU after MAX_ITERATIONS solves.
+        PowerFlowDiverged
+            When the feeder has no voltages at all for these loads.
+        """
+        here = self._trial(loads, kept, new, guess)
+        for _ in range(MAX_ITERATIONS):
+            if here.size <= TOLERANCE_PU:
+                return here.point
+            there = self._attempt(loads, kept, new, here.point.x + here.defect)
+            if there is None or there.size > CONTRACTS * here.size:
+                there = self._newton(loads, kept, new, here)
+            here = there
+        raise NoEquilibrium(
+            f"inverters and feeder do not settle: {here.size:.2g} pu of reactive power are left over"
+        )
+
+    def _trial(self, loads: Loads, kept: Floats, new: Floats, x: Floats) -> _Trial:
+        point = self.point(loads, x)
+        defect = kept + new * point.setpoint - x
+        return _Trial(point, defect, float(np.max(np.abs(defect), initial=0.0)))
+
+    def _attempt(self, loads: Loads, kept: Floats, new: Floats, x: Floats) -> _Trial | None:
+        """A trial that may overshoot to where the feeder has no voltages at all: then None."""
+        try:
+            return self._trial(loads, kept, new, x)
+        except PowerFlowDiverged:
+            return None
+
+    def _newton(self, loads: Loads, kept: Floats, new: Floats, here: _Trial) -> _Trial:
+        """One damped Newton step of `settle`; the curves' slopes are those at the present voltages."""
+        if self._sensitivity is None:
+            self._sensitivity = self._measure(loads, here.point)
+        slope = new * self._slope(here.point.v_volt)
+        step = np.linalg.solve(np.eye(self.count) - slope[:, None] * self._sensitivity, here.defect)
+        share = 1.0
+        while share > SMALLEST_SHARE:
+            there = self._attempt(loads, kept, new, here.point.x + share * step)
+            if there is not None and there.size < (1.0 - 0.1 * share) * here.size:
+                return there
+            share *= 0.5
+        # The last resort moves all the same, so that a kink at which no step helps is left behind.
+        return self._trial(loads, kept, new, here.point.x + share * step)
+
+    def _slope(self, v_volt: Floats) -> Floats:
+        """dK/dv of every inverter, 1, <= 0."""
+        v = (v_volt[self._customer] / self._base_volt)[:, None]
+        slope: Floats = np.where((v >= self._low) & (v < self._high), self._ramp, 0.0).sum(axis=1)
+        return slope
+
+    def _measure(self, loads: Loads, here: Point) -> Floats:
+        """dv/dx between all inverters by AC power flow, 1, (m, m)."""
+        probes = here.x + PROBE_PU * np.eye(self.count)
+        q = self.reactive(loads.q_kvar, probes)
+        p = np.broadcast_to(loads.p_kw, q.shape)
+        v, _ = self.flow.solve_batch(p, q, np.repeat(np.asarray(loads.v0_volt)[None], self.count, axis=0))
+        change = (v - here.v_volt)[:, self._customer]
+        return (change / (PROBE_PU * self._base_volt)).T
+
+
+BLOCK_TICKS: Final = 256
+
+SUBSTEPS_PER_TAU: Final = 2.0
+"""Substeps per smallest time constant; see docs/simulation.md for the error that this leaves."""
+
+SHORTEST_STRETCH: Final = 8
+LONGEST_STRETCH: Final = 64
+"""Fewest and most steps that are solved together."""
+
+MAX_SWEEPS: Final = 12
+"""Sweeps over a stretch before it is given up."""
+
+VANISHED_PU: Final = 1e-30
+"""What decays below this is zero; otherwise it would become denormal, and arithmetic slow."""
+
+QUASI_STATIC_TAUS: Final = 10.0
+"""A tick longer than this many of the largest time constants is one quasi-static step."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Block:
+    """The truth at T consecutive ticks. N customers, m inverters, b + 1 buses.
+
+    Attributes
+    ----------
+    ticks : (T,)
+        Their numbers.
+    t : (T,)
+        Their times, Unix s.
+    v_volt : (T, N)
+        Voltage at each customer, V.
+    v_bus_volt : (T, b + 1)
+        Voltage of each bus, V; in three phases of each phase of each.
+    x : (T, m)
+        Reactive injection of each inverter as its droop curve has it, pu.
+    demand
+        What customers draw without their inverters' reactive power, and the busbar's voltage.
+    shown_kw : (T, N)
+        The active power that readings show.
+    """
+
+    ticks: Ints
+    t: Floats
+    v_volt: Floats
+    v_bus_volt: Floats
+    x: Floats
+    demand: Demand
+    shown_kw: Floats
+
+
+def truth(site: Site, scenario: Scenario, first: int, end: float) -> Iterator[Block]:
+    """The truth from tick `first` up to tick `end`, which may be infinite; begins in equilibrium."""
+    customers = Customers(
+        site, scenario.variation, scenario.seed, scenario.start, scenario.profile_s, season=scenario.season
+    )
+    loop = ClosedLoop(power_flow(site), site.droop, site.feeder.base_kva, site.customer_volt)
+    steps = substeps(site, scenario)
+    course = _Course(loop, scenario.dt_s / steps)
+    begin = first
+    while begin < end:
+        ticks = np.arange(begin, min(begin + BLOCK_TICKS, end), dtype=np.intp)
+        t = scenario.start + ticks.astype(np.float64) * scenario.dt_s
+        back = scenario.dt_s * np.arange(steps - 1, -1, -1) / steps
+        # The very first tick is where the course begins: nothing has to lead up to it.
+        skip = steps - 1 if begin == first else 0
+        moments = (t[:, None] - back).ravel()[skip:]
+        told = customers.at(moments)
+        p, q = customers.hidden(moments)
+        q = q - site.feeder.base_kva * injected(site, scenario.inverter_attacks, moments)
+        fine = Demand(told.p_kw + p, told.q_kvar + q, told.v0_volt)
+        v_volt, v_bus_volt, x = course.run(fine)
+        at = slice(steps - 1 - skip, None, steps)
+        demand = Demand(fine.p_kw[at], fine.q_kvar[at], fine.v0_volt[at])
+        yield Block(ticks, t, v_volt[at], v_bus_volt[at], x[at], demand, told.p_kw[at])
+        begin += ticks.size
+
+
+def injected(site: Site, attacks: tuple[InverterAttack, ...], t: Floats) -> Floats | float:
+    """What attacked inverters inject beside their droop curves at times t (T,), pu per customer, (T, N)."""
+    if not attacks:
+        return 0.0
+    count = len(site.tables.customers)
+    out = np.zeros((t.size, count))
+    for attack in attacks:
+        at = site.droop.customer[attack.inverters]
+        on = (attack.t_on <= t) & (t < attack.t_off)
+        out[on] += np.bincount(at, weights=attack.q, minlength=count)
+    return out
+
+
+class _Course:
+    """The closed loop carried forward in equal steps of h seconds; begins in equilibrium.
+
+    Solving many power flows at once costs little more than solving one. So a stretch of steps is guessed
+    first, all of it is solved, the inverters' course is computed from the voltages found, and so on until it
+    no longer changes. Where that does not converge quickly, the same equations are solved step by step.
+    """
+
+    def __init__(self, loop: ClosedLoop, h: float) -> None:
+        self._loop = loop
+        self._h = h
+        self._weights = loop.weights(h)
+        self._now: Point | None = None
+        self._before: Point | None = None
+        self._stretch = LONGEST_STRETCH
+        self._single = 0
+
+    def run(self, demand: Demand) -> tuple[Floats, Floats, Floats]:
+        """One step to each row of `demand`.
+
+        Returns
+        -------
+        v_volt (T, N), v_bus_volt (T, b + 1)
+            Voltages after each step, V.
+        x (T, m)
+            Injections of the inverters, pu.
+        """
+        steps = len(demand.v0_volt)
+        parts: list[tuple[Floats, Floats, Floats]] = []
+        k = 0
+        while k < steps:
+            part = self._relax(demand, slice(k, min(k + self._stretch, steps)))
+            if part is None:
+                part = self._step(Loads(demand.p_kw[k], demand.q_kvar[k], demand.v0_volt[k]))
+            parts.append(part)
+            k += len(part[0])
+        v_volt, v_bus_volt, x = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+        return v_volt, v_bus_volt, x
+
+    def _step(self, loads: Loads) -> tuple[Floats, Floats, Floats]:
+        if self._now is None:
+            after = self._loop.equilibrium(loads)
+        else:
+            after = self._loop.advance(loads, self._now, self._before, self._h)
+        self._before, self._now = self._now, after
+        return after.v_volt[None], after.v_bus_volt[None], after.x[None]
+
+    def _relax(self, demand: Demand, rows: slice) -> tuple[Floats, Floats, Floats] | None:
+        """A stretch of steps at once; None where it has to be done step by step."""
+        now = self._now
+        if now is None or self._single > 0:
+            self._single = max(self._single - 1, 0)
+            return None
+        length = rows.stop - rows.start
+        course = self._follow(now, np.broadcast_to(now.setpoint, (length, self._loop.count)))
+        for _ in range(MAX_SWEEPS):
+            v_volt, v_bus_volt, setpoint = self._loop.held(demand, rows, course)
+            found = self._follow(now, setpoint)
+            if np.max(np.abs(found - course), initial=0.0) <= TOLERANCE_PU:
+                self._before = None
+                self._now = Point(course[-1], setpoint[-1], v_volt[-1], v_bus_volt[-1])
+                self._stretch = min(2 * self._stretch, LONGEST_STRETCH)
+                return v_volt, v_bus_volt, course
+            course = found
+        self._stretch = max(self._stretch // 2, SHORTEST_STRETCH)
+        if self._stretch == SHORTEST_STRETCH:
+            self._single = BLOCK_TICKS  # hopeless for now: do not pay for the attempt before every step
+        return None
+
+    def _follow(self, now: Point, setpoint: Floats) -> Floats:
+        """The course x (T, m) of the inverters from `now` on, for given set-points (T, m)."""
+        decay, old, new = self._weights
+        drive = new * setpoint
+        drive[0] += old * now.setpoint
+        drive[1:] += old * setpoint[:-1]
+        course = np.empty_like(drive)
+        x = np.where(np.abs(now.x) < VANISHED_PU, 0.0, now.x)
+        for k in range(len(drive)):
+            x = decay * x + drive[k]
+            course[k] = x
+        return course
+
+
+def substeps(site: Site, scenario: Scenario) -> int:
+    """How many steps the integrator takes per tick, at least 1."""
+    tau = site.droop.tau
+    if tau.size == 0:
+        return 1
+    if scenario.substep_s is not None:
+        longest = scenario.substep_s
+    elif scenario.dt_s > QUASI_STATIC_TAUS * float(tau.max()):
+        return 1
+    else:
+        longest = float(tau.min()) / SUBSTEPS_PER_TAU
+    return max(int(np.ceil(scenario.dt_s / longest - 1e-9)), 1)
+
+
+def net_reactive(site: Site, block: Block) -> Floats:
+    """Net reactive import of every customer, inverter included, kvar, (T, N)."""
+    owner = np.eye(len(site.tables.customers))[site.droop.customer]
+    return block.demand.q_kvar - site.feeder.base_kva * (block.x @ owner)

@@ -1,0 +1,484 @@
+"""Scenarios: a real feeder, its loads, inverters, meters and attackers, played tick by tick.
+
+The truth is full AC power flow with the droop inverters in closed loop (`feeders.simulation.plant`); what
+comes out are readings as a service would receive them, beside the truth that they should have told. The same
+scenario gives the same numbers every time; no clock is read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from heapq import heappop, heappush
+from itertools import count
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from feeders.model.profiles import Season
+from feeders.model.site import Snapshot
+from feeders.simulation.attacks import random_attacks
+from feeders.simulation.demand import Variation
+from feeders.simulation.meters import BUSBAR, Channel, Delivery, MeterErrors, Meters, Registers
+from feeders.simulation.plant import Block, net_reactive, truth
+from feeders.util import own_numbers
+from gridsec.arrays import Bools, Floats, Ints
+from gridsec.attack import Attack, InverterAttack, Reports, apply_all, manipulated, reach
+from gridsec.errors import InputInvalid, Problem, choice, refuse
+from gridsec.grid.network import busbar_places
+
+if TYPE_CHECKING:
+    from feeders.model.site import Site
+
+__all__ = [
+    "LATEST_S",
+    "START",
+    "SUNNY_NOON_S",
+    "Reading",
+    "Sample",
+    "Scenario",
+    "Season",
+    "by_arrival",
+    "check",
+    "random_attacks",
+    "simulate",
+    "snapshots",
+]
+
+START: Final = 1_780_272_000.0
+"""Monday, 1 June 2026, 00:00 UTC."""
+
+LATEST_S: Final = 1e10
+"""Times from here on, in the year 2286, are in another unit than seconds."""
+
+SUNNY_NOON_S: Final = 216_000.0
+"""Noon of the first Wednesday of a season's profiles; in summer a sunny day in June."""
+
+LONGEST_LOOK_BACK_S: Final = 7 * 86_400.0
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """What happens to a feeder.
+
+    Attributes
+    ----------
+    seed
+        Chooses everything random, >= 0.
+    start
+        Unix time of the first tick, s.
+    duration_s
+        Ticks are at start + k dt_s < start + duration_s; may be infinite.
+    dt_s
+        Interval between readings, s.
+    profile_s
+        Position within the season's profiles at `start`, s; they begin on a Monday at 00:00, are two weeks in
+        summer and one in the other seasons, and repeat. By default the noon of a Wednesday.
+    substep_s
+        Longest step of the integrator, s; None: half the smallest time constant of the inverters, or one
+        quasi-static step where a tick is more than ten of the largest.
+    variation, errors, channel
+        How loads and busbar vary, what errors meters have, what happens to readings on the way.
+    attacks
+        Who lies, when and how, applied in this order. Meters are indices into `Site.meters`.
+    inverter_attacks
+        Which inverters inject a wrong reactive power; they add up. Inverters are indices into `Site.droop`.
+    season
+        The time of the year of loads and generation; the calendar of `start` plays no part.
+    busbar_attacks
+        How the busbar's meter lies, applied in this order; none may look back. Their meters are its phases, 0
+        to 2, or 0 on a balanced feeder.
+
+    Raises
+    ------
+    ValueError
+        If there is no such season, or a number cannot be meant.
+    """
+
+    seed: int = 0
+    start: float = START
+    duration_s: float = 600.0
+    dt_s: float = 1.0
+    profile_s: float = SUNNY_NOON_S
+    substep_s: float | None = None
+    variation: Variation = field(default_factory=Variation)
+    errors: MeterErrors = field(default_factory=MeterErrors)
+    channel: Channel = field(default_factory=Channel)
+    attacks: tuple[Attack, ...] = ()
+    inverter_attacks: tuple[InverterAttack, ...] = ()
+    season: Season = Season.SUMMER
+    busbar_attacks: tuple[Attack, ...] = ()
+
+    def __post_init__(self) -> None:
+        own_numbers(self)
+        object.__setattr__(self, "season", choice("season", Season, self.season))
+        if self.seed < 0:
+            raise InputInvalid([Problem("negative", f"seed must not be negative, got {self.seed}")])
+        if not np.isfinite(self.profile_s):
+            raise InputInvalid([Problem("not-finite", f"profile_s must be finite, got {self.profile_s}")])
+        if not 0.0 <= self.start < LATEST_S:
+            raise InputInvalid(
+                [Problem("out-of-range", f"start must be a Unix time in seconds, got {self.start}")]
+            )
+        if not self.duration_s > 0.0:
+            raise InputInvalid(
+                [Problem("not-positive", f"duration_s must be positive, got {self.duration_s}")]
+            )
+        if not 0.0 < self.dt_s < np.inf:
+            raise InputInvalid(
+                [Problem("not-positive", f"dt_s must be positive and finite, got {self.dt_s}")]
+            )
+        if self.substep_s is not None and not self.substep_s > 0.0:
+            raise InputInvalid([Problem("not-positive", f"substep_s must be positive, got {self.substep_s}")])
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """One reading on its way to a service; net import positive.
+
+    Attributes
+    ----------
+    meter
+        Id of the meter; BUSBAR (the empty string) for the busbar's.
+    t
+        Time by the meter's clock, Unix s.
+    seq
+        Number of the reading; rises by one with every tick, also while nothing arrives. None in foreign
+        recordings without numbers.
+    arrival
+        When the reading arrives, Unix s.
+    v_volt
+        Voltage, phase to neutral, V; the mean of the phases where there are several.
+    p_kw, q_kvar
+        Net import, kW and kvar; None where not reported.
+    v_phases
+        Busbar voltage of each phase, V; None on a balanced feeder.
+    t_power
+        Time of the powers by the meter's clock, Unix s; None where it is `t`.
+    """
+
+    meter: str
+    t: float
+    seq: int | None
+    arrival: float
+    v_volt: float
+    p_kw: float | None
+    q_kvar: float | None
+    v_phases: tuple[float, ...] | None = None
+    t_power: float | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sample:
+    """One tick: the truth, and what is reported of it. N customers, m inverters, p meters, b + 1 buses.
+
+    Attributes
+    ----------
+    t
+        Unix time, s.
+    seq
+        Number of the tick, from 0.
+    meter_ids : (p,)
+        Ids of the meters.
+    v_volt : (N,)
+        True voltage at each customer, V.
+    v_bus_volt : (b + 1,)
+        True voltage of each bus, the busbar first, V; in three phases (3 (b + 1),), those of a bus side by
+        side, NaN for one that it does not have.
+    x_kvar : (m,)
+        Reactive injection of each inverter as its droop curve has it, kvar; attacks come on top.
+    p_kw, q_kvar : (N,)
+        True net import of each customer, inverter included, kW and kvar.
+    manipulated : (p,)
+        Which meters are under attack.
+    shift_volt : (p,)
+        Reported minus honest reading, V; 0 for honest meters.
+    reported
+        What the meters report, manipulations included, as one row: whether or not it arrives.
+    delivery
+        When it arrives, as one row.
+    """
+
+    t: float
+    seq: int
+    meter_ids: tuple[str, ...]
+    v_volt: Floats
+    v_bus_volt: Floats
+    x_kvar: Floats
+    p_kw: Floats
+    q_kvar: Floats
+    manipulated: Bools
+    shift_volt: Floats
+    reported: Registers
+    delivery: Delivery
+
+    @property
+    def readings(self) -> list[Reading]:
+        """The readings of this tick that arrive, duplicates included, in the order of their arrival."""
+        out = [
+            self._reading(j, meter, float(arrival))
+            for j, meter in enumerate((*self.meter_ids, BUSBAR))
+            for arrival in (self.delivery.arrival[0, j], self.delivery.copy[0, j])
+            if np.isfinite(arrival)
+        ]
+        return sorted(out, key=lambda reading: reading.arrival)
+
+    def _reading(self, j: int, meter: str, arrival: float) -> Reading:
+        stamp, registers = float(self.delivery.stamp[0, j]), self.reported
+        if meter == BUSBAR:
+            v0 = registers.v0_volt[0]
+            phases = tuple(v0.tolist()) if np.ndim(v0) else None
+            return Reading(meter, stamp, self.seq, arrival, float(np.mean(v0)), None, None, phases)
+        q = float(registers.q_kvar[0, j])
+        return Reading(
+            meter,
+            stamp,
+            self.seq,
+            arrival,
+            float(registers.v_volt[0, j]),
+            float(registers.p_kw[0, j]),
+            None if np.isnan(q) else q,
+        )
+
+
+def simulate(site: Site, scenario: Scenario) -> Iterator[Sample]:
+    """Play a scenario.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    scenario
+        What happens to it.
+
+    Yields
+    ------
+    Sample
+        One per tick, in the order of time.
+
+    Raises
+    ------
+    PowerFlowDiverged
+        When the loads are beyond what the feeder can carry.
+    NoEquilibrium
+        When inverters and feeder find no common answer.
+    ValueError
+        When an attack or a silence names a meter that the feeder does not have, or looks too far back.
+    """
+    check(site, scenario)
+    meters = Meters(site, scenario.errors, scenario.channel, scenario.seed)
+    nominal = site.customer_nominal[site.meters]
+    past = _Past(site.meters.size, scenario)
+    if past.first < 0:
+        for block in truth(site, scenario, past.first, 0):
+            past.add(block.ticks, _honest(site, meters, block).v_volt / nominal)
+    for block in truth(site, scenario, 0, _tick_count(scenario)):
+        honest = _honest(site, meters, block)
+        past.add(block.ticks, honest.v_volt / nominal)
+        lies = manipulated(scenario.attacks, block.t, site.meters.size)
+        reported = _attacked(site, scenario, block.t, honest, past=past, lies=lies)
+        reported = _busbar_attacked(site, scenario, block.t, reported)
+        delivery = meters.deliver(block.ticks, block.t)
+        yield from _samples(site, block, honest, reported, delivery=delivery, lies=lies)
+
+
+def _samples(
+    site: Site, block: Block, honest: Registers, reported: Registers, *, delivery: Delivery, lies: Bools
+) -> Iterator[Sample]:
+    """Take a block apart, tick by tick."""
+    shift = reported.v_volt - honest.v_volt
+    q_net = net_reactive(site, block)
+    x_kvar = block.x * site.feeder.base_kva
+    for k in range(block.t.size):
+        row = slice(k, k + 1)
+        yield Sample(
+            t=float(block.t[k]),
+            seq=int(block.ticks[k]),
+            meter_ids=site.meter_ids,
+            v_volt=block.v_volt[k],
+            v_bus_volt=block.v_bus_volt[k],
+            x_kvar=x_kvar[k],
+            p_kw=block.demand.p_kw[k],
+            q_kvar=q_net[k],
+            manipulated=lies[k],
+            shift_volt=shift[k],
+            reported=Registers(
+                reported.v_volt[row], reported.p_kw[row], reported.q_kvar[row], reported.v0_volt[row]
+            ),
+            delivery=Delivery(delivery.stamp[row], delivery.arrival[row], delivery.copy[row]),
+        )
+
+
+def snapshots(samples: Iterable[Sample]) -> Iterator[Snapshot]:
+    """Turn samples into what `feeders.model.site.to_frame` takes: one row of readings per tick.
+
+    Lost readings and silences are missing; delay and clock errors play no part.
+    """
+    for sample in samples:
+        there = np.isfinite(sample.delivery.arrival[0])
+        meters, registers = there[:-1], sample.reported
+        yield Snapshot(
+            t=sample.t,
+            v_volt=np.where(meters, registers.v_volt[0], np.nan),
+            p_kw=np.where(meters, registers.p_kw[0], np.nan),
+            q_kvar=np.where(meters, registers.q_kvar[0], np.nan),
+            v0_volt=np.where(there[-1], registers.v0_volt[0], np.nan)[()],
+        )
+
+
+def by_arrival(samples: Iterable[Sample]) -> Iterator[Reading]:
+    """Readings of many ticks in the order of their arrival; equal ones in the order of time and meters."""
+    waiting: list[tuple[float, int, Reading]] = []
+    number = count()
+    for sample in samples:
+        # Nothing of this tick or a later one arrives before its own time.
+        while waiting and waiting[0][0] < sample.t:
+            yield heappop(waiting)[2]
+        for reading in sample.readings:
+            heappush(waiting, (reading.arrival, next(number), reading))
+    while waiting:
+        yield heappop(waiting)[2]
+
+
+class _Past:
+    """The honest voltage reports that attacks may still want to see, pu, in blocks of consecutive ticks.
+
+    Attributes
+    ----------
+    first
+        The first tick that any attack will ask for; 0 or negative. Ticks before 0 have to be played before
+        the scenario begins.
+    """
+
+    def __init__(self, meters: int, scenario: Scenario) -> None:
+        self._meters = meters
+        self._scenario = scenario
+        self._blocks: dict[int, Floats] = {}
+        self._attacks = [attack for attack in scenario.attacks if reach(attack, attack.t_off) > 0.0]
+        self.first = min(self._oldest(scenario.start), 0)
+
+    def add(self, ticks: Ints, honest: Floats) -> None:
+        """Keep the reports (T, p) of some ticks and forget those that nobody can ask for any more."""
+        if not self._attacks:
+            return
+        self._blocks[int(ticks[0])] = honest
+        oldest = self._oldest(self._scenario.start + float(ticks[0]) * self._scenario.dt_s)
+        for start in [start for start, v in self._blocks.items() if start + len(v) <= oldest]:
+            del self._blocks[start]
+
+    def __call__(self, t: Floats) -> Floats:
+        """The reports at the ticks at or just before times t (T,): (T, p)."""
+        wanted = np.array([self._tick(float(when)) for when in t], dtype=np.intp)
+        out = np.full((t.size, self._meters), np.nan)
+        for start, v in self._blocks.items():
+            rows = (wanted >= start) & (wanted < start + len(v))
+            out[rows] = v[wanted[rows] - start]
+        return out
+
+    def _oldest(self, now: float) -> int:
+        """The oldest tick that can still be asked for from time `now` on."""
+        looks = []
+        for attack in self._attacks:
+            if attack.t_off > now:
+                then = max(now, attack.t_on)
+                looks.append(self._tick(then - reach(attack, then)))
+        return min(looks, default=self._tick(now))
+
+    def _tick(self, t: float) -> int:
+        # Half a microsecond of slack: t - delay is rarely a representable multiple of dt.
+        return int(np.floor((t - self._scenario.start + 5e-7) / self._scenario.dt_s))
+
+
+def _tick_count(scenario: Scenario) -> float:
+    return float(np.ceil(scenario.duration_s / scenario.dt_s - 1e-9))
+
+
+def _honest(site: Site, meters: Meters, block: Block) -> Registers:
+    return meters.read(
+        block.ticks, block.v_volt, block.shown_kw, net_reactive(site, block), block.demand.v0_volt
+    )
+
+
+def _attacked(
+    site: Site, scenario: Scenario, t: Floats, honest: Registers, *, past: _Past, lies: Bools
+) -> Registers:
+    """What is reported; honest meters keep their registers to the last bit."""
+    if not lies.any():
+        return honest
+    nominal = site.customer_nominal[site.meters]
+    before = Reports(honest.v_volt / nominal, honest.p_kw, honest.q_kvar)
+    after = apply_all(scenario.attacks, t, before, past)
+    v = np.where(lies, after.v * nominal, honest.v_volt)
+    return Registers(v, after.p, after.q, honest.v0_volt)
+
+
+def _busbar_attacked(site: Site, scenario: Scenario, t: Floats, reported: Registers) -> Registers:
+    """What is reported, by the busbar's meter too."""
+    nominal = site.nominal_volt[busbar_places(site.feeder)]
+    lies = manipulated(scenario.busbar_attacks, t, nominal.size)
+    if not lies.any():
+        return reported
+    honest = reported.v0_volt.reshape(lies.shape)
+    none = np.zeros_like(honest)
+    after = apply_all(scenario.busbar_attacks, t, Reports(honest / nominal, none, none), lambda _: none)
+    v0_volt = np.where(lies, after.v * nominal, honest).reshape(reported.v0_volt.shape)
+    return replace(reported, v0_volt=v0_volt)
+
+
+def check(site: Site, scenario: Scenario) -> None:
+    """Refuse attacks that cannot be played on a feeder.
+
+    Parameters
+    ----------
+    site, scenario
+        The feeder, and what happens to it.
+
+    Raises
+    ------
+    ValueError
+        With everything that is wrong.
+    """
+    name, phases = site.feeder.name, busbar_places(site.feeder).stop
+    problems = [
+        Problem(
+            "unknown-index",
+            f"an attack names inverter {wrong.inverters.max()}, but {name} has {site.droop.tau.size}",
+        )
+        for wrong in scenario.inverter_attacks
+        if wrong.inverters.max() >= site.droop.tau.size
+    ]
+    if any(
+        attack.meters.max() >= phases or reach(attack, attack.t_off) > 0.0
+        for attack in scenario.busbar_attacks
+    ):
+        problems.append(
+            Problem(
+                "unknown-index",
+                f"an attack on the busbar's meter looks back, or names phases that {name} has not",
+            )
+        )
+    for attack in scenario.attacks:
+        if attack.meters.max() >= site.meters.size:
+            problems.append(
+                Problem(
+                    "unknown-index",
+                    f"an attack names meter {attack.meters.max()}, but {name} has {site.meters.size}",
+                )
+            )
+        then = max(attack.t_on, scenario.start)
+        if attack.t_off > then and reach(attack, then) > LONGEST_LOOK_BACK_S:
+            back = reach(attack, then)
+            problems.append(
+                Problem("out-of-range", f"an attack looks back {back:.0f} s, further than can be played")
+            )
+    every = (*scenario.attacks, *scenario.busbar_attacks, *scenario.inverter_attacks)
+    problems += [
+        Problem(
+            "out-of-range",
+            f"an attack begins {attack.t_on - scenario.start:g} s after the start, when the scenario of "
+            f"{scenario.duration_s:g} s is over",
+        )
+        for attack in every
+        if attack.t_on >= scenario.start + scenario.duration_s
+    ]
+    refuse(problems)

@@ -1,0 +1,447 @@
+"""Trials: short simulated runs with known liars, by which any estimator family is judged.
+
+A trial is a `feeders.simulation.scenario.Scenario` with one load situation that varies slowly. Its frames
+hold the powers of the profiles of all customers whose meter is heard, and the true loads differ from these by
+an Ornstein-Uhlenbeck process; of all others they know what the service does, the range that these can draw or
+feed in, or a forecast. The truth is full AC power flow with the droop inverters in closed loop.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from feeders.model.site import Site, from_tables, to_frame
+from feeders.simulation.attacks import Lie, Trick, manipulations
+from feeders.simulation.demand import Customers, Variation
+from feeders.simulation.meters import MeterErrors
+from feeders.simulation.scenario import START, SUNNY_NOON_S, Sample, Scenario, simulate, snapshots
+from feeders.util import own_numbers
+from gridsec.arrays import Bools, Floats, Ints
+from gridsec.attack import Coordinated, active
+from gridsec.errors import choice
+from gridsec.interface import Decision, Frame, Verdict
+
+if TYPE_CHECKING:
+    from feeders.registry.registry import Watcher
+
+__all__ = [
+    "STEADY",
+    "Lie",
+    "LoadError",
+    "Meters",
+    "Outcome",
+    "Trial",
+    "Trick",
+    "Truth",
+    "frames",
+    "judge",
+]
+
+NO_CLASS_PERCENT: Final = 1e-4
+"""Accuracy class of meters without a fixed error: the files have no class of zero."""
+
+STEADY: Final = Variation(load_spread=0.0, cloud_spread=0.0, tap_step_pu=0.0)
+"""Loads and generation follow their profiles, the busbar changes slowly."""
+
+SETTLING_S: Final = 10.0
+"""How long after the start, and after the onset of a lie, reconstructions do not count yet, s."""
+
+
+class Meters(StrEnum):
+    """What errors the meters of a trial have, and are known to have."""
+
+    WHITE = "white"
+    """White noise of 0.2 % (busbar 0.02 %), no fixed error, no resolution."""
+    REAL = "real"
+    """A fixed error within 0.5 % (busbar 0.1 %), a resolution of 0.1 V, jitter of 0.05 % (busbar 0.02 %)."""
+    SITE = "site"
+    """As the feeder's files say."""
+
+
+@dataclass(frozen=True, slots=True)
+class LoadError:
+    """What the powers in the frames do not show.
+
+    Attributes
+    ----------
+    p_kw, q_kvar
+        Standard deviations at every customer with a meter, kW and kvar.
+    correlation_s
+        Correlation time, s.
+    half_width
+        Half-width of the intervals that frames state, in standard deviations. The default is that of a
+        uniform distribution with this standard deviation.
+    """
+
+    p_kw: float = 0.6
+    q_kvar: float = 0.2
+    correlation_s: float = 600.0
+    half_width: float = float(np.sqrt(3.0))
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """One run.
+
+    Attributes
+    ----------
+    site
+        The feeder. Watchers are to be designed for `stated`, which says how wrong meters and loads are.
+    seed
+        Chooses everything random.
+    duration_s, step_s
+        Length and interval of the frames, s.
+    load_error, meters
+        What nobody knows, and what meters make of the truth. No `load_error`: registers, power factors and
+        what comes and go beside them err as the feeder's files say, and frames are those of `to_frame`.
+    lie
+        Who lies; None: nobody.
+    profile_s
+        Position within the fourteen days of the summer's profiles, s.
+    variation
+        What changes beside, known to all; `hidden_*` of it are those of `load_error`.
+    report_q
+        Whether meters report the net reactive power.
+    """
+
+    site: Site
+    seed: int = 0
+    duration_s: float = 120.0
+    step_s: float = 1.0
+    load_error: LoadError | None = field(default_factory=LoadError)
+    meters: Meters = Meters.WHITE
+    lie: Lie | None = None
+    profile_s: float = SUNNY_NOON_S
+    variation: Variation = STEADY
+    report_q: bool = False
+
+    def __post_init__(self) -> None:
+        own_numbers(self)
+        object.__setattr__(self, "meters", choice("meters", Meters, self.meters))
+
+    @property
+    def stated(self) -> Site:
+        """The feeder whose files say what the trial does: errors of meters and loads, and the interval."""
+        meta, rows, error = self.site.tables.meta, self.site.tables.customers, self.load_error
+        load, registers = meta.load, meta.meters
+        if error is not None:
+            rows = tuple(
+                replace(row, p_std_kw=error.p_kw, q_std_kvar=error.q_kvar, p_error_percent=None)
+                if row.meter
+                else row
+                for row in rows
+            )
+            load = replace(load, correlation_s=error.correlation_s)
+            registers = replace(registers, p_error_percent=0.0, p_resolution_kw=0.0)
+        monitor = replace(meta.monitor, tick_s=self.step_s)
+        meta = replace(meta, load=load, monitor=monitor, meters=registers)
+        if self.meters is not Meters.SITE:
+            rows = tuple(
+                replace(row, class_percent=None, resolution_volt=None, jitter_percent=None) for row in rows
+            )
+            white = self.meters is Meters.WHITE
+            step = 0.0 if white else 0.1
+            meta = replace(
+                meta,
+                accept=(*meta.accept, "class"),
+                busbar_class_percent=NO_CLASS_PERCENT if white else 0.1,
+                busbar_resolution_volt=step,
+                busbar_jitter_percent=0.02,
+                meters=replace(
+                    registers,
+                    class_percent=NO_CLASS_PERCENT if white else 0.5,
+                    resolution_volt=step,
+                    jitter_percent=0.2 if white else 0.05,
+                ),
+            )
+        return from_tables(replace(self.site.tables, meta=meta, customers=rows))
+
+    @property
+    def scenario(self) -> Scenario:
+        """What is played on `stated`."""
+        error, told = self.load_error, self.site.tables.meta.load.correlation_s
+        honest = Scenario(
+            seed=self.seed,
+            duration_s=self.duration_s,
+            dt_s=self.step_s,
+            profile_s=self.profile_s,
+            errors=MeterErrors(power=1.0 if error is None else 0.0, report_q=self.report_q),
+            variation=replace(
+                self.variation,
+                hidden_kw=None if error is None else error.p_kw,
+                hidden_kvar=None if error is None else error.q_kvar,
+                hidden_correlation_s=told if error is None else error.correlation_s,
+            ),
+        )
+        attacks, inverter_attacks = manipulations(self.site, self.lie, honest)
+        return replace(honest, attacks=attacks, inverter_attacks=inverter_attacks)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Truth:
+    """The truth of one frame. N customers, p meters, m inverters.
+
+    Attributes
+    ----------
+    v2 : (N,)
+        Squared voltages, pu.
+    liars : (p,)
+        Which meters are manipulated at present.
+    attack : (p,)
+        Reported minus honest squared voltage, pu.
+    inverters : (m,)
+        Which inverters are manipulated at present.
+    """
+
+    v2: Floats
+    liars: Bools
+    attack: Floats
+    inverters: Bools
+
+
+def frames(
+    trial: Trial, scenario: Scenario | None = None, *, stated: Site | None = None
+) -> Iterator[tuple[Frame, Truth]]:
+    """Play a trial.
+
+    Parameters
+    ----------
+    trial
+        The trial.
+    scenario
+        What is played in place of `trial.scenario`: another season, other attacks.
+    stated
+        `trial.stated`, where it is known already.
+
+    Yields
+    ------
+    Frame, Truth
+        One pair per tick. Frames hold the powers of the profiles (as falsified where the lie says so), and
+        intervals of `LoadError.half_width`, of customers whose meter is heard; the others', and all where
+        there is no `load_error`, are those of `to_frame`.
+
+    Raises
+    ------
+    NoSuchAttack, PowerFlowDiverged, NoEquilibrium
+        When the lie cannot be told on this feeder, or the feeder not be solved.
+    """
+    site = trial.stated if stated is None else stated
+    scenario = trial.scenario if scenario is None else scenario
+    known = Customers(
+        site, scenario.variation, scenario.seed, scenario.start, scenario.profile_s, season=scenario.season
+    )
+    if site.forecast is not None:
+        origin = scenario.start - scenario.profile_s
+        site = replace(site, forecast=site.forecast.played(origin, scenario.season))
+    samples = list(simulate(site, scenario))
+    t = np.array([sample.t for sample in samples])
+    demand = known.at(t)
+    fake_kw, fake_kvar = _fake_load(site, scenario, t)
+    told = zip(demand.p_kw + fake_kw, demand.q_kvar + fake_kvar, strict=True)
+    for sample, snapshot, (p_kw, q_kvar) in zip(samples, snapshots(samples), told, strict=True):
+        frame = to_frame(site, snapshot)
+        if trial.load_error is not None:
+            read = np.isfinite(snapshot.p_kw)
+            frame = _powers(trial.load_error, site, frame, (p_kw, q_kvar), read)
+        yield frame, _truth(site, scenario, sample)
+
+
+def _powers(error: LoadError, site: Site, frame: Frame, powers: tuple[Floats, Floats], read: Bools) -> Frame:
+    """The frame with powers as told; those that nobody reads, or would believe, stay what they are."""
+    (p_kw, q_kvar), base = powers, site.feeder.base_kva
+    believed = np.zeros(frame.p.size, dtype=np.bool_)
+    believed[site.meters] = read & (np.abs(p_kw) <= site.loads.credible * base)[site.meters]
+    p_error = np.full(frame.p.size, error.half_width * error.p_kw / base)
+    # Registers are exact here, so that what a frame does not believe of them is what no connection carries.
+    p_error[site.meters] = np.maximum(p_error[site.meters], frame.p_error[site.meters])
+    forecast = (
+        None if std is None else np.where(believed, np.nan, std) for std in (frame.p_std, frame.q_std)
+    )
+    p_std, q_std = forecast
+    return replace(
+        frame,
+        p=np.where(believed, -p_kw / base, frame.p),
+        p_error=np.where(believed, p_error, frame.p_error),
+        q=np.where(believed, -q_kvar / base, frame.q),
+        q_error=np.where(believed, error.half_width * error.q_kvar / base, frame.q_error),
+        p_std=p_std,
+        q_std=q_std,
+    )
+
+
+def _fake_load(site: Site, scenario: Scenario, t: Floats) -> tuple[Floats, Floats]:
+    """Loads that do not exist, where their powers are reported, kW and kvar, (T, N) each."""
+    p_kw, q_kvar = np.zeros((2, t.size, len(site.tables.customers)))
+    for attack in scenario.attacks:
+        if isinstance(attack, Coordinated):
+            cells = np.ix_(active(attack, t), site.meters[attack.meters])
+            p_kw[cells] += attack.p_shift
+            q_kvar[cells] += attack.q_shift
+    return p_kw, q_kvar
+
+
+def _truth(site: Site, scenario: Scenario, sample: Sample) -> Truth:
+    base = site.customer_volt
+    reported = sample.reported.v_volt[0]
+    inverters = np.zeros(site.droop.tau.size, dtype=np.bool_)
+    for attack in scenario.inverter_attacks:
+        inverters[attack.inverters] |= attack.t_on <= sample.t < attack.t_off
+    return Truth(
+        v2=(sample.v_volt / base) ** 2,
+        liars=sample.manipulated,
+        attack=(reported**2 - (reported - sample.shift_volt) ** 2) / base[site.meters] ** 2,
+        inverters=inverters,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Outcome:
+    """How a watcher did in one trial. T ticks, p meters, k liars, l manipulated inverters.
+
+    Attributes
+    ----------
+    liars : (k,)
+        Meters that lied at some time.
+    delay_s : (k,)
+        From the onset of each one's lie until it was first named while lying, s; infinite if never.
+    inverters, inverter_delay_s : (l,)
+        The same for inverters.
+    accused : (p,)
+        Meters that were named before they lied, or without ever lying.
+    accused_inverters : (m,)
+        The same for inverters.
+    false_names : (T,)
+        How many meters were falsely named at each tick.
+    error_liars, error_all
+        Reconstruction errors of the voltage at lying meters and at all customers, % of nominal, one per
+        tick and place after settling; infinite where the estimate is not finite.
+    step_ms : (T,)
+        Processor time of each step, ms.
+    clean_while_lying : (T,)
+        Ticks with a lie at which the verdict was CLEAN and named nobody.
+    lying : (T,)
+        Ticks with a lie.
+    undecided : (T,)
+        Ticks at which the verdict was UNDECIDED.
+    """
+
+    liars: Ints
+    delay_s: Floats
+    inverters: Ints
+    inverter_delay_s: Floats
+    accused: Bools
+    accused_inverters: Bools
+    false_names: Ints
+    error_liars: Floats
+    error_all: Floats
+    step_ms: Floats
+    clean_while_lying: Bools
+    lying: Bools
+    undecided: Bools
+
+    @property
+    def missed(self) -> int:
+        """How many liars, inverters included, were never named."""
+        return int(np.isinf(self.delay_s).sum() + np.isinf(self.inverter_delay_s).sum())
+
+    @property
+    def false_clean(self) -> float:
+        """Share of the ticks with a lie at which the answer was CLEAN; NaN without a lie."""
+        return float(self.clean_while_lying.sum() / self.lying.sum()) if self.lying.any() else np.nan
+
+
+def judge(
+    watcher: Watcher,
+    trial: Trial,
+    *,
+    settling_s: float = SETTLING_S,
+    played: Iterable[tuple[Frame, Truth]] | None = None,
+) -> Outcome:
+    """Let a watcher watch a trial.
+
+    Parameters
+    ----------
+    watcher
+        The design, made for `trial.stated`.
+    trial
+        The trial.
+    settling_s
+        How long after the start and after each onset reconstructions do not count, s.
+    played
+        The frames of this trial, if they have been made already.
+    """
+    state = watcher.init(START)
+    ticks: list[tuple[float, Verdict, Truth]] = []
+    all_errors: list[Floats] = []
+    liar_errors: list[Floats] = []
+    of_nominal = trial.site.customer_volt / trial.site.customer_nominal
+    step_ms: list[float] = []
+    settled, lied = START + settling_s, False
+    for frame, truth in frames(trial) if played is None else played:
+        begun = time.process_time()  # what other programs do meanwhile does not count
+        state, estimate, verdict = watcher.step(state, frame)
+        step_ms.append(1e3 * (time.process_time() - begun))
+        ticks.append((frame.t, verdict, truth))
+        lies = bool(truth.liars.any() or truth.inverters.any())
+        if lies and not lied:
+            settled = max(settled, frame.t + settling_s)
+        lied = lies
+        if frame.t >= settled:
+            error = of_nominal * _error_percent(estimate.v2, truth.v2)
+            all_errors.append(error)
+            liar_errors.append(error[trial.site.meters[truth.liars]])
+    t = np.array([t for t, _, _ in ticks])
+    named = np.array([verdict.suspects for _, verdict, _ in ticks])
+    liars = np.array([truth.liars for _, _, truth in ticks])
+    wrong = np.array([truth.inverters for _, _, truth in ticks])
+    blamed = np.array([_inverters(verdict, truth) for _, verdict, truth in ticks])
+    decisions = [verdict.decision for _, verdict, _ in ticks]
+    lying: Bools = np.any(liars, axis=1) | np.any(wrong, axis=1)
+    clean = np.array([decision is Decision.CLEAN for decision in decisions])
+    false = named & ~_since(liars)
+    return Outcome(
+        liars=np.flatnonzero(liars.any(axis=0)),
+        delay_s=_delays(t, named, liars),
+        inverters=np.flatnonzero(wrong.any(axis=0)),
+        inverter_delay_s=_delays(t, blamed, wrong),
+        accused=np.any(false, axis=0),
+        accused_inverters=np.any(blamed & ~_since(wrong), axis=0),
+        false_names=false.sum(axis=1),
+        error_liars=np.concatenate(liar_errors) if liar_errors else np.zeros(0),
+        error_all=np.concatenate(all_errors) if all_errors else np.zeros(0),
+        step_ms=np.array(step_ms),
+        clean_while_lying=lying & clean & ~named.any(axis=1) & ~blamed.any(axis=1),
+        lying=lying,
+        undecided=np.array([decision is Decision.UNDECIDED for decision in decisions]),
+    )
+
+
+def _error_percent(v2: Floats, truth: Floats) -> Floats:
+    with np.errstate(invalid="ignore"):
+        error = 100.0 * np.abs(np.sqrt(v2) - np.sqrt(truth))
+    return np.where(np.isfinite(error), error, np.inf)
+
+
+def _inverters(verdict: Verdict, truth: Truth) -> Bools:
+    """The inverters named; none by estimators that do not judge them."""
+    return verdict.inverters if verdict.inverters.size else np.zeros_like(truth.inverters)
+
+
+def _since(lies: Bools) -> Bools:
+    """Whether each has begun to lie, (T, k): a name that stays a while after the lie is not false."""
+    return np.logical_or.accumulate(lies, axis=0)
+
+
+def _delays(t: Floats, named: Bools, lies: Bools) -> Floats:
+    """From each one's first lie to its first name during a lie, s."""
+    out = []
+    for j in np.flatnonzero(lies.any(axis=0)):
+        caught = np.flatnonzero(named[:, j] & lies[:, j])
+        out.append(t[caught[0]] - t[np.argmax(lies[:, j])] if caught.size else np.inf)
+    return np.array(out)

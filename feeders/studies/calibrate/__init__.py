@@ -1,0 +1,1 @@
+"""Calibration of a feeder's files by recorded readings."""

@@ -1,0 +1,578 @@
+"""Feeder, radial, meshed or in three phases, with its single-phase parts, as calibration compares it.
+
+References
+----------
+docs/theory-studies.md, Calibration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from feeders.model.site import Site, find, from_tables
+from feeders.model.three_phase import ThreePhaseSite, spanned
+from feeders.studies.operating import line_rows
+from gridsec.arrays import Bools, Floats, Ints, Phasors
+from gridsec.errors import FeederInvalid, Problem
+from gridsec.grid import three_phase as three
+from gridsec.grid.droop import voltage_curve
+from gridsec.grid.meshed import MeshedFeeder, impedances
+from gridsec.grid.radial import Feeder, bus_voltages, lindistflow
+from gridsec.grid.three_phase import PHASES, ThreePhaseFeeder, lindist3flow
+from gridsec.planning.calibration import Doubts, Field, Places, Series
+from gridsec.planning.droop.ac_sensitivity import lines
+
+if TYPE_CHECKING:
+    from feeders.format.tables import FeederTables
+    from feeders.studies.calibrate.readings import Frames
+
+__all__ = ["Lateral", "Network", "alone", "laterals", "network", "site_of"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lateral:
+    """Part of a feeder behind a line of one phase that begins at a bus of several; or a customer there.
+
+    Attributes
+    ----------
+    customers
+        All on it, by index.
+    lines
+        All its lines, indices into the tables, the first line first; none of a customer.
+    phase
+        Its phase.
+    place
+        The place that feeds it.
+    others
+        Places of the other phases at the same bus, by phase.
+    """
+
+    customers: Ints
+    lines: tuple[int, ...]
+    phase: str
+    place: int
+    others: Mapping[str, int]
+
+    def to(self, phase: str) -> tuple[Ints, int, int]:
+        """Its customers, the place that feeds it, and the place of another phase there."""
+        return self.customers, self.place, self.others[phase]
+
+
+def laterals(feeder: ThreePhaseFeeder, lines: Sequence[tuple[int, ...]], place: Ints) -> tuple[Lateral, ...]:
+    """Single-phase laterals of a tree.
+
+    Parameters
+    ----------
+    feeder
+        The tree.
+    lines
+        The lines of each branch, indices into the tables.
+    place : (Q, 2)
+        Bus and phase of each place.
+    """
+    at = {(bus, PHASES[phase]): q for q, (bus, phase) in enumerate(place.tolist())}
+    above, own = feeder.phases[feeder.parent], feeder.phases[1:]
+    buses = np.arange(len(feeder.buses))
+    out = []
+    for k in np.flatnonzero((own.sum(axis=1) == 1) & (above.sum(axis=1) > 1)).tolist():
+        fed, was = int(feeder.parent[k]), PHASES[int(own[k].argmax())]
+        below = [bus - 1 for bus in np.flatnonzero(_below(feeder, buses, k + 1)).tolist() if bus != k + 1]
+        out.append(
+            Lateral(
+                customers=np.flatnonzero(_below(feeder, feeder.bus, k + 1)),
+                lines=tuple(row for branch in (k, *below) for row in lines[branch]),
+                phase=was,
+                place=at[fed, was],
+                others={phase: at[fed, phase] for phase in PHASES if phase != was and (fed, phase) in at},
+            )
+        )
+    return tuple(out)
+
+
+def alone(feeder: ThreePhaseFeeder, phases: Sequence[str], place: Ints) -> tuple[Lateral, ...]:
+    """Single-phase customers at buses of several phases.
+
+    Parameters
+    ----------
+    feeder
+        The tree.
+    phases
+        Phases of each customer.
+    place : (Q, 2)
+        Bus and phase of each place.
+    """
+    at = {(bus, PHASES[phase]): q for q, (bus, phase) in enumerate(place.tolist())}
+    out = []
+    for k, (bus, own) in enumerate(zip(feeder.bus.tolist(), phases, strict=True)):
+        others = {phase: at[bus, phase] for phase in PHASES if phase != own and (bus, phase) in at}
+        if len(own) == 1 and others:
+            out.append(Lateral(np.array([k]), (), own, at[bus, own], others))
+    return tuple(out)
+
+
+def _below(feeder: ThreePhaseFeeder, buses: Ints, first: int) -> Bools:
+    """Whether buses are this one or behind it."""
+    start = feeder.start[buses]
+    return np.asarray((feeder.start[first] <= start) & (start < feeder.stop[first]))
+
+
+MOST_BUSES: Final = 150
+"""In larger feeders lines in series without customers between them are one."""
+
+IDLE: Final = 0.25
+"""Share of its peak that a customer without meter is taken to draw."""
+
+HIDDEN: Final = 3.0**-0.5
+"""Share of the load that generation may hide, by which the sunniest roof misleads: uniform in its limits."""
+
+CLOUDS: Final = 0.1
+"""The part of that share that comes and goes."""
+
+STEEP_PU: Final = 0.003
+"""Half of the voltage over which the slope of an inverter's curve is taken, pu."""
+
+_STEPS: Final = 2
+_ROUNDS: Final = 4
+_CHUNK: Final = 64
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Network:
+    """A feeder whose lines in series are merged where that is needed.
+
+    Attributes
+    ----------
+    site
+        The feeder as its files say.
+    feeder
+        Its tree, merged; or with closed loops.
+    lines : (L,)
+        The lines of each branch, and then each that closes a loop, indices into the tables.
+    ends : (L, 2)
+        Their buses, of a branch the one nearer to the busbar first.
+    place : (Q, 2)
+        Bus of the feeder and phase of each place.
+    places
+        What readings see of it.
+    laterals
+        Its single-phase laterals.
+    parts
+        The same, and single-phase customers at buses of several phases: all whose phase may be wrong.
+    """
+
+    site: Site | ThreePhaseSite
+    feeder: Model
+    lines: tuple[tuple[int, ...], ...]
+    ends: Ints
+    place: Ints
+    places: Places
+    laterals: tuple[Lateral, ...]
+    parts: tuple[Lateral, ...]
+
+    @property
+    def meter_of(self) -> dict[int, int]:
+        """Meter of each customer with one."""
+        return {int(customer): j for j, customer in enumerate(self.site.meters)}
+
+    def weight(self, bus: int, phases: str) -> Floats:
+        """Weights (Q,) of a customer at a bus of the feeder."""
+        at = self.place[:, 0] == bus
+        if self.places.phase.max() > 0:
+            at &= np.isin(self.place[:, 1], [PHASES.index(phase) for phase in phases])
+        return np.asarray(at / at.sum())
+
+    def reaches(self, bus: int, phases: str) -> bool:
+        """Whether a bus of the feeder has these phases."""
+        if isinstance(self.feeder, ThreePhaseFeeder):
+            return bool(all(self.feeder.phases[bus][PHASES.index(phase)] for phase in phases))
+        return True
+
+
+def site_of(path_or_name: Path | str) -> Site | ThreePhaseSite:
+    """Load a feeder, balanced or of three phases.
+
+    Parameters
+    ----------
+    path_or_name
+        As in `feeders.model.site.load`, which says what it raises; closed loops in three phases are invalid,
+        too.
+    """
+    return _site(find(path_or_name))
+
+
+def _site(tables: FeederTables) -> Site | ThreePhaseSite:
+    if not tables.in_phases:
+        return from_tables(tables)
+    site, ties = spanned(tables)
+    if ties.ends.size:
+        raise FeederInvalid(
+            [
+                Problem(
+                    "not-radial",
+                    "lines: closed lines form loops, and in three phases calibration takes radial "
+                    "feeders only: "
+                    "in a loop a longer line changes all phases everywhere, which it has no model of",
+                )
+            ]
+        )
+    return site
+
+
+def network(tables: FeederTables) -> Network:
+    """Prepare a feeder.
+
+    Parameters
+    ----------
+    tables
+        Its files; with single-phase customers or zero-sequence impedances it is one of three phases.
+
+    Raises
+    ------
+    FeederInvalid
+        With every problem of the files; if closed lines form loops in three phases.
+    """
+    site = _site(tables)
+    feeder, rows = _merged(_model(site), tuple((row,) for row in line_rows(site)))
+    single, parts = tuple[Lateral, ...](), tuple[Lateral, ...]()
+    if isinstance(feeder, ThreePhaseFeeder):
+        place, ends = np.argwhere(feeder.phases), _branches(feeder)
+        single = laterals(feeder, rows, place)
+        parts = (*single, *alone(feeder, [row.phases for row in tables.customers], place))
+    else:
+        place = np.column_stack([np.arange(len(feeder.buses)), np.zeros(len(feeder.buses))]).astype(np.intp)
+        ends = lines(feeder)[0]
+    return Network(site, feeder, rows, ends, place, _places(site, feeder, place), single, parts)
+
+
+Model = Feeder | MeshedFeeder | ThreePhaseFeeder
+
+
+def _model(site: Site | ThreePhaseSite) -> Model:
+    """A site's feeder, which in three phases is a tree."""
+    if isinstance(site.feeder, MeshedFeeder):
+        return site.feeder
+    return site.tree if isinstance(site, Site) else site.feeder
+
+
+def _branches(feeder: ThreePhaseFeeder) -> Ints:
+    return np.column_stack([feeder.parent, np.arange(1, len(feeder.buses))])
+
+
+def _merged(feeder: Model, rows: tuple[tuple[int, ...], ...]) -> tuple[Model, tuple[tuple[int, ...], ...]]:
+    """Join lines in series without customers between them, in large feeders without loops."""
+    count = len(feeder.buses)
+    if count <= MOST_BUSES or isinstance(feeder, MeshedFeeder):
+        return feeder, rows
+    children = np.bincount(feeder.parent, minlength=count)
+    keep = children != 1
+    keep[0] = True
+    keep[feeder.bus] = True
+    if isinstance(feeder, ThreePhaseFeeder):
+        for k, above in enumerate(feeder.parent.tolist()):
+            keep[above] |= bool((feeder.phases[k + 1] != feeder.phases[above]).any())
+    new = np.cumsum(keep) - 1
+    above_of, chain = np.zeros(count, dtype=np.intp), list[tuple[int, ...]]([()] * count)
+    impedances = {name: np.array(getattr(feeder, name)) for name in _impedances(feeder)}
+    for k, above in enumerate(feeder.parent.tolist()):
+        chain[k + 1] = rows[k]
+        above_of[k + 1] = above
+        if not keep[above]:
+            chain[k + 1] = chain[above] + rows[k]
+            above_of[k + 1] = above_of[above]
+            for values in impedances.values():
+                values[k] += values[above - 1]
+    kept = np.flatnonzero(keep)
+    change: dict[str, Any] = {name: values[kept[1:] - 1] for name, values in impedances.items()}
+    change |= {"parent": new[above_of[kept[1:]]], "bus": new[feeder.bus]}
+    change |= {"buses": tuple(feeder.buses[k] for k in kept)}
+    if isinstance(feeder, ThreePhaseFeeder):
+        change["phases"] = feeder.phases[kept]
+    return replace(feeder, **change), tuple(chain[k] for k in kept[1:])
+
+
+def _impedances(feeder: Feeder | ThreePhaseFeeder) -> tuple[str, ...]:
+    return ("r", "x", "charging") if isinstance(feeder, Feeder) else ("z", "charging")
+
+
+def _places(site: Site | ThreePhaseSite, feeder: Model, place: Ints) -> Places:
+    bus, phase = place.T
+    ids = tuple(map(str, range(bus.size)))
+    weight = np.zeros((len(feeder.customers), bus.size))
+    if isinstance(feeder, MeshedFeeder):
+        Z = impedances(feeder, bus)
+        active, reactive = 2.0 * Z.real, 2.0 * Z.imag
+        weight[np.arange(feeder.bus.size), feeder.bus] = 1.0
+    elif isinstance(feeder, Feeder):
+        flow = lindistflow(replace(feeder, bus=bus, customers=ids))
+        active, reactive = 2.0 * flow.R, 2.0 * flow.X
+        weight[np.arange(feeder.bus.size), feeder.bus] = 1.0
+    else:
+        everywhere = replace(feeder, bus=bus, customers=ids, connected=phase[:, None] == np.arange(3))
+        flow3 = lindist3flow(everywhere)
+        # Powers in units of the three-phase base instead of a third of it.
+        active, reactive = 6.0 * flow3.R, 6.0 * flow3.X
+        at = {(int(k), int(f)): q for q, (k, f) in enumerate(place)}
+        where = [at[int(k), int(f)] for k, f in zip(feeder.at, feeder.phase, strict=True)]
+        weight[feeder.of, where] = feeder.share
+    buses = site.spanning.buses if isinstance(site, Site) else site.feeder.buses
+    own = {name: k for k, name in enumerate(buses)}
+    volt = site.base_volt.reshape(len(own), -1)[[own[feeder.buses[k]] for k in bus], phase]
+    unit = site.customer_volt[site.meters]
+    return Places(active, reactive, phase, _shares(feeder, bus), weight, site.meters, volt, unit)
+
+
+def _shares(feeder: Model, bus: Ints) -> Floats | Phasors:
+    """What of each line's drop a bus has, (Q, L): all that are behind it, or what loops make of it.
+
+    A line of impedance z from i to j whose length grows is one with a source in it, so that bus k has
+    ``(Z_kj - Z_ki) / z`` of its drop.
+    """
+    if isinstance(feeder, MeshedFeeder):
+        (one, other), z = lines(feeder)[0].T, lines(feeder)[1]
+        Z = impedances(feeder, np.arange(len(feeder.buses)))[bus]
+        return np.asarray((Z[:, other] - Z[:, one]) / z)
+    start = feeder.start[bus][:, None]
+    behind = (feeder.start[1:] <= start) & (start < feeder.stop[1:])
+    return behind.astype(np.float64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Powers:
+    """What the readings and the files say of the customers' powers. T frames, N customers, pu.
+
+    Attributes
+    ----------
+    p, q, load, roof, steep : (T, N)
+        See `gridsec.planning.calibration.Series`.
+    metered_q : (N,)
+        Whose reactive power is metered.
+    missing : (T, N)
+        Powers of a customer with a meter that were interpolated.
+    """
+
+    p: Floats
+    q: Floats
+    load: Floats
+    roof: Floats
+    steep: Floats
+    metered_q: Bools
+    missing: Bools
+
+
+def powers(site: Site | ThreePhaseSite, given: Frames) -> Powers:
+    """Powers of all customers.
+
+    Without a reading of q it is that of the load, by the middle of the limits of its power factor, less what
+    the inverter's curve gives at the voltage read.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    given
+        The readings.
+    """
+    model, base, T = site.loads, site.feeder.base_kva, given.t.size
+    N = model.load_peak.size
+    order = [given.meter_ids.index(name) for name in site.meter_ids]
+    draws = np.broadcast_to(IDLE * model.load_peak, (T, N)).copy()
+    missing = np.zeros((T, N), dtype=np.bool_)
+    metered_q = np.zeros(N, dtype=np.bool_)
+    q_read, v = np.zeros((T, N)), np.tile(site.customer_volt, (T, 1))
+    for j, customer in zip(order, site.meters.tolist(), strict=True):
+        there = np.isfinite(given.p_kw[:, j])
+        if there.any():
+            draws[:, customer] = np.interp(given.t, given.t[there], given.p_kw[there, j]) / base
+            missing[:, customer] = ~there
+        there = np.isfinite(given.q_kvar[:, j])
+        metered_q[customer] = 2 * there.sum() > T
+        if metered_q[customer]:
+            q_read[:, customer] = np.interp(given.t, given.t[there], given.q_kvar[there, j]) / base
+        there = np.isfinite(given.v_volt[:, j])
+        if there.any():
+            v[:, customer] = np.interp(given.t, given.t[there], given.v_volt[there, j])
+    v /= site.customer_volt
+    low = np.maximum(draws, 0.0)
+    tan = 0.5 * (model.tan_min + model.tan_max)
+    roof = model.pv_peak * _sun(draws, model.pv_peak)[:, None]
+    most = np.maximum(low, np.minimum(draws + model.pv_peak, model.load_peak))
+    load = np.clip(draws + roof, low, most)
+    q = tan * load
+    steep = np.zeros((T, N))
+    own = site.droop.customer
+    if own.size:
+        at = v[:, own]
+        q[:, own] -= voltage_curve(site.droop, at)
+        slope = voltage_curve(site.droop, at + STEEP_PU) - voltage_curve(site.droop, at - STEEP_PU)
+        steep[:, own] = slope / (2.0 * STEEP_PU) / (2.0 * at)
+    return Powers(
+        p=-draws,
+        q=-np.where(metered_q, q_read, q),
+        load=np.where(metered_q, 0.0, load),
+        roof=np.where(metered_q, 0.0, tan * (most - low)),
+        steep=np.where(metered_q, 0.0, steep),
+        metered_q=metered_q,
+        missing=missing,
+    )
+
+
+def _sun(draws: Floats, pv_peak: Floats) -> Floats:
+    """Generation relative to its peak: the largest that any roof feeds in beyond its load, (T,)."""
+    roofs = pv_peak > 0.0
+    feeds = -draws[:, roofs] / pv_peak[roofs]
+    return np.asarray(np.clip(feeds.max(axis=1, initial=0.0), 0.0, 1.0))
+
+
+def series(net: Network, given: Frames, drawn: Powers, excluded: Collection[str]) -> Series:
+    """Readings and power flow of a feeder.
+
+    Parameters
+    ----------
+    net
+        The feeder.
+    given
+        The readings.
+    drawn
+        From `powers`.
+    excluded
+        Meters whose voltages are not looked at.
+    """
+    site = net.site
+    order = [given.meter_ids.index(name) for name in site.meter_ids]
+    v = given.v_volt[:, order] / net.places.unit
+    seen = np.isfinite(v) & ~np.isin(site.meter_ids, list(excluded))
+    busbar = given.v0_volt
+    if isinstance(net.feeder, ThreePhaseFeeder):
+        # Nobody looks at phases that are not read, and what they do to others is of second order.
+        busbar = np.where(np.isfinite(given.v0_phases), given.v0_phases, busbar[:, None])
+    U, drop = _voltages(net, drawn.p, drawn.q, busbar / site.feeder.base_volt)
+    bus, phase = net.place.T
+    return Series(
+        t=given.t,
+        y=np.where(seen, v**2, 1.0),
+        seen=seen,
+        p=drawn.p,
+        q=drawn.q,
+        load=drawn.load,
+        roof=drawn.roof,
+        steep=drawn.steep,
+        places=U[:, phase, bus],
+        drop=drop,
+    )
+
+
+def _voltages(net: Network, p: Floats, q: Floats, v0: Floats) -> tuple[Floats, Floats | Phasors]:
+    """Squared voltages of all buses with their losses, (T, F, b + 1), and `Series.drop`, (T, F, L).
+
+    From the busbar's voltages (T,) or (T, 3).
+    """
+    feeder, (one, other) = net.feeder, net.ends.T
+    if isinstance(feeder, MeshedFeeder):
+        V = _phasors(feeder, p + 1j * q, v0)
+        apart = V[:, one] - V[:, other]
+        return (V.real**2 + V.imag**2)[:, None], (np.conj(V[:, one] + V[:, other]) * apart)[:, None]
+    if isinstance(feeder, Feeder):
+        U = bus_voltages(feeder, p, q, v0**2, steps=_STEPS)[:, None, :]
+    else:
+        parts = [slice(k, k + _CHUNK) for k in range(0, len(v0), _CHUNK)]
+        # 1 pu of a phase's power is a third of the feeder's base.
+        p3, q3 = (3.0 * feeder.connections(power) for power in (p, q))
+        U = np.concatenate(
+            [three.bus_voltages(feeder, p3[some], q3[some], v0[some] ** 2, steps=_STEPS) for some in parts]
+        )
+    return U, U[:, :, one] - U[:, :, other]
+
+
+def _phasors(feeder: MeshedFeeder, s: Phasors, v0: Floats) -> Phasors:
+    """Voltages of all buses, (T, b + 1): as `gridsec.grid.meshed.bus_voltages`, which has their squares."""
+    idle = v0[:, None] * feeder.idle
+    here = V = idle[:, feeder.bus]
+    for _ in range(_ROUNDS):
+        V = here + np.conj(s / V) @ feeder.between.T
+    return np.asarray(idle + np.conj(s / V) @ feeder.transfer.T)
+
+
+def doubts(net: Network, drawn: Powers, tolerance: float, free: Collection[int], spread: float) -> Doubts:
+    """What the files leave open; uniform within the limits they state.
+
+    Parameters
+    ----------
+    net
+        The feeder.
+    drawn
+        From `powers`.
+    tolerance
+        Relative error of lines' lengths that is no mistake.
+    free
+        Branches whose length is estimated.
+    spread
+        Prior of their relative error.
+    """
+    site, model = net.site, net.site.loads
+    without = np.ones(model.load_peak.size, dtype=np.bool_)
+    without[site.meters] = False
+    unmetered = ~drawn.metered_q
+    length = np.full(len(net.lines), tolerance)
+    length[list(free)] = spread
+    half = 0.5 * (model.tan_max - model.tan_min)
+    root = np.sqrt(3.0)
+    return Doubts(
+        bias=np.hypot(site.accuracy.class_fraction, site.accuracy.busbar_class) / root,
+        p_gain=np.where(without, 0.0, model.p_fraction / root),
+        q_gain=np.where(unmetered, 0.0, model.q_fraction / root),
+        tan=np.where(unmetered, half / root, 0.0),
+        roof=np.where(unmetered & (model.pv_peak > 0.0), HIDDEN, 0.0),
+        p_level=np.where(without, IDLE * model.load_peak, 0.0),
+        q_level=np.where(unmetered, model.q_floor / root, 0.0),
+        length=length,
+    )
+
+
+def field(net: Network, drawn: Powers) -> Field:
+    """What errors of the loads do at the meters.
+
+    Parameters
+    ----------
+    net
+        The feeder.
+    drawn
+        From `powers`.
+    """
+    site, model = net.site, net.site.loads
+    A, B = net.places.at_meters
+    metered = np.zeros(model.load_peak.size)
+    metered[site.meters] = 1.0
+    hidden_q = CLOUDS**2 * np.mean(drawn.roof**2, axis=0)
+    hidden_p = np.where(metered > 0.0, 0.0, (IDLE * model.load_peak) ** 2)
+    return Field(
+        active=(A * metered) @ A.T,
+        reactive=(B * metered) @ B.T,
+        known=(A * hidden_p) @ A.T + (B * hidden_q) @ B.T,
+    )
+
+
+def meter_noise(net: Network, given: Frames) -> tuple[Floats, Floats]:
+    """Variances of the readings' own noise (T, p), squared pu^2, and what the busbar's does, (T, p, F).
+
+    Each phase of the busbar is metered apart, and a place has the error of its own phase.
+    """
+    site, accuracy = net.site, net.site.accuracy
+    order = [given.meter_ids.index(name) for name in site.meter_ids]
+    own = 4.0 * (accuracy.jitter**2 + accuracy.resolution**2 / 12.0)
+    busbar = 4.0 * (accuracy.busbar_jitter**2 + accuracy.busbar_resolution**2 / 12.0)
+    count = np.maximum(given.count[:, order], 1.0)
+    std = np.sqrt(busbar / np.maximum(given.count[:, -1], 1.0))
+    return own / count, std[:, None, None] * net.places.of_phases
+
+
+def gaps(net: Network, drawn: Powers) -> list[Floats]:
+    """What interpolated powers of each frame may do, T times (p, g): their changes from frame to frame."""
+    A, B = net.places.at_meters
+    change_p, change_q = (np.diff(power, axis=0).std(axis=0) for power in (drawn.p, drawn.q))
+    effect = A * change_p + B * np.where(drawn.metered_q, change_q, 0.0)
+    return [effect[:, np.flatnonzero(row)] for row in drawn.missing]

@@ -1,0 +1,826 @@
+"""Calibration of a feeder's files by recorded readings: stepwise selection, proposals, tables.
+
+A forward step corrects the error that the readings support most. An early step is compared while later
+errors are still in the files, so that it may stand in for them. Re-examination therefore withdraws each
+error alone, with all others corrected, and compares all hypotheses again: the error stays, another one takes
+its place, or none is needed.
+
+References
+----------
+docs/theory-studies.md, Calibration.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import pandas as pd
+from scipy.stats import norm
+
+from feeders.format.tables import write
+from feeders.model.equipment import digest, find
+from feeders.studies.calibrate.readings import Frames, blind, frames
+from feeders.studies.calibrate.search import (
+    LENGTH_SPREAD,
+    PLACES,
+    SHORTEST,
+    Correction,
+    Guess,
+    Kind,
+    Round,
+    State,
+    Verdict,
+    apply,
+    as_filed,
+    compare,
+    concerned,
+    correction,
+    left,
+    prepare,
+)
+from feeders.studies.journal import Journal, Progress, Where
+from gridsec.errors import FeederInvalid, InputInvalid, Problem, refuse
+from gridsec.planning.calibration import explain, lengthened
+
+if TYPE_CHECKING:
+    from feeders.format.tables import FeederTables
+    from feeders.model.site import Site
+    from feeders.model.three_phase import ThreePhaseSite
+    from feeders.simulation.recording import Recording
+    from gridsec.arrays import Floats
+
+__all__ = [
+    "Calibrate",
+    "Found",
+    "OtherFeeder",
+    "Search",
+    "calibrate",
+    "customers",
+    "described",
+    "errors",
+    "final",
+    "line_table",
+    "loads",
+    "meters",
+    "present",
+    "read",
+    "wrong_numbers",
+]
+
+
+AS_FILED, PROPOSED, UNTOLD, EXCLUDED = "as in the files", "proposed", "cannot be told", "excluded"
+UNASKED: Final = "not looked for"
+UNREAD: Final = "phase not read"
+
+WIDE: Final = 1.96
+"""Half-width of intervals, in standard errors: 95 %."""
+
+VAGUE: Final = 0.7
+"""What the readings leave of a prior standard deviation if they say nothing: more than this."""
+
+ALIKE: Final = 0.98
+"""Correlation of the effects of two lines that are the same."""
+
+UNSURE_LENGTH: Final = 0.25
+"""A length less certain than this is not known."""
+
+_SHOWN: Final = 5
+
+_COLUMNS: Final = (
+    *("kind", "what", "now", "proposed", "estimate", "std", "low", "high"),
+    *("log_factor", "confidence", "verdict", "alternatives"),
+)
+
+
+def meters(now: Round, risk: float) -> pd.DataFrame:
+    """Bias of every meter."""
+    at, site = now.given.where["bias"], now.net.site
+    bias, std, prior = 100.0 * now.fit.estimate[at], 100.0 * now.fit.std[at], 100.0 * now.given.spread[at]
+    count = now.series.seen.sum(axis=0)
+    # A bias is told relative to the busbar's meter, which may be off the other way.
+    limit = 100.0 * (site.accuracy.class_fraction + site.accuracy.busbar_class)
+    sure = norm.isf(risk / (2.0 * max(at.size, 1)))
+
+    unread = blind(site, now.state.unread)
+
+    def verdict(j: int) -> str:
+        if site.meter_ids[j] in unread:
+            return UNREAD
+        if site.meter_ids[j] in now.state.excluded:
+            return EXCLUDED
+        if not count[j] or std[j] > VAGUE * prior[j]:
+            return UNTOLD
+        if abs(bias[j]) > limit[j] + sure * std[j]:
+            return "outside its class"
+        return "biased" if abs(bias[j]) > sure * std[j] else "within error"
+
+    return pd.DataFrame(
+        {
+            "meter": site.meter_ids,
+            "customer": [site.feeder.customers[k] for k in site.meters],
+            "frames": count,
+            "bias_percent": bias,
+            "std_percent": std,
+            "low_percent": bias - WIDE * std,
+            "high_percent": bias + WIDE * std,
+            "verdict": [verdict(j) for j in range(at.size)],
+        }
+    )
+
+
+def line_table(
+    now: Round, tolerance: float, kinds: Collection[Kind]
+) -> tuple[pd.DataFrame, list[tuple[str, ...]]]:
+    """Length of every line, or lines in series, alone; and the ids of the lines of each row."""
+    net, rows = now.net, now.state.tables.lines
+    names = [tuple(rows[k].line for k in chain) for chain in net.lines]
+    free = np.array([any(name in now.state.lengths for name in chain) for chain in names])
+    effect = np.where(now.series.seen[:, :, None], lengthened(net.places, now.series), 0.0)
+    z = now.whiten(effect).reshape(-1, len(names))
+    own = np.where(free, LENGTH_SPREAD, tolerance)
+    shift, std, same = explain(now.fit, z, own, ALIKE)
+    base = np.array([now.state.lengths.get(chain[0], 1.0) for chain in names])
+    factor, std = base * (1.0 + shift), base * std
+    unknown = ~(std < UNSURE_LENGTH)
+    right = AS_FILED if Kind.LENGTH in kinds else UNASKED
+    shown = [" ".join(chain[:1] if len(chain) == 1 else (chain[0], "to", chain[-1])) for chain in names]
+    frame = pd.DataFrame(
+        {
+            "lines": shown,
+            "from_bus": [net.feeder.buses[k] for k in net.ends[:, 0]],
+            "to_bus": [net.feeder.buses[k] for k in net.ends[:, 1]],
+            "factor": np.where(unknown, np.nan, factor),
+            "std": np.where(unknown, np.nan, std),
+            "low": np.where(unknown, 0.0, factor - WIDE * std),
+            "high": np.where(unknown, np.inf, factor + WIDE * std),
+            "same": [
+                _some([shown[k] for k in np.flatnonzero(row) if k != own_row])
+                for own_row, row in enumerate(same)
+            ],
+            "verdict": np.where(unknown, UNTOLD, np.where(free, PROPOSED, right)),
+        }
+    )
+    return frame, names
+
+
+def final(
+    found: Sequence[dict[str, Any]],
+    wrongs: Sequence[Correction],
+    length: pd.DataFrame,
+    ids: Sequence[tuple[str, ...]],
+) -> tuple[pd.DataFrame, tuple[Correction, ...]]:
+    """Proposals, lengths as they were estimated last, and those corrections that are sure."""
+    rows = zip(length.to_dict("records"), ids, strict=True)
+    by_line = {name: row for row, chain in rows for name in chain}
+    vague = {
+        name
+        for row, wrong in zip(found, wrongs, strict=True)
+        if row["alternatives"] and wrong.kind in PLACES
+        for name in wrong.names
+    }
+    out, sure, told_of = [], [], set[tuple[str, ...]]()
+    for row, first in zip(found, wrongs, strict=True):
+        wrong = first
+        if wrong.kind is Kind.LENGTH:
+            if wrong.names in told_of:
+                continue
+            told_of.add(wrong.names)
+            last = by_line[wrong.names[0]]
+            known = last["verdict"] != UNTOLD
+            factor = float(last["factor"]) if known else wrong.factor
+            wrong = Correction(wrong.kind, wrong.names, factor=factor)
+            numbers = {name: float(last[name]) for name in ("std", "low", "high")} | {"estimate": factor}
+        else:
+            estimate, std = row["estimate"], row["std"]
+            numbers = {
+                "estimate": estimate,
+                "std": std,
+                "low": estimate - WIDE * std,
+                "high": estimate + WIDE * std,
+            }
+        decided = not row["alternatives"] and wrong.factor >= SHORTEST
+        # A customer's bus and phases belong together: one is not written without the other.
+        decided &= wrong.kind not in PLACES or vague.isdisjoint(wrong.names)
+        verdict = EXCLUDED if wrong.kind is Kind.METER else PROPOSED if decided else UNTOLD
+        if decided and wrong.kind is not Kind.METER:
+            sure.append(wrong)
+        out.append(
+            {
+                "kind": str(wrong.kind),
+                "what": _who(wrong) if wrong.kind is not Kind.LENGTH else " ".join(wrong.names),
+                "now": row["now"],
+                "proposed": _proposed(wrong, row),
+                **{name: numbers[name] for name in ("estimate", "std", "low", "high")},
+                "log_factor": row["log_factor"],
+                "confidence": row["confidence"],
+                "verdict": verdict,
+                "alternatives": _some(row["alternatives"]),
+            }
+        )
+    return pd.DataFrame(out, columns=list(_COLUMNS)), tuple(sure)
+
+
+def _proposed(wrong: Correction, row: dict[str, Any]) -> str:
+    if wrong.kind is Kind.METER:
+        when = pd.to_datetime([row["since"], row["until"]], unit="s", utc=True).strftime("%Y-%m-%d %H:%M")
+        return f"its error is another from {when[0]} to {when[1]} UTC"
+    if wrong.kind is Kind.LENGTH:
+        return f"{wrong.factor:.3g} times as long"
+    if wrong.exchange:
+        return "phases exchanged"
+    return {Kind.BUS: wrong.bus, Kind.PHASE: wrong.phases}.get(wrong.kind, "meters exchanged")
+
+
+def _who(wrong: Correction) -> str:
+    """Subject of an error; of a lateral its first line and its customers."""
+    if wrong.exchange:
+        on, lines_on = wrong.on
+        parts = []
+        for phase in dict.fromkeys(on.values()):
+            names = _some([name for name, own in on.items() if own == phase])
+            first = next((line for line, own in lines_on.items() if own == phase), "")
+            parts.append(f"{first} with {names}" if first else names)
+        return " and ".join(parts)
+    if wrong.lines:
+        return f"{wrong.lines[0]} with {_some(wrong.names)}"
+    return " and ".join(wrong.names[:2])
+
+
+def present(tables: FeederTables, wrong: Correction) -> str:
+    """What files say about it."""
+    rows = {row.customer: row for row in tables.customers}
+    if wrong.kind is Kind.BUS:
+        return rows[wrong.names[0]].bus
+    if wrong.exchange:
+        first = {phases: name for name, phases in reversed(wrong.on[0].items())}
+        return " and ".join(rows[first[phases]].phases for phases in dict.fromkeys(wrong.on[0].values()))
+    if wrong.lines:
+        return next(row.phases for row in tables.lines if row.line == wrong.lines[0])
+    if wrong.kind is Kind.PHASE:
+        return rows[wrong.names[0]].phases
+    if wrong.kind is Kind.SWAP:
+        return " and ".join(rows[name].meter for name in wrong.names)
+    return ""
+
+
+def described(wrong: Correction) -> str:
+    """An alternative in a few words."""
+    who = _who(wrong)
+    if wrong.kind is Kind.BUS:
+        return f"{who} at {wrong.bus}"
+    if wrong.exchange:
+        return f"{who} with exchanged phases"
+    if wrong.kind is Kind.PHASE:
+        return f"{who} on {wrong.phases}"
+    return {Kind.SWAP: f"{who} swapped", Kind.LENGTH: f"length of {who}"}.get(
+        wrong.kind, f"error of {who} changes"
+    )
+
+
+def customers(
+    now: Round, said: Verdict, wrongs: Sequence[Correction], risk: float, kinds: Collection[Kind]
+) -> pd.DataFrame:
+    """Place of every customer, and which others the readings do not rule out."""
+    net, right = now.net, _as_filed(now.state.tables, kinds)
+    moved = {name for wrong in wrongs if wrong.kind in (*PLACES, Kind.SWAP) for name in wrong.names}
+    excluded = {*now.state.excluded}.difference(blind(net.site, now.state.unread))
+    open_from = -float(np.log(1.0 / risk))
+    others: dict[int, list[tuple[float, str]]] = {}
+    for guess, factor in zip(said.guesses, said.found.log_factor, strict=True):
+        for customer in concerned(now, guess) if guess.kind in PLACES else ():
+            stays = guess.lateral or guess.exchange
+            bus = net.feeder.buses[net.feeder.bus[customer] if stays else guess.other]
+            on = guess.phases
+            if guess.exchange:
+                on = guess.phases[customer not in net.parts[guess.subject].customers]
+            place = f"{bus} {on}" if guess.kind is Kind.PHASE else bus
+            others.setdefault(customer, []).append((float(factor), place))
+    out = []
+    for k, row in enumerate(now.state.tables.customers):
+        ranked = sorted(others.get(k, []), reverse=True)
+        possible = [place for factor, place in ranked if factor > open_from]
+        untold = possible or (not ranked and right != UNASKED)
+        verdict = UNTOLD if untold else PROPOSED if row.customer in moved else right
+        out.append(
+            {
+                "customer": row.customer,
+                "meter": row.meter,
+                "bus": row.bus,
+                "phases": row.phases,
+                "alternative": ranked[0][1] if ranked else "",
+                "log_factor": ranked[0][0] if ranked else np.nan,
+                "open": _some(possible),
+                "verdict": EXCLUDED if row.meter in excluded else verdict,
+            }
+        )
+    return pd.DataFrame(out)
+
+
+def _as_filed(tables: FeederTables, kinds: Collection[Kind]) -> str:
+    """The verdict on a place against which nothing speaks: of what was not looked for, nothing is known."""
+    possible = PLACES if tables.in_phases else (Kind.BUS,)
+    missing = [kind for kind in possible if kind not in kinds]
+    if len(missing) == len(possible):
+        return UNASKED
+    return f"{AS_FILED}; {missing[0]} {UNASKED}" if missing else AS_FILED
+
+
+def loads(now: Round) -> pd.DataFrame:
+    """Power factor of every load whose q is not metered, and the gain of its register of p."""
+    model, given, found = now.net.site.loads, now.given, now.fit
+    at, gain = given.where["tan"], given.where["p_gain"]
+    middle = 0.5 * (model.tan_min + model.tan_max)
+    tan, std, prior = middle + found.estimate[at], found.std[at], given.spread[at]
+
+    def factor(value: Floats) -> Floats:
+        return np.asarray(np.cos(np.arctan(np.maximum(value, 0.0))))
+
+    metered = prior == 0.0
+    learned = np.where(metered, "q is metered", np.where(std > VAGUE * prior, UNTOLD, "learned"))
+    hide = np.where(metered, np.nan, 1.0)
+    return pd.DataFrame(
+        {
+            "customer": now.net.site.feeder.customers,
+            "power_factor": factor(tan) * hide,
+            "low": factor(tan + WIDE * std) * hide,
+            "high": factor(tan - WIDE * std) * hide,
+            "p_gain_percent": 100.0 * found.estimate[gain],
+            "p_gain_std_percent": 100.0 * found.std[gain],
+            "verdict": learned,
+        }
+    )
+
+
+def errors(now: Round) -> pd.DataFrame:
+    """Sizes and correlation time of the errors of the customers' powers."""
+    noise, base = now.noise, now.net.site.feeder.base_kva
+    named = (
+        ("error of p", noise.p * base, "kW"),
+        ("error of q", noise.q * base, "kvar"),
+        ("correlation time", noise.time_s, "s"),
+        ("noise of meters", noise.white, "of what they promise"),
+    )
+    return pd.DataFrame(
+        [
+            {
+                "quantity": name,
+                "estimate": value,
+                "low": value * np.exp(-WIDE * std),
+                "high": value * np.exp(WIDE * std),
+                "unit": unit,
+                "verdict": "learned" if std < VAGUE else UNTOLD,
+            }
+            for (name, value, unit), std in zip(named, noise.std.tolist(), strict=True)
+        ]
+    )
+
+
+def _some(items: Sequence[str]) -> str:
+    tail = f" and {len(items) - _SHOWN} more" if len(items) > _SHOWN else ""
+    return ", ".join(items[:_SHOWN]) + tail
+
+
+MOST_ERRORS: Final = 24
+"""Largest number of errors; with more the files are another feeder's."""
+
+MOST_REVISIONS: Final = 3
+"""Largest number of re-examinations of all errors; most searches need one."""
+
+Row = dict[str, Any]
+"""One error in plain JSON types, as the journal holds it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """Result of a search.
+
+    Attributes
+    ----------
+    now
+        The files with all errors corrected, fitted.
+    said
+        Comparison of all further hypotheses there.
+    rows
+        The errors, in the order of their corrections.
+    """
+
+    now: Round
+    said: Verdict
+    rows: list[Row]
+
+
+class Search:
+    """Search for the errors of a feeder's files.
+
+    Parameters
+    ----------
+    files
+        The files.
+    fitted
+        Fits files that are taken for right.
+    weighed
+        Compares all hypotheses at such a fit.
+    risk
+        Probability of any proposal if the files are right.
+    kept
+        Journal of the steps; an interrupted search resumes from it.
+    """
+
+    def __init__(
+        self,
+        files: State,
+        fitted: Callable[[State], Round],
+        weighed: Callable[[Round], Verdict],
+        risk: float,
+        kept: Journal,
+    ) -> None:
+        self._files = files
+        self._fitted = fitted
+        self._weighed = weighed
+        self._risk = risk
+        self._kept = kept
+        self._steps = 0
+
+    def run(self) -> Found:
+        """Forward steps and re-examinations until both change nothing."""
+        found, settled = self._forward(self._files, [])
+        for _ in range(MOST_REVISIONS if settled else 0):
+            rows = self._revised(found.rows)
+            same = [row["correction"] for row in rows] == [row["correction"] for row in found.rows]
+            if same:
+                return replace(found, rows=rows)
+            found, settled = self._forward(self._after(rows), rows)
+            if not settled:
+                break
+        return found
+
+    def _after(self, rows: Sequence[Row]) -> State:
+        """The files with these errors corrected."""
+        state = self._files
+        for row in rows:
+            state = state.after(read(row["correction"]))
+        return state
+
+    def _step(self, state: State) -> tuple[Round, Callable[[], Verdict], Row | None]:
+        """Fit, comparison, and the error that the readings support most; None without one."""
+        now = self._fitted(state)
+        said: list[Verdict] = []
+
+        def verdict() -> Verdict:
+            if not said:
+                said.append(self._weighed(now))
+            return said[0]
+
+        row = self._kept.get(
+            f"error {self._steps}", lambda: _best(now, verdict(), self._risk, self._files.tables)
+        )
+        self._steps += 1
+        return now, verdict, row
+
+    def _forward(self, state: State, rows: list[Row]) -> tuple[Found, bool]:
+        """One error after the other; False where the search comes back to files that it has seen."""
+        been, settled = [self._files, state], True
+        for step in range(MOST_ERRORS + 1):
+            now, verdict, row = self._step(state)
+            if row is None or step == MOST_ERRORS:
+                break
+            wrong = read(row["correction"])
+            if wrong.kind is Kind.METER:
+                # All that was found may rest on this meter's readings: the search restarts without it.
+                meters = [each for each in rows if each["correction"]["kind"] == Kind.METER]
+                rows = [*meters, row]
+                state = self._after(rows)
+            elif any(state.after(wrong).same(before) for before in been):
+                # The readings support each of two places once the other one is taken for right.
+                rows, settled = [_doubted(each, wrong) for each in rows], False
+                break
+            else:
+                state = state.after(wrong)
+                rows = _together(rows, row, self._files.tables, now.net.site.bus_of_file)
+            been.append(state)
+        return Found(now, verdict(), rows), settled
+
+    def _revised(self, rows: list[Row]) -> list[Row]:
+        """The errors, each compared again with all others corrected."""
+        for row in rows:
+            wrong = read(row["correction"])
+            alone = [each for each in rows if _same_subject(read(each["correction"]), wrong)]
+            rest = [each for each in rows if each not in alone]
+            if row not in rows or wrong.kind is Kind.METER or not _files_of(rest) or _chained(wrong, rest):
+                continue
+            try:
+                now, _, again = self._step(self._after(rest))
+            except FeederInvalid:
+                continue  # A bus and a phase that need each other cannot be withdrawn alone.
+            if again is None:
+                rows = rest
+            elif again["correction"]["kind"] != Kind.METER:
+                rows = _together(rest, again, self._files.tables, now.net.site.bus_of_file)
+        return rows
+
+
+def _files_of(rows: Sequence[Row]) -> bool:
+    """Any of the errors is one of the files: otherwise nothing has changed since the first comparison."""
+    return any(row["correction"]["kind"] != Kind.METER for row in rows)
+
+
+def _same_subject(one: Correction, other: Correction) -> bool:
+    """Equal errors, or lengths of the same lines, which are found in several steps."""
+    return one == other or (one.kind is other.kind is Kind.LENGTH and one.names == other.names)
+
+
+def _chained(wrong: Correction, rest: Sequence[Row]) -> bool:
+    """An exchange of meters is relative to others of the same customers: it cannot be withdrawn alone."""
+    others = [read(row["correction"]) for row in rest]
+    return wrong.kind is Kind.SWAP and any(
+        other.kind is Kind.SWAP and set(other.names) & set(wrong.names) for other in others
+    )
+
+
+def _together(found: list[Row], row: Row, files: FeederTables, bus_of_file: Mapping[str, int]) -> list[Row]:
+    """Errors that do not contradict each other: of a customer's place the last one holds.
+
+    Its gain includes that of those it replaces. One that leads back to what the files say is none.
+    """
+    wrong, gain, rest = read(row["correction"]), row["log_factor"], []
+    for each in found:
+        earlier = read(each["correction"])
+        kept = left(earlier, wrong)
+        if kept is None:
+            gain += each["log_factor"]
+        else:
+            changed = {"correction": asdict(kept), "now": present(files, kept)}
+            rest.append(each if kept == earlier else each | changed)
+    return rest if as_filed(files, wrong, bus_of_file) else [*rest, row | {"log_factor": gain}]
+
+
+def _doubted(row: Row, wrong: Correction) -> Row:
+    """An error that cannot be told from another one, if it is about the same customers."""
+    told = read(row["correction"])
+    if (told.kind, told.names) != (wrong.kind, wrong.names):
+        return row
+    return row | {"alternatives": [*row["alternatives"], described(wrong)]}
+
+
+def _best(now: Round, said: Verdict, risk: float, files: FeederTables) -> Row | None:
+    """The error that the readings support most; None where they support none."""
+    if said.any < math.log(1.0 / risk):
+        return None
+    best = int(said.kept[0])
+    guess, g, h = said.guesses[best], float(said.found.g[best]), float(said.found.h[best])
+    shift = g / (h + LENGTH_SPREAD**-2) if guess.kind is Kind.LENGTH else 0.0
+    wrong = correction(now, guess, max(1.0 + shift, SHORTEST))
+    others = [correction(now, said.guesses[k]) for k in said.kept[1:]]
+    if wrong.kind is Kind.PHASE:
+        others += _unread(wrong, guess, now.state.unread)
+    return {
+        "correction": asdict(wrong),
+        "estimate": g / h if h > 0.0 else 0.0,
+        "std": h**-0.5 if h > 0.0 else math.inf,
+        "log_factor": float(said.found.log_factor[best]),
+        "confidence": float(said.confidence[best]),
+        # Swaps build on each other; a place is compared with that in the files.
+        "now": present(now.state.tables if wrong.kind is Kind.SWAP else files, wrong),
+        "since": guess.since,
+        "until": guess.until,
+        "alternatives": [described(other) for other in others],
+    }
+
+
+def _unread(wrong: Correction, guess: Guess, unread: str) -> list[Correction]:
+    """Phases without a voltage of the busbar to compare with: a single part may be on one of them."""
+    return [] if guess.exchange else [replace(wrong, phases=phase) for phase in unread]
+
+
+def read(row: Row) -> Correction:
+    """A correction from the plain types of the journal."""
+    return Correction(
+        Kind(row["kind"]),
+        tuple(row["names"]),
+        row["bus"],
+        row["phases"],
+        row["factor"],
+        tuple(row["lines"]),
+    )
+
+
+class OtherFeeder(InputInvalid):
+    """A folder holds another feeder than the one that was studied."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibrate:
+    """What `calibrate` found.
+
+    Attributes
+    ----------
+    feeder, digest
+        The feeder's name, and its content.
+    frames, span_h
+        How many moments were compared, and over what time, h.
+    risk
+        Probability of any proposal if the files are right.
+    meters
+        One row for each meter: `meter`, `customer`, `frames` (readings used), `bias_percent`, `std_percent`,
+        `low_percent`, `high_percent` (95 %; of the voltage, relative to the busbar's meter: an error that all
+        have in common cannot be told), `verdict`.
+    lines
+        One row for each line, or lines in series: `lines`, `from_bus`, `to_bus`, `factor`, `std`, `low`,
+        `high` (of the length in the files, if all others are right), `same` (lines whose effect is the same),
+        `verdict`.
+    customers
+        One row for each customer: `customer`, `meter`, `bus`, `phases` (as corrected), `alternative` (the
+        best other place), `log_factor` (of it against this one), `open` (places that are not ruled out),
+        `verdict`.
+    loads
+        One row for each customer: `customer`, `power_factor`, `low`, `high`, `p_gain_percent`,
+        `p_gain_std_percent`, `verdict`.
+    errors
+        `quantity`, `estimate`, `low`, `high`, `unit`, `verdict`: standard deviations and correlation time of
+        the errors of the customers' powers, and the meters' noise relative to what they promise.
+    proposals
+        What to correct, in the order it was found: `kind`, `what` (of a lateral its first line and its
+        customers), `now`, `proposed`, `estimate`, `std` (of a length, the factor; otherwise how much of the
+        proposed change the readings show: 1 is all), `low`, `high`, `log_factor` (gain of the
+        log-likelihood), `confidence`, `verdict`, `alternatives`.
+    corrections
+        The proposals that are sure, in the words of the files.
+    unread
+        Phases of which the busbar has no voltage: the meters on them are left out.
+    """
+
+    feeder: str
+    digest: str
+    frames: int
+    span_h: float
+    risk: float
+    meters: pd.DataFrame
+    lines: pd.DataFrame
+    customers: pd.DataFrame
+    loads: pd.DataFrame
+    errors: pd.DataFrame
+    proposals: pd.DataFrame
+    corrections: tuple[Correction, ...]
+    unread: str = ""
+
+    @property
+    def tables(self) -> dict[str, pd.DataFrame]:
+        """All tables by name."""
+        names = ("proposals", "meters", "lines", "customers", "loads", "errors")
+        return {name: getattr(self, name) for name in names}
+
+    def corrected(self, site_folder: Path | str, out: Path | str) -> None:
+        """Write a corrected copy of a feeder's folder; only what is sure is corrected.
+
+        Parameters
+        ----------
+        site_folder
+            The feeder that was studied: its folder, or its name.
+        out
+            A new or empty folder.
+
+        Raises
+        ------
+        OtherFeeder
+            If it is not the feeder that was studied.
+        FileExistsError
+            If there is something in the folder.
+        FeederInvalid, OSError
+            If it cannot be read or written.
+        """
+        tables, target = find(site_folder), Path(out)
+        if digest(tables) != self.digest:
+            raise OtherFeeder(
+                [Problem("other-origin", f"{site_folder}: not the feeder that was studied, or changed since")]
+            )
+        if target.exists() and (not target.is_dir() or any(target.iterdir())):
+            raise FileExistsError(f"{target}: already there; a corrected copy goes into a new folder")
+        for wrong in self.corrections:
+            tables = apply(tables, wrong)
+        write(tables, target)
+
+
+def calibrate(
+    site: Site | ThreePhaseSite,
+    readings: pd.DataFrame | Recording | Path | str,
+    *,
+    risk: float = 0.05,
+    tolerance: float = 0.02,
+    exclude: Sequence[str] = (),
+    kinds: Sequence[Kind] = tuple(Kind),
+    journal: Where = None,
+    progress: Progress | None = None,
+) -> Calibrate:
+    """Compare recorded readings with a feeder's files.
+
+    Parameters
+    ----------
+    site
+        The feeder, balanced (with loops or without) or of three phases.
+    readings
+        A recording, a table with its columns, or a Parquet or CSV file.
+    risk
+        Probability of any proposal if the files are right, 0 to 1.
+    tolerance
+        Relative error (1 sigma) of lines' lengths that is no mistake.
+    exclude
+        Meters that are not trusted. Their powers are still believed.
+    kinds
+        Which errors to look for; fewer take less time, and what is not looked for may pass for another.
+    journal
+        File in which each error that is found is kept; an interrupted study goes on from it.
+    progress
+        Told how much of the present comparison is done.
+
+    Raises
+    ------
+    RecordingInvalid
+        If the readings are another feeder's, name unknown meters, lack the busbar, are hardly in V, kW and
+        kvar, or are too few.
+    ValueError
+        If there is no such meter, or a number is out of range.
+    FeederInvalid
+        If closed lines form loops in three phases.
+    OtherStudy
+        If the journal is another study's.
+    InUse
+        If another process is writing it.
+    """
+    problems = wrong_numbers(risk, tolerance)
+    if unknown := sorted(set(exclude) - set(site.meter_ids)):
+        problems.append(Problem("unknown-name", f"{site.feeder.name} has no meter {', '.join(unknown)}"))
+    refuse(problems)
+    given = frames(site, readings, exclude=exclude)
+    subject = _subject(site, given, risk, tolerance) | {"exclude": sorted(exclude), "kinds": sorted(kinds)}
+
+    def weighed(now: Round) -> Verdict:
+        return compare(now, given, risk, progress or _quiet, kinds)
+
+    def fitted(state: State) -> Round:
+        return prepare(state, given, tolerance=tolerance, errors=True)
+
+    unread = given.unread if site.tables.in_phases else ""
+    files = State(site.tables, (*exclude, *blind(site, unread)), unread=unread)
+    with Journal(journal, subject) as kept:
+        found = Search(files, fitted, weighed, risk, kept).run()
+    now = found.now
+    lines, ids = line_table(now, tolerance, kinds)
+    wrongs = [read(row["correction"]) for row in found.rows]
+    rows, sure = final(found.rows, wrongs, lines, ids)
+    return Calibrate(
+        feeder=site.feeder.name,
+        digest=site.digest,
+        frames=given.t.size,
+        span_h=float(given.t[-1] - given.t[0]) / 3600.0,
+        risk=risk,
+        meters=meters(now, risk),
+        lines=lines,
+        customers=customers(now, found.said, wrongs, risk, kinds),
+        loads=loads(now),
+        errors=errors(now),
+        proposals=rows,
+        corrections=sure,
+        unread=unread,
+    )
+
+
+def wrong_numbers(risk: float, tolerance: float) -> list[Problem]:
+    """Return what is wrong with numbers of a calibration.
+
+    Parameters
+    ----------
+    risk, tolerance
+        As `calibrate` takes them.
+    """
+    problems = []
+    if not 0.0 < risk < 1.0:
+        problems.append(Problem("out-of-range", f"risk is {risk}; it must be between 0 and 1"))
+    if not 0.0 < tolerance < LENGTH_SPREAD:
+        problems.append(
+            Problem("out-of-range", f"tolerance is {tolerance}; it must be between 0 and {LENGTH_SPREAD}")
+        )
+    return problems
+
+
+def _quiet(done: int, total: int) -> None:
+    """Tell nobody."""
+
+
+def _subject(site: Site | ThreePhaseSite, given: Frames, risk: float, tolerance: float) -> dict[str, Any]:
+    content = hashlib.sha256()
+    busbar = given.v0_volt, given.v0_phases
+    for values in (given.t, given.v_volt, given.p_kw, given.q_kvar, *busbar, given.count):
+        content.update(np.ascontiguousarray(values).tobytes())
+    return {
+        "study": "calibrate",
+        "digest": site.digest,
+        "readings": content.hexdigest(),
+        "risk": risk,
+        "tolerance": tolerance,
+    }

@@ -1,0 +1,1 @@
+"""Campaigns of simulated attacks on a feeder."""

@@ -1,0 +1,347 @@
+"""Test of the sizes that `detectable` guarantees by simulated attacks and in campaigns.
+
+Every trial draws errors of loads, meters and busbar anew, Gaussian in even trials and as bounded as their
+standard deviations allow in odd ones, solves the feeder with its inverters at rest, and lets the monitor
+watch a few honest frames and then the lie.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from functools import cache, partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+
+from feeders.format.tables import FeederTables
+from feeders.model.site import from_tables
+from feeders.simulation.attacks import Trick
+from feeders.studies.campaign.plan import Kind, Promise
+from feeders.studies.detectable import Detectable, monitor_rule
+from feeders.studies.journal import Journal, Progress, Where, worked
+from feeders.studies.operating import SHARE, squared, volts_of_lie
+from feeders.studies.workers import Here, Runner
+from gridsec.arrays import Bools, Floats
+from gridsec.estimators import sequential
+from gridsec.estimators.sequential import LoadDoubt
+from gridsec.grid.network import bus_voltages, busbar_places
+from gridsec.interface import Frame
+from gridsec.planning.detectability import Rule, largest_shift
+
+if TYPE_CHECKING:
+    from feeders.model.site import Site
+
+__all__ = ["Rehearsal", "promised", "rehearse", "rehearse_everywhere"]
+
+
+_HONEST, _LYING = 4, 16
+"""Frames before and after a lie begins."""
+_SETTLING = 25
+"""Rounds in which inverters come to rest; their loop gain is below one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rehearsal:
+    """What became of lies of the promised sizes.
+
+    Attributes
+    ----------
+    trials
+        How many of each kind.
+    hidden_named
+        Trials with a lie of at most the hidden size after which somebody was named.
+    large_missed
+        Trials with a lie of at least the named size in which its meter was not named.
+    honest_named
+        Of the latter, those in which a meter that did not lie was named.
+    """
+
+    trials: int
+    hidden_named: int
+    large_missed: int
+    honest_named: int
+
+    @property
+    def table(self) -> pd.DataFrame:
+        """All of it as a table of one row."""
+        return pd.DataFrame([asdict(self)])
+
+
+def rehearse(
+    site: Site,
+    found: Detectable,
+    *,
+    trials: int,
+    seed: int = 0,
+    share: float = SHARE,
+    journal: Where = None,
+    progress: Progress | None = None,
+) -> Rehearsal:
+    """Let the monitor watch lies at the limits that were found, by M meters and by one.
+
+    Hidden lies are the worst of their size: those of the mixed-integer program. Large ones are told by one
+    meter beyond its size; in every second trial M - 1 others lie as well, by anything up to twice of that.
+
+    Parameters
+    ----------
+    site, found
+        The feeder, and what was found for it.
+    trials
+        How many of each kind.
+    seed
+        Chooses everything random.
+    share
+        As `found` was made with.
+    journal
+        File in which finished trials are kept; an interrupted rehearsal goes on from it, also to more trials.
+    progress
+        Told how many trials are done.
+
+    Raises
+    ------
+    OtherStudy
+        If the journal is another study's.
+    InUse
+        If another process is writing it.
+    """
+    sizes = [float(size) for name in ("hidden", "named", "named_alone") for size in found.meters[name]]
+    told = {"max_attacked": found.max_attacked, "risk": found.risk, "sizes": sizes}
+    subject = {"study": "trials", "digest": site.digest, "found": told, "seed": seed, "share": share}
+    given = monitor_rule(site, risk=found.risk, share=share)
+    p = site.meters.size
+
+    @cache
+    def worst(j: int) -> Floats:
+        return largest_shift(given, np.eye(p)[j], found.max_attacked, seen=False, must=j).lies
+
+    def trial(k: int) -> list[int]:
+        rng = np.random.default_rng([seed, k])
+        sign, j = rng.choice([-1.0, 1.0]), int(rng.integers(p))
+        caught = _named(given, site, share, rng, sign * rng.uniform(0.5, 1.0) * worst(j)).any()
+        lies = _large(site, found, rng, j, together=k % 2 == 0)
+        named = _named(given, site, share, rng, sign * lies)
+        return [int(caught), int(not named[j]), int((named & (lies == 0.0)).any())]
+
+    done = worked(journal, subject, ((str(k), partial(trial, k)) for k in range(trials)), progress)
+    return Rehearsal(trials, *(sum(each[i] for each in done.values()) for i in range(3)))
+
+
+def _large(site: Site, found: Detectable, rng: np.random.Generator, j: int, *, together: bool) -> Floats:
+    """A lie of meter j beyond its named size, and others in collusion; squared pu."""
+    column = "named" if together else "named_alone"
+    sizes = squared(site.customer_volt[site.meters], found.meters[column].to_numpy())
+    lies = np.zeros(sizes.size)
+    if together and found.max_attacked > 1:
+        others = rng.choice(np.delete(np.arange(sizes.size), j), found.max_attacked - 1, replace=False)
+        lies[others] = rng.uniform(-2.0, 2.0, others.size) * sizes[others]
+    lies[j] = rng.uniform(1.0, 1.2) * sizes[j]
+    return lies
+
+
+def _named(given: Rule, site: Site, share: float, rng: np.random.Generator, lies: Floats) -> Bools:
+    """Who is named in one trial."""
+    design = given.design
+    frame = _world(given, site, share, rng)
+    state = sequential.init(design, 0.0)
+    named = np.zeros(lies.size, dtype=np.bool_)
+    for tick in range(_HONEST + _LYING):
+        state, _, verdict = sequential.step(
+            design, state, frame(tick, lies if tick >= _HONEST else 0.0 * lies)
+        )
+        named |= verdict.suspects
+    return named
+
+
+def _world(given: Rule, site: Site, share: float, rng: np.random.Generator) -> Callable[[int, Floats], Frame]:
+    """Frames of a feeder at rest whose true powers, busbar and meters are off by fixed errors."""
+    design, doubt, loads = given.design, given.design.doubt, site.loads
+    accuracy, own = site.accuracy, site.droop.customer
+    draw = _bounded if rng.integers(2) else _gaussian
+    p = -share * loads.load_peak
+    q = 0.5 * (loads.tan_min + loads.tan_max) * p
+    off_p, off_q = _errors(doubt, draw, rng)
+    x = np.zeros(own.size)
+    for _ in range(_SETTLING):
+        injected = q + off_q + np.bincount(own, weights=x, minlength=q.size)
+        v2 = bus_voltages(site.feeder, p + off_p, injected, 1.0, steps=3)[site.feeder.bus]
+        x = 0.5 * x + 0.5 * site.droop(site.droop.vbar**2 - v2[own])
+    v = np.sqrt(v2[site.meters]) * (1.0 + accuracy.class_fraction * rng.uniform(-1.0, 1.0, site.meters.size))
+    busbar = (1.0 + design.busbar / 2.0 * draw(rng, busbar_places(site.feeder).stop)) ** 2
+    root3 = np.sqrt(3.0)
+
+    def frame(tick: int, lies: Floats) -> Frame:
+        reading = v + accuracy.jitter * rng.standard_normal(v.size)
+        step = np.maximum(accuracy.resolution, 1e-9)
+        reading = np.round(reading / step) * step
+        return Frame(
+            t=(tick + 1) * design.step_s,
+            y=reading**2 + lies,
+            seen=np.ones(v.size, dtype=np.bool_),
+            v0_squared=float(busbar.mean()),
+            p=p,
+            p_error=root3 * doubt.p,
+            q=q,
+            q_error=root3 * doubt.q,
+            q_net=np.full(q.size, np.nan),
+            q_net_error=np.zeros(q.size),
+            v0_phases=busbar if busbar.size > 1 else None,
+        )
+
+    return frame
+
+
+def _errors(
+    doubt: LoadDoubt, draw: Callable[[np.random.Generator, int], Floats], rng: np.random.Generator
+) -> tuple[Floats, Floats]:
+    """What the powers are off, pu, (N,) each."""
+    own = [
+        np.sqrt(1.0 - common) * draw(rng, std.size) + np.sqrt(common) * draw(rng, 1)
+        for std, common in ((doubt.p, doubt.common_p), (doubt.q, doubt.common_q))
+    ]
+    if np.any(doubt.together):
+        level = np.sqrt(doubt.together) * draw(rng, 1)
+        own = [np.sqrt(1.0 - doubt.together) * each + level for each in own]
+    return doubt.p * own[0], doubt.q * own[1]
+
+
+def _gaussian(rng: np.random.Generator, size: int) -> Floats:
+    return rng.standard_normal(size)
+
+
+def _bounded(rng: np.random.Generator, size: int) -> Floats:
+    return np.asarray(np.sqrt(3.0) * rng.uniform(-1.0, 1.0, size))
+
+
+PIECE = 1_000
+"""Trials of a piece."""
+
+HIDDEN, NAMED = (0.5, 1.0), (1.0, 1.2)
+"""Factors on the sizes up to which lies stay hidden, and beyond which liars are named."""
+
+NOTHING = 1e-6
+"""What a solver leaves where nobody lies, V."""
+
+
+def promised(site: Site, found: Detectable, *, share: float = SHARE) -> tuple[Kind, ...]:
+    """Lies of the sizes that `detectable` found, in a campaign.
+
+    Parameters
+    ----------
+    site
+        The feeder, as stated: with the campaign's errors of loads and meters.
+    found
+        What was found for it.
+    share
+        As `found` was made with.
+
+    Returns
+    -------
+    hidden_alone, hidden
+        One meter, and M of them in the worst collusion of this size; nobody is to be named.
+    named_alone, named
+        One meter, and any M of them, each by its size; all are to be named.
+
+    Notes
+    -----
+    For M = 1 there are only those alone, and where no lie stays hidden for sure there are none of these.
+    """
+    most, alone = found.max_attacked, (1,)
+    kinds = [
+        Kind("hidden_alone", Trick.BIAS, HIDDEN, _volts(found, "hidden_alone"), (), alone, Promise.HIDDEN),
+        Kind("named_alone", Trick.BIAS, NAMED, _volts(found, "named_alone"), (), alone, Promise.NAMED),
+    ]
+    if most > 1:
+        worst = _collusions(site, found, share)
+        kinds += [
+            Kind("hidden", Trick.BIAS, HIDDEN, (), worst, (most,), Promise.HIDDEN),
+            Kind("named", Trick.BIAS, NAMED, _volts(found, "named"), (), (most,), Promise.NAMED),
+        ]
+    return tuple(kind for kind in kinds if any(kind.volts) or kind.together)
+
+
+def _volts(found: Detectable, column: str) -> tuple[float, ...]:
+    return tuple(float(volt) for volt in found.meters[column])
+
+
+def _collusions(site: Site, found: Detectable, share: float) -> tuple[tuple[float, ...], ...]:
+    """Lies of all meters, V: for each of them the worst that stay hidden although it takes part."""
+    rule, p = monitor_rule(site, risk=found.risk, share=share), site.meters.size
+    worst = [largest_shift(rule, np.eye(p)[j], found.max_attacked, seen=False, must=j).lies for j in range(p)]
+    base = site.customer_volt[site.meters]
+    volts = [np.sign(lies) * volts_of_lie(base, np.abs(lies)) for lies in worst]
+    volts = [np.where(np.abs(row) > NOTHING, row, 0.0) for row in volts]
+    return tuple(tuple(row.tolist()) for row in volts if row.any())
+
+
+def rehearse_everywhere(
+    site: Site,
+    found: Detectable,
+    *,
+    trials: int,
+    seed: int = 0,
+    share: float = SHARE,
+    runner: Runner | None = None,
+    piece: int = PIECE,
+    journal: Where = None,
+    progress: Progress | None = None,
+) -> Rehearsal:
+    """As `guarantees.rehearse`, in pieces that are worked on anywhere.
+
+    Parameters
+    ----------
+    site, found, trials, share
+        As `rehearse`.
+    seed
+        Chooses everything random; piece k has the seed `seed + k piece` of its own.
+    runner
+        Where; see `feeders.studies.workers`.
+    piece
+        Trials of a piece.
+    journal
+        File in which finished pieces are kept.
+    progress
+        Told how many trials are done.
+
+    Raises
+    ------
+    OtherStudy
+        If the journal is another study's.
+    InUse
+        If another process is writing it.
+    ClusterUnusable, WorkerLost
+        From the runner; what is finished is in the journal.
+    """
+    subject = {
+        "study": "rehearsal",
+        "digest": site.digest,
+        "found": {"max_attacked": found.max_attacked, "risk": found.risk},
+        "trials": [trials, piece],
+        "seed": seed,
+        "share": share,
+    }
+    sizes = [min(piece, trials - begin) for begin in range(0, trials, piece)]
+    work = partial(_piece, site.tables, found, sizes, seed, share)
+    with Journal(journal, subject, of=len(sizes)) as kept:
+        todo = [k for k in range(len(sizes)) if str(k) not in kept]
+        done = trials - sum(sizes[k] for k in todo)
+        if progress is not None:
+            progress(done, trials)
+        with closing((runner or Here()).run(work, todo)) as results:
+            for k, counted in results:
+                kept.put(str(k), counted)
+                done += sizes[k]
+                if progress is not None:
+                    progress(done, trials)
+        counts = [kept[str(k)] for k in range(len(sizes))]
+    return Rehearsal(trials, *(sum(each[i] for each in counts) for i in range(3)))
+
+
+def _piece(  # noqa: PLR0917  # all that a worker needs
+    tables: FeederTables, found: Detectable, sizes: list[int], seed: int, share: float, k: int
+) -> list[int]:
+    begin = sum(sizes[:k])
+    seen = rehearse(from_tables(tables), found, trials=sizes[k], seed=seed + begin, share=share)
+    return [seen.hidden_named, seen.large_missed, seen.honest_named]

@@ -1,0 +1,560 @@
+"""One scene of a campaign: cases with their attacks, played against AC power flow.
+
+Until its onset a case is to the last bit the scene without lies: that is watched once, and each case goes on
+from the state in which the estimator then is; states are values. Lies of meters do not change the truth:
+it is computed once for each scene; what inverters do, and powers that are told wrong, are played in full.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from feeders.registry.registry import Watcher, design
+from feeders.simulation.attacks import (
+    Lie,
+    NoSuchAttack,
+    Trick,
+    coordinated,
+    each_alone,
+    fake_load,
+    present_loads,
+)
+from feeders.simulation.plant import Loads, NoEquilibrium
+from feeders.simulation.powerflow import PowerFlowDiverged
+from feeders.simulation.scenario import Scenario
+from feeders.simulation.trial import Trial, Truth, frames
+from feeders.studies.campaign.plan import CLEAN, Case, Place, Plan
+from gridsec.arrays import Bools, Floats, Ints
+from gridsec.attack import (
+    Attack,
+    Bias,
+    Coordinated,
+    InverterAttack,
+    Reports,
+    apply_all,
+    load_pattern,
+    manipulated,
+    most_affected,
+    reach,
+)
+from gridsec.errors import InputInvalid, Problem
+from gridsec.estimators.sequential import Commission
+from gridsec.grid.network import Power, between
+from gridsec.interface import Decision, Frame
+
+if TYPE_CHECKING:
+    from feeders.model.site import Site
+
+__all__ = ["Prepared", "attacks", "liars", "prepare", "risings", "watch"]
+
+
+def attacks(
+    site: Site, plan: Plan, case: Case, honest: Scenario
+) -> tuple[tuple[Attack, ...], tuple[InverterAttack, ...]]:
+    """Turn a case into attacks.
+
+    Parameters
+    ----------
+    site, plan, case
+        The feeder, and what is to happen; somebody lies.
+    honest
+        The scene without it.
+
+    Raises
+    ------
+    NoSuchAttack
+        When the feeder has too few meters or inverters, or no place for a load that does not exist.
+    """
+    kind, random = plan.kind(case.kind), np.random.default_rng(case.seed)
+    there = site.droop.tau.size if kind.trick is Trick.INVERTER else site.meters.size
+    if case.liars > there:
+        raise NoSuchAttack(
+            f"{site.feeder.name} has {there} of what {case.liars} should lie", code="too-few-meters"
+        )
+    t_on = honest.start + case.onset_s
+    t_off = honest.start + min(case.onset_s + plan.lying_s, plan.duration_s)
+    if kind.trick in (Trick.COORDINATED, Trick.COORDINATED_POWER):
+        power = kind.trick is Trick.COORDINATED_POWER
+        loads = present_loads(site, honest, t_on)
+        return (_story(site, case, loads, random, t_on=t_on, t_off=t_off, power=power),), ()
+    if kind.trick is Trick.INVERTER:
+        some = np.sort(random.choice(there, case.liars, replace=False))
+        rating = np.array([row.inverter_kva for row in site.tables.customers])[site.droop.customer[some]]
+        q = case.size / 100.0 * random.choice([-1.0, 1.0], some.size) * rating / site.feeder.base_kva
+        return (), (InverterAttack(some.astype(np.intp), q, t_on, t_off),)
+    for sizes in (kind.volts, *kind.together):
+        if sizes and len(sizes) != there:
+            raise NoSuchAttack(
+                f"kind {kind.name!r} has sizes for {len(sizes)} meters of {there}", code="shape"
+            )
+    if kind.together:
+        told = np.array(kind.together[int(random.integers(len(kind.together)))])
+        some, signs = np.flatnonzero(told), random.choice([-1.0, 1.0], 1)
+    else:
+        told = np.array(kind.volts)
+        some, signs = liars(site, case, random)
+    if told.size:
+        nominal = site.customer_nominal[site.meters[some]]
+        return (Bias(some, t_on, t_off, case.size * signs * told[some] / nominal),), ()
+    lie = Lie(kind.trick, case.liars, case.size)
+    return (each_alone(lie, some, signs, t_on, t_off),), ()
+
+
+def liars(site: Site, case: Case, random: np.random.Generator) -> tuple[Ints, Floats]:
+    """Choose who lies by a case's rule.
+
+    Parameters
+    ----------
+    site, case
+        The feeder, and what is to happen.
+    random
+        Chooses.
+
+    Returns
+    -------
+    meters : (k,)
+        Who lies, ascending.
+    signs : (k,)
+        In which direction.
+
+    Raises
+    ------
+    NoSuchAttack
+        When no load is felt by so many meters.
+    """
+    p, count = site.meters.size, case.liars
+    signs: Floats = random.choice([-1.0, 1.0], count)
+    if case.place == Place.RANDOM:
+        return np.sort(random.choice(p, count, replace=False)).astype(np.intp), signs
+    R, X = (between(site.feeder, power) for power in Power)
+    if case.place == Place.SENSITIVE:
+        # What loads of equal and independent uncertainty do to each voltage.
+        felt = np.sqrt((R**2).sum(axis=1) + (X**2).sum(axis=1))
+        return most_affected(felt[site.meters], count), signs
+    if case.place == Place.STREET:
+        return _nearest(R, site.meters, int(random.integers(p)), count), signs
+    v = np.ones(len(R))
+    for customer in random.permutation(site.meters):
+        ratio = 0.5 * float(site.loads.tan_min[customer] + site.loads.tan_max[customer])
+        pattern = np.abs(load_pattern(R, X, int(customer), ratio, v)[site.meters])
+        some = most_affected(pattern, count)
+        if pattern[some].min() > 0.0:
+            return some, np.full(count, signs[0])
+    raise NoSuchAttack(f"{site.feeder.name} has no load that {count} meters feel")
+
+
+def _nearest(R: Floats, meters: Ints, one: int, count: int) -> Ints:
+    """A meter and those with the least resistance between them and it."""
+    own = np.diagonal(R)[meters]
+    apart = own[one] + own - 2.0 * R[meters[one], meters]
+    apart[one] = -1.0
+    return np.sort(np.argsort(apart, kind="stable")[:count]).astype(np.intp)
+
+
+def _story(
+    site: Site,
+    case: Case,
+    loads: Loads,
+    random: np.random.Generator,
+    *,
+    t_on: float,
+    t_off: float,
+    power: bool,
+) -> Attack:
+    """The trace of a load at the first customer, in random order, who could draw it."""
+    why: NoSuchAttack | None = None
+    for customer in random.permutation(site.meters):
+        try:
+            some, fake = fake_load(site, int(customer), case.liars, case.size / 100.0, loads=loads)
+        except NoSuchAttack as error:
+            why = error
+            continue
+        return coordinated(site, some, fake, t_on=t_on, t_off=t_off, power=power)
+    raise NoSuchAttack(f"{site.feeder.name} has no place for the trace of a load of {case.size:g} %: {why}")
+
+
+ERROR_PERCENTILE = 95.0
+
+IMPOSSIBLE = (NoSuchAttack, PowerFlowDiverged, NoEquilibrium)
+"""What keeps a case from being played, and the others not."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prepared:
+    """What all scenes of a campaign share.
+
+    Attributes
+    ----------
+    site
+        The feeder.
+    plan
+        The campaign.
+    stated
+        The feeder whose files say how wrong loads and meters are.
+    watchers
+        By false-alarm rate.
+    learners
+        The same, with the interval of the readings that they learn from; none where nothing is learned.
+    """
+
+    site: Site
+    plan: Plan
+    stated: Site
+    watchers: dict[float, Watcher]
+    learners: dict[float, Watcher]
+
+
+def prepare(site: Site, plan: Plan) -> Prepared:
+    """Design the estimators of a campaign.
+
+    Parameters
+    ----------
+    site, plan
+        The feeder, and the campaign.
+
+    Raises
+    ------
+    NotObservable, DesignInfeasible, EstimatorUnusable, FeederInvalid, ValueError
+        If the estimator cannot watch this feeder with these settings.
+    """
+    scene = plan.trial(site, plan.moment(0))
+    watchers = _designed(plan, scene.stated)
+    learners = _designed(plan, replace(scene, step_s=plan.learn_step_s).stated) if plan.learn_s else {}
+    if any(watcher.learner is None for watcher in learners.values()):
+        raise InputInvalid(
+            [Problem("inconsistent", f"{plan.estimator} does not learn its meters' fixed errors")]
+        )
+    return Prepared(site, plan, scene.stated, watchers, learners)
+
+
+def _designed(plan: Plan, stated: Site) -> dict[float, Watcher]:
+    return {rate: design(plan.watched(stated, rate)) for rate in plan.alarms_per_year}
+
+
+def watch(given: Prepared, scene: int) -> list[dict[str, Any]]:
+    """Play and watch all cases of one scene.
+
+    Parameters
+    ----------
+    given
+        From `prepare`.
+    scene
+        Its number.
+
+    Returns
+    -------
+    list of dict
+        One for each case and false-alarm rate; values that JSON can hold. See `study.Campaign`.
+    """
+    plan, moment, cases = given.plan, given.plan.moment(scene), given.plan.cases(scene)
+    trial = plan.trial(given.site, moment)
+    honest = replace(trial.scenario, season=moment.season)
+    head = {
+        "scene": scene,
+        "season": str(moment.season),
+        "hour": moment.profile_s % 86_400.0 / 3600.0,
+        "weekday": int(moment.profile_s // 86_400.0) % 7,
+    }
+    try:
+        played = _Played.of(list(frames(trial, honest, stated=given.stated)))
+        known = _learned(given, trial, honest) if plan.learn_s else {}
+    except IMPOSSIBLE as error:
+        return [_row(head, case, rate) | _nothing(error) for case in cases for rate in given.watchers]
+    onsets = {round(case.onset_s / plan.step_s) for case in cases[1:]}
+    clean, states = {}, {}
+    for rate, watcher in given.watchers.items():
+        clean[rate], states[rate] = _clean(
+            watcher, watcher.init(honest.start, known.get(rate)), played, onsets
+        )
+    rows = [_told(given, head, cases[0], rate, seen, played, 0, seen) for rate, seen in clean.items()]
+    for case in cases[1:]:
+        onset = round(case.onset_s / plan.step_s)
+        try:
+            lied = _lied(given, played, honest, case)
+        except IMPOSSIBLE as error:
+            rows += [_row(head, case, rate) | _nothing(error) for rate in given.watchers]
+            continue
+        for rate, watcher in given.watchers.items():
+            seen, _ = _step(watcher, states[rate][onset], lied.frames[onset:])
+            rows.append(_told(given, head, case, rate, seen, lied, onset, clean[rate]))
+    return rows
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Played:
+    """What is watched, and the truth. T frames, N customers, p meters, m inverters."""
+
+    frames: list[Frame]
+    v2: Floats  # (T, N)
+    liars: Bools  # (T, p)
+    shift: Floats  # (T, p) reported minus honest voltage, pu
+    inverters: Bools  # (T, m)
+
+    @classmethod
+    def of(cls, played: list[tuple[Frame, Truth]]) -> _Played:
+        return cls(
+            [frame for frame, _ in played],
+            np.array([truth.v2 for _, truth in played]),
+            np.array([truth.liars for _, truth in played]),
+            np.array([_shift(frame.y, truth.attack) for frame, truth in played]),
+            np.array([truth.inverters for _, truth in played]),
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Seen:
+    """What an estimator said. T frames."""
+
+    named: Bools  # (T, p)
+    inverters: Bools  # (T, m)
+    clean: Bools  # (T,)
+    undecided: Bools  # (T,)
+    v2: Floats  # (T, N)
+
+
+def _learned(given: Prepared, trial: Trial, honest: Scenario) -> dict[float, Commission]:
+    """What estimators learn of their meters in the honest time before a scene."""
+    learn_s, step_s = given.plan.learn_s, given.plan.learn_step_s
+    # One frame more than what is asked for, and quasi-static inverters: they settle between two readings.
+    before = replace(
+        honest,
+        start=honest.start - learn_s - step_s,
+        profile_s=honest.profile_s - learn_s - step_s,
+        duration_s=learn_s + step_s,
+        dt_s=step_s,
+        substep_s=step_s,
+    )
+    states = {rate: watcher.init(before.start) for rate, watcher in given.learners.items()}
+    for frame, _ in frames(replace(trial, step_s=step_s), before):
+        for rate, watcher in given.learners.items():
+            states[rate], _, _ = watcher.step(states[rate], frame)
+    found = {}
+    for rate, watcher in given.learners.items():
+        if watcher.learner is not None:
+            found[rate] = watcher.learner.commission(states[rate])
+    return found
+
+
+def _clean(watcher: Watcher, state: Any, played: _Played, onsets: set[int]) -> tuple[_Seen, dict[int, Any]]:
+    """Watch the scene without lies, and keep the states before some frames."""
+    states, parts, begin = {}, [], 0
+    for end in sorted({*onsets, len(played.frames)}):
+        seen, state = _step(watcher, state, played.frames[begin:end])
+        states[end], begin = state, end
+        parts.append(seen)
+    columns = (
+        [getattr(part, name) for part in parts] for name in ("named", "inverters", "clean", "undecided", "v2")
+    )
+    return _Seen(*(np.concatenate(column) for column in columns)), states
+
+
+def _step(watcher: Watcher, state: Any, some: list[Frame]) -> tuple[_Seen, Any]:
+    named, inverters, decisions, v2 = [], [], [], []
+    for frame in some:
+        state, estimate, verdict = watcher.step(state, frame)
+        named.append(verdict.suspects)
+        inverters.append(verdict.inverters)
+        decisions.append(verdict.decision)
+        v2.append(estimate.v2)
+    clean = np.array([each is Decision.CLEAN for each in decisions], dtype=np.bool_)
+    undecided = np.array([each is Decision.UNDECIDED for each in decisions], dtype=np.bool_)
+    return _Seen(np.array(named), np.array(inverters), clean, undecided, np.array(v2)), state
+
+
+# ------------------------------------------------------------------------------------------ what is told
+
+
+def _lied(given: Prepared, played: _Played, honest: Scenario, case: Case) -> _Played:
+    """The scene with the lies of a case."""
+    some, wrong = attacks(given.stated, given.plan, case, honest)
+    if wrong or not all(_simple(attack, honest.start) for attack in some):
+        trial = given.plan.trial(given.site, given.plan.moment(case.number // given.plan.together))
+        lying = replace(honest, attacks=some, inverter_attacks=wrong)
+        return _Played.of(list(frames(trial, lying, stated=given.stated)))
+    t = np.array([frame.t for frame in played.frames])
+    y = np.array([frame.y for frame in played.frames])
+    # Lies have sizes in parts of the nominal voltage, as in scenarios, frames in parts of each place's base.
+    of_nominal = (given.site.customer_volt / given.site.customer_nominal)[given.site.meters]
+    # The root of a rounded square is the number itself.
+    v = np.sqrt(y) * of_nominal
+    nothing = np.zeros_like(v)
+
+    def past(when: Floats) -> Floats:
+        # Half a microsecond of slack, as in scenarios: the difference of two times is rarely exact.
+        row = np.floor((when - honest.start + 5e-7) / honest.dt_s).astype(np.intp)
+        return np.asarray(v[row])
+
+    told = apply_all(some, t, Reports(v, nothing, nothing), past).v
+    lies = manipulated(some, t, v.shape[1])
+    claimed = told / of_nominal
+    y, some_lie = np.where(lies, claimed * np.abs(claimed), y), np.any(lies, axis=1).tolist()
+    return replace(
+        played,
+        frames=[
+            replace(frame, y=row) if lying else frame
+            for frame, row, lying in zip(played.frames, y, some_lie, strict=True)
+        ],
+        liars=lies,
+        shift=(told - v) / of_nominal,
+    )
+
+
+def _shift(y: Floats, attack: Floats) -> Floats:
+    """Reported minus honest voltage, pu, of squared ones."""
+    return np.asarray(np.sqrt(y) - np.sqrt(y - attack))
+
+
+def _simple(attack: Attack, start: float) -> bool:
+    """Whether only voltages are told wrong, by what the scene itself has seen."""
+    powers = isinstance(attack, Coordinated) and bool(attack.p_shift.any() or attack.q_shift.any())
+    return not powers and reach(attack, attack.t_on) <= attack.t_on - start
+
+
+# --------------------------------------------------------------------------------------- what came of it
+
+
+def _row(head: dict[str, Any], case: Case, rate: float) -> dict[str, Any]:
+    return {
+        "scenario": case.number,
+        **head,
+        "alarms_per_year": rate,
+        "kind": case.kind,
+        "size": case.size,
+        "liars": case.liars,
+        "place": str(case.place),
+        "onset_s": case.onset_s if case.kind != CLEAN else float("nan"),
+        "reason": "",
+    }
+
+
+def _nothing(error: Exception) -> dict[str, Any]:
+    """The rest of a row of which there is nothing to tell but why."""
+    nothing = dict.fromkeys(("delay_s", "clear_s", *_ERRORS), float("nan"))
+    times = dict.fromkeys(("watched_s", "undecided_s", "clean_lying_s"), 0.0)
+    counts = dict.fromkeys(("named", "false_events", "most_named"), 0)
+    none = {"exact": False, "missed": "", "falsely_named": "", "because": "", "each": []}
+    return {"reason": str(error)} | none | counts | times | nothing
+
+
+_ERRORS = ("error_liars", "error_liars_95", "error_others", "error_others_95")
+
+
+def _told(  # noqa: PLR0917  # one row needs all that is known of the case
+    given: Prepared,
+    head: dict[str, Any],
+    case: Case,
+    rate: float,
+    seen: _Seen,
+    played: _Played,
+    begin: int,
+    control: _Seen,
+) -> dict[str, Any]:
+    """One row: what an estimator made of a case from frame `begin` on, and of the scene without lies."""
+    plan, site, step_s = given.plan, given.site, given.plan.step_s
+    names = (*site.meter_ids, *(site.feeder.customers[k] for k in site.droop.customer))
+    lies = np.hstack([played.liars[begin:], played.inverters[begin:]])
+    named = _everybody(seen, lies)
+    anyway: Bools = np.any(_everybody(control, lies), axis=0)
+    because = named.any(axis=0) & ~anyway
+    told = _each(played, begin, site, lies, named, anyway, names, step_s)
+    # A name that stays a while after the lie is not false.
+    wrong_names = named & ~np.logical_or.accumulate(lies, axis=0)
+    false = wrong_names.any(axis=0)
+    delays = np.array([one["delay_s"] for one in told])
+    missed = [one["who"] for one in told if np.isinf(one["delay_s"])]
+    lying: Bools = np.any(lies, axis=1)
+    after = np.flatnonzero(lying)[-1] + 1 if lying.any() else len(lying)
+    quiet = np.flatnonzero(~named[after:].any(axis=1))
+    ended = after < len(lying)
+    row = _row(head, case, rate) | {
+        "exact": not missed and not false.any(),
+        "named": len(told) - len(missed),
+        "missed": " ".join(missed),
+        "falsely_named": " ".join(np.array(names)[false]),
+        "because": " ".join(np.array(names)[because]),
+        "false_events": risings(wrong_names),
+        "delay_s": float(delays.max()) if delays.size else float("nan"),
+        "clear_s": (float(quiet[0] * step_s) if quiet.size else float("inf")) if ended else float("nan"),
+        "most_named": int(named.sum(axis=1).max(initial=0)),
+        "watched_s": len(lying) * step_s,
+        "undecided_s": float(seen.undecided.sum() * step_s),
+        "clean_lying_s": float((seen.clean & lying & ~named.any(axis=1)).sum() * step_s),
+    }
+    return row | _errors(plan, site, seen, played, begin, lies) | {"each": told}
+
+
+def _everybody(seen: _Seen, lies: Bools) -> Bools:
+    """Which meters and inverters (T, p + m) were named in the last frames."""
+    # Families that do not judge inverters name none.
+    inverters = np.zeros((len(seen.named), lies.shape[1] - seen.named.shape[1]), dtype=np.bool_)
+    some = np.hstack([seen.named, seen.inverters if seen.inverters.shape[1] else inverters])
+    return np.asarray(some[len(some) - len(lies) :], dtype=np.bool_)
+
+
+def risings(flags: Bools) -> int:
+    """How often any of some flags goes up, from down before the first row.
+
+    Parameters
+    ----------
+    flags : (T, k)
+        The flags over time.
+    """
+    before = np.vstack([np.zeros((1, flags.shape[1]), dtype=np.bool_), flags[:-1]])
+    return int(np.count_nonzero(flags & ~before))
+
+
+def _each(  # noqa: PLR0917  # meters and inverters alike
+    played: _Played,
+    begin: int,
+    site: Site,
+    lies: Bools,
+    named: Bools,
+    anyway: Bools,
+    names: tuple[str, ...],
+    step_s: float,
+) -> list[dict[str, Any]]:
+    """One row for every liar."""
+    rows = []
+    for j in np.flatnonzero(lies.any(axis=0)):
+        lying = lies[:, j]
+        caught = np.flatnonzero(named[:, j] & lying)
+        delay = (caught[0] - np.argmax(lying)) * step_s if caught.size else np.inf
+        inverter = bool(j >= site.meters.size)
+        base = np.nan if inverter else site.customer_volt[site.meters[j]]
+        volt = np.nan if inverter else np.abs(played.shift[begin:, j]).max() * base
+        rows.append(
+            {
+                "who": names[j],
+                "inverter": inverter,
+                "lie_volt": float(volt),
+                "delay_s": float(delay),
+                "anyway": bool(anyway[j]),
+            }
+        )
+    return rows
+
+
+def _errors(  # noqa: PLR0917  # the same
+    plan: Plan, site: Site, seen: _Seen, played: _Played, begin: int, lies: Bools
+) -> dict[str, float]:
+    """Errors of the voltage, % of nominal, at liars while they lie and at everybody else."""
+    with np.errstate(invalid="ignore"):
+        error = 100.0 * np.abs(np.sqrt(seen.v2) - np.sqrt(played.v2[begin:]))
+    error *= site.customer_volt / site.customer_nominal
+    error = np.where(np.isfinite(error), error, np.inf)
+    lying: Bools = np.any(lies, axis=1)
+    first = int(np.argmax(lying)) if lying.any() else 0
+    use = np.arange(len(lying)) >= first + round(plan.settling_s / plan.step_s)
+    at_liars = np.zeros(error.shape, dtype=np.bool_)
+    at_liars[:, site.meters] = played.liars[begin:]
+    out = {}
+    for where, some in (("liars", at_liars & use[:, None]), ("others", ~at_liars & use[:, None])):
+        values = error[some]
+        out[f"error_{where}"] = float(np.max(values)) if values.size else float("nan")
+        out[f"error_{where}_95"] = (
+            float(np.percentile(values, ERROR_PERCENTILE, method="higher")) if values.size else float("nan")
+        )
+    return out

@@ -1,0 +1,432 @@
+"""Campaign of simulated attacks on a feeder: identification, delay, shown voltages, tables.
+
+The truth is full AC power flow with the droop inverters in closed loop, over days of profiles.
+
+References
+----------
+docs/studies.md; docs/theory-studies.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import pandas as pd
+from scipy.stats import binomtest, chi2
+
+from feeders.format.tables import FeederTables
+from feeders.model.site import from_tables
+from feeders.studies.campaign.plan import CLEAN, Plan, Promise
+from feeders.studies.campaign.scene import Prepared, prepare, watch
+from feeders.studies.journal import Journal, Progress, Where
+from feeders.studies.workers import Here, Runner, versions
+from gridsec.errors import GridsecError
+
+if TYPE_CHECKING:
+    from feeders.model.site import Site
+
+__all__ = [
+    "CONFIDENCE",
+    "WITHIN_S",
+    "Campaign",
+    "NothingPlayed",
+    "campaign",
+    "delays",
+    "false_names",
+    "grouped",
+    "promises",
+    "scenarios",
+]
+
+
+CONFIDENCE: Final = 0.95
+"""Of every interval."""
+
+WITHIN_S: Final = (1.0, 2.0, 5.0, 10.0, 30.0, 60.0, 120.0, 300.0)
+"""Times of the operating curve, s after the onset."""
+
+YEAR_S: Final = 365.25 * 86_400.0
+
+
+def scenarios(rows: Sequence[dict[str, Any]]) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Tables of all scenarios, and of all their liars.
+
+    Parameters
+    ----------
+    rows
+        As `scene.watch` gives them.
+    """
+    kept = ("scenario", "alarms_per_year", "kind", "size", "liars", "place")
+    each = [{name: row[name] for name in kept} | one for row in rows for one in row.get("each", ())]
+    frame = pd.DataFrame([{name: cell for name, cell in row.items() if name != "each"} for row in rows])
+    liars = pd.DataFrame(each, columns=[*kept, "who", "inverter", "lie_volt", "delay_s", "anyway"])
+    return frame, liars.astype({"alarms_per_year": float, "delay_s": float})
+
+
+def grouped(found: pd.DataFrame, liars: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
+    """One row for each group of scenarios.
+
+    Parameters
+    ----------
+    found, liars
+        From `scenarios`.
+    by
+        Columns that tell the groups apart, besides the false-alarm rate.
+    """
+    keys = ["alarms_per_year", *by]
+    tried = found[found["reason"] == ""]
+    lied = dict(list(liars.groupby(keys, sort=True)))
+    rows = []
+    for key, group in tried.groupby(keys, sort=True):
+        some = lied.get(key)
+        delay = np.zeros(0) if some is None else some["delay_s"].to_numpy()
+        named = np.isfinite(delay)
+        lying = group["kind"] != CLEAN
+        rows.append(
+            dict(zip(keys, key, strict=True))
+            | {"scenarios": len(group)}
+            | _share("exact", int(group["exact"].sum()), len(group))
+            | {"liars_told": delay.size}
+            | _share("named", int(named.sum()), delay.size)
+            | _share("false", int((group["falsely_named"] != "").sum()), len(group))
+            | {
+                "delay_median_s": float(np.median(delay[named])) if named.any() else np.nan,
+                "delay_95_s": _most(delay[named]),
+                "clear_median_s": _median(group["clear_s"][lying].to_numpy()),
+                "error_liars_95": _median(group["error_liars_95"].to_numpy()),
+                "error_liars_worst": _largest(group["error_liars"].to_numpy()),
+                "error_others_95": _median(group["error_others_95"].to_numpy()),
+                "error_others_worst": _largest(group["error_others"].to_numpy()),
+                "undecided": float(group["undecided_s"].sum() / group["watched_s"].sum()),
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def delays(liars: pd.DataFrame) -> pd.DataFrame:
+    """Share of the liars that are named within some time of their onset, by kind and size.
+
+    Parameters
+    ----------
+    liars
+        From `scenarios`.
+    """
+    rows = []
+    for key, group in liars.groupby(["alarms_per_year", "kind", "size"], sort=True):
+        for within in WITHIN_S:
+            named = int((group["delay_s"] <= within).sum())
+            rows.append(
+                dict(zip(("alarms_per_year", "kind", "size"), key, strict=True))
+                | {"within_s": within}
+                | _share("named", named, len(group))
+            )
+    return pd.DataFrame(rows)
+
+
+def false_names(found: pd.DataFrame, liars: pd.DataFrame) -> pd.DataFrame:
+    """What a false-alarm rate costs and gains: false names per year while nobody lies, and liars named.
+
+    Parameters
+    ----------
+    found, liars
+        From `scenarios`.
+
+    Notes
+    -----
+    With k events in a time T, the limits of the rate are those of a Poisson process,
+    ``chi2(a / 2; 2 k) / (2 T)`` and ``chi2(1 - a / 2; 2 k + 2) / (2 T)`` with a = 1 - CONFIDENCE.
+
+    References
+    ----------
+    F. Garwood: Fiducial limits for the Poisson distribution. Biometrika 28, 1936.
+    """
+    rows = []
+    for rate, group in found.groupby("alarms_per_year", sort=True):
+        clean = group[(group["kind"] == CLEAN) & (group["reason"] == "")]
+        years, events = clean["watched_s"].sum() / YEAR_S, int(clean["false_events"].sum())
+        tail = 0.5 * (1.0 - CONFIDENCE)
+        low = chi2.ppf(tail, 2 * events) / (2.0 * years) if events else 0.0
+        lied = liars[liars["alarms_per_year"] == rate]
+        rows.append(
+            {
+                "alarms_per_year": rate,
+                "hours": years * YEAR_S / 3600.0,
+                "false_names": events,
+                "per_year": events / years,
+                "per_year_low": float(low),
+                "per_year_high": float(chi2.ppf(1.0 - tail, 2 * events + 2) / (2.0 * years)),
+                "liars_told": len(lied),
+            }
+            | _share("named", int(np.isfinite(lied["delay_s"]).sum()), len(lied))
+        )
+    return pd.DataFrame(rows)
+
+
+def promises(found: pd.DataFrame, liars: pd.DataFrame, promised: Mapping[str, Promise]) -> pd.DataFrame:
+    """What became of lies of which something is promised; columns as in `study.Campaign`.
+
+    Parameters
+    ----------
+    found, liars
+        From `scenarios`.
+    promised
+        By kind.
+
+    Notes
+    -----
+    Lies of a scene have their loads and the errors of their meters in common; scenes have nothing in common.
+    So the limit is that of the scenes with a broken promise, each of which counts once: it holds for the
+    probability that a lie breaks it, however alike the lies of a scene fare.
+    """
+    rows = []
+    tried = found[(found["reason"] == "") & found["kind"].isin(list(promised))]
+    columns = ["alarms_per_year", "scenario"]
+    anyway = liars.loc[liars["anyway"].astype(bool), columns].drop_duplicates()
+    by_chance = pd.MultiIndex.from_frame(tried[columns]).isin(pd.MultiIndex.from_frame(anyway))
+    tried = tried.assign(promise=tried["kind"].map(promised), by_chance=by_chance)
+    for (rate, promise), group in tried.groupby(["alarms_per_year", "promise"], sort=True):
+        if promise is Promise.HIDDEN:
+            lies, broken = group, group["because"] != ""
+        else:
+            lies = group[~group["by_chance"]]
+            broken = lies["missed"] != ""
+        scenes = broken.groupby(lies["scene"]).any()
+        limits = _share("broken", int(scenes.sum()), len(scenes))
+        rows.append(
+            {
+                "alarms_per_year": rate,
+                "promise": str(promise),
+                "lies": len(lies),
+                "broken": int(broken.sum()),
+                "by_chance": int(group["by_chance"].sum()),
+                "honest_named": int((group["falsely_named"] != "").sum()),
+                "scenes": len(scenes),
+                "scenes_broken": int(scenes.sum()),
+                "probability_high": limits["broken_high"],
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def _share(name: str, count: int, of: int) -> dict[str, float]:
+    """A share, and its interval by Clopper and Pearson; NaN of nothing."""
+    if not of:
+        return dict.fromkeys((name, f"{name}_low", f"{name}_high"), np.nan)
+    limits = binomtest(count, of).proportion_ci(CONFIDENCE, method="exact")
+    return {name: count / of, f"{name}_low": float(limits.low), f"{name}_high": float(limits.high)}
+
+
+def _median(values: np.ndarray) -> float:
+    known = values[~np.isnan(values)]
+    # One of the values, so that infinite ones stay what they are.
+    return float(np.percentile(known, 50.0, method="lower")) if known.size else np.nan
+
+
+def _most(values: np.ndarray) -> float:
+    return float(np.percentile(values, 95.0, method="higher")) if values.size else np.nan
+
+
+def _largest(values: np.ndarray) -> float:
+    known = values[~np.isnan(values)]
+    return float(known.max()) if known.size else np.nan
+
+
+ROWS: Final = 2
+"""Edition of the rows that journals hold."""
+
+
+class NothingPlayed(GridsecError):
+    """Not one scenario of a campaign could be played."""
+
+    code = "nothing-played"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Campaign:
+    """What became of all scenarios. Shares have limits `_low` and `_high`, Clopper and Pearson's at 95 %.
+
+    Attributes
+    ----------
+    feeder, digest
+        The feeder's name, and its content.
+    plan
+        What was played.
+    versions
+        Of everything that numbers depend on.
+    scenarios
+        One row for each scenario and false-alarm rate: `scenario`, `scene`, `season`, `weekday` (0 is
+        Monday), `hour` of its beginning; `alarms_per_year`; `kind`, `size`, `liars`, `place`, `onset_s`;
+        `reason` why it could not be played, or empty;
+        `exact`: all liars and nobody else were named; `named`, how many liars, `missed` and `falsely_named`,
+        who; `because`, who was named from the onset on, and not in the same scene without the lie;
+        `false_events`, how often an honest meter or inverter became named; `delay_s` from the onset
+        until the last liar had been named; `clear_s` from the end of the lies until nobody was named;
+        `most_named` at once; `watched_s`, `undecided_s`, and `clean_lying_s`, CLEAN during a lie;
+        `error_liars` and `error_others` of the reconstructed voltage, the largest and (`_95`) the 95th
+        percentile, % of nominal, from `settling_s` after the onset on. What never came is infinite, what
+        there was nothing of is NaN.
+    liars
+        One row for each liar: `who`, whether an `inverter`, `lie_volt`, the largest displacement, and
+        `delay_s`; `anyway`, whether it is named without the lie too.
+    by_kind, by_size, by_place, by_liars
+        The same together: shares `exact` and `false` (somebody honest was named) of the scenarios, `named`
+        of the liars; median and 95th percentile of the delays of those that were named; median `_95` and
+        `_worst` of the errors; the share of the time that was `undecided`.
+    delays
+        Operating curve: share of liars `named` within `within_s`, by kind and size.
+    false_names
+        Operating curve: false names `per_year` while nobody lies, with Poisson limits at 95 %, and the
+        share of liars named, by `alarms_per_year`.
+    promises
+        Lies of which something is promised, one row for each `promise`: how many `lies`, how many that were
+        to stay hidden somebody was named because of, or that were to be named left a liar unnamed (`broken`);
+        `by_chance`, a liar was named without the lie too, which proves nothing: not among the lies that were
+        to be named; `honest_named`, scenarios with a false name; of how many independent `scenes` how many
+        have a broken promise, and the upper limit of its probability, Clopper and Pearson's at 95 %.
+    """
+
+    feeder: str
+    digest: str
+    plan: Plan
+    versions: dict[str, str]
+    scenarios: pd.DataFrame
+    liars: pd.DataFrame
+    by_kind: pd.DataFrame
+    by_size: pd.DataFrame
+    by_place: pd.DataFrame
+    by_liars: pd.DataFrame
+    delays: pd.DataFrame
+    false_names: pd.DataFrame
+    promises: pd.DataFrame
+
+    @property
+    def seed(self) -> int:
+        """What chose everything random."""
+        return self.plan.seed
+
+    @property
+    def tables(self) -> dict[str, pd.DataFrame]:
+        """All tables by name."""
+        names = ("by_kind", "by_size", "by_place", "by_liars", "delays", "false_names", "scenarios", "liars")
+        tables: dict[str, pd.DataFrame] = {name: getattr(self, name) for name in names}
+        return tables if self.promises.empty else {"promises": self.promises, **tables}
+
+
+def campaign(
+    site: Site,
+    plan: Plan | None = None,
+    *,
+    seed: int | None = None,
+    runner: Runner | None = None,
+    journal: Where = None,
+    progress: Progress | None = None,
+) -> Campaign:
+    """Play a campaign on a feeder.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    plan
+        What is played.
+    seed
+        In place of the plan's.
+    runner
+        Where: `workers.Here`, `Processes` or `Dask`; the results are the same.
+    journal
+        File in which finished scenes are kept; an interrupted campaign goes on from it.
+    progress
+        Told how many scenarios are done.
+
+    Raises
+    ------
+    NotObservable, DesignInfeasible, EstimatorUnusable, FeederInvalid, ValueError
+        If the estimator cannot watch this feeder with these settings, or the plan is none.
+    NothingPlayed
+        If the feeder can carry its loads at no moment that was drawn.
+    OtherStudy
+        If the journal is another study's.
+    InUse
+        If another process is writing it.
+    ClusterUnusable, WorkerLost
+        From the runner; what is finished is in the journal.
+    """
+    plan = Plan() if plan is None else plan
+    plan = plan if seed is None else replace(plan, seed=seed)
+    prepare(site, plan)  # whatever is wrong with it is told here, and not by a worker
+    used = versions()
+    subject = {
+        "study": "campaign",
+        "rows": ROWS,
+        "digest": site.digest,
+        "plan": plan.subject,
+    }
+    with Journal(journal, subject, of=plan.scenes) as kept:
+        rows = _played(site, plan, runner or Here(), kept, progress)
+    return _campaign(site, plan, used, rows)
+
+
+def _played(
+    site: Site, plan: Plan, runner: Runner, kept: Journal, progress: Progress | None
+) -> list[dict[str, Any]]:
+    """The rows of all scenes; those that the journal does not have are played."""
+    keys = [f"scene|{scene}" for scene in range(plan.scenes)]
+    todo = [scene for scene, key in enumerate(keys) if key not in kept]
+    done = plan.scenes - len(todo)
+    if progress is not None:
+        progress(done * plan.together, plan.scenarios)
+    with closing(runner.run(partial(_scene, site.tables, plan), todo)) as results:
+        for scene, rows in results:
+            kept.put(keys[scene], rows)
+            done += 1
+            if progress is not None:
+                progress(done * plan.together, plan.scenarios)
+    return [row for key in keys for row in kept[key]]
+
+
+# What the worker of this process prepared last, and for what.
+_prepared: list[tuple[str, Prepared]] = []
+
+
+def _scene(tables: FeederTables, plan: Plan, scene: int) -> list[dict[str, Any]]:
+    """Work on a scene, wherever this is: designs are made once in each process."""
+    asked = repr((tables, plan))
+    given = next((made for what, made in _prepared if what == asked), None)
+    if given is None:
+        given = prepare(from_tables(tables), plan)
+        _prepared[:] = [(asked, given)]
+    return watch(given, scene)
+
+
+def _campaign(site: Site, plan: Plan, used: dict[str, str], rows: list[dict[str, Any]]) -> Campaign:
+    if all(row["reason"] for row in rows):
+        raise NothingPlayed(f"{site.feeder.name}: no scenario can be played; the first: {rows[0]['reason']}")
+    found, liars = scenarios(rows)
+    by = {
+        name: grouped(found, liars, columns)
+        for name, columns in (
+            ("by_kind", ["kind"]),
+            ("by_size", ["kind", "size"]),
+            ("by_place", ["kind", "place"]),
+            ("by_liars", ["kind", "liars"]),
+        )
+    }
+    return Campaign(
+        feeder=site.feeder.name,
+        digest=site.digest,
+        plan=plan,
+        versions=used,
+        scenarios=found,
+        liars=liars,
+        **by,
+        delays=delays(liars),
+        false_names=false_names(found, liars),
+        promises=promises(
+            found, liars, {kind.name: kind.promise for kind in plan.kinds if kind.promise is not None}
+        ),
+    )

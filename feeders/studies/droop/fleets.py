@@ -1,0 +1,275 @@
+"""A feeder's droop fleet, or one of a preset; its operating points, and the box that its loads stay in."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from feeders.studies.operating import Bases
+from feeders.studies.unobservable import customer_indices
+from gridsec.arrays import Floats, Ints
+from gridsec.errors import FeederInvalid, Problem, refuse
+from gridsec.grid.droop import Droop, fleet
+from gridsec.planning.droop.ac_sensitivity import Box
+
+if TYPE_CHECKING:
+    from feeders.model.site import Site
+
+__all__ = [
+    "KVA_PER_KW",
+    "NOTHING",
+    "NoInverters",
+    "Who",
+    "box",
+    "chosen_fleet",
+    "equip",
+    "inverter_names",
+    "made",
+    "point",
+    "points",
+]
+
+KVA_PER_KW: Final = 1.1
+"""Rating of an inverter for each kW of generation behind it: at full sun 0.46 of it is left for q."""
+
+SMALLEST_KVA: Final = 5.0
+"""Rating of inverters given to customers without generation, kVA."""
+
+NOTHING: Final = "no inverters: nothing to be stable"
+"""What there is to say of a feeder without them."""
+
+
+class NoInverters(FeederInvalid):
+    """There is no droop inverter on a feeder, and so nothing that could be unstable."""
+
+
+class Who(StrEnum):
+    """Which customers a preset equips."""
+
+    PV = "pv"
+    ALL = "all"
+
+
+@dataclass(frozen=True, slots=True)
+class _Point:
+    load: float
+    pv: float
+
+
+_POINTS: Final = {"evening": _Point(1.0, 0.0), "noon": _Point(0.2, 1.0), "half": _Point(0.5, 0.5)}
+"""Shares of the peaks of load and generation."""
+
+
+def equip(
+    site: Site,
+    preset: str,
+    who: Who = Who.PV,
+    *,
+    customers: Sequence[str] | None = None,
+    kva: float | None = None,
+) -> Droop:
+    """Give inverters of one preset to customers of a feeder, in place of those that it has.
+
+    A customer's own inverter keeps its rating; others get 1.1 kVA for each kW of generation, or 5 kVA.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    preset
+        One of `gridsec.grid.droop.PRESETS`.
+    who
+        Customers with generation, or all.
+    customers
+        These customers instead.
+    kva
+        Rating of each inverter instead, kVA.
+
+    Raises
+    ------
+    FeederInvalid
+        If there is no such preset, or nobody to equip.
+    ValueError
+        If there is no such customer.
+    """
+    rows = site.tables.customers
+    if customers is not None:
+        own = customer_indices(site, customers)
+    else:
+        kept = [k for k, row in enumerate(rows) if who is Who.ALL or row.pv_kw > 0 or row.inverter_kva > 0]
+        own = np.array(kept, dtype=np.intp)
+    if not own.size:
+        raise FeederInvalid(
+            [
+                Problem(
+                    "nothing-to-design",
+                    f"{site.feeder.name}: no customer has generation; equip all (--who all)",
+                )
+            ]
+        )
+    rated = [
+        kva or rows[k].inverter_kva or (KVA_PER_KW * rows[k].pv_kw if rows[k].pv_kw > 0 else SMALLEST_KVA)
+        for k in own
+    ]
+    return made(site, own, preset, np.array(rated))
+
+
+def made(site: Site, own: Ints, preset: str, kva: Floats) -> Droop:
+    """Inverters of a preset, whose curve is one of the nominal voltage at their customer.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    own : (m,)
+        Customers.
+    preset
+        One of `gridsec.grid.droop.PRESETS`.
+    kva : (m,)
+        Ratings, kVA.
+    """
+    usual = fleet(own, preset, kva, site.feeder.base_kva)
+    ratio = Bases.of(site).ratio[own]
+    return usual if (ratio == 1.0).all() else replace(usual, v=usual.v / ratio[:, None])
+
+
+def chosen_fleet(site: Site, preset: str | None, who: Who = Who.PV) -> Droop:
+    """The feeder's own fleet, or one of a preset.
+
+    Parameters
+    ----------
+    site, preset, who
+        As in `equip`; without a preset, the inverters of the feeder's files.
+
+    Raises
+    ------
+    NoInverters
+        If there is none.
+    FeederInvalid
+        If a preset has nobody to equip.
+    """
+    if preset is not None:
+        return equip(site, preset, who)
+    if not site.droop.tau.size:
+        raise NoInverters(
+            [
+                Problem(
+                    "nothing-to-design",
+                    f"{site.feeder.name} has no droop inverters: fill the columns inverter_kva and "
+                    "droop of its customers.csv, or give a preset (--preset ieee1547-b) to equip customers "
+                    "with generation, or all (--who all)",
+                )
+            ]
+        )
+    return site.droop
+
+
+def points(site: Site, v0: float = 1.0) -> dict[str, Box]:
+    """The operating points that are looked at, each a box without width.
+
+    Evening: full load, no generation. Noon: a fifth of the load, full generation. Half: half of both.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    v0
+        Voltage of the busbar, pu.
+    """
+    return {name: point(site, at.load, at.pv, v0) for name, at in _POINTS.items()}
+
+
+def point(site: Site, load: Floats | float, pv: Floats | float, v0: float = 1.0) -> Box:
+    """One operating point without the inverters' reactive power, the loads at their expected power factor.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    load, pv : (N,) or scalar
+        Shares of the peaks.
+    v0
+        Voltage of the busbar, pu.
+    """
+    meta, rows = site.tables.meta, site.tables.customers
+    usual = [meta.load.power_factor if row.power_factor is None else row.power_factor for row in rows]
+    drawn = load * site.loads.load_peak
+    p, q = pv * site.loads.pv_peak - drawn, -drawn * np.tan(np.arccos(np.array(usual)))
+    return Box(p, p, q, q, v0, v0)
+
+
+def box(
+    site: Site,
+    *,
+    load_low: float = 0.0,
+    load_high: float = 1.0,
+    pv_low: float = 0.0,
+    pv_high: float = 1.0,
+    v0_low: float = 1.0,
+    v0_high: float = 1.0,
+) -> Box:
+    """All powers that the feeder's files allow for, each customer's on its own.
+
+    Loads from `load_low load_kw` to `load_high load_kw`, with q from `load tan_min - floor` to
+    `load tan_max + floor`; generation from `pv_low pv_kw` to `pv_high pv_kw` at unity power factor.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    load_low, load_high, pv_low, pv_high
+        Shares of the peaks.
+    v0_low, v0_high
+        Voltage of the busbar, pu.
+
+    Raises
+    ------
+    ValueError
+        If limits are the wrong way round.
+    """
+    problems = [
+        *range_problem("load", load_low, load_high),
+        *range_problem("generation", pv_low, pv_high),
+        *range_problem("busbar voltage", v0_low, v0_high),
+    ]
+    refuse(problems)
+    known = site.loads
+    return Box(
+        p_low=pv_low * known.pv_peak - load_high * known.load_peak,
+        p_high=pv_high * known.pv_peak - load_low * known.load_peak,
+        q_low=-(load_high * known.load_peak * known.tan_max + known.q_floor),
+        q_high=-(load_low * known.load_peak * known.tan_min - known.q_floor),
+        v0_low=v0_low,
+        v0_high=v0_high,
+    )
+
+
+def range_problem(what: str, low: float, high: float) -> list[Problem]:
+    """What is wrong with two limits; empty if nothing is.
+
+    Parameters
+    ----------
+    what, low, high
+        Of what they are, and the limits.
+    """
+    if 0.0 <= low <= high < math.inf:
+        return []
+    return [Problem("order", f"{what}: from {low:g} to {high:g}; expected two ascending numbers from 0 on")]
+
+
+def inverter_names(site: Site, droop: Droop, rows: Ints) -> list[str]:
+    """Customers of inverters.
+
+    Parameters
+    ----------
+    site, droop
+        The feeder and the fleet.
+    rows : (k,)
+        Rows of the fleet.
+    """
+    return [site.feeder.customers[int(k)] for k in droop.customer[rows]]

@@ -1,0 +1,543 @@
+"""Voltage band for all loads within their limits, and hosting capacity of a droop fleet.
+
+Proven by limits of the AC power flow with the fleet (`gridsec.planning.droop.equilibrium`), or refuted by
+loads with which the AC power flow of `feeders.simulation.powerflow` leaves the band.
+
+Generation runs at its peak while loads draw a small share of theirs. Every operating point is an AC power
+flow with the inverters at rest.
+
+References
+----------
+chong2020, (13); docs/theory-studies.md, section on the droop fleet.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from feeders.simulation.powerflow import PowerFlowDiverged
+from feeders.studies.droop.fleets import KVA_PER_KW, made, point
+from feeders.studies.droop.verdict import CLEARLY, Subject, judge
+from feeders.studies.operating import Bases, line_rows
+from feeders.studies.unobservable import customer_indices
+from gridsec.arrays import Floats, Ints
+from gridsec.errors import DesignInfeasible
+from gridsec.grid.droop import Droop, voltage_curve
+from gridsec.planning.droop.ac_sensitivity import Box, Complex, Network, currents, sensitivity, solve
+from gridsec.planning.droop.equilibrium import Band, always, at_rest, injected, rest
+from gridsec.planning.droop.stability import Update, growth, slopes
+
+if TYPE_CHECKING:
+    from feeders.model.site import Site
+
+__all__ = [
+    "Conditions",
+    "Kept",
+    "Plan",
+    "Safety",
+    "capacity",
+    "checked",
+    "curve",
+    "draw",
+    "nobody",
+    "ratings_pu",
+    "safety",
+    "shares_of",
+]
+
+
+EXACT: Final = 1e-6
+"""How far set-points by the second power flow may be from the injections of a witness, pu."""
+
+
+class Kept(StrEnum):
+    """What is known of the band."""
+
+    KEPT = "kept"
+    VIOLATED = "violated"
+    UNDECIDED = "undecided"
+
+
+@dataclass(frozen=True, slots=True)
+class Safety:
+    """What is known of a fleet's voltages.
+
+    Attributes
+    ----------
+    rest
+        While loads move slowly against the time constants.
+    always
+        At all times, however loads move within their limits.
+    why
+        What kept the bounds from being found; empty if they were.
+    low_volt, high_volt, low_rest_volt, high_rest_volt
+        The extremes of the proven limits, V; NaN if there are none.
+    rows
+        One for each customer.
+    witness
+        One for each customer: the loads that break the band, if such were found.
+    """
+
+    rest: Kept
+    always: Kept
+    why: str
+    low_volt: float
+    high_volt: float
+    low_rest_volt: float
+    high_rest_volt: float
+    rows: list[dict[str, Any]]
+    witness: list[dict[str, Any]]
+
+
+def nobody(droop: Droop) -> Droop:
+    """A fleet without inverters, to compare with."""
+    return droop.take(np.zeros(0, dtype=np.intp))
+
+
+def safety(subject: Subject, droop: Droop, loads: Box, limits: tuple[float, float]) -> Safety:
+    """Prove or refute that no voltage leaves a band.
+
+    Parameters
+    ----------
+    subject
+        The feeder.
+    droop
+        The fleet, from rest with any loads of the box.
+    loads
+        Limits of the injections without the fleet; every customer moves in them as it likes.
+    limits
+        The band, parts of the nominal voltage.
+    """
+    bases, reasons = Bases.of(subject.site), list[str]()
+    within = bases.band(*limits)
+    ever = _or_none(always, subject.net, droop, loads, reasons)
+    still = _or_none(at_rest, subject.net, droop, loads, reasons)
+    still = ever if still is None else still
+    found = {
+        name: None if _inside(band, within) else _witness(subject, droop, loads, within, jump=jump)
+        for name, band, jump in (("rest", still, False), ("always", ever, True))
+    }
+    # What happens at rest happens.
+    found["always"] = found["always"] or found["rest"]
+    nothing = Band(*np.full((2, loads.p_low.size), np.nan))
+    e, r = ever or nothing, still or nothing
+    volt, names = bases.volt, subject.site.feeder.customers
+    rows = [
+        {
+            "customer": names[k],
+            "low_volt": float(volt[k] * e.low[k]),
+            "high_volt": float(volt[k] * e.high[k]),
+            "low_rest_volt": float(volt[k] * r.low[k]),
+            "high_rest_volt": float(volt[k] * r.high[k]),
+            "kept": bool(e.low[k] >= within[0][k] and e.high[k] <= within[1][k]),
+            "kept_rest": bool(r.low[k] >= within[0][k] and r.high[k] <= within[1][k]),
+        }
+        for k in range(len(names))
+    ]
+    return Safety(
+        rest=_verdict(still, within, found["rest"]),
+        always=_verdict(ever, within, found["always"]),
+        why="; ".join(dict.fromkeys(reasons)),
+        low_volt=bases.extremes(e.low)[0],
+        high_volt=bases.extremes(e.high)[1],
+        low_rest_volt=bases.extremes(r.low)[0],
+        high_rest_volt=bases.extremes(r.high)[1],
+        rows=rows,
+        witness=(found["rest"] or found["always"] or []),
+    )
+
+
+def _or_none(
+    bound: Callable[[Network, Droop, Box], Band], net: Network, droop: Droop, loads: Box, reasons: list[str]
+) -> Band | None:
+    try:
+        return bound(net, droop, loads)
+    except DesignInfeasible as error:
+        reasons.append(str(error))
+        return None
+
+
+Limits = tuple[Floats, Floats]
+"""The band, pu of every customer."""
+
+
+def _inside(band: Band | None, limits: Limits) -> bool:
+    return band is not None and bool(np.all(band.low >= limits[0]) and np.all(band.high <= limits[1]))
+
+
+def _verdict(band: Band | None, limits: Limits, witness: list[dict[str, Any]] | None) -> Kept:
+    if _inside(band, limits):
+        return Kept.KEPT
+    return Kept.VIOLATED if witness else Kept.UNDECIDED
+
+
+def _witness(
+    subject: Subject, droop: Droop, loads: Box, limits: Limits, *, jump: bool
+) -> list[dict[str, Any]] | None:
+    """Loads in the box with which a voltage is beyond the band, at rest or after a jump of all loads."""
+    s, v0 = _candidates(subject.net, droop, loads)
+    x, V = rest(subject.net, droop, s, v0)
+    if jump:
+        # From rest at the other end of the box: pairs (low, high), (high, low).
+        x = x[np.arange(len(x)) ^ 1]
+        V = solve(subject.net, injected(droop, s, x), v0)
+    beyond = np.max(np.maximum(limits[0] - np.abs(V), np.abs(V) - limits[1]), axis=1)
+    order = np.argsort(-np.where(np.isfinite(beyond), beyond, -np.inf))
+    for k in order[:3]:
+        if beyond[k] > 0.0:
+            rows = _confirmed(subject, droop, (s[k], float(v0[k]), x[k]), limits, jump=jump)
+            if rows:
+                return rows
+    return None
+
+
+def _candidates(net: Network, droop: Droop, loads: Box) -> tuple[Complex, Floats]:
+    """Corners of the box in pairs (low, high): of all loads, and what one customer's voltage asks for."""
+    low, high = loads.p_low + 1j * loads.q_low, loads.p_high + 1j * loads.q_high
+    middle: Complex = np.asarray(0.5 * (low + high))
+    v0 = 0.5 * (loads.v0_low + loads.v0_high)
+    x, V = rest(net, droop, middle, v0)
+    corners = [low, high]
+    if np.isfinite(V).all():
+        at, own = sensitivity(net, injected(droop, middle, x), V), droop.customer
+        D = slopes(droop, np.full(own.size, 0.0), np.full(own.size, 9.0))
+        closed = np.eye(V.size)
+        np.add.at(closed.T, own, (at.dv_dq[:, own] * D).T)
+        J = np.linalg.solve(closed, np.hstack([at.v[:, None] * at.p.real, at.dv_dq]))
+        for row in J:
+            up_p, up_q = row[: V.size] >= 0.0, row[V.size :] >= 0.0
+            corners.append(np.where(up_p, low.real, high.real) + 1j * np.where(up_q, low.imag, high.imag))
+            corners.append(np.where(up_p, high.real, low.real) + 1j * np.where(up_q, high.imag, low.imag))
+    return np.array(corners), np.tile([loads.v0_low, loads.v0_high], len(corners) // 2)
+
+
+def _confirmed(
+    subject: Subject,
+    droop: Droop,
+    at: tuple[Complex, float, Floats],
+    limits: Limits,
+    *,
+    jump: bool,
+) -> list[dict[str, Any]]:
+    """The witness as rows, if the power flow of `feeders.simulation.powerflow` agrees; none otherwise."""
+    (s, v0, x), feeder = at, subject.site.feeder
+    net = injected(droop, s, x)
+    try:
+        volts, _ = subject.flow.solve(
+            -feeder.base_kva * net.real, -feeder.base_kva * net.imag, v0 * feeder.base_volt
+        )
+    except PowerFlowDiverged:
+        return []
+    v = volts / subject.site.customer_volt
+    beyond = (v < limits[0]) | (v > limits[1])
+    off = np.max(np.abs(voltage_curve(droop, v[droop.customer]) - x), initial=0.0)
+    if not beyond.any() or (not jump and off > EXACT):
+        return []
+    return [
+        {
+            "when": "after a jump of all loads" if jump else "at rest",
+            "customer": feeder.customers[k],
+            "p_kw": -feeder.base_kva * float(s[k].real),
+            "q_kvar": -feeder.base_kva * float(s[k].imag),
+            "inverter_kvar": feeder.base_kva * float(net[k].imag - s[k].imag),
+            "busbar_volt": v0 * feeder.base_volt,
+            "v_volt": float(volts[k]),
+            "beyond": bool(beyond[k]),
+        }
+        for k in range(v.size)
+    ]
+
+
+RESOLUTION: Final = 1e-3
+"""Relative accuracy of a capacity."""
+
+MOST: Final = 2.0**14
+"""Largest capacity that is looked for, kW for each customer who may have generation."""
+
+
+@dataclass(frozen=True, slots=True)
+class Conditions:
+    """When generation is at its peak.
+
+    Attributes
+    ----------
+    load
+        Share of its peak that every load draws.
+    v0
+        Voltage of the busbar, pu.
+    v_min, v_max
+        The band, parts of the nominal voltage.
+    update
+        When inverters act.
+    """
+
+    load: float
+    v0: float
+    v_min: float
+    v_max: float
+    update: Update
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Plan:
+    """Who gets generation, and what inverters they have.
+
+    Attributes
+    ----------
+    share : (N,)
+        Every customer's part of the generation; together 1.
+    preset
+        Droop preset of all of them; empty: inverters without reactive power.
+    """
+
+    share: Floats
+    preset: str
+
+
+def shares_of(site: Site, customers: Sequence[str] | None) -> Floats:
+    """How generation is distributed: as in the feeder's files, or equally among customers, (N,).
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    customers
+        Who gets it; by default those who have some, in proportion, or everybody if nobody has.
+
+    Raises
+    ------
+    ValueError
+        If there is no such customer.
+    """
+    out = np.array([row.pv_kw for row in site.tables.customers])
+    if customers is not None:
+        out = np.zeros(out.size)
+        out[customer_indices(site, customers)] = 1.0
+    if not out.any():
+        out = np.ones(out.size)
+    return np.asarray(out / out.sum())
+
+
+def ratings_pu(site: Site) -> Floats:
+    """Largest current of every conductor of every line, pu; infinity where the files give none, (L, k).
+
+    In the order and the units of `gridsec.planning.droop.ac_sensitivity.currents`.
+    """
+    lines = [site.tables.lines[k] for k in line_rows(site)]
+    amps = np.array([np.inf if line.rating_a is None else line.rating_a for line in lines])
+    # An ideal transformer is at from_bus: the impedance is in the base of to_bus.
+    behind = [site.bus_of_file[line.to_bus] for line in lines]
+    volt = site.base_volt.reshape(len(site.spanning.buses), -1)[behind]
+    return np.asarray(amps[:, None] * 3.0 * volt / (1000.0 * site.feeder.base_kva))
+
+
+def _fleet(site: Site, plan: Plan, kw: float) -> Droop:
+    own = np.flatnonzero(plan.share > 0.0) if plan.preset and kw > 0.0 else np.zeros(0, dtype=np.intp)
+    return made(site, own, plan.preset or "ieee1547-b", KVA_PER_KW * kw * plan.share[own])
+
+
+def _loads(site: Site, plan: Plan, kw: float, at: Conditions) -> Box:
+    drawn = point(site, at.load, 0.0, at.v0)
+    p = drawn.p_low + kw / site.feeder.base_kva * plan.share
+    return Box(p, p, drawn.q_low, drawn.q_high, at.v0, at.v0)
+
+
+def checked(subject: Subject, plan: Plan, kw: float, at: Conditions, ratings: Floats) -> dict[str, Any]:
+    """What so much generation does: extreme voltages, the fullest line, and what is broken.
+
+    Parameters
+    ----------
+    subject
+        The feeder.
+    plan
+        Who gets it.
+    kw
+        All of it, kW.
+    at
+        Loads, busbar, limits.
+    ratings : (L, k)
+        From `ratings_pu`.
+
+    Returns
+    -------
+    dict
+        `v_low_volt`, `v_high_volt`, `line_percent`, `growth` and `broken`: empty, `no power flow`, `voltage
+        high`, `voltage low`, `line ...` or `unstable`.
+    """
+    site, droop = subject.site, _fleet(subject.site, plan, kw)
+    loads, bases = _loads(site, plan, kw, at), Bases.of(site)
+    s = loads.p_low + 1j * loads.q_low
+    x, V = rest(subject.net, droop, s, at.v0)
+    if not np.isfinite(V).all():
+        nan = float("nan")
+        return {
+            "v_low_volt": nan,
+            "v_high_volt": nan,
+            "line_percent": nan,
+            "growth": nan,
+            "broken": "no power flow",
+        }
+    net, own, v = injected(droop, s, x), droop.customer, np.abs(V)
+    full = (currents(site.feeder, subject.net, net, V, at.v0) / ratings).max(axis=1)
+    near = 1e-7
+    steep = slopes(droop, v[own] - near, v[own] + near)
+    J = sensitivity(subject.net, net, V).dv_dq[np.ix_(own, own)]
+    grows = growth(J, steep, droop.tau, at.update)
+    worst = int(np.argmax(full))
+    lowest, highest = bases.band(at.v_min, at.v_max)
+    broken = (
+        "voltage high" * bool((v > highest).any())
+        or "voltage low" * bool((v < lowest).any())
+        or _named(site, worst) * bool(full[worst] > 1.0)
+        or "unstable" * bool(grows > 1.0 + CLEARLY)
+    )
+    low_volt, high_volt = bases.extremes(v)
+    return {
+        "v_low_volt": low_volt,
+        "v_high_volt": high_volt,
+        "line_percent": 100.0 * float(full[worst]),
+        "growth": grows,
+        "broken": broken,
+    }
+
+
+def _named(site: Site, line: int) -> str:
+    """A line of `currents` in words."""
+    tree = site.spanning
+    if line < tree.parent.size:
+        return f"line to {tree.buses[line + 1]}"
+    one, other = site.ties[line - tree.parent.size]
+    return f"line from {tree.buses[one]} to {tree.buses[other]}"
+
+
+def _largest(holds: Callable[[float], bool], most: float) -> float:
+    """The largest amount found at which nothing is broken, to a thousandth; 0 if something is without any."""
+    if not holds(0.0):
+        return 0.0
+    if holds(most):
+        return most
+    low, high = 0.0, most
+    first = 1.0
+    while first < most and holds(first):
+        low, first = first, 2.0 * first
+    high = min(first, most)
+    while high - low > RESOLUTION * high:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if holds(middle) else (low, middle)
+    return low
+
+
+def capacity(subject: Subject, plan: Plan, at: Conditions, *, seed: int = 0) -> dict[str, Any]:
+    """The most generation before something is broken, by bisection; confirmed by the other power flow.
+
+    Parameters
+    ----------
+    subject, plan, at
+        As in `checked`.
+    seed
+        As in `judge`.
+
+    Returns
+    -------
+    dict
+        `capacity_kw`, `limit` (what breaks next), `verdict` and `proof` (is the fleet stable there?),
+        `v_high_volt`, `v_low_volt`, `line_percent`, and `confirmed`: the largest difference of a voltage in
+        the power flow of `feeders.simulation.powerflow`, V.
+    """
+    site, ratings = subject.site, ratings_pu(subject.site)
+    most = MOST * max(1, int(np.count_nonzero(plan.share)))
+    kw = _largest(lambda some: not checked(subject, plan, some, at, ratings)["broken"], most)
+    here = checked(subject, plan, kw, at, ratings)
+    beyond = checked(subject, plan, kw * (1.0 + 2.0 * RESOLUTION) + RESOLUTION, at, ratings)
+    droop, loads = _fleet(site, plan, kw), _loads(site, plan, kw, at)
+    told = judge(subject, droop, at.update, loads, seed=seed) if droop.tau.size else None
+    return {
+        "preset": plan.preset or "none",
+        "capacity_kw": kw,
+        "limit": here["broken"] or beyond["broken"],
+        "verdict": str(told.verdict) if told else "",
+        "proof": told.proof if told else "",
+        **{name: here[name] for name in ("v_low_volt", "v_high_volt", "line_percent")},
+        "confirmed_volt": _confirmed_hosting(subject, droop, loads),
+    }
+
+
+def _confirmed_hosting(subject: Subject, droop: Droop, loads: Box) -> float:
+    """Largest difference between the two power flows, V; infinity where the second finds none."""
+    feeder, s = subject.site.feeder, loads.p_low + 1j * loads.q_low
+    x, V = rest(subject.net, droop, s, loads.v0_low)
+    net = -feeder.base_kva * injected(droop, s, x)
+    try:
+        volts, _ = subject.flow.solve(net.real, net.imag, feeder.base_volt * loads.v0_low)
+    except PowerFlowDiverged:
+        return float("inf")
+    return float(np.max(np.abs(volts - subject.site.customer_volt * np.abs(V))))
+
+
+def curve(subject: Subject, plan: Plan, amounts: Sequence[float], at: Conditions) -> list[dict[str, Any]]:
+    """What growing generation does, one row for each amount.
+
+    Parameters
+    ----------
+    subject, plan, at
+        As in `checked`.
+    amounts
+        Of all generation, kW.
+    """
+    ratings = ratings_pu(subject.site)
+    return [
+        {"preset": plan.preset or "none", "pv_kw": float(kw), **checked(subject, plan, kw, at, ratings)}
+        for kw in amounts
+    ]
+
+
+def draw(  # noqa: PLR0917  # which feeder, which fleet, which order of places
+    subject: Subject, preset: str, unit_kw: float, at: Conditions, seed: int, number: int
+) -> dict[str, Any]:
+    """How many units of generation a feeder hosts that come to its customers in a random order.
+
+    Every customer gets one before anybody gets a second. The order is that of `seed` and `number` alone, so
+    that all presets see the same ones.
+
+    Parameters
+    ----------
+    subject, at
+        As in `checked`.
+    preset
+        As in `Plan`.
+    unit_kw
+        Size of a unit, kW.
+    seed, number
+        Choose the order.
+    """
+    count = len(subject.site.feeder.customers)
+    order: Ints = np.random.default_rng([seed, number]).permutation(count)
+    ratings = ratings_pu(subject.site)
+
+    def plan(units: int) -> Plan:
+        has = np.full(count, units // count, dtype=np.float64)
+        has[order[: units % count]] += 1.0
+        return Plan(has / max(units, 1), preset)
+
+    def broken(units: int) -> str:
+        return str(checked(subject, plan(units), unit_kw * units, at, ratings)["broken"])
+
+    low, high = 0, 1
+    if not broken(0):
+        while high < MOST and not broken(high):
+            low, high = high, 2 * high
+        while high - low > 1:
+            middle = (low + high) // 2
+            low, high = (low, middle) if broken(middle) else (middle, high)
+    return {
+        "preset": preset or "none",
+        "draw": number,
+        "units": low,
+        "capacity_kw": low * unit_kw,
+        "limit": broken(low) if low == 0 and broken(0) else broken(high),
+    }

@@ -1,0 +1,588 @@
+"""Stability of a droop fleet at an operating point: proofs, margins, step responses.
+
+The inverters are those of `gridsec.planning.droop.stability`: sampled, with dead time. Continuous filters are
+simulated with intervals of a small part of their time constants. The power flow is that of
+`feeders.simulation.powerflow`, which shares nothing with the proofs.
+
+References
+----------
+docs/theory-studies.md, section on the droop fleet.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import pandas as pd
+
+from feeders.simulation.powerflow import PowerFlow, PowerFlowDiverged
+from feeders.simulation.powerflow_three_phase import PlacesFlow, power_flow
+from feeders.studies.droop.fleets import inverter_names, point
+from feeders.studies.operating import Bases
+from gridsec.arrays import Floats
+from gridsec.errors import DesignInfeasible, FeederInvalid
+from gridsec.grid.droop import Droop, voltage_curve
+from gridsec.grid.network import InPhases
+from gridsec.planning.droop.ac_sensitivity import Box, Network, network, sensitivity
+from gridsec.planning.droop.equilibrium import Share, injected, rest, shares, shares_of_gain
+from gridsec.planning.droop.stability import Loop, Update, growth, loop, proof, reach, slopes, steepened
+
+if TYPE_CHECKING:
+    from feeders.model.site import Site
+
+__all__ = [
+    "Judgement",
+    "Outcome",
+    "Run",
+    "Step",
+    "Subject",
+    "Verdict",
+    "edge",
+    "inverter_rows",
+    "judge",
+    "longest_interval",
+    "margin",
+    "simulate",
+    "step_rows",
+    "steps",
+    "trajectories",
+    "worst",
+]
+
+
+FINE: Final = 40.0
+"""Continuous filters are simulated with so many intervals in the shortest time constant / (1 + gain)."""
+
+SETTLED: Final = 1e-6
+"""Injections that move by less than this part of the largest limit within a window have settled."""
+
+DECAYS: Final = 0.9
+"""A movement that is not smaller than this part of what it was a window before does not die out."""
+
+BAND: Final = 0.02
+"""Voltages have settled when they stay this near to their end, as a part of the largest change."""
+
+LEAST_PU: Final = 1e-5
+"""Changes of voltages below this are none, pu."""
+
+
+class Outcome(StrEnum):
+    """What became of a simulated fleet."""
+
+    SETTLES = "settles"
+    OSCILLATES = "oscillates"
+    COLLAPSES = "collapses"
+    OPEN = "open"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Step:
+    """A sudden change of loads, generation or busbar. From rest before it.
+
+    Attributes
+    ----------
+    before, after
+        Operating points without the inverters' reactive power.
+    """
+
+    before: Box
+    after: Box
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Run:
+    """One simulated step. T + 1 instants.
+
+    Attributes
+    ----------
+    outcome
+        How it ended.
+    t : (T + 1,)
+        Time, s; the step comes at 0.
+    v : (T + 1, N)
+        Voltages of the customers, pu; the first row is right after the step, before any inverter has moved.
+    x : (T + 1, m)
+        Reactive injections, pu.
+    """
+
+    outcome: Outcome
+    t: Floats
+    v: Floats
+    x: Floats
+
+
+def steps(site: Site, v0: float = 1.0, *, tap: float = 0.025) -> dict[str, Step]:
+    """The steps that are looked at.
+
+    Load: from 0.2 to 0.8 of the peak, no generation. Cloud: generation from its peak to 0.2 of it, at 0.2
+    of the load. Tap: the busbar up by one tap, at the same load and full generation.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    v0
+        Voltage of the busbar, pu.
+    tap
+        Height of a tap, pu.
+    """
+    noon = point(site, 0.2, 1.0, v0)
+    return {
+        "load": Step(point(site, 0.2, 0.0, v0), point(site, 0.8, 0.0, v0)),
+        "cloud": Step(noon, point(site, 0.2, 0.2, v0)),
+        "tap": Step(noon, replace(noon, v0_low=v0 + tap, v0_high=v0 + tap)),
+    }
+
+
+def simulate(
+    plant: tuple[Site, PowerFlow | PlacesFlow],
+    droop: Droop,
+    update: Update,
+    loads: Box,
+    x: Floats,
+    *,
+    gain: float = 0.0,
+    updates: int = 400,
+) -> Run:
+    """Let the inverters act on the AC power flow with constant loads, until they rest or time is up.
+
+    Parameters
+    ----------
+    plant
+        The feeder, and its AC power flow.
+    droop, update
+        The fleet, and when it acts.
+    loads
+        Operating point, a box without width.
+    x : (m,)
+        Injections at the beginning, and what the inverters last asked for, pu.
+    gain
+        Gain of the loop at rest; only continuous filters need it, for the interval.
+    updates
+        How many updates at most.
+    """
+    site, flow = plant
+    base_kva, own = site.feeder.base_kva, droop.customer
+    base_volt, v0_volt = site.customer_volt, site.feeder.base_volt * loads.v0_low
+    owner = np.equal.outer(own, np.arange(loads.p_low.size)).astype(np.float64)
+    if not update.interval_s:
+        update = Update(float(np.min(droop.tau)) / FINE / (1.0 + gain))
+    alpha = update.share(droop.tau)
+    asked = [x] * update.dead
+    xs: list[Floats] = [x]
+    vs: list[Floats] = []
+    outcome = Outcome.OPEN
+    still = SETTLED * max(float(np.max(droop.limit, initial=0.0)), 1e-12)
+    window = max(16, updates // 8)
+    for k in range(updates + 1):
+        try:
+            q = loads.q_low + x @ owner
+            v = flow.solve(-base_kva * loads.p_low, -base_kva * q, v0_volt)[0] / base_volt
+        except PowerFlowDiverged:
+            outcome = Outcome.COLLAPSES
+            break
+        vs.append(v)
+        if k == updates or (k >= window and _moved(xs[-window:]) <= still):
+            break
+        asked.append(voltage_curve(droop, v[own]))
+        x = (1.0 - alpha) * x + alpha * asked.pop(0)
+        xs.append(x)
+    if outcome is Outcome.OPEN:
+        outcome = _told(xs, window, still)
+    xs = xs[: len(vs)]
+    t = update.interval_s * np.arange(len(vs), dtype=np.float64)
+    return Run(outcome, t, np.array(vs), np.array(xs))
+
+
+def _moved(xs: list[Floats]) -> float:
+    return float(np.max(np.ptp(np.array(xs), axis=0), initial=0.0))
+
+
+def _told(xs: list[Floats], window: int, still: float) -> Outcome:
+    """What the last two windows say."""
+    late, before = _moved(xs[-window:]), _moved(xs[-2 * window : -window])
+    if late <= still:
+        return Outcome.SETTLES
+    return Outcome.OSCILLATES if late >= DECAYS * before else Outcome.OPEN
+
+
+def step_rows(site: Site, runs: Mapping[str, Run]) -> list[dict[str, Any]]:
+    """Settling time, overshoot and extreme voltages of steps, one row each.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    runs
+        By name.
+    """
+    rows: list[dict[str, Any]] = []
+    bases = Bases.of(site)
+    for name, run in runs.items():
+        row: dict[str, Any] = {"step": name, "outcome": str(run.outcome)}
+        if not len(run.v):
+            rows.append(row)
+            continue
+        v = bases.ratio * run.v  # parts of the nominal voltage
+        end = v[-1] if run.outcome is not Outcome.OSCILLATES else v[len(v) // 2 :].mean(axis=0)
+        change = end - v[0]
+        most = int(np.argmax(np.abs(change)))
+        size = float(np.abs(change[most]))
+        away = np.max(np.abs(v - end), axis=1, initial=0.0)
+        late = np.flatnonzero(away > max(BAND * size, LEAST_PU))
+        past = np.max((v - end) * np.sign(change), initial=0.0)
+        low, high = bases.extremes(end / bases.ratio)
+        settles = run.outcome is Outcome.SETTLES
+        row |= {
+            "settling_s": (float(run.t[late[-1] + 1]) if late.size else 0.0) if settles else math.nan,
+            "overshoot_percent": 100.0 * float(past) / size if size > LEAST_PU else 0.0,
+            "change_volt": size * float(bases.nominal[most]),
+            "end_low_volt": low,
+            "end_high_volt": high,
+            "worst_customer": site.feeder.customers[int(np.argmax(np.abs(end - 1.0)))],
+        }
+        rows.append(row)
+    return rows
+
+
+def trajectories(site: Site, runs: Mapping[str, Run]) -> pd.DataFrame:
+    """Voltages and reactive power over time, for plots: one row for each step, instant and customer.
+
+    Parameters
+    ----------
+    site, runs
+        As in `step_rows`.
+    """
+    parts = []
+    for name, run in runs.items():
+        instants, customers = run.v.shape
+        parts.append(
+            pd.DataFrame(
+                {
+                    "step": name,
+                    "t_s": np.repeat(run.t, customers),
+                    "customer": list(site.feeder.customers) * instants,
+                    "v_volt": (site.customer_volt * run.v).ravel(),
+                }
+            )
+        )
+    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
+
+
+KICK: Final = 1e-3
+"""Largest deviation from rest from which an unstable fleet is simulated, part of each limit."""
+
+CLEARLY: Final = 1e-4
+"""Growth in one update must be beyond 1 by this before a fleet counts as unstable."""
+
+_AWAY: Final = 80
+"""Updates in which a fleet that grows is simulated."""
+
+MOST: Final = 1024.0
+"""Slopes grow up to this factor."""
+
+PLACES: Final = 4
+"""How often an interval of factor 2 is halved: factors are found to 4 %."""
+
+
+class Verdict(StrEnum):
+    """What is known of a fleet."""
+
+    STABLE = "stable"
+    UNSTABLE = "unstable"
+    UNDECIDED = "undecided"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Subject:
+    """A feeder whose fleets are judged: its power flow twice, for simulation and for proofs.
+
+    Attributes
+    ----------
+    site
+        The feeder.
+    flow
+        AC power flow for simulation.
+    net
+        AC power flow for proofs.
+    """
+
+    site: Site
+    flow: PowerFlow | PlacesFlow
+    net: Network
+
+    @classmethod
+    def of(cls, site: Site) -> Subject:
+        """Both power flows of a feeder."""
+        return cls(site, power_flow(site), network(site.feeder))
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """What is proven of a fleet with given loads.
+
+    Attributes
+    ----------
+    verdict
+        STABLE: from every state the fleet comes to the same rest. UNSTABLE: rest is unstable, and the
+        simulation moves away from it for good. UNDECIDED: neither is proven.
+    proof
+        The certificate, as in `gridsec.planning.droop.stability.Proof`.
+    gain
+        Largest gain of the loop at rest within reach, 1; NaN if nothing can be said of what is within reach.
+    growth
+        Factor by which a small deviation from rest grows in one update; NaN for loads in a box, or no rest.
+    outcome
+        What the simulation of an unstable fleet did after a small deviation from rest.
+    why
+        Why nothing is proven.
+    """
+
+    verdict: Verdict
+    proof: str
+    gain: float
+    growth: float
+    outcome: str = ""
+    why: str = ""
+
+
+def judge(subject: Subject, droop: Droop, update: Update, loads: Box, *, seed: int = 0) -> Judgement:
+    """Judge a fleet with constant loads, somewhere in a box or at a point.
+
+    Parameters
+    ----------
+    subject
+        The feeder.
+    droop, update
+        The fleet, and when it acts.
+    loads
+        Injections without it.
+    seed
+        Chooses the deviation from rest that is simulated.
+    """
+    given, why = _loop(subject.net, droop, update, loads)
+    gain = math.nan if given is None else given.gain
+    pointlike = _pointlike(loads)
+    steady = _linearised(subject.net, droop, update, loads) if pointlike else None
+    grows = (math.nan, math.nan) if steady is None else steady[1]
+    if given is not None:
+        found = proof(given)
+        if found.kind:
+            return Judgement(Verdict.STABLE, found.kind, gain, grows[1])
+        why = f"the loop gain may be {gain:.3g}, and the certificates end at {found.factor:.3g} of it"
+    if not pointlike:
+        return Judgement(Verdict.UNDECIDED, "", gain, math.nan, why=why)
+    if steady is None:
+        return Judgement(Verdict.UNDECIDED, "", gain, math.nan, why=f"{why}; no equilibrium was found")
+    if grows[0] > 1.0 + CLEARLY:
+        x, plant = _kicked(droop, steady[0], seed), (subject.site, subject.flow)
+        run = simulate(plant, droop, update, loads, x, gain=0.0 if math.isnan(gain) else gain, updates=_AWAY)
+        if run.outcome in {Outcome.OSCILLATES, Outcome.COLLAPSES}:
+            return Judgement(Verdict.UNSTABLE, "", gain, grows[0], str(run.outcome))
+        why += f"; rest is unstable, but the simulation {run.outcome}"
+    return Judgement(Verdict.UNDECIDED, "", gain, grows[1], why=why)
+
+
+def _pointlike(loads: Box) -> bool:
+    ends = ((loads.p_low, loads.p_high), (loads.q_low, loads.q_high), (loads.v0_low, loads.v0_high))
+    return all(np.array_equal(low, high) for low, high in ends)
+
+
+def _loop(net: Network, droop: Droop, update: Update, loads: Box) -> tuple[Loop | None, str]:
+    try:
+        return loop(droop, reach(net, droop, loads), update), ""
+    except DesignInfeasible as error:
+        return None, str(error)
+
+
+def _linearised(
+    net: Network, droop: Droop, update: Update, loads: Box
+) -> tuple[Floats, tuple[float, float]] | None:
+    """Injections at rest; least and largest growth around it, which differ only on breakpoints."""
+    s, own = loads.p_low + 1j * loads.q_low, droop.customer
+    x, V = rest(net, droop, s, loads.v0_low)
+    if not np.isfinite(x).all():
+        return None
+    J = sensitivity(net, injected(droop, s, x), V).dv_dq[np.ix_(own, own)]
+    v, near = np.abs(V[own]), 1e-7
+    below, above = slopes(droop, v - 2.0 * near, v - near), slopes(droop, v + near, v + 2.0 * near)
+    both = [growth(J, some(below, above), droop.tau, update) for some in (np.minimum, np.maximum)]
+    return x, (min(both), max(both))
+
+
+def _kicked(droop: Droop, x: Floats, seed: int) -> Floats:
+    """A small deviation from rest, in every direction."""
+    kick = KICK * np.random.default_rng(seed).choice([-1.0, 1.0], x.size) * droop.limit
+    return np.asarray(np.clip(x + kick, droop.q[:, 3], droop.q[:, 0]))
+
+
+# --- margins --------------------------------------------------------------------------------------------
+
+
+def edge(
+    subject: Subject,
+    droop: Droop,
+    update: Update,
+    loads: Box,
+    change: Callable[[Droop, float], Droop] = steepened,
+) -> tuple[float, float]:
+    """Between which factors on all slopes a fleet ceases to be stable, by doubling and bisection.
+
+    Parameters
+    ----------
+    subject, droop, update
+        As in `judge`.
+    loads
+        An operating point.
+    change
+        How slopes grow: `steepened` with the same limits, or `enlarged` with the same breakpoints.
+
+    Returns
+    -------
+    tuple
+        The largest factor found with which the fleet is proven to be stable, 0 if none; the smallest found
+        with which its rest is unstable, infinity if none up to 1024.
+    """
+
+    def proven(times: float) -> bool:
+        try:
+            given, _ = _loop(subject.net, change(droop, times), update, loads)
+        except FeederInvalid:
+            return False
+        return given is not None and bool(proof(given).kind)
+
+    def grows(times: float) -> bool:
+        steady = _linearised(subject.net, change(droop, times), update, loads)
+        return steady is not None and steady[1][0] > 1.0 + CLEARLY
+
+    certified = _last(proven, PLACES)
+    # Up to there nothing grows: what is proven need not be looked at again.
+    unstable = _last(lambda times: times <= certified or not grows(times), PLACES)
+    return certified, math.inf if unstable >= MOST else unstable * 2.0 ** (0.5**PLACES)
+
+
+def _last(holds: Callable[[float], bool], places: int) -> float:
+    """The largest factor found at which something holds, 0 if it does not even at a quarter."""
+    times = 1.0
+    while times >= 0.25 and not holds(times):
+        times *= 0.5
+    if times < 0.25:
+        return 0.0
+    while times < MOST and holds(2.0 * times):
+        times *= 2.0
+    if times >= MOST:
+        return times
+    step = 2.0
+    for _ in range(places):
+        step = math.sqrt(step)
+        if holds(step * times):
+            times *= step
+    return times
+
+
+def longest_interval(subject: Subject, droop: Droop, update: Update, loads: Box) -> float:
+    """The longest sampling interval found with which the fleet is proven to be stable, s.
+
+    Infinity: the certificate covers every interval. The time constants may be shorter in the same ratio.
+
+    Parameters
+    ----------
+    subject, droop, update, loads
+        As in `judge`.
+    """
+    try:
+        within = reach(subject.net, droop, loads)
+    except DesignInfeasible:
+        return 0.0
+    longest = float(np.max(droop.tau, initial=0.0))
+
+    def proven(interval: float) -> bool:
+        return bool(proof(loop(droop, within, replace(update, interval_s=interval))).kind)
+
+    jumping = loop(droop, within, replace(update, interval_s=50.0 * longest))
+    # e^-50 is nothing: as if inverters jumped to their set-points.
+    if proof(jumping).kind and jumping.covers_shorter:
+        return math.inf
+    start = update.interval_s or 1e-3 * float(np.min(droop.tau))
+    return start * _last(lambda times: proven(start * times), 5)
+
+
+def inverter_rows(
+    subject: Subject, droop: Droop, update: Update, loads: Box, where: str
+) -> list[dict[str, Any]]:
+    """Who contributes how much to the loop gain, and how much steeper each alone may be.
+
+    Parameters
+    ----------
+    subject, droop, update, loads
+        As in `judge`.
+    where
+        Name of the operating point.
+    """
+    given, _ = _loop(subject.net, droop, update, loads)
+    if given is None:
+        return []
+    own = _shares(subject.site, given)
+    names = inverter_names(subject.site, droop, given.rows)
+    order = np.argsort(-own.part)
+    return [
+        {
+            "point": where,
+            "customer": names[k],
+            "limit_kvar": float(droop.limit[given.rows[k]]) * subject.site.feeder.base_kva,
+            "part": float(own.part[k]),
+            "alone": float(own.factor[k]),
+        }
+        for k in order
+    ]
+
+
+def _shares(site: Site, given: Loop) -> Share:
+    """By the modes of a loop of reactances in common; in three phases by its gain without regard to sign."""
+    limit = proof(given).factor
+    if not isinstance(site.feeder, InPhases):
+        return shares(given, limit * float(np.linalg.norm(0.5 * (given.S + given.S.T), 2)))
+    own = shares_of_gain(given)
+    # What all may do together, one may do alone.
+    return replace(own, factor=np.fmax(own.factor, limit if limit >= 1.0 else math.nan))
+
+
+def margin(subject: Subject, droop: Droop, update: Update, loads: Box) -> float:
+    """Factor on the steepest slopes up to which all curves with the same limits are proven to be stable.
+
+    Parameters
+    ----------
+    subject, droop, update, loads
+        As in `judge`.
+
+    Returns
+    -------
+    float
+        0 if nothing can be said of all that such curves can do.
+    """
+    try:
+        within = reach(subject.net, droop, loads, rounds=0)
+    except DesignInfeasible:
+        return 0.0
+    size = within.region.low.size
+    wide = replace(within.region, low=np.zeros(size), high=np.full(size, np.inf))
+    return proof(loop(droop, replace(within, region=wide), update)).factor
+
+
+def worst(verdicts: Iterable[str]) -> Verdict:
+    """One verdict of several: unstable if one is, stable if all are.
+
+    Parameters
+    ----------
+    verdicts
+        At least one.
+    """
+    known = set(verdicts)
+    if Verdict.UNSTABLE in known:
+        return Verdict.UNSTABLE
+    return Verdict.STABLE if known == {Verdict.STABLE} else Verdict.UNDECIDED

@@ -1,0 +1,1 @@
+"""Estimators of a feeder. Each has `design`, `init` and `step`."""

@@ -1,0 +1,499 @@
+"""Exact bank monitor of one feeder: from a frame of readings to an estimate and a verdict.
+
+Offline, `design` turns a plant into a bank of observers with a certificate; online, `init` and `step`
+run it. A step never raises on data: outcomes are values.
+
+1. The known input w comes from the busbar voltage, the loads, and the loss correction at the last
+   estimate; chong2020 (19).
+2. The bank takes one step; chong2020 (5). The set with the best agreement between its estimate and those
+   of its subsets is selected, (6) and (7), among the sets without a named meter.
+3. The residuals of *all* meters against the selected estimate are compared with the largest value of an
+   unmanipulated meter (`gridsec.estimators.thresholds`). Attacks inside a droop curve's deadband do not move
+   any estimate, so that agreement alone would not detect them.
+4. A meter is named with its `confirm`-th reading above the threshold, and until `release` consecutive
+   readings are below it; the selection is repeated without the named meters.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from gridsec.arrays import Bools, Floats, Ints
+from gridsec.errors import DesignInfeasible
+from gridsec.estimators import thresholds
+from gridsec.estimators.decision import Situation, Tally, count, decide, residual_excess
+from gridsec.estimators.exact_bank import bank as banks
+from gridsec.estimators.exact_bank.bank import StackedState
+from gridsec.estimators.inputs import Inputs, Past, clean, injections, known, nothing_new, reconstruct
+from gridsec.estimators.plant import Options, Plant, Setting, check_plant
+from gridsec.estimators.thresholds import ErrorBound, ErrorModel, Majorant, Motion
+from gridsec.grid.meter import reading_error
+from gridsec.grid.network import linear
+from gridsec.grid.radial import LinDistFlow
+from gridsec.interface import Estimate, Frame, Verdict
+from gridsec.observers.certificates import Certificate, certify, small_gain, verify
+from gridsec.observers.lmi import contraction
+from gridsec.observers.lure import Lure, close_loop, rest
+
+__all__ = ["MonitorDesign", "MonitorState", "design", "init", "step"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MonitorDesign:
+    """Design of the exact bank monitor.
+
+    Attributes
+    ----------
+    model
+        Linear power flow of the plant.
+    bank
+        The observers.
+    errors
+        Propagation of errors.
+    certificate
+        Proof that the observers converge, for all sensor sets at once.
+    proven
+        System of the certificate: the closed loop, or a majorant of all observers.
+    step_s
+        Expected interval between frames, s.
+    """
+
+    plant: Plant
+    model: LinDistFlow
+    bank: banks.Bank
+    errors: ErrorModel
+    certificate: Certificate
+    proven: Lure
+    step_s: float
+    options: Options
+
+    @property
+    def setting(self) -> Setting:
+        """Setting for the preparation of frames."""
+        return Setting(
+            self.plant,
+            self.model,
+            self.errors,
+            self.options,
+            self.bank.sets.max_attacked,
+            self.bank.direct,
+        )
+
+    @property
+    def observers(self) -> int:
+        """Number of observers."""
+        return len(self.bank.masks)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MonitorState:
+    """State between frames.
+
+    Attributes
+    ----------
+    t
+        Time of the last used frame, s; that of `init` before the first one.
+    valid
+        True if the certificate was verified.
+    bank
+        The observers; None before the first frame.
+    x : (m,)
+        Last selected estimate of the injections, pu.
+    z : (m,)
+        Its z at the inverters, pu.
+    spread : (m,)
+        Largest distance of it from that of an observer without manipulated meters, pu.
+    bound, level
+        Bounds on the observers' error, and their upper level during the last step.
+    settled
+        True once the initial transient has decayed.
+    tally
+        Counters of readings above and below the thresholds, and the named meters.
+    v0_squared
+        Last squared busbar voltage, pu; in three phases (3,).
+    last
+        Last estimate and verdict, returned for unusable frames; None before the first one.
+    """
+
+    t: float
+    valid: bool
+    bank: banks.BankState | None
+    x: Floats
+    z: Floats
+    spread: Floats
+    bound: ErrorBound
+    level: ErrorBound
+    settled: bool
+    tally: Tally
+    v0_squared: Floats | float
+    last: tuple[Estimate, Verdict] | None
+
+
+def design(
+    plant: Plant,
+    *,
+    max_attacked: int,
+    step_s: float,
+    gains: Literal["direct"] | banks.Gains = "direct",
+    options: Options | None = None,
+    certificate: Certificate | None = None,
+) -> MonitorDesign:
+    """Design the bank, its certificate and its error bounds for one feeder.
+
+    Parameters
+    ----------
+    max_attacked
+        M, largest number of simultaneously manipulated meters.
+    step_s
+        Expected interval between frames, s. Other intervals work too. Above 30 s, four consecutive readings
+        below the threshold clear a meter in place of six, unless `options` are given.
+    gains
+        `direct`: the inverter of a trusted meter is driven by that meter's reading. Or stacked gains
+        of circle-criterion observers in the order of `bank.subsets(p, M).masks()`; an entrywise
+        majorant of all of them must then satisfy the small-gain condition.
+    certificate
+        An external proof; by default the best closed form, or the solver's where none applies. It is verified
+        here.
+
+    Raises
+    ------
+    NotObservable
+        Unless there are more than 2M meters.
+    DesignInfeasible
+        If no certificate holds, the bank would be too large, or the gains detect nothing.
+    ValueError
+        As `plant.check_plant`; or if `gains` is another text.
+
+    References
+    ----------
+    chong2020, Corollary 1, for any feeder and with the corrections of its errata.
+    """
+    meters = plant.meters
+    check_plant(plant, max_attacked=max_attacked, step_s=step_s)
+    if options is None:
+        options = Options() if step_s <= 30.0 else Options(release=4)
+    lure = close_loop(plant.feeder, plant.droop, meters)
+    model = linear(plant.feeder)
+    bank = banks.design(lure, max_attacked, gains=gains, reactive=_reactive(model, meters, gains))
+    errors = thresholds.error_model(plant.droop, model, meters, max_attacked)
+    proven = lure
+    if bank.gains is not None:
+        big = _majorant(lure, bank.gains)
+        errors = replace(errors, majorant=big, quota=meters.size)
+        proven = replace(lure, H=-_loop(lure, big))
+    proof = certificate
+    if proof is None:
+        proof = _proof(proven) if bank.direct else small_gain(proven)
+    margin = verify(proof, proven)
+    if not margin > 0:
+        raise DesignInfeasible(
+            f"{proof.kind} certificate", "the verification fails", margin, code="not-verified"
+        )
+    return MonitorDesign(plant, model, bank, errors, proof, proven, step_s, options)
+
+
+def _reactive(model: LinDistFlow, meters: Ints, gains: object) -> Floats | None:
+    return -2.0 * model.X[:, meters] if isinstance(gains, str) else None
+
+
+# Decay rate requested from the solver, as a fraction of the slowest inverter's rate.
+_RATE = 0.1
+
+
+def _proof(lure: Lure) -> Certificate:
+    """The best closed-form certificate, or the solver's where none applies."""
+    try:
+        return certify(lure)
+    except DesignInfeasible:
+        return contraction(lure, rate=_RATE * float(np.min(-np.diagonal(lure.A))))
+
+
+def _majorant(lure: Lure, gains: banks.Gains) -> Majorant:
+    H, F = np.abs(lure.H), np.abs(lure.F)
+    for K in gains.K:
+        np.maximum(H, _extreme(lure.H, K, lure.C), out=H)
+        np.maximum(F, _extreme(lure.F, K, lure.D), out=F)
+    tau = -1.0 / np.diagonal(lure.A)
+    return Majorant(H, F, np.abs(gains.K).max(axis=0), tau[:, None] * np.abs(gains.L).max(axis=0))
+
+
+def _loop(lure: Lure, big: Majorant) -> Floats:
+    """Feedback with a small-gain condition that covers all observers: the effect of L counts as H / slope."""
+    through = big.L @ np.abs(lure.C)
+    deaf = lure.slope <= 0
+    if through[deaf].any():
+        raise DesignInfeasible(
+            "observer bank",
+            "gains inject into the state of an inverter with slope 0",
+            None,
+            code="wrong-form",
+        )
+    return np.asarray(big.H + through / np.where(deaf, 1.0, lure.slope)[:, None])
+
+
+def _extreme(M: Floats, K: Floats, N: Floats) -> Floats:
+    """Largest `|M - K N|`, entry by entry, over all choices of columns of K set to zero."""
+    terms = -K[:, :, None] * N
+    high, low = np.maximum(terms, 0.0).sum(axis=1), np.minimum(terms, 0.0).sum(axis=1)
+    return np.asarray(np.maximum(np.abs(M + high), np.abs(M + low)))
+
+
+def init(design: MonitorDesign, t: float) -> MonitorState:
+    """Initial state; the observers start with the first frame.
+
+    Parameters
+    ----------
+    design
+        From `design`. Its certificate is verified again, because a stored or hand-made design may be wrong.
+    t
+        Unix time, s.
+    """
+    m, p = design.plant.droop.tau.size, design.plant.meters.size
+    try:
+        valid = verify(design.certificate, design.proven) > 0
+    except DesignInfeasible:
+        valid = False
+    widest = thresholds.widest(design.errors)
+    return MonitorState(
+        t=t,
+        valid=valid,
+        bank=None,
+        x=np.zeros(m),
+        z=np.zeros(m),
+        spread=np.zeros(m),
+        bound=widest,
+        level=widest,
+        settled=False,
+        tally=Tally(np.zeros(p, dtype=np.intp), np.zeros(p, dtype=np.intp), np.zeros(p, dtype=np.bool_)),
+        v0_squared=design.plant.droop.vbar**2,
+        last=None,
+    )
+
+
+def step(design: MonitorDesign, state: MonitorState, frame: Frame) -> tuple[MonitorState, Estimate, Verdict]:
+    """Process one frame.
+
+    Parameters
+    ----------
+    frame
+        Data of one tick. A frame that is not later than the last one changes nothing: it returns the last
+        estimate and UNDECIDED.
+
+    Returns
+    -------
+    MonitorState, Estimate, Verdict
+        As every estimator's step; see `gridsec.interface`.
+    """
+    late = state.bank is not None and not frame.t > state.t
+    if late or not np.isfinite(frame.t):
+        return state, *nothing_new(design.plant, frame, state.t, state.last, state.v0_squared, state.x)
+    frame = known(frame)
+    inputs = clean(design.setting, Past(state.x, state.v0_squared, state.tally.named), frame)
+    h = 0.0 if state.bank is None else frame.t - state.t
+    if state.bank is None:
+        bank = banks.init(design.bank, inputs.z, inputs.w, inputs.live, net=inputs.net)
+        unknown = _unknown(design, bank)
+        state = replace(state, bound=unknown, level=unknown)
+    else:
+        bank = banks.step(
+            design.bank, state.bank, inputs.z, inputs.w, inputs.live, h, net=inputs.net, adopt=state.x
+        )
+        if banks.decided(design.bank, bank) and not banks.decided(design.bank, state.bank):
+            # The observers restart from one without trusted meters.
+            unknown = _unknown(design, bank)
+            state = replace(state, bound=unknown, level=unknown, settled=False)
+        else:
+            state = replace(state, bound=_handed_over(design, state, inputs.live))
+    return _conclude(design, state, frame, inputs, bank, h)
+
+
+def _unknown(design: MonitorDesign, bank: banks.BankState) -> ErrorBound:
+    """Bound on the error of observers that just started."""
+    return thresholds.widest(design.errors, bank.x if isinstance(bank, StackedState) else None)
+
+
+def _handed_over(design: MonitorDesign, state: MonitorState, live: Bools) -> ErrorBound:
+    """The bounds when meters become unavailable or return: each inverter takes the other mode's error."""
+    meter_of, bound = design.errors.meter_of, state.bound
+    if state.bank is None or not live.size:
+        return bound
+    was, now = state.bank.seen[meter_of], live[meter_of]
+    silenced, returned = (meter_of >= 0) & was & ~now, (meter_of >= 0) & ~was & now
+    free = np.where(silenced, np.maximum(bound.free, bound.driven), bound.free)
+    # The inverter of a returning meter starts from the selected estimate.
+    return ErrorBound(np.where(returned, bound.free + state.spread, bound.driven), free)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _View:
+    """Estimate of the feeder from one selected set of meters, with residuals and bounds."""
+
+    index: int
+    x: Floats
+    z: Floats
+    spread: Floats
+    bound: ErrorBound
+    level: ErrorBound
+    settled: bool
+    v2: Floats
+    v2_bus: Floats
+    error: Floats  # (N,)
+    score: Floats  # (p,) NaN where unavailable
+    threshold: Floats  # (p,)
+
+
+def _conclude(  # noqa: PLR0917  # design, state and frame, then the results of this step
+    design: MonitorDesign,
+    state: MonitorState,
+    frame: Frame,
+    inputs: Inputs,
+    bank: banks.BankState,
+    h: float,
+) -> tuple[MonitorState, Estimate, Verdict]:
+    plant, options, live = design.plant, design.options, inputs.live
+    view = _select(design, state, frame, inputs, bank, h)
+    over = live & (np.nan_to_num(view.score) > view.threshold)
+    enough = banks.decided(design.bank, bank)
+    tally = state.tally
+    if enough:
+        tally = count(tally, over, live, confirm=options.confirm, release=options.release)
+    decision, cause, reason = decide(
+        Situation(
+            names=tuple(plant.feeder.customers[c] for c in plant.meters),
+            max_attacked=design.bank.sets.max_attacked,
+            live=live,
+            suspected=tally.above > 0,
+            named=tally.named,
+            wide=live & ~(view.threshold <= options.widest),
+            valid=state.valid,
+            settled=view.settled,
+            busbar=inputs.busbar,
+        )
+    )
+    trusted = np.zeros(live.size, dtype=np.bool_)
+    if view.index >= 0:
+        trusted = design.bank.masks[view.index] & live & ~tally.named
+    error = view.error
+    if np.count_nonzero(tally.named) > design.bank.sets.max_attacked:
+        # More manipulated meters than the bank covers: only saturation bounds their effect on the estimate.
+        error = _saturated(design, inputs, frame, view.x)
+    estimate = Estimate(t=frame.t, v2=view.v2, bound=error, v2_bus=view.v2_bus, trusted=trusted, x=view.x)
+    accused = tally.named & live
+    attack = np.where(accused, inputs.y - view.v2[plant.meters], 0.0)
+    verdict = Verdict(decision, cause, reason, tally.named, view.score, view.threshold, attack)
+    after = MonitorState(
+        t=frame.t,
+        valid=state.valid,
+        bank=bank,
+        x=view.x,
+        z=view.z,
+        spread=view.spread,
+        bound=view.bound,
+        level=view.level,
+        settled=view.settled,
+        tally=tally,
+        v0_squared=inputs.v0_squared,
+        last=(estimate, verdict),
+    )
+    return after, estimate, verdict
+
+
+def _select(  # noqa: PLR0917  # as _conclude
+    design: MonitorDesign,
+    state: MonitorState,
+    frame: Frame,
+    inputs: Inputs,
+    bank: banks.BankState,
+    h: float,
+) -> _View:
+    """Select a set, detect meters above their thresholds, and select again without them."""
+    sets, live = design.bank.sets, inputs.live
+    pi = banks.consistency(design.bank, bank)
+    tie = design.options.tie * float(np.max(design.plant.droop.limit, initial=0.0))
+    masks = design.bank.masks[: sets.count_large]
+    named = state.tally.named
+    excluded = named if np.count_nonzero(named) <= sets.max_attacked else np.zeros_like(named)
+    penalty: Floats | None = None
+    while True:
+        index = -1
+        if pi.size:
+            allowed = np.asarray(~(masks & excluded).any(axis=1))
+            index = banks.select(pi, allowed=allowed, penalty=penalty, tie=tie)
+        view = _view(design, state, frame, inputs, bank, index, h)
+        over = live & (np.nan_to_num(view.score) > view.threshold)
+        if index < 0 or not over.any():
+            return view
+        wanted = excluded | over
+        if np.count_nonzero(wanted) <= sets.max_attacked:
+            if not (masks[index] & wanted).any():
+                return view
+            excluded = wanted
+        elif penalty is None:
+            penalty = masks @ residual_excess(np.nan_to_num(view.score), view.threshold, live)
+        else:
+            return view
+
+
+def _view(  # noqa: PLR0917  # as _conclude
+    design: MonitorDesign,
+    state: MonitorState,
+    frame: Frame,
+    inputs: Inputs,
+    bank: banks.BankState,
+    index: int,
+    h: float,
+) -> _View:
+    plant, errors = design.plant, design.errors
+    own, at = plant.droop.customer, plant.meters
+    x = banks.estimate(design.bank, bank, index)
+    spread = banks.spread(design.bank, bank, index) if index >= 0 else np.zeros(x.shape)
+    told = inputs.now.told & (design.bank.masks[index] if index >= 0 else False)
+    seen = reconstruct(design.setting, frame, inputs, injections(plant, frame, x, told))
+    v2 = seen.v2
+    z = plant.droop.vbar**2 - v2[own]
+    # Difference of the selected set to a subset without manipulated meters: the estimates differ by
+    # `spread`, and metered reactive power of at most M meters is replaced.
+    offset = errors.inverters @ spread
+    if told.any():
+        held = np.bincount(own, weights=x, minlength=v2.size)[at] + inputs.q[at]
+        doubt = np.where(told, np.abs(frame.q_net[at] - held), 0.0)
+        offset = offset + thresholds.largest(errors.reach * np.nan_to_num(doubt), errors.quota // 2)
+    moved = np.abs(seen.correction - inputs.correction)[plant.feeder.bus]
+    now = replace(inputs.now, base=inputs.now.base + moved)
+    before = z if state.bank is None else state.z
+    lag = _slowed(design, h) * (np.abs(x - state.x) + spread)
+    motion = Motion(before=before, after=z, offset=offset[own], h=h, lag=lag)
+    if index >= 0:
+        bound, level = thresholds.advance(errors, now, motion, state.bound, state.level)
+        error = thresholds.gap(errors, now, bound) + offset
+    else:
+        bound, level = state.bound, state.level
+        error = _saturated(design, inputs, frame, x)
+    threshold = reading_error(plant.accuracy, v2[at] + error[at], design.options.sigmas) + error[at]
+    score = np.where(inputs.live, np.abs(inputs.y - v2[at]), np.nan)
+    settled = state.settled
+    if index >= 0 and not settled:
+        none = np.zeros(x.shape)
+        top = thresholds.ceiling(errors, now, motion, ErrorBound(none, none))
+        level_at_rest = thresholds.settled(errors, now, motion, top)
+        transient = thresholds.gap(errors, now, bound)[at] - thresholds.gap(errors, now, level_at_rest)[at]
+        settled = bool(np.all(transient <= design.options.settled * threshold))
+    return _View(index, x, z, spread, bound, level, settled, v2, seen.v2_bus, error, score, threshold)
+
+
+def _slowed(design: MonitorDesign, h: float) -> Bools:
+    """Mask (m,) of inverters that the step treats as slower than they are: `lure.transition`, `rest`."""
+    fast = design.plant.droop.tau * rest(h, design.bank.policy) < 1.0
+    # If all are that fast, the step ends in the equilibrium.
+    return fast & ~fast.all()
+
+
+def _saturated(design: MonitorDesign, inputs: Inputs, frame: Frame, x: Floats) -> Floats:
+    """Error of the estimate (N,) under any attack: inverters saturate, and used reports are plausible."""
+    errors = design.errors
+    told = np.where(inputs.now.told, 2.0 * frame.q_error[design.plant.meters], 0.0)
+    far = thresholds.widest(errors, None if design.bank.direct else x).free
+    return np.asarray(inputs.now.base + errors.inverters @ far + errors.reach @ told)

@@ -1,0 +1,211 @@
+"""Whom the monitor does not believe, apart from all else it carries: what survives when it begins anew.
+
+Means over many ticks are empty when a monitor begins, so small lies, which only long means tell from
+chance, would pass for honest until these are full again. What a scale found therefore stands until it has
+enough readings to say something else.
+
+References
+----------
+docs/theory-sequential.md, section 5.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from gridsec.arrays import Bools, Floats, Ints
+from gridsec.estimators.sequential.busbar import Busbar
+from gridsec.estimators.sequential.design import SequentialDesign
+from gridsec.estimators.sequential.naming import MOST_COUNTED
+from gridsec.estimators.sequential.repeats import BLOCKS, ROWS, unnoticed
+from gridsec.estimators.sequential.scales import needed
+from gridsec.estimators.sequential.state import SequentialState
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Distrust:
+    """Who is not believed. p meters, m inverters, b phases of the busbar, one on a balanced feeder.
+
+    Attributes
+    ----------
+    scale_s : (p,)
+        Time scale on which each distrusted meter was caught, s; NaN for those that are trusted.
+    repeats_s : (p,)
+        Time after which a distrusted meter repeats its readings, s, that from one to the next for a stuck
+        one; NaN for all others.
+    named : (p,)
+        Meters named as manipulated; all of them are distrusted.
+    inverters : (m,)
+        Inverters named as manipulated.
+    busbar_scale_s : (b,)
+        Time scale on which the busbar's meter was caught, s; NaN where it is believed.
+    busbar_named : (b,)
+        Where it is named as manipulated; there it is not believed.
+    busbar_off : (b,)
+        What it reads too much, the mean over its scale, squared pu; 0 where it is believed.
+    """
+
+    scale_s: Floats
+    repeats_s: Floats
+    named: Bools
+    inverters: Bools
+    busbar_scale_s: Floats = field(default_factory=lambda: np.full(1, np.nan))
+    busbar_named: Bools = field(default_factory=lambda: np.zeros(1, dtype=np.bool_))
+    busbar_off: Floats = field(default_factory=lambda: np.zeros(1))
+
+    @property
+    def empty(self) -> bool:
+        """Whether everybody is believed."""
+        scales_s = (self.scale_s, self.busbar_scale_s)
+        return not (self.inverters.any() or any(np.isfinite(scale_s).any() for scale_s in scales_s))
+
+    def same(self, other: Distrust) -> bool:
+        """Whether another says the same of everybody; by how much the busbar's meter is off does not count.
+
+        Parameters
+        ----------
+        other
+            Of the same feeder.
+        """
+        return (
+            np.array_equal(self.scale_s, other.scale_s, equal_nan=True)
+            and np.array_equal(self.repeats_s, other.repeats_s, equal_nan=True)
+            and np.array_equal(self.named, other.named)
+            and np.array_equal(self.inverters, other.inverters)
+            and np.array_equal(self.busbar_scale_s, other.busbar_scale_s, equal_nan=True)
+            and np.array_equal(self.busbar_named, other.busbar_named)
+        )
+
+    def without(self, which: Bools) -> Distrust:
+        """What is left when some meters were replaced.
+
+        Parameters
+        ----------
+        which : (p,)
+            The meters.
+        """
+        scale_s, repeats_s = (np.where(which, np.nan, each) for each in (self.scale_s, self.repeats_s))
+        return replace(self, scale_s=scale_s, repeats_s=repeats_s, named=self.named & ~which)
+
+
+def nobody(meters: int, inverters: int, phases: int = 1) -> Distrust:
+    """Everybody is believed.
+
+    Parameters
+    ----------
+    meters, inverters, phases
+        p, m and b.
+    """
+    no, none, here = (np.zeros(count, dtype=np.bool_) for count in (meters, inverters, phases))
+    never = np.full(meters, np.nan)
+    return Distrust(never, never, no, none, np.full(phases, np.nan), here, np.zeros(phases))
+
+
+def distrusted(design: SequentialDesign, state: SequentialState) -> Distrust:
+    """Whom a state does not believe.
+
+    Parameters
+    ----------
+    design, state
+        The design, and the state after a tick.
+    """
+    trust = state.trust
+    inverters = trust.inverters if state.last is None else state.last[1].inverters
+    busbar = state.busbar
+    if trust.trusted.all() and busbar.believed.all() and not inverters.any():
+        return nobody(trust.trusted.size, inverters.size, busbar.believed.size)
+    scales_s = np.array(design.lengths) * design.step_s
+    # Repetition shows on no scale; the longest is what is left to judge such a meter by.
+    repeats = ~trust.trusted & (trust.lag > 0)
+    scale = np.where(repeats, len(design.lengths) - 1, trust.scale)
+    return Distrust(
+        np.where(trust.trusted, np.nan, scales_s[scale]),
+        np.where(repeats, trust.lag * design.step_s, np.nan),
+        trust.named,
+        inverters,
+        np.where(busbar.believed, np.nan, scales_s[busbar.scale]),
+        busbar.named,
+        busbar.off,
+    )
+
+
+def restore(design: SequentialDesign, state: SequentialState, before: Distrust) -> SequentialState:
+    """Go on distrusting who was, from a state that has not seen any frame.
+
+    A meter is trusted again as always, but not before it has given as many readings as its scale needs to
+    judge, and the observer has settled, and one that repeated itself as many as it takes to notice that anew;
+    an inverter that is named, as many as the longest scale needs. The busbar's meter is compared with the
+    others as before, by the mean that was known, and has to agree with them for as much longer.
+
+    Parameters
+    ----------
+    design, state
+        The design, and a state from `init`.
+    before
+        Who was distrusted.
+    """
+    if before.empty:
+        return state
+    trust, which = state.trust, np.isfinite(before.scale_s)
+    scale = _closest(design, before.scale_s)
+    need, settling = (
+        np.array([needed(design, s) for s in range(len(design.lengths))]),
+        _settling(design, state),
+    )
+    still = trust.still.copy()
+    still[scale[which], np.flatnonzero(which)] = True
+    repeats = np.isfinite(before.repeats_s)
+    ticks = np.where(repeats, np.rint(before.repeats_s / design.step_s), 0.0)
+    lag = np.where(repeats, np.clip(ticks, 1.0, ROWS * BLOCKS), 0.0).astype(np.intp)
+    owed = np.maximum(np.maximum(need[scale], settling), unnoticed(design.shapes.rules, lag))
+    longest = max(int(need[-1]), int(settling.max(initial=0)))
+    return replace(
+        state,
+        busbar=_busbar(design, before, need, int(settling.max(initial=0))),
+        trust=replace(
+            trust,
+            trusted=~which,
+            scale=scale,
+            age=np.where(before.named, design.confirmed[scale], which),
+            still=still,
+            owed=np.where(which, owed, 0),
+            lag=np.where(which, lag, 0),
+            named=before.named & which,
+            counted=np.where(before.inverters, longest + MOST_COUNTED, 0),
+            inverters=before.inverters,
+        ),
+    )
+
+
+def _busbar(design: SequentialDesign, before: Distrust, need: Ints, settling: int) -> Busbar:
+    """What is thought of the busbar's meter, as far as it was not believed."""
+    out = np.isfinite(before.busbar_scale_s)
+    scale = _closest(design, before.busbar_scale_s)
+    known = before.busbar_named & out
+    # The mean goes on over the whole of its scale.
+    length = np.maximum(design.confirmed, design.lengths)[scale]
+    return Busbar(
+        believed=~out,
+        scale=scale,
+        age=np.where(known, length, 0),
+        quiet=np.where(out, -np.maximum(need[scale], settling), 0),
+        off=np.where(known, before.busbar_off, 0.0),
+        named=known,
+    )
+
+
+def _closest(design: SequentialDesign, scale_s: Floats) -> Ints:
+    """The scales closest to those on which somebody was caught, 0 for NaN: they may have changed since."""
+    scales_s = np.array(design.lengths) * design.step_s
+    far = np.abs(np.log(np.where(np.isfinite(scale_s), scale_s, scales_s[0])[:, None] / scales_s))
+    return np.asarray(far.argmin(axis=1))
+
+
+def _settling(design: SequentialDesign, state: SequentialState) -> Ints:
+    """Ticks until the unknown initial state moves each meter by less than matters, (p,)."""
+    least = design.options.settled * np.maximum(state.learned.allowed, np.finfo(np.float64).tiny)
+    more = np.log(np.maximum(design.reach / least, 1.0))
+    rate = design.certificate.rate * design.step_s
+    return np.asarray(np.where(more > 0.0, np.ceil(more / rate), 0.0)).astype(np.intp)

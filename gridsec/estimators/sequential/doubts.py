@@ -1,0 +1,332 @@
+"""How much less the frames know of powers than the design supposes, and what then holds on every scale.
+
+A mean over some ticks contains residuals of all of them, so on each scale a customer's power is as uncertain
+as it was at worst within the ticks of that scale, and the busbar is known only where it was at all of them.
+
+References
+----------
+docs/theory-sequential.md, section 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gridsec.arrays import Bools, Floats, Ints, all_of, any_of
+from gridsec.estimators.inputs import usual
+from gridsec.estimators.sequential.conditional import Prior
+from gridsec.estimators.sequential.design import SequentialDesign
+from gridsec.estimators.sequential.loads import EXACT, UNMETERED, prior
+from gridsec.grid.network import reach
+from gridsec.interface import Frame, PowerOrigin
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Doubts:
+    """How much less the frames know than the design supposes. N customers, s scales.
+
+    Attributes
+    ----------
+    p, q : (s, N)
+        Factors on the standard deviations of the design: the largest that any residual in the mean of a scale
+        was made with. Exact for a power that a reporting meter withholds, else powers of two.
+    p_calm, q_calm : (s, N)
+        For how many ticks a smaller one would have done.
+    p_rest, q_rest : (s, N)
+        The largest that these would have needed.
+    busbar : (s, b)
+        Whether there was a busbar voltage at all ticks of a scale; b is 3 in three phases, else 1.
+    busbar_calm : (s, b)
+        For how many ticks there has been one where there was none at all of them.
+    priors : (s,)
+        What follows.
+    sizes : (k,)
+        How much there may be of whatever else is in the book of the design, pu: false powers are of the size
+        of what the customers claim, rounded up.
+    vouched : (s, p)
+        Meters without a residual in the mean of a scale that was made without a reading of their customer's
+        active power.
+    vouched_calm : (s, p)
+        Consecutive ticks without such a residual, for meters that are not vouched.
+    read, read_calm : (s, p)
+        The same with late powers as readings.
+    heard
+        While no meter is heard: the same when one was, for the last time.
+    """
+
+    p: Floats
+    q: Floats
+    p_calm: Ints
+    q_calm: Ints
+    p_rest: Floats
+    q_rest: Floats
+    busbar: Bools
+    busbar_calm: Ints
+    priors: tuple[Prior, ...]
+    sizes: Floats
+    vouched: Bools
+    vouched_calm: Ints
+    read: Bools
+    read_calm: Ints
+    heard: Doubts | None = None
+
+
+def none(design: SequentialDesign) -> Doubts:
+    """The frames know what the design supposes.
+
+    Parameters
+    ----------
+    design
+        The design.
+    """
+    scales, phases = len(design.lengths), design.hangs_on.shape[1]
+    one, never = np.ones((scales, design.customers)), np.zeros((scales, design.customers), dtype=np.intp)
+    known, unbroken = np.ones((scales, phases), dtype=np.bool_), np.zeros((scales, phases), dtype=np.intp)
+    priors, meters = (design.prior,) * scales, design.plant.meters.size
+    vouched, calm = np.ones((scales, meters), dtype=np.bool_), np.zeros((scales, meters), dtype=np.intp)
+    sizes = design.book.std
+    return Doubts(
+        one, one, never, never, one, one, known, unbroken, priors, sizes, vouched, calm, vouched, calm
+    )
+
+
+_MUCH_LESS = 4.0
+"""Ratio of a frame's uncertainty to the design's beyond which it is used, unless a power is withheld."""
+_ROUNDED = 1.0 + 1e-9
+"""Ratio up to which two uncertainties are the same but for rounding."""
+_FELT = 0.5
+"""Part of the accuracy class that doubts about late or excessive powers must move a voltage by to count."""
+_ALIKE = 0.5
+"""Share of the variance of powers that are not read that all of them have in common."""
+
+
+def doubted(
+    design: SequentialDesign, before: Doubts, frame: Frame, live: Bools, busbar: Bools | bool
+) -> Doubts:
+    """What is not known at this frame, and of the residuals that are remembered.
+
+    Where no meter is heard there is no residual that was made with what this frame does not know: once one is
+    heard again, doubts go on as they were before.
+
+    Parameters
+    ----------
+    design, before
+        The design, and the doubts so far.
+    frame
+        With powers that can be.
+    live : (p,)
+        Which meters have a reading.
+    busbar
+        Whether there is a busbar voltage that is believed; in three phases (3,).
+    """
+    last = before if before.heard is None else before.heard
+    if any_of(live):
+        return _doubts(design, last, frame, live, busbar)
+    found = _doubts(design, before, frame, live, busbar)
+    return found if found.heard is last else replace(found, heard=last)
+
+
+def checked(design: SequentialDesign, frame: Frame) -> Bools:
+    """Meters with an active power that is known about as well as the design supposes, (p,).
+
+    A power that is not read is as good as one that is if the design supposes no more of it.
+
+    Parameters
+    ----------
+    design, frame
+        The design, and a frame with powers that can be.
+    """
+    meters = design.plant.meters
+    if frame.p_origin is None:
+        return np.ones(meters.size, dtype=np.bool_)
+    origins = frame.p_origin[meters]
+    if not any_of(origins):
+        return np.ones(meters.size, dtype=np.bool_)
+    least = np.where(origins == PowerOrigin.UNREAD, _ROUNDED, _MUCH_LESS)
+    wide = frame.p_error[meters] > least * design.doubt.even_p[meters]
+    return np.asarray((origins == PowerOrigin.READ) | ~wide)
+
+
+def _withheld(design: SequentialDesign, frame: Frame, live: Bools) -> tuple[Bools | None, Bools | None]:
+    """Meters with a voltage at this frame and without a usable active power of its moment, (p,); None: none.
+
+    And those of them without a late one. A late power, or one beyond the declared range, counts if all of
+    these together can move the voltage at its meter by `_FELT` of the accuracy class.
+    """
+    meters = design.plant.meters
+    if frame.p_origin is None or not any_of(frame.p_origin[meters]):
+        return None, None
+    origins, out = frame.p_origin[meters], live & ~checked(design, frame)
+    doubted = out & (origins != PowerOrigin.UNREAD)
+    if any_of(doubted):
+        power = np.where(_customers(design, doubted), frame.p_error, 0.0)
+        moved = reach(design.plant.feeder, power, np.zeros_like(power))[design.prior.meters]
+        out = out & ~(doubted & (moved <= _FELT * design.allowed))
+    unread = out & (origins != PowerOrigin.LATE)
+    return out if any_of(out) else None, unread if any_of(unread) else None
+
+
+def _doubts(
+    design: SequentialDesign, before: Doubts, frame: Frame, live: Bools, busbar: Bools | bool
+) -> Doubts:
+    """What this frame does not know; new priors only where that changed."""
+    # The design has standard deviations, and so have frames that tell them apart from their intervals.
+    frame, lengths = usual(frame), design.lengths
+    withheld, unread = _withheld(design, frame, live)
+    exact = None if unread is None else _customers(design, unread)
+    p, p_calm, p_rest = _factors(
+        frame.p_error, design.doubt.even_p, (before.p, before.p_calm, before.p_rest), lengths, exact
+    )
+    q, q_calm, q_rest = _factors(
+        frame.q_error, design.doubt.even_q, (before.q, before.q_calm, before.q_rest), lengths, exact
+    )
+    sizes = _claims(np.abs(frame.p), design.options.hidden_power, before.sizes)
+    metered, calm = _metered(busbar, before.busbar, before.busbar_calm, lengths)
+    before = _checks(before, withheld, unread, lengths)
+    if metered is before.busbar and p is before.p and q is before.q:
+        return before if sizes is before.sizes else replace(before, sizes=sizes)
+    same = np.ones(len(lengths), dtype=np.bool_)
+    for new, old in ((p, before.p), (q, before.q), (metered, before.busbar)):
+        if new is not old:
+            same &= (new == old).all(axis=1)
+    if all_of(same):
+        return replace(
+            before,
+            sizes=sizes,
+            p_calm=p_calm,
+            q_calm=q_calm,
+            p_rest=p_rest,
+            q_rest=q_rest,
+            busbar_calm=calm,
+        )
+    priors: list[Prior] = []
+    for s, known in enumerate(before.priors):
+        if same[s]:
+            priors.append(known)
+            continue
+        # Scales that are in doubt about the same share what follows.
+        parts = (p, q, metered, before.read)
+        shared = (k for k in range(s) if all(np.array_equal(of[k], of[s]) for of in parts))
+        k = next(shared, None)
+        priors.append(_prior(design, p[s], q[s], metered[s], before.read[s]) if k is None else priors[k])
+    return replace(
+        before,
+        p=p,
+        q=q,
+        p_calm=p_calm,
+        q_calm=q_calm,
+        p_rest=p_rest,
+        q_rest=q_rest,
+        busbar=metered,
+        busbar_calm=calm,
+        priors=tuple(priors),
+        sizes=sizes,
+        heard=None,
+    )
+
+
+def _checks(before: Doubts, withheld: Bools | None, unread: Bools | None, lengths: tuple[int, ...]) -> Doubts:
+    """The doubts with `vouched` and `read` of this tick."""
+    if withheld is None and all_of(before.vouched):
+        return before
+    vouched, vouched_calm = _metered(
+        True if withheld is None else ~withheld, before.vouched, before.vouched_calm, lengths
+    )
+    read, read_calm = _metered(True if unread is None else ~unread, before.read, before.read_calm, lengths)
+    return replace(before, vouched=vouched, vouched_calm=vouched_calm, read=read, read_calm=read_calm)
+
+
+def _customers(design: SequentialDesign, meters: Bools) -> Bools:
+    """Customers of some meters, (N,)."""
+    out = np.zeros(design.customers, dtype=np.bool_)
+    out[design.plant.meters] = meters
+    return out
+
+
+def _prior(design: SequentialDesign, p: Floats, q: Floats, busbar: Bools, read: Bools) -> Prior:
+    if all_of(busbar) and all_of(p == 1.0) and all_of(q == 1.0):
+        return design.prior
+    unknown = np.where(busbar, design.busbar, UNMETERED)
+    together = design.doubt.together
+    if not all_of(read):
+        # Powers that are not read are low together by night, with a meter as without.
+        unread = (p > 1.0) & _customers(design, ~read)
+        together = np.where(unread, np.maximum(together, _ALIKE), together)
+    doubt = replace(
+        design.doubt,
+        together=together,
+        p=np.where(p > 1.0, np.maximum(design.doubt.p, EXACT) * p, design.doubt.p),
+        q=np.where(q > 1.0, np.maximum(design.doubt.q, EXACT) * q, design.doubt.q),
+    )
+    return prior(
+        design.plant.feeder,
+        design.prior.meters,
+        doubt,
+        busbar=unknown if unknown.size > 1 else float(unknown[0]),
+        inverters=design.injections,
+    )
+
+
+def _claims(power: Floats, least: float, before: Floats) -> Floats:
+    """False powers as large as what is claimed, in powers of two, and kept while they are close to that."""
+    old = before[: power.size]
+    fine = (power <= old) & ((old <= least) | (4.0 * power >= old))
+    if all_of(fine):
+        return before
+    new = np.where(fine, old, np.exp2(np.ceil(np.log2(np.maximum(power, least)))))
+    return np.concatenate([new, before[power.size :]])
+
+
+def _metered(busbar: Bools | bool, old: Bools, calm: Ints, lengths: tuple[int, ...]) -> tuple[Bools, Ints]:
+    """On which scales the busbar is known: where no residual is remembered that was made without it.
+
+    Such residuals are as far off as it had moved meanwhile, and all meters alike.
+    """
+    now = np.asarray(busbar)
+    if all_of(now) and all_of(old):
+        return old, calm
+    known = now & (old | (calm + 1 >= np.array(lengths)[:, None]))
+    return known, np.where(now & ~known, calm + 1, 0)
+
+
+def _factors(  # one power of all customers
+    error: Floats,
+    known: Floats,
+    before: tuple[Floats, Ints, Floats],
+    lengths: tuple[int, ...],
+    exact: Bools | None,
+) -> tuple[Floats, Ints, Floats]:
+    """`_factor`, but as long as residuals are remembered that were made with a larger one, that one.
+
+    Then the largest of those made since, for as long again: they are remembered still.
+    """
+    old, calm, rest = before
+    new = _factor(error, known, old, exact)
+    if new is old:
+        return before
+    lower = new < old
+    rest = np.where(lower, np.maximum(rest, new), 1.0)
+    falls = lower & (calm + 1 >= np.array(lengths)[:, None])
+    held = lower & ~falls
+    after = np.where(held, old, np.where(falls, rest, new))
+    return after, np.where(held, calm + 1, 0), np.where(held, rest, 1.0)
+
+
+def _factor(error: Floats, known: Floats, old: Floats, exact: Bools | None) -> Floats:
+    """Factor by which a frame knows a power less well than the design assumes, with hysteresis.
+
+    The ratio itself where `exact`, else a power of two.
+    """
+    if exact is None and all_of(error <= _MUCH_LESS * known) and all_of(old <= 1.0):
+        return old
+    ratio = error / known
+    keep = (ratio <= old * _MUCH_LESS) & (ratio * _MUCH_LESS >= old) & (old > _MUCH_LESS)
+    raised = np.exp2(np.ceil(np.log2(np.maximum(ratio, 1.0))))
+    new = np.where(keep, old, np.where(ratio > _MUCH_LESS, raised, 1.0))
+    if exact is None:
+        return new
+    # A forecast states its own standard deviation; rounding it up would widen more than is stated.
+    near = (ratio <= _ROUNDED * old) & (ratio * _MUCH_LESS >= old) & (old > 1.0)
+    return np.where(exact, np.where(near, old, np.where(ratio > _ROUNDED, ratio, 1.0)), new)

@@ -1,0 +1,156 @@
+"""How wrong the customers' powers may be, and what that does to voltages.
+
+Readings differ from the model because powers are not known exactly: dp, dq at every customer move *all*
+voltages by ``2 R dp + 2 X dq``, and neighbours nearly alike. That correlation is what makes a lying meter
+visible among its neighbours.
+
+References
+----------
+docs/theory-sequential.md, section 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gridsec.arrays import Floats, Ints
+from gridsec.errors import Problem, refuse
+from gridsec.estimators.sequential.conditional import Prior
+from gridsec.grid.droop import Droop
+from gridsec.grid.meter import MeterAccuracy
+from gridsec.grid.network import Network, Power, bus_voltages, by_place, covariance, one_busbar, variances
+
+EXACT = 1e-6
+"""Standard deviation of a power that is known exactly, pu: none is known better."""
+UNMETERED = 0.1
+"""Standard deviation of a squared busbar voltage that nobody reads, squared pu."""
+LONGEST_S = 1e12
+"""Longest correlation time of errors of powers, s: nothing learned would be left of those of longer ones."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoadDoubt:
+    """How wrong the powers may be that the frames give. N customers.
+
+    Attributes
+    ----------
+    p, q : (N,)
+        Standard deviation of the error of each customer's active and reactive power, pu. A frame whose
+        `p_error` or `q_error` says more is believed.
+    time_s
+        Correlation time of these errors, s: means over much less time still contain all of them.
+    common_p, common_q
+        Shares of their variances that all customers have in common (weather, time of day), 0 to 1.
+    lasting
+        Share of their variances that no mean takes away, however long, 0 to 1: an unknown power factor is
+        wrong in the same direction for years, and grows and shrinks with the load.
+    together : (N,) or one for all
+        Share of both variances, 0 to 1, that goes up and down with that of all others: powers that nobody
+        meters are low together by night, the active and the reactive one alike.
+    even_p, even_q : (N,)
+        Derived. Half-widths of errors that are evenly spread and deviate by p and q, pu.
+
+    Raises
+    ------
+    ValueError
+        If a number is none, negative, or a share outside [0, 1]; names every problem.
+    """
+
+    p: Floats
+    q: Floats
+    time_s: float
+    common_p: float = 0.0
+    common_q: float = 0.0
+    lasting: float = 0.0
+    together: Floats | float = 0.0
+    even_p: Floats = field(init=False, repr=False)
+    even_q: Floats = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        problems = [
+            Problem("negative", f"{name} must be finite and not negative")
+            for name in ("p", "q")
+            if not (np.isfinite(getattr(self, name)).all() and (getattr(self, name) >= 0).all())
+        ]
+        if not 0 < self.time_s <= LONGEST_S:
+            most = f"at most {LONGEST_S:g}; what never changes is `lasting`"
+            problems.append(
+                Problem("out-of-range", f"time_s is {self.time_s}; it must be positive and {most}")
+            )
+        problems += [
+            Problem("out-of-range", f"{name} is {getattr(self, name)}; it must be from 0 to 1")
+            for name in ("common_p", "common_q", "lasting", "together")
+            if not (np.greater_equal(getattr(self, name), 0) & np.less_equal(getattr(self, name), 1)).all()
+        ]
+        refuse(problems)
+        for name, std in (("even_p", self.p), ("even_q", self.q)):
+            object.__setattr__(self, name, np.sqrt(3.0) * np.maximum(std, EXACT))
+
+
+def prior(
+    feeder: Network, at: Ints, doubt: LoadDoubt, *, busbar: Floats | float, inverters: Floats | None = None
+) -> Prior:
+    """Covariance of the buses' squared voltages without any meter.
+
+    ``S = 4 R V_p R^T + 4 X V_q X^T + u u^T + busbar^2 1 1^T``, where ``u = 2 R g s_p + 2 X g s_q`` with
+    ``g^2 = together`` is what goes up and down together, and of the rest, s now for ``sqrt(1 - together) s``,
+    ``V = (1 - common) diag(s^2) + common s s^T``. In three phases places stand for buses, and only those of
+    the same phase share an error of the busbar's.
+
+    Parameters
+    ----------
+    feeder
+        The feeder.
+    at : (p,)
+        Bus of each meter.
+    doubt
+        How wrong the powers may be.
+    busbar
+        Standard deviation of the squared busbar voltage, squared pu; in three phases one or (3,).
+    inverters : (N,)
+        Standard deviation of the injections that observers attribute to the customers' inverters, pu.
+    """
+    alone, together = (np.sqrt(part) for part in (1.0 - doubt.together, doubt.together))
+    p, q = alone * doubt.p, alone * doubt.q
+    q = q if inverters is None else np.hypot(q, inverters)
+    variance = by_place(feeder, busbar**2)
+    of_meters: Floats = np.repeat(variance[:, None], at.size, axis=1)
+    of_meters *= one_busbar(feeder, np.arange(variance.size), at)
+    none = np.zeros_like(q)
+    for power, std, common, shared in (
+        (Power.ACTIVE, p, doubt.common_p, bus_voltages(feeder, p, none, 0.0, steps=0)),
+        (Power.REACTIVE, q, doubt.common_q, bus_voltages(feeder, none, q, 0.0, steps=0)),
+    ):
+        of_meters += covariance(feeder, power, at, (1.0 - common) * std**2)
+        variance += variances(feeder, power, (1.0 - common) * std**2)
+        if common:
+            of_meters += np.multiply.outer(common * shared, shared[at])
+            variance += common * shared**2
+    if np.any(together):
+        shared = bus_voltages(feeder, together * doubt.p, together * doubt.q, 0.0, steps=0)
+        of_meters += np.multiply.outer(shared, shared[at])
+        variance += shared**2
+    return Prior(of_meters, at, variance)
+
+
+def injection_doubt(droop: Droop, accuracy: MeterAccuracy, meters: Ints, customers: int) -> Floats:
+    """Standard deviation of what the meters' own errors do to the observers' injections, (N,) in pu.
+
+    An inverter that is driven by its meter's reading follows the reading's error: the fixed part of it
+    through the steepest part of its curve, at most up to saturation.
+
+    Parameters
+    ----------
+    droop, accuracy, meters
+        The inverters and the meters.
+    customers
+        N.
+    """
+    error = np.zeros(customers)
+    error[meters] = 2.0 * np.sqrt(
+        accuracy.class_fraction**2 / 3.0 + accuracy.resolution**2 / 12.0 + accuracy.jitter**2
+    )
+    own = np.minimum(droop.slope * error[droop.customer], droop.limit)
+    return np.asarray(np.sqrt(droop.per_customer(own**2, customers)))

@@ -1,0 +1,538 @@
+"""Switched observer that searches for another set of trusted meters when its own test fails.
+
+Part of `gridsec.estimators.set_search`, which selects the trusted meters.
+
+kim2018 and lee2018, chapter 5, do not run an observer for every set. They trust one set of meters while
+all of its readings agree with its estimate, and search for another one only if they do not:
+
+1. *One observer.* Inverters with a trusted meter are driven by that meter's reading, all others by the
+   model; the set may change at any moment (`gridsec.observers.certificates`).
+2. *Test.* `|y_j - yhat_j| <= threshold_j(t)` for every trusted meter j. The threshold is the worst case of
+   `gridsec.estimators.thresholds` for exactly this set. After a switch it starts from the saturation bound
+   and falls as the transient of the observer decays.
+3. *Search.* If the test fails, every set D of at most M dropped meters is tried, the smallest first, and
+   among equals the one with the smallest residuals. D passes if all other meters are within `threshold_j(D)`,
+   which uses only their own readings: an inverter with a meter in D, or without one, may be anywhere within
+   saturation. Named meters stay dropped as long as possible.
+4. *Dwell.* A dropped meter is trusted again once it was within its limit for a time Delta, and for `release`
+   consecutive readings.
+
+If at most M meters are manipulated, they are one of the sets that pass. So a meter in *every* passing set is
+manipulated, and only such meters are named. If several smallest sets pass, all of them are given as
+explanations, and no meter outside one of them is named.
+
+The papers' sets have partial observers of their own, with estimates that can be compared at once. Here a
+candidate is judged by the injections that its members' readings alone imply, which needs no observer.
+Metered net reactive power is not used: that of a dropped meter would have to be removed, too.
+
+References
+----------
+docs/theory-high-gain.md, section 8; docs/theory-detection.md.
+kim2018, section III.D, Theorem 2; lee2018, section 5.4, Theorem 5.4.3; docs/theory-high-gain.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import combinations
+from math import comb
+
+import numpy as np
+
+from gridsec.arrays import Bools, Floats, Ints
+from gridsec.errors import DesignInfeasible, NotObservable, Problem
+from gridsec.estimators import thresholds
+from gridsec.estimators.decision import Situation, Tally, count, decide
+from gridsec.estimators.exact_bank import bank as banks
+from gridsec.estimators.inputs import Inputs, Past, clean, injections, known, nothing_new, reconstruct
+from gridsec.estimators.plant import Options, Plant, Setting, check_plant, setting
+from gridsec.estimators.single_tick import MOST_SETS
+from gridsec.estimators.thresholds import ErrorBound, ErrorModel, Motion, Uncertainty
+from gridsec.grid.meter import reading_error
+from gridsec.interface import Cause, Decision, Estimate, Explanation, Frame, Verdict
+from gridsec.observers.certificates import Certificate, certify
+from gridsec.observers.lure import close_loop, rest
+
+__all__ = [
+    "SetSearchDesign",
+    "SetSearchState",
+    "View",
+    "advance",
+    "design",
+    "driven_by",
+    "init",
+    "lost",
+    "step",
+    "threshold_of",
+]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SetSearchDesign:
+    """Design of the switched observer. p meters, c candidate sets.
+
+    Attributes
+    ----------
+    bank
+        The observer: a bank for M = 0, with the trusted meters as its available meters.
+    errors
+        Propagation of errors in an observer without manipulated meters.
+    certificate
+        Proof that the observer converges for every set and every switching.
+    dropped : (c, p)
+        Sets of dropped meters, the smallest first.
+    dwell_s
+        Delta, s.
+    """
+
+    setting: Setting
+    bank: banks.Bank
+    errors: ErrorModel
+    certificate: Certificate
+    dropped: Bools
+    dwell_s: float
+
+    @property
+    def observers(self) -> int:
+        """Number of observers."""
+        return 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SetSearchState:
+    """State between frames. m inverters, p meters.
+
+    Attributes
+    ----------
+    t
+        Time of the last used frame, s; that of `init` before the first one.
+    bank
+        The observer; None before the first frame.
+    x : (m,)
+        Its estimate, pu.
+    z : (m,)
+        Its z at the inverters, squared pu.
+    y : (p,)
+        Last readings as z, squared pu; NaN where missing.
+    bound, level
+        Bounds on its error if no trusted meter is manipulated, see `thresholds.advance`.
+    sure : (m,)
+        Bound on the error of inverters with an unmanipulated own meter, under any other attack, pu.
+    settled
+        True once the transient of the start, or of the last switch, has decayed.
+    dropped : (p,)
+        Meters that are not trusted.
+    innocent : (p,)
+        Time since which a dropped meter is within its limit, s; infinite where it is not.
+    readings : (p,)
+        Number of these readings.
+    tally
+        Counters of accusations, and the named meters.
+    v0_squared
+        Last squared busbar voltage, pu.
+    last
+        Last estimate and verdict; None before the first frame.
+    """
+
+    t: float
+    bank: banks.BankState | None
+    x: Floats
+    z: Floats
+    y: Floats
+    bound: ErrorBound
+    level: ErrorBound
+    sure: Floats
+    settled: bool
+    dropped: Bools
+    innocent: Floats
+    readings: Ints
+    tally: Tally
+    v0_squared: Floats | float
+    last: tuple[Estimate, Verdict] | None
+
+
+def design(
+    plant: Plant,
+    *,
+    max_attacked: int,
+    step_s: float,
+    dwell_s: float | None = None,
+    options: Options | None = None,
+) -> SetSearchDesign:
+    """Design the observer and the candidate sets for one feeder.
+
+    Parameters
+    ----------
+    max_attacked
+        M, largest number of simultaneously manipulated meters.
+    step_s
+        Expected interval between frames, s. Other intervals work, too.
+    dwell_s
+        Delta, s; by default the time in which the observer's transient decays to the fraction
+        `options.settled`.
+
+    Raises
+    ------
+    NotObservable
+        Unless there are more than 2M meters.
+    DesignInfeasible
+        If no closed-form certificate holds, or there are too many sets to search.
+    ValueError
+        As `plant.check_plant`, or if `dwell_s` is negative or not finite.
+    """
+    p = plant.meters.size
+    wrong = dwell_s is not None and not 0.0 <= dwell_s < np.inf
+    more = (
+        [Problem("negative", f"dwell_s is {dwell_s}; it must be a number of seconds that is not negative")]
+        if wrong
+        else []
+    )
+    check_plant(plant, max_attacked=max_attacked, step_s=step_s, more=more)
+    if p <= 2 * max_attacked:
+        what = f"{p} meters cannot be told apart when {max_attacked} of them may be manipulated"
+        raise NotObservable(range(p), p, what, code="too-few-meters")
+    sets = sum(comb(p, k) for k in range(1, max_attacked + 1))
+    if sets > MOST_SETS:
+        raise DesignInfeasible(
+            "search over sets", f"{sets} sets of dropped meters; at most {MOST_SETS}", code="too-many"
+        )
+    dropped = np.zeros((sets, p), dtype=np.bool_)
+    chosen = (D for k in range(1, max_attacked + 1) for D in combinations(range(p), k))
+    for row, D in zip(dropped, chosen, strict=True):
+        row[list(D)] = True
+    if options is None:
+        options = Options() if step_s <= 30.0 else Options(release=4)
+    lure = close_loop(plant.feeder, plant.droop, plant.meters)
+    proof = certify(lure)
+    watched = setting(plant, max_attacked=max_attacked, options=options)
+    slowest = float(np.max(plant.droop.tau, initial=0.0))
+    dwell = slowest * float(np.log(1.0 / options.settled)) if dwell_s is None else dwell_s
+    return SetSearchDesign(
+        watched, banks.design(lure, 0), replace(watched.errors, quota=0), proof, dropped, dwell
+    )
+
+
+def init(design: SetSearchDesign, t: float) -> SetSearchState:
+    """Initial state at Unix time t, s; the observer starts with the first frame and trusts all meters."""
+    plant, widest = design.setting.plant, thresholds.widest(design.errors)
+    m, p = plant.droop.tau.size, plant.meters.size
+    nobody, zero = np.zeros(p, dtype=np.bool_), np.zeros(p, dtype=np.intp)
+    return SetSearchState(
+        t=t,
+        bank=None,
+        x=np.zeros(m),
+        z=np.zeros(m),
+        y=np.full(p, np.nan),
+        bound=widest,
+        level=widest,
+        sure=widest.free,
+        settled=False,
+        dropped=nobody,
+        innocent=np.full(p, np.inf),
+        readings=zero,
+        tally=Tally(zero, zero, nobody),
+        v0_squared=plant.droop.vbar**2,
+        last=None,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """Estimate of the feeder from the trusted set. N customers, p meters, m inverters.
+
+    Attributes
+    ----------
+    bank, x, z, bound, level, sure, settled
+        As in `SetSearchState`, at this frame.
+    v2, v2_bus : (N,), (b + 1,)
+        Reconstructed squared voltages, pu.
+    base : (N,)
+        Error of `v2` for known injections, squared pu.
+    score, threshold : (p,)
+        Residuals, NaN without a reading, and their limits if no trusted meter is manipulated.
+    over : (p,)
+        Meters with a residual above its limit.
+    """
+
+    bank: banks.BankState
+    x: Floats
+    z: Floats
+    bound: ErrorBound
+    level: ErrorBound
+    sure: Floats
+    settled: bool
+    v2: Floats
+    v2_bus: Floats
+    base: Floats
+    score: Floats
+    threshold: Floats
+    over: Bools
+
+
+def advance(design: SetSearchDesign, state: SetSearchState, frame: Frame, inputs: Inputs) -> View:
+    """Advance the observer to a frame, and compare all meters with it."""
+    watched, errors, at = design.setting, design.errors, design.setting.plant.meters
+    plant, droop = watched.plant, watched.plant.droop
+    J = inputs.live & ~state.dropped
+    h = 0.0 if state.bank is None else frame.t - state.t
+    if state.bank is None:
+        bank = banks.init(design.bank, inputs.z, inputs.w, J)
+    else:
+        bank = banks.step(design.bank, state.bank, inputs.z, inputs.w, J, h, adopt=state.x)
+    x = banks.estimate(design.bank, bank, -1)
+    none = np.zeros(J.size, dtype=np.bool_)
+    seen = reconstruct(watched, frame, inputs, injections(plant, frame, x, none))
+    z = droop.vbar**2 - seen.v2[droop.customer]
+    moved = np.abs(seen.correction - inputs.correction)[plant.feeder.bus]
+    now = replace(inputs.now, base=inputs.now.base + moved, live=J)
+    lag = np.where(_slowed(design, h), np.abs(x - state.x), 0.0)
+    before = z if state.bank is None else state.z
+    motion = Motion(before=before, after=z, offset=np.zeros(x.shape), h=h, lag=lag)
+    handed = _handed_over(design, state, J)
+    bound, level = thresholds.advance(errors, now, motion, handed, state.level)
+    error = thresholds.gap(errors, now, bound)
+    threshold = threshold_of(design, seen.v2[at], error[at])
+    score = np.where(inputs.live, np.abs(inputs.y - seen.v2[at]), np.nan)
+    return View(
+        bank=bank,
+        x=x,
+        z=z,
+        bound=bound,
+        level=level,
+        sure=_sure(design, state, inputs, J, motion),
+        settled=state.settled or _settled(design, now, motion, error, threshold),
+        v2=seen.v2,
+        v2_bus=seen.v2_bus,
+        base=now.base,
+        score=score,
+        threshold=threshold,
+        over=inputs.live & (np.nan_to_num(score) > threshold),
+    )
+
+
+def _slowed(design: SetSearchDesign, h: float) -> Bools:
+    """Mask (m,) of inverters that the step treats as slower than they are: `lure.transition`, `rest`."""
+    fast = design.setting.plant.droop.tau * rest(h, design.bank.policy) < 1.0
+    return fast & ~fast.all()
+
+
+def driven_by(design: SetSearchDesign, J: Bools) -> Bools:
+    """Mask (m,) of inverters driven by a trusted meter, for the trusted meters J (p,)."""
+    meter = design.errors.meter_of
+    return (meter >= 0) & J[meter]
+
+
+def _handed_over(design: SetSearchDesign, state: SetSearchState, J: Bools) -> ErrorBound:
+    """The bounds when meters become unavailable or return: each inverter takes the other mode's error."""
+    if state.bank is None:
+        return state.bound
+    was, now = driven_by(design, state.bank.seen), driven_by(design, J)
+    free = np.where(was & ~now, np.maximum(state.bound.free, state.bound.driven), state.bound.free)
+    return ErrorBound(np.where(now & ~was, state.bound.free, state.bound.driven), free)
+
+
+def _sure(design: SetSearchDesign, state: SetSearchState, inputs: Inputs, J: Bools, motion: Motion) -> Floats:
+    """Error of each inverter that follows from its own unmanipulated meter alone; the span without one.
+
+    During the step its argument was between two readings, each within its accuracy.
+    """
+    errors, droop = design.errors, design.setting.plant.droop
+    meter, driven = errors.meter_of, driven_by(design, J & np.isfinite(state.y))
+    z = np.where(driven, inputs.z[meter], 0.0)
+    past, off = np.where(driven, state.y[meter], 0.0), np.where(driven, inputs.now.reading[meter], 0.0)
+    most, own, least = droop(np.stack([np.maximum(z, past) + off, z, np.minimum(z, past) - off]))
+    image = np.minimum(np.maximum(most - own, own - least) + errors.mismatch + motion.lag, errors.span)
+    keep = np.exp(-motion.h / droop.tau)
+    return np.where(driven, keep * state.sure + (1.0 - keep) * image, errors.span)
+
+
+def threshold_of(design: SetSearchDesign, v2: Floats, error: Floats) -> Floats:
+    """Largest residual of an unmanipulated meter for an estimate with an error of at most `error`.
+
+    Parameters
+    ----------
+    v2 : (p,)
+        Reconstructed squared voltages at the meters, pu.
+    error : (…, p)
+        Their error bounds, squared pu.
+    """
+    plant, sigmas = design.setting.plant, design.setting.options.sigmas
+    return np.asarray(reading_error(plant.accuracy, v2 + error, sigmas) + error)
+
+
+def _settled(
+    design: SetSearchDesign, now: Uncertainty, motion: Motion, error: Floats, threshold: Floats
+) -> bool:
+    """True once the remaining transient is negligible against every threshold."""
+    none, at = np.zeros(motion.after.shape), design.setting.plant.meters
+    top = thresholds.ceiling(design.errors, now, motion, ErrorBound(none, none))
+    rest_ = thresholds.gap(design.errors, now, thresholds.settled(design.errors, now, motion, top))
+    return bool(np.all((error - rest_)[at] <= design.setting.options.settled * threshold))
+
+
+def lost(errors: ErrorModel, sure: Floats) -> Floats:
+    """Additional error at every customer without one meter, (N, p): its inverter may inject anything.
+
+    Parameters
+    ----------
+    sure : (m,)
+        Error of each inverter that follows from its own meter, pu.
+    """
+    metered, p = errors.meter_of >= 0, errors.meters.size
+    more = np.bincount(errors.meter_of[metered], weights=(errors.span - sure)[metered], minlength=p)
+    return np.asarray(errors.reach * more)
+
+
+def step(
+    design: SetSearchDesign, state: SetSearchState, frame: Frame
+) -> tuple[SetSearchState, Estimate, Verdict]:
+    """Process one frame.
+
+    Parameters
+    ----------
+    frame
+        Data of one tick. A frame that is not later than the last one changes nothing: it returns the last
+        estimate and UNDECIDED.
+
+    Returns
+    -------
+    SetSearchState, Estimate, Verdict
+        As every estimator's step; see `gridsec.interface`.
+    """
+    if not np.isfinite(frame.t) or (state.bank is not None and not frame.t > state.t):
+        plant = design.setting.plant
+        return state, *nothing_new(plant, frame, state.t, state.last, state.v0_squared, state.x)
+    frame = known(frame)
+    inputs = clean(design.setting, Past(state.x, state.v0_squared, state.tally.named), frame)
+    view = advance(design, state, frame, inputs)
+    found = _Found(state.dropped, view.over & ~state.dropped, (), False)
+    unsure = view.over & state.dropped & ~state.tally.named
+    if (view.over & ~state.dropped).any() or unsure.any():
+        found = _search(design, inputs, view, state)
+    return _conclude(design, state, frame, inputs, view, found)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Found:
+    """Result of a search. p meters."""
+
+    dropped: Bools  # (p,) meters not to trust
+    accused: Bools  # (p,) meters that are certainly manipulated
+    rivals: tuple[Bools, ...]  # several smallest sets
+    torn: bool  # no set passes
+
+
+def _search(design: SetSearchDesign, inputs: Inputs, view: View, state: SetSearchState) -> _Found:
+    """Test all sets of at most M dropped meters by the injections that their own readings imply."""
+    errors, at, live = design.errors, design.setting.plant.meters, inputs.live
+    sets = design.dropped[~(design.dropped & ~live).any(axis=1)]
+    error = (view.base + errors.inverters @ view.sure)[at] + sets @ lost(errors, view.sure)[at].T
+    limit = threshold_of(design, view.v2[at], error)
+    excess = np.where(live & ~sets, np.nan_to_num(view.score) / limit, 0.0).max(axis=1, initial=0.0)
+    fine = np.flatnonzero(excess <= 1.0)
+    if not fine.size:
+        return _Found(state.dropped, np.zeros_like(live), (), True)
+    accused = np.asarray(sets[fine].all(axis=0))
+    known = fine[(sets[fine] >= (state.tally.named & live)).all(axis=1)]
+    pool = known if known.size else fine
+    sizes = sets[pool].sum(axis=1)
+    smallest = pool[sizes == sizes[0]]
+    best = sets[smallest[np.argmin(excess[smallest])]]
+    rivals = tuple(sets[smallest]) if smallest.size > 1 else ()
+    # A missing reading does not clear a meter: dropped and unavailable meters stay dropped.
+    return _Found(best | (state.dropped & ~live), accused, rivals, False)
+
+
+def _conclude(  # noqa: PLR0917  # design, state and frame, then the results of this step
+    design: SetSearchDesign, state: SetSearchState, frame: Frame, inputs: Inputs, view: View, found: _Found
+) -> tuple[SetSearchState, Estimate, Verdict]:
+    options, live = design.setting.options, inputs.live
+    held = state.tally.named & view.over & found.dropped
+    accused = found.accused | held
+    tally = count(state.tally, accused, live, confirm=options.confirm, release=options.release)
+    quiet = found.dropped & live & ~view.over
+    innocent = np.where(quiet, np.minimum(state.innocent, frame.t), np.where(live, np.inf, state.innocent))
+    readings = np.where(quiet, state.readings + 1, np.where(live, 0, state.readings))
+    back = quiet & (frame.t - innocent >= design.dwell_s) & (readings >= options.release)
+    dropped = found.dropped & ~back
+    tally = replace(tally, named=tally.named & dropped, above=np.where(back, 0, tally.above))
+    switched = bool((dropped & ~state.dropped).any())
+    # Effect of an attack on the meter's own inverter and, through the model, on those without a trusted
+    # meter.
+    driven = driven_by(design, live & ~dropped)
+    free = np.where(driven, view.bound.free, design.errors.span)
+    estimate = Estimate(
+        frame.t, view.v2, _error(design, view, found.torn), view.v2_bus, live & ~dropped, view.x
+    )
+    verdict = _verdict(design, inputs, view, found, tally, dropped, switched)
+    after = SetSearchState(
+        t=frame.t,
+        bank=view.bank,
+        x=view.x,
+        z=view.z,
+        y=np.where(live, inputs.z, np.nan),
+        bound=ErrorBound(view.sure, free) if switched else view.bound,
+        level=thresholds.widest(design.errors) if switched else view.level,
+        sure=view.sure,
+        settled=view.settled and not switched,
+        dropped=dropped,
+        innocent=np.where(dropped, innocent, np.inf),
+        readings=np.where(dropped, readings, 0),
+        tally=tally,
+        v0_squared=inputs.v0_squared,
+        last=(estimate, verdict),
+    )
+    return after, estimate, verdict
+
+
+def _error(design: SetSearchDesign, view: View, torn: bool) -> Floats:
+    """Half-width of the estimate for any M manipulated meters, detected or not; (N,)."""
+    errors = design.errors
+    if torn:
+        return np.asarray(view.base + errors.inverters @ errors.span)
+    most = thresholds.largest(lost(errors, view.sure), design.setting.max_attacked)
+    return np.asarray(view.base + errors.inverters @ view.sure + most)
+
+
+def _verdict(  # noqa: PLR0917  # all results of one tick
+    design: SetSearchDesign,
+    inputs: Inputs,
+    view: View,
+    found: _Found,
+    tally: Tally,
+    dropped: Bools,
+    switched: bool,
+) -> Verdict:
+    plant, live = design.setting.plant, inputs.live
+    decision, cause, reason = decide(
+        Situation(
+            names=tuple(plant.feeder.customers[c] for c in plant.meters),
+            max_attacked=design.setting.max_attacked,
+            live=live,
+            suspected=(tally.above > 0) | dropped,
+            named=tally.named,
+            wide=live & ~(view.threshold <= design.setting.options.widest),
+            valid=True,
+            settled=view.settled and not switched,
+            busbar=inputs.busbar,
+        )
+    )
+    if found.torn and cause not in {Cause.TOO_FEW_METERS, Cause.NO_BUSBAR}:
+        decision, cause = Decision.UNDECIDED, Cause.TOO_MANY_SUSPECTS
+        reason = (
+            f"Without any {design.setting.max_attacked} meters, the others contradict each other: "
+            "more are manipulated, or the busbar reading, a switch or a line in the model is wrong."
+        )
+    attack = np.where(tally.named & live, inputs.y - view.v2[plant.meters], 0.0)
+    none = np.zeros(plant.droop.tau.size, dtype=np.bool_)
+    share = 1.0 / max(len(found.rivals), 1)
+    return Verdict(
+        decision,
+        cause,
+        reason,
+        tally.named,
+        view.score,
+        view.threshold,
+        attack,
+        explanations=tuple(Explanation(meters, none, share) for meters in found.rivals),
+    )

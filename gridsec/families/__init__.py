@@ -1,1 +1,0 @@
-"""Estimator families of the papers on a feeder, behind the same three functions as `gridsec.monitor`."""

@@ -1,0 +1,1 @@
+"""Feeders as linear and AC models: radial, meshed, in three phases."""

@@ -1,0 +1,607 @@
+"""Feeders with closed ties, balanced or in three phases, and their power flow.
+
+`MeshedFeeder` and `PhasedMesh` are a tree and the lines that close loops in it. Both are represented by the
+inverse of their admittances, so that `bus_voltages`, `model_error_bound` and `interval_bounds` are the same.
+
+With W the voltage without load by the busbar, and ``Z = R + j X`` the inverse of the admittance
+matrix without the busbar, powers s and voltages V of the other buses obey
+
+    V = W + Z conj(s / V).
+
+To first order in s, and without charging, ``|V|^2 = v0^2 + 2 Re(Z conj(s)) = v0^2 + 2 R p + 2 X q``. On a
+tree Z has the sums of common paths, so that this is LinDistFlow. With ties its entries may be negative, but
+it stays symmetric, and both parts positive semidefinite. Derivations: docs/theory-mesh.md.
+
+The voltages of its places are ``V = W + Z conj(s / V)`` as on a balanced mesh, with Z the inverse of the
+admittances between phases of buses. With the busbar's phases a third of a turn apart, a = 1, e^{-j 2 pi / 3},
+e^{j 2 pi / 3}, the derivative of ``|V|^2`` at no load is ``2 Re(Z_kl a_l / a_k conj(s_l))``: on a tree
+LinDist3Flow. Z is symmetric; the rotated matrix is not. Derivations: docs/theory-mesh.md.
+
+``V = W + Z conj(s / V)`` holds for the places of three phases as for the buses of a balanced feeder, with W
+the voltages without load by the busbar's phases. Nothing below depends on the number of phases, or needs Z
+to be symmetric or of any sign. Derivations: docs/theory-mesh.md.
+
+References
+----------
+.. [1] S. Bolognani, S. Zampieri, "On the existence and linear approximation of the power flow solution in
+   power distribution networks", IEEE Trans. Power Systems 31(1), 2016: the model, for networks of any form.
+.. [2] C. Wang, A. Bernstein, J.-Y. Le Boudec, M. Paolone, "Explicit conditions on existence and uniqueness
+   of load-flow solutions in distribution networks", IEEE Trans. Smart Grid 9(2), 2018: the fixed point.
+.. [3] C. Wang, A. Bernstein, J.-Y. Le Boudec, M. Paolone, "Explicit conditions on existence and uniqueness
+   of load-flow solutions in distribution networks", IEEE Trans. Smart Grid 9(2), 2018: the fixed point.
+.. [4] A. Bernstein, C. Wang, E. Dall'Anese, J.-Y. Le Boudec, C. Zhao, "Load flow in multiphase distribution
+   networks: existence, uniqueness, non-singularity and linear models", IEEE Trans. Power Systems 33(6), 2018.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.sparse import coo_array, csc_array, diags_array
+from scipy.sparse.linalg import splu
+
+from gridsec.arrays import Bools, Floats, Ints, Phasors, frozen, frozen_ints
+from gridsec.errors import FeederInvalid, Problem
+from gridsec.grid.intervals import Sweeps, bounds
+from gridsec.grid.phased import PhasedFeeder
+from gridsec.grid.radial import Feeder, LinDistFlow, common_paths
+from gridsec.grid.three_phase import PHASES, ROTATION, ThreePhaseFeeder, line_problems, named
+from gridsec.grid.three_phase import common_paths as phase_paths
+from gridsec.grid.trees import OnTree
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeshedFeeder(OnTree):
+    """Feeder with closed loops. N customers, b + 1 buses, t ties.
+
+    Attributes
+    ----------
+    tree
+        The feeder without the ties: a radial feeder that reaches every bus.
+    ends : (t, 2)
+        Buses at both ends of each tie.
+    r, x : (t,)
+        Series resistance and reactance of each tie, pu.
+    charging : (t,)
+        Total shunt susceptance of each tie, pu; half of it at each end.
+    half : (b + 1,)
+        Derived. Shunt susceptance at the buses, pu.
+    R, X : (b + 1, N)
+        Derived. The linear power flow ``v^2 = v0^2 + 2 R p + 2 X q``, from a customer's power to every bus.
+    idle : (b + 1,)
+        Derived. Voltage of every bus without load, per voltage of the busbar; 1 without charging.
+    transfer : (b + 1, N)
+        Derived. From an injected current of a customer to the voltage of every bus, charging included, pu.
+    between : (N, N)
+        Derived. The same to the customers' voltages.
+    size : (N, N)
+        Derived. Its absolute values.
+
+    Raises
+    ------
+    FeederInvalid
+        With every problem found.
+    """
+
+    tree: Feeder
+    ends: Ints
+    r: Floats
+    x: Floats
+    charging: Floats
+    half: Floats = field(init=False, repr=False)
+    R: Floats = field(init=False, repr=False)
+    X: Floats = field(init=False, repr=False)
+    idle: Phasors = field(init=False, repr=False)
+    transfer: Phasors = field(init=False, repr=False)
+    between: Phasors = field(init=False, repr=False)
+    size: Floats = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        def put(name: str, value: object) -> None:
+            object.__setattr__(self, name, value)
+
+        for name in ("r", "x", "charging"):
+            put(name, frozen(getattr(self, name)))
+        put("ends", frozen_ints(self.ends))
+        problems = _problems(self)
+        if problems:
+            raise FeederInvalid(problems)
+        half = self.tree.half.copy()
+        np.add.at(half, self.ends, 0.5 * self.charging[:, None])
+        put("half", frozen(half))
+        Z = impedances(self, self.bus)
+        put("R", frozen(Z.real))
+        put("X", frozen(Z.imag))
+        idle, transfer = _charged(self) if half.any() else (np.ones(half.size, np.complex128), Z)
+        for name, values in (("idle", idle), ("transfer", transfer), ("between", transfer[self.bus])):
+            values.flags.writeable = False
+            put(name, values)
+        put("size", frozen(np.abs(self.between)))
+
+    @property
+    def bus(self) -> Ints:
+        """Bus of each customer, (N,)."""
+        return self.tree.bus
+
+    @property
+    def buses(self) -> tuple[str, ...]:
+        """Identifiers of the buses, the busbar first, (b + 1,)."""
+        return self.tree.buses
+
+
+def _problems(feeder: MeshedFeeder) -> list[Problem]:
+    """Problems of the ties against the tree."""
+    count, buses = feeder.r.size, len(feeder.tree.buses)
+    expected = (
+        ("ends", feeder.ends.shape, (count, 2)),
+        ("r", feeder.r.shape, (count,)),
+        ("x", feeder.x.shape, (count,)),
+        ("charging", feeder.charging.shape, (count,)),
+    )
+    out = [
+        Problem("shape", f"{what} has shape {has}; expected {wants}")
+        for what, has, wants in expected
+        if has != wants
+    ]
+    if out:
+        return out
+    for k, (one, other) in enumerate(feeder.ends.tolist()):
+        missing = [end for end in (one, other) if not 0 <= end < buses]
+        out.extend(
+            Problem("unknown-index", f"tie {k}: bus {end} does not exist; expected 0 to {buses - 1}")
+            for end in missing
+        )
+        if one == other:
+            out.append(Problem("self-loop", f"tie {k}: both ends are bus {one}; a line needs two"))
+        for what in ("r", "x", "charging"):
+            value = getattr(feeder, what)[k]
+            if not (np.isfinite(value) and value >= 0):
+                out.append(
+                    Problem("negative", f"tie {k}: {what} is {value}; it must be finite and not negative")
+                )
+        if feeder.r[k] == 0 and feeder.x[k] == 0:
+            out.append(Problem("zero-impedance", f"tie {k}: r and x are both 0; fuse the two buses"))
+    return out
+
+
+def impedances(feeder: MeshedFeeder, buses: Ints) -> Phasors:
+    """Columns of the inverse of the reduced admittance matrix, without charging; O(b k t).
+
+    The ties, with ends C (+1 at one, -1 at the other) and impedances z, add ``C z^-1 C^T`` to the admittances
+    of the tree, with the common paths T as inverse. The inverse of the sum is (Woodbury)
+
+        Z = T - T C (z + C^T T C)^-1 C^T T,
+
+    with the impedances of the t loops in the middle: no linear system of the feeder's size is solved.
+
+    Parameters
+    ----------
+    buses : (k,)
+        Buses of injected currents.
+
+    Returns
+    -------
+    (b + 1, k)
+        Rise of the voltage of every bus for each of them, pu; 0 at the busbar.
+    """
+    tree = feeder.tree
+
+    def paths(some: Ints) -> Phasors:
+        return common_paths(tree, tree.r, some) + 1j * common_paths(tree, tree.x, some)
+
+    Z = paths(buses)
+    if feeder.r.size:
+        one, other = feeder.ends.T
+        across = paths(one) - paths(other)  # T C
+        loops = np.diag(feeder.r + 1j * feeder.x) + across[one] - across[other]
+        Z = Z - across @ np.linalg.solve(loops, across[buses].T)
+    return Z
+
+
+def admittance(feeder: MeshedFeeder) -> csc_array:
+    """Admittance matrix of all buses, charging included, (b + 1, b + 1), pu."""
+    tree = feeder.tree
+    lines = np.vstack([np.column_stack([tree.parent, np.arange(1, len(tree.buses))]), feeder.ends])
+    z = np.concatenate([tree.r, feeder.r]) + 1j * np.concatenate([tree.x, feeder.x])
+    signs = np.repeat([1.0, -1.0], len(lines))
+    rows = np.tile(np.arange(len(lines)), 2)
+    incidence = csc_array((signs, (rows, lines.T.ravel())), shape=(len(lines), len(tree.buses)))
+    return csc_array(incidence.T @ diags_array(1.0 / z) @ incidence + diags_array(1j * feeder.half))
+
+
+def _charged(feeder: MeshedFeeder) -> tuple[Phasors, Phasors]:
+    """Voltages without load, and effects of the customers' currents, charging included."""
+    Y = admittance(feeder)
+    below = splu(csc_array(Y[1:, 1:]))
+    idle = np.ones(len(feeder.buses), dtype=np.complex128)
+    idle[1:] = below.solve(-Y[1:, [0]].toarray().ravel())
+    transfer, injected = np.zeros((2, idle.size, feeder.bus.size), dtype=np.complex128)
+    injected[feeder.bus, np.arange(feeder.bus.size)] = 1.0
+    transfer[1:] = below.solve(injected[1:])
+    return idle, transfer
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PhasedMesh(OnTree):
+    """Feeder of single-phase customers with closed ties. N customers, t ties, n = 3 (b + 1) places.
+
+    Attributes
+    ----------
+    tree
+        The feeder without the ties, with customers of one phase; it contains every phase of every bus.
+    ends : (t, 2)
+        Buses at both ends of each tie.
+    phases : (t, 3)
+        Phases a, b, c of each tie.
+    z : (t, 3, 3)
+        Series impedance of each tie, pu; symmetric, rows and columns of absent phases are 0.
+    charging : (t, 3, 3)
+        Total shunt susceptance of each tie, pu; half of it at each end.
+    bus : (N,)
+        Derived. Place of each customer.
+    buses : (n,)
+        Derived. Identifiers of the places, the busbar's three first.
+    half : (b + 1, 3, 3)
+        Derived. Shunt susceptance at the buses, pu.
+    R, X : (n, N)
+        Derived. The linear power flow ``v^2 = v0^2 + 2 R p + 2 X q``: from a customer's power, in units of
+        the three-phase base S, to the squared voltage of every place, pu. For an absent phase, that of its
+        end in the tree.
+    idle : (n, 3)
+        Derived. Voltage of every place without load, per voltage of the busbar; without charging that of its
+        phase.
+    transfer : (n, N)
+        Derived. From an injected current of a customer, in units of S, to the voltage of every place,
+        charging included, pu.
+    between : (N, N)
+        Derived. The same to the customers' voltages.
+    size : (N, N)
+        Derived. Its absolute values.
+
+    Raises
+    ------
+    FeederInvalid
+        With every problem found.
+    """
+
+    tree: ThreePhaseFeeder
+    ends: Ints
+    phases: Bools
+    z: Phasors
+    charging: Floats
+    bus: Ints = field(init=False, repr=False)
+    buses: tuple[str, ...] = field(init=False, repr=False)
+    half: Floats = field(init=False, repr=False)
+    R: Floats = field(init=False, repr=False)
+    X: Floats = field(init=False, repr=False)
+    idle: Phasors = field(init=False, repr=False)
+    transfer: Phasors = field(init=False, repr=False)
+    between: Phasors = field(init=False, repr=False)
+    size: Floats = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        def put(name: str, value: object) -> None:
+            if isinstance(value, np.ndarray):
+                value.flags.writeable = False
+            object.__setattr__(self, name, value)
+
+        put("ends", frozen_ints(self.ends))
+        put("phases", np.array(self.phases, dtype=np.bool_))
+        put("z", np.array(self.z, dtype=np.complex128))
+        put("charging", frozen(self.charging))
+        problems = _phased_problems(self)
+        if problems:
+            raise FeederInvalid(problems)
+        radial = PhasedFeeder(self.tree)
+        put("bus", radial.bus)
+        put("buses", radial.buses)
+        half = self.tree.half.copy()
+        np.add.at(half, self.ends, 0.5 * self.charging[:, None])
+        put("half", half)
+        Z = _impedances(self)
+        turned = Z * (ROTATION[self.tree.phase] / np.tile(ROTATION, len(self.tree.buses))[:, None])
+        put("R", frozen(turned.real))
+        put("X", frozen(turned.imag))
+        quiet = np.tile(np.eye(3, dtype=np.complex128), (len(self.tree.buses), 1))
+        idle, transfer = _phased_charged(self) if half.any() else (quiet, Z)
+        put("idle", idle)
+        put("transfer", transfer)
+        put("between", transfer[self.bus])
+        put("size", np.abs(self.between))
+
+
+def _phased_problems(feeder: PhasedMesh) -> list[Problem]:
+    """Problems of the ties against the tree."""
+    count, tree = len(feeder.ends), feeder.tree
+    expected = (
+        ("ends", feeder.ends.shape, (count, 2)),
+        ("phases", feeder.phases.shape, (count, 3)),
+        ("z", feeder.z.shape, (count, 3, 3)),
+        ("charging", feeder.charging.shape, (count, 3, 3)),
+    )
+    out = [
+        Problem("shape", f"{what} has shape {has}; expected {wants}")
+        for what, has, wants in expected
+        if has != wants
+    ]
+    if out:
+        return out
+    last = len(tree.buses) - 1
+    for k, (one, other) in enumerate(feeder.ends.tolist()):
+        here, where = feeder.phases[k], f"tie {k}"
+        for end in (one, other):
+            if not 0 <= end <= last:
+                out.append(
+                    Problem("unknown-index", f"{where}: bus {end} does not exist; expected 0 to {last}")
+                )
+            elif (here & ~tree.phases[end]).any():
+                out.append(
+                    Problem(
+                        "absent-phase",
+                        f"{where}: phases {named(here)!r} but the other lines bring only "
+                        f"{named(tree.phases[end])!r} to {tree.buses[end]!r}",
+                    )
+                )
+        if one == other:
+            out.append(Problem("self-loop", f"{where}: both ends are bus {one}; a line needs two"))
+        if not here.any():
+            out.append(Problem("no-phase", f"{where}: it has no phase; expected one, two or three"))
+        lines = line_problems(feeder.z[k], feeder.charging[k], here)
+        out.extend(Problem(problem.code, f"{where}: {problem}") for problem in lines)
+    return out
+
+
+def _impedances(feeder: PhasedMesh) -> Phasors:
+    """Matrix (n, N) from the customers' currents to all places, the inverse admittances without charging.
+
+    As `gridsec.grid.meshed.impedances`, with a loop for every phase of every tie: ``Z = T - T C (z + C^T T
+    C)^-1 C^T T``, T the sums of common paths in the tree. Three times that, as 1 pu of the power of a phase
+    is S / 3.
+    """
+    tree = feeder.tree
+
+    def paths(bus: Ints, phase: Ints) -> Phasors:
+        found = phase_paths(tree, tree.z, bus, phase)
+        return np.moveaxis(found, 0, 1).reshape(3 * len(tree.buses), bus.size)
+
+    Z = paths(tree.at, tree.phase)
+    tie, phase = np.nonzero(feeder.phases)
+    if tie.size:
+        one, other = feeder.ends[tie].T
+        across = paths(one, phase) - paths(other, phase)  # T C
+        own = np.equal.outer(tie, tie) * feeder.z[tie[:, None], phase[:, None], phase]
+        loops = own + across[3 * one + phase] - across[3 * other + phase]
+        size = np.sqrt(np.abs(np.diagonal(loops)))
+        if not size.all() or np.linalg.cond(loops / np.outer(size, size)) > _SINGULAR:
+            raise FeederInvalid([Problem("singular", "ties: the impedances around a loop add up to zero")])
+        Z = Z - across @ np.linalg.solve(loops, across[feeder.bus].T)
+    return np.asarray(3.0 * Z)
+
+
+# Impedances of passive lines do not cancel, but those in a faulty table may.
+_SINGULAR = 1e13
+
+
+def phased_admittance(feeder: PhasedMesh) -> csc_array:
+    """Admittance matrix of all places, charging included, (n, n), pu; rows of absent phases are empty.
+
+    Raises
+    ------
+    FeederInvalid
+        If the impedances of a line have no inverse.
+    """
+    tree = feeder.tree
+    lines = np.vstack([np.column_stack([tree.parent, np.arange(1, len(tree.buses))]), feeder.ends])
+    series = np.zeros((len(lines), 3, 3), dtype=np.complex128)
+    present = np.vstack([tree.phases[1:], feeder.phases])
+    for k, (out, z, here) in enumerate(zip(series, [*tree.z, *feeder.z], present, strict=True)):
+        some = np.ix_(here, here)
+        if np.linalg.cond(z[some]) > _SINGULAR:
+            where = f"branch {k}" if k < len(tree.z) else f"tie {k - len(tree.z)}"
+            raise FeederInvalid(
+                [Problem("singular", f"{where}: z is singular; with charging it must be regular")]
+            )
+        out[some] = np.linalg.inv(z[some])
+    one, other = lines.T
+    every = np.arange(len(tree.buses))
+    at = np.concatenate([one, other, one, other, every])
+    to = np.concatenate([one, other, other, one, every])
+    blocks = np.concatenate([series, series, -series, -series, 1j * feeder.half])
+    rows = np.broadcast_to(3 * at[:, None, None] + np.arange(3)[:, None], blocks.shape)
+    columns = np.broadcast_to(3 * to[:, None, None] + np.arange(3), blocks.shape)
+    there = blocks != 0.0
+    size = 3 * len(tree.buses)
+    return csc_array(coo_array((blocks[there], (rows[there], columns[there])), shape=(size, size)))
+
+
+def _phased_charged(feeder: PhasedMesh) -> tuple[Phasors, Phasors]:
+    """Voltages without load, and effects of the customers' currents, charging included."""
+    Y, tree = phased_admittance(feeder).tocsr(), feeder.tree
+    free = np.flatnonzero(tree.phases.ravel())
+    free = free[free >= len(PHASES)]
+    solver = splu(csc_array(Y[free][:, free]))
+    idle = np.zeros((len(feeder.buses), 3), dtype=np.complex128)
+    idle[:3] = np.eye(3)
+    idle[free] = solver.solve(-Y[free][:, :3].toarray())
+    transfer, injected = np.zeros((2, len(idle), feeder.bus.size), dtype=np.complex128)
+    injected[feeder.bus, np.arange(feeder.bus.size)] = 3.0
+    transfer[free] = solver.solve(injected[free])
+    # Beyond the end of a phase, its voltage is that at the end.
+    stands = np.arange(len(idle)).reshape(-1, 3)
+    for k, above in enumerate(tree.parent.tolist(), 1):
+        stands[k] = np.where(tree.phases[k], stands[k], stands[above])
+    return idle[stands.ravel()], transfer[stands.ravel()]
+
+
+Meshed = MeshedFeeder | PhasedMesh
+"""A feeder with closed loops."""
+
+
+def bus_voltages(
+    feeder: Meshed, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 1
+) -> Floats:
+    """Squared voltage of every place, corrected for losses, charging and, in three phases, unequal phases.
+
+    The fixed-point iteration ``V <- W + Z conj(s / V)`` from ``V = W``: its first iterate has the voltages of
+    the linear power flow and the square of its drops, and every step after it gains one order in the load, as
+    a step of `gridsec.grid.radial.loss_correction` does.
+
+    Parameters
+    ----------
+    p, q : (…, N)
+        Net active and reactive injection of each customer (generation positive), pu.
+    v0_squared : (…) or scalar
+        Squared busbar voltage, pu; in three phases (3,), one for each, or scalar.
+    steps
+        Steps after the first iterate; 0 gives the linear power flow.
+
+    Returns
+    -------
+    (…, n)
+        Squared voltages, pu; on a balanced feeder n = b + 1.
+    """
+    if not steps:
+        base = np.asarray(v0_squared, dtype=np.float64)[..., None]
+        if isinstance(feeder, PhasedMesh):
+            base = np.tile(np.broadcast_to(v0_squared, len(PHASES)), len(feeder.tree.buses))
+        return np.asarray(base + 2.0 * (p @ feeder.R.T + q @ feeder.X.T))
+    s, idle, here = _start(feeder, p, q, v0_squared)
+    V = here
+    for _ in range(steps):
+        V = here + np.conj(s / V) @ feeder.between.T
+    V = idle + np.conj(s / V) @ feeder.transfer.T
+    return np.asarray(V.real**2 + V.imag**2)
+
+
+def sensitivities(
+    feeder: Meshed, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 4
+) -> LinDistFlow:
+    """Derivatives of squared voltages at an operating point, halved: R and X under load.
+
+    A change ds of one customer's power changes all currents, because powers are constant. The
+    differential of the fixed point,
+
+        dV + Z diag(conj(s / V^2)) conj(dV) = Z conj(ds / V),
+
+    is a real linear system for real and imaginary parts of dV at the customers, solved for all of them at
+    once; Re(conj(V) dV) is half the derivative of ``|V|^2``. Without load and charging it is R and X. O(N^3).
+
+    Parameters
+    ----------
+    p, q : (N,)
+        Net active and reactive injection of each customer at the operating point, pu.
+    v0_squared
+        As in `bus_voltages`.
+    steps
+        Steps to the voltages of the operating point, as in `bus_voltages`.
+
+    Returns
+    -------
+    LinDistFlow
+        The matrices; ``v^2`` then changes by ``2 R dp + 2 X dq``.
+    """
+    s, idle, here = _start(feeder, p, q, v0_squared)
+    V = here
+    for _ in range(steps + 1):
+        V = here + feeder.between @ np.conj(s / V)
+    turned, alone = feeder.between * np.conj(s / V**2), np.eye(s.size)
+    own: Phasors = np.concatenate([np.diag(unit / np.conj(V)) for unit in (1.0, -1j)], axis=1)
+    system = np.block([[alone + turned.real, turned.imag], [turned.imag, alone - turned.real]])
+    driven = feeder.between @ own
+    moved = np.linalg.solve(system, np.concatenate([driven.real, driven.imag]))
+    change = moved[: s.size] + 1j * moved[s.size :]
+    currents = own - np.conj((s / V**2)[:, None] * change)
+    volts = idle + feeder.transfer @ np.conj(s / V)
+    R, X = np.split((np.conj(volts)[:, None] * (feeder.transfer @ currents)).real, 2, axis=1)
+    return LinDistFlow(*(frozen(each) for each in (R[feeder.bus], X[feeder.bus], R, X)))
+
+
+def model_error_bound(feeder: Meshed, p: Floats, q: Floats, v0_squared: Floats | float) -> Floats:
+    """Bound of the error of `v^2` after one correction against the AC power flow, for every customer.
+
+    V1 and V2 are the iterates of `bus_voltages`, ``d = |V2 - V1|``, and ``M_ij = |Z_ij| |s_j| / (c_j
+    min(|V1_j|, c_j))`` with ``c = 0.9 |V2|``. A step maps all voltages within ``rho <= 0.1 |V2|`` of V2 to a
+    distance of at most ``M (rho + d)`` from V2. So if ``M M d <= theta M d`` for a theta below 1, and ``rho =
+    M d / (1 - theta)``, the disks of radius rho around V2 are mapped into themselves. They contain a solution
+    of the AC power flow (Brouwer), and only one, because theta also bounds the contraction there. If theta is
+    1 or more, or rho above 0.1 |V2|, the bound is infinite.
+
+    Parameters
+    ----------
+    feeder, p, q, v0_squared
+        As in `bus_voltages`.
+
+    Returns
+    -------
+    (…, N)
+        Bound on the error of `v^2`, pu.
+
+    References
+    ----------
+    Wang et al. 2018, for the existence of the solution; the componentwise bound: docs/theory-mesh.md.
+    """
+    with np.errstate(all="ignore"):
+        s, _, idle = _start(feeder, p, q, v0_squared)
+        first = idle + np.conj(s / idle) @ feeder.between.T
+        second = idle + np.conj(s / first) @ feeder.between.T
+        low = (1.0 - _NEAR) * np.abs(second)
+        weight = np.abs(s) / (low * np.minimum(low, np.abs(first)))
+        once = (weight * np.abs(second - first)) @ feeder.size.T
+        twice = (weight * once) @ feeder.size.T
+        theta = np.max(np.where(twice > 0.0, twice / once, 0.0), axis=-1, keepdims=True, initial=0.0)
+        rho = once / (1.0 - theta)
+        holds = (theta < 1.0) & np.all(rho <= _NEAR * np.abs(second), axis=-1, keepdims=True)
+        bound = np.where(holds, rho * (2.0 * np.abs(second) + rho), np.inf)
+    return np.asarray(bound)
+
+
+def interval_bounds(
+    feeder: Meshed,
+    p: Floats,
+    q: Floats,
+    v0_squared: Floats | float,
+    *,
+    p_error: Floats,
+    q_error: Floats,
+) -> tuple[Floats, Floats]:
+    """Error bounds of the correction of `bus_voltages` for powers within intervals.
+
+    Parameters
+    ----------
+    feeder, p, q : (N,), v0_squared
+        As in `bus_voltages`, one operating point.
+    p_error, q_error : (N,)
+        Largest errors of the powers, pu.
+
+    Returns
+    -------
+    (N,), (N,)
+        Change of the correction, and distance of its first step from the AC power flow, pu:
+        `gridsec.grid.intervals.bounds`.
+    """
+    with np.errstate(all="ignore"):
+        s, _, idle = _start(feeder, p, q, v0_squared)
+        first = idle + np.conj(s / idle) @ feeder.between.T
+        second = idle + np.conj(s / first) @ feeder.between.T
+    error = np.hypot(p_error, q_error)
+    sweeps = Sweeps(idle, first, second, np.abs(s), lambda current: feeder.size @ current, np.zeros_like)
+    moved, rest = bounds(sweeps, error)
+    # The linear power flow assumes no charging and equal phases of the busbar; the first sweep has the actual
+    # ones.
+    linear = (feeder.R + 1j * feeder.X)[feeder.bus]
+    apart = np.abs(np.conj(idle)[:, None] * feeder.between / np.conj(idle) - linear)
+    return np.asarray(moved + 2.0 * (apart @ error)), rest
+
+
+# Radius around the second iterate, as a fraction of it, within which a solution is located.
+_NEAR = 0.1
+
+
+def _start(
+    feeder: Meshed, p: Floats, q: Floats, v0_squared: Floats | float
+) -> tuple[Phasors, Phasors, Phasors]:
+    """Powers of the customers (…, N), and voltages without load of all places (…, n) and of the customers."""
+    v0 = np.sqrt(np.asarray(v0_squared, dtype=np.float64))
+    idle = feeder.idle @ (v0 * ROTATION) if isinstance(feeder, PhasedMesh) else v0[..., None] * feeder.idle
+    return np.asarray(p + 1j * q), np.asarray(idle), np.asarray(idle[..., feeder.bus])

@@ -1,0 +1,128 @@
+"""Three-phase feeder in the form for estimators: single-phase customers, and a place per phase of each bus.
+
+Places take the role of the buses in `gridsec.grid.radial`, in the same per unit:
+powers in units of the three-phase base S. Place ``3 k + phi`` is phase phi of bus k, and the busbar has the
+first three. R and X are not symmetric, and their entries have either sign.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gridsec.arrays import Floats, Ints, frozen, frozen_ints
+from gridsec.errors import FeederInvalid, Problem
+from gridsec.grid import three_phase
+from gridsec.grid.three_phase import PHASES, ThreePhaseFeeder, lindist3flow
+from gridsec.grid.trees import OnTree
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PhasedFeeder(OnTree):
+    """Feeder of single-phase customers. N customers, b + 1 buses, n = 3 (b + 1) places.
+
+    Attributes
+    ----------
+    tree
+        The feeder in three phases; each of its customers is connected to one of them.
+    bus : (N,)
+        Derived. Place of each customer.
+    buses : (n,)
+        Derived. Identifiers of the places, the busbar's three first.
+    R, X : (n, N)
+        Derived. The linear power flow ``v^2 = v0^2 + 2 R p + 2 X q``: from a customer's power, in units of
+        S, to the squared voltage of every place, pu. For an absent phase, that of its end.
+
+    Raises
+    ------
+    FeederInvalid
+        If customers have several phases; lists them all.
+    """
+
+    tree: ThreePhaseFeeder
+    bus: Ints = field(init=False, repr=False)
+    buses: tuple[str, ...] = field(init=False, repr=False)
+    R: Floats = field(init=False, repr=False)
+    X: Floats = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        tree, several = self.tree, self.tree.connected.sum(axis=1) > 1
+        if several.any():
+            raise FeederInvalid(
+                [
+                    Problem(
+                        "several-phases",
+                        f"customer {tree.customers[k]!r} has several phases; expected one customer for each",
+                    )
+                    for k in np.flatnonzero(several).tolist()
+                ]
+            )
+        model = lindist3flow(tree)
+        names = tuple(f"{bus}.{phase}" for bus in tree.buses for phase in PHASES)
+        object.__setattr__(self, "bus", frozen_ints(len(PHASES) * tree.at + tree.phase))
+        object.__setattr__(self, "buses", names)
+        for name, found in (("R", model.R_bus), ("X", model.X_bus)):
+            # 1 pu of the power of a phase is a third of S.
+            by_place = 3.0 * np.moveaxis(found, 0, 1).reshape(len(names), tree.at.size)
+            object.__setattr__(self, name, frozen(by_place))
+
+
+def bus_voltages(
+    feeder: PhasedFeeder, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 1
+) -> Floats:
+    """Squared voltage of every place, corrected for losses, charging and unequal phases.
+
+    Parameters
+    ----------
+    p, q : (…, N)
+        Net active and reactive injection of each customer (generation positive), pu.
+    v0_squared : (…, 3) or scalar
+        Squared busbar voltage of each phase, pu.
+    steps
+        As in `gridsec.grid.three_phase.loss_correction`; 0 gives LinDist3Flow.
+
+    Returns
+    -------
+    (…, n)
+        Squared voltages, pu.
+    """
+    given = np.asarray(v0_squared, dtype=np.float64)
+    v0 = np.broadcast_to(given, (*given.shape[:-1], len(PHASES)))
+    by_phase = three_phase.bus_voltages(feeder.tree, 3.0 * p, 3.0 * q, v0, steps=steps)
+    return np.moveaxis(by_phase, -2, -1).reshape(*by_phase.shape[:-2], len(feeder.buses))
+
+
+def model_error_bound(feeder: PhasedFeeder, p: Floats, q: Floats, v0_squared: Floats | float) -> Floats:
+    """Bound (…, N) of the error of `v^2` after one correction against the AC power flow, by customer, pu."""
+    v0 = np.broadcast_to(np.asarray(v0_squared, dtype=np.float64), len(PHASES))
+    return three_phase.model_error_bound(feeder.tree, 3.0 * p, 3.0 * q, v0)
+
+
+def interval_bounds(
+    feeder: PhasedFeeder,
+    p: Floats,
+    q: Floats,
+    v0_squared: Floats | float,
+    *,
+    p_error: Floats,
+    q_error: Floats,
+) -> tuple[Floats, Floats]:
+    """`gridsec.grid.three_phase.interval_bounds`, for every customer.
+
+    Parameters
+    ----------
+    feeder, p, q : (N,), v0_squared
+        As in `bus_voltages`, one operating point.
+    p_error, q_error : (N,)
+        Largest errors of the powers, pu.
+
+    Returns
+    -------
+    (N,), (N,)
+        Change of the correction, and distance of its first step from the AC power flow, pu.
+    """
+    v0 = np.broadcast_to(np.asarray(v0_squared, dtype=np.float64), len(PHASES))
+    return three_phase.interval_bounds(
+        feeder.tree, 3.0 * p, 3.0 * q, v0, p_error=3.0 * p_error, q_error=3.0 * q_error
+    )

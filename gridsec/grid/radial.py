@@ -1,0 +1,500 @@
+"""Radial feeder in per unit, its linear power flow, and the correction for losses and charging.
+
+Everything is balanced three-phase, per phase, in per unit of the base voltage (phase to neutral) and
+of the three-phase base power, so that powers in kW of all phases together divide by `base_kva`.
+
+References
+----------
+.. [1] M. E. Baran, F. F. Wu, "Network reconfiguration in distribution systems for loss reduction and
+   load balancing", IEEE Trans. Power Delivery 4(2), 1989: the DistFlow branch equations.
+.. [2] chong2020, equation (15): the linear form, with service drops as leaf edges of the tree.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from math import prod
+
+import numpy as np
+
+from gridsec.arrays import Floats, Ints, any_of, frozen, frozen_ints
+from gridsec.errors import FeederInvalid, InputInvalid, Problem
+from gridsec.grid.trees import below, from_root, shrinking, walk
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Feeder:
+    """Radial feeder: a tree of b branches and b + 1 buses, rooted at the metered busbar (bus 0).
+
+    Attributes
+    ----------
+    name
+        Name of the feeder.
+    parent : (b,)
+        Bus that feeds bus k + 1; `parent[k] <= k`, so buses are in topological order.
+    r, x : (b,)
+        Series resistance and reactance of the branch into bus k + 1, pu.
+    bus : (N,)
+        Bus of each customer. Several customers may share one; bus 0 is allowed.
+    customers : (N,)
+        Identifiers of the customers.
+    buses : (b + 1,)
+        Identifiers of the buses, the busbar first.
+    base_volt
+        Nominal phase-to-neutral voltage (1 pu), V.
+    base_kva
+        Three-phase base power (1 pu), kVA.
+    charging : (b,)
+        Total shunt susceptance of the branch into bus k + 1, pu; half of it at each end.
+    start, stop : (b + 1,)
+        Derived. Depth-first numbering: bus k and the buses fed through it are those with `start` in
+        `[start[k], stop[k])`.
+    order : (b + 1,)
+        Derived. The buses by these numbers.
+    depth : (b + 1,)
+        Derived. Number of branches between bus k and the busbar.
+    enter, leave : (b + 1,)
+        Derived. Steps of a walk around the tree at which it reaches a bus first, and has left it.
+    inside : (b + 1, b + 1) or None
+        Derived. 1 where the bus of the row is fed through that of the column; None for large trees.
+    half : (b + 1,)
+        Derived. Shunt susceptance at the buses, pu.
+    charges
+        Derived. True if any bus has charging.
+    squared : (b,)
+        Derived. ``r^2 + x^2``, pu.
+    alone
+        Derived. True if no two customers share a bus.
+
+    Raises
+    ------
+    FeederInvalid
+        With every problem found.
+    """
+
+    name: str
+    parent: Ints
+    r: Floats
+    x: Floats
+    bus: Ints
+    customers: tuple[str, ...]
+    buses: tuple[str, ...]
+    base_volt: float
+    base_kva: float
+    charging: Floats
+    start: Ints = field(init=False, repr=False)
+    stop: Ints = field(init=False, repr=False)
+    order: Ints = field(init=False, repr=False)
+    depth: Ints = field(init=False, repr=False)
+    enter: Ints = field(init=False, repr=False)
+    leave: Ints = field(init=False, repr=False)
+    inside: Floats | None = field(init=False, repr=False)
+    half: Floats = field(init=False, repr=False)
+    charges: bool = field(init=False, repr=False)
+    squared: Floats = field(init=False, repr=False)
+    alone: bool = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        for name in ("r", "x", "charging"):
+            object.__setattr__(self, name, frozen(getattr(self, name)))
+        for name in ("parent", "bus"):
+            object.__setattr__(self, name, frozen_ints(getattr(self, name)))
+        problems = _problems(self)
+        if problems:
+            raise FeederInvalid(problems)
+        found = walk(self.parent)
+        for name in ("start", "stop", "order", "depth", "enter", "leave", "inside"):
+            object.__setattr__(self, name, getattr(found, name))
+        half: Floats = np.zeros(found.start.size)
+        np.add.at(half, self.parent, 0.5 * self.charging)
+        half[1:] += 0.5 * self.charging
+        object.__setattr__(self, "half", frozen(half))
+        object.__setattr__(self, "charges", any_of(half))
+        object.__setattr__(self, "alone", np.unique(self.bus).size == self.bus.size)
+        object.__setattr__(self, "squared", frozen(self.r**2 + self.x**2))
+
+
+def _problems(feeder: Feeder) -> list[Problem]:
+    """Problems of the fields of `feeder`."""
+    out = _shape_problems(feeder)
+    if out:
+        return out
+    branches = feeder.parent.size
+    for what in ("base_volt", "base_kva"):
+        value = getattr(feeder, what)
+        if not (np.isfinite(value) and value > 0):
+            out.append(Problem("not-positive", f"{what} is {value}; it must be a positive number"))
+    for k in range(branches):
+        where = f"branch {k} into bus {feeder.buses[k + 1]!r}"
+        if not 0 <= feeder.parent[k] <= k:
+            out.append(
+                Problem(
+                    "not-radial", f"{where}: parent {feeder.parent[k]} does not precede it; expected 0 to {k}"
+                )
+            )
+        for what in ("r", "x", "charging"):
+            value = getattr(feeder, what)[k]
+            if not (np.isfinite(value) and value >= 0):
+                out.append(
+                    Problem("negative", f"{where}: {what} is {value}; it must be finite and not negative")
+                )
+        if feeder.r[k] == 0 and feeder.x[k] == 0:
+            out.append(Problem("zero-impedance", f"{where}: r and x are both 0; fuse the two buses"))
+    for j, bus in enumerate(feeder.bus):
+        if not 0 <= bus <= branches:
+            out.append(
+                Problem(
+                    "unknown-index",
+                    f"customer {feeder.customers[j]!r}: bus {bus} does not exist; expected 0 to {branches}",
+                )
+            )
+    for what, names in (("customer", feeder.customers), ("bus", feeder.buses)):
+        counted = Counter(names)
+        out.extend(
+            Problem("duplicate", f"{what} {name!r} is named {times} times")
+            for name, times in counted.items()
+            if times > 1
+        )
+    return out
+
+
+def _shape_problems(feeder: Feeder) -> list[Problem]:
+    """Problems of array lengths; all other checks require that there are none."""
+    branches = feeder.parent.size
+    expected = (
+        ("parent", feeder.parent.shape, (branches,)),
+        ("r", feeder.r.shape, (branches,)),
+        ("x", feeder.x.shape, (branches,)),
+        ("charging", feeder.charging.shape, (branches,)),
+        ("buses", (len(feeder.buses),), (branches + 1,)),
+        ("bus", feeder.bus.shape, (len(feeder.customers),)),
+    )
+    return [
+        Problem("shape", f"{what} has shape {has}; expected {wants}")
+        for what, has, wants in expected
+        if has != wants
+    ]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinDistFlow:
+    """Linear power flow `v^2 = v0^2 + 2 R p + 2 X q` of one feeder.
+
+    Attributes
+    ----------
+    R, X : (N, N)
+        Resistance and reactance of the path from the busbar that two customers share, pu.
+    R_bus, X_bus : (b + 1, N)
+        The same for a bus and a customer.
+    """
+
+    R: Floats
+    X: Floats
+    R_bus: Floats
+    X_bus: Floats
+
+
+def lindistflow(feeder: Feeder) -> LinDistFlow:
+    """Matrices of the linear power flow of a feeder.
+
+    `R_bus[k, j] = sum of r over the branches on both paths to the busbar`, from bus k and from the bus of
+    customer j.
+
+    References
+    ----------
+    chong2020, equation (15), for any tree.
+    """
+    R_bus = common_paths(feeder, feeder.r, feeder.bus)
+    X_bus = common_paths(feeder, feeder.x, feeder.bus)
+    return LinDistFlow(
+        R=frozen(R_bus[feeder.bus]), X=frozen(X_bus[feeder.bus]), R_bus=frozen(R_bus), X_bus=frozen(X_bus)
+    )
+
+
+def common_paths(feeder: Feeder, branch: Floats, buses: Ints) -> Floats:
+    """Sum of a branch quantity over the common part of the paths of two buses to the busbar; O(n k).
+
+    In depth-first order it is the minimum over consecutive buses between the two of their common sum: the sum
+    up to the parent of the later bus.
+
+    Parameters
+    ----------
+    branch : (b,)
+        Quantity of each branch, not negative; for example `feeder.r`.
+    buses : (k,)
+        The second bus of each pair.
+
+    Returns
+    -------
+    (b + 1, k)
+        For every bus and each of `buses`.
+    """
+    start, whole = feeder.start, path_sums(feeder, branch)
+    between = np.zeros(start.size)
+    between[start[1:]] = whole[feeder.parent]
+    out, count = np.empty((buses.size, start.size)), np.arange(start.size)
+    together = max(1, _TOGETHER // start.size)
+    for first in range(0, buses.size, together):
+        some = buses[first : first + together]
+        at = start[some][:, None]
+        later = np.where(count > at, between, np.inf)
+        later[count == at] = whole[some]
+        np.minimum.accumulate(later, axis=1, out=later)
+        earlier = np.where(count[1:] <= at, between[1:], np.inf)[:, ::-1]
+        earlier = np.minimum.accumulate(earlier, axis=1)[:, ::-1]
+        np.minimum(later[:, :-1], earlier, out=later[:, :-1])
+        out[first : first + together] = later[:, start]
+    return out.T
+
+
+# Entries per block, chosen for the processor's cache.
+_TOGETHER = 16384
+
+
+def path_sums(feeder: Feeder, branch: Floats) -> Floats:
+    """Sum of a branch quantity over the path from the busbar to each bus, with one rounding per branch.
+
+    Parameters
+    ----------
+    branch : (b,)
+        Quantity of each branch.
+
+    Returns
+    -------
+    (b + 1,)
+        0 at the busbar.
+    """
+    out = [0.0]
+    for above, more in zip(feeder.parent.tolist(), branch.tolist(), strict=True):
+        out.append(out[above] + more)
+    return np.array(out)
+
+
+def squared_voltages(model: LinDistFlow, p: Floats, q: Floats, v0_squared: Floats | float) -> Floats:
+    """Squared voltage of every customer by the linear power flow.
+
+    Parameters
+    ----------
+    model
+        From `lindistflow`.
+    p, q : (…, N)
+        Net active and reactive injection of each customer (generation positive), pu.
+    v0_squared : (…) or scalar
+        Squared busbar voltage, pu.
+
+    Returns
+    -------
+    (…, N)
+        Squared voltages, pu.
+    """
+    base = np.asarray(v0_squared, dtype=np.float64)[..., None]
+    return base + 2.0 * (p @ model.R.T + q @ model.X.T)
+
+
+def loss_correction(
+    feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 1
+) -> Floats:
+    """Correction of the linear squared voltage of every bus for branch losses and charging.
+
+    From the linear flows `P, Q` (towards the child, at its end of the branch) and the linear `v^2`:
+    the squared current `l = (P^2 + Q^2) / v^2`, the losses `r l`, `x l`, and
+
+        v_child^2 = v_parent^2 - 2 (r P + x Q) - (r^2 + x^2) l
+
+    with the losses of the branches below added to `P` and `Q`. This is one step of the fixed-point iteration
+    with the AC power flow of a balanced radial feeder as its limit; `steps` repeats it. O(b) for each
+    operating point.
+
+    Parameters
+    ----------
+    p, q : (…, N)
+        Net active and reactive injection of each customer (generation positive, droop inverters
+        included), pu.
+    v0_squared : (…) or scalar
+        Squared busbar voltage, pu.
+    steps
+        Number of fixed-point steps, at least 1.
+
+    Returns
+    -------
+    (…, b + 1)
+        Additive correction of `v^2`, pu; 0 at the busbar.
+
+    Raises
+    ------
+    ValueError
+        If `steps` is below 1.
+
+    References
+    ----------
+    Baran and Wu 1989, the DistFlow equations. Derivation: docs/theory-model.md.
+    """
+    if steps < 1:
+        raise InputInvalid([Problem("out-of-range", f"steps is {steps}; it must be at least 1")])
+    flows = _linear_flows(feeder, p, q, v0_squared)
+    return np.asarray(_lossy(feeder, flows, flows, steps).v2 - flows.v2)
+
+
+def bus_voltages(
+    feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 1
+) -> Floats:
+    """Squared voltage of every bus, corrected for losses and charging; O(b), without the N x N matrices.
+
+    Parameters
+    ----------
+    feeder, p, q, v0_squared, steps
+        As in `loss_correction`; `steps` = 0 gives LinDistFlow.
+
+    Returns
+    -------
+    (…, b + 1)
+        Squared voltages, pu.
+    """
+    flows = _linear_flows(feeder, p, q, v0_squared)
+    return _lossy(feeder, flows, flows, steps).v2
+
+
+def corrected(
+    feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 1
+) -> tuple[Floats, Floats]:
+    """`loss_correction` and `model_error_bound` of the same operating points, faster than separately.
+
+    Parameters
+    ----------
+    feeder, p, q, v0_squared, steps
+        As in `loss_correction`.
+
+    Returns
+    -------
+    (…, b + 1), (…, N)
+        Additive correction of `v^2`, and a bound on the error that remains after its first step, pu.
+
+    Raises
+    ------
+    ValueError
+        If `steps` is below 1.
+    """
+    if steps < 1:
+        raise InputInvalid([Problem("out-of-range", f"steps is {steps}; it must be at least 1")])
+    flows = _linear_flows(feeder, p, q, v0_squared)
+    once = _lossy(feeder, flows, flows, 1)
+    return np.asarray(_lossy(feeder, flows, once, steps - 1).v2 - flows.v2), _remainder(feeder, flows, once)
+
+
+def _lossy(feeder: Feeder, flows: _Flows, now: _Flows, steps: int) -> _Flows:
+    """The linear power flow with the losses of the flows `now`, repeated `steps` times."""
+    for _ in range(steps):
+        current = (now.P * now.P + now.charged * now.charged) / now.v2[..., 1:]
+        charge = feeder.half * now.v2 if feeder.charges else now.v2
+        loss_p, loss_q, drop = _losses(feeder, current, charge, sign=-1.0)
+        # The losses include charging.
+        Q = flows.Q + loss_q
+        now = _Flows(flows.P + loss_p, Q, Q, flows.v2 - from_root(feeder, drop))
+    return now
+
+
+def model_error_bound(feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats | float) -> Floats:
+    """Bound of the error of `v^2` after one loss correction against the AC power flow, for every customer.
+
+    Twice the size of the second fixed-point step, with magnitudes summed: the steps shrink geometrically, and
+    twice the next step bounds the sum of all later ones while each is at most half its predecessor (in
+    practice a few hundredths). Under heavy loads the quotients grow from step to step, so the second step
+    must be below a fifth of the first. Otherwise, towards voltage collapse, the bound is infinite.
+
+    Parameters
+    ----------
+    feeder, p, q, v0_squared
+        As in `loss_correction`.
+
+    Returns
+    -------
+    (…, N)
+        Bound on the remaining error of `v^2`, pu.
+    """
+    flows = _linear_flows(feeder, p, q, v0_squared)
+    with np.errstate(all="ignore"):
+        return _remainder(feeder, flows, _lossy(feeder, flows, flows, 1))
+
+
+def reach(feeder: Feeder, p: Floats, q: Floats) -> Floats:
+    """Largest change of the squared voltages by powers of given sizes: ``2 |R| p + 2 |X| q``; O(b).
+
+    Parameters
+    ----------
+    p, q : (…, N)
+        Sizes of the customers' active and reactive powers, not negative, pu.
+
+    Returns
+    -------
+    (…, b + 1)
+        Change at every bus, pu.
+    """
+    both = np.empty((2, *np.broadcast(p, q).shape))
+    both[0], both[1] = p, q
+    P, Q = below(feeder, _at_buses(feeder, both))[..., 1:]
+    return from_root(feeder, 2.0 * (np.abs(feeder.r) * P + np.abs(feeder.x) * Q))
+
+
+def _remainder(feeder: Feeder, flows: _Flows, once: _Flows) -> Floats:
+    with np.errstate(all="ignore"):
+        # Increments of the first and of the second step.
+        current, charge = np.empty((2, *flows.v2[..., 1:].shape)), np.empty((2, *flows.v2.shape))
+        np.divide(flows.P**2 + flows.charged**2, flows.v2[..., 1:], out=current[0])
+        np.subtract((once.P**2 + once.Q**2) / once.v2[..., 1:], current[0], out=current[1])
+        charge[0], charge[1] = flows.v2, once.v2 - flows.v2
+        drop = _losses(feeder, np.abs(current), np.abs(feeder.half * charge), sign=1.0)[2]
+        first, second = from_root(feeder, drop)
+        shrinks = shrinking(first, second, (-1,))
+        shrinks &= np.all((flows.v2 > 0) & (once.v2 > 0), axis=-1, keepdims=True)
+        bound = np.where(shrinks, 2.0 * second, np.inf)
+    return np.asarray(bound[..., feeder.bus])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Flows:
+    """Linear power flow.
+
+    P, Q: flows at the end of the branches, (…, b). charged: Q less the supply from charging below.
+    v2: squared voltages (…, b + 1).
+    """
+
+    P: Floats
+    Q: Floats
+    charged: Floats
+    v2: Floats
+
+
+def _linear_flows(feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats | float) -> _Flows:
+    """Linear power flow from the injections of the customers."""
+    both = np.empty((2, *np.broadcast(p, q).shape))
+    both[0], both[1] = p, q
+    P, Q = -below(feeder, _at_buses(feeder, both))[..., 1:]
+    base = np.asarray(v0_squared, dtype=np.float64)[..., None]
+    v2 = base + from_root(feeder, -2.0 * (feeder.r * P + feeder.x * Q))
+    charged = Q - below(feeder, feeder.half * v2)[..., 1:] if feeder.charges else Q
+    return _Flows(P, Q, charged, v2)
+
+
+def _losses(feeder: Feeder, current: Floats, charge: Floats, *, sign: float) -> tuple[Floats, Floats, Floats]:
+    """Contributions of squared currents (…, b) and charging (…, b + 1) to P, Q and to the drop of v^2."""
+    own = np.zeros((2, *current.shape[:-1], current.shape[-1] + 1))
+    np.multiply(feeder.r, current, out=own[0, ..., 1:])
+    np.multiply(feeder.x, current, out=own[1, ..., 1:])
+    loss_p, loss_q = (below(feeder, own) - own)[..., 1:]
+    if feeder.charges:
+        loss_q = loss_q + sign * below(feeder, charge)[..., 1:]
+    drop = 2.0 * (feeder.r * loss_p + feeder.x * loss_q) + feeder.squared * current
+    return loss_p, loss_q, drop
+
+
+def _at_buses(feeder: Feeder, values: Floats) -> Floats:
+    """Sum of the customers' `values` (…, N) at every bus, (…, b + 1)."""
+    shape = (*values.shape[:-1], len(feeder.buses))
+    if feeder.alone:
+        out = np.zeros(shape)
+        out[..., feeder.bus] = values
+        return out
+    first = np.arange(0, prod(shape), shape[-1])[:, None]
+    total = np.bincount((first + feeder.bus).ravel(), weights=values.ravel(), minlength=prod(shape))
+    return np.asarray(total.reshape(shape))

@@ -1,0 +1,244 @@
+"""Lur'e systems in discrete time, and the feeder's loop sampled at its readings.
+
+    x(k+1) = A x(k) + G phi(H x(k) + F u(k)) + B u(k),      y(k) = C x(k) + D u(k)
+
+The module is in this package because the inequalities use these systems; no solver is used here.
+
+References
+----------
+yang2019 (1), (2), with the known vector rho written as B u; docs/theory-discrete.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.linalg import expm
+
+from gridsec.arrays import Floats, exponential_integrals, spectral_radius
+from gridsec.errors import Problem, refuse
+from gridsec.observers.lure import Lure, as_floats, freeze, input_matrices, without_lower
+from gridsec.observers.newton import Nonlinearity
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DiscreteLure:
+    """`x+ = A x + G phi(H x + F u) + B u`, `y = C x + D u`. n states, m nonlinearities, l inputs, p meters.
+
+    Attributes
+    ----------
+    A : (n, n)
+    G : (n, m)
+    H : (m, n)
+    F : (m, l)
+    B : (n, l)
+    C : (p, n)
+    D : (p, l)
+        The matrices. A known vector rho(u, y) as in yang2019 (1) is passed as further entries of u.
+    lower, upper : (m,)
+        Bounds of the slopes of each entry of phi, `lower <= upper`.
+    phi
+        The nonlinearity, (…, m) -> (…, m), entry by entry.
+    h
+        Time from one step to the next, s.
+
+    Raises
+    ------
+    ValueError
+        If shapes are inconsistent, an entry is not finite, a lower slope exceeds its upper one, or h is not
+        positive; lists every problem.
+    """
+
+    A: Floats
+    G: Floats
+    H: Floats
+    F: Floats
+    B: Floats
+    C: Floats
+    D: Floats
+    lower: Floats
+    upper: Floats
+    phi: Nonlinearity
+    h: float = 1.0
+
+    def __post_init__(self) -> None:
+        wrong = freeze(self, "lower", "upper")
+        if self.lower.shape == self.upper.shape and np.any(self.lower > self.upper):
+            wrong.append(Problem("order", "a lower slope exceeds its upper slope"))
+        if not (np.isfinite(self.h) and self.h > 0.0):
+            wrong.append(Problem("not-positive", f"h is {self.h}; the time between steps must be positive"))
+        refuse(wrong)
+
+    @classmethod
+    def of(
+        cls,
+        A: ArrayLike,
+        C: ArrayLike,
+        *,
+        G: ArrayLike,
+        H: ArrayLike,
+        phi: Nonlinearity,
+        lower: ArrayLike,
+        upper: ArrayLike,
+        F: ArrayLike | None = None,
+        B: ArrayLike | None = None,
+        D: ArrayLike | None = None,
+        h: float = 1.0,
+    ) -> DiscreteLure:
+        """System from nested lists or arrays; a missing input matrix is zero.
+
+        Parameters
+        ----------
+        A, C, G, H, phi, F, B, D, h
+            As in the class. Without any of F, B and D there are no inputs, l = 0.
+        lower, upper
+            Likewise; one number for all entries of phi.
+
+        Raises
+        ------
+        ValueError
+            As in the class.
+        """
+        a, c, g, hh, low, high = as_floats(A, C, G, H, lower, upper)
+        f, b, d = input_matrices((len(hh), len(a), len(c)), F, B, D)
+        low, high = (np.broadcast_to(bound, len(hh)) for bound in (low, high))
+        return cls(a, g, hh, f, b, c, d, low, high, phi, h)
+
+    @property
+    def slope(self) -> Floats:
+        """Width of each slope interval, (m,): the slope bound after the loop transform."""
+        return np.asarray(self.upper - self.lower)
+
+
+def shift(system: DiscreteLure) -> DiscreteLure:
+    """The same system with slopes in [0, upper - lower]: `gridsec.observers.lure.without_lower`."""
+    A, B, phi = without_lower(system, system.lower)
+    return replace(system, A=A, B=B, lower=np.zeros(system.lower.shape), upper=system.slope, phi=phi)
+
+
+def advance(system: DiscreteLure, x: Floats, u: Floats) -> Floats:
+    """State one step later.
+
+    Parameters
+    ----------
+    x : (…, n)
+        State.
+    u : (…, l)
+        Input.
+    """
+    z = x @ system.H.T + u @ system.F.T
+    return np.asarray(x @ system.A.T + system.phi(z) @ system.G.T + u @ system.B.T)
+
+
+def measure(system: DiscreteLure, x: Floats, u: Floats) -> Floats:
+    """Noiseless outputs `C x + D u`, (…, p), for arguments as in `advance`."""
+    return np.asarray(x @ system.C.T + u @ system.D.T)
+
+
+def sample(lure: Lure, h: float) -> DiscreteLure:
+    """Continuous Lur'e system at steps of length h, with constant inputs and nonlinearity over a step.
+
+    The exponential Euler step `x+ = exp(A h) x + h phi_1(A h) (G phi(H x + F u) + B u)`. It is exact for z
+    constant over the step. For a droop loop it is exact in general if the argument of inverter i is taken at
+    some value of z_i *during* the step; `held_error` bounds the distance of that value from the one at its
+    beginning.
+
+    Parameters
+    ----------
+    h
+        Length of a step, s, positive.
+
+    References
+    ----------
+    docs/theory-discrete.md, section 5.
+    """
+    n = len(lure.A)
+    own = np.diagonal(lure.A)
+    if np.count_nonzero(lure.A) == np.count_nonzero(own):
+        decay, one, _ = exponential_integrals(own * h)
+        A, hold = np.diag(decay), np.diag(h * one)
+    else:
+        block = np.zeros((2 * n, 2 * n))
+        block[:n, :n], block[:n, n:] = h * lure.A, h * np.eye(n)
+        full = expm(block)
+        A, hold = full[:n, :n], full[:n, n:]
+    return DiscreteLure(
+        A=A,
+        G=hold @ lure.G,
+        H=lure.H,
+        F=lure.F,
+        B=hold @ lure.B,
+        C=lure.C,
+        D=lure.D,
+        lower=np.zeros(lure.slope.shape),
+        upper=lure.slope,
+        phi=lure.phi,
+        h=h,
+    )
+
+
+def held_error(lure: Lure, h: float, away: Floats) -> Floats:
+    """Largest motion of z within one step of a droop loop with constant input.
+
+    Inverter j obeys `tau_j x_j' = -x_j + K_j(z_j)`, so `|x_j(s) - x_j(0)| <= q_j sup |K_j(z_j) - x_j(0)|`
+    with `q_j = 1 - exp(-h / tau_j)`. With `away_j >= |K_j(z_j(0)) - x_j(0)|`, the motion m solves
+    `m = q (away + d |H| m)`, if the spectral radius of `diag(q d) |H|` is below 1.
+
+    Parameters
+    ----------
+    lure
+        Closed loop of a feeder, A and G diagonal with G = -A.
+    h
+        Length of the step, s.
+    away : (m,)
+        Distance of each inverter from its set point at the beginning of the step, pu.
+
+    Returns
+    -------
+    (m,)
+        Bound on `|z_i(s) - z_i(0)|`, 0 <= s <= h, squared pu; infinite without a bound.
+
+    References
+    ----------
+    docs/theory-discrete.md, section 5.
+    """
+    q = -np.expm1(np.diagonal(lure.A) * h)
+    reach = np.abs(lure.H)
+    loop = (q * lure.slope)[:, None] * reach
+    if spectral_radius(loop) >= 1.0:
+        return np.full(len(reach), np.inf)
+    moved = np.linalg.solve(np.eye(len(loop)) - loop, q * away)
+    return np.asarray(reach @ moved)
+
+
+def drift_error(lure: Lure, h: float, jump: Floats) -> Floats:
+    """Largest motion of z for a loop that was at rest once, with small input jumps between steps.
+
+    With `|F (u(k+1) - u(k))| <= jump` the motion m of the inverters within any step obeys
+    `m <= d ((1 + 2 q) |H| m + jump)`, if the spectral radius of `(1 + 2 q) diag(d) |H|` is below 1.
+
+    Parameters
+    ----------
+    lure, h
+        As in `held_error`.
+    jump : (m,)
+        Largest change of each argument's own input from one step to the next, squared pu.
+
+    Returns
+    -------
+    (m,)
+        Bound on `|z_i(s) - z_i(0)|`, 0 <= s <= h, squared pu; infinite without a bound.
+
+    References
+    ----------
+    docs/theory-discrete.md, section 5.
+    """
+    q = -np.expm1(np.diagonal(lure.A) * h)
+    reach = np.abs(lure.H)
+    loop = (lure.slope * (1.0 + 2.0 * q))[:, None] * reach
+    if spectral_radius(loop) >= 1.0:
+        return np.full(len(reach), np.inf)
+    moved = np.linalg.solve(np.eye(len(loop)) - loop, lure.slope * jump)
+    return np.asarray(reach @ moved)

@@ -1,0 +1,85 @@
+"""Solver settings, and basis pursuit as a second-order cone program.
+
+References
+----------
+lee2018 (2.1.4), with the Euclidean norm of every block in place of the absolute value of every entry.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+from gridsec.arrays import Floats, Ints
+from gridsec.errors import DesignInfeasible
+
+
+@contextmanager
+def solver_warnings_as_status() -> Iterator[None]:
+    """Suppress the warning about inaccurate solutions; the margin of a design decides."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Solution may be inaccurate", category=UserWarning)
+        yield
+
+
+def cvxpy_late() -> Any:
+    """Import cvxpy late: it takes a second, and only a design needs it. Its annotations are incomplete."""
+    import cvxpy
+
+    return cvxpy
+
+
+def group_pursuit(F: Floats, y: Floats, heights: Ints) -> Floats:
+    """Minimise `sum_i |e_i|_2` subject to `F e = y`.
+
+    Parameters
+    ----------
+    F : (m, N)
+        Sensing matrix.
+    y : (m,)
+        Observation.
+    heights : (p,)
+        Entries of each block of e; they sum to N.
+
+    Returns
+    -------
+    (N,)
+        e.
+
+    Raises
+    ------
+    DesignInfeasible
+        If the solver finds no solution, or its solution does not satisfy `F e = y` to 1e-6 of y.
+    """
+    import cvxpy
+
+    cp: Any = cvxpy  # its annotations are incomplete
+
+    size = float(np.max(np.abs(y), initial=0.0))
+    if size == 0.0:
+        return np.zeros(F.shape[1])
+    e = cp.Variable(F.shape[1])
+    parts = [part for part in np.split(np.arange(F.shape[1]), np.cumsum(heights)[:-1]) if part.size]
+    problem = cp.Problem(cp.Minimize(sum(cp.norm(e[part], 2) for part in parts)), [F @ e == y / size])
+    try:
+        problem.solve(solver=cp.CLARABEL)
+    except cp.error.SolverError as failure:
+        raise DesignInfeasible(
+            "stacked basis pursuit", f"the solver failed: {failure}", code="solver-failed"
+        ) from failure
+    if e.value is None:
+        raise DesignInfeasible("stacked basis pursuit", f"no solution ({problem.status})", code="no-solution")
+    found = size * np.asarray(e.value, dtype=np.float64)
+    gap = float(np.max(np.abs(F @ found - y))) / size
+    if not gap <= 1e-6:
+        raise DesignInfeasible(
+            "stacked basis pursuit",
+            f"{problem.status}, but the equation is violated",
+            -gap,
+            code="not-verified",
+        )
+    return found

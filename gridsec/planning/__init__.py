@@ -1,0 +1,1 @@
+"""Planning studies of a feeder: arrays in, frozen results out."""

@@ -1,0 +1,216 @@
+"""Detectability under the sequential monitor's decision rule, as inequalities: hidden, noticed, named.
+
+Attacks a on trusted meters move the leave-one-out residual of meter j by ``(Q a)_j / Q_jj``. Residuals
+without attack are sub-Gaussian with variance ``1 / Q_jj`` (Gaussian and uniform parts alike). So at one
+moment, on s scales and at p meters together, all are within ``H_j`` with probability at least 1 - risk. Hence
+
+- hidden:  ``|(Q a)_j| <= (limit_j - H_j) Q_jj`` on all scales: no meter is beyond its limit;
+- noticed: an attack without ``|(Q a)_j| <= (limit_j + H_j) Q_jj`` everywhere: some meter is beyond it;
+- named:   every explanation that trusts meter k has a misfit of at least ``m_k^2 / (S_kk + d_k)``,
+  for any readings of all other meters; if that exceeds the cost of the true one by 2 ln(like), there is no
+  rival.
+
+The first two are linear in a but for the number of manipulated meters: `gridsec.planning.collusion` searches
+them.
+
+References
+----------
+D. Hsu, S. Kakade, T. Zhang, "A tail inequality for quadratic forms of subgaussian random vectors", 2012;
+docs/theory-studies.md, section 5; docs/theory-sequential.md, sections 3 to 5.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gridsec.arrays import Bools, Floats
+from gridsec.estimators.sequential.design import SequentialDesign
+from gridsec.estimators.sequential.dictionary import of_a_liar
+from gridsec.estimators.sequential.search import Limits, price
+from gridsec.planning.collusion import Corridor, Shift, corridor, furthest
+
+__all__ = ["Rule", "Shift", "largest_shift", "named_size", "rule", "within"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rule:
+    """The monitor's rule before biases are learned, with all meters trusted. s scales, p meters, n buses.
+
+    Attributes
+    ----------
+    risk
+        Probability that residuals without attack are beyond `honest` somewhere, at one moment.
+    deviations
+        The corresponding standard deviations of a sub-Gaussian variable: ``sqrt(2 ln(2 s p / risk))``.
+    inverse : (s, p, p)
+        Q on each scale.
+    limit, honest : (s, p)
+        Largest offset without evidence, and H, squared pu.
+    noise : (s, p)
+        Variance d of each meter's mean.
+    model : (p,)
+        Error of the model, squared pu.
+    """
+
+    design: SequentialDesign
+    risk: float
+    deviations: float
+    inverse: Floats
+    limit: Floats
+    honest: Floats
+    noise: Floats
+    model: Floats
+
+    def weights(self, bus: int) -> Floats:
+        """Effect of each meter's attack on the reconstruction of a bus, on each scale, (s, p)."""
+        return np.asarray(self.inverse @ self.design.prior.of_meters[bus])
+
+    def spread(self, bus: int) -> float:
+        """Uncertainty of a bus without attack, with the same probability on any scale, squared pu."""
+        prior = self.design.prior
+        row = prior.of_meters[bus]
+        left = prior.variance[bus] - np.einsum("p,spq,q->s", row, self.inverse, row)
+        return self.deviations * float(np.sqrt(np.maximum(left, 0.0).max())) + float(self.model.max())
+
+
+def rule(design: SequentialDesign, *, risk: float, model: Floats) -> Rule:
+    """Compute the rule of a monitor.
+
+    Parameters
+    ----------
+    design
+        The monitor, with its default search.
+    risk
+        As in `Rule`.
+    model : (p,)
+        As in `Rule`.
+    """
+    between, prior = design.prior.between, design.prior
+    need = [max(1, int(np.ceil(design.options.enough * length))) for length in design.lengths]
+    noise = np.array([design.white / n + design.fixed for n in need])
+    inverse = np.array([np.linalg.inv(between + np.diag(d)) for d in noise])
+    std = 1.0 / np.sqrt(np.einsum("sjj->sj", inverse))
+    t = float(np.sqrt(2.0 * np.log(2.0 * std.size / risk)))
+    limit = np.array(
+        [
+            Limits(sigmas, np.zeros_like(model), design.allowed, design.fixed).of(row)
+            for sigmas, row in zip(design.sigmas, std, strict=True)
+        ]
+    )
+    # A meter's own fixed error is fully in its residual, and within the class.
+    rest = np.sqrt(np.maximum(std**2 - design.fixed, 0.0))
+    honest = np.minimum(t * std, design.allowed + t * rest)
+    assert prior.meters.size == model.size  # noqa: S101  # both are of the meters
+    return Rule(design, risk, t, inverse, limit, honest, noise, model)
+
+
+def within(given: Rule, liars: int, *, seen: bool, honest: Bools | None = None) -> Corridor:
+    """Constraints on attacks of at most M meters with all residuals within their bounds.
+
+    Parameters
+    ----------
+    liars
+        M.
+    seen
+        The bound: False for limit - H (certainly within the limit: hidden), True for limit + H + the
+        model error on both sides (beyond it, some meter certainly exceeds its limit).
+    honest : (p,), optional
+        Meters that cannot be manipulated.
+    """
+    s, p = given.limit.shape
+    width = given.limit + given.honest + 2.0 * given.model if seen else given.limit - given.honest
+    if liars < 1 or (width <= 0.0).any():
+        return Corridor(np.zeros((0, p)), np.zeros(p), 1)
+    size = np.einsum("sjj->sj", given.inverse)
+    rows = (given.inverse / (width * size)[:, :, None]).reshape(s * p, p)
+    # |a| <= |Q^-1| |Q a|
+    most = np.min(
+        [np.abs(np.linalg.inv(Q)) @ (w * d) for Q, w, d in zip(given.inverse, width, size, strict=True)], 0
+    )
+    return corridor(rows, liars, reach=most if honest is None else np.where(honest, 0.0, most))
+
+
+def largest_shift(
+    given: Rule,
+    along: Floats,
+    liars: int,
+    *,
+    seen: bool,
+    must: int | None = None,
+    honest: Bools | None = None,
+) -> Shift:
+    """Largest displacement by attacks on at most M meters with all residuals within their bounds.
+
+    Parameters
+    ----------
+    given, liars, seen, honest
+        As in `within`.
+    along : (p,) or (d, p)
+        Displacement per attack on each meter; a unit vector for the attack on one meter itself. Of several
+        rows, the one with the largest displacement.
+    must
+        A meter that is manipulated in any case.
+    """
+    return furthest(within(given, liars, seen=seen, honest=honest), along, must=must)
+
+
+def named_size(given: Rule, meter: int, liars: int, *, claims: Floats) -> float:
+    """Smallest attack on a meter above which no explanation that trusts it is a rival, squared pu.
+
+    It holds for any attacks on other meters. The true explanation, with at most M manipulated meters, costs
+    at most ``p + 2 sqrt(p t) + 2 t + 2 ln binom(p, M)``, t = -ln risk, except with probability risk (Hsu,
+    Kakade and Zhang 2012, for sub-Gaussian residuals). Trusting k, accusing n others and freeing directions D
+    costs at least ``m_k^2 / (S_kk + d_k + sum_D s^2 b_k^2) + 2 ln binom(p, n)`` plus the charges of D. The
+    best D is bounded by a fractional knapsack, for every n from which charges are lower. Without k, its
+    offset is evidence.
+
+    Parameters
+    ----------
+    meter
+        k.
+    liars
+        M.
+    claims : (N,)
+        Size of each customer's possibly false powers, as in the monitor's dictionary, pu.
+    """
+    design, (_, p) = given.design, given.limit.shape
+    bus = np.array([design.prior.meters[meter]])
+    book = design.book
+    std = np.concatenate([claims, book.std[design.customers :]])
+    at = book.columns(np.arange(std.size))[bus[0]]
+    loose = (std * at) ** 2
+    # The charge of a power is lowest while its customer's meter is not trusted, and falls with the number of
+    # accused meters: use the next number with a lower charge.
+    numbers = [0, *(k for k in range(1, p) if of_a_liar(k) < of_a_liar(k - 1))]
+    of_customers = np.arange(std.size) < design.customers
+    ways = [
+        (np.where(of_customers, np.minimum(book.charge, of_a_liar(k)), book.charge), price(p, k))
+        for k in numbers
+    ]
+    t = -float(np.log(given.risk))
+    truth = p + 2.0 * np.sqrt(p * t) + 2.0 * t + price(p, liars) + 2.0 * np.log(design.options.like)
+    sizes = []
+    for d, sigmas in zip(given.noise[:, meter], design.sigmas, strict=True):
+        own = float(design.prior.variance[bus[0]] + d)
+        honest = given.deviations * np.sqrt(own) + float(given.model[meter])
+        evidence = sigmas * np.sqrt(own) + float(given.model[meter])
+        rivals = (_worst(own, loose, each * price(p, 1), truth - others) for each, others in ways)
+        sizes.append(max(np.sqrt(max(rivals)), evidence) + honest)
+    return float(min(sizes))
+
+
+def _worst(own: float, gain: Floats, cost: Floats, budget: float) -> float:
+    """Maximum of ``(own + G(C)) (budget - C)`` over C >= 0, G the fractional knapsack of gains for costs."""
+    order = np.argsort(-gain / cost)
+    total, spent, best = own, 0.0, own * budget
+    for k in order:
+        if spent >= budget or gain[k] <= 0.0:
+            break
+        slope = gain[k] / cost[k]
+        # Along this piece: (total + slope u) (budget - spent - u), a parabola in u.
+        u = float(np.clip(0.5 * (budget - spent - total / slope), 0.0, cost[k]))
+        best = max(best, (total + slope * u) * (budget - spent - u))
+        total, spent = total + gain[k], spent + cost[k]
+    return best

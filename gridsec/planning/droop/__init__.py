@@ -1,0 +1,1 @@
+"""Droop inverters on the AC feeder: sensitivities, equilibria, stability."""

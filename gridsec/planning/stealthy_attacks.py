@@ -1,0 +1,299 @@
+"""Largest manipulations that no test without false alarms detects, with true or with false powers.
+
+Squared voltages differ from the model by ``w = B c``, c in the box [-1, 1]^k, and unmanipulated readings by
+at most e. Attacks ``a`` on the meters J stay undetected if some other c', e' of an unmanipulated feeder give
+the same readings; halving the differences,
+
+    a_k / 2 = b_k c + e_k (-1 .. 1),    |b_j c| <= e_j  for all meters j outside J.
+
+So the largest consistent attack on meter k is ``2 max (b_k c + e_k)`` over c and over J with k in J and
+|J| <= M: a mixed-integer program with tight big-M constants, ``sum |b_j| - e_j``. The resulting error of a
+customer's voltage is the same program with ``2 max b_i c``.
+
+As in `gridsec.planning.stealthy_attacks`, but a customer's powers are known within the meter's errors only
+while that meter is unmanipulated. The powers of a manipulated meter are anywhere in the customer's range, the
+true ones and the reported ones:
+
+    |b_j c| <= e_j  for all meters j outside J,    |c_i| <= n_i  for unknowns i with a meter outside J.
+
+With a binary for every meter this is a mixed-integer program again.
+
+References
+----------
+docs/theory-studies.md, section 3.
+docs/theory-studies.md, section 4.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import Bounds, LinearConstraint, linprog, milp
+
+from gridsec.arrays import Bools, Floats, Ints
+from gridsec.errors import DesignInfeasible, InputInvalid, Problem
+
+__all__ = ["Box", "FalsePowers", "Fit", "largest_lie", "largest_of", "largest_story", "worst_error"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Box:
+    """Errors of unmanipulated customers and meters. N customers, k unknowns, p meters.
+
+    Attributes
+    ----------
+    effect : (N, k)
+        B: effect of each unknown, at the end of its interval, on the squared voltages, pu.
+    meters : (p,)
+        Customer of each meter.
+    reading : (p,)
+        e: largest error of an unmanipulated squared reading, pu; positive.
+
+    Raises
+    ------
+    ValueError
+        If numbers of meters differ, an effect is not finite, or an error of a reading not positive.
+    """
+
+    effect: Floats
+    meters: Ints
+    reading: Floats
+
+    def __post_init__(self) -> None:
+        if self.reading.shape != self.meters.shape or self.effect.ndim != 2:
+            raise InputInvalid(
+                [Problem("shape", f"{self.reading.size} errors of {self.meters.size} readings")]
+            )
+        if not (
+            np.isfinite(self.effect).all() and np.isfinite(self.reading).all() and (self.reading > 0).all()
+        ):
+            raise InputInvalid(
+                [
+                    Problem(
+                        "not-positive", "effects must be finite, and errors of readings finite and positive"
+                    )
+                ]
+            )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """Largest attack, or error, consistent with an unmanipulated feeder.
+
+    Attributes
+    ----------
+    size
+        Squared pu; reached by `liars` with the unknowns at `unknowns`. 0 without possible attacks.
+    bound
+        Upper bound of the solver; at least `size`.
+    liars
+        Meters that must be manipulated for it.
+    unknowns : (k,)
+        c.
+    """
+
+    size: float
+    bound: float
+    liars: Ints
+    unknowns: Floats
+
+
+def largest_lie(box: Box, meter: int, liars: int, *, honest: Bools | None = None) -> Fit:
+    """Largest attack on a meter, in collusion with others, that is consistent with an unmanipulated feeder.
+
+    Parameters
+    ----------
+    liars
+        Largest number of manipulated meters, this one among them.
+    honest : (p,), optional
+        Protected meters: they cannot be manipulated.
+
+    Raises
+    ------
+    DesignInfeasible
+        If the solver fails.
+    """
+    honest = np.zeros(box.meters.size, dtype=np.bool_) if honest is None else honest
+    if honest[meter] or liars < 1:
+        return Fit(0.0, 0.0, np.zeros(0, dtype=np.intp), np.zeros(box.effect.shape[1]))
+    found = _most(box, box.effect[box.meters[meter]], liars, honest, meter)
+    own = 2.0 * float(box.reading[meter])
+    return Fit(found.size + own, found.bound + own, found.liars, found.unknowns)
+
+
+def worst_error(box: Box, customer: int, liars: int, *, honest: Bools | None = None) -> Fit:
+    """Largest difference of a customer's voltage between two states with the same readings.
+
+    Parameters
+    ----------
+    box, liars, honest
+        As in `largest_lie`; with `liars` = 0, the uncertainty under unmanipulated meters.
+    """
+    honest = np.zeros(box.meters.size, dtype=np.bool_) if honest is None else honest
+    return _most(box, box.effect[customer], liars, honest, None)
+
+
+# Relative excess over its own error that counts as the solver's rounding, not as an attack.
+_HONEST = 1e-6
+
+
+def _most(box: Box, row: Floats, liars: int, honest: Bools, must: int | None) -> Fit:
+    """Maximise ``2 row c`` with integers, then again with fixed meters, so that the maximum is attained."""
+    scaled = box.effect[box.meters] / box.reading[:, None]
+    slack = np.maximum(np.abs(scaled).sum(axis=1) - 1.0, 0.0)
+    able = ~honest & (slack > 0.0)
+    if must is not None:
+        able[must] = True
+    size = float(np.abs(row).sum())
+    # Meters that cannot exceed their own error need no binary; without binaries it is a linear program.
+    if not size:
+        liar = np.zeros(0, dtype=np.intp) if must is None else np.array([must], dtype=np.intp)
+        return Fit(0.0, 0.0, liar, np.zeros(row.size))
+    chosen, bound = able, 0.0
+    if int(np.count_nonzero(able)) > liars:
+        chosen, bound = _choose(scaled, slack, row / size, liars, able, must=must)
+    c = _reach(scaled[~chosen], row / size)
+    reached = 2.0 * float(row @ c)
+    beyond = chosen & (np.abs(scaled @ c) > 1.0 + _HONEST)
+    if must is not None:
+        beyond[must] = True
+    return Fit(reached, max(reached, 2.0 * size * bound), np.flatnonzero(beyond), c)
+
+
+def _choose(
+    scaled: Floats, slack: Floats, row: Floats, liars: int, able: Bools, *, must: int | None
+) -> tuple[Bools, float]:
+    """Choice of manipulated meters by HiGHS, and its bound of the maximum of ``row c``."""
+    p, k = scaled.shape
+    who = np.flatnonzero(able)
+    open_ = np.zeros((p, who.size))
+    open_[who, np.arange(who.size)] = slack[who]
+    least = (who == must).astype(np.float64)
+    found = milp(
+        np.concatenate([-row, np.zeros(who.size)]),
+        constraints=[
+            LinearConstraint(np.hstack([scaled, -open_]), ub=np.ones(p)),
+            LinearConstraint(np.hstack([-scaled, -open_]), ub=np.ones(p)),
+            LinearConstraint(np.concatenate([np.zeros(k), np.ones(who.size)])[None, :], ub=float(liars)),
+        ],
+        bounds=Bounds(np.concatenate([-np.ones(k), least]), np.concatenate([np.ones(k), np.ones(who.size)])),
+        integrality=np.concatenate([np.zeros(k), np.ones(who.size)]),
+        options={"mip_rel_gap": 1e-6},
+    )
+    if found.x is None:
+        raise DesignInfeasible("largest attack consistent with the feeder", found.message, code="no-solution")
+    chosen = np.zeros(p, dtype=np.bool_)
+    chosen[who] = found.x[k:] > 0.5
+    return chosen, float(-found.mip_dual_bound)
+
+
+def _reach(scaled: Floats, row: Floats) -> Floats:
+    """The c that attains the maximum while the rows `scaled` are unmanipulated."""
+    if not row.size:
+        return row
+    found = linprog(
+        -row,
+        A_ub=np.vstack([scaled, -scaled]) if scaled.size else None,
+        b_ub=np.ones(2 * scaled.shape[0]) if scaled.size else None,
+        bounds=(-1.0, 1.0),
+    )
+    if found.x is None:
+        raise DesignInfeasible("largest attack consistent with the feeder", found.message, code="no-solution")
+    return np.asarray(found.x)
+
+
+# Excess over an unmanipulated share that counts as the solver's rounding.
+_HONEST_REPORTS = 1e-6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FalsePowers:
+    """Errors of meters and customers, manipulated or not. k unknowns, p meters.
+
+    Attributes
+    ----------
+    box
+        Unknowns at the ends of their ranges under manipulated meters.
+    owner : (k,)
+        Meter that determines each unknown; -1 for none.
+    honest : (k,)
+        Share of that range while its meter is unmanipulated, 0 to 1.
+    """
+
+    box: Box
+    owner: Ints
+    honest: Floats
+
+    def told(self, liars: Bools) -> Box:
+        """The box while the meters in the mask (p,) may report any powers."""
+        free = (self.owner >= 0) & liars[self.owner]
+        return replace(self.box, effect=self.box.effect * np.where(free, 1.0, self.honest))
+
+
+def largest_story(given: FalsePowers, meter: int, liars: int, *, honest: Bools | None = None) -> Fit:
+    """Largest attack on a meter consistent with an unmanipulated feeder, with false powers of such meters.
+
+    Parameters
+    ----------
+    meter, liars, honest
+        As in `gridsec.planning.stealthy_attacks.largest_lie`. Protected meters report true powers, too.
+
+    Raises
+    ------
+    DesignInfeasible
+        If the solver fails.
+    """
+    p = given.box.meters.size
+    honest = np.zeros(p, dtype=np.bool_) if honest is None else honest
+    chosen, bound = np.arange(p) == meter, 0.0
+    if liars > 1 and not honest[meter]:
+        chosen, bound = _choose_reports(given, meter, liars, honest)
+    box = given.told(chosen)
+    found = largest_lie(box, meter, liars, honest=honest | ~chosen)
+    if honest[meter] or liars < 1:
+        return found
+    # A meter with false powers is manipulated at any voltage. Powers without effect are not false.
+    free = (given.owner >= 0) & chosen[given.owner] & box.effect.any(axis=0)
+    false = free & (np.abs(found.unknowns) > given.honest + _HONEST_REPORTS)
+    who = np.union1d(found.liars, given.owner[false]).astype(np.intp)
+    return replace(found, bound=max(found.size, bound), liars=who)
+
+
+def largest_of(given: Box | FalsePowers, meter: int, liars: int, *, honest: Bools | None = None) -> Fit:
+    """`largest_lie` of a box, and `largest_story` of false powers."""
+    if isinstance(given, FalsePowers):
+        return largest_story(given, meter, liars, honest=honest)
+    return largest_lie(given, meter, liars, honest=honest)
+
+
+def _choose_reports(given: FalsePowers, meter: int, liars: int, honest: Bools) -> tuple[Bools, float]:
+    """Choice of manipulated meters by HiGHS, and its bound of the meter's attack."""
+    box = given.box
+    p, k = box.meters.size, box.effect.shape[1]
+    row = box.effect[box.meters[meter]]
+    size, own = float(np.abs(row).sum()) or 1.0, 2.0 * float(box.reading[meter])
+    scaled = box.effect[box.meters] / box.reading[:, None]
+    slack = np.diag(np.maximum(np.abs(scaled).sum(axis=1) - 1.0, 0.0))
+    freed = np.flatnonzero((given.owner >= 0) & (given.honest < 1.0))
+    unit, gain = np.eye(k)[freed], np.zeros((freed.size, p))
+    gain[np.arange(freed.size), given.owner[freed]] = 1.0 - given.honest[freed]
+    most = np.concatenate([np.where(given.owner < 0, given.honest, 1.0), ~honest])
+    least = (np.arange(p) == meter).astype(np.float64)
+    found = milp(
+        np.concatenate([-row / size, np.zeros(p)]),
+        constraints=[
+            LinearConstraint(np.hstack([sign * scaled, -slack]), ub=np.ones(p)) for sign in (1.0, -1.0)
+        ]
+        + [LinearConstraint(np.hstack([sign * unit, -gain]), ub=given.honest[freed]) for sign in (1.0, -1.0)]
+        + [LinearConstraint(np.concatenate([np.zeros(k), np.ones(p)])[None, :], ub=float(liars))],
+        bounds=Bounds(np.concatenate([-most[:k], least]), most),
+        integrality=np.concatenate([np.zeros(k), np.ones(p)]),
+        # Presolve has nothing to remove, and a solution without it needs no postsolve.
+        options={"mip_rel_gap": 1e-6, "presolve": False},
+    )
+    if found.x is None:
+        raise DesignInfeasible(
+            "largest attack with false powers consistent with the feeder", found.message, code="no-solution"
+        )
+    return found.x[k:] > 0.5, 2.0 * size * float(-found.mip_dual_bound) + own

@@ -1,0 +1,490 @@
+"""l0 decoding: exact search, rows with bounds of their own, and recovery without enumeration.
+
+    F_(p,r)(z) = {Phi_Lambda^+ z_Lambda : |Lambda| = p - r},   q <= r <= 2q
+
+always contains a good answer, so C(p, r) candidates take the place of R^n. One pass serves the
+noiseless decoder and the one for bounded noise; they differ in the criterion for an explained block.
+
+    s = B xi + v + e,     |xi_i| <= 1,     |v_k| <= 1,     e zero in all but q blocks
+
+xi is the state in units of its prior intervals: rows of an identity that cannot be attacked, such as a
+model's own prediction and loads within their intervals. For every set of q blocks the least-squares fit to
+all others is made. With W = (I + B B^T)^-1, Lambda the rows that are kept, D the others and
+``g = W_DD^-1 W_D s``,
+
+    residual_Lambda = W_Lambda s - W_LambdaD g,     residual_D = g,
+
+and both are known matrices times (xi, v). The largest value of a row of blocks without attack is therefore
+the sum of absolute values of its coefficients, attained by some xi and v; no norm is estimated.
+
+Both recover the error from `F z = F e`, F an annihilator of Phi, fast, but under stronger conditions than
+correctability; otherwise they may fail. `gridsec.secure.decode.search` has no such conditions.
+
+References
+----------
+lee2018 (2.2.4) to (2.2.6), (2.2.8) to (2.2.8''), Theorems 2.2.7 and 2.2.11.
+lee2018 (2.2.8') and Theorem 2.2.11 with r = q, for boxes instead of balls; docs/theory-partial-observers.md,
+section 8.
+lee2018, section 2.1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import comb
+
+import numpy as np
+from scipy.optimize import linprog
+
+from gridsec.arrays import Bools, Floats, Ints, frozen, not_negative
+from gridsec.errors import DesignInfeasible, InputInvalid, Problem
+from gridsec.observers.lmi.solver import group_pursuit
+from gridsec.secure.decode.stacks import MOST_SUBSETS, Stack, annihilator, masked, require, subsets
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Decoder:
+    """Part of l0 decoding that does not depend on the measurements.
+
+    Attributes
+    ----------
+    stack
+        Phi.
+    max_attacked
+        q, number of blocks that may be in error.
+    left_out
+        r, number of blocks that each candidate ignores.
+    kept : (S, p - r)
+        The blocks used by each candidate.
+    inverses : (S, n, N)
+        Pseudo-inverses of `Phi_Lambda`; zero in the columns of ignored blocks.
+    """
+
+    stack: Stack
+    max_attacked: int
+    left_out: int
+    kept: Ints
+    inverses: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Decoded:
+    """Result for a batch of measurements.
+
+    Attributes
+    ----------
+    x : (…, n)
+        Decoded unknowns.
+    in_error : (…, p)
+        Blocks that x does not explain.
+    credible : (…)
+        True if these are at most q, as assumed. Otherwise more than q blocks are in error or the noise
+        exceeds its bound, and x is invalid.
+    residuals : (…, p)
+        Norms of `z_i - Phi_i x`.
+    """
+
+    x: Floats
+    in_error: Bools
+    credible: Bools
+    residuals: Floats
+
+
+def cheapest(p: int, q: int) -> int:
+    """The r in q … 2q with the fewest candidates C(p, r); of several the smallest, with most averaging.
+
+    References
+    ----------
+    lee2018, Remark 2.2.2.
+    """
+    return min(range(q, 2 * q + 1), key=lambda r: (comb(p, r), r))
+
+
+def design(
+    stack: Stack, max_attacked: int, *, tol: float, left_out: int | None = None, most: int = MOST_SUBSETS
+) -> Decoder:
+    """Prepare l0 decoding.
+
+    Parameters
+    ----------
+    stack
+        Phi; must be q-error correctable.
+    max_attacked
+        q.
+    tol
+        Tolerance of that test, relative to blocks of norm one.
+    left_out
+        r between q and 2q; by default the cheapest.
+
+    Raises
+    ------
+    NotObservable
+        If Phi is not q-error correctable; the message lists sensors with a loss that proves it.
+    DesignInfeasible
+        If there would be more than `most` candidates.
+    ValueError
+        Unless 0 <= q <= r <= 2 q.
+    """
+    q = max_attacked
+    r = cheapest(stack.count, q) if left_out is None else left_out
+    if q < 0 or not q <= r <= 2 * q:
+        raise InputInvalid(
+            [
+                Problem(
+                    "out-of-range",
+                    f"r = {r} with q = {q}; expected 0 <= q <= r <= 2 q (lee2018, Theorem 2.2.7)",
+                )
+            ]
+        )
+    require(stack, 2 * q, tol, f"undoing {q} errors")
+    kept = subsets(stack.count, stack.count - r, most)
+    inverses = np.asarray(np.linalg.pinv(masked(stack, kept)), dtype=np.float64)
+    return Decoder(stack, q, r, kept, frozen(inverses))
+
+
+def exact(decoder: Decoder, z: Floats, *, tol: float) -> Decoded:
+    """Noiseless l0 decoding: recovers x exactly from any error in at most q blocks.
+
+    Parameters
+    ----------
+    z : (…, N)
+        Measurements, finite.
+    tol
+        A block counts as explained if its residual is at most this times `|z_i| + |Phi_i| |x|`.
+
+    References
+    ----------
+    lee2018 (2.2.6), Theorem 2.2.7.
+    """
+    size = np.linalg.norm(decoder.stack.blocks(), 2, axis=(1, 2)) if decoder.stack.matrix.size else 0.0
+    x = _candidates(decoder, z)
+    limit = tol * (decoder.stack.norms(z)[..., None, :] + np.linalg.norm(x, axis=-1)[..., None] * size)
+    return _vote(decoder, z, x, limit)
+
+
+def bounded(decoder: Decoder, z: Floats, *, limit: Floats | float) -> Decoded:
+    """l0 decoding with bounded noise: fewest blocks with a residual above a limit.
+
+    Parameters
+    ----------
+    z : (…, N)
+        Measurements, finite.
+    limit : scalar or (…, 1) or (…, p)
+        `v'_max = theta v_max`, for which `gridsec.secure.decode.noise` gives the error bound; not negative.
+
+    Returns
+    -------
+    Decoded
+        Of several minimisers the one with the best fit of the explained blocks; the bound holds for all.
+
+    Raises
+    ------
+    ValueError
+        If a limit is negative or NaN.
+
+    References
+    ----------
+    lee2018 (2.2.8'), Proposition 2.2.10, Theorem 2.2.11.
+    """
+    wide = not_negative("limit", limit)
+    return _vote(decoder, z, _candidates(decoder, z), wide if wide.ndim == 0 else wide[..., None, :])
+
+
+def _candidates(decoder: Decoder, z: Floats) -> Floats:
+    """All candidates, (…, S, n), by one product for the whole batch."""
+    S, n, N = decoder.inverses.shape
+    flat = np.asarray(z, dtype=np.float64) @ decoder.inverses.reshape(S * n, N).T
+    return flat.reshape(*flat.shape[:-1], S, n)
+
+
+def _vote(decoder: Decoder, z: Floats, x: Floats, limit: Floats) -> Decoded:
+    stack = decoder.stack
+    sizes = stack.norms(np.asarray(z)[..., None, :] - x @ stack.matrix.T)
+    # Negated comparison: a residual of NaN counts as unexplained.
+    unexplained = ~(sizes <= limit)
+    count = np.count_nonzero(unexplained, axis=-1)
+    misfit = np.where(unexplained, 0.0, sizes).sum(axis=-1)
+    best = np.argmin(np.where(count == count.min(axis=-1, keepdims=True), misfit, np.inf), axis=-1)
+    pick = best[..., None, None]
+    chosen = np.take_along_axis(unexplained, pick, axis=-2)[..., 0, :]
+    return Decoded(
+        np.take_along_axis(x, pick, axis=-2)[..., 0, :],
+        chosen,
+        np.count_nonzero(chosen, axis=-1) <= decoder.max_attacked,
+        np.take_along_axis(sizes, pick, axis=-2)[..., 0, :],
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fits:
+    """Fits that leave q blocks out, for all sets. S sets, p blocks, A rows, n unknowns, F functionals.
+
+    Attributes
+    ----------
+    left_out : (S, p)
+        The blocks left out by each fit.
+    residual, limit : (S, A)
+        ``s - B xi_hat`` and its largest value if all blocks outside the set are unmanipulated and, for rows
+        of the set, these as well.
+    reach : (A,)
+        Largest value of ``|s|`` of an unmanipulated row: the limit of the fit without blocks.
+    disagree : (S, p)
+        Blocks with a residual above its limit, or a value above `reach`.
+    xi : (S, n)
+        Fitted unknowns.
+    error : (S, F)
+        Bound of ``|f (xi - xi_hat)|`` for each functional, if all blocks outside the set are unmanipulated.
+    """
+
+    left_out: Bools
+    residual: Floats
+    limit: Floats
+    reach: Floats
+    disagree: Bools
+    xi: Floats
+    error: Floats
+
+    @property
+    def credible(self) -> Bools:
+        """Fits that explain every block in them; (S,). A set of unmanipulated blocks always does."""
+        return np.asarray(~(self.disagree & ~self.left_out).any(axis=1))
+
+    @property
+    def certain(self) -> Bools:
+        """Blocks left out by every credible fit; (p,). None if no fit is credible.
+
+        If at most q blocks are attacked, an unmanipulated block j belongs to some set of p - q unmanipulated
+        ones. The fit of that set is credible and does not leave j out: a certain block is attacked.
+        """
+        fine = self.credible
+        return np.asarray(self.left_out[fine].all(axis=0) & fine.any())
+
+    @property
+    def contradicted(self) -> Bools:
+        """Blocks that some fit uses and does not explain; (p,). If there is one, some block is attacked."""
+        return np.asarray((self.disagree & ~self.left_out).any(axis=0))
+
+
+def fits(  # noqa: PLR0917  # the terms of s = B xi + v, then the requested bounds
+    B: Floats, s: Floats, block: Ints, blocks: int, q: int, functionals: Floats, *, most: int = MOST_SUBSETS
+) -> Fits:
+    """Fit the unknowns without every set of q blocks, with the limits of unmanipulated rows.
+
+    Parameters
+    ----------
+    B : (A, n)
+        Rows that can be attacked, in units of their own bounds.
+    s : (A,)
+        Their values.
+    block : (A,)
+        Block of each row. A block without rows can be left out too, and never disagrees.
+    blocks
+        p.
+    q
+        Number of blocks that each fit leaves out; all of them if fewer have rows.
+    functionals : (F, n)
+        Functionals to bound.
+
+    Raises
+    ------
+    DesignInfeasible
+        If there are more sets.
+    """
+    present = np.unique(block)
+    chosen = present[subsets(present.size, min(q, present.size), most)]
+    left_out = np.zeros((len(chosen), blocks), dtype=np.bool_)
+    np.put_along_axis(left_out, chosen.astype(np.intp), values=True, axis=1)
+    W = np.asarray(np.linalg.inv(np.eye(s.size) + B @ B.T), dtype=np.float64)
+    P = W @ B
+    whole = _Whole(W, P, W @ s, functionals - functionals @ (B.T @ P), functionals @ P.T)
+    made = [_without(whole, out[block], functionals) for out in left_out]
+    residual, limit, error = (np.array([one[k] for one in made]) for k in range(3))
+    disagree = np.zeros((len(made), blocks), dtype=np.bool_)
+    reach = 1.0 + np.abs(B).sum(axis=1)
+    over = (np.abs(residual) > limit * _ROUNDING) | (np.abs(s) > reach * _ROUNDING)
+    for j in present:
+        disagree[:, j] = over[:, block == j].any(axis=1)
+    # xi_hat = B_Lambda^T W_Lambda s_Lambda, and the residual on Lambda is W_Lambda s_Lambda.
+    xi = np.where(left_out[:, block], 0.0, residual) @ B
+    return Fits(left_out, residual, limit, reach, disagree, xi, error)
+
+
+_ROUNDING = 1.0 + 1e-9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Whole:
+    """Fit to all rows, the base of the updates."""
+
+    W: Floats  # (A, A)
+    P: Floats  # (A, n) W B
+    ws: Floats  # (A,)
+    by_xi: Floats  # (F, n) error of the functionals, by xi
+    by_v: Floats  # (F, A) and by v
+
+
+def _without(whole: _Whole, out: Bools, functionals: Floats) -> tuple[Floats, Floats, Floats]:
+    """Residuals, their limits, and the functionals' bounds without some rows; block elimination of W."""
+    W, P, kept = whole.W, whole.P, ~out
+    if not out.any():
+        limit = np.abs(P).sum(axis=1) + np.abs(W).sum(axis=1)
+        return whole.ws, limit, np.abs(whole.by_xi).sum(axis=1) + np.abs(whole.by_v).sum(axis=1)
+    WD = W[out]
+    # (rows of D, [value | by xi | by v]): part of D not explained by the kept rows.
+    solved = np.linalg.solve(WD[:, out], np.column_stack([whole.ws[out], P[out], WD * kept]))
+    g, by_xi, by_v = solved[:, 0], solved[:, 1 : 1 + P.shape[1]], solved[:, 1 + P.shape[1] :]
+    residual, limit = np.empty(out.size), np.empty(out.size)
+    residual[out], limit[out] = g, np.abs(by_xi).sum(axis=1) + np.abs(by_v).sum(axis=1) + 1.0
+    across = W[np.ix_(kept, out)]
+    residual[kept] = whole.ws[kept] - across @ g
+    inner = np.abs(W[np.ix_(kept, kept)] - across @ by_v[:, kept]).sum(axis=1)
+    limit[kept] = np.abs(P[kept] - across @ by_xi).sum(axis=1) + inner
+    f = functionals @ P[out].T
+    error = np.abs(whole.by_xi + f @ by_xi).sum(axis=1)
+    error += np.abs(whole.by_v[:, kept] - f @ by_v[:, kept]).sum(axis=1)
+    return residual, limit, error
+
+
+def restricted_isometry(F: Floats, k: int, *, most: int = MOST_SUBSETS) -> float:
+    """Smallest delta_k with `(1 - delta) |e|^2 <= |F e|^2 <= (1 + delta) |e|^2` for all k-sparse e.
+
+    Parameters
+    ----------
+    F : (m, p)
+        Sensing matrix. Its scale matters.
+    k
+        Order.
+    most
+        Largest number of subsets of columns.
+
+    References
+    ----------
+    lee2018, Definition 2.1.1.
+    """
+    columns = subsets(F.shape[1], min(k, F.shape[1]), most)
+    gram = F.T @ F
+    values = np.linalg.eigvalsh(gram[columns[:, :, None], columns[:, None, :]])
+    return float(np.max(np.abs(values - 1.0), initial=0.0))
+
+
+def basis_pursuit(F: Floats, y: Floats) -> Floats:
+    """Minimise `|e|_1` subject to `F e = y`, as a linear program.
+
+    Parameters
+    ----------
+    F : (m, p)
+        Sensing matrix.
+    y : (m,)
+        Observation.
+
+    Returns
+    -------
+    (p,)
+        e; the sparse one if `delta_2q < sqrt(2) - 1`.
+
+    Raises
+    ------
+    DesignInfeasible
+        If no e satisfies the constraint.
+
+    References
+    ----------
+    lee2018 (2.1.4), Theorem 2.1.1.
+    """
+    p = F.shape[1]
+    size = float(np.max(np.abs(y), initial=0.0))
+    if size == 0.0:
+        return np.zeros(p)
+    # Scaled, because the solver's tolerances are absolute.
+    found = linprog(np.ones(2 * p), A_eq=np.hstack([F, -F]), b_eq=y / size, method="highs")
+    if not found.success or found.x is None:
+        raise DesignInfeasible("basis pursuit", f"linear program: {found.message}", code="no-solution")
+    return np.asarray(size * (found.x[:p] - found.x[p:]))
+
+
+def matching_pursuit(F: Floats, y: Floats, q: int, *, heights: Ints | None = None) -> tuple[Floats, Ints]:
+    """Orthogonal matching pursuit: q times the block of columns that explains the residual best.
+
+    Parameters
+    ----------
+    F : (m, N)
+        Sensing matrix.
+    y : (m,)
+        Observation.
+    q
+        Number of blocks to choose.
+    heights : (p,)
+        Columns per block; single columns by default, which is the paper's algorithm. A block's
+        correlation is the norm of the projection of the residual on its columns.
+
+    Returns
+    -------
+    e : (N,)
+        Least squares on the chosen blocks, zero elsewhere.
+    chosen : (q,)
+        The blocks, in the order of their choice; fewer if the residual vanishes or all are chosen earlier.
+
+    References
+    ----------
+    lee2018, Algorithm 2.1, Theorem 2.1.2.
+    """
+    sizes = np.ones(F.shape[1], dtype=np.intp) if heights is None else heights
+    parts = np.split(np.arange(F.shape[1]), np.cumsum(sizes)[:-1])
+    bases = [np.linalg.qr(F[:, part])[0] for part in parts]
+    chosen: list[int] = []
+    e, rest = np.zeros(F.shape[1]), y
+    while len(chosen) < min(q, len(parts)) and np.any(rest):
+        match = np.array([np.linalg.norm(b.T @ rest) for b in bases])
+        # Prevents a second choice of a block by rounding.
+        match[chosen] = -1.0
+        chosen.append(int(np.argmax(match)))
+        at = np.concatenate([parts[i] for i in chosen])
+        e = np.zeros(F.shape[1])
+        e[at] = np.linalg.lstsq(F[:, at], y, rcond=None)[0]
+        rest = y - F @ e
+    return e, np.array(chosen, dtype=np.intp)
+
+
+def decode_by_pursuit(stack: Stack, z: Floats, *, tol: float) -> Floats:
+    """Decode by basis pursuit: rows as single errors, or whole blocks by their Euclidean norms.
+
+    A stack of single rows is solved as a linear program; otherwise `sum_i |e_i|_2` is minimised, a
+    second-order cone program, because an attack has no pattern within the block of its sensor.
+
+    Parameters
+    ----------
+    stack
+        Phi of full column rank.
+    z : (N,)
+        Measurements.
+    tol
+        As in `annihilator`.
+
+    Returns
+    -------
+    (n,)
+        `Phi^+ (z - e)`.
+
+    References
+    ----------
+    lee2018 (2.1.4); Remark 2.2.2.
+    """
+    F = annihilator(stack.matrix, tol=tol)
+    single = bool(np.all(stack.heights == 1))
+    e = basis_pursuit(F, F @ z) if single else group_pursuit(F, F @ z, stack.heights)
+    return np.asarray(np.linalg.lstsq(stack.matrix, z - e, rcond=None)[0])
+
+
+def decode_by_matching(stack: Stack, z: Floats, q: int, *, tol: float) -> tuple[Floats, Ints]:
+    """Decode by orthogonal matching pursuit; x and the blocks assumed in error.
+
+    Parameters
+    ----------
+    stack, z, tol
+        As in `decode_by_pursuit`.
+    q
+        Number of blocks in error.
+    """
+    F = annihilator(stack.matrix, tol=tol)
+    e, chosen = matching_pursuit(F, F @ z, q, heights=stack.heights)
+    return np.asarray(np.linalg.lstsq(stack.matrix, z - e, rcond=None)[0]), chosen

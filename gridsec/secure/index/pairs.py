@@ -1,0 +1,775 @@
+"""Redundant observability and detectability of a pair (A, C), eigenspaces, and security indices.
+
+In floating point a repeated eigenvalue comes back as a cluster. An m-fold one of a Jordan block spreads by
+`eps^(1/m)`, far more than the distance of distinct ones can be, so no threshold on distances separates the
+two. The restriction of A to the invariant subspace of a cluster does: minus its mean eigenvalue it is
+nilpotent and singular if the cluster is one eigenvalue, and not if it is several.
+
+Everything has two independent forms: by ranks of observability matrices, and by eigenvectors. The
+latter minimise over each whole eigenspace, which covers repeated eigenvalues, defective or not.
+
+For `x(k+1) = A x + B a`, `y = C x + D a` with an unknown a. With B = 0 and D the identity on the
+manipulated sensors this is a system under attack, which ties chapter 3 of lee2018 to the geometric theory.
+
+References
+----------
+lee2018, chapter 3. Corrections: docs/errata/lee2018-chapter-3.md.
+lee2018, chapter 3; chong2020 (9).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import lapack, schur
+
+from gridsec.arrays import Bools, Floats, Ints, frozen_ints, unit_rows
+from gridsec.errors import no_choice, refuse
+from gridsec.observers.lure import Lure
+from gridsec.secure.index.blocks import Matrix, fewest, kernel, row_space, span
+
+Complexes = NDArray[np.complex128]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Eigenspace:
+    """One eigenvalue with all its eigenvectors.
+
+    Attributes
+    ----------
+    value
+        The eigenvalue: the mean of its cluster, which is more accurate than its members.
+    vectors : (n, g)
+        Orthonormal basis of the eigenspace; g is the geometric multiplicity.
+    invariant : (n, m)
+        Orthonormal basis of the generalised eigenspace; m is the algebraic multiplicity.
+    """
+
+    value: complex
+    vectors: Complexes
+    invariant: Complexes
+
+    def unstable(self, *, discrete: bool, tol: float) -> bool:
+        """True for an unstable eigenvalue: `|value| >= 1`, or `Re value >= 0` in continuous time.
+
+        Parameters
+        ----------
+        discrete
+            Sampled time.
+        tol
+            Distance from the border within which it counts as unstable.
+        """
+        return bool(abs(self.value) >= 1.0 - tol if discrete else self.value.real >= -tol)
+
+
+def eigenspaces(A: Floats, *, tol: float) -> tuple[Eigenspace, ...]:
+    """All eigenvalues of a matrix with their eigenspaces, repeated ones once.
+
+    Starting from all eigenvalues as one cluster, a cluster is split at the widest gaps of its single
+    linkage until its block T of an ordered Schur form, with `N = T - mean(T)`, satisfies
+
+        |N^m| <= tol |N|^(m-1)   and   the smallest singular value of N is at most tol |A|,
+
+    or N itself is that small. That holds, up to the constant, for any matrix within tol of one with an m-fold
+    eigenvalue, and fails for several distinct eigenvalues further apart.
+
+    Parameters
+    ----------
+    A : (n, n)
+        Real matrix.
+    tol
+        Relative backward error at which eigenvalues count as equal and vectors as eigenvectors.
+
+    Returns
+    -------
+    tuple of Eigenspace
+        In no particular order; the algebraic multiplicities sum to n.
+    """
+    return tuple(_eigenspace(cluster, tol) for cluster in _clusters(_Schur.of(A), tol))
+
+
+def unstable_subspace(A: Floats, *, discrete: bool, tol: float) -> Floats:
+    """X_u(A): the span of the generalised eigenvectors of all unstable eigenvalues.
+
+    Parameters
+    ----------
+    A : (n, n)
+        Real matrix.
+    discrete
+        Sampled time.
+    tol
+        As in `eigenspaces` and `Eigenspace.unstable`.
+
+    Returns
+    -------
+    (n, d)
+        Real orthonormal basis.
+
+    References
+    ----------
+    lee2018, Notation and Symbols.
+    """
+    return _part(A, discrete=discrete, tol=tol, unstable=True)
+
+
+def stable_subspace(A: Floats, *, discrete: bool, tol: float) -> Floats:
+    """X_s(A): the span of the generalised eigenvectors of all other eigenvalues.
+
+    Parameters and result as in `unstable_subspace`.
+    """
+    return _part(A, discrete=discrete, tol=tol, unstable=False)
+
+
+def _part(A: Floats, *, discrete: bool, tol: float, unstable: bool) -> Floats:
+    """Real basis of the sum of the generalised eigenspaces on one side of the border."""
+    form = _Schur.of(A)
+    chosen = np.zeros(form.values.size, dtype=bool)
+    for cluster in _clusters(form, tol):
+        chosen[cluster.members] = _eigenspace(cluster, tol).unstable(discrete=discrete, tol=tol) == unstable
+    count = int(np.count_nonzero(chosen))
+    basis, _ = form.invariant(chosen)
+    # The space equals its conjugate, so real and imaginary parts span it over the reals: rank = count.
+    u, _, _ = np.linalg.svd(np.hstack([basis.real, basis.imag]), full_matrices=False)
+    return np.asarray(u[:, :count])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Schur:
+    """A = Z T Z^H with T upper triangular, and |A|."""
+
+    Z: Complexes
+    T: Complexes
+    size: float
+
+    @classmethod
+    def of(cls, A: Floats) -> _Schur:
+        T, Z = schur(np.asarray(A, dtype=np.float64), output="complex")
+        return cls(Z, T, float(np.linalg.norm(A, 2)) or 1.0)
+
+    @property
+    def values(self) -> Complexes:
+        return np.diagonal(self.T)
+
+    def invariant(self, chosen: Bools) -> tuple[Complexes, Complexes]:
+        """Basis of the invariant subspace of the chosen eigenvalues, and A restricted to it (triangular)."""
+        count = int(np.count_nonzero(chosen))
+        T, Z, *_ = lapack.ztrsen(chosen.astype(np.int32), self.T, self.Z, job="N")
+        return np.asarray(Z[:, :count]), np.asarray(T[:count, :count])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Cluster:
+    """Eigenvalues that count as one; `rest` is A restricted to their space, minus their mean, over |A|."""
+
+    members: Ints
+    mean: complex
+    basis: Complexes
+    rest: Complexes
+
+
+def _clusters(form: _Schur, tol: float) -> list[_Cluster]:
+    found: list[_Cluster] = []
+    todo = [np.arange(form.values.size)] if form.values.size else []
+    while todo:
+        members = todo.pop()
+        chosen = np.zeros(form.values.size, dtype=bool)
+        chosen[members] = True
+        basis, block = form.invariant(chosen)
+        mean = complex(np.trace(block) / members.size)
+        rest = np.asarray((block - mean * np.eye(members.size)) / form.size, dtype=np.complex128)
+        if members.size == 1 or _one_eigenvalue(rest, tol):
+            found.append(_Cluster(members, mean, basis, rest))
+        else:
+            todo.extend(_split(form.values, members))
+    return found
+
+
+def _eigenspace(cluster: _Cluster, tol: float) -> Eigenspace:
+    return Eigenspace(cluster.mean, cluster.basis @ kernel(cluster.rest, tol), cluster.basis)
+
+
+def _one_eigenvalue(rest: Matrix, tol: float) -> bool:
+    size = float(np.linalg.norm(rest, 2))
+    if size <= tol:
+        return True
+    m = rest.shape[0]
+    power = float(np.linalg.norm(np.linalg.matrix_power(rest / size, m), 2))
+    smallest = float(np.linalg.svd(rest, compute_uv=False)[-1])
+    return power * size <= tol and smallest <= tol
+
+
+def _split(values: Complexes, members: Ints) -> list[Ints]:
+    """Cut the widest edges of the minimum spanning tree of the members' eigenvalues."""
+    points = values[members]
+    away = np.abs(points[:, None] - points[None, :])
+    reached, edges = [0], []
+    distance, source = away[0].copy(), np.zeros(members.size, dtype=np.intp)
+    distance[0] = np.inf
+    for _ in range(members.size - 1):
+        new = int(np.argmin(distance))
+        edges.append((float(distance[new]), int(source[new]), new))
+        reached.append(new)
+        closer = away[new] < distance
+        distance[closer], source[closer] = away[new][closer], new
+        distance[reached] = np.inf
+    widest = max(length for length, _, _ in edges)
+    label = np.arange(members.size)
+    for length, one, other in edges:
+        if length < widest * (1.0 - 1e-12):
+            label[label == label[other]] = label[one]
+    return [members[label == name] for name in np.unique(label)]
+
+
+By = Literal["eigenvectors", "rank"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Index:
+    """Smallest set of sensors of an invisible attack, and its direction.
+
+    Attributes
+    ----------
+    count
+        The index; infinite if no number of sensors suffices.
+    sensors : (count,)
+        A smallest set of sensors; empty if there is none.
+    direction : (n,)
+        Apparent displacement of the state; empty if there is none. Complex directions stand for their real
+        part, which is seen by the same sensors and has a norm of at least sqrt(1/2).
+    """
+
+    count: float
+    sensors: Ints
+    direction: Matrix
+
+    @property
+    def correctable(self) -> float:
+        """Largest number of correctable manipulated sensors: `ceil(count / 2) - 1`.
+
+        It is -1 for a system that is not observable, and infinite for an infinite index.
+        """
+        return float(np.ceil(self.count / 2.0) - 1.0)
+
+    @property
+    def detectable(self) -> float:
+        """Largest number of manipulated sensors that are always detectable: `count - 1`."""
+        return self.count - 1.0
+
+
+def observability(A: Floats, C: Floats, steps: int | None = None) -> Floats:
+    """Observability matrices of the single sensors, `G_i = [c_i; c_i A; …; c_i A^(k-1)]`.
+
+    Parameters
+    ----------
+    A : (n, n)
+    C : (p, n)
+        The pair.
+    steps
+        k; n by default.
+
+    Returns
+    -------
+    (p, k, n)
+        G_i in `[i]`; reshaped to (p k, n) it is the stacked G of the paper.
+
+    References
+    ----------
+    lee2018 (3.1.3), (3.1.4).
+    """
+    k = A.shape[0] if steps is None else steps
+    out = np.empty((C.shape[0], k, A.shape[0]))
+    row = np.asarray(C, dtype=np.float64)
+    for j in range(k):
+        out[:, j] = row
+        row = row @ A
+    return out
+
+
+def observable_rows(A: Floats, C: Floats, *, tol: float) -> tuple[Floats, ...]:
+    """Orthonormal rows that span the rows of each sensor's observability matrix.
+
+    By Arnoldi's method on A^T, which does not form powers of A, so that ranks stay decidable if G_i itself is
+    badly scaled. The kernel is the unobservable subspace of the pair (A, c_i).
+
+    Parameters
+    ----------
+    A, C : (n, n), (p, n)
+        The pair.
+    tol
+        A new row shorter than this times |A| counts as dependent. A sensor with a row up to this fraction of
+        the longest measures nothing.
+
+    Returns
+    -------
+    p times (rank G_i, n)
+        Empty for a sensor that measures nothing.
+    """
+    size = float(np.linalg.norm(A, 2)) or 1.0
+    rows = unit_rows(np.asarray(C, dtype=np.float64), tol=tol)
+    return tuple(_arnoldi(A.T / size, row, tol) for row in rows)
+
+
+def _arnoldi(step: Floats, row: Floats, tol: float) -> Floats:
+    basis = np.zeros((0, row.size))
+    while np.linalg.norm(row) > tol and len(basis) < row.size:
+        basis = np.vstack([basis, row / np.linalg.norm(row)])
+        row = step @ basis[-1]
+        # Twice: a single pass leaves rounding errors that a third of the rows would inherit.
+        for _ in range(2):
+            row = row - basis.T @ (basis @ row)
+    return basis
+
+
+def _sensors(C: Floats, tol: float) -> list[Matrix]:
+    """Row of each sensor, scaled to length one: the unit of a sensor is not a property of the system."""
+    rows = unit_rows(np.asarray(C, dtype=np.float64), tol=tol)
+    return [row_space(row[None, :], 0.0) for row in rows]
+
+
+def static_index(C: Floats, *, tol: float) -> Index:
+    """alpha_s(C) = cospark(C), the index of one snapshot of readings.
+
+    Parameters
+    ----------
+    C : (p, n)
+        Output matrix.
+    tol
+        A product of a sensor's unit row with a unit state up to this counts as zero. A sensor with a row up
+        to this fraction of the longest measures nothing.
+
+    References
+    ----------
+    lee2018 (3.2.2).
+    """
+    found = fewest(_sensors(C, tol), np.eye(C.shape[1]), tol=tol)
+    return Index(found.count, frozen_ints(found.blocks), found.direction)
+
+
+def dynamic_index(A: Floats, C: Floats, *, tol: float, by: By = "eigenvectors") -> Index:
+    """Smallest number of sensors of an attack that stays invisible for all time, alpha_d(A, C).
+
+        min over x != 0 of |G x|_{0^n}   =   min over eigenvectors v of A of |C v|_0
+
+    The same number for sampled and for continuous time.
+
+    Parameters
+    ----------
+    A, C : (n, n), (p, n)
+        The pair.
+    tol
+        Tolerance of zero, relative to unit vectors, |A| and the longest row of C.
+    by
+        "eigenvectors": over every eigenspace, (3.2.4). "rank": over all states, (3.2.3).
+
+    Raises
+    ------
+    ValueError
+        If `by` is another text.
+
+    References
+    ----------
+    lee2018 (3.2.3), Proposition 3.2.2.
+    """
+    refuse(no_choice("by", get_args(By), by))
+    if by == "rank":
+        found = fewest(observable_rows(A, C, tol=tol), np.eye(A.shape[0]), tol=tol)
+        return Index(found.count, frozen_ints(found.blocks), found.direction)
+    return _over(tuple(e.vectors for e in eigenspaces(A, tol=tol)), C, tol)
+
+
+def asymptotic_index(A: Floats, C: Floats, *, discrete: bool, tol: float, by: By = "eigenvectors") -> Index:
+    """`dynamic_index` for attacks with an effect that does not decay, alpha_a(A, C).
+
+        min over x outside X_s(A) of |G x|_{0^n}   =   min over unstable eigenvectors v of |C v|_0
+
+    Parameters
+    ----------
+    A, C : (n, n), (p, n)
+        The pair.
+    discrete
+        True if A is the matrix of a sampled system (unstable: |lambda| >= 1), False for that of a
+        differential equation (Re lambda >= 0).
+    tol
+        Tolerance of zero. An eigenvalue within this of the border counts as unstable.
+    by
+        As in `dynamic_index`.
+
+    Returns
+    -------
+    Index
+        Infinite for a stable A.
+
+    Raises
+    ------
+    ValueError
+        If `by` is another text.
+
+    References
+    ----------
+    lee2018 (3.2.5), Proposition 3.2.4.
+    """
+    refuse(no_choice("by", get_args(By), by))
+    if by == "rank":
+        # An invariant kernel is the sum of its stable and its unstable part: searching X_u suffices.
+        space = unstable_subspace(A, discrete=discrete, tol=tol)
+        found = fewest(observable_rows(A, C, tol=tol), space, tol=tol)
+        return Index(found.count, frozen_ints(found.blocks), found.direction)
+    spaces = eigenspaces(A, tol=tol)
+    return _over(tuple(e.vectors for e in spaces if e.unstable(discrete=discrete, tol=tol)), C, tol)
+
+
+def _over(spaces: Sequence[Matrix], C: Floats, tol: float, *, below: float = 0.0) -> Index:
+    rows = _sensors(C, tol)
+    best = fewest(rows, np.zeros((C.shape[1], 0)), tol=tol)
+    for space in spaces:
+        found = fewest(rows, space, tol=tol, below=below)
+        if found.count < best.count:
+            best = found
+    return Index(best.count, frozen_ints(best.blocks), _turned(best.direction))
+
+
+def _turned(direction: Matrix) -> Matrix:
+    """The same direction with the longest possible real part: an eigenvector's phase is arbitrary."""
+    square = np.sum(direction * direction)
+    return direction if square == 0.0 else direction * np.exp(-0.5j * np.angle(square))
+
+
+def redundant_observable(A: Floats, C: Floats, q: int, *, tol: float, by: By = "eigenvectors") -> bool:
+    """True if (A, C) stays observable after the loss of any q sensors.
+
+    Parameters
+    ----------
+    A, C : (n, n), (p, n)
+        The pair.
+    q
+        Number of sensors lost.
+    tol
+        As in `dynamic_index`.
+    by
+        "eigenvectors": `|C v|_0 > q` for every eigenvector. "rank": all C(p, q) stacked matrices.
+
+    Raises
+    ------
+    ValueError
+        If `by` is another text.
+
+    References
+    ----------
+    lee2018, Definition 3.1.1, Propositions 3.1.1 (iii) and 3.1.2 (ii).
+    """
+    refuse(no_choice("by", get_args(By), by))
+    if by == "eigenvectors":
+        return _over([e.vectors for e in eigenspaces(A, tol=tol)], C, tol, below=q + 1).count > q
+    rows = observable_rows(A, C, tol=tol)
+    return all(_lost(rows, kept, A.shape[0], tol).shape[1] == 0 for kept in _survivors(len(rows), q))
+
+
+def redundant_detectable(
+    A: Floats, C: Floats, q: int, *, discrete: bool, tol: float, by: By = "eigenvectors"
+) -> bool:
+    """True if (A, C) stays detectable after the loss of any q sensors.
+
+    Parameters
+    ----------
+    A, C, q, tol, by
+        As in `redundant_observable`.
+    discrete
+        As in `asymptotic_index`.
+
+    Raises
+    ------
+    ValueError
+        If `by` is another text.
+
+    References
+    ----------
+    lee2018, Definition 3.1.3, Propositions 3.1.8 (ii) and 3.1.9 (ii).
+    """
+    refuse(no_choice("by", get_args(By), by))
+    if by == "eigenvectors":
+        spaces = [e.vectors for e in eigenspaces(A, tol=tol) if e.unstable(discrete=discrete, tol=tol)]
+        return _over(spaces, C, tol, below=q + 1).count > q
+    rows = observable_rows(A, C, tol=tol)
+    space = unstable_subspace(A, discrete=discrete, tol=tol)
+    return all(_lost(rows, kept, 0, tol, space).shape[1] == 0 for kept in _survivors(len(rows), q))
+
+
+def unobservable_subspace(A: Floats, C: Floats, q: int = 0, *, tol: float) -> Floats:
+    """The q-redundant unobservable subspace: span of all states made unobservable by the loss of q sensors.
+
+        sum over |Lambda| = p - q of N(G_Lambda)
+
+    Parameters
+    ----------
+    A, C, q, tol
+        As in `redundant_observable`. The whole space for q >= p. Costs C(p, q) kernels.
+
+    Returns
+    -------
+    (n, d)
+        Orthonormal basis. Its orthogonal complement is the redundant observable subspace.
+
+    References
+    ----------
+    lee2018, Definition 3.1.2, Propositions 3.1.4 and 3.1.6.
+    """
+    return _summed(A, C, q, np.eye(A.shape[0]), tol)
+
+
+def undetectable_subspace(A: Floats, C: Floats, q: int = 0, *, discrete: bool, tol: float) -> Floats:
+    """The q-redundant undetectable subspace: the unstable part of the redundant unobservable one.
+
+        sum over |Lambda| = p - q of N(G_Lambda) ∩ X_u(A)
+
+    Parameters
+    ----------
+    A, C, q, discrete, tol
+        As in `redundant_detectable`.
+
+    Returns
+    -------
+    (n, d)
+        Orthonormal basis. Its orthogonal complement is the redundant detectable subspace.
+
+    References
+    ----------
+    lee2018, Definition 3.1.4, Propositions 3.1.11 and 3.1.13.
+    """
+    return _summed(A, C, q, unstable_subspace(A, discrete=discrete, tol=tol), tol)
+
+
+def _summed(A: Floats, C: Floats, q: int, space: Floats, tol: float) -> Floats:
+    rows = observable_rows(A, C, tol=tol)
+    total = np.zeros((A.shape[0], 0))
+    for kept in _survivors(len(rows), q):
+        lost = _lost(rows, kept, A.shape[0], tol, space)
+        # Only new directions are added, so that the basis never exceeds n columns.
+        total = np.asarray(span(np.hstack([total, lost]), np.sqrt(tol)))
+        if total.shape[1] == space.shape[1]:
+            break
+    return total
+
+
+def _survivors(p: int, q: int) -> list[tuple[int, ...]]:
+    return list(combinations(range(p), max(p - q, 0)))
+
+
+def _lost(
+    rows: Sequence[Floats], kept: Sequence[int], n: int, tol: float, space: Floats | None = None
+) -> Floats:
+    """Basis of the directions of a space that are invisible to all kept sensors."""
+    start = np.eye(n) if space is None else space
+    if not kept:
+        return start
+    return np.asarray(start @ kernel(np.vstack([rows[i] for i in kept]) @ start, tol))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hidden:
+    """Motions of a system with an unknown input that cannot be distinguished from rest.
+
+    Attributes
+    ----------
+    weakly_unobservable : (n, d)
+        Basis of the initial states with an input that keeps the output zero for ever.
+    controllable : (n, c)
+        Basis of those among them that are reached from rest with zero output: the input stays hidden there
+        without any effect on the initial state.
+    zeros : (d - c,)
+        Invariant zeros: the eigenvalues of the remaining motion, which no input can change.
+    """
+
+    weakly_unobservable: Floats
+    controllable: Floats
+    zeros: NDArray[np.complex128]
+
+    @property
+    def strongly_observable(self) -> bool:
+        """True if zero output implies zero state, for any input."""
+        return bool(self.weakly_unobservable.shape[1] == 0)
+
+    def strongly_detectable(self, *, discrete: bool, tol: float) -> bool:
+        """True if zero output implies a state that decays, for any input.
+
+        Parameters
+        ----------
+        discrete
+            Sampled time: zeros must have modulus below 1; otherwise a negative real part.
+        tol
+            Distance from that border within which a zero counts as unstable.
+
+        References
+        ----------
+        lee2018, Proposition 3.1.10 (iii), corrected: docs/errata/lee2018-chapter-3.md.
+        """
+        size = np.abs(self.zeros) - 1.0 if discrete else self.zeros.real
+        return bool(self.controllable.shape[1] == 0 and np.all(size < -tol))
+
+
+def hidden(A: Floats, B: Floats, C: Floats, D: Floats, *, tol: float) -> Hidden:
+    """Weakly unobservable subspace, its controllable part, and the invariant zeros.
+
+        V_0 = R^n,  V_(k+1) = {x : exists a with A x + B a in V_k, C x + D a = 0}
+        T_0 = 0,    T_(k+1) = {A x + B a : x in T_k, C x + D a = 0},   controllable part = V ∩ T
+
+    Parameters
+    ----------
+    A, B, C, D : (n, n), (n, m), (p, n), (p, m)
+        The system, preferably in units with entries of order one.
+    tol
+        Singular values up to this, times the largest of the system's, count as zero.
+
+    References
+    ----------
+    H. Trentelman, A. Stoorvogel, M. Hautus, "Control theory for linear systems", Springer, 2001,
+    chapter 7; lee2018, section 3.1.2.
+    """
+    whole = np.block([[A, B], [C, D]])
+    size = float(np.linalg.norm(whole, 2)) or 1.0
+    A, B, C, D = A / size, B / size, C / size, D / size
+    V = _output_nulling(A, B, C, D, tol)
+    T = _reachable(A, B, C, D, tol)
+    # V ∩ T: combinations V a = T b.
+    meet = kernel(np.hstack([V, -T]), tol)
+    R = span(V @ meet[: V.shape[1]], tol)
+    # A V - V X + B U = 0 and C V + D U = 0; X is the motion inside V, in a basis that begins with R.
+    rest = V @ kernel(R.T @ V, tol) if R.shape[1] else V
+    basis = np.hstack([R, rest])
+    p, d = C.shape[0], basis.shape[1]
+    left = np.block([[basis, -B], [np.zeros((p, d)), -D]])
+    X = np.linalg.lstsq(left, np.vstack([A @ basis, C @ basis]), rcond=tol)[0][:d]
+    inner = X[R.shape[1] :, R.shape[1] :] * size
+    zeros = np.linalg.eigvals(inner) if inner.size else np.zeros(0)
+    return Hidden(V, R, zeros.astype(np.complex128))
+
+
+def under_attack(A: Floats, C: Floats, manipulated: Sequence[int], *, tol: float) -> Hidden:
+    """`hidden` for the pair (A, C) with arbitrary reports of the sensors in `manipulated`.
+
+    The system `x+ = A x`, `y = C x + I_manipulated a` of the paper's (3.1.6).
+
+    Parameters
+    ----------
+    A, C : (n, n), (p, n)
+        The pair.
+    manipulated
+        Sensors under the attacker's control.
+    tol
+        As in `hidden`. A sensor with a row up to this fraction of the longest measures nothing.
+
+    References
+    ----------
+    lee2018 (3.1.6), Propositions 3.1.3 and 3.1.10.
+    """
+    # All blocks scaled to the size of A, so that one tolerance suffices: units change no subspace.
+    size = float(np.linalg.norm(A, 2)) or 1.0
+    unit = unit_rows(C, tol=tol) * size
+    D = size * np.eye(C.shape[0])[:, list(manipulated)]
+    return hidden(A, np.zeros((A.shape[0], D.shape[1])), unit, D, tol=tol)
+
+
+def _output_nulling(A: Floats, B: Floats, C: Floats, D: Floats, tol: float) -> Floats:
+    n = A.shape[0]
+    V = np.eye(n)
+    while V.shape[1] > 0:
+        outside = np.eye(n) - V @ V.T
+        free = np.vstack([outside @ B, D])
+        u = span(free, tol)
+        image = np.vstack([outside @ A, C])
+        image = image - u @ (u.T @ image)
+        smaller = np.asarray(V @ kernel(image @ V, tol))
+        if smaller.shape[1] == V.shape[1]:
+            break
+        V = smaller
+    return V
+
+
+def _reachable(A: Floats, B: Floats, C: Floats, D: Floats, tol: float) -> Floats:
+    n = A.shape[0]
+    T = np.zeros((n, 0))
+    for _ in range(n):
+        inputs = kernel(np.hstack([C @ T, D]), tol)
+        larger = np.asarray(span(np.hstack([A @ T, B]) @ inputs, tol))
+        if larger.shape[1] == T.shape[1]:
+            break
+        T = larger
+    return T
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FeederIndex:
+    """Smallest numbers of meters in an invisible coordinated attack, for exactly known loads.
+
+    Attributes
+    ----------
+    static
+        From one snapshot of readings alone.
+    dynamic
+        From the readings of all time.
+    asymptotic
+        As `dynamic`, for attacks that do not decay; infinite for a stable closed loop.
+    A, C : (n, n), (p, n)
+        The linearisation.
+    """
+
+    static: Index
+    dynamic: Index
+    asymptotic: Index
+    A: Floats
+    C: Floats
+
+
+def slopes(lure: Lure, z: Floats, *, step: float) -> Floats:
+    """Slopes of the nonlinearities at a point, by symmetric differences; (m,).
+
+    Parameters
+    ----------
+    z : (m,)
+        Arguments of the nonlinearities.
+    step
+        Half the width of the difference, in the unit of z. Near a kink closer than this, the result is a
+        mixture of the slopes on both sides.
+    """
+    return np.asarray((lure.phi(z + step) - lure.phi(z - step)) / (2.0 * step))
+
+
+def linearise(lure: Lure, slope: Floats) -> tuple[Floats, Floats]:
+    """The pair `(A + G diag(slope) H, C)` of a Lur'e system about a trajectory with these slopes.
+
+    Parameters
+    ----------
+    slope : (m,)
+        Slope of each nonlinearity, from `slopes`; `lure.slope` for the steepest; 0 in deadband.
+    """
+    return lure.A + (lure.G * slope) @ lure.H, np.asarray(lure.C)
+
+
+def feeder_index(lure: Lure, slope: Floats, *, tol: float) -> FeederIndex:
+    """Static, dynamic and asymptotic security index of a feeder's linearised closed loop.
+
+    States and meters are scaled to order one first, which changes no index. Inverters of slope zero decay
+    independently; those with equal time constants share one eigenspace, on which the dynamic index falls to
+    the static one of their columns.
+
+    Parameters
+    ----------
+    lure
+        Closed loop, from `close_loop`.
+    slope : (m,)
+        As in `linearise`.
+    tol
+        As in `dynamic_index`.
+    """
+    A, C = linearise(lure, slope)
+    return FeederIndex(
+        static_index(C, tol=tol),
+        dynamic_index(A, C, tol=tol),
+        asymptotic_index(A, C, discrete=False, tol=tol),
+        A,
+        C,
+    )

@@ -1,1 +1,0 @@
-"""Computations of the offline studies of a feeder: arrays in, frozen results out."""

@@ -1,0 +1,1 @@
+"""Alarms: conditions of a feeder, and the state machine of each alarm."""

@@ -1,0 +1,339 @@
+"""What is wrong with a feeder at one tick, and about what that tick says nothing. Pure."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+from gridsec.interface import Cause, Decision
+from service.report.reasons import DataErrorReport
+from service.report.report import BUSBAR, ExplanationReport, FeederReport, MeterReport, StalledMeter, finite
+
+
+class AlarmKind(StrEnum):
+    """What can be wrong."""
+
+    METER_MANIPULATED = "meter-manipulated"
+    INVERTER_MANIPULATED = "inverter-manipulated"
+    VOLTAGE_LIMIT = "voltage-limit"
+    DATA_LOSS = "data-loss"
+    UNDECIDED = "undecided"
+    LEARNING_STALLED = "learning-stalled"
+    CLOCK_OFFSET = "clock-offset"
+
+
+class Severity(StrEnum):
+    """How much it matters."""
+
+    CRITICAL = "critical"
+    MAJOR = "major"
+    MINOR = "minor"
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """The numbers behind an alarm at the tick that raised it; None where there is none.
+
+    Attributes
+    ----------
+    score, threshold
+        Residual of the meter and the largest one that an honest meter can reach, squared pu.
+    v_volt_reported, v_volt_estimated, attack_volt_estimated
+        Reported and reconstructed voltage and their difference for suspects, V.
+    kind
+        What a meter's manipulation looks like, see `gridsec.interface.Kind`.
+    attack_kvar_estimated
+        Reactive power that an inverter injects beside its droop curve, kvar.
+    explanations
+        What could all explain the readings, where nobody can be named.
+    learning
+        Meters that are not learned after twice the expected time, with the reasons.
+    data_error
+        Error of the feeder's files that explains the accusation as well.
+    """
+
+    score: float | None = None
+    threshold: float | None = None
+    v_volt_reported: float | None = None
+    v_volt_estimated: float | None = None
+    attack_volt_estimated: float | None = None
+    kind: str | None = None
+    attack_kvar_estimated: float | None = None
+    explanations: tuple[ExplanationReport, ...] = ()
+    learning: tuple[StalledMeter, ...] = ()
+    data_error: DataErrorReport | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """One thing that is wrong at a tick or, with `known=False`, about which this tick says nothing.
+
+    Attributes
+    ----------
+    kind, feeder, meter
+        What and where; the meter is None if it is about the whole feeder.
+    customer
+        Whose inverter it is about; None if it is about none. The meter is that customer's, if there is one.
+    severity, evidence, reason
+        How bad, the numbers, and a sentence for the operator.
+    known
+        False: nobody can tell at this tick; the alarm, if there is one, is held as it is.
+    unheard
+        It is so because readings are missing from those who are not silent yet: worth an alarm only if it
+        lasts for longer than any of them could be missing unnoticed.
+    """
+
+    kind: AlarmKind
+    feeder: str
+    meter: str | None
+    severity: Severity
+    evidence: Evidence = Evidence()
+    reason: str = ""
+    known: bool = True
+    customer: str | None = None
+    unheard: bool = False
+
+    @property
+    def subject(self) -> str | None:
+        """What it is about: a customer's inverter, a meter, or (None) the whole feeder."""
+        return self.customer or self.meter
+
+
+def conditions(report: FeederReport) -> list[Condition]:
+    """Say what is wrong with a feeder at one tick, and about what the tick says nothing.
+
+    - `meter-manipulated`: the verdict names the meter, or that of the busbar. Unknown while the verdict is
+      UNDECIDED or the meter is silent, whatever the list of suspects says; about the busbar's also from an
+      estimator that does not judge it.
+    - `inverter-manipulated`: the verdict names the inverter. Unknown while the verdict is UNDECIDED, or from
+      an estimator that does not judge inverters.
+    - `voltage-limit`: the whole interval around the *reconstructed* voltage is outside the limits, so a
+      lying meter raises none. Unknown while the interval straddles a limit with its middle outside, or
+      while the reconstruction itself carries no guarantee or is model only.
+    - `data-loss`: a meter, or the busbar meter, is silent. Unknown while it is unseen but not for long.
+    - `undecided`: there is no verdict, for a cause of its own. Unknown while the monitor settles, or where
+      `data-loss` says already why: everybody of whom a reading is missing is silent.
+    - `learning-stalled`: the fixed error of a meter is not learned after twice the expected time; one
+      condition per feeder. Unknown at a tick without a monitor.
+    - `clock-offset`: the clock of a meter, or of the busbar's, is measurably ahead or behind, or its readings
+      come late.
+
+    Parameters
+    ----------
+    report
+        The feeder at this tick.
+
+    Returns
+    -------
+    list of Condition
+        What is not in it is known to be absent.
+    """
+    manipulated = (*_manipulated(report), *_busbar(report), *_inverters(report))
+    found = [*manipulated, *_data_loss(report), *_undecided(report), *_learning(report), *_clocks(report)]
+    for meter in report.meters:
+        found.extend(_voltage_limit(report, meter))
+    return found
+
+
+def _evidence(meter: MeterReport) -> Evidence:
+    def number(value: float | None) -> float | None:
+        return None if value is None else finite(value)
+
+    return Evidence(
+        number(meter.score),
+        number(meter.threshold),
+        number(meter.v_volt_reported),
+        None if meter.model_only else number(meter.v_volt_estimated),
+        None if meter.model_only else number(meter.attack_volt_estimated),
+        meter.kind,
+    )
+
+
+def _volt(value: float | None) -> str:
+    return "an unknown voltage" if value is None else f"{value:.1f} V"
+
+
+def _manipulated(report: FeederReport) -> Iterable[Condition]:
+    decided = report.verdict is not Decision.UNDECIDED
+    for meter in report.meters:
+        known = decided and meter.seen
+        if known and not meter.suspect:
+            continue
+        evidence = _evidence(meter)
+        reported, estimated = _volt(evidence.v_volt_reported), _volt(evidence.v_volt_estimated)
+        beside = (
+            "no trusted meter reports beside it"
+            if meter.model_only
+            else f"but the rest of the feeder says {estimated}"
+        )
+        error = _data_error(report, meter.meter)
+        hint = "" if error is None else f". {error.text}"
+        yield Condition(
+            AlarmKind.METER_MANIPULATED,
+            report.feeder,
+            meter.meter,
+            Severity.CRITICAL,
+            replace(evidence, data_error=error),
+            f"reports {reported}, {beside}{hint}",
+            known,
+        )
+
+
+def _data_error(report: FeederReport, meter: str) -> DataErrorReport | None:
+    """The error of the files that explains an accused meter."""
+    error = report.data_error
+    return error if error is not None and meter in error.meters else None
+
+
+def _busbar(report: FeederReport) -> Iterable[Condition]:
+    busbar = report.busbar
+    known = report.verdict is not Decision.UNDECIDED and busbar.judged and busbar.seen
+    if known and not busbar.suspect:
+        return
+    reported, estimated = _volt(busbar.v_volt_reported), _volt(busbar.v_volt_estimated)
+    phase = "" if busbar.phase is None else f" in phase {busbar.phase}"
+    yield Condition(
+        AlarmKind.METER_MANIPULATED,
+        report.feeder,
+        BUSBAR,
+        Severity.CRITICAL,
+        Evidence(
+            v_volt_reported=busbar.v_volt_reported,
+            v_volt_estimated=busbar.v_volt_estimated,
+            attack_volt_estimated=busbar.attack_volt_estimated,
+        ),
+        f"reports {reported}{phase}, but the meters of the feeder say {estimated}",
+        known,
+    )
+
+
+def _inverters(report: FeederReport) -> Iterable[Condition]:
+    decided = report.verdict is not Decision.UNDECIDED
+    for inverter in report.inverters:
+        known = decided and inverter.judged
+        if known and not inverter.suspect:
+            continue
+        kvar = inverter.attack_kvar_estimated
+        much = "reactive power" if kvar is None else f"{kvar:+.1f} kvar"
+        yield Condition(
+            AlarmKind.INVERTER_MANIPULATED,
+            report.feeder,
+            inverter.meter,
+            Severity.CRITICAL,
+            Evidence(attack_kvar_estimated=kvar),
+            f"the inverter of {inverter.customer} injects {much} that its droop curve does not ask for",
+            known,
+            inverter.customer,
+        )
+
+
+# With these causes the reconstruction still is what the design promises: the readings that are there are
+# enough, or the standard deviation is wide. With every other UNDECIDED its bound is not a bound.
+_SOUND = frozenset(
+    {
+        Cause.AGREEMENT,
+        Cause.RESIDUALS,
+        Cause.SILENT_METERS,
+        Cause.CLOCK_OFFSET,
+        Cause.MISSING_POWERS,
+    }
+)
+
+
+def _voltage_limit(report: FeederReport, meter: MeterReport) -> Iterable[Condition]:
+    evidence = _evidence(meter)
+    v = evidence.v_volt_estimated  # None where it is model only
+    half_width = None if meter.v_volt_std is None else finite(3.0 * meter.v_volt_std)
+    if v is None or half_width is None or report.cause not in _SOUND:
+        yield Condition(
+            AlarmKind.VOLTAGE_LIMIT, report.feeder, meter.meter, Severity.MAJOR, evidence, known=False
+        )
+        return
+    low, high = meter.limits(report)
+    if low <= v <= high:
+        return
+    surely = v + half_width < low or v - half_width > high
+    side, limit = ("below", low) if v < low else ("above", high)
+    yield Condition(
+        AlarmKind.VOLTAGE_LIMIT,
+        report.feeder,
+        meter.meter,
+        Severity.MAJOR,
+        evidence,
+        f"{v:.1f} V ± {half_width:.1f} V at the connection point, {side} the limit of {limit:.1f} V",
+        surely,
+    )
+
+
+def _data_loss(report: FeederReport) -> Iterable[Condition]:
+    silent = dict(report.silent)
+    unsure = [meter.meter for meter in report.meters if not meter.seen and meter.meter not in silent]
+    busbar_seen = report.busbar.seen and report.cause is not Cause.NO_BUSBAR
+    if not busbar_seen and BUSBAR not in silent:
+        unsure.append(BUSBAR)
+    for meter, seconds in silent.items():
+        # Without the busbar's voltage nothing on the feeder can be judged.
+        severity = Severity.MAJOR if meter == BUSBAR else Severity.MINOR
+        length = "yet" if not math.isfinite(seconds) else f"for {seconds:.0f} s"
+        yield Condition(
+            AlarmKind.DATA_LOSS, report.feeder, meter, severity, reason=f"no usable reading {length}"
+        )
+    for meter in unsure:
+        yield Condition(AlarmKind.DATA_LOSS, report.feeder, meter, Severity.MINOR, known=False)
+
+
+def _undecided(report: FeederReport) -> Iterable[Condition]:
+    if report.verdict is not Decision.UNDECIDED:
+        return
+    unheard = report.cause in {Cause.SILENT_METERS, Cause.NO_BUSBAR}
+    gone = [meter.meter for meter in report.meters if not meter.seen] if unheard else []
+    if report.cause is Cause.NO_BUSBAR:
+        gone = [BUSBAR]
+    # Who is missing at every other tick is never silent, and nothing else would tell of it.
+    told = bool(gone) and {*gone} <= {meter for meter, _ in report.silent}
+    # Each of these meters has an alarm of kind `clock-offset`.
+    told = told or report.cause is Cause.CLOCK_OFFSET
+    yield Condition(
+        AlarmKind.UNDECIDED,
+        report.feeder,
+        None,
+        Severity.MAJOR,
+        Evidence(explanations=report.explanations, data_error=report.data_error),
+        reason=report.reason,
+        known=not told and report.cause is not Cause.SETTLING,
+        unheard=unheard,
+    )
+
+
+def _clocks(report: FeederReport) -> Iterable[Condition]:
+    each = [(meter.meter, meter.clock_offset_s) for meter in report.meters]
+    for meter, offset in (*each, (BUSBAR, report.busbar.clock_offset_s)):
+        if offset is None:
+            continue
+        side = "ahead of" if offset > 0.0 else "behind"
+        late = "" if offset > 0.0 else ", or its readings come later"
+        reason = f"the clock is {abs(offset):.1f} s {side} the other meters'{late}"
+        yield Condition(AlarmKind.CLOCK_OFFSET, report.feeder, meter, Severity.MINOR, reason=reason)
+
+
+def _learning(report: FeederReport) -> Iterable[Condition]:
+    learning = report.learning
+    if learning is not None and not learning.stalled:
+        return
+    stalled = () if learning is None else learning.stalled
+    count = Counter(meter.reason or "no time lost" for meter in stalled)
+    why = ", ".join(f"{reason} ({number})" for reason, number in sorted(count.items()))
+    time = "" if learning is None or learning.expected_s is None else f" of {learning.expected_s:.0f} s"
+    yield Condition(
+        AlarmKind.LEARNING_STALLED,
+        report.feeder,
+        None,
+        Severity.MINOR,
+        Evidence(learning=stalled),
+        f"{len(stalled)} of {len(report.meters)} meters are not learned after twice the expected time{time}: "
+        f"{why}",
+        known=learning is not None,
+    )

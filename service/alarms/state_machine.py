@@ -1,0 +1,473 @@
+"""From verdicts to alarms: delays, flapping, acknowledgement. Pure: time is an argument, state is a value.
+
+`conditions` says what is wrong at one tick, `advance` turns a stream of such ticks into transitions::
+
+    book = AlarmBook("village")
+    book, transitions = advance(book, AlarmRules(), conditions(report), report.t)
+
+A condition is present, absent, or unknown at a tick, and what a tick says stands until the next one. Unknown
+*holds*: the clock of that condition stands still, nothing is raised and nothing is cleared, because no answer
+must never look like no attack. So an alarm is raised once its condition has been seen for `on_delay_s`
+without a tick in between that saw it absent, and cleared once it has been seen absent for `off_delay_s`
+without a tick that saw it present; time after an unknown tick counts for neither. Ticks that were not judged
+are unknown (`hold`), and so is a restart (`restore`).
+
+The evidence of an alarm is that of the tick that raised it. It is updated when an error of the feeder's files
+is found that explains the condition as well.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+
+from gridsec.errors import InputInvalid, Problem
+from service.alarms.alarm import (
+    Alarm,
+    AlarmState,
+    AlarmUnknown,
+    AlreadyAcknowledged,
+    Change,
+    RaisedAgain,
+    Transition,
+    from_json,
+    to_json,
+)
+from service.alarms.conditions import AlarmKind, Condition, Evidence, Severity, conditions
+
+__all__ = [
+    "Alarm",
+    "AlarmBook",
+    "AlarmKind",
+    "AlarmRules",
+    "AlarmState",
+    "AlarmUnknown",
+    "AlreadyAcknowledged",
+    "Change",
+    "Condition",
+    "Evidence",
+    "RaisedAgain",
+    "Severity",
+    "Transition",
+    "acknowledge",
+    "acknowledged",
+    "advance",
+    "carried",
+    "close",
+    "conditions",
+    "from_json",
+    "hold",
+    "restore",
+    "to_json",
+]
+
+
+@dataclass(frozen=True, slots=True)
+class AlarmRules:
+    """How long a condition must last.
+
+    Attributes
+    ----------
+    on_delay_s, off_delay_s
+        How long a condition must be seen before its alarm is raised, and be gone before it is cleared, s.
+    on_delays_s, off_delays_s
+        Other delays for single kinds, s.
+    memory_s
+        A condition that returns within this time after it cleared raises the same alarm again, s.
+    silence_s
+        What is so only for want of readings must be seen for longer than this to raise an alarm, s.
+    """
+
+    on_delay_s: float = 2.0
+    off_delay_s: float = 5.0
+    on_delays_s: Mapping[AlarmKind, float] = field(default_factory=dict)
+    off_delays_s: Mapping[AlarmKind, float] = field(default_factory=dict)
+    memory_s: float = 600.0
+    silence_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        times = (
+            self.on_delay_s,
+            self.off_delay_s,
+            self.memory_s,
+            self.silence_s,
+            *self.on_delays_s.values(),
+            *self.off_delays_s.values(),
+        )
+        if not all(math.isfinite(s) and s >= 0.0 for s in times):
+            raise InputInvalid([Problem("negative", f"delays must be finite and not negative: {self}")])
+
+    def on(self, kind: AlarmKind) -> float:
+        """Return the on-delay of a kind, s."""
+        return self.on_delays_s.get(kind, self.on_delay_s)
+
+    def off(self, kind: AlarmKind) -> float:
+        """Return the off-delay of a kind, s."""
+        return self.off_delays_s.get(kind, self.off_delay_s)
+
+
+Key = tuple[AlarmKind, str | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """What the book remembers about one condition.
+
+    Attributes
+    ----------
+    present
+        What the last tick that knew said.
+    onset
+        When the present run of equal answers began, s.
+    since
+        The same, moved forward by every hold, so that t - since is the time that counts, s.
+    t_known
+        Until when its last answer stands: the last tick that knew, or the first after it that did not, s.
+    held
+        Whether there were ticks that did not know since then.
+    alarm
+        Its alarm: active, or cleared and remembered; None while the condition is only pending.
+    """
+
+    present: bool
+    onset: float
+    since: float
+    t_known: float
+    held: bool
+    alarm: Alarm | None
+
+
+@dataclass(frozen=True, slots=True)
+class AlarmBook:
+    """The alarm state of one feeder. A value: `advance` and `acknowledge` return a new one.
+
+    Attributes
+    ----------
+    feeder
+        Whose alarms these are.
+    t
+        Time of the last tick, s; None before the first one.
+    entries
+        By kind and subject.
+    """
+
+    feeder: str
+    t: float | None = None
+    entries: Mapping[Key, Entry] = field(default_factory=dict)
+
+    @property
+    def alarms(self) -> tuple[Alarm, ...]:
+        """Every alarm that is active, or cleared and still remembered; oldest first."""
+        found = (e.alarm for e in self.entries.values() if e.alarm is not None)
+        return tuple(sorted(found, key=lambda alarm: alarm.id))
+
+    @property
+    def active(self) -> tuple[Alarm, ...]:
+        """Every alarm that still stands; oldest first."""
+        return tuple(alarm for alarm in self.alarms if alarm.active)
+
+
+def advance(
+    book: AlarmBook, rules: AlarmRules, conditions: Iterable[Condition], t: float
+) -> tuple[AlarmBook, tuple[Transition, ...]]:
+    """Take one tick into the book.
+
+    Parameters
+    ----------
+    book
+        The feeder's alarms so far.
+    rules
+        Delays and memory.
+    conditions
+        What `conditions` says about this tick; what it does not mention is known to be absent.
+    t
+        Unix time of the tick, s. A tick that is older than the last one holds every clock.
+
+    Returns
+    -------
+    book, transitions
+        The new state, and what happened, in a repeatable order.
+
+    Raises
+    ------
+    ValueError
+        If a condition belongs to another feeder.
+    """
+    seen: dict[Key, Condition] = {}
+    for condition in conditions:
+        if condition.feeder != book.feeder:
+            text = f"a condition of {condition.feeder!r} in the book of {book.feeder!r}"
+            raise InputInvalid([Problem("other-feeder", text)])
+        seen[condition.kind, condition.subject] = condition
+    backwards = book.t is not None and t < book.t
+    entries: dict[Key, Entry] = {}
+    transitions: list[Transition] = []
+    for key in sorted({*book.entries, *seen}, key=_order):
+        old, condition_now = book.entries.get(key), seen.get(key)
+        if condition_now is not None and not condition_now.known:
+            entry = None if old is None else _hold(old, t)
+        else:
+            entry, transition = _settle(
+                _timed(old, condition_now is not None, t, backwards), condition_now, rules, key, t
+            )
+            transitions.extend(transition)
+        if entry is not None:
+            entries[key] = entry
+    return AlarmBook(book.feeder, t, entries), tuple(transitions)
+
+
+def hold(book: AlarmBook, t: float) -> AlarmBook:
+    """Return the book after ticks that were not judged: every clock stands still, as at an unknown tick.
+
+    Parameters
+    ----------
+    book
+        The feeder's alarms so far.
+    t
+        Unix time of the first tick that was not judged, s.
+    """
+    return replace(book, entries={key: _hold(entry, t) for key, entry in book.entries.items()})
+
+
+def _order(key: Key) -> tuple[str, str]:
+    return key[0].value, key[1] or ""
+
+
+def _hold(old: Entry, t: float) -> Entry:
+    """Return the entry after a tick that does not know; its clock stands still from here on."""
+    # If it stood still from the answer before, whoever is heard at every other tick would raise no alarm.
+    return replace(old, held=True, t_known=old.t_known if old.held else max(old.t_known, t))
+
+
+def _timed(old: Entry | None, present: bool, t: float, backwards: bool) -> Entry:
+    """Return the entry after a tick that knows, with its clock moved on."""
+    if old is None or old.present != present:
+        return Entry(present, t, t, t, held=False, alarm=None if old is None else old.alarm)
+    pause = t - old.t_known if old.held or backwards else 0.0
+    return replace(old, since=old.since + pause, t_known=t, held=False)
+
+
+def _settle(
+    entry: Entry, condition: Condition | None, rules: AlarmRules, key: Key, t: float
+) -> tuple[Entry | None, tuple[Transition, ...]]:
+    """Raise, clear or forget what is due."""
+    kind, alarm = key[0], entry.alarm
+    lasted = t - entry.since
+    if condition is not None:
+        return _present(entry, condition, rules, t)
+    if alarm is None:
+        return None, ()
+    if alarm.active:
+        if lasted < rules.off(kind):
+            return entry, ()
+        alarm = replace(alarm, state=AlarmState.CLEARED, t_cleared=t)
+        return replace(entry, alarm=alarm), (Transition(alarm, Change.CLEARED, t),)
+    return (entry if _remembered(alarm, rules, t) else None), ()
+
+
+def _present(
+    entry: Entry, condition: Condition, rules: AlarmRules, t: float
+) -> tuple[Entry, tuple[Transition, ...]]:
+    """Raise the alarm of a present condition when it is due, and update its evidence."""
+    alarm, lasted = entry.alarm, t - entry.since
+    if alarm is None or not alarm.active:
+        due = lasted >= rules.on(condition.kind) and (not condition.unheard or lasted > rules.silence_s)
+        if not due:
+            return entry, ()
+        alarm, change = _raise(alarm, condition, rules, entry.onset, t), Change.RAISED
+    elif _explains_more(condition.evidence, alarm.evidence):
+        alarm, change = replace(alarm, reason=condition.reason, evidence=condition.evidence), Change.UPDATED
+    else:
+        return entry, ()
+    return replace(entry, alarm=alarm), (Transition(alarm, change, t),)
+
+
+def _explains_more(now: Evidence, before: Evidence) -> bool:
+    """An error of the feeder's files explains the condition, and the alarm names another one or none."""
+    error, told = now.data_error, before.data_error
+    if error is None or told is None:
+        return error is not None
+    return (error.kind, set(error.customers), error.proposed) != (
+        told.kind,
+        set(told.customers),
+        told.proposed,
+    )
+
+
+def _remembered(alarm: Alarm, rules: AlarmRules, t: float) -> bool:
+    # Of a time ahead, after the clock was set back or a recording began again, no more is remembered.
+    return alarm.t_cleared is not None and abs(t - alarm.t_cleared) <= rules.memory_s
+
+
+def _raise(old: Alarm | None, condition: Condition, rules: AlarmRules, onset: float, t: float) -> Alarm:
+    again = old is not None and _remembered(old, rules, onset)
+    return Alarm(
+        id=old.id if old is not None and again else alarm_id(condition, onset),
+        kind=condition.kind,
+        feeder=condition.feeder,
+        meter=condition.meter,
+        severity=condition.severity,
+        state=AlarmState.RAISED,
+        count=old.count + 1 if old is not None and again else 1,
+        t_event=onset,
+        t_raised=t,
+        t_cleared=None,
+        reason=condition.reason,
+        evidence=condition.evidence,
+        customer=condition.customer,
+    )
+
+
+_CROCKFORD = "0123456789ABCDEFGHJKMNPQRSTVWXYZ"
+
+
+def alarm_id(condition: Condition, onset: float) -> str:
+    """Return the id of the alarm of a condition that was first seen at `onset`.
+
+    In the form of a ULID: ten characters of Crockford's base 32 for the milliseconds, then sixteen; those
+    are a hash instead of random bits, so that a replay gives the same ids.
+
+    Parameters
+    ----------
+    condition
+        Kind, feeder and subject enter the hash.
+    onset
+        Unix time, s.
+    """
+    what = "\0".join((condition.kind, condition.feeder, condition.subject or "", repr(onset)))
+    tail = int.from_bytes(hashlib.sha256(what.encode()).digest()[:10], "big")
+    number = (max(0, int(onset * 1000.0)) % (1 << 48)) << 80 | tail
+    return "".join(_CROCKFORD[number >> shift & 31] for shift in range(125, -1, -5))
+
+
+def acknowledged(alarm: Alarm, who: str, comment: str, t: float, *, count: int | None = None) -> Transition:
+    """Return the transition by which an operator answers an alarm.
+
+    An alarm that has cleared unanswered can still be answered; it stays cleared.
+
+    Parameters
+    ----------
+    alarm
+        The alarm as it is.
+    who, comment
+        The operator, and what they say.
+    t
+        Unix time, s.
+    count
+        Which occurrence they have seen; None: whichever it is.
+
+    Raises
+    ------
+    RaisedAgain
+        If the alarm has come back since: what they answer is not what stands.
+    AlreadyAcknowledged
+        If somebody did so before, for the same occurrence.
+    """
+    if count is not None and count != alarm.count:
+        raise RaisedAgain(alarm, count)
+    if alarm.acknowledged_by is not None:
+        raise AlreadyAcknowledged(alarm)
+    answered = replace(
+        alarm,
+        state=AlarmState.ACKNOWLEDGED if alarm.active else alarm.state,
+        acknowledged_by=who,
+        t_acknowledged=t,
+        comment=comment,
+    )
+    return Transition(answered, Change.ACKNOWLEDGED, t, who, comment)
+
+
+def carried(alarm: Alarm, answered: Alarm) -> Alarm:
+    """Return an alarm with the acknowledgement that was stored while it changed.
+
+    Parameters
+    ----------
+    alarm
+        The alarm after the change.
+    answered
+        The acknowledged alarm; of another alarm or occurrence nothing is carried over.
+    """
+    if (alarm.id, alarm.count) != (answered.id, answered.count):
+        return alarm
+    return replace(
+        alarm,
+        state=AlarmState.ACKNOWLEDGED if alarm.active else alarm.state,
+        acknowledged_by=answered.acknowledged_by,
+        t_acknowledged=answered.t_acknowledged,
+        comment=answered.comment,
+    )
+
+
+def acknowledge(
+    book: AlarmBook, alarm_id: str, who: str, comment: str, t: float, *, count: int | None = None
+) -> tuple[AlarmBook, tuple[Transition, ...]]:
+    """Answer an alarm of the book.
+
+    Parameters
+    ----------
+    book
+        The feeder's alarms.
+    alarm_id, who, comment, t
+        Which alarm, who answers it, with what words, and when (Unix s).
+    count
+        Which occurrence; None: whichever it is.
+
+    Returns
+    -------
+    book, transitions
+        As from `advance`.
+
+    Raises
+    ------
+    AlarmUnknown
+        If the book holds no such alarm: never raised, or cleared and forgotten (the store may know it).
+    RaisedAgain, AlreadyAcknowledged
+        If the alarm has come back since, or somebody was faster.
+    """
+    for key, entry in book.entries.items():
+        if entry.alarm is not None and entry.alarm.id == alarm_id:
+            transition = acknowledged(entry.alarm, who, comment, t, count=count)
+            entries = {**book.entries, key: replace(entry, alarm=transition.alarm)}
+            return replace(book, entries=entries), (transition,)
+    raise AlarmUnknown(alarm_id)
+
+
+def close(alarms: Iterable[Alarm], t: float, why: str) -> tuple[Transition, ...]:
+    """Return the transitions that clear alarms that nobody would clear any more.
+
+    Parameters
+    ----------
+    alarms, t, why
+        The alarms, of which those that stand are cleared; when (Unix s), and why, for the event.
+    """
+    cleared = (replace(alarm, state=AlarmState.CLEARED, t_cleared=t) for alarm in alarms if alarm.active)
+    return tuple(Transition(alarm, Change.CLEARED, t, None, why) for alarm in cleared)
+
+
+def restore(feeder: str, alarms: Iterable[Alarm]) -> AlarmBook:
+    """Return the book of a feeder from its stored alarms, after a restart.
+
+    The restart is a hold: nobody looked. Alarms keep their id, count, state and acknowledgement; a clock
+    that was running (a condition pending, an alarm about to clear) starts again from zero, so a transition
+    may come later than without the restart, by less than its delay, and never earlier.
+
+    Parameters
+    ----------
+    feeder
+        Name.
+    alarms
+        Its active alarms and those that cleared within the memory of the rules, in any order. Of several
+        with the same kind and subject one counts: an active one before those that have cleared, then the one
+        that was raised last.
+    """
+    entries: dict[Key, Entry] = {}
+    # Ids follow a clock that may have been set back since, and then say nothing about which one stands.
+    for alarm in sorted(alarms, key=lambda alarm: (alarm.active, alarm.t_raised, alarm.id)):
+        if alarm.feeder != feeder:
+            text = f"an alarm of {alarm.feeder!r} in the book of {feeder!r}"
+            raise InputInvalid([Problem("other-feeder", text)])
+        t = alarm.t_raised if alarm.t_cleared is None else alarm.t_cleared
+        entries[alarm.kind, alarm.subject] = Entry(alarm.active, t, t, t, held=True, alarm=alarm)
+    return AlarmBook(feeder, None, entries)

@@ -1,0 +1,1 @@
+"""HTTP interface: REST, server-sent events, web page."""

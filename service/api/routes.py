@@ -1,0 +1,620 @@
+"""REST, server-sent events and the web page. The only module that imports FastAPI.
+
+Nothing here owns state: reads come from the store and from the backend's latest reports, writes go through
+the backend. Streams keep no queue per client: a wake-up from the backend lets each of them read on from the
+store (alarms, by event number) or take the latest report (states), so a slow client costs no memory and
+loses no alarm. Every error is `application/problem+json` (RFC 9457).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import json
+import secrets
+from collections.abc import AsyncGenerator, AsyncIterator, Collection, Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path as FilePath
+from typing import Annotated, Any, Protocol, cast
+
+from anyio import CapacityLimiter, to_thread
+from fastapi import APIRouter, Depends, FastAPI, Header, HTTPException, Path, Query, Request, Response
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from fastapi.sse import EventSourceResponse, ServerSentEvent
+from fastapi.staticfiles import StaticFiles
+
+from gridsec.errors import FeederInvalid, Problem
+from service.alarms.state_machine import AlarmKind, AlarmState, AlarmUnknown, Severity
+from service.alarms.state_machine import to_json as alarm_json
+from service.api import models
+from service.api.errors import Guard, handlers, problem
+from service.errors import FeederNotLoaded, FeederUnknown
+from service.report.report import FeederReport
+from service.report.report import to_json as report_json
+from service.store import Event, Store, StoreUnavailable
+
+
+class Backend(Protocol):
+    """The running service, as REST sees it; `runtime.Runtime` is one."""
+
+    @property
+    def store(self) -> Store:
+        """The database, for reads."""
+
+    def feeders(self) -> list[dict[str, Any]]:
+        """Return the fields of `models.FeederSummary` for every feeder; verdict and time are added here."""
+
+    def feeder(self, name: str) -> dict[str, Any] | None:
+        """Return the fields of `models.FeederDetail`, or None if there is no such feeder."""
+
+    def known(self, name: str) -> bool:
+        """Whether there is such a feeder; costs nothing."""
+
+    def unloaded(self, name: str) -> str | None:
+        """Return why the stored tables of a feeder could not be loaded, or None if that is not so."""
+
+    def report(self, name: str) -> FeederReport | None:
+        """Return the latest report of a feeder, or None before its first tick."""
+
+    def age(self, report: FeederReport) -> float:
+        """Return how old a feeder's latest report is by the service's clock, s."""
+
+    def commissioning(self, name: str) -> dict[str, Any] | None:
+        """Return the fields of `models.Commissioning` but `kept`, or None if there is no such feeder."""
+
+    def unstored(self) -> tuple[int, str | None]:
+        """Return how many changes of alarms wait for the database, and what is wrong with it, or None."""
+
+    def metrics(self) -> bytes:
+        """Return the metrics in Prometheus's text format."""
+
+    def ready(self) -> tuple[bool, list[str]]:
+        """Say whether everything works that is needed to watch, and what does not."""
+
+    def healthy(self) -> tuple[bool, list[str]]:
+        """Say whether the process should live on, and if not, why."""
+
+    async def put_feeder(self, name: str, tables: dict[str, Any]) -> None:
+        """Take over a feeder's tables; raises what says that it is wrong, or TooManyFeeders."""
+
+    async def delete_feeder(self, name: str) -> None:
+        """Watch a feeder no more; raises FeederUnknown or FeederFixed."""
+
+    async def acknowledge(
+        self, alarm_id: str, who: str, comment: str, *, count: int | None = None
+    ) -> dict[str, Any]:
+        """Answer an alarm and return it; raises AlarmUnknown, RaisedAgain or AlreadyAcknowledged."""
+
+    async def recommission(self, name: str, meters: Sequence[str], who: str, reason: str) -> dict[str, Any]:
+        """Learn meters' errors anew, none for all; raises FeederUnknown or NothingToLearn."""
+
+    def subscribe(self) -> AsyncGenerator[dict[str, Any], None]:
+        """Return an asynchronous generator of wake-ups; it ends when the service stops.
+
+        Each is `{"type": "alarm" | "state", "data": ...}`, sent after the alarm has been stored or the
+        report replaced. Only the type is read here, so the backend may drop wake-ups of a client that is
+        slow, as long as one is left. The first step into the generator subscribes, closing it ends that.
+        """
+
+
+async def wakes(backend: Backend) -> AsyncIterator[None]:
+    """Yield once the subscription stands, and again after each wake-up, until the service stops.
+
+    Parameters
+    ----------
+    backend
+        The running service.
+    """
+    subscription = backend.subscribe()
+    waiting: asyncio.Future[dict[str, Any] | None] | None = None
+    try:
+        while True:
+            waiting = asyncio.ensure_future(anext(subscription, None))
+            await asyncio.sleep(0)  # The first step subscribes: nothing that happens from here on is missed.
+            yield
+            if await waiting is None:
+                return
+    finally:
+        if waiting is not None:
+            waiting.cancel()
+            await asyncio.gather(waiting, return_exceptions=True)
+        await subscription.aclose()
+
+
+ANSWER_S = 0.7
+"""Wait for the test write, s: `/readyz` answers within 1 s."""
+
+
+class Probe:
+    """Test write that concurrent requests share; none of them waits for it longer than `ANSWER_S`.
+
+    Parameters
+    ----------
+    store
+        The database.
+    """
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._running: asyncio.Task[str | None] | None = None
+
+    async def trouble(self) -> str | None:
+        """Return why the database cannot be written, or None."""
+        if self._running is None or self._running.done():
+            self._running = asyncio.create_task(self._check(), name="readiness")
+        await asyncio.wait({self._running}, timeout=ANSWER_S)
+        if self._running.done():
+            return self._running.result()
+        return f"{self._store.name}: no answer within {ANSWER_S:g} s"
+
+    async def _check(self) -> str | None:
+        # A thread of its own: reads that wait for the database may hold all of the shared ones.
+        try:
+            await to_thread.run_sync(self._store.check, limiter=CapacityLimiter(1), abandon_on_cancel=True)
+        except StoreUnavailable as error:
+            return str(error)
+        return None
+
+
+MAX_BODY = 4 << 20
+"""Longest request body that is read, bytes."""
+MAX_STREAMS = 100
+"""Event streams that may be open at once."""
+MAX_EVENT = (1 << 63) - 1
+"""The highest number that an event can have."""
+_WEB = FilePath(__file__).parent.with_name("web")
+_NAME = r"^[A-Za-z0-9_-]{1,64}$"
+
+
+def create_api(backend: Backend, hosts: Collection[str] = (), *, max_streams: int = MAX_STREAMS) -> FastAPI:
+    """Return the HTTP application.
+
+    Parameters
+    ----------
+    backend
+        The running service.
+    hosts
+        Names by which it may be asked to change something, besides `localhost` and this machine's.
+    max_streams
+        Event streams that may be open at once.
+    """
+    app = FastAPI(
+        title="gridsec",
+        description="Watches the voltages of distribution feeders and names the meters that lie.",
+        version="1",
+        docs_url=None,
+        redoc_url=None,
+        openapi_url="/api/v1/openapi.json",
+        responses={"default": {"model": models.Problem, "description": "Any error."}},
+    )
+    app.state.backend = backend
+    app.state.probe = Probe(backend.store)
+    app.state.streams, app.state.max_streams = 0, max_streams
+    app.state.run = secrets.token_hex(4)
+    app.add_middleware(Guard, max_body=MAX_BODY, hosts=hosts)
+    for error, handler in handlers().items():
+        app.add_exception_handler(error, handler)
+    app.add_exception_handler(RequestValidationError, _validation_handler)
+    app.include_router(_feeders)
+    app.include_router(_alarms)
+    app.include_router(_operations)
+    app.mount("/", _Web(directory=_WEB, html=True), name="web")
+    _describe(app)
+    return app
+
+
+class _Web(StaticFiles):
+    """The page. Browsers ask each time whether it has changed, so that an upgrade is seen at once."""
+
+    def file_response(self, *args: Any, **kwargs: Any) -> Response:
+        response = super().file_response(*args, **kwargs)
+        response.headers["Cache-Control"] = "no-cache"
+        return response
+
+
+def _describe(app: FastAPI) -> None:
+    """Write the OpenAPI description once, with errors as the problems that they are."""
+    schema = app.openapi()
+    error = {"$ref": "#/components/schemas/Problem"}
+    for path in schema["paths"].values():
+        for operation in path.values():
+            operation["responses"].pop("422", None)
+            operation["responses"]["default"]["content"] = {"application/problem+json": {"schema": error}}
+    for unused in ("HTTPValidationError", "ValidationError"):
+        schema["components"]["schemas"].pop(unused, None)
+
+
+def _backend(request: Request) -> Backend:
+    backend: Backend = request.app.state.backend
+    return backend
+
+
+BackendHere = Annotated[Backend, Depends(_backend)]
+FeederName = Annotated[str, Path(pattern=_NAME, description="Name of the feeder.")]
+AlarmId = Annotated[str, Path(pattern=r"^[0-9A-Z]{26}$", description="Id of the alarm.")]
+Since = Annotated[float | None, Query(allow_inf_nan=False, description="Not before this Unix time, s.")]
+Until = Annotated[float | None, Query(allow_inf_nan=False, description="Before this Unix time, s.")]
+
+
+def _known_feeder(backend: BackendHere, feeder: FeederName) -> str:
+    if backend.known(feeder):
+        return feeder
+    if problem := backend.unloaded(feeder):
+        raise FeederNotLoaded(feeder, problem)
+    raise FeederUnknown(feeder)
+
+
+def _latest(backend: BackendHere, feeder: Annotated[str, Depends(_known_feeder)]) -> FeederReport:
+    report = backend.report(feeder)
+    if report is None:
+        raise HTTPException(503, f"feeder {feeder!r} has had no tick yet", {"Retry-After": "1"})
+    return report
+
+
+async def _json_only(request: Request) -> None:
+    """Refuse bodies that do not say that they are JSON; this also keeps foreign web pages from posting."""
+    kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if kind != "application/json":
+        raise HTTPException(415, f"the body must be application/json, not {kind or 'of unknown type'}")
+
+
+async def _slot(request: Request) -> AsyncIterator[None]:
+    """Count an open stream for as long as it is open."""
+    state = request.app.state
+    if state.streams >= state.max_streams:
+        raise HTTPException(503, f"{state.max_streams} event streams are open already", {"Retry-After": "10"})
+    state.streams += 1
+    try:
+        yield
+    finally:
+        state.streams -= 1
+
+
+KnownFeeder = Annotated[str, Depends(_known_feeder)]
+Latest = Annotated[FeederReport, Depends(_latest)]
+IfNoneMatch = Annotated[str | None, Header(include_in_schema=False)]
+
+_NOT_MODIFIED: dict[int | str, dict[str, Any]] = {304: {"description": "As the client has it."}}
+
+
+def _unchanged(response: Response, tag: str, if_none_match: str | None) -> Response | None:
+    """Mark a response with its ETag; return the answer 304 if the client has it already."""
+    headers = {"ETag": tag, "Cache-Control": "no-cache"}
+    response.headers.update(headers)
+    known = {part.strip() for part in (if_none_match or "").split(",")}
+    return Response(status_code=304, headers=headers) if known & {tag, "*"} else None
+
+
+# -------------------------------------------------------------------- feeders
+
+_feeders = APIRouter(prefix="/api/v1/feeders", tags=["feeders"])
+
+
+def _summary(backend: Backend, fields: dict[str, Any]) -> models.FeederSummary:
+    report = backend.report(fields["name"])
+    now: dict[str, Any] = {}
+    if report is not None:
+        age_s, model_only = backend.age(report), report.model_only
+        now = {"t": report.t, "verdict": report.verdict, "age_s": age_s, "model_only": model_only}
+    return models.FeederSummary.model_validate({**fields, **now})
+
+
+def _detail(backend: Backend, feeder: str) -> dict[str, Any]:
+    fields = backend.feeder(feeder)
+    if fields is None:
+        raise FeederUnknown(feeder)
+    return fields
+
+
+@_feeders.get("")
+def list_feeders(backend: BackendHere) -> models.Feeders:
+    """All feeders, with the latest verdict of each."""
+    return models.Feeders(feeders=[_summary(backend, fields) for fields in backend.feeders()])
+
+
+@_feeders.get("/{feeder}", response_model=models.FeederDetail, responses=_NOT_MODIFIED)
+def get_feeder(
+    backend: BackendHere, feeder: KnownFeeder, response: Response, if_none_match: IfNoneMatch = None
+) -> Any:
+    """A feeder: its tree, and the columns of its files."""
+    fields = _detail(backend, feeder)
+    return _unchanged(response, f'"{fields["revision"]}"', if_none_match) or fields
+
+
+@_feeders.put("/{feeder}", response_model=models.FeederDetail, dependencies=[Depends(_json_only)])
+async def put_feeder(backend: BackendHere, feeder: FeederName, tables: dict[str, Any]) -> Any:
+    """Add a feeder or replace it, from JSON of the same columns as its files."""
+    try:
+        await to_thread.run_sync(lambda: json.dumps(tables, allow_nan=False))
+    except ValueError as error:
+        text = "the JSON contains NaN or an infinity; leave the field out instead"
+        raise FeederInvalid([Problem("not-finite", text)]) from error
+    await backend.put_feeder(feeder, tables)
+    return _detail(backend, feeder)
+
+
+@_feeders.delete("/{feeder}", status_code=204)
+async def delete_feeder(backend: BackendHere, feeder: FeederName) -> None:
+    """Watch a feeder no more that was put: its alarms are cleared, its history is kept."""
+    await backend.delete_feeder(feeder)
+
+
+@_feeders.get("/{feeder}/state")
+def get_state(backend: BackendHere, report: Latest, response: Response) -> models.State:
+    """The latest tick: verdict, and every meter with what it says and what is true there."""
+    response.headers["Cache-Control"] = "no-store"
+    return _state(backend, report)
+
+
+def _state(backend: Backend, report: FeederReport) -> models.State:
+    return models.State.model_validate({**report_json(report), "age_s": backend.age(report)})
+
+
+@_feeders.get("/{feeder}/meters/{meter}")
+def get_meter(backend: BackendHere, report: Latest, meter: str, response: Response) -> models.MeterNow:
+    """One meter at the latest tick, and what is known of its own error."""
+    response.headers["Cache-Control"] = "no-store"
+    known = backend.commissioning(report.feeder) or {"meters": ()}
+    for found in report_json(report)["meters"]:
+        if found["meter"] == meter:
+            own = next((one for one in known["meters"] if one["meter"] == meter), None)
+            whole = {"feeder": report.feeder, "t": report.t, "verdict": report.verdict, "commissioning": own}
+            return models.MeterNow.model_validate({**found, **whole})
+    raise HTTPException(404, f"feeder {report.feeder!r} has no meter {meter!r}")
+
+
+@_feeders.get("/{feeder}/history")
+def get_history(
+    backend: BackendHere,
+    feeder: KnownFeeder,
+    *,
+    since: Since = None,
+    until: Until = None,
+    meter: Annotated[str | None, Query(pattern=_NAME, description="Also the numbers of this meter.")] = None,
+    limit: Annotated[int, Query(ge=1, le=5000)] = 500,
+) -> models.History:
+    """The newest kept ticks in [since, until), oldest first."""
+    rows = backend.store.history(feeder, since=since, until=until, meter=meter, limit=limit)
+    points = [models.HistoryPoint.model_validate(row) for row in rows]
+    return models.History(feeder=feeder, points=points, more=len(rows) == limit)
+
+
+@_feeders.get("/{feeder}/commissioning", response_model=models.Commissioning)
+def get_commissioning(backend: BackendHere, feeder: KnownFeeder, response: Response) -> Any:
+    """How far the meters' own fixed errors are known: what was gathered, what was learned, and when."""
+    response.headers["Cache-Control"] = "no-store"
+    return _commissioning(backend, feeder, backend.commissioning(feeder))
+
+
+@_feeders.post(
+    "/{feeder}/commissioning",
+    response_model=models.Commissioning,
+    dependencies=[Depends(_json_only)],
+    openapi_extra=models.Recommissioning.in_openapi(),
+)
+async def recommission(backend: BackendHere, feeder: KnownFeeder, request: Request) -> Any:
+    """Learn anew: meters that were replaced, while the others stay, or without `meters` the whole feeder."""
+    layout = _detail(backend, feeder)["layout"]
+    meters = [row["meter"] for row in layout["customers"] if row["meter"]]
+    found = models.Recommissioning.of(await request.body(), meters)
+    if isinstance(found, list):
+        raise RequestValidationError(found)
+    fields = await backend.recommission(feeder, found.meters or (), found.who, found.reason)
+    return await to_thread.run_sync(_commissioning, backend, feeder, fields)
+
+
+@_feeders.get("/{feeder}/commissioning/events")
+def get_commissioning_events(
+    backend: BackendHere, feeder: KnownFeeder, limit: Annotated[int, Query(ge=1, le=1000)] = 100
+) -> models.CommissioningEvents:
+    """What happened to the commissioning, who wanted it and why: the newest ones, oldest first."""
+    found = [asdict(event) for event in backend.store.commission_events(feeder, limit)]
+    return models.CommissioningEvents.model_validate({"events": found})
+
+
+def _commissioning(backend: Backend, feeder: str, fields: dict[str, Any] | None) -> dict[str, Any]:
+    if fields is None:
+        raise FeederUnknown(feeder)
+    kept = backend.store.commission(feeder)
+    return {**fields, "kept": None if kept is None else kept.t}
+
+
+@_feeders.get(
+    "/{feeder}/stream", response_class=EventSourceResponse, dependencies=[Depends(_slot)], tags=["streams"]
+)
+async def stream_states(backend: BackendHere, feeder: KnownFeeder) -> AsyncIterator[ServerSentEvent]:
+    """Server-sent events `state`: the latest tick and each that follows; a slow client skips some."""
+    yield ServerSentEvent(comment="connected", retry=2000)
+    last: FeederReport | None = None
+    async for _ in wakes(backend):
+        if not backend.known(feeder):
+            return
+        report = backend.report(feeder)
+        if report is not None and report is not last:
+            last = report
+            yield ServerSentEvent(event="state", data=_state(backend, report))
+
+
+# --------------------------------------------------------------------- alarms
+
+_alarms = APIRouter(prefix="/api/v1/alarms", tags=["alarms"])
+
+
+@_alarms.get("", response_model=models.Alarms, responses=_NOT_MODIFIED)
+def list_alarms(
+    request: Request,
+    backend: BackendHere,
+    response: Response,
+    *,
+    state: Annotated[list[AlarmState] | None, Query(description="May be repeated.")] = None,
+    kind: Annotated[list[AlarmKind] | None, Query(description="May be repeated.")] = None,
+    severity: Annotated[list[Severity] | None, Query(description="May be repeated.")] = None,
+    feeder: Annotated[str | None, Query(pattern=_NAME)] = None,
+    meter: Annotated[str | None, Query(pattern=_NAME)] = None,
+    since: Since = None,
+    until: Until = None,
+    cursor: Annotated[str | None, Query(pattern=r"^[0-9A-Z]{26}$")] = None,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
+    if_none_match: IfNoneMatch = None,
+) -> Any:
+    """A page of alarms, those that began last first; `since` and `until` are about `t_raised`."""
+    last_event = backend.store.last_event
+    # Before the page is read: what waits no longer by then is in it.
+    unstored, trouble = backend.unstored()
+    # Event numbers say what has changed within one database, and a run has only one.
+    waits = hashlib.sha256(f"{unstored} {trouble}".encode()).hexdigest()[:16]
+    if known := _unchanged(response, f'W/"{request.app.state.run}-{last_event}-{waits}"', if_none_match):
+        return known
+    page, following = backend.store.alarms(
+        state=state or (),
+        kind=kind or (),
+        severity=severity or (),
+        feeder=feeder,
+        meter=meter,
+        since=since,
+        until=until,
+        cursor=cursor,
+        limit=limit,
+    )
+    found = [alarm_json(alarm) for alarm in page]
+    return {
+        "alarms": found,
+        "next": following,
+        "last_event": last_event,
+        "raised": backend.store.raised(),
+        "unstored": unstored,
+        "problem": trouble,
+    }
+
+
+@_alarms.get("/stream", response_class=EventSourceResponse, dependencies=[Depends(_slot)], tags=["streams"])
+async def stream_alarms(
+    backend: BackendHere,
+    feeder: Annotated[str | None, Query(pattern=_NAME, description="Only this one's.")] = None,
+    after: Annotated[int | None, Query(ge=0, description="Begin after this event number.")] = None,
+    last_event_id: Annotated[int | None, Header(ge=0, description="Goes before `after`.")] = None,
+) -> AsyncIterator[ServerSentEvent]:
+    """Server-sent events `alarm`, whose ids are event numbers: with `Last-Event-ID` none is ever missed.
+
+    Without it and without `after`, it begins with what happens next.
+    """
+    store = backend.store
+    start = last_event_id if last_event_id is not None else after
+    # A number from the future belongs to another database: begin now, or nothing would ever come.
+    seen = store.last_event if start is None else min(start, store.last_event)
+    yield ServerSentEvent(comment="connected", id=str(seen), retry=2000)
+    async for _ in wakes(backend):
+        while seen < (newest := store.last_event):
+            try:
+                events = await to_thread.run_sync(partial(store.events_after, seen, feeder=feeder))
+            except StoreUnavailable:
+                return  # The client comes back with the number of the last event it got.
+            for event in events:
+                yield ServerSentEvent(event="alarm", id=str(event.seq), data=_event(event))
+                seen = event.seq
+            if not events:
+                seen = newest
+
+
+@_alarms.get("/{alarm_id}", response_model=models.AlarmModel)
+def get_alarm(backend: BackendHere, alarm_id: AlarmId) -> Any:
+    """One alarm."""
+    alarm = backend.store.alarm(alarm_id)
+    if alarm is None:
+        raise AlarmUnknown(alarm_id)
+    return alarm_json(alarm)
+
+
+@_alarms.get("/{alarm_id}/events")
+def get_events(
+    backend: BackendHere,
+    alarm_id: AlarmId,
+    after: Annotated[int, Query(ge=0, le=MAX_EVENT, description="Only events with a higher number.")] = 0,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
+) -> models.AlarmEvents:
+    """A page of what happened to an alarm, oldest first."""
+    found = backend.store.events(alarm_id, after=after, limit=limit + 1)
+    if not found and backend.store.alarm(alarm_id) is None:
+        raise AlarmUnknown(alarm_id)
+    page = [_event(event) for event in found[:limit]]
+    return models.AlarmEvents(events=page, next=page[-1].seq if len(found) > limit else None)
+
+
+@_alarms.post("/{alarm_id}/ack", response_model=models.AlarmModel, dependencies=[Depends(_json_only)])
+async def acknowledge(backend: BackendHere, alarm_id: AlarmId, answer: models.Acknowledgement) -> Any:
+    """Answer an alarm: say who has seen it."""
+    return await backend.acknowledge(alarm_id, answer.who, answer.comment, count=answer.count)
+
+
+def _event(event: Event) -> models.AlarmEvent:
+    return models.AlarmEvent(
+        seq=event.seq,
+        t=event.t,
+        change=event.change,
+        who=event.who,
+        comment=event.comment,
+        alarm=models.AlarmModel.model_validate(alarm_json(event.alarm)),
+    )
+
+
+# ----------------------------------------------------------------- operations
+
+_operations = APIRouter(tags=["operations"])
+
+
+@_operations.get("/api/v1/bad-readings")
+def list_rejected(
+    backend: BackendHere, limit: Annotated[int, Query(ge=1, le=1000)] = 100
+) -> models.RejectedReadings:
+    """The newest readings that could not be used, and why."""
+    return models.RejectedReadings(
+        readings=[
+            models.RejectedReading(
+                t=item.t, key=item.key, reason=item.reason, payload=item.payload.decode("utf-8", "replace")
+            )
+            for item in backend.store.rejected(limit)
+        ]
+    )
+
+
+@_operations.get("/healthz", response_model=models.Health)
+@_operations.head("/healthz", include_in_schema=False)
+async def healthz(request: Request, backend: BackendHere) -> Any:
+    """Whether the process and its tasks are alive."""
+    return _probe(request, *backend.healthy(), "the service does not work and should be restarted")
+
+
+@_operations.get("/readyz", response_model=models.Health)
+@_operations.head("/readyz", include_in_schema=False)
+async def readyz(request: Request, backend: BackendHere) -> Any:
+    """Whether feeders are designed, the database can be written and zenoh is connected."""
+    ready, reasons = backend.ready()
+    trouble = await request.app.state.probe.trouble()
+    if trouble is not None:
+        ready, reasons = False, [*reasons, *([] if any(trouble in one for one in reasons) else [trouble])]
+    return _probe(request, ready, reasons, "the service cannot watch at the moment")
+
+
+def _probe(request: Request, good: bool, reasons: list[str], what: str) -> Any:
+    if good:
+        return JSONResponse({"ok": True, "reasons": reasons}, headers={"Cache-Control": "no-store"})
+    return problem(request, 503, what, ok=False, reasons=reasons)
+
+
+@_operations.get("/metrics", response_class=Response)
+def metrics(backend: BackendHere) -> Response:
+    """Metrics in Prometheus's text format."""
+    return Response(backend.metrics(), media_type="text/plain; version=0.0.4; charset=utf-8")
+
+
+# --------------------------------------------------------------------- errors
+
+
+async def _validation_handler(request: Request, error: Exception) -> Response:
+    found = cast(RequestValidationError, error).errors()
+    errors = [{"where": ".".join(str(part) for part in item["loc"]), "what": item["msg"]} for item in found]
+    broken = any(item["type"] == "json_invalid" for item in found)
+    detail = "; ".join(f"{item['where']}: {item['what']}" for item in errors)
+    return problem(request, 400 if broken else 422, detail, errors=errors)

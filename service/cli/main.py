@@ -1,0 +1,443 @@
+"""Command line. Every command is a thin layer over a module that does the work.
+
+Exit codes: 0 done; 1 a check failed or something unexpected; 2 wrong usage or settings; 3 a feeder is invalid
+or cannot be watched; 4 the database cannot be used; 5 an address cannot be used (HTTP or zenoh); 6 a file is
+no recording, no network of another tool, or cannot be written; 7 the writer's lock of the database is lost.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+import time
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+
+from gridsec.errors import DesignInfeasible, FeederInvalid, GridsecError, NotObservable, refuse
+from service.cli import (
+    console,
+    feeders,
+    replay,
+    reproduce,
+    serve,
+    session,
+    study_calibrate,
+    study_campaign,
+    study_compare,
+    study_droop,
+    study_planning,
+    study_report,
+)
+from service.cli.console import (
+    ADDRESS,
+    DATABASE,
+    FAILED,
+    FEEDER,
+    FILE,
+    USAGE,
+    WRITER_LOST,
+    Feeder,
+    complain,
+    read_all,
+)
+from service.cli.paths import Unusable, see
+from service.cli.serve import Endpoints
+from service.cli.study_planning import said
+
+if TYPE_CHECKING:
+    from feeders.model.site import Site
+    from feeders.simulation.attacks import Kind
+    from feeders.simulation.scenario import Scenario
+    from gridsec.attack import Attack, InverterAttack
+
+
+study_app = typer.Typer(no_args_is_help=True)
+
+
+@study_app.callback()
+def study(context: typer.Context) -> None:
+    """Study feeders and estimators."""
+    context.call_on_close(session.idle())
+
+
+study_app.command("redundancy")(study_planning.redundancy)
+study_app.command("protect")(study_planning.protect)
+study_app.command("detectable")(study_planning.detectable)
+study_app.command("calibrate")(study_calibrate.calibrate)
+study_app.command("campaign")(study_campaign.campaign)
+study_app.command("droop")(study_droop.droop)
+study_app.command("report")(study_report.report)
+study_app.command("compare")(study_compare.compare)
+
+
+app = typer.Typer(
+    name="gridsec",
+    help="Watches the voltages of distribution feeders and names the meters that lie.",
+    no_args_is_help=True,
+    rich_markup_mode="markdown",  # brackets in help texts are brackets
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+app.add_typer(feeders.app, name="feeders")
+app.command("convert")(feeders.convert)
+app.add_typer(study_app, name="study")
+app.command()(replay.replay)
+app.command()(reproduce.reproduce)
+app.command()(serve.serve)
+
+
+def main() -> None:
+    """Run the command line; errors made on purpose become one clear message and an exit code."""
+    # The observers are memory-bound: more BLAS threads only fight with each other.
+    for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+        os.environ.setdefault(variable, "1")
+    try:
+        app()
+    except GridsecError as error:
+        complain(str(error))
+        sys.exit(exit_code(error))
+    except OSError as error:
+        complain(f"{error.filename or ''}: {error.strerror or error}".removeprefix(": "))
+        sys.exit(FILE)
+
+
+def exit_code(error: GridsecError) -> int:
+    """Return the exit code of an error.
+
+    Parameters
+    ----------
+    error
+        The error.
+    """
+    from feeders.convert.provenance import BusbarUnclear, SourceUnreadable
+    from feeders.simulation.recording import RecordingInvalid
+    from service.app import AddressUnavailable
+    from service.ingest.queues import BusUnavailable
+    from service.settings import SettingsInvalid
+    from service.store import StoreUnavailable, WriterLost
+
+    codes: dict[type[GridsecError], int] = {
+        SettingsInvalid: USAGE,
+        FeederInvalid: FEEDER,
+        NotObservable: FEEDER,
+        DesignInfeasible: FEEDER,
+        BusbarUnclear: FEEDER,
+        WriterLost: WRITER_LOST,
+        StoreUnavailable: DATABASE,
+        AddressUnavailable: ADDRESS,
+        BusUnavailable: ADDRESS,
+        RecordingInvalid: FILE,
+        SourceUnreadable: FILE,
+        Unusable: FILE,
+    }
+    return next((code for kind, code in codes.items() if isinstance(error, kind)), FAILED)
+
+
+# ----------------------------------------------------------------------------------------------------- demo
+
+
+@app.command()
+def demo(
+    *,
+    feeder: Annotated[str, typer.Option(help="Folder or name of a feeder.")] = "simbench-lv-rural1",
+    duration: Annotated[float, typer.Option(min=30.0, help="How long it plays, s.")] = 120.0,
+    attacked: Annotated[int, typer.Option(min=1, help="How many meters lie.")] = 2,
+    size: Annotated[
+        float, typer.Option(help="By how much at least, as a part of the nominal voltage; 0.03 is 3 %.")
+    ] = 0.03,
+    kind: Annotated[
+        str, typer.Option(help="bias, scaling, drift, stuck, replay, random, coordinated, coordinated-power.")
+    ] = "bias",
+    seed: Annotated[int, typer.Option(min=0, help="Chooses meters, loads and errors.")] = 1,
+    http: Annotated[
+        str, typer.Option(help="Address of the web page; another free port if it is taken.")
+    ] = "127.0.0.1:8000",
+    check: Annotated[
+        bool,
+        typer.Option(
+            "--check", help="Exit 0 only if exactly the manipulated meters were named and all alarms cleared."
+        ),
+    ] = False,
+    keep: Annotated[bool, typer.Option("--keep", help="Go on until interrupted.")] = False,
+) -> None:
+    """Show it: a service, virtual meters on zenoh of which some begin to lie, and a web page."""
+    from service.cli.demo import Plan, run, verdict
+
+    _see_kind(kind, check=check)
+    _see_size(size)
+    plan = Plan(feeder, duration, attacked, size, kind, seed, http)
+    try:
+        outcome = run(plan, console.out, check=check, keep=keep)
+    except KeyboardInterrupt:
+        console.out.print("Interrupted.")
+        raise typer.Exit(130) from None
+    console.out.print(f"Manipulated:          {', '.join(sorted(outcome.lied)) or 'none'}")
+    console.out.print(f"Named by the service: {', '.join(sorted(outcome.named)) or 'none'}")
+    if check:
+        problems = verdict(outcome)
+        for problem in problems:
+            complain(problem)
+        if problems:
+            raise typer.Exit(FAILED)
+        console.out.print("[green]Exactly the manipulated meters were named, and all alarms have cleared.[/]")
+
+
+def _see_kind(kind: str, *, check: bool) -> None:
+    """Refuse kinds that there are not, and with `--check` those that need not show within the demo."""
+    from feeders.simulation.attacks import Kind
+
+    if kind not in set(Kind):
+        raise typer.BadParameter(
+            f"{kind!r} is not known; expected one of {', '.join(Kind)}", param_hint="--kind"
+        )
+    if check and kind in {Kind.STUCK, Kind.REPLAY}:
+        raise typer.BadParameter(
+            f"{kind} shows only once the voltage has moved away from what is repeated, which may take longer "
+            "than the demo: such meters lie by nothing yet and are rightly not named. Leave out --check",
+            param_hint="--kind",
+        )
+
+
+def _see_size(size: float) -> None:
+    """Refuse sizes that are none, or were said in per cent."""
+    from feeders.simulation.attacks import no_size
+
+    problems = no_size(size) if 0.0 < size < math.inf else [f"{size:g}; expected a positive part of nominal"]
+    if problems:
+        raise typer.BadParameter("; ".join(problems), param_hint="--size")
+
+
+# ------------------------------------------------------------------------------------------------- simulate
+
+PREFIX: Final = "gridsec"
+
+Attacks = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--attack",
+        help="kind:count:size:from:to, e.g. bias:2:0.03:20:55 (size as a part of nominal: 0.03 is 3 %, "
+        "times in s after the start); may be repeated. With 'substation' in place of the count the busbar's "
+        "meter lies, by just that size, which may be negative: bias:substation:0.03:20:55.",
+    ),
+]
+
+
+InverterAttacks = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--inverter-attack",
+        help="customer:kvar:from:to, e.g. 'load-6:-4:20:55': the customer's inverter injects so many kvar "
+        "beside its droop curve (times in s after the start); may be repeated.",
+    ),
+]
+
+
+@app.command()
+def simulate(
+    feeder: Feeder,
+    *,
+    connect: Endpoints = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Write a recording (Parquet) instead of publishing; it replaces simulated ones only."
+        ),
+    ] = None,
+    duration: Annotated[float, typer.Option(min=0.0, help="How long, s; 0 is without end.")] = 600.0,
+    dt: Annotated[
+        float | None, typer.Option(help="Interval between readings, s. [default: the tick]")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Chooses everything random.")] = 0,
+    season: Annotated[
+        str, typer.Option(help="Loads and generation of winter, spring, summer or autumn.")
+    ] = "summer",
+    attack: Attacks = None,
+    inverter_attack: InverterAttacks = None,
+    start: Annotated[
+        float | None, typer.Option(help="Unix time of the first tick, s. [default: now]")
+    ] = None,
+    speed: Annotated[float, typer.Option(min=0.0, help="Virtual seconds per second; 0 is no limit.")] = 1.0,
+    lockstep: Annotated[
+        int | None,
+        typer.Option(min=2, help="Stay within so many ticks of the service's published estimates."),
+    ] = None,
+    loss: Annotated[float, typer.Option(min=0.0, max=1.0, help="Part of the readings that is lost.")] = 0.0,
+    report_q: Annotated[bool, typer.Option("--report-q", help="Meters report reactive power.")] = False,
+    prefix: Annotated[str, typer.Option(help="First chunks of all keys.")] = PREFIX,
+) -> None:
+    """Play a feeder's meters by full AC power flow: onto zenoh, or into a file.
+
+    Faster than real time needs a service with `--clock events`.
+    """
+    from feeders.model.site import load
+    from feeders.simulation.meters import Channel, MeterErrors
+    from feeders.simulation.recording import record, truth_path
+    from feeders.simulation.scenario import Scenario, Season
+    from feeders.simulation.scenario import check as see_attacks
+    from gridsec.errors import no_choice
+
+    site = load(feeder)
+    length = duration or math.inf
+    problems = _wrong_times(dt, start)
+    if out is not None:
+        if math.isinf(length):
+            problems.append("--duration: a recording has an end")
+        live = {
+            "--connect": connect,
+            "--lockstep": lockstep,
+            "--speed": speed != 1.0,
+            "--prefix": prefix != PREFIX,
+        }
+        problems += [f"{name} goes with publishing, not with --out" for name, given in live.items() if given]
+    problems += no_choice("--season", Season, season)
+    lies = read_all("--attack", attack, _lie, problems)
+    wrong = read_all("--inverter-attack", inverter_attack, partial(_injection, site), problems)
+    if problems:
+        raise typer.BadParameter("; ".join(problems))
+    if out is not None:
+        see(simulated={"--out": out, "--out, its truth": truth_path(out)})
+    tick = site.tables.meta.monitor.tick_s if dt is None else dt
+    first = math.ceil(time.time() / tick) * tick if start is None else start
+    with said():
+        scenario = Scenario(
+            seed=seed,
+            start=first,
+            duration_s=length,
+            dt_s=tick,
+            errors=MeterErrors(report_q=report_q),
+            channel=Channel(loss=loss),
+            season=Season(season),
+        )
+        scenario = _attacked(site, scenario, lies, wrong)
+        see_attacks(site, scenario)
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        recording = record(site, scenario, out)
+        console.out.print(f"{recording.path}: {recording.count} readings of {site.feeder.name}")
+        return
+    _publish(site, scenario, tuple(connect or ("tcp/127.0.0.1:7447",)), prefix, (speed or math.inf, lockstep))
+
+
+def _wrong_times(dt: float | None, start: float | None) -> list[str]:
+    """What is wrong with the times of a scenario."""
+    from feeders.simulation.scenario import LATEST_S
+
+    problems = []
+    if dt is not None and not 0.0 < dt < math.inf:
+        problems.append(f"--dt is {dt:g}; expected a positive number of seconds")
+    if start is not None and not 0.0 <= start < LATEST_S:
+        problems.append(f"--start is {start:g}; expected a Unix time in seconds")
+    return problems
+
+
+def _span(begin: float, end: float) -> tuple[float, float]:
+    """Two times, s after the start, one before the other."""
+    if not (math.isfinite(begin) and begin < end and end > 0.0):
+        raise ValueError(
+            f"it must begin before it ends, and end after the start, not at {begin:g} and {end:g}"
+        )
+    return begin, end
+
+
+@dataclass(frozen=True, slots=True)
+class _Lie:
+    """What --attack says; no count: the busbar's meter lies."""
+
+    kind: Kind
+    count: int | None
+    size: float
+    begin: float
+    end: float
+
+
+def _lie(text: str) -> _Lie:
+    """Read `kind:count:size:from:to`."""
+    from feeders.simulation.attacks import Kind, no_size
+    from service.report.voltages import BUSBAR
+
+    try:
+        name, count, size, begin, end = text.split(":")
+        many, part, kind = None if count == BUSBAR else int(count), float(size), Kind(name)
+        times = float(begin), float(end)
+    except ValueError:
+        raise ValueError(f"expected kind:count:size:from:to with a kind of {', '.join(Kind)}") from None
+    on, off = _span(*times)
+    if many is not None and many < 1:
+        raise ValueError(f"{many} meters cannot lie")
+    # Who repeats what was lies by what has changed since, whatever size is said.
+    sized = many is not None and kind not in (Kind.STUCK, Kind.REPLAY)
+    if not math.isfinite(part) or (sized and part <= 0.0):
+        what = "positive" if sized else "finite"
+        raise ValueError(f"its size is {size}; expected a {what} part of nominal")
+    if kind not in (Kind.STUCK, Kind.REPLAY):
+        refuse(no_size(part))
+    if kind is Kind.DRIFT and math.isinf(off):
+        raise ValueError("a drift must end, as its speed follows from that")
+    return _Lie(kind, many, part, on, off)
+
+
+def _injection(site: Site, text: str) -> InverterAttack:
+    """Read `customer:kvar:from:to`; times are still after the start."""
+    import numpy as np
+
+    from gridsec.attack import InverterAttack
+
+    owners = [site.feeder.customers[int(c)] for c in site.droop.customer]
+    try:
+        customer, kvar, begin, end = text.rsplit(":", 3)
+        which, q = owners.index(customer), float(kvar) / site.feeder.base_kva
+        times = float(begin), float(end)
+    except ValueError:
+        known = f"a customer who has an inverter: {', '.join(owners)}"
+        whose = known if owners else f"an inverter, and {site.feeder.name} has none"
+        raise ValueError(f"expected customer:kvar:from:to with {whose}") from None
+    return InverterAttack(np.array([which], dtype=np.intp), np.array([q]), *_span(*times))
+
+
+def _attacked(site: Site, scenario: Scenario, lies: list[_Lie], wrong: list[InverterAttack]) -> Scenario:
+    """The scenario with those who lie, and inverters that inject something else."""
+    from feeders.simulation.attacks import busbar_attack, random_attacks
+
+    attacks: list[Attack] = []
+    on_busbar: list[Attack] = []
+    for number, lie in enumerate(lies):
+        on, off = scenario.start + lie.begin, scenario.start + lie.end
+        if lie.count is None:
+            on_busbar.append(busbar_attack(site, lie.kind, lie.size, t_on=on, t_off=off))
+            continue
+        seed = scenario.seed + number
+        attacks += random_attacks(
+            site, seed, lie.kind, lie.count, lie.size, t_on=on, t_off=off, scenario=scenario
+        )
+    begin = scenario.start
+    moved = (replace(each, t_on=begin + each.t_on, t_off=begin + each.t_off) for each in wrong)
+    return replace(
+        scenario, attacks=tuple(attacks), busbar_attacks=tuple(on_busbar), inverter_attacks=tuple(moved)
+    )
+
+
+def _publish(
+    site: Site, scenario: Scenario, connect: tuple[str, ...], prefix: str, pace: tuple[float, int | None]
+) -> None:
+    from service.cli.simulate import OutOfStep, Pace, play
+    from service.ingest.queues import BusConfig
+    from service.ingest.zenoh_bus import Meters
+
+    ticks = 0
+    if pace[0] == 1.0:
+        time.sleep(max(0.0, scenario.start - time.time()))
+    try:
+        with Meters(BusConfig("client", connect=connect), prefix) as meters:
+            for _ in play(site, scenario, meters, Pace(*pace)):
+                ticks += 1
+    except OutOfStep as error:
+        complain(f"the service does not keep step: {error}")
+        raise typer.Exit(FAILED) from None
+    except KeyboardInterrupt:
+        pass
+    console.out.print(f"{ticks} ticks of {len(site.meter_ids)} meters and the busbar published")

@@ -1,0 +1,169 @@
+"""`gridsec serve`: the service, until it is interrupted."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import sys
+import threading
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from service.cli.console import FAILED
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from service.app import Running
+
+Feeders = Annotated[list[str] | None, typer.Option(help="Folder or name of a feeder; may be repeated.")]
+Estimator = Annotated[str | None, typer.Option(help="See `feeders estimators`. [default: as in feeder.toml]")]
+Listen = Annotated[
+    list[str] | None, typer.Option(help="zenoh endpoint to listen on. [default: tcp/127.0.0.1:7447]")
+]
+Endpoints = Annotated[
+    list[str] | None, typer.Option(help="zenoh endpoint to connect to, e.g. tcp/127.0.0.1:7447.")
+]
+Mode = Annotated[str | None, typer.Option(help="router, peer or client. [default: router]")]
+Config = Annotated[
+    Path | None, typer.Option(help="Your own zenoh configuration (json5): TLS, access rules, ...")
+]
+Prefix = Annotated[str | None, typer.Option(help="First chunks of all keys. [default: gridsec]")]
+Http = Annotated[str | None, typer.Option(help="Address of REST and web page. [default: 127.0.0.1:8000]")]
+HttpHost = Annotated[
+    list[str] | None,
+    typer.Option(help="Host name by which REST may change something, behind a proxy; may be repeated."),
+]
+Database = Annotated[
+    str | None,
+    typer.Option(help="sqlite:///file or postgresql+psycopg://... [default: sqlite:///gridsec.db]"),
+]
+ClockOf = Annotated[
+    str | None, typer.Option(help="wall, or events: the readings tell the time. [default: wall]")
+]
+MaxSkew = Annotated[
+    float | None,
+    typer.Option(help="Refuse readings whose time is further off, s. [default: 60 or 2 ticks]"),
+]
+Grace = Annotated[
+    float | None,
+    typer.Option(help="How long a tick waits for readings, s. [default: half a tick, at most 60]"),
+]
+MaxPayload = Annotated[int | None, typer.Option(help="Largest payload, bytes. [default: 262144]")]
+Queue = Annotated[int | None, typer.Option(help="Payloads that may wait. [default: 20000]")]
+MaxFeeders = Annotated[int | None, typer.Option(help="Feeders that may be put over REST. [default: 100]")]
+LogLevel = Annotated[str | None, typer.Option(help="debug, info, warning or error. [default: info]")]
+LogFormat = Annotated[str | None, typer.Option(help="console or json. [default: console]")]
+STOP_S = 2.7
+"""Time from a signal to the end by force, s; the promise is 3 s."""
+UntilEof = Annotated[bool, typer.Option(hidden=True, help="End when standard input ends.")]
+
+
+def serve(
+    *,
+    feeder: Feeders = None,
+    estimator: Estimator = None,
+    zenoh_listen: Listen = None,
+    zenoh_connect: Endpoints = None,
+    zenoh_mode: Mode = None,
+    zenoh_config: Config = None,
+    prefix: Prefix = None,
+    http: Http = None,
+    http_host: HttpHost = None,
+    database: Database = None,
+    clock: ClockOf = None,
+    max_skew: MaxSkew = None,
+    grace: Grace = None,
+    max_payload: MaxPayload = None,
+    queue: Queue = None,
+    max_feeders: MaxFeeders = None,
+    log_level: LogLevel = None,
+    log_format: LogFormat = None,
+    until_eof: UntilEof = False,
+) -> None:
+    """Watch feeders until interrupted. Every option can also be set as GRIDSEC_..., e.g. GRIDSEC_HTTP.
+
+    `--feeder` is GRIDSEC_FEEDERS, `--http-host` GRIDSEC_HTTP_HOSTS, `--max-skew` GRIDSEC_MAX_SKEW_S and
+    `--grace` GRIDSEC_GRACE_S.
+    """
+    import structlog
+
+    from service import logs
+    from service.app import serve as run
+    from service.engine.design_jobs import abandon, settle
+    from service.settings import settings, strangers
+
+    chosen = settings(
+        {
+            "feeders": tuple(feeder) if feeder else None,
+            "estimator": estimator,
+            "zenoh_listen": tuple(zenoh_listen) if zenoh_listen else None,
+            "zenoh_connect": tuple(zenoh_connect) if zenoh_connect else None,
+            "zenoh_mode": zenoh_mode,
+            "zenoh_config": zenoh_config,
+            "prefix": prefix,
+            "http": http,
+            "http_hosts": tuple(http_host) if http_host else None,
+            "database": database,
+            "clock": clock,
+            "max_skew_s": max_skew,
+            "grace_s": grace,
+            "max_payload": max_payload,
+            "queue": queue,
+            "max_feeders": max_feeders,
+            "log_level": log_level,
+            "log_format": log_format,
+        }
+    )
+    logs.set_up(chosen.log_level, chosen.log_format)
+    for variable, closest in strangers(os.environ).items():
+        structlog.get_logger().warning("variable_ignored", variable=variable, closest=closest or None)
+
+    def announce(running: Running) -> None:
+        print(running.url, flush=True)
+        if until_eof:
+            _stop_at_eof(asyncio.get_running_loop(), running.stop)
+
+    ended = threading.Event()
+    try:
+        stopping = partial(_end_within, STOP_S, ended)
+        asyncio.run(run(chosen, announce=announce, settled=settle, stopping=stopping))
+        ended.set()
+    finally:
+        abandon()
+
+
+def _end_within(seconds: float, ended: threading.Event) -> None:
+    """End the process after a time even if something hangs: a commit, a socket, a design.
+
+    A request is confirmed after its commit only, so nothing confirmed is lost. The exit code is 0 where the
+    service itself has ended and only the interpreter has not.
+    """
+    import structlog
+
+    from service.engine.design_jobs import abandon
+
+    def end() -> None:
+        if ended.is_set():
+            os._exit(0)
+        structlog.get_logger().error("ended by force: something did not end in time", after_s=seconds)
+        abandon()
+        os._exit(FAILED)
+
+    timer = threading.Timer(seconds, end)
+    timer.daemon = True
+    timer.start()
+
+
+def _stop_at_eof(loop: asyncio.AbstractEventLoop, stop: Callable[[], None]) -> None:
+    """Stop when whoever started us has gone: its end of our standard input closes."""
+
+    def wait() -> None:
+        while os.read(sys.stdin.fileno(), 4096):
+            pass
+        loop.call_soon_threadsafe(stop)
+
+    threading.Thread(target=wait, name="gridsec-eof", daemon=True).start()

@@ -1,0 +1,109 @@
+"""`gridsec study calibrate`: what recorded readings say against a feeder's files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.markup import escape
+
+from service.cli import console
+from service.cli.console import Studied, refuse_options
+from service.cli.paths import write_tables
+from service.cli.session import JournalAt, NoJournal, keeping
+from service.cli.sources import converted
+from service.cli.study_planning import Out, bar, said, show
+
+if TYPE_CHECKING:
+    from feeders.studies.calibrate.study import Calibrate
+
+
+def calibrate(
+    feeder: Studied = "simbench-lv-rural1",
+    *,
+    readings: Annotated[
+        Path, typer.Option(help="A recording (Parquet), or a CSV table with columns meter, t, v_volt, p_kw.")
+    ],
+    risk: Annotated[
+        float, typer.Option(help="Probability of any proposal if the files are right.", min=1e-9, max=0.5)
+    ] = 0.05,
+    tolerance: Annotated[
+        float, typer.Option(help="Error of lines' lengths that is no mistake, 1 sigma, relative.")
+    ] = 0.02,
+    exclude: Annotated[
+        list[str] | None, typer.Option(help="A meter that is not trusted; may be repeated.")
+    ] = None,
+    look_for: Annotated[
+        list[str] | None,
+        typer.Option(help="bus, phase, swap, length or meter; may be repeated. [default: all]"),
+    ] = None,
+    write: Annotated[
+        Path | None, typer.Option(help="Write a corrected copy of the feeder into this new folder.")
+    ] = None,
+    journal: JournalAt = None,
+    no_journal: NoJournal = False,
+    out: Out = None,
+) -> None:
+    """What recorded readings say against a feeder's files: places, phases, lengths, meters, loads.
+
+    Only what is sure gets into the copy that `--write` makes; the feeder itself is never touched.
+    """
+    from feeders.studies.calibrate.feeder import site_of
+    from feeders.studies.calibrate.search import Kind
+    from feeders.studies.calibrate.study import calibrate as study
+    from feeders.studies.calibrate.study import wrong_numbers
+    from gridsec.errors import no_choice
+
+    refuse_options(
+        [*no_choice("--look-for", Kind, *(look_for or ())), *wrong_numbers(risk, tolerance)],
+        folders={"--out": out},
+        new={"--write": write},
+        files={"--journal": journal},
+        read={"--readings": readings},
+    )
+    with keeping("calibrate", feeder, journal, without=no_journal) as kept:
+        feeder = converted(feeder, out)
+        site = site_of(feeder)
+        with bar("errors that the readings may speak for") as tell, said():
+            found = study(
+                site,
+                readings,
+                risk=risk,
+                tolerance=tolerance,
+                exclude=exclude or (),
+                kinds=[kind for kind in Kind if not look_for or kind in look_for],
+                journal=kept,
+                progress=tell,
+            )
+        _tell(found)
+        write_tables(out, "calibrate", found.tables)
+        if write is not None:
+            found.corrected(feeder, write)
+            console.out.print(escape(f"{write}: {found.feeder} with {len(found.corrections)} corrections"))
+
+
+def _tell(found: Calibrate) -> None:
+    from feeders.studies.calibrate.study import UNREAD
+
+    console.out.print(
+        escape(
+            f"{found.feeder}: {found.frames} moments in {found.span_h:.4g} h; any proposal would be "
+            f"wrong with probability {found.risk:g} at most"
+        )
+    )
+    if found.unread:
+        count, phases = int((found.meters["verdict"] == UNREAD).sum()), " and ".join(found.unread)
+        console.out.print(
+            f"left out: {count} of {len(found.meters)} meters, as the busbar's readings have no voltage of "
+            f"phase {phases} (column v_phases)"
+        )
+    if found.proposals.empty:
+        console.out.print("nothing to propose")
+    else:
+        show("Proposals", found.proposals.drop(columns=["low", "high"]))
+    show("Meters", found.meters.drop(columns=["low_percent", "high_percent"]))
+    show("Lines", found.lines)
+    show("Customers", found.customers)
+    show("Loads", found.loads)
+    show("Errors of powers and meters", found.errors)

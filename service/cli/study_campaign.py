@@ -1,0 +1,418 @@
+"""`gridsec study campaign`: simulated attacks by thousands, on all cores or on a Dask cluster."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from enum import StrEnum
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar
+
+import numpy as np
+import typer
+from rich.markup import escape
+
+from gridsec.errors import refuse
+from service.cli import console
+from service.cli.console import Studied, finite, options_of, read_all
+from service.cli.paths import see, write_tables
+from service.cli.session import JournalAt, Keeping, NoJournal, keeping
+from service.cli.sources import converted
+from service.cli.study_planning import Out, bar, said, show
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from feeders.model.site import Site
+    from feeders.studies.campaign.plan import Kind, Plan
+    from feeders.studies.campaign.study import Campaign
+    from feeders.studies.workers import Runner
+
+__all__ = [
+    "NO_LIES",
+    "AlarmsPerYear",
+    "Choice",
+    "DaskAt",
+    "DesignOf",
+    "Duration",
+    "Estimator",
+    "Kinds",
+    "KnownKvar",
+    "KnownKw",
+    "Learned",
+    "Liars",
+    "LoadErrorKvar",
+    "LoadErrorKw",
+    "MetersAs",
+    "Places",
+    "Promised",
+    "Scenarios",
+    "Seasons",
+    "Seed",
+    "Settings",
+    "Step",
+    "Together",
+    "Workers",
+    "campaign",
+    "planned",
+    "sources",
+]
+
+
+SHORTEST: Final = 10
+"""A scenario has at least so many readings: lies begin after a tenth of it."""
+
+FILES: Final = "feeder's files"
+
+
+def planned(
+    site: Site,
+    *,
+    step: float | None,
+    duration: float | None = None,
+    load_error_kw: float | None,
+    load_error_kvar: float | None,
+    **chosen: Any,
+) -> Plan:
+    """The plan of a campaign; all that is wrong with it is told at once.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    step, duration, load_error_kw, load_error_kvar
+        As on the command line; None: as the files say. With one of the load errors the other is none.
+    chosen
+        Attributes of the plan by name; None: as the files say.
+
+    Raises
+    ------
+    ValueError
+        If a scenario is too short for readings so far apart, there is no such setting, or as `Plan`.
+    """
+    from feeders.simulation.trial import LoadError
+    from feeders.studies.campaign.plan import Plan, wrong_settings
+
+    problems: list[str] = [*wrong_settings(site, chosen.get("settings") or ())]
+    step_s = step or site.tables.meta.monitor.tick_s
+    if duration is not None and duration < SHORTEST * step_s:
+        problems.append(
+            f"--duration: {duration:g} s are too few where readings come every {step_s:g} s "
+            f"({_from(step, '--step')}): at least {SHORTEST * step_s:g} s, or more frequent readings with "
+            "--step"
+        )
+        duration = None
+    chosen |= {"step_s": step, "duration_s": duration}
+    if load_error_kw is not None or load_error_kvar is not None:
+        chosen["load_error"] = LoadError(load_error_kw or 0.0, load_error_kvar or 0.0)
+    try:
+        plan = Plan.of(site, **{name: value for name, value in chosen.items() if value is not None})
+    except ValueError as error:
+        refuse([*problems, str(error)])
+        raise
+    refuse(problems)
+    return plan
+
+
+def sources(site: Site, plan: Plan, given: Mapping[str, object]) -> str:
+    """What is played, and which of it is from the files and which from options.
+
+    Parameters
+    ----------
+    site, plan
+        The feeder, and the campaign.
+    given
+        Options such as --step, and None where they were not given.
+    """
+    from feeders.model.load_uncertainty import load_doubt
+
+    some = {option for option, value in given.items() if value is not None}
+    asked = "--step", "--estimator", "--alarms-per-year"
+    step, estimator, rate = (option if option in some else FILES for option in asked)
+    rates = ", ".join(f"{each:g}" for each in plan.alarms_per_year)
+    loads = [option for option in ("--load-error-kw", "--load-error-kvar") if option in some]
+    doubt, base = load_doubt(plan.trial(site, plan.moment(0)).stated), site.feeder.base_kva
+    kw, kvar = (float(np.median(each[site.meters])) * base for each in (doubt.p, doubt.q))
+    return (
+        f"{site.feeder.name}: {plan.scenarios} scenarios of {plan.duration_s / plan.step_s:.0f} readings, "
+        f"one every {plan.step_s:g} s ({step}), watched by {plan.estimator} "
+        f"({estimator}); allowed false alarms a year: {rates} ({rate}); powers of "
+        f"metered customers within {kw:.2g} kW and {kvar:.2g} kvar, medians of 1 sigma "
+        f"({', '.join(loads) or FILES})"
+    )
+
+
+def _from(value: float | None, option: str) -> str:
+    return FILES if value is None else option
+
+
+Scenarios = Annotated[
+    int,
+    typer.Option(
+        help="How many, rounded up to whole scenes; the first of each scene is without a lie.", min=1
+    ),
+]
+Together = Annotated[
+    int,
+    typer.Option(
+        help="Scenarios of a scene, the first without a lie; 2: every lie has a scene of its own.",
+        min=1,
+    ),
+]
+Seed = Annotated[int, typer.Option(help="Chooses everything random.", min=0)]
+Kinds = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="A kind of lie and its sizes, like bias:1,3; may be repeated. bias, together, scaling: % of "
+        "nominal; drift: % per minute; coordinated, coordinated-power, power: % by which a load that is none "
+        "moves the least affected liar; replay, clock-shift: s; inverter: % of its rating; stuck: no size. "
+        "[default: six kinds]"
+    ),
+]
+Promised = Annotated[
+    bool,
+    typer.Option(
+        "--promised",
+        help="Lies of the sizes that `study detectable` finds, for M = 2, in place of the six kinds, and "
+        "how many of its promises are kept.",
+    ),
+]
+Liars = Annotated[
+    list[int] | None, typer.Option(help="How many lie; may be repeated. [default: 1 and 3]", min=1)
+]
+Places = Annotated[
+    list[str] | None,
+    typer.Option(help="random, street, sensitive or colluding; may be repeated. [default: all]"),
+]
+Seasons = Annotated[list[str] | None, typer.Option(help="May be repeated. [default: all four]")]
+Duration = Annotated[
+    float | None,
+    typer.Option(help="Length of a scenario, s. [default: 600 readings]", min=30.0, callback=finite),
+]
+Step = Annotated[
+    float | None,
+    typer.Option(
+        help="Interval of the readings, s. [default: as the feeder's files say]", min=0.1, callback=finite
+    ),
+]
+DesignOf = Annotated[str, typer.Option(help="factorial or random combinations.")]
+Estimator = Annotated[
+    str | None,
+    typer.Option(help="Who watches; see `gridsec feeders estimators`. [default: as the feeder's files say]"),
+]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="A setting of [monitor], like max_attacked=2; may be repeated. [default: the feeder's]"
+    ),
+]
+AlarmsPerYear = Annotated[
+    list[float] | None,
+    typer.Option(
+        help="False alarms it may raise in a year; may be repeated, for a curve. [default: as the files say]"
+    ),
+]
+Learned = Annotated[
+    float,
+    typer.Option(
+        help="Hours over which it has learned its meters' fixed errors before.", min=0.0, callback=finite
+    ),
+]
+MetersAs = Annotated[str, typer.Option(help="Errors of the meters: site, real or white.")]
+LoadErrorKw = Annotated[
+    float,
+    typer.Option(
+        help="What nobody knows of each customer's active power, 1 sigma.", min=0.0, callback=finite
+    ),
+]
+LoadErrorKvar = Annotated[
+    float, typer.Option(help="The same of its reactive power, 1 sigma.", min=0.0, callback=finite)
+]
+KnownKw = Annotated[
+    float | None,
+    typer.Option(
+        help="What nobody knows of each metered customer's active power, 1 sigma; comes and goes within ten "
+        "minutes. [default: what the files say of registers; with --load-error-kvar, none]",
+        min=0.0,
+        callback=finite,
+    ),
+]
+KnownKvar = Annotated[
+    float | None,
+    typer.Option(
+        help="The same of its reactive power. [default: what the files say of power factors; with "
+        "--load-error-kw, none]",
+        min=0.0,
+        callback=finite,
+    ),
+]
+Workers = Annotated[int | None, typer.Option(help="Processes. [default: all cores]", min=1)]
+DaskAt = Annotated[str | None, typer.Option(help="Address of a Dask scheduler, in place of processes here.")]
+
+
+def campaign(
+    feeder: Studied = "simbench-lv-rural1",
+    *,
+    scenarios: Scenarios = 160,
+    together: Together = 16,
+    seed: Seed = 0,
+    kind: Kinds = None,
+    promised: Promised = False,
+    liars: Liars = None,
+    place: Places = None,
+    season: Seasons = None,
+    duration: Duration = None,
+    step: Step = None,
+    design: DesignOf = "factorial",
+    estimator: Estimator = None,
+    setting: Settings = None,
+    alarms_per_year: AlarmsPerYear = None,
+    learned: Learned = 0.0,
+    meters: MetersAs = "site",
+    load_error_kw: KnownKw = None,
+    load_error_kvar: KnownKvar = None,
+    workers: Workers = None,
+    dask: DaskAt = None,
+    journal: JournalAt = None,
+    no_journal: NoJournal = False,
+    out: Out = None,
+) -> None:
+    """Simulate attacks over days of profiles: who is named, missed or falsely named, and how soon."""
+    from feeders.model.profiles import Season
+    from feeders.model.site import load
+    from feeders.simulation.trial import Meters
+    from feeders.studies.campaign.plan import Design, Place
+    from feeders.studies.campaign.study import campaign as study
+
+    see(folders={"--out": out}, files={"--journal": journal})
+    site, count = load(converted(feeder, out)), min(scenarios, together)
+    problems = ["--workers: a Dask cluster has its own workers"] * (dask is not None and workers is not None)
+    if count == 1:
+        lies = {"--kind": kind, "--promised": promised, "--liars": liars, "--place": place}
+        if told := [option for option, value in lies.items() if value]:
+            problems.append(f"{', '.join(told)}: {NO_LIES}")
+    kinds = read_all("--kind", kind, partial(_kind, step_s=step or site.tables.meta.monitor.tick_s), problems)
+    settings = read_all("--setting", setting, _setting, problems)
+    places = _each("--place", Place, place, problems)
+    seasons = _each("--season", Season, season, problems)
+    (drawn,) = _each("--design", Design, [design], problems) or (None,)
+    (quality,) = _each("--meters", Meters, [meters], problems) or (None,)
+    with keeping("campaign", feeder, journal, without=no_journal) as kept, said():
+        plan = options_of(
+            lambda: planned(
+                site,
+                step=step,
+                duration=duration,
+                load_error_kw=load_error_kw,
+                load_error_kvar=load_error_kvar,
+                scenes=-(-scenarios // count),
+                together=count,
+                seed=seed,
+                kinds=tuple(kinds) or None,
+                liars=tuple(liars or (1, 3)),
+                places=places,
+                design=drawn,
+                seasons=seasons,
+                estimator=estimator,
+                alarms_per_year=tuple(sorted(set(alarms_per_year))) if alarms_per_year else None,
+                learn_s=3600.0 * learned,
+                settings=tuple(settings),
+                meters=quality,
+            ),
+            problems,
+        )
+        given = {
+            "--step": step,
+            "--estimator": estimator,
+            "--alarms-per-year": alarms_per_year,
+            "--load-error-kw": load_error_kw,
+            "--load-error-kvar": load_error_kvar,
+        }
+        console.out.print(escape(sources(site, plan, given)))
+        if promised:
+            plan = _with_promised(site, plan, plan.kinds if kind else (), kept)
+        with bar("scenarios") as tell:
+            found = study(site, plan, runner=_runner(workers, dask), journal=kept, progress=tell)
+        _print(found)
+        write_tables(out, "campaign", found.tables)
+
+
+NO_LIES = (
+    "with one scenario of each scene, which is the one without a lie, nobody lies; expected --scenarios and "
+    "--together of 2 or more"
+)
+"""Otherwise it would look as if nobody was named for lies that nobody told."""
+
+
+def _print(found: Campaign) -> None:
+    plan, impossible = found.plan, int((found.scenarios["reason"] != "").sum())
+    told = f"{plan.scenarios} scenarios of {plan.duration_s:g} s watched by {plan.estimator}"
+    note = f"; {impossible} cannot be played, see `reason`" if impossible else ""
+    console.out.print(escape(f"{found.feeder}: {told}{note}"))
+    if not found.promises.empty:
+        show("Promises of `study detectable`", found.promises)
+    show("By kind and size", _short(found.by_size))
+    show("By place", _short(found.by_place))
+    show("By number of liars", _short(found.by_liars))
+    show("False names while nobody lies, and liars named", found.false_names)
+
+
+def _with_promised(site: Site, plan: Plan, others: tuple[Kind, ...], kept: Keeping) -> Plan:
+    from feeders.studies.campaign.guarantees import promised
+    from feeders.studies.detectable import detectable, workers
+
+    stated = plan.trial(site, plan.moment(0)).stated
+    with bar("lies of meters, errors of customers") as tell:
+        found = detectable(stated, max_attacked=2, runner=workers(stated, None), journal=kept, progress=tell)
+    return replace(plan, kinds=(*others, *promised(stated, found)))
+
+
+def _short(table: pd.DataFrame) -> pd.DataFrame:
+    """What fits on a terminal; everything is in the files."""
+    limits = [name for name in table.columns if name.endswith(("_low", "_high")) and name != "false_high"]
+    return table.drop(columns=[*limits, "liars_told", "error_liars_worst", "error_others_worst"])
+
+
+Choice = TypeVar("Choice", bound=StrEnum)
+
+
+def _each(
+    option: str, known: type[Choice], chosen: list[str] | None, problems: list[str]
+) -> tuple[Choice, ...] | None:
+    """What was chosen; None: nothing, or what is wrong is among the problems."""
+    from gridsec.errors import no_choice
+
+    wrong = no_choice(option, known, *(chosen or ()))
+    problems += wrong
+    return None if wrong or not chosen else tuple(known(name) for name in dict.fromkeys(chosen))
+
+
+def _kind(text: str, step_s: float) -> Kind:
+    from feeders.simulation.attacks import Trick
+    from feeders.studies.campaign.plan import KINDS, Kind
+
+    name, _, sizes = text.partition(":")
+    if name not in tuple(Trick):
+        raise ValueError(f"expected one of {', '.join(Trick)}")
+    trick = Trick(name)
+    if not sizes:
+        usual = [kind.every(step_s) for kind in KINDS if kind.trick is trick]
+        sizes = ",".join(str(size) for kind in usual for size in kind.sizes)
+    try:
+        return Kind(name, trick, tuple(float(size) for size in sizes.split(",")))
+    except ValueError as error:
+        raise ValueError("expected something like bias:1,3") from error
+
+
+def _setting(text: str) -> tuple[str, float]:
+    name, _, value = text.partition("=")
+    try:
+        return name, float(value)
+    except ValueError as error:
+        raise ValueError("expected NAME=NUMBER") from error
+
+
+def _runner(workers: int | None, dask: str | None) -> Runner:
+    from feeders.studies.workers import Dask, cores
+
+    return cores(workers) if dask is None else Dask(dask)

@@ -1,0 +1,291 @@
+"""`gridsec study redundancy`, `protect`, `detectable`: what a planner asks of a feeder's meters."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from service.cli import console
+from service.cli.console import Studied, finite
+from service.cli.paths import see, write_tables
+from service.cli.session import JournalAt, NoJournal, keeping
+from service.cli.sources import converted
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from feeders.studies.journal import Progress as Tell
+    from feeders.studies.protect import Protect
+
+Unknown = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="A customer whose powers nobody knows; may be repeated. [default: those without a meter]"
+    ),
+]
+Silent = Annotated[list[str] | None, typer.Option(help="A meter that is missing; may be repeated.")]
+BusbarUnknown = Annotated[bool, typer.Option("--busbar-unknown", help="The busbar's voltage is not metered.")]
+CurvesAt = Annotated[str, typer.Option(help="Where inverters work: steepest or deadband.")]
+Out = Annotated[Path | None, typer.Option(help="Write the tables into this folder, as CSV and Parquet.")]
+
+
+GoalOf = Annotated[
+    str | None,
+    typer.Option(
+        help="identify: liars are named; notice: some lie is; bound: lies stay small, powers being true; "
+        "contain: powers being false too. [default: identify where liars can stay invisible, or contain]"
+    ),
+]
+LieVolt = Annotated[
+    float | None,
+    typer.Option(
+        help="For bound and contain: largest unnoticed lie, V of the busbar's level. "
+        "[contain: half of what company and false powers add]"
+    ),
+]
+
+NO_ANSWER = (
+    "It counts lies that fit exactly to powers that are known exactly, and none does. How large lies are "
+    "that fit within honest errors: --goal contain. What hides behind a load that nobody knows: --unknown "
+    "CUSTOMER. Lies that inverters forget within seconds: --attack any."
+)
+
+
+def redundancy(
+    feeder: Studied = "simbench-lv-rural1",
+    *,
+    unknown: Unknown = None,
+    silent: Silent = None,
+    busbar_unknown: BusbarUnknown = False,
+    curves: CurvesAt = "steepest",
+    journal: JournalAt = None,
+    no_journal: NoJournal = False,
+    out: Out = None,
+) -> None:
+    """How many lying meters stay invisible: in all, by meter, by part of the feeder, with meters missing."""
+    from feeders.model.site import load
+    from feeders.studies.redundancy import redundancy as study
+
+    see(folders={"--out": out}, files={"--journal": journal})
+    with keeping("redundancy", feeder, journal, without=no_journal) as kept:
+        site = load(converted(feeder, out))
+        with bar("searching for liars that stay invisible") as tell, said():
+            found = study(
+                site,
+                unknown=unknown,
+                silent=silent or (),
+                busbar_known=not busbar_unknown,
+                curves=curves,
+                journal=kept,
+                progress=tell,
+            )
+        console.out.print(_unknowns(found.unknown, found.feeder))
+        show("Liars that stay invisible", found.summary)
+        show("By meter", found.meters)
+        show("Liars inside one part", found.parts)
+        if found.silent:
+            show(f"What changes without {', '.join(found.silent)}", found.changes)
+        write_tables(out, "redundancy", found.tables)
+
+
+def protect(
+    feeder: Studied = "simbench-lv-rural1",
+    *,
+    max_attacked: Annotated[int, typer.Option(help="How many of the other meters lie at most.", min=1)] = 2,
+    goal: GoalOf = None,
+    lie_volt: LieVolt = None,
+    attack: Annotated[str, typer.Option(help="Attacks that count: persistent or any.")] = "persistent",
+    unknown: Unknown = None,
+    busbar_unknown: BusbarUnknown = False,
+    never: Annotated[
+        list[str] | None, typer.Option(help="A meter that cannot be protected; may be repeated.")
+    ] = None,
+    greedy: Annotated[
+        bool, typer.Option("--greedy", help="For large feeders: not proven the fewest; with its gap.")
+    ] = False,
+    journal: JournalAt = None,
+    no_journal: NoJournal = False,
+    out: Out = None,
+) -> None:
+    """The fewest meters to protect so that liars are named, are noticed, or can only lie a little."""
+    from feeders.model.site import load
+    from feeders.studies.protect import Goal, check
+    from feeders.studies.protect import protect as study
+    from feeders.studies.unobservable import Attack
+
+    bound = math.nan if lie_volt is None else lie_volt
+    with said():
+        check(
+            max_attacked=max_attacked,
+            goal=goal,
+            lie_volt=bound,
+            attack=attack,
+            unknown=unknown,
+            busbar_known=not busbar_unknown,
+        )
+    see(folders={"--out": out}, files={"--journal": journal})
+    with keeping("protect", feeder, journal, without=no_journal) as kept:
+        site = load(converted(feeder, out))
+        with bar("meters protected, against attacks") as tell, said():
+            found = study(
+                site,
+                max_attacked=max_attacked,
+                goal=Goal(goal) if goal else None,
+                lie_volt=bound,
+                attack=Attack(attack),
+                unknown=unknown,
+                busbar_known=not busbar_unknown,
+                never=never or (),
+                exact=not greedy,
+                journal=kept,
+                progress=lambda known, done: tell(done, known),
+            )
+        _tell_protection(found, len(site.meter_ids))
+        write_tables(out, "protect", found.tables)
+
+
+def _tell_protection(found: Protect, of: int) -> None:
+    count = len(found.meters)
+    if found.no_answer:
+        console.out.print(escape(f"{found.feeder}: {found.goal} asks for nothing here, which is no safety"))
+        console.out.print(NO_ANSWER)
+        return
+    proof = "no fewer suffice" if not found.gap else f"at least {found.least} are needed"
+    measure = "largest hidden lie, V" if found.goal.in_volts else "fewest liars that stay invisible"
+    console.out.print(escape(f"{found.feeder}: protect {count} of {of} meters; {proof}"))
+    console.out.print(f"{measure}: {_cell(found.before)} before, {_cell(found.after)} after")
+    if found.goal.in_volts:
+        console.out.print(
+            f"asked for ({found.goal}): at most {_cell(found.lie_volt)}; "
+            f"one meter hides {_cell(found.alone)} by itself, with true powers, whoever else is protected"
+        )
+    if count:
+        show("Protect", found.meters)
+        show("Attacks that ask for them", found.attacks)
+
+
+def detectable(
+    feeder: Studied = "simbench-lv-rural1",
+    *,
+    max_attacked: Annotated[int, typer.Option(help="How many meters lie together at most.", min=1)] = 2,
+    share: Annotated[
+        float, typer.Option(help="Share of its peak that every load draws.", min=0.0, callback=finite)
+    ] = 0.5,
+    risk: Annotated[float, typer.Option(help="Probability left out of account, at one moment.")] = 1e-3,
+    trials: Annotated[int, typer.Option(help="Simulate so many lies of each size.", min=0)] = 0,
+    seed: Annotated[int, typer.Option(help="Chooses what is random in simulated lies.", min=0)] = 0,
+    workers: Annotated[
+        int | None, typer.Option(help="Processes. [default: all cores, from 50 meters on]", min=1)
+    ] = None,
+    journal: JournalAt = None,
+    no_journal: NoJournal = False,
+    out: Out = None,
+) -> None:
+    """The smallest lies that are surely named, the largest that stay unnoticed, and what they spoil; in V."""
+    from feeders.model.site import load
+    from feeders.studies.campaign.guarantees import rehearse
+    from feeders.studies.detectable import detectable as study
+    from feeders.studies.detectable import workers as where
+
+    see(folders={"--out": out}, files={"--journal": journal})
+    with keeping("detectable", feeder, journal, without=no_journal) as kept:
+        site = load(converted(feeder, out))
+        with bar("lies of meters, errors of customers") as tell, said():
+            found = study(
+                site,
+                max_attacked=max_attacked,
+                share=share,
+                risk=risk,
+                runner=where(site, workers),
+                journal=kept,
+                progress=tell,
+            )
+        more = found.max_attacked - 1
+        places = ["customer", "bus"]
+        show(f"Lies, V: each alone, and with {more} more", found.meters.drop(columns=places).round(2))
+        show(f"Errors of the voltage with {more + 1} unnoticed liars, V", found.customers.round(2))
+        write_tables(out, "detectable", found.tables)
+        if trials:
+            with bar("simulated lies") as tell:
+                seen = rehearse(
+                    site, found, trials=trials, seed=seed, share=share, journal=kept, progress=tell
+                )
+            console.out.print(
+                f"{seen.trials} lies up to the hidden size: {seen.hidden_named} led to a name\n"
+                f"{seen.trials} lies from the named size on: {seen.large_missed} missed, "
+                f"{seen.honest_named} with an honest meter named"
+            )
+            write_tables(out, "detectable", {**found.tables, "trials": seen.table})
+
+
+def _unknowns(names: Sequence[str], feeder: str) -> str:
+    who = ", ".join(names) if names else "nobody"
+    return escape(f"{feeder}: powers unknown of {who}")
+
+
+@contextmanager
+def bar(what: str) -> Iterator[Tell]:
+    """A progress bar on the terminal.
+
+    Parameters
+    ----------
+    what
+        Which pieces of work are counted.
+    """
+    with Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        console=console.err,
+        transient=True,
+        disable=not console.err.is_terminal,
+    ) as shown:
+        task = shown.add_task(escape(what), total=None)
+        yield lambda done, total: shown.update(task, completed=done, total=total)
+
+
+@contextmanager
+def said() -> Iterator[None]:
+    """Say what is wrong with what was asked."""
+    try:
+        yield
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from error
+
+
+def show(title: str, frame: pd.DataFrame) -> None:
+    """Print a table; columns that say nothing are left out.
+
+    Parameters
+    ----------
+    title, frame
+        What it is, and the table.
+    """
+    kept = [name for name in frame.columns if not all(_empty(cell) for cell in frame[name])]
+    table = Table(*(escape(name.replace("_", " ")) for name in kept), title=title, title_justify="left")
+    for row in frame[kept].itertuples(index=False):
+        table.add_row(*(escape(_cell(cell)) for cell in row))
+    console.out.print(table, soft_wrap=False)
+
+
+def _empty(cell: Any) -> bool:
+    return isinstance(cell, str) and not cell
+
+
+def _cell(cell: Any) -> str:
+    if cell is None or (isinstance(cell, float) and math.isnan(cell)):
+        return "-"
+    if isinstance(cell, bool):
+        return "yes" if cell else "no"
+    if isinstance(cell, float):
+        return "∞" if math.isinf(cell) else f"{cell:.4g}"
+    return str(cell)

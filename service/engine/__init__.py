@@ -1,0 +1,1 @@
+"""Engine: state of the service, monitors of the feeders, and the cycle that drives them."""

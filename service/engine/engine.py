@@ -1,0 +1,737 @@
+"""State of the service and its cycle: decode, align, estimate, alarm, store, publish.
+
+A tick is stale when a later tick of the same feeder is due as well. Stale ticks are judged oldest first, in a
+limited time. By the wall clock the others are skipped: an old tick is worth less than the next one. Where
+the readings tell the time, nothing is stale, and the others wait for the next round.
+
+Everything here is synchronous and called from one thread at a time; `runtime` sees to that. Readers on other
+threads (REST, metrics) only ever take references to immutable reports.
+
+Nobody who watches waits for the database: see `service.store.committer`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass
+from functools import partial
+from itertools import zip_longest
+from typing import Any, TypeVar
+
+import msgspec
+import numpy as np
+import structlog
+
+from feeders.model.site import Site
+from gridsec.errors import GridsecError
+from service.alarms.state_machine import (
+    Alarm,
+    AlarmRules,
+    AlarmUnknown,
+    AlreadyAcknowledged,
+    RaisedAgain,
+    acknowledged,
+    close,
+    restore,
+)
+from service.alarms.state_machine import to_json as alarm_json
+from service.engine.commissioning import Commissioning
+from service.engine.commissioning import to_json as commissioning_json
+from service.engine.feeder_monitor import TickResult, Watch, align_rules, known_of
+from service.engine.suspicions import Suspicions
+from service.errors import FeederUnknown
+from service.ingest.align import Clock, Outcome
+from service.ingest.decode import Decoded, Wire
+from service.ingest.queues import Sample
+from service.ingest.reading import HEAD_BYTES, BadReading, BadReason, Reading, beginning, head_of
+from service.metrics import Metrics
+from service.report.report import FeederReport
+from service.report.report import to_json as report_json
+from service.store import Rejected, Store
+from service.store.committer import Apart, Keeper, Wish, alarm_key, at_once
+from service.store.schema import Happened
+from service.store.state_codec import Kept
+
+BAD_PER_SOURCE = 5
+"""So many bad readings of one key and for one reason are kept of a round; the others become one entry."""
+BAD_PER_ROUND = 50
+"""So many entries are kept of a round."""
+
+T = TypeVar("T")
+
+
+def some_of_each(bad: Iterable[Rejected]) -> tuple[list[Rejected], int]:
+    """Return entries for bad readings, and how many readings have none.
+
+    Whoever sends the most leaves room for the others: entries are taken by reason and key in turn.
+
+    Parameters
+    ----------
+    bad
+        Bad readings of one round, in the order of arrival.
+
+    Returns
+    -------
+    entries, left_out
+        In the order of arrival; and how many bad readings they do not tell of.
+    """
+    sources: dict[str, dict[str, list[tuple[int, Rejected]]]] = {}
+    for number, one in enumerate(bad):
+        reason = one.reason.partition(":")[0]
+        sources.setdefault(reason, {}).setdefault(one.key, []).append((number, one))
+    turns = [_in_turn([_entries(found) for found in keys.values()]) for keys in sources.values()]
+    entries = _in_turn(turns)
+    kept = sorted(entries[:BAD_PER_ROUND], key=lambda entry: entry[0])
+    return [one for _, one, _ in kept], sum(count for _, _, count in entries[BAD_PER_ROUND:])
+
+
+_Entry = tuple[int, Rejected, int]
+
+
+def _entries(found: Sequence[tuple[int, Rejected]]) -> list[_Entry]:
+    """The entries for the bad readings of one key and reason: place, entry, how many it stands for."""
+    entries = [(number, one, 1) for number, one in found[:BAD_PER_SOURCE]]
+    more = len(found) - BAD_PER_SOURCE
+    if more > 0:
+        number, last = found[-1]
+        reason = f"{last.reason.partition(':')[0]}: {more} more on this key at the same time"
+        entries.append((number, Rejected(last.t, last.key, reason), more))
+    return entries
+
+
+def _in_turn(queues: Iterable[Sequence[T]]) -> list[T]:
+    return [item for row in zip_longest(*queues) for item in row if item is not None]
+
+
+BUDGET_S = 1.0
+"""Time for stale ticks, from the first one until all feeders are up to date again, s."""
+
+CALM_S = 60.0
+"""Time without a skipped tick after which the next one is logged again, s."""
+
+SHOWN = 5
+"""Feeders named in one line of the log."""
+
+_log = structlog.get_logger("gridsec.runtime")
+
+
+class CatchUp:
+    """Time budget for stale ticks, and the log of those that were skipped.
+
+    Parameters
+    ----------
+    clock
+        Monotonic time, s.
+    waits
+        Whether ticks beyond the budget wait (`Clock.EVENTS`) instead of being skipped.
+    """
+
+    def __init__(self, clock: Callable[[], float], *, waits: bool) -> None:
+        self._clock, self._waits = clock, waits
+        self._left_s = BUDGET_S
+        self._skipped: Counter[str] = Counter()
+        self._calm_at: float | None = None
+
+    def judge(
+        self, watches: Iterable[Watch], judge: Callable[[Watch], None], go_on: Callable[[], bool]
+    ) -> None:
+        """Judge what is pending.
+
+        Parameters
+        ----------
+        watches
+            The feeders.
+        judge
+            Judges the oldest pending tick of a feeder.
+        go_on
+            Asked before each tick; where it answers False, what is left stays pending.
+        """
+        due = [watch for watch in watches if watch.pending]
+        stale = [watch for watch in due if len(watch.pending) > 1]
+        if self._waits or not stale:
+            self._left_s = BUDGET_S
+        begun = self._clock()
+        end = begun + self._left_s
+        while stale and go_on() and self._clock() < end:
+            first = min(stale, key=lambda watch: watch.pending[0].t)
+            judge(first)
+            if len(first.pending) < 2:
+                stale.remove(first)
+        self._left_s -= self._clock() - begun
+        if stale and self._waits:
+            return
+        for watch in stale if go_on() else ():
+            watch.skip(len(watch.pending) - 1)
+        for watch in due:
+            if watch.pending and go_on():
+                judge(watch)
+
+    def skipped(self, feeder: str, count: int) -> None:
+        """Log the first skipped ticks, and their number once there have been none for `CALM_S`.
+
+        Parameters
+        ----------
+        feeder, count
+            Its name, and the number of ticks.
+        """
+        if self._calm_at is None:
+            _log.warning("ticks are skipped: the service was behind by more than it can judge", feeder=feeder)
+        self._skipped[feeder] += count
+        self._calm_at = self._clock() + CALM_S
+
+    def calm(self) -> None:
+        """Log the end of an episode, if it is over."""
+        if self._calm_at is None or self._clock() < self._calm_at:
+            return
+        names = [name for name, _ in self._skipped.most_common(SHOWN)]
+        total, feeders = self._skipped.total(), len(self._skipped)
+        _log.warning("ticks were skipped", ticks=total, feeders=feeders, most=names, calm_s=CALM_S)
+        self._calm_at = None
+        self._skipped.clear()
+
+
+NOT_WATCHED = "the feeder is not watched any more"
+TOLD_TWICE = "another alarm tells the same"
+
+
+@dataclass(frozen=True, slots=True)
+class RuntimeConfig:
+    """How the service works, apart from its feeders.
+
+    Attributes
+    ----------
+    prefix
+        First chunks of every zenoh key.
+    clock
+        Who says what time it is.
+    max_skew_s, grace_s
+        As in `align.rules`; None: from the feeder's tick.
+    max_payload
+        Largest payload that is read, bytes.
+    max_samples
+        Length of the queue before the runtime.
+    max_feeders
+        So many feeders may be put while it runs, besides those that were given at the start.
+    """
+
+    prefix: str = "gridsec"
+    clock: Clock = Clock.WALL
+    max_skew_s: float | None = None
+    grace_s: float | None = None
+    max_payload: int = 256 * 1024
+    max_samples: int = 20_000
+    max_feeders: int = 100
+
+
+@dataclass(frozen=True, slots=True)
+class Past:
+    """State of a feeder that a new monitor goes on from: alarms, commissioning, suspicions."""
+
+    alarms: tuple[Alarm, ...]
+    commission: Kept | None
+    distrust: Kept | None
+
+
+class Rounds:
+    """All state of the service.
+
+    Parameters
+    ----------
+    config
+        How the service works.
+    store
+        The database.
+    sites
+        The feeders to watch.
+    wall
+        The wall clock, Unix s.
+    stored
+        Called after alarms have been stored.
+    apart
+        How writing is done apart from judging: called with what to do, in any thread, and with what to do
+        with the outcome, between two rounds.
+    unloaded
+        Feeders that are stored but cannot be loaded, and why.
+    clock
+        Monotonic time, s.
+    go_on
+        Asked between two payloads and between two ticks; a round ends early where it answers False.
+    """
+
+    def __init__(
+        self,
+        config: RuntimeConfig,
+        store: Store,
+        sites: Iterable[Site],
+        *,
+        wall: Callable[[], float],
+        stored: Callable[[], None],
+        apart: Apart = at_once,
+        unloaded: Mapping[str, str] | None = None,
+        clock: Callable[[], float] = time.monotonic,
+        go_on: Callable[[], bool] = lambda: True,
+    ) -> None:
+        self.config = config
+        self.store = store
+        self.metrics = Metrics()
+        self.watches: dict[str, Watch] = {}
+        self.unloaded = dict(unloaded or {})
+        self.reported: dict[str, float] = {}
+        self._wall, self._stored, self._continues = wall, stored, go_on
+        self._catch_up = CatchUp(clock, waits=config.clock is Clock.EVENTS)
+        self.keeper = Keeper(store, self.metrics, stored, self._count_stored, apart)
+        self._wire = Wire({}, config.prefix, config.max_payload)
+        for site in sites:
+            self.add(site)
+
+    def add(self, site: Site, past: Past | None = None) -> Watch:
+        """Begin to watch a feeder, or begin anew with other tables; its alarms stay.
+
+        Parameters
+        ----------
+        site
+            The feeder.
+        past
+            What it goes on from; None: from the database, read at once.
+        """
+        config, name = self.config, site.feeder.name
+        past = past or self._past(name, self.store)
+        rules = align_rules(
+            site, config.clock, max_skew_s=config.max_skew_s, grace_s=config.grace_s, live=True
+        )
+        book = restore(name, past.alarms)
+        watch = Watch(
+            site, rules, book, Commissioning(site, past.commission), Suspicions(site, past.distrust)
+        )
+        held = {alarm.id for alarm in book.alarms}
+        twice = [alarm for alarm in past.alarms if alarm.id not in held]
+        self.keeper.waiting.add(transitions=close(twice, self._wall(), TOLD_TWICE))
+        self.watches = {**self.watches, name: watch}
+        self.unloaded.pop(name, None)
+        self._learn()
+        return watch
+
+    def _past(self, name: str, store: Store) -> Past:
+        # Where the readings tell the time, that may be long ago; `advance` forgets what is too old.
+        latest = min([self._wall(), *(tick["t"] for tick in store.history(name, limit=1))])
+        alarms = store.active(name, cleared_since=latest - AlarmRules().memory_s)
+        return Past(tuple(alarms), store.commission(name), store.distrust(name))
+
+    def put(self, site: Site, tables: Mapping[str, Any], installed: Callable[[Watch], None]) -> Future[None]:
+        """Store a feeder's tables and begin to watch it, or begin anew with other tables.
+
+        Parameters
+        ----------
+        site, tables
+            The feeder, and JSON of the columns of its files.
+        installed
+            Called with what watches it.
+
+        Raises
+        ------
+        StoreUnavailable
+            If that cannot be stored; the feeder stays as it was.
+        """
+        answer: Future[None] = Future()
+        name = site.feeder.name
+
+        def store(past: Past) -> None:
+            self.keeper.store(
+                Wish(put=(name, tables)),
+                _landing(answer, lambda: installed(self.add(site, self._go_on(name, past)))),
+                partial(_refuse, answer),
+            )
+
+        self.keep_states(at_once=True)
+        self.keeper.look(partial(self._past, name), _then(answer, store), partial(_refuse, answer))
+        return answer
+
+    def _go_on(self, name: str, stored: Past) -> Past:
+        """Return the state of a feeder: of one that is watched, ticks have come since it was stored."""
+        watch = self.watches.get(name)
+        if watch is None:
+            return stored
+        return Past(
+            watch.book.alarms,
+            watch.commissioning.now() or stored.commission,
+            watch.suspicions.now() or stored.distrust,
+        )
+
+    def remove(self, name: str) -> Future[None]:
+        """Watch a feeder no more: its alarms are cleared, its tables forgotten, its history kept.
+
+        Parameters
+        ----------
+        name
+            Its name.
+
+        Raises
+        ------
+        FeederUnknown, StoreUnavailable
+            If there is none, or that cannot be stored; it is watched as before then.
+        """
+        answer: Future[None] = Future()
+        watch = self.watches.get(name)
+        if watch is None and name not in self.unloaded:
+            raise FeederUnknown(name)
+
+        def store(standing: Iterable[Alarm]) -> None:
+            t = self._wall() if watch is None or watch.book.t is None else watch.book.t
+            self.keeper.store(
+                Wish(close(standing, t, NOT_WATCHED), without=name),
+                _landing(answer, partial(self._removed, name)),
+                partial(_refuse, answer),
+            )
+
+        if watch is None:
+            self.keeper.look(lambda db: db.active(name), _then(answer, store), partial(_refuse, answer))
+        else:
+            store(watch.book.active)
+        return answer
+
+    def _removed(self, name: str) -> None:
+        self.unloaded.pop(name, None)
+        self.watches = {other: kept for other, kept in self.watches.items() if other != name}
+        self.keeper.waiting.forget(name)
+        self._learn()
+        self.metrics.forget(name)
+        if self.keeper.publisher is not None:
+            self.keeper.publisher.withdraw(f"{name}/estimate")
+
+    def _learn(self) -> None:
+        known = {name: known_of(watch.site) for name, watch in self.watches.items()}
+        self._wire = Wire(known, self.config.prefix, self.config.max_payload)
+
+    def begin(self) -> None:
+        """Answer queries for what stands; publish what an earlier process stored and did not publish.
+
+        Alarms of feeders that are neither watched nor stored any more are cleared: nobody else would.
+        """
+        ours, t = self.watches.keys() | self.unloaded.keys() | self.store.feeders().keys(), self._wall()
+        standing = self.store.active()
+        left_out = [alarm for alarm in standing if alarm.feeder not in ours]
+        self.keeper.waiting.add(transitions=close(left_out, t, NOT_WATCHED))
+        if self.keeper.publisher is not None:
+            for alarm in standing:
+                if alarm.feeder in ours:
+                    self.keeper.publisher.answer(alarm_key(alarm), msgspec.json.encode(alarm_json(alarm)))
+        for name in self.unloaded:
+            self.metrics.alarms.labels(name).set(sum(alarm.feeder == name for alarm in standing))
+        self.keeper.commit()
+
+    # ---------------------------------------------------------------- one round
+
+    def round(self, samples: list[Sample], oldest: Callable[[], float | None] = lambda: None) -> bool:
+        """Take samples in, do what is due, store, publish.
+
+        Parameters
+        ----------
+        samples
+            In the order of arrival.
+        oldest
+            Says when the oldest of those arrived that still wait, Unix s; None if none does.
+
+        Returns
+        -------
+        bool
+            Whether there is a new report.
+        """
+        started = time.perf_counter()
+        bad = self._place(samples)
+        now, waiting = self._wall(), oldest()
+        # No tick goes without readings that only wait here.
+        until = now if waiting is None else min(now, waiting)
+        for watch in self.watches.values():
+            self._guarded(watch, partial(watch.reach, until))
+        results = self._judge()
+        entries, left_out = some_of_each(bad)
+        self.keeper.waiting.add(rejected=entries)
+        self.metrics.forgotten.labels("bad-reading").inc(left_out)
+        for result in results:
+            self.keeper.waiting.add(transitions=result.transitions, reports=(result.report,))
+            self._count_tick(result.report)
+            self.reported[result.report.feeder] = time.monotonic()
+        judged = {result.report.feeder for result in results}
+        self.keep_states(watch for name, watch in self.watches.items() if name in judged)
+        self.keeper.commit()
+        self._publish_estimates(results)
+        if samples or results:
+            self.metrics.cycle.observe(time.perf_counter() - started)
+        return bool(results)
+
+    @property
+    def behind(self) -> bool:
+        """True while due ticks wait for the next round."""
+        return any(watch.pending for watch in self.watches.values())
+
+    def _place(self, samples: Iterable[Sample]) -> list[Rejected]:
+        """Decode and align samples without judging; return the readings that cannot be used."""
+        bad: list[Rejected] = []
+        outcomes: Counter[tuple[str, Outcome]] = Counter()
+        lost: dict[str, int] = {}
+        for sample in samples:
+            if not self._continues():
+                break
+            decoded = self._decode(sample)
+            bad.extend(self._note(problem, sample) for problem in decoded.bad)
+            for reading in decoded.readings:
+                watch = self.watches[reading.feeder]
+                lost.setdefault(watch.name, watch.aligner.lost)
+                outcome = self._guarded(watch, partial(watch.place, reading, sample.arrival))
+                if outcome is not None:
+                    outcomes[watch.name, outcome] += 1
+                if outcome is Outcome.CLOCK_OFF:
+                    bad.append(self._clock_off(reading, sample.arrival))
+                bad.extend(self._clock_off(refused, sample.arrival) for refused in watch.aligner.refused())
+        for (name, outcome), count in outcomes.items():
+            self.metrics.readings.labels(name, outcome).inc(count)
+        for name, before in lost.items():
+            self.metrics.lost.labels(name).inc(self.watches[name].aligner.lost - before)
+        return bad
+
+    def _judge(self) -> list[TickResult]:
+        """Judge the pending ticks within the time budget; skipped ones are counted."""
+        results: list[TickResult] = []
+
+        def judge(watch: Watch) -> None:
+            skipped = watch.skipped
+            result = self._guarded(watch, watch.judge)
+            if watch.skipped > skipped:
+                self.metrics.skipped.labels(watch.name).inc(watch.skipped - skipped)
+                self._catch_up.skipped(watch.name, watch.skipped - skipped)
+            if result is not None:
+                results.append(result)
+
+        self._catch_up.judge(self.watches.values(), judge, self._continues)
+        self._catch_up.calm()
+        return results
+
+    def keep_states(self, watches: Iterable[Watch] | None = None, *, at_once: bool = False) -> None:
+        """Queue the commissioning and the suspicions of feeders for the database, where they are due.
+
+        Parameters
+        ----------
+        watches
+            The feeders; None: all. Both change with judged ticks only.
+        at_once
+            Also a commissioning that is not due yet.
+        """
+        for watch in self.watches.values() if watches is None else watches:
+            kept, happened = watch.commissioning.due(at_once=at_once)
+            self.keeper.waiting.add(kept=(*kept, *watch.suspicions.due()), happened=happened)
+            for one in happened:
+                _say(one)
+            if happened:
+                self._count_learned(watch)
+
+    def _count_learned(self, watch: Watch) -> None:
+        known = watch.commissioning.known
+        if known is not None:
+            self.metrics.learned.labels(watch.name).set(np.isfinite(known.learned.at).sum())
+
+    def _decode(self, sample: Sample) -> Decoded:
+        """Decode a payload; a defect of the decoder costs this payload and nothing else."""
+        try:
+            return self._wire.decode(sample.key, sample.payload, sample.encoding, size=sample.size)
+        except Exception as error:  # noqa: BLE001 - whatever it is, one payload must not end the service
+            problem = beginning(f"{type(error).__name__}: {error}")
+            _log.error("a payload could not be decoded", key=sample.key[:HEAD_BYTES], problem=problem)
+            head, key = head_of(sample.payload[:HEAD_BYTES]), beginning(sample.key)
+            return Decoded(bad=(BadReading(BadReason.INTERNAL, (problem,), key, head=head),))
+
+    def _guarded(self, watch: Watch, run: Callable[[], T]) -> T | None:
+        """Let a defect in one feeder's chain stop that feeder, visibly, and no other."""
+        found: T | None = None
+        try:
+            found = run()
+        except Exception as error:  # noqa: BLE001 - whatever it is, it must not blind the other feeders
+            watch.break_down(error)
+        if watch.defect is not None:
+            _log.error("a feeder's monitor failed", feeder=watch.name, exc_info=watch.defect)
+            watch.defect = None
+        return found
+
+    def _note(self, problem: BadReading, sample: Sample) -> Rejected:
+        self.metrics.bad.labels(problem.feeder or "", problem.reason).inc(problem.count)
+        reason = f"{problem.reason}: {'; '.join(problem.problems)}"[:1000]
+        return Rejected(sample.arrival, problem.key, reason, problem.head.encode())
+
+    def _clock_off(self, reading: Reading, arrival: float) -> Rejected:
+        self.metrics.bad.labels(reading.feeder, BadReason.CLOCK_OFF).inc()
+        source = "substation" if reading.meter is None else f"meter/{reading.meter}"
+        key = f"{self.config.prefix}/{reading.feeder}/{source}/reading"
+        reason = f"{BadReason.CLOCK_OFF}: t = {reading.t:.3f} is too far from now"
+        return Rejected(arrival, key, reason, head_of(reading).encode())
+
+    def _count_stored(self, reports: tuple[FeederReport, ...]) -> None:
+        if self.config.clock is Clock.WALL:
+            now = self._wall()
+            for report in reports:
+                self.metrics.delay.labels(report.feeder).observe(max(0.0, now - report.t))
+
+    def _count_tick(self, report: FeederReport) -> None:
+        metrics, name = self.metrics, report.feeder
+        metrics.ticks.labels(name, report.verdict).inc()
+        metrics.seen.labels(name).set(sum(meter.seen for meter in report.meters))
+        metrics.suspects.labels(name).set(len(report.suspects))
+        metrics.count_learning(report)
+        metrics.alarms.labels(name).set(len(self.watches[name].book.active))
+
+    # ---------------------------------------------------------------- publishing
+
+    def _publish_estimates(self, results: list[TickResult]) -> None:
+        if self.keeper.publisher is None:
+            return
+        for result in results:
+            key = f"{result.report.feeder}/estimate"
+            self.keeper.publisher.telemetry(key, msgspec.json.encode(report_json(result.report)))
+        self.metrics.count_bus(self.keeper.publisher.counts)
+
+    # ---------------------------------------------------------------- operators
+
+    def acknowledge(
+        self, alarm_id: str, who: str, comment: str, *, count: int | None = None
+    ) -> Future[dict[str, Any]]:
+        """Answer an alarm. The result is the alarm, when it is on the disk; the book follows then.
+
+        The same answer to the same occurrence once more has the same result.
+
+        Parameters
+        ----------
+        alarm_id, who, comment
+            Which alarm, who answers it, and with what words.
+        count
+            Which occurrence; None: whichever it is.
+
+        Raises
+        ------
+        AlarmUnknown, RaisedAgain, AlreadyAcknowledged, StoreUnavailable
+            If it cannot be answered, here or as the result; nothing has changed then.
+        OutcomeUnknown
+            As the result, if it is stored now or later, or not at all.
+        """
+        answer: Future[dict[str, Any]] = Future()
+        t = self._wall()
+
+        def store(alarm: Alarm | None) -> None:
+            if alarm is None:
+                raise AlarmUnknown(alarm_id)
+            occurrence = alarm.count if count is None else count
+            if (alarm.acknowledged_by, alarm.comment, alarm.count) == (who, comment, occurrence):
+                answer.set_result(alarm_json(alarm))
+                return
+            transition = acknowledged(alarm, who, comment, t, count=count)
+
+            def landed() -> dict[str, Any]:
+                self._acknowledged(transition.alarm)
+                return alarm_json(transition.alarm)
+
+            self.keeper.store(Wish((transition,)), _landing(answer, landed), partial(_refuse, answer))
+
+        books = (alarm for watch in self.watches.values() for alarm in watch.book.alarms)
+        held = next((alarm for alarm in books if alarm.id == alarm_id), None)
+        if held is None:
+            self.keeper.look(lambda db: db.alarm(alarm_id), _then(answer, store), partial(_refuse, answer))
+        else:
+            store(held)
+        return answer
+
+    def _acknowledged(self, alarm: Alarm) -> None:
+        """Carry a stored acknowledgement over to the book, and to what was judged while it was stored."""
+        self.keeper.waiting.carry(alarm)
+        watch = self.watches.get(alarm.feeder)
+        if watch is not None and alarm.acknowledged_by is not None and alarm.t_acknowledged is not None:
+            try:
+                watch.acknowledge(
+                    alarm.id,
+                    alarm.acknowledged_by,
+                    alarm.comment or "",
+                    alarm.t_acknowledged,
+                    count=alarm.count,
+                )
+            except (AlarmUnknown, AlreadyAcknowledged, RaisedAgain):
+                _log.info("the acknowledged occurrence is over", feeder=alarm.feeder, id=alarm.id)
+
+    def recommission(self, name: str, meters: Sequence[str], who: str, reason: str) -> Future[dict[str, Any]]:
+        """Learn meters' errors anew. The result is the progress, when it is on the disk.
+
+        Parameters
+        ----------
+        name, meters, who, reason
+            The feeder, which of its meters (none for all), who wants it, and why.
+
+        Raises
+        ------
+        FeederUnknown, NothingToLearn, StoreUnavailable
+            If that cannot be, here or as the result; nothing has changed then.
+        OutcomeUnknown
+            As in `acknowledge`.
+        """
+        answer: Future[dict[str, Any]] = Future()
+        watch = self.watches.get(name)
+        if watch is None:
+            raise FeederUnknown(name)
+        t = self._wall() if watch.book.t is None else watch.book.t
+        take_back = watch.recommission(meters, t, who, reason)
+        kept, happened = watch.commissioning.due()
+        kept, wanted = (*kept, *watch.suspicions.due()), happened[-1:]
+        take_back()
+
+        def landed() -> dict[str, Any]:
+            # Ticks have come since: begun anew from the present state, which is stored with the next batch.
+            watch.recommission(meters, t, who, reason)
+            kept, happened = watch.commissioning.due()
+            kept = (*kept, *watch.suspicions.due())
+            self.keeper.waiting.add(kept=kept, happened=happened[:-1])
+            for one in wanted:
+                _say(one)
+            self._count_learned(watch)
+            return commissioning_json(watch.commissioning.progress())
+
+        wish = Wish(kept=kept, happened=wanted)
+        self.keeper.store(wish, _landing(answer, landed), partial(_refuse, answer))
+        return answer
+
+
+def _then(answer: Future[Any], store: Callable[[T], None]) -> Callable[[T], None]:
+    """Return the second step of a command, errors of which are its result."""
+
+    def run(found: T) -> None:
+        try:
+            store(found)
+        except GridsecError as error:
+            _refuse(answer, error)
+
+    return run
+
+
+def _landing(answer: Future[T], run: Callable[[], T]) -> Callable[[], None]:
+    """Return the last step of a command, which has its result unless that was unknown before."""
+
+    def landed() -> None:
+        result = run()
+        if not answer.done():
+            answer.set_result(result)
+
+    return landed
+
+
+def _refuse(answer: Future[Any], error: GridsecError) -> None:
+    if not answer.done():
+        answer.set_exception(error)
+
+
+def _say(happened: Happened) -> None:
+    """Tell the log what happened to a commissioning."""
+    _log.info(
+        "commissioning",
+        feeder=happened.feeder,
+        change=str(happened.change),
+        meters=len(happened.meters),
+        who=happened.who,
+        reason=happened.reason or None,
+        t=happened.t,
+    )

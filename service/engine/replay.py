@@ -1,0 +1,142 @@
+"""A recording through the same chain as in the live service, in its own time or in that of its arrival."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+
+from feeders.model.site import Site
+from feeders.simulation.meters import BUSBAR
+from feeders.simulation.scenario import Reading as Recorded
+from gridsec.interface import Decision
+from service.alarms.state_machine import AlarmBook
+from service.engine.commissioning import Commissioning
+from service.engine.feeder_monitor import TickResult, Watch, align_rules, design, known_of
+from service.engine.suspicions import Suspicions
+from service.ingest.align import Clock, Outcome
+from service.ingest.reading import T_MAX, T_MIN, BadReason, Findings, Known, Reading, judge, to_reading
+from service.store.state_codec import Kept
+
+
+@dataclass(slots=True)
+class Tally:
+    """Counts of a replay: readings by outcome or reason, ticks by verdict, ticks that were not judged."""
+
+    readings: Counter[str] = field(default_factory=Counter)
+    ticks: Counter[str] = field(default_factory=Counter)
+    lost: int = 0
+    skipped: int = 0
+
+    @property
+    def judged(self) -> int:
+        """Number of ticks at which the monitor could tell whether anybody lies."""
+        return self.ticks.total() - self.ticks[Decision.UNDECIDED]
+
+
+def replay(
+    site: Site,
+    recorded: Iterable[Recorded],
+    tally: Tally,
+    *,
+    clock: Clock = Clock.EVENTS,
+    max_skew_s: float | None = None,
+    grace_s: float | None = None,
+    kept: Kept | None = None,
+    distrust: Kept | None = None,
+    skipped: Sequence[tuple[float, float]] = (),
+) -> Iterator[TickResult]:
+    """Yield what the service would have made of recorded readings.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    recorded
+        Readings in the order of their arrival.
+    tally
+        Filled on the way.
+    clock
+        Who says what time it is: the readings, or, as it was live, the wall clock by which they arrived.
+    max_skew_s, grace_s
+        As in `align.rules`.
+    kept
+        What was known of the meters when the recording began, as in `Commissioning`; None: nothing.
+    distrust
+        Who was not believed then, as in `Suspicions`; None: nobody.
+    skipped
+        First and last Unix time of ticks that the live service skipped, s: they are not judged here either.
+
+    Raises
+    ------
+    NotObservable, DesignInfeasible
+        If the feeder cannot be watched.
+    """
+    rules = align_rules(site, clock, max_skew_s=max_skew_s, grace_s=grace_s)
+    book = AlarmBook(site.feeder.name)
+    watch = Watch(site, rules, book, Commissioning(site, kept), Suspicions(site, distrust))
+    watch.install(design(site))
+    known = known_of(site)
+    for one in recorded:
+        reading = _checked(watch.name, known, one, tally, clock)
+        if reading is not None:
+            # Where the readings tell the time, nothing else needs to, and a file need not say more.
+            now = one.arrival if clock is Clock.WALL else 0.0
+            outcome = watch.place(reading, now)
+            tally.readings[outcome] += 1
+            watch.reach(now)
+            yield from _counted(watch, _judged(watch, skipped), tally)
+            refused = len(watch.aligner.refused())
+            tally.readings[Outcome.ACCEPTED] -= refused
+            tally.readings[Outcome.CLOCK_OFF] += refused
+    watch.finish()
+    yield from _counted(watch, _judged(watch, skipped), tally)
+    tally.lost, tally.skipped = watch.aligner.lost, watch.skipped
+
+
+def _judged(watch: Watch, skipped: Sequence[tuple[float, float]]) -> Iterator[TickResult]:
+    """Judge the pending ticks; one that was skipped stays until the next one counts it."""
+    while watch.pending:
+        t = watch.pending[0].t
+        if not any(first <= t <= last for first, last in skipped):
+            yield watch.judge()
+        elif len(watch.pending) > 1:
+            watch.skip(1)
+        else:
+            return
+
+
+def _counted(watch: Watch, results: Iterator[TickResult], tally: Tally) -> list[TickResult]:
+    found = list(results)
+    if watch.defect is not None:
+        raise watch.defect
+    tally.ticks.update(str(result.report.verdict) for result in found)
+    return found
+
+
+def _checked(feeder: str, known: Known, recorded: Recorded, tally: Tally, clock: Clock) -> Reading | None:
+    """Return a recorded reading as it would have come off the wire, or None (counted) if it is a bad one."""
+    if clock is Clock.WALL and not _is_time(recorded.arrival):
+        tally.readings[BadReason.VALUE] += 1
+        return None
+    if recorded.meter != BUSBAR and recorded.meter not in known.meters:
+        tally.readings["unknown-meter"] += 1
+        return None
+    fields = {
+        "t": recorded.t,
+        "v_volt": recorded.v_volt,
+        "p_kw": recorded.p_kw,
+        "q_kvar": recorded.q_kvar,
+        "seq": recorded.seq,
+        "v_phases": recorded.v_phases and list(recorded.v_phases),
+        "t_power": recorded.t_power,
+    }
+    found = judge(fields, known, recorded.meter, in_batch=False)
+    if isinstance(found, Findings):
+        tally.readings[found.reason] += 1
+        return None
+    return to_reading(feeder, None if recorded.meter == BUSBAR else recorded.meter, found)
+
+
+def _is_time(t: float | None) -> bool:
+    return t is not None and T_MIN <= t <= T_MAX

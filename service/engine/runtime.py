@@ -1,0 +1,573 @@
+"""The running service: one task owns all state.
+
+Rounds run one after the other in one worker thread, so that the event loop stays free for HTTP;
+acknowledgements, new feeders and finished designs are executed between them. Nothing else touches the state.
+With the wall clock that thread makes no call to the database: a command sends one, and its outcome is taken
+in between two later rounds.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from collections import deque
+from collections.abc import AsyncGenerator, Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
+from typing import Any, TypeVar
+
+import structlog
+
+from feeders.model.site import Site
+from feeders.registry.registry import Watcher
+from gridsec.errors import GridsecError
+from service.engine import design_jobs
+from service.engine.commissioning import to_json as commissioning_json
+from service.engine.engine import Rounds, RuntimeConfig
+from service.engine.feeder_monitor import Phase, Watch
+from service.errors import FeederFixed, TooManyFeeders
+from service.ingest.align import Clock
+from service.ingest.queues import Inbox, Sample
+from service.report import feeder_info
+from service.report.report import FeederReport
+from service.store import OutcomeUnknown, Store, StoreUnavailable
+from service.store.committer import Done, Publisher
+
+SAMPLES_PER_ROUND = 512
+"""Payloads of one round where senders wait. By the wall clock a round takes all that wait."""
+GATHER_S = 0.005
+"""Pause after a wake-up by readings, s: a round costs the same for one reading as for dozens."""
+LAST_COMMIT_S = 1.5
+"""Time for the last commit after `stop`, s: the service ends within 3 s."""
+IDLE_S = 1.0
+STUCK_S = 30.0
+COMMAND_S = 10.0
+"""Time limit of a command that needs the database, s: a write before it and its own."""
+STOPPING = "the service is stopping"
+
+T = TypeVar("T")
+
+_log = structlog.get_logger("gridsec.runtime")
+
+
+class Runtime:
+    """The running service. It is the backend of the API.
+
+    Parameters
+    ----------
+    config
+        How it works.
+    store
+        The database.
+    sites
+        The feeders to watch.
+    given
+        Names of those that cannot be deleted over REST; None: all of them.
+    unloaded
+        Feeders that are stored but cannot be loaded, and why: nobody watches them.
+    wall
+        The wall clock, Unix s.
+    settled
+        Called between two rounds when a feeder has got its monitor and no other is still being designed.
+    """
+
+    def __init__(
+        self,
+        config: RuntimeConfig,
+        store: Store,
+        sites: Iterable[Site],
+        *,
+        given: Iterable[str] | None = None,
+        unloaded: Mapping[str, str] | None = None,
+        wall: Callable[[], float] = time.time,
+        settled: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._wall, self._settled = wall, settled
+        self._stopping = False
+        self._rounds = Rounds(
+            config,
+            store,
+            sites,
+            wall=wall,
+            stored=lambda: self._in_loop(partial(self._notify, "alarm")),
+            apart=self._write_apart,
+            unloaded=unloaded,
+            go_on=lambda: not self._stopping,
+        )
+        # Where the readings tell the time, samples wait for ticks and for the database.
+        self._waits = config.clock is Clock.EVENTS
+        self._given = frozenset(self._rounds.watches) if given is None else frozenset(given)
+        self._inbox = Inbox(
+            lambda: self._in_loop(self._wake.set),
+            max_samples=config.max_samples,
+            lossless=self._waits,
+        )
+        self._commands: deque[tuple[Callable[[], Future[Any]], asyncio.Future[Any]]] = deque()
+        self._prepared: set[asyncio.Future[tuple[Site, Watcher]]] = set()
+        self._subscribers: set[asyncio.Queue[str]] = set()
+        self._outcomes: deque[Callable[[], None]] = deque()
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix="gridsec-round")
+        self._writer = ThreadPoolExecutor(1, thread_name_prefix="gridsec-store")
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._wake = asyncio.Event()
+        self._last_round: float | None = None
+        self._died: str | None = None
+
+    # ---------------------------------------------------------------- the task
+
+    def attach(self, publisher: Publisher) -> None:
+        """Say where estimates and alarms go, before `run`.
+
+        Parameters
+        ----------
+        publisher
+            Usually the zenoh bus.
+        """
+        self._rounds.keeper.publisher = publisher
+
+    def deliver(self, batch: list[Sample]) -> int:
+        """Take samples from a receiving thread; returns how many were dropped for them.
+
+        Parameters
+        ----------
+        batch
+            In the order of arrival.
+        """
+        dropped = self._inbox.put(batch)
+        self._rounds.metrics.samples.inc(len(batch))
+        self._rounds.metrics.dropped.inc(dropped)
+        return dropped
+
+    async def run(self) -> None:
+        """Watch until `stop`.
+
+        Raises
+        ------
+        WriterLost
+            If another process may have written the database; nothing more is stored.
+        """
+        self._loop = asyncio.get_running_loop()
+        try:
+            await self._loop.run_in_executor(self._writer, self._rounds.begin)
+            for watch in self._rounds.watches.values():
+                design_jobs.begin(watch, lambda install: self._in_loop(partial(self._hand_over, install)))
+            while not self._stopping:
+                self._check_writer()
+                await self._execute_commands()
+                samples = self._samples()
+                news = await self._in_worker(self._rounds.round, samples, self._inbox.oldest)
+                self._last_round = time.monotonic()
+                self._rounds.metrics.queue.set(len(self._inbox))
+                if news:
+                    self._notify("state")
+                await self._pause()
+            await self._end()
+            self._check_writer()
+        except BaseException as error:
+            self._died = f"{type(error).__name__}: {error}"
+            raise
+        finally:
+            self.stop()
+            for _, answer in self._commands:
+                answer.cancel()
+            self._worker.shutdown(wait=False)
+            self._writer.shutdown(wait=False)
+
+    def _check_writer(self) -> None:
+        if (lost := self.store.lost) is not None:
+            raise lost
+
+    def stop(self) -> None:
+        """End `run` and every subscription soon; called from the event loop."""
+        self._stopping = True
+        self._inbox.close()
+        for prepared in self._prepared:
+            if not prepared.done():
+                prepared.set_exception(StoreUnavailable(STOPPING, code="stopping"))
+        self._wake.set()
+        self._notify("stop")
+
+    def _samples(self) -> list[Sample]:
+        """Take the samples of the next round; where they wait, none before the last are judged and stored."""
+        if not self._waits:
+            return self._inbox.drain(len(self._inbox))
+        busy = self._rounds.behind or self._rounds.keeper.storing
+        return [] if busy else self._inbox.drain(SAMPLES_PER_ROUND)
+
+    async def _pause(self) -> None:
+        """Wait for samples, commands or the next tick."""
+        commands = self._commands and self._rounds.keeper.takes_commands
+        if self._stopping or self._outcomes or commands or self._rounds.behind:
+            await asyncio.sleep(0)
+            return
+        if len(self._inbox) and not (self._waits and self._rounds.keeper.storing):
+            await asyncio.sleep(0.0 if self._waits else GATHER_S)
+            return
+        now = self._wall()
+        wakes = [t for watch in self._rounds.watches.values() if (t := watch.aligner.wake()) is not None]
+        timeout = min([IDLE_S, *(t - now for t in wakes)])
+        if timeout > 0.0:
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._wake.wait(), timeout)
+        self._wake.clear()
+        if len(self._inbox) and not self._waits:
+            await asyncio.sleep(GATHER_S)
+
+    async def _in_worker(self, run: Callable[..., T], *arguments: Any) -> T:
+        return await asyncio.get_running_loop().run_in_executor(self._worker, run, *arguments)
+
+    def _write_apart(self, write: Callable[[], Done], then: Callable[[Done], None]) -> None:
+        """Write in a thread of its own; what came of it is taken in between two rounds."""
+
+        def run() -> None:
+            try:
+                done = write()
+            except Exception as error:  # noqa: BLE001 - without an outcome nothing would ever be stored again
+                done = Done(error=StoreUnavailable(f"{type(error).__name__}: {error}", code="defect"))
+            self._in_loop(partial(self._take_in, partial(then, done)))
+
+        self._writer.submit(run)
+
+    def _take_in(self, outcome: Callable[[], None]) -> None:
+        self._outcomes.append(outcome)
+        self._wake.set()
+
+    async def _end(self) -> None:
+        """Store what is left, if the database answers in time."""
+        try:
+            await asyncio.wait_for(self._last_commit(), LAST_COMMIT_S)
+        except TimeoutError:
+            # No request is answered with success before its commit.
+            waiting = len(self._rounds.keeper.waiting)
+            _log.error("the database did not answer before the end", transitions=waiting, s=LAST_COMMIT_S)
+
+    async def _last_commit(self) -> None:
+        """Store what is left, after what is on its way."""
+        await self._landed()
+        await self._in_worker(partial(self._rounds.keep_states, at_once=True))
+        await self._in_worker(partial(self._rounds.keeper.commit, at_once=True))
+        await self._landed()
+
+    async def _landed(self) -> None:
+        """Wait for a write that is on its way, and take in what came of it."""
+        await self._take_outcomes()
+        while self._rounds.keeper.storing:
+            await self._wake.wait()
+            self._wake.clear()
+            await self._take_outcomes()
+
+    async def _take_outcomes(self) -> None:
+        while self._outcomes:
+            await self._in_worker(self._outcomes.popleft())
+
+    async def _execute_commands(self) -> None:
+        await self._take_outcomes()
+        # One write is on its way at a time; one before a command comes first.
+        while self._commands and self._rounds.keeper.takes_commands:
+            command, answer = self._commands.popleft()
+            try:
+                found = await self._in_worker(command)
+            except GridsecError as error:
+                if not answer.done():
+                    answer.set_exception(error)
+            else:
+                found.add_done_callback(partial(self._pass_on, answer))
+
+    def _pass_on(self, answer: asyncio.Future[T], found: Future[T]) -> None:
+        """Give a command's result to the request that waits for it; called in any thread."""
+
+        def give() -> None:
+            if answer.done():
+                return
+            if (error := found.exception()) is not None:
+                answer.set_exception(error)
+            else:
+                answer.set_result(found.result())
+
+        self._in_loop(give)
+
+    async def _command(self, run: Callable[[], Future[T]]) -> T:
+        """Have something executed between two rounds, and wait for its result within a time limit."""
+        self._go_on()
+        answer: asyncio.Future[T] = asyncio.get_running_loop().create_future()
+        entry = (run, answer)
+        self._commands.append(entry)
+        self._wake.set()
+        await asyncio.wait({answer}, timeout=COMMAND_S)
+        if answer.done():
+            return answer.result()
+        answer.cancel()
+        name = self.store.name
+        if entry in self._commands:
+            self._commands.remove(entry)
+            text = f"{name}: the write before has not ended within {COMMAND_S:g} s"
+            raise StoreUnavailable(text, code="write-under-way")
+        raise OutcomeUnknown(
+            f"{name}: no answer within {COMMAND_S:g} s; whether it is stored is not known yet"
+        )
+
+    def _go_on(self) -> None:
+        if self._stopping:
+            raise StoreUnavailable(STOPPING, code="stopping")
+
+    def _in_loop(self, run: Callable[[], object]) -> None:
+        """Call something in the event loop, from any thread; not at all once the loop has ended."""
+        if self._loop is not None:
+            with contextlib.suppress(RuntimeError):
+                self._loop.call_soon_threadsafe(run)
+
+    def _hand_over(self, install: Callable[[], None]) -> None:
+        def run() -> None:
+            install()
+            self._settle()
+
+        self._take_in(run)
+
+    def _settle(self) -> None:
+        if all(watch.phase is not Phase.DESIGNING for watch in self._rounds.watches.values()):
+            self._settled()
+
+    # ---------------------------------------------------------------- the backend of the API
+
+    @property
+    def store(self) -> Store:
+        """The database."""
+        return self._rounds.store
+
+    def feeders(self) -> list[dict[str, Any]]:
+        """Return the summary of every feeder, with the phase of its monitor and of the commissioning."""
+        watched = [
+            {
+                **feeder_info.summary(watch.site),
+                "phase": str(watch.phase),
+                "problem": watch.problem or None,
+                "patience_s": watch.patience_s,
+                "ticks_skipped": watch.skipped,
+                "commissioning": str(watch.commissioning.progress().state),
+            }
+            for watch in self._rounds.watches.values()
+        ]
+        failed = [
+            {"name": name, "phase": str(Phase.FAILED), "problem": problem}
+            for name, problem in self._rounds.unloaded.copy().items()
+        ]
+        return watched + failed
+
+    def feeder(self, name: str) -> dict[str, Any] | None:
+        """Return everything about a feeder, or None.
+
+        Parameters
+        ----------
+        name
+            Its name.
+        """
+        watch = self._rounds.watches.get(name)
+        return None if watch is None else feeder_info.detail(watch.site, watch.patience_s)
+
+    def known(self, name: str) -> bool:
+        """Whether a feeder is watched.
+
+        Parameters
+        ----------
+        name
+            Its name.
+        """
+        return name in self._rounds.watches
+
+    def unloaded(self, name: str) -> str | None:
+        """Return why the stored tables of a feeder could not be loaded, or None if that is not so.
+
+        Parameters
+        ----------
+        name
+            Its name.
+        """
+        return self._rounds.unloaded.get(name)
+
+    def report(self, name: str) -> FeederReport | None:
+        """Return a feeder's latest report, or None.
+
+        Parameters
+        ----------
+        name
+            Its name.
+        """
+        watch = self._rounds.watches.get(name)
+        return None if watch is None else watch.report
+
+    def age(self, report: FeederReport) -> float:
+        """Return how old a feeder's latest report is by the service's clock, s.
+
+        Where the readings tell the time, it counts from when the report was made.
+
+        Parameters
+        ----------
+        report
+            The report.
+        """
+        now = time.monotonic()
+        since = now - self._rounds.reported.get(report.feeder, now)
+        return since if self._rounds.config.clock is Clock.EVENTS else max(since, self._wall() - report.t)
+
+    def commissioning(self, name: str) -> dict[str, Any] | None:
+        """Return how far a feeder's meters are known, or None.
+
+        Parameters
+        ----------
+        name
+            Its name.
+        """
+        watch = self._rounds.watches.get(name)
+        return None if watch is None else commissioning_json(watch.commissioning.progress())
+
+    def unstored(self) -> tuple[int, str | None]:
+        """Return how many changes of alarms wait for the database, and what is wrong with it, or None."""
+        keeper = self._rounds.keeper
+        return len(keeper.waiting), "; ".join(keeper.problems()) or None
+
+    def metrics(self) -> bytes:
+        """Return the metrics in Prometheus's text format."""
+        return self._rounds.metrics.exposition()
+
+    def healthy(self) -> tuple[bool, list[str]]:
+        """Say whether the process should live on, and if not, why."""
+        problems = []
+        if self._died is not None:
+            problems.append(f"the runtime has died: {self._died}")
+        elif self._last_round is not None and time.monotonic() - self._last_round > STUCK_S:
+            problems.append(f"the runtime has been stuck for {time.monotonic() - self._last_round:.0f} s")
+        return not problems, problems
+
+    def ready(self) -> tuple[bool, list[str]]:
+        """Say whether everything works that is needed to watch, and what does not."""
+        rounds = self._rounds
+        problems = self.healthy()[1]
+        if self._last_round is None:
+            problems.append("the runtime is starting")
+        problems.extend(rounds.keeper.problems())
+        publisher = rounds.keeper.publisher
+        if publisher is not None and publisher.failure is not None:
+            problems.append(f"zenoh: {publisher.failure}")
+        for watch in rounds.watches.values():
+            if watch.phase is Phase.DESIGNING:
+                problems.append(f"feeder {watch.name}: the monitor is still being designed")
+            elif watch.phase is Phase.FAILED:
+                problems.append(f"feeder {watch.name}: {watch.problem}")
+            # Where the readings tell the time, it may well stand still.
+            told, waits = watch.report, rounds.config.clock is Clock.WALL
+            if waits and told is not None and (age := self.age(told)) > watch.patience_s:
+                problems.append(f"feeder {watch.name}: the latest report is {age:.0f} s old")
+        for name, problem in rounds.unloaded.copy().items():
+            problems.append(f"feeder {name}: {problem}")
+        return not problems, problems
+
+    async def put_feeder(self, name: str, tables: dict[str, Any]) -> None:
+        """Take over a feeder's tables: check, design, store, watch; all or nothing.
+
+        Parameters
+        ----------
+        name, tables
+            Its name, and JSON of the columns of its files.
+
+        Raises
+        ------
+        FeederInvalid, NotObservable, DesignInfeasible, TooManyFeeders, StoreUnavailable
+            If it cannot be taken over; the feeder stays as it was.
+        """
+        self._go_on()
+        self._make_room(name)
+        prepared = design_jobs.prepare(name, tables)
+        self._prepared.add(prepared)
+        prepared.add_done_callback(self._prepared.discard)
+        site, finished = await prepared
+
+        def installed(watch: Watch) -> None:
+            design_jobs.install(watch, finished, "")
+            self._settle()
+
+        def put() -> Future[None]:
+            self._make_room(name)
+            return self._rounds.put(site, tables, installed)
+
+        await self._command(put)
+
+    def _make_room(self, name: str) -> None:
+        """See whether one more feeder may be put."""
+        put = (self._rounds.watches.keys() | self._rounds.unloaded.keys()) - self._given
+        most = self._rounds.config.max_feeders
+        if name not in put | self._given and len(put) >= most:
+            raise TooManyFeeders(most)
+
+    async def delete_feeder(self, name: str) -> None:
+        """Watch a feeder no more that was put over REST; its alarms are cleared, its history is kept.
+
+        Parameters
+        ----------
+        name
+            Its name.
+
+        Raises
+        ------
+        FeederUnknown, FeederFixed, StoreUnavailable
+            If it cannot be deleted; it is watched as before then.
+        """
+        if name in self._given:
+            raise FeederFixed(name)
+        await self._command(partial(self._rounds.remove, name))
+        self._notify("state")
+
+    async def acknowledge(
+        self, alarm_id: str, who: str, comment: str, *, count: int | None = None
+    ) -> dict[str, Any]:
+        """Answer an alarm; it is on the disk when this returns.
+
+        Parameters
+        ----------
+        alarm_id, who, comment
+            Which alarm, who answers it, and with what words.
+        count
+            Which occurrence; None: whichever it is.
+
+        Raises
+        ------
+        AlarmUnknown, RaisedAgain, AlreadyAcknowledged, StoreUnavailable
+            If it cannot be answered; nothing has changed then.
+        OutcomeUnknown
+            If it is stored now or later, or not at all; the same answer again tells.
+        """
+        return await self._command(partial(self._rounds.acknowledge, alarm_id, who, comment, count=count))
+
+    async def recommission(self, name: str, meters: Sequence[str], who: str, reason: str) -> dict[str, Any]:
+        """Learn meters' errors anew; it is on the disk when this returns.
+
+        Parameters
+        ----------
+        name, meters, who, reason
+            The feeder, which of its meters (none for all), who wants it, and why.
+
+        Raises
+        ------
+        FeederUnknown, NothingToLearn, StoreUnavailable
+            If that cannot be; nothing has changed then.
+        """
+        return await self._command(partial(self._rounds.recommission, name, meters, who, reason))
+
+    async def subscribe(self) -> AsyncGenerator[dict[str, Any], None]:
+        """Yield a wake-up after each stored alarm and each new report, until the service stops."""
+        queue: asyncio.Queue[str] = asyncio.Queue(maxsize=4)
+        self._subscribers.add(queue)
+        try:
+            while not self._stopping:
+                kind = await queue.get()
+                if kind == "stop":
+                    return
+                yield {"type": kind, "data": None}
+        finally:
+            self._subscribers.discard(queue)
+
+    def _notify(self, kind: str) -> None:
+        for queue in self._subscribers:
+            if queue.full():
+                queue.get_nowait()
+            queue.put_nowait(kind)

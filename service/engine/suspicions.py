@@ -1,0 +1,114 @@
+"""Whom the monitor of one feeder does not believe: followed, kept, and gone on with when it begins anew.
+
+`Suspicions` has no clock and no input or output, like the `Watch` that owns it: time comes from the ticks,
+texts that are kept come and go as values.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from feeders.model.site import Site
+from feeders.registry.registry import Memory, Watcher
+from gridsec.estimators.sequential import Distrust, nobody
+from service.report.voltages import busbar_phases
+from service.store.state_codec import Kept, KeptInvalid, decode_distrust, encode_distrust
+
+
+class Suspicions:
+    """Who is not believed of one feeder's meters and inverters, the busbar's meter among them.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    kept
+        What the store has of it.
+
+    Attributes
+    ----------
+    known
+        Who it is at the last tick, or was when the service ended.
+    note
+        Why what was kept is not used, if something was.
+    """
+
+    def __init__(self, site: Site, kept: Kept | None = None) -> None:
+        self.known = nobody(len(site.meter_ids), site.droop.tau.size, len(busbar_phases(site)))
+        self.note = ""
+        self._site = site
+        self._watcher: Watcher | None = None
+        self._t: float | None = None
+        if kept is not None:
+            try:
+                self.known = decode_distrust(site, kept)
+            except KeptInvalid as error:
+                self.note = f"who was suspected at {kept.t:.0f} is not known: {error}"
+        self._stored: Distrust | None = None if self.note else self.known
+
+    @property
+    def _memory(self) -> Memory | None:
+        return None if self._watcher is None else self._watcher.family.memory
+
+    def install(self, watcher: Watcher) -> None:
+        """Take a finished design.
+
+        Parameters
+        ----------
+        watcher
+            The design.
+        """
+        self._watcher = watcher
+
+    def restore(self, state: Any) -> Any:
+        """Go on from what is known, where the monitor can.
+
+        Parameters
+        ----------
+        state
+            The monitor's, before its first tick.
+        """
+        if self._watcher is None or self._memory is None:
+            return state
+        return self._memory.restore(self._watcher.design, state, self.known)
+
+    def follow(self, state: Any, t: float) -> None:
+        """Take over what a tick brought.
+
+        Parameters
+        ----------
+        state
+            The monitor's, after the tick.
+        t
+            Unix time of the tick, s.
+        """
+        if self._watcher is not None and self._memory is not None:
+            self.known, self._t = self._memory.distrusted(self._watcher.design, state), t
+
+    def forget(self, meters: Sequence[str], t: float) -> None:
+        """Believe meters that were replaced.
+
+        Parameters
+        ----------
+        meters
+            Which; none for all.
+        t
+            Unix time, s.
+        """
+        chosen = set(meters)
+        which = [not chosen or meter in chosen for meter in self._site.meter_ids]
+        self.known, self._t = self.known.without(np.array(which, dtype=np.bool_)), t
+
+    def now(self) -> Kept | None:
+        """Return the present state as it is stored; None before the first tick."""
+        return None if self._t is None else encode_distrust(self._site, self._t, self.known)
+
+    def due(self) -> tuple[Kept, ...]:
+        """Return what is to be stored now, if it has changed; it counts as stored from here on."""
+        if self._t is None or (self._stored is not None and self._stored.same(self.known)):
+            return ()
+        self._stored = self.known
+        return (encode_distrust(self._site, self._t, self.known),)

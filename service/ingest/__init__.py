@@ -1,0 +1,1 @@
+"""Readings from zenoh to ticks: transport, decoding, alignment."""

@@ -1,0 +1,632 @@
+"""Alignment of readings to the ticks of a feeder, and clock offsets of their sources.
+
+A reading with the stamp t that arrives at the wall time a has the delay ``a - t``: the way of the reading
+plus the error of the clock. The median delay of a source, less that of all sources, is the negative offset of
+its clock if the ways are alike. A longer way looks like a clock that is behind.
+
+Readings of one source that arrive at one instant count once, with the newest stamp: a concentrator sends a
+backlog at once, and its age is not an offset.
+
+A tick is a multiple of the feeder's `tick_s`. A meter is seen at a tick if its latest reading at or before it
+is younger than `max_age_s`, so that at short ticks a single lost reading does no harm. A tick is let go as
+soon as every source that is not silent has reported for it, and at the latest `grace_s` after it. What comes
+later is late: counted, and used for the next tick if it is still fresh. Silence does not stop the ticks.
+
+There is no clock in here. `now` is an argument (the wall clock), or is told by the readings themselves
+(`Clock.EVENTS`: the latest time that at least half of the sources have reached, so that a few wild clocks
+cannot move it; for replay and for time that runs faster). The same readings in the same order, with the same
+`now`, give the same ticks, whatever happens in between.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left, insort
+from collections import Counter, OrderedDict, deque
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from itertools import zip_longest
+from statistics import median
+from typing import Final
+
+from gridsec.errors import InputInvalid, Problem
+from service.ingest.reading import Reading
+
+KEPT: Final = 64
+"""Arrivals of a source that count, the newest."""
+FEWEST: Final = 16
+"""Arrivals of a source below which its offset is not measurable."""
+SOURCES: Final = 3
+"""Sources with enough arrivals below which the delay of the fleet is not known."""
+LEAST_S: Final = 0.5
+"""Smallest reported offset, s."""
+LEAST_TICKS: Final = 0.1
+"""Smallest reported offset, as a part of a tick: readings up to this much after a tick belong to it."""
+SURE: Final = 4.0
+"""Smallest reported offset in standard errors of the median of a source's delays."""
+KEEPS: Final = 0.5
+"""Part of the limits above which a reported offset stays reported."""
+_NORMAL, _MEDIAN = 1.4826, 1.2533
+"""Standard deviation over median absolute deviation, and standard error of a median over that of a mean."""
+
+
+class ClockOffsets:
+    """Delays of the sources of one feeder.
+
+    Parameters
+    ----------
+    sources
+        Meters, and None for the busbar's meter.
+    tick_s
+        Interval of the ticks, s.
+    silence_s
+        Time without an arrival after which the delays of a source are forgotten, s. The service's clock may
+        be set meanwhile: delays of sources that no longer report would shift the median of all.
+    """
+
+    def __init__(self, sources: Iterable[str | None], tick_s: float, silence_s: float) -> None:
+        self._delays: dict[str | None, deque[float]] = {source: deque(maxlen=KEPT) for source in sources}
+        self._arrived: dict[str | None, float] = {}
+        self._least = max(LEAST_S, LEAST_TICKS * tick_s)
+        self._silence = silence_s
+        self._reported: set[str | None] = set()
+
+    def note(self, source: str | None, t: float, arrival: float) -> None:
+        """Take in the delay of one reading.
+
+        Parameters
+        ----------
+        source
+            The meter, or None.
+        t, arrival
+            Time stamp and wall time of its arrival, Unix s.
+        """
+        delays = self._delays[source]
+        if self._arrived.get(source) == arrival:
+            delays[-1] = min(delays[-1], arrival - t)
+            return
+        self._arrived[source] = arrival
+        delays.append(arrival - t)
+
+    def forget(self) -> None:
+        """Forget everything: the wall clock was set."""
+        for delays in self._delays.values():
+            delays.clear()
+        self._arrived.clear()
+        self._reported.clear()
+
+    def measured(self, now: float) -> Mapping[str | None, float]:
+        """Return the measurable offsets, s; positive where a clock is ahead.
+
+        Parameters
+        ----------
+        now
+            Wall time, Unix s. Delays of silent sources are forgotten.
+        """
+        for source in [each for each, last in self._arrived.items() if now - last > self._silence]:
+            del self._arrived[source]
+            self._delays[source].clear()
+        middle = {source: median(delays) for source, delays in self._delays.items() if len(delays) >= FEWEST}
+        if len(middle) < SOURCES:
+            self._reported.clear()
+            return {}
+        fleet = median(middle.values())
+        least = KEEPS * self._least
+        found = {
+            source: fleet - one
+            for source, one in middle.items()
+            # No limit is smaller than the first.
+            if abs(fleet - one) >= least and abs(fleet - one) >= self._limit(source, one)
+        }
+        self._reported = set(found)
+        return found
+
+    def _limit(self, source: str | None, middle: float) -> float:
+        """Smallest offset of a source that is reported, s."""
+        delays = self._delays[source]
+        spread = _NORMAL * median(abs(delay - middle) for delay in delays)
+        limit = max(self._least, SURE * _MEDIAN * spread / math.sqrt(len(delays)))
+        return KEEPS * limit if source in self._reported else limit
+
+
+HELD_PER_SOURCE = 512
+"""A source that is more than this many readings ahead of the ticks is not listened to."""
+
+BACKLOG_TICKS = 3600
+"""Ticks formed after one step of the time where time may wait (`Clock.EVENTS`, replay); older are skipped."""
+
+LEAP_TICKS = 60
+"""Ticks formed after one step of the wall clock of a running service, where old ticks are stale."""
+
+BRIDGED_TICK_S = 2.0
+"""Up to this tick, a lost reading is replaced by the one before."""
+
+GAP_MAX = 1_000_000
+"""A running number that leaps further was not counted on; nothing is known to be lost."""
+
+OFFSETS_TICKS = 16
+"""Ticks from one measurement of the clock offsets to the next."""
+
+_ACTIVE_ROUNDS = 4
+
+
+class Clock(StrEnum):
+    """Who says what time it is."""
+
+    WALL = "wall"
+    EVENTS = "events"
+
+
+class Outcome(StrEnum):
+    """What became of a reading that is well-formed."""
+
+    ACCEPTED = "accepted"
+    OUT_OF_ORDER = "out-of-order"
+    LATE = "late"
+    DUPLICATE = "duplicate"
+    OVERFLOW = "overflow"
+    CLOCK_OFF = "clock-off"
+
+
+@dataclass(frozen=True, slots=True)
+class AlignRules:
+    """The times of one feeder, all in seconds.
+
+    Attributes
+    ----------
+    tick_s
+        Interval between ticks.
+    max_age_s
+        A reading of this age or older at a tick does not count as seen.
+    grace_s
+        How long after a tick to wait for those who have not reported.
+    lead_s
+        A reading up to this much after a tick still belongs to it: meters that mean to read at the tick
+        miss it by a little in both directions.
+    max_skew_s
+        A reading whose time is further than this from now is refused: that clock is off.
+    silence_s
+        A source whose last usable reading is older than this is silent.
+    clock
+        Who says what time it is.
+    backlog
+        Ticks formed after one step of the time; older ones are skipped and counted.
+    skips_empty
+        After such a step all ticks are skipped if none of them has a usable reading.
+    """
+
+    tick_s: float
+    max_age_s: float
+    grace_s: float
+    lead_s: float
+    max_skew_s: float
+    silence_s: float
+    clock: Clock = Clock.WALL
+    backlog: int = BACKLOG_TICKS
+    skips_empty: bool = False
+
+    def __post_init__(self) -> None:
+        times = (self.tick_s, self.max_age_s, self.max_skew_s, self.silence_s)
+        if not all(math.isfinite(s) and s > 0.0 for s in times):
+            raise InputInvalid([Problem("not-positive", f"times must be finite and positive: {self}")])
+        if not all(math.isfinite(s) and s >= 0.0 for s in (self.grace_s, self.lead_s)):
+            raise InputInvalid([Problem("negative", f"times must be finite and not negative: {self}")])
+
+
+def rules(
+    tick_s: float,
+    silence_s: float,
+    *,
+    clock: Clock = Clock.WALL,
+    max_skew_s: float | None = None,
+    grace_s: float | None = None,
+    live: bool = False,
+) -> AlignRules:
+    """Return the rules that follow from a feeder's tick.
+
+    Up to `BRIDGED_TICK_S` a reading serves for two and a half ticks, which bridges single losses. At longer
+    ticks it serves for one: a lost reading is a lost reading there, because a voltage of a quarter of an
+    hour ago says nothing about now.
+
+    Parameters
+    ----------
+    tick_s, silence_s
+        As in the feeder's file.
+    clock
+        Who says what time it is.
+    max_skew_s
+        None: a minute, or two ticks where they are longer.
+    grace_s
+        None: half a tick, at most a minute.
+    live
+        By the wall clock at most `LEAP_TICKS` missed ticks are formed, and none if no reading serves them.
+    """
+    lead_s = min(0.1 * tick_s, 1.0)
+    leaps = live and clock is Clock.WALL
+    max_age_s = 2.5 * tick_s if tick_s <= BRIDGED_TICK_S else tick_s - lead_s
+    return AlignRules(
+        tick_s=tick_s,
+        max_age_s=max_age_s,
+        grace_s=min(0.5 * tick_s, 60.0) if grace_s is None else grace_s,
+        lead_s=lead_s,
+        max_skew_s=max(60.0, 2.0 * tick_s) if max_skew_s is None else max_skew_s,
+        # Nobody is silent before two ticks have gone by without a reading; the silent are not waited for.
+        silence_s=max(silence_s, tick_s + max_age_s),
+        clock=clock,
+        backlog=LEAP_TICKS if leaps else BACKLOG_TICKS,
+        skips_empty=leaps,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Tick:
+    """What is known at one tick.
+
+    Attributes
+    ----------
+    t
+        Unix time, s.
+    readings
+        The usable reading of each meter, in the order of the feeder's meters; None where unseen.
+    busbar
+        The usable reading of the busbar meter, or None.
+    silent
+        (meter, seconds since its last usable reading) of those who are silent; None is the busbar meter,
+        and infinity says never.
+    skipped
+        Number of ticks directly before this one that are not judged.
+    clock_offset : (p,) or ()
+        By how much the clock of each meter is ahead, s; None where that is not measurable, () where none is.
+    busbar_offset
+        By how much the clock of the busbar meter is ahead, s; None where that is not measurable.
+    """
+
+    t: float
+    readings: tuple[Reading | None, ...]
+    busbar: Reading | None
+    silent: tuple[tuple[str | None, float], ...]
+    skipped: int = 0
+    clock_offset: tuple[float | None, ...] = ()
+    busbar_offset: float | None = None
+
+
+@dataclass(slots=True)
+class _Source:
+    held: list[Reading] = field(default_factory=list)
+    last_t: float = -math.inf
+    last_heard: float = -math.inf
+    last_used: float = -math.inf
+    heard: int = 0
+    seq: int | None = None
+
+
+def _time_of(reading: Reading) -> float:
+    return reading.t
+
+
+class Aligner:
+    """The alignment of one feeder. It belongs to one task.
+
+    Parameters
+    ----------
+    meters
+        Ids of the feeder's meters, in order. The busbar meter is added.
+    rules
+        The times.
+
+    Attributes
+    ----------
+    counts
+        Readings by outcome.
+    lost
+        Readings that never came, by the gaps in their running numbers.
+    restarts
+        How often the clock was set back by more than `silence_s`, and the ticks with it.
+    """
+
+    def __init__(self, meters: Iterable[str], rules: AlignRules) -> None:
+        self.meters = tuple(meters)
+        self.rules = rules
+        self.counts: Counter[Outcome] = Counter()
+        self.lost = 0
+        self.restarts = 0
+        self._skipped = 0
+        self._sources: dict[str | None, _Source] = {meter: _Source() for meter in (*self.meters, None)}
+        self._waiting: set[str | None] = set()
+        self._next: int | None = None
+        self._first: int | None = None
+        self._resumed = -math.inf
+        self._refused: list[Reading] = []
+        self._now: float | None = None
+        self._latest = -math.inf
+        self._arrivals = 0
+        self._active: OrderedDict[str | None, float] = OrderedDict()
+        self._claims: list[float] = []
+        self._clocks = ClockOffsets((*self.meters, None), rules.tick_s, rules.silence_s)
+        self._offsets: tuple[float | None, ...] = ()
+        self._busbar_offset: float | None = None
+
+    # ---------------------------------------------------------------- in
+
+    def take(self, reading: Reading, now: float) -> tuple[Outcome, list[Tick]]:
+        """Take one reading in, and let go the ticks that are due.
+
+        Parameters
+        ----------
+        reading
+            A reading of this feeder.
+        now
+            Wall time of its arrival, Unix s; ignored when the readings tell the time.
+
+        Returns
+        -------
+        outcome, ticks
+            What became of the reading; the ticks, in order.
+        """
+        # A reading that had to wait came before what is known to be now; that is no clock set back.
+        self._latest = max(self._latest, now)
+        ticks = list(self._let_go(self._latest))
+        source = self._sources[reading.meter]
+        if self.rules.clock is Clock.EVENTS:
+            self._hear(reading, source)
+            ticks.extend(self._let_go(self._latest))
+        outcome = self._place(reading, source, self.now(now))
+        self.counts[outcome] += 1
+        ticks.extend(self._let_go(self._latest))
+        return outcome, ticks
+
+    def refused(self) -> tuple[Reading, ...]:
+        """Return, once, the readings that were taken in but turned out to have a wrong clock."""
+        refused, self._refused = tuple(self._refused), []
+        return refused
+
+    def _place(self, reading: Reading, source: _Source, now: float | None) -> Outcome:
+        t = reading.t
+        if now is not None and abs(t - now) > self.rules.max_skew_s:
+            return Outcome.CLOCK_OFF
+        index = bisect_left(source.held, t, key=_time_of)
+        if index < len(source.held) and source.held[index].t == t:
+            return Outcome.DUPLICATE
+        if now is not None and self.rules.clock is Clock.WALL:
+            self._clocks.note(reading.meter, t, now)
+        self._count_gap(reading, source)
+        late = self._next is not None and t <= self._time(self._next - 1) + self.rules.lead_s
+        if late and t <= source.last_t:
+            return Outcome.LATE
+        if len(source.held) >= HELD_PER_SOURCE:
+            self._thin(source)
+            if len(source.held) >= HELD_PER_SOURCE:
+                return Outcome.OVERFLOW
+            index = bisect_left(source.held, t, key=_time_of)
+        source.held.insert(index, reading)
+        in_order = t > source.last_t
+        source.last_t = max(source.last_t, t)
+        # A reading from the future does not prove that its meter will still be alive then.
+        source.last_heard = t if now is None or self.rules.clock is Clock.EVENTS else now
+        if self._next is not None:
+            self._wait_for(reading.meter, source, self._next)
+        if late:
+            return Outcome.LATE
+        return Outcome.ACCEPTED if in_order else Outcome.OUT_OF_ORDER
+
+    def _thin(self, source: _Source) -> None:
+        """Keep of the readings between two ticks the last one: no tick uses the others."""
+        numbers = [self._serves(held) for held in source.held]
+        pairs = zip(source.held, numbers, [*numbers[1:], None], strict=True)
+        source.held = [held for held, number, after in pairs if number != after]
+
+    def _count_gap(self, reading: Reading, source: _Source) -> None:
+        # Numbers that go back are a restart or another order, no loss; the ring of the subscription drops
+        # the oldest samples, which shows here and nowhere else.
+        # What was overtaken by a later one tells no loss, and nothing of the next.
+        if reading.seq is None or reading.t < source.last_t:
+            return
+        if source.seq is not None and 0 < (gap := reading.seq - source.seq - 1) <= GAP_MAX:
+            self.lost += gap
+        source.seq = reading.seq
+
+    # ---------------------------------------------------------------- time
+
+    def now(self, wall: float) -> float | None:
+        """Return the time that counts here, s; None while the readings have not told it yet.
+
+        Parameters
+        ----------
+        wall
+            Wall time, Unix s.
+        """
+        return wall if self.rules.clock is Clock.WALL else self._now
+
+    def wake(self) -> float | None:
+        """Return the wall time at which `due` has something at the latest, s; None if only readings can."""
+        if self.rules.clock is Clock.EVENTS or self._next is None:
+            return None
+        return self._time(self._next) + (self.rules.grace_s if self._waiting else 0.0)
+
+    def _hear(self, reading: Reading, source: _Source) -> None:
+        """Let a reading have its say about the time."""
+        # However often a clock far ahead of all others speaks, they are not forgotten over it.
+        if self._now is None or reading.t - self._now <= self.rules.max_skew_s:
+            self._arrivals += 1
+        meter = reading.meter
+        if meter in self._active:
+            self._claims.pop(bisect_left(self._claims, self._active.pop(meter)))
+        source.heard = self._arrivals
+        self._active[meter] = reading.t
+        insort(self._claims, reading.t)
+        window = max(_ACTIVE_ROUNDS * len(self._sources), 64)
+        while self._sources[next(iter(self._active))].heard <= self._arrivals - window:
+            _, claim = self._active.popitem(last=False)
+            self._claims.pop(bisect_left(self._claims, claim))
+        if self._now is None and 2 * len(self._active) < len(self._sources) and self._arrivals < window:
+            return
+        count = len(self._claims)
+        reached = self._claims[count - (count + 1) // 2]
+        if self._now is None:
+            self._now = reached
+            self._sweep(reached)
+        else:
+            self._now = max(self._now, reached)
+
+    def _sweep(self, now: float) -> None:
+        """Throw out what was taken in before the time was known and does not fit it."""
+        for source in self._sources.values():
+            wild = [r for r in source.held if abs(r.t - now) > self.rules.max_skew_s]
+            if wild:
+                self._refused.extend(wild)
+                self.counts[Outcome.ACCEPTED] -= len(wild)
+                self.counts[Outcome.CLOCK_OFF] += len(wild)
+                source.held = [r for r in source.held if abs(r.t - now) <= self.rules.max_skew_s]
+                source.last_t = source.held[-1].t if source.held else -math.inf
+
+    def _time(self, number: int) -> float:
+        return number * self.rules.tick_s
+
+    # ---------------------------------------------------------------- out
+
+    def due(self, wall: float) -> Iterator[Tick]:
+        """Let go the ticks that are due, in order.
+
+        Parameters
+        ----------
+        wall
+            Wall time up to which all that arrived was taken, Unix s; ignored when the readings tell the time.
+        """
+        if self.rules.clock is Clock.WALL and wall < self._latest - self.rules.silence_s:
+            # The clock was set back. To wait until it is where it was would be to watch nothing meanwhile.
+            self.restarts += 1
+            for source in self._sources.values():
+                source.held.clear()
+                source.last_t = source.last_heard = source.last_used = -math.inf
+            self._clocks.forget()
+            self._offsets, self._busbar_offset = (), None
+            self._latest = wall
+            self._begin(wall)
+        self._latest = max(self._latest, wall)
+        yield from self._let_go(wall)
+
+    def _let_go(self, wall: float) -> Iterator[Tick]:
+        now = self.now(wall)
+        if now is None:
+            return
+        if self._next is None:
+            self._begin(now)
+        first = self._number()
+        behind = math.floor(now / self.rules.tick_s) - first
+        if behind > self.rules.backlog:
+            self._skip(first, self._resume(first + behind))
+            # A skipped tick is no evidence of silence: it was not formed.
+            self._resumed = self._time(self._number())
+        while True:
+            t = self._time(self._number())
+            if now < t or (self._waiting and now < t + self.rules.grace_s):
+                return
+            tick = self._tick(t)
+            self._turn_to(self._number() + 1)
+            yield tick
+
+    def flush(self) -> Iterator[Tick]:
+        """Let go every tick that the time has reached, without grace: nothing more will come."""
+        if self._now is None and self._claims:
+            self._now = self._claims[len(self._claims) // 2]
+            self._sweep(self._now)
+        now = self.now(self._latest)
+        if now is None or now == -math.inf:
+            return
+        yield from self.due(now)
+        while self._time(self._number()) <= now:
+            tick = self._tick(self._time(self._number()))
+            self._turn_to(self._number() + 1)
+            yield tick
+
+    def _resume(self, now: int) -> int:
+        """Number of the first tick to form after a step of the time to tick number `now`."""
+        first = now - self.rules.backlog
+        newest = [source.held[-1] for source in self._sources.values() if source.held]
+        starts = ((max(first, self._serves(reading)), reading.t) for reading in newest)
+        serving = any(n < now and self._time(n) - t < self.rules.max_age_s for n, t in starts)
+        return first if serving or not self.rules.skips_empty else now
+
+    def _skip(self, first: int, following: int) -> None:
+        """Go on with the tick `following`; readings serve as if the skipped ticks had been formed."""
+        for source in self._sources.values():
+            for reading, later in zip_longest(source.held, source.held[1:]):
+                begin = max(first, self._serves(reading))
+                end = following if later is None else min(following, self._serves(later))
+                if begin < end and self._time(begin) - reading.t < self.rules.max_age_s:
+                    source.last_used = max(source.last_used, reading.t)
+        self._skipped += following - first
+        self._turn_to(following)
+
+    def _serves(self, reading: Reading) -> int:
+        """Return the number of the first tick that may use a reading."""
+        return math.ceil((reading.t - self.rules.lead_s) / self.rules.tick_s)
+
+    def _begin(self, now: float) -> None:
+        self._first = math.ceil(now / self.rules.tick_s)
+        self._resumed = -math.inf
+        self._skipped = 0
+        self._turn_to(self._first)
+
+    def _number(self) -> int:
+        if self._next is None:
+            raise RuntimeError("no tick before the time is known")
+        return self._next
+
+    def _turn_to(self, number: int) -> None:
+        self._next = number
+        before = self._time(number - 1) + self.rules.lead_s
+        self._waiting.clear()
+        for meter, source in self._sources.items():
+            # The newest reading at or before the last tick may serve the next one; older ones never will.
+            done = bisect_left(source.held, math.nextafter(before, math.inf), key=_time_of)
+            if done > 1:
+                del source.held[: done - 1]
+            self._wait_for(meter, source, number)
+
+    def _wait_for(self, meter: str | None, source: _Source, number: int) -> None:
+        """Wait for a source at a tick, if it is alive and has not reported for it."""
+        reported = source.last_t > self._time(number - 1) + self.rules.lead_s
+        # Also if nothing of it could be used: at long ticks whoever comes after all others would otherwise
+        # be late at every tick, and silent for ever.
+        if reported or self._silent_for(source, source.last_t, self._time(number)):
+            self._waiting.discard(meter)
+        else:
+            self._waiting.add(meter)
+
+    def _silent_for(self, source: _Source, last: float, t: float) -> float:
+        """Return for how long a source has been silent at t, s, if `last` was its last; 0 if it is not."""
+        if t - self._resumed <= self.rules.silence_s:
+            return 0.0
+        since = min(last, source.last_heard)
+        if since == -math.inf and self._first is not None:
+            since = self._time(self._first)
+            return math.inf if t - since > self.rules.silence_s else 0.0
+        return t - since if t - since > self.rules.silence_s else 0.0
+
+    def _tick(self, t: float) -> Tick:
+        seen = {meter: self._usable(source, t) for meter, source in self._sources.items()}
+        for meter, reading in seen.items():
+            if reading is not None:
+                self._sources[meter].last_used = reading.t
+        silent = tuple(
+            (meter, seconds)
+            for meter, source in self._sources.items()
+            if (seconds := self._silent_for(source, source.last_used, t)) > 0.0
+        )
+        skipped, self._skipped = self._skipped, 0
+        if self._number() % OFFSETS_TICKS == 0:
+            found = self._clocks.measured(t)
+            self._busbar_offset = found.get(None)
+            offsets = tuple(found.get(meter) for meter in self.meters)
+            self._offsets = offsets if any(offsets) else ()
+        readings = tuple(seen[meter] for meter in self.meters)
+        return Tick(t, readings, seen[None], silent, skipped, self._offsets, self._busbar_offset)
+
+    def _usable(self, source: _Source, t: float) -> Reading | None:
+        index = bisect_left(source.held, math.nextafter(t + self.rules.lead_s, math.inf), key=_time_of)
+        if index == 0:
+            return None
+        reading = source.held[index - 1]
+        return reading if t - reading.t < self.rules.max_age_s else None

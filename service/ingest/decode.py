@@ -1,0 +1,457 @@
+"""Payloads as readings, or as bad readings with a reason: JSON, CBOR, Arrow.
+
+Arrow is made to be trusted: a small payload can unfold into a huge table (compressed buffers, null or
+dictionary columns), and unchecked offsets reach outside of the buffers. So only plain columns are read, only
+uncompressed, only after full validation.
+
+Nothing here raises on data. A payload that cannot be used, or an element of a batch, becomes a `BadReading`
+that names everything wrong with it at once; the good elements of a batch are used all the same. The reason
+is one of a few words (a label for counters), the problems are sentences (for people).
+
+Formats are told apart by the zenoh encoding: JSON (also when no encoding is set), and for concentrators the
+same fields as columns in CBOR (a map of equally long arrays) or Arrow IPC (stream or file, uncompressed).
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import chain
+from typing import Any
+
+import cbor2
+import msgspec
+import pyarrow as pa
+from pyarrow import ipc
+
+from service.ingest.reading import (
+    HEAD_BYTES,
+    BadReading,
+    BadReason,
+    Known,
+    Raw,
+    Reading,
+    beginning,
+    head_of,
+    judge,
+    name_of,
+    plausible,
+    printable,
+    to_reading,
+)
+
+_RECORD_BATCH_COMPRESSION_SLOT = 3
+_MESSAGE_HEADER_SLOT = 2
+_UNREADABLE = (
+    pa.ArrowException,
+    OSError,
+    EOFError,
+    ValueError,
+    TypeError,
+    LookupError,
+    OverflowError,
+    MemoryError,
+    struct.error,
+)
+
+
+class ArrowProblem(ValueError):
+    """A payload is not read.
+
+    Parameters
+    ----------
+    problems
+        Why, one sentence each.
+    well_formed
+        Whether it is Arrow IPC at all.
+    """
+
+    def __init__(self, problems: Iterable[str], *, well_formed: bool) -> None:
+        self.problems = tuple(problems)
+        self.well_formed = well_formed
+        super().__init__("; ".join(self.problems))
+
+
+def columns_of(payload: bytes, is_file: bool, names: tuple[str, ...]) -> dict[str, list[Any]]:
+    """Return the named columns of an Arrow IPC stream or file as Python lists, nulls as None.
+
+    Parameters
+    ----------
+    payload
+        The bytes.
+    is_file
+        File format (with a footer) instead of the stream format.
+    names
+        The columns that are wanted; others are ignored, absent ones are left out.
+
+    Raises
+    ------
+    ArrowProblem
+        If the payload is not Arrow IPC, is compressed, or a wanted column is not a plain column of
+        strings (`meter`), integers (`seq`) or numbers (all others).
+    """
+    try:
+        reader = _open(payload, is_file)
+        _check_columns(reader.schema, names)
+        columns: dict[str, list[Any]] = {name: [] for name in names if name in reader.schema.names}
+        for batch in _batches(reader, limit=len(payload)):
+            batch.validate(full=True)
+            for name, column in columns.items():
+                column.extend(batch.column(name).to_pylist())
+    except ArrowProblem:
+        raise
+    except _UNREADABLE as error:
+        detail = str(error).partition("\n")[0] or type(error).__name__
+        raise ArrowProblem([f"no Arrow IPC: {detail}"], well_formed=False) from error
+    return columns
+
+
+def _open(payload: bytes, is_file: bool) -> Any:
+    if is_file:
+        # The file format wraps the messages of a stream between two magic words, so that the same check
+        # for compression runs over them; the footer is not needed to read a file from front to back.
+        if payload[:6] != b"ARROW1" or payload[-6:] != b"ARROW1":
+            raise pa.ArrowInvalid("not an Arrow file")
+        payload = payload[8:]
+    _refuse_compression(payload)
+    return ipc.open_stream(pa.py_buffer(payload))
+
+
+def _refuse_compression(payload: bytes) -> None:
+    source = pa.BufferReader(payload)
+    while True:
+        try:
+            message = ipc.read_message(source)
+        except EOFError:
+            return
+        if message.type == "record batch" and _is_compressed(message.metadata.to_pybytes()):
+            raise ArrowProblem(["compressed Arrow IPC is not read; write it uncompressed"], well_formed=True)
+        if message.type == "dictionary":
+            raise ArrowProblem(["dictionary columns are not read; write plain strings"], well_formed=True)
+
+
+def _is_compressed(metadata: bytes) -> bool:
+    """Tell whether a record batch's flatbuffer header has its `compression` field set."""
+    message = struct.unpack_from("<I", metadata, 0)[0]
+    header = _slot(metadata, message, _MESSAGE_HEADER_SLOT)
+    if header == 0:
+        return False
+    batch = header + struct.unpack_from("<I", metadata, header)[0]
+    return _slot(metadata, batch, _RECORD_BATCH_COMPRESSION_SLOT) != 0
+
+
+def _slot(data: bytes, table: int, index: int) -> int:
+    """Return the position of field `index` of a flatbuffer table, 0 if absent."""
+    vtable = table - struct.unpack_from("<i", data, table)[0]
+    size = struct.unpack_from("<H", data, vtable)[0]
+    entry = 4 + 2 * index
+    if entry >= size:
+        return 0
+    offset = struct.unpack_from("<H", data, vtable + entry)[0]
+    return table + offset if offset else 0
+
+
+def _check_columns(schema: pa.Schema, names: tuple[str, ...]) -> None:
+    problems = []
+    for name in names:
+        count = schema.names.count(name)
+        if count > 1:
+            problems.append(f"column `{name}` appears {count} times")
+        if count != 1:
+            continue
+        kind = schema.field(name).type
+        if name == "meter":
+            good = pa.types.is_string(kind) or pa.types.is_large_string(kind)
+        elif name == "seq":
+            good = pa.types.is_integer(kind)
+        else:
+            good = pa.types.is_integer(kind) or pa.types.is_floating(kind)
+        if not good:
+            problems.append(f"column `{name}` has type {kind}")
+    if problems:
+        raise ArrowProblem(problems, well_formed=True)
+
+
+def _batches(reader: Any, limit: int) -> Iterable[Any]:
+    rows = 0
+    for batch in reader:
+        rows += batch.num_rows
+        # A row costs at least one byte somewhere, or else its length is a lie (a column without buffers).
+        if rows > limit:
+            raise ArrowProblem([f"more than {limit} rows in {limit} bytes"], well_formed=True)
+        yield batch
+
+
+JSON_ENCODINGS = frozenset({"", "zenoh/bytes", "zenoh/string", "text/plain", "application/json", "text/json"})
+DETAILED_PER_REASON = 5
+"""So many bad elements of one batch are kept in full for each reason; the others are only counted."""
+
+
+@dataclass(frozen=True, slots=True)
+class Decoded:
+    """The harvest of one payload."""
+
+    readings: tuple[Reading, ...] = ()
+    bad: tuple[BadReading, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """Where a payload comes from: a feeder, and a meter, the busbar (meter None) or a concentrator."""
+
+    feeder: str
+    meter: str | None = None
+    concentrator: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Wire:
+    """The decoder of one service.
+
+    Attributes
+    ----------
+    known
+        The feeders that are watched, by name.
+    prefix
+        First chunks of every key, without a slash at the end.
+    max_bytes
+        Largest accepted payload.
+    """
+
+    known: Mapping[str, Known]
+    prefix: str = "gridsec"
+    max_bytes: int = 256 * 1024
+
+    def decode(self, key: str, payload: bytes, encoding: str = "", *, size: int | None = None) -> Decoded:
+        """Return the readings and the bad readings in one payload.
+
+        Parameters
+        ----------
+        key
+            Full zenoh key.
+        payload
+            The bytes.
+        encoding
+            The zenoh encoding; a schema after `;` is ignored.
+        size
+            Length of the payload where only its beginning was kept.
+
+        Returns
+        -------
+        Decoded
+            Never empty: a payload without any reading is a bad reading itself.
+        """
+        source = source_of(key, self.prefix, self.known)
+        head = head_of(payload[:HEAD_BYTES])
+        if isinstance(source, BadReading):
+            return Decoded(bad=(replace(source, head=head),))
+        base = BadReading(BadReason.SYNTAX, (), beginning(key), source.feeder, source.meter, head)
+        length = len(payload) if size is None else size
+        if length > self.max_bytes:
+            problem = f"payload of {length} bytes; at most {self.max_bytes} are read"
+            return _refuse(base, BadReason.OVERSIZE, problem)
+        if not payload:
+            return _refuse(base, BadReason.EMPTY, "the payload is empty")
+        decoder = _decoder(encoding.partition(";")[0].strip().lower(), source)
+        if decoder is None:
+            accepted = "application/json" if source.concentrator is None else "JSON, CBOR or Arrow IPC"
+            problem = f"encoding `{encoding[:80]}` is not read here; use {accepted}"
+            return _refuse(base, BadReason.ENCODING, problem)
+        return decoder(payload, source, self.known[source.feeder], base)
+
+
+def _decoder(kind: str, source: Source) -> Callable[[bytes, Source, Known, BadReading], Decoded] | None:
+    if kind in JSON_ENCODINGS:
+        return _single if source.concentrator is None else _json_batch
+    if source.concentrator is not None:
+        return _BATCH_DECODERS.get(kind)
+    return None
+
+
+def source_of(key: str, prefix: str, known: Mapping[str, Known]) -> Source | BadReading:
+    """Return what a key names, or why it names nothing.
+
+    Parameters
+    ----------
+    key
+        Full key: `<prefix>/<feeder>/meter/<meter>/reading`, `<prefix>/<feeder>/substation/reading` or
+        `<prefix>/<feeder>/concentrator/<id>/readings`.
+    prefix
+        The prefix, without a slash at the end.
+    known
+        The feeders that are watched.
+    """
+    if "*" in key or "$" in key:
+        return _nowhere(key, BadReason.KEY, "is a pattern; every reading is put on a key of its own")
+    head, _, rest = key.partition(prefix + "/")
+    match rest.split("/"):
+        case [feeder, "meter", meter, "reading"] if not head:
+            source = Source(feeder, meter)
+        case [feeder, "substation", "reading"] if not head:
+            source = Source(feeder)
+        case [feeder, "concentrator", concentrator, "readings"] if not head:
+            source = Source(feeder, None, concentrator)
+        case _:
+            return _nowhere(key, BadReason.KEY, "is no key of a reading")
+    limits = known.get(source.feeder)
+    if limits is None:
+        return _nowhere(key, BadReason.UNKNOWN_FEEDER, "names a feeder that is not watched here")
+    if source.meter is not None and source.meter not in limits.meters:
+        bad = _nowhere(key, BadReason.UNKNOWN_METER, "names a meter that the feeder does not have")
+        return replace(bad, feeder=source.feeder)
+    return source
+
+
+def _nowhere(key: str, reason: BadReason, why: str) -> BadReading:
+    shown = beginning(key)
+    return BadReading(reason, (f"`{shown}` {why}",), shown)
+
+
+def _refuse(base: BadReading, reason: BadReason, *problems: str) -> Decoded:
+    return Decoded(bad=(replace(base, reason=reason, problems=tuple(map(printable, problems))),))
+
+
+# ---------------------------------------------------------------------------------------------------------
+# JSON
+
+
+_decode_one = msgspec.json.Decoder(Raw).decode
+_decode_many = msgspec.json.Decoder(list[Raw]).decode
+
+
+def _parse(payload: bytes) -> Any:
+    """Parse JSON leniently where that makes a better message: NaN and infinities are named by field."""
+    try:
+        return msgspec.json.decode(payload)
+    except msgspec.ValidationError:
+        return json.loads(payload)
+    except msgspec.DecodeError as error:
+        try:
+            return json.loads(payload)
+        except ValueError:
+            raise error from None
+
+
+def _single(payload: bytes, source: Source, known: Known, base: BadReading) -> Decoded:
+    try:
+        raw = _decode_one(payload)
+    except (msgspec.MsgspecError, RecursionError):
+        pass
+    else:
+        if plausible(raw, known, source.meter):
+            return Decoded((to_reading(source.feeder, source.meter, raw),))
+    try:
+        value = _parse(payload)
+    except (ValueError, RecursionError, msgspec.MsgspecError) as error:
+        return _refuse(base, BadReason.SYNTAX, f"no JSON: {error}")
+    if value in ([], {}):
+        return _refuse(base, BadReason.EMPTY, "the reading is empty")
+    found = judge(value, known, source.meter, in_batch=False)
+    if isinstance(found, Raw):
+        return Decoded((to_reading(source.feeder, source.meter, found),))
+    return _refuse(base, found.reason, *found.problems)
+
+
+def _json_batch(payload: bytes, source: Source, known: Known, base: BadReading) -> Decoded:
+    try:
+        rows = _decode_many(payload)
+    except (msgspec.MsgspecError, RecursionError):
+        pass
+    else:
+        if rows and all(plausible(raw, known, raw.meter) and raw.meter in known.meters for raw in rows):
+            return Decoded(tuple(to_reading(source.feeder, raw.meter, raw) for raw in rows))
+    try:
+        value = _parse(payload)
+    except (ValueError, RecursionError, msgspec.MsgspecError) as error:
+        return _refuse(base, BadReason.SYNTAX, f"no JSON: {error}")
+    if not isinstance(value, list):
+        return _refuse(base, BadReason.TYPE, f"a JSON array of readings is wanted, not {name_of(value)}")
+    return _batch(value, source, known, base)
+
+
+# ---------------------------------------------------------------------------------------------------------
+# Columns
+
+
+_FIELDS = ("meter", "t", "v_volt", "p_kw", "q_kvar", "seq", "t_power")
+
+
+def _cbor(payload: bytes, source: Source, known: Known, base: BadReading) -> Decoded:
+    try:
+        columns = cbor2.loads(payload)
+    except (
+        cbor2.CBORDecodeError,
+        ValueError,
+        OverflowError,
+        RecursionError,
+        MemoryError,
+        TypeError,
+    ) as error:
+        return _refuse(base, BadReason.SYNTAX, f"no CBOR: {error}")
+    if not isinstance(columns, dict):
+        return _refuse(base, BadReason.TYPE, f"a CBOR map of columns is wanted, not {name_of(columns)}")
+    return _columns(columns, source, known, base)
+
+
+def _arrow(payload: bytes, source: Source, known: Known, base: BadReading, *, is_file: bool) -> Decoded:
+    try:
+        columns = columns_of(payload, is_file, _FIELDS)
+    except ArrowProblem as error:
+        reason = BadReason.TYPE if error.well_formed else BadReason.SYNTAX
+        return _refuse(base, reason, *error.problems)
+    return _columns(columns, source, known, base)
+
+
+_BATCH_DECODERS: Mapping[str, Callable[[bytes, Source, Known, BadReading], Decoded]] = {
+    "application/cbor": _cbor,
+    "application/vnd.apache.arrow.stream": partial(_arrow, is_file=False),
+    "application/vnd.apache.arrow.file": partial(_arrow, is_file=True),
+}
+
+
+def _columns(columns: Mapping[Any, Any], source: Source, known: Known, base: BadReading) -> Decoded:
+    present = {name: columns[name] for name in _FIELDS if name in columns}
+    problems = [
+        f"column `{name}` is {name_of(column)}, not an array"
+        for name, column in present.items()
+        if not isinstance(column, list)
+    ]
+    problems += [f"column `{name}` is missing" for name in ("meter", "t", "v_volt") if name not in present]
+    if problems:
+        return _refuse(base, BadReason.TYPE, *problems)
+    lengths = {name: len(column) for name, column in present.items()}
+    if len(set(lengths.values())) > 1:
+        listed = ", ".join(f"`{name}` {length}" for name, length in lengths.items())
+        return _refuse(base, BadReason.TYPE, f"the columns differ in length: {listed}")
+    rows = [dict(zip(present, row, strict=True)) for row in zip(*present.values(), strict=True)]
+    return _batch(rows, source, known, base)
+
+
+def _batch(rows: list[Any], source: Source, known: Known, base: BadReading) -> Decoded:
+    if not rows:
+        return _refuse(base, BadReason.EMPTY, "the batch is empty")
+    readings: list[Reading] = []
+    bad: dict[BadReason, list[BadReading]] = {}
+    more: Counter[BadReason] = Counter()
+    for index, row in enumerate(rows):
+        found = judge(row, known, in_batch=True)
+        if isinstance(found, Raw):
+            readings.append(to_reading(source.feeder, found.meter, found))
+            continue
+        alike = bad.setdefault(found.reason, [])
+        if len(alike) == DETAILED_PER_REASON:
+            more[found.reason] += 1
+            continue
+        meter = row.get("meter") if isinstance(row, dict) else None
+        ours = meter if isinstance(meter, str) and meter in known.meters else None
+        listed = tuple(f"element {index}: {problem}" for problem in found.problems)
+        alike.append(replace(base, reason=found.reason, problems=listed, meter=ours, head=head_of(row)))
+    rest = (
+        replace(base, reason=reason, problems=(f"{count} more elements of the batch: {reason}",), count=count)
+        for reason, count in more.items()
+    )
+    return Decoded(tuple(readings), (*chain.from_iterable(bad.values()), *rest))

@@ -1,0 +1,458 @@
+"""zenoh, and nothing but zenoh: samples in, estimates and alarms out, queries answered.
+
+The rest of the service sees plain Python: `Sample`s in batches, and `Bus.telemetry` and `Bus.event` to
+publish. What the binding demands is kept in here: samples are drained by one blocking receive and then
+non-blocking ones, callbacks are not used at all (they collapse under a busy interpreter, and calling zenoh
+from one can deadlock), every session is closed explicitly (or the process hangs at exit).
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from typing import Any
+
+import zenoh
+
+from service.ingest.queues import BusConfig, BusCounts, BusUnavailable, Event, Outgoing, Sample
+
+RING = 8192
+"""Samples that zenoh keeps for us."""
+
+BATCH = 1024
+_HEAD = 1024
+QUERIES_WAITING = 256
+_ESTIMATES = 1024
+_OPEN_TIMEOUT_MS = 5_000
+JSON = "application/json"
+
+
+def _config(config: BusConfig) -> zenoh.Config:
+    try:
+        if config.file is None:
+            built = zenoh.Config()
+            settings: dict[str, Any] = {
+                "mode": "router",
+                "listen/endpoints": [],
+                "connect/endpoints": [],
+                "connect/timeout_ms": {"router": -1, "peer": -1, "client": _OPEN_TIMEOUT_MS},
+                "scouting/multicast/enabled": False,
+                "transport/shared_memory/enabled": False,
+                "transport/unicast/max_sessions": config.max_sessions,
+                "transport/unicast/accept_pending": config.accept_pending,
+            }
+        else:
+            built = zenoh.Config.from_file(str(config.file))
+            settings = {}
+        if config.mode is not None:
+            settings["mode"] = config.mode
+        if config.listen:
+            settings["listen/endpoints"] = [_buffered(endpoint) for endpoint in config.listen]
+        if config.connect:
+            settings["connect/endpoints"] = list(config.connect)
+        for key, value in settings.items():
+            built.insert_json5(key, json.dumps(value))
+    except (zenoh.ZError, OSError, ValueError) as error:
+        raise BusUnavailable(
+            f"zenoh configuration: {_first_line(error)}", code="bus-configuration"
+        ) from error
+    return built
+
+
+def _buffered(endpoint: str) -> str:
+    """Bound the age of data when we are slow: small socket buffers make the sender feel it at once."""
+    if "#" in endpoint or not endpoint.startswith("tcp/"):
+        return endpoint
+    return endpoint + "#so_rcvbuf=65536;so_sndbuf=65536"
+
+
+def _first_line(error: BaseException) -> str:
+    return str(error).partition("\n")[0].partition(" at /")[0].strip()
+
+
+@contextmanager
+def session(config: BusConfig) -> Iterator[zenoh.Session]:
+    """Open a zenoh session and close it in any case.
+
+    Parameters
+    ----------
+    config
+        How.
+
+    Raises
+    ------
+    BusUnavailable
+        If an endpoint cannot be listened on or connected to, or the configuration is wrong.
+    """
+    built = _config(config)
+    try:
+        opened = zenoh.open(built)
+    except zenoh.ZError as error:
+        ends = ", ".join((*config.listen, *config.connect)) or "no endpoint"
+        text = f"zenoh cannot be opened on {ends}: {_first_line(error)}"
+        raise BusUnavailable(text, code="bus-endpoint") from error
+    with opened:
+        yield opened
+
+
+class Bus:
+    """The service's side of zenoh, as a context manager.
+
+    Parameters
+    ----------
+    config
+        How to take part.
+    prefix
+        First chunks of every key.
+    deliver
+        Called from the receiving threads with each batch. It may wait for room only if `lossless`.
+    max_payload
+        Of longer payloads only the beginning is kept.
+    lossless
+        When we are slow, let the senders wait instead of dropping the oldest samples: right where time is
+        told by the readings, wrong in real time, where old data are worth nothing.
+    wall
+        The wall clock, Unix s.
+    """
+
+    def __init__(
+        self,
+        config: BusConfig,
+        prefix: str,
+        deliver: Callable[[list[Sample]], object],
+        *,
+        max_payload: int,
+        lossless: bool,
+        wall: Callable[[], float] = time.time,
+    ) -> None:
+        self._wall = wall
+        self._config = config
+        self._prefix = prefix
+        self._deliver = deliver
+        self._max_payload = max_payload
+        self._lossless = lossless
+        self._stack = ExitStack()
+        self._threads: list[threading.Thread] = []
+        self._outgoing = Outgoing()
+        self._answers: dict[str, bytes] = {}
+        self._answers_lock = threading.Lock()
+        self.counts = BusCounts()
+        self.failure: str | None = None
+
+    def __enter__(self) -> Bus:
+        """Open the session, subscribe, answer queries."""
+        with ExitStack() as stack:
+            live = stack.enter_context(session(self._config))
+            # One subscription for every kind of reading keeps them in the order they were sent. It also
+            # hears keys that are almost right, and those deserve an answer in the bad readings.
+            key = f"{self._prefix}/*/**/reading$*"
+            # A ring that is full drops the oldest samples; the gap shows in their numbers.
+            subscriber = (
+                live.declare_subscriber(key, zenoh.handlers.FifoChannel(RING))
+                if self._lossless
+                else live.declare_subscriber(key, zenoh.handlers.RingChannel(RING))
+            )
+            stack.callback(subscriber.undeclare)
+            self._start("zenoh readings", self._receive, subscriber.handler)
+            for key in (f"{self._prefix}/*/estimate", f"{self._prefix}/*/alarm/*"):
+                queryable = live.declare_queryable(key, zenoh.handlers.FifoChannel(QUERIES_WAITING))
+                stack.callback(queryable.undeclare)
+                self._start(f"zenoh queries {key}", self._answer, queryable.handler)
+            token = live.liveliness().declare_token(f"{self._prefix}/service/{live.zid()}")
+            stack.callback(token.undeclare)
+            publishing = self._start("zenoh publish", self._publish, live)
+            stack.callback(self._stop_publishing, publishing)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Publish what is waiting, close the session, end the threads."""
+        self._stack.close()
+        for thread in self._threads:
+            thread.join(timeout=2.0)
+
+    def _start(self, name: str, run: Callable[[Any], None], argument: Any) -> threading.Thread:
+        thread = threading.Thread(target=run, args=(argument,), name=name, daemon=True)
+        thread.start()
+        self._threads.append(thread)
+        return thread
+
+    # ---------------------------------------------------------------- in
+
+    def _receive(self, handler: zenoh.handlers.Handler[zenoh.Sample]) -> None:
+        while True:
+            try:
+                raw: zenoh.Sample | None = handler.recv()
+            except zenoh.ZError:  # the subscription is closed and drained
+                return
+            batch: list[Sample] = []
+            while raw is not None:
+                if raw.kind == zenoh.SampleKind.DELETE:
+                    self.counts.deleted += 1
+                else:
+                    batch.append(self._copy(raw))
+                raw = _try_recv(handler) if len(batch) < BATCH else None
+            self._deliver(batch)
+
+    def _copy(self, raw: zenoh.Sample) -> Sample:
+        payload = raw.payload.to_bytes()
+        size = len(payload)
+        kept = payload if size <= self._max_payload else payload[:_HEAD]
+        # What is cut is longer than any key that is read, and stays so.
+        key = str(raw.key_expr)[: len(self._prefix) + _HEAD]
+        return Sample(key, kept, str(raw.encoding), self._wall(), size)
+
+    # ---------------------------------------------------------------- out
+
+    def telemetry(self, key: str, payload: bytes) -> None:
+        """Publish the newest value of a key, and let queries find it.
+
+        Parameters
+        ----------
+        key
+            Key without the prefix.
+        payload
+            JSON.
+        """
+        with self._answers_lock:
+            self._answers[f"{self._prefix}/{key}"] = payload
+        self._outgoing.add_telemetry(f"{self._prefix}/{key}", payload)
+
+    def event(self, key: str, payload: bytes, *, last: bool, done: Callable[[], None] | None = None) -> bool:
+        """Publish something that must not be lost; in order, with high priority.
+
+        Parameters
+        ----------
+        key
+            Key without the prefix.
+        payload
+            JSON.
+        last
+            The matter is closed: the key is deleted after the put, and queries find nothing any more.
+        done
+            Called from the publishing thread once it is out.
+
+        Returns
+        -------
+        bool
+            False if too many events are waiting; nothing was taken.
+        """
+        full = f"{self._prefix}/{key}"
+        with self._answers_lock:
+            if last:
+                self._answers.pop(full, None)
+            else:
+                self._answers[full] = payload
+        put = Event(full, payload, None if last else done)
+        return self._outgoing.add_events(put, *([Event(full, None, done)] if last else []))
+
+    def answer(self, key: str, payload: bytes) -> None:
+        """Let queries for a key find this, without publishing it.
+
+        Parameters
+        ----------
+        key
+            Key without the prefix.
+        payload
+            JSON.
+        """
+        with self._answers_lock:
+            self._answers[f"{self._prefix}/{key}"] = payload
+
+    def withdraw(self, key: str) -> None:
+        """Let queries for a key find nothing any more.
+
+        Parameters
+        ----------
+        key
+            Key without the prefix.
+        """
+        with self._answers_lock:
+            self._answers.pop(f"{self._prefix}/{key}", None)
+
+    def _publish(self, live: zenoh.Session) -> None:
+        publishers: dict[str, zenoh.Publisher] = {}
+        while (item := self._outgoing.next()) is not None:
+            try:
+                if isinstance(item, Event):
+                    _put_event(live, item.key, item.payload)
+                else:
+                    key, value = item
+                    if key not in publishers:
+                        publishers[key] = live.declare_publisher(
+                            key,
+                            encoding=JSON,
+                            congestion_control=zenoh.CongestionControl.DROP,
+                        )
+                    publishers[key].put(value)
+            except zenoh.ZError as error:
+                self.counts.publish_failed += 1
+                self.failure = _first_line(error)
+                if isinstance(item, Event) and _well_formed(item.key):
+                    self._outgoing.put_back(item)
+                continue
+            self.counts.published += 1
+            if isinstance(item, Event):
+                self._outgoing.retry_at = None
+                if item.done is not None:
+                    item.done()
+            if self._outgoing.retry_at is None:
+                self.failure = None
+
+    def _stop_publishing(self, thread: threading.Thread) -> None:
+        self._outgoing.close()
+        thread.join(timeout=2.0)
+
+    # ---------------------------------------------------------------- queries
+
+    def _answer(self, handler: zenoh.handlers.Handler[zenoh.Query]) -> None:
+        while True:
+            try:
+                query = handler.recv()
+            except zenoh.ZError:
+                return
+            self.counts.queries += 1
+            with self._answers_lock:
+                known = tuple(self._answers.items())
+            with query:
+                for key, payload in known:
+                    if query.key_expr.intersects(key) and not _reply(query, key, payload):
+                        break
+
+
+def _well_formed(key: str) -> bool:
+    try:
+        zenoh.KeyExpr(key)
+    except zenoh.ZError:
+        return False
+    return True
+
+
+def _put_event(live: zenoh.Session, key: str, payload: bytes | None) -> None:
+    options: Mapping[str, Any] = {
+        "congestion_control": zenoh.CongestionControl.BLOCK,
+        "priority": zenoh.Priority.INTERACTIVE_HIGH,
+        "express": True,
+    }
+    if payload is None:
+        live.delete(key, **options)
+    else:
+        live.put(key, payload, encoding=JSON, **options)
+
+
+def _reply(query: zenoh.Query, key: str, payload: bytes) -> bool:
+    try:
+        query.reply(key, payload, encoding=JSON)
+    except zenoh.ZError:  # the asker is gone
+        return False
+    return True
+
+
+def _try_recv(handler: zenoh.handlers.Handler[zenoh.Sample]) -> zenoh.Sample | None:
+    try:
+        return handler.try_recv()
+    except zenoh.ZError:  # closed and drained; the next blocking receive ends the thread
+        return None
+
+
+class Meters:
+    """The virtual meters' side of zenoh: puts readings, and watches the estimates if asked to.
+
+    Parameters
+    ----------
+    config
+        How to take part; usually a client of the service.
+    prefix
+        First chunks of every key.
+    """
+
+    def __init__(self, config: BusConfig, prefix: str) -> None:
+        self._config = config
+        self._prefix = prefix
+        self._stack = ExitStack()
+        self._live: zenoh.Session | None = None
+        self._estimates: zenoh.handlers.Handler[zenoh.Sample] | None = None
+
+    def __enter__(self) -> Meters:
+        """Open the session."""
+        self._live = self._stack.enter_context(session(self._config))
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the session."""
+        self._live = None
+        self._stack.close()
+
+    def watch(self, feeder: str) -> None:
+        """Start to watch the estimates of a feeder.
+
+        Parameters
+        ----------
+        feeder
+            Name.
+        """
+        live = self._session()
+        subscriber = live.declare_subscriber(
+            f"{self._prefix}/{feeder}/estimate", zenoh.handlers.RingChannel(_ESTIMATES)
+        )
+        self._stack.callback(subscriber.undeclare)
+        self._estimates = subscriber.handler
+
+    def estimates(self) -> list[bytes]:
+        """Return the estimates that have come since the last call, oldest first."""
+        found: list[bytes] = []
+        while self._estimates is not None and (sample := _try_recv(self._estimates)) is not None:
+            found.append(sample.payload.to_bytes())
+        return found
+
+    def query(self, key: str, timeout_s: float) -> dict[str, bytes]:
+        """Ask for the values of a key.
+
+        Parameters
+        ----------
+        key
+            Key or pattern, without the prefix.
+        timeout_s
+            How long to wait, s.
+
+        Returns
+        -------
+        dict
+            Payload by full key.
+        """
+        replies = self._session().get(f"{self._prefix}/{key}", timeout=timeout_s)
+        samples = (reply.ok for reply in replies)
+        return {str(one.key_expr): one.payload.to_bytes() for one in samples if one is not None}
+
+    def _session(self) -> zenoh.Session:
+        if self._live is None:
+            raise BusUnavailable("the meters' zenoh session is not open", code="bus-closed")
+        return self._live
+
+    def put(self, key: str, payload: bytes, encoding: str = JSON) -> None:
+        """Put a payload on a key (without the prefix).
+
+        Parameters
+        ----------
+        key, payload, encoding
+            As in zenoh.
+
+        Raises
+        ------
+        BusUnavailable
+            If the session is closed.
+        """
+        try:
+            # The default (drop when the network is congested) would lose readings of a simulation that runs
+            # faster than real time; a meter with one reading a second never notices the difference.
+            self._session().put(
+                f"{self._prefix}/{key}",
+                payload,
+                encoding=encoding,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+            )
+        except zenoh.ZError as error:
+            raise BusUnavailable(f"zenoh put: {_first_line(error)}", code="put-failed") from error

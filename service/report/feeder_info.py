@@ -1,0 +1,83 @@
+"""Feeders as JSON: their summary in the list, and their detail with tree and tables."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from feeders.format.tables import to_json
+from feeders.model.site import Site
+
+
+def summary(site: Site) -> dict[str, Any]:
+    """Return a feeder's entry in the list of feeders.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    """
+    settings = site.tables.meta.monitor
+    return {
+        "name": site.feeder.name,
+        "title": site.tables.meta.title,
+        "customers": len(site.feeder.customers),
+        "meters": len(site.meter_ids),
+        "inverters": int(site.droop.customer.size),
+        "estimator": settings.estimator,
+        "max_attacked": settings.max_attacked,
+        "tick_s": settings.tick_s,
+    }
+
+
+def revision(fields: Mapping[str, Any]) -> str:
+    """Return a digest of what is told of a feeder: the same as long as all of it is.
+
+    Parameters
+    ----------
+    fields
+        What is told, as JSON.
+    """
+    return hashlib.sha256(json.dumps(fields, sort_keys=True, default=str).encode()).hexdigest()[:32]
+
+
+def detail(site: Site, patience_s: float) -> dict[str, Any]:
+    """Return everything about a feeder: limits, tree with positions, tables, and the `revision` of all that.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    patience_s
+        From which age its states are stale, s.
+    """
+    meta = site.tables.meta
+    tree = site.spanning
+    xy = site.xy
+    fields = {
+        **summary(site),
+        "patience_s": patience_s,
+        "v_nominal_volt": meta.voltage_volt,
+        "v_min_volt": meta.limits.v_min_pu * meta.voltage_volt,
+        "v_max_volt": meta.limits.v_max_pu * meta.voltage_volt,
+        "layout": {
+            "buses": list(tree.buses),
+            "parent": [None, *(int(bus) for bus in tree.parent)],
+            "ties": [(int(one), int(other)) for one, other in site.ties],
+            "xy": None if xy is None else [[float(x), float(y)] for x, y in xy],
+            "v_nominal_volt": site.nominal_volt[:: site.nominal_volt.size // len(tree.buses)].tolist(),
+            "customers": [
+                {
+                    "customer": row.customer,
+                    "bus": tree.buses[int(bus)],
+                    "meter": row.meter or None,
+                    "phase": row.phases if len(row.phases) == 1 else None,
+                }
+                for row, bus in zip(site.tables.customers, tree.bus, strict=True)
+            ],
+        },
+        "tables": to_json(site.tables),
+    }
+    return {**fields, "revision": revision(fields)}

@@ -1,0 +1,349 @@
+"""Voltages of reports: meters, buses, phases, and the meter of the busbar."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+
+from feeders.model.site import Site, Snapshot, volts
+from gridsec.arrays import Bools, Floats
+from gridsec.grid.network import InPhases, busbar_places, hangs_on
+from gridsec.interface import Cause, Estimate, Verdict
+from service.ingest.align import Tick
+
+Phase: TypeAlias = Literal["a", "b", "c"]
+
+
+def snapshot(site: Site, tick: Tick) -> Snapshot:
+    """Return what a tick's readings say, as `feeders.model.site.to_frame` takes it.
+
+    Parameters
+    ----------
+    site, tick
+        The feeder, and the tick.
+    """
+    nan = math.nan
+    rows = [
+        (nan, nan, nan, nan, nan) if r is None else (r.v_volt, r.p_kw, r.q_kvar, r.t, r.t_power)
+        for r in tick.readings
+    ]
+    columns = np.array(rows, dtype=np.float64).reshape(-1, 5)
+    age = columns[:, 3] - columns[:, 4]
+    return Snapshot(
+        t=tick.t,
+        v_volt=columns[:, 0].copy(),
+        p_kw=columns[:, 1].copy(),
+        q_kvar=columns[:, 2].copy(),
+        v0_volt=busbar_volt(site, tick),
+        p_age_s=None if np.isnan(age).all() else age,
+        clock_offset_s=np.array(tick.clock_offset, dtype=np.float64) if any(tick.clock_offset) else None,
+        busbar_offset_s=nan if tick.busbar_offset is None else tick.busbar_offset,
+    )
+
+
+def busbar_volt(site: Site, tick: Tick) -> Floats | float:
+    """Return what the busbar's meter says, V: one voltage, or in three phases (3,); NaN for none.
+
+    Parameters
+    ----------
+    site, tick
+        The feeder, and the tick.
+    """
+    if tick.busbar is None:
+        return math.nan
+    phases = tick.busbar.v_phases
+    # A balanced feeder has one voltage, and a phase that is not measured does not take it away.
+    one = phases is None or not isinstance(site.feeder, InPhases)
+    return tick.busbar.v_volt if one else np.array(phases)
+
+
+def busbar_phases(site: Site) -> tuple[Phase | None, ...]:
+    """Return the phases of the busbar, (b,): a, b and c, or a nameless one on a balanced feeder.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    """
+    return ("a", "b", "c") if isinstance(site.feeder, InPhases) else (None,)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Grounds:
+    """Voltage readings of one tick that reconstructed values rest on, by phase of the busbar, (b,).
+
+    A value without one of these in its phase is *model only*: it follows from powers, the model and what the
+    estimator remembers. All buses of a phase are connected, so that one reading counts for all of them.
+
+    Attributes
+    ----------
+    meters : (b,)
+        At least one meter of the phase reports and is trusted.
+    busbar : (b,)
+        The busbar's meter reports the phase and is not named as manipulated.
+    """
+
+    meters: Bools
+    busbar: Bools
+
+    @property
+    def measured(self) -> Bools:
+        """Phases with at least one reading, (b,)."""
+        return self.meters | self.busbar
+
+    def model_only(self, site: Site) -> Bools:
+        """Return which customers' values are model only, (N,).
+
+        Parameters
+        ----------
+        site
+            The feeder.
+        """
+        return np.asarray(~(hangs_on(site.feeder) * self.measured).any(axis=1), dtype=np.bool_)
+
+
+def grounds(
+    site: Site, tick: Tick, estimate: Estimate | None = None, verdict: Verdict | None = None
+) -> Grounds:
+    """Return the readings that the values of a tick rest on.
+
+    Parameters
+    ----------
+    site, tick
+        The feeder, and what was known.
+    estimate, verdict
+        What the estimator says; None: there is no monitor, and each reading counts.
+    """
+    used = np.array([reading is not None for reading in tick.readings], dtype=np.bool_)
+    busbar = np.isfinite(np.broadcast_to(busbar_volt(site, tick), len(busbar_phases(site))))
+    if estimate is not None:
+        used &= estimate.trusted
+    if verdict is not None:
+        busbar = busbar & (verdict.cause is not Cause.NO_BUSBAR)
+        busbar = busbar & ~verdict.busbar if verdict.busbar.size else busbar
+    of_meters = hangs_on(site.feeder)[site.meters[used]].any(axis=0)
+    return Grounds(np.asarray(of_meters, dtype=np.bool_), busbar)
+
+
+def bus_volts(site: Site, v2_bus: Floats, measured: Bools) -> tuple[Floats, Floats, Bools]:
+    """Return the voltage of every bus, V: in three phases that of the phase furthest from nominal.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    v2_bus : (n,)
+        Squared voltages as in `gridsec.interface.Estimate`, pu.
+    measured : (b,)
+        Phases with a reading, see `Grounds`. The other phases of a bus count only where it has none of these.
+
+    Returns
+    -------
+    one : (b + 1,)
+        Voltage of each bus, V.
+    phases : (b + 1, 3) or (b + 1, 0)
+        Voltage of each of its phases, V, NaN for one that it does not have; nothing on a balanced feeder.
+    model_only : (b + 1,)
+        The first is model only.
+    """
+    v = volts(site.base_volt, v2_bus)
+    if not isinstance(site.feeder, InPhases):
+        return v, np.zeros((v.size, 0)), np.full(v.size, not measured[0])
+    phases = np.where(site.feeder.tree.phases, v.reshape(-1, 3), np.nan)
+    there = site.feeder.tree.phases & measured
+    among = np.where(there.any(axis=1, keepdims=True), there, site.feeder.tree.phases)
+    off = np.where(among, np.nan_to_num(np.abs(phases - site.nominal_volt.reshape(-1, 3)), nan=-0.5), -1.0)
+    one = np.take_along_axis(phases, off.argmax(axis=1)[:, None], axis=1)[:, 0]
+    return one, phases, np.asarray(~there.any(axis=1), dtype=np.bool_)
+
+
+def std_volts(site: Site, estimate: Estimate) -> Floats:
+    """Return the standard deviation of every customer's voltage, V, (N,): told, or from the bound.
+
+    Parameters
+    ----------
+    site, estimate
+        The feeder, and what the estimator says.
+    """
+    half, share = (estimate.std, 1.0) if estimate.std.size else (estimate.bound, 1.0 / 3.0)
+    base = site.customer_volt
+    return np.asarray(0.5 * share * (volts(base, estimate.v2 + half) - volts(base, estimate.v2 - half)))
+
+
+def attack_volts(site: Site, tick: Tick, verdict: Verdict) -> Floats:
+    """Return what every meter that is named reads too much, (p,), see `excess_volts`.
+
+    Parameters
+    ----------
+    site, tick, verdict
+        The feeder, what was known, and what the estimator says.
+    """
+    reported = np.array([math.nan if r is None else r.v_volt for r in tick.readings], dtype=np.float64)
+    return excess_volts(site.customer_volt[site.meters], reported, verdict.attack, verdict.suspects)
+
+
+def excess_volts(base: Floats, reported: Floats, attack: Floats, named: Bools) -> Floats:
+    """Turn attacks on squared voltages into volts: ``sqrt(y) - sqrt(y - a)``, 0 where nobody is named.
+
+    Parameters
+    ----------
+    base, reported : (k,)
+        1 pu of each, and what is reported, V.
+    attack : (k,)
+        What is too much of the squared voltages, pu.
+    named : (k,)
+        Who is named.
+    """
+    true = volts(base, (reported / base) ** 2 - attack)
+    return np.where(named, reported - true, 0.0)
+
+
+BUSBAR = "substation"
+"""The name under which the busbar meter is reported, as in its zenoh key. No other meter may have it."""
+
+
+@dataclass(frozen=True, slots=True)
+class BusbarReport:
+    """The busbar's meter at one tick; in three phases the numbers are those of one of them.
+
+    Attributes
+    ----------
+    judged
+        The estimator judges this meter, and this tick has readings to do so: of this meter and of a trusted
+        meter in the same phase. Estimators that rely on this meter, or do without, never judge it.
+    seen
+        Whether a usable reading of it belongs to this tick.
+    suspect
+        Whether the verdict names it as manipulated.
+    phases
+        The phases in which it does: of a, b and c; nothing on a balanced feeder.
+    phase
+        The phase that the numbers are of, the one that is furthest off of those in which it is suspect, or of
+        all; None on a balanced feeder.
+    v_volt_reported
+        RMS phase-to-neutral voltage that the meter claims, V; None if unseen.
+    v_volt_estimated
+        Reconstructed voltage of the busbar, V: what the meter claims while that is believed. None if there is
+        no estimate.
+    attack_volt_estimated
+        Reconstructed manipulation, V: the mean over the time scale on which it was found; 0 if it is no
+        suspect.
+    model_only
+        `v_volt_estimated` rests on no reading of this tick, see `voltages.Grounds`.
+    clock_offset_s
+        By how much its clock is ahead of the other meters', s; None where that is not measurable.
+    """
+
+    judged: bool
+    seen: bool
+    suspect: bool
+    phases: tuple[str, ...] = ()
+    phase: str | None = None
+    v_volt_reported: float | None = None
+    v_volt_estimated: float | None = None
+    attack_volt_estimated: float | None = None
+    model_only: bool = False
+    clock_offset_s: float | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what REST's `state` shows."""
+        return {"meter": BUSBAR} | asdict(self) | {"phases": list(self.phases)}
+
+
+UNKNOWN_BUSBAR = BusbarReport(judged=False, seen=False, suspect=False)
+"""Nothing is known of it."""
+
+
+def busbar_report(
+    site: Site, tick: Tick, estimate: Estimate | None = None, verdict: Verdict | None = None
+) -> BusbarReport:
+    """Say what is known of the busbar's meter.
+
+    Parameters
+    ----------
+    site, tick
+        The feeder, and what was known.
+    estimate, verdict
+        What the monitor made of it; None: there is none.
+    """
+    names, reported = busbar_phases(site), _reported(site, tick)
+    nothing = np.full(reported.size, math.nan)
+    judges = verdict is not None and verdict.busbar.size > 0
+    rests_on = grounds(site, tick, estimate, verdict)
+    suspect = np.zeros(reported.size, dtype=np.bool_)
+    attack, estimated = nothing, nothing
+    if verdict is not None and judges:
+        suspect, attack = verdict.busbar, _attack_volts(site, reported, verdict)
+    if estimate is not None:
+        places = busbar_places(site.feeder)
+        estimated = volts(site.base_volt[places], estimate.v2_bus[places])
+    k = _furthest(suspect, attack if suspect.any() else reported - estimated)
+
+    def number(values: Floats) -> float | None:
+        return float(values[k]) if math.isfinite(values[k]) else None
+
+    return BusbarReport(
+        judged=judges and bool((np.isfinite(reported) & rests_on.meters).any()),
+        seen=math.isfinite(reported[k]),
+        suspect=bool(suspect.any()),
+        phases=tuple(name for name, one in zip(names, suspect, strict=True) if one and name is not None),
+        phase=names[k],
+        v_volt_reported=number(reported),
+        v_volt_estimated=number(estimated),
+        attack_volt_estimated=number(attack),
+        model_only=not rests_on.measured[k],
+        clock_offset_s=tick.busbar_offset,
+    )
+
+
+def busbar_in_words(site: Site, which: Bools) -> str:
+    """Name the busbar's meter, with the phases in question where there are several.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    which : (b,)
+        Phases, one on a balanced feeder.
+    """
+    names = [name for name, one in zip(busbar_phases(site), which, strict=True) if one and name is not None]
+    phases = f" (phase{'s' * (len(names) > 1)} {', '.join(names)})" if names else ""
+    return f"the substation's meter{phases}"
+
+
+def busbar_off(site: Site, tick: Tick, verdict: Verdict) -> str:
+    """Say by how much a busbar's meter that is named is off, in the phase where most.
+
+    Parameters
+    ----------
+    site, tick, verdict
+        The feeder, what was known, and what the estimator says.
+    """
+    reported = _reported(site, tick)
+    attack = _attack_volts(site, reported, verdict)
+    k = _furthest(verdict.busbar, attack)
+    if not math.isfinite(attack[k]):
+        return "reports nothing at present"
+    percent = 100.0 * attack[k] / max(reported[k] - attack[k], 1e-6 * reported[k])
+    much = f"{abs(attack[k]):.1f} V ({abs(percent):.1f} %) {'more' if attack[k] > 0 else 'less'}"
+    return f"reads {much} than the meters of the feeder say"
+
+
+def _furthest(which: Bools, off: Floats) -> int:
+    """The phase that is furthest off of some, or of all if there is none; better one that is known."""
+    among = which if which.any() else np.ones_like(which)
+    return int(np.where(among, np.nan_to_num(np.abs(off), nan=-0.5), -1.0).argmax())
+
+
+def _reported(site: Site, tick: Tick) -> Floats:
+    """What the busbar's meter says, V, NaN where nothing, (b,)."""
+    return np.broadcast_to(busbar_volt(site, tick), len(busbar_phases(site)))
+
+
+def _attack_volts(site: Site, reported: Floats, verdict: Verdict) -> Floats:
+    """What the busbar's meter reads too much where it is named, V, (b,)."""
+    base = site.base_volt[busbar_places(site.feeder)]
+    return excess_volts(base, reported, verdict.busbar_attack, verdict.busbar)

@@ -1,0 +1,416 @@
+"""Storing and publishing alarms: in this order, without holding up whoever watches, and losing none.
+
+What a round brings is gathered in `Waiting` and handed to `apart`, which the runtime sets to a thread of its
+own where time does not wait; one write is on its way at a time. If the database refuses it, what it held is
+kept and tried again. Alarms are published when they are stored, not before.
+
+A command stores a `Wish` in the same way and gets the outcome between two rounds. A commit without an answer
+is repeated with its key until the database tells that it is stored.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import count
+from typing import Any, Protocol, TypeVar
+
+import msgspec
+import structlog
+
+from service.alarms.state_machine import Alarm, Transition
+from service.alarms.state_machine import to_json as alarm_json
+from service.ingest.queues import BusCounts
+from service.metrics import Metrics
+from service.report.report import FeederReport
+from service.store import Event, OutcomeUnknown, Store, StoreUnavailable
+from service.store.schema import Happened
+from service.store.state_codec import Kept
+from service.store.write_queue import Batch, Waiting
+
+RETRY_S = 1.0
+SLOW_S = 15.0
+"""A write that takes longer is told to the operator."""
+OUTBOX_PAGE = 1000
+"""So many events are read from the outbox at once."""
+UNPUBLISHED_KEPT = 10_000
+"""So many stored events wait in memory for zenoh; the others are read from the outbox later."""
+_log = structlog.get_logger("gridsec.keeper")
+
+T = TypeVar("T")
+
+
+class Publisher(Protocol):
+    """Where estimates and alarms go; `zenoh_bus.Bus` is one."""
+
+    failure: str | None
+    counts: BusCounts
+
+    def telemetry(self, key: str, payload: bytes) -> None:
+        """Publish the newest value of a key."""
+
+    def event(self, key: str, payload: bytes, *, last: bool, done: Callable[[], None] | None = None) -> bool:
+        """Publish something that must not be lost; False if there is no room."""
+
+    def answer(self, key: str, payload: bytes) -> None:
+        """Let queries find a value."""
+
+    def withdraw(self, key: str) -> None:
+        """Let queries find nothing any more."""
+
+
+@dataclass(frozen=True, slots=True)
+class Wish:
+    """Contents of a command's write: all of it is stored, or the command fails.
+
+    Attributes
+    ----------
+    transitions, kept, happened, without, put
+        As in `Store.commit`.
+    """
+
+    transitions: tuple[Transition, ...] = ()
+    kept: tuple[Kept, ...] = ()
+    happened: tuple[Happened, ...] = ()
+    without: str | None = None
+    put: tuple[str, Mapping[str, Any]] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """A command's part of a job.
+
+    Attributes
+    ----------
+    wish
+        Its contents.
+    read
+        Called after the commit, in the writing thread.
+    landed
+        Called between two rounds when it is stored, with the result of `read`.
+    refused
+        Called between two rounds if it is not stored, or not known to be; `landed` may follow the latter.
+    """
+
+    wish: Wish
+    read: Callable[[Store], Any]
+    landed: Callable[[Any], None]
+    refused: Callable[[StoreUnavailable], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One visit to the database: what to store, what has been published, whether to read the outbox on."""
+
+    key: int
+    batch: Batch
+    published: tuple[int, ...] = ()
+    probe: bool = False
+    page_after: int | None = None
+    command: Command | None = None
+
+    @property
+    def transitions(self) -> tuple[Transition, ...]:
+        """All transitions, in the order of their event numbers."""
+        own = () if self.command is None else self.command.wish.transitions
+        return (*self.batch.transitions, *own)
+
+
+@dataclass(frozen=True, slots=True)
+class Done:
+    """Result of a job: event numbers if it was stored, values read, or the error."""
+
+    numbers: tuple[int, ...] | None = None
+    marked: bool = False
+    page: tuple[Event, ...] | None = None
+    found: Any = None
+    error: StoreUnavailable | None = None
+
+
+Apart = Callable[[Callable[[], Done], Callable[[Done], None]], None]
+
+
+def at_once(write: Callable[[], Done], then: Callable[[Done], None]) -> None:
+    """Write, and take the outcome in, before going on.
+
+    Parameters
+    ----------
+    write, then
+        What to do, and who wants to know the outcome.
+    """
+    then(write())
+
+
+class Keeper:
+    """The way of alarms from the rounds to the database and from there to zenoh.
+
+    Parameters
+    ----------
+    store
+        The database.
+    metrics
+        Where failures and transitions are counted.
+    stored
+        Called after alarms have been stored.
+    kept
+        Called with the reports that have been stored.
+    apart
+        How writing is done apart from judging: called with what to do, in any thread, and with what to do
+        with the outcome, between two rounds.
+
+    Attributes
+    ----------
+    waiting
+        What waits for the database.
+    publisher
+        Where alarms go; None: nowhere.
+    problem
+        Why the database cannot be used, or None.
+    storing
+        Whether a write is on its way; only `waiting` and `commit` may be used then.
+    """
+
+    def __init__(
+        self,
+        store: Store,
+        metrics: Metrics,
+        stored: Callable[[], None],
+        kept: Callable[[tuple[FeederReport, ...]], None],
+        apart: Apart = at_once,
+    ) -> None:
+        self.waiting = Waiting(lambda what, count: metrics.forgotten.labels(what).inc(count))
+        self.publisher: Publisher | None = None
+        self.problem: str | None = None
+        self.storing = False
+        self._store = store
+        self._metrics = metrics
+        self._stored, self._kept = stored, kept
+        self._apart = apart
+        self._retry_at = self._began = 0.0
+        self._keys = count(1)
+        # A job whose outcome is not known; nothing else is stored before it.
+        self._unknown: Job | None = None
+        self._published: deque[int] = deque()
+        self._unpublished: deque[tuple[int, Alarm]] = deque()
+        # The outbox holds events after this number that are not in `_unpublished`; None: it holds none.
+        self._outbox_after: int | None = 0
+
+    def commit(self, *, at_once: bool = False) -> None:
+        """Have what has been gathered stored; on failure it is kept and tried again later.
+
+        Parameters
+        ----------
+        at_once
+            Do not wait after a failure.
+        """
+        self._publish_waiting()
+        if self.storing or (time.monotonic() < self._retry_at and not at_once):
+            return
+        job = self._unknown or self._job()
+        if job.batch or job.command or job.published or job.probe or job.page_after is not None:
+            self._send(job)
+
+    @property
+    def takes_commands(self) -> bool:
+        """True if a command can be sent, or is refused at once because the database is known to be away."""
+        return self.problem is not None or not self.storing
+
+    def store(
+        self, wish: Wish, landed: Callable[[], None], refused: Callable[[StoreUnavailable], None]
+    ) -> None:
+        """Have everything gathered and a command's wish stored, all or nothing.
+
+        Parameters
+        ----------
+        wish, landed, refused
+            As in `Command`.
+
+        Raises
+        ------
+        StoreUnavailable
+            If the database is known to be away; it is not asked again.
+        """
+        self._command(Command(wish, lambda _: None, lambda _: landed(), refused))
+
+    def look(
+        self,
+        read: Callable[[Store], T],
+        landed: Callable[[T], None],
+        refused: Callable[[StoreUnavailable], None],
+    ) -> None:
+        """Have something read after everything gathered is stored.
+
+        Parameters
+        ----------
+        read, landed, refused
+            As in `Command`.
+
+        Raises
+        ------
+        StoreUnavailable
+            As in `store`.
+        """
+        self._command(Command(Wish(), read, landed, refused))
+
+    def _command(self, command: Command) -> None:
+        if self.problem is not None:
+            raise StoreUnavailable(self.problem, code="writes-fail")
+        self._send(replace(self._job(), command=command))
+
+    def _job(self) -> Job:
+        more = self._outbox_after is not None and len(self._unpublished) < OUTBOX_PAGE
+        return Job(
+            next(self._keys),
+            self.waiting.take(),
+            tuple(self._published),
+            probe=self.problem is not None,
+            page_after=self._outbox_after if more else None,
+        )
+
+    def _send(self, job: Job) -> None:
+        self.storing, self._began = True, time.monotonic()
+        self._metrics.unstored.set(len(self.waiting))
+        self._apart(partial(_write, self._store, job), partial(self._written, job))
+
+    def _written(self, job: Job, done: Done) -> None:
+        """Take in what came of a job."""
+        self.storing = False
+        if done.numbers is not None:
+            self._unknown = None
+            self.waiting.stored()
+            self._kept(job.batch.reports)
+            self._tell(job.transitions, done.numbers)
+        elif isinstance(done.error, OutcomeUnknown) or job is self._unknown:
+            self._unknown = job
+        else:
+            self.waiting.give_back(job.batch)
+        if done.marked:
+            for _ in job.published:
+                self._published.popleft()
+        if done.page is not None:
+            self._unpublished.extend((event.seq, event.alarm) for event in done.page)
+            full = len(done.page) == OUTBOX_PAGE
+            self._outbox_after = done.page[-1].seq if full else None
+        if done.error is not None:
+            self._refused(done.error)
+        elif self.problem is not None:
+            _log.info("the database is back")
+            self.problem, self._retry_at = None, 0.0
+        self._metrics.unstored.set(len(self.waiting))
+        self._publish_waiting()
+        if job.command is not None:
+            self._answer(job.command, done)
+
+    def _answer(self, command: Command, done: Done) -> None:
+        """Tell a command its outcome. What was stored is so, whatever failed after it."""
+        if done.numbers is not None and (done.error is None or command.wish != Wish()):
+            command.landed(done.found)
+        elif done.error is not None:
+            command.refused(done.error)
+
+    def _tell(self, transitions: tuple[Transition, ...], numbers: tuple[int, ...]) -> None:
+        """Say what has been stored, and let it be published."""
+        for number, transition in zip(numbers, transitions, strict=True):
+            alarm = transition.alarm
+            self.publish(number, alarm)
+            self._metrics.transitions.labels(alarm.feeder, alarm.kind, transition.change).inc()
+            _log.info(
+                "alarm",
+                change=str(transition.change),
+                kind=str(alarm.kind),
+                feeder=alarm.feeder,
+                meter=alarm.meter,
+                id=alarm.id,
+                t=transition.t,
+            )
+        if numbers:
+            self._stored()
+
+    def _refused(self, error: StoreUnavailable) -> None:
+        if self.problem is None:
+            _log.error("the database cannot be used; alarms are kept and tried again", problem=str(error))
+        self.problem = str(error)
+        self._retry_at = time.monotonic() + RETRY_S
+        self._metrics.store_failures.inc()
+
+    def problems(self) -> list[str]:
+        """Return what is wrong with the database and what that costs, for the operator."""
+        under_way = time.monotonic() - self._began if self.storing else 0.0
+        if self.problem is None and under_way < SLOW_S:
+            return []
+        problems = [] if self.problem is None else [f"database: {self.problem}"]
+        if under_way >= SLOW_S:
+            problems.append(f"database: a write has been under way for {under_way:.0f} s")
+        if waiting := len(self.waiting):
+            problems.append(f"{waiting} changes of alarms wait for the database")
+        if gone := self.waiting.given_up:
+            problems.append(f"{gone} changes of alarms were given up; what stands now is kept")
+        return problems
+
+    def publish(self, number: int, alarm: Alarm) -> None:
+        """Let a stored event be published after those before it.
+
+        Parameters
+        ----------
+        number, alarm
+            The event's number, and the alarm as it was then.
+        """
+        if self._outbox_after is not None:
+            return  # It is read from the outbox when its turn comes.
+        if len(self._unpublished) >= UNPUBLISHED_KEPT:
+            self._outbox_after = self._unpublished[-1][0]
+        else:
+            self._unpublished.append((number, alarm))
+
+    def _publish_waiting(self) -> None:
+        while self._unpublished:
+            number, alarm = self._unpublished[0]
+            done = partial(self._published.append, number)
+            if self.publisher is None:
+                done()
+            else:
+                payload = msgspec.json.encode(alarm_json(alarm))
+                if not self.publisher.event(alarm_key(alarm), payload, last=not alarm.active, done=done):
+                    return
+            self._unpublished.popleft()
+
+
+def _write(store: Store, job: Job) -> Done:
+    """Do a job; called in any thread, it changes nothing but the database, and it always returns."""
+    done = Done()
+    try:
+        if job.probe:
+            store.check()
+        batch, wish = job.batch, Wish() if job.command is None else job.command.wish
+        numbers = store.commit(
+            job.transitions,
+            reports=batch.reports,
+            rejected=batch.rejected,
+            kept=(*batch.kept, *wish.kept),
+            happened=(*batch.happened, *wish.happened),
+            without=wish.without,
+            put=wish.put,
+            key=job.key,
+        )
+        done = Done(numbers)
+        if job.command is not None:
+            done = replace(done, found=job.command.read(store))
+        store.outbox_done(job.published)
+        done = replace(done, marked=True)
+        if job.page_after is not None:
+            page = store.outbox_pending(OUTBOX_PAGE, after=job.page_after)
+            done = replace(done, page=tuple(page))
+    except StoreUnavailable as error:
+        return replace(done, error=error)
+    except Exception as error:  # noqa: BLE001 - shown to the operator as the database's problem, and tried again
+        _log.exception("storing failed")
+        return replace(done, error=StoreUnavailable(f"{type(error).__name__}: {error}", code="defect"))
+    return done
+
+
+def alarm_key(alarm: Alarm) -> str:
+    """Return the zenoh key of an alarm, without the prefix."""
+    return f"{alarm.feeder}/alarm/{alarm.id}"

@@ -1,0 +1,350 @@
+"""What is kept of a feeder: typed, versioned JSON texts, and whether they still fit.
+
+Its commissioning, and whom its monitor does not believe.
+
+Numbers are written with as many digits as give the same float64 back, NaN as null.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Annotated, Any, Final, TypeAlias, TypeVar
+
+import msgspec
+import numpy as np
+
+from feeders.format.tables import to_json
+from feeders.model.site import Site
+from gridsec.arrays import Floats
+from gridsec.errors import GridsecError
+from gridsec.estimators.sequential import Distrust
+from service.report.voltages import Phase, busbar_phases
+
+FORMAT: Final = 1
+"""Version of the text; it changes when its fields do."""
+_Finite = Annotated[float, msgspec.Meta(gt=-1e300, lt=1e300)]
+_Time: TypeAlias = Annotated[float, msgspec.Meta(gt=0.0, lt=1e300)]
+# Of the feeder's file, what says how it is watched and shown, not what it is.
+_BESIDE = ("title", "accept", "busbar_xy", "limits", "monitor")
+
+
+class Matter(StrEnum):
+    """What a text is about."""
+
+    COMMISSION = "commission"
+    DISTRUST = "distrust"
+
+
+class KeptInvalid(GridsecError):
+    """A stored text of monitor state cannot be used; the message says why."""
+
+    code = "state-unusable"
+
+
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """A text of the store, as it is.
+
+    Attributes
+    ----------
+    feeder
+        Whose.
+    t
+        Unix time of the tick that it belongs to, s.
+    text
+        What `encode` or `encode_distrust` wrote.
+    matter
+        Which of them.
+    """
+
+    feeder: str
+    t: float
+    text: str
+    matter: Matter = Matter.COMMISSION
+
+
+class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What the text of a commissioning holds.
+
+    Attributes
+    ----------
+    format
+        Its version.
+    feeder, t
+        As in `Kept`.
+    fingerprint
+        What the feeder was, see `fingerprint`.
+    meters
+        Ids, in the order of the arrays.
+    arrays
+        One number per meter, by name; None for NaN.
+    """
+
+    format: int
+    feeder: str
+    t: _Finite
+    fingerprint: dict[str, str]
+    meters: list[str]
+    arrays: dict[str, list[_Finite | None]]
+
+
+def fingerprint(site: Site) -> dict[str, str]:
+    """Return what learned errors depend on, as digests by the name of what they are of.
+
+    Titles, limits, delays of alarms and the like may change without a new commissioning.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    """
+    tables = to_json(site.tables)
+    meta, monitor = tables["feeder"], site.tables.meta.monitor
+    parts = {
+        "meters": list(site.meter_ids),
+        "lines": tables["lines"],
+        "customers": tables["customers"],
+        "feeder.toml": {name: value for name, value in meta.items() if name not in _BESIDE},
+        "estimator": monitor.estimator,
+        "commission_s": monitor.commission_s,
+    }
+    return {name: _digest(part) for name, part in parts.items()}
+
+
+def encode(site: Site, now: Mapping[str, str], t: float, arrays: Mapping[str, Floats]) -> Kept:
+    """Write a text.
+
+    Parameters
+    ----------
+    site, now
+        The feeder, and its fingerprint.
+    t
+        Unix time of the tick, s.
+    arrays : of (p,)
+        What is to be kept, by name.
+    """
+    name = site.feeder.name
+    numbers = {key: [None if math.isnan(x) else x for x in value.tolist()] for key, value in arrays.items()}
+    record = Record(FORMAT, name, t, dict(now), list(site.meter_ids), numbers)
+    return Kept(name, t, msgspec.json.encode(record).decode())
+
+
+def decode(site: Site, now: Mapping[str, str], kept: Kept) -> dict[str, Floats]:
+    """Read a text for the feeder as it is now.
+
+    Parameters
+    ----------
+    site, now, kept
+        The feeder, its fingerprint, and the text.
+
+    Returns
+    -------
+    dict of (p,) arrays
+        What `encode` was given.
+
+    Raises
+    ------
+    KeptInvalid
+        If the text is damaged, newer than this program, or of a feeder that has changed since.
+    """
+    record = _read(site, kept, Record)
+    changed = [name for name in now if record.fingerprint.get(name) != now[name]]
+    if changed:
+        raise KeptInvalid(f"the feeder has changed since ({', '.join(changed)})", code="feeder-changed")
+    lengths = {len(value) for value in record.arrays.values()}
+    if record.meters != list(site.meter_ids) or lengths - {len(record.meters)}:
+        raise KeptInvalid("it is damaged: its numbers do not belong to its meters", code="other-meters")
+    return {
+        name: np.array([math.nan if x is None else x for x in value], dtype=np.float64)
+        for name, value in record.arrays.items()
+    }
+
+
+class Suspect(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A meter that is not believed.
+
+    Attributes
+    ----------
+    meter
+        Its id.
+    scale_s
+        Time scale on which it was caught, s.
+    named
+        Whether it was named as manipulated.
+    repeats_s
+        Time after which it repeated its readings, s; None if it did not. Older texts lack it.
+    """
+
+    meter: str
+    scale_s: _Time
+    named: bool
+    repeats_s: _Time | None = None
+
+
+class Deviant(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """An inverter that was named as manipulated.
+
+    Attributes
+    ----------
+    customer
+        Whose.
+    number
+        Which of them, in the order of the feeder's file.
+    """
+
+    customer: str
+    number: Annotated[int, msgspec.Meta(ge=0)]
+
+
+class OffPhase(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A phase in which the busbar's meter is not believed.
+
+    Attributes
+    ----------
+    phase
+        Which; None on a balanced feeder.
+    scale_s, named
+        As in `Suspect`.
+    off
+        What it reads too much, squared pu.
+    """
+
+    phase: Phase | None
+    scale_s: _Time
+    named: bool
+    off: _Finite
+
+
+class DistrustRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What the text about who is not believed holds.
+
+    Attributes
+    ----------
+    format
+        Its version.
+    feeder, t
+        As in `Kept`.
+    meters, inverters
+        Who; nobody else.
+    busbar
+        Where the busbar's meter is not; texts from before it was judged lack it.
+    """
+
+    format: int
+    feeder: str
+    t: _Finite
+    meters: list[Suspect]
+    inverters: list[Deviant]
+    busbar: list[OffPhase] = []
+
+
+def encode_distrust(site: Site, t: float, distrust: Distrust) -> Kept:
+    """Write who is not believed.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    t
+        Unix time of the tick, s.
+    distrust
+        Who.
+    """
+    name, owners = site.feeder.name, _owners(site)
+    columns = (distrust.scale_s, distrust.named, distrust.repeats_s)
+    meters = zip(*(column.tolist() for column in columns), strict=True)
+    suspects = [
+        Suspect(site.meter_ids[k], scale, named, None if math.isnan(again) else again)
+        for k, (scale, named, again) in enumerate(meters)
+        if math.isfinite(scale)
+    ]
+    deviants = [Deviant(*owners[k]) for k in np.flatnonzero(distrust.inverters).tolist()]
+    each = zip(
+        busbar_phases(site), distrust.busbar_scale_s, distrust.busbar_named, distrust.busbar_off, strict=True
+    )
+    phases = [
+        OffPhase(phase, float(scale), bool(named), float(off))
+        for phase, scale, named, off in each
+        if math.isfinite(scale)
+    ]
+    record = DistrustRecord(FORMAT, name, t, suspects, deviants, phases)
+    return Kept(name, t, msgspec.json.encode(record).decode(), Matter.DISTRUST)
+
+
+def decode_distrust(site: Site, kept: Kept) -> Distrust:
+    """Read who is not believed of the meters, inverters and phases that the feeder has now.
+
+    Parameters
+    ----------
+    site, kept
+        The feeder, and the text.
+
+    Raises
+    ------
+    KeptInvalid
+        If the text is damaged, newer than this program, or of another feeder.
+    """
+    record, owners = _read(site, kept, DistrustRecord), _owners(site)
+    who = {suspect.meter: suspect for suspect in record.meters}
+    if len(who) < len(record.meters):
+        raise KeptInvalid("it is damaged: a meter is in it twice", code="duplicate")
+    deviants = {(deviant.customer, deviant.number) for deviant in record.inverters}
+    found = [who.get(meter) for meter in site.meter_ids]
+    off = {phase.phase: phase for phase in record.busbar}
+    if len(off) < len(record.busbar):
+        raise KeptInvalid("it is damaged: a phase is in it twice", code="duplicate")
+    phases = [off.get(phase) for phase in busbar_phases(site)]
+    return Distrust(
+        np.array([math.nan if one is None else one.scale_s for one in found], dtype=np.float64),
+        np.array([one.repeats_s if one and one.repeats_s else math.nan for one in found], dtype=np.float64),
+        np.array([one is not None and one.named for one in found], dtype=np.bool_),
+        np.array([owner in deviants for owner in owners], dtype=np.bool_),
+        np.array([math.nan if one is None else one.scale_s for one in phases], dtype=np.float64),
+        np.array([one is not None and one.named for one in phases], dtype=np.bool_),
+        np.array([0.0 if one is None else one.off for one in phases], dtype=np.float64),
+    )
+
+
+def _owners(site: Site) -> list[tuple[str, int]]:
+    """Customer of every inverter, and which of that customer's it is."""
+    count: Counter[str] = Counter()
+    owners = []
+    for name in (site.feeder.customers[k] for k in site.droop.customer):
+        owners.append((name, count[name]))
+        count[name] += 1
+    return owners
+
+
+class _Version(msgspec.Struct, frozen=True):
+    """What every version of the text has."""
+
+    format: Annotated[int, msgspec.Meta(ge=1)]
+
+
+_Text = TypeVar("_Text", Record, DistrustRecord)
+
+
+def _read(site: Site, kept: Kept, kind: type[_Text]) -> _Text:
+    """What a text of this feeder holds."""
+    try:
+        version = msgspec.json.decode(kept.text, type=_Version).format
+        if version > FORMAT:
+            text = f"it is of format {version}, and this program knows {FORMAT}"
+            raise KeptInvalid(text, code="newer-format")
+        record = msgspec.json.decode(kept.text, type=kind)
+    except msgspec.DecodeError as error:
+        raise KeptInvalid(f"it is damaged: {error}", code="damaged") from error
+    if record.feeder != site.feeder.name:
+        raise KeptInvalid(f"it is of feeder {record.feeder!r}", code="other-feeder")
+    return record
+
+
+def _digest(part: Any) -> str:
+    text = json.dumps(part, sort_keys=True, allow_nan=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:32]

@@ -1,0 +1,205 @@
+"""What waits for the database, within stated bounds: nothing goes without being counted. Pure bookkeeping.
+
+Reports, bad readings and what happened to commissionings are records: of too many, the oldest go.
+Transitions are state: of too many, each alarm keeps its newest one, which says all that is true of it; if
+that is not enough, those alarms go that came and went while the database knew nothing of them. What stands,
+what the database believes to stand and what an operator has answered is kept in any case, and there is only
+so much of it: at most a few alarms for each meter.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+from service.alarms.state_machine import Alarm, Change, Transition, carried
+from service.report.report import FeederReport
+from service.store import Rejected
+from service.store.schema import Happened
+from service.store.state_codec import Kept, Matter
+
+TRANSITIONS_KEPT = 10_000
+"""So many transitions wait before they are thinned out."""
+RECORDS_KEPT = 3600
+"""So many reports, and as many bad readings and so on, wait; then the oldest go."""
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """What goes into one transaction."""
+
+    transitions: tuple[Transition, ...] = ()
+    reports: tuple[FeederReport, ...] = ()
+    rejected: tuple[Rejected, ...] = ()
+    kept: tuple[Kept, ...] = ()
+    happened: tuple[Happened, ...] = ()
+
+    def __bool__(self) -> bool:
+        """Whether there is anything in it."""
+        return any((self.transitions, self.reports, self.rejected, self.kept, self.happened))
+
+
+class Waiting:
+    """What waits for the database. One thread at a time.
+
+    Parameters
+    ----------
+    forgotten
+        Called with what had to be given up (a label) and how many of it.
+
+    Attributes
+    ----------
+    given_up
+        Transitions given up since the database last took some.
+    """
+
+    def __init__(self, forgotten: Callable[[str, int], None]) -> None:
+        self.given_up = 0
+        self._forgotten = forgotten
+        self._transitions: list[Transition] = []
+        self._reports: deque[FeederReport] = deque()
+        self._rejected: deque[Rejected] = deque()
+        self._kept: dict[tuple[str, Matter], Kept] = {}
+        self._happened: deque[Happened] = deque()
+        # Alarms of which the database knows nothing; those of a batch on its way may be known any moment.
+        self._unheard: set[str] = set()
+        self._on_the_way: set[str] = set()
+        self._taken = 0
+        self._thin_at = TRANSITIONS_KEPT
+
+    def __len__(self) -> int:
+        """Return how many transitions wait, those on their way included."""
+        return len(self._transitions) + self._taken
+
+    def add(
+        self,
+        *,
+        transitions: Iterable[Transition] = (),
+        reports: Iterable[FeederReport] = (),
+        rejected: Iterable[Rejected] = (),
+        kept: Iterable[Kept] = (),
+        happened: Iterable[Happened] = (),
+    ) -> None:
+        """Let something wait.
+
+        Parameters
+        ----------
+        transitions, reports, rejected, kept, happened
+            As in `Store.commit`.
+        """
+        for item in transitions:
+            if item.change is Change.RAISED and item.alarm.count == 1:
+                self._unheard.add(item.alarm.id)
+            self._transitions.append(item)
+        self._reports.extend(reports)
+        self._rejected.extend(rejected)
+        self._kept.update(((item.feeder, item.matter), item) for item in kept)
+        self._happened.extend(happened)
+        self._bound()
+
+    def take(self) -> Batch:
+        """Take everything out; `stored` or `give_back` must follow."""
+        batch = Batch(
+            tuple(self._transitions),
+            tuple(self._reports),
+            tuple(self._rejected),
+            tuple(self._kept.values()),
+            tuple(self._happened),
+        )
+        self._transitions.clear()
+        self._reports.clear()
+        self._rejected.clear()
+        self._kept.clear()
+        self._happened.clear()
+        self._unheard, self._on_the_way = set(), self._unheard
+        self._taken = len(batch.transitions)
+        return batch
+
+    def stored(self) -> None:
+        """Note that what `take` returned is on the disk."""
+        self._on_the_way = set()
+        self._taken = 0
+        self.given_up, self._thin_at = 0, TRANSITIONS_KEPT
+
+    def give_back(self, batch: Batch) -> None:
+        """Put a batch that was not stored before everything that has come since.
+
+        Parameters
+        ----------
+        batch
+            What `take` returned.
+        """
+        self._unheard |= self._on_the_way
+        self._on_the_way = set()
+        self._taken = 0
+        self._transitions[:0] = batch.transitions
+        self._reports.extendleft(reversed(batch.reports))
+        self._rejected.extendleft(reversed(batch.rejected))
+        # Of each feeder and matter only the newest is of use.
+        self._kept = {(item.feeder, item.matter): item for item in batch.kept} | self._kept
+        self._happened.extendleft(reversed(batch.happened))
+        self._bound()
+
+    def carry(self, answered: Alarm) -> None:
+        """Carry a stored acknowledgement over into the transitions that were gathered while it was stored.
+
+        Parameters
+        ----------
+        answered
+            The acknowledged alarm.
+        """
+        self._transitions = [replace(item, alarm=carried(item.alarm, answered)) for item in self._transitions]
+
+    def forget(self, feeder: str) -> None:
+        """Drop everything of a feeder: its removal, which is stored, is its last change.
+
+        Parameters
+        ----------
+        feeder
+            Its name.
+        """
+        self._transitions = [item for item in self._transitions if item.alarm.feeder != feeder]
+        self._reports = deque(item for item in self._reports if item.feeder != feeder)
+        self._kept = {key: item for key, item in self._kept.items() if item.feeder != feeder}
+        self._happened = deque(item for item in self._happened if item.feeder != feeder)
+
+    def _bound(self) -> None:
+        self._drop_oldest(self._reports, "report")
+        self._drop_oldest(self._rejected, "bad-reading")
+        self._drop_oldest(self._happened, "commissioning")
+        if len(self._transitions) > self._thin_at:
+            before = len(self._transitions)
+            most = TRANSITIONS_KEPT * 3 // 4
+            self._thin(most)
+            gone = before - len(self._transitions)
+            self.given_up += gone
+            self._forgotten("transition", gone)
+            left = len(self._transitions)
+            self._thin_at = TRANSITIONS_KEPT if left <= most else max(TRANSITIONS_KEPT, 2 * left)
+
+    def _drop_oldest(self, queue: deque[T], what: str) -> None:
+        over = len(queue) - RECORDS_KEPT
+        for _ in range(over):
+            queue.popleft()
+        if over > 0:
+            self._forgotten(what, over)
+
+    def _thin(self, most: int) -> None:
+        newest = {item.alarm.id: index for index, item in enumerate(self._transitions)}
+        kept = [
+            item
+            for index, item in enumerate(self._transitions)
+            if newest[item.alarm.id] == index or item.change is Change.ACKNOWLEDGED
+        ]
+        passed = [
+            item.alarm.id
+            for item in kept
+            if item.alarm.id in self._unheard and not item.alarm.active and item.alarm.acknowledged_by is None
+        ]
+        gone = set(passed[: max(0, len(kept) - most)])
+        self._unheard -= gone
+        self._transitions = [item for item in kept if item.alarm.id not in gone]

@@ -1,0 +1,123 @@
+"""Powers that are older than the voltage beside them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.late_powers import run
+from feeders.model.load_uncertainty import load_doubt
+from feeders.model.site import SWITCHED, Site, Snapshot, from_tables, late, load, to_frame
+from gridsec.estimators.sequential.design import SequentialOptions
+from gridsec.interface import PowerOrigin
+from tests.feeders.model.test_forecast import forecasting
+
+T = 1_795_212_000.0
+
+
+@pytest.fixture(scope="module")
+def site() -> Site:
+    return load("kerber-dorfnetz")
+
+
+def stating(site: Site, interval_s: float) -> Site:
+    meta = site.tables.meta
+    return from_tables(
+        replace(site.tables, meta=replace(meta, meters=replace(meta.meters, p_interval_s=interval_s)))
+    )
+
+
+def said(site: Site, kw: float = 1.0, age: float | None = None) -> Snapshot:
+    p, v = np.full(site.meters.size, kw), np.full(site.meters.size, site.feeder.base_volt)
+    return Snapshot(
+        T, v, p, np.full(p.size, 0.1), site.feeder.base_volt, None if age is None else np.full(p.size, age)
+    )
+
+
+def test_the_deviation_is_that_of_a_first_order_process_and_of_a_switch(site: Site) -> None:
+    """Against 400 000 draws of such a process, and of a switch between the reading and the far end."""
+    row, age, kw = site.tables.customers[0], 60.0, 1.0
+    sigma = (row.load_kw + row.pv_kw) / np.sqrt(12.0)
+    rng = np.random.default_rng(1)
+    now = rng.normal(0.0, sigma, 400_000)
+    decay = np.exp(-age / site.tables.meta.load.correlation_s)
+    then = decay * now + sigma * np.sqrt(1.0 - decay**2) * rng.standard_normal(now.size)
+    far = max(row.load_kw - kw, kw + row.pv_kw)
+    expected = np.hypot((then - now).std(), far / SWITCHED) / site.feeder.base_kva
+    found = late(site, said(site, kw, age))
+    assert found is not None
+    assert found.std[site.meters[0]] == pytest.approx(expected, rel=0.005)
+    assert min(SequentialOptions().scales_s) == 0.0
+
+
+@pytest.mark.parametrize("kw", [-3.0, 0.0, 1.0, 6.0])
+@pytest.mark.parametrize("age", [0.5, 60.0, 200.0])
+def test_intervals_hold_every_load_that_there_may_be_by_now(site: Site, kw: float, age: float) -> None:
+    frame, fresh = to_frame(site, said(site, kw, age)), to_frame(site, said(site, kw))
+    loads = site.loads
+    inside = (-kw / site.feeder.base_kva <= loads.pv_peak) & (kw / site.feeder.base_kva <= loads.load_peak)
+    for p in (loads.load_peak, -loads.pv_peak):
+        assert (np.abs(-p - frame.p) <= frame.p_error + 1e-12)[inside].all()
+    for q in (loads.load_peak * loads.tan_max + loads.q_floor, -loads.q_floor):
+        assert (np.abs(-q - frame.q) <= frame.q_error + 1e-12)[inside].all()
+    assert frame.p_std is not None
+    assert fresh.p_std is None
+    assert (frame.p_error >= fresh.p_error)[inside].all()
+    known = inside & (frame.p_origin == PowerOrigin.LATE)
+    np.testing.assert_array_equal(frame.p[known], fresh.p[known])
+    assert np.isnan(frame.q_net[known]).all()
+
+
+def test_age_zero_and_a_power_from_the_future_change_nothing(site: Site) -> None:
+    for age in (0.0, -5.0):
+        frame, fresh = to_frame(site, said(site, age=age)), to_frame(site, said(site))
+        assert frame.p_std is None
+        for name in ("p", "p_error", "q", "q_error", "q_net", "p_origin"):
+            np.testing.assert_array_equal(getattr(frame, name), getattr(fresh, name))
+
+
+def test_a_power_older_than_it_is_worth_is_unread_and_forecast(site: Site) -> None:
+    """Beyond the deviation of the range, or of the forecast, the reading is not used."""
+    for where in (site, forecasting(site)):
+        frame, none = to_frame(where, said(where, age=1e5)), to_frame(where, said(where, kw=np.nan))
+        assert frame.p_origin is not None
+        assert (frame.p_origin == PowerOrigin.UNREAD).all()
+        np.testing.assert_array_equal(frame.p, none.p)
+        np.testing.assert_array_equal(frame.p_error, none.p_error)
+        if where.forecast is not None:
+            assert frame.p_std is not None
+            np.testing.assert_array_equal(frame.p_std, where.forecast.p_std)
+
+
+def test_a_stated_interval_is_in_design_and_frames_alike(site: Site) -> None:
+    """No frame knows less than the design supposes, whatever the reading."""
+    where = stating(site, 60.0)
+    doubt = load_doubt(where)
+    assert (doubt.p[where.meters] > load_doubt(site).p[where.meters]).all()
+    for kw in (-3.0, 0.0, 1.0, 6.0):
+        frame = to_frame(where, said(where, kw))
+        assert frame.p_std is not None
+        assert frame.p_origin is not None
+        assert (frame.p_origin != PowerOrigin.LATE).all()
+        read = frame.p_origin == PowerOrigin.READ
+        # The design has a register's error at half of the peak.
+        assert (frame.p_std <= 1.01 * doubt.p)[read].all()
+    older = to_frame(where, said(where, age=90.0))
+    assert older.p_origin is not None
+    assert (older.p_origin == PowerOrigin.LATE).all()
+
+
+@pytest.mark.canary("p_interval_s")
+@pytest.mark.parametrize("stated", ["t_power", "p_interval_s"])
+def test_kettles_and_cars_accuse_nobody_once_the_age_is_stated(stated: str) -> None:
+    """Powers 60 s old: without the age honest meters are named in these runs, with it none."""
+    assert run(0, 600, "late", "")[0]["honest"] + run(1, 600, "late", "")[0]["honest"] > 0
+    for seed in (0, 1):
+        seen, _, of_bound = run(seed, 600, "late", stated)
+        assert seen["honest"] == 0
+        assert of_bound <= 1.0
+        if stated == "p_interval_s":
+            assert seen["named"] == seen["liars"]
+            assert seen["clean"] == seen["ticks"]

@@ -1,0 +1,207 @@
+"""Metered reactive power against the droop curves: no honest error looks wrong, nothing wrong looks clean."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from feeders.model.site import load, names, to_frame
+from feeders.registry.registry import design
+from feeders.simulation.scenario import START
+from feeders.simulation.trial import Lie, LoadError, Meters, Trial, Trick, frames
+from gridsec.attack import Bias
+from gridsec.estimators import sequential
+from gridsec.interface import Cause, Decision, Frame, Verdict
+from tests.feeders.registry.test_adversarial import HIGH, LOW, Ends, World, default
+
+WITH_INVERTERS = [name for name in names() if load(name).droop.tau.size]
+
+
+class Reporting(World):
+    """A feeder whose meters report the net reactive power too, as wrong as they may."""
+
+    def snapshot(self, lies: dict[int, float], wrong: float = 1.0) -> object:
+        base, at, model = self.site.feeder.base_kva, self.site.meters, self.site.loads
+        injected = np.bincount(self.site.droop.customer, self.now.x, self.q.size) * base
+        net = (self.q - injected)[at]
+        floor = np.broadcast_to(model.q_error, self.q.size)[at] * base
+        error = np.maximum(floor, model.q_fraction / (1.0 + model.q_fraction) * np.abs(net))
+        return replace(super().snapshot(lies), q_kvar=net + wrong * error)
+
+
+@pytest.mark.canary("900.0-simbench-lv-rural1", "1.0-cigre-lv")
+@pytest.mark.parametrize("name", WITH_INVERTERS)
+@pytest.mark.parametrize("step_s", [1.0, 900.0])
+def test_honest_errors_at_their_ends_never_accuse_an_inverter(name: str, step_s: float) -> None:
+    made = default(name, step_s)
+    for ends in (HIGH, LOW, Ends(1, 1, 1, 1)):
+        for v0, load_, sun in ((0.95, 1.0, 0.0), (1.05, 0.1, 1.0)):
+            for wrong in (-1.0, 1.0):
+                world = Reporting(name, ends, v0=v0, load=load_, sun=sun)
+                state = sequential.init(made, world.t)
+                for _ in range(9 if step_s == 1.0 else 7):
+                    world.run(step_s)
+                    frame = to_frame(world.site, world.snapshot({}, wrong))  # type: ignore[arg-type]
+                    assert np.isfinite(frame.q_net[world.site.meters]).all()
+                    state, estimate, verdict = sequential.step(made, state, frame)
+                    # Honest errors are taken for independent: all at their ends, they are a misfit.
+                    assert verdict.cause in {Cause.AGREEMENT, Cause.SETTLING, Cause.MISFIT}
+                    true = (world.now.v_volt / world.volt) ** 2
+                    assert (np.abs(estimate.v2 - true) <= estimate.bound).all()
+
+
+@pytest.mark.parametrize(("count", "liar"), [(1, 2), (2, None), (2, 2)])
+def test_all_are_told_of_whoever_else_lies(count: int, liar: int | None) -> None:
+    """Two inverters off their curves are both in an explanation; a named meter hides none of them."""
+    site = load("cigre-lv")
+    lie = Lie(Trick.INVERTER, count, 100.0)
+    trial = Trial(site, 0, duration_s=60.0, load_error=LoadError(0.1, 0.05), lie=lie, report_q=True)
+    honest = trial.scenario
+    owners = set(site.droop.customer[honest.inverter_attacks[0].inverters].tolist())
+    attacks = () if liar is None else (Bias(np.array([liar]), START + 30.0, START + 90.0, np.array([0.03])),)
+    watcher = design(trial.stated)
+    state = watcher.init(0.0)
+    for frame, _ in frames(trial, replace(honest, attacks=attacks)):
+        state, _, verdict = watcher.step(state, frame)
+    assert verdict.decision is (Decision.UNDECIDED if liar is None else Decision.ATTACKED)
+    assert np.flatnonzero(verdict.suspects).tolist() == ([] if liar is None else [liar])
+    # A manipulated majority of the six meters may explain the readings besides, with the named meter in it.
+    assert all(way.meters[verdict.suspects].all() for way in verdict.explanations)
+    named = set(site.droop.customer[verdict.inverters].tolist())
+    told = [
+        named | set(site.droop.customer[way.inverters].tolist()) | set(np.flatnonzero(way.powers).tolist())
+        for way in verdict.explanations
+    ]
+    few = [each for each, way in zip(told, verdict.explanations, strict=True) if way.meters.sum() <= count]
+    assert all(each == owners for each in few or [named])
+    assert all(site.feeder.customers[owner] in verdict.reason for owner in owners)
+    if told:
+        assert sum(way.probability for way in verdict.explanations) == pytest.approx(1.0, abs=0.05)
+
+
+def watched(
+    name: str, *, seed: int = 0, meters: Meters = Meters.SITE, error: LoadError | None = None
+) -> Iterator[tuple[Frame, Verdict, int]]:
+    """A minute in which one inverter leaves its curve by its rating after 30 s: frames, verdicts, whose."""
+    trial = Trial(
+        load(name),
+        seed,
+        duration_s=60.0,
+        load_error=LoadError(0.1, 0.05) if error is None else error,
+        meters=meters,
+        lie=Lie(Trick.INVERTER, 1, 100.0),
+        report_q=True,
+    )
+    watcher = design(trial.stated)
+    state = watcher.init(0.0)
+    for frame, truth in frames(trial):
+        state, _, verdict = watcher.step(state, frame)
+        yield frame, verdict, int(np.argmax(truth.inverters)) if truth.inverters.any() else -1
+
+
+@pytest.mark.canary("0-cigre-lv", "1-simbench-lv-rural1")
+@pytest.mark.parametrize("name", [name for name in WITH_INVERTERS if name != "kerber-vorstadtnetz"])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_an_inverter_off_its_curve_is_never_clean_and_nobody_else_is_accused(name: str, seed: int) -> None:
+    site, since = load(name), 0
+    for _, verdict, which in watched(name, seed=seed):
+        assert not verdict.suspects.any()
+        assert not np.delete(verdict.inverters, max(which, 0)).any()
+        since += which >= 0
+        if since <= 6:
+            continue
+        assert verdict.decision is not Decision.CLEAN
+        owner = int(site.droop.customer[which])
+        assert not verdict.unjudged[which]
+        for way in verdict.explanations:
+            assert not way.meters.any()
+            accused = set(site.droop.customer[way.inverters].tolist()) | set(
+                np.flatnonzero(way.powers).tolist()
+            )
+            assert accused == {owner}
+    assert since > 20
+
+
+def test_the_voltages_say_that_it_is_the_inverter_where_they_can() -> None:
+    answers = list(watched("cigre-lv", meters=Meters.WHITE, error=LoadError(0.01, 0.01)))
+    _, verdict, which = answers[-1]
+    assert verdict.decision is Decision.ATTACKED
+    assert np.flatnonzero(verdict.inverters).tolist() == [which]
+    droop, site = load("cigre-lv").droop, load("cigre-lv")
+    rating = site.tables.customers[int(droop.customer[which])].inverter_kva / site.feeder.base_kva
+    assert abs(verdict.inverter_attack[which]) == pytest.approx(rating, rel=0.3)
+
+
+@pytest.mark.parametrize("meters", [Meters.SITE, Meters.WHITE])
+def test_a_false_report_is_never_clean_and_names_no_inverter(meters: Meters) -> None:
+    """The inverter does as it should; what the meter says of the reactive power is off by its rating."""
+    site = load("cigre-lv")
+    error = LoadError(0.01, 0.01) if meters is Meters.WHITE else LoadError(0.1, 0.05)
+    trial = Trial(site, 3, duration_s=60.0, load_error=error, meters=meters, report_q=True)
+    c = int(site.droop.customer[0])
+    false = site.tables.customers[c].inverter_kva / site.feeder.base_kva
+    watcher, late = design(trial.stated), []
+    state = watcher.init(0.0)
+    for k, (frame, _) in enumerate(frames(trial)):
+        q_net = frame.q_net.copy()
+        q_net[c] += false * (k >= 20)
+        state, _, verdict = watcher.step(state, replace(frame, q_net=q_net))
+        assert not verdict.inverters.any()
+        assert not verdict.suspects.any()
+        late += [verdict] * (k >= 26)
+    assert all(verdict.decision is Decision.UNDECIDED for verdict in late)
+    assert all(verdict.cause is Cause.AMBIGUOUS for verdict in late)
+    assert all(np.flatnonzero(way.powers).tolist() in ([], [c]) for v in late for way in v.explanations)
+
+
+def test_inverters_that_nobody_hears_and_that_move_nothing_are_not_judged() -> None:
+    trial = Trial(load("simbench-lv-rural1"), 0, duration_s=40.0)  # what they inject is forgotten by then
+    for heard, error in (
+        (False, LoadError(0.1, 0.05)),
+        (True, LoadError(0.1, 0.05)),
+        (True, LoadError(2.0, 2.0)),
+    ):
+        told = replace(trial, report_q=heard, load_error=error)
+        watcher = design(told.stated)
+        state = watcher.init(0.0)
+        for frame, _ in frames(told):
+            state, _, verdict = watcher.step(state, frame)
+        # Nor where loads are known less well than what an inverter can inject.
+        assert verdict.unjudged.any() != (heard and error.q_kvar < 1.0)
+
+
+def test_who_pauses_is_not_forgotten() -> None:
+    """A report that is false for four seconds and true for four, again and again, is not CLEAN for long."""
+    site = load("cigre-lv")
+    trial = Trial(site, 3, duration_s=90.0, load_error=LoadError(0.1, 0.05), report_q=True)
+    c = int(site.droop.customer[1])
+    false = site.tables.customers[c].inverter_kva / site.feeder.base_kva
+    watcher, late = design(trial.stated), []
+    state = watcher.init(0.0)
+    for k, (frame, _) in enumerate(frames(trial)):
+        q_net = frame.q_net.copy()
+        q_net[c] += false * (k >= 20 and k % 8 < 4)
+        state, _, verdict = watcher.step(state, replace(frame, q_net=q_net))
+        assert not verdict.inverters.any()
+        late += [verdict.decision] * (k >= 40)
+    assert Decision.CLEAN not in late
+
+
+def test_nothing_of_a_replaced_meter_counts() -> None:
+    site = load("cigre-lv")
+    trial = Trial(site, 3, duration_s=30.0, load_error=LoadError(0.1, 0.05), report_q=True)
+    c = int(site.droop.customer[1])
+    made, which = default("cigre-lv", 1.0), load("cigre-lv").meters == c
+    state = sequential.init(made, 0.0)
+    for k, (frame, _) in enumerate(frames(trial)):
+        q_net = frame.q_net.copy()
+        q_net[c] += 0.5 * (10 <= k < 20)
+        q_net[:] = np.nan if k >= 20 else q_net
+        state = sequential.renew(made, state, which) if k == 22 else state
+        state, _, verdict = sequential.step(made, state, replace(frame, q_net=q_net))
+        # Silence clears nobody; a new meter does.
+        assert k != 21 or verdict.cause is Cause.AMBIGUOUS
+    assert verdict.decision is Decision.CLEAN

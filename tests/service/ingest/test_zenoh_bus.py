@@ -1,0 +1,296 @@
+"""zenoh between real sessions over TCP on this machine."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from service.ingest import queues, zenoh_bus
+from service.ingest.queues import BusConfig, BusUnavailable, Sample
+from service.ingest.zenoh_bus import BATCH, RING, Bus, Meters
+from tests.codes import refused
+from tests.service.running import free_port, until
+
+
+class Sink:
+    """Collects batches."""
+
+    def __init__(self) -> None:
+        self.batches: list[list[Sample]] = []
+
+    def __call__(self, batch: list[Sample]) -> None:
+        self.batches.append(batch)
+
+    @property
+    def samples(self) -> list[Sample]:
+        return [sample for batch in self.batches for sample in batch]
+
+
+@contextmanager
+def pair(
+    sink: Sink, *, lossless: bool = False, max_payload: int = 10_000
+) -> Iterator[tuple[Bus, Meters, str]]:
+    end = f"tcp/127.0.0.1:{free_port()}"
+    with (
+        Bus(BusConfig(listen=(end,)), "gridsec", sink, max_payload=max_payload, lossless=lossless) as bus,
+        Meters(BusConfig("client", connect=(end,)), "gridsec") as meters,
+    ):
+        yield bus, meters, end
+
+
+def client(end: str) -> zenoh.Session:
+    config = zenoh.Config()
+    config.insert_json5("mode", '"client"')
+    config.insert_json5("connect/endpoints", f'["{end}"]')
+    config.insert_json5("scouting/multicast/enabled", "false")
+    return zenoh.open(config)
+
+
+def test_samples_arrive_in_order_with_key_bytes_and_encoding() -> None:
+    sink = Sink()
+    with pair(sink, lossless=True) as (_, meters, _end):
+        for k in range(3 * BATCH):
+            meters.put(f"f/meter/m{k % 7}/reading", str(k).encode())
+            if k % 100 == 0:
+                meters.put("f/substation/reading", f"busbar {k}".encode(), "text/plain")
+        meters.put("f/concentrator/k1/readings", b"last", "application/cbor")
+        until(lambda: sink.samples and sink.samples[-1].payload == b"last")
+    numbers = [int(s.payload) for s in sink.samples if "/meter/" in s.key]
+    assert numbers == list(range(3 * BATCH))
+    assert sink.samples[0].key == "gridsec/f/meter/m0/reading"
+    assert sink.samples[0].encoding == "application/json"
+    assert sink.samples[1].payload == b"busbar 0"
+    assert sink.samples[-1].encoding == "application/cbor"
+    assert all(len(batch) <= BATCH for batch in sink.batches)
+    assert not [t for t in threading.enumerate() if t.name.startswith("zenoh ")]
+
+
+def test_patterns_and_wrong_keys_are_handed_over_and_deletions_are_counted() -> None:
+    sink = Sink()
+    with pair(sink) as (bus, _, end), client(end) as foreign:
+        foreign.put("gridsec/f/meter/*/reading", b"pattern")
+        foreign.put("gridsec/f/meters/a/reading", b"typo")
+        foreign.put("elsewhere/f/meter/a/reading", b"foreign")
+        foreign.delete("gridsec/f/meter/a/reading")
+        foreign.put("gridsec/f/meter/a/reading", b"plain")
+        until(lambda: len(sink.samples) == 3)
+        assert bus.counts.deleted == 1
+    assert [s.payload for s in sink.samples] == [b"pattern", b"typo", b"plain"]
+    assert "*" in sink.samples[0].key
+    assert sink.samples[2].encoding == "zenoh/bytes"
+
+
+def test_of_long_payloads_only_the_beginning_is_kept() -> None:
+    sink = Sink()
+    with pair(sink) as (_, meters, _end):
+        meters.put("f/meter/a/reading", b"x" * (1 << 20))
+        meters.put("f/meter/a/reading", b"x" * 10_000)
+        until(lambda: len(sink.samples) == 2)
+    assert [(len(s.payload), s.size) for s in sink.samples] == [(1024, 1 << 20), (10_000, 10_000)]
+
+
+def test_of_absurd_keys_only_the_beginning_is_kept() -> None:
+    sink = Sink()
+    with pair(sink) as (_, meters, _end):
+        meters.put(f"f/meter/{'a' * 50_000}/reading", b"{}")
+        until(lambda: sink.samples)
+    (found,) = sink.samples
+    assert found.key == "gridsec/f/meter/" + "a" * (len(found.key) - 16)
+    assert len(found.key) == len("gridsec") + 1024
+
+
+def test_a_slow_service_keeps_the_newest_and_does_not_hold_up_the_sender() -> None:
+    sink = Sink()
+    hold = threading.Event()
+
+    def slow(batch: list[Sample]) -> None:
+        hold.wait(20.0)
+        sink(batch)
+
+    end = f"tcp/127.0.0.1:{free_port()}"
+    with (
+        Bus(BusConfig(listen=(end,)), "gridsec", slow, max_payload=1000, lossless=False),
+        Meters(BusConfig("client", connect=(end,)), "gridsec") as meters,
+    ):
+        for k in range(RING + 2_000):
+            meters.put("f/meter/a/reading", str(k).encode())
+        meters.put("f/meter/a/reading", b"-1")
+        threading.Timer(0.5, hold.set).start()
+        until(lambda: sink.samples and sink.samples[-1].payload == b"-1")
+    numbers = [int(s.payload) for s in sink.samples[:-1]]
+    assert numbers == sorted(numbers)
+    assert numbers[-1] == RING + 1_999
+    assert len(numbers) < RING + 2_000
+
+
+def test_estimates_and_alarms_are_published_and_answer_queries() -> None:
+    done: list[str] = []
+    with pair(Sink()) as (bus, meters, end), client(end) as watcher:
+        events = watcher.declare_subscriber("gridsec/f/alarm/*", zenoh.handlers.FifoChannel(100))
+        meters.watch("f")
+        until(lambda: meters.query("f/estimate", 0.2) == {})
+        for k in range(5):
+            bus.telemetry("f/estimate", b"%d" % k)
+        found: list[bytes] = []
+        until(lambda: found.extend(meters.estimates()) or len(found) == 5)
+        assert found == [b"0", b"1", b"2", b"3", b"4"]
+        assert bus.event("f/alarm/A", b"raised", last=False, done=lambda: done.append("raised"))
+        until(lambda: done)
+        bus.answer("f/alarm/B", b"old")
+        assert meters.query("**", 2.0) == {
+            "gridsec/f/estimate": b"4",
+            "gridsec/f/alarm/A": b"raised",
+            "gridsec/f/alarm/B": b"old",
+        }
+        assert bus.event("f/alarm/A", b"cleared", last=True, done=lambda: done.append("cleared"))
+        until(lambda: len(done) == 2)
+        assert set(meters.query("f/alarm/*", 2.0)) == {"gridsec/f/alarm/B"}
+        heard = [events.handler.recv() for _ in range(3)]
+        assert [(h.kind, h.payload.to_bytes()) for h in heard] == [
+            (zenoh.SampleKind.PUT, b"raised"),
+            (zenoh.SampleKind.PUT, b"cleared"),
+            (zenoh.SampleKind.DELETE, b""),
+        ]
+        assert heard[0].priority == zenoh.Priority.INTERACTIVE_HIGH
+        assert str(heard[0].encoding) == "application/json"
+        tokens = [
+            str(r.ok.key_expr) for r in watcher.liveliness().get("gridsec/service/*", timeout=2.0) if r.ok
+        ]
+        assert len(tokens) == 1
+        events.undeclare()
+
+
+def test_what_waits_is_published_before_closing() -> None:
+    done: list[int] = []
+    with pair(Sink()) as (bus, _, _end):
+        for k in range(200):
+            bus.event(f"f/alarm/{k}", b"x", last=False, done=lambda k=k: done.append(k))
+    assert done == list(range(200))
+
+
+def test_a_port_in_use_is_named() -> None:
+    sink = Sink()
+    with (
+        pair(sink) as (_, _meters, end),
+        refused(BusUnavailable, "bus-endpoint") as caught,
+        Bus(BusConfig(listen=(end,)), "gridsec", sink, max_payload=1, lossless=False),
+    ):
+        pass
+    assert end in str(caught.value)
+    assert "address already in use" in str(caught.value).lower()
+
+
+def test_nobody_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(zenoh_bus, "_OPEN_TIMEOUT_MS", 500)
+    end = f"tcp/127.0.0.1:{free_port()}"
+    config = BusConfig("client", connect=(end,))
+    with refused(BusUnavailable, "bus-endpoint") as caught, Meters(config, "gridsec"):
+        pass
+    assert end in str(caught.value)
+
+
+def test_a_user_s_own_configuration(tmp_path: Path) -> None:
+    end = f"tcp/127.0.0.1:{free_port()}"
+    file = tmp_path / "zenoh.json5"
+    file.write_text(
+        f"""{{ mode: "router", listen: {{ endpoints: ["{end}"] }}, // a comment
+             scouting: {{ multicast: {{ enabled: false }} }} }}"""
+    )
+    sink = Sink()
+    with (
+        Bus(BusConfig(file=file), "gridsec", sink, max_payload=1000, lossless=False),
+        Meters(BusConfig("client", connect=(end,)), "gridsec") as meters,
+    ):
+        meters.put("f/meter/a/reading", b"1")
+        until(lambda: sink.samples)
+    file.write_text("{ mode: ")
+    with refused(BusUnavailable, "bus-configuration"), Meters(BusConfig(file=file), "gridsec"):
+        pass
+
+
+def test_a_closed_session_says_so() -> None:
+    with pair(Sink()) as (_, meters, _end):
+        pass
+    with refused(BusUnavailable, "bus-closed"):
+        meters.put("f/meter/a/reading", b"1")
+
+
+def test_what_cannot_be_published_is_said_until_something_is_again() -> None:
+    with pair(Sink()) as (bus, _, _end):
+        bus.telemetry("f//state", b"no key of zenoh")
+        until(lambda: bus.failure)
+        assert bus.counts.publish_failed == 1
+        bus.telemetry("f/state", b"a key")
+        until(lambda: bus.failure is None)
+        assert bus.counts.published == 1
+
+
+class Refusing:
+    """Lets zenoh refuse puts and deletes on keys that hold a word, until told otherwise."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, word: str) -> None:
+        self.word: str | None = word
+        self.tries = 0
+        put_event = zenoh_bus._put_event
+
+        def put(live: zenoh.Session, key: str, payload: bytes | None) -> None:
+            if self.word is not None and self.word in key:
+                self.tries += 1
+                raise zenoh.ZError("no way out")
+            put_event(live, key, payload)
+
+        monkeypatch.setattr(zenoh_bus, "_put_event", put)
+
+
+def test_an_event_that_zenoh_refused_is_tried_again_in_its_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(queues, "RETRY_S", 0.1)
+    refusing, done = Refusing(monkeypatch, "alarm/A"), list[str]()
+    with pair(Sink()) as (bus, _, end), client(end) as watcher:
+        events = watcher.declare_subscriber("gridsec/f/alarm/*", zenoh.handlers.FifoChannel(100))
+        for name in ("A", "B"):
+            bus.event(f"f/alarm/{name}", b"x", last=name == "A", done=lambda name=name: done.append(name))
+        until(lambda: refusing.tries >= 3)
+        bus.telemetry("f/estimate", b"goes out meanwhile")
+        until(lambda: bus.counts.published == 1)
+        assert bus.failure == "no way out"
+        assert done == []
+        refusing.word = None
+        until(lambda: len(done) == 2)
+        assert done == ["A", "B"]
+        assert bus.failure is None
+        heard = [events.handler.recv() for _ in range(3)]
+        assert [(str(h.key_expr)[-1], h.kind) for h in heard] == [
+            ("A", zenoh.SampleKind.PUT),
+            ("A", zenoh.SampleKind.DELETE),
+            ("B", zenoh.SampleKind.PUT),
+        ]
+        assert bus.counts.publish_failed == refusing.tries
+        events.undeclare()
+
+
+def test_closing_waits_for_no_event_that_zenoh_refuses(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(queues, "RETRY_S", 60.0)
+    refusing, done = Refusing(monkeypatch, "alarm/A"), list[str]()
+    with pair(Sink()) as (bus, _, _end):
+        for name in ("A", "B"):
+            bus.event(f"f/alarm/{name}", b"x", last=False, done=lambda name=name: done.append(name))
+        until(lambda: refusing.tries)
+        begin = time.monotonic()
+    assert time.monotonic() - begin < 1.5
+    assert refusing.tries == 2
+    assert done == []
+
+
+def test_an_event_without_a_possible_key_holds_up_no_other() -> None:
+    done: list[str] = []
+    with pair(Sink()) as (bus, _, _end):
+        bus.event("f//alarm", b"no key of zenoh", last=True, done=lambda: done.append("none"))
+        bus.event("f/alarm/A", b"a key", last=False, done=lambda: done.append("A"))
+        until(lambda: done)
+        assert (done, bus.failure, bus.counts.publish_failed) == (["A"], None, 2)
