@@ -190,8 +190,8 @@ class CatchUp:
         self._skipped.clear()
 
 
-NOT_WATCHED = "the feeder is not watched any more"
-TOLD_TWICE = "another alarm tells the same"
+NOT_WATCHED = "the feeder is not monitored any more"
+TOLD_TWICE = "duplicate of another alarm"
 
 
 @dataclass(frozen=True, slots=True)

@@ -288,7 +288,7 @@ class Runtime:
             text = f"{name}: the previous write has not ended within {COMMAND_S:g} s"
             raise StoreUnavailable(text, code="write-under-way")
         raise OutcomeUnknown(
-            f"{name}: no answer within {COMMAND_S:g} s; whether it is stored is not known yet"
+            f"{name}: no answer within {COMMAND_S:g} s; its outcome is not known yet"
         )
 
     def _go_on(self) -> None:
