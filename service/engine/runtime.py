@@ -287,9 +287,7 @@ class Runtime:
             self._commands.remove(entry)
             text = f"{name}: the previous write has not ended within {COMMAND_S:g} s"
             raise StoreUnavailable(text, code="write-under-way")
-        raise OutcomeUnknown(
-            f"{name}: no answer within {COMMAND_S:g} s; its outcome is not known yet"
-        )
+        raise OutcomeUnknown(f"{name}: no answer within {COMMAND_S:g} s; its outcome is not known yet")
 
     def _go_on(self) -> None:
         if self._stopping:
