@@ -27,7 +27,7 @@ _KINDS = 256
 
 
 class Repeats:
-    """Limits the records of one kind: the first of a window are written, the others become one line with a number.
+    """Limits the records of one kind: the first of a window are written, the others counted in one line.
 
     Parameters
     ----------
