@@ -379,7 +379,7 @@ class AlarmEvidence(BaseModel):
         default=None, description="Injection of an inverter beyond its droop curve, kvar."
     )
     explanations: list[ExplanationModel] = []
-    learning: list[StalledMeterModel] = Field(default=[], description="Meters whose learning is stalled.")
+    learning: list[StalledMeterModel] = Field(default=[], description="Meters with stalled learning.")
     data_error: DataErrorModel | None = Field(
         default=None, description="Error of the feeder's files that explains the accusation as well."
     )

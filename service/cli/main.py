@@ -161,7 +161,7 @@ def demo(
     ] = False,
     keep: Annotated[bool, typer.Option("--keep", help="Continue until interrupted.")] = False,
 ) -> None:
-    """Run a demonstration: a service, virtual meters on zenoh, an attack on some of them, and the web page."""
+    """Run a demonstration: a service, virtual meters on zenoh, an attack on some of them, and a web page."""
     from service.cli.demo import Plan, run, verdict
 
     _see_kind(kind, check=check)
@@ -218,7 +218,8 @@ Attacks = Annotated[
         "--attack",
         help="kind:count:size:from:to, e.g. bias:2:0.03:20:55 (size as a part of nominal: 0.03 is 3 %, "
         "times in s after the start); may be repeated. With 'substation' in place of the count, the "
-        "attack is on the busbar meter, with exactly this size, which may be negative: bias:substation:0.03:20:55.",
+        "attack is on the busbar meter, with exactly this size, which may be negative: "
+        "bias:substation:0.03:20:55.",
     ),
 ]
 
@@ -392,8 +393,8 @@ def _injection(site: Site, text: str) -> InverterAttack:
         times = float(begin), float(end)
     except ValueError:
         known = f"a customer with an inverter: {', '.join(owners)}"
-        whose = known if owners else f"an inverter, and {site.feeder.name} has none"
-        raise ValueError(f"expected customer:kvar:from:to with {whose}") from None
+        expected = known if owners else f"an inverter, and {site.feeder.name} has none"
+        raise ValueError(f"expected customer:kvar:from:to with {expected}") from None
     return InverterAttack(np.array([which], dtype=np.intp), np.array([q]), *_span(*times))
 
 

@@ -38,8 +38,8 @@ Out = Annotated[Path | None, typer.Option(help="Write the tables into this folde
 GoalOf = Annotated[
     str | None,
     typer.Option(
-        help="identify: manipulated meters are named; notice: an attack is detected; bound: attacks stay small "
-        "with true powers; contain: also with false powers. [default: identify if attacks can be invisible, "
+        help="identify: manipulated meters are named; notice: an attack is detected; bound: attacks stay "
+        "small with true powers; contain: also with false powers. [default: identify if attacks can be invisible, "
         "otherwise contain]"
     ),
 ]
@@ -234,8 +234,8 @@ def detectable(
 
 
 def _unknowns(names: Sequence[str], feeder: str) -> str:
-    who = ", ".join(names) if names else "none"
-    return escape(f"{feeder}: customers with unknown powers: {who}")
+    shown = ", ".join(names) if names else "none"
+    return escape(f"{feeder}: customers with unknown powers: {shown}")
 
 
 @contextmanager

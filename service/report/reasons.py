@@ -187,14 +187,14 @@ def reason_of(site: Site, tick: Tick, max_attacked: int, verdict: Verdict) -> st
 
 def _named(site: Site, tick: Tick, verdict: Verdict) -> str:
     """Devices named as manipulated, with the deviation of a busbar meter: all estimates depend on it."""
-    who = _who(site, verdict.suspects, verdict.inverters, busbar=verdict.busbar)
+    accused = _who(site, verdict.suspects, verdict.inverters, busbar=verdict.busbar)
     if not verdict.busbar.any():
-        return f"Manipulated: {who}; further off than meter accuracy and load uncertainty allow."
+        return f"Manipulated: {accused}; further off than meter accuracy and load uncertainty allow."
     off = busbar_off(site, tick, verdict)
     if not verdict.suspects.any() and not verdict.inverters.any():
-        return f"Manipulated: {who}; it {off}."
+        return f"Manipulated: {accused}; it {off}."
     far = "further off than meter accuracy and load uncertainty allow"
-    return f"Manipulated: {who}; {far}. The substation's meter {off}."
+    return f"Manipulated: {accused}; {far}. The substation's meter {off}."
 
 
 def _ways(site: Site, verdict: Verdict) -> str:

@@ -152,11 +152,11 @@ def excess_volts(base: Floats, reported: Floats, attack: Floats, named: Bools) -
     Parameters
     ----------
     base, reported : (k,)
-        1 pu of each, and what is reported, V.
+        1 pu, and the reported voltages, V.
     attack : (k,)
-        What is too much of the squared voltages, pu.
+        Excess of the squared voltages, pu.
     named : (k,)
-        Who is named.
+        True for devices named as manipulated.
     """
     true = volts(base, (reported / base) ** 2 - attack)
     return np.where(named, reported - true, 0.0)

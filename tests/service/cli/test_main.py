@@ -255,7 +255,8 @@ def test_all_that_is_wrong_with_a_scenario_is_told_at_once(gridsec: Run, tmp_pat
     assert done.returncode == 2
     assert "Traceback" not in done.stderr
     said = plain(done.stderr)
-    for text in (*lies, *wrong, "--dt is 0", "--start is -5", "--season is 'dry'", "a recording needs an end"):
+    others = ("--dt is 0", "--start is -5", "--season is 'dry'", "a recording needs an end")
+    for text in (*lies, *wrong, *others):
         assert text in said
     assert "3 is 300 % of nominal; 0.03 is 3 %" in said
     assert "-3 is -300 % of nominal; -0.03 is -3 %" in said
@@ -356,7 +357,8 @@ def test_a_recording_of_a_folder_asks_where_that_is(gridsec: Run, tmp_path: Path
     made = gridsec("simulate", str(folder), "--out", str(file), "--duration", "2", "--start", "1795212000")
     assert made.returncode == 0, made.stderr
     told = gridsec("replay", str(file))
-    assert "recorded on 'mine-alone': give its folder with --feeder" in " ".join(refused(told.returncode, told).split())
+    words = " ".join(refused(told.returncode, told).split())
+    assert "recorded on 'mine-alone': give its folder with --feeder" in words
     assert told.returncode == gridsec("replay", str(file), "--feeder", str(tmp_path / "no")).returncode > 0
 
 

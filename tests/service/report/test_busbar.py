@@ -97,7 +97,7 @@ def test_it_is_reported_in_volts_and_named_in_words(site: Site) -> None:
     assert beside.reason == (
         "Manipulated: m02, m03 and the substation's meter; further off than meter accuracy and load "
         "uncertainty allow. The substation's meter reads 2.3 V (1.0 %) less than the meters of the feeder "
-        "say."
+        "imply."
     )
     silent = build(site, tick(site, None), 2, *said(site, [True], [6.9]))
     assert silent.reason == "Manipulated: the substation's meter; it has no reading at present."
