@@ -115,7 +115,7 @@ def conditions(report: FeederReport) -> list[Condition]:
     while the reconstruction has no guarantee or is model only.
     - `data-loss`: a meter, or the busbar meter, is silent. Unknown while it is unavailable but not yet
     silent.
-    - `undecided`: there is no verdict, for a cause of its own. Unknown while the monitor settles, or if
+    - `undecided`: there is no verdict, for a separate cause. Unknown while the monitor settles, or if
     `data-loss` gives the reason: every meter without a reading is silent.
     - `learning-stalled`: the fixed error of a meter is not learned after twice the expected time; one
       condition per feeder. Unknown at a tick without a monitor.

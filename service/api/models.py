@@ -83,7 +83,7 @@ class MeterState(BaseModel):
     model_only: ModelOnly = False
     clock_offset_s: Number = Field(
         default=None,
-        description="By how much its clock is ahead of the other meters', s; null where not measurable.",
+        description="Lead of its clock relative to the other meters, s; null if not measurable.",
     )
 
 
@@ -113,7 +113,7 @@ class BusbarMeterState(BaseModel):
     model_only: ModelOnly = False
     clock_offset_s: Number = Field(
         default=None,
-        description="By how much its clock is ahead of the other meters', s; null where not measurable.",
+        description="Lead of its clock relative to the other meters, s; null if not measurable.",
     )
 
 
@@ -206,7 +206,7 @@ class State(BaseModel):
     silent: list[Silence]
     v_min_volt: Number
     v_max_volt: Number
-    busbar: BusbarMeterState = Field(default=BusbarMeterState(), description="The busbar's own meter.")
+    busbar: BusbarMeterState = Field(default=BusbarMeterState(), description="The busbar meter.")
     customers: list[CustomerState] = []
     inverters: list[InverterState] = []
     explanations: list[ExplanationModel] = []

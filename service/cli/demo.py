@@ -184,7 +184,7 @@ def started(feeder: str, address: str) -> Iterator[Service]:
 
 def _launch(options: tuple[str, ...], log: IO[str]) -> subprocess.Popen[str]:
     command = [sys.executable, "-c", "from service.cli.main import main; main()", "serve", *options]
-    return subprocess.Popen(  # noqa: S603 - our own interpreter, our own arguments
+    return subprocess.Popen(  # noqa: S603 - fixed interpreter and arguments
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True
     )
 

@@ -39,8 +39,8 @@ GoalOf = Annotated[
     str | None,
     typer.Option(
         help="identify: manipulated meters are named; notice: an attack is detected; bound: attacks stay "
-        "small with true powers; contain: also with false powers. [default: identify if attacks can be invisible, "
-        "otherwise contain]"
+        "small with true powers; contain: also with false powers. [default: identify if attacks can be "
+        "invisible, otherwise contain]"
     ),
 ]
 LieVolt = Annotated[

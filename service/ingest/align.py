@@ -227,7 +227,7 @@ def rules(
 
     Up to `BRIDGED_TICK_S` a reading serves for two and a half ticks, which bridges single losses. At longer
     ticks
-    it serves for one tick: a voltage of a quarter of an hour ago is no evidence of the present one.
+    it serves for one tick: a voltage of a quarter of an hour ago is not evidence of the present one.
 
     Parameters
     ----------
@@ -416,7 +416,7 @@ class Aligner:
     def _count_gap(self, reading: Reading, source: _Source) -> None:
         # A decreasing number is a restart or a changed order, not a loss. The ring of the subscription drops
         # the
-        # oldest samples, which only this gap shows. A reading overtaken by a later one is no evidence of a
+        # oldest samples, which only this gap shows. A reading overtaken by a later one is not evidence of a
         # loss.
         if reading.seq is None or reading.t < source.last_t:
             return
@@ -516,7 +516,7 @@ class Aligner:
         behind = math.floor(now / self.rules.tick_s) - first
         if behind > self.rules.backlog:
             self._skip(first, self._resume(first + behind))
-            # A skipped tick was not formed and is no evidence of silence.
+            # A skipped tick was not formed and is not evidence of silence.
             self._resumed = self._time(self._number())
         while True:
             t = self._time(self._number())

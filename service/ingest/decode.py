@@ -287,7 +287,7 @@ def source_of(key: str, prefix: str, known: Mapping[str, Known]) -> Source | Bad
         The monitored feeders.
     """
     if "*" in key or "$" in key:
-        return _nowhere(key, BadReason.KEY, "is a pattern; every reading is put on a key of its own")
+        return _nowhere(key, BadReason.KEY, "is a pattern; a reading needs a key without wildcards")
     head, _, rest = key.partition(prefix + "/")
     match rest.split("/"):
         case [feeder, "meter", meter, "reading"] if not head:
