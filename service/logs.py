@@ -1,8 +1,7 @@
 """Log on standard error, one event per line, as text or as JSON.
 
 A log that cannot be written (a full disk, a closed pipe) does not stop the monitoring: such lines are lost
-and
-counted.
+and counted.
 """
 
 from __future__ import annotations

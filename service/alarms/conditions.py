@@ -106,21 +106,21 @@ def conditions(report: FeederReport) -> list[Condition]:
     """Return the present and the unknown conditions of a feeder at one tick.
 
     - `meter-manipulated`: the verdict names the meter, or the busbar meter. Unknown while the verdict is
-    UNDECIDED or the meter is unavailable, whatever the list of suspects; for the busbar meter also with an
-    estimator that does not test it.
+      UNDECIDED or the meter is unavailable, whatever the list of suspects; for the busbar meter also with an
+      estimator that does not test it.
     - `inverter-manipulated`: the verdict names the inverter. Unknown while the verdict is UNDECIDED, or with
-    an estimator that does not monitor inverters.
+      an estimator that does not monitor inverters.
     - `voltage-limit`: the whole interval around the *reconstructed* voltage is outside the limits, so that a
-    manipulated meter raises none. Unknown while the interval contains a limit with its middle outside, or
-    while the reconstruction has no guarantee or is model only.
+      manipulated meter raises none. Unknown while the interval contains a limit with its middle outside, or
+      while the reconstruction has no guarantee or is model only.
     - `data-loss`: a meter, or the busbar meter, is silent. Unknown while it is unavailable but not yet
-    silent.
+      silent.
     - `undecided`: there is no verdict, for a separate cause. Unknown while the monitor settles, or if
-    `data-loss` gives the reason: every meter without a reading is silent.
+      `data-loss` gives the reason: every meter without a reading is silent.
     - `learning-stalled`: the fixed error of a meter is not learned after twice the expected time; one
       condition per feeder. Unknown at a tick without a monitor.
     - `clock-offset`: the clock of a meter, or of the busbar meter, is measurably ahead or behind, or its
-    readings are late.
+      readings are late.
 
     Returns
     -------

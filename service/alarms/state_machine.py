@@ -229,7 +229,8 @@ def _order(key: Key) -> tuple[str, str]:
 
 def _hold(old: Entry, t: float) -> Entry:
     """Return the entry after an unknown tick; its clock stops here."""
-    # Hold only from the second unknown tick on; otherwise a meter available at every other tick never alarms.
+    # The clock stops at the first unknown tick, not at the last known one: otherwise a meter that is available
+    # at every other tick never raises an alarm.
     return replace(old, held=True, t_known=old.t_known if old.held else max(old.t_known, t))
 
 
@@ -320,8 +321,7 @@ def alarm_id(condition: Condition, onset: float) -> str:
     """Return the id of the alarm of a condition that began at `onset`.
 
     In the form of a ULID: ten characters of Crockford's base 32 for the milliseconds, then sixteen, which are
-    a
-    hash instead of random bits, so that a replay gives the same ids.
+    a hash instead of random bits, so that a replay gives the same ids.
 
     Parameters
     ----------
@@ -440,10 +440,8 @@ def restore(feeder: str, alarms: Iterable[Alarm]) -> AlarmBook:
     """Return the book of a feeder from its stored alarms, after a restart.
 
     The restart is a hold: no tick is known. Alarms keep their id, count, state and acknowledgement. A running
-    clock
-    (a pending condition, an alarm about to clear) restarts from zero. A transition may therefore come later
-    than
-    without the restart, by less than its delay, and never earlier.
+    clock (a pending condition, an alarm about to clear) restarts from zero. A transition may therefore come
+    later than without the restart, by less than its delay, and never earlier.
 
     Parameters
     ----------

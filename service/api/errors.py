@@ -67,8 +67,7 @@ class Guard:
     """Security headers on every response, a limit of the body, and a check of the origin of changes.
 
     DNS rebinding: a foreign page can point its host name at this server. A request that changes something
-    must
-    therefore use an address or a host name of this server, and a page that sends it must have the same
+    must therefore use an address or a host name of this server, and a page that sends it must have the same
     origin.
 
     Parameters

@@ -1,10 +1,8 @@
 """Limits of HTTP connections: their number, the time for a header and a body, and descriptors.
 
 uvicorn limits the idle time after a response only. This module adds a limit of open connections, time-outs
-for
-incomplete requests and for stalled responses, and an accept loop that waits when the process has no
-descriptor
-left. asyncio's own loop would log each of `backlog` failed accepts with a traceback.
+for incomplete requests and for stalled responses, and an accept loop that waits when the process has no
+descriptor left. asyncio's own loop would log each of `backlog` failed accepts with a traceback.
 """
 
 from __future__ import annotations

@@ -94,10 +94,8 @@ class Backend(Protocol):
         """Return an asynchronous generator of wake-ups; it ends when the service stops.
 
         Each is `{"type": "alarm" | "state", "data": ...}`, sent after the alarm is stored or the report
-        replaced. Only
-        the type is read here: the backend may drop wake-ups of a slow client, as long as one is left. The
-        first step
-        into the generator subscribes, closing it unsubscribes.
+        replaced. Only the type is read here: the backend may drop wake-ups of a slow client, as long as one
+        is left. The first step into the generator subscribes, closing it unsubscribes.
         """
 
 

@@ -1,8 +1,7 @@
 """Demonstration: a service, virtual meters with an attack, and the reaction of the service.
 
 The service is a separate process; the meters are its zenoh client, driven by full AC power flow. The
-displayed
-and checked data come over HTTP, as for an operator.
+displayed and checked data come over HTTP, as for an operator.
 """
 
 from __future__ import annotations

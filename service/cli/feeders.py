@@ -187,8 +187,7 @@ def convert(
     """Convert another tool's network into a feeder's folder, and check it by AC power flow against that tool.
 
     Changes of the conversion are printed, and written to conversion.csv and SOURCE.md. A feeder that was
-    written by
-    hand is never replaced; an earlier conversion that differs is kept as FOLDER-1.
+    written by hand is never replaced; an earlier conversion that differs is kept as FOLDER-1.
     """
     from feeders.convert.convert import convert as run
 

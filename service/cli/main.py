@@ -1,10 +1,9 @@
 """Command line. Every command is a thin layer over one module.
 
 Exit codes: 0 done; 1 a check failed or an unexpected error; 2 wrong usage or settings; 3 a feeder is invalid
-or
-cannot be monitored; 4 the database cannot be used; 5 an address cannot be used (HTTP or zenoh); 6 a file is
-not a
-recording or another tool's network, or cannot be written; 7 the writer's lock of the database is lost.
+or cannot be monitored; 4 the database cannot be used; 5 an address cannot be used (HTTP or zenoh); 6 a file
+is not a recording or another tool's network, or cannot be written; 7 the writer's lock of the database is
+lost.
 """
 
 from __future__ import annotations

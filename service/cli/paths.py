@@ -38,8 +38,7 @@ def write_tables(folder: Path | None, study: str, tables: Mapping[str, pd.DataFr
     """Write every table of a study to a folder, as `STUDY-NAME.csv` and `STUDY-NAME.parquet`.
 
     A file is replaced when its new content is complete: an interruption leaves the old one. Tables of earlier
-    runs
-    of the study that the present run does not write are removed.
+    runs of the study that the present run does not write are removed.
 
     Parameters
     ----------

@@ -41,8 +41,7 @@ def replay(
     """Run a recording through the chain of the live service, and print the resulting alarms.
 
     Use the `--estimator`, `--max-skew` and `--grace` of the live service, from its options or GRIDSEC_...
-    variables:
-    this command does not read the variables.
+    variables: this command does not read the variables.
     """
     from feeders.registry.registry import choose
     from feeders.simulation.recording import RecordingInvalid, read_recording

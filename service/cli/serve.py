@@ -136,8 +136,7 @@ def _end_within(seconds: float, ended: threading.Event) -> None:
     """End the process after a time even if a step hangs: a commit, a socket, a design.
 
     A request is confirmed only after its commit, so that no confirmed request is lost. The exit code is 0 if
-    the
-    service itself has ended and only the interpreter has not.
+    the service itself has ended and only the interpreter has not.
     """
     import structlog
 

@@ -230,8 +230,7 @@ def _signals(left: Callable[[], str]) -> Iterator[None]:
     """Stop a command by SIGTERM as by Ctrl-C; a second signal ends it at once.
 
     A long call of a solver lets no signal handler run. The thread then ends the program, and also if child
-    processes
-    do not end. Every result is in the journal as soon as it exists: no more is lost.
+    processes do not end. Every result is in the journal as soon as it exists: no more is lost.
     """
     heard, over = threading.Event(), threading.Event()
 

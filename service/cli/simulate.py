@@ -126,10 +126,8 @@ class _Steps:
     """Keeps a simulation in step with the published estimates of a feeder.
 
     Readings every d seconds, the last of them at t, let the service publish the latest tick that is not after
-    t; of
-    ticks every s seconds that is one of less than s ago. The wait until t minus the published time is less
-    than
-    a max(d, s) therefore always ends, for any d, s, start, and a >= 1.
+    t; of ticks every s seconds that is one of less than s ago. The wait until t minus the published time is
+    less than a max(d, s) therefore always ends, for any d, s, start, and a >= 1.
     """
 
     def __init__(self, meters: Meters, site: Site, ahead: int, dt_s: float) -> None:

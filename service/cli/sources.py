@@ -31,8 +31,7 @@ def converted(feeder: str, out: Path | None) -> str:
     """Return a feeder for `model.site.load`; another tool's network is converted, with a message.
 
     The conversion is repeated each time: an OpenDSS file may refer to others that have changed. A different
-    earlier
-    conversion in the folder is kept under another name, see `spared`.
+    earlier conversion in the folder is kept under another name, see `spared`.
 
     Parameters
     ----------

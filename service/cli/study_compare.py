@@ -60,8 +60,7 @@ def compare(
     """Compare all estimators on the same simulated attacks.
 
     The truth is full AC power flow; loads and meters are as uncertain as stated to the estimators. Estimators
-    that
-    cannot monitor the feeder are listed with the reason.
+    that cannot monitor the feeder are listed with the reason.
     """
     from feeders.model.site import load
     from feeders.registry.registry import FAMILIES

@@ -128,8 +128,7 @@ def settle() -> None:
     """Exclude all permanent objects, modules and designs, from Python's garbage collection.
 
     A full pass over them stops every thread for about 20 ms. Objects excluded earlier are collected once
-    more, so
-    that removed feeders leave nothing in memory.
+    more, so that removed feeders leave nothing in memory.
     """
     gc.unfreeze()
     gc.collect()

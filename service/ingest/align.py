@@ -226,8 +226,7 @@ def rules(
     """Return the rules that follow from a feeder's tick.
 
     Up to `BRIDGED_TICK_S` a reading serves for two and a half ticks, which bridges single losses. At longer
-    ticks
-    it serves for one tick: a voltage of a quarter of an hour ago is not evidence of the present one.
+    ticks it serves for one tick: a voltage of a quarter of an hour ago is not evidence of the present one.
 
     Parameters
     ----------
@@ -415,9 +414,8 @@ class Aligner:
 
     def _count_gap(self, reading: Reading, source: _Source) -> None:
         # A decreasing number is a restart or a changed order, not a loss. The ring of the subscription drops
-        # the
-        # oldest samples, which only this gap shows. A reading overtaken by a later one is not evidence of a
-        # loss.
+        # the oldest samples, which only this gap shows. A reading overtaken by a later one is not evidence of
+        # a loss.
         if reading.seq is None or reading.t < source.last_t:
             return
         if source.seq is not None and 0 < (gap := reading.seq - source.seq - 1) <= GAP_MAX:

@@ -233,8 +233,7 @@ def _in_ids(site: Site, text: str) -> str:
     """Replace customers in a sentence by their meters' ids.
 
     Longer names come first, since one name may be the beginning of another. Inverters keep their customer's
-    name,
-    as in alarms.
+    name, as in alarms.
     """
     meter_of = {
         site.feeder.customers[int(customer)]: meter

@@ -58,8 +58,7 @@ class Grounds:
     """Voltage readings of one tick that the reconstruction uses, by phase of the busbar, (b,).
 
     A value without such a reading in its phase is *model only*: it follows from powers, the model and the
-    state of
-    the estimator. All buses of a phase are connected, so that one reading counts for all of them.
+    state of the estimator. All buses of a phase are connected, so that one reading counts for all of them.
 
     Attributes
     ----------

@@ -1,8 +1,7 @@
 """Store of alarms, their events, the outbox, history, rejected readings, monitor state and feeder tables.
 
 SQLite or PostgreSQL, by SQLAlchemy's Core. One transaction contains an alarm's state, its event and the
-outbox
-entry for its publication; readers see all three or none.
+outbox entry for its publication; readers see all three or none.
 
 There is one writer: one connection in one process, protected by a lock that ends with the process. SQLite
 before 3.51.3 can corrupt a WAL database that two connections write or checkpoint at once; the readers here

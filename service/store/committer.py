@@ -5,8 +5,7 @@ thread with the wall clock. One write is in progress at a time. After a failed w
 written again. Alarms are published after they are stored, not before.
 
 A command stores a `Wish` in the same way and gets the result between two rounds. A commit without an answer
-is
-repeated with its key until the database confirms it.
+is repeated with its key until the database confirms it.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Queue of data that wait for the database, within stated bounds; dropped data are counted. Pure.
 
 Reports, bad readings and changes of commissionings are records: a full queue drops the oldest. Transitions
-are
-state: beyond the limit, each alarm keeps its newest one, which contains its whole state. If that does not
+are state: beyond the limit, each alarm keeps its newest one, which contains its whole state. If that does not
 suffice, alarms are dropped that were raised and cleared without the database. Active alarms, alarms that are
 active in the database and acknowledgements are kept in any case; their number is bounded by a few alarms for
 each meter.
