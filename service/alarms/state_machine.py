@@ -229,8 +229,8 @@ def _order(key: Key) -> tuple[str, str]:
 
 def _hold(old: Entry, t: float) -> Entry:
     """Return the entry after an unknown tick; its clock stops here."""
-    # The clock stops at the first unknown tick, not at the last known one: otherwise a meter that is available
-    # at every other tick never raises an alarm.
+    # The clock stops at the first unknown tick, not at the last known one: otherwise a meter available at
+    # every other tick would never raise an alarm.
     return replace(old, held=True, t_known=old.t_known if old.held else max(old.t_known, t))
 
 
