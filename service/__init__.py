@@ -1,1 +1,1 @@
-"""The monitoring service: readings in over zenoh, estimates and alarms out over REST and zenoh."""
+"""Monitoring service: readings in over zenoh, estimates and alarms out over REST and zenoh."""

@@ -1,4 +1,4 @@
-"""The service put together: settings, database, feeders, runtime, zenoh, HTTP. Straight-line wiring."""
+"""Assembly of the service: settings, database, feeders, runtime, zenoh, HTTP."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ _log = structlog.get_logger("gridsec.app")
 
 
 class AddressUnavailable(GridsecError):
-    """The HTTP address cannot be listened on; the message says which and why."""
+    """The HTTP address cannot be listened on."""
 
     code = "address-unavailable"
 
 
 @dataclass(frozen=True, slots=True)
 class Running:
-    """What a starter wants to know once the service is up."""
+    """Properties of the running service for its starter."""
 
     url: str
     feeders: tuple[str, ...]
@@ -61,23 +61,21 @@ async def serve(
 
     Parameters
     ----------
-    settings
-        All of them.
     announce
-        Called once HTTP answers.
+        Called once HTTP responds.
     signals
-        Whether to listen to signals; not possible outside of the main thread.
+        Handle signals; only possible in the main thread.
     settled
         As in `Runtime`.
     stopping
-        Called when the end begins.
+        Called at the beginning of the end.
     wall
-        The wall clock, Unix s.
+        Wall clock, Unix s.
 
     Raises
     ------
     FeederInvalid, StoreUnavailable, BusUnavailable, AddressUnavailable
-        If it cannot start.
+        If the service cannot start.
     """
     shares = Shares.of(raise_limit())
     sites = {
@@ -169,9 +167,9 @@ async def _run(
 
 
 class _Server(BoundedServer):
-    """uvicorn that says when it is up, and leaves signals to `serve`.
+    """uvicorn with an event for its start, and without signal handlers.
 
-    Its own handling would end the process before zenoh and the database are closed.
+    uvicorn's own handlers would end the process before zenoh and the database are closed.
     """
 
     def __init__(self, app: Callable[..., Any], most: int, **options: Any) -> None:
@@ -179,7 +177,7 @@ class _Server(BoundedServer):
         self.up = asyncio.Event()
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Start, and say so."""
+        """Start, and set the event."""
         await super().startup(sockets=sockets)
         self.up.set()
 
@@ -205,7 +203,7 @@ def _signals(stop: asyncio.Event) -> Iterator[None]:
 def _listen(address: str) -> Iterator[socket.socket]:
     host, port = split_address(address)
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    # asyncio switches Nagle's algorithm off (40 ms an answer) only where the protocol is said to be TCP.
+    # asyncio disables Nagle's algorithm (40 ms per response) only if the protocol is given as TCP.
     with socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP) as listener:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -218,12 +216,12 @@ def _listen(address: str) -> Iterator[socket.socket]:
 
 
 def load_sites(names: Iterable[str]) -> dict[str, Site]:
-    """Load feeders, and name the problems of all of them at once.
+    """Load feeders, and report the problems of all of them at once.
 
     Parameters
     ----------
     names
-        Folders, or names of feeders that come with the project.
+        Folders, or names of feeders of the project.
 
     Raises
     ------
@@ -248,12 +246,12 @@ def load_sites(names: Iterable[str]) -> dict[str, Site]:
 
 
 def _stored(given: Mapping[str, Site], store: Store) -> tuple[dict[str, Site], dict[str, str]]:
-    """Load the feeders that were put over REST; those given on the command line go before.
+    """Load the feeders added over REST; those of the command line take precedence.
 
     Returns
     -------
     loaded, unloaded
-        By name: the feeders, and why others could not be loaded.
+        By name: the feeders, and the reasons for those that cannot be loaded.
     """
     loaded: dict[str, Site] = {}
     unloaded: dict[str, str] = {}
@@ -264,7 +262,8 @@ def _stored(given: Mapping[str, Site], store: Store) -> tuple[dict[str, Site], d
         try:
             loaded[name] = from_tables(from_json(tables))
         except GridsecError as error:
-            # It was valid when it was put; an update of the program must not keep the others from starting.
+            # The tables were valid when they were added; after an update of the program the other feeders
+            # must still start.
             unloaded[name] = "; ".join(error.problems) if isinstance(error, FeederInvalid) else str(error)
             _log.error("a stored feeder is not watched", feeder=name, problem=unloaded[name])
     return loaded, unloaded

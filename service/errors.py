@@ -17,7 +17,7 @@ __all__ = [
 
 
 def prefixed(start: str, problem: str) -> Problem:
-    """Return a problem with its place in front, once, and its code if it has one.
+    """Return a problem with its place in front, once, and with its code.
 
     Parameters
     ----------
@@ -39,16 +39,16 @@ class FeederUnknown(GridsecError):
 
 
 class FeederNotLoaded(GridsecError):
-    """The feeder's stored tables cannot be loaded any more; the feeder is not watched."""
+    """The feeder's stored tables cannot be loaded; the feeder is not monitored."""
 
     code = "feeder-not-loaded"
 
     def __init__(self, name: str, problem: str) -> None:
-        super().__init__(f"nobody watches feeder {name!r}: its stored tables cannot be loaded: {problem}")
+        super().__init__(f"feeder {name!r} is not monitored: its stored tables cannot be loaded: {problem}")
 
 
 class FeederFixed(GridsecError):
-    """The feeder belongs to the command line."""
+    """The feeder was given on the command line."""
 
     code = "feeder-fixed"
 
@@ -57,9 +57,9 @@ class FeederFixed(GridsecError):
 
 
 class TooManyFeeders(GridsecError):
-    """The limit of feeders that are put over REST is reached."""
+    """The limit of feeders added over REST is reached."""
 
     code = "too-many-feeders"
 
     def __init__(self, most: int) -> None:
-        super().__init__(f"{most} feeders have been put already, and no more are taken; delete one first")
+        super().__init__(f"the limit of {most} feeders over REST is reached; delete one first")

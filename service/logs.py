@@ -1,7 +1,7 @@
-"""Logs go to standard error, one event a line: for people, or JSON for machines.
+"""Log on standard error, one event per line, as text or as JSON.
 
-Nobody who watches stumbles over a log that cannot be written (a full disk, a closed pipe): such lines are
-lost and counted.
+A log that cannot be written (a full disk, a closed pipe) does not stop the monitoring: such lines are lost
+and counted.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ REPEATS = 5
 WINDOW_S = 10.0
 """Window of repeated records, s."""
 _KINDS = 256
-"""Kinds of records that are told apart at a time; the oldest goes first."""
+"""Largest number of kinds of records that are counted at a time; the oldest is dropped."""
 
 
 class Repeats:
-    """Counts records of one kind: the first of a window are written, the others as one line with a number.
+    """Limits the records of one kind: the first of a window are written, the others counted in one line.
 
     Parameters
     ----------
     report
-        Called with a kind and the number of its records that were not written.
+        Called with a kind and the number of its suppressed records.
     clock
         Monotonic time, s.
     window_s, first
@@ -53,12 +53,12 @@ class Repeats:
         self._timer: threading.Timer | None = None
 
     def admit(self, kind: tuple[str, ...]) -> bool:
-        """Say whether a record is written.
+        """True if a record is written.
 
         Parameters
         ----------
         kind
-            Level, event and source: records with the same are repeated.
+            Level, event and source: records with equal ones are of one kind.
         """
         self.flush(over_only=True)
         with self._lock:
@@ -66,7 +66,7 @@ class Repeats:
             self._kinds[kind] = begun, count + 1
             gone = [self._kinds.popitem(last=False)] if len(self._kinds) > _KINDS else []
             if count == self._first and self._timer is None:
-                # Without a further record, nothing else would write the number.
+                # Writes the number if no further record follows.
                 self._timer = threading.Timer(self._window_s, self._on_timer)
                 self._timer.daemon = True
                 self._timer.start()
@@ -74,16 +74,16 @@ class Repeats:
         return count < self._first
 
     def flush(self, *, over_only: bool = False) -> None:
-        """Write the numbers of what was counted.
+        """Write the numbers of suppressed records.
 
         Parameters
         ----------
         over_only
-            Only of windows that are over.
+            Restrict to windows that have ended.
         """
         now, ended = self._clock(), []
         with self._lock:
-            # In the order of their beginnings.
+            # In the order of their starts.
             while self._kinds:
                 begun, _ = next(iter(self._kinds.values()))
                 if over_only and now - begun < self._window_s:
@@ -103,7 +103,7 @@ class Repeats:
 
 
 class _OncePerWindow(logging.Filter):
-    """Bounds the records of other libraries (uvicorn, asyncio), by the first line of their text."""
+    """Limits the records of other libraries (uvicorn, asyncio), by the first line of their text."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -111,8 +111,8 @@ class _OncePerWindow(logging.Filter):
         atexit.register(self._repeats.flush)
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Say whether a record is written."""
-        # A text with an object's address or a task's number in it is of the same kind as the next one.
+        """True if a record is written."""
+        # Digits are removed: texts that differ in an object's address or a task's number are of one kind.
         text = "".join(c for c in str(record.msg).partition("\n")[0] if not c.isdigit())[:200]
         return self._repeats.admit((record.levelname.lower(), text, record.name))
 
@@ -134,16 +134,10 @@ def _bounded(repeats: Repeats) -> structlog.typing.Processor:
 
 
 class LineLogger:
-    """Writes lines into a file, or loses them.
-
-    Parameters
-    ----------
-    file
-        Where to.
-    """
+    """Writes lines to a file; a line that cannot be written is lost."""
 
     lost = 0
-    """Lines that could not be written, of this process."""
+    """Number of lost lines of this process."""
     _lock = threading.Lock()
 
     def __init__(self, file: TextIO) -> None:
@@ -155,13 +149,13 @@ class LineLogger:
         Parameters
         ----------
         message
-            Without its end.
+            Text without a line end.
         """
         with self._lock:
             try:
                 self._file.write(f"{message}\n")
                 self._file.flush()
-            except (OSError, ValueError):  # ValueError: it has been closed
+            except (OSError, ValueError):  # ValueError: the file is closed
                 LineLogger.lost += 1
 
     debug = info = warning = error = critical = exception = msg

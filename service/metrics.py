@@ -1,4 +1,4 @@
-"""What Prometheus sees. One registry per service, so that several can live in one process."""
+"""Metrics for Prometheus. One registry per service, so that a process can contain several."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _DELAY_BUCKETS = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0, 60.0, 300.0)
 
 
 class Metrics:
-    """The counters and gauges of one service; every name begins with `gridsec_`."""
+    """Counters and gauges of one service; every name begins with `gridsec_`."""
 
     def __init__(self) -> None:
         self._registry = CollectorRegistry()
@@ -27,35 +27,37 @@ class Metrics:
         self._of_storing(self._registry)
 
     def _of_readings(self, registry: CollectorRegistry) -> None:
-        """What comes in."""
+        """Metrics of the input."""
         counter = partial(Counter, registry=registry)
         self.samples = counter("gridsec_samples", "Payloads received over zenoh.")
         self.dropped = counter("gridsec_samples_dropped", "Payloads dropped because the queue was full.")
         self.readings = counter(
-            "gridsec_readings", "Well-formed readings, by what became of them.", ["feeder", "outcome"]
+            "gridsec_readings", "Well-formed readings, by outcome.", ["feeder", "outcome"]
         )
         self.bad = counter(
             "gridsec_bad_readings",
-            "Readings that could not be used, by reason; no feeder if it is unknown.",
+            "Bad readings, by reason; without a feeder if it is unknown.",
             ["feeder", "reason"],
         )
-        self.lost = counter("gridsec_readings_lost", "Readings missing by their running numbers.", ["feeder"])
+        self.lost = counter(
+            "gridsec_readings_lost", "Readings missing by their sequence numbers.", ["feeder"]
+        )
         self.queue = Gauge("gridsec_queue_length", "Payloads waiting for the runtime.", registry=registry)
-        self.bus = counter("gridsec_zenoh", "What went through zenoh.", ["what"])
+        self.bus = counter("gridsec_zenoh", "Operations on zenoh, by kind.", ["what"])
 
     def _of_ticks(self, registry: CollectorRegistry) -> None:
-        """What is made of it."""
+        """Metrics of the evaluation."""
         counter, gauge = partial(Counter, registry=registry), partial(Gauge, registry=registry)
         self.ticks = counter("gridsec_ticks", "Ticks, by verdict.", ["feeder", "verdict"])
-        self.skipped = counter("gridsec_ticks_skipped", "Ticks that were due and not judged.", ["feeder"])
-        self.seen = gauge("gridsec_meters_seen", "Meters seen at the latest tick.", ["feeder"])
-        self.suspects = gauge("gridsec_suspects", "Meters under suspicion at the latest tick.", ["feeder"])
-        self.learned = gauge("gridsec_meters_learned", "Meters whose own error is known.", ["feeder"])
+        self.skipped = counter("gridsec_ticks_skipped", "Skipped ticks.", ["feeder"])
+        self.seen = gauge("gridsec_meters_seen", "Available meters at the latest tick.", ["feeder"])
+        self.suspects = gauge("gridsec_suspects", "Suspects at the latest tick.", ["feeder"])
+        self.learned = gauge("gridsec_meters_learned", "Meters with a learned fixed error.", ["feeder"])
         self.learning = gauge("gridsec_meters_learning", "Meters by state of learning.", ["feeder", "state"])
         self.delayed = gauge(
             "gridsec_meters_learning_delayed", "Meters behind schedule, by reason.", ["feeder", "reason"]
         )
-        self.alarms = gauge("gridsec_alarms_active", "Alarms that stand.", ["feeder"])
+        self.alarms = gauge("gridsec_alarms_active", "Active alarms.", ["feeder"])
         self.cycle = Histogram(
             "gridsec_cycle_seconds",
             "One round of the runtime: decode, align, estimate, store.",
@@ -64,14 +66,14 @@ class Metrics:
         )
         self.delay = Histogram(
             "gridsec_report_delay_seconds",
-            "Wall time from a tick until its report has been judged and stored.",
+            "Wall time from a tick until its report is stored.",
             ["feeder"],
             buckets=_DELAY_BUCKETS,
             registry=registry,
         )
 
     def _of_storing(self, registry: CollectorRegistry) -> None:
-        """What is kept of it."""
+        """Metrics of the database and the log."""
         counter = partial(Counter, registry=registry)
         self.transitions = counter(
             "gridsec_alarm_transitions", "Stored alarm transitions.", ["feeder", "kind", "change"]
@@ -82,8 +84,8 @@ class Metrics:
         self.store_failures = counter("gridsec_store_failures", "Commits that the database refused.")
         self.forgotten = counter(
             "gridsec_records_forgotten",
-            "What was given up: reports, bad readings, transitions while the database stayed away, "
-            "and bad readings of which too many came at once.",
+            "Dropped records: reports, bad readings and transitions while the database is unavailable, "
+            "and bad readings beyond the limit of a round.",
             ["what"],
         )
         unwritten = Gauge(
@@ -92,12 +94,12 @@ class Metrics:
         unwritten.set_function(lambda: LineLogger.lost)
 
     def count_bus(self, counts: BusCounts) -> None:
-        """Take over the counts of the zenoh bus.
+        """Update from the counters of the zenoh bus.
 
         Parameters
         ----------
         counts
-            Its running totals.
+            Totals since the start.
         """
         now = asdict(counts)
         for what, total in now.items():
@@ -105,13 +107,7 @@ class Metrics:
         self._bus_before = now
 
     def count_learning(self, report: FeederReport) -> None:
-        """Count a feeder's meters by state and reason of learning; unchanged at a tick without a monitor.
-
-        Parameters
-        ----------
-        report
-            The latest.
-        """
+        """Count a feeder's meters by state and reason of learning; unchanged at a tick without a monitor."""
         if report.learning is None:
             return
         for state in LearningState:
@@ -120,13 +116,7 @@ class Metrics:
             self.delayed.labels(report.feeder, reason).set(report.learning.reasons.count(reason))
 
     def forget(self, feeder: str) -> None:
-        """Show the present state of a feeder no more; what has been counted stays.
-
-        Parameters
-        ----------
-        feeder
-            Its name.
-        """
+        """Remove the gauges of a feeder; counters stay."""
         for gauge in (self.seen, self.suspects, self.learned, self.learning, self.delayed, self.alarms):
             for labels in [sample.labels for m in gauge.collect() for sample in m.samples]:
                 if labels["feeder"] == feeder:

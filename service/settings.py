@@ -1,6 +1,6 @@
-"""What an operator can set: by command line, by environment (`GRIDSEC_...`), or not at all.
+"""Settings of the service: by command line, by environment (`GRIDSEC_...`), or by default.
 
-All problems are reported at once, in the operator's words.
+All problems are reported at once, in terms of the options.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ _CODES = {
     "less_than_equal": "out-of-range",
     "literal_error": "unknown-name",
 }
-"""Code by pydantic's type of the error; of others `wrong-type`."""
+"""Code by pydantic's type of the error; `wrong-type` for all others."""
 
 
 class SettingsInvalid(GridsecError):
-    """The settings are wrong; `problems` names all of them.
+    """The settings are wrong; `problems` lists all of them.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ Listed = Annotated[tuple[str, ...], NoDecode]
 
 
 class Settings(BaseSettings):
-    """Everything that can be set for `gridsec serve`. Lists in the environment are separated by commas."""
+    """All settings of `gridsec serve`. Lists in the environment are separated by commas."""
 
     model_config = SettingsConfigDict(env_prefix=ENV_PREFIX, extra="forbid", frozen=True)
 
@@ -87,7 +87,7 @@ class Settings(BaseSettings):
 
     @property
     def listen(self) -> tuple[str, ...]:
-        """The endpoints to listen on; none by default for clients and with a zenoh file of the user's own."""
+        """Endpoints to listen on; none by default for clients and with a zenoh configuration file."""
         if self.zenoh_listen or self.zenoh_config is not None or self.zenoh_mode == "client":
             return self.zenoh_listen
         return (DEFAULT_ENDPOINT,)
@@ -121,7 +121,7 @@ class Settings(BaseSettings):
     @classmethod
     def _known(cls, value: str | None) -> str | None:
         if value is not None and value not in ESTIMATORS:
-            text = f"{value!r} is no estimator; there are {', '.join(ESTIMATORS)}"
+            text = f"{value!r} is not an estimator; expected one of {', '.join(ESTIMATORS)}"
             raise InputInvalid([Problem("unknown-name", text)])
         return value
 
@@ -129,7 +129,7 @@ class Settings(BaseSettings):
     @classmethod
     def _file(cls, value: Path | None) -> Path | None:
         if value is not None and not value.is_file():
-            raise InputInvalid([Problem("no-file", f"{value} is no file")])
+            raise InputInvalid([Problem("no-file", f"{value} is not a file")])
         return value
 
     @field_validator("prefix")
@@ -153,12 +153,12 @@ def split_address(address: str) -> tuple[str, int]:
     Parameters
     ----------
     address
-        The text.
+        `host:port` or `[v6]:port`.
 
     Raises
     ------
     InputInvalid
-        If it is none.
+        If the text is not an address.
     """
     host, _, port = address.rpartition(":")
     host = host.removeprefix("[").removesuffix("]")
@@ -169,12 +169,12 @@ def split_address(address: str) -> tuple[str, int]:
 
 
 def settings(given: Mapping[str, Any]) -> Settings:
-    """Return the settings: what is given, else the environment, else the defaults.
+    """Return the settings: given values, then the environment, then the defaults.
 
     Parameters
     ----------
     given
-        Values from the command line by field name; None means not given.
+        Values from the command line by field name; None for missing ones.
 
     Raises
     ------
@@ -188,14 +188,9 @@ def settings(given: Mapping[str, Any]) -> Settings:
 
 
 def strangers(environment: Mapping[str, str]) -> dict[str, str]:
-    """Variables that look like settings and are none, each with the setting whose name is closest, or "".
+    """Return the variables that look like settings, each with the closest setting or "".
 
-    They are no reason not to start: where containers are linked, others put variables of such names.
-
-    Parameters
-    ----------
-    environment
-        All variables.
+    They do not prevent the start: links between containers add variables of such names.
     """
     ours = [ENV_PREFIX + name.upper() for name in Settings.model_fields]
     strange = (
@@ -205,7 +200,7 @@ def strangers(environment: Mapping[str, str]) -> dict[str, str]:
     return {name: found[0] if found else "" for name, found in sorted(closest.items())}
 
 
-# Read elsewhere: where designs are kept, and that tests skip nothing.
+# Read elsewhere: folder of cached designs, and the switch that forbids tests to skip.
 _OTHERS = ("GRIDSEC_CACHE_DIR", "GRIDSEC_TESTS_REQUIRE_ALL")
 
 

@@ -130,7 +130,7 @@ def test_the_estimator_is_listed_compared_with_ours_and_enters_a_campaign() -> N
     assert re.search(r"neighbours +│ every meter against the median", listed)
     (row,) = (line for line in compared.splitlines() if line.startswith("│ neighbours "))
     assert row.split("│")[2].strip().endswith("of 1")
-    assert "3 scenarios of 30 s watched by neighbours" in campaign
+    assert "3 scenarios of 30 s monitored by neighbours" in campaign
     assert re.search(r"bias +│ 8 +│ 2 +│ 1 +│ 1 +│ 0 ", campaign)
 
 

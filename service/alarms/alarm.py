@@ -1,4 +1,4 @@
-"""An alarm as operators see it, what can happen to it, and its JSON. Pure."""
+"""Alarms, their transitions, and their JSON. Pure."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from service.report.report import ExplanationReport, StalledMeter
 
 
 class AlarmState(StrEnum):
-    """Where an alarm stands. Clearing keeps who acknowledged it; rising again asks for a new answer."""
+    """State of an alarm. Clearing keeps the acknowledgement; raising again requires a new one."""
 
     RAISED = "raised"
     ACKNOWLEDGED = "acknowledged"
@@ -22,7 +22,7 @@ class AlarmState(StrEnum):
 
 
 class Change(StrEnum):
-    """What happened to an alarm."""
+    """Change of an alarm."""
 
     RAISED = "raised"
     ACKNOWLEDGED = "acknowledged"
@@ -31,7 +31,7 @@ class Change(StrEnum):
 
 
 class AlarmUnknown(GridsecError):
-    """No alarm has this id (any more)."""
+    """No alarm has this id."""
 
     code = "unknown-alarm"
 
@@ -41,7 +41,7 @@ class AlarmUnknown(GridsecError):
 
 
 class AlreadyAcknowledged(GridsecError):
-    """The alarm has been acknowledged before."""
+    """The alarm is already acknowledged."""
 
     code = "already-acknowledged"
 
@@ -51,7 +51,7 @@ class AlreadyAcknowledged(GridsecError):
 
 
 class RaisedAgain(GridsecError):
-    """The answer is to another occurrence than the one that stands."""
+    """The acknowledgement refers to an earlier occurrence than the present one."""
 
     code = "raised-again"
 
@@ -65,26 +65,26 @@ class RaisedAgain(GridsecError):
 
 @dataclass(frozen=True, slots=True)
 class Alarm:
-    """An alarm as operators see it. Times are Unix seconds.
+    """An alarm. Times are Unix seconds.
 
     Attributes
     ----------
     id
-        26 characters, the first ten of which sort by time; the same data gives the same id.
+        26 characters, the first ten of which sort by time; the same data give the same id.
     kind, feeder, meter, severity, reason, evidence, customer
-        As in the condition that raised it.
+        As in the condition of the alarm.
     state
         Raised, acknowledged or cleared.
     count
-        How often it has been raised: above 1 it flaps.
+        Number of occurrences; above 1 the alarm flaps.
     t_event
-        When the condition of the present (or last) occurrence was first seen.
+        Start of the condition of the present (or last) occurrence.
     t_raised
-        When that occurrence had lasted for the on-delay.
+        End of the on-delay of that occurrence.
     t_cleared
-        When it was cleared; None while it is active.
+        Time of clearing; None while active.
     acknowledged_by, t_acknowledged, comment
-        The answer of an operator to the present (or last) occurrence.
+        Operator's acknowledgement of the present (or last) occurrence.
     """
 
     id: str
@@ -106,18 +106,18 @@ class Alarm:
 
     @property
     def subject(self) -> str | None:
-        """What it is about: a customer's inverter, a meter, or (None) the whole feeder."""
+        """Subject of the alarm: a customer's inverter, a meter, or (None) the whole feeder."""
         return self.customer or self.meter
 
     @property
     def active(self) -> bool:
-        """Whether the alarm still stands."""
+        """True until the alarm is cleared."""
         return self.state is not AlarmState.CLEARED
 
 
 @dataclass(frozen=True, slots=True)
 class Transition:
-    """One change of one alarm: the alarm as it is afterwards, what happened, when, and by whom."""
+    """One change of one alarm: the alarm after it, the change, its time and the operator."""
 
     alarm: Alarm
     change: Change
@@ -127,13 +127,7 @@ class Transition:
 
 
 def to_json(alarm: Alarm) -> dict[str, Any]:
-    """Return the alarm as the JSON object that REST and zenoh show.
-
-    Parameters
-    ----------
-    alarm
-        The alarm.
-    """
+    """Return the alarm as the JSON object of REST and zenoh."""
     return {
         **asdict(alarm),
         "kind": str(alarm.kind),
@@ -148,7 +142,7 @@ def from_json(data: Mapping[str, Any]) -> Alarm:
     Parameters
     ----------
     data
-        The object; it may carry more fields, and one from before a field existed lacks it.
+        The object; it may have more fields, and older ones lack newer fields.
     """
     fields = {name: data[name] for name in Alarm.__dataclass_fields__ if name in data}
     fields["kind"] = AlarmKind(data["kind"])

@@ -1,4 +1,4 @@
-"""What is wrong with a feeder at one tick, and about what that tick says nothing. Pure."""
+"""Conditions of a feeder at one tick: present, absent or unknown. Pure."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from service.report.report import BUSBAR, ExplanationReport, FeederReport, Meter
 
 
 class AlarmKind(StrEnum):
-    """What can be wrong."""
+    """Kind of a condition."""
 
     METER_MANIPULATED = "meter-manipulated"
     INVERTER_MANIPULATED = "inverter-manipulated"
@@ -26,7 +26,7 @@ class AlarmKind(StrEnum):
 
 
 class Severity(StrEnum):
-    """How much it matters."""
+    """Severity of a condition."""
 
     CRITICAL = "critical"
     MAJOR = "major"
@@ -35,20 +35,20 @@ class Severity(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """The numbers behind an alarm at the tick that raised it; None where there is none.
+    """Numbers of an alarm at the tick that raised it; None without one.
 
     Attributes
     ----------
     score, threshold
-        Residual of the meter and the largest one that an honest meter can reach, squared pu.
+        Residual of the meter and the largest one of an honest meter, squared pu.
     v_volt_reported, v_volt_estimated, attack_volt_estimated
         Reported and reconstructed voltage and their difference for suspects, V.
     kind
-        What a meter's manipulation looks like, see `gridsec.interface.Kind`.
+        Attack kind of a meter, see `gridsec.interface.Kind`.
     attack_kvar_estimated
-        Reactive power that an inverter injects beside its droop curve, kvar.
+        Injection of an inverter beyond its droop curve, kvar.
     explanations
-        What could all explain the readings, where nobody can be named.
+        Possible explanations of the readings, if no device can be named as manipulated.
     learning
         Meters that are not learned after twice the expected time, with the reasons.
     data_error
@@ -69,21 +69,21 @@ class Evidence:
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """One thing that is wrong at a tick or, with `known=False`, about which this tick says nothing.
+    """One condition that is present at a tick or, with `known=False`, unknown.
 
     Attributes
     ----------
     kind, feeder, meter
-        What and where; the meter is None if it is about the whole feeder.
+        Kind and subject; the meter is None for a condition of the whole feeder.
     customer
-        Whose inverter it is about; None if it is about none. The meter is that customer's, if there is one.
+        Customer of the inverter that the condition refers to, or None. `meter` is that customer's, if any.
     severity, evidence, reason
-        How bad, the numbers, and a sentence for the operator.
+        Severity, numbers, and a sentence for the operator.
     known
-        False: nobody can tell at this tick; the alarm, if there is one, is held as it is.
+        False: the tick gives no answer; an existing alarm is held.
     unheard
-        It is so because readings are missing from those who are not silent yet: worth an alarm only if it
-        lasts for longer than any of them could be missing unnoticed.
+        The condition is present because readings are missing of meters that are not silent yet: it raises an
+        alarm only if it lasts for longer than `silence_s`.
     """
 
     kind: AlarmKind
@@ -98,38 +98,34 @@ class Condition:
 
     @property
     def subject(self) -> str | None:
-        """What it is about: a customer's inverter, a meter, or (None) the whole feeder."""
+        """Subject of the condition: a customer's inverter, a meter, or (None) the whole feeder."""
         return self.customer or self.meter
 
 
 def conditions(report: FeederReport) -> list[Condition]:
-    """Say what is wrong with a feeder at one tick, and about what the tick says nothing.
+    """Return the present and the unknown conditions of a feeder at one tick.
 
-    - `meter-manipulated`: the verdict names the meter, or that of the busbar. Unknown while the verdict is
-      UNDECIDED or the meter is silent, whatever the list of suspects says; about the busbar's also from an
-      estimator that does not judge it.
-    - `inverter-manipulated`: the verdict names the inverter. Unknown while the verdict is UNDECIDED, or from
-      an estimator that does not judge inverters.
-    - `voltage-limit`: the whole interval around the *reconstructed* voltage is outside the limits, so a
-      lying meter raises none. Unknown while the interval straddles a limit with its middle outside, or
-      while the reconstruction itself carries no guarantee or is model only.
-    - `data-loss`: a meter, or the busbar meter, is silent. Unknown while it is unseen but not for long.
-    - `undecided`: there is no verdict, for a cause of its own. Unknown while the monitor settles, or where
-      `data-loss` says already why: everybody of whom a reading is missing is silent.
+    - `meter-manipulated`: the verdict names the meter, or the busbar meter. Unknown while the verdict is
+      UNDECIDED or the meter is unavailable, whatever the list of suspects; for the busbar meter also with an
+      estimator that does not test it.
+    - `inverter-manipulated`: the verdict names the inverter. Unknown while the verdict is UNDECIDED, or with
+      an estimator that does not monitor inverters.
+    - `voltage-limit`: the whole interval around the *reconstructed* voltage is outside the limits, so that a
+      manipulated meter raises none. Unknown while the interval contains a limit with its middle outside, or
+      while the reconstruction has no guarantee or is model only.
+    - `data-loss`: a meter, or the busbar meter, is silent. Unknown while it is unavailable but not yet
+      silent.
+    - `undecided`: there is no verdict, for a separate cause. Unknown while the monitor settles, or if
+      `data-loss` gives the reason: every meter without a reading is silent.
     - `learning-stalled`: the fixed error of a meter is not learned after twice the expected time; one
       condition per feeder. Unknown at a tick without a monitor.
-    - `clock-offset`: the clock of a meter, or of the busbar's, is measurably ahead or behind, or its readings
-      come late.
-
-    Parameters
-    ----------
-    report
-        The feeder at this tick.
+    - `clock-offset`: the clock of a meter, or of the busbar meter, is measurably ahead or behind, or its
+      readings are late.
 
     Returns
     -------
     list of Condition
-        What is not in it is known to be absent.
+        A condition that is not in the list is absent.
     """
     manipulated = (*_manipulated(report), *_busbar(report), *_inverters(report))
     found = [*manipulated, *_data_loss(report), *_undecided(report), *_learning(report), *_clocks(report)]
@@ -165,9 +161,9 @@ def _manipulated(report: FeederReport) -> Iterable[Condition]:
         evidence = _evidence(meter)
         reported, estimated = _volt(evidence.v_volt_reported), _volt(evidence.v_volt_estimated)
         beside = (
-            "no trusted meter reports beside it"
+            "no other trusted meter is available"
             if meter.model_only
-            else f"but the rest of the feeder says {estimated}"
+            else f"but the rest of the feeder implies {estimated}"
         )
         error = _data_error(report, meter.meter)
         hint = "" if error is None else f". {error.text}"
@@ -183,7 +179,7 @@ def _manipulated(report: FeederReport) -> Iterable[Condition]:
 
 
 def _data_error(report: FeederReport, meter: str) -> DataErrorReport | None:
-    """The error of the files that explains an accused meter."""
+    """The error of the files that explains an accused meter, or None."""
     error = report.data_error
     return error if error is not None and meter in error.meters else None
 
@@ -205,7 +201,7 @@ def _busbar(report: FeederReport) -> Iterable[Condition]:
             v_volt_estimated=busbar.v_volt_estimated,
             attack_volt_estimated=busbar.attack_volt_estimated,
         ),
-        f"reports {reported}{phase}, but the meters of the feeder say {estimated}",
+        f"reports {reported}{phase}, but the meters of the feeder imply {estimated}",
         known,
     )
 
@@ -224,14 +220,14 @@ def _inverters(report: FeederReport) -> Iterable[Condition]:
             inverter.meter,
             Severity.CRITICAL,
             Evidence(attack_kvar_estimated=kvar),
-            f"the inverter of {inverter.customer} injects {much} that its droop curve does not ask for",
+            f"the inverter of {inverter.customer} injects {much} beyond its droop curve",
             known,
             inverter.customer,
         )
 
 
-# With these causes the reconstruction still is what the design promises: the readings that are there are
-# enough, or the standard deviation is wide. With every other UNDECIDED its bound is not a bound.
+# With these causes the reconstruction keeps the guarantee of the design: the available readings suffice, or
+# the standard deviation is wide. With every other UNDECIDED its bound does not hold.
 _SOUND = frozenset(
     {
         Cause.AGREEMENT,
@@ -245,7 +241,7 @@ _SOUND = frozenset(
 
 def _voltage_limit(report: FeederReport, meter: MeterReport) -> Iterable[Condition]:
     evidence = _evidence(meter)
-    v = evidence.v_volt_estimated  # None where it is model only
+    v = evidence.v_volt_estimated  # None if model only
     half_width = None if meter.v_volt_std is None else finite(3.0 * meter.v_volt_std)
     if v is None or half_width is None or report.cause not in _SOUND:
         yield Condition(
@@ -275,7 +271,7 @@ def _data_loss(report: FeederReport) -> Iterable[Condition]:
     if not busbar_seen and BUSBAR not in silent:
         unsure.append(BUSBAR)
     for meter, seconds in silent.items():
-        # Without the busbar's voltage nothing on the feeder can be judged.
+        # Without the busbar voltage the whole feeder is not monitored.
         severity = Severity.MAJOR if meter == BUSBAR else Severity.MINOR
         length = "yet" if not math.isfinite(seconds) else f"for {seconds:.0f} s"
         yield Condition(
@@ -292,7 +288,7 @@ def _undecided(report: FeederReport) -> Iterable[Condition]:
     gone = [meter.meter for meter in report.meters if not meter.seen] if unheard else []
     if report.cause is Cause.NO_BUSBAR:
         gone = [BUSBAR]
-    # Who is missing at every other tick is never silent, and nothing else would tell of it.
+    # A meter that is unavailable at every other tick is never silent; only this condition reports it.
     told = bool(gone) and {*gone} <= {meter for meter, _ in report.silent}
     # Each of these meters has an alarm of kind `clock-offset`.
     told = told or report.cause is Cause.CLOCK_OFFSET

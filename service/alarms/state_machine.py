@@ -1,16 +1,15 @@
-"""From verdicts to alarms: delays, flapping, acknowledgement. Pure: time is an argument, state is a value.
+"""State machine of alarms: delays, flapping, acknowledgement. Pure: time is an argument, state is a value.
 
-`conditions` says what is wrong at one tick, `advance` turns a stream of such ticks into transitions::
+`conditions` returns the conditions of one tick, `advance` turns a stream of such ticks into transitions::
 
     book = AlarmBook("village")
     book, transitions = advance(book, AlarmRules(), conditions(report), report.t)
 
-A condition is present, absent, or unknown at a tick, and what a tick says stands until the next one. Unknown
-*holds*: the clock of that condition stands still, nothing is raised and nothing is cleared, because no answer
-must never look like no attack. So an alarm is raised once its condition has been seen for `on_delay_s`
-without a tick in between that saw it absent, and cleared once it has been seen absent for `off_delay_s`
-without a tick that saw it present; time after an unknown tick counts for neither. Ticks that were not judged
-are unknown (`hold`), and so is a restart (`restore`).
+A condition is present, absent, or unknown at a tick, and its state stands until the next one. Unknown
+*holds*: the clock of that condition stops, nothing is raised and nothing is cleared, because no answer must
+never look like no attack. An alarm is raised once its condition has been present for `on_delay_s` without an
+absent tick in between, and cleared once it has been absent for `off_delay_s` without a present tick. Time
+after an unknown tick counts for neither. Skipped ticks are unknown (`hold`), and so is a restart (`restore`).
 
 The evidence of an alarm is that of the tick that raised it. It is updated when an error of the feeder's files
 is found that explains the condition as well.
@@ -66,18 +65,18 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class AlarmRules:
-    """How long a condition must last.
+    """Delays of alarms.
 
     Attributes
     ----------
     on_delay_s, off_delay_s
-        How long a condition must be seen before its alarm is raised, and be gone before it is cleared, s.
+        Time that a condition must be present before its alarm is raised, and absent before it is cleared, s.
     on_delays_s, off_delays_s
         Other delays for single kinds, s.
     memory_s
         A condition that returns within this time after it cleared raises the same alarm again, s.
     silence_s
-        What is so only for want of readings must be seen for longer than this to raise an alarm, s.
+        A condition caused only by missing readings must be present for longer than this to raise an alarm, s.
     """
 
     on_delay_s: float = 2.0
@@ -113,20 +112,21 @@ Key = tuple[AlarmKind, str | None]
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """What the book remembers about one condition.
+    """State of one condition in the book.
 
     Attributes
     ----------
     present
-        What the last tick that knew said.
+        State at the last known tick.
     onset
-        When the present run of equal answers began, s.
+        Start of the present run of equal states, s.
     since
         The same, moved forward by every hold, so that t - since is the time that counts, s.
     t_known
-        Until when its last answer stands: the last tick that knew, or the first after it that did not, s.
+        End of the validity of the last known state: the last known tick, or the first unknown one after it,
+        s.
     held
-        Whether there were ticks that did not know since then.
+        True if unknown ticks followed.
     alarm
         Its alarm: active, or cleared and remembered; None while the condition is only pending.
     """
@@ -141,12 +141,10 @@ class Entry:
 
 @dataclass(frozen=True, slots=True)
 class AlarmBook:
-    """The alarm state of one feeder. A value: `advance` and `acknowledge` return a new one.
+    """Alarm state of one feeder. A value: `advance` and `acknowledge` return a new one.
 
     Attributes
     ----------
-    feeder
-        Whose alarms these are.
     t
         Time of the last tick, s; None before the first one.
     entries
@@ -159,36 +157,32 @@ class AlarmBook:
 
     @property
     def alarms(self) -> tuple[Alarm, ...]:
-        """Every alarm that is active, or cleared and still remembered; oldest first."""
+        """All alarms that are active, or cleared and still remembered; oldest first."""
         found = (e.alarm for e in self.entries.values() if e.alarm is not None)
         return tuple(sorted(found, key=lambda alarm: alarm.id))
 
     @property
     def active(self) -> tuple[Alarm, ...]:
-        """Every alarm that still stands; oldest first."""
+        """All active alarms; oldest first."""
         return tuple(alarm for alarm in self.alarms if alarm.active)
 
 
 def advance(
     book: AlarmBook, rules: AlarmRules, conditions: Iterable[Condition], t: float
 ) -> tuple[AlarmBook, tuple[Transition, ...]]:
-    """Take one tick into the book.
+    """Update the book by one tick.
 
     Parameters
     ----------
-    book
-        The feeder's alarms so far.
-    rules
-        Delays and memory.
     conditions
-        What `conditions` says about this tick; what it does not mention is known to be absent.
+        Result of `conditions` for this tick; a condition that is not in it is absent.
     t
-        Unix time of the tick, s. A tick that is older than the last one holds every clock.
+        Unix time of the tick, s. A tick before the last one holds every clock.
 
     Returns
     -------
     book, transitions
-        The new state, and what happened, in a repeatable order.
+        The new state, and the transitions, in a reproducible order.
 
     Raises
     ------
@@ -219,14 +213,12 @@ def advance(
 
 
 def hold(book: AlarmBook, t: float) -> AlarmBook:
-    """Return the book after ticks that were not judged: every clock stands still, as at an unknown tick.
+    """Return the book after skipped ticks: every clock stops, as at an unknown tick.
 
     Parameters
     ----------
-    book
-        The feeder's alarms so far.
     t
-        Unix time of the first tick that was not judged, s.
+        Unix time of the first skipped tick, s.
     """
     return replace(book, entries={key: _hold(entry, t) for key, entry in book.entries.items()})
 
@@ -236,13 +228,14 @@ def _order(key: Key) -> tuple[str, str]:
 
 
 def _hold(old: Entry, t: float) -> Entry:
-    """Return the entry after a tick that does not know; its clock stands still from here on."""
-    # If it stood still from the answer before, whoever is heard at every other tick would raise no alarm.
+    """Return the entry after an unknown tick; its clock stops here."""
+    # The clock stops at the first unknown tick, not at the last known one: otherwise a meter available at
+    # every other tick would never raise an alarm.
     return replace(old, held=True, t_known=old.t_known if old.held else max(old.t_known, t))
 
 
 def _timed(old: Entry | None, present: bool, t: float, backwards: bool) -> Entry:
-    """Return the entry after a tick that knows, with its clock moved on."""
+    """Return the entry after a known tick, with its clock advanced."""
     if old is None or old.present != present:
         return Entry(present, t, t, t, held=False, alarm=None if old is None else old.alarm)
     pause = t - old.t_known if old.held or backwards else 0.0
@@ -252,7 +245,7 @@ def _timed(old: Entry | None, present: bool, t: float, backwards: bool) -> Entry
 def _settle(
     entry: Entry, condition: Condition | None, rules: AlarmRules, key: Key, t: float
 ) -> tuple[Entry | None, tuple[Transition, ...]]:
-    """Raise, clear or forget what is due."""
+    """Raise, clear or drop the alarm of an entry if it is due."""
     kind, alarm = key[0], entry.alarm
     lasted = t - entry.since
     if condition is not None:
@@ -285,7 +278,7 @@ def _present(
 
 
 def _explains_more(now: Evidence, before: Evidence) -> bool:
-    """An error of the feeder's files explains the condition, and the alarm names another one or none."""
+    """True if an error of the feeder's files explains the condition and is new to the alarm."""
     error, told = now.data_error, before.data_error
     if error is None or told is None:
         return error is not None
@@ -297,7 +290,8 @@ def _explains_more(now: Evidence, before: Evidence) -> bool:
 
 
 def _remembered(alarm: Alarm, rules: AlarmRules, t: float) -> bool:
-    # Of a time ahead, after the clock was set back or a recording began again, no more is remembered.
+    # With the clock set back, or a repeated recording, the clearing is in the future: the difference counts
+    # in both directions.
     return alarm.t_cleared is not None and abs(t - alarm.t_cleared) <= rules.memory_s
 
 
@@ -324,10 +318,10 @@ _CROCKFORD = "0123456789ABCDEFGHJKMNPQRSTVWXYZ"
 
 
 def alarm_id(condition: Condition, onset: float) -> str:
-    """Return the id of the alarm of a condition that was first seen at `onset`.
+    """Return the id of the alarm of a condition that began at `onset`.
 
-    In the form of a ULID: ten characters of Crockford's base 32 for the milliseconds, then sixteen; those
-    are a hash instead of random bits, so that a replay gives the same ids.
+    In the form of a ULID: ten characters of Crockford's base 32 for the milliseconds, then sixteen, which are
+    a hash instead of random bits, so that a replay gives the same ids.
 
     Parameters
     ----------
@@ -343,27 +337,25 @@ def alarm_id(condition: Condition, onset: float) -> str:
 
 
 def acknowledged(alarm: Alarm, who: str, comment: str, t: float, *, count: int | None = None) -> Transition:
-    """Return the transition by which an operator answers an alarm.
+    """Return the transition by which an operator acknowledges an alarm.
 
-    An alarm that has cleared unanswered can still be answered; it stays cleared.
+    A cleared alarm without an acknowledgement can still be acknowledged; it stays cleared.
 
     Parameters
     ----------
-    alarm
-        The alarm as it is.
     who, comment
-        The operator, and what they say.
+        The operator, and the comment.
     t
         Unix time, s.
     count
-        Which occurrence they have seen; None: whichever it is.
+        Occurrence that the operator refers to; None: the latest.
 
     Raises
     ------
     RaisedAgain
-        If the alarm has come back since: what they answer is not what stands.
+        If the alarm has been raised again: the acknowledgement refers to an earlier occurrence.
     AlreadyAcknowledged
-        If somebody did so before, for the same occurrence.
+        If the same occurrence is already acknowledged.
     """
     if count is not None and count != alarm.count:
         raise RaisedAgain(alarm, count)
@@ -387,7 +379,7 @@ def carried(alarm: Alarm, answered: Alarm) -> Alarm:
     alarm
         The alarm after the change.
     answered
-        The acknowledged alarm; of another alarm or occurrence nothing is carried over.
+        The acknowledged alarm; ignored for another alarm or occurrence.
     """
     if (alarm.id, alarm.count) != (answered.id, answered.count):
         return alarm
@@ -403,16 +395,14 @@ def carried(alarm: Alarm, answered: Alarm) -> Alarm:
 def acknowledge(
     book: AlarmBook, alarm_id: str, who: str, comment: str, t: float, *, count: int | None = None
 ) -> tuple[AlarmBook, tuple[Transition, ...]]:
-    """Answer an alarm of the book.
+    """Acknowledge an alarm of the book.
 
     Parameters
     ----------
-    book
-        The feeder's alarms.
     alarm_id, who, comment, t
-        Which alarm, who answers it, with what words, and when (Unix s).
+        Id of the alarm, operator, comment, and time (Unix s).
     count
-        Which occurrence; None: whichever it is.
+        Occurrence; None: the latest.
 
     Returns
     -------
@@ -422,9 +412,9 @@ def acknowledge(
     Raises
     ------
     AlarmUnknown
-        If the book holds no such alarm: never raised, or cleared and forgotten (the store may know it).
+        If the book has no such alarm: never raised, or cleared and dropped (the store may have it).
     RaisedAgain, AlreadyAcknowledged
-        If the alarm has come back since, or somebody was faster.
+        If the alarm has been raised again, or is already acknowledged.
     """
     for key, entry in book.entries.items():
         if entry.alarm is not None and entry.alarm.id == alarm_id:
@@ -435,12 +425,12 @@ def acknowledge(
 
 
 def close(alarms: Iterable[Alarm], t: float, why: str) -> tuple[Transition, ...]:
-    """Return the transitions that clear alarms that nobody would clear any more.
+    """Return the transitions that clear alarms without a monitor.
 
     Parameters
     ----------
     alarms, t, why
-        The alarms, of which those that stand are cleared; when (Unix s), and why, for the event.
+        The alarms, of which the active ones are cleared; time (Unix s), and reason for the event.
     """
     cleared = (replace(alarm, state=AlarmState.CLEARED, t_cleared=t) for alarm in alarms if alarm.active)
     return tuple(Transition(alarm, Change.CLEARED, t, None, why) for alarm in cleared)
@@ -449,21 +439,18 @@ def close(alarms: Iterable[Alarm], t: float, why: str) -> tuple[Transition, ...]
 def restore(feeder: str, alarms: Iterable[Alarm]) -> AlarmBook:
     """Return the book of a feeder from its stored alarms, after a restart.
 
-    The restart is a hold: nobody looked. Alarms keep their id, count, state and acknowledgement; a clock
-    that was running (a condition pending, an alarm about to clear) starts again from zero, so a transition
-    may come later than without the restart, by less than its delay, and never earlier.
+    The restart is a hold: no tick is known. Alarms keep their id, count, state and acknowledgement. A running
+    clock (a pending condition, an alarm about to clear) restarts from zero. A transition may therefore come
+    later than without the restart, by less than its delay, and never earlier.
 
     Parameters
     ----------
-    feeder
-        Name.
     alarms
-        Its active alarms and those that cleared within the memory of the rules, in any order. Of several
-        with the same kind and subject one counts: an active one before those that have cleared, then the one
-        that was raised last.
+        Its active alarms and those that cleared within the memory of the rules, in any order. Of several with
+        the same kind and subject one counts: an active one before cleared ones, then the one raised last.
     """
     entries: dict[Key, Entry] = {}
-    # Ids follow a clock that may have been set back since, and then say nothing about which one stands.
+    # Ids follow a clock that may have been set back since, so that they do not tell which alarm is active.
     for alarm in sorted(alarms, key=lambda alarm: (alarm.active, alarm.t_raised, alarm.id)):
         if alarm.feeder != feeder:
             text = f"an alarm of {alarm.feeder!r} in the book of {feeder!r}"

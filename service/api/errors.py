@@ -1,4 +1,4 @@
-"""Errors as `application/problem+json` (RFC 9457), and the guard in front of the HTTP application."""
+"""Errors as `application/problem+json` (RFC 9457), and request checks before the HTTP application."""
 
 from __future__ import annotations
 
@@ -36,18 +36,16 @@ _HEADERS = [
 def problem(
     request: Request, status: int, detail: str, *, headers: dict[str, str] | None = None, **more: Any
 ) -> Response:
-    """Return an error.
+    """Return an error response.
 
     Parameters
     ----------
-    request
-        What was asked.
     status, detail
-        HTTP's number, and a sentence that says what is wrong.
+        HTTP status, and a sentence on the error.
     headers
-        Headers besides.
+        Additional headers.
     **more
-        Members besides, such as the list of all problems of a feeder.
+        Additional members, such as the list of all problems of a feeder.
     """
     body = {
         "type": "about:blank",
@@ -66,19 +64,18 @@ def problem(
 
 
 class Guard:
-    """Security headers on every answer, an end to bodies that are too long, and no change for strangers.
+    """Security headers on every response, a limit of the body, and a check of the origin of changes.
 
-    A foreign web page can give its own name our address and then ask us as if it were ours. So whoever
-    changes something must call us by an address or a name of ours, and a page that does must come from there.
+    DNS rebinding: a foreign page can point its host name at this server. A request that changes something
+    must therefore use an address or a host name of this server, and a page that sends it must have the same
+    origin.
 
     Parameters
     ----------
-    app
-        The application behind it.
     max_body
-        Longest body that is read, bytes.
+        Largest request body, bytes.
     hosts
-        Names of ours, besides `localhost` and this machine's.
+        Host names of this server, besides `localhost` and the machine's name.
     """
 
     def __init__(self, app: ASGIApp, max_body: int, hosts: Collection[str] = ()) -> None:
@@ -88,29 +85,26 @@ class Guard:
         self.own = self.hosts | {"localhost", socket.gethostname().lower()}
 
     def stranger(self, request: Request) -> tuple[int, str] | None:
-        """Return why a request may change nothing, as status and sentence, or None.
-
-        Parameters
-        ----------
-        request
-            What is asked.
-        """
+        """Return the reason why a request may change nothing, as status and sentence, or None."""
         if request.method in _READS:
             return None
         host, origin = request.headers.get("host", ""), request.headers.get("origin")
         name = _name_of(f"//{host}")
         if name not in self.own and not _is_address(name):
-            return 421, f"{host!r} is no name of this service; `--http-host` of `gridsec serve` makes it one"
+            return (
+                421,
+                f"{host!r} is not a host name of this service; `--http-host` of `gridsec serve` adds one",
+            )
         if (
             origin is None
             or origin.partition("://")[2].lower() == host.lower()
             or _name_of(origin) in self.hosts
         ):
             return None
-        return 403, f"a page of {origin!r} may change nothing at {host!r}"
+        return 403, f"a page of {origin!r} must not change anything at {host!r}"
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a request on."""
+        """Check a request and pass it to the application."""
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
@@ -137,7 +131,7 @@ class Guard:
         elif declared.isdecimal() and int(declared) > self.max_body:
             await problem(request, 413, text, headers={"Connection": "close"})(scope, receive, guarded)
         else:
-            # A client that leaves before its body is complete gets no answer, and is no defect.
+            # A client that disconnects before its body is complete gets no response; this is not a defect.
             with contextlib.suppress(ClientDisconnect):
                 await self.app(scope, limited, guarded)
 
@@ -146,7 +140,7 @@ _READS = frozenset({"GET", "HEAD", "OPTIONS"})
 
 
 def _name_of(address: str) -> str:
-    """Return the host of an address in small letters; empty if there is none."""
+    """Return the host of an address in lower case; empty without one."""
     try:
         return urlsplit(address).hostname or ""
     except ValueError:
@@ -182,7 +176,7 @@ _STATUS: dict[type[GridsecError], int] = {
 
 
 def handlers() -> dict[type[Exception], Handler]:
-    """Return what makes problems of errors, by their type."""
+    """Return the handlers that convert errors to problems, by type of the error."""
     ours: dict[type[Exception], Handler] = {error: _gridsec_handler(code) for error, code in _STATUS.items()}
     return {**ours, HTTPException: _http_handler, Exception: _unexpected_handler}
 
@@ -202,11 +196,11 @@ def _gridsec_handler(status: int) -> Handler:
 
 async def _http_handler(request: Request, error: Exception) -> Response:
     error = cast(HTTPException, error)
-    detail = "there is nothing here" if error.detail == "Not Found" else error.detail
+    detail = "no such resource" if error.detail == "Not Found" else error.detail
     return problem(request, error.status_code, detail, headers=dict(error.headers or {}))
 
 
 async def _unexpected_handler(request: Request, _error: Exception) -> Response:
-    # The server hangs up after an error that it did not expect; the client must not be surprised by that.
-    text = "something went wrong here; the log of the service says what"
+    # The server closes the connection after an unexpected error; the header announces it to the client.
+    text = "internal error; the log of the service has the details"
     return problem(request, 500, text, headers={"Connection": "close"})

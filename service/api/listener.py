@@ -1,8 +1,8 @@
-"""HTTP connections within bounds: their number, the time for a header and a body, and descriptors.
+"""Limits of HTTP connections: their number, the time for a header and a body, and descriptors.
 
-uvicorn bounds the idle time after a response only. Added here: a bound on open connections,
-time-outs for incomplete requests and for responses that are not taken, and an accept loop that waits when the
-process has no descriptor left. asyncio's own loop reports each of `backlog` failed accepts as a traceback.
+uvicorn limits the idle time after a response only. This module adds a limit of open connections, time-outs
+for incomplete requests and for stalled responses, and an accept loop that waits when the process has no
+descriptor left. asyncio's own loop would log each of `backlog` failed accepts with a traceback.
 """
 
 from __future__ import annotations
@@ -24,24 +24,24 @@ import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 HEADER_S = 10.0
-"""Time from the connection, or from the last response, to a complete header, s."""
+"""Time limit from the connection, or from the last response, to a complete header, s."""
 BODY_S = 60.0
-"""Time from the header to a complete body, s: 4 MiB at 0.6 Mbit/s."""
+"""Time limit from the header to a complete body, s: 4 MiB at 0.6 Mbit/s."""
 STALLED_S = 60.0
-"""Time for which a client may leave a full buffer of a response, streams included, s."""
+"""Time limit of a full buffer of a response, streams included, s."""
 CLOSE_S = 10.0
-"""Time for the rest of a response after the connection has ended, s."""
+"""Time limit of the rest of a response after the end of the connection, s."""
 ACCEPT_PAUSE_S = 0.2
-"""Pause after an accept that failed for want of a resource, s."""
+"""Pause after an accept that failed for lack of a resource, s."""
 
 RESERVE = 96
-"""Descriptors kept for the database, zenoh's own threads, files of the page and the log."""
+"""Descriptors reserved for the database, zenoh's own threads, files of the page and the log."""
 HTTP_MOST = 512
-"""HTTP connections at most, however many descriptors there are."""
+"""Largest number of HTTP connections, for any number of descriptors."""
 SESSIONS_MOST = 100_000
-"""zenoh sessions at most, likewise."""
+"""Largest number of zenoh sessions, for any number of descriptors."""
 PENDING_MOST = 1_000
-"""zenoh sessions that are being opened, likewise."""
+"""Largest number of zenoh sessions that are being opened, for any number of descriptors."""
 
 _FULL = (
     b"HTTP/1.1 503 Service Unavailable\r\ncontent-type: application/problem+json\r\nretry-after: 5\r\n"
@@ -70,7 +70,7 @@ class Shares:
 
     @classmethod
     def of(cls, limit: int) -> Shares:
-        """Share the descriptors of a process.
+        """Divide the descriptors of a process.
 
         Parameters
         ----------
@@ -84,26 +84,26 @@ class Shares:
 
     @property
     def streams(self) -> int:
-        """Event streams at most: half of the connections stay for requests."""
+        """Largest number of event streams: half of the connections stay for requests."""
         return max(1, self.http // 2)
 
 
 def raise_limit() -> int:
     """Raise the soft limit of open descriptors to the hard limit, and return it."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    with contextlib.suppress(ValueError, OSError):  # more than the kernel gives to one process
+    with contextlib.suppress(ValueError, OSError):  # above the kernel's limit of one process
         resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
         soft = hard
     return (1 << 20) if soft == resource.RLIM_INFINITY else soft
 
 
 class Connection(H11Protocol):
-    """One HTTP connection with time-outs; of too many, the one longest without a complete request ends.
+    """One HTTP connection with time-outs; beyond the limit, the longest incomplete one is closed.
 
     Parameters
     ----------
     most
-        Connections at most.
+        Largest number of connections.
     *args, **kwargs
         As in uvicorn.
     """
@@ -117,7 +117,7 @@ class Connection(H11Protocol):
         self._stalled: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Take a connection, or refuse it where no other can end for it."""
+        """Accept a connection; beyond the limit, close an incomplete one or refuse the new one."""
         super().connection_made(transport)
         if len(self.connections) > self._most and not self._make_room():
             transport.write(_FULL)
@@ -131,53 +131,53 @@ class Connection(H11Protocol):
             return False
         oldest = min(waiting, key=lambda one: one._since)
         _log.warning("http connection ended for a new one", most=self._most, phase=oldest._phase)
-        # Without this its slot would be free only in the next turn of the loop.
+        # Frees its place at once; otherwise it would be free only in the next turn of the loop.
         self.connections.discard(oldest)
         oldest.transport.abort()
         return True
 
     @property
     def incomplete(self) -> bool:
-        """The header or the body of a request is still to come."""
+        """True before the end of a request's header or body."""
         return self._phase in {"header", "body"}
 
     def data_received(self, data: bytes) -> None:
-        """Read on."""
+        """Process received data and update the timer."""
         super().data_received(data)
         self._watch()
 
     def on_response_complete(self) -> None:
-        """Wait for the next request."""
+        """Start the wait for the next request."""
         super().on_response_complete()
         self._phase = ""
         self._watch()
 
     def timeout_keep_alive_handler(self) -> None:
-        """End an idle connection."""
+        """Close an idle connection."""
         super().timeout_keep_alive_handler()
         self._watch()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """End the timers."""
+        """Cancel the timers."""
         for timer in (self._timer, self._stalled):
             if timer is not None:
                 timer.cancel()
         super().connection_lost(exc)
 
     def pause_writing(self) -> None:
-        """Give the client time to take what waits."""
+        """Start the time limit of a stalled response."""
         super().pause_writing()
         self._stalled = self.loop.call_later(STALLED_S, self._end, "response")
 
     def resume_writing(self) -> None:
-        """Go on."""
+        """Cancel the time limit of a stalled response."""
         super().resume_writing()
         if self._stalled is not None:
             self._stalled.cancel()
             self._stalled = None
 
     def _watch(self) -> None:
-        """Set the timer of the present phase; a phase that goes on keeps its time."""
+        """Set the timer of the present phase; an unchanged phase keeps its timer."""
         phase, seconds = "answer", 0.0
         if self.transport.is_closing():
             phase, seconds = "closing", CLOSE_S
@@ -198,23 +198,23 @@ class Connection(H11Protocol):
 
 
 class _Accepting:
-    """Stands for asyncio's server in uvicorn: a task that accepts."""
+    """Replacement of asyncio's server in uvicorn: a task that accepts connections."""
 
     def __init__(self, listener: socket.socket, make: Callable[[], asyncio.Protocol]) -> None:
         self.sockets = (listener,)
         self._task = asyncio.create_task(_accept(listener, make), name="http accept")
 
     def close(self) -> None:
-        """Accept no more."""
+        """Stop accepting."""
         self._task.cancel()
 
     async def wait_closed(self) -> None:
-        """Wait until that is so."""
+        """Wait for the end of the task."""
         await asyncio.gather(self._task, return_exceptions=True)
 
 
 async def _accept(listener: socket.socket, make: Callable[[], asyncio.Protocol]) -> None:
-    """Accept connections for ever. Without a descriptor left, a spare one serves to turn clients away."""
+    """Accept connections until cancelled. Without a free descriptor, a spare one serves to refuse clients."""
     loop = asyncio.get_running_loop()
     spare = _spare()
     try:
@@ -235,7 +235,7 @@ async def _accept(listener: socket.socket, make: Callable[[], asyncio.Protocol])
             accepted.setblocking(False)
             try:
                 await loop.connect_accepted_socket(make, accepted)
-            except OSError:  # the client has gone
+            except OSError:  # the client has disconnected
                 accepted.close()
             if spare is None:
                 spare = _spare()
@@ -252,16 +252,14 @@ def _spare() -> int | None:
 
 
 class BoundedServer(uvicorn.Server):
-    """uvicorn on connections within bounds.
+    """uvicorn with limited connections.
 
     Parameters
     ----------
-    app
-        The application.
     most
-        Connections at most.
+        Largest number of connections.
     **options
-        Of uvicorn.
+        Options of uvicorn.
     """
 
     def __init__(self, app: Callable[..., Any], most: int, **options: Any) -> None:
@@ -269,7 +267,7 @@ class BoundedServer(uvicorn.Server):
         super().__init__(uvicorn.Config(app, http=made, ws="none", **options))
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Begin to accept on listening sockets."""
+        """Start accepting on listening sockets."""
         await self.lifespan.startup()
         config, state = self.config, self.lifespan.state
 

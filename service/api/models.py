@@ -1,4 +1,4 @@
-"""What REST shows, as pydantic models: they write the OpenAPI description and keep NaN out of JSON."""
+"""Pydantic models of REST: source of the OpenAPI description; NaN becomes null."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ Text = Annotated[
 
 
 class Problem(BaseModel):
-    """An error, as RFC 9457 describes it (`application/problem+json`)."""
+    """An error as in RFC 9457 (`application/problem+json`)."""
 
     model_config = ConfigDict(extra="allow")
 
-    type: str = Field(description="Kind of problem; `about:blank` if the status says it all.")
+    type: str = Field(description="Kind of problem; `about:blank` if the status suffices.")
     title: str
     status: int
     detail: str
@@ -50,8 +50,8 @@ class Problem(BaseModel):
 ModelOnly = Annotated[
     bool,
     Field(
-        description="The estimated values rest on no voltage reading of this tick: on powers, the model and "
-        "what the estimator remembers alone."
+        description="The estimates use no voltage reading of this tick, only powers, the model and the state "
+        "of the estimator."
     ),
 ]
 
@@ -64,18 +64,18 @@ class MeterState(BaseModel):
     seen: bool = Field(description="A usable reading belongs to this tick.")
     suspect: bool = Field(description="The verdict names this meter as manipulated.")
     score: Number = Field(description="Absolute residual of the squared voltage, squared pu.")
-    threshold: Number = Field(description="The largest score that an honest meter can reach, squared pu.")
-    v_volt_reported: Number = Field(description="Voltage the meter claims, phase to neutral, V.")
+    threshold: Number = Field(description="Largest score of an honest meter, squared pu.")
+    v_volt_reported: Number = Field(description="Reported voltage, phase to neutral, V.")
     v_volt_estimated: Number = Field(description="Reconstructed voltage, V.")
     v_volt_std: Number = Field(description="Its standard deviation, or a third of its hard bound, V.")
     v2_pu_estimated: Number = Field(description="Reconstructed squared voltage, pu.")
-    attack_volt_estimated: Number = Field(description="Reported minus reconstructed, V; 0 if no suspect.")
-    kind: str | None = Field(default=None, description="What the manipulation looks like, if known.")
-    phase: str | None = Field(default=None, description="Phase that it measures; null if balanced.")
-    v_min_volt: Number = Field(default=None, description="Lowest voltage allowed where it is, V.")
-    v_max_volt: Number = Field(default=None, description="Highest voltage allowed where it is, V.")
+    attack_volt_estimated: Number = Field(description="Reported minus reconstructed, V; 0 if not suspect.")
+    kind: str | None = Field(default=None, description="Attack kind, if known.")
+    phase: str | None = Field(default=None, description="Measured phase; null if balanced.")
+    v_min_volt: Number = Field(default=None, description="Lowest permitted voltage at the meter, V.")
+    v_max_volt: Number = Field(default=None, description="Highest permitted voltage at the meter, V.")
     learning_state: LearningState | None = Field(
-        default=None, description="Learning of its own error; null where the estimator does not learn."
+        default=None, description="Learning of its fixed error; null if the estimator does not learn."
     )
     learning_reason: LearningReason | None = Field(
         default=None, description="Reason that took most of the time that did not count; null on schedule."
@@ -83,36 +83,37 @@ class MeterState(BaseModel):
     model_only: ModelOnly = False
     clock_offset_s: Number = Field(
         default=None,
-        description="By how much its clock is ahead of the other meters', s; null where not measurable.",
+        description="Lead of its clock relative to the other meters, s; null if not measurable.",
     )
 
 
 class BusbarMeterState(BaseModel):
-    """The busbar's own meter at the latest tick; in three phases the numbers are those of one of them."""
+    """The busbar meter at the latest tick; in three phases the numbers belong to one phase."""
 
     meter: str = Field(default=BUSBAR, description="Its name in alarms and explanations.")
     judged: bool = Field(
         default=False,
-        description="The estimator judges this meter, and this tick has readings to do so: of this meter and "
-        "of a trusted meter in the same phase.",
+        description="The estimator tests this meter, and this tick has the readings for the test: of this "
+        "meter and of a trusted meter in the same phase.",
     )
     seen: bool = Field(default=False, description="A usable reading belongs to this tick.")
     suspect: bool = Field(default=False, description="The verdict names it as manipulated.")
     phases: list[str] = Field(
-        default=[], description="In which phases, a, b or c; empty on a balanced feeder."
+        default=[], description="Manipulated phases, a, b or c; empty on a balanced feeder."
     )
     phase: str | None = Field(
-        default=None, description="Phase that the numbers are of, the one furthest off; null if balanced."
+        default=None,
+        description="Phase of the numbers, the one with the largest deviation; null if balanced.",
     )
-    v_volt_reported: Number = Field(default=None, description="Voltage it claims, phase to neutral, V.")
+    v_volt_reported: Number = Field(default=None, description="Reported voltage, phase to neutral, V.")
     v_volt_estimated: Number = Field(default=None, description="Reconstructed voltage of the busbar, V.")
     attack_volt_estimated: Number = Field(
-        default=None, description="What it reads too much, on average, V; 0 if no suspect."
+        default=None, description="Mean excess of its reading, V; 0 if not suspect."
     )
     model_only: ModelOnly = False
     clock_offset_s: Number = Field(
         default=None,
-        description="By how much its clock is ahead of the other meters', s; null where not measurable.",
+        description="Lead of its clock relative to the other meters, s; null if not measurable.",
     )
 
 
@@ -131,32 +132,30 @@ class InverterState(BaseModel):
     customer: str
     bus: str
     meter: str | None = Field(description="The customer's meter, if there is one.")
-    judged: bool = Field(description="The estimator can tell whether it is manipulated.")
+    judged: bool = Field(description="The inverter is monitored at this tick.")
     suspect: bool = Field(description="The verdict names this inverter as manipulated.")
-    q_kvar_estimated: Number = Field(description="Reactive power that it injects, kvar.")
-    attack_kvar_estimated: Number = Field(description="What its curve does not ask for of it, kvar.")
+    q_kvar_estimated: Number = Field(description="Injected reactive power, kvar.")
+    attack_kvar_estimated: Number = Field(description="Injection beyond its droop curve, kvar.")
     model_only: ModelOnly = False
 
 
 class ExplanationModel(BaseModel):
-    """One way to explain the readings, where several do about equally well."""
+    """One of several explanations of the readings with similar probability."""
 
-    meters: list[str] = Field(description="Which meters would lie; `substation` is the busbar's.")
-    inverters: list[str] = Field(description="Whose inverters would inject a wrong reactive power.")
-    powers: list[str] = Field(
-        default=[], description="Whose powers would not be what they are said to be; accuses nobody."
-    )
-    probability: float = Field(description="Its share among the explanations given.")
+    meters: list[str] = Field(description="Accused meters; `substation` is the busbar meter.")
+    inverters: list[str] = Field(description="Accused inverters, by customer.")
+    powers: list[str] = Field(default=[], description="False reported powers, by customer; accuses no meter.")
+    probability: float = Field(description="Share among the given explanations.")
 
 
 class DataErrorModel(BaseModel):
     """An error of the feeder's files that explains accused meters as well as a manipulation does."""
 
     kind: DataErrorKind
-    meters: list[str] = Field(description="The accused meters that it explains.")
+    meters: list[str] = Field(description="The accused meters that the error explains.")
     customers: list[str] = Field(description="The one customer, or the two that are exchanged.")
-    proposed: list[str] = Field(description="Bus and phase of each customer that explain the readings.")
-    study: str = Field(description="Command that checks it on a recording.")
+    proposed: list[str] = Field(description="Bus and phase of each customer that agree with the readings.")
+    study: str = Field(description="Command that checks the error on a recording.")
     text: str = Field(description="One sentence for the operator.")
 
 
@@ -165,7 +164,7 @@ class BusState(BaseModel):
 
     bus: str
     v_volt: Number = Field(
-        description="Reconstructed voltage to neutral, V; of several phases that furthest from nominal."
+        description="Reconstructed voltage to neutral, V; in three phases the one furthest from nominal."
     )
     v_phases: list[Number] | None = Field(
         default=None, description="Reconstructed voltage of each phase, V; null on a balanced feeder."
@@ -174,7 +173,7 @@ class BusState(BaseModel):
 
 
 class Silence(BaseModel):
-    """A meter without usable readings for longer than the feeder allows."""
+    """A meter without usable readings for longer than `silence_s` of the feeder."""
 
     meter: str
     seconds: Number
@@ -184,30 +183,30 @@ class State(BaseModel):
     """A feeder at its latest tick."""
 
     feeder: str
-    revision: str = Field(default="", description="That of the feeder that it is about.")
+    revision: str = Field(default="", description="Revision of the feeder that the state belongs to.")
     t: float = Field(description="Unix time of the tick, s.")
-    age_s: float = Field(description="How old it was when this was sent, by the service's clock, s.")
+    age_s: float = Field(description="Age of the tick at the response, by the service's clock, s.")
     verdict: Decision
     reason: str
     cause: Cause
     max_attacked: int
-    skipped: int = Field(default=0, description="Ticks directly before this one that were not judged.")
+    skipped: int = Field(default=0, description="Number of skipped ticks directly before this one.")
     model_only: bool = Field(
-        default=False, description="No value of the feeder rests on a voltage reading of this tick."
+        default=False, description="No value of the feeder uses a voltage reading of this tick."
     )
     model_only_phases: list[str] = Field(
-        default=[], description="Of a, b and c those without such a reading; empty on a balanced feeder."
+        default=[], description="Phases without such a reading, of a, b and c; empty on a balanced feeder."
     )
     t_measured: Number = Field(
         default=None,
-        description="Newest tick at which a value rested on a reading, Unix s; null: none since the start.",
+        description="Newest tick with a reading that a value uses, Unix s; null: none since the start.",
     )
     meters: list[MeterState]
     buses: list[BusState]
     silent: list[Silence]
     v_min_volt: Number
     v_max_volt: Number
-    busbar: BusbarMeterState = Field(default=BusbarMeterState(), description="The busbar's own meter.")
+    busbar: BusbarMeterState = Field(default=BusbarMeterState(), description="The busbar meter.")
     customers: list[CustomerState] = []
     inverters: list[InverterState] = []
     explanations: list[ExplanationModel] = []
@@ -217,17 +216,17 @@ class State(BaseModel):
 
 
 class MeterCommissioning(BaseModel):
-    """What is known of one meter's own fixed error."""
+    """Commissioning of one meter: its fixed error."""
 
     meter: str
     state: Stage
-    since: Number = Field(description="Since when it is being learned, Unix s; null once it is learned.")
-    learned_at: Number = Field(description="When it was learned, Unix s; null while it is not.")
-    gathered_s: Number = Field(description="For how long it was heard and trusted meanwhile, s.")
-    expected: Number = Field(description="When it is learned at the latest if heard and trusted, Unix s.")
-    error_volt: Number = Field(description="Its own error at nominal voltage, V; 0 while not learned.")
-    error_volt_std: Number = Field(description="Standard deviation of that, ageing included, V.")
-    allowed_volt: Number = Field(description="By how much it may honestly differ from its error, V.")
+    since: Number = Field(description="Start of the learning, Unix s; null for a learned meter.")
+    learned_at: Number = Field(description="Time at which it was learned, Unix s; null before.")
+    gathered_s: Number = Field(description="Time with usable readings of a trusted meter since the start, s.")
+    expected: Number = Field(description="Expected end of the learning if every tick counts, Unix s.")
+    error_volt: Number = Field(description="Fixed error at nominal voltage, V; 0 before it is learned.")
+    error_volt_std: Number = Field(description="Standard deviation of the error, ageing included, V.")
+    allowed_volt: Number = Field(description="Largest deviation of an honest meter from its error, V.")
     learning_state: LearningState = Field(
         description="`waiting`: no tick counted yet. `learning`. `stalled`: not learned after twice "
         "`expected_s`. `learned`."
@@ -235,50 +234,50 @@ class MeterCommissioning(BaseModel):
     learning_reason: LearningReason | None = Field(
         description="Reason that took most of the time that did not count; null on schedule."
     )
-    watched_s: Number = Field(description="Time of all ticks since learning began, s; null once learned.")
+    watched_s: Number = Field(description="Time of all ticks since the start, s; null for a learned meter.")
     lost_s: dict[LearningReason, float] = Field(description="Time that did not count, s, by reason.")
 
 
 class MeterNow(MeterState):
-    """One meter at the latest tick, with what it belongs to."""
+    """One meter at the latest tick, with its feeder and the verdict."""
 
     feeder: str
     t: float
     verdict: Decision
     commissioning: MeterCommissioning | None = Field(
-        default=None, description="What is known of its own error; null where that is not learned."
+        default=None, description="Commissioning of the meter; null if the estimator does not learn."
     )
 
 
 class Commissioning(BaseModel):
-    """How far the meters' own fixed errors are known."""
+    """Commissioning of a feeder: learning of its meters' fixed errors."""
 
     feeder: str
     estimator: str
     state: Stage = Field(
-        description="`off`: this monitor learns nothing. `waiting`: no monitor or no tick yet. `learning`: "
+        description="`off`: this monitor does not learn. `waiting`: no monitor or no tick yet. `learning`: "
         "at least one meter is being learned. `learned`: all are."
     )
-    t: Number = Field(description="Tick that this is about, Unix s.")
+    t: Number = Field(description="Tick of the data, Unix s.")
     tick_s: float = Field(description="Interval of the monitor's steps, s.")
-    needed_s: float = Field(description="`commission_s`: for how long a meter has to be heard, s.")
+    needed_s: float = Field(description="`commission_s`: required time with usable readings, s.")
     gathered_s: Number = Field(
-        description="For how long the meter heard least was, of those being learned, s."
+        description="Least time with usable readings of the meters that are being learned, s."
     )
-    since: Number = Field(description="Since when there is something to learn, Unix s.")
-    expected: Number = Field(description="When it will be finished, Unix s; null if `held`.")
-    learned_at: Number = Field(description="When the last meter was learned, Unix s.")
-    held: bool = Field(description="Time enough has passed, but nothing is learned while one is suspected.")
-    restored: bool = Field(description="It goes on from what an earlier run of the service kept.")
-    note: str = Field(description="Why what was kept is not used; empty if all is well.")
-    expected_s: Number = Field(description="Time that learning takes if every tick counts, s.")
+    since: Number = Field(description="Earliest start of the learning, Unix s.")
+    expected: Number = Field(description="Expected end of the learning, Unix s; null if `held`.")
+    learned_at: Number = Field(description="Time of the latest learned meter, Unix s.")
+    held: bool = Field(description="Enough time has passed, but a suspect prevents learning.")
+    restored: bool = Field(description="The commissioning continues from stored state.")
+    note: str = Field(description="Reason why stored state is not used; empty otherwise.")
+    expected_s: Number = Field(description="Time of learning if every tick counts, s.")
     stalled: int = Field(description="Meters that are not learned after twice that time.")
-    kept: Number = Field(description="Tick up to which it is in the database, Unix s.")
+    kept: Number = Field(description="Newest tick of the stored commissioning, Unix s.")
     meters: list[MeterCommissioning]
 
 
 class CommissioningEvent(BaseModel):
-    """Something that happened to a commissioning."""
+    """One change of a commissioning."""
 
     t: float
     change: Step
@@ -288,7 +287,7 @@ class CommissioningEvent(BaseModel):
 
 
 class CommissioningEvents(BaseModel):
-    """What happened to a commissioning, oldest first."""
+    """Changes of a commissioning, oldest first."""
 
     events: list[CommissioningEvent]
 
@@ -301,10 +300,10 @@ class FeederSummary(BaseModel):
     name: str
     title: str = ""
     t: Number = Field(default=None, description="Latest tick; null before the first one.")
-    age_s: Number = Field(default=None, description="How old that is by the service's clock, s.")
-    patience_s: Number = Field(default=None, description="An older tick is stale, s.")
+    age_s: Number = Field(default=None, description="Age of that tick by the service's clock, s.")
+    patience_s: Number = Field(default=None, description="Age beyond which a tick is stale, s.")
     ticks_skipped: int | None = Field(
-        default=None, description="Ticks that were not judged since the service started; null if not watched."
+        default=None, description="Number of skipped ticks since the start; null if not monitored."
     )
     verdict: Decision | None = None
     model_only: bool | None = Field(default=None, description="As in the state; null before the first tick.")
@@ -317,16 +316,16 @@ class Feeders(BaseModel):
 
 
 class LayoutCustomer(BaseModel):
-    """Where a customer is connected."""
+    """Connection point of a customer."""
 
     customer: str
     bus: str = Field(description="Id of the bus in this layout (zero-impedance lines fuse buses).")
-    meter: str | None = Field(default=None, description="Its meter; null if it has none.")
+    meter: str | None = Field(default=None, description="Its meter; null without one.")
     phase: str | None = Field(default=None, description="Its phase: a, b or c; null on a balanced feeder.")
 
 
 class Layout(BaseModel):
-    """A tree of the feeder, the busbar first, and the lines that close loops in it."""
+    """Spanning tree of the feeder, the busbar first, and the lines that close loops in it."""
 
     buses: list[str]
     parent: list[int | None] = Field(description="Index of the bus that feeds each one; null for the busbar.")
@@ -351,8 +350,10 @@ class FeederDetail(BaseModel):
     v_min_volt: float
     v_max_volt: float
     tick_s: float = 1.0
-    patience_s: Number = Field(default=None, description="A state that is older is stale, s.")
-    revision: str = Field(description="Digest of all the rest; a state with another one is not about this.")
+    patience_s: Number = Field(default=None, description="Age beyond which a state is stale, s.")
+    revision: str = Field(
+        description="Digest of all other fields; a state with another one does not belong to them."
+    )
     layout: Layout
     tables: dict[str, Any]
 
@@ -366,19 +367,19 @@ class StalledMeterModel(BaseModel):
 
 
 class AlarmEvidence(BaseModel):
-    """The numbers behind an alarm when it was raised, or when `data_error` was found."""
+    """Numbers of an alarm when it was raised, or when `data_error` was found."""
 
     score: Number
     threshold: Number
     v_volt_reported: Number
     v_volt_estimated: Number
     attack_volt_estimated: Number
-    kind: str | None = Field(default=None, description="What a meter's manipulation looks like.")
+    kind: str | None = Field(default=None, description="Attack kind of a meter.")
     attack_kvar_estimated: Number = Field(
-        default=None, description="Wrong part of an inverter's injection, kvar."
+        default=None, description="Injection of an inverter beyond its droop curve, kvar."
     )
     explanations: list[ExplanationModel] = []
-    learning: list[StalledMeterModel] = Field(default=[], description="Meters whose learning is stalled.")
+    learning: list[StalledMeterModel] = Field(default=[], description="Meters with stalled learning.")
     data_error: DataErrorModel | None = Field(
         default=None, description="Error of the feeder's files that explains the accusation as well."
     )
@@ -390,38 +391,44 @@ class AlarmModel(BaseModel):
     id: str
     kind: AlarmKind
     feeder: str
-    meter: str | None = Field(description="Null if it is about the whole feeder; `substation` is the busbar.")
+    meter: str | None = Field(
+        description="Null for an alarm of the whole feeder; `substation` is the busbar meter."
+    )
     severity: Severity
     state: AlarmState
-    count: int = Field(description="How often it has been raised; above 1 it flaps.")
-    t_event: float = Field(description="When the condition was first seen.")
-    t_raised: float = Field(description="When it had lasted for the on-delay.")
+    count: int = Field(description="Number of occurrences; above 1 the alarm flaps.")
+    t_event: float = Field(description="Start of the condition.")
+    t_raised: float = Field(description="End of the on-delay.")
     t_cleared: float | None
     reason: str
     evidence: AlarmEvidence
     acknowledged_by: str | None
     t_acknowledged: float | None
     comment: str | None
-    customer: str | None = Field(default=None, description="Whose inverter it is about.")
+    customer: str | None = Field(
+        default=None, description="Customer of the inverter, for an alarm of an inverter."
+    )
 
 
 class Alarms(BaseModel):
-    """A page of alarms, those that began last first."""
+    """A page of alarms, those with the latest onset first."""
 
     alarms: list[AlarmModel]
     next: str | None = Field(description="Cursor of the next page; null on the last one.")
-    last_event: int = Field(description="Newest event number: `after` of the stream that goes on from here.")
-    raised: int = Field(description="So many alarms of all feeders and kinds stand that nobody has answered.")
+    last_event: int = Field(
+        description="Newest event number: `after` of the stream that continues from here."
+    )
+    raised: int = Field(
+        description="Number of active alarms without an acknowledgement, of all feeders and kinds."
+    )
     unstored: int = Field(
-        default=0, description="So many changes of alarms wait for the database and are not among these."
+        default=0, description="Number of alarm changes that wait for the database and are not included."
     )
-    problem: str | None = Field(
-        default=None, description="What is wrong with the database; null while it takes what it is given."
-    )
+    problem: str | None = Field(default=None, description="Problem of the database; null without one.")
 
 
 class AlarmEvent(BaseModel):
-    """Something that happened to an alarm, and the alarm as it was afterwards."""
+    """One event of an alarm, and the alarm after it."""
 
     seq: int
     t: float
@@ -432,50 +439,52 @@ class AlarmEvent(BaseModel):
 
 
 class AlarmEvents(BaseModel):
-    """A page of what happened to an alarm, oldest first."""
+    """A page of events of an alarm, oldest first."""
 
     events: list[AlarmEvent]
     next: int | None = Field(description="`after` of the next page; null on the last one.")
 
 
 class Acknowledgement(BaseModel):
-    """The answer of an operator."""
+    """Acknowledgement by an operator."""
 
     model_config = ConfigDict(extra="forbid")
 
     who: Line
     comment: Text = ""
     count: int | None = Field(
-        default=None, ge=1, description="The alarm's `count` as it was seen; 409 if it has been raised since."
+        default=None,
+        ge=1,
+        description="The alarm's `count` that the operator refers to; 409 if it has been raised since.",
     )
 
 
 class Recommissioning(BaseModel):
-    """The wish of an operator to have meters learned anew."""
+    """Request of an operator to restart the learning of meters."""
 
     model_config = ConfigDict(extra="forbid")
 
     who: Line
     reason: Annotated[Text, StringConstraints(min_length=1)]
     meters: Annotated[list[str], Field(min_length=1)] | None = Field(
-        default=None, description="Which meters were replaced; without this, all are learned anew."
+        default=None, description="Replaced meters; without this field the learning of all restarts."
     )
 
     @classmethod
     def of(cls, body: bytes, known: Sequence[str]) -> Recommissioning | list[Any]:
-        """Return what a body says, or everything that is wrong with it at once.
+        """Return the request in a body, or all its problems.
 
         Parameters
         ----------
         body
             JSON.
         known
-            The feeder's meters.
+            Ids of the feeder's meters.
         """
         try:
             given = json.loads(body)
         except (ValueError, RecursionError) as error:
-            return [{"loc": ("body",), "msg": f"no JSON: {error}", "type": "json_invalid"}]
+            return [{"loc": ("body",), "msg": f"not JSON: {error}", "type": "json_invalid"}]
         found, problems = None, list[Any]()
         try:
             found = cls.model_validate(given)
@@ -486,7 +495,7 @@ class Recommissioning(BaseModel):
         for k, meter in enumerate(meters if isinstance(meters, list) else ()):
             if not isinstance(meter, str):
                 continue
-            what = f"there is no meter {meter!r}" if meter not in known else f"meter {meter!r} is named twice"
+            what = f"there is no meter {meter!r}" if meter not in known else f"meter {meter!r} occurs twice"
             if meter not in known or meter in seen:
                 problems.append({"loc": ("body", "meters", k), "msg": what, "type": "meter"})
             seen.add(meter)
@@ -494,7 +503,7 @@ class Recommissioning(BaseModel):
 
     @classmethod
     def in_openapi(cls) -> dict[str, Any]:
-        """Return how a request is described."""
+        """Return the OpenAPI description of the request."""
         schema = cls.model_json_schema()
         return {"requestBody": {"required": True, "content": {"application/json": {"schema": schema}}}}
 
@@ -510,9 +519,9 @@ class HistoryPoint(BaseModel):
     v_volt_lowest: Number = Field(
         description="Lowest reconstructed voltage at a meter that is not model only, V."
     )
-    v_volt_highest: Number = Field(description="Highest one likewise, V.")
+    v_volt_highest: Number = Field(description="Highest such voltage, V.")
     model_only: bool = Field(default=False, description="As in the state.")
-    meter: HistoryMeter | None = Field(default=None, description="If one was asked for and was there.")
+    meter: HistoryMeter | None = Field(default=None, description="The requested meter; null without one.")
 
 
 class HistoryMeter(BaseModel):
@@ -529,30 +538,30 @@ class HistoryMeter(BaseModel):
 
 
 class History(BaseModel):
-    """The newest kept ticks of the time asked for, oldest first."""
+    """The newest kept ticks of the requested time, oldest first."""
 
     feeder: str
     points: list[HistoryPoint]
-    more: bool = Field(description="There may be older ones: ask again with `until` = `t` of the first.")
+    more: bool = Field(description="There may be older ones: repeat with `until` = `t` of the first.")
 
 
 class RejectedReading(BaseModel):
-    """A reading that could not be used."""
+    """A rejected reading."""
 
     t: float
     key: str
     reason: str
-    payload: str = Field(description="The start of its bytes, as text where that is possible.")
+    payload: str = Field(description="The beginning of its bytes, as text.")
 
 
 class RejectedReadings(BaseModel):
-    """The newest readings that could not be used, newest first."""
+    """The newest rejected readings, newest first."""
 
     readings: list[RejectedReading]
 
 
 class Health(BaseModel):
-    """The answer to a probe."""
+    """Response to a probe."""
 
     ok: Literal[True]
     reasons: list[str]

@@ -1,9 +1,9 @@
 """REST, server-sent events and the web page. The only module that imports FastAPI.
 
-Nothing here owns state: reads come from the store and from the backend's latest reports, writes go through
-the backend. Streams keep no queue per client: a wake-up from the backend lets each of them read on from the
-store (alarms, by event number) or take the latest report (states), so a slow client costs no memory and
-loses no alarm. Every error is `application/problem+json` (RFC 9457).
+This module owns no state: reads come from the store and from the backend's latest reports, writes go through
+the backend. Streams have no queue per client. After a wake-up from the backend each one reads from the store
+(alarms, by event number) or takes the latest report (states), so that a slow client costs no memory and loses
+no alarm. Every error is `application/problem+json` (RFC 9457).
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from service.store import Event, Store, StoreUnavailable
 
 
 class Backend(Protocol):
-    """The running service, as REST sees it; `runtime.Runtime` is one."""
+    """Interface of the running service, such as `runtime.Runtime`."""
 
     @property
     def store(self) -> Store:
@@ -47,72 +47,66 @@ class Backend(Protocol):
         """Return the fields of `models.FeederSummary` for every feeder; verdict and time are added here."""
 
     def feeder(self, name: str) -> dict[str, Any] | None:
-        """Return the fields of `models.FeederDetail`, or None if there is no such feeder."""
+        """Return the fields of `models.FeederDetail`, or None for an unknown feeder."""
 
     def known(self, name: str) -> bool:
-        """Whether there is such a feeder; costs nothing."""
+        """True if the feeder is monitored; fast."""
 
     def unloaded(self, name: str) -> str | None:
-        """Return why the stored tables of a feeder could not be loaded, or None if that is not so."""
+        """Return the reason why the stored tables of a feeder cannot be loaded, or None."""
 
     def report(self, name: str) -> FeederReport | None:
         """Return the latest report of a feeder, or None before its first tick."""
 
     def age(self, report: FeederReport) -> float:
-        """Return how old a feeder's latest report is by the service's clock, s."""
+        """Return the age of a feeder's latest report by the service's clock, s."""
 
     def commissioning(self, name: str) -> dict[str, Any] | None:
-        """Return the fields of `models.Commissioning` but `kept`, or None if there is no such feeder."""
+        """Return the fields of `models.Commissioning` without `kept`, or None for an unknown feeder."""
 
     def unstored(self) -> tuple[int, str | None]:
-        """Return how many changes of alarms wait for the database, and what is wrong with it, or None."""
+        """Return the number of alarm changes that wait for the database, and its problem or None."""
 
     def metrics(self) -> bytes:
         """Return the metrics in Prometheus's text format."""
 
     def ready(self) -> tuple[bool, list[str]]:
-        """Say whether everything works that is needed to watch, and what does not."""
+        """Return True if everything needed for monitoring works, and the problems otherwise."""
 
     def healthy(self) -> tuple[bool, list[str]]:
-        """Say whether the process should live on, and if not, why."""
+        """Return True if the process can continue, and the problems otherwise."""
 
     async def put_feeder(self, name: str, tables: dict[str, Any]) -> None:
-        """Take over a feeder's tables; raises what says that it is wrong, or TooManyFeeders."""
+        """Take over a feeder's tables; raises the errors of invalid tables, or TooManyFeeders."""
 
     async def delete_feeder(self, name: str) -> None:
-        """Watch a feeder no more; raises FeederUnknown or FeederFixed."""
+        """Stop monitoring a feeder; raises FeederUnknown or FeederFixed."""
 
     async def acknowledge(
         self, alarm_id: str, who: str, comment: str, *, count: int | None = None
     ) -> dict[str, Any]:
-        """Answer an alarm and return it; raises AlarmUnknown, RaisedAgain or AlreadyAcknowledged."""
+        """Acknowledge an alarm and return it; raises AlarmUnknown, RaisedAgain or AlreadyAcknowledged."""
 
     async def recommission(self, name: str, meters: Sequence[str], who: str, reason: str) -> dict[str, Any]:
-        """Learn meters' errors anew, none for all; raises FeederUnknown or NothingToLearn."""
+        """Restart the learning of meters, empty for all; raises FeederUnknown or NothingToLearn."""
 
     def subscribe(self) -> AsyncGenerator[dict[str, Any], None]:
         """Return an asynchronous generator of wake-ups; it ends when the service stops.
 
-        Each is `{"type": "alarm" | "state", "data": ...}`, sent after the alarm has been stored or the
-        report replaced. Only the type is read here, so the backend may drop wake-ups of a client that is
-        slow, as long as one is left. The first step into the generator subscribes, closing it ends that.
+        Each is `{"type": "alarm" | "state", "data": ...}`, sent after the alarm is stored or the report
+        replaced. Only the type is read here: the backend may drop wake-ups of a slow client, as long as one
+        is left. The first step into the generator subscribes, closing it unsubscribes.
         """
 
 
 async def wakes(backend: Backend) -> AsyncIterator[None]:
-    """Yield once the subscription stands, and again after each wake-up, until the service stops.
-
-    Parameters
-    ----------
-    backend
-        The running service.
-    """
+    """Yield once after the subscription, and again after each wake-up, until the service stops."""
     subscription = backend.subscribe()
     waiting: asyncio.Future[dict[str, Any] | None] | None = None
     try:
         while True:
             waiting = asyncio.ensure_future(anext(subscription, None))
-            await asyncio.sleep(0)  # The first step subscribes: nothing that happens from here on is missed.
+            await asyncio.sleep(0)  # The first step subscribes: no later change is missed.
             yield
             if await waiting is None:
                 return
@@ -124,24 +118,18 @@ async def wakes(backend: Backend) -> AsyncIterator[None]:
 
 
 ANSWER_S = 0.7
-"""Wait for the test write, s: `/readyz` answers within 1 s."""
+"""Time limit of the test write, s: `/readyz` answers within 1 s."""
 
 
 class Probe:
-    """Test write that concurrent requests share; none of them waits for it longer than `ANSWER_S`.
-
-    Parameters
-    ----------
-    store
-        The database.
-    """
+    """Test write shared by concurrent requests, each of which waits at most `ANSWER_S`."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
         self._running: asyncio.Task[str | None] | None = None
 
     async def trouble(self) -> str | None:
-        """Return why the database cannot be written, or None."""
+        """Return the reason why the database cannot be written, or None."""
         if self._running is None or self._running.done():
             self._running = asyncio.create_task(self._check(), name="readiness")
         await asyncio.wait({self._running}, timeout=ANSWER_S)
@@ -150,7 +138,7 @@ class Probe:
         return f"{self._store.name}: no answer within {ANSWER_S:g} s"
 
     async def _check(self) -> str | None:
-        # A thread of its own: reads that wait for the database may hold all of the shared ones.
+        # In a separate thread: reads that wait for the database may occupy all shared ones.
         try:
             await to_thread.run_sync(self._store.check, limiter=CapacityLimiter(1), abandon_on_cancel=True)
         except StoreUnavailable as error:
@@ -159,11 +147,11 @@ class Probe:
 
 
 MAX_BODY = 4 << 20
-"""Longest request body that is read, bytes."""
+"""Largest request body, bytes."""
 MAX_STREAMS = 100
-"""Event streams that may be open at once."""
+"""Largest number of open event streams."""
 MAX_EVENT = (1 << 63) - 1
-"""The highest number that an event can have."""
+"""Largest number of an event."""
 _WEB = FilePath(__file__).parent.with_name("web")
 _NAME = r"^[A-Za-z0-9_-]{1,64}$"
 
@@ -173,16 +161,14 @@ def create_api(backend: Backend, hosts: Collection[str] = (), *, max_streams: in
 
     Parameters
     ----------
-    backend
-        The running service.
     hosts
-        Names by which it may be asked to change something, besides `localhost` and this machine's.
+        Host names for requests that change something, besides `localhost` and the machine's name.
     max_streams
-        Event streams that may be open at once.
+        Largest number of open event streams.
     """
     app = FastAPI(
         title="gridsec",
-        description="Watches the voltages of distribution feeders and names the meters that lie.",
+        description="Monitors the voltages of distribution feeders and identifies manipulated meters.",
         version="1",
         docs_url=None,
         redoc_url=None,
@@ -206,7 +192,7 @@ def create_api(backend: Backend, hosts: Collection[str] = (), *, max_streams: in
 
 
 class _Web(StaticFiles):
-    """The page. Browsers ask each time whether it has changed, so that an upgrade is seen at once."""
+    """The page. Browsers revalidate its files on every load, so that an upgrade takes effect at once."""
 
     def file_response(self, *args: Any, **kwargs: Any) -> Response:
         response = super().file_response(*args, **kwargs)
@@ -215,7 +201,7 @@ class _Web(StaticFiles):
 
 
 def _describe(app: FastAPI) -> None:
-    """Write the OpenAPI description once, with errors as the problems that they are."""
+    """Write the OpenAPI description once, with errors as problems."""
     schema = app.openapi()
     error = {"$ref": "#/components/schemas/Problem"}
     for path in schema["paths"].values():
@@ -254,14 +240,14 @@ def _latest(backend: BackendHere, feeder: Annotated[str, Depends(_known_feeder)]
 
 
 async def _json_only(request: Request) -> None:
-    """Refuse bodies that do not say that they are JSON; this also keeps foreign web pages from posting."""
+    """Refuse bodies without the type JSON; this also prevents posts from foreign web pages."""
     kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if kind != "application/json":
         raise HTTPException(415, f"the body must be application/json, not {kind or 'of unknown type'}")
 
 
 async def _slot(request: Request) -> AsyncIterator[None]:
-    """Count an open stream for as long as it is open."""
+    """Count a stream while it is open."""
     state = request.app.state
     if state.streams >= state.max_streams:
         raise HTTPException(503, f"{state.max_streams} event streams are open already", {"Retry-After": "10"})
@@ -276,11 +262,11 @@ KnownFeeder = Annotated[str, Depends(_known_feeder)]
 Latest = Annotated[FeederReport, Depends(_latest)]
 IfNoneMatch = Annotated[str | None, Header(include_in_schema=False)]
 
-_NOT_MODIFIED: dict[int | str, dict[str, Any]] = {304: {"description": "As the client has it."}}
+_NOT_MODIFIED: dict[int | str, dict[str, Any]] = {304: {"description": "Unchanged."}}
 
 
 def _unchanged(response: Response, tag: str, if_none_match: str | None) -> Response | None:
-    """Mark a response with its ETag; return the answer 304 if the client has it already."""
+    """Set the ETag of a response; return the response 304 if the client has the same version."""
     headers = {"ETag": tag, "Cache-Control": "no-cache"}
     response.headers.update(headers)
     known = {part.strip() for part in (if_none_match or "").split(",")}
@@ -337,13 +323,13 @@ async def put_feeder(backend: BackendHere, feeder: FeederName, tables: dict[str,
 
 @_feeders.delete("/{feeder}", status_code=204)
 async def delete_feeder(backend: BackendHere, feeder: FeederName) -> None:
-    """Watch a feeder no more that was put: its alarms are cleared, its history is kept."""
+    """Stop monitoring a feeder that was added over REST: its alarms are cleared, its history stays."""
     await backend.delete_feeder(feeder)
 
 
 @_feeders.get("/{feeder}/state")
 def get_state(backend: BackendHere, report: Latest, response: Response) -> models.State:
-    """The latest tick: verdict, and every meter with what it says and what is true there."""
+    """The latest tick: verdict, and every meter with its reported and its reconstructed voltage."""
     response.headers["Cache-Control"] = "no-store"
     return _state(backend, report)
 
@@ -354,7 +340,7 @@ def _state(backend: Backend, report: FeederReport) -> models.State:
 
 @_feeders.get("/{feeder}/meters/{meter}")
 def get_meter(backend: BackendHere, report: Latest, meter: str, response: Response) -> models.MeterNow:
-    """One meter at the latest tick, and what is known of its own error."""
+    """One meter at the latest tick, and its commissioning."""
     response.headers["Cache-Control"] = "no-store"
     known = backend.commissioning(report.feeder) or {"meters": ()}
     for found in report_json(report)["meters"]:
@@ -372,7 +358,9 @@ def get_history(
     *,
     since: Since = None,
     until: Until = None,
-    meter: Annotated[str | None, Query(pattern=_NAME, description="Also the numbers of this meter.")] = None,
+    meter: Annotated[
+        str | None, Query(pattern=_NAME, description="Include the numbers of this meter.")
+    ] = None,
     limit: Annotated[int, Query(ge=1, le=5000)] = 500,
 ) -> models.History:
     """The newest kept ticks in [since, until), oldest first."""
@@ -383,7 +371,7 @@ def get_history(
 
 @_feeders.get("/{feeder}/commissioning", response_model=models.Commissioning)
 def get_commissioning(backend: BackendHere, feeder: KnownFeeder, response: Response) -> Any:
-    """How far the meters' own fixed errors are known: what was gathered, what was learned, and when."""
+    """Commissioning of the meters: gathered time, learned errors, and times."""
     response.headers["Cache-Control"] = "no-store"
     return _commissioning(backend, feeder, backend.commissioning(feeder))
 
@@ -395,7 +383,7 @@ def get_commissioning(backend: BackendHere, feeder: KnownFeeder, response: Respo
     openapi_extra=models.Recommissioning.in_openapi(),
 )
 async def recommission(backend: BackendHere, feeder: KnownFeeder, request: Request) -> Any:
-    """Learn anew: meters that were replaced, while the others stay, or without `meters` the whole feeder."""
+    """Restart the learning: of replaced meters, or without `meters` of the whole feeder."""
     layout = _detail(backend, feeder)["layout"]
     meters = [row["meter"] for row in layout["customers"] if row["meter"]]
     found = models.Recommissioning.of(await request.body(), meters)
@@ -409,7 +397,7 @@ async def recommission(backend: BackendHere, feeder: KnownFeeder, request: Reque
 def get_commissioning_events(
     backend: BackendHere, feeder: KnownFeeder, limit: Annotated[int, Query(ge=1, le=1000)] = 100
 ) -> models.CommissioningEvents:
-    """What happened to the commissioning, who wanted it and why: the newest ones, oldest first."""
+    """The newest changes of the commissioning, with operator and reason, oldest first."""
     found = [asdict(event) for event in backend.store.commission_events(feeder, limit)]
     return models.CommissioningEvents.model_validate({"events": found})
 
@@ -425,7 +413,7 @@ def _commissioning(backend: Backend, feeder: str, fields: dict[str, Any] | None)
     "/{feeder}/stream", response_class=EventSourceResponse, dependencies=[Depends(_slot)], tags=["streams"]
 )
 async def stream_states(backend: BackendHere, feeder: KnownFeeder) -> AsyncIterator[ServerSentEvent]:
-    """Server-sent events `state`: the latest tick and each that follows; a slow client skips some."""
+    """Server-sent events `state`: the latest tick and each later one; a slow client skips some."""
     yield ServerSentEvent(comment="connected", retry=2000)
     last: FeederReport | None = None
     async for _ in wakes(backend):
@@ -459,11 +447,11 @@ def list_alarms(
     limit: Annotated[int, Query(ge=1, le=1000)] = 100,
     if_none_match: IfNoneMatch = None,
 ) -> Any:
-    """A page of alarms, those that began last first; `since` and `until` are about `t_raised`."""
+    """A page of alarms, those with the latest onset first; `since` and `until` refer to `t_raised`."""
     last_event = backend.store.last_event
-    # Before the page is read: what waits no longer by then is in it.
+    # Before the page is read: changes stored in between are in the page.
     unstored, trouble = backend.unstored()
-    # Event numbers say what has changed within one database, and a run has only one.
+    # Event numbers identify changes within one database, and a run has only one.
     waits = hashlib.sha256(f"{unstored} {trouble}".encode()).hexdigest()[:16]
     if known := _unchanged(response, f'W/"{request.app.state.run}-{last_event}-{waits}"', if_none_match):
         return known
@@ -492,17 +480,17 @@ def list_alarms(
 @_alarms.get("/stream", response_class=EventSourceResponse, dependencies=[Depends(_slot)], tags=["streams"])
 async def stream_alarms(
     backend: BackendHere,
-    feeder: Annotated[str | None, Query(pattern=_NAME, description="Only this one's.")] = None,
+    feeder: Annotated[str | None, Query(pattern=_NAME, description="Restrict to this feeder.")] = None,
     after: Annotated[int | None, Query(ge=0, description="Begin after this event number.")] = None,
-    last_event_id: Annotated[int | None, Header(ge=0, description="Goes before `after`.")] = None,
+    last_event_id: Annotated[int | None, Header(ge=0, description="Takes precedence over `after`.")] = None,
 ) -> AsyncIterator[ServerSentEvent]:
-    """Server-sent events `alarm`, whose ids are event numbers: with `Last-Event-ID` none is ever missed.
+    """Server-sent events `alarm`, with event numbers as ids: with `Last-Event-ID` none is missed.
 
-    Without it and without `after`, it begins with what happens next.
+    Without it and without `after`, the stream starts with the next event.
     """
     store = backend.store
     start = last_event_id if last_event_id is not None else after
-    # A number from the future belongs to another database: begin now, or nothing would ever come.
+    # A number beyond the newest belongs to another database: start now, otherwise no event would ever come.
     seen = store.last_event if start is None else min(start, store.last_event)
     yield ServerSentEvent(comment="connected", id=str(seen), retry=2000)
     async for _ in wakes(backend):
@@ -510,7 +498,7 @@ async def stream_alarms(
             try:
                 events = await to_thread.run_sync(partial(store.events_after, seen, feeder=feeder))
             except StoreUnavailable:
-                return  # The client comes back with the number of the last event it got.
+                return  # The client reconnects with the number of its last event.
             for event in events:
                 yield ServerSentEvent(event="alarm", id=str(event.seq), data=_event(event))
                 seen = event.seq
@@ -534,7 +522,7 @@ def get_events(
     after: Annotated[int, Query(ge=0, le=MAX_EVENT, description="Only events with a higher number.")] = 0,
     limit: Annotated[int, Query(ge=1, le=1000)] = 100,
 ) -> models.AlarmEvents:
-    """A page of what happened to an alarm, oldest first."""
+    """A page of events of an alarm, oldest first."""
     found = backend.store.events(alarm_id, after=after, limit=limit + 1)
     if not found and backend.store.alarm(alarm_id) is None:
         raise AlarmUnknown(alarm_id)
@@ -544,7 +532,7 @@ def get_events(
 
 @_alarms.post("/{alarm_id}/ack", response_model=models.AlarmModel, dependencies=[Depends(_json_only)])
 async def acknowledge(backend: BackendHere, alarm_id: AlarmId, answer: models.Acknowledgement) -> Any:
-    """Answer an alarm: say who has seen it."""
+    """Acknowledge an alarm, with the operator's name."""
     return await backend.acknowledge(alarm_id, answer.who, answer.comment, count=answer.count)
 
 
@@ -568,7 +556,7 @@ _operations = APIRouter(tags=["operations"])
 def list_rejected(
     backend: BackendHere, limit: Annotated[int, Query(ge=1, le=1000)] = 100
 ) -> models.RejectedReadings:
-    """The newest readings that could not be used, and why."""
+    """The newest rejected readings, with reasons."""
     return models.RejectedReadings(
         readings=[
             models.RejectedReading(
@@ -582,19 +570,19 @@ def list_rejected(
 @_operations.get("/healthz", response_model=models.Health)
 @_operations.head("/healthz", include_in_schema=False)
 async def healthz(request: Request, backend: BackendHere) -> Any:
-    """Whether the process and its tasks are alive."""
-    return _probe(request, *backend.healthy(), "the service does not work and should be restarted")
+    """Liveness of the process and its tasks."""
+    return _probe(request, *backend.healthy(), "the service does not work; restart it")
 
 
 @_operations.get("/readyz", response_model=models.Health)
 @_operations.head("/readyz", include_in_schema=False)
 async def readyz(request: Request, backend: BackendHere) -> Any:
-    """Whether feeders are designed, the database can be written and zenoh is connected."""
+    """Readiness: feeders are designed, the database can be written and zenoh is connected."""
     ready, reasons = backend.ready()
     trouble = await request.app.state.probe.trouble()
     if trouble is not None:
         ready, reasons = False, [*reasons, *([] if any(trouble in one for one in reasons) else [trouble])]
-    return _probe(request, ready, reasons, "the service cannot watch at the moment")
+    return _probe(request, ready, reasons, "the service cannot monitor at present")
 
 
 def _probe(request: Request, good: bool, reasons: list[str], what: str) -> Any:

@@ -1,4 +1,4 @@
-"""Consoles, exit codes, arguments and checks of options that all commands share."""
+"""Consoles, exit codes, arguments and checks of options, shared by all commands."""
 
 from __future__ import annotations
 
@@ -39,16 +39,16 @@ Told = TypeVar("Told")
 def read_all(
     option: str, texts: Iterable[str] | None, read: Callable[[str], Told], problems: list[str]
 ) -> list[Told]:
-    """Read all texts of an option.
+    """Parse all texts of an option.
 
     Parameters
     ----------
     option, texts
-        The option, and what was given.
+        Name of the option, and its values.
     read
-        Reads one of them; raises a ValueError with what is wrong with it.
+        Parser of one text; raises a ValueError with the problem.
     problems
-        Takes what is wrong.
+        List to which problems are added.
     """
     out = []
     for text in texts or ():
@@ -60,21 +60,21 @@ def read_all(
 
 
 def refuse_options(problems: Iterable[str], **places: Given) -> None:
-    """Refuse options that are wrong, and files and folders that cannot be used, before the work.
+    """Refuse wrong options, and unusable files and folders, before the work.
 
     Parameters
     ----------
     problems
-        What is wrong so far.
+        Problems found so far.
     places
-        Files and folders, as `service.cli.paths.see` takes them.
+        Files and folders as in `service.cli.paths.see`.
 
     Raises
     ------
     typer.BadParameter
-        If there are any problems, with the files and folders that cannot be used.
+        If there are any problems, together with the unusable files and folders.
     Unusable
-        If there are no others than these.
+        If only files and folders are unusable.
     """
     found = list(problems)
     try:
@@ -88,19 +88,19 @@ def refuse_options(problems: Iterable[str], **places: Given) -> None:
 
 
 def options_of(make: Callable[[], Told], problems: Iterable[str], **places: Given) -> Told:
-    """Make something of options; what it is that they do not make is refused with all other problems.
+    """Create an object from options; its problem is reported together with all others.
 
     Parameters
     ----------
     make
-        Makes it; raises a ValueError with what is wrong with the options.
+        Creates the object; raises a ValueError with the problem of the options.
     problems, places
-        As `refuse_options` takes them.
+        As in `refuse_options`.
 
     Raises
     ------
     typer.BadParameter, Unusable
-        As `refuse_options` does.
+        As in `refuse_options`.
     """
     try:
         out = make()
@@ -135,20 +135,15 @@ err = Console(stderr=True, highlight=False, soft_wrap=True)
 
 
 def finite(value: float | None) -> float | None:
-    """Refuse infinite numbers where they are options of a command.
-
-    Parameters
-    ----------
-    value
-        What was given, if anything.
+    """Refuse infinite numbers and NaN as options of a command.
 
     Raises
     ------
     typer.BadParameter
-        If it is infinite, or none.
+        If the number is not finite.
     """
     if value is not None and not math.isfinite(value):
-        raise typer.BadParameter(f"{value} is no finite number")
+        raise typer.BadParameter(f"{value} is not finite")
     return value
 
 
@@ -158,6 +153,6 @@ def complain(message: str) -> None:
     Parameters
     ----------
     message
-        The message, without markup.
+        Text without markup.
     """
     err.print(f"[bold red]gridsec:[/] {escape(message)}")

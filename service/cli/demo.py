@@ -1,7 +1,7 @@
-"""The whole thing in one go: a service, virtual meters that begin to lie, and what comes of it.
+"""Demonstration: a service, virtual meters with an attack, and the reaction of the service.
 
-The service is a process of its own; the meters are a zenoh client of it, driven by full AC power flow; what
-is shown and checked comes over HTTP, as an operator would get it.
+The service is a separate process; the meters are its zenoh client, driven by full AC power flow. The
+displayed and checked data come over HTTP, as for an operator.
 """
 
 from __future__ import annotations
@@ -38,35 +38,35 @@ START_WITHIN_S = 30.0
 CLEAR_WITHIN_S = 30.0
 FEEDER = "simbench-lv-rural1"
 ADDRESS_CODE = 5
-"""The exit code of a service that found an address taken (see `cli`)."""
+"""Exit code of a service with an address in use (see `cli`)."""
 
 
 class DemoFailed(GridsecError):
-    """The service could not be started, or went away."""
+    """The service could not be started, or ended."""
 
     code = "demo-failed"
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What the demo does.
+    """Parameters of the demo.
 
     Attributes
     ----------
     feeder
         Folder or name.
     duration_s
-        How long the meters play, s.
+        Duration of the simulation, s.
     attacked
-        How many meters lie.
+        Number of manipulated meters.
     size
-        By how much at least, pu.
+        Smallest size of the manipulation, pu.
     kind
-        How (see `feeders.simulation.attacks.Kind`).
+        Attack kind (see `feeders.simulation.attacks.Kind`).
     seed
-        Chooses meters, loads and errors.
+        Seed of meters, loads and errors.
     http
-        Where the web page should be; another free port is taken if that one is not.
+        Address of the web page; if it is in use, another free port.
     """
 
     feeder: str = FEEDER
@@ -79,13 +79,13 @@ class Plan:
 
     @property
     def attack(self) -> tuple[float, float]:
-        """Begin and end of the attack, s after the start: 20 and 55, earlier in a short demo."""
+        """Start and end of the attack, s after the start: 20 and 55, earlier in a short demo."""
         return min(20.0, 0.25 * self.duration_s), min(55.0, 0.6 * self.duration_s)
 
 
 @dataclass(slots=True)
 class Outcome:
-    """What was seen over HTTP: meters by what was said of them, and everything that went wrong."""
+    """Results over HTTP: manipulated meters, meters named as manipulated, and problems."""
 
     lied: set[str] = field(default_factory=set)
     named: set[str] = field(default_factory=set)
@@ -93,7 +93,7 @@ class Outcome:
 
 
 class Service:
-    """A service in a process of its own, and HTTP requests to it."""
+    """A service in a separate process, and HTTP requests to it."""
 
     def __init__(self, process: subprocess.Popen[str], url: str, zenoh: str) -> None:
         self.process = process
@@ -106,12 +106,12 @@ class Service:
         Parameters
         ----------
         path
-            From the root.
+            Path from the root.
 
         Raises
         ------
         DemoFailed
-            If there is no good answer.
+            If the response is missing or has another status.
         """
         parts = urlsplit(self.url)
         connection = http.client.HTTPConnection(parts.hostname or "", parts.port, timeout=10.0)
@@ -129,13 +129,7 @@ class Service:
 
 
 def free_address(wanted: str) -> str:
-    """Return the wanted `host:port` if it is free, else one with a free port.
-
-    Parameters
-    ----------
-    wanted
-        The address.
-    """
+    """Return the given `host:port` if it is free, otherwise one with a free port."""
     host, _, port = wanted.rpartition(":")
     for candidate in (int(port), 0):
         with socket.socket() as probe:
@@ -150,26 +144,26 @@ def free_address(wanted: str) -> str:
 
 @contextmanager
 def started(feeder: str, address: str) -> Iterator[Service]:
-    """Start a service with a database of its own and end it in any case.
+    """Start a service with a separate database and end it in any case.
 
     Parameters
     ----------
     feeder
         Folder or name.
     address
-        Where HTTP should be.
+        Address of HTTP.
 
     Raises
     ------
     DemoFailed
-        If it does not come up; with what it said.
+        If it does not start; with its output.
     """
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="gridsec-demo-")))
         log = stack.enter_context((folder / "log").open("w+", encoding="utf-8"))
         database = f"sqlite:///{folder / 'demo.db'}"
         host = address.rpartition(":")[0]
-        # Another program can be faster to take a port that was free a moment ago.
+        # Another program may take the port in the meantime.
         for http_wanted, zenoh_wanted in [(address, "127.0.0.1:7447"), *[(f"{host}:0", "127.0.0.1:0")] * 2]:
             zenoh = "tcp/" + free_address(zenoh_wanted)
             ends = ("--zenoh-listen", zenoh, "--http", free_address(http_wanted))
@@ -189,13 +183,13 @@ def started(feeder: str, address: str) -> Iterator[Service]:
 
 def _launch(options: tuple[str, ...], log: IO[str]) -> subprocess.Popen[str]:
     command = [sys.executable, "-c", "from service.cli.main import main; main()", "serve", *options]
-    return subprocess.Popen(  # noqa: S603 - our own interpreter, our own arguments
+    return subprocess.Popen(  # noqa: S603 - fixed interpreter and arguments
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True
     )
 
 
 def _first_line(process: subprocess.Popen[str]) -> str:
-    """Read the URL that the service prints; a service that says nothing in time is ended."""
+    """Read the URL that the service prints; a service without output within `START_WITHIN_S` is ended."""
     timer = threading.Timer(START_WITHIN_S, process.kill)
     timer.start()
     try:
@@ -230,24 +224,20 @@ def run(plan: Plan, console: Console, *, check: bool, keep: bool) -> Outcome:
 
     Parameters
     ----------
-    plan
-        What it does.
-    console
-        Where it is told.
     check
         After the duration, wait until every alarm has cleared.
     keep
-        Go on with honest meters until interrupted.
+        Continue with honest meters until interrupted.
 
     Returns
     -------
     Outcome
-        What was named, and everything that went wrong.
+        Meters named as manipulated, and all problems.
 
     Raises
     ------
     DemoFailed, FeederInvalid, BusUnavailable
-        If it could not run.
+        If it cannot run.
     """
     site = load(plan.feeder)
     with started(plan.feeder, plan.http) as service:
@@ -282,7 +272,7 @@ def run(plan: Plan, console: Console, *, check: bool, keep: bool) -> Outcome:
 
 @contextmanager
 def _screen(console: Console) -> Iterator[Callable[[Table], None] | None]:
-    """Keep a table up to date below what is told, where there is a terminal."""
+    """Update a table below the messages, on a terminal."""
     if not console.is_terminal:
         yield None
         return
@@ -297,18 +287,12 @@ def _over(elapsed: float, plan: Plan, story: _Story, *, check: bool, keep: bool)
         return True
     if elapsed < plan.duration_s + CLEAR_WITHIN_S:
         return False
-    story.outcome.problems.append(f"alarms still stand: {', '.join(sorted(story.standing))}")
+    story.outcome.problems.append(f"alarms still active: {', '.join(sorted(story.standing))}")
     return True
 
 
 def verdict(outcome: Outcome) -> tuple[str, ...]:
-    """Return why a demo has not shown what it must; empty if it has.
-
-    Parameters
-    ----------
-    outcome
-        What was seen.
-    """
+    """Return the failures of a demo; empty for a success."""
     problems = list(outcome.problems)
     if missed := outcome.lied - outcome.named:
         problems.append(f"manipulated and not named: {', '.join(sorted(missed))}")
@@ -324,19 +308,19 @@ def _introduce(site: Site, service: Service, plan: Plan, console: Console) -> No
     title = site.tables.meta.title or site.feeder.name
     console.print(
         f"[bold]{escape(title)}[/]: {len(site.feeder.customers)} customers, {len(site.meter_ids)} meters, "
-        f"watched by the {site.tables.meta.monitor.estimator} monitor."
+        f"monitored by the {site.tables.meta.monitor.estimator} estimator."
     )
     console.print(
         f"Web page: [bold cyan]{service.url}/[/]   REST: {service.url}/api/v1/feeders", highlight=False
     )
     console.print(
         f"Virtual meters publish over zenoh on {service.zenoh}. From {on:.0f} s to {off:.0f} s "
-        f"{plan.attacked} of them lie; after {plan.duration_s:.0f} s the demo ends."
+        f"{plan.attacked} of them are manipulated; after {plan.duration_s:.0f} s the demo ends."
     )
 
 
 class _Story:
-    """Tells what happens: what is done to the meters, and what the service says of it."""
+    """Prints the events: manipulations of the meters, and alarms of the service."""
 
     def __init__(
         self,
@@ -358,15 +342,15 @@ class _Story:
         self._states: dict[str, str] = {}
 
     def tell(self, sample: Sample) -> None:
-        """Say what is new since the last tick."""
+        """Print the changes since the last tick."""
         lying = {self._site.meter_ids[k] for k in np.flatnonzero(sample.manipulated)}
         self.outcome.lied |= lying
         if lying - self._lying:
             shifts = dict(zip(self._site.meter_ids, sample.shift_volt, strict=True))
             told = ", ".join(f"{meter} by {shifts[meter]:+.1f} V" for meter in sorted(lying))
-            self._say(sample.t, "red", f"begin to lie: {told}")
+            self._say(sample.t, "red", f"attack starts: {told}")
         if self._lying - lying:
-            self._say(sample.t, "green", f"honest again: {', '.join(sorted(self._lying - lying))}")
+            self._say(sample.t, "green", f"attack ends: {', '.join(sorted(self._lying - lying))}")
         self._lying = lying
         self._alarms()
         self._picture(sample)

@@ -1,4 +1,4 @@
-"""`gridsec feeders`: what there is to watch, whether it is right, and designs made ahead of time."""
+"""`gridsec feeders`: list, validation, conversion and design of feeders."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ if TYPE_CHECKING:
 app = typer.Typer(no_args_is_help=True, help="List, show, validate, convert and design feeders.")
 
 SHOWN = 40
-"""Rows of the table of changes that are printed; the file has all of them."""
+"""Printed rows of the table of changes; the file contains all of them."""
 
 
 @app.command("list")
 def feeders_list() -> None:
-    """List the feeders that come with gridsec."""
+    """List the feeders of the project."""
     from feeders.model.site import load, names
     from gridsec.grid.network import InPhases
 
@@ -57,7 +57,7 @@ def feeders_show(feeder: Feeder) -> None:
         f"{told(site.nominal_volt, 'g')} phase to neutral, {len(site.spanning.buses)} buses, "
         + (f"{len(site.ties)} closed ties, " if site.ties.size else "")
         + f"{len(site.feeder.customers)} customers, {len(site.meter_ids)} meters, "
-        f"watched every {meta.monitor.tick_s:g} s for up to {meta.monitor.max_attacked} manipulated meters"
+        f"monitored every {meta.monitor.tick_s:g} s for up to {meta.monitor.max_attacked} manipulated meters"
     )
     table = Table("customer", "bus", "phases", "meter", "load kW", "PV kW", "inverter kVA", "droop")
     for row in site.tables.customers:
@@ -68,11 +68,11 @@ def feeders_show(feeder: Feeder) -> None:
 
 @app.command("estimators")
 def feeders_estimators() -> None:
-    """List the estimators a feeder can be watched with."""
+    """List the estimators."""
     from feeders.registry.plugins import EstimatorUnusable
     from feeders.registry.registry import FAMILIES
 
-    table = Table("name", "what it is")
+    table = Table("name", "summary")
     for name in FAMILIES:
         try:
             what = FAMILIES[name].summary
@@ -84,9 +84,9 @@ def feeders_estimators() -> None:
 
 @app.command("validate")
 def feeders_validate(
-    folder: Annotated[list[Path], typer.Argument(help="Folders, or names of gridsec's own feeders.")],
+    folder: Annotated[list[Path], typer.Argument(help="Folders, or names of feeders of the project.")],
 ) -> None:
-    """Check feeders and name every problem at once."""
+    """Validate feeders and print all problems."""
     from feeders.format.tables import examine
     from feeders.model.equipment import folder_of
     from feeders.model.site import from_tables
@@ -120,13 +120,13 @@ def feeders_design(
         typer.Option(help="See `feeders estimators`. [default: as in the file]"),
     ] = None,
     max_attacked: Annotated[
-        int | None, typer.Option(help="How many meters may be manipulated. [default: as in the file]")
+        int | None, typer.Option(help="Number M of manipulated meters. [default: as in the file]")
     ] = None,
     workers: Annotated[
         int | None, typer.Option(help="Processes for matrix inequalities. [default: all cores]", min=1)
     ] = None,
 ) -> None:
-    """Design a feeder's estimator ahead of time; designs that take long are kept for the next start."""
+    """Design a feeder's estimator in advance; slow designs are cached for the next start."""
     from feeders.format.columns import ESTIMATORS
     from feeders.model.site import load
     from feeders.registry.registry import choose, design
@@ -167,25 +167,27 @@ def convert(
     ],
     folder: Annotated[Path, typer.Argument(help="Folder to write.")],
     *,
-    root: Annotated[str | None, typer.Option(help="Bus that is the metered busbar.")] = None,
+    root: Annotated[str | None, typer.Option(help="Bus of the metered busbar.")] = None,
     name: Annotated[
         str | None,
         typer.Option(help="Name of the feeder. [default: that of FOLDER, or of a source that is a feeder]"),
     ] = None,
     droop: Annotated[str | None, typer.Option(help="Droop preset of the source's generators.")] = None,
     opened: Annotated[
-        list[str] | None, typer.Option("--open", help="A line to take as open; may be repeated.")
+        list[str] | None, typer.Option("--open", help="A line to open; may be repeated.")
     ] = None,
     meshed: Annotated[bool, typer.Option("--meshed", help="Keep loops closed.")] = False,
     one_voltage: Annotated[
         bool,
-        typer.Option("--one-voltage", help="End at transformers to another voltage: each is a customer."),
+        typer.Option(
+            "--one-voltage", help="End at transformers to another voltage: each becomes a customer."
+        ),
     ] = False,
 ) -> None:
     """Convert another tool's network into a feeder's folder, and check it by AC power flow against that tool.
 
-    What could not be carried over as it was is printed, and written into conversion.csv and SOURCE.md. A
-    feeder that was written by hand is never replaced; an earlier conversion that differs is kept as FOLDER-1.
+    Changes of the conversion are printed, and written to conversion.csv and SOURCE.md. A feeder that was
+    written by hand is never replaced; an earlier conversion that differs is kept as FOLDER-1.
     """
     from feeders.convert.convert import convert as run
 
@@ -209,7 +211,7 @@ def convert(
 
 
 def _show_changes(done: Conversion) -> None:
-    """Print what was not carried over as it was, elements of the same fate in one row."""
+    """Print the changes of a conversion, equal ones in one row."""
     if not done.changes:
         return
     fates: dict[tuple[str, str, str], list[str]] = {}

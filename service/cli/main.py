@@ -1,8 +1,9 @@
-"""Command line. Every command is a thin layer over a module that does the work.
+"""Command line. Every command is a thin layer over one module.
 
-Exit codes: 0 done; 1 a check failed or something unexpected; 2 wrong usage or settings; 3 a feeder is invalid
-or cannot be watched; 4 the database cannot be used; 5 an address cannot be used (HTTP or zenoh); 6 a file is
-no recording, no network of another tool, or cannot be written; 7 the writer's lock of the database is lost.
+Exit codes: 0 done; 1 a check failed or an unexpected error; 2 wrong usage or settings; 3 a feeder is invalid
+or cannot be monitored; 4 the database cannot be used; 5 an address cannot be used (HTTP or zenoh); 6 a file
+is not a recording or another tool's network, or cannot be written; 7 the writer's lock of the database is
+lost.
 """
 
 from __future__ import annotations
@@ -77,9 +78,9 @@ study_app.command("compare")(study_compare.compare)
 
 app = typer.Typer(
     name="gridsec",
-    help="Watches the voltages of distribution feeders and names the meters that lie.",
+    help="Monitors the voltages of distribution feeders and identifies manipulated meters.",
     no_args_is_help=True,
-    rich_markup_mode="markdown",  # brackets in help texts are brackets
+    rich_markup_mode="markdown",  # plain brackets in help texts
     pretty_exceptions_enable=False,
     add_completion=False,
 )
@@ -92,8 +93,8 @@ app.command()(serve.serve)
 
 
 def main() -> None:
-    """Run the command line; errors made on purpose become one clear message and an exit code."""
-    # The observers are memory-bound: more BLAS threads only fight with each other.
+    """Run the command line; anticipated errors become one message and an exit code."""
+    # The observers are memory-bound: more BLAS threads slow each other down.
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
     try:
@@ -107,13 +108,7 @@ def main() -> None:
 
 
 def exit_code(error: GridsecError) -> int:
-    """Return the exit code of an error.
-
-    Parameters
-    ----------
-    error
-        The error.
-    """
+    """Return the exit code of an error."""
     from feeders.convert.provenance import BusbarUnclear, SourceUnreadable
     from feeders.simulation.recording import RecordingInvalid
     from service.app import AddressUnavailable
@@ -145,27 +140,27 @@ def exit_code(error: GridsecError) -> int:
 def demo(
     *,
     feeder: Annotated[str, typer.Option(help="Folder or name of a feeder.")] = "simbench-lv-rural1",
-    duration: Annotated[float, typer.Option(min=30.0, help="How long it plays, s.")] = 120.0,
-    attacked: Annotated[int, typer.Option(min=1, help="How many meters lie.")] = 2,
+    duration: Annotated[float, typer.Option(min=30.0, help="Duration, s.")] = 120.0,
+    attacked: Annotated[int, typer.Option(min=1, help="Number of manipulated meters.")] = 2,
     size: Annotated[
-        float, typer.Option(help="By how much at least, as a part of the nominal voltage; 0.03 is 3 %.")
+        float, typer.Option(help="Smallest size, as a part of the nominal voltage; 0.03 is 3 %.")
     ] = 0.03,
     kind: Annotated[
         str, typer.Option(help="bias, scaling, drift, stuck, replay, random, coordinated, coordinated-power.")
     ] = "bias",
-    seed: Annotated[int, typer.Option(min=0, help="Chooses meters, loads and errors.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of meters, loads and errors.")] = 1,
     http: Annotated[
-        str, typer.Option(help="Address of the web page; another free port if it is taken.")
+        str, typer.Option(help="Address of the web page; another free port if it is in use.")
     ] = "127.0.0.1:8000",
     check: Annotated[
         bool,
         typer.Option(
-            "--check", help="Exit 0 only if exactly the manipulated meters were named and all alarms cleared."
+            "--check", help="Exit 0 only if exactly the manipulated meters are named and all alarms clear."
         ),
     ] = False,
-    keep: Annotated[bool, typer.Option("--keep", help="Go on until interrupted.")] = False,
+    keep: Annotated[bool, typer.Option("--keep", help="Continue until interrupted.")] = False,
 ) -> None:
-    """Show it: a service, virtual meters on zenoh of which some begin to lie, and a web page."""
+    """Run a demonstration: a service, virtual meters on zenoh, an attack on some of them, and a web page."""
     from service.cli.demo import Plan, run, verdict
 
     _see_kind(kind, check=check)
@@ -188,7 +183,7 @@ def demo(
 
 
 def _see_kind(kind: str, *, check: bool) -> None:
-    """Refuse kinds that there are not, and with `--check` those that need not show within the demo."""
+    """Refuse unknown kinds, and with `--check` those that may not become visible during the demo."""
     from feeders.simulation.attacks import Kind
 
     if kind not in set(Kind):
@@ -197,14 +192,14 @@ def _see_kind(kind: str, *, check: bool) -> None:
         )
     if check and kind in {Kind.STUCK, Kind.REPLAY}:
         raise typer.BadParameter(
-            f"{kind} shows only once the voltage has moved away from what is repeated, which may take longer "
-            "than the demo: such meters lie by nothing yet and are rightly not named. Leave out --check",
+            f"{kind} is visible only after the voltage has left the repeated values, which may take longer "
+            "than the demo; until then such meters are correctly not named. Leave out --check",
             param_hint="--kind",
         )
 
 
 def _see_size(size: float) -> None:
-    """Refuse sizes that are none, or were said in per cent."""
+    """Refuse invalid sizes, and sizes in per cent."""
     from feeders.simulation.attacks import no_size
 
     problems = no_size(size) if 0.0 < size < math.inf else [f"{size:g}; expected a positive part of nominal"]
@@ -221,8 +216,9 @@ Attacks = Annotated[
     typer.Option(
         "--attack",
         help="kind:count:size:from:to, e.g. bias:2:0.03:20:55 (size as a part of nominal: 0.03 is 3 %, "
-        "times in s after the start); may be repeated. With 'substation' in place of the count the busbar's "
-        "meter lies, by just that size, which may be negative: bias:substation:0.03:20:55.",
+        "times in s after the start); may be repeated. With 'substation' in place of the count, the "
+        "attack is on the busbar meter, with exactly this size, which may be negative: "
+        "bias:substation:0.03:20:55.",
     ),
 ]
 
@@ -231,8 +227,8 @@ InverterAttacks = Annotated[
     list[str] | None,
     typer.Option(
         "--inverter-attack",
-        help="customer:kvar:from:to, e.g. 'load-6:-4:20:55': the customer's inverter injects so many kvar "
-        "beside its droop curve (times in s after the start); may be repeated.",
+        help="customer:kvar:from:to, e.g. 'load-6:-4:20:55': the customer's inverter injects this reactive "
+        "power beyond its droop curve (times in s after the start); may be repeated.",
     ),
 ]
 
@@ -248,11 +244,11 @@ def simulate(
             help="Write a recording (Parquet) instead of publishing; it replaces simulated ones only."
         ),
     ] = None,
-    duration: Annotated[float, typer.Option(min=0.0, help="How long, s; 0 is without end.")] = 600.0,
+    duration: Annotated[float, typer.Option(min=0.0, help="Duration, s; 0 is without end.")] = 600.0,
     dt: Annotated[
         float | None, typer.Option(help="Interval between readings, s. [default: the tick]")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Chooses everything random.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 0,
     season: Annotated[
         str, typer.Option(help="Loads and generation of winter, spring, summer or autumn.")
     ] = "summer",
@@ -261,16 +257,18 @@ def simulate(
     start: Annotated[
         float | None, typer.Option(help="Unix time of the first tick, s. [default: now]")
     ] = None,
-    speed: Annotated[float, typer.Option(min=0.0, help="Virtual seconds per second; 0 is no limit.")] = 1.0,
+    speed: Annotated[
+        float, typer.Option(min=0.0, help="Virtual seconds per second; 0 is without limit.")
+    ] = 1.0,
     lockstep: Annotated[
         int | None,
-        typer.Option(min=2, help="Stay within so many ticks of the service's published estimates."),
+        typer.Option(min=2, help="Largest lead over the service's published estimates, ticks."),
     ] = None,
-    loss: Annotated[float, typer.Option(min=0.0, max=1.0, help="Part of the readings that is lost.")] = 0.0,
+    loss: Annotated[float, typer.Option(min=0.0, max=1.0, help="Share of lost readings.")] = 0.0,
     report_q: Annotated[bool, typer.Option("--report-q", help="Meters report reactive power.")] = False,
     prefix: Annotated[str, typer.Option(help="First chunks of all keys.")] = PREFIX,
 ) -> None:
-    """Play a feeder's meters by full AC power flow: onto zenoh, or into a file.
+    """Simulate a feeder's meters by full AC power flow: onto zenoh, or into a file.
 
     Faster than real time needs a service with `--clock events`.
     """
@@ -286,7 +284,7 @@ def simulate(
     problems = _wrong_times(dt, start)
     if out is not None:
         if math.isinf(length):
-            problems.append("--duration: a recording has an end")
+            problems.append("--duration: a recording needs an end")
         live = {
             "--connect": connect,
             "--lockstep": lockstep,
@@ -324,7 +322,7 @@ def simulate(
 
 
 def _wrong_times(dt: float | None, start: float | None) -> list[str]:
-    """What is wrong with the times of a scenario."""
+    """Problems of the times of a scenario."""
     from feeders.simulation.scenario import LATEST_S
 
     problems = []
@@ -336,17 +334,17 @@ def _wrong_times(dt: float | None, start: float | None) -> list[str]:
 
 
 def _span(begin: float, end: float) -> tuple[float, float]:
-    """Two times, s after the start, one before the other."""
+    """Two times in ascending order, s after the start."""
     if not (math.isfinite(begin) and begin < end and end > 0.0):
         raise ValueError(
-            f"it must begin before it ends, and end after the start, not at {begin:g} and {end:g}"
+            f"expected a start before the end, and an end after the start, not {begin:g} and {end:g}"
         )
     return begin, end
 
 
 @dataclass(frozen=True, slots=True)
 class _Lie:
-    """What --attack says; no count: the busbar's meter lies."""
+    """Parsed value of --attack; without a count, an attack on the busbar meter."""
 
     kind: Kind
     count: int | None
@@ -356,7 +354,7 @@ class _Lie:
 
 
 def _lie(text: str) -> _Lie:
-    """Read `kind:count:size:from:to`."""
+    """Parse `kind:count:size:from:to`."""
     from feeders.simulation.attacks import Kind, no_size
     from service.report.voltages import BUSBAR
 
@@ -368,8 +366,8 @@ def _lie(text: str) -> _Lie:
         raise ValueError(f"expected kind:count:size:from:to with a kind of {', '.join(Kind)}") from None
     on, off = _span(*times)
     if many is not None and many < 1:
-        raise ValueError(f"{many} meters cannot lie")
-    # Who repeats what was lies by what has changed since, whatever size is said.
+        raise ValueError(f"{many} is not a number of meters; expected 1 or more")
+    # The size of a stuck or replayed reading follows from later changes, not from the option.
     sized = many is not None and kind not in (Kind.STUCK, Kind.REPLAY)
     if not math.isfinite(part) or (sized and part <= 0.0):
         what = "positive" if sized else "finite"
@@ -377,12 +375,12 @@ def _lie(text: str) -> _Lie:
     if kind not in (Kind.STUCK, Kind.REPLAY):
         refuse(no_size(part))
     if kind is Kind.DRIFT and math.isinf(off):
-        raise ValueError("a drift must end, as its speed follows from that")
+        raise ValueError("a drift needs an end, which determines its speed")
     return _Lie(kind, many, part, on, off)
 
 
 def _injection(site: Site, text: str) -> InverterAttack:
-    """Read `customer:kvar:from:to`; times are still after the start."""
+    """Parse `customer:kvar:from:to`; times are s after the start."""
     import numpy as np
 
     from gridsec.attack import InverterAttack
@@ -393,14 +391,14 @@ def _injection(site: Site, text: str) -> InverterAttack:
         which, q = owners.index(customer), float(kvar) / site.feeder.base_kva
         times = float(begin), float(end)
     except ValueError:
-        known = f"a customer who has an inverter: {', '.join(owners)}"
-        whose = known if owners else f"an inverter, and {site.feeder.name} has none"
-        raise ValueError(f"expected customer:kvar:from:to with {whose}") from None
+        known = f"a customer with an inverter: {', '.join(owners)}"
+        expected = known if owners else f"an inverter, and {site.feeder.name} has none"
+        raise ValueError(f"expected customer:kvar:from:to with {expected}") from None
     return InverterAttack(np.array([which], dtype=np.intp), np.array([q]), *_span(*times))
 
 
 def _attacked(site: Site, scenario: Scenario, lies: list[_Lie], wrong: list[InverterAttack]) -> Scenario:
-    """The scenario with those who lie, and inverters that inject something else."""
+    """The scenario with its attacks on meters and inverters."""
     from feeders.simulation.attacks import busbar_attack, random_attacks
 
     attacks: list[Attack] = []
@@ -436,7 +434,7 @@ def _publish(
             for _ in play(site, scenario, meters, Pace(*pace)):
                 ticks += 1
     except OutOfStep as error:
-        complain(f"the service does not keep step: {error}")
+        complain(f"the service is out of step: {error}")
         raise typer.Exit(FAILED) from None
     except KeyboardInterrupt:
         pass

@@ -24,37 +24,35 @@ A_FEEDER: Final = "a feeder's folder; tables go into another folder"
 
 
 def is_feeder(folder: Path) -> bool:
-    """Return whether a folder holds a feeder.
+    """True if a folder contains a feeder.
 
     Parameters
     ----------
     folder
-        A folder, or what may become one.
+        A folder, which need not exist.
     """
     return (folder / META_FILE).exists()
 
 
 def write_tables(folder: Path | None, study: str, tables: Mapping[str, pd.DataFrame]) -> None:
-    """Write every table of a study into a folder, as `STUDY-NAME.csv` and `STUDY-NAME.parquet`.
+    """Write every table of a study to a folder, as `STUDY-NAME.csv` and `STUDY-NAME.parquet`.
 
-    A file is replaced when its new content is complete: an interruption leaves the old one. Tables that the
-    study has written there before, and that are no answer to the present question, are removed.
+    A file is replaced when its new content is complete: an interruption leaves the old one. Tables of earlier
+    runs of the study that the present run does not write are removed.
 
     Parameters
     ----------
     folder
-        Where to; it is made if it does not exist. None: nothing is written.
-    study
-        The study's name.
+        Destination; created if it does not exist. None: nothing is written.
     tables
-        Table by name. Names are those of files, without ending.
+        Table by name. Names are file names without a suffix.
 
     Raises
     ------
     ValueError
-        If a name is not that of a file in the folder.
+        If a name is not a file name.
     FileExistsError
-        If the folder is a feeder's.
+        If the folder contains a feeder.
     OSError
         If the folder cannot be written.
     """
@@ -65,11 +63,11 @@ def write_tables(folder: Path | None, study: str, tables: Mapping[str, pd.DataFr
     folder.mkdir(parents=True, exist_ok=True)
     for name, frame in tables.items():
         if Path(name).name != name or name in ("", ".."):
-            raise InputInvalid([Problem("wrong-name", f"{name!r} is no name of a table's file")])
+            raise InputInvalid([Problem("wrong-name", f"{name!r} is not a name of a table's file")])
         replace_file(folder / f"{study}-{name}.csv", partial(frame.to_csv, index=False))
         replace_file(folder / f"{study}-{name}.parquet", partial(_for_parquet(frame).to_parquet, index=False))
     for old in sorted(folder.glob(f"{study}-*.csv")):
-        # A table is two files: one alone is somebody's own.
+        # A table is a pair of files; a single file is not from a study and stays.
         twin = old.with_suffix(".parquet")
         if old.stem.removeprefix(f"{study}-") not in tables and twin.is_file():
             old.unlink()
@@ -77,7 +75,7 @@ def write_tables(folder: Path | None, study: str, tables: Mapping[str, pd.DataFr
 
 
 def _for_parquet(frame: pd.DataFrame) -> pd.DataFrame:
-    """Parquet has one type for each column: values of several types become text, as CSV shows them."""
+    """Convert columns of several types to text, as in CSV: Parquet has one type for each column."""
     mixed = [
         name
         for name in frame.columns
@@ -87,18 +85,18 @@ def _for_parquet(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 Given = Mapping[str, Path | None]
-"""Path by option; None where the option was not given."""
+"""Path by option; None for an option that was not given."""
 
 NONE: Final[Given] = {}
 
 
 class Unusable(GridsecError):
-    """Files or folders of a command cannot be used; `problems` names everything that is wrong with them.
+    """Files or folders of a command cannot be used; `problems` lists all problems.
 
     Parameters
     ----------
     problems
-        One sentence each: option, path, and what is wrong.
+        One sentence each: option, path, and problem.
     """
 
     code = "unusable-path"
@@ -123,29 +121,29 @@ def see(
     simulated: Given = NONE,
     read: Given = NONE,
 ) -> None:
-    """Refuse, all at once, what could not be read or written after the work. Nothing is left behind.
+    """Check input and output paths before a command starts; raise all problems at once. Leaves no files.
 
     Parameters
     ----------
     folders
-        Into which tables are written; made where they do not exist.
+        Folders for tables; created if they do not exist.
     over
-        Other folders into which something is written, be it over a feeder.
+        Other output folders, which may contain a feeder.
     new
-        Folders that must not be there yet, or be empty.
+        Folders that must not exist yet, or be empty.
     files
-        That are written as they are; folders above them are made.
+        Files that are written in place; folders above them are created.
     replaced
-        Files that are replaced as a whole, by others made beside them.
+        Files that are replaced as a whole, by new files beside them.
     simulated
-        Files of a simulation, likewise: they replace only such files, never what was measured.
+        Files of a simulation, also replaced as a whole: only such files are replaced, never measurements.
     read
-        Files that are read.
+        Input files.
 
     Raises
     ------
     Unusable
-        If there is something that cannot be used.
+        If a path cannot be used.
     """
     written = {**folders, **over, **new, **files, **replaced, **simulated}
     checks: list[tuple[Given, Callable[[Path], Problem | None]]] = [
@@ -183,13 +181,13 @@ def _over(path: Path) -> Problem | None:
     if path.exists() and not path.is_dir():
         return Problem("not-folder", "a file; expected a folder")
     if path.is_symlink() and not path.exists():
-        return Problem("dead-link", "a link to what does not exist; expected a folder")
+        return Problem("dead-link", "a dead link; expected a folder")
     return _room(path)
 
 
 def _new(path: Path) -> Problem | None:
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
-        return Problem("exists", "already there; expected a new folder")
+        return Problem("exists", "exists; expected a new folder")
     return _room(path)
 
 
@@ -212,7 +210,7 @@ def _simulated(path: Path) -> Problem | None:
     from feeders.simulation.recording import is_simulated
 
     if path.is_file() and path.stat().st_size and not is_simulated(path):
-        return Problem("not-simulated", "already there, and not of a simulation; expected another file")
+        return Problem("not-simulated", "exists and is not from a simulation; expected another file")
     return _replaced(path)
 
 
@@ -226,7 +224,7 @@ def _read(path: Path) -> Problem | None:
 
 
 def _room(path: Path) -> Problem | None:
-    """Why nothing can be made in a folder, or in one that is made for it."""
+    """Reason why no file can be created in a folder, or in its lowest existing parent; None without one."""
     above = path.absolute()
     there = next(each for each in (above, *above.parents) if each.exists())
     if not there.is_dir():
@@ -239,7 +237,7 @@ def _room(path: Path) -> Problem | None:
 
 
 def _same(given: Given, files: set[str]) -> Iterator[Problem]:
-    """Files that something else is written into, or read from, as well."""
+    """Files with a path that another option also writes or reads."""
     where = {option: Path(os.path.realpath(path)) for option, path in given.items() if path is not None}
     told = set[frozenset[str]]()
     for one, other in permutations(where, 2):
@@ -247,4 +245,4 @@ def _same(given: Given, files: set[str]) -> Iterator[Problem]:
             continue
         if frozenset((one, other)) not in told:
             told.add(frozenset((one, other)))
-            yield Problem("same-path", f"{one} {given[one]}: {other} needs it as well")
+            yield Problem("same-path", f"{one} {given[one]}: {other} uses it as well")

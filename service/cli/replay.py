@@ -1,4 +1,4 @@
-"""`gridsec replay`: what the service would have said of a recording."""
+"""`gridsec replay`: alarms of the service for a recording."""
 
 from __future__ import annotations
 
@@ -23,14 +23,12 @@ def replay(
     *,
     file: Annotated[Path, typer.Argument(help="A recording (Parquet).", metavar="FILE")],
     feeder: Annotated[
-        str | None, typer.Option(help="Folder or name. [default: the one it was recorded on]")
+        str | None, typer.Option(help="Folder or name. [default: the feeder of the recording]")
     ] = None,
     estimator: Estimator = None,
     clock: Annotated[
         str,
-        typer.Option(
-            help="events: the readings tell the time; wall: the time of their arrival, as it was live."
-        ),
+        typer.Option(help="events: time of the readings; wall: time of their arrival, as in live operation."),
     ] = "events",
     max_skew: MaxSkew = None,
     grace: Grace = None,
@@ -40,10 +38,10 @@ def replay(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object per alarm transition.")] = False,
 ) -> None:
-    """Run a recording through the same chain as the live service, and show what it would have said.
+    """Run a recording through the chain of the live service, and print the resulting alarms.
 
-    With the `--estimator`, `--max-skew` and `--grace` that the service was started with, by options or by
-    GRIDSEC_... variables: these are not read here.
+    Use the `--estimator`, `--max-skew` and `--grace` of the live service, from its options or GRIDSEC_...
+    variables: this command does not read the variables.
     """
     from feeders.registry.registry import choose
     from feeders.simulation.recording import RecordingInvalid, read_recording
@@ -56,9 +54,7 @@ def replay(
     intervals = [interval for one in skipped or [] if (interval := _interval(one)) is not None]
     recording = read_recording(file)
     if clock == Clock.WALL and not recording.timed:
-        raise RecordingInvalid(
-            f"{file}: no column arrival, so it does not say what was live with --clock wall"
-        )
+        raise RecordingInvalid(f"{file}: no column arrival, which --clock wall needs")
     site = choose(_site_of(recording, feeder), estimator=estimator)
     tally = Tally()
     began: float | None = None
@@ -85,7 +81,7 @@ def replay(
     summary.print(f"ticks:    {_counts(tally.ticks)}, skipped {tally.skipped}")
     summary.print(f"readings: {_counts(tally.readings)}, never arrived {tally.lost}")
     if not tally.judged:
-        complain("no tick was judged, which is no answer: whether anybody lied is not known")
+        complain("no tick has a verdict: there is no answer on manipulation")
         raise typer.Exit(FAILED)
 
 
@@ -109,7 +105,7 @@ def _problems(
 
 
 def _interval(text: str) -> tuple[float, float] | None:
-    """First and last time of `FROM:TO`, Unix s; None if the text is something else."""
+    """First and last time of `FROM:TO`, Unix s; None for another text."""
     try:
         first, last = map(float, text.split(":"))
     except ValueError:
@@ -118,20 +114,20 @@ def _interval(text: str) -> tuple[float, float] | None:
 
 
 def _site_of(recording: Recording, feeder: str | None) -> Site:
-    """The feeder that is given, or that of the recording; said if it is not quite the same."""
+    """The given feeder, or the feeder of the recording; a difference in its files is printed."""
     from feeders.model.site import load
     from feeders.simulation.recording import RecordingInvalid
 
     file = recording.path
     name = feeder or recording.feeder
     if name is None:
-        raise typer.BadParameter("the file does not say which feeder it belongs to", param_hint="--feeder")
+        raise typer.BadParameter("the file does not contain the name of its feeder", param_hint="--feeder")
     try:
         site = load(name)
     except FeederInvalid as error:
         if feeder is not None:
             raise
-        where = f"{file} was recorded on {name!r}: --feeder says where its folder is"
+        where = f"{file} was recorded on {name!r}: give its folder with --feeder"
         raise FeederInvalid([Problem("recorded-feeder", where), *error.problems]) from error
     if recording.feeder not in {None, site.feeder.name}:
         raise RecordingInvalid(f"{file}: recorded on {recording.feeder}, not on {site.feeder.name}")

@@ -1,4 +1,4 @@
-"""`gridsec reproduce`: the examples of the papers, their numbers beside ours, their figures as PNG."""
+"""`gridsec reproduce`: the examples of the papers, printed and computed numbers, and figures as PNG."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from gridsec.papers.claims import Claim, Reproduction
 
-# Short name of each paper: the module of gridsec.papers that holds its examples.
+# Short names of the papers: modules of gridsec.papers.
 PAPERS: Final = ("chong2020", "kim2018", "lee2018", "yang2019", "yang2021")
 
 
@@ -30,9 +30,9 @@ def reproduce(
     *,
     out: Annotated[Path, typer.Option(help="Folder for the figures.")] = Path("figures"),
 ) -> None:
-    r"""Compute a paper's examples, show its numbers beside ours, and draw its figures.
+    r"""Compute a paper's examples, print its numbers and the computed ones, and draw its figures.
 
-    Exit code 1 if a number of a paper does not come out and no reason for it is known. The figures need
+    Exit code 1 if a number of a paper differs without a known reason. The figures need
     matplotlib, in a checkout: pip install -e '.\[plot]'.
     """
     from gridsec.papers import draw
@@ -73,7 +73,7 @@ def _chosen(paper: str) -> tuple[str, ...]:
 
 
 def _computed(papers: tuple[str, ...]) -> Iterator[tuple[Reproduction, float]]:
-    """Reproduce one paper after the other, with a line of progress on standard error meanwhile."""
+    """Reproduce the papers one by one, with a line of progress on standard error."""
     columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
     for number, paper in enumerate(papers, start=1):
         started = time.monotonic()
@@ -86,7 +86,7 @@ def _computed(papers: tuple[str, ...]) -> Iterator[tuple[Reproduction, float]]:
 
 
 def _show(made: Reproduction, seconds: float) -> None:
-    """Print a table of claims; below it the reasons where they differ."""
+    """Print a table of claims, and below it the reasons of differences."""
     reasons: list[str] = []
     table = Table("", "what", "where", "paper", "ours", title_justify="left")
     table.title = f"[bold]{escape(made.paper)}[/], computed in {seconds:.1f} s"
@@ -110,5 +110,5 @@ def _printed(claim: Claim) -> str:
 
 
 def _text(value: float | str) -> str:
-    """Write a value: a text as it is, a number with six digits."""
+    """Format a value: a text unchanged, a number with six digits."""
     return value if isinstance(value, str) else f"{value:.6g}"

@@ -1,4 +1,4 @@
-"""`gridsec serve`: the service, until it is interrupted."""
+"""`gridsec serve`: runs the service until it is interrupted."""
 
 from __future__ import annotations
 
@@ -28,37 +28,33 @@ Endpoints = Annotated[
     list[str] | None, typer.Option(help="zenoh endpoint to connect to, e.g. tcp/127.0.0.1:7447.")
 ]
 Mode = Annotated[str | None, typer.Option(help="router, peer or client. [default: router]")]
-Config = Annotated[
-    Path | None, typer.Option(help="Your own zenoh configuration (json5): TLS, access rules, ...")
-]
+Config = Annotated[Path | None, typer.Option(help="zenoh configuration file (json5): TLS, access rules, ...")]
 Prefix = Annotated[str | None, typer.Option(help="First chunks of all keys. [default: gridsec]")]
 Http = Annotated[str | None, typer.Option(help="Address of REST and web page. [default: 127.0.0.1:8000]")]
 HttpHost = Annotated[
     list[str] | None,
-    typer.Option(help="Host name by which REST may change something, behind a proxy; may be repeated."),
+    typer.Option(help="Host name for changes over REST, behind a proxy; may be repeated."),
 ]
 Database = Annotated[
     str | None,
     typer.Option(help="sqlite:///file or postgresql+psycopg://... [default: sqlite:///gridsec.db]"),
 ]
-ClockOf = Annotated[
-    str | None, typer.Option(help="wall, or events: the readings tell the time. [default: wall]")
-]
+ClockOf = Annotated[str | None, typer.Option(help="wall, or events: time of the readings. [default: wall]")]
 MaxSkew = Annotated[
     float | None,
-    typer.Option(help="Refuse readings whose time is further off, s. [default: 60 or 2 ticks]"),
+    typer.Option(help="Largest deviation of a reading's time, s. [default: 60 or 2 ticks]"),
 ]
 Grace = Annotated[
     float | None,
-    typer.Option(help="How long a tick waits for readings, s. [default: half a tick, at most 60]"),
+    typer.Option(help="Longest wait of a tick for readings, s. [default: half a tick, at most 60]"),
 ]
 MaxPayload = Annotated[int | None, typer.Option(help="Largest payload, bytes. [default: 262144]")]
-Queue = Annotated[int | None, typer.Option(help="Payloads that may wait. [default: 20000]")]
-MaxFeeders = Annotated[int | None, typer.Option(help="Feeders that may be put over REST. [default: 100]")]
+Queue = Annotated[int | None, typer.Option(help="Length of the queue, payloads. [default: 20000]")]
+MaxFeeders = Annotated[int | None, typer.Option(help="Largest number of feeders over REST. [default: 100]")]
 LogLevel = Annotated[str | None, typer.Option(help="debug, info, warning or error. [default: info]")]
 LogFormat = Annotated[str | None, typer.Option(help="console or json. [default: console]")]
 STOP_S = 2.7
-"""Time from a signal to the end by force, s; the promise is 3 s."""
+"""Time from a signal to the forced end, s; the documented limit is 3 s."""
 UntilEof = Annotated[bool, typer.Option(hidden=True, help="End when standard input ends.")]
 
 
@@ -84,7 +80,7 @@ def serve(
     log_format: LogFormat = None,
     until_eof: UntilEof = False,
 ) -> None:
-    """Watch feeders until interrupted. Every option can also be set as GRIDSEC_..., e.g. GRIDSEC_HTTP.
+    """Monitor feeders until interrupted. Every option can also be set as GRIDSEC_..., e.g. GRIDSEC_HTTP.
 
     `--feeder` is GRIDSEC_FEEDERS, `--http-host` GRIDSEC_HTTP_HOSTS, `--max-skew` GRIDSEC_MAX_SKEW_S and
     `--grace` GRIDSEC_GRACE_S.
@@ -137,10 +133,10 @@ def serve(
 
 
 def _end_within(seconds: float, ended: threading.Event) -> None:
-    """End the process after a time even if something hangs: a commit, a socket, a design.
+    """End the process after a time even if a step hangs: a commit, a socket, a design.
 
-    A request is confirmed after its commit only, so nothing confirmed is lost. The exit code is 0 where the
-    service itself has ended and only the interpreter has not.
+    A request is confirmed only after its commit, so that no confirmed request is lost. The exit code is 0 if
+    the service itself has ended and only the interpreter has not.
     """
     import structlog
 
@@ -159,7 +155,7 @@ def _end_within(seconds: float, ended: threading.Event) -> None:
 
 
 def _stop_at_eof(loop: asyncio.AbstractEventLoop, stop: Callable[[], None]) -> None:
-    """Stop when whoever started us has gone: its end of our standard input closes."""
+    """Stop when the parent process has ended: standard input is then closed."""
 
     def wait() -> None:
         while os.read(sys.stdin.fileno(), 4096):

@@ -1,4 +1,4 @@
-"""What a command has done is kept, unless it is told not to; and what is said when it is interrupted."""
+"""Journal handling and signal handling of study commands."""
 
 from __future__ import annotations
 
@@ -33,25 +33,25 @@ JournalAt = Annotated[
     Path | None,
     typer.Option(
         "--journal",
-        help="Keep finished work in this file, and go on from it. [default: a file in the user's folder for "
-        "caches, until the study is done]",
+        help="Keep finished work in this file, and continue from it. [default: a file in the user's cache "
+        "folder, until the study is done]",
     ),
 ]
 NoJournal = Annotated[
-    bool, typer.Option("--no-journal", help="Keep none: an interruption loses what is done.")
+    bool, typer.Option("--no-journal", help="No journal: an interruption loses finished work.")
 ]
 
 SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
 
 PATIENCE_S: Final = 3.0
-"""How long a command may take to hear a signal, and then to end its processes, s."""
+"""Time limit for the reaction to a signal, and then for the end of the processes, s."""
 
 MOST: Final = 64
-"""How many journals of interrupted studies stay in the user's folder for caches."""
+"""Largest number of journals of interrupted studies in the user's cache folder."""
 
 
 class Stopped(KeyboardInterrupt):
-    """A signal asks the command to end."""
+    """A signal requests the end of the command."""
 
     def __init__(self, number: int) -> None:
         super().__init__(number)
@@ -60,22 +60,22 @@ class Stopped(KeyboardInterrupt):
 
 @dataclass(slots=True)
 class Keeping:
-    """A command's journals; a `feeders.studies.journal.Keeper`.
+    """Journals of a command; a `feeders.studies.journal.Keeper`.
 
     Attributes
     ----------
     study, feeder
-        The command's own study, and its feeder as it was given.
+        Study of the command, and its feeder as on the command line.
     chosen
-        The file for it that was asked for; further studies of the command have theirs beside it.
+        Journal file of the option; further studies of the command have theirs beside it.
     folder
-        Where journals are otherwise; None: there are none.
+        Folder of the other journals; None without any.
     stay
-        Whether they stay there when the command is done.
+        True if they stay there after the command.
     journals
-        All that were opened, with the name of the study.
+        All opened journals, with the name of the study.
     resumed
-        Names of studies that went on from before.
+        Names of studies that were continued.
     """
 
     study: str
@@ -89,7 +89,7 @@ class Keeping:
     _warned: bool = False
 
     def file(self, study: str, digest: str) -> Path | None:
-        """As `Keeper`: the file that was asked for, or one in the folder."""
+        """As `Keeper`: the file of the option, or one in the folder."""
         self._name = study
         if self.chosen is not None:
             return (
@@ -101,14 +101,14 @@ class Keeping:
         return self.folder / f"{study}-{feeder}-{digest}.jsonl"
 
     def opened(self, journal: Journal) -> None:
-        """As `Keeper`: say where it goes on."""
+        """As `Keeper`: print the progress of a continued study."""
         self.journals.append((self._name, journal))
         if journal.path is not None and journal.done:
             self.resumed.add(self._name)
-            console.err.print(escape(f"going on from {journal.path}, {_amount(journal)} done"))
+            console.err.print(escape(f"continuing from {journal.path}, {_amount(journal)} done"))
 
     def refused(self, path: Path, why: OSError | OtherStudy | InUse) -> bool:
-        """As `Keeper`: what was not asked for is no reason not to work."""
+        """As `Keeper`: without the option, a study runs without a journal that cannot be used."""
         from feeders.studies.journal import OtherStudy
 
         if self.chosen is not None:
@@ -118,17 +118,17 @@ class Keeping:
             return True
         if not self._warned:
             said = f"{why.filename or path}: {why.strerror}" if isinstance(why, OSError) else str(why)
-            complain(f"no journal is kept, an interruption loses what is done: {said}")
+            complain(f"no journal is kept, an interruption loses finished work: {said}")
             self._warned = True
         return False
 
     def close(self, *, done: bool) -> None:
-        """Let go of all journals; those that are not needed any more are removed.
+        """Close all journals; those no longer needed are removed.
 
         Parameters
         ----------
         done
-            Whether the command is.
+            True after a complete command.
         """
         from feeders.studies.journal import remove
 
@@ -139,17 +139,17 @@ class Keeping:
                 remove(journal.path)
 
     def left(self) -> str:
-        """What is done, and where it is kept."""
+        """Finished work, and the location of its journal."""
         if not self.journals:
-            return "nothing was done yet"
+            return "no work was done yet"
         study, journal = self.journals[-1]
         begun = f"{study}: {_amount(journal)} done"
         if not journal.done:
             before = [each for _, each in self.journals[:-1] if each.path is not None and each.done]
-            return f"{begun}; what was before it is kept, the same command goes on" if before else begun
+            return f"{begun}; earlier studies are kept, the same command continues" if before else begun
         if journal.path is None:
             return f"{begun}, and lost: no journal was kept"
-        return f"{begun}, kept in {journal.path}; the same command goes on from there"
+        return f"{begun}, kept in {journal.path}; the same command continues from there"
 
 
 def _amount(journal: Journal) -> str:
@@ -167,26 +167,26 @@ def keeping(
     without: bool = False,
     folder: Path | None = None,
 ) -> Iterator[Keeping]:
-    """Keep journals of a command's studies; interrupted, it says in one line what is done and how to go on.
+    """Keep journals of a command's studies; after an interruption one line states the progress.
 
     Parameters
     ----------
     study, feeder
-        The command's own study, and its feeder as it was given.
+        Study of the command, and its feeder as on the command line.
     journal
-        The file that was asked for.
+        Journal file of the option.
     without
-        Keep none.
+        Keep no journal.
     folder
-        Where they are and stay; None: in the user's folder for caches, until the command is done.
+        Folder in which journals stay; None: in the user's cache folder, until the command is done.
 
     Raises
     ------
     typer.Exit
-        If it was interrupted.
+        After an interruption.
     """
     if without and journal is not None:
-        raise typer.BadParameter("goes without --journal", param_hint="--no-journal")
+        raise typer.BadParameter("excludes --journal", param_hint="--no-journal")
     from feeders.registry.design_cache import folder as cache_folder
     from feeders.studies.workers import ClusterUnusable, WorkerLost
 
@@ -205,9 +205,9 @@ def keeping(
         console.err.print(escape(kept.left()))
         raise
     except (DesignInfeasible, NotObservable):
-        kept.close(done=True)  # that there is no answer is one, and it would be the same again
+        kept.close(done=True)  # an infeasible design is a result; a repetition would give the same
         raise
-    except BaseException:  # what was finished before something else failed is not to be done again
+    except BaseException:  # work finished before another failure need not be repeated
         kept.close(done=False)
         raise
     kept.close(done=True)
@@ -216,10 +216,10 @@ def keeping(
 
 
 def idle() -> Callable[[], object]:
-    """Let a signal end the program with one line while no work is in hand; returns what undoes that."""
+    """Let a signal end the program with one line while no study runs; returns the undo function."""
 
     def stop(number: int, _: FrameType | None) -> Never:
-        complain("interrupted; no work was in hand")
+        complain("interrupted; no work was in progress")
         sys.exit(128 + number)
 
     return partial(_handle, _handle(dict.fromkeys(SIGNALS, stop)))
@@ -227,10 +227,10 @@ def idle() -> Callable[[], object]:
 
 @contextmanager
 def _signals(left: Callable[[], str]) -> Iterator[None]:
-    """SIGTERM stops a command as Ctrl-C does, and whoever does that twice does not want to wait.
+    """Stop a command by SIGTERM as by Ctrl-C; a second signal ends it at once.
 
-    A solver that has the program for minutes lets no handler run, but a thread: this ends it then, and also
-    where processes do not end. Every result is in the journal as soon as there is one: no more is lost.
+    A long call of a solver lets no signal handler run. The thread then ends the program, and also if child
+    processes do not end. Every result is in the journal as soon as it exists: no more is lost.
     """
     heard, over = threading.Event(), threading.Event()
 
@@ -244,7 +244,7 @@ def _signals(left: Callable[[], str]) -> Iterator[None]:
         if not number or (heard.wait(PATIENCE_S) and over.wait(PATIENCE_S)):
             return
         try:
-            with suppress(IndexError):  # there is no progress bar
+            with suppress(IndexError):  # without a progress bar
                 console.err.clear_live()
             console.err.control(Control(ControlType.CARRIAGE_RETURN, (ControlType.ERASE_IN_LINE, 2)))
             complain(f"interrupted; {left()}")
@@ -272,7 +272,7 @@ def _signals(left: Callable[[], str]) -> Iterator[None]:
 
 
 def _handle(handlers: Mapping[signal.Signals, Any]) -> dict[signal.Signals, Any]:
-    """Set handlers and return those before. Who ignores a signal, as `nohup` does, goes on doing so."""
+    """Set handlers and return the previous ones. Ignored signals, as with `nohup`, stay ignored."""
     if threading.current_thread() is not threading.main_thread():
         return {}
     return {
@@ -288,7 +288,7 @@ def _end(number: int, _: FrameType | None) -> Never:
 
 
 def _prune(folder: Path) -> None:
-    """Drop the journals that nobody has come back to for longest."""
+    """Remove the journals with the oldest last use."""
     from feeders.studies.journal import remove
 
     found = sorted(folder.glob("*.jsonl"), key=lambda path: path.stat().st_mtime_ns)

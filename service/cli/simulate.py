@@ -1,4 +1,4 @@
-"""Virtual meters: a scenario's readings onto zenoh, at any speed, or in step with the service."""
+"""Virtual meters: readings of a scenario onto zenoh, at any speed, or in step with the service."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from feeders.simulation.meters import BUSBAR
 from feeders.simulation.scenario import Reading, Sample, Scenario, simulate
 from service.ingest.zenoh_bus import Meters
 
-# Beside much other work a service may pause for seconds.
+# A service on a busy machine may pause for seconds.
 WAIT_S = 20.0
 _POLL_S = 0.0005
 
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """How fast virtual time runs.
+    """Speed of virtual time.
 
     Attributes
     ----------
     speed
-        Virtual seconds per second; 1 is real time, infinity as fast as it goes.
+        Virtual seconds per second; 1 is real time, infinity without limit.
     ahead
-        In step with the service: at most so many ticks ahead of its published estimates (the feeder's ticks,
-        or the meters' readings where these are rarer). None: not in step.
+        In step with the service: largest lead over its published estimates, ticks (the feeder's ticks, or the
+        intervals of readings if longer). None: not in step.
     """
 
     speed: float = 1.0
@@ -39,7 +39,7 @@ class Pace:
 
 
 class OutOfStep(Exception):
-    """The service has published no estimate for a while, although it should have."""
+    """The service has published no estimate within `WAIT_S`."""
 
 
 def key_of(feeder: str, meter: str) -> str:
@@ -48,20 +48,14 @@ def key_of(feeder: str, meter: str) -> str:
     Parameters
     ----------
     feeder, meter
-        Names; the meter `feeders.simulation.meters.BUSBAR` is the substation's.
+        Names; the meter `feeders.simulation.meters.BUSBAR` is the busbar meter.
     """
     source = "substation" if meter == BUSBAR else f"meter/{meter}"
     return f"{feeder}/{source}/reading"
 
 
 def payload_of(reading: Reading) -> bytes:
-    """Return a reading as the JSON of the wire.
-
-    Parameters
-    ----------
-    reading
-        The reading.
-    """
+    """Return a reading as transmitted JSON."""
     fields = {
         "t": reading.t,
         "seq": reading.seq,
@@ -83,20 +77,14 @@ def play(
     clock: Callable[[], float] = time.monotonic,
     sleep: Callable[[float], None] = time.sleep,
 ) -> Iterator[Sample]:
-    """Publish a scenario's readings, tick by tick, each when its time has come.
+    """Publish a scenario's readings, tick by tick, each at its time.
 
     Parameters
     ----------
-    site
-        The feeder.
-    scenario
-        What happens to it.
     meters
-        The open zenoh session of the meters.
-    pace
-        How fast.
+        Open zenoh session of the meters.
     clock, sleep
-        The machine's.
+        Clock and sleep function, s.
 
     Yields
     ------
@@ -106,7 +94,7 @@ def play(
     Raises
     ------
     OutOfStep
-        If the service does not keep step.
+        If the service does not keep up.
     BusUnavailable
         If zenoh is closed.
     """
@@ -138,21 +126,21 @@ class _Steps:
     """Keeps a simulation in step with the published estimates of a feeder.
 
     Readings every d seconds, the last of them at t, let the service publish the latest tick that is not after
-    t; of ticks every s seconds that is one of less than s ago. So it can always be waited for until t minus
-    the published time is less than a max(d, s), for any d, s, beginning, and a >= 1.
+    t; of ticks every s seconds that is one of less than s ago. The wait until t minus the published time is
+    less than a max(d, s) therefore always ends, for any d, s, start, and a >= 1.
     """
 
     def __init__(self, meters: Meters, site: Site, ahead: int, dt_s: float) -> None:
         tick_s = site.tables.meta.monitor.tick_s
         self._meters = meters
-        # Sums of many steps are not exact: what is a thousandth short of the next step has reached it.
+        # Sums of many steps are not exact: a thousandth of a step is the tolerance.
         self._ahead_s = ahead * max(dt_s, tick_s) - 1e-3 * min(dt_s, tick_s)
         self._reached: float | None = None
         self._first: float | None = None
         meters.watch(site.feeder.name)
 
     def wait(self, t: float, clock: Callable[[], float], sleep: Callable[[float], None]) -> None:
-        """Wait until the estimates have come near to t."""
+        """Wait until the estimates are near t."""
         if self._first is None:
             self._first = t
         give_up = clock() + WAIT_S

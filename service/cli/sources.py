@@ -1,4 +1,4 @@
-"""Studies of another tool's network: it becomes a feeder's folder first."""
+"""Conversion of another tool's network to a feeder's folder before a study."""
 
 from __future__ import annotations
 
@@ -24,32 +24,31 @@ if TYPE_CHECKING:
 __all__ = ["FOLDER", "converted", "show_check", "spared"]
 
 FOLDER: Final = "feeder"
-"""Name of a converted feeder's folder within that of the results."""
+"""Name of a converted feeder's folder within the folder of the results."""
 
 
 def converted(feeder: str, out: Path | None) -> str:
-    """Return a feeder as `model.site.load` takes it; another tool's network is converted, and that is told.
+    """Return a feeder for `model.site.load`; another tool's network is converted, with a message.
 
-    It is converted again each time: an OpenDSS file may lead to others that have changed while it has not.
-    What an earlier conversion left there is kept under another name unless it is the same, see `spared`.
+    The conversion is repeated each time: an OpenDSS file may refer to others that have changed. A different
+    earlier conversion in the folder is kept under another name, see `spared`.
 
     Parameters
     ----------
     feeder
-        A folder, the name of a feeder that comes with the project, or any source of
-        `feeders.convert.convert`.
+        A folder, the name of a feeder of the project, or any source of `feeders.convert.convert`.
     out
-        Folder of the results, in which the feeder's becomes `feeder`; None: a folder for temporary files,
-        which stays, so that what was not carried over can be read.
+        Folder of the results, in which the feeder's becomes `feeder`; None: a temporary folder, which stays
+        with its list of changes.
 
     Raises
     ------
     FeederInvalid, BusbarUnclear
-        If there is no feeder in it, or more than one; with how to choose.
+        If the network contains no feeder, or more than one; with advice on the choice.
     GridsecError
-        If it cannot be read.
+        If the network cannot be read.
     FileExistsError
-        If there is something else where the feeder is to be written.
+        If the destination exists and is not a converted feeder.
     """
     from feeders.convert.convert import convert
     from feeders.convert.provenance import CHANGES_FILE, BusbarUnclear
@@ -60,7 +59,9 @@ def converted(feeder: str, out: Path | None) -> str:
     temporary = None if out is not None else Path(tempfile.mkdtemp(prefix="gridsec-"))
     folder = (out or temporary or Path()) / FOLDER
     if folder.exists() and not (folder / CHANGES_FILE).is_file():
-        raise FileExistsError(f"{folder}: already there, and no converted feeder; {feeder} would become it")
+        raise FileExistsError(
+            f"{folder}: exists and is not a converted feeder; {feeder} would be converted to it"
+        )
     command = command_line(("gridsec", "feeders", "convert", feeder, "FOLDER"))
     advice = (
         f"to choose: {command}, with --root BUS (the metered busbar) and "
@@ -87,14 +88,14 @@ def converted(feeder: str, out: Path | None) -> str:
 
 @contextmanager
 def spared(folder: Path) -> Iterator[None]:
-    """Keep a copy of an earlier conversion, as `FOLDER-1`, unless what is written over it is the same.
+    """Keep a copy of an earlier conversion, as `FOLDER-1`, unless the new one is equal.
 
-    A copy, since the folder may be the source, hold its files, or be the one that the command runs in.
+    A copy, since the folder may be the source, contain its files, or be the working directory.
 
     Parameters
     ----------
     folder
-        Where a conversion is written.
+        Destination of a conversion.
     """
     from feeders.convert.convert import WRITTEN
 
@@ -114,24 +115,18 @@ def spared(folder: Path) -> Iterator[None]:
         if all((folder / name).read_bytes() == (kept / name).read_bytes() for name in old):
             shutil.rmtree(kept)
         else:
-            console.out.print(escape(f"what was in {folder} before is not the same; it is now in {kept}"))
+            console.out.print(escape(f"the earlier content of {folder} differs; it is now in {kept}"))
 
 
 def _name(feeder: str) -> str:
-    """A feeder's name: that of the file, or of the network within its collection."""
+    """Name of a feeder: that of the file, or of the network within its collection."""
     path = Path(feeder)
     name = path.stem if path.is_file() else feeder.partition(":")[2] or feeder
     return re.sub(r"[^A-Za-z0-9_-]+", "-", name)[:64]
 
 
 def show_check(done: Conversion) -> None:
-    """Print how a conversion compares with its source's power flow.
-
-    Parameters
-    ----------
-    done
-        The conversion.
-    """
+    """Print the comparison of a conversion with its source's power flow."""
     if done.check is None:
         console.err.print(f"[yellow]not checked: {escape(done.unchecked)}[/]")
         return

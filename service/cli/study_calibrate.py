@@ -1,4 +1,4 @@
-"""`gridsec study calibrate`: what recorded readings say against a feeder's files."""
+"""`gridsec study calibrate`: comparison of recorded readings with a feeder's files."""
 
 from __future__ import annotations
 
@@ -29,11 +29,9 @@ def calibrate(
         float, typer.Option(help="Probability of any proposal if the files are right.", min=1e-9, max=0.5)
     ] = 0.05,
     tolerance: Annotated[
-        float, typer.Option(help="Error of lines' lengths that is no mistake, 1 sigma, relative.")
+        float, typer.Option(help="Accepted error of lines' lengths, 1 sigma, relative.")
     ] = 0.02,
-    exclude: Annotated[
-        list[str] | None, typer.Option(help="A meter that is not trusted; may be repeated.")
-    ] = None,
+    exclude: Annotated[list[str] | None, typer.Option(help="A meter to exclude; may be repeated.")] = None,
     look_for: Annotated[
         list[str] | None,
         typer.Option(help="bus, phase, swap, length or meter; may be repeated. [default: all]"),
@@ -45,9 +43,9 @@ def calibrate(
     no_journal: NoJournal = False,
     out: Out = None,
 ) -> None:
-    """What recorded readings say against a feeder's files: places, phases, lengths, meters, loads.
+    """Compare recorded readings with a feeder's files: places, phases, lengths, meters, loads.
 
-    Only what is sure gets into the copy that `--write` makes; the feeder itself is never touched.
+    `--write` makes a copy with the significant corrections only; the feeder itself is never changed.
     """
     from feeders.studies.calibrate.feeder import site_of
     from feeders.studies.calibrate.search import Kind
@@ -65,7 +63,7 @@ def calibrate(
     with keeping("calibrate", feeder, journal, without=no_journal) as kept:
         feeder = converted(feeder, out)
         site = site_of(feeder)
-        with bar("errors that the readings may speak for") as tell, said():
+        with bar("possible errors of the files") as tell, said():
             found = study(
                 site,
                 readings,

@@ -1,4 +1,4 @@
-"""`gridsec study campaign`: simulated attacks by thousands, on all cores or on a Dask cluster."""
+"""`gridsec study campaign`: thousands of simulated attacks, on all cores or on a Dask cluster."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ __all__ = [
 
 
 SHORTEST: Final = 10
-"""A scenario has at least so many readings: lies begin after a tenth of it."""
+"""Smallest number of readings of a scenario: attacks start after a tenth of it."""
 
 FILES: Final = "feeder's files"
 
@@ -74,21 +74,20 @@ def planned(
     load_error_kvar: float | None,
     **chosen: Any,
 ) -> Plan:
-    """The plan of a campaign; all that is wrong with it is told at once.
+    """Return the plan of a campaign; all problems of its options are raised at once.
 
     Parameters
     ----------
-    site
-        The feeder.
     step, duration, load_error_kw, load_error_kvar
-        As on the command line; None: as the files say. With one of the load errors the other is none.
+        As on the command line; None for the values of the files. With one of the load errors the other is
+        zero.
     chosen
-        Attributes of the plan by name; None: as the files say.
+        Attributes of the plan by name; None for the values of the files.
 
     Raises
     ------
     ValueError
-        If a scenario is too short for readings so far apart, there is no such setting, or as `Plan`.
+        If a scenario is too short for the interval of the readings, a setting is unknown, or as for `Plan`.
     """
     from feeders.simulation.trial import LoadError
     from feeders.studies.campaign.plan import Plan, wrong_settings
@@ -97,7 +96,7 @@ def planned(
     step_s = step or site.tables.meta.monitor.tick_s
     if duration is not None and duration < SHORTEST * step_s:
         problems.append(
-            f"--duration: {duration:g} s are too few where readings come every {step_s:g} s "
+            f"--duration: {duration:g} s are too short for one reading every {step_s:g} s "
             f"({_from(step, '--step')}): at least {SHORTEST * step_s:g} s, or more frequent readings with "
             "--step"
         )
@@ -115,14 +114,12 @@ def planned(
 
 
 def sources(site: Site, plan: Plan, given: Mapping[str, object]) -> str:
-    """What is played, and which of it is from the files and which from options.
+    """Summary of a campaign, with the origin of its parameters: files or options.
 
     Parameters
     ----------
-    site, plan
-        The feeder, and the campaign.
     given
-        Options such as --step, and None where they were not given.
+        Options such as --step, and None for those not given.
     """
     from feeders.model.load_uncertainty import load_doubt
 
@@ -135,7 +132,7 @@ def sources(site: Site, plan: Plan, given: Mapping[str, object]) -> str:
     kw, kvar = (float(np.median(each[site.meters])) * base for each in (doubt.p, doubt.q))
     return (
         f"{site.feeder.name}: {plan.scenarios} scenarios of {plan.duration_s / plan.step_s:.0f} readings, "
-        f"one every {plan.step_s:g} s ({step}), watched by {plan.estimator} "
+        f"one every {plan.step_s:g} s ({step}), monitored by {plan.estimator} "
         f"({estimator}); allowed false alarms a year: {rates} ({rate}); powers of "
         f"metered customers within {kw:.2g} kW and {kvar:.2g} kvar, medians of 1 sigma "
         f"({', '.join(loads) or FILES})"
@@ -149,23 +146,23 @@ def _from(value: float | None, option: str) -> str:
 Scenarios = Annotated[
     int,
     typer.Option(
-        help="How many, rounded up to whole scenes; the first of each scene is without a lie.", min=1
+        help="Number, rounded up to whole scenes; the first of each scene is without an attack.", min=1
     ),
 ]
 Together = Annotated[
     int,
     typer.Option(
-        help="Scenarios of a scene, the first without a lie; 2: every lie has a scene of its own.",
+        help="Scenarios of a scene, the first without an attack; 2: a separate scene for each attack.",
         min=1,
     ),
 ]
-Seed = Annotated[int, typer.Option(help="Chooses everything random.", min=0)]
+Seed = Annotated[int, typer.Option(help="Seed of all random numbers.", min=0)]
 Kinds = Annotated[
     list[str] | None,
     typer.Option(
-        help="A kind of lie and its sizes, like bias:1,3; may be repeated. bias, together, scaling: % of "
-        "nominal; drift: % per minute; coordinated, coordinated-power, power: % by which a load that is none "
-        "moves the least affected liar; replay, clock-shift: s; inverter: % of its rating; stuck: no size. "
+        help="An attack kind and its sizes, like bias:1,3; may be repeated. bias, together, scaling: % of "
+        "nominal; drift: % per minute; coordinated, coordinated-power, power: % by which a false load moves "
+        "the least affected meter; replay, clock-shift: s; inverter: % of its rating; stuck: no size. "
         "[default: six kinds]"
     ),
 ]
@@ -173,12 +170,13 @@ Promised = Annotated[
     bool,
     typer.Option(
         "--promised",
-        help="Lies of the sizes that `study detectable` finds, for M = 2, in place of the six kinds, and "
-        "how many of its promises are kept.",
+        help="Attacks of the sizes that `study detectable` finds, for M = 2, in place of the six kinds, and "
+        "the number of its guarantees that hold.",
     ),
 ]
 Liars = Annotated[
-    list[int] | None, typer.Option(help="How many lie; may be repeated. [default: 1 and 3]", min=1)
+    list[int] | None,
+    typer.Option(help="Number of manipulated meters; may be repeated. [default: 1 and 3]", min=1),
 ]
 Places = Annotated[
     list[str] | None,
@@ -192,13 +190,13 @@ Duration = Annotated[
 Step = Annotated[
     float | None,
     typer.Option(
-        help="Interval of the readings, s. [default: as the feeder's files say]", min=0.1, callback=finite
+        help="Interval of the readings, s. [default: as in the feeder's files]", min=0.1, callback=finite
     ),
 ]
 DesignOf = Annotated[str, typer.Option(help="factorial or random combinations.")]
 Estimator = Annotated[
     str | None,
-    typer.Option(help="Who watches; see `gridsec feeders estimators`. [default: as the feeder's files say]"),
+    typer.Option(help="Estimator, see `gridsec feeders estimators`. [default: as in the feeder's files]"),
 ]
 Settings = Annotated[
     list[str] | None,
@@ -209,30 +207,29 @@ Settings = Annotated[
 AlarmsPerYear = Annotated[
     list[float] | None,
     typer.Option(
-        help="False alarms it may raise in a year; may be repeated, for a curve. [default: as the files say]"
+        help="Allowed false alarms per year; may be repeated, for a curve. [default: as in the files]"
     ),
 ]
 Learned = Annotated[
     float,
     typer.Option(
-        help="Hours over which it has learned its meters' fixed errors before.", min=0.0, callback=finite
+        help="Hours of learning the meters' fixed errors before the scenario.", min=0.0, callback=finite
     ),
 ]
 MetersAs = Annotated[str, typer.Option(help="Errors of the meters: site, real or white.")]
 LoadErrorKw = Annotated[
     float,
-    typer.Option(
-        help="What nobody knows of each customer's active power, 1 sigma.", min=0.0, callback=finite
-    ),
+    typer.Option(help="Uncertainty of each customer's active power, 1 sigma.", min=0.0, callback=finite),
 ]
 LoadErrorKvar = Annotated[
-    float, typer.Option(help="The same of its reactive power, 1 sigma.", min=0.0, callback=finite)
+    float,
+    typer.Option(help="Uncertainty of each customer's reactive power, 1 sigma.", min=0.0, callback=finite),
 ]
 KnownKw = Annotated[
     float | None,
     typer.Option(
-        help="What nobody knows of each metered customer's active power, 1 sigma; comes and goes within ten "
-        "minutes. [default: what the files say of registers; with --load-error-kvar, none]",
+        help="Uncertainty of each metered customer's active power, 1 sigma; correlated over ten minutes. "
+        "[default: as the files state for registers; with --load-error-kvar, none]",
         min=0.0,
         callback=finite,
     ),
@@ -240,7 +237,7 @@ KnownKw = Annotated[
 KnownKvar = Annotated[
     float | None,
     typer.Option(
-        help="The same of its reactive power. [default: what the files say of power factors; with "
+        help="Uncertainty of its reactive power. [default: as the files state for power factors; with "
         "--load-error-kw, none]",
         min=0.0,
         callback=finite,
@@ -277,7 +274,7 @@ def campaign(
     no_journal: NoJournal = False,
     out: Out = None,
 ) -> None:
-    """Simulate attacks over days of profiles: who is named, missed or falsely named, and how soon."""
+    """Simulate attacks over days of profiles: meters named correctly, missed or named falsely, and delays."""
     from feeders.model.profiles import Season
     from feeders.model.site import load
     from feeders.simulation.trial import Meters
@@ -338,23 +335,23 @@ def campaign(
 
 
 NO_LIES = (
-    "with one scenario of each scene, which is the one without a lie, nobody lies; expected --scenarios and "
+    "one scenario of each scene is the control scenario without an attack; expected --scenarios and "
     "--together of 2 or more"
 )
-"""Otherwise it would look as if nobody was named for lies that nobody told."""
+"""Refused: the result would suggest that attacks were missed."""
 
 
 def _print(found: Campaign) -> None:
     plan, impossible = found.plan, int((found.scenarios["reason"] != "").sum())
-    told = f"{plan.scenarios} scenarios of {plan.duration_s:g} s watched by {plan.estimator}"
+    told = f"{plan.scenarios} scenarios of {plan.duration_s:g} s monitored by {plan.estimator}"
     note = f"; {impossible} cannot be played, see `reason`" if impossible else ""
     console.out.print(escape(f"{found.feeder}: {told}{note}"))
     if not found.promises.empty:
-        show("Promises of `study detectable`", found.promises)
+        show("Guarantees of `study detectable`", found.promises)
     show("By kind and size", _short(found.by_size))
     show("By place", _short(found.by_place))
-    show("By number of liars", _short(found.by_liars))
-    show("False names while nobody lies, and liars named", found.false_names)
+    show("By number of manipulated meters", _short(found.by_liars))
+    show("False accusations without an attack, and manipulated meters named", found.false_names)
 
 
 def _with_promised(site: Site, plan: Plan, others: tuple[Kind, ...], kept: Keeping) -> Plan:
@@ -362,13 +359,13 @@ def _with_promised(site: Site, plan: Plan, others: tuple[Kind, ...], kept: Keepi
     from feeders.studies.detectable import detectable, workers
 
     stated = plan.trial(site, plan.moment(0)).stated
-    with bar("lies of meters, errors of customers") as tell:
+    with bar("attacks on meters, errors of customers") as tell:
         found = detectable(stated, max_attacked=2, runner=workers(stated, None), journal=kept, progress=tell)
     return replace(plan, kinds=(*others, *promised(stated, found)))
 
 
 def _short(table: pd.DataFrame) -> pd.DataFrame:
-    """What fits on a terminal; everything is in the files."""
+    """Columns that fit on a terminal; the files contain all of them."""
     limits = [name for name in table.columns if name.endswith(("_low", "_high")) and name != "false_high"]
     return table.drop(columns=[*limits, "liars_told", "error_liars_worst", "error_others_worst"])
 
@@ -379,7 +376,7 @@ Choice = TypeVar("Choice", bound=StrEnum)
 def _each(
     option: str, known: type[Choice], chosen: list[str] | None, problems: list[str]
 ) -> tuple[Choice, ...] | None:
-    """What was chosen; None: nothing, or what is wrong is among the problems."""
+    """Chosen values; None without a choice, or if a problem was added."""
     from gridsec.errors import no_choice
 
     wrong = no_choice(option, known, *(chosen or ()))

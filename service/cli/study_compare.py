@@ -1,4 +1,4 @@
-"""`gridsec study compare`: all estimators watch the same simulated attacks."""
+"""`gridsec study compare`: all estimators on the same simulated attacks."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ if TYPE_CHECKING:
 Families = Annotated[list[str] | None, typer.Option(help="An estimator; may be repeated. [default: all]")]
 Cases = Annotated[list[str] | None, typer.Option(help="A case; may be repeated. [default: all]")]
 MaxAttacked = Annotated[
-    int, typer.Option(help="How many meters lie, and estimators are to withstand.", min=1)
+    int, typer.Option(help="Number of manipulated meters, and M of the estimators.", min=1)
 ]
 Seeds = Annotated[int, typer.Option(help="Runs of each case.", min=1)]
 Duration = Annotated[float, typer.Option(help="Length of a run, s.", min=70.0, callback=finite)]
 ReportQ = Annotated[bool, typer.Option(help="Meters report the net reactive power.")]
-Csv = Annotated[Path | None, typer.Option(help="Write all numbers into this file.")]
+Csv = Annotated[Path | None, typer.Option(help="Write all numbers to this file.")]
 Write = Annotated[
     Path | None, typer.Option(help="Replace the tables between the markers of this Markdown file.")
 ]
@@ -57,10 +57,10 @@ def compare(
     journal: JournalAt = None,
     no_journal: NoJournal = False,
 ) -> None:
-    """Let all estimators watch the same simulated attacks, and tell who did what.
+    """Compare all estimators on the same simulated attacks.
 
-    The truth is full AC power flow; what the estimators know of loads and meters is as uncertain as it is
-    stated to be. Estimators that cannot watch the feeder are listed with the reason.
+    The truth is full AC power flow; loads and meters are as uncertain as stated to the estimators. Estimators
+    that cannot monitor the feeder are listed with the reason.
     """
     from feeders.model.site import load
     from feeders.registry.registry import FAMILIES
@@ -92,7 +92,7 @@ def compare(
         workers=workers or os.cpu_count() or 1,
     )
     if write is not None:
-        splice(_read(write), "")  # a document without markers is refused before the work, not after it
+        splice(_read(write), "")  # refuses a document without markers before the work
     with keeping("compare", feeder, journal, without=no_journal) as kept:
         site = load(converted(feeder, None))
         rows = _compared(site, plan, kept)
@@ -101,7 +101,7 @@ def compare(
             write_csv(rows, csv)
         if write is not None:
             told = f"{_told(feeder, site, plan)}\n\n{markdown(rows, plan)}"
-            text = splice(_read(write), told)  # as it is now: somebody may have worked on it meanwhile
+            text = splice(_read(write), told)  # read again: the document may have changed during the work
             replace_file(write, lambda new: new.write_text(text, encoding="utf-8"))
 
 
@@ -110,7 +110,7 @@ def _read(page: Path) -> str:
 
 
 def _compared(site: Site, plan: Plan, kept: Keeping) -> list[Row]:
-    """Compare, and show what is being done."""
+    """Run the comparison with a progress display."""
     from feeders.studies.comparison import compare as study
 
     with Progress(
@@ -128,7 +128,7 @@ def _compared(site: Site, plan: Plan, kept: Keeping) -> list[Row]:
 
 
 def _told(feeder: str, site: Site, plan: Plan) -> str:
-    """What the tables hold for, in one sentence."""
+    """Conditions of the tables, in one sentence."""
     error, runs = plan.load_error, "one run" if plan.seeds == 1 else f"{plan.seeds} runs"
     return (
         f"{site.tables.meta.title or site.feeder.name}: {len(site.meter_ids)} meters "
@@ -141,7 +141,7 @@ def _told(feeder: str, site: Site, plan: Plan) -> str:
 
 
 def _command(feeder: str, plan: Plan) -> str:
-    """The command line that measures all this again."""
+    """Command line of the same measurement."""
     from feeders.studies.comparison import Plan
 
     usual = Plan()
@@ -166,7 +166,7 @@ def _command(feeder: str, plan: Plan) -> str:
 
 
 def _show(rows: list[Row], plan: Plan) -> None:
-    """Print one table for each case; reasons stand below it."""
+    """Print one table for each case, with reasons below it."""
     from feeders.studies.comparison import CASES, HEADERS, cells
 
     meanings = {case.name: case.told(plan.max_attacked) for case in CASES}

@@ -1,4 +1,4 @@
-"""`gridsec study droop`: is the droop fleet stable, does it keep the band, how much generation is hosted."""
+"""`gridsec study droop`: stability of the droop fleet, voltage band, and hosting capacity."""
 
 from __future__ import annotations
 
@@ -23,29 +23,29 @@ if TYPE_CHECKING:
 
 TITLES = {
     "stability": "Stability",
-    "inverters": "Who makes the loop gain",
+    "inverters": "Loop gain by inverter",
     "steps": "Steps, simulated",
-    "band": "The band of voltages, proven limits, V",
-    "witness": "Loads that break the band",
+    "band": "Voltage band, proven limits, V",
+    "witness": "Loads that violate the band",
     "presets": "Presets",
     "time_constants": "Time constants",
     "hosting": "Hosting capacity",
 }
-"""Tables that are printed; all are written with --out."""
+"""Printed tables; --out writes all of them."""
 
 
 Preset = Annotated[
     str | None, typer.Option(help="Equip customers with this preset. [default: the feeder's inverters]")
 ]
-Equipped = Annotated[str, typer.Option(help="Whom presets equip: pv (with generation) or all.")]
+Equipped = Annotated[str, typer.Option(help="Customers that presets equip: pv (with generation) or all.")]
 Interval = Annotated[
     float, typer.Option(help="Sampling interval of inverters, s; 0: continuous filters.", min=0.0)
 ]
-Dead = Annotated[int, typer.Option(help="Their dead time, whole intervals.", min=0)]
+Dead = Annotated[int, typer.Option(help="Dead time of inverters, whole intervals.", min=0)]
 Busbar = Annotated[tuple[float, float], typer.Option(help="Limits of the busbar's voltage, pu.")]
 Allowed = Annotated[
     tuple[float, float] | None,
-    typer.Option(help="Allowed voltages, parts of the nominal one. [default: as in the file]"),
+    typer.Option(help="Permitted voltages, pu. [default: as in the file]"),
 ]
 LoadHigh = Annotated[float, typer.Option(help="Largest load, share of the peak.", min=0.0)]
 PvHigh = Annotated[float, typer.Option(help="Largest generation, share of the peak.", min=0.0)]
@@ -56,19 +56,19 @@ Also = Annotated[list[str] | None, typer.Option(help="Compare presets on this fe
 TauFactor = Annotated[
     list[float] | None, typer.Option(help="Factor on all time constants to compare; may be repeated.")
 ]
-Hosting = Annotated[bool, typer.Option("--hosting", help="Look for hosting capacities.")]
+Hosting = Annotated[bool, typer.Option("--hosting", help="Compute hosting capacities.")]
 HostingPreset = Annotated[
     list[str] | None,
     typer.Option(help="Preset of new inverters, or none; may be repeated. [default: none, ieee1547-b]"),
 ]
-HostingLoad = Annotated[float, typer.Option(help="Share of their peak that loads draw meanwhile.", min=0.0)]
+HostingLoad = Annotated[float, typer.Option(help="Loads for hosting capacities, share of the peak.", min=0.0)]
 HostingAt = Annotated[
     list[str] | None,
-    typer.Option(help="A customer who gets the generation; may be repeated. [default: as it is]"),
+    typer.Option(help="A customer with the new generation; may be repeated. [default: as in the files]"),
 ]
-UnitKw = Annotated[float, typer.Option(help="Generation that comes at random places, kW.")]
-Draws = Annotated[int, typer.Option(help="Random orders of places.", min=0)]
-Seed = Annotated[int, typer.Option(help="Chooses what is random.", min=0)]
+UnitKw = Annotated[float, typer.Option(help="Generation per random place, kW.")]
+Draws = Annotated[int, typer.Option(help="Number of random orders of places.", min=0)]
+Seed = Annotated[int, typer.Option(help="Seed of all random numbers.", min=0)]
 
 
 def droop(
@@ -96,7 +96,7 @@ def droop(
     no_journal: NoJournal = False,
     out: Out = None,
 ) -> None:
-    """Is the volt/VAR fleet stable, with what margins; does it keep the band; how much more is hosted."""
+    """Study the volt/VAR fleet: stability with margins, voltage band, and hosting capacity."""
     from feeders.studies.droop.fleets import NOTHING, NoInverters, Who
     from feeders.studies.droop.study import DroopOptions
     from gridsec.errors import no_choice
@@ -147,7 +147,7 @@ def droop(
 def _studied(
     site: Site, others: Sequence[Site], options: DroopOptions, seed: int, kept: Keeping
 ) -> DroopStudy:
-    """The study, with the presets on other feeders below its own."""
+    """The study, with the presets on other feeders appended to its own."""
     import pandas as pd
 
     from feeders.studies.droop.study import droop as study
@@ -162,7 +162,7 @@ def _studied(
 
 
 def _loaded(names: Sequence[tuple[str, Path | None]]) -> list[Site]:
-    """Feeders by name, each with the folder of its results; all problems of all of them are told."""
+    """Feeders by name, each with the folder of its results; all problems are raised at once."""
     from feeders.model.site import load
 
     sites: list[Site] = []
@@ -178,10 +178,10 @@ def _loaded(names: Sequence[tuple[str, Path | None]]) -> list[Site]:
 
 
 def _tell(found: DroopStudy, options: DroopOptions) -> None:
-    """Print the answer, and the tables behind it."""
+    """Print the result and its tables."""
     sampled = f"sampled every {options.interval_s:g} s" if options.interval_s else "continuous"
     console.out.print(escape(f"{found.feeder}: the fleet ({sampled}) is {found.verdict}"))
-    console.out.print(f"The band is {found.rest} while loads move slowly, {found.always} however they move.")
+    console.out.print(f"Voltage band: {found.rest} for slow load changes, {found.always} for arbitrary ones.")
     for name, title in TITLES.items():
         if name in found.tables:
             show(title, found.tables[name])

@@ -1,4 +1,4 @@
-"""`gridsec study redundancy`, `protect`, `detectable`: what a planner asks of a feeder's meters."""
+"""`gridsec study redundancy`, `protect`, `detectable`: planning of meters."""
 
 from __future__ import annotations
 
@@ -27,35 +27,34 @@ if TYPE_CHECKING:
 
 Unknown = Annotated[
     list[str] | None,
-    typer.Option(
-        help="A customer whose powers nobody knows; may be repeated. [default: those without a meter]"
-    ),
+    typer.Option(help="A customer with unknown powers; may be repeated. [default: those without a meter]"),
 ]
 Silent = Annotated[list[str] | None, typer.Option(help="A meter that is missing; may be repeated.")]
 BusbarUnknown = Annotated[bool, typer.Option("--busbar-unknown", help="The busbar's voltage is not metered.")]
-CurvesAt = Annotated[str, typer.Option(help="Where inverters work: steepest or deadband.")]
+CurvesAt = Annotated[str, typer.Option(help="Operating point of the inverters: steepest or deadband.")]
 Out = Annotated[Path | None, typer.Option(help="Write the tables into this folder, as CSV and Parquet.")]
 
 
 GoalOf = Annotated[
     str | None,
     typer.Option(
-        help="identify: liars are named; notice: some lie is; bound: lies stay small, powers being true; "
-        "contain: powers being false too. [default: identify where liars can stay invisible, or contain]"
+        help="identify: manipulated meters are named; notice: an attack is detected; bound: attacks stay "
+        "small with true powers; contain: also with false powers. [default: identify if attacks can be "
+        "invisible, otherwise contain]"
     ),
 ]
 LieVolt = Annotated[
     float | None,
     typer.Option(
-        help="For bound and contain: largest unnoticed lie, V of the busbar's level. "
-        "[contain: half of what company and false powers add]"
+        help="For bound and contain: largest hidden attack, V of the busbar's level. "
+        "[contain: half of the increase by further meters and false powers]"
     ),
 ]
 
 NO_ANSWER = (
-    "It counts lies that fit exactly to powers that are known exactly, and none does. How large lies are "
-    "that fit within honest errors: --goal contain. What hides behind a load that nobody knows: --unknown "
-    "CUSTOMER. Lies that inverters forget within seconds: --attack any."
+    "The goal counts attacks that fit exactly to exactly known powers, and no attack does. Attacks within "
+    "honest errors: --goal contain. Attacks behind an unknown load: --unknown CUSTOMER. Attacks that decay "
+    "with the inverters within seconds: --attack any."
 )
 
 
@@ -70,14 +69,14 @@ def redundancy(
     no_journal: NoJournal = False,
     out: Out = None,
 ) -> None:
-    """How many lying meters stay invisible: in all, by meter, by part of the feeder, with meters missing."""
+    """Count the manipulated meters of invisible attacks: in all, by meter, by part, with missing meters."""
     from feeders.model.site import load
     from feeders.studies.redundancy import redundancy as study
 
     see(folders={"--out": out}, files={"--journal": journal})
     with keeping("redundancy", feeder, journal, without=no_journal) as kept:
         site = load(converted(feeder, out))
-        with bar("searching for liars that stay invisible") as tell, said():
+        with bar("search for invisible attacks") as tell, said():
             found = study(
                 site,
                 unknown=unknown,
@@ -88,18 +87,20 @@ def redundancy(
                 progress=tell,
             )
         console.out.print(_unknowns(found.unknown, found.feeder))
-        show("Liars that stay invisible", found.summary)
+        show("Manipulated meters of invisible attacks", found.summary)
         show("By meter", found.meters)
-        show("Liars inside one part", found.parts)
+        show("Invisible attacks inside one part", found.parts)
         if found.silent:
-            show(f"What changes without {', '.join(found.silent)}", found.changes)
+            show(f"Changes without {', '.join(found.silent)}", found.changes)
         write_tables(out, "redundancy", found.tables)
 
 
 def protect(
     feeder: Studied = "simbench-lv-rural1",
     *,
-    max_attacked: Annotated[int, typer.Option(help="How many of the other meters lie at most.", min=1)] = 2,
+    max_attacked: Annotated[
+        int, typer.Option(help="Largest number of manipulated meters among the others.", min=1)
+    ] = 2,
     goal: GoalOf = None,
     lie_volt: LieVolt = None,
     attack: Annotated[str, typer.Option(help="Attacks that count: persistent or any.")] = "persistent",
@@ -109,13 +110,13 @@ def protect(
         list[str] | None, typer.Option(help="A meter that cannot be protected; may be repeated.")
     ] = None,
     greedy: Annotated[
-        bool, typer.Option("--greedy", help="For large feeders: not proven the fewest; with its gap.")
+        bool, typer.Option("--greedy", help="For large feeders: fewest not proven; with the gap.")
     ] = False,
     journal: JournalAt = None,
     no_journal: NoJournal = False,
     out: Out = None,
 ) -> None:
-    """The fewest meters to protect so that liars are named, are noticed, or can only lie a little."""
+    """Find the fewest meters to protect so that attacks are identified, detected, or bounded."""
     from feeders.model.site import load
     from feeders.studies.protect import Goal, check
     from feeders.studies.protect import protect as study
@@ -155,33 +156,37 @@ def protect(
 def _tell_protection(found: Protect, of: int) -> None:
     count = len(found.meters)
     if found.no_answer:
-        console.out.print(escape(f"{found.feeder}: {found.goal} asks for nothing here, which is no safety"))
+        console.out.print(
+            escape(f"{found.feeder}: {found.goal} requires no protection here; that is no safety")
+        )
         console.out.print(NO_ANSWER)
         return
     proof = "no fewer suffice" if not found.gap else f"at least {found.least} are needed"
-    measure = "largest hidden lie, V" if found.goal.in_volts else "fewest liars that stay invisible"
+    measure = "largest hidden attack, V" if found.goal.in_volts else "fewest meters of an invisible attack"
     console.out.print(escape(f"{found.feeder}: protect {count} of {of} meters; {proof}"))
     console.out.print(f"{measure}: {_cell(found.before)} before, {_cell(found.after)} after")
     if found.goal.in_volts:
         console.out.print(
-            f"asked for ({found.goal}): at most {_cell(found.lie_volt)}; "
-            f"one meter hides {_cell(found.alone)} by itself, with true powers, whoever else is protected"
+            f"required ({found.goal}): at most {_cell(found.lie_volt)}; "
+            f"one meter hides {_cell(found.alone)} alone, with true powers, whatever others are protected"
         )
     if count:
         show("Protect", found.meters)
-        show("Attacks that ask for them", found.attacks)
+        show("Attacks that require them", found.attacks)
 
 
 def detectable(
     feeder: Studied = "simbench-lv-rural1",
     *,
-    max_attacked: Annotated[int, typer.Option(help="How many meters lie together at most.", min=1)] = 2,
+    max_attacked: Annotated[
+        int, typer.Option(help="Largest number of meters manipulated together.", min=1)
+    ] = 2,
     share: Annotated[
-        float, typer.Option(help="Share of its peak that every load draws.", min=0.0, callback=finite)
+        float, typer.Option(help="Load of every customer, share of its peak.", min=0.0, callback=finite)
     ] = 0.5,
-    risk: Annotated[float, typer.Option(help="Probability left out of account, at one moment.")] = 1e-3,
-    trials: Annotated[int, typer.Option(help="Simulate so many lies of each size.", min=0)] = 0,
-    seed: Annotated[int, typer.Option(help="Chooses what is random in simulated lies.", min=0)] = 0,
+    risk: Annotated[float, typer.Option(help="Neglected probability, at one moment.")] = 1e-3,
+    trials: Annotated[int, typer.Option(help="Simulated attacks of each size.", min=0)] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the simulated attacks.", min=0)] = 0,
     workers: Annotated[
         int | None, typer.Option(help="Processes. [default: all cores, from 50 meters on]", min=1)
     ] = None,
@@ -189,7 +194,7 @@ def detectable(
     no_journal: NoJournal = False,
     out: Out = None,
 ) -> None:
-    """The smallest lies that are surely named, the largest that stay unnoticed, and what they spoil; in V."""
+    """Compute the smallest surely identified attacks, the largest hidden ones, and their errors; in V."""
     from feeders.model.site import load
     from feeders.studies.campaign.guarantees import rehearse
     from feeders.studies.detectable import detectable as study
@@ -198,7 +203,7 @@ def detectable(
     see(folders={"--out": out}, files={"--journal": journal})
     with keeping("detectable", feeder, journal, without=no_journal) as kept:
         site = load(converted(feeder, out))
-        with bar("lies of meters, errors of customers") as tell, said():
+        with bar("attacks on meters, errors of customers") as tell, said():
             found = study(
                 site,
                 max_attacked=max_attacked,
@@ -210,25 +215,27 @@ def detectable(
             )
         more = found.max_attacked - 1
         places = ["customer", "bus"]
-        show(f"Lies, V: each alone, and with {more} more", found.meters.drop(columns=places).round(2))
-        show(f"Errors of the voltage with {more + 1} unnoticed liars, V", found.customers.round(2))
+        show(
+            f"Attacks, V: each meter alone, and with {more} more", found.meters.drop(columns=places).round(2)
+        )
+        show(f"Errors of the voltage with {more + 1} hidden manipulated meters, V", found.customers.round(2))
         write_tables(out, "detectable", found.tables)
         if trials:
-            with bar("simulated lies") as tell:
+            with bar("simulated attacks") as tell:
                 seen = rehearse(
                     site, found, trials=trials, seed=seed, share=share, journal=kept, progress=tell
                 )
             console.out.print(
-                f"{seen.trials} lies up to the hidden size: {seen.hidden_named} led to a name\n"
-                f"{seen.trials} lies from the named size on: {seen.large_missed} missed, "
+                f"{seen.trials} attacks up to the hidden size: {seen.hidden_named} with a meter named\n"
+                f"{seen.trials} attacks from the named size on: {seen.large_missed} missed, "
                 f"{seen.honest_named} with an honest meter named"
             )
             write_tables(out, "detectable", {**found.tables, "trials": seen.table})
 
 
 def _unknowns(names: Sequence[str], feeder: str) -> str:
-    who = ", ".join(names) if names else "nobody"
-    return escape(f"{feeder}: powers unknown of {who}")
+    shown = ", ".join(names) if names else "none"
+    return escape(f"{feeder}: customers with unknown powers: {shown}")
 
 
 @contextmanager
@@ -238,7 +245,7 @@ def bar(what: str) -> Iterator[Tell]:
     Parameters
     ----------
     what
-        Which pieces of work are counted.
+        Name of the counted pieces of work.
     """
     with Progress(
         TextColumn("{task.description}"),
@@ -255,7 +262,7 @@ def bar(what: str) -> Iterator[Tell]:
 
 @contextmanager
 def said() -> Iterator[None]:
-    """Say what is wrong with what was asked."""
+    """Convert a ValueError to a usage error."""
     try:
         yield
     except ValueError as error:
@@ -263,13 +270,7 @@ def said() -> Iterator[None]:
 
 
 def show(title: str, frame: pd.DataFrame) -> None:
-    """Print a table; columns that say nothing are left out.
-
-    Parameters
-    ----------
-    title, frame
-        What it is, and the table.
-    """
+    """Print a table without its empty columns."""
     kept = [name for name in frame.columns if not all(_empty(cell) for cell in frame[name])]
     table = Table(*(escape(name.replace("_", " ")) for name in kept), title=title, title_justify="left")
     for row in frame[kept].itertuples(index=False):

@@ -65,7 +65,7 @@ LIBRARIES: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """What a report is about; every study takes what concerns it.
+    """Options of a report; every study uses those that concern it.
 
     Attributes
     ----------
@@ -74,20 +74,20 @@ class Asked:
     max_attacked
         M.
     goal, lie_volt
-        What protection is for, by default as the study has it, and the bound of a lie, V.
+        Goal of the protection, by default that of the study, and the bound of an attack, V.
     unknown, silent, busbar_unknown
-        What nobody knows; meters that are missing.
+        Customers with unknown powers; missing meters; True without a busbar meter.
     scenarios, seed, workers
-        Of simulated attacks; the seed is for all that is random.
+        Options of the simulated attacks; the seed is for all random numbers.
     step, estimator, load_error_kw, load_error_kvar
-        Of simulated attacks: interval of the readings, s, who watches, and what nobody knows of powers; None:
-        as the feeder's files say.
+        Options of the simulated attacks: interval of the readings, s, estimator, and uncertainty of powers;
+        None for the values of the feeder's files.
     preset, busbar, band
-        Of the inverters' study, as in `DroopOptions`; None: as there.
+        Options of the inverters' study, as in `DroopOptions`; None for its defaults.
     hosting
-        Whether to look for hosting capacities.
+        Compute hosting capacities.
     readings
-        A recording to compare the files with.
+        A recording to compare with the files.
     """
 
     feeder: str
@@ -113,18 +113,18 @@ class Asked:
 
 @dataclass(frozen=True, slots=True)
 class Study:
-    """How a report runs a study.
+    """Properties of a study in a report.
 
     Attributes
     ----------
     run
-        Runs it.
+        Runs the study.
     options
-        The options of its own command that do the same.
+        Equivalent options of its own command.
     what
-        For the progress bar: which pieces of work are counted.
+        Name of the counted pieces of work, for the progress bar.
     seeded
-        Whether it uses the seed.
+        True if it uses the seed.
     """
 
     run: Callable[[Site, Asked, Where, Progress | None], Result]
@@ -183,7 +183,7 @@ def _calibrate(site: Site, asked: Asked, journal: Where, tell: Progress | None) 
     from feeders.studies.calibrate.study import calibrate
 
     if asked.readings is None:
-        raise InputInvalid([Problem("missing", "there are no recorded readings to compare with")])
+        raise InputInvalid([Problem("missing", "recorded readings are missing")])
     return calibrate(site, asked.readings, journal=journal, progress=tell)
 
 
@@ -195,13 +195,7 @@ def _campaign(site: Site, asked: Asked, journal: Where, tell: Progress | None) -
 
 
 def plan(site: Site, asked: Asked) -> Plan:
-    """The simulated attacks of a report.
-
-    Parameters
-    ----------
-    site, asked
-        The feeder, and what was asked.
-    """
+    """Return the simulated attacks of a report."""
     from feeders.studies.campaign.plan import Plan
 
     together = min(asked.scenarios, Plan().together)
@@ -220,13 +214,7 @@ def plan(site: Site, asked: Asked) -> Plan:
 
 
 def attacks(site: Site, asked: Asked) -> str:
-    """What the simulated attacks of a report take from the feeder's files, and what from options.
-
-    Parameters
-    ----------
-    site, asked
-        The feeder, and what was asked.
-    """
+    """Summary of the simulated attacks of a report, with the origin of their parameters: files or options."""
     names = ("step", "estimator", "load_error_kw", "load_error_kvar")
     return sources(site, plan(site, asked), {option(name): getattr(asked, name) for name in names})
 
@@ -259,7 +247,7 @@ def _fleet(asked: Asked) -> list[str]:
 
 
 def _given(asked: Asked, *names: str) -> list[str]:
-    """Options whose values are not the usual ones."""
+    """Options with other values than the defaults."""
     words = []
     for name in names:
         value = getattr(asked, name)
@@ -270,42 +258,36 @@ def _given(asked: Asked, *names: str) -> list[str]:
 
 
 def option(name: str) -> str:
-    """What an attribute of `Asked` is called on the command line.
-
-    Parameters
-    ----------
-    name
-        The attribute.
-    """
+    """Name of an attribute of `Asked` on the command line."""
     return f"--{name.replace('_', '-')}"
 
 
 STUDIES: Final[dict[str, Study]] = {
-    "detectable": Study(_detectable, _liars, "lies of meters, errors of customers"),
+    "detectable": Study(_detectable, _liars, "attacks on meters, errors of customers"),
     "protect": Study(_protect, _protection, "meters protected, against attacks"),
     "droop": Study(_droop, _fleet, "fleets, steps and loads", seeded=True),
     "campaign": Study(_campaign, _campaigned, "simulated attacks", seeded=True),
     "redundancy": Study(
         _redundancy,
         lambda asked: [word for name in asked.silent for word in ("--silent", name)] + _known(asked),
-        "searching for liars that stay invisible",
+        "search for invisible attacks",
     ),
     "calibrate": Study(
         _calibrate,
         lambda asked: [] if asked.readings is None else ["--readings", str(asked.readings)],
-        "errors that the readings may speak for",
+        "possible errors of the files",
     ),
 }
 """Studies of a report, in the order of its sections."""
 
 
 def misplaced(asked: Asked, chosen: Collection[str]) -> list[str]:
-    """Return what was asked of none of the chosen studies, one sentence each.
+    """Return the options that none of the chosen studies uses, one sentence each.
 
     Parameters
     ----------
     asked, chosen
-        What was asked, and names of studies.
+        Options, and names of studies.
     """
     problems = []
     for each in fields(asked):
@@ -326,18 +308,14 @@ def outcome(
     kept: Keeping,
     bar: Callable[[str], AbstractContextManager[Progress]],
 ) -> Outcome:
-    """Run a study; whatever goes wrong with it becomes part of the report.
+    """Run a study; a failure becomes part of the report.
 
     Parameters
     ----------
     name
-        One of STUDIES.
-    site, asked
-        The feeder, and what was asked.
-    kept
-        Keeps finished work.
+        Key of STUDIES.
     bar
-        Shows how far it is.
+        Progress bar.
     """
     from feeders.report.html import Outcome
     from feeders.studies.droop.fleets import NOTHING, NoInverters
@@ -362,17 +340,12 @@ def outcome(
 
 
 def see_readings(names: Iterable[str], site: Site, asked: Asked) -> None:
-    """Refuse readings that cannot be compared with before the other studies, and not after them.
-
-    Parameters
-    ----------
-    names, site, asked
-        The studies, the feeder, and what was asked.
+    """Refuse readings that cannot be compared with the files before the other studies run.
 
     Raises
     ------
     RecordingInvalid
-        If they are no readings of this feeder.
+        If the file has no readings of this feeder.
     """
     if "calibrate" in names and asked.readings is not None:
         from feeders.studies.calibrate.readings import frames
@@ -381,7 +354,7 @@ def see_readings(names: Iterable[str], site: Site, asked: Asked) -> None:
 
 
 def versions() -> dict[str, str]:
-    """Versions of everything that numbers and pictures depend on."""
+    """Versions of all libraries that affect numbers and figures."""
     found = {"python": platform.python_version()}
     for name in LIBRARIES:
         try:
@@ -392,7 +365,7 @@ def versions() -> dict[str, str]:
 
 
 def write(made: Report, out: Path, folder: Path) -> None:
-    """Write the files of a report; the page last, when all that it speaks of is there, and nothing else.
+    """Write the files of a report; the page comes last, after its figures and tables.
 
     Parameters
     ----------
@@ -404,7 +377,7 @@ def write(made: Report, out: Path, folder: Path) -> None:
     Raises
     ------
     OSError
-        If something cannot be written.
+        If a file cannot be written.
     """
     from feeders.report.html import FEEDER
 
@@ -424,13 +397,7 @@ def write(made: Report, out: Path, folder: Path) -> None:
 
 
 def seeds(names: Iterable[str], asked: Asked) -> Mapping[str, int]:
-    """With what everything random began, by study.
-
-    Parameters
-    ----------
-    names, asked
-        The studies, and what was asked.
-    """
+    """Seed of each study."""
     return {name: asked.seed for name in names if STUDIES[name].seeded}
 
 
@@ -439,23 +406,23 @@ Page = Annotated[
 ]
 Studies = Annotated[
     str | None,
-    typer.Option(help="Names of studies, with commas between them. [default: all there is data for]"),
+    typer.Option(help="Names of studies, separated by commas. [default: all with data]"),
 ]
-MaxAttacked = Annotated[int, typer.Option(help="M: how many meters lie together at most.", min=1)]
-Scenarios = Annotated[int, typer.Option(help="How many attacks are simulated.", min=1)]
+MaxAttacked = Annotated[int, typer.Option(help="M: largest number of meters manipulated together.", min=1)]
+Scenarios = Annotated[int, typer.Option(help="Number of simulated attacks.", min=1)]
 Workers = Annotated[
     int | None, typer.Option(help="Processes for simulated attacks. [default: all cores]", min=1)
 ]
 BusbarLimits = Annotated[
     tuple[float, float] | None, typer.Option(help="Limits of the busbar's voltage, pu. [default: 1 1]")
 ]
-Hosting = Annotated[bool, typer.Option("--hosting", help="Look for hosting capacities too.")]
+Hosting = Annotated[bool, typer.Option("--hosting", help="Compute hosting capacities, too.")]
 Readings = Annotated[
-    Path | None, typer.Option(help="A recording (Parquet or CSV) to compare the files with.")
+    Path | None, typer.Option(help="A recording (Parquet or CSV) to compare with the files.")
 ]
 At = Annotated[
     str | None,
-    typer.Option(help="Date and time that the report bears, like 2026-11-21T12:00Z. [default: now]"),
+    typer.Option(help="Date and time of the report, like 2026-11-21T12:00Z. [default: now]"),
 ]
 
 
@@ -486,7 +453,7 @@ def report(
 ) -> None:
     """Run studies and write a report on the feeder: one HTML file, to print or to send.
 
-    Interrupted, the same command goes on where it was. What a study cannot answer, the report says.
+    After an interruption the same command continues. The report states questions that a study cannot answer.
     """
     from feeders.format.columns import ESTIMATORS
     from feeders.studies.protect import check as see_question
@@ -539,12 +506,12 @@ def report(
 
 
 def _beside(out: Path) -> Path:
-    """The folder beside the page."""
+    """Folder beside the page."""
     return out.with_name(f"{out.stem}-files")
 
 
 def _no_limits(option: str, limits: tuple[float, float] | None, *, apart: bool = False) -> list[str]:
-    """What the droop study would refuse of limits, before the work."""
+    """Problems of limits that the droop study would refuse, before the work."""
     low, high = limits or (1.0, 2.0)
     if 0.0 < low <= high < math.inf and not (apart and low == high):
         return []
@@ -582,7 +549,7 @@ def _make(asked: Asked, chosen: tuple[str, ...], out: Path, *, made: str, comman
 def _studies(
     text: str | None, known: tuple[str, ...], *, recorded: bool, problems: list[str]
 ) -> tuple[str, ...]:
-    """Names of studies, each once; calibration only where there are readings."""
+    """Names of studies, each once; calibration only with readings."""
     from gridsec.errors import no_choice
 
     if text is None:
@@ -599,7 +566,7 @@ def _now() -> str:
 
 
 def _moment(text: str) -> str:
-    """The time that the report is to bear."""
+    """Time of the report."""
     try:
         return _told(datetime.fromisoformat(text))
     except ValueError as error:
@@ -611,7 +578,7 @@ def _told(given: datetime) -> str:
 
 
 def _command(asked: Asked, out: Path, studies: str | None) -> str:
-    """The command line that makes the report again: what differs from the defaults."""
+    """Command line of the same report: options that differ from the defaults."""
     usual = replace(
         asked, **{each.name: each.default for each in fields(asked) if each.default is not MISSING}
     )

@@ -1,1 +1,1 @@
-"""Engine: state of the service, monitors of the feeders, and the cycle that drives them."""
+"""Engine: state of the service, monitors of the feeders, and their cycle."""

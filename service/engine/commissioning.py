@@ -1,7 +1,7 @@
-"""How far the monitor of one feeder knows its meters' own errors: followed, kept, and begun anew.
+"""Commissioning of one feeder: learning of its meters' fixed errors, with storage across restarts.
 
-`Commissioning` has no clock and no input or output, like the `Watch` that owns it: time comes from the
-ticks, texts that are kept come and go as values. Readers on other threads only take references.
+`Commissioning` has no clock and no input or output, like the `Watch` that owns it: time comes from the ticks,
+stored texts are passed as values. Readers on other threads only take references.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from service.store.schema import Happened, Step
 from service.store.state_codec import Kept, KeptInvalid, decode, encode, fingerprint
 
 SAVE_S = 60.0
-"""What is gathered is kept this often, s; all else at once."""
+"""Interval of storing the learning in progress, s; all other changes are stored at once."""
 
 
 class NothingToLearn(GridsecError):
@@ -43,7 +43,7 @@ class NothingToLearn(GridsecError):
 
 
 class Stage(StrEnum):
-    """Where the commissioning of a feeder, or of a meter, stands."""
+    """State of the commissioning of a feeder, or of a meter."""
 
     OFF = "off"
     WAITING = "waiting"
@@ -53,30 +53,28 @@ class Stage(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class MeterStage:
-    """One meter.
+    """Commissioning of one meter.
 
     Attributes
     ----------
-    meter
-        Its id.
     state
         Learning or learned.
     since, learned_at
-        Since when it is being learned, or when it was learned, Unix s.
+        Start of the learning, and time at which the meter was learned, Unix s.
     gathered_s
-        For how long it was heard and trusted while being learned, s.
+        Time with usable readings of a trusted meter since the start, s.
     expected
-        When it will be learned if it is heard and trusted from now on, Unix s.
+        Expected end of the learning, Unix s, if every tick from now on counts.
     error_volt, error_volt_std
-        Its own fixed error at the nominal voltage, and the standard deviation of that, V.
+        Fixed error at the nominal voltage, and its standard deviation, V.
     allowed_volt
-        By how much it may honestly differ from that error, V.
+        Largest deviation of an honest meter from that error, V.
     learning_state, learning_reason
         As in `gridsec.estimators.sequential.LearningProgress`.
     watched_s
-        Time of all ticks since learning began, s; None once the meter is learned.
+        Time of all ticks since the start, s; None for a learned meter.
     lost_s
-        Time that did not count, s, by reason; reasons without any are left out.
+        Time that does not count, s, by reason; reasons with zero time are left out.
     """
 
     meter: str
@@ -96,35 +94,31 @@ class MeterStage:
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """A feeder.
+    """Commissioning of a feeder.
 
     Attributes
     ----------
-    feeder, estimator
-        Its name, and what watches it.
     state
-        Learning as long as one meter is.
+        Learning while at least one meter is being learned.
     t
-        Unix time of the tick that this is about, s.
+        Unix time of the tick, s.
     tick_s
         Interval of the monitor's steps, s.
     needed_s, gathered_s
-        For how long meters have to be heard, and for how long the last one was, s.
+        Required time with usable readings, and the least time that a meter has, s.
     since, expected, learned_at
-        The earliest begin, the latest expected end, and when the last one was learned, Unix s.
+        Earliest start, latest expected end, and latest time of a learned meter, Unix s.
     held
-        Time enough has gone by, but somebody is suspected: such a meter is not learned, and as long as it is
-        not named nobody is.
+        Enough time has passed, but a device is suspect: a suspect meter is not learned, and until it is named
+        as manipulated no meter is.
     restored
-        Whether this goes on from what was kept by an earlier run.
+        True if the commissioning continues from stored state.
     note
-        Why it does not, if something was kept.
+        Reason why stored state is not used; empty otherwise.
     expected_s
-        Time that learning takes if every tick counts, s; None without a monitor that learns.
+        Time of learning if every tick counts, s; None without a monitor that learns.
     stalled
         Number of meters that are not learned after twice that time.
-    meters
-        One by one.
     """
 
     feeder: str
@@ -146,19 +140,17 @@ class Progress:
 
 
 class Commissioning:
-    """The commissioning of one feeder.
+    """Commissioning of one feeder.
 
     Parameters
     ----------
-    site
-        The feeder.
     kept
-        What the store has of it.
+        Stored state.
 
     Attributes
     ----------
     known
-        What is known of the meters' errors; None before the first tick, unless something was kept.
+        Present state of the meters' errors; None before the first tick without stored state.
     restored, note
         As in `Progress`.
     """
@@ -175,17 +167,11 @@ class Commissioning:
 
     @property
     def learner(self) -> Learner | None:
-        """How the present monitor learns; None where it does not, or where there is none yet."""
+        """Learning functions of the present monitor; None if it does not learn, or before its design."""
         return None if self._watcher is None else self._watcher.learner
 
     def install(self, watcher: Watcher) -> None:
-        """Take a finished design, and what was kept if it fits.
-
-        Parameters
-        ----------
-        watcher
-            The design.
-        """
+        """Install a finished design, and the stored state if it fits."""
         self._watcher = watcher
         if self.learner is None:
             self.known = None
@@ -195,18 +181,18 @@ class Commissioning:
                     watcher.design, decode(self._site, self._fingerprint, self._kept)
                 )
             except (KeptInvalid, ValueError) as error:
-                self.note = f"what was learned until {self._kept.t:.0f} is not used: {error}"
+                self.note = f"meter errors learned until {self._kept.t:.0f} are not used: {error}"
             else:
                 self._t = self._saved_t = self._kept.t
                 self.restored = True
 
     def follow(self, state: Any, t: float) -> None:
-        """Take over what a tick brought.
+        """Update from the result of a tick.
 
         Parameters
         ----------
         state
-            The monitor's, after the tick.
+            State of the monitor after the tick.
         t
             Unix time of the tick, s.
         """
@@ -220,21 +206,21 @@ class Commissioning:
             self._note(Step.LEARNED, self.known.learned.at == t, t)
 
     def renew(self, state: Any, meters: Sequence[str], t: float, who: str, reason: str) -> Any:
-        """Learn meters anew.
+        """Restart the learning of meters.
 
         Parameters
         ----------
         state
-            The monitor's; None before the first tick.
+            State of the monitor; None before the first tick.
         meters
-            Which; none for all.
+            Their ids; empty for all.
         t, who, reason
-            When (Unix s), who wants it, and why.
+            Time (Unix s), operator and reason.
 
         Returns
         -------
         Any
-            The monitor's new state; None if it was None.
+            New state of the monitor; None if it was None.
 
         Raises
         ------
@@ -255,36 +241,36 @@ class Commissioning:
 
     def _why_not(self) -> Problem:
         if self._watcher is None:
-            return Problem("no-monitor", "there is no monitor yet, or it could not be designed")
+            return Problem("no-monitor", "the monitor has no design yet, or the design failed")
         family = self._watcher.family
         if family.learner is None:
             text = f"its estimator, {family.name}, does not learn meters' errors"
             return Problem("never-learns", text)
-        return Problem("learning-off", "commission_s is 0: nothing is learned")
+        return Problem("learning-off", "commission_s is 0: learning is off")
 
     def _note(
         self, change: Step, which: Bools, t: float, *, who: str | None = None, reason: str = ""
     ) -> None:
         meters = tuple(meter for meter, one in zip(self._site.meter_ids, which, strict=True) if one)
         one_more = Happened(self._site.feeder.name, t, change, meters, who, reason)
-        # Never changed in place: whoever took a copy of all this can go back to it.
+        # Never changed in place: a copy of this object stays valid for an undo.
         self._happened = (*self._happened, one_more)
 
-    # ---------------------------------------------------------------- to keep
+    # ---------------------------------------------------------------- storage
 
     def now(self) -> Kept | None:
-        """Return the present state as it is stored; None before the first tick."""
+        """Return the present state for the store; None before the first tick."""
         if self.known is None or self._t is None:
             return None
         return encode(self._site, self._fingerprint, self._t, to_arrays(self.known))
 
     def due(self, *, at_once: bool = False) -> tuple[tuple[Kept, ...], tuple[Happened, ...]]:
-        """Return what is to be stored now; it counts as stored from here on.
+        """Return the state that is due for the store; it counts as stored afterwards.
 
         Parameters
         ----------
         at_once
-            Also what could wait.
+            Include state that is not due yet.
         """
         happened, self._happened = self._happened, ()
         if self.known is None or self._t is None:
@@ -297,10 +283,10 @@ class Commissioning:
         kept = self.now()
         return () if kept is None else (kept,), happened
 
-    # ---------------------------------------------------------------- to show
+    # ---------------------------------------------------------------- display
 
     def report(self) -> LearningReport:
-        """Return the learning of the meters as a tick's report shows it."""
+        """Return the learning of the meters for a tick's report."""
         known = self.known
         found = self._found(known)
         if known is None or found is None:
@@ -314,14 +300,14 @@ class Commissioning:
         return LearningReport(found.state, found.reason, found.expected_s, stalled)
 
     def _found(self, known: Commission | None) -> LearningProgress | None:
-        """Progress by the estimator; None without one that learns, and before the first tick."""
+        """Progress of the estimator; None if it does not learn, and before the first tick."""
         watcher = self._watcher
         if known is None or watcher is None or watcher.learner is None:
             return None
         return watcher.learner.progress(watcher.design, known)
 
     def progress(self) -> Progress:
-        """Return how far it is."""
+        """Return the progress."""
         known, learner, monitor = self.known, self.learner, self._site.tables.meta.monitor
         found = self._found(known)
         meters = () if known is None or found is None else self._meters(known, found)
@@ -384,18 +370,12 @@ class Commissioning:
 
 
 def to_json(progress: Progress) -> dict[str, Any]:
-    """Return the JSON object that REST shows.
-
-    Parameters
-    ----------
-    progress
-        How far it is.
-    """
+    """Return the JSON object of REST."""
     return asdict(progress)
 
 
 def _lost(learning: Learning | None, k: int) -> dict[LearningReason, float]:
-    """Time that did not count for one meter, s, by reason."""
+    """Time that does not count for one meter, s, by reason."""
     if learning is None:
         return {}
     each = zip(LearningReason, learning.lost_s[:, k].tolist(), strict=True)

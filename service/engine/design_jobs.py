@@ -1,4 +1,4 @@
-"""Monitors that are designed in threads of their own while the service goes on."""
+"""Design of monitors in separate threads while the service runs."""
 
 from __future__ import annotations
 
@@ -24,14 +24,12 @@ _log = structlog.get_logger("gridsec.runtime")
 
 
 def begin(watch: Watch, hand_over: Callable[[Callable[[], None]], None]) -> None:
-    """Design in a thread of its own, which does not keep the process from ending.
+    """Design in a daemon thread, which does not delay the end of the process.
 
     Parameters
     ----------
-    watch
-        The feeder.
     hand_over
-        Called from that thread with what is left to do between two rounds: `install`.
+        Called from that thread with the remaining step, `install`, to run between two rounds.
     """
 
     def run() -> None:
@@ -64,13 +62,13 @@ def prepare(name: str, tables: dict[str, Any]) -> asyncio.Future[tuple[Site, Wat
     Parameters
     ----------
     name, tables
-        Its name, and JSON of the columns of its files.
+        Name of the feeder, and the columns of its files as JSON.
 
     Returns
     -------
     asyncio.Future
-        The feeder and its design, or FeederInvalid, NotObservable or DesignInfeasible. Who does not want to
-        wait any more ends it in another way; the thread then works for nobody.
+        The feeder and its design, or FeederInvalid, NotObservable or DesignInfeasible. A caller that stops
+        waiting completes it in another way; the result of the thread is then discarded.
     """
     loop = asyncio.get_running_loop()
     answer: asyncio.Future[tuple[Site, Watcher]] = loop.create_future()
@@ -97,7 +95,7 @@ def prepare(name: str, tables: dict[str, Any]) -> asyncio.Future[tuple[Site, Wat
 
 
 def abandon() -> None:
-    """End all processes that this one has begun: Python would wait at its end for designs under way."""
+    """End all child processes of this process: at its exit Python would wait for unfinished designs."""
     for process in multiprocessing.active_children():
         process.kill()
 
@@ -107,12 +105,12 @@ def _apart(name: str, run: Callable[[], None]) -> None:
 
 
 def install(watch: Watch, finished: Watcher | None, problem: str) -> None:
-    """Watch with a finished design, or give up.
+    """Start monitoring with a finished design, or mark the feeder as failed.
 
     Parameters
     ----------
     watch, finished, problem
-        The feeder, and its design, or without one why there is none.
+        Monitor of the feeder, and its design, or None with the reason.
     """
     if finished is None:
         watch.fail(problem)
@@ -123,14 +121,14 @@ def install(watch: Watch, finished: Watcher | None, problem: str) -> None:
     elif watch.commissioning.note:
         _log.warning("commissioning begins anew", feeder=watch.name, reason=watch.commissioning.note)
     if watch.suspicions.note:
-        _log.warning("nobody is suspected from before", feeder=watch.name, reason=watch.suspicions.note)
+        _log.warning("stored suspicions are not used", feeder=watch.name, reason=watch.suspicions.note)
 
 
 def settle() -> None:
-    """Take all that stays, modules and designs, out of sight of Python's garbage collector.
+    """Exclude all permanent objects, modules and designs, from Python's garbage collection.
 
-    Each of its full passes over them stops every thread for some 20 ms. What was taken out before is looked
-    at once more, so that a feeder that is gone leaves nothing behind.
+    A full pass over them stops every thread for about 20 ms. Objects excluded earlier are collected once
+    more, so that removed feeders leave nothing in memory.
     """
     gc.unfreeze()
     gc.collect()
@@ -138,7 +136,7 @@ def settle() -> None:
 
 
 def _progress(feeder: str) -> Callable[[int, int], None]:
-    """Say how far a design of many parts is, ten times on the way."""
+    """Return a callback that logs the progress of a design of many parts in ten steps."""
 
     def said(done: int, total: int) -> None:
         if done * 10 // total > (done - 1) * 10 // total:

@@ -1,13 +1,12 @@
 """State of the service and its cycle: decode, align, estimate, alarm, store, publish.
 
-A tick is stale when a later tick of the same feeder is due as well. Stale ticks are judged oldest first, in a
-limited time. By the wall clock the others are skipped: an old tick is worth less than the next one. Where
-the readings tell the time, nothing is stale, and the others wait for the next round.
+A tick is stale when a later tick of the same feeder is due as well. Stale ticks are evaluated oldest first,
+within a time budget. With the wall clock the remaining ones are skipped: an old tick is worth less than the
+next one. With `Clock.EVENTS` no tick is stale, and the remaining ones wait for the next round.
 
-Everything here is synchronous and called from one thread at a time; `runtime` sees to that. Readers on other
-threads (REST, metrics) only ever take references to immutable reports.
-
-Nobody who watches waits for the database: see `service.store.committer`.
+Everything here is synchronous and called from one thread at a time, as `runtime` ensures. Readers on other
+threads (REST, metrics) only take references to immutable reports. Monitoring never waits for the database:
+see `service.store.committer`.
 """
 
 from __future__ import annotations
@@ -56,27 +55,27 @@ from service.store.schema import Happened
 from service.store.state_codec import Kept
 
 BAD_PER_SOURCE = 5
-"""So many bad readings of one key and for one reason are kept of a round; the others become one entry."""
+"""Bad readings of one round, key and reason that are stored separately; the others become one entry."""
 BAD_PER_ROUND = 50
-"""So many entries are kept of a round."""
+"""Largest number of entries for bad readings of a round."""
 
 T = TypeVar("T")
 
 
 def some_of_each(bad: Iterable[Rejected]) -> tuple[list[Rejected], int]:
-    """Return entries for bad readings, and how many readings have none.
+    """Sample the rejected readings of a round fairly over their sources.
 
-    Whoever sends the most leaves room for the others: entries are taken by reason and key in turn.
+    Entries are taken by reason and key in turn, so that the largest source leaves room for the others.
 
     Parameters
     ----------
     bad
-        Bad readings of one round, in the order of arrival.
+        Rejected readings of one round, in the order of arrival.
 
     Returns
     -------
     entries, left_out
-        In the order of arrival; and how many bad readings they do not tell of.
+        Entries in the order of arrival; number of rejected readings without an entry.
     """
     sources: dict[str, dict[str, list[tuple[int, Rejected]]]] = {}
     for number, one in enumerate(bad):
@@ -92,7 +91,7 @@ _Entry = tuple[int, Rejected, int]
 
 
 def _entries(found: Sequence[tuple[int, Rejected]]) -> list[_Entry]:
-    """The entries for the bad readings of one key and reason: place, entry, how many it stands for."""
+    """Entries for the bad readings of one key and reason: position, entry, number of readings."""
     entries = [(number, one, 1) for number, one in found[:BAD_PER_SOURCE]]
     more = len(found) - BAD_PER_SOURCE
     if more > 0:
@@ -107,26 +106,26 @@ def _in_turn(queues: Iterable[Sequence[T]]) -> list[T]:
 
 
 BUDGET_S = 1.0
-"""Time for stale ticks, from the first one until all feeders are up to date again, s."""
+"""Time budget for stale ticks, s, until all feeders are up to date again."""
 
 CALM_S = 60.0
-"""Time without a skipped tick after which the next one is logged again, s."""
+"""Time without a skipped tick, s, after which the next one is logged again."""
 
 SHOWN = 5
-"""Feeders named in one line of the log."""
+"""Largest number of feeders in one line of the log."""
 
 _log = structlog.get_logger("gridsec.runtime")
 
 
 class CatchUp:
-    """Time budget for stale ticks, and the log of those that were skipped.
+    """Time budget for stale ticks, and log of skipped ones.
 
     Parameters
     ----------
     clock
         Monotonic time, s.
     waits
-        Whether ticks beyond the budget wait (`Clock.EVENTS`) instead of being skipped.
+        True if ticks beyond the budget wait (`Clock.EVENTS`) instead of being skipped.
     """
 
     def __init__(self, clock: Callable[[], float], *, waits: bool) -> None:
@@ -138,16 +137,14 @@ class CatchUp:
     def judge(
         self, watches: Iterable[Watch], judge: Callable[[Watch], None], go_on: Callable[[], bool]
     ) -> None:
-        """Judge what is pending.
+        """Evaluate the pending ticks.
 
         Parameters
         ----------
-        watches
-            The feeders.
         judge
-            Judges the oldest pending tick of a feeder.
+            Evaluates the oldest pending tick of a feeder.
         go_on
-            Asked before each tick; where it answers False, what is left stays pending.
+            Checked before each tick; if False, the remaining ticks stay pending.
         """
         due = [watch for watch in watches if watch.pending]
         stale = [watch for watch in due if len(watch.pending) > 1]
@@ -170,12 +167,12 @@ class CatchUp:
                 judge(watch)
 
     def skipped(self, feeder: str, count: int) -> None:
-        """Log the first skipped ticks, and their number once there have been none for `CALM_S`.
+        """Log the first skipped ticks, and their number after `CALM_S` without one.
 
         Parameters
         ----------
         feeder, count
-            Its name, and the number of ticks.
+            Name of the feeder, and number of ticks.
         """
         if self._calm_at is None:
             _log.warning("ticks are skipped: the service was behind by more than it can judge", feeder=feeder)
@@ -193,28 +190,28 @@ class CatchUp:
         self._skipped.clear()
 
 
-NOT_WATCHED = "the feeder is not watched any more"
-TOLD_TWICE = "another alarm tells the same"
+NOT_WATCHED = "the feeder is not monitored any more"
+TOLD_TWICE = "duplicate of another alarm"
 
 
 @dataclass(frozen=True, slots=True)
 class RuntimeConfig:
-    """How the service works, apart from its feeders.
+    """Configuration of the service, apart from its feeders.
 
     Attributes
     ----------
     prefix
         First chunks of every zenoh key.
     clock
-        Who says what time it is.
+        Source of the present time.
     max_skew_s, grace_s
-        As in `align.rules`; None: from the feeder's tick.
+        As in `align.rules`; None for the values of the feeder's tick.
     max_payload
-        Largest payload that is read, bytes.
+        Size of the largest accepted payload, bytes.
     max_samples
-        Length of the queue before the runtime.
+        Length of the queue before the runtime, samples.
     max_feeders
-        So many feeders may be put while it runs, besides those that were given at the start.
+        Largest number of feeders added at run time, besides those given at the start.
     """
 
     prefix: str = "gridsec"
@@ -228,7 +225,7 @@ class RuntimeConfig:
 
 @dataclass(frozen=True, slots=True)
 class Past:
-    """State of a feeder that a new monitor goes on from: alarms, commissioning, suspicions."""
+    """Stored state of a feeder for the warm start of a monitor: alarms, commissioning, suspicions."""
 
     alarms: tuple[Alarm, ...]
     commission: Kept | None
@@ -240,25 +237,21 @@ class Rounds:
 
     Parameters
     ----------
-    config
-        How the service works.
-    store
-        The database.
     sites
-        The feeders to watch.
+        The monitored feeders.
     wall
-        The wall clock, Unix s.
+        Wall clock, Unix s.
     stored
         Called after alarms have been stored.
     apart
-        How writing is done apart from judging: called with what to do, in any thread, and with what to do
-        with the outcome, between two rounds.
+        Executor of writes: called with the write, for any thread, and with the handler of its result, for the
+        time between two rounds.
     unloaded
-        Feeders that are stored but cannot be loaded, and why.
+        Stored feeders that cannot be loaded, with the reason.
     clock
         Monotonic time, s.
     go_on
-        Asked between two payloads and between two ticks; a round ends early where it answers False.
+        Checked between two payloads and between two ticks; if False, the round ends early.
     """
 
     def __init__(
@@ -288,14 +281,12 @@ class Rounds:
             self.add(site)
 
     def add(self, site: Site, past: Past | None = None) -> Watch:
-        """Begin to watch a feeder, or begin anew with other tables; its alarms stay.
+        """Start monitoring a feeder, or restart it with other tables; its alarms stay.
 
         Parameters
         ----------
-        site
-            The feeder.
         past
-            What it goes on from; None: from the database, read at once.
+            State for the warm start; None: read from the database at once.
         """
         config, name = self.config, site.feeder.name
         past = past or self._past(name, self.store)
@@ -315,25 +306,25 @@ class Rounds:
         return watch
 
     def _past(self, name: str, store: Store) -> Past:
-        # Where the readings tell the time, that may be long ago; `advance` forgets what is too old.
+        # With `Clock.EVENTS` the latest tick may be long ago; `advance` drops alarms that are too old.
         latest = min([self._wall(), *(tick["t"] for tick in store.history(name, limit=1))])
         alarms = store.active(name, cleared_since=latest - AlarmRules().memory_s)
         return Past(tuple(alarms), store.commission(name), store.distrust(name))
 
     def put(self, site: Site, tables: Mapping[str, Any], installed: Callable[[Watch], None]) -> Future[None]:
-        """Store a feeder's tables and begin to watch it, or begin anew with other tables.
+        """Store a feeder's tables and start monitoring it, or restart it with other tables.
 
         Parameters
         ----------
         site, tables
-            The feeder, and JSON of the columns of its files.
+            The feeder, and the columns of its files as JSON.
         installed
-            Called with what watches it.
+            Called with its monitor.
 
         Raises
         ------
         StoreUnavailable
-            If that cannot be stored; the feeder stays as it was.
+            If the tables cannot be stored; the feeder stays unchanged.
         """
         answer: Future[None] = Future()
         name = site.feeder.name
@@ -350,7 +341,7 @@ class Rounds:
         return answer
 
     def _go_on(self, name: str, stored: Past) -> Past:
-        """Return the state of a feeder: of one that is watched, ticks have come since it was stored."""
+        """Return the latest state of a feeder: a monitored one has had ticks since it was stored."""
         watch = self.watches.get(name)
         if watch is None:
             return stored
@@ -361,17 +352,12 @@ class Rounds:
         )
 
     def remove(self, name: str) -> Future[None]:
-        """Watch a feeder no more: its alarms are cleared, its tables forgotten, its history kept.
-
-        Parameters
-        ----------
-        name
-            Its name.
+        """Stop monitoring a feeder: its alarms are cleared, its tables deleted, its history stays.
 
         Raises
         ------
         FeederUnknown, StoreUnavailable
-            If there is none, or that cannot be stored; it is watched as before then.
+            If it does not exist, or the change cannot be stored; monitoring then continues.
         """
         answer: Future[None] = Future()
         watch = self.watches.get(name)
@@ -406,9 +392,9 @@ class Rounds:
         self._wire = Wire(known, self.config.prefix, self.config.max_payload)
 
     def begin(self) -> None:
-        """Answer queries for what stands; publish what an earlier process stored and did not publish.
+        """Set the replies for standing alarms; publish the stored alarms of an earlier process.
 
-        Alarms of feeders that are neither watched nor stored any more are cleared: nobody else would.
+        Alarms of feeders that are neither monitored nor stored any more are cleared here: no monitor does it.
         """
         ours, t = self.watches.keys() | self.unloaded.keys() | self.store.feeders().keys(), self._wall()
         standing = self.store.active()
@@ -425,24 +411,24 @@ class Rounds:
     # ---------------------------------------------------------------- one round
 
     def round(self, samples: list[Sample], oldest: Callable[[], float | None] = lambda: None) -> bool:
-        """Take samples in, do what is due, store, publish.
+        """Process samples and due ticks, store, publish.
 
         Parameters
         ----------
         samples
             In the order of arrival.
         oldest
-            Says when the oldest of those arrived that still wait, Unix s; None if none does.
+            Returns the arrival time of the oldest waiting sample, Unix s; None if none waits.
 
         Returns
         -------
         bool
-            Whether there is a new report.
+            True if there is a new report.
         """
         started = time.perf_counter()
         bad = self._place(samples)
         now, waiting = self._wall(), oldest()
-        # No tick goes without readings that only wait here.
+        # A tick must not end before samples that arrived in time have left the queue.
         until = now if waiting is None else min(now, waiting)
         for watch in self.watches.values():
             self._guarded(watch, partial(watch.reach, until))
@@ -468,7 +454,7 @@ class Rounds:
         return any(watch.pending for watch in self.watches.values())
 
     def _place(self, samples: Iterable[Sample]) -> list[Rejected]:
-        """Decode and align samples without judging; return the readings that cannot be used."""
+        """Decode and align samples without evaluation; return the unusable readings."""
         bad: list[Rejected] = []
         outcomes: Counter[tuple[str, Outcome]] = Counter()
         lost: dict[str, int] = {}
@@ -493,7 +479,7 @@ class Rounds:
         return bad
 
     def _judge(self) -> list[TickResult]:
-        """Judge the pending ticks within the time budget; skipped ones are counted."""
+        """Evaluate the pending ticks within the time budget; count skipped ones."""
         results: list[TickResult] = []
 
         def judge(watch: Watch) -> None:
@@ -510,14 +496,14 @@ class Rounds:
         return results
 
     def keep_states(self, watches: Iterable[Watch] | None = None, *, at_once: bool = False) -> None:
-        """Queue the commissioning and the suspicions of feeders for the database, where they are due.
+        """Queue the commissioning and the suspicions of feeders for the database, if they are due.
 
         Parameters
         ----------
         watches
-            The feeders; None: all. Both change with judged ticks only.
+            The feeders; None: all. Both states change with evaluated ticks only.
         at_once
-            Also a commissioning that is not due yet.
+            Include a commissioning that is not due yet.
         """
         for watch in self.watches.values() if watches is None else watches:
             kept, happened = watch.commissioning.due(at_once=at_once)
@@ -533,21 +519,21 @@ class Rounds:
             self.metrics.learned.labels(watch.name).set(np.isfinite(known.learned.at).sum())
 
     def _decode(self, sample: Sample) -> Decoded:
-        """Decode a payload; a defect of the decoder costs this payload and nothing else."""
+        """Decode a payload; a defect of the decoder costs this payload only."""
         try:
             return self._wire.decode(sample.key, sample.payload, sample.encoding, size=sample.size)
-        except Exception as error:  # noqa: BLE001 - whatever it is, one payload must not end the service
+        except Exception as error:  # noqa: BLE001 - one payload must not end the service
             problem = beginning(f"{type(error).__name__}: {error}")
             _log.error("a payload could not be decoded", key=sample.key[:HEAD_BYTES], problem=problem)
             head, key = head_of(sample.payload[:HEAD_BYTES]), beginning(sample.key)
             return Decoded(bad=(BadReading(BadReason.INTERNAL, (problem,), key, head=head),))
 
     def _guarded(self, watch: Watch, run: Callable[[], T]) -> T | None:
-        """Let a defect in one feeder's chain stop that feeder, visibly, and no other."""
+        """Run a step of one feeder; a defect stops this feeder, visibly, and no other."""
         found: T | None = None
         try:
             found = run()
-        except Exception as error:  # noqa: BLE001 - whatever it is, it must not blind the other feeders
+        except Exception as error:  # noqa: BLE001 - the other feeders stay monitored
             watch.break_down(error)
         if watch.defect is not None:
             _log.error("a feeder's monitor failed", feeder=watch.name, exc_info=watch.defect)
@@ -595,23 +581,23 @@ class Rounds:
     def acknowledge(
         self, alarm_id: str, who: str, comment: str, *, count: int | None = None
     ) -> Future[dict[str, Any]]:
-        """Answer an alarm. The result is the alarm, when it is on the disk; the book follows then.
+        """Acknowledge an alarm. The result is the stored alarm; the book follows after the commit.
 
-        The same answer to the same occurrence once more has the same result.
+        Repeating the same acknowledgement of the same occurrence gives the same result.
 
         Parameters
         ----------
         alarm_id, who, comment
-            Which alarm, who answers it, and with what words.
+            Id of the alarm, operator, and comment.
         count
-            Which occurrence; None: whichever it is.
+            Occurrence; None: the latest.
 
         Raises
         ------
         AlarmUnknown, RaisedAgain, AlreadyAcknowledged, StoreUnavailable
-            If it cannot be answered, here or as the result; nothing has changed then.
+            If it cannot be acknowledged, at once or as the result; nothing is changed then.
         OutcomeUnknown
-            As the result, if it is stored now or later, or not at all.
+            As the result, if it is not known to be stored.
         """
         answer: Future[dict[str, Any]] = Future()
         t = self._wall()
@@ -640,7 +626,7 @@ class Rounds:
         return answer
 
     def _acknowledged(self, alarm: Alarm) -> None:
-        """Carry a stored acknowledgement over to the book, and to what was judged while it was stored."""
+        """Copy a stored acknowledgement to the book, and to results since the start of the write."""
         self.keeper.waiting.carry(alarm)
         watch = self.watches.get(alarm.feeder)
         if watch is not None and alarm.acknowledged_by is not None and alarm.t_acknowledged is not None:
@@ -656,17 +642,17 @@ class Rounds:
                 _log.info("the acknowledged occurrence is over", feeder=alarm.feeder, id=alarm.id)
 
     def recommission(self, name: str, meters: Sequence[str], who: str, reason: str) -> Future[dict[str, Any]]:
-        """Learn meters' errors anew. The result is the progress, when it is on the disk.
+        """Restart the learning of meters' errors. The result is the stored progress.
 
         Parameters
         ----------
         name, meters, who, reason
-            The feeder, which of its meters (none for all), who wants it, and why.
+            The feeder, its meters (empty for all), operator, and reason.
 
         Raises
         ------
         FeederUnknown, NothingToLearn, StoreUnavailable
-            If that cannot be, here or as the result; nothing has changed then.
+            If it is not possible, at once or as the result; nothing is changed then.
         OutcomeUnknown
             As in `acknowledge`.
         """
@@ -681,7 +667,8 @@ class Rounds:
         take_back()
 
         def landed() -> dict[str, Any]:
-            # Ticks have come since: begun anew from the present state, which is stored with the next batch.
+            # Ticks since then have changed the state: the restart is repeated from the present state, stored
+            # with the next batch.
             watch.recommission(meters, t, who, reason)
             kept, happened = watch.commissioning.due()
             kept = (*kept, *watch.suspicions.due())
@@ -697,7 +684,7 @@ class Rounds:
 
 
 def _then(answer: Future[Any], store: Callable[[T], None]) -> Callable[[T], None]:
-    """Return the second step of a command, errors of which are its result."""
+    """Return the second step of a command; its errors become the command's result."""
 
     def run(found: T) -> None:
         try:
@@ -709,7 +696,7 @@ def _then(answer: Future[Any], store: Callable[[T], None]) -> Callable[[T], None
 
 
 def _landing(answer: Future[T], run: Callable[[], T]) -> Callable[[], None]:
-    """Return the last step of a command, which has its result unless that was unknown before."""
+    """Return the last step of a command; it sets the result unless the outcome was reported as unknown."""
 
     def landed() -> None:
         result = run()
@@ -725,7 +712,7 @@ def _refuse(answer: Future[Any], error: GridsecError) -> None:
 
 
 def _say(happened: Happened) -> None:
-    """Tell the log what happened to a commissioning."""
+    """Log a change of a commissioning."""
     _log.info(
         "commissioning",
         feeder=happened.feeder,

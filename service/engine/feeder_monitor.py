@@ -1,7 +1,7 @@
-"""One feeder being watched: readings in, reports and alarm transitions out.
+"""Monitor of one feeder: readings in, reports and alarm transitions out.
 
-The live service, replay and tests all run this. It has no clock, no threads and no input or output; whoever
-owns a `Watch` calls it from one place at a time.
+The live service, replay and tests all use it. It has no clock, no threads and no input or output. Calls on a
+`Watch` must not overlap.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from service.report.report import FeederReport, blind, build, with_data_error, w
 from service.report.voltages import snapshot
 
 POWER_MAX_FACTOR = 100.0
-"""Powers beyond this many times the feeder's base power are no readings."""
+"""Largest plausible power over the feeder's base power."""
 
 PATIENCE_MIN_S = 5.0
-"""A younger report is never stale."""
+"""Lower limit of `patience_s`, s."""
 
 
 class Phase(StrEnum):
-    """Whether a feeder has a monitor."""
+    """State of a feeder's monitor."""
 
     DESIGNING = "designing"
     WATCHING = "watching"
@@ -46,20 +46,14 @@ class Phase(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class TickResult:
-    """What one tick brought."""
+    """Result of one tick."""
 
     report: FeederReport
     transitions: tuple[Transition, ...]
 
 
 def known_of(site: Site) -> Known:
-    """Return what the wire has to know of a feeder.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    """
+    """Return the properties of a feeder that the validation of readings uses."""
     meta = site.tables.meta
     nominal = zip(site.meter_ids, site.customer_nominal[site.meters].tolist(), strict=True)
     own = {meter: volt for meter, volt in nominal if volt != meta.voltage_volt}
@@ -74,12 +68,10 @@ def align_rules(
     grace_s: float | None = None,
     live: bool = False,
 ) -> AlignRules:
-    """Return the times by which a feeder's readings are aligned.
+    """Return the times of the alignment of a feeder's readings.
 
     Parameters
     ----------
-    site
-        The feeder.
     clock, max_skew_s, grace_s, live
         As in `align.rules`.
     """
@@ -90,63 +82,53 @@ def align_rules(
 
 
 def alarm_rules(site: Site, times: AlignRules) -> AlarmRules:
-    """Return the delays of a feeder's alarms.
-
-    Parameters
-    ----------
-    site, times
-        The feeder, and the times by which its readings are aligned.
-    """
+    """Return the delays of a feeder's alarms."""
     settings = site.tables.meta.monitor
     return AlarmRules(settings.on_delay_s, settings.off_delay_s, silence_s=times.silence_s)
 
 
 def design(site: Site, progress: Callable[[int, int], None] | None = None) -> registry.Watcher:
-    """Return the design of the estimator that a feeder's file names; takes its time on large ones.
+    """Return the design of a feeder's estimator; slow on large feeders.
 
     Parameters
     ----------
-    site
-        The feeder.
     progress
-        Called with (done, total) where the design has many parts.
+        Called with (done, total) if the design has many parts.
 
     Raises
     ------
     NotObservable, DesignInfeasible
-        If the feeder cannot be watched as its file asks for.
+        If the feeder does not satisfy the conditions of its estimator.
     """
     return registry.design(site, workers=os.cpu_count() or 1, progress=progress)
 
 
 class Watch:
-    """One feeder being watched.
+    """Monitor of one feeder.
 
     Parameters
     ----------
-    site
-        The feeder.
     rules
-        Its times.
+        Times of its alignment.
     book
         Its alarms so far.
     commissioning
-        What is known of its meters; None: nothing.
+        State of the meters' errors; None for none.
     suspicions
-        Who was not believed; None: nobody.
+        Distrusted devices; None for none.
 
     Attributes
     ----------
     phase, problem
-        Whether there is a monitor, and if it failed, why.
+        State of the monitor, and the reason of a failure.
     report
         The latest report, or None before the first tick.
     pending
-        Ticks that are due and not judged, oldest first.
+        Ticks that are due and not evaluated, oldest first.
     skipped
-        Ticks that were not judged.
+        Number of skipped ticks.
     defect
-        What made the monitor fail, until somebody has seen to it; None: nothing.
+        Error that ended the monitor, until it is logged; None without one.
     """
 
     def __init__(
@@ -177,24 +159,18 @@ class Watch:
 
     @property
     def patience_s(self) -> float:
-        """An older report is stale: three ticks have gone by without one, and the grace, s."""
+        """Age beyond which a report is stale, s: three ticks and the grace."""
         rules = self.aligner.rules
         return max(PATIENCE_MIN_S, 3.0 * rules.tick_s + rules.grace_s)
 
     @cached_property
     def revision(self) -> str:
-        """What its reports carry, so that nobody reads them with the meters of other tables."""
+        """Revision in its reports, against reading them with the meters of other tables."""
         revision: str = feeder_info.detail(self.site, self.patience_s)["revision"]
         return revision
 
     def install(self, finished: registry.Watcher) -> None:
-        """Begin to watch with a finished design.
-
-        Parameters
-        ----------
-        finished
-            The design.
-        """
+        """Start monitoring with a finished design."""
         self._watcher, self._state = finished, None
         self._data_errors.renew()
         self.max_attacked = finished.max_attacked
@@ -203,29 +179,29 @@ class Watch:
         self.phase, self.problem = Phase.WATCHING, ""
 
     def fail(self, problem: str) -> None:
-        """Give up watching; ticks go on and are undecided.
+        """End monitoring; ticks continue and are undecided.
 
         Parameters
         ----------
         problem
-            Why, for the operator.
+            Reason for the operator.
         """
         self._watcher = self._state = None
         self.phase, self.problem = Phase.FAILED, problem
 
     def break_down(self, defect: Exception) -> None:
-        """Give up watching because of a defect, and keep that for whoever sees to it.
+        """End monitoring because of a defect, and keep the defect until it is logged.
 
         Parameters
         ----------
         defect
-            What was raised.
+            The exception.
         """
         self.fail(f"{type(defect).__name__}: {defect}")
         self.defect = defect
 
     def place(self, reading: Reading, now: float) -> Outcome:
-        """Align one reading; the ticks that become due are pending.
+        """Align one reading; ticks that become due are pending.
 
         Parameters
         ----------
@@ -247,19 +223,19 @@ class Watch:
         self.pending.extend(self.aligner.due(now))
 
     def skip(self, count: int) -> None:
-        """Drop the oldest pending ticks without judging them; the next one counts them.
+        """Drop the oldest pending ticks without evaluation; the next one counts them.
 
         Parameters
         ----------
         count
-            Their number, less than that of the pending ticks.
+            Number of dropped ticks, less than that of the pending ones.
         """
         gone = sum(self.pending.popleft().skipped + 1 for _ in range(count))
         following = self.pending[0]
         self.pending[0] = replace(following, skipped=following.skipped + gone)
 
     def judge(self) -> TickResult:
-        """Judge the oldest pending tick.
+        """Evaluate the oldest pending tick.
 
         Raises
         ------
@@ -271,7 +247,7 @@ class Watch:
         return self._result(tick)
 
     def take(self, reading: Reading, now: float) -> tuple[Outcome, list[TickResult]]:
-        """Align one reading and judge the ticks that become due.
+        """Align one reading and evaluate the ticks that become due.
 
         Parameters
         ----------
@@ -281,7 +257,7 @@ class Watch:
         return self.place(reading, now), self._judged()
 
     def due(self, now: float) -> list[TickResult]:
-        """Judge the ticks that are due without a new reading.
+        """Evaluate the ticks that are due without a new reading.
 
         Parameters
         ----------
@@ -292,13 +268,13 @@ class Watch:
         return self._judged()
 
     def finish(self) -> None:
-        """Add all ticks that the time has reached to the pending ones: nothing more will come."""
+        """Add all ticks that the time has reached to the pending ones: the input has ended."""
         self.pending.extend(self.aligner.flush())
 
     def acknowledge(
         self, alarm_id: str, who: str, comment: str, t: float, *, count: int | None = None
     ) -> tuple[Transition, ...]:
-        """Answer an alarm of this feeder.
+        """Acknowledge an alarm of this feeder.
 
         Parameters
         ----------
@@ -309,7 +285,7 @@ class Watch:
         return transitions
 
     def recommission(self, meters: Sequence[str], t: float, who: str, reason: str) -> Callable[[], None]:
-        """Learn meters' errors anew, because they were replaced.
+        """Restart the learning of meters' errors, after their replacement.
 
         Parameters
         ----------
@@ -319,7 +295,7 @@ class Watch:
         Returns
         -------
         callable
-            Takes it back, as long as nothing else has happened.
+            Undoes the restart, if nothing else has happened since.
         """
         state, before, believed = self._state, copy(self.commissioning), copy(self.suspicions)
         self._state = self.commissioning.renew(state, meters, t, who, reason)
@@ -335,15 +311,15 @@ class Watch:
         return [self.judge() for _ in range(len(self.pending))]
 
     def _result(self, tick: Tick) -> TickResult:
-        """Judge a tick; a defect costs the answer to it, and no alarm of the ticks before."""
+        """Evaluate a tick; a defect costs its verdict, but no alarm of earlier ticks."""
         book = self.book
         if tick.skipped:
             book = hold(book, tick.t - tick.skipped * self.aligner.rules.tick_s)
-        for _ in range(2):  # watched, and given up
+        for _ in range(2):  # monitored, then failed
             try:
                 report = self._complete(self._judge(tick))
                 after, transitions = advance(book, self._alarm_rules, conditions(report), report.t)
-            except Exception as error:  # noqa: BLE001 - whatever it is, ticks before and after have their answers
+            except Exception as error:  # noqa: BLE001 - ticks before and after keep their verdicts
                 self.break_down(error)
             else:
                 self.report, self.book = report, after
@@ -352,21 +328,21 @@ class Watch:
         return TickResult(self.report, ())
 
     def _complete(self, report: FeederReport) -> FeederReport:
-        """The report with the revision of its feeder, and the newest tick that rests on a reading."""
+        """The report with the revision of its feeder, and the newest tick with a reading."""
         last = None if self.report is None else self.report.t_measured
-        # After the clock was set back, an earlier time of measurement would lie in the future.
+        # After the clock was set back, an earlier time of measurement would be in the future.
         measured = (last if last is None or last <= report.t else None) if report.model_only else report.t
         return replace(report, revision=self.revision, t_measured=measured)
 
     def _judge(self, tick: Tick) -> FeederReport:
         if self._watcher is None:
             if self.phase is Phase.FAILED:
-                cause, reason = Cause.DESIGN_INVALID, f"nobody watches: {self.problem}"
+                cause, reason = Cause.DESIGN_INVALID, f"not monitored: {self.problem}"
             else:
-                cause, reason = Cause.SETTLING, "the monitor is still being designed"
+                cause, reason = Cause.SETTLING, "the design of the monitor is not finished"
             return blind(self.site, tick, self.max_attacked, cause, reason)
         if self._state is None or (self.report is not None and tick.t <= self.report.t):
-            # The first tick, or the clock was set back: readings from before belong to another time.
+            # The first tick, or the clock was set back: earlier readings belong to another time.
             begun = self._watcher.init(tick.t, self.commissioning.known)
             self._state = self.suspicions.restore(begun)
             self._data_errors.renew()

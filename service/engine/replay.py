@@ -1,4 +1,4 @@
-"""A recording through the same chain as in the live service, in its own time or in that of its arrival."""
+"""Replay of a recording through the chain of the live service, by its time stamps or by its arrivals."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from service.store.state_codec import Kept
 
 @dataclass(slots=True)
 class Tally:
-    """Counts of a replay: readings by outcome or reason, ticks by verdict, ticks that were not judged."""
+    """Counts of a replay: readings by outcome or reason, ticks by verdict, skipped ticks."""
 
     readings: Counter[str] = field(default_factory=Counter)
     ticks: Counter[str] = field(default_factory=Counter)
@@ -30,7 +30,7 @@ class Tally:
 
     @property
     def judged(self) -> int:
-        """Number of ticks at which the monitor could tell whether anybody lies."""
+        """Number of ticks with a verdict other than undecided."""
         return self.ticks.total() - self.ticks[Decision.UNDECIDED]
 
 
@@ -46,31 +46,29 @@ def replay(
     distrust: Kept | None = None,
     skipped: Sequence[tuple[float, float]] = (),
 ) -> Iterator[TickResult]:
-    """Yield what the service would have made of recorded readings.
+    """Yield the service's results for recorded readings.
 
     Parameters
     ----------
-    site
-        The feeder.
     recorded
         Readings in the order of their arrival.
     tally
-        Filled on the way.
+        Filled by the replay.
     clock
-        Who says what time it is: the readings, or, as it was live, the wall clock by which they arrived.
+        Source of the present time: the readings, or, as in live operation, the wall clock of their arrival.
     max_skew_s, grace_s
         As in `align.rules`.
     kept
-        What was known of the meters when the recording began, as in `Commissioning`; None: nothing.
+        State of the meters' errors at the start of the recording, as in `Commissioning`; None for none.
     distrust
-        Who was not believed then, as in `Suspicions`; None: nobody.
+        Distrusted devices at the start, as in `Suspicions`; None for none.
     skipped
-        First and last Unix time of ticks that the live service skipped, s: they are not judged here either.
+        First and last Unix time of ticks that the live service skipped, s; the replay skips them, too.
 
     Raises
     ------
     NotObservable, DesignInfeasible
-        If the feeder cannot be watched.
+        If the feeder cannot be monitored.
     """
     rules = align_rules(site, clock, max_skew_s=max_skew_s, grace_s=grace_s)
     book = AlarmBook(site.feeder.name)
@@ -80,7 +78,7 @@ def replay(
     for one in recorded:
         reading = _checked(watch.name, known, one, tally, clock)
         if reading is not None:
-            # Where the readings tell the time, nothing else needs to, and a file need not say more.
+            # With `Clock.EVENTS` the arrival has no effect, and a file need not contain it.
             now = one.arrival if clock is Clock.WALL else 0.0
             outcome = watch.place(reading, now)
             tally.readings[outcome] += 1
@@ -95,7 +93,7 @@ def replay(
 
 
 def _judged(watch: Watch, skipped: Sequence[tuple[float, float]]) -> Iterator[TickResult]:
-    """Judge the pending ticks; one that was skipped stays until the next one counts it."""
+    """Evaluate the pending ticks; a skipped one stays until the next one counts it."""
     while watch.pending:
         t = watch.pending[0].t
         if not any(first <= t <= last for first, last in skipped):
@@ -115,7 +113,7 @@ def _counted(watch: Watch, results: Iterator[TickResult], tally: Tally) -> list[
 
 
 def _checked(feeder: str, known: Known, recorded: Recorded, tally: Tally, clock: Clock) -> Reading | None:
-    """Return a recorded reading as it would have come off the wire, or None (counted) if it is a bad one."""
+    """Return a recorded reading as if received from zenoh, or None (counted) for a bad one."""
     if clock is Clock.WALL and not _is_time(recorded.arrival):
         tally.readings[BadReason.VALUE] += 1
         return None

@@ -1,9 +1,9 @@
 """The running service: one task owns all state.
 
-Rounds run one after the other in one worker thread, so that the event loop stays free for HTTP;
-acknowledgements, new feeders and finished designs are executed between them. Nothing else touches the state.
-With the wall clock that thread makes no call to the database: a command sends one, and its outcome is taken
-in between two later rounds.
+Rounds run one after the other in one worker thread, so that the event loop stays free for HTTP.
+Acknowledgements, new feeders and finished designs are executed between them. No other code changes the state.
+With the wall clock that thread makes no call to the database: a command starts one, and its result is
+processed between two later rounds.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ from service.store import OutcomeUnknown, Store, StoreUnavailable
 from service.store.committer import Done, Publisher
 
 SAMPLES_PER_ROUND = 512
-"""Payloads of one round where senders wait. By the wall clock a round takes all that wait."""
+"""Payloads of one round if senders wait. With the wall clock a round takes all waiting samples."""
 GATHER_S = 0.005
 """Pause after a wake-up by readings, s: a round costs the same for one reading as for dozens."""
 LAST_COMMIT_S = 1.5
-"""Time for the last commit after `stop`, s: the service ends within 3 s."""
+"""Time limit of the last commit after `stop`, s: the service ends within 3 s."""
 IDLE_S = 1.0
 STUCK_S = 30.0
 COMMAND_S = 10.0
-"""Time limit of a command that needs the database, s: a write before it and its own."""
+"""Time limit of a command with the database, s: an earlier write and its own."""
 STOPPING = "the service is stopping"
 
 T = TypeVar("T")
@@ -52,24 +52,20 @@ _log = structlog.get_logger("gridsec.runtime")
 
 
 class Runtime:
-    """The running service. It is the backend of the API.
+    """The running service; backend of the API.
 
     Parameters
     ----------
-    config
-        How it works.
-    store
-        The database.
     sites
-        The feeders to watch.
+        The monitored feeders.
     given
-        Names of those that cannot be deleted over REST; None: all of them.
+        Names of the feeders that REST cannot delete; None: all of them.
     unloaded
-        Feeders that are stored but cannot be loaded, and why: nobody watches them.
+        Stored feeders that cannot be loaded and are not monitored, with the reason.
     wall
-        The wall clock, Unix s.
+        Wall clock, Unix s.
     settled
-        Called between two rounds when a feeder has got its monitor and no other is still being designed.
+        Called between two rounds after the last unfinished design.
     """
 
     def __init__(
@@ -95,7 +91,7 @@ class Runtime:
             unloaded=unloaded,
             go_on=lambda: not self._stopping,
         )
-        # Where the readings tell the time, samples wait for ticks and for the database.
+        # With `Clock.EVENTS` samples wait for ticks and for the database.
         self._waits = config.clock is Clock.EVENTS
         self._given = frozenset(self._rounds.watches) if given is None else frozenset(given)
         self._inbox = Inbox(
@@ -117,30 +113,18 @@ class Runtime:
     # ---------------------------------------------------------------- the task
 
     def attach(self, publisher: Publisher) -> None:
-        """Say where estimates and alarms go, before `run`.
-
-        Parameters
-        ----------
-        publisher
-            Usually the zenoh bus.
-        """
+        """Set the publisher of estimates and alarms; called before `run`."""
         self._rounds.keeper.publisher = publisher
 
     def deliver(self, batch: list[Sample]) -> int:
-        """Take samples from a receiving thread; returns how many were dropped for them.
-
-        Parameters
-        ----------
-        batch
-            In the order of arrival.
-        """
+        """Take samples from a receiving thread; return the number of dropped ones."""
         dropped = self._inbox.put(batch)
         self._rounds.metrics.samples.inc(len(batch))
         self._rounds.metrics.dropped.inc(dropped)
         return dropped
 
     async def run(self) -> None:
-        """Watch until `stop`.
+        """Run rounds until `stop`.
 
         Raises
         ------
@@ -189,7 +173,7 @@ class Runtime:
         self._notify("stop")
 
     def _samples(self) -> list[Sample]:
-        """Take the samples of the next round; where they wait, none before the last are judged and stored."""
+        """Return the samples of the next round; with `Clock.EVENTS` none before the last ones are stored."""
         if not self._waits:
             return self._inbox.drain(len(self._inbox))
         busy = self._rounds.behind or self._rounds.keeper.storing
@@ -218,12 +202,12 @@ class Runtime:
         return await asyncio.get_running_loop().run_in_executor(self._worker, run, *arguments)
 
     def _write_apart(self, write: Callable[[], Done], then: Callable[[Done], None]) -> None:
-        """Write in a thread of its own; what came of it is taken in between two rounds."""
+        """Write in a separate thread; its result is processed between two rounds."""
 
         def run() -> None:
             try:
                 done = write()
-            except Exception as error:  # noqa: BLE001 - without an outcome nothing would ever be stored again
+            except Exception as error:  # noqa: BLE001 - without a result nothing would be stored any more
                 done = Done(error=StoreUnavailable(f"{type(error).__name__}: {error}", code="defect"))
             self._in_loop(partial(self._take_in, partial(then, done)))
 
@@ -234,23 +218,23 @@ class Runtime:
         self._wake.set()
 
     async def _end(self) -> None:
-        """Store what is left, if the database answers in time."""
+        """Store the remaining data, if the database answers in time."""
         try:
             await asyncio.wait_for(self._last_commit(), LAST_COMMIT_S)
         except TimeoutError:
-            # No request is answered with success before its commit.
+            # Requests are answered with success only after their commit.
             waiting = len(self._rounds.keeper.waiting)
             _log.error("the database did not answer before the end", transitions=waiting, s=LAST_COMMIT_S)
 
     async def _last_commit(self) -> None:
-        """Store what is left, after what is on its way."""
+        """Store the remaining data, after the write in progress."""
         await self._landed()
         await self._in_worker(partial(self._rounds.keep_states, at_once=True))
         await self._in_worker(partial(self._rounds.keeper.commit, at_once=True))
         await self._landed()
 
     async def _landed(self) -> None:
-        """Wait for a write that is on its way, and take in what came of it."""
+        """Wait for the write in progress, and process its result."""
         await self._take_outcomes()
         while self._rounds.keeper.storing:
             await self._wake.wait()
@@ -263,7 +247,7 @@ class Runtime:
 
     async def _execute_commands(self) -> None:
         await self._take_outcomes()
-        # One write is on its way at a time; one before a command comes first.
+        # Only one write is in progress at a time; one before a command comes first.
         while self._commands and self._rounds.keeper.takes_commands:
             command, answer = self._commands.popleft()
             try:
@@ -275,7 +259,7 @@ class Runtime:
                 found.add_done_callback(partial(self._pass_on, answer))
 
     def _pass_on(self, answer: asyncio.Future[T], found: Future[T]) -> None:
-        """Give a command's result to the request that waits for it; called in any thread."""
+        """Pass a command's result to the waiting request; called in any thread."""
 
         def give() -> None:
             if answer.done():
@@ -288,7 +272,7 @@ class Runtime:
         self._in_loop(give)
 
     async def _command(self, run: Callable[[], Future[T]]) -> T:
-        """Have something executed between two rounds, and wait for its result within a time limit."""
+        """Execute a command between two rounds, and wait for its result within a time limit."""
         self._go_on()
         answer: asyncio.Future[T] = asyncio.get_running_loop().create_future()
         entry = (run, answer)
@@ -301,18 +285,16 @@ class Runtime:
         name = self.store.name
         if entry in self._commands:
             self._commands.remove(entry)
-            text = f"{name}: the write before has not ended within {COMMAND_S:g} s"
+            text = f"{name}: the previous write has not ended within {COMMAND_S:g} s"
             raise StoreUnavailable(text, code="write-under-way")
-        raise OutcomeUnknown(
-            f"{name}: no answer within {COMMAND_S:g} s; whether it is stored is not known yet"
-        )
+        raise OutcomeUnknown(f"{name}: no answer within {COMMAND_S:g} s; its outcome is not known yet")
 
     def _go_on(self) -> None:
         if self._stopping:
             raise StoreUnavailable(STOPPING, code="stopping")
 
     def _in_loop(self, run: Callable[[], object]) -> None:
-        """Call something in the event loop, from any thread; not at all once the loop has ended."""
+        """Call a function in the event loop, from any thread; ignored after the end of the loop."""
         if self._loop is not None:
             with contextlib.suppress(RuntimeError):
                 self._loop.call_soon_threadsafe(run)
@@ -355,74 +337,39 @@ class Runtime:
         return watched + failed
 
     def feeder(self, name: str) -> dict[str, Any] | None:
-        """Return everything about a feeder, or None.
-
-        Parameters
-        ----------
-        name
-            Its name.
-        """
+        """Return all properties of a feeder, or None."""
         watch = self._rounds.watches.get(name)
         return None if watch is None else feeder_info.detail(watch.site, watch.patience_s)
 
     def known(self, name: str) -> bool:
-        """Whether a feeder is watched.
-
-        Parameters
-        ----------
-        name
-            Its name.
-        """
+        """True if a feeder is monitored."""
         return name in self._rounds.watches
 
     def unloaded(self, name: str) -> str | None:
-        """Return why the stored tables of a feeder could not be loaded, or None if that is not so.
-
-        Parameters
-        ----------
-        name
-            Its name.
-        """
+        """Return the reason why the stored tables of a feeder cannot be loaded, or None."""
         return self._rounds.unloaded.get(name)
 
     def report(self, name: str) -> FeederReport | None:
-        """Return a feeder's latest report, or None.
-
-        Parameters
-        ----------
-        name
-            Its name.
-        """
+        """Return a feeder's latest report, or None."""
         watch = self._rounds.watches.get(name)
         return None if watch is None else watch.report
 
     def age(self, report: FeederReport) -> float:
-        """Return how old a feeder's latest report is by the service's clock, s.
+        """Return the age of a feeder's latest report by the service's clock, s.
 
-        Where the readings tell the time, it counts from when the report was made.
-
-        Parameters
-        ----------
-        report
-            The report.
+        With `Clock.EVENTS` the age counts from the creation of the report.
         """
         now = time.monotonic()
         since = now - self._rounds.reported.get(report.feeder, now)
         return since if self._rounds.config.clock is Clock.EVENTS else max(since, self._wall() - report.t)
 
     def commissioning(self, name: str) -> dict[str, Any] | None:
-        """Return how far a feeder's meters are known, or None.
-
-        Parameters
-        ----------
-        name
-            Its name.
-        """
+        """Return the progress of a feeder's commissioning, or None."""
         watch = self._rounds.watches.get(name)
         return None if watch is None else commissioning_json(watch.commissioning.progress())
 
     def unstored(self) -> tuple[int, str | None]:
-        """Return how many changes of alarms wait for the database, and what is wrong with it, or None."""
+        """Return the number of alarm changes that wait for the database, and its problem or None."""
         keeper = self._rounds.keeper
         return len(keeper.waiting), "; ".join(keeper.problems()) or None
 
@@ -431,16 +378,16 @@ class Runtime:
         return self._rounds.metrics.exposition()
 
     def healthy(self) -> tuple[bool, list[str]]:
-        """Say whether the process should live on, and if not, why."""
+        """Return True if the process can continue, and the problems otherwise."""
         problems = []
         if self._died is not None:
-            problems.append(f"the runtime has died: {self._died}")
+            problems.append(f"the runtime has ended: {self._died}")
         elif self._last_round is not None and time.monotonic() - self._last_round > STUCK_S:
             problems.append(f"the runtime has been stuck for {time.monotonic() - self._last_round:.0f} s")
         return not problems, problems
 
     def ready(self) -> tuple[bool, list[str]]:
-        """Say whether everything works that is needed to watch, and what does not."""
+        """Return True if everything needed for monitoring works, and the problems otherwise."""
         rounds = self._rounds
         problems = self.healthy()[1]
         if self._last_round is None:
@@ -451,10 +398,10 @@ class Runtime:
             problems.append(f"zenoh: {publisher.failure}")
         for watch in rounds.watches.values():
             if watch.phase is Phase.DESIGNING:
-                problems.append(f"feeder {watch.name}: the monitor is still being designed")
+                problems.append(f"feeder {watch.name}: the design of the monitor is not finished")
             elif watch.phase is Phase.FAILED:
                 problems.append(f"feeder {watch.name}: {watch.problem}")
-            # Where the readings tell the time, it may well stand still.
+            # With `Clock.EVENTS` the time may stand still.
             told, waits = watch.report, rounds.config.clock is Clock.WALL
             if waits and told is not None and (age := self.age(told)) > watch.patience_s:
                 problems.append(f"feeder {watch.name}: the latest report is {age:.0f} s old")
@@ -463,17 +410,17 @@ class Runtime:
         return not problems, problems
 
     async def put_feeder(self, name: str, tables: dict[str, Any]) -> None:
-        """Take over a feeder's tables: check, design, store, watch; all or nothing.
+        """Take over a feeder's tables: check, design, store, start monitoring; all or nothing.
 
         Parameters
         ----------
         name, tables
-            Its name, and JSON of the columns of its files.
+            Name of the feeder, and the columns of its files as JSON.
 
         Raises
         ------
         FeederInvalid, NotObservable, DesignInfeasible, TooManyFeeders, StoreUnavailable
-            If it cannot be taken over; the feeder stays as it was.
+            If it cannot be taken over; the feeder stays unchanged.
         """
         self._go_on()
         self._make_room(name)
@@ -493,24 +440,19 @@ class Runtime:
         await self._command(put)
 
     def _make_room(self, name: str) -> None:
-        """See whether one more feeder may be put."""
+        """Check the limit of feeders before one more is added."""
         put = (self._rounds.watches.keys() | self._rounds.unloaded.keys()) - self._given
         most = self._rounds.config.max_feeders
         if name not in put | self._given and len(put) >= most:
             raise TooManyFeeders(most)
 
     async def delete_feeder(self, name: str) -> None:
-        """Watch a feeder no more that was put over REST; its alarms are cleared, its history is kept.
-
-        Parameters
-        ----------
-        name
-            Its name.
+        """Stop monitoring a feeder that was added over REST; its alarms are cleared, its history stays.
 
         Raises
         ------
         FeederUnknown, FeederFixed, StoreUnavailable
-            If it cannot be deleted; it is watched as before then.
+            If it cannot be deleted; monitoring then continues.
         """
         if name in self._given:
             raise FeederFixed(name)
@@ -520,36 +462,36 @@ class Runtime:
     async def acknowledge(
         self, alarm_id: str, who: str, comment: str, *, count: int | None = None
     ) -> dict[str, Any]:
-        """Answer an alarm; it is on the disk when this returns.
+        """Acknowledge an alarm; it is stored when this returns.
 
         Parameters
         ----------
         alarm_id, who, comment
-            Which alarm, who answers it, and with what words.
+            Id of the alarm, operator, and comment.
         count
-            Which occurrence; None: whichever it is.
+            Occurrence; None: the latest.
 
         Raises
         ------
         AlarmUnknown, RaisedAgain, AlreadyAcknowledged, StoreUnavailable
-            If it cannot be answered; nothing has changed then.
+            If it cannot be acknowledged; nothing is changed then.
         OutcomeUnknown
-            If it is stored now or later, or not at all; the same answer again tells.
+            If it is not known to be stored; repeating the acknowledgement gives the answer.
         """
         return await self._command(partial(self._rounds.acknowledge, alarm_id, who, comment, count=count))
 
     async def recommission(self, name: str, meters: Sequence[str], who: str, reason: str) -> dict[str, Any]:
-        """Learn meters' errors anew; it is on the disk when this returns.
+        """Restart the learning of meters' errors; it is stored when this returns.
 
         Parameters
         ----------
         name, meters, who, reason
-            The feeder, which of its meters (none for all), who wants it, and why.
+            The feeder, its meters (empty for all), operator, and reason.
 
         Raises
         ------
         FeederUnknown, NothingToLearn, StoreUnavailable
-            If that cannot be; nothing has changed then.
+            If it is not possible; nothing is changed then.
         """
         return await self._command(partial(self._rounds.recommission, name, meters, who, reason))
 

@@ -1,7 +1,7 @@
-"""Whom the monitor of one feeder does not believe: followed, kept, and gone on with when it begins anew.
+"""Record of a feeder's distrusted devices, with storage across restarts.
 
 `Suspicions` has no clock and no input or output, like the `Watch` that owns it: time comes from the ticks,
-texts that are kept come and go as values.
+stored texts are passed as values.
 """
 
 from __future__ import annotations
@@ -19,21 +19,19 @@ from service.store.state_codec import Kept, KeptInvalid, decode_distrust, encode
 
 
 class Suspicions:
-    """Who is not believed of one feeder's meters and inverters, the busbar's meter among them.
+    """Distrusted meters and inverters of one feeder, including the busbar meter.
 
     Parameters
     ----------
-    site
-        The feeder.
     kept
-        What the store has of it.
+        Stored state.
 
     Attributes
     ----------
     known
-        Who it is at the last tick, or was when the service ended.
+        Distrusted devices at the last tick, or at the end of the previous process.
     note
-        Why what was kept is not used, if something was.
+        Reason why stored state is not used; empty otherwise.
     """
 
     def __init__(self, site: Site, kept: Kept | None = None) -> None:
@@ -46,7 +44,7 @@ class Suspicions:
             try:
                 self.known = decode_distrust(site, kept)
             except KeptInvalid as error:
-                self.note = f"who was suspected at {kept.t:.0f} is not known: {error}"
+                self.note = f"suspicions of {kept.t:.0f} are not used: {error}"
         self._stored: Distrust | None = None if self.note else self.known
 
     @property
@@ -54,34 +52,28 @@ class Suspicions:
         return None if self._watcher is None else self._watcher.family.memory
 
     def install(self, watcher: Watcher) -> None:
-        """Take a finished design.
-
-        Parameters
-        ----------
-        watcher
-            The design.
-        """
+        """Install a finished design."""
         self._watcher = watcher
 
     def restore(self, state: Any) -> Any:
-        """Go on from what is known, where the monitor can.
+        """Apply the record to a state, if the monitor supports a warm start.
 
         Parameters
         ----------
         state
-            The monitor's, before its first tick.
+            State of the monitor before its first tick.
         """
         if self._watcher is None or self._memory is None:
             return state
         return self._memory.restore(self._watcher.design, state, self.known)
 
     def follow(self, state: Any, t: float) -> None:
-        """Take over what a tick brought.
+        """Update from the result of a tick.
 
         Parameters
         ----------
         state
-            The monitor's, after the tick.
+            State of the monitor after the tick.
         t
             Unix time of the tick, s.
         """
@@ -89,12 +81,12 @@ class Suspicions:
             self.known, self._t = self._memory.distrusted(self._watcher.design, state), t
 
     def forget(self, meters: Sequence[str], t: float) -> None:
-        """Believe meters that were replaced.
+        """Remove replaced meters from the record.
 
         Parameters
         ----------
         meters
-            Which; none for all.
+            Their ids; empty for all.
         t
             Unix time, s.
         """
@@ -103,11 +95,11 @@ class Suspicions:
         self.known, self._t = self.known.without(np.array(which, dtype=np.bool_)), t
 
     def now(self) -> Kept | None:
-        """Return the present state as it is stored; None before the first tick."""
+        """Return the present state for the store; None before the first tick."""
         return None if self._t is None else encode_distrust(self._site, self._t, self.known)
 
     def due(self) -> tuple[Kept, ...]:
-        """Return what is to be stored now, if it has changed; it counts as stored from here on."""
+        """Return the state for the store if it has changed; it counts as stored afterwards."""
         if self._t is None or (self._stored is not None and self._stored.same(self.known)):
             return ()
         self._stored = self.known

@@ -1,20 +1,20 @@
 """Alignment of readings to the ticks of a feeder, and clock offsets of their sources.
 
-A reading with the stamp t that arrives at the wall time a has the delay ``a - t``: the way of the reading
-plus the error of the clock. The median delay of a source, less that of all sources, is the negative offset of
-its clock if the ways are alike. A longer way looks like a clock that is behind.
+A reading with the stamp t that arrives at the wall time a has the delay ``a - t``: transmission time plus
+clock error. The median delay of a source, less that of all sources, is the negative offset of its clock if
+transmission times are equal. A longer transmission time looks like a clock that is behind.
 
 Readings of one source that arrive at one instant count once, with the newest stamp: a concentrator sends a
 backlog at once, and its age is not an offset.
 
-A tick is a multiple of the feeder's `tick_s`. A meter is seen at a tick if its latest reading at or before it
-is younger than `max_age_s`, so that at short ticks a single lost reading does no harm. A tick is let go as
-soon as every source that is not silent has reported for it, and at the latest `grace_s` after it. What comes
-later is late: counted, and used for the next tick if it is still fresh. Silence does not stop the ticks.
+A tick is a multiple of the feeder's `tick_s`. A meter is available at a tick if its latest reading at or
+before it is younger than `max_age_s`; at short ticks a single lost reading has no effect. A tick is emitted
+as soon as every source that is not silent has reported for it, and at the latest `grace_s` after it. Later
+readings are late: counted, and used for the next tick if still fresh. Silence does not stop the ticks.
 
-There is no clock in here. `now` is an argument (the wall clock), or is told by the readings themselves
-(`Clock.EVENTS`: the latest time that at least half of the sources have reached, so that a few wild clocks
-cannot move it; for replay and for time that runs faster). The same readings in the same order, with the same
+The alignment has no clock. `now` is an argument (the wall clock) or follows from the readings
+(`Clock.EVENTS`: the latest time that at least half of the sources have reached, so that a few wrong clocks
+cannot move it; for replay and for accelerated time). The same readings in the same order, with the same
 `now`, give the same ticks, whatever happens in between.
 """
 
@@ -34,19 +34,19 @@ from gridsec.errors import InputInvalid, Problem
 from service.ingest.reading import Reading
 
 KEPT: Final = 64
-"""Arrivals of a source that count, the newest."""
+"""Newest arrivals of a source that its median delay uses."""
 FEWEST: Final = 16
-"""Arrivals of a source below which its offset is not measurable."""
+"""Smallest number of arrivals of a source for a measurable offset."""
 SOURCES: Final = 3
-"""Sources with enough arrivals below which the delay of the fleet is not known."""
+"""Smallest number of sources with measurable delays for the median of all sources."""
 LEAST_S: Final = 0.5
 """Smallest reported offset, s."""
 LEAST_TICKS: Final = 0.1
-"""Smallest reported offset, as a part of a tick: readings up to this much after a tick belong to it."""
+"""Smallest reported offset, in ticks: readings up to this much after a tick belong to it."""
 SURE: Final = 4.0
 """Smallest reported offset in standard errors of the median of a source's delays."""
 KEEPS: Final = 0.5
-"""Part of the limits above which a reported offset stays reported."""
+"""Factor on the limits for an offset that is already reported (hysteresis)."""
 _NORMAL, _MEDIAN = 1.4826, 1.2533
 """Standard deviation over median absolute deviation, and standard error of a median over that of a mean."""
 
@@ -57,12 +57,12 @@ class ClockOffsets:
     Parameters
     ----------
     sources
-        Meters, and None for the busbar's meter.
+        Meters, and None for the busbar meter.
     tick_s
         Interval of the ticks, s.
     silence_s
-        Time without an arrival after which the delays of a source are forgotten, s. The service's clock may
-        be set meanwhile: delays of sources that no longer report would shift the median of all.
+        Time without an arrival after which the delays of a source are deleted, s. The service's clock may be
+        set meanwhile: delays of sources that no longer report would shift the median of all.
     """
 
     def __init__(self, sources: Iterable[str | None], tick_s: float, silence_s: float) -> None:
@@ -73,12 +73,12 @@ class ClockOffsets:
         self._reported: set[str | None] = set()
 
     def note(self, source: str | None, t: float, arrival: float) -> None:
-        """Take in the delay of one reading.
+        """Add the delay of one reading.
 
         Parameters
         ----------
         source
-            The meter, or None.
+            The meter, or None for the busbar meter.
         t, arrival
             Time stamp and wall time of its arrival, Unix s.
         """
@@ -90,19 +90,19 @@ class ClockOffsets:
         delays.append(arrival - t)
 
     def forget(self) -> None:
-        """Forget everything: the wall clock was set."""
+        """Delete all delays: the wall clock was set."""
         for delays in self._delays.values():
             delays.clear()
         self._arrived.clear()
         self._reported.clear()
 
     def measured(self, now: float) -> Mapping[str | None, float]:
-        """Return the measurable offsets, s; positive where a clock is ahead.
+        """Return the measurable offsets, s; positive if the clock is ahead.
 
         Parameters
         ----------
         now
-            Wall time, Unix s. Delays of silent sources are forgotten.
+            Wall time, Unix s. Delays of silent sources are deleted.
         """
         for source in [each for each, last in self._arrived.items() if now - last > self._silence]:
             del self._arrived[source]
@@ -116,14 +116,14 @@ class ClockOffsets:
         found = {
             source: fleet - one
             for source, one in middle.items()
-            # No limit is smaller than the first.
+            # `least` is the lower bound of all limits and is cheaper.
             if abs(fleet - one) >= least and abs(fleet - one) >= self._limit(source, one)
         }
         self._reported = set(found)
         return found
 
     def _limit(self, source: str | None, middle: float) -> float:
-        """Smallest offset of a source that is reported, s."""
+        """Smallest reported offset of a source, s."""
         delays = self._delays[source]
         spread = _NORMAL * median(abs(delay - middle) for delay in delays)
         limit = max(self._least, SURE * _MEDIAN * spread / math.sqrt(len(delays)))
@@ -131,19 +131,19 @@ class ClockOffsets:
 
 
 HELD_PER_SOURCE = 512
-"""A source that is more than this many readings ahead of the ticks is not listened to."""
+"""Largest number of readings of a source ahead of the ticks; further ones overflow."""
 
 BACKLOG_TICKS = 3600
-"""Ticks formed after one step of the time where time may wait (`Clock.EVENTS`, replay); older are skipped."""
+"""Ticks formed after one step of the time where ticks may wait (`Clock.EVENTS`, replay); older: skipped."""
 
 LEAP_TICKS = 60
 """Ticks formed after one step of the wall clock of a running service, where old ticks are stale."""
 
 BRIDGED_TICK_S = 2.0
-"""Up to this tick, a lost reading is replaced by the one before."""
+"""Largest tick at which the previous reading replaces a lost one, s."""
 
 GAP_MAX = 1_000_000
-"""A running number that leaps further was not counted on; nothing is known to be lost."""
+"""Largest gap of sequence numbers that counts as lost readings; a larger one is a restart of the counter."""
 
 OFFSETS_TICKS = 16
 """Ticks from one measurement of the clock offsets to the next."""
@@ -152,14 +152,14 @@ _ACTIVE_ROUNDS = 4
 
 
 class Clock(StrEnum):
-    """Who says what time it is."""
+    """Source of the present time."""
 
     WALL = "wall"
     EVENTS = "events"
 
 
 class Outcome(StrEnum):
-    """What became of a reading that is well-formed."""
+    """Result of the alignment of a well-formed reading."""
 
     ACCEPTED = "accepted"
     OUT_OF_ORDER = "out-of-order"
@@ -171,29 +171,29 @@ class Outcome(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class AlignRules:
-    """The times of one feeder, all in seconds.
+    """Times of the alignment of one feeder.
 
     Attributes
     ----------
     tick_s
-        Interval between ticks.
+        Interval between ticks, s.
     max_age_s
-        A reading of this age or older at a tick does not count as seen.
+        Age of a reading at a tick, s, from which it is not usable.
     grace_s
-        How long after a tick to wait for those who have not reported.
+        Longest wait after a tick for sources that have not reported, s.
     lead_s
-        A reading up to this much after a tick still belongs to it: meters that mean to read at the tick
-        miss it by a little in both directions.
+        A reading up to this much after a tick still belongs to it, s: meters that read at the tick miss it
+        slightly in both directions.
     max_skew_s
-        A reading whose time is further than this from now is refused: that clock is off.
+        Largest difference of a reading's time from now, s; beyond it the reading is refused.
     silence_s
-        A source whose last usable reading is older than this is silent.
+        Age of the last usable reading, s, beyond which a source is silent.
     clock
-        Who says what time it is.
+        Source of the present time.
     backlog
         Ticks formed after one step of the time; older ones are skipped and counted.
     skips_empty
-        After such a step all ticks are skipped if none of them has a usable reading.
+        Skip all ticks after such a step if none of them has a usable reading.
     """
 
     tick_s: float
@@ -226,21 +226,20 @@ def rules(
     """Return the rules that follow from a feeder's tick.
 
     Up to `BRIDGED_TICK_S` a reading serves for two and a half ticks, which bridges single losses. At longer
-    ticks it serves for one: a lost reading is a lost reading there, because a voltage of a quarter of an
-    hour ago says nothing about now.
+    ticks it serves for one tick: a voltage of a quarter of an hour ago is not evidence of the present one.
 
     Parameters
     ----------
     tick_s, silence_s
         As in the feeder's file.
     clock
-        Who says what time it is.
+        Source of the present time.
     max_skew_s
-        None: a minute, or two ticks where they are longer.
+        None: one minute, or two ticks if they are longer.
     grace_s
-        None: half a tick, at most a minute.
+        None: half a tick, at most one minute.
     live
-        By the wall clock at most `LEAP_TICKS` missed ticks are formed, and none if no reading serves them.
+        With the wall clock at most `LEAP_TICKS` missed ticks are formed, and none if no reading serves them.
     """
     lead_s = min(0.1 * tick_s, 1.0)
     leaps = live and clock is Clock.WALL
@@ -251,7 +250,8 @@ def rules(
         grace_s=min(0.5 * tick_s, 60.0) if grace_s is None else grace_s,
         lead_s=lead_s,
         max_skew_s=max(60.0, 2.0 * tick_s) if max_skew_s is None else max_skew_s,
-        # Nobody is silent before two ticks have gone by without a reading; the silent are not waited for.
+        # A source is silent after two ticks without a reading at the earliest; silent sources are not waited
+        # for.
         silence_s=max(silence_s, tick_s + max_age_s),
         clock=clock,
         backlog=LEAP_TICKS if leaps else BACKLOG_TICKS,
@@ -261,25 +261,25 @@ def rules(
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """What is known at one tick.
+    """Readings that belong to one tick.
 
     Attributes
     ----------
     t
         Unix time, s.
     readings
-        The usable reading of each meter, in the order of the feeder's meters; None where unseen.
+        The usable reading of each meter, in the order of the feeder's meters; None if unavailable.
     busbar
         The usable reading of the busbar meter, or None.
     silent
-        (meter, seconds since its last usable reading) of those who are silent; None is the busbar meter,
-        and infinity says never.
+        Silent sources as (meter, seconds since the last usable reading); None is the busbar meter, infinity a
+        source without any usable reading.
     skipped
-        Number of ticks directly before this one that are not judged.
+        Number of skipped ticks directly before this one.
     clock_offset : (p,) or ()
-        By how much the clock of each meter is ahead, s; None where that is not measurable, () where none is.
+        Lead of each meter's clock, s; None if not measurable, () if none is.
     busbar_offset
-        By how much the clock of the busbar meter is ahead, s; None where that is not measurable.
+        Lead of the busbar meter's clock, s; None if not measurable.
     """
 
     t: float
@@ -306,23 +306,21 @@ def _time_of(reading: Reading) -> float:
 
 
 class Aligner:
-    """The alignment of one feeder. It belongs to one task.
+    """Alignment of one feeder. Only one task may use it.
 
     Parameters
     ----------
     meters
         Ids of the feeder's meters, in order. The busbar meter is added.
-    rules
-        The times.
 
     Attributes
     ----------
     counts
         Readings by outcome.
     lost
-        Readings that never came, by the gaps in their running numbers.
+        Number of lost readings, from gaps of the sequence numbers.
     restarts
-        How often the clock was set back by more than `silence_s`, and the ticks with it.
+        Number of steps of the clock back by more than `silence_s`; each restarts the ticks.
     """
 
     def __init__(self, meters: Iterable[str], rules: AlignRules) -> None:
@@ -350,21 +348,19 @@ class Aligner:
     # ---------------------------------------------------------------- in
 
     def take(self, reading: Reading, now: float) -> tuple[Outcome, list[Tick]]:
-        """Take one reading in, and let go the ticks that are due.
+        """Align one reading, and emit the ticks that are due.
 
         Parameters
         ----------
-        reading
-            A reading of this feeder.
         now
-            Wall time of its arrival, Unix s; ignored when the readings tell the time.
+            Wall time of its arrival, Unix s; ignored for `Clock.EVENTS`.
 
         Returns
         -------
         outcome, ticks
-            What became of the reading; the ticks, in order.
+            Result for the reading; the ticks, in order.
         """
-        # A reading that had to wait came before what is known to be now; that is no clock set back.
+        # A reading that waited in the queue arrived before the present time; the clock was not set back.
         self._latest = max(self._latest, now)
         ticks = list(self._let_go(self._latest))
         source = self._sources[reading.meter]
@@ -377,7 +373,7 @@ class Aligner:
         return outcome, ticks
 
     def refused(self) -> tuple[Reading, ...]:
-        """Return, once, the readings that were taken in but turned out to have a wrong clock."""
+        """Return, once, the readings that were accepted before the time was known and have a wrong clock."""
         refused, self._refused = tuple(self._refused), []
         return refused
 
@@ -402,7 +398,7 @@ class Aligner:
         source.held.insert(index, reading)
         in_order = t > source.last_t
         source.last_t = max(source.last_t, t)
-        # A reading from the future does not prove that its meter will still be alive then.
+        # A time stamp in the future does not prove that the meter still reports then.
         source.last_heard = t if now is None or self.rules.clock is Clock.EVENTS else now
         if self._next is not None:
             self._wait_for(reading.meter, source, self._next)
@@ -411,15 +407,15 @@ class Aligner:
         return Outcome.ACCEPTED if in_order else Outcome.OUT_OF_ORDER
 
     def _thin(self, source: _Source) -> None:
-        """Keep of the readings between two ticks the last one: no tick uses the others."""
+        """Keep only the last reading between two ticks: no tick uses the others."""
         numbers = [self._serves(held) for held in source.held]
         pairs = zip(source.held, numbers, [*numbers[1:], None], strict=True)
         source.held = [held for held, number, after in pairs if number != after]
 
     def _count_gap(self, reading: Reading, source: _Source) -> None:
-        # Numbers that go back are a restart or another order, no loss; the ring of the subscription drops
-        # the oldest samples, which shows here and nowhere else.
-        # What was overtaken by a later one tells no loss, and nothing of the next.
+        # A decreasing number is a restart or a changed order, not a loss. The ring of the subscription drops
+        # the oldest samples, which only this gap shows. A reading overtaken by a later one is not evidence of
+        # a loss.
         if reading.seq is None or reading.t < source.last_t:
             return
         if source.seq is not None and 0 < (gap := reading.seq - source.seq - 1) <= GAP_MAX:
@@ -429,7 +425,7 @@ class Aligner:
     # ---------------------------------------------------------------- time
 
     def now(self, wall: float) -> float | None:
-        """Return the time that counts here, s; None while the readings have not told it yet.
+        """Return the present time of the alignment, s; None until the readings determine it.
 
         Parameters
         ----------
@@ -439,14 +435,15 @@ class Aligner:
         return wall if self.rules.clock is Clock.WALL else self._now
 
     def wake(self) -> float | None:
-        """Return the wall time at which `due` has something at the latest, s; None if only readings can."""
+        """Return the latest wall time of the next tick of `due`, s; None if only readings can cause one."""
         if self.rules.clock is Clock.EVENTS or self._next is None:
             return None
         return self._time(self._next) + (self.rules.grace_s if self._waiting else 0.0)
 
     def _hear(self, reading: Reading, source: _Source) -> None:
-        """Let a reading have its say about the time."""
-        # However often a clock far ahead of all others speaks, they are not forgotten over it.
+        """Update the time from a reading."""
+        # The count leaves out clocks far ahead: frequent readings of such a clock must not expire the other
+        # sources.
         if self._now is None or reading.t - self._now <= self.rules.max_skew_s:
             self._arrivals += 1
         meter = reading.meter
@@ -470,7 +467,7 @@ class Aligner:
             self._now = max(self._now, reached)
 
     def _sweep(self, now: float) -> None:
-        """Throw out what was taken in before the time was known and does not fit it."""
+        """Remove the readings that were accepted before the time was known and do not fit it."""
         for source in self._sources.values():
             wild = [r for r in source.held if abs(r.t - now) > self.rules.max_skew_s]
             if wild:
@@ -486,15 +483,16 @@ class Aligner:
     # ---------------------------------------------------------------- out
 
     def due(self, wall: float) -> Iterator[Tick]:
-        """Let go the ticks that are due, in order.
+        """Emit the ticks that are due, in order.
 
         Parameters
         ----------
         wall
-            Wall time up to which all that arrived was taken, Unix s; ignored when the readings tell the time.
+            Wall time up to which all arrivals are aligned, Unix s; ignored for `Clock.EVENTS`.
         """
         if self.rules.clock is Clock.WALL and wall < self._latest - self.rules.silence_s:
-            # The clock was set back. To wait until it is where it was would be to watch nothing meanwhile.
+            # The clock was set back: without a restart there would be no tick until it reaches its previous
+            # time.
             self.restarts += 1
             for source in self._sources.values():
                 source.held.clear()
@@ -516,7 +514,7 @@ class Aligner:
         behind = math.floor(now / self.rules.tick_s) - first
         if behind > self.rules.backlog:
             self._skip(first, self._resume(first + behind))
-            # A skipped tick is no evidence of silence: it was not formed.
+            # A skipped tick was not formed and is not evidence of silence.
             self._resumed = self._time(self._number())
         while True:
             t = self._time(self._number())
@@ -527,7 +525,7 @@ class Aligner:
             yield tick
 
     def flush(self) -> Iterator[Tick]:
-        """Let go every tick that the time has reached, without grace: nothing more will come."""
+        """Emit every tick that the time has reached, without grace: the input has ended."""
         if self._now is None and self._claims:
             self._now = self._claims[len(self._claims) // 2]
             self._sweep(self._now)
@@ -549,7 +547,7 @@ class Aligner:
         return first if serving or not self.rules.skips_empty else now
 
     def _skip(self, first: int, following: int) -> None:
-        """Go on with the tick `following`; readings serve as if the skipped ticks had been formed."""
+        """Continue with the tick `following`; readings serve as if the skipped ticks had been formed."""
         for source in self._sources.values():
             for reading, later in zip_longest(source.held, source.held[1:]):
                 begin = max(first, self._serves(reading))
@@ -586,17 +584,17 @@ class Aligner:
             self._wait_for(meter, source, number)
 
     def _wait_for(self, meter: str | None, source: _Source, number: int) -> None:
-        """Wait for a source at a tick, if it is alive and has not reported for it."""
+        """Wait for a source at a tick if it is not silent and has not reported for it."""
         reported = source.last_t > self._time(number - 1) + self.rules.lead_s
-        # Also if nothing of it could be used: at long ticks whoever comes after all others would otherwise
-        # be late at every tick, and silent for ever.
+        # Independent of usability: with long ticks the last source would otherwise be late at every tick, and
+        # silent.
         if reported or self._silent_for(source, source.last_t, self._time(number)):
             self._waiting.discard(meter)
         else:
             self._waiting.add(meter)
 
     def _silent_for(self, source: _Source, last: float, t: float) -> float:
-        """Return for how long a source has been silent at t, s, if `last` was its last; 0 if it is not."""
+        """Return the duration of a source's silence at t since `last`, s; 0 if it is not silent."""
         if t - self._resumed <= self.rules.silence_s:
             return 0.0
         since = min(last, source.last_heard)

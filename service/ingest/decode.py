@@ -1,15 +1,15 @@
-"""Payloads as readings, or as bad readings with a reason: JSON, CBOR, Arrow.
+"""Decoder of payloads in JSON, CBOR and Arrow to readings, or to bad readings with a reason.
 
-Arrow is made to be trusted: a small payload can unfold into a huge table (compressed buffers, null or
-dictionary columns), and unchecked offsets reach outside of the buffers. So only plain columns are read, only
-uncompressed, only after full validation.
+Arrow is designed for trusted data: a small payload can expand to a huge table (compressed buffers, null or
+dictionary columns), and unchecked offsets point outside of the buffers. Only plain, uncompressed columns are
+read, after full validation.
 
-Nothing here raises on data. A payload that cannot be used, or an element of a batch, becomes a `BadReading`
-that names everything wrong with it at once; the good elements of a batch are used all the same. The reason
-is one of a few words (a label for counters), the problems are sentences (for people).
+The decoder raises no error on data. An unusable payload, or element of a batch, becomes a `BadReading` with
+all its problems; the good elements of a batch are used. The reason is one of a few words (a label for
+counters), the problems are sentences (for operators).
 
-Formats are told apart by the zenoh encoding: JSON (also when no encoding is set), and for concentrators the
-same fields as columns in CBOR (a map of equally long arrays) or Arrow IPC (stream or file, uncompressed).
+The zenoh encoding gives the format: JSON (also without an encoding), and for concentrators the same fields as
+columns in CBOR (a map of arrays of equal length) or Arrow IPC (stream or file, uncompressed).
 """
 
 from __future__ import annotations
@@ -60,14 +60,14 @@ _UNREADABLE = (
 
 
 class ArrowProblem(ValueError):
-    """A payload is not read.
+    """A payload cannot be read.
 
     Parameters
     ----------
     problems
-        Why, one sentence each.
+        One sentence for each problem.
     well_formed
-        Whether it is Arrow IPC at all.
+        True for valid Arrow IPC.
     """
 
     def __init__(self, problems: Iterable[str], *, well_formed: bool) -> None:
@@ -81,18 +81,16 @@ def columns_of(payload: bytes, is_file: bool, names: tuple[str, ...]) -> dict[st
 
     Parameters
     ----------
-    payload
-        The bytes.
     is_file
         File format (with a footer) instead of the stream format.
     names
-        The columns that are wanted; others are ignored, absent ones are left out.
+        Requested columns; absent ones are left out of the result.
 
     Raises
     ------
     ArrowProblem
-        If the payload is not Arrow IPC, is compressed, or a wanted column is not a plain column of
-        strings (`meter`), integers (`seq`) or numbers (all others).
+        If the payload is not Arrow IPC, is compressed, or a requested column is not a plain column of strings
+        (`meter`), integers (`seq`) or numbers (all others).
     """
     try:
         reader = _open(payload, is_file)
@@ -106,14 +104,14 @@ def columns_of(payload: bytes, is_file: bool, names: tuple[str, ...]) -> dict[st
         raise
     except _UNREADABLE as error:
         detail = str(error).partition("\n")[0] or type(error).__name__
-        raise ArrowProblem([f"no Arrow IPC: {detail}"], well_formed=False) from error
+        raise ArrowProblem([f"not Arrow IPC: {detail}"], well_formed=False) from error
     return columns
 
 
 def _open(payload: bytes, is_file: bool) -> Any:
     if is_file:
-        # The file format wraps the messages of a stream between two magic words, so that the same check
-        # for compression runs over them; the footer is not needed to read a file from front to back.
+        # The file format wraps the messages of a stream between two magic words: the check for compression
+        # works for both. Reading from front to back does not need the footer.
         if payload[:6] != b"ARROW1" or payload[-6:] != b"ARROW1":
             raise pa.ArrowInvalid("not an Arrow file")
         payload = payload[8:]
@@ -129,13 +127,17 @@ def _refuse_compression(payload: bytes) -> None:
         except EOFError:
             return
         if message.type == "record batch" and _is_compressed(message.metadata.to_pybytes()):
-            raise ArrowProblem(["compressed Arrow IPC is not read; write it uncompressed"], well_formed=True)
+            raise ArrowProblem(
+                ["compressed Arrow IPC is not supported; write it uncompressed"], well_formed=True
+            )
         if message.type == "dictionary":
-            raise ArrowProblem(["dictionary columns are not read; write plain strings"], well_formed=True)
+            raise ArrowProblem(
+                ["dictionary columns are not supported; write plain strings"], well_formed=True
+            )
 
 
 def _is_compressed(metadata: bytes) -> bool:
-    """Tell whether a record batch's flatbuffer header has its `compression` field set."""
+    """True if a record batch's flatbuffer header has its `compression` field set."""
     message = struct.unpack_from("<I", metadata, 0)[0]
     header = _slot(metadata, message, _MESSAGE_HEADER_SLOT)
     if header == 0:
@@ -180,7 +182,7 @@ def _batches(reader: Any, limit: int) -> Iterable[Any]:
     rows = 0
     for batch in reader:
         rows += batch.num_rows
-        # A row costs at least one byte somewhere, or else its length is a lie (a column without buffers).
+        # A row takes at least one byte, otherwise its length is false (a column without buffers).
         if rows > limit:
             raise ArrowProblem([f"more than {limit} rows in {limit} bytes"], well_formed=True)
         yield batch
@@ -188,12 +190,13 @@ def _batches(reader: Any, limit: int) -> Iterable[Any]:
 
 JSON_ENCODINGS = frozenset({"", "zenoh/bytes", "zenoh/string", "text/plain", "application/json", "text/json"})
 DETAILED_PER_REASON = 5
-"""So many bad elements of one batch are kept in full for each reason; the others are only counted."""
+"""Largest number of bad elements of one batch and reason that are reported in full; the others are counted.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Decoded:
-    """The harvest of one payload."""
+    """Readings and bad readings of one payload."""
 
     readings: tuple[Reading, ...] = ()
     bad: tuple[BadReading, ...] = ()
@@ -201,7 +204,7 @@ class Decoded:
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """Where a payload comes from: a feeder, and a meter, the busbar (meter None) or a concentrator."""
+    """Source of a payload: a feeder, and a meter, the busbar (meter None) or a concentrator."""
 
     feeder: str
     meter: str | None = None
@@ -215,11 +218,11 @@ class Wire:
     Attributes
     ----------
     known
-        The feeders that are watched, by name.
+        The monitored feeders, by name.
     prefix
-        First chunks of every key, without a slash at the end.
+        First chunks of every key, without a final slash.
     max_bytes
-        Largest accepted payload.
+        Size of the largest accepted payload, bytes.
     """
 
     known: Mapping[str, Known]
@@ -233,17 +236,15 @@ class Wire:
         ----------
         key
             Full zenoh key.
-        payload
-            The bytes.
         encoding
             The zenoh encoding; a schema after `;` is ignored.
         size
-            Length of the payload where only its beginning was kept.
+            Length of the whole payload, bytes, if `payload` is only its beginning.
 
         Returns
         -------
         Decoded
-            Never empty: a payload without any reading is a bad reading itself.
+            Never empty: a payload without readings is a bad reading.
         """
         source = source_of(key, self.prefix, self.known)
         head = head_of(payload[:HEAD_BYTES])
@@ -259,7 +260,7 @@ class Wire:
         decoder = _decoder(encoding.partition(";")[0].strip().lower(), source)
         if decoder is None:
             accepted = "application/json" if source.concentrator is None else "JSON, CBOR or Arrow IPC"
-            problem = f"encoding `{encoding[:80]}` is not read here; use {accepted}"
+            problem = f"encoding `{encoding[:80]}` is not supported; use {accepted}"
             return _refuse(base, BadReason.ENCODING, problem)
         return decoder(payload, source, self.known[source.feeder], base)
 
@@ -273,7 +274,7 @@ def _decoder(kind: str, source: Source) -> Callable[[bytes, Source, Known, BadRe
 
 
 def source_of(key: str, prefix: str, known: Mapping[str, Known]) -> Source | BadReading:
-    """Return what a key names, or why it names nothing.
+    """Return the source that a key denotes, or a bad reading with the reason.
 
     Parameters
     ----------
@@ -281,12 +282,12 @@ def source_of(key: str, prefix: str, known: Mapping[str, Known]) -> Source | Bad
         Full key: `<prefix>/<feeder>/meter/<meter>/reading`, `<prefix>/<feeder>/substation/reading` or
         `<prefix>/<feeder>/concentrator/<id>/readings`.
     prefix
-        The prefix, without a slash at the end.
+        The prefix, without a final slash.
     known
-        The feeders that are watched.
+        The monitored feeders.
     """
     if "*" in key or "$" in key:
-        return _nowhere(key, BadReason.KEY, "is a pattern; every reading is put on a key of its own")
+        return _nowhere(key, BadReason.KEY, "is a pattern; a reading needs a key without wildcards")
     head, _, rest = key.partition(prefix + "/")
     match rest.split("/"):
         case [feeder, "meter", meter, "reading"] if not head:
@@ -296,12 +297,12 @@ def source_of(key: str, prefix: str, known: Mapping[str, Known]) -> Source | Bad
         case [feeder, "concentrator", concentrator, "readings"] if not head:
             source = Source(feeder, None, concentrator)
         case _:
-            return _nowhere(key, BadReason.KEY, "is no key of a reading")
+            return _nowhere(key, BadReason.KEY, "is not the key of a reading")
     limits = known.get(source.feeder)
     if limits is None:
-        return _nowhere(key, BadReason.UNKNOWN_FEEDER, "names a feeder that is not watched here")
+        return _nowhere(key, BadReason.UNKNOWN_FEEDER, "is the key of a feeder that is not monitored here")
     if source.meter is not None and source.meter not in limits.meters:
-        bad = _nowhere(key, BadReason.UNKNOWN_METER, "names a meter that the feeder does not have")
+        bad = _nowhere(key, BadReason.UNKNOWN_METER, "is the key of a meter that the feeder does not have")
         return replace(bad, feeder=source.feeder)
     return source
 
@@ -324,7 +325,7 @@ _decode_many = msgspec.json.Decoder(list[Raw]).decode
 
 
 def _parse(payload: bytes) -> Any:
-    """Parse JSON leniently where that makes a better message: NaN and infinities are named by field."""
+    """Parse JSON; NaN and infinities are accepted here and reported by field."""
     try:
         return msgspec.json.decode(payload)
     except msgspec.ValidationError:
@@ -347,7 +348,7 @@ def _single(payload: bytes, source: Source, known: Known, base: BadReading) -> D
     try:
         value = _parse(payload)
     except (ValueError, RecursionError, msgspec.MsgspecError) as error:
-        return _refuse(base, BadReason.SYNTAX, f"no JSON: {error}")
+        return _refuse(base, BadReason.SYNTAX, f"not JSON: {error}")
     if value in ([], {}):
         return _refuse(base, BadReason.EMPTY, "the reading is empty")
     found = judge(value, known, source.meter, in_batch=False)
@@ -367,9 +368,9 @@ def _json_batch(payload: bytes, source: Source, known: Known, base: BadReading) 
     try:
         value = _parse(payload)
     except (ValueError, RecursionError, msgspec.MsgspecError) as error:
-        return _refuse(base, BadReason.SYNTAX, f"no JSON: {error}")
+        return _refuse(base, BadReason.SYNTAX, f"not JSON: {error}")
     if not isinstance(value, list):
-        return _refuse(base, BadReason.TYPE, f"a JSON array of readings is wanted, not {name_of(value)}")
+        return _refuse(base, BadReason.TYPE, f"expected a JSON array of readings, not {name_of(value)}")
     return _batch(value, source, known, base)
 
 
@@ -391,9 +392,9 @@ def _cbor(payload: bytes, source: Source, known: Known, base: BadReading) -> Dec
         MemoryError,
         TypeError,
     ) as error:
-        return _refuse(base, BadReason.SYNTAX, f"no CBOR: {error}")
+        return _refuse(base, BadReason.SYNTAX, f"not CBOR: {error}")
     if not isinstance(columns, dict):
-        return _refuse(base, BadReason.TYPE, f"a CBOR map of columns is wanted, not {name_of(columns)}")
+        return _refuse(base, BadReason.TYPE, f"expected a CBOR map of columns, not {name_of(columns)}")
     return _columns(columns, source, known, base)
 
 

@@ -15,28 +15,29 @@ from gridsec.errors import GridsecError
 
 
 class BusUnavailable(GridsecError):
-    """zenoh cannot be used as configured; the message says which endpoint and why."""
+    """zenoh cannot be used as configured."""
 
     code = "bus-unavailable"
 
 
 @dataclass(frozen=True, slots=True)
 class BusConfig:
-    """How to take part in zenoh.
+    """Configuration of a zenoh session.
 
     Attributes
     ----------
     mode
         `router` for the service (it routes between clients and needs no separate router process), `client`
-        for meters and tools, `peer` if an existing network asks for it. None: what the file says, or
+        for meters and tools, `peer` if an existing network requires it. None: the mode of the file, or
         `router` without a file.
     listen, connect
         Endpoints such as `tcp/127.0.0.1:7447`.
     file
-        A user's own json5 configuration (TLS, users, access control, ...). What it says is kept; mode and
-        endpoints given here are put on top.
+        A zenoh configuration in json5 (TLS, users, access control, ...). Mode and endpoints given here
+        override it.
     max_sessions, accept_pending
-        Sessions at most, and those that are being opened; not where a file is given. Each takes a descriptor.
+        Largest number of sessions, and of sessions that are being opened; ignored with a file. Each session
+        takes a file descriptor.
     """
 
     mode: str | None = None
@@ -49,10 +50,10 @@ class BusConfig:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """One put, copied out of zenoh: key, bytes, encoding, wall time of its arrival (Unix s).
+    """One put, copied from zenoh: key, bytes, encoding, wall time of its arrival (Unix s).
 
-    Of a payload above the limit only the beginning is kept; `size` is its whole length. Of an absurdly long
-    key only the beginning is kept, too.
+    A payload above the limit is cut to its beginning; `size` is the whole length. An oversized key is cut,
+    too.
     """
 
     key: str
@@ -64,7 +65,7 @@ class Sample:
 
 @dataclass(slots=True)
 class BusCounts:
-    """What went through and what did not: deletions on reading keys, puts and deletes of ours, queries."""
+    """Counters: deletions on reading keys, puts and deletions of the service, failures, queries."""
 
     deleted: int = 0
     published: int = 0
@@ -76,17 +77,17 @@ _OVERHEAD = 256
 
 
 class Inbox:
-    """Samples that wait for the runtime, bounded in number and bytes.
+    """Queue of samples before the runtime, bounded in number and bytes.
 
     Parameters
     ----------
     max_samples, max_bytes
         The bounds.
     lossless
-        When full, let the sender wait instead of dropping the oldest: right where time is told by the
-        readings (nothing gets stale), wrong where it is the wall clock's.
+        When full, block the sender instead of dropping the oldest sample. For `Clock.EVENTS`, where no sample
+        gets stale; with the wall clock the oldest samples are worthless.
     wake
-        Called, from the sender's thread, when something has come.
+        Called from the sender's thread after samples have been added.
     """
 
     def __init__(
@@ -107,26 +108,21 @@ class Inbox:
         self._room = threading.Condition()
 
     def __len__(self) -> int:
-        """Return how many samples wait."""
+        """Number of waiting samples."""
         return len(self._waiting)
 
     def oldest(self) -> float | None:
-        """Return when the oldest of the waiting samples arrived, Unix s; None if none waits."""
+        """Return the arrival time of the oldest waiting sample, Unix s; None if the queue is empty."""
         with self._room:
             return self._waiting[0].arrival if self._waiting else None
 
     def put(self, batch: list[Sample]) -> int:
         """Add samples; called from any thread.
 
-        Parameters
-        ----------
-        batch
-            In the order of arrival.
-
         Returns
         -------
         int
-            How many samples were dropped for it.
+            Number of dropped samples.
         """
         dropped = 0
         for sample in batch:
@@ -146,13 +142,7 @@ class Inbox:
         return dropped
 
     def drain(self, limit: int) -> list[Sample]:
-        """Take out up to `limit` samples, oldest first.
-
-        Parameters
-        ----------
-        limit
-            At most so many.
-        """
+        """Remove and return up to `limit` samples, oldest first."""
         with self._room:
             count = min(limit, len(self._waiting))
             taken = [self._waiting.popleft() for _ in range(count)]
@@ -161,7 +151,7 @@ class Inbox:
         return taken
 
     def close(self) -> None:
-        """Let waiting senders go; what they bring is not wanted any more."""
+        """Release blocked senders; later samples are discarded."""
         with self._room:
             self._closed = True
             self._room.notify_all()
@@ -171,18 +161,18 @@ class Inbox:
 
 
 def _size(sample: Sample) -> int:
-    """What a waiting sample takes, bytes: its sender chooses the key and the encoding, too."""
+    """Memory of a waiting sample, bytes: the sender chooses the key and the encoding, too."""
     return len(sample.payload) + sys.getsizeof(sample.key) + sys.getsizeof(sample.encoding) + _OVERHEAD
 
 
 EVENTS_WAITING = 10_000
 TELEMETRY_WAITING = 2_000
 RETRY_S = 1.0
-"""An event that was refused is tried again after this time, s."""
+"""Time until the next attempt to publish a refused event, s."""
 
 
 class Event(NamedTuple):
-    """A put, or (without a payload) a delete, that must not be lost; `done` is called once it is out."""
+    """A put, or (without a payload) a deletion, that must not be lost; `done` is called after it."""
 
     key: str
     payload: bytes | None
@@ -190,12 +180,12 @@ class Event(NamedTuple):
 
 
 class Outgoing:
-    """The queue before the thread that publishes; whoever adds may be any thread.
+    """Queue before the publishing thread; any thread may add to it.
 
     Attributes
     ----------
     retry_at
-        Set while the first event is one that was refused: when to try again, by the monotonic clock, s.
+        Time of the next attempt, by the monotonic clock, s, while the first event is a refused one.
     """
 
     def __init__(self) -> None:
@@ -206,25 +196,13 @@ class Outgoing:
         self._wakeup = threading.Condition()
 
     def add_telemetry(self, key: str, payload: bytes) -> None:
-        """Add a value; of too many the oldest go.
-
-        Parameters
-        ----------
-        key, payload
-            What to put.
-        """
+        """Add a value; a full queue drops the oldest."""
         with self._wakeup:
             self._telemetry.append((key, payload))
             self._wakeup.notify()
 
     def add_events(self, *events: Event) -> bool:
-        """Add events, all or, if too many wait, none: False then.
-
-        Parameters
-        ----------
-        events
-            In their order.
-        """
+        """Add all events and return True, or none if the queue is full."""
         with self._wakeup:
             if len(self._events) >= EVENTS_WAITING:
                 return False
@@ -233,13 +211,13 @@ class Outgoing:
         return True
 
     def close(self) -> None:
-        """Let `next` come to its end with what waits."""
+        """End `next` after the waiting items."""
         with self._wakeup:
             self._closing = True
             self._wakeup.notify()
 
     def next(self) -> Event | tuple[str, bytes] | None:
-        """Wait for what is to be published next, and take it out; events go first. None: the end."""
+        """Wait for the next item and remove it; events come first. None after the last one."""
         with self._wakeup:
             while True:
                 pause = 0.0
@@ -254,12 +232,12 @@ class Outgoing:
                 self._wakeup.wait(pause if self._events else None)
 
     def put_back(self, event: Event) -> None:
-        """Let an event that was refused be tried again; at the end, give up all of them.
+        """Queue a refused event again; after `close`, discard all events.
 
         Parameters
         ----------
         event
-            What `next` returned.
+            The result of `next`.
         """
         with self._wakeup:
             if self._closing:

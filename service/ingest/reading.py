@@ -1,7 +1,7 @@
-"""Readings: what a usable one is, and everything that can be wrong with one.
+"""Readings: validation of values, with all problems of a reading.
 
-A value is judged as a whole: a `BadReading` names every problem of the reading at once. The reason is one of
-a few words (a label for counters), the problems are sentences (for people).
+A value is checked as a whole: a `BadReading` lists every problem of the reading at once. The reason is one of
+a few words (a label for counters), the problems are sentences (for operators).
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from typing import Any
 import msgspec
 
 T_MIN, T_MAX = 1e8, 1e10
-"""Unix seconds outside of 1973 to 2286 are milliseconds, counters or uptimes, but no seconds."""
+"""Range of Unix times, s (1973 to 2286); values outside are milliseconds, counters or uptimes."""
 
 VOLT_FACTOR = 10.0
-"""A meter that reads more than this many times the nominal voltage is broken, not manipulated."""
+"""Largest plausible voltage over the nominal one; beyond it the meter is defective, not manipulated."""
 
 SEQ_MAX = 2**63 - 1
 PHASES = 3
@@ -28,7 +28,7 @@ NOT_REPORTED = math.nan
 
 
 class BadReason(StrEnum):
-    """Why a reading is not used: few enough for a label of a counter."""
+    """Reason of a bad reading; the number of reasons suits the label of a counter."""
 
     KEY = "key"
     UNKNOWN_FEEDER = "unknown-feeder"
@@ -49,9 +49,9 @@ class Reading(msgspec.Struct, frozen=True, gc=False):
     Attributes
     ----------
     feeder
-        Name of the feeder.
+        Its name.
     meter
-        Id of the meter; None is the busbar meter of the substation.
+        Its id; None for the busbar meter.
     t
         Unix time of the measurement by the meter's clock, s.
     v_volt
@@ -59,12 +59,12 @@ class Reading(msgspec.Struct, frozen=True, gc=False):
     p_kw, q_kvar
         Net import at the connection point, kW and kvar; NaN where not reported.
     seq
-        Running number of the reading, or None.
+        Sequence number of the reading, or None.
     v_phases
-        Voltage of each phase at the busbar of a feeder in three phases, V, NaN where there is none; None
-        where the reading does not tell them apart.
+        Voltage of each phase at the busbar of a feeder in three phases, V, NaN if absent; None if the reading
+        has no separate phases.
     t_power
-        Unix time of the powers by the meter's clock, s; NaN where they are of the moment `t`.
+        Unix time of the powers by the meter's clock, s; NaN for the time `t`.
     """
 
     feeder: str
@@ -87,15 +87,15 @@ class BadReading:
     reason
         The kind of problem.
     problems
-        Everything that is wrong, one sentence each.
+        All problems, one sentence each.
     key
-        The zenoh key it came on, printable; of a long one the beginning.
+        The zenoh key, printable; a long one is cut.
     feeder, meter
-        Known ids only; None where the key names nothing that is known here.
+        Known ids only; None if the key denotes none.
     head
         The beginning of the payload or element, printable.
     count
-        How many readings this stands for (more than one only for the tail of a bad batch).
+        Number of readings that this entry stands for (more than one only for the tail of a bad batch).
     """
 
     reason: BadReason
@@ -109,7 +109,7 @@ class BadReading:
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """What has to be known of a feeder to judge its readings.
+    """Properties of a feeder that the validation of its readings uses.
 
     Attributes
     ----------
@@ -118,9 +118,9 @@ class Known:
     nominal_volt
         Nominal phase-to-neutral voltage of the busbar, V.
     power_max_kw
-        Largest believable magnitude of a customer's active or reactive power, kW or kvar.
+        Largest plausible magnitude of a customer's active or reactive power, kW or kvar.
     own_volt
-        The same of the meters behind a transformer.
+        Nominal voltage of each meter behind a transformer, V.
     """
 
     meters: frozenset[str]
@@ -134,7 +134,7 @@ class Known:
 
 
 class Raw(msgspec.Struct, gc=False):
-    """A reading as it is on the wire; `meter` is there in batches only, `v_phases` at the busbar."""
+    """A reading as transmitted; `meter` is present in batches only, `v_phases` at the busbar."""
 
     t: float
     v_volt: float
@@ -147,7 +147,7 @@ class Raw(msgspec.Struct, gc=False):
 
 
 def plausible(raw: Raw, known: Known, meter: str | None) -> bool:
-    """Tell whether every number of a well-typed reading of a meter (None: the busbar) is believable."""
+    """True if every number of a well-typed reading of a meter (None: the busbar) is plausible."""
     limit = known.power_max_kw
     return (
         0.0 < raw.v_volt <= VOLT_FACTOR * known.volt(meter)
@@ -161,7 +161,7 @@ def plausible(raw: Raw, known: Known, meter: str | None) -> bool:
 
 
 def _phases_plausible(phases: list[float | None], known: Known) -> bool:
-    # A phase may be dead, and its voltage 0.
+    # An outage of a phase gives the voltage 0.
     highest = VOLT_FACTOR * known.nominal_volt
     return len(phases) == PHASES and all(v is None or 0.0 <= v <= highest for v in phases)
 
@@ -182,7 +182,7 @@ def to_reading(feeder: str, meter: str | None, raw: Raw) -> Reading:
 
 
 def _phases_of(raw: Raw) -> tuple[float, ...] | None:
-    """Voltages of the phases; of none at all no more is known than without the field."""
+    """Voltages of the phases; None if all are absent."""
     if raw.v_phases is None or all(v is None for v in raw.v_phases):
         return None
     return tuple(math.nan if v is None else v for v in raw.v_phases)
@@ -190,22 +190,22 @@ def _phases_of(raw: Raw) -> tuple[float, ...] | None:
 
 @dataclass(frozen=True, slots=True)
 class Findings:
-    """What is wrong with one reading, by kind."""
+    """Problems of one reading, by kind."""
 
     of: dict[BadReason, list[str]] = field(default_factory=dict)
 
     def add(self, reason: BadReason, problem: str) -> None:
-        """Note a problem."""
+        """Add a problem."""
         self.of.setdefault(reason, []).append(printable(problem))
 
     @property
     def reason(self) -> BadReason:
-        """The kind under which the reading is counted: a wrong type before a wrong value."""
+        """The kind that counts the reading: a wrong type before a wrong value."""
         return next(reason for reason in _GRAVITY if reason in self.of)
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """Every problem."""
+        """Every problem, by gravity."""
         return tuple(problem for reason in _GRAVITY for problem in self.of.get(reason, ()))
 
 
@@ -213,18 +213,18 @@ _GRAVITY = (BadReason.TYPE, BadReason.VALUE, BadReason.UNKNOWN_METER)
 
 
 def judge(value: Any, known: Known, meter: str | None = None, *, in_batch: bool) -> Raw | Findings:
-    """Return the reading in a parsed value, or everything that is wrong with it.
+    """Return the reading in a parsed value, or all its problems.
 
     Parameters
     ----------
     value
-        Anything that JSON, CBOR or a row of columns can hold.
+        Any value of JSON, CBOR or a row of columns.
     known
         The feeder's limits.
     meter
-        Whose it is, unless the reading itself names its meter; None: the busbar's.
+        The meter of the reading outside of batches; None: the busbar meter.
     in_batch
-        Whether the reading has to name its meter.
+        True if the reading must contain its meter.
     """
     findings = Findings()
     if not isinstance(value, dict):
@@ -232,17 +232,17 @@ def judge(value: Any, known: Known, meter: str | None = None, *, in_batch: bool)
         return findings
     t = _number(value, "t", findings, required=True)
     if t is not None and not T_MIN <= t <= T_MAX:
-        findings.add(BadReason.VALUE, f"t = {t:g} is no Unix time in seconds")
+        findings.add(BadReason.VALUE, f"t = {t:g} is not a Unix time in seconds")
     v_volt = _number(value, "v_volt", findings, required=True)
     nominal = known.volt(value.get("meter") if in_batch else meter)
     if v_volt is not None and not 0.0 < v_volt <= VOLT_FACTOR * nominal:
-        problem = f"v_volt = {v_volt:g} V is absurd where {nominal:g} V is nominal"
+        problem = f"v_volt = {v_volt:g} V is implausible at a nominal voltage of {nominal:g} V"
         findings.add(BadReason.VALUE, problem)
     p_kw = _power(value, "p_kw", known, findings)
     q_kvar = _power(value, "q_kvar", known, findings)
     t_power = _number(value, "t_power", findings, required=False)
     if t_power is not None and not T_MIN <= t_power <= T_MAX:
-        findings.add(BadReason.VALUE, f"t_power = {t_power:g} is no Unix time in seconds")
+        findings.add(BadReason.VALUE, f"t_power = {t_power:g} is not a Unix time in seconds")
     v_phases = _phases(value.get("v_phases"), known, findings)
     seq = value.get("seq")
     if seq is not None and (isinstance(seq, bool) or not isinstance(seq, int)):
@@ -269,7 +269,9 @@ def _phases(value: Any, known: Known, findings: Findings) -> list[float | None] 
     named = {f"v_phases[{k}]": v for k, v in enumerate(value)}
     phases = [_number(named, name, findings, required=False) for name in named]
     if not _phases_plausible(phases, known):
-        findings.add(BadReason.VALUE, f"v_phases are absurd where {known.nominal_volt:g} V is nominal")
+        findings.add(
+            BadReason.VALUE, f"v_phases are implausible at a nominal voltage of {known.nominal_volt:g} V"
+        )
     return phases
 
 
@@ -277,7 +279,7 @@ def _power(value: dict[Any, Any], name: str, known: Known, findings: Findings) -
     power = _number(value, name, findings, required=False)
     limit = known.power_max_kw
     if power is not None and abs(power) > limit:
-        findings.add(BadReason.VALUE, f"{name} = {power:g} is absurd for one customer (limit {limit:g})")
+        findings.add(BadReason.VALUE, f"{name} = {power:g} is implausible for one customer (limit {limit:g})")
     return power
 
 
@@ -295,16 +297,16 @@ def _number(value: dict[Any, Any], name: str, findings: Findings, *, required: b
     except OverflowError:
         result = math.inf
     if not math.isfinite(result):
-        findings.add(BadReason.VALUE, f"{name} = {result} is no finite number")
+        findings.add(BadReason.VALUE, f"{name} = {result} is not finite")
         return None
     return result
 
 
 def name_of(value: object) -> str:
-    """Return what a value is, in the words of JSON."""
+    """Return the JSON name of a value's type."""
     names: dict[type, str] = {
         type(None): "null",
-        bool: "a truth value",
+        bool: "a boolean",
         str: "a string",
         int: "a number",
         float: "a number",
@@ -321,20 +323,20 @@ def printable(text: str) -> str:
 
 
 def beginning(text: str) -> str:
-    """Return a text, printable, and of a long one the beginning."""
+    """Return the beginning of a text, printable."""
     return printable(text[:HEAD_BYTES])
 
 
-# CBOR can refer to one value many times, so that three hundred bytes stand for more than memory holds.
+# CBOR can refer to one value many times: 300 bytes can stand for more than the memory holds.
 _BRIEF = reprlib.Repr()
 _BRIEF.maxlevel, _BRIEF.maxdict, _BRIEF.maxstring, _BRIEF.maxother = 3, 12, HEAD_BYTES, HEAD_BYTES
 
 
 def head_of(value: object) -> str:
-    """Return the beginning of something as printable text; of what is nested, only as much as is shown."""
+    """Return the beginning of a value as printable text; nested values are expanded up to its end only."""
     if isinstance(value, bytes):
         return printable(value[:HEAD_BYTES].decode("utf-8", "backslashreplace"))
     try:
         return beginning(_BRIEF.repr(value))
-    except (ValueError, RecursionError):  # an integer of thousands of digits, a value inside itself
+    except (ValueError, RecursionError):  # an integer of thousands of digits, or a value that contains itself
         return name_of(value)

@@ -1,9 +1,9 @@
-"""zenoh, and nothing but zenoh: samples in, estimates and alarms out, queries answered.
+"""zenoh interface: samples in, estimates and alarms out, replies to queries.
 
-The rest of the service sees plain Python: `Sample`s in batches, and `Bus.telemetry` and `Bus.event` to
-publish. What the binding demands is kept in here: samples are drained by one blocking receive and then
-non-blocking ones, callbacks are not used at all (they collapse under a busy interpreter, and calling zenoh
-from one can deadlock), every session is closed explicitly (or the process hangs at exit).
+The rest of the service uses plain Python: `Sample`s in batches, and `Bus.telemetry` and `Bus.event` to
+publish. This module contains the workarounds of the binding. Samples are drained by one blocking receive and
+then non-blocking ones. Callbacks are not used: they collapse under a busy interpreter, and a call of zenoh
+from a callback can deadlock. Every session is closed explicitly, otherwise the process hangs at exit.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import zenoh
 from service.ingest.queues import BusConfig, BusCounts, BusUnavailable, Event, Outgoing, Sample
 
 RING = 8192
-"""Samples that zenoh keeps for us."""
+"""Capacity of the subscription's queue, samples."""
 
 BATCH = 1024
 _HEAD = 1024
@@ -63,7 +63,7 @@ def _config(config: BusConfig) -> zenoh.Config:
 
 
 def _buffered(endpoint: str) -> str:
-    """Bound the age of data when we are slow: small socket buffers make the sender feel it at once."""
+    """Bound the age of data under load: small socket buffers pass backpressure to the sender at once."""
     if "#" in endpoint or not endpoint.startswith("tcp/"):
         return endpoint
     return endpoint + "#so_rcvbuf=65536;so_sndbuf=65536"
@@ -76,11 +76,6 @@ def _first_line(error: BaseException) -> str:
 @contextmanager
 def session(config: BusConfig) -> Iterator[zenoh.Session]:
     """Open a zenoh session and close it in any case.
-
-    Parameters
-    ----------
-    config
-        How.
 
     Raises
     ------
@@ -99,23 +94,21 @@ def session(config: BusConfig) -> Iterator[zenoh.Session]:
 
 
 class Bus:
-    """The service's side of zenoh, as a context manager.
+    """zenoh session of the service, as a context manager.
 
     Parameters
     ----------
-    config
-        How to take part.
     prefix
         First chunks of every key.
     deliver
-        Called from the receiving threads with each batch. It may wait for room only if `lossless`.
+        Called from the receiving threads with each batch. It may block only if `lossless`.
     max_payload
-        Of longer payloads only the beginning is kept.
+        Size beyond which a payload is cut to its beginning, bytes.
     lossless
-        When we are slow, let the senders wait instead of dropping the oldest samples: right where time is
-        told by the readings, wrong in real time, where old data are worth nothing.
+        Under load, block the senders instead of dropping the oldest samples. For `Clock.EVENTS`; in real time
+        old data are worthless.
     wall
-        The wall clock, Unix s.
+        Wall clock, Unix s.
     """
 
     def __init__(
@@ -143,13 +136,13 @@ class Bus:
         self.failure: str | None = None
 
     def __enter__(self) -> Bus:
-        """Open the session, subscribe, answer queries."""
+        """Open the session, subscribe, and declare the queryables."""
         with ExitStack() as stack:
             live = stack.enter_context(session(self._config))
-            # One subscription for every kind of reading keeps them in the order they were sent. It also
-            # hears keys that are almost right, and those deserve an answer in the bad readings.
+            # One subscription for all kinds of readings keeps their order. Its pattern also matches nearly
+            # correct keys: they are reported as bad readings.
             key = f"{self._prefix}/*/**/reading$*"
-            # A ring that is full drops the oldest samples; the gap shows in their numbers.
+            # A full ring drops the oldest samples; the gap shows in the sequence numbers.
             subscriber = (
                 live.declare_subscriber(key, zenoh.handlers.FifoChannel(RING))
                 if self._lossless
@@ -169,7 +162,7 @@ class Bus:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Publish what is waiting, close the session, end the threads."""
+        """Publish the waiting items, close the session, end the threads."""
         self._stack.close()
         for thread in self._threads:
             thread.join(timeout=2.0)
@@ -201,14 +194,14 @@ class Bus:
         payload = raw.payload.to_bytes()
         size = len(payload)
         kept = payload if size <= self._max_payload else payload[:_HEAD]
-        # What is cut is longer than any key that is read, and stays so.
+        # A key that is cut here is longer than every valid key, and stays invalid.
         key = str(raw.key_expr)[: len(self._prefix) + _HEAD]
         return Sample(key, kept, str(raw.encoding), self._wall(), size)
 
     # ---------------------------------------------------------------- out
 
     def telemetry(self, key: str, payload: bytes) -> None:
-        """Publish the newest value of a key, and let queries find it.
+        """Publish the newest value of a key, and store it for queries.
 
         Parameters
         ----------
@@ -222,7 +215,7 @@ class Bus:
         self._outgoing.add_telemetry(f"{self._prefix}/{key}", payload)
 
     def event(self, key: str, payload: bytes, *, last: bool, done: Callable[[], None] | None = None) -> bool:
-        """Publish something that must not be lost; in order, with high priority.
+        """Publish an event that must not be lost; in order, with high priority.
 
         Parameters
         ----------
@@ -231,14 +224,14 @@ class Bus:
         payload
             JSON.
         last
-            The matter is closed: the key is deleted after the put, and queries find nothing any more.
+            Delete the key after the put; queries then return nothing.
         done
-            Called from the publishing thread once it is out.
+            Called from the publishing thread after the event is published.
 
         Returns
         -------
         bool
-            False if too many events are waiting; nothing was taken.
+            False if too many events are waiting; the event is not queued.
         """
         full = f"{self._prefix}/{key}"
         with self._answers_lock:
@@ -250,7 +243,7 @@ class Bus:
         return self._outgoing.add_events(put, *([Event(full, None, done)] if last else []))
 
     def answer(self, key: str, payload: bytes) -> None:
-        """Let queries for a key find this, without publishing it.
+        """Store the reply to queries for a key, without publishing it.
 
         Parameters
         ----------
@@ -263,7 +256,7 @@ class Bus:
             self._answers[f"{self._prefix}/{key}"] = payload
 
     def withdraw(self, key: str) -> None:
-        """Let queries for a key find nothing any more.
+        """Remove the reply to queries for a key.
 
         Parameters
         ----------
@@ -346,7 +339,7 @@ def _put_event(live: zenoh.Session, key: str, payload: bytes | None) -> None:
 def _reply(query: zenoh.Query, key: str, payload: bytes) -> bool:
     try:
         query.reply(key, payload, encoding=JSON)
-    except zenoh.ZError:  # the asker is gone
+    except zenoh.ZError:  # the querying session is closed
         return False
     return True
 
@@ -359,12 +352,12 @@ def _try_recv(handler: zenoh.handlers.Handler[zenoh.Sample]) -> zenoh.Sample | N
 
 
 class Meters:
-    """The virtual meters' side of zenoh: puts readings, and watches the estimates if asked to.
+    """zenoh session of the virtual meters: puts readings and, on request, receives estimates.
 
     Parameters
     ----------
     config
-        How to take part; usually a client of the service.
+        Usually a client of the service.
     prefix
         First chunks of every key.
     """
@@ -387,13 +380,7 @@ class Meters:
         self._stack.close()
 
     def watch(self, feeder: str) -> None:
-        """Start to watch the estimates of a feeder.
-
-        Parameters
-        ----------
-        feeder
-            Name.
-        """
+        """Subscribe to the estimates of a feeder."""
         live = self._session()
         subscriber = live.declare_subscriber(
             f"{self._prefix}/{feeder}/estimate", zenoh.handlers.RingChannel(_ESTIMATES)
@@ -402,21 +389,21 @@ class Meters:
         self._estimates = subscriber.handler
 
     def estimates(self) -> list[bytes]:
-        """Return the estimates that have come since the last call, oldest first."""
+        """Return the estimates received since the last call, oldest first."""
         found: list[bytes] = []
         while self._estimates is not None and (sample := _try_recv(self._estimates)) is not None:
             found.append(sample.payload.to_bytes())
         return found
 
     def query(self, key: str, timeout_s: float) -> dict[str, bytes]:
-        """Ask for the values of a key.
+        """Query the values of a key.
 
         Parameters
         ----------
         key
             Key or pattern, without the prefix.
         timeout_s
-            How long to wait, s.
+            Time limit, s.
 
         Returns
         -------
@@ -435,19 +422,14 @@ class Meters:
     def put(self, key: str, payload: bytes, encoding: str = JSON) -> None:
         """Put a payload on a key (without the prefix).
 
-        Parameters
-        ----------
-        key, payload, encoding
-            As in zenoh.
-
         Raises
         ------
         BusUnavailable
             If the session is closed.
         """
         try:
-            # The default (drop when the network is congested) would lose readings of a simulation that runs
-            # faster than real time; a meter with one reading a second never notices the difference.
+            # The default (drop when the network is congested) would lose readings of a simulation faster than
+            # real time; a meter with one reading per second is not affected.
             self._session().put(
                 f"{self._prefix}/{key}",
                 payload,

@@ -1,4 +1,4 @@
-"""Feeders as JSON: their summary in the list, and their detail with tree and tables."""
+"""Feeders as JSON: the summary in the list, and the detail with tree and tables."""
 
 from __future__ import annotations
 
@@ -12,13 +12,7 @@ from feeders.model.site import Site
 
 
 def summary(site: Site) -> dict[str, Any]:
-    """Return a feeder's entry in the list of feeders.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    """
+    """Return a feeder's entry in the list of feeders."""
     settings = site.tables.meta.monitor
     return {
         "name": site.feeder.name,
@@ -33,25 +27,23 @@ def summary(site: Site) -> dict[str, Any]:
 
 
 def revision(fields: Mapping[str, Any]) -> str:
-    """Return a digest of what is told of a feeder: the same as long as all of it is.
+    """Return a digest of a feeder's published properties; it changes with any of them.
 
     Parameters
     ----------
     fields
-        What is told, as JSON.
+        The properties, as JSON.
     """
     return hashlib.sha256(json.dumps(fields, sort_keys=True, default=str).encode()).hexdigest()[:32]
 
 
 def detail(site: Site, patience_s: float) -> dict[str, Any]:
-    """Return everything about a feeder: limits, tree with positions, tables, and the `revision` of all that.
+    """Return all properties of a feeder: limits, tree with positions, tables, and their `revision`.
 
     Parameters
     ----------
-    site
-        The feeder.
     patience_s
-        From which age its states are stale, s.
+        Age beyond which its reports are stale, s.
     """
     meta = site.tables.meta
     tree = site.spanning

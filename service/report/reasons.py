@@ -1,4 +1,4 @@
-"""Reasons of verdicts, and errors of a feeder's files as explanations of accusations."""
+"""Reasons of verdicts, and errors of a feeder's files that explain accusations."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ class DataErrorReport:
     kind
         See `gridsec.estimators.data_errors.DataErrorKind`.
     meters
-        The accused meters that it explains.
+        The accused meters that the error explains.
     customers
-        The customers at another phase or bus than the files say, or with exchanged meters.
+        The customers at another phase or bus than in the files, or with exchanged meters.
     proposed
-        Bus and phase of each of these customers that explain the readings.
+        Bus and phase of each of these customers that agree with the readings.
     study
-        Command that checks it on a recording.
+        Command that checks the error on a recording.
     text
         One sentence for the operator.
     """
@@ -60,13 +60,7 @@ class DataErrorReport:
 
 
 class DataErrors:
-    """Search for errors of a feeder's files while a meter is accused; nothing runs while none is.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    """
+    """Search for errors of a feeder's files; it runs only while a meter is accused."""
 
     def __init__(self, site: Site) -> None:
         self._site = site
@@ -75,11 +69,11 @@ class DataErrors:
         self._designed = False
 
     def renew(self) -> None:
-        """Begin the window anew."""
+        """Restart the window."""
         self._window = data_errors.begin()
 
     def follow(self, frame: Frame, estimate: Estimate, verdict: Verdict) -> DataErrorReport | None:
-        """Take one tick into the window; return the error that explains a meter accused at this tick.
+        """Add one tick to the window; return the error that explains a meter accused at this tick.
 
         Parameters
         ----------
@@ -95,7 +89,7 @@ class DataErrors:
             return None
         try:
             self._window = data_errors.follow(self._design, self._window, frame, estimate.x, accused)
-        except Exception:  # noqa: BLE001 - a hint never costs the verdict beside it
+        except Exception:  # noqa: BLE001 - a failed search costs no verdict
             _log.exception(
                 "errors of the feeder's files are no longer compared", feeder=self._site.feeder.name
             )
@@ -157,22 +151,20 @@ def _place(site: Site, place: int) -> str:
 
 
 _NAMING: Final = frozenset({Cause.AMBIGUOUS, Cause.SILENT_METERS, Cause.CLOCK_OFFSET, Cause.MISSING_POWERS})
-"""Causes with a sentence of the monitor that names meters by their customers."""
+"""Causes with a sentence of the monitor that contains customers in place of meters."""
 _SHOWN: Final = 5
-"""So many names are listed at most."""
+"""Largest number of names in a list."""
 
 
 def reason_of(site: Site, tick: Tick, max_attacked: int, verdict: Verdict) -> str:
-    """Say why, with the meters' ids, as in alarms: the monitor knows customers only.
+    """Return the reason of a verdict, with the meters' ids as in alarms: the monitor uses customers only.
 
     Parameters
     ----------
     site, tick
-        The feeder, and what was known.
+        The feeder, and the readings.
     max_attacked
-        The number M that the monitor was designed for.
-    verdict
-        What the monitor made of it.
+        M of the design.
     """
     suspects = np.flatnonzero(verdict.suspects).tolist()
     unseen = [k for k, reading in enumerate(tick.readings) if reading is None]
@@ -194,19 +186,19 @@ def reason_of(site: Site, tick: Tick, max_attacked: int, verdict: Verdict) -> st
 
 
 def _named(site: Site, tick: Tick, verdict: Verdict) -> str:
-    """Who is manipulated; of the busbar's meter also by how much, since everything else hangs on it."""
-    who = _who(site, verdict.suspects, verdict.inverters, busbar=verdict.busbar)
+    """Devices named as manipulated, with the deviation of a busbar meter: all estimates depend on it."""
+    accused = _who(site, verdict.suspects, verdict.inverters, busbar=verdict.busbar)
     if not verdict.busbar.any():
-        return f"Manipulated: {who}; further off than meter accuracy and load uncertainty allow."
+        return f"Manipulated: {accused}; further off than meter accuracy and load uncertainty allow."
     off = busbar_off(site, tick, verdict)
     if not verdict.suspects.any() and not verdict.inverters.any():
-        return f"Manipulated: {who}; it {off}."
+        return f"Manipulated: {accused}; it {off}."
     far = "further off than meter accuracy and load uncertainty allow"
-    return f"Manipulated: {who}; {far}. The substation's meter {off}."
+    return f"Manipulated: {accused}; {far}. The substation's meter {off}."
 
 
 def _ways(site: Site, verdict: Verdict) -> str:
-    """What may be the case, each with its share."""
+    """Explanations, each with its share."""
     ways = [
         f"{_who(site, e.meters, e.inverters, e.powers, busbar=e.busbar)} ({e.probability:.0%})"
         for e in verdict.explanations
@@ -217,13 +209,13 @@ def _ways(site: Site, verdict: Verdict) -> str:
 
 
 def _meters(site: Site, which: Sequence[int]) -> str:
-    """The ids of some meters, the first few of many."""
+    """Ids of meters, at most `_SHOWN`."""
     rest = f" and {len(which) - _SHOWN} more" if len(which) > _SHOWN else ""
     return ", ".join(site.meter_ids[k] for k in which[:_SHOWN]) + rest
 
 
 def _who(site: Site, meters: Bools, inverters: Bools, powers: Bools | None = None, *, busbar: Bools) -> str:
-    """Meters by their ids, all else by its customers, as in alarms; the first few of many."""
+    """Meters by their ids, other devices by their customers, as in alarms; at most `_SHOWN` of a kind."""
     found = np.flatnonzero(meters).tolist()
     parts = [_meters(site, found)] if found else []
     doubted = () if powers is None else np.flatnonzero(powers)
@@ -234,13 +226,14 @@ def _who(site: Site, meters: Bools, inverters: Bools, powers: Bools | None = Non
             parts.append(f"the {what}{'s' if len(names) > 1 else ''} of {', '.join(names[:_SHOWN])}{rest}")
     if busbar.any():
         parts.append(busbar_in_words(site, busbar))
-    return " and ".join(parts) or "nobody"
+    return " and ".join(parts) or "no device"
 
 
 def _in_ids(site: Site, text: str) -> str:
-    """Call customers in a sentence by their meters' ids; longer names first, one may begin another.
+    """Replace customers in a sentence by their meters' ids.
 
-    Inverters keep their customer's name, as in alarms.
+    Longer names come first, since one name may be the beginning of another. Inverters keep their customer's
+    name, as in alarms.
     """
     meter_of = {
         site.feeder.customers[int(customer)]: meter

@@ -1,8 +1,8 @@
-"""What is known about one feeder at one tick, in the units and words of its operators.
+"""Report of one feeder at one tick, in operators' units and terms.
 
-The monitor speaks per unit and indices; everything after it (alarms, store, REST, zenoh, web page) speaks
-of `FeederReport`, in volts and with the operator's own ids. A report is a value: it holds only tuples,
-strings and floats, so it can be kept, compared, sent and read from any thread.
+The monitor uses per unit and indices; everything after it (alarms, store, REST, zenoh, web page) uses
+`FeederReport`, in volts and with the ids of the feeder's files. A report is a value: it contains only tuples,
+strings and floats, so that it can be stored, compared, sent and read from any thread.
 """
 
 from __future__ import annotations
@@ -58,10 +58,8 @@ class StalledMeter:
 
     Attributes
     ----------
-    meter
-        Id.
     reason
-        Code of `gridsec.estimators.sequential.LearningReason`; None where no time was lost.
+        Code of `gridsec.estimators.sequential.LearningReason`; None without lost time.
     gathered_s
         Time that counted, s.
     """
@@ -81,9 +79,9 @@ class LearningReport:
         Codes of `gridsec.estimators.sequential.LearningState` and `LearningReason`, in the order of the
         feeder's file; empty where the estimator does not learn.
     expected_s
-        Time that learning takes if every tick counts, s; None where the estimator does not learn.
+        Time of learning if every tick counts, s; None if the estimator does not learn.
     stalled
-        Meters not learned after twice that time.
+        Meters that are not learned after twice that time.
     """
 
     states: tuple[str, ...] = ()
@@ -101,37 +99,38 @@ class MeterReport:
     meter, bus
         Ids as in the feeder's files.
     seen
-        Whether a usable reading belongs to this tick.
+        True if a usable reading belongs to this tick.
     suspect
-        Whether the verdict names this meter as manipulated.
+        True if the verdict names this meter as manipulated.
     score
-        Absolute residual between reported and reconstructed squared voltage, squared pu; None if unseen.
+        Absolute residual between reported and reconstructed squared voltage, squared pu; None if unavailable.
     threshold
-        The largest score that an honest meter can reach, squared pu; None if there is none.
+        Largest score of an honest meter, squared pu; None without one.
     v_volt_reported
-        RMS phase-to-neutral voltage that the meter claims, V; None if unseen.
+        Reported RMS phase-to-neutral voltage, V; None if unavailable.
     v_volt_estimated
-        Reconstructed voltage at the meter's connection point, V; None if there is no estimate.
+        Reconstructed voltage at the meter's connection point, V; None without an estimate.
     v_volt_std
-        Standard deviation of the reconstructed voltage, V. From estimators that only bound it: a third of
-        the half-width of the interval that holds the true voltage, the standard deviation of the normal law
-        whose three-sigma interval it is.
+        Standard deviation of the reconstructed voltage, V. For estimators with an error bound only: a third
+        of the half-width of the interval that contains the true voltage, as for the three-sigma interval of a
+        normal distribution.
     v2_pu_estimated
-        Reconstructed squared voltage, in parts of its nominal voltage squared.
+        Reconstructed squared voltage over the square of its nominal voltage.
     attack_volt_estimated
         Reconstructed manipulation: reported minus reconstructed voltage, V, for suspects; 0 for others.
     kind
-        What the manipulation looks like, see `gridsec.interface.Kind`; None where nobody can tell.
+        Attack kind, see `gridsec.interface.Kind`; None if unknown.
     phase
-        The phase that it measures: a, b or c; None on a balanced feeder.
+        Measured phase: a, b or c; None on a balanced feeder.
     v_min_volt, v_max_volt
-        The voltage limits where it is, V: behind a transformer others than the busbar's; None: the feeder's.
+        Voltage limits at the meter, V: behind a transformer they differ from the busbar's; None: the
+        feeder's.
     learning_state, learning_reason
-        As in `LearningReport`; None where the estimator does not learn, or does not run.
+        As in `LearningReport`; None if the estimator does not learn, or does not run.
     model_only
-        The estimated values rest on no reading of this tick, see `voltages.Grounds`.
+        True if the estimates use no reading of this tick, see `voltages.Grounds`.
     clock_offset_s
-        By how much its clock is ahead of those of the other meters, s; None where that is not measurable.
+        Lead of its clock relative to the other meters, s; None if not measurable.
     """
 
     meter: str
@@ -155,12 +154,12 @@ class MeterReport:
     clock_offset_s: float | None = None
 
     def limits(self, report: FeederReport) -> tuple[float, float]:
-        """Return the lowest and the highest voltage allowed at the meter, V.
+        """Return the lowest and the highest permitted voltage at the meter, V.
 
         Parameters
         ----------
         report
-            Of its feeder.
+            Report of its feeder.
         """
         low, high = self.v_min_volt, self.v_max_volt
         return report.v_min_volt if low is None else low, report.v_max_volt if high is None else high
@@ -168,7 +167,7 @@ class MeterReport:
 
 @dataclass(frozen=True, slots=True)
 class CustomerReport:
-    """The reconstructed voltage of one customer, metered or not.
+    """Reconstructed voltage of one customer, metered or not.
 
     Attributes
     ----------
@@ -191,17 +190,18 @@ class InverterReport:
     Attributes
     ----------
     customer, bus
-        Whose it is and where, ids as in the feeder's files.
+        Ids as in the feeder's files.
     meter
         The customer's meter; None without one.
     judged
-        The estimator judges inverters, the data say enough of this one, and its values are not model only.
+        True if the estimator monitors inverters, the data suffice for this one, and its values are not model
+        only.
     suspect
-        Whether the verdict names it as manipulated.
+        True if the verdict names it as manipulated.
     q_kvar_estimated
-        Reactive power that it injects, kvar.
+        Injected reactive power, kvar.
     attack_kvar_estimated
-        The part of it that its droop curve does not ask for, kvar; 0 if it is no suspect, None if not judged.
+        Injection beyond its droop curve, kvar; 0 if not suspect, None if not monitored.
     model_only
         As in `MeterReport`.
     """
@@ -218,18 +218,18 @@ class InverterReport:
 
 @dataclass(frozen=True, slots=True)
 class ExplanationReport:
-    """One way to explain the readings, where several do about equally well.
+    """One of several explanations of the readings with similar probability.
 
     Attributes
     ----------
     meters
-        Who would lie, by meter; the busbar's is `BUSBAR`.
+        Accused meters; the busbar meter is `BUSBAR`.
     inverters
-        Whose inverters would inject a wrong reactive power, by customer.
+        Accused inverters, by customer.
     probability
-        Its share among the explanations given, from 0 to 1.
+        Share among the given explanations, from 0 to 1.
     powers
-        Whose powers would not be what they are said to be, by customer.
+        Accused reported powers, by customer.
     """
 
     meters: tuple[str, ...]
@@ -244,49 +244,46 @@ class FeederReport:
 
     Attributes
     ----------
-    feeder
-        Name.
     t
         Unix time of the tick, s.
     verdict, cause, reason
-        The decision, why for programs, why for people.
+        The decision, its code for programs, and its sentence for operators.
     max_attacked
         The number M of manipulated meters up to which the verdict is guaranteed.
     meters
         One entry per meter, in the order of the feeder's file.
     bus_v_volt
-        (bus id, reconstructed voltage in V or None) of every bus, the busbar first; in three phases that of
-        the phase furthest from nominal.
+        (bus id, reconstructed voltage in V or None) of every bus, the busbar first; in three phases the
+        voltage of the phase furthest from nominal.
     silent
-        (meter id, seconds since its last usable reading, infinity if there never was one) of the meters
-        that have been silent for longer than the feeder's `silence_s`; the busbar meter appears as
-        `BUSBAR`.
+        (meter id, seconds since its last usable reading, infinity without any) of the meters that have been
+        silent for longer than the feeder's `silence_s`; the busbar meter is `BUSBAR`.
     v_min_volt, v_max_volt
         The feeder's voltage limits, V, at the nominal voltage of its busbar.
     customers, inverters
         One entry per customer, and per droop inverter, in the order of the feeder's file.
     explanations
-        Where several explanations fit the readings, those, the likeliest first.
+        If several explanations fit the readings: these, the likeliest first.
     bus_phases
-        In three phases, the voltage of each phase of every bus, V; None for one that it does not have.
+        In three phases, the voltage of each phase of every bus, V; None for an absent phase.
     busbar
-        The busbar's own meter.
+        The busbar meter.
     learning
         Learning of the meters' fixed errors; None at a tick without a monitor.
     revision
-        Of which tables, limits and times of the feeder this is, see `feeder_info.revision`.
+        Digest of the feeder's tables, limits and times, see `feeder_info.revision`.
     skipped
-        Number of ticks directly before this one that were not judged.
+        Number of skipped ticks directly before this one.
     model_only
-        No value of the feeder rests on a reading of this tick, see `voltages.Grounds`.
+        True if no value of the feeder uses a reading of this tick, see `voltages.Grounds`.
     model_only_phases
-        In three phases, those of a, b and c without such a reading.
+        In three phases, the phases without such a reading.
     bus_model_only
-        Of each entry of `bus_v_volt`, whether it is model only; empty: none is.
+        For each entry of `bus_v_volt`, True if it is model only; empty: none is.
     t_measured
-        Newest tick at which a value rested on a reading, Unix s; None: no such tick since the start.
+        Newest tick with a reading that a value uses, Unix s; None without such a tick since the start.
     data_error
-        Error of the feeder's files that explains accused meters; None: none does.
+        Error of the feeder's files that explains accused meters, or None.
     """
 
     feeder: str
@@ -316,24 +313,18 @@ class FeederReport:
 
     @property
     def suspects(self) -> tuple[str, ...]:
-        """The meters that the verdict names as manipulated, the busbar's as `BUSBAR`."""
+        """Meters that the verdict names as manipulated, the busbar meter as `BUSBAR`."""
         named = tuple(meter.meter for meter in self.meters if meter.suspect)
         return (*named, BUSBAR) if self.busbar.suspect else named
 
 
 def finite(value: float) -> float | None:
-    """Return a number that JSON can carry: None for NaN and infinities."""
+    """Return a number for JSON: None for NaN and infinities."""
     return float(value) if math.isfinite(value) else None
 
 
 def with_learning(report: FeederReport, learning: LearningReport) -> FeederReport:
-    """Return the report with the learning of its meters.
-
-    Parameters
-    ----------
-    report, learning
-        Of the same feeder and tick.
-    """
+    """Return the report with the learning of its meters."""
     if not learning.states:
         return replace(report, learning=learning)
     each = zip(report.meters, learning.states, learning.reasons, strict=True)
@@ -342,35 +333,24 @@ def with_learning(report: FeederReport, learning: LearningReport) -> FeederRepor
 
 
 def with_data_error(report: FeederReport, error: DataErrorReport | None) -> FeederReport:
-    """Return the report with an error of the files that explains accused meters, in its reason too.
-
-    Parameters
-    ----------
-    report, error
-        Of the same feeder and tick.
-    """
+    """Return the report with an error of the files that explains accused meters, also in its reason."""
     if error is None:
         return report
     return replace(report, data_error=error, reason=f"{report.reason.removesuffix('.')}. {error.text}")
 
 
 def build(site: Site, tick: Tick, max_attacked: int, estimate: Estimate, verdict: Verdict) -> FeederReport:
-    """Put a tick, its estimate and its verdict into an operator's words.
+    """Return the report of a tick, its estimate and its verdict.
 
     Parameters
     ----------
-    site
-        The feeder.
-    tick
-        What was known.
     max_attacked
-        The number M that the monitor was designed for.
-    estimate, verdict
-        What the monitor made of it.
+        M of the design.
     """
     v, std = volts(site.customer_volt, estimate.v2), std_volts(site, estimate)
     at = site.meters
-    v2 = estimate.v2 * (site.customer_volt / site.customer_nominal) ** 2  # of nominal, behind taps too
+    # relative to nominal, behind taps too
+    v2 = estimate.v2 * (site.customer_volt / site.customer_nominal) ** 2
     numbers = np.column_stack((verdict.score, verdict.threshold, v[at], std[at], v2[at]))
     attack = attack_volts(site, tick, verdict)
     rests_on = grounds(site, tick, estimate, verdict)
@@ -423,14 +403,14 @@ def build(site: Site, tick: Tick, max_attacked: int, estimate: Estimate, verdict
 
 
 def blind(site: Site, tick: Tick, max_attacked: int, cause: Cause, reason: str) -> FeederReport:
-    """Return the report of a tick at which no monitor runs: undecided, with what the meters say.
+    """Return the report of a tick without a monitor: undecided, with the reported voltages.
 
     Parameters
     ----------
     site, tick, max_attacked
         As in `build`.
     cause, reason
-        Why there is no estimate.
+        Reason of the missing estimate, as code and as sentence.
     """
     allowed, offsets = _limits(site), tick.clock_offset or (None,) * len(site.meter_ids)
     rests_on = grounds(site, tick)
@@ -476,7 +456,7 @@ def blind(site: Site, tick: Tick, max_attacked: int, cause: Cause, reason: str) 
 
 
 def _limits(site: Site) -> list[tuple[float, float]]:
-    """Lowest and highest voltage allowed at every meter, V."""
+    """Lowest and highest permitted voltage at every meter, V."""
     limits = site.tables.meta.limits
     return [
         (limits.v_min_pu * volt, limits.v_max_pu * volt)
@@ -492,7 +472,7 @@ def _phase(site: Site, meter: int) -> str | None:
 def _inverters(
     site: Site, estimate: Estimate | None, verdict: Verdict | None, model_only: Bools
 ) -> tuple[InverterReport, ...]:
-    """Every inverter; model-only values judge none, and leave an inverter named that is named."""
+    """Reports of all inverters; model-only values test none, but an inverter stays named as manipulated."""
     base = site.feeder.base_kva
     judges = verdict is not None and verdict.inverters.size > 0
     out = []
@@ -569,23 +549,18 @@ def _whole(
 
 
 def skipped_in_words(count: int) -> str:
-    """Return the sentence about ticks that were not judged.
+    """Return the sentence about skipped ticks.
 
     Parameters
     ----------
     count
-        Their number, 1 or more.
+        Number of skipped ticks, 1 or more.
     """
-    return "The tick before was not judged." if count == 1 else f"The {count} ticks before were not judged."
+    return "The tick before was skipped." if count == 1 else f"The {count} ticks before were skipped."
 
 
 def to_json(report: FeederReport) -> dict[str, Any]:
-    """Return the report as the JSON object that REST's `state` and the zenoh key `estimate` show.
-
-    Parameters
-    ----------
-    report
-        The report.
+    """Return the report as the JSON object of REST's `state` and of the zenoh key `estimate`.
 
     Returns
     -------

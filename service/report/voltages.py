@@ -1,4 +1,4 @@
-"""Voltages of reports: meters, buses, phases, and the meter of the busbar."""
+"""Voltages of reports: meters, buses, phases, and the busbar meter."""
 
 from __future__ import annotations
 
@@ -18,13 +18,7 @@ Phase: TypeAlias = Literal["a", "b", "c"]
 
 
 def snapshot(site: Site, tick: Tick) -> Snapshot:
-    """Return what a tick's readings say, as `feeders.model.site.to_frame` takes it.
-
-    Parameters
-    ----------
-    site, tick
-        The feeder, and the tick.
-    """
+    """Return a tick's readings in the form of `feeders.model.site.to_frame`."""
     nan = math.nan
     rows = [
         (nan, nan, nan, nan, nan) if r is None else (r.v_volt, r.p_kw, r.q_kvar, r.t, r.t_power)
@@ -45,38 +39,26 @@ def snapshot(site: Site, tick: Tick) -> Snapshot:
 
 
 def busbar_volt(site: Site, tick: Tick) -> Floats | float:
-    """Return what the busbar's meter says, V: one voltage, or in three phases (3,); NaN for none.
-
-    Parameters
-    ----------
-    site, tick
-        The feeder, and the tick.
-    """
+    """Return the reading of the busbar meter, V: one voltage, or in three phases (3,); NaN without one."""
     if tick.busbar is None:
         return math.nan
     phases = tick.busbar.v_phases
-    # A balanced feeder has one voltage, and a phase that is not measured does not take it away.
+    # A balanced feeder has one voltage, also if single phases are not measured.
     one = phases is None or not isinstance(site.feeder, InPhases)
     return tick.busbar.v_volt if one else np.array(phases)
 
 
 def busbar_phases(site: Site) -> tuple[Phase | None, ...]:
-    """Return the phases of the busbar, (b,): a, b and c, or a nameless one on a balanced feeder.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    """
+    """Return the phases of the busbar, (b,): a, b and c, or None on a balanced feeder."""
     return ("a", "b", "c") if isinstance(site.feeder, InPhases) else (None,)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Grounds:
-    """Voltage readings of one tick that reconstructed values rest on, by phase of the busbar, (b,).
+    """Voltage readings of one tick that the reconstruction uses, by phase of the busbar, (b,).
 
-    A value without one of these in its phase is *model only*: it follows from powers, the model and what the
-    estimator remembers. All buses of a phase are connected, so that one reading counts for all of them.
+    A value without such a reading in its phase is *model only*: it follows from powers, the model and the
+    state of the estimator. All buses of a phase are connected, so that one reading counts for all of them.
 
     Attributes
     ----------
@@ -95,27 +77,19 @@ class Grounds:
         return self.meters | self.busbar
 
     def model_only(self, site: Site) -> Bools:
-        """Return which customers' values are model only, (N,).
-
-        Parameters
-        ----------
-        site
-            The feeder.
-        """
+        """Return the customers with model-only values, (N,)."""
         return np.asarray(~(hangs_on(site.feeder) * self.measured).any(axis=1), dtype=np.bool_)
 
 
 def grounds(
     site: Site, tick: Tick, estimate: Estimate | None = None, verdict: Verdict | None = None
 ) -> Grounds:
-    """Return the readings that the values of a tick rest on.
+    """Return the readings that the values of a tick use.
 
     Parameters
     ----------
-    site, tick
-        The feeder, and what was known.
     estimate, verdict
-        What the estimator says; None: there is no monitor, and each reading counts.
+        None without a monitor: each reading then counts.
     """
     used = np.array([reading is not None for reading in tick.readings], dtype=np.bool_)
     busbar = np.isfinite(np.broadcast_to(busbar_volt(site, tick), len(busbar_phases(site))))
@@ -133,8 +107,6 @@ def bus_volts(site: Site, v2_bus: Floats, measured: Bools) -> tuple[Floats, Floa
 
     Parameters
     ----------
-    site
-        The feeder.
     v2_bus : (n,)
         Squared voltages as in `gridsec.interface.Estimate`, pu.
     measured : (b,)
@@ -161,80 +133,67 @@ def bus_volts(site: Site, v2_bus: Floats, measured: Bools) -> tuple[Floats, Floa
 
 
 def std_volts(site: Site, estimate: Estimate) -> Floats:
-    """Return the standard deviation of every customer's voltage, V, (N,): told, or from the bound.
-
-    Parameters
-    ----------
-    site, estimate
-        The feeder, and what the estimator says.
-    """
+    """Return the standard deviation of every customer's voltage, V, (N,): given, or from the bound."""
     half, share = (estimate.std, 1.0) if estimate.std.size else (estimate.bound, 1.0 / 3.0)
     base = site.customer_volt
     return np.asarray(0.5 * share * (volts(base, estimate.v2 + half) - volts(base, estimate.v2 - half)))
 
 
 def attack_volts(site: Site, tick: Tick, verdict: Verdict) -> Floats:
-    """Return what every meter that is named reads too much, (p,), see `excess_volts`.
-
-    Parameters
-    ----------
-    site, tick, verdict
-        The feeder, what was known, and what the estimator says.
-    """
+    """Return the excess of every meter that is named as manipulated, (p,), see `excess_volts`."""
     reported = np.array([math.nan if r is None else r.v_volt for r in tick.readings], dtype=np.float64)
     return excess_volts(site.customer_volt[site.meters], reported, verdict.attack, verdict.suspects)
 
 
 def excess_volts(base: Floats, reported: Floats, attack: Floats, named: Bools) -> Floats:
-    """Turn attacks on squared voltages into volts: ``sqrt(y) - sqrt(y - a)``, 0 where nobody is named.
+    """Convert attacks on squared voltages to volts: ``sqrt(y) - sqrt(y - a)``, 0 without a name.
 
     Parameters
     ----------
     base, reported : (k,)
-        1 pu of each, and what is reported, V.
+        1 pu, and the reported voltages, V.
     attack : (k,)
-        What is too much of the squared voltages, pu.
+        Excess of the squared voltages, pu.
     named : (k,)
-        Who is named.
+        True for devices named as manipulated.
     """
     true = volts(base, (reported / base) ** 2 - attack)
     return np.where(named, reported - true, 0.0)
 
 
 BUSBAR = "substation"
-"""The name under which the busbar meter is reported, as in its zenoh key. No other meter may have it."""
+"""Name of the busbar meter in reports, as in its zenoh key; reserved for it."""
 
 
 @dataclass(frozen=True, slots=True)
 class BusbarReport:
-    """The busbar's meter at one tick; in three phases the numbers are those of one of them.
+    """The busbar meter at one tick; in three phases the numbers belong to one phase.
 
     Attributes
     ----------
     judged
-        The estimator judges this meter, and this tick has readings to do so: of this meter and of a trusted
-        meter in the same phase. Estimators that rely on this meter, or do without, never judge it.
+        True if the estimator tests this meter, and this tick has readings for the test: of this meter and of
+        a trusted meter in the same phase. Estimators that trust this meter, or do not use it, never test it.
     seen
-        Whether a usable reading of it belongs to this tick.
+        True if a usable reading of it belongs to this tick.
     suspect
-        Whether the verdict names it as manipulated.
+        True if the verdict names it as manipulated.
     phases
-        The phases in which it does: of a, b and c; nothing on a balanced feeder.
+        The manipulated phases: of a, b and c; empty on a balanced feeder.
     phase
-        The phase that the numbers are of, the one that is furthest off of those in which it is suspect, or of
-        all; None on a balanced feeder.
+        Phase of the numbers: the one with the largest deviation, among the suspect ones if there are any;
+        None on a balanced feeder.
     v_volt_reported
-        RMS phase-to-neutral voltage that the meter claims, V; None if unseen.
+        Reported RMS phase-to-neutral voltage, V; None if unavailable.
     v_volt_estimated
-        Reconstructed voltage of the busbar, V: what the meter claims while that is believed. None if there is
-        no estimate.
+        Reconstructed voltage of the busbar, V: the reported one while the meter is trusted. None without an
+        estimate.
     attack_volt_estimated
-        Reconstructed manipulation, V: the mean over the time scale on which it was found; 0 if it is no
-        suspect.
+        Reconstructed manipulation, V: the mean over the time scale of its detection; 0 if not suspect.
     model_only
-        `v_volt_estimated` rests on no reading of this tick, see `voltages.Grounds`.
+        True if `v_volt_estimated` uses no reading of this tick, see `voltages.Grounds`.
     clock_offset_s
-        By how much its clock is ahead of the other meters', s; None where that is not measurable.
+        Lead of its clock relative to the other meters, s; None if not measurable.
     """
 
     judged: bool
@@ -249,25 +208,23 @@ class BusbarReport:
     clock_offset_s: float | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """Return what REST's `state` shows."""
+        """Return the JSON object of REST's `state`."""
         return {"meter": BUSBAR} | asdict(self) | {"phases": list(self.phases)}
 
 
 UNKNOWN_BUSBAR = BusbarReport(judged=False, seen=False, suspect=False)
-"""Nothing is known of it."""
+"""Default without any data."""
 
 
 def busbar_report(
     site: Site, tick: Tick, estimate: Estimate | None = None, verdict: Verdict | None = None
 ) -> BusbarReport:
-    """Say what is known of the busbar's meter.
+    """Return the report of the busbar meter.
 
     Parameters
     ----------
-    site, tick
-        The feeder, and what was known.
     estimate, verdict
-        What the monitor made of it; None: there is none.
+        None without a monitor.
     """
     names, reported = busbar_phases(site), _reported(site, tick)
     nothing = np.full(reported.size, math.nan)
@@ -300,12 +257,10 @@ def busbar_report(
 
 
 def busbar_in_words(site: Site, which: Bools) -> str:
-    """Name the busbar's meter, with the phases in question where there are several.
+    """Return the name of the busbar meter for a sentence, with the phases if there are several.
 
     Parameters
     ----------
-    site
-        The feeder.
     which : (b,)
         Phases, one on a balanced feeder.
     """
@@ -315,35 +270,29 @@ def busbar_in_words(site: Site, which: Bools) -> str:
 
 
 def busbar_off(site: Site, tick: Tick, verdict: Verdict) -> str:
-    """Say by how much a busbar's meter that is named is off, in the phase where most.
-
-    Parameters
-    ----------
-    site, tick, verdict
-        The feeder, what was known, and what the estimator says.
-    """
+    """Return the deviation of a busbar meter named as manipulated, in the phase with the largest one."""
     reported = _reported(site, tick)
     attack = _attack_volts(site, reported, verdict)
     k = _furthest(verdict.busbar, attack)
     if not math.isfinite(attack[k]):
-        return "reports nothing at present"
+        return "has no reading at present"
     percent = 100.0 * attack[k] / max(reported[k] - attack[k], 1e-6 * reported[k])
     much = f"{abs(attack[k]):.1f} V ({abs(percent):.1f} %) {'more' if attack[k] > 0 else 'less'}"
-    return f"reads {much} than the meters of the feeder say"
+    return f"reads {much} than the meters of the feeder imply"
 
 
 def _furthest(which: Bools, off: Floats) -> int:
-    """The phase that is furthest off of some, or of all if there is none; better one that is known."""
+    """Phase with the largest deviation among the given ones, or among all if none is given."""
     among = which if which.any() else np.ones_like(which)
     return int(np.where(among, np.nan_to_num(np.abs(off), nan=-0.5), -1.0).argmax())
 
 
 def _reported(site: Site, tick: Tick) -> Floats:
-    """What the busbar's meter says, V, NaN where nothing, (b,)."""
+    """Voltages reported by the busbar meter, V, NaN without a reading, (b,)."""
     return np.broadcast_to(busbar_volt(site, tick), len(busbar_phases(site)))
 
 
 def _attack_volts(site: Site, reported: Floats, verdict: Verdict) -> Floats:
-    """What the busbar's meter reads too much where it is named, V, (b,)."""
+    """Excess of the busbar meter in phases named as manipulated, V, (b,)."""
     base = site.base_volt[busbar_places(site.feeder)]
     return excess_volts(base, reported, verdict.busbar_attack, verdict.busbar)

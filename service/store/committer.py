@@ -1,11 +1,11 @@
-"""Storing and publishing alarms: in this order, without holding up whoever watches, and losing none.
+"""Writes alarm transitions to the database, then publishes them on zenoh, without delaying the monitoring.
 
-What a round brings is gathered in `Waiting` and handed to `apart`, which the runtime sets to a thread of its
-own where time does not wait; one write is on its way at a time. If the database refuses it, what it held is
-kept and tried again. Alarms are published when they are stored, not before.
+The results of a round are collected in `Waiting` and passed to `apart`, which the runtime sets to a separate
+thread with the wall clock. One write is in progress at a time. After a failed write its contents are kept and
+written again. Alarms are published after they are stored, not before.
 
-A command stores a `Wish` in the same way and gets the outcome between two rounds. A commit without an answer
-is repeated with its key until the database tells that it is stored.
+A command stores a `Wish` in the same way and gets the result between two rounds. A commit without an answer
+is repeated with its key until the database confirms it.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ from service.store.write_queue import Batch, Waiting
 
 RETRY_S = 1.0
 SLOW_S = 15.0
-"""A write that takes longer is told to the operator."""
+"""Duration of a write, s, beyond which it is reported to the operator."""
 OUTBOX_PAGE = 1000
-"""So many events are read from the outbox at once."""
+"""Number of events in one read of the outbox."""
 UNPUBLISHED_KEPT = 10_000
-"""So many stored events wait in memory for zenoh; the others are read from the outbox later."""
+"""Largest number of stored events in memory before zenoh; the others are read from the outbox later."""
 _log = structlog.get_logger("gridsec.keeper")
 
 T = TypeVar("T")
 
 
 class Publisher(Protocol):
-    """Where estimates and alarms go; `zenoh_bus.Bus` is one."""
+    """Destination of estimates and alarms, such as `zenoh_bus.Bus`."""
 
     failure: str | None
     counts: BusCounts
@@ -53,13 +53,13 @@ class Publisher(Protocol):
         """Publish the newest value of a key."""
 
     def event(self, key: str, payload: bytes, *, last: bool, done: Callable[[], None] | None = None) -> bool:
-        """Publish something that must not be lost; False if there is no room."""
+        """Publish an event that must not be lost; False if the queue is full."""
 
     def answer(self, key: str, payload: bytes) -> None:
-        """Let queries find a value."""
+        """Store the reply to queries for a key."""
 
     def withdraw(self, key: str) -> None:
-        """Let queries find nothing any more."""
+        """Remove the reply to queries for a key."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,18 +81,17 @@ class Wish:
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A command's part of a job.
+    """Command part of a job.
 
     Attributes
     ----------
-    wish
-        Its contents.
     read
         Called after the commit, in the writing thread.
     landed
-        Called between two rounds when it is stored, with the result of `read`.
+        Called between two rounds after it is stored, with the result of `read`.
     refused
-        Called between two rounds if it is not stored, or not known to be; `landed` may follow the latter.
+        Called between two rounds if it is not stored, or its outcome is unknown; `landed` may follow the
+        latter.
     """
 
     wish: Wish
@@ -103,7 +102,7 @@ class Command:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """One visit to the database: what to store, what has been published, whether to read the outbox on."""
+    """One write: data, published events, and the next part of the outbox."""
 
     key: int
     batch: Batch
@@ -121,7 +120,7 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """Result of a job: event numbers if it was stored, values read, or the error."""
+    """Result of a job: event numbers of a stored one, values read, or the error."""
 
     numbers: tuple[int, ...] | None = None
     marked: bool = False
@@ -134,43 +133,41 @@ Apart = Callable[[Callable[[], Done], Callable[[Done], None]], None]
 
 
 def at_once(write: Callable[[], Done], then: Callable[[Done], None]) -> None:
-    """Write, and take the outcome in, before going on.
+    """Write, and process the result, before returning.
 
     Parameters
     ----------
     write, then
-        What to do, and who wants to know the outcome.
+        The write, and the handler of its result.
     """
     then(write())
 
 
 class Keeper:
-    """The way of alarms from the rounds to the database and from there to zenoh.
+    """Writes alarm transitions to the database, then publishes them on zenoh.
 
     Parameters
     ----------
-    store
-        The database.
     metrics
-        Where failures and transitions are counted.
+        Counters of failures and transitions.
     stored
         Called after alarms have been stored.
     kept
-        Called with the reports that have been stored.
+        Called with the stored reports.
     apart
-        How writing is done apart from judging: called with what to do, in any thread, and with what to do
-        with the outcome, between two rounds.
+        Executor of writes: called with the write, for any thread, and with the handler of its result, for the
+        time between two rounds.
 
     Attributes
     ----------
     waiting
-        What waits for the database.
+        Data that wait for the database.
     publisher
-        Where alarms go; None: nowhere.
+        Destination of alarms, or None.
     problem
-        Why the database cannot be used, or None.
+        Reason why the database cannot be used, or None.
     storing
-        Whether a write is on its way; only `waiting` and `commit` may be used then.
+        True while a write is in progress; only `waiting` and `commit` may be used then.
     """
 
     def __init__(
@@ -191,20 +188,20 @@ class Keeper:
         self._apart = apart
         self._retry_at = self._began = 0.0
         self._keys = count(1)
-        # A job whose outcome is not known; nothing else is stored before it.
+        # A job with an unknown outcome; nothing else is stored before it.
         self._unknown: Job | None = None
         self._published: deque[int] = deque()
         self._unpublished: deque[tuple[int, Alarm]] = deque()
-        # The outbox holds events after this number that are not in `_unpublished`; None: it holds none.
+        # The outbox has events after this number that are not in `_unpublished`; None: it has none.
         self._outbox_after: int | None = 0
 
     def commit(self, *, at_once: bool = False) -> None:
-        """Have what has been gathered stored; on failure it is kept and tried again later.
+        """Start storing the collected data; after a failure they are kept and stored later.
 
         Parameters
         ----------
         at_once
-            Do not wait after a failure.
+            Skip the wait after a failure.
         """
         self._publish_waiting()
         if self.storing or (time.monotonic() < self._retry_at and not at_once):
@@ -215,13 +212,13 @@ class Keeper:
 
     @property
     def takes_commands(self) -> bool:
-        """True if a command can be sent, or is refused at once because the database is known to be away."""
+        """True if a command can be sent, or is refused at once: the database is unavailable."""
         return self.problem is not None or not self.storing
 
     def store(
         self, wish: Wish, landed: Callable[[], None], refused: Callable[[StoreUnavailable], None]
     ) -> None:
-        """Have everything gathered and a command's wish stored, all or nothing.
+        """Start storing all collected data and a command's wish, all or nothing.
 
         Parameters
         ----------
@@ -231,7 +228,7 @@ class Keeper:
         Raises
         ------
         StoreUnavailable
-            If the database is known to be away; it is not asked again.
+            If the database is known to be unavailable; no call is made then.
         """
         self._command(Command(wish, lambda _: None, lambda _: landed(), refused))
 
@@ -241,7 +238,7 @@ class Keeper:
         landed: Callable[[T], None],
         refused: Callable[[StoreUnavailable], None],
     ) -> None:
-        """Have something read after everything gathered is stored.
+        """Start a read after all collected data are stored.
 
         Parameters
         ----------
@@ -276,7 +273,7 @@ class Keeper:
         self._apart(partial(_write, self._store, job), partial(self._written, job))
 
     def _written(self, job: Job, done: Done) -> None:
-        """Take in what came of a job."""
+        """Process the result of a job."""
         self.storing = False
         if done.numbers is not None:
             self._unknown = None
@@ -305,14 +302,14 @@ class Keeper:
             self._answer(job.command, done)
 
     def _answer(self, command: Command, done: Done) -> None:
-        """Tell a command its outcome. What was stored is so, whatever failed after it."""
+        """Pass a command its result. Stored data stay stored, whatever failed afterwards."""
         if done.numbers is not None and (done.error is None or command.wish != Wish()):
             command.landed(done.found)
         elif done.error is not None:
             command.refused(done.error)
 
     def _tell(self, transitions: tuple[Transition, ...], numbers: tuple[int, ...]) -> None:
-        """Say what has been stored, and let it be published."""
+        """Log stored transitions, and queue them for publication."""
         for number, transition in zip(numbers, transitions, strict=True):
             alarm = transition.alarm
             self.publish(number, alarm)
@@ -337,7 +334,7 @@ class Keeper:
         self._metrics.store_failures.inc()
 
     def problems(self) -> list[str]:
-        """Return what is wrong with the database and what that costs, for the operator."""
+        """Return the problems of the database and their consequences, for the operator."""
         under_way = time.monotonic() - self._began if self.storing else 0.0
         if self.problem is None and under_way < SLOW_S:
             return []
@@ -347,19 +344,21 @@ class Keeper:
         if waiting := len(self.waiting):
             problems.append(f"{waiting} changes of alarms wait for the database")
         if gone := self.waiting.given_up:
-            problems.append(f"{gone} changes of alarms were given up; what stands now is kept")
+            problems.append(
+                f"{gone} changes of alarms were dropped; the present state of active alarms is kept"
+            )
         return problems
 
     def publish(self, number: int, alarm: Alarm) -> None:
-        """Let a stored event be published after those before it.
+        """Queue a stored event for publication, after earlier ones.
 
         Parameters
         ----------
         number, alarm
-            The event's number, and the alarm as it was then.
+            Number of the event, and the alarm at that event.
         """
         if self._outbox_after is not None:
-            return  # It is read from the outbox when its turn comes.
+            return  # It is read from the outbox in its order.
         if len(self._unpublished) >= UNPUBLISHED_KEPT:
             self._outbox_after = self._unpublished[-1][0]
         else:
@@ -379,7 +378,7 @@ class Keeper:
 
 
 def _write(store: Store, job: Job) -> Done:
-    """Do a job; called in any thread, it changes nothing but the database, and it always returns."""
+    """Execute a job in any thread: it changes only the database, and raises nothing."""
     done = Done()
     try:
         if job.probe:
@@ -405,7 +404,7 @@ def _write(store: Store, job: Job) -> Done:
             done = replace(done, page=tuple(page))
     except StoreUnavailable as error:
         return replace(done, error=error)
-    except Exception as error:  # noqa: BLE001 - shown to the operator as the database's problem, and tried again
+    except Exception as error:  # noqa: BLE001 - reported as the database's problem, and repeated
         _log.exception("storing failed")
         return replace(done, error=StoreUnavailable(f"{type(error).__name__}: {error}", code="defect"))
     return done

@@ -1,8 +1,8 @@
 """Connections to SQLite and PostgreSQL: one writer, read-only readers, errors of the database.
 
-The server drops the advisory lock when the session ends. `IDLE_S` ends the session of a stopped process, so
-its heartbeat is due every `BEAT_S`. `CALL_S + 2 BEAT_S < IDLE_S`: a stopped server, continued later, never
-ends a session that this process still uses.
+The server releases the advisory lock at the end of the session. `IDLE_S` ends the session of a stopped
+process; the heartbeat of a running one is due every `BEAT_S`. With `CALL_S + 2 BEAT_S < IDLE_S` a stopped
+server, continued later, never ends a session that this process still uses.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from sqlalchemy.dialects import postgresql, sqlite
 from service.store.schema import WRITER, OutcomeUnknown, StoreUnavailable, WriterLost
 
 CALL_S = 5.0
-"""Time limit of a call without any answer of the server, s."""
+"""Time limit of a call without any response of the server, s."""
 BEAT_S = 2.0
 """Interval of the heartbeat of the writer's session, s."""
 IDLE_S = 10.0
-"""The server ends a writer's session after this time without a call, s."""
+"""Time without a call after which the server ends a writer's session, s."""
 LOCK_S = 12.0
 """Wait for the lock at the start, s; above `IDLE_S`, so that the session of a stopped writer ends first."""
 RELOCK_S = 3.0
@@ -49,13 +49,13 @@ T = TypeVar("T")
 
 
 class NoAnswer(psycopg.OperationalError):
-    """The server has not answered within the time limit of a call; the connection is closed."""
+    """The server did not respond within the time limit of a call; the connection is closed."""
 
     code = "no-answer"
 
 
 class Timed(psycopg.Connection[Any]):
-    """A connection that is closed when the server sends nothing for `limit_s`, s.
+    """A connection that closes when the server sends nothing for `limit_s`, s.
 
     Neither `statement_timeout` nor `tcp_user_timeout` ends a call to a stopped server: its kernel still
     acknowledges what it receives.
@@ -85,12 +85,12 @@ class Timed(psycopg.Connection[Any]):
 
 
 class WriterSession:
-    """The session that may write.
+    """Session of the writer.
 
     Attributes
     ----------
     up
-        Whether it is open.
+        True while the session is open.
     """
 
     def __init__(self) -> None:
@@ -101,7 +101,7 @@ class WriterSession:
         self._ended = False
 
     def opened(self) -> None:
-        """Note that the database is open: from here on calls have the limit `CALL_S`."""
+        """Set the time limit of calls to `CALL_S` after the database is open."""
         self._limit_s = CALL_S
         if self._connection is not None:
             self._connection.limit_s = CALL_S
@@ -112,7 +112,7 @@ class WriterSession:
         Raises
         ------
         WriterLost
-            If the server that still runs has ended the session before.
+            If the server, still running, has ended the previous session.
         """
         made = Timed.connect(*arguments, **options)
         try:
@@ -129,7 +129,8 @@ class WriterSession:
         server = None if row is None else str(row[0])
         if self._ended and server == self._server:
             raise WriterLost(
-                "the server has ended the session that holds the writer's lock, and others may have written",
+                "the server has ended the session that holds the writer's lock, and other processes may have "
+                "written",
                 code="session-ended",
             )
         wait = LOCK_S if self._server is None else RELOCK_S
@@ -141,20 +142,14 @@ class WriterSession:
         self._server = server
 
     def note(self, error: sa.exc.DBAPIError) -> None:
-        """Note how a call failed.
-
-        Parameters
-        ----------
-        error
-            Its error.
-        """
+        """Update the state of the session after a failed call."""
         if error.connection_invalidated:
             self.up = False
             self._ended = getattr(error.orig, "sqlstate", None) in _ENDED_BY_SERVER
 
 
 def code_of(cause: BaseException) -> str:
-    """Return the code of a failed call; empty if it has none of its own.
+    """Return the code of a failed call; empty without a specific one.
 
     Parameters
     ----------
@@ -167,19 +162,11 @@ def code_of(cause: BaseException) -> str:
 
 
 def engines(url: sa.URL, session: WriterSession) -> tuple[sa.Engine, sa.Engine]:
-    """Return the engine that writes and the one that reads.
-
-    Parameters
-    ----------
-    url
-        Address of the database.
-    session
-        The session that may write.
-    """
+    """Return the engine of the writer and that of the readers."""
     if url.get_driver_name() != "psycopg":
         url = url.set(drivername="postgresql+psycopg")
     wait = {"connect_timeout": int(CALL_S), "tcp_user_timeout": int(CALL_S * 1e3)}
-    # The server ends calls whose client has gone; otherwise an abandoned one keeps its locks.
+    # The server ends calls of disconnected clients; otherwise an abandoned call keeps its locks.
     gone = f"-c client_connection_check_interval={BEAT_S * 1e3:.0f}"
     silent = " ".join(
         f"-c {name}={IDLE_S * 1e3:.0f}"
@@ -211,9 +198,9 @@ def engines(url: sa.URL, session: WriterSession) -> tuple[sa.Engine, sa.Engine]:
 WAIT_S = 5.0
 """Wait for a free connection of the readers, s."""
 BUSY_S = 0.5
-"""Wait of a commit for another process that locks an SQLite file, s."""
+"""Wait of a commit while another process locks an SQLite file, s."""
 _VERB_CODES = {"open": "open-failed", "read": "read-failed"}
-"""Code of a failure without a more specific one, by the verb of its message; of others `write-failed`."""
+"""Code of a failure without a more specific one, by the verb of its message; otherwise `write-failed`."""
 _SQLITE_CODES = {
     sqlite3.SQLITE_BUSY: "database-locked",
     sqlite3.SQLITE_LOCKED: "database-locked",
@@ -224,15 +211,7 @@ _SQLITE_CODES = {
 
 
 class _FileMoved(OSError):
-    """The database's file is not at its place.
-
-    Parameters
-    ----------
-    text
-        What happened to it.
-    code
-        Code of the reason.
-    """
+    """The database file is not in its place."""
 
     def __init__(self, text: str, *, code: str) -> None:
         self.code = code
@@ -240,7 +219,7 @@ class _FileMoved(OSError):
 
 
 class Connections:
-    """The one writer and the readers of a database.
+    """The writer and the readers of a database.
 
     Parameters
     ----------
@@ -250,11 +229,11 @@ class Connections:
     Attributes
     ----------
     name
-        The address without its password.
+        Address without the password.
     insert
-        The family's INSERT, which knows ON CONFLICT.
+        INSERT of the dialect, with ON CONFLICT.
     lost
-        Why nothing more may be written, or None.
+        Reason why nothing more may be written, or None.
 
     Raises
     ------
@@ -274,7 +253,7 @@ class Connections:
         try:
             parsed = sa.make_url(url)
         except sa.exc.ArgumentError as error:
-            text = f"{url!r} is no database address: {error}"
+            text = f"{url!r} is not a database address: {error}"
             raise StoreUnavailable(text, code="wrong-address") from error
         self.name = parsed.render_as_string(hide_password=True)
         family = parsed.get_backend_name()
@@ -292,7 +271,7 @@ class Connections:
             raise
 
     def close(self) -> None:
-        """Let go of the database. Closing twice is fine."""
+        """Close all connections and release the lock; idempotent."""
         for engine in self._engines:
             engine.dispose()
         if self._lock_file is not None:
@@ -301,12 +280,12 @@ class Connections:
 
     @contextmanager
     def write(self, doing: str = "write") -> Iterator[sa.Connection]:
-        """Begin a transaction of the writer; it is on the disk when the block has ended.
+        """Begin a transaction of the writer; it is durable after the block.
 
         Parameters
         ----------
         doing
-            The verb of the message, should it fail.
+            The verb of the message after a failure.
 
         Raises
         ------
@@ -329,12 +308,12 @@ class Connections:
             self._session.opened()
 
     def own(self, connection: sa.Connection) -> None:
-        """Become the one that may write.
+        """Register this store as the writer.
 
         Parameters
         ----------
         connection
-            A transaction of the writer.
+            Transaction of the writer.
         """
         connection.execute(WRITER.delete())
         connection.execute(WRITER.insert().values(owner=self._owner, commits=0, checks=0))
@@ -348,7 +327,7 @@ class Connections:
         return BEAT_S
 
     def beat(self) -> None:
-        """Keep the session that holds the lock, or note its loss."""
+        """Keep the session of the lock, or note its loss."""
         if self._session is not None and self._session.up:
             with self.write("keep the session of"):
                 pass
@@ -369,8 +348,8 @@ class Connections:
                         raise
                     self._note(error)
                     raise OutcomeUnknown(
-                        f"{self.name}: the connection broke during a commit ({_text(error)}); whether it is "
-                        "stored is not known yet"
+                        f"{self.name}: the connection broke during a commit ({_text(error)}); its outcome is "
+                        "not known yet"
                     ) from error
         except WriterLost as error:
             self.lost = WriterLost(f"cannot write {self.name}: {error}", code=error.code)
@@ -384,7 +363,7 @@ class Connections:
             self._session.note(error)
 
     def _begun(self, check: Callable[[sa.Connection], None], *, again: bool = True) -> sa.Connection:
-        """Return a connection in a transaction; once more if it turns out to be closed."""
+        """Return a connection in a transaction; a second attempt follows if the connection was closed."""
         connection = self._engines[0].connect()
         try:
             connection.begin()
@@ -403,7 +382,7 @@ class Connections:
 
     @staticmethod
     def _closed_before(error: sa.exc.DBAPIError) -> bool:
-        """True if a call failed at once because its connection had been closed."""
+        """True if a call failed at once because its connection was closed."""
         if not error.connection_invalidated:
             return False
 
@@ -411,7 +390,7 @@ class Connections:
 
     def _check_owner(self, connection: sa.Connection) -> None:
         if connection.scalar(sa.select(WRITER.c.owner)) != self._owner:
-            raise WriterLost("another process has opened it to write since", code="other-writer")
+            raise WriterLost("another process has opened it for writing since", code="other-writer")
 
     @contextmanager
     def read(self) -> Iterator[sa.Connection]:
@@ -422,24 +401,24 @@ class Connections:
                 yield connection
 
     def _in_place(self) -> None:
-        """See that the file is where it was: one that was removed takes every commit and keeps none."""
+        """Check that the database file is in its place: a removed file accepts every commit and loses it."""
         if self._path is None or self._file is None:
             return
         place = _place(self._path)
         if place != self._file:
             what = "removed" if place is None else "replaced"
             raise _FileMoved(
-                f"the file has been {what}; put it back, or restart to begin with what is there",
+                f"the file has been {what}; put it back, or restart with the present files",
                 code="file-removed" if place is None else "file-replaced",
             )
 
     def _locked(self) -> None:
-        """See that our lock is the one that others meet: another file of that name keeps nobody away."""
+        """Check that the held lock file is in its place: another file of that name locks out no process."""
         if self._lock_path is None or self._lock_file is None:
             return
         held = os.fstat(self._lock_file.fileno())
         if _place(self._lock_path) != (held.st_dev, held.st_ino):
-            text = f"{self._lock_path} has been removed or replaced, and others may write"
+            text = f"{self._lock_path} has been removed or replaced, and other processes may write"
             raise WriterLost(text, code="lock-moved")
 
     @contextmanager
@@ -451,7 +430,7 @@ class Connections:
             raise StoreUnavailable(text, code=self._code(doing, error)) from error
 
     def _code(self, doing: str, error: BaseException) -> str:
-        """Code of a failure: by its cause, or else by the verb of its message."""
+        """Code of a failure: by its cause, otherwise by the verb of its message."""
         cause = getattr(error, "orig", None) or error
         found = cause.code if isinstance(cause, _FileMoved) else ""
         if isinstance(cause, sqlite3.Error):
@@ -462,9 +441,9 @@ class Connections:
 
     def _open_sqlite(self, url: sa.URL) -> tuple[sa.Engine, sa.Engine]:
         if not url.database or url.database == ":memory:":
-            text = f"{self.name}: name a file; what is in memory does not survive"
+            text = f"{self.name}: expected a file; a database in memory is lost at the end"
             raise StoreUnavailable(text, code="in-memory")
-        # One file has one lock, under whatever name it was given.
+        # One file has one lock, independent of the name in the address.
         path = self._path = Path(os.path.realpath(url.database))
         self._lock_path = path.with_name(path.name + ".lock")
         lock = self._lock_file = self._lock_path.open("ab")
@@ -516,6 +495,6 @@ def _place(path: Path) -> tuple[int, int] | None:
 
 
 def _text(error: BaseException) -> str:
-    """Return the words of the database in one line."""
+    """Return the message of the database in one line."""
     cause = getattr(error, "orig", None) or error
     return " ".join(str(cause).split()) or type(cause).__name__

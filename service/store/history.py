@@ -1,7 +1,7 @@
-"""A feeder's past, small enough to keep: which ticks are worth a row, and how a row is packed. Pure.
+"""History of a feeder: selection of ticks, and packing of rows. Pure.
 
-A report of 146 meters is 30 kB of JSON and comes every second. Kept are the ticks on a coarser grid and
-every tick at which the verdict, its cause or its suspects change; of each the reported and the
+A report of 146 meters has 30 kB of JSON and comes every second. The history keeps ticks on a coarser grid and
+every tick with a change of the verdict, its cause or its suspects. A row contains the reported and the
 reconstructed voltage, score and threshold of every meter, as compressed single-precision columns (volts to
 2e-5), about 2 kB.
 """
@@ -24,14 +24,14 @@ _SEEN, _SUSPECT, _MODEL_ONLY = 1, 2, 4
 
 @dataclass(frozen=True, slots=True)
 class HistoryRules:
-    """How much of the past is kept.
+    """Grid and duration of the history.
 
     Attributes
     ----------
     step_s
-        The grid of the kept ticks, s; 0 keeps all.
+        Grid of the kept ticks, s; 0 keeps all.
     keep_s
-        How long they are kept, s.
+        Time for which they are kept, s.
     """
 
     step_s: float = 10.0
@@ -40,7 +40,7 @@ class HistoryRules:
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """What decides whether the next tick is kept: the last kept one."""
+    """The last kept tick, which the selection compares with."""
 
     t: float
     verdict: str
@@ -54,16 +54,12 @@ def mark(report: FeederReport) -> Mark:
 
 
 def worth_keeping(last: Mark | None, now: Mark, rules: HistoryRules) -> bool:
-    """Say whether a tick gets a row.
+    """True if a tick gets a row.
 
     Parameters
     ----------
     last
-        The last kept tick of the feeder, if any.
-    now
-        This tick.
-    rules
-        The grid.
+        Last kept tick of the feeder, or None.
     """
     if last is None or now.t < last.t:
         return True
@@ -73,7 +69,7 @@ def worth_keeping(last: Mark | None, now: Mark, rules: HistoryRules) -> bool:
 
 
 def rows(report: FeederReport) -> tuple[MeterReport, ...]:
-    """Return whose numbers are kept: the meters, and the busbar's as `BUSBAR`, without a score."""
+    """Return the meters of a row: those of the report, and the busbar meter as `BUSBAR`, without a score."""
     now = report.busbar
     busbar = MeterReport(
         meter=BUSBAR,
@@ -103,7 +99,7 @@ def pack(meters: Sequence[MeterReport]) -> bytes:
 
 
 def unpack(data: bytes, meters: Sequence[str], only: str | None = None) -> dict[str, Any]:
-    """Return what a kept row says about the feeder and, if asked for, about one of its meters.
+    """Return the values of a kept row for the feeder and, on request, for one of its meters.
 
     Parameters
     ----------
@@ -112,13 +108,13 @@ def unpack(data: bytes, meters: Sequence[str], only: str | None = None) -> dict[
     meters
         The ids of its meters, in order.
     only
-        Also the numbers of this meter.
+        Include the numbers of this meter.
 
     Returns
     -------
     dict
         `seen` (number of meters), `suspects`, `v_volt_lowest`, `v_volt_highest`, `model_only`, and `meter`:
-        its fields as in REST's `state`, or None. The busbar's meter may be among the suspects; `seen` and the
+        its fields as in REST's `state`, or None. The busbar meter may be among the suspects; `seen` and the
         extremes leave it out. The extremes leave out model-only values; rows of earlier versions mark none.
     """
     raw = zlib.decompress(data)
@@ -150,5 +146,5 @@ def unpack(data: bytes, meters: Sequence[str], only: str | None = None) -> dict[
 
 
 def _short(value: float) -> float | None:
-    """Return a single-precision number without the digits that it never had."""
+    """Return a single-precision number without insignificant digits."""
     return finite(float(f"{value:.7g}"))

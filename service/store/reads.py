@@ -1,4 +1,4 @@
-"""Everything that is asked of the store."""
+"""Read access to the store."""
 
 from __future__ import annotations
 
@@ -32,13 +32,7 @@ from service.store.state_codec import Kept, Matter
 
 
 class Reader:
-    """What a store knows. Its connections cannot write.
-
-    Parameters
-    ----------
-    connections
-        The open database.
-    """
+    """Read access to a store. Its connections cannot write."""
 
     def __init__(self, connections: Connections) -> None:
         self._connections = connections
@@ -50,13 +44,7 @@ class Reader:
             yield connection
 
     def alarm(self, alarm_id: str) -> Alarm | None:
-        """Return an alarm by its id.
-
-        Parameters
-        ----------
-        alarm_id
-            The id.
-        """
+        """Return an alarm by its id."""
         with self._read() as connection:
             data = connection.scalar(sa.select(ALARM.c.data).where(ALARM.c.id == alarm_id))
         return None if data is None else from_json(json.loads(data))
@@ -74,18 +62,18 @@ class Reader:
         cursor: str | None = None,
         limit: int = 100,
     ) -> tuple[list[Alarm], str | None]:
-        """Return a page of alarms, those that began last first.
+        """Return a page of alarms, those with the latest onset first.
 
         Parameters
         ----------
         state, kind, severity
-            Only these; empty: all.
+            Permitted values; empty for all.
         feeder, meter
-            Only of these.
+            Restrict to these; None for all.
         since, until
-            Only those raised in [since, until), Unix s.
+            Restrict to alarms raised in [since, until), Unix s.
         cursor
-            Where the last page ended; pages stay right while alarms come and change.
+            End of the previous page; pages stay correct while alarms are added or change.
         limit
             Length of a page.
 
@@ -114,20 +102,20 @@ class Reader:
         return page, (page[-1].id if len(rows) > limit else None)
 
     def raised(self) -> int:
-        """Return how many alarms stand that nobody has answered."""
+        """Number of active alarms without an acknowledgement."""
         query = sa.select(sa.func.count()).where(ALARM.c.state == str(AlarmState.RAISED))
         with self._read() as connection:
             return int(connection.execute(query).scalar_one())
 
     def active(self, feeder: str | None = None, *, cleared_since: float | None = None) -> list[Alarm]:
-        """Return what `state_machine.restore` needs.
+        """Return the alarms that `state_machine.restore` needs.
 
         Parameters
         ----------
         feeder
-            Whose alarms; None: of all feeders.
+            Name; None for all feeders.
         cleared_since
-            Also those that cleared at or after this time, Unix s.
+            Include alarms that cleared at or after this time, Unix s.
         """
         a = ALARM.c
         stands: sa.ColumnElement[bool] = a.state != str(AlarmState.CLEARED)
@@ -140,16 +128,14 @@ class Reader:
             return [from_json(json.loads(data)) for data in connection.scalars(query)]
 
     def events(self, alarm_id: str, *, after: int = 0, limit: int = 1000) -> list[Event]:
-        """Return what happened to an alarm, oldest first.
+        """Return the events of an alarm, oldest first.
 
         Parameters
         ----------
-        alarm_id
-            The id.
         after
-            Only events with a higher number.
+            Restrict to events with a higher number.
         limit
-            At most so many.
+            Largest number of events.
         """
         query = sa.select(EVENT).where(EVENT.c.alarm_id == alarm_id, EVENT.c.seq > after)
         query = query.order_by(EVENT.c.seq).limit(limit)
@@ -162,11 +148,11 @@ class Reader:
         Parameters
         ----------
         number
-            The last event that is known already.
+            The last known event.
         feeder
-            Only of this one.
+            Restrict to this feeder; None for all.
         limit
-            At most so many.
+            Largest number of events.
         """
         query = sa.select(EVENT).where(EVENT.c.seq > number).order_by(EVENT.c.seq).limit(limit)
         if feeder is not None:
@@ -175,14 +161,14 @@ class Reader:
             return [_event(row) for row in connection.execute(query).mappings()]
 
     def outbox_pending(self, limit: int = 1000, *, after: int = 0) -> list[Event]:
-        """Return the events that have not been published yet, oldest first.
+        """Return the unpublished events, oldest first.
 
         Parameters
         ----------
         limit
-            At most so many.
+            Largest number of events.
         after
-            Only those with a higher number.
+            Restrict to events with a higher number.
         """
         query = sa.select(EVENT).join(OUTBOX, OUTBOX.c.seq == EVENT.c.seq).where(OUTBOX.c.seq > after)
         query = query.order_by(EVENT.c.seq)
@@ -202,19 +188,17 @@ class Reader:
 
         Parameters
         ----------
-        feeder
-            Name.
         since, until
             Unix s.
         meter
-            Also this one's numbers; None at ticks at which the feeder had no such meter.
+            Include this meter's numbers; None at ticks without such a meter.
         limit
-            At most so many ticks.
+            Largest number of ticks.
 
         Returns
         -------
         list of dict
-            `t`, `verdict`, `cause`, and what `history.unpack` returns.
+            `t`, `verdict`, `cause`, and the result of `history.unpack`.
         """
         h = HISTORY.c
         query = (
@@ -236,12 +220,12 @@ class Reader:
         ]
 
     def rejected(self, limit: int = 100) -> list[Rejected]:
-        """Return the newest readings that could not be used, newest first.
+        """Return the newest rejected readings, newest first.
 
         Parameters
         ----------
         limit
-            At most so many.
+            Largest number of readings.
         """
         b = BAD.c
         query = sa.select(b.t, b.key, b.reason, b.payload).order_by(b.seq.desc()).limit(limit)
@@ -249,29 +233,17 @@ class Reader:
             return [Rejected(*row) for row in connection.execute(query)]
 
     def feeders(self) -> dict[str, dict[str, Any]]:
-        """Return the tables that `put_feeder` kept, by name."""
+        """Return the tables of the feeders added over REST, by name."""
         with self._read() as connection:
             rows = connection.execute(sa.select(FEEDER.c.name, FEEDER.c.tables).order_by(FEEDER.c.name))
             return {name: json.loads(tables) for name, tables in rows}
 
     def commission(self, feeder: str) -> Kept | None:
-        """Return what is kept of a feeder's commissioning, or None.
-
-        Parameters
-        ----------
-        feeder
-            Its name.
-        """
+        """Return the stored commissioning of a feeder, or None."""
         return self._kept(COMMISSION, feeder, Matter.COMMISSION)
 
     def distrust(self, feeder: str) -> Kept | None:
-        """Return what is kept of whom a feeder's monitor does not believe, or None.
-
-        Parameters
-        ----------
-        feeder
-            Its name.
-        """
+        """Return the stored suspicions of a feeder, or None."""
         return self._kept(DISTRUST, feeder, Matter.DISTRUST)
 
     def _kept(self, table: sa.Table, feeder: str, matter: Matter) -> Kept | None:
@@ -285,10 +257,8 @@ class Reader:
 
         Parameters
         ----------
-        feeder
-            Its name.
         limit
-            At most so many.
+            Largest number of entries.
         """
         c = COMMISSION_EVENT.c
         query = sa.select(COMMISSION_EVENT).where(c.feeder == feeder).order_by(c.seq.desc()).limit(limit)

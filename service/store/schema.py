@@ -14,7 +14,7 @@ from service.alarms.state_machine import Alarm, Change
 
 
 class Step(StrEnum):
-    """What happened to a commissioning."""
+    """Change of a commissioning."""
 
     BEGUN = "begun"
     LEARNED = "learned"
@@ -27,16 +27,14 @@ class Happened:
 
     Attributes
     ----------
-    feeder
-        Whose.
     t
         Unix time, s.
     change
-        What happened.
+        Kind of the entry.
     meters
-        To which meters.
+        Their ids.
     who, reason
-        Who wanted it, if somebody did, and why.
+        Operator or None, and reason.
     """
 
     feeder: str
@@ -48,26 +46,26 @@ class Happened:
 
 
 class StoreUnavailable(GridsecError):
-    """The database cannot be opened, read or written; the message says which one and why."""
+    """The database cannot be opened, read or written."""
 
     code = "database-unavailable"
 
 
 class OutcomeUnknown(StoreUnavailable):
-    """The connection broke while a transaction was committed: it is stored as a whole, or not at all."""
+    """The connection broke during the commit of a transaction: it is stored as a whole, or not at all."""
 
     code = "outcome-unknown"
 
 
 class WriterLost(StoreUnavailable):
-    """The lock of the one writer is lost: another process may have written, and this one must end."""
+    """The writer's lock is lost: another process may have written, and this one must end."""
 
     code = "writer-lost"
 
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """One stored transition. `seq` rises by the order of commits and is never used twice."""
+    """One stored transition. `seq` increases in the order of commits and is never reused."""
 
     seq: int
     t: float
@@ -79,7 +77,7 @@ class Event:
 
 @dataclass(frozen=True, slots=True)
 class Rejected:
-    """A reading that could not be used: arrival time (Unix s), key, why, and the start of its bytes."""
+    """A rejected reading: arrival time (Unix s), key, reason, and the beginning of its bytes."""
 
     t: float
     key: str
@@ -128,7 +126,7 @@ LAYOUT = sa.Table(
     META,
     sa.Column("id", SEQ, primary_key=True, autoincrement=True),
     sa.Column("meters", sa.Text, nullable=False),
-    # No index of PostgreSQL takes a text of more than 2704 bytes.
+    # PostgreSQL cannot index a text of more than 2704 bytes.
     sa.Column("digest", sa.String(64), nullable=False),
     sa.Index("history_layout_by_digest", "digest", unique=True),
 )
@@ -188,12 +186,12 @@ COMMISSION_EVENT = sa.Table(
 WRITER = sa.Table(
     "writer",
     META,
-    # Which opened store may write; the key of its last commit; its checks.
+    # The store that may write; the key of its last commit; its checks.
     sa.Column("owner", sa.String(32), nullable=False),
     sa.Column("commits", sa.BigInteger, nullable=False),
     sa.Column("checks", sa.BigInteger, nullable=False),
 )
-"""One row. A store whose `owner` has been replaced writes nothing more."""
+"""One row. A store with a replaced `owner` writes nothing more."""
 
 
 def _add_commissioning(connection: sa.Connection) -> None:
@@ -206,12 +204,12 @@ def _add_distrust(connection: sa.Connection) -> None:
 
 
 def digest(meters: str) -> str:
-    """Return what a layout is found by.
+    """Return the lookup key of a layout.
 
     Parameters
     ----------
     meters
-        Its text, of any length.
+        Text of the layout, of any length.
     """
     return hashlib.sha256(meters.encode()).hexdigest()
 
@@ -220,7 +218,8 @@ def _add_digest(connection: sa.Connection) -> None:
     add = "ALTER TABLE history_layout ADD COLUMN digest VARCHAR(64) NOT NULL DEFAULT ''"
     connection.exec_driver_sql(add)
     if connection.dialect.name == "postgresql":
-        # SQLite has no such limit, and drops no constraint without making anew what all history refers to.
+        # SQLite has no such limit; to drop a constraint there, the table that all history refers to would be
+        # rebuilt.
         connection.exec_driver_sql("ALTER TABLE history_layout DROP CONSTRAINT history_layout_meters_key")
     for number, meters in connection.execute(sa.select(LAYOUT.c.id, LAYOUT.c.meters)).all():
         connection.execute(LAYOUT.update().where(LAYOUT.c.id == number).values(digest=digest(meters)))
@@ -237,18 +236,18 @@ MIGRATIONS: tuple[Callable[[sa.Connection], None], ...] = (
     _add_digest,
     _add_writer,
 )
-"""Step k leads from schema version k + 1 to k + 2. A new database starts at the newest version."""
+"""Step k migrates schema version k + 1 to k + 2. A new database starts at the newest version."""
 
 
 def migrate(connection: sa.Connection, name: str) -> None:
-    """Make the tables, or bring those of an older version forward.
+    """Create the tables, or migrate those of an older version.
 
     Parameters
     ----------
     connection
-        A transaction of the writer.
+        Transaction of the writer.
     name
-        What the database is called in a message.
+        Name of the database in messages.
 
     Raises
     ------
@@ -263,7 +262,7 @@ def migrate(connection: sa.Connection, name: str) -> None:
     version = int(connection.execute(sa.select(VERSION.c.version)).scalar_one())
     if version > newest:
         raise StoreUnavailable(
-            f"{name} has schema version {version}; this program knows {newest} and is too old for it",
+            f"{name} has schema version {version}; this program supports versions up to {newest}",
             code="newer-schema",
         )
     for step in MIGRATIONS[version - 1 :]:

@@ -1,8 +1,6 @@
-"""What is kept of a feeder: typed, versioned JSON texts, and whether they still fit.
+"""Versioned JSON encoding of a feeder's persistent monitor state: commissioning and suspicions.
 
-Its commissioning, and whom its monitor does not believe.
-
-Numbers are written with as many digits as give the same float64 back, NaN as null.
+Numbers are written with enough digits to restore the same float64, NaN as null.
 """
 
 from __future__ import annotations
@@ -27,40 +25,38 @@ from gridsec.estimators.sequential import Distrust
 from service.report.voltages import Phase, busbar_phases
 
 FORMAT: Final = 1
-"""Version of the text; it changes when its fields do."""
+"""Version of the text; it increases with a change of its fields."""
 _Finite = Annotated[float, msgspec.Meta(gt=-1e300, lt=1e300)]
 _Time: TypeAlias = Annotated[float, msgspec.Meta(gt=0.0, lt=1e300)]
-# Of the feeder's file, what says how it is watched and shown, not what it is.
+# Entries of the feeder's file that concern monitoring and display, not the network.
 _BESIDE = ("title", "accept", "busbar_xy", "limits", "monitor")
 
 
 class Matter(StrEnum):
-    """What a text is about."""
+    """Subject of a text."""
 
     COMMISSION = "commission"
     DISTRUST = "distrust"
 
 
 class KeptInvalid(GridsecError):
-    """A stored text of monitor state cannot be used; the message says why."""
+    """A stored text of monitor state cannot be used."""
 
     code = "state-unusable"
 
 
 @dataclass(frozen=True, slots=True)
 class Kept:
-    """A text of the store, as it is.
+    """An encoded text of the store.
 
     Attributes
     ----------
-    feeder
-        Whose.
     t
-        Unix time of the tick that it belongs to, s.
+        Unix time of its tick, s.
     text
-        What `encode` or `encode_distrust` wrote.
+        Result of `encode` or `encode_distrust`.
     matter
-        Which of them.
+        Subject of the text.
     """
 
     feeder: str
@@ -70,16 +66,16 @@ class Kept:
 
 
 class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What the text of a commissioning holds.
+    """Contents of the text of a commissioning.
 
     Attributes
     ----------
     format
-        Its version.
+        Version of the text.
     feeder, t
         As in `Kept`.
     fingerprint
-        What the feeder was, see `fingerprint`.
+        Result of `fingerprint` at that time.
     meters
         Ids, in the order of the arrays.
     arrays
@@ -95,14 +91,9 @@ class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def fingerprint(site: Site) -> dict[str, str]:
-    """Return what learned errors depend on, as digests by the name of what they are of.
+    """Return digests of everything that learned errors depend on, by name.
 
     Titles, limits, delays of alarms and the like may change without a new commissioning.
-
-    Parameters
-    ----------
-    site
-        The feeder.
     """
     tables = to_json(site.tables)
     meta, monitor = tables["feeder"], site.tables.meta.monitor
@@ -118,7 +109,7 @@ def fingerprint(site: Site) -> dict[str, str]:
 
 
 def encode(site: Site, now: Mapping[str, str], t: float, arrays: Mapping[str, Floats]) -> Kept:
-    """Write a text.
+    """Encode a commissioning.
 
     Parameters
     ----------
@@ -127,7 +118,7 @@ def encode(site: Site, now: Mapping[str, str], t: float, arrays: Mapping[str, Fl
     t
         Unix time of the tick, s.
     arrays : of (p,)
-        What is to be kept, by name.
+        One array per name.
     """
     name = site.feeder.name
     numbers = {key: [None if math.isnan(x) else x for x in value.tolist()] for key, value in arrays.items()}
@@ -136,7 +127,7 @@ def encode(site: Site, now: Mapping[str, str], t: float, arrays: Mapping[str, Fl
 
 
 def decode(site: Site, now: Mapping[str, str], kept: Kept) -> dict[str, Floats]:
-    """Read a text for the feeder as it is now.
+    """Decode a commissioning for the present feeder.
 
     Parameters
     ----------
@@ -146,7 +137,7 @@ def decode(site: Site, now: Mapping[str, str], kept: Kept) -> dict[str, Floats]:
     Returns
     -------
     dict of (p,) arrays
-        What `encode` was given.
+        The arrays of `encode`.
 
     Raises
     ------
@@ -159,7 +150,7 @@ def decode(site: Site, now: Mapping[str, str], kept: Kept) -> dict[str, Floats]:
         raise KeptInvalid(f"the feeder has changed since ({', '.join(changed)})", code="feeder-changed")
     lengths = {len(value) for value in record.arrays.values()}
     if record.meters != list(site.meter_ids) or lengths - {len(record.meters)}:
-        raise KeptInvalid("it is damaged: its numbers do not belong to its meters", code="other-meters")
+        raise KeptInvalid("it is damaged: its arrays do not fit its meters", code="other-meters")
     return {
         name: np.array([math.nan if x is None else x for x in value], dtype=np.float64)
         for name, value in record.arrays.items()
@@ -167,18 +158,16 @@ def decode(site: Site, now: Mapping[str, str], kept: Kept) -> dict[str, Floats]:
 
 
 class Suspect(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A meter that is not believed.
+    """A distrusted meter.
 
     Attributes
     ----------
-    meter
-        Its id.
     scale_s
-        Time scale on which it was caught, s.
+        Time scale of its detection, s.
     named
-        Whether it was named as manipulated.
+        True if it was named as manipulated.
     repeats_s
-        Time after which it repeated its readings, s; None if it did not. Older texts lack it.
+        Lag of a replay of its readings, s; None without one. Older texts lack it.
     """
 
     meter: str
@@ -192,10 +181,8 @@ class Deviant(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes
     ----------
-    customer
-        Whose.
     number
-        Which of them, in the order of the feeder's file.
+        Index among the inverters of this customer, in the order of the feeder's file.
     """
 
     customer: str
@@ -203,16 +190,16 @@ class Deviant(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class OffPhase(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A phase in which the busbar's meter is not believed.
+    """A phase with a distrusted busbar meter.
 
     Attributes
     ----------
     phase
-        Which; None on a balanced feeder.
+        Name of the phase; None on a balanced feeder.
     scale_s, named
         As in `Suspect`.
     off
-        What it reads too much, squared pu.
+        Excess of its reading, squared pu.
     """
 
     phase: Phase | None
@@ -222,18 +209,18 @@ class OffPhase(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class DistrustRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What the text about who is not believed holds.
+    """Contents of the text of suspicions.
 
     Attributes
     ----------
     format
-        Its version.
+        Version of the text.
     feeder, t
         As in `Kept`.
     meters, inverters
-        Who; nobody else.
+        Distrusted devices.
     busbar
-        Where the busbar's meter is not; texts from before it was judged lack it.
+        Phases with a distrusted busbar meter; absent in texts of versions that did not test it.
     """
 
     format: int
@@ -245,16 +232,12 @@ class DistrustRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def encode_distrust(site: Site, t: float, distrust: Distrust) -> Kept:
-    """Write who is not believed.
+    """Encode suspicions.
 
     Parameters
     ----------
-    site
-        The feeder.
     t
         Unix time of the tick, s.
-    distrust
-        Who.
     """
     name, owners = site.feeder.name, _owners(site)
     columns = (distrust.scale_s, distrust.named, distrust.repeats_s)
@@ -278,7 +261,7 @@ def encode_distrust(site: Site, t: float, distrust: Distrust) -> Kept:
 
 
 def decode_distrust(site: Site, kept: Kept) -> Distrust:
-    """Read who is not believed of the meters, inverters and phases that the feeder has now.
+    """Decode suspicions for the meters, inverters and phases of the present feeder.
 
     Parameters
     ----------
@@ -293,12 +276,12 @@ def decode_distrust(site: Site, kept: Kept) -> Distrust:
     record, owners = _read(site, kept, DistrustRecord), _owners(site)
     who = {suspect.meter: suspect for suspect in record.meters}
     if len(who) < len(record.meters):
-        raise KeptInvalid("it is damaged: a meter is in it twice", code="duplicate")
+        raise KeptInvalid("it is damaged: a meter occurs twice", code="duplicate")
     deviants = {(deviant.customer, deviant.number) for deviant in record.inverters}
     found = [who.get(meter) for meter in site.meter_ids]
     off = {phase.phase: phase for phase in record.busbar}
     if len(off) < len(record.busbar):
-        raise KeptInvalid("it is damaged: a phase is in it twice", code="duplicate")
+        raise KeptInvalid("it is damaged: a phase occurs twice", code="duplicate")
     phases = [off.get(phase) for phase in busbar_phases(site)]
     return Distrust(
         np.array([math.nan if one is None else one.scale_s for one in found], dtype=np.float64),
@@ -312,7 +295,7 @@ def decode_distrust(site: Site, kept: Kept) -> Distrust:
 
 
 def _owners(site: Site) -> list[tuple[str, int]]:
-    """Customer of every inverter, and which of that customer's it is."""
+    """Customer of every inverter, and its index among the inverters of that customer."""
     count: Counter[str] = Counter()
     owners = []
     for name in (site.feeder.customers[k] for k in site.droop.customer):
@@ -322,7 +305,7 @@ def _owners(site: Site) -> list[tuple[str, int]]:
 
 
 class _Version(msgspec.Struct, frozen=True):
-    """What every version of the text has."""
+    """Common part of all versions of the text."""
 
     format: Annotated[int, msgspec.Meta(ge=1)]
 
@@ -331,17 +314,17 @@ _Text = TypeVar("_Text", Record, DistrustRecord)
 
 
 def _read(site: Site, kept: Kept, kind: type[_Text]) -> _Text:
-    """What a text of this feeder holds."""
+    """Return the contents of a text of this feeder."""
     try:
         version = msgspec.json.decode(kept.text, type=_Version).format
         if version > FORMAT:
-            text = f"it is of format {version}, and this program knows {FORMAT}"
+            text = f"its format is {version}; this program supports formats up to {FORMAT}"
             raise KeptInvalid(text, code="newer-format")
         record = msgspec.json.decode(kept.text, type=kind)
     except msgspec.DecodeError as error:
         raise KeptInvalid(f"it is damaged: {error}", code="damaged") from error
     if record.feeder != site.feeder.name:
-        raise KeptInvalid(f"it is of feeder {record.feeder!r}", code="other-feeder")
+        raise KeptInvalid(f"it belongs to feeder {record.feeder!r}", code="other-feeder")
     return record
 
 

@@ -1,10 +1,10 @@
-"""What waits for the database, within stated bounds: nothing goes without being counted. Pure bookkeeping.
+"""Queue of data that wait for the database, within stated bounds; dropped data are counted. Pure.
 
-Reports, bad readings and what happened to commissionings are records: of too many, the oldest go.
-Transitions are state: of too many, each alarm keeps its newest one, which says all that is true of it; if
-that is not enough, those alarms go that came and went while the database knew nothing of them. What stands,
-what the database believes to stand and what an operator has answered is kept in any case, and there is only
-so much of it: at most a few alarms for each meter.
+Reports, bad readings and changes of commissionings are records: a full queue drops the oldest. Transitions
+are state: beyond the limit, each alarm keeps its newest one, which contains its whole state. If that does not
+suffice, alarms are dropped that were raised and cleared without the database. Active alarms, alarms that are
+active in the database and acknowledgements are kept in any case; their number is bounded by a few alarms for
+each meter.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from service.store.schema import Happened
 from service.store.state_codec import Kept, Matter
 
 TRANSITIONS_KEPT = 10_000
-"""So many transitions wait before they are thinned out."""
+"""Number of waiting transitions beyond which they are thinned out."""
 RECORDS_KEPT = 3600
-"""So many reports, and as many bad readings and so on, wait; then the oldest go."""
+"""Largest number of waiting records of each kind; a full queue drops the oldest."""
 
 T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """What goes into one transaction."""
+    """Contents of one transaction."""
 
     transitions: tuple[Transition, ...] = ()
     reports: tuple[FeederReport, ...] = ()
@@ -39,22 +39,22 @@ class Batch:
     happened: tuple[Happened, ...] = ()
 
     def __bool__(self) -> bool:
-        """Whether there is anything in it."""
+        """True if it has any contents."""
         return any((self.transitions, self.reports, self.rejected, self.kept, self.happened))
 
 
 class Waiting:
-    """What waits for the database. One thread at a time.
+    """Queue of data that wait for the database. Used by one thread at a time.
 
     Parameters
     ----------
     forgotten
-        Called with what had to be given up (a label) and how many of it.
+        Called with the kind (a label) and the number of dropped data.
 
     Attributes
     ----------
     given_up
-        Transitions given up since the database last took some.
+        Transitions dropped since the last successful write.
     """
 
     def __init__(self, forgotten: Callable[[str, int], None]) -> None:
@@ -65,14 +65,14 @@ class Waiting:
         self._rejected: deque[Rejected] = deque()
         self._kept: dict[tuple[str, Matter], Kept] = {}
         self._happened: deque[Happened] = deque()
-        # Alarms of which the database knows nothing; those of a batch on its way may be known any moment.
+        # Alarms that are not in the database; those of the batch in progress may be stored at any moment.
         self._unheard: set[str] = set()
         self._on_the_way: set[str] = set()
         self._taken = 0
         self._thin_at = TRANSITIONS_KEPT
 
     def __len__(self) -> int:
-        """Return how many transitions wait, those on their way included."""
+        """Number of waiting transitions, including those of the batch in progress."""
         return len(self._transitions) + self._taken
 
     def add(
@@ -84,7 +84,7 @@ class Waiting:
         kept: Iterable[Kept] = (),
         happened: Iterable[Happened] = (),
     ) -> None:
-        """Let something wait.
+        """Add data.
 
         Parameters
         ----------
@@ -102,7 +102,7 @@ class Waiting:
         self._bound()
 
     def take(self) -> Batch:
-        """Take everything out; `stored` or `give_back` must follow."""
+        """Remove and return all data; `stored` or `give_back` must follow."""
         batch = Batch(
             tuple(self._transitions),
             tuple(self._reports),
@@ -120,18 +120,18 @@ class Waiting:
         return batch
 
     def stored(self) -> None:
-        """Note that what `take` returned is on the disk."""
+        """Confirm that the batch of `take` is stored."""
         self._on_the_way = set()
         self._taken = 0
         self.given_up, self._thin_at = 0, TRANSITIONS_KEPT
 
     def give_back(self, batch: Batch) -> None:
-        """Put a batch that was not stored before everything that has come since.
+        """Put a batch that was not stored before all later data.
 
         Parameters
         ----------
         batch
-            What `take` returned.
+            Result of `take`.
         """
         self._unheard |= self._on_the_way
         self._on_the_way = set()
@@ -139,29 +139,17 @@ class Waiting:
         self._transitions[:0] = batch.transitions
         self._reports.extendleft(reversed(batch.reports))
         self._rejected.extendleft(reversed(batch.rejected))
-        # Of each feeder and matter only the newest is of use.
+        # Only the newest text of each feeder and subject is needed.
         self._kept = {(item.feeder, item.matter): item for item in batch.kept} | self._kept
         self._happened.extendleft(reversed(batch.happened))
         self._bound()
 
     def carry(self, answered: Alarm) -> None:
-        """Carry a stored acknowledgement over into the transitions that were gathered while it was stored.
-
-        Parameters
-        ----------
-        answered
-            The acknowledged alarm.
-        """
+        """Copy a stored acknowledgement to the transitions collected since the start of its write."""
         self._transitions = [replace(item, alarm=carried(item.alarm, answered)) for item in self._transitions]
 
     def forget(self, feeder: str) -> None:
-        """Drop everything of a feeder: its removal, which is stored, is its last change.
-
-        Parameters
-        ----------
-        feeder
-            Its name.
-        """
+        """Drop all data of a feeder: its stored removal is its last change."""
         self._transitions = [item for item in self._transitions if item.alarm.feeder != feeder]
         self._reports = deque(item for item in self._reports if item.feeder != feeder)
         self._kept = {key: item for key, item in self._kept.items() if item.feeder != feeder}

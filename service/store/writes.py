@@ -1,4 +1,4 @@
-"""Everything that the store keeps, each matter in one transaction."""
+"""Write access to the store, one transaction per commit."""
 
 from __future__ import annotations
 
@@ -41,11 +41,12 @@ BAD_READINGS_KEPT = 1000
 _PAYLOAD_KEPT = 256
 _PRUNE_EVERY = 500
 _PRUNED_AT_ONCE = 5000
-"""Rows of the history that one transaction forgets at most: ten times those that come until the next."""
+"""Largest number of history rows that one transaction deletes: ten times those added until the next pruning.
+"""
 ALONE_S = 5.0
-"""Wait of a write for the one before it, s."""
+"""Wait of a write for the previous one, s."""
 _STEADY_S = 86_400.0
-"""Nothing is forgotten before a feeder has reported for so long."""
+"""Time for which a feeder must have reported before anything is deleted, s."""
 _log = structlog.get_logger("gridsec.store")
 _KEPT = {Matter.COMMISSION: COMMISSION, Matter.DISTRUST: DISTRUST}
 
@@ -58,7 +59,7 @@ class Store(Reader):
     url
         `sqlite:///file`, `sqlite:////absolute/file` or `postgresql+psycopg://user@host/name`.
     history
-        How much of the past is kept.
+        Grid and duration of the history.
 
     Raises
     ------
@@ -89,7 +90,7 @@ class Store(Reader):
             ).start()
 
     def __enter__(self) -> Store:
-        """Return itself."""
+        """Return the store."""
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -97,7 +98,7 @@ class Store(Reader):
         self.close()
 
     def close(self) -> None:
-        """Let go of the database. Closing twice is fine."""
+        """Close the database; idempotent."""
         self._closed.set()
         alone = self._lock.acquire(timeout=ALONE_S)
         try:
@@ -108,11 +109,11 @@ class Store(Reader):
 
     @property
     def lost(self) -> WriterLost | None:
-        """Reason for which this store writes nothing more, or None; without a call to the database."""
+        """Reason why this store writes nothing more, or None; without a call to the database."""
         return self._connections.lost
 
     def _beat(self, every_s: float) -> None:
-        """Keep the writer's session. A call that is under way keeps it, too."""
+        """Keep the writer's session. A write in progress keeps it, too."""
         while not self._closed.wait(every_s):
             if self._lock.acquire(blocking=False):
                 try:
@@ -125,15 +126,15 @@ class Store(Reader):
 
     @property
     def last_event(self) -> int:
-        """Number of the newest event; costs nothing."""
+        """Number of the newest event; without a call to the database."""
         return self._last_event
 
     @contextmanager
     def _alone(self) -> Iterator[None]:
-        """Wait for the write before, within a time limit."""
+        """Wait for the previous write, within a time limit."""
         if not self._lock.acquire(timeout=ALONE_S):
             raise StoreUnavailable(
-                f"cannot write {self.name}: the write before has not ended within {ALONE_S:g} s",
+                f"cannot write {self.name}: the previous write has not ended within {ALONE_S:g} s",
                 code="write-under-way",
             )
         try:
@@ -158,27 +159,26 @@ class Store(Reader):
         put: tuple[str, Mapping[str, Any]] | None = None,
         key: int | None = None,
     ) -> tuple[int, ...]:
-        """Store what a tick brought, in one transaction; it is on the disk when this returns.
+        """Store the results of a tick in one transaction; durable when this returns.
 
         Parameters
         ----------
         transitions
-            Alarms that changed: state, event and outbox entry of each.
+            Changed alarms: state, event and outbox entry of each.
         reports
-            Reports of the feeders; those worth keeping go into the history.
+            Reports of the feeders; the history selects from them.
         rejected
-            Readings that could not be used; the newest `BAD_READINGS_KEPT` are kept. Those that the database
-            cannot represent are dropped, with a line in the log.
+            Rejected readings; the newest `BAD_READINGS_KEPT` are kept. Readings that the database cannot
+            represent are dropped and logged.
         kept, happened
-            What goes on of the feeders' commissioning and of who is not believed, and what happened to the
-            former.
+            State of the feeders' commissioning and suspicions, and changes of the former.
         without
-            Forget the tables of this feeder, and what was learned and believed of its meters.
+            Delete the tables of this feeder, its commissioning and its suspicions.
         put
-            A feeder and the JSON of the columns of its files, in place of those it had.
+            A feeder and the columns of its files as JSON, which replace the stored ones.
         key
-            A positive number of this commit, different from that of the commit before. After
-            `OutcomeUnknown` the same call with the same key stores it, or tells that it is stored.
+            Positive number of this commit, different from that of the previous commit. After `OutcomeUnknown`
+            the same call with the same key stores it, or finds it stored.
 
         Returns
         -------
@@ -222,20 +222,14 @@ class Store(Reader):
             return numbers
 
     def outbox_done(self, numbers: Iterable[int]) -> None:
-        """Forget outbox entries that have been published.
-
-        Parameters
-        ----------
-        numbers
-            Their event numbers.
-        """
+        """Delete the outbox entries of published events."""
         rows = [{"number": number} for number in numbers]
         if rows:
             with self._write() as connection:
                 connection.execute(OUTBOX.delete().where(OUTBOX.c.seq == sa.bindparam("number")), rows)
 
     def check(self) -> None:
-        """Write something and see.
+        """Test a write.
 
         Raises
         ------
@@ -246,7 +240,7 @@ class Store(Reader):
             connection.execute(WRITER.update().values(checks=WRITER.c.checks + 1))
 
     def writable(self) -> bool:
-        """Whether the database can be written now; `check` says why not."""
+        """True if the database can be written now; `check` raises the reason otherwise."""
         try:
             self.check()
         except StoreUnavailable:
@@ -294,7 +288,7 @@ class Store(Reader):
         connection.execute(statement.on_conflict_do_update(index_elements=["feeder"], set_=row))
 
     def _worth(self, marks: dict[str, Mark], report: FeederReport) -> bool:
-        """Say whether a report gets a row, and if so, let the following ones be compared with it."""
+        """True if a report gets a row; later ones are then compared with it."""
         now = mark(report)
         worth = worth_keeping(marks.get(report.feeder), now, self._history_rules)
         if worth:
@@ -315,21 +309,21 @@ class Store(Reader):
         self._prune(connection, report)
 
     def _prune(self, connection: sa.Connection, report: FeederReport) -> None:
-        """Forget what is too old, with the first row after a start and then every so many."""
+        """Delete old history, with the first row after a start and then every `_PRUNE_EVERY` rows."""
         before = self._since_prune.get(report.feeder)
         count = 0 if before is None or before + 1 >= _PRUNE_EVERY else before + 1
         self._since_prune[report.feeder] = count
         h, keep = HISTORY.c, self._history_rules.keep_s
-        # A clock that leaps must not cost the history: it has to have gone on steadily for a while.
+        # A leaping clock must not cost the history: the feeder must have reported steadily for a while.
         steady = min(_STEADY_S, 0.5 * keep)
         lately = h.t.between(report.t - 2.0 * steady, report.t - steady)
         if count or not connection.scalar(sa.select(sa.exists().where(h.feeder == report.feeder, lately))):
             return
         whose = h.feeder == report.feeder
         if before is not None:
-            # Of whom nothing has come since the start is watched no more; his time goes on with ours.
+            # Feeders without reports since start-up are pruned by this feeder's clock.
             whose |= h.feeder.not_in([*self._marks, report.feeder])
-        # At most so much as fits well within the time limit of a call.
+        # The number of rows fits the time limit of a call.
         oldest = sa.select(h.feeder, h.t).where(whose, h.t < report.t - keep).limit(_PRUNED_AT_ONCE)
         connection.execute(HISTORY.delete().where(sa.tuple_(h.feeder, h.t).in_(oldest)))
 
@@ -343,7 +337,7 @@ class Store(Reader):
 
 
 def _stored_before(connection: sa.Connection, key: int) -> bool:
-    """True if the last commit had this key; the transaction has it from here on."""
+    """True if the last commit had this key; the transaction sets it."""
     changed = connection.execute(WRITER.update().values(commits=key).where(WRITER.c.commits != key))
     return changed.rowcount == 0
 
@@ -366,7 +360,7 @@ def _happened(item: Happened) -> dict[str, Any]:
 
 
 def _put_rejected(connection: sa.Connection, rejected: Iterable[Rejected]) -> None:
-    """Keep bad readings; what their senders put into them must not cost the alarms of this transaction."""
+    """Store rejected readings; their contents must not cost the alarms of this transaction."""
     rows = [
         {"t": item.t, "key": item.key, "reason": item.reason, "payload": item.payload[:_PAYLOAD_KEPT]}
         for item in tuple(rejected)[-BAD_READINGS_KEPT:]

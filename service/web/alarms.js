@@ -1,4 +1,4 @@
-// The alarm list: loaded once, then kept right by the event stream; answers go back with a name.
+// Alarm list: loaded once, then updated by the event stream; acknowledgements are sent with a name.
 
 import { byId, clock, duration, el, getJson, isKnown, settle, signed, volt } from "./dom.js";
 
@@ -12,12 +12,12 @@ const KIND = {
   "learning-stalled": "Learning stalled",
   "clock-offset": "Clock offset",
 };
-const LISTED = 5; // Meters of one alarm that its text names.
+const LISTED = 5; // Largest number of meters in the text of an alarm.
 const PAGE = 50;
 const EVERY_MS = 5000;
 const SOON_MS = 200;
 
-// Meters of stalled learning when the alarm was raised.
+// Meters with stalled learning when the alarm was raised.
 function stalled({ learning = [] }) {
   if (!learning.length) return "";
   const more = learning.length > LISTED ? ` and ${learning.length - LISTED} more` : "";
@@ -34,8 +34,8 @@ export class Alarms {
     this.alarms = new Map();
     this.items = new Map();
     this.loading = 0;
-    this.heard = new Map(); // Newest event of each alarm that a list on its way may not know yet.
-    this.raised = 0; // So many nobody has answered, loaded or not.
+    this.heard = new Map(); // Newest event of each alarm during a request: the list may be older.
+    this.raised = 0; // Number of active alarms without an acknowledgement, loaded or not.
     this.soon = null;
     this.turn = 0;
     this.onPick = onPick;
@@ -43,7 +43,7 @@ export class Alarms {
     this.feeder = null;
     this.source = null;
     this.retry = null;
-    this.problem = null; // Why alarms may stand that are not listed: the database does not take them.
+    this.problem = null; // Problem of the database: active alarms may be missing in the list.
     setInterval(() => this.check(), EVERY_MS);
     for (const id of ["alarm-state", "alarm-kind"]) byId(id).addEventListener("change", () => this.reload());
     byId("alarm-scope").addEventListener("change", () => this.reload());
@@ -66,7 +66,7 @@ export class Alarms {
 
   async connect() {
     this.retry = null;
-    this.heard.clear(); // The new stream begins where the list ends.
+    this.heard.clear(); // The new stream starts at the end of the list.
     try {
       const after = await this.load();
       this.source?.close();
@@ -116,7 +116,7 @@ export class Alarms {
     this.loading += 1;
     try {
       const page = await getJson(`${API}?${query}`);
-      if (turn === this.turn) this.list(page, more); // Or else a newer choice has overtaken this answer.
+      if (turn === this.turn) this.list(page, more); // Otherwise the response belongs to an earlier choice.
       return page.last_event;
     } finally {
       this.loading -= 1;
@@ -129,13 +129,13 @@ export class Alarms {
     if (!more) this.alarms.clear();
     this.tell(page);
     for (const alarm of page.alarms) this.alarms.set(alarm.id, alarm);
-    // The stream may have been faster than this answer, and tells nothing twice.
+    // Events that arrived before this response and are newer; the stream sends each once.
     for (const { seq, alarm } of this.heard.values()) if (seq > page.last_event) this.put(alarm);
     this.next = page.next;
     this.render();
   }
 
-  // What no event says.
+  // Values that are not part of any event.
   async check() {
     if (!this.source) return;
     try {
@@ -162,7 +162,7 @@ export class Alarms {
     this.soon ??= setTimeout(() => { this.soon = null; this.check(); }, SOON_MS);
   }
 
-  // What the filters do not show is not kept: the service has it.
+  // Alarms outside of the filters are not kept: the service has them.
   put(alarm) {
     if (this.fits(alarm)) this.alarms.set(alarm.id, alarm);
     else this.alarms.delete(alarm.id);
@@ -184,7 +184,7 @@ export class Alarms {
     byId("alarm-none").hidden = list.length > 0 || !byId("alarm-error").hidden || this.problem !== null;
     byId("alarm-more").hidden = !this.next;
     const focused = document.activeElement?.closest?.("[data-alarm]")?.dataset.alarm;
-    // What has not changed stays where it is: nobody's click may fall between two copies of a button.
+    // Unchanged items keep their nodes: a click must not fall between two copies of a button.
     const before = this.items;
     this.items = new Map(list.map((alarm) => {
       const said = JSON.stringify(alarm);
@@ -213,7 +213,7 @@ export class Alarms {
         el("p", { class: "name" },
           el("b", { text: KIND[alarm.kind] ?? alarm.kind }),
           el("span", { class: "severity", text: alarm.severity }),
-          alarm.count > 1 ? el("span", { class: "times", title: "raised so many times", text: `× ${alarm.count}` }) : null),
+          alarm.count > 1 ? el("span", { class: "times", title: "number of occurrences", text: `× ${alarm.count}` }) : null),
         el("p", {}, el("a", { href: `#${encodeURIComponent(alarm.feeder)}`, class: "where", text: where, on: { click: (event) => {
           event.preventDefault();
           this.onPick(alarm.feeder, alarm.meter, alarm.customer);
@@ -237,17 +237,17 @@ export class Alarms {
 
   async answer(event) {
     event.preventDefault();
-    const who = byId("ack-who").value.trim();
-    if (!who) {
+    const given = { who: byId("ack-who").value.trim(), comment: byId("ack-comment").value, count: this.asking.count };
+    if (!given.who) {
       this.complain("Please enter your name.");
       return;
     }
-    localStorage.setItem("gridsec.who", who);
+    localStorage.setItem("gridsec.who", given.who);
     try {
       const response = await fetch(`${API}/${encodeURIComponent(this.asking.id)}/ack`, {
         method: "POST",
         headers: { "Content-Type": "application/json" },
-        body: JSON.stringify({ who, comment: byId("ack-comment").value, count: this.asking.count }),
+        body: JSON.stringify(given),
       });
       const body = await response.json();
       if (!response.ok) throw new Error(body.detail);

@@ -1,4 +1,4 @@
-// Wires the page: which feeder is shown, its live states, and whether what is shown can still be believed.
+// Assembly of the page: selection of the feeder, its live states, and the freshness of the data.
 
 import { Alarms } from "./alarms.js";
 import { Commissioning } from "./commissioning.js";
@@ -43,7 +43,7 @@ async function start() {
   byId("feeder").replaceChildren(...feeders.map((f) => el("option", { value: f.name, text: f.title || f.name })));
   byId("feeder").disabled = feeders.length < 2;
   if (!feeders.length) {
-    byId("reason").textContent = "The service watches no feeder yet.";
+    byId("reason").textContent = "The service monitors no feeder yet.";
     setTimeout(start, 5000);
     return;
   }
@@ -57,7 +57,7 @@ async function show(name) {
   page.turn += 1;
   const { turn } = page;
   const found = await getJson(`${API}/${encodeURIComponent(name)}`).catch((error) => error);
-  if (turn !== page.turn) return; // Another choice has overtaken this answer.
+  if (turn !== page.turn) return; // The response belongs to an earlier choice.
   if (found instanceof Error) {
     if (found.answered) refused(name, found.message);
     else page.linked = false;
@@ -81,7 +81,7 @@ async function show(name) {
   listen(name);
 }
 
-// The service answers, and says why it does not watch this feeder.
+// The service responds with the reason why this feeder is not monitored.
 function refused(name, why) {
   Object.assign(page, { feeder: null, report: null, heard: null, past: new Map(), refused: why, linked: true });
   byId("feeder").value = name;
@@ -109,10 +109,10 @@ function listen(name) {
 function take(report) {
   if (report.feeder !== page.feeder?.name) return;
   if (report.revision !== page.feeder.revision) {
-    show(report.feeder); // Its meters may belong to others than those that are drawn.
+    show(report.feeder); // The drawn meters may belong to other customers now.
     return;
   }
-  // By the service's clock; a state that comes again does not grow younger on the way.
+  // By the service's clock; a repeated state keeps its age.
   const made = performance.now() - 1000 * report.age_s;
   const again = page.report?.t === report.t;
   page.heard = again ? Math.min(page.heard, made) : made;
@@ -175,16 +175,16 @@ function verdict() {
   const range = real.length ? `${low} – ${high} ${several ? "pu" : "V"}` : "–";
   const fact = (name, value) => el("div", {}, el("dt", { text: name }), el("dd", { text: value }));
   byId("facts").replaceChildren(
-    fact("Meters heard", `${report.meters.filter((m) => m.seen).length} of ${report.meters.length}`),
+    fact("Meters available", `${report.meters.filter((m) => m.seen).length} of ${report.meters.length}`),
     fact("Suspects", String(suspects.length + liar.length + inverters.length)),
-    fact("Tells apart up to", `${report.max_attacked} manipulated`),
-    fact("Real voltages", range),
+    fact("Identifies up to", `${report.max_attacked} manipulated`),
+    fact("Reconstructed voltages", range),
     fact("Tick", clock(report.t)));
 }
 
-// ------------------------------------------------- can it still be believed?
+// ------------------------------------------------------------- the freshness
 
-// Since when no value rests on a reading.
+// Time since which no value uses a reading.
 function unmeasured(report) {
   return isKnown(report.t_measured) ? `no data since ${clock(report.t_measured)}` : "no data yet";
 }
@@ -198,7 +198,7 @@ function fresh() {
   const words = {
     live: "live",
     connecting: "waiting for data …",
-    refused: "not watched",
+    refused: "not monitored",
     alarms: "connection lost for alarms",
     lost: age === null ? "connection lost" : `connection lost, data ${duration(age)} old`,
     stale: `data stale, ${duration(age ?? 0)} old`,
@@ -206,30 +206,30 @@ function fresh() {
   };
   byId("link").dataset.state = shown;
   byId("link").lastElementChild.textContent = words[shown];
-  // One feeder that nobody watches makes no old alarms of the others'.
+  // A feeder that is not monitored does not make the alarms of others stale.
   byId("main").dataset.alarms = page.alarmsLinked && state !== "lost" && state !== "stale" ? "yes" : "no";
   const believable = state === "live";
   byId("main").dataset.fresh = believable ? "yes" : "no";
   if (state === "nodata") {
-    // The model goes on without readings; its voltages must not look like measured ones.
+    // The model continues without readings; its voltages must not look like measured ones.
     byId("decision").textContent = "NO DATA";
     byId("verdict").dataset.verdict = "none";
     byId("sign").setAttribute("d", SIGNS.none);
-    byId("reason").textContent = `${words.nodata.replace("n", "N")}. Voltages shown are those of the model alone. ${page.report.reason}`;
+    byId("reason").textContent = `${words.nodata.replace("n", "N")}. The voltages are those of the model alone. ${page.report.reason}`;
     document.title = `NO DATA – ${page.feeder.title || page.feeder.name} – gridsec`;
   } else if (!believable && !waiting) {
-    // An old answer must not look like an answer.
+    // An old verdict must not look like a verdict.
     byId("decision").textContent = "NO LIVE DATA";
     byId("verdict").dataset.verdict = "none";
     byId("sign").setAttribute("d", SIGNS.none);
-    byId("reason").textContent = `Nothing new for ${duration(age)}. Last verdict, at ${clock(page.report.t)}: ${page.report.verdict}.`;
+    byId("reason").textContent = `No data for ${duration(age)}. Last verdict, at ${clock(page.report.t)}: ${page.report.verdict}.`;
     document.title = `NO LIVE DATA – ${page.feeder.title || page.feeder.name} – gridsec`;
   } else if (!waiting && byId("decision").textContent.startsWith("NO ")) {
     verdict();
   }
 }
 
-// ---------------------------------------------------------------- one of them
+// ------------------------------------------------------------- one customer
 
 function select(id) {
   page.selected = id;
@@ -248,7 +248,7 @@ async function recall(feeder, meter) {
   if (room <= 0 || until <= since) return;
   const query = new URLSearchParams({ meter, since, until, limit: room });
   const found = await getJson(`${API}/${encodeURIComponent(feeder)}/history?${query}`).catch(() => ({ points: [] }));
-  if (page.past !== past) return; // Another feeder by now.
+  if (page.past !== past) return; // Another feeder is shown now.
   const old = found.points.filter((p) => p.meter).map((p) => point(p.t, p.meter));
   const later = (past.get(meter) ?? []).filter((p) => p.t >= until);
   past.set(meter, [...old, ...later].slice(-KEPT));
@@ -270,7 +270,7 @@ function detail() {
   showDetail(page.feeder, customer, { ...now, own, report: page.report }, page.past.get(customer.meter) ?? []);
 }
 
-// ------------------------------------------------------------- all of them
+// ------------------------------------------------------------- all meters
 
 function table() {
   if (!byId("meters-box").open || !page.report) return;

@@ -1,4 +1,4 @@
-// What is known of the meters' own errors: a line for the feeder, numbers for a meter, and meters that were replaced.
+// Commissioning: a line for the feeder, numbers for a meter, and the dialogue for a replaced meter.
 
 import { byId, getJson, isKnown, signed } from "./dom.js";
 
@@ -6,10 +6,10 @@ const API = "/api/v1/feeders";
 const EVERY_MS = 60000;
 const REASON = {
   silent: "no readings",
-  suspected: "meter suspected",
-  "others-suspected": "others suspected",
+  suspected: "meter suspect",
+  "others-suspected": "other devices suspect",
   "no-busbar": "no busbar voltage",
-  "unread-powers": "powers not read",
+  "unread-powers": "powers unread",
   "load-beyond-declared": "load beyond declared",
   "active-uncertainty": "active power uncertain",
   "reactive-uncertainty": "reactive power uncertain",
@@ -24,7 +24,7 @@ const day = (t) => new Date(t * 1000).toLocaleDateString();
 
 const words = (reason) => REASON[reason] ?? reason;
 
-// Sentence on the meters that are behind schedule, with their number for each reason, the most frequent first.
+// Sentence on the meters behind schedule, with their number for each reason, the most frequent first.
 function delays(meters) {
   const late = meters.filter((m) => m.learning_state === "stalled" || m.learning_reason);
   if (!late.length) return "";
@@ -68,23 +68,23 @@ export class Commissioning {
   line() {
     const k = this.known;
     if (k === null || k.state === "off" || (k.state === "waiting" && !k.note)) return "";
-    const note = k.note ? ` Begun anew: ${k.note}.` : "";
+    const note = k.note ? ` Restarted: ${k.note}.` : "";
     if (k.state === "learned") return `Meters' own errors learned on ${day(k.learned_at)}.${note}`;
     if (k.state === "waiting") return note.trim();
     const open = k.meters.filter((m) => m.state === "learning").length;
-    const who = open === k.meters.length ? "meters" : `${open} of ${k.meters.length} meters`;
-    const held = k.held ? " Waiting until no meter is suspected." : "";
-    return `Learning ${who}, ${hours(k.gathered_s)} of ${hours(k.needed_s)} h.${delays(k.meters)}${held}${note}`;
+    const which = open === k.meters.length ? "meters" : `${open} of ${k.meters.length} meters`;
+    const held = k.held ? " Waiting until no meter is suspect." : "";
+    return `Learning ${which}, ${hours(k.gathered_s)} of ${hours(k.needed_s)} h.${delays(k.meters)}${held}${note}`;
   }
 
-  // Label, value and remark for the panel of a meter; null where nothing is learned.
+  // Label, value and remark for the panel of a meter; null if the estimator does not learn.
   of(meter) {
     const found = this.known?.meters.find((m) => m.meter === meter);
     if (!found) return null;
     if (found.state === "learning") {
       const why = found.learning_reason ? `: ${words(found.learning_reason)}` : "";
-      const time = `${hours(found.gathered_s)} of ${hours(this.known.needed_s)} h heard`;
-      return ["Own error", "not known yet", `${time}, ${found.learning_state}${why}`];
+      const time = `${hours(found.gathered_s)} of ${hours(this.known.needed_s)} h gathered`;
+      return ["Own error", "not learned yet", `${time}, ${found.learning_state}${why}`];
     }
     const since = isKnown(found.learned_at) ? `, learned on ${day(found.learned_at)}` : "";
     return ["Own error", `${signed(found.error_volt, 2)} V`, `± ${found.error_volt_std.toFixed(2)} V${since}`];
@@ -92,8 +92,8 @@ export class Commissioning {
 
   ask(meter) {
     this.asking = meter;
-    byId("renew-what").textContent = `Meter ${meter} of ${this.feeder}: its own error is forgotten and learned anew, `
-      + `over ${hours(this.known.needed_s)} h. The other meters stay as they are.`;
+    byId("renew-what").textContent = `Meter ${meter} of ${this.feeder}: its own error is deleted and learned again, `
+      + `over ${hours(this.known.needed_s)} h. The other meters stay unchanged.`;
     byId("renew-who").value = localStorage.getItem("gridsec.who") ?? "";
     byId("renew-reason").value = "";
     byId("renew-error").hidden = true;
@@ -102,24 +102,24 @@ export class Commissioning {
 
   async answer(event) {
     event.preventDefault();
-    const [who, reason] = [byId("renew-who").value.trim(), byId("renew-reason").value.trim()];
-    if (!who || !reason) {
+    const given = { who: byId("renew-who").value.trim(), reason: byId("renew-reason").value.trim(), meters: [this.asking] };
+    if (!given.who || !given.reason) {
       this.complain("Please enter your name and the reason.");
       return;
     }
-    localStorage.setItem("gridsec.who", who);
+    localStorage.setItem("gridsec.who", given.who);
     try {
       const response = await fetch(`${API}/${encodeURIComponent(this.feeder)}/commissioning`, {
         method: "POST",
         headers: { "Content-Type": "application/json" },
-        body: JSON.stringify({ who, reason, meters: [this.asking] }),
+        body: JSON.stringify(given),
       });
       const body = await response.json();
       if (!response.ok) throw new Error(body.detail);
       if (body.feeder === this.feeder) this.take(body);
       byId("renew").close();
     } catch (error) {
-      this.complain(`Not begun: ${error.message}`);
+      this.complain(`Not started: ${error.message}`);
     }
   }
 

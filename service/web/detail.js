@@ -1,4 +1,4 @@
-// One customer: what its meter says, what the voltage is, how far that may be from each other, and a trend.
+// One customer: reported and reconstructed voltage, score and threshold, and a trend.
 
 import { bare, byId, clock, duration, el, isKnown, nominals, signed, status, svg, volt } from "./dom.js";
 
@@ -10,7 +10,7 @@ function trend(points, limits, nominal) {
     ...points.flatMap((p) => [p.reported, p.estimated]),
     ...whole.flatMap((p) => [p.estimated - p.half, p.estimated + p.half]),
   ].filter(isKnown);
-  if (values.length < 2) return el("p", { class: "quiet", text: "The trend begins with the next ticks." });
+  if (values.length < 2) return el("p", { class: "quiet", text: "The trend starts with the next ticks." });
   const [t0, t1] = [points[0].t, points.at(-1).t];
   let [low, high] = [Math.min(...values), Math.max(...values)];
   const air = Math.max(0.08 * (high - low), 0.001 * nominal);
@@ -50,8 +50,8 @@ function gauge(meter) {
   const ratio = isKnown(meter.score) && isKnown(meter.threshold) ? meter.score / meter.threshold : null;
   if (!isKnown(ratio)) return el("p", { class: "quiet", text: "No score at this tick." });
   const words = ratio > 1
-    ? `${ratio >= 10 ? Math.round(ratio) : ratio.toFixed(1)} times what an honest meter can reach`
-    : `${Math.round(100 * ratio)} % of what an honest meter can reach`;
+    ? `${ratio >= 10 ? Math.round(ratio) : ratio.toFixed(1)} times the threshold`
+    : `${Math.round(100 * ratio)} % of the threshold`;
   const reach = 2;
   return el("div", { class: "gauge" },
     svg("svg", { viewBox: "0 0 200 22", preserveAspectRatio: "none", "aria-hidden": true },
@@ -77,7 +77,7 @@ export function showDetail(feeder, customer, { meter, inverter, alone, v, std, o
     el("span", { class: "quiet", text: ` ${customer.meter ? `meter ${customer.meter}, ` : ""}bus ${customer.bus}${customer.phase ? `, phase ${customer.phase}` : ""}` }));
   const half = isKnown(std) ? 3 * std : null;
   const list = el("dl", { class: "numbers" });
-  if (meter) list.append(...row("Meter says", volt(meter.v_volt_reported, 2), pu(meter.v_volt_reported)));
+  if (meter) list.append(...row("Reported", volt(meter.v_volt_reported, 2), pu(meter.v_volt_reported)));
   list.append(...row(alone ? "Model only, no reading" : "Reconstructed", volt(v, 2), `${half === null ? "" : `± ${half.toFixed(2)} V, `}${pu(v)}`));
   if (half !== null) list.append(...row("Standard deviation", volt(std, 2)));
   if (own) list.append(...row(...own));
@@ -92,6 +92,6 @@ export function showDetail(feeder, customer, { meter, inverter, alone, v, std, o
     el("div", { class: "trend-box" }, trend(points, limits, nominal)),
     el("p", { class: "key" },
       el("span", { class: "k-estimated", text: "reconstructed" }),
-      el("span", { class: "k-band", text: "interval that holds it" }),
-      el("span", { class: "k-reported", text: "meter says" })));
+      el("span", { class: "k-band", text: "its interval" }),
+      el("span", { class: "k-reported", text: "reported" })));
 }

@@ -1,10 +1,10 @@
-// The feeder as a drawing: built once per feeder and width, coloured at every tick.
+// Diagram of the feeder: built once per feeder and width, coloured at every tick.
 
 import { busbarWords, byId, el, isKnown, nominals, signed, status, svg, volt } from "./dom.js";
 import { hasMap, oneLine } from "./layout.js";
 import { Scale } from "./scale.js";
 
-// Shapes around (0, 0): what a customer is must be readable without any colour.
+// Shapes around (0, 0): the status of a customer must be readable without colour.
 const SHAPE = {
   ok: "M-7 0a7 7 0 1 0 14 0a7 7 0 1 0-14 0z",
   none: "M-4 0a4 4 0 1 0 8 0a4 4 0 1 0-8 0z",
@@ -16,13 +16,13 @@ const SHAPE = {
   low: "M0 10L10-7H-10z",
 };
 const SIGN = { suspect: "!", doubtful: "?", silent: "?" };
-// Of these the colour of a voltage would promise too much.
+// Without the colour of the voltage, which is uncertain here.
 const PLAIN = new Set(["silent", "unjudged", "doubtful"]);
 const LEGEND = [
-  ["ok", "honest meter"],
-  ["suspect", "suspect: says something else than the feeder"],
-  ["doubtful", "doubtful: off by too much, but not named"],
-  ["unjudged", "not judged"],
+  ["ok", "consistent"],
+  ["suspect", "suspect: contradicts the feeder"],
+  ["doubtful", "doubtful: beyond its threshold, but not named"],
+  ["unjudged", "not monitored"],
   ["silent", "silent"],
   ["high", "above limit"],
   ["low", "below limit"],
@@ -186,13 +186,13 @@ export class Diagram {
     for (const b of this.placed.buses) places.set(b.bus, [b.x, b.row, 0]);
     for (const c of this.placed.customers) if (c.bus !== c.from) places.set(c.bus, [c.x, c.row, 1]);
     for (const [one, other] of this.feeder.layout.ties ?? []) {
-      // The busbar is met where the other end is.
+      // A tie meets the busbar at the row of its other end.
       const ends = [one, other].map((bus, k) => places.get(bus) ?? [0, places.get(k ? one : other)?.[1] ?? 0, 0]);
       const [[ax, ay], [bx, by]] = ends.map(([x, row, low]) => {
         const [px, py] = at(x, row);
         return [px + low * hang[0], py + low * hang[1]];
       });
-      // Bent, so that it does not hide behind the row that it closes.
+      // Bent, so that the row of the loop does not hide it.
       const bend = Math.min(36, 12 + 0.2 * Math.hypot(bx - ax, by - ay));
       const [mx, my] = [(ax + bx) / 2 - (upright ? bend : 0), (ay + by) / 2 - (upright ? 0 : bend)];
       wires.push({ d: `M${ax} ${ay}Q${mx} ${my} ${bx} ${by}`, kind: "tie" });
@@ -211,7 +211,7 @@ export class Diagram {
       "aria-label": `One-line diagram, ${this.feeder.layout.customers.length} customers`,
     }, svg("text", { class: "busbar-name", x: 8, y: 12, text: this.feeder.layout.buses[0] }));
     this.busbarName = root.firstChild;
-    // Beyond the end of the busbar, where nothing else is.
+    // Beyond the end of the busbar, where the drawing is empty.
     return { root, spots, wires, busbar: upright ? { x: x1 + 27, y: y0 } : { x: x0, y: y1 + 27 } };
   }
 
@@ -271,12 +271,12 @@ export class Diagram {
     this.scale.draw({ low: this.limits.low / nominal, high: this.limits.high / nominal });
   }
 
-  // A voltage by the nominal one of its bus.
+  // Voltage over the nominal voltage of its bus.
   part(bus, v) {
     return isKnown(v) ? v / this.nominal.get(bus) : NaN;
   }
 
-  // The voltage of a customer rests on no reading.
+  // True if the voltage of a customer is model only.
   alone(customer) {
     const meter = this.meters.get(customer.meter);
     return meter ? meter.model_only : this.customersModelled.has(customer.customer) || this.modelled.has(customer.bus);
@@ -308,7 +308,7 @@ export class Diagram {
       part.shape.style.fill = alone || PLAIN.has(now.key) ? "" : (this.scale.color(this.part(part.customer.bus, v)) ?? "");
       part.sign.textContent = SIGN[now.key] ?? "";
       const loud = now.key === "suspect";
-      // Neighbours that both have something to say must not say it in the same place.
+      // Notes of neighbouring suspects must not overlap.
       const low = loud && !part.labels && before?.loud && !before.low && before.near(part);
       if (part.place.y > 10) part.note.setAttribute("y", part.place.y + (low ? 11 : 0));
       before = { loud, low, near: (other) => other.order - part.order === 1 };
@@ -365,7 +365,7 @@ export class Diagram {
       el("b", { text: id }),
       ...(part.customer.phase ? [el("span", { text: `phase ${part.customer.phase}` })] : []),
       el("span", { class: "state", "data-status": now.key, text: now.text }),
-      el("span", { text: `meter says ${volt(meter?.v_volt_reported)}` }),
+      el("span", { text: `reported ${volt(meter?.v_volt_reported)}` }),
       el("span", { text: `${this.alone(part.customer) ? "model only" : "reconstructed"} ${volt(this.voltAt(part.customer))}` }),
     );
     const card = this.tip.parentElement.getBoundingClientRect();

@@ -41,33 +41,33 @@ export function clock(t, { day = false } = {}) {
   return day || Math.abs(Date.now() - date) > 43200000 ? `${date.toLocaleDateString()} ${time}` : time;
 }
 
-// Without a verdict no meter is known to be honest. A meter without a usable reading is no evidence against the others.
+// Without a verdict no meter is shown as consistent. A meter without a usable reading is not evidence against the others.
 export const vouches = ({ verdict, cause }) =>
   verdict !== "undecided" || cause === "silent-meters" || cause === "clock-offset";
 
-// What a meter is, in one word for people and one for style sheets. Only who was judged can be honest.
+// Status of a meter: a text, and a key for style sheets. Only a monitored meter can be consistent.
 export function status(meter, limits, report) {
   if (!meter) return { key: "none", text: "no meter" };
   if (meter.suspect) return { key: "suspect", text: "suspect" };
   if (!meter.seen) return { key: "silent", text: "silent" };
   const { score, threshold, v_volt_estimated: v } = meter;
-  // The busbar's meter has no score, and says itself whether it was judged.
+  // The busbar meter has no score; its field `judged` states if it is monitored.
   const judged = meter.judged ?? (known(score) && known(threshold));
   if (known(score) && known(threshold) && score > threshold) return { key: "doubtful", text: "doubtful" };
-  if (meter.model_only) return { key: "unjudged", text: "not judged" };
+  if (meter.model_only) return { key: "unjudged", text: "not monitored" };
   if (known(v) && v > (meter.v_max_volt ?? limits.high)) return { key: "high", text: "above limit" };
   if (known(v) && v < (meter.v_min_volt ?? limits.low)) return { key: "low", text: "below limit" };
-  if (!judged || !known(v) || !vouches(report)) return { key: "unjudged", text: "not judged" };
-  return { key: "ok", text: "honest" };
+  if (!judged || !known(v) || !vouches(report)) return { key: "unjudged", text: "not monitored" };
+  return { key: "ok", text: "consistent" };
 }
 
-// What the busbar's own meter says beside what the others say of the busbar, in a sentence.
+// Reading of a suspect busbar meter and the reconstructed voltage, in a sentence.
 export function busbarWords({ phase, v_volt_reported: said, v_volt_estimated: real, attack_volt_estimated: off }) {
   const where = phase ? `, phase ${phase}` : "";
-  return `Busbar meter suspect${where}: says ${volt(said)}, reconstructed ${volt(real)} (${signed(off)} V)`;
+  return `Busbar meter suspect${where}: reports ${volt(said)}, reconstructed ${volt(real)} (${signed(off)} V)`;
 }
 
-// Nominal voltage of every bus: another one than the busbar's behind a transformer.
+// Nominal voltage of every bus: behind a transformer it differs from the busbar's.
 export function nominals(feeder) {
   const { buses, v_nominal_volt: own = [] } = feeder.layout;
   return new Map(buses.map((bus, k) => [bus, own[k] ?? feeder.v_nominal_volt]));
@@ -80,7 +80,7 @@ export async function getJson(url) {
   return body;
 }
 
-// Make nodes the children of a parent, in their order, and move none that stands where it should.
+// Make nodes the children of a parent, in their order; nodes in their place are not moved.
 export function settle(parent, nodes) {
   const wanted = new Set(nodes);
   for (const child of [...parent.children]) if (!wanted.has(child)) child.remove();

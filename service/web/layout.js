@@ -1,6 +1,6 @@
-// From the tree of a feeder to places on a grid: every line from the busbar becomes a row, customers hang
-// below it. Along a row goes the branch with the most customers; what branches off gets a row of its own,
-// as near as it fits. One grid step along the row is one customer or one bus.
+// Places of a feeder's tree on a grid: every line from the busbar becomes a row, with its customers below.
+// A row follows the branch with the most customers; each side branch gets a separate row, as near as it fits.
+// One grid step along the row is one customer or one bus.
 
 function tree({ buses, parent, customers }) {
   const n = buses.length;
@@ -24,7 +24,7 @@ export function oneLine(layout) {
   const heavier = (a, b) => weight[b] - weight[a] || depth[b] - depth[a] || a - b;
   const isDrop = (bus) => children[bus].length === 0;
 
-  // A block: items with rows counted from its own first row, and what each row has taken already.
+  // A block: items with rows counted from its first row, and the occupied spans of each row.
   function block(start, x0) {
     const items = { buses: [], customers: [], lines: [] };
     const taken = [];
@@ -34,7 +34,7 @@ export function oneLine(layout) {
     for (let bus = start; bus !== undefined; ) {
       let [next, ...others] = [...children[bus]].sort(heavier);
       if (next !== undefined && isDrop(next) && !at[bus].length && bus !== start) {
-        [next, others] = [undefined, [next, ...others]]; // A pole at the end of a line: all its houses hang.
+        [next, others] = [undefined, [next, ...others]]; // A pole at the end of a line: all its customers are drops.
       }
       const drops = others.filter(isDrop);
       const sides = others.filter((child) => !isDrop(child));
@@ -56,7 +56,7 @@ export function oneLine(layout) {
       bus = next;
     }
     taken[0] = [[x0, x - 1]];
-    // Those that branch off far out are placed first: no connector then crosses a row.
+    // The outermost side branches are placed first: no connector then crosses a row.
     for (const { side, x: from } of branches.reverse()) {
       const inner = block(side, from + 1);
       const overlap = (a, row) => (taken[row] ?? []).some((b) => a[0] <= b[1] && b[0] <= a[1]);
@@ -97,7 +97,7 @@ export function oneLine(layout) {
   return { ...all, rows: Math.max(row, 1), columns };
 }
 
-// Real places, if every bus has one and they are not all the same.
+// True if every bus has coordinates and they are not all the same.
 export function hasMap({ xy }) {
   if (!xy || xy.some((p) => !p || !p.every(Number.isFinite))) return false;
   return new Set(xy.map(String)).size > xy.length / 4;

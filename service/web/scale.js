@@ -1,6 +1,6 @@
-// Voltage to colour: blue is low, orange is high, the middle is the nominal voltage. The range fits the data
-// in few steps, so that colours keep their meaning while one looks; its ends are written beside it. Voltages
-// come as parts of the nominal one; that itself is null where there are several.
+// Colour of a voltage: blue is low, orange is high, the middle is the nominal voltage. The range fits the data
+// in few steps, so that the colours rarely change their meaning; its ends are labelled. Voltages are relative
+// to the nominal one, which is null if there are several.
 
 import { bare, byId, el, svg } from "./dom.js";
 
@@ -24,7 +24,7 @@ export class Scale {
     this.stops = STOPS.map((name) => parse(style.getPropertyValue(name)));
   }
 
-  // Returns whether the range changed.
+  // Returns true if the range changed.
   fit(parts, nominal) {
     const largest = Math.max(0, ...parts.map((part) => Math.abs(part - 1)));
     const needed = STEPS.find((step) => step >= largest) ?? STEPS.at(-1);

@@ -115,7 +115,7 @@ def test_a_reading_is_absurd_by_its_own_level() -> None:
     assert len(taken["sawmill"].readings) == 1
     (bad,) = taken["a1-east"].bad
     assert isinstance(bad, BadReading)
-    assert "absurd where 230.94 V is nominal" in bad.problems[0]
+    assert "implausible at a nominal voltage of 230.94 V" in bad.problems[0]
     both = b'[{"meter": "sawmill", "t": 1795212000.0, "v_volt": 5000.0}, ' + (
         b'{"meter": "a1-east", "t": 1795212000.0, "v_volt": 5000.0}]'
     )

@@ -29,7 +29,7 @@ run = command("study")
 
 @pytest.fixture
 def rare(tmp_path: Path) -> Path:
-    """CIGRE with a reading in a quarter of an hour, watched by another estimator."""
+    """CIGRE with a reading in a quarter of an hour, monitored by another estimator."""
     tables = load("cigre-lv").tables
     monitor = replace(
         tables.meta.monitor,
@@ -49,7 +49,7 @@ def test_a_campaign_follows_the_files(
     code, told, _ = run(monkeypatch, capsys, *words, "--duration", "18000")
     assert code == 0
     assert (
-        "rare: 3 scenarios of 20 readings, one every 900 s (feeder's files), watched by "
+        "rare: 3 scenarios of 20 readings, one every 900 s (feeder's files), monitored by "
         "weighted-least-squares (feeder's files); allowed false alarms a year: 2 (feeder's files); powers of "
         "metered customers within 0.14 kW and 3.4 kvar, medians of 1 sigma (feeder's files)"
     ) in plain(told)
@@ -67,7 +67,7 @@ def test_a_scenario_that_is_too_short_for_the_files_is_refused(
     code, _, error = run(monkeypatch, capsys, "campaign", str(rare), *FEW, "--duration", "600")
     assert code == 2
     assert (
-        "--duration: 600 s are too few where readings come every 900 s (feeder's files): at least 9000 s"
+        "--duration: 600 s are too short for one reading every 900 s (feeder's files): at least 9000 s"
         in (plain(error))
     )
 
@@ -101,7 +101,7 @@ def test_options_are_stronger_than_the_files(
     assert code == 0
     for said in (
         "one every 1 s (--step)",
-        "watched by sequential (--estimator)",
+        "monitored by sequential (--estimator)",
         "a year: 1 (--alarms-per-year)",
         "within 0.1 kW and 0.05 kvar, medians of 1 sigma (--load-error-kw, --load-error-kvar)",
     ):
@@ -167,7 +167,7 @@ def test_a_report_tells_what_its_attacks_take_from_the_files(
     code, told, _ = run(monkeypatch, capsys, *words, "--step", "5", *KNOWN)
     assert code == 0
     assert (
-        "600 readings, one every 5 s (--step), watched by weighted-least-squares (feeder's files)"
+        "600 readings, one every 5 s (--step), monitored by weighted-least-squares (feeder's files)"
         in plain(told)
     )
     html = text_of(page.read_text(encoding="utf-8"))

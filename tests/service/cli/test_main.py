@@ -255,7 +255,8 @@ def test_all_that_is_wrong_with_a_scenario_is_told_at_once(gridsec: Run, tmp_pat
     assert done.returncode == 2
     assert "Traceback" not in done.stderr
     said = plain(done.stderr)
-    for text in (*lies, *wrong, "--dt is 0", "--start is -5", "--season is 'dry'", "a recording has an end"):
+    others = ("--dt is 0", "--start is -5", "--season is 'dry'", "a recording needs an end")
+    for text in (*lies, *wrong, *others):
         assert text in said
     assert "3 is 300 % of nominal; 0.03 is 3 %" in said
     assert "-3 is -300 % of nominal; -0.03 is -3 %" in said
@@ -273,7 +274,7 @@ def test_all_that_is_wrong_with_a_scenario_is_told_at_once(gridsec: Run, tmp_pat
         assert f"begins {begin} s after the start, when the scenario of 60 s is over" in plain(done.stderr)
     done = gridsec("simulate", FEEDER, "--duration", "60", "--attack=bias:1:0.03:-20:-5", "--out", str(out))
     assert done.returncode == 2
-    assert "end after the start, not at -20 and -5" in plain(done.stderr)
+    assert "end after the start, not -20 and -5" in plain(done.stderr)
     assert not out.exists()
 
 
@@ -286,7 +287,7 @@ def test_a_simulation_replaces_simulations_only(gridsec: Run, tmp_path: Path) ->
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     some = ("simulate", FEEDER, "--duration", "2", "--start", "1795212000", "--out")
     for out in (field, notes, tmp_path / "own.parquet"):
-        assert "already there, and not of a simulation" in plain(refused(6, gridsec(*some, str(out))))
+        assert "exists and is not from a simulation" in plain(refused(6, gridsec(*some, str(out))))
         assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
     for _ in range(2):
         assert gridsec(*some, str(tmp_path / "new.parquet")).returncode == 0
@@ -356,7 +357,8 @@ def test_a_recording_of_a_folder_asks_where_that_is(gridsec: Run, tmp_path: Path
     made = gridsec("simulate", str(folder), "--out", str(file), "--duration", "2", "--start", "1795212000")
     assert made.returncode == 0, made.stderr
     told = gridsec("replay", str(file))
-    assert "recorded on 'mine-alone': --feeder says where" in " ".join(refused(told.returncode, told).split())
+    words = " ".join(refused(told.returncode, told).split())
+    assert "recorded on 'mine-alone': give its folder with --feeder" in words
     assert told.returncode == gridsec("replay", str(file), "--feeder", str(tmp_path / "no")).returncode > 0
 
 
@@ -496,15 +498,15 @@ def test_demo_shows_and_checks(gridsec: Run) -> None:
         address = f"127.0.0.1:{taken.getsockname()[1]}"
         done = gridsec("demo", "--duration", "36", "--check", "--http", address, "--seed", "4")
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "begin to lie" in done.stdout
+    assert "attack starts" in done.stdout
     assert "alarm: meter-manipulated" in done.stdout
     assert f"http://{address}/" not in done.stdout
 
 
 def test_demo_fails_for_every_kind_of_mistake() -> None:
     assert verdict(Outcome({"a", "b"}, {"a", "b"})) == ()
-    assert verdict(Outcome({"a", "b"}, {"a", "c"}, ["alarms still stand: undecided x"])) == (
-        "alarms still stand: undecided x",
+    assert verdict(Outcome({"a", "b"}, {"a", "c"}, ["alarms still active: undecided x"])) == (
+        "alarms still active: undecided x",
         "manipulated and not named: b",
         "named and not manipulated: c",
     )

@@ -25,11 +25,11 @@ WRONG = [
     ),
     ("study redundancy cigre-lv --out FILE/deep/er", {"--out FILE/deep/er": "FILE is a file"}),
     ("study protect cigre-lv --out VILLAGE", {"--out VILLAGE": "a feeder's folder"}),
-    ("study detectable cigre-lv --out new --journal new", {"--journal new": "--out needs it as well"}),
+    ("study detectable cigre-lv --out new --journal new", {"--journal new": "--out uses it as well"}),
     ("study droop cigre-lv --out new --journal FILE/j", {"--journal FILE/j": "FILE is a file"}),
     (
         "study campaign cigre-lv --out new/j/out --journal new/j",
-        {"--journal new/j": "--out needs it as well"},
+        {"--journal new/j": "--out uses it as well"},
     ),
     (
         "study calibrate cigre-lv --readings none --out FILE --journal FOLDER --write VILLAGE",
@@ -37,7 +37,7 @@ WRONG = [
             "--readings none": MISSING,
             "--out FILE": NO_FOLDER,
             "--journal FOLDER": NO_FILE,
-            "--write VILLAGE": "already there; expected a new folder",
+            "--write VILLAGE": "exists; expected a new folder",
         },
     ),
     ("study compare cigre-lv --csv FOLDER --write none", {"--csv FOLDER": NO_FILE, "--write none": MISSING}),

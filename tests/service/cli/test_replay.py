@@ -63,7 +63,7 @@ def test_no_answer_does_not_look_like_no_attack(
     )
     code, told, said = replay(absurd, "--feeder", FEEDER, *options)
     assert code == 1
-    assert "no tick was judged" in plain(said)
+    assert "no tick has a verdict" in plain(said)
     assert "readings: value 560" in plain(said if options else told)
 
 

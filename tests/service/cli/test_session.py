@@ -101,7 +101,7 @@ def test_ctrl_c_at_half_loses_nothing_and_nobody_else_writes_meanwhile(
         # The same command, while the first one has the journal.
         code, whole, said = run(monkeypatch, capsys, *words, "--out", str(tmp_path / "whole"))
         assert code == 0
-        assert plain(said).count("no journal is kept, an interruption loses what is done:") == 1
+        assert plain(said).count("no journal is kept, an interruption loses finished work:") == 1
         assert "another command is writing this journal" in said
         assert lines(cache) == kept
         first.send_signal(signal.SIGINT)
@@ -120,11 +120,12 @@ def test_ctrl_c_at_half_loses_nothing_and_nobody_else_writes_meanwhile(
     done = lines(cache) - 1
     assert 8 <= done < 26
     (line,) = re.findall(r"[^\r\n]*gridsec:[^\r\n]*", told)
-    assert f"interrupted; detectable: {done} of 26 done, kept in {journal}; the same command goes on" in line
+    kept = f"interrupted; detectable: {done} of 26 done, kept in {journal}"
+    assert f"{kept}; the same command continues" in line
 
     code, again, said = run(monkeypatch, capsys, *words, "--out", str(tmp_path / "again"))
     assert (code, again) == (0, whole)
-    assert said == f"going on from {journal}, {done} of 26 done\n"
+    assert said == f"continuing from {journal}, {done} of 26 done\n"
     assert tables(tmp_path / "again") == tables(tmp_path / "whole")
     assert not list(cache.iterdir()), "what is done needs no journal"
 
@@ -152,12 +153,12 @@ def test_sigterm_ends_all_processes_of_a_campaign_and_it_goes_on(
     (journal,) = cache.iterdir()
     assert told == (
         f"gridsec: interrupted; campaign: {done} of 8 done, kept in {journal}; "
-        "the same command goes on from there\n"
+        "the same command continues from there\n"
     )
     alone = (*CAMPAIGN[:-1], "1")
     code, again, said = run(monkeypatch, capsys, *alone, "--out", str(tmp_path / "again"))
     assert code == 0
-    assert said == f"going on from {journal}, {done} of 8 done\n"
+    assert said == f"continuing from {journal}, {done} of 8 done\n"
     code, whole, said = run(monkeypatch, capsys, *alone, "--out", str(tmp_path / "whole"), "--no-journal")
     assert (code, said) == (0, "")
     assert again == whole
@@ -184,7 +185,7 @@ def test_a_folder_that_cannot_be_is_said_once(
     words = ("detectable", "cigre-lv", "--max-attacked", "1", "--trials", "1")
     code, told, said = run(monkeypatch, capsys, *words)
     assert code == 0
-    assert "1 lies from the named size on: 0 missed" in told
+    assert "1 attacks from the named size on: 0 missed" in told
     assert said.count("\n") == 1
     assert "no journal is kept" in said
     assert "Not a directory" in said
@@ -260,8 +261,6 @@ def test_a_solver_that_hears_no_signal_is_ended_all_the_same(tmp_path: Path) -> 
         finally:
             first.kill()
     assert first.returncode == 130
-    assert (
-        told
-        == f"gridsec: interrupted; any: 1 of 2 done, kept in {journal}; the same command goes on from there\n"
-    )
+    done = f"any: 1 of 2 done, kept in {journal}"
+    assert told == f"gridsec: interrupted; {done}; the same command continues from there\n"
     assert journal.read_bytes().count(b"\n") == 2

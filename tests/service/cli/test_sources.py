@@ -89,7 +89,7 @@ def test_a_folder_of_somebody_else_is_not_replaced(
     (own / "feeder.toml").write_text("mine", encoding="utf-8")
     code, _, told = run(monkeypatch, capsys, "redundancy", str(file), "--out", str(tmp_path / "out"))
     assert code == 6
-    assert "already there, and no converted feeder" in plain(told)
+    assert "exists and is not a converted feeder" in plain(told)
     assert (own / "feeder.toml").read_text(encoding="utf-8") == "mine"
     assert [path.name for path in own.iterdir()] == ["feeder.toml"]
 

@@ -29,7 +29,7 @@ def test_tables_are_printed_and_written(
     some = ("--kind", "bias:3,5", "--liars", "1", "--place", "random", "--out", str(out))
     code, told, _ = run(monkeypatch, capsys, *FEW, *some, "--journal", str(journal))
     assert code == 0
-    assert "cigre-lv: 3 scenarios of 30 s watched by sequential" in told
+    assert "cigre-lv: 3 scenarios of 30 s monitored by sequential" in told
     assert "By kind and size" in told
     found = pd.read_csv(out / "campaign-scenarios.csv")
     assert found["kind"].tolist() == ["clean", "bias", "bias"]
@@ -51,7 +51,7 @@ def test_promises_are_played_and_counted(
     words = (*some, "--place", "random", "--workers", "1", "--out", str(tmp_path / "out"))
     code, told, _ = run(monkeypatch, capsys, *words)
     assert code == 0
-    assert "Promises of `study detectable`" in told
+    assert "Guarantees of `study detectable`" in told
     kept = pd.read_csv(tmp_path / "out" / "campaign-promises.csv").set_index("promise")
     assert kept["lies"].to_dict() == {"hidden": 4, "named": 4}
     assert kept["broken"].sum() == 0
@@ -86,9 +86,9 @@ def test_options_about_lies_need_scenarios_with_lies(
         code, _, told = run(monkeypatch, capsys, "campaign", "cigre-lv", *count, *lies)
         assert code == 2
         assert "--kind, --liars, --place" in plain(told)
-        assert "nobody lies; expected --scenarios and --together of 2 or more" in plain(told)
+        assert "scenario without an attack; expected --scenarios and --together of 2 or more" in plain(told)
         code, _, told = run(monkeypatch, capsys, "campaign", "cigre-lv", *count, "--promised")
-        assert (code, "nobody lies" in plain(told)) == (2, True)
+        assert (code, "without an attack" in plain(told)) == (2, True)
     clean = ("--scenarios", "1", "--duration", "30", "--workers", "1")
     code, told, _ = run(monkeypatch, capsys, "campaign", "cigre-lv", *clean)
     assert code == 0

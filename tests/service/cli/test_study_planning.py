@@ -24,7 +24,7 @@ def test_redundancy_prints_tables_and_writes_them(
     )
     assert code == 0
     assert "m05 m12" in told
-    assert "What changes without m04" in told
+    assert "Changes without m04" in told
     summary = pd.read_csv(folder / "redundancy-summary.csv")
     assert summary["liars"].tolist()[2] == "m05 m12"
     assert journal.exists()
@@ -48,7 +48,7 @@ def test_protect_tells_the_meters_and_what_they_are_worth(
     code, told, _ = run(monkeypatch, capsys, "protect", *some)
     assert code == 0
     assert "protect 1 of 13 meters; no fewer suffice" in told
-    assert "fewest liars that stay invisible: 1 before, ∞ after" in told
+    assert "fewest meters of an invisible attack: 1 before, ∞ after" in told
     assert pd.read_csv(tmp_path / "out" / "protect-meters.csv")["meter"].tolist() == ["m08"]
 
 
@@ -64,7 +64,7 @@ def test_the_usual_question_has_an_answer_where_all_powers_are_known(
     for goal in ("identify", "notice"):
         code, told, _ = run(monkeypatch, capsys, "protect", "--goal", goal)
         assert code == 0
-        assert f"{goal} asks for nothing here, which is no safety" in told
+        assert f"{goal} requires no protection here; that is no safety" in told
         assert "suffice" not in told
 
 
@@ -85,8 +85,8 @@ def test_detectable_tells_sizes_and_keeps_its_word(
     some = ("--max-attacked", "1", "--trials", "3", "--out", str(tmp_path / "out"))
     code, told, _ = run(monkeypatch, capsys, "detectable", "cigre-lv", *some)
     assert code == 0
-    assert "3 lies up to the hidden size: 0 led to a name" in told
-    assert "3 lies from the named size on: 0 missed, 0 with an honest meter named" in told
+    assert "3 attacks up to the hidden size: 0 with a meter named" in told
+    assert "3 attacks from the named size on: 0 missed, 0 with an honest meter named" in told
     assert len(pd.read_csv(tmp_path / "out" / "detectable-meters.csv")) == 6
     (trials,) = pd.read_csv(tmp_path / "out" / "detectable-trials.csv").to_dict("records")
     assert trials == {"trials": 3, "hidden_named": 0, "large_missed": 0, "honest_named": 0}
@@ -104,7 +104,7 @@ def test_feeders_in_three_phases_are_studied(
     assert pd.read_csv(tmp_path / "redundancy-summary.csv")["index"].tolist() == [float("inf"), 53.0]
     code, told, _ = run(monkeypatch, capsys, "protect", "ieee-european-lv", "--goal", "identify")
     assert code == 0
-    assert "identify asks for nothing here, which is no safety" in told
+    assert "identify requires no protection here; that is no safety" in told
     assert "--goal contain" in told
 
 

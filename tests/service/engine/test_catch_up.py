@@ -104,7 +104,7 @@ def test_a_leap_costs_a_second_of_catching_up_and_skips_the_rest(
     assert [r.skipped for r in new] == gaps
     assert sum(gaps) == HOURS - len(new) >= HOURS - LEAP_TICKS
     assert {str(r.verdict) for r in new} == {"undecided"}
-    assert f"The {new[-1].skipped} ticks before were not judged." in new[-1].reason
+    assert f"The {new[-1].skipped} ticks before were skipped." in new[-1].reason
     assert to_json(new[-1])["skipped"] == new[-1].skipped
     assert f'ticks_skipped_total{{feeder="{FEEDER}"}} {sum(gaps):.1f}' in (
         live.rounds.metrics.exposition().decode()

@@ -592,7 +592,7 @@ def test_rest_names_all_problems_at_once(live: InProcess) -> None:
         "body.who", "body.reason", "body.more", "body.meters.1", "body.meters.2", "body.meters.3",
     }  # fmt: skip
     assert ("body.meters.1", "there is no meter 'm99'") in where
-    assert ("body.meters.2", "meter 'm03' is named twice") in where
+    assert ("body.meters.2", "meter 'm03' occurs twice") in where
     for body in (
         [],
         {"who": "Ada", "reason": "x", "meters": []},

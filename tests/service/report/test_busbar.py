@@ -90,17 +90,17 @@ def test_it_is_reported_in_volts_and_named_in_words(site: Site) -> None:
         True, True, True, (), None, base + 6.9, pytest.approx(base), pytest.approx(6.9)
     )
     assert found.suspects == (BUSBAR,)
-    off = "reads 6.9 V (3.0 %) more than the meters of the feeder say."
+    off = "reads 6.9 V (3.0 %) more than the meters of the feeder imply."
     assert found.reason == f"Manipulated: the substation's meter; it {off}"
     beside = build(site, tick(site, base - 2.3), 2, *said(site, [True], [-2.3], lying=(1, 2)))
     assert beside.suspects == ("m02", "m03", BUSBAR)
     assert beside.reason == (
         "Manipulated: m02, m03 and the substation's meter; further off than meter accuracy and load "
         "uncertainty allow. The substation's meter reads 2.3 V (1.0 %) less than the meters of the feeder "
-        "say."
+        "imply."
     )
     silent = build(site, tick(site, None), 2, *said(site, [True], [6.9]))
-    assert silent.reason == "Manipulated: the substation's meter; it reports nothing at present."
+    assert silent.reason == "Manipulated: the substation's meter; it has no reading at present."
     assert (silent.busbar.seen, silent.busbar.suspect) == (False, True)
     assert silent.busbar.v_volt_reported is silent.busbar.attack_volt_estimated is None
 
@@ -118,7 +118,7 @@ def test_in_three_phases_the_one_furthest_off_is_shown(european: Site) -> None:
     assert known is not None
     assert (
         known.reason
-        == f"reports {base - 7.0:.1f} V in phase b, but the meters of the feeder say {base:.1f} V"
+        == f"reports {base - 7.0:.1f} V in phase b, but the meters of the feeder imply {base:.1f} V"
     )
     # A phase in question that is not heard leaves the other; where nobody is named, all are in question.
     half = tick(european, base, (base + 1.0, np.nan, base))
@@ -186,7 +186,7 @@ def test_its_alarm_is_known_only_if_decided_judged_and_seen() -> None:
     numbers = found.evidence
     shown = (numbers.v_volt_reported, numbers.v_volt_estimated, numbers.attack_volt_estimated)
     assert shown == (238.0, 231.0, 7.0)
-    assert found.reason == "reports 238.0 V, but the meters of the feeder say 231.0 V"
+    assert found.reason == "reports 238.0 V, but the meters of the feeder imply 231.0 V"
     for other in (
         replace(now, verdict=Decision.UNDECIDED),
         replace(now, busbar=replace(liar, seen=False)),

@@ -171,7 +171,7 @@ def test_readings_that_are_not_trusted_are_no_ground(site: Site) -> None:
     assert marked(named) == {True}
     (found,) = (c for c in conditions(named) if (c.kind, c.meter) == (AlarmKind.METER_MANIPULATED, "m05"))
     assert found.evidence.v_volt_estimated is None
-    assert found.reason == "reports 245.0 V, no trusted meter reports beside it"
+    assert found.reason == "reports 245.0 V, no other trusted meter is available"
     trusted = build(site, tick, 2, replace(estimate, trusted=which), verdict)
     assert marked(trusted) == {False}
 

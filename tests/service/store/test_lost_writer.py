@@ -164,7 +164,7 @@ def test_a_stopped_service_ends_when_it_goes_on_after_the_next_one(cluster: Clus
         first.send_signal(signal.SIGCONT)
         assert first.wait(timeout=20.0) == WRITER_LOST, log.read_text()
         assert settled(url) == last
-    assert "others may have written" in log.read_text() or "another process" in log.read_text()
+    assert "processes may have written" in log.read_text() or "another process" in log.read_text()
     with Store(url) as third:
         assert an_alarm(1) in third.active()
 

@@ -54,7 +54,7 @@ def test_damaged_or_newer_texts_are_refused(site: Site) -> None:
         (replace(kept, text="{"), "damaged", ""),
         (replace(kept, text="[]"), "damaged", ""),
         (replace(kept, text="{}"), "damaged", "`format`"),
-        (_damaged(kept, format=FORMAT + 1, new=1), "newer-format", f" {FORMAT + 1}, "),
+        (_damaged(kept, format=FORMAT + 1, new=1), "newer-format", f" {FORMAT + 1}; "),
         (_damaged(kept, format=0), "damaged", "$.format"),
         (_damaged(kept, more=1), "damaged", "`more`"),
         (_damaged(kept, feeder="other"), "other-feeder", "'other'"),
@@ -91,7 +91,7 @@ def test_who_is_not_believed_comes_back_by_name(site: Site) -> None:
     assert decode_distrust(site, more).same(before)
     for bad, code, field in (
         (replace(kept, text="{"), "damaged", ""),
-        (_damaged(kept, format=FORMAT + 1), "newer-format", f" {FORMAT + 1}, "),
+        (_damaged(kept, format=FORMAT + 1), "newer-format", f" {FORMAT + 1}; "),
         (_damaged(kept, feeder="other"), "other-feeder", "'other'"),
         (_damaged(kept, more=1), "damaged", "`more`"),
         (_damaged(kept, t=1e400), "damaged", ""),

@@ -74,8 +74,8 @@ def test_a_feeder_that_cannot_be_loaded_is_said_to_be_watched_by_nobody(site: Si
     expect(page.locator("#decision")).to_have_text("CLEAN")
     page.select_option("#feeder", "town")
     expect(page.locator("#decision")).to_have_text("NO DATA")
-    expect(page.locator("#reason")).to_contain_text("nobody watches feeder 'town'")
-    expect(page.locator("#link")).to_have_text("not watched")
+    expect(page.locator("#reason")).to_contain_text("feeder 'town' is not monitored")
+    expect(page.locator("#link")).to_have_text("not monitored")
     expect(page.locator("#diagram .customer")).to_have_count(0)
     page.select_option("#feeder", "village")
     expect(page.locator("#decision")).to_have_text("CLEAN")
@@ -128,7 +128,7 @@ def test_who_is_in_doubt_or_not_judged_is_not_honest(site: Site, size: dict[str,
     expect(page.locator("#decision")).to_have_text("UNDECIDED")
     page.locator("#meters-box summary").click()
     wanted = {"H3": "doubtful", "H4": "unjudged", "H5": "unjudged", "H6": "unjudged", "H7": "ok"}
-    words = {"doubtful": "doubtful", "unjudged": "not judged", "ok": "honest"}
+    words = {"doubtful": "doubtful", "unjudged": "not monitored", "ok": "consistent"}
     shapes = {}
     for name, key in wanted.items():
         spot = customer(page, name)
@@ -144,11 +144,12 @@ def test_who_is_in_doubt_or_not_judged_is_not_honest(site: Site, size: dict[str,
         expect(page.locator("#detail-title")).to_have_text(name)
         expect(page.locator("#detail .state")).to_have_text(words[key])
     assert len(set(shapes.values())) == len(shapes)
-    expect(page.locator("#legend")).to_contain_text("not judged")
+    expect(page.locator("#legend")).to_contain_text("not monitored")
     # Without a verdict nothing tells who is honest, not even of those whose scores are small, or the busbar.
     busbar = BusbarReport(True, True, False, (), None, 231.0, 231.0, 0.0)
     states = [page.locator(f'#meters tr:has-text("{name}") .state') for name in ("H7", "substation")]
-    for k, (cause, word) in enumerate([(Cause.AMBIGUOUS, "not judged"), (Cause.AGREEMENT, "honest")], 1):
+    texts = [(Cause.AMBIGUOUS, "not monitored"), (Cause.AGREEMENT, "consistent")]
+    for k, (cause, word) in enumerate(texts, 1):
         site.service.tick(replace(site.village.report(T0 + k, cause=cause), busbar=busbar))
         for state in states:
             expect(state).to_have_text(word)
@@ -194,7 +195,7 @@ def test_a_customer_shows_what_its_meter_says_and_what_is_true(site: Site) -> No
     box = customer(page, "H3")
     box.hover()
     report = site.service.report("village").meters[3]
-    expect(page.locator("#tip")).to_contain_text(f"meter says {report.v_volt_reported:.1f} V")
+    expect(page.locator("#tip")).to_contain_text(f"reported {report.v_volt_reported:.1f} V")
     expect(page.locator("#tip")).to_contain_text(f"reconstructed {report.v_volt_estimated:.1f} V")
     box.click()
     panel = page.locator("#detail-card")
@@ -203,11 +204,11 @@ def test_a_customer_shows_what_its_meter_says_and_what_is_true(site: Site) -> No
     expect(panel).to_contain_text(f"{report.v_volt_estimated:.2f} V")
     expect(panel).to_contain_text("+9.00 V")
     ratio = report.score / report.threshold
-    expect(panel).to_contain_text(f"{ratio:.1f} times what an honest meter can reach")
+    expect(panel).to_contain_text(f"{ratio:.1f} times the threshold")
     # The trend goes back into the stored history, to before the page was opened.
     expect(panel.locator(".trend")).to_contain_text("44 s ago")
     site.tick(T0 + 45, 1)
-    expect(panel).to_contain_text("of what an honest meter can reach")
+    expect(panel).to_contain_text("of the threshold")
     page.locator("#unselect").click()
     expect(panel).to_be_hidden()
 
@@ -252,7 +253,7 @@ def test_what_is_told_at_the_pointer_follows_the_readings(site: Site) -> None:
     expect(page.locator("#tip")).to_be_hidden()
     for k, volts in enumerate((229.0, 227.0)):
         site.tick(T0 + k, volts={"H3": volts})
-        expect(page.locator("#tip")).to_contain_text(f"meter says {volts:.1f} V")
+        expect(page.locator("#tip")).to_contain_text(f"reported {volts:.1f} V")
 
 
 def test_the_diagram_works_by_keyboard(site: Site) -> None:
@@ -540,7 +541,7 @@ def test_values_of_the_model_alone_do_not_look_measured(site: Site, size: dict[s
     link, decision = page.locator("#link"), page.locator("#decision")
     expect(link).to_have_text("no data yet")
     expect(decision).to_have_text("NO DATA")
-    expect(page.locator("#facts")).to_contain_text("Real voltages–")
+    expect(page.locator("#facts")).to_contain_text("Reconstructed voltages–")
     expect(customer(page, "H3")).to_have_attribute("aria-label", re.compile("silent, model only"))
     expect(page.locator(".wire:not(.unknown)")).to_have_count(0)
     site.tick(T0 + 1)

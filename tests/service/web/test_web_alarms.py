@@ -90,7 +90,8 @@ def test_a_busbar_meter_that_lies_is_marked(site: Site, size: dict[str, int]) ->
     liar = BusbarReport(True, True, True, ("b",), "b", 238.0, 231.0, 7.0)
     for k in range(1, 5):
         site.service.tick(replace(site.village.report(T0 + k, cause=Cause.RESIDUALS), busbar=liar))
-    expect(note).to_have_text("Busbar meter suspect, phase b: says 238.0 V, reconstructed 231.0 V (+7.0 V)")
+    off = "Busbar meter suspect, phase b: reports 238.0 V, reconstructed 231.0 V (+7.0 V)"
+    expect(note).to_have_text(off)
     expect(mark).to_be_visible()
     expect(mark.locator(".sign")).to_have_text("!")
     expect(mark.locator(".note")).to_have_text("+7.0")
@@ -151,7 +152,7 @@ def test_what_is_learned_of_the_meters_and_a_replaced_one(site: Site) -> None:
     page.locator("#renew-form .primary").click()
     expect(page.locator("#renew")).to_be_hidden()
     expect(page.locator("#commissioning")).to_have_text("Learning 1 of 13 meters, 5 of 24 h.")
-    expect(panel).to_contain_text("not known yet 5 of 24 h heard, learning")
+    expect(panel).to_contain_text("not learned yet 5 of 24 h gathered, learning")
     (event,) = site.service.store.commission_events("village")
     assert (event.who, event.reason, event.meters) == ("Ada <b>", "new <i>meter", ("H3",))
 
@@ -162,7 +163,7 @@ def test_a_commissioning_that_begins_anew_says_why(site: Site) -> None:
     site.tick(T0)
     page = site.open()
     expect(page.locator("#commissioning")).to_have_text(
-        "Learning meters, 5 of 24 h. Begun anew: the feeder has changed since (<b>lines)."
+        "Learning meters, 5 of 24 h. Restarted: the feeder has changed since (<b>lines)."
     )
 
 
@@ -185,7 +186,7 @@ def test_stalled_learning_is_shown_with_its_reasons_and_its_alarm(site: Site) ->
     )
     customer(page, "H3").click()
     panel = page.locator("#detail-card")
-    expect(panel).to_contain_text("not known yet 5 of 24 h heard, stalled: no busbar voltage")
+    expect(panel).to_contain_text("not learned yet 5 of 24 h gathered, stalled: no busbar voltage")
     page.select_option("#alarm-kind", "learning-stalled")
     alarm = page.locator(".alarm")
     expect(alarm).to_have_count(1)
