@@ -1,0 +1,219 @@
+"""Residuals drawn from the model of `estimators.modal`, and the dense Kalman filter of all states as its
+oracle."""
+
+from __future__ import annotations
+
+from math import exp
+
+import numpy as np
+
+from gridsec.arrays import Bools, Floats, Ints
+from gridsec.estimators.modal.model import ResidualModel
+from gridsec.grid.network import Power, columns, covariance, variances
+from gridsec.grid.radial import Feeder
+
+BASE_KVA = 100.0
+"""Base of random feeders, kVA."""
+
+
+def tree(customers: int, random: np.random.Generator, drop: float = 0.03) -> Feeder:
+    """Random radial feeder with one customer at each bus.
+
+    Parameters
+    ----------
+    customers
+        N.
+    random
+        Chooses everything random.
+    drop
+        Largest voltage drop at 5 kW per customer, pu.
+    """
+    parent = np.array([random.integers(max(0, k - 3), k + 1) for k in range(customers)])
+    r = random.uniform(0.5, 1.5, customers)
+    below, depth = np.ones(customers + 1), np.zeros(customers + 1)
+    for k in range(customers, 0, -1):
+        below[parent[k - 1]] += below[k]
+    for k in range(1, customers + 1):
+        depth[k] = depth[parent[k - 1]] + r[k - 1] * below[k] * 5.0 / BASE_KVA
+    r *= drop / depth.max()
+    return Feeder(
+        name="tree",
+        parent=parent,
+        r=r,
+        x=0.4 * r,
+        bus=np.arange(1, customers + 1),
+        customers=tuple(f"c{k}" for k in range(customers)),
+        buses=tuple(f"b{k}" for k in range(customers + 1)),
+        base_volt=230.0,
+        base_kva=BASE_KVA,
+        charging=np.zeros(customers),
+    )
+
+
+def model_of(
+    feeder: Feeder,
+    *,
+    p_std: float = 0.006,
+    q_std: float = 0.002,
+    jitter: Floats | float = 5e-4,
+    classes: Floats | float = 0.005,
+    busbar: float = 1e-3,
+    flicker: float = 2e-4,
+    lasting: float = 0.0,
+    time_s: float = 600.0,
+    fixed_s: float = np.inf,
+) -> ResidualModel:
+    """Model of a balanced radial feeder, all errors as parts of the nominal voltage.
+
+    Parameters
+    ----------
+    feeder
+        The feeder; all customers have meters.
+    p_std, q_std
+        Standard deviations of the errors of powers, pu.
+    jitter, classes
+        White standard deviation and accuracy class of the meters, one or (p,).
+    busbar, flicker
+        Standard deviations of the fixed and of the white error of the busbar's meter.
+    lasting, time_s, fixed_s
+        As in `ResidualModel`.
+    """
+    at, n = feeder.bus, len(feeder.buses)
+    sizes = ((Power.ACTIVE, np.full(at.size, p_std**2)), (Power.REACTIVE, np.full(at.size, q_std**2)))
+    return ResidualModel(
+        of_meters=np.sum([covariance(feeder, power, at, of) for power, of in sizes], axis=0),
+        variance=np.sum([variances(feeder, power, of) for power, of in sizes], axis=0),
+        meters=at,
+        white=np.broadcast_to(4.0 * np.square(jitter), at.shape).astype(np.float64),
+        fixed=np.broadcast_to(4.0 * np.square(classes) / 3.0, at.shape).astype(np.float64),
+        busbar=4.0 * busbar**2,
+        flicker=4.0 * flicker**2,
+        busbar_of=np.ones((n, 1)),
+        lasting=lasting,
+        time_s=time_s,
+        fixed_s=fixed_s,
+    )
+
+
+def power_columns(feeder: Feeder) -> Floats:
+    """Effect of every customer's active power, then of the reactive ones, on the meters, (p, 2 N)."""
+    every = np.arange(feeder.bus.size)
+    return np.hstack([columns(feeder, power, every)[feeder.bus] for power in Power])
+
+
+def root(matrix: Floats) -> Floats:
+    """Square root of a positive semidefinite matrix, ``root root' = matrix``, (k, k)."""
+    lam, Q = np.linalg.eigh(0.5 * (matrix + matrix.T))
+    return np.asarray(Q * np.sqrt(np.maximum(lam, 0.0)))
+
+
+class Source:
+    """Honest residuals of a model, tick by tick.
+
+    Parameters
+    ----------
+    model
+        The model.
+    random
+        Chooses everything random.
+    step_s
+        Interval, s.
+    """
+
+    def __init__(self, model: ResidualModel, random: np.random.Generator, step_s: float = 1.0) -> None:
+        at = np.arange(model.meters.size)
+        self.random, self.size = random, at.size
+        self.rho, self.rho_b = exp(-step_s / model.time_s), exp(-step_s / model.fixed_s)
+        self.noise = root(model.noise(at))
+        self.loads = root((1.0 - model.lasting) * model.loads(at))
+        self.ages = root(model.aging(at))
+        # What has aged since the start is added to errors of the first tick: exact for times far below T_b.
+        self.w, self.b = self.loads @ self._white(), root(model.static(at)) @ self._white()
+        self.aged = np.zeros(self.size)
+
+    def _white(self) -> Floats:
+        return self.random.standard_normal(self.size)
+
+    def tick(self) -> Floats:
+        """Residuals of the next tick, (p,)."""
+        out = self.w + self.b + self.aged + self.noise @ self._white()
+        self.w = self.rho * self.w + np.sqrt(1.0 - self.rho**2) * (self.loads @ self._white())
+        self.aged = self.rho_b * self.aged + np.sqrt(1.0 - self.rho_b**2) * (self.ages @ self._white())
+        return np.asarray(out)
+
+    def ticks(self, count: int) -> Floats:
+        """Residuals of the next ticks, (count, p)."""
+        return np.stack([self.tick() for _ in range(count)])
+
+
+class Dense:
+    """Kalman filter of the 3 p states (w, aging b, constant b) and of k constant faults, by dense matrices.
+
+    Parameters
+    ----------
+    model
+        The model.
+    faults : (p, k)
+        Directions of the faults.
+    std
+        Prior standard deviation of their amounts.
+    at : (t,)
+        Meters in use; None: all.
+    """
+
+    def __init__(
+        self, model: ResidualModel, faults: Floats | None = None, std: float = 1.0, at: Ints | None = None
+    ) -> None:
+        at = np.arange(model.meters.size) if at is None else at
+        p = at.size
+        G = np.zeros((p, 0)) if faults is None else faults[at]
+        self.model, self.p, self.k = model, p, G.shape[1]
+        self.prior = np.zeros((3 * p + self.k, 3 * p + self.k))
+        self.prior[:p, :p] = (1.0 - model.lasting) * model.loads(at)
+        self.prior[p : 2 * p, p : 2 * p] = model.aging(at)
+        self.prior[2 * p : 3 * p, 2 * p : 3 * p] = model.static(at) - model.aging(at)
+        self.prior[3 * p :, 3 * p :] = std**2 * np.eye(self.k)
+        self.H, self.D = np.hstack([np.eye(p), np.eye(p), np.eye(p), G]), model.noise(at)
+        self.mean, self.cov = np.zeros(len(self.prior)), self.prior.copy()
+
+    @property
+    def varies(self) -> Floats:
+        """Mean of w, (p,)."""
+        return self.mean[: self.p]
+
+    @property
+    def lasts(self) -> Floats:
+        """Mean of b, (p,)."""
+        return self.mean[self.p : 2 * self.p] + self.mean[2 * self.p : 3 * self.p]
+
+    def step(
+        self, h: float, m: Floats, seen: Bools | None = None, level: float = 1.0
+    ) -> tuple[Floats, Floats]:
+        """One tick: innovations of the meters with a reading, and their covariance.
+
+        Parameters
+        ----------
+        h
+            Interval, s.
+        m : (t,)
+            Residuals.
+        seen : (t,)
+            Meters with a reading; None: all.
+        level
+            Level of the faults at this tick: 0 before their onset.
+        """
+        p, k = self.p, self.k
+        rho, rho_b = exp(-h / self.model.time_s), exp(-h / self.model.fixed_s)
+        F = np.concatenate([np.full(p, rho), np.full(p, rho_b), np.ones(p + k)])
+        self.mean = F * self.mean
+        both = np.outer(F, F)
+        self.cov = both * self.cov + (1.0 - both) * np.where(np.arange(F.size) < 2 * p, self.prior, 0.0)
+        rows = np.arange(p) if seen is None else np.flatnonzero(seen)
+        H = self.H[rows] * np.where(np.arange(F.size) < 3 * p, 1.0, level)
+        V = H @ self.cov @ H.T + self.D[np.ix_(rows, rows)]
+        nu = m[rows] - H @ self.mean
+        K = np.linalg.solve(V, H @ self.cov).T
+        self.mean = self.mean + K @ nu
+        self.cov = self.cov - K @ V @ K.T
+        self.cov = 0.5 * (self.cov + self.cov.T)
+        return nu, V

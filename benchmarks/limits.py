@@ -1,0 +1,479 @@
+"""Default monitor and modal core against the limits of detection and estimation, as tables in Markdown.
+
+    python -m benchmarks.limits [runs] [feeder ...]
+
+Matched world: residuals are drawn from the model of `gridsec.estimators.modal`, white noise of 0.2 %, loads
+known to 0.6 kW and 0.2 kvar with a correlation time of 600 s, no inverters, one reading per second, one false
+alarm a year. The first 180 ticks are honest.
+
+Delays: one random meter is off by a constant part of the voltage. Ticks from the onset, its own included,
+to the first answer that is not CLEAN and to the first tick at which exactly this meter is named, means of
+the runs. Lorden: the least n with ``F_n f^2 / 2 >= log gamma``, F_n being the information after n ticks.
+GLR: the largest likelihood ratio over all onsets for the true meter and size, against ``log gamma``.
+
+Liars: a third of the meters, random, with random signs or alike, or contiguous and alike, 60 ticks long.
+Named of the liars and honest meters named in the last tick; error at the liars over the Cramer-Rao bound,
+the standard deviation of a Kalman filter that knows the liars and the onset, root mean squares of the
+second half.
+
+Honest: AC power flow, meters of class 0.5 % with 0.1 V and 0.05 %. Root mean square error of all customers'
+voltages, and of the error over its stated standard deviation. Cost: mean of a calm step in the same run; the
+core's includes no front end.
+"""
+
+from __future__ import annotations
+
+import os
+
+# Before NumPy loads its libraries.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from math import exp, log
+
+import numpy as np
+
+from benchmarks._arguments import arguments
+from feeders.model.site import Site, from_tables, load
+from feeders.registry.registry import Watcher, design
+from feeders.simulation.trial import LoadError, Meters, Trial, frames
+from gridsec.arrays import Bools, Floats, Ints
+from gridsec.estimators.modal import core, estimate, signatures, static
+from gridsec.estimators.modal import filter as modal
+from gridsec.estimators.modal.core import Core
+from gridsec.estimators.modal.estimate import Estimated
+from gridsec.estimators.modal.search import Identification, Problem
+from gridsec.estimators.sequential import SequentialDesign
+from gridsec.grid.network import bus_voltages
+from gridsec.interface import Decision, Frame
+
+QUIET, WATCHED = 180, 120
+"""Honest ticks before an onset, and ticks after it."""
+SHORT = 60
+"""Ticks of a manipulation by a third of the meters."""
+LOOK = 5
+"""Ticks from one identification to the next while a manipulation goes on."""
+STEPS = (0.003, 0.005, 0.01, 0.02)
+"""Sizes of the steps, parts of the voltage."""
+LIES = (("random signs", 0.005), ("alike", 0.005), ("contiguous", 0.005), ("contiguous", 0.01))
+VOLT = 230.0
+
+
+@lru_cache(maxsize=8)
+def site(feeder: str) -> Site:
+    """A feeder without inverters: their observers are the same for both."""
+    tables = load(feeder).tables
+    rows = tuple(replace(row, inverter_kva=0.0, droop="") for row in tables.customers)
+    return from_tables(replace(tables, customers=rows))
+
+
+@lru_cache(maxsize=8)
+def watcher(feeder: str, meters: Meters) -> Watcher:
+    """The default monitor of a feeder; fixed errors are not learned."""
+    stated = Trial(site(feeder), meters=meters).stated
+    settings = replace(stated.tables.meta.monitor, commission_s=0.0)
+    return design(from_tables(replace(stated.tables, meta=replace(stated.tables.meta, monitor=settings))))
+
+
+@lru_cache(maxsize=8)
+def kernel_of(feeder: str, meters: Meters) -> Core:
+    """The core beside `watcher`, with the connections of the files."""
+    where = site(feeder)
+    kw = np.array([max(row.load_kw, row.pv_kw) for row in where.tables.customers])
+    return core.design(watcher(feeder, meters).design, kw / where.feeder.base_kva)
+
+
+class World:
+    """Frames of the linear model with matched errors.
+
+    Parameters
+    ----------
+    front
+        Design of the default monitor.
+    seed
+        Chooses everything random.
+    """
+
+    def __init__(self, front: SequentialDesign, seed: int) -> None:
+        self.front, self.random, self.k = front, np.random.default_rng([seed, 9]), 0
+        count = front.customers
+        self.effects = front.effects.of(np.arange(2 * count))
+        self.std = np.concatenate([front.doubt.p, front.doubt.q])
+        self.rho = exp(-front.step_s / front.doubt.time_s)
+        self.powers = self.std * self.random.standard_normal(2 * count)
+        self.fixed = np.sqrt(front.fixed) * self.random.standard_normal(front.fixed.size)
+        self.busbar = front.busbar * float(self.random.standard_normal())
+        self.p, self.zero = np.full(count, -0.01), np.zeros(count)
+        self.model = bus_voltages(front.plant.feeder, self.p, self.zero, 1.0, steps=1)
+        self.seen = np.ones(front.fixed.size, dtype=np.bool_)
+
+    def tick(self, lie: Floats | float = 0.0) -> tuple[Frame, Floats, Floats]:
+        """Next frame, residuals of the meters, and true errors of the model at all places.
+
+        Parameters
+        ----------
+        lie : (p,)
+            Manipulation, squared pu.
+        """
+        front, random = self.front, self.random
+        flick = np.sqrt(front.flicker) * float(random.standard_normal())
+        truth = self.effects @ self.powers + self.busbar + flick
+        white = np.sqrt(front.white) * random.standard_normal(front.white.size)
+        residual = truth[front.prior.meters] + self.fixed + white + lie
+        y = self.model[front.prior.meters] + residual
+        none = np.full(self.p.size, np.nan)
+        doubt, t = front.doubt, float(self.k)
+        frame = Frame(t, y, self.seen, 1.0, self.p, doubt.even_p, self.zero, doubt.even_q, none, none)
+        fresh = np.sqrt(1.0 - self.rho**2) * self.std * random.standard_normal(self.std.size)
+        self.powers = self.rho * self.powers + fresh
+        self.k += 1
+        return frame, residual, truth
+
+
+def squared(part: float) -> float:
+    """Squared lie of a part of the voltage near nominal, pu."""
+    return (1.0 + part) ** 2 - 1.0
+
+
+@dataclass
+class Delays:
+    """Ticks from the onset; NaN where an answer did not come."""
+
+    glr: float
+    clean_now: float
+    named_now: float
+    clean_new: float
+    named_new: float
+
+
+def delay(made: Watcher, kernel: Core, part: float, seed: int) -> Delays:
+    """One step of one meter."""
+    world, f = World(made.design, seed), squared(part)
+    p = kernel.modes.size
+    liar = int(np.random.default_rng([seed, 1]).integers(p))
+    state, mine = made.init(0.0), core.init(kernel, 0.0)
+    glr, out = Known(kernel, liar, f), dict.fromkeys(Delays.__annotations__, np.nan)
+    lie = np.where(np.arange(p) == liar, f, 0.0)
+
+    def first(name: str, there: bool, k: int) -> None:
+        if there and np.isnan(out[name]):
+            out[name] = k - QUIET + 1
+
+    for k in range(QUIET + WATCHED):
+        on = k >= QUIET
+        frame, m, _ = world.tick(lie if on else 0.0)
+        state, _, verdict = made.step(state, frame)
+        mine, evidence = core.step(kernel, mine, frame.t, m)
+        level = glr.tick(float(k), m) if k >= QUIET - 10 else glr.wait(float(k), m)
+        if not on:
+            continue
+        first("glr", level >= kernel.limit, k)
+        first("clean_now", verdict.decision is not Decision.CLEAN, k)
+        first("named_now", bool(verdict.suspects[liar]) and int(verdict.suspects.sum()) == 1, k)
+        if core.alarmed(kernel, evidence) and np.isnan(out["named_new"]):
+            first("clean_new", True, k)
+            named = core.identify(kernel, mine, evidence).found.named
+            first("named_new", bool(named[liar]) and int(named.sum()) == 1, k)
+        if not np.isnan(list(out.values())).any():
+            break
+    return Delays(**out)
+
+
+class Known:
+    """Likelihood ratio of a step of known size at a known meter, the largest over onsets.
+
+    Parameters
+    ----------
+    kernel
+        The core.
+    liar
+        The meter.
+    f
+        Size, squared pu.
+    """
+
+    def __init__(self, kernel: Core, liar: int, f: float) -> None:
+        self.made, self.f = kernel.modes, f
+        self.W = self.made.U.T[:, [liar]]
+        self.state, self.more = modal.start(self.made, 0.0), static.start(self.made)
+        self.rows, self.next = signatures.empty(self.made, WATCHED + 16), 0
+
+    def wait(self, t: float, m: Floats) -> float:
+        """Take in a tick without an onset."""
+        return self._tick(t, m, [])
+
+    def tick(self, t: float, m: Floats) -> float:
+        """Take in a tick; the largest log likelihood ratio."""
+        self.next += 1
+        return self._tick(t, m, [self.next - 1])
+
+    def _tick(self, t: float, m: Floats, begun: list[int]) -> float:
+        self.state, update = modal.step(self.made, self.state, t, m)
+        self.more = static.follow(self.made, self.more, update)
+        self.rows = signatures.follow(self.rows, update, self.more, 1.0, begun=begun)
+        y, F = self._scores()
+        return float((self.f * y - 0.5 * self.f**2 * F).max())
+
+    def _scores(self) -> tuple[Floats, Floats]:
+        y, F = signatures.scores(self.made, self.rows, self.more).of(self.W, self.W**2)
+        return y[:, 0], F[:, 0]
+
+
+def lorden(kernel: Core, part: float) -> float:
+    """Least number of ticks with the information of one false alarm a year, mean over meters."""
+    made, f = kernel.modes, squared(part)
+    state, more, rows = modal.start(made, 0.0), static.start(made), signatures.empty(made, 1)
+    done = np.full(made.size, np.nan)
+    for k in range(QUIET + WATCHED):
+        state, update = modal.step(made, state, float(k), np.zeros(made.size))
+        more = static.follow(made, more, update)
+        rows = signatures.follow(rows, update, more, 1.0, begun=[0] if k == QUIET else [])
+        if k >= QUIET:
+            F = signatures.scores(made, rows, more).of(made.U.T, made.U.T**2)[1][0]
+            done = np.where(np.isnan(done) & (0.5 * f * f * F >= kernel.limit), k - QUIET + 1, done)
+    return float(np.mean(done))
+
+
+def third(kernel: Core, kind: str, part: float, seed: int) -> Floats:
+    """Manipulation by a third of the meters, squared pu, (p,)."""
+    random, p = np.random.default_rng([seed, 2]), kernel.modes.size
+    which = random.choice(p, p // 3, replace=False)
+    if kind == "contiguous":
+        S = kernel.model.loads(np.arange(p))
+        distance = S.diagonal()[:, None] + S.diagonal() - 2.0 * S
+        which = np.argsort(distance[int(random.integers(p))])[: p // 3]
+    sign = random.choice([-1.0, 1.0], which.size) if kind == "random signs" else 1.0
+    out = np.zeros(p)
+    out[which] = squared(part) * sign
+    return out
+
+
+@dataclass
+class Third:
+    """Result of one run with a third of the meters manipulated."""
+
+    named_now: int
+    honest_now: int
+    named_new: int
+    honest_new: int
+    error_now: float
+    error_new: float
+    error_known: float
+    bound: float
+
+
+def attacked(made: Watcher, kernel: Core, kind: str, part: float, seed: int) -> Third:
+    """One run."""
+    world, lie = World(made.design, seed), third(kernel, kind, part, seed)
+    state, mine, liars = made.init(0.0), core.init(kernel, 0.0), lie != 0.0
+    at, known = kernel.model.meters[liars], Support(kernel, liars)
+    found, named = None, np.zeros(liars.size, dtype=np.bool_)
+    squares: list[Floats] = []
+    for k in range(QUIET + SHORT):
+        frame, m, truth = world.tick(lie if k >= QUIET else 0.0)
+        state, answer, verdict = made.step(state, frame)
+        mine, evidence = core.step(kernel, mine, frame.t, m)
+        bound = known.tick(float(k), m, k == QUIET)
+        if k >= QUIET + SHORT // 2 and (k - QUIET) % LOOK == LOOK - 1:
+            found = core.identify(kernel, mine, evidence) if core.alarmed(kernel, evidence) else None
+            named = np.zeros_like(named) if found is None else found.found.named
+            now = core.estimate(kernel, mine, found).mean
+            exact = world.model + truth
+            old = answer.v2[made.design.plant.meters][liars]
+            squares.append(
+                np.array(
+                    [
+                        np.mean((old - exact[at]) ** 2),
+                        np.mean((now - truth)[at] ** 2),
+                        np.mean((bound.mean - truth)[at] ** 2),
+                        np.mean(bound.variance[at]),
+                    ]
+                )
+            )
+    errors = np.sqrt(np.mean(squares, axis=0)) * 0.5 * VOLT
+    suspects = verdict.suspects
+    return Third(
+        int((suspects & liars).sum()),
+        int((suspects & ~liars).sum()),
+        int((named & liars).sum()),
+        int((named & ~liars).sum()),
+        *errors.tolist(),
+    )
+
+
+class Support:
+    """Kalman filter that knows the manipulated meters and the onset: the Cramer-Rao bound.
+
+    Parameters
+    ----------
+    kernel
+        The core.
+    liars : (p,)
+        The manipulated meters.
+    """
+
+    def __init__(self, kernel: Core, liars: Bools) -> None:
+        self.kernel, self.made = kernel, kernel.modes
+        self.liars: Ints = np.flatnonzero(liars)
+        self.state, self.more = modal.start(self.made, 0.0), static.start(self.made)
+        self.rows = signatures.empty(self.made, 1)
+
+    def tick(self, t: float, m: Floats, onset: bool) -> Estimated:
+        """Take in a tick; errors of the model at all places and their variance."""
+        made, kernel, k = self.made, self.kernel, self.liars.size
+        self.state, update = modal.step(made, self.state, t, m)
+        self.more = static.follow(made, self.more, update)
+        self.rows = signatures.follow(self.rows, update, self.more, 1.0, begun=[0] if onset else [])
+        plain = estimate.honest(made, kernel.estimator, self.state, self.more, update)
+        if not self.rows.used[0]:
+            return plain
+        W = made.U.T[:, self.liars]
+        y, F = signatures.scores(made, self.rows, self.more).matrix(0, W)
+        problem = Problem(y, F, np.full(k, 1.0), k, np.zeros(k), np.full(k, np.inf))
+        every = np.ones((1, k), dtype=np.bool_)
+        one = Identification(every, ~every[:, 0], np.ones(1), every[0], (problem,))
+        zero = np.zeros((plain.mean.size, k))
+        T = estimate.moves(made, kernel.estimator, self.more, self.rows, 0, W, zero)
+        return estimate.corrected(plain, T, one)
+
+
+@dataclass
+class Honest:
+    """Result of one honest run: errors in mV, ratios to the stated deviation, and mean steps in ms."""
+
+    error_now: float
+    error_new: float
+    ratio_now: float
+    ratio_new: float
+    step_now: float
+    step_new: float
+    most: float
+
+
+def honest(feeder: str, seed: int, ticks: int = 240) -> Honest:
+    """AC power flow as the truth; the core beside the default monitor."""
+    trial = Trial(
+        site(feeder), seed=seed, duration_s=float(ticks), meters=Meters.REAL, load_error=LoadError()
+    )
+    made = watcher(feeder, Meters.REAL)
+    front: SequentialDesign = made.design
+    kernel = kernel_of(feeder, Meters.REAL)
+    state, mine, most = None, None, -np.inf
+    errors: list[Floats] = []
+    took: list[tuple[float, float]] = []
+    customers = front.plant.feeder.bus
+    for k, (frame, truth) in enumerate(_played(trial)):
+        if state is None or mine is None:
+            state, mine = made.init(frame.t), core.init(kernel, frame.t)
+        begun = time.thread_time()
+        state, answer, _ = made.step(state, frame)
+        between = time.thread_time()
+        m, seen = core.residuals(state)
+        again = time.thread_time()
+        mine, evidence = core.step(kernel, mine, frame.t, m, seen)
+        took.append((between - begun, time.thread_time() - again))
+        if k < ticks // 4:
+            continue
+        most = max(most, evidence.log_m)
+        now = core.estimate(kernel, mine)
+        feeder_model = bus_voltages(front.plant.feeder, frame.p, frame.q, state.v0_squared, steps=1)
+        new = (feeder_model + now.mean)[customers] - truth.v2
+        old = answer.v2 - truth.v2
+        errors.append(
+            np.array(
+                [
+                    np.mean(old**2),
+                    np.mean(new**2),
+                    np.mean((old / answer.std) ** 2),
+                    np.mean(new**2 / now.variance[customers]),
+                ]
+            )
+        )
+    root = np.sqrt(np.mean(errors, axis=0))
+    steps = 1e3 * np.mean(took[ticks // 4 :], axis=0)
+    return Honest(*(root[:2] * 0.5 * VOLT * 1e3).tolist(), *root[2:].tolist(), *steps.tolist(), most)
+
+
+def _played(trial: Trial) -> Iterator[tuple[Frame, object]]:
+    yield from list(frames(trial))
+
+
+def row(*cells: object) -> None:
+    """Print one row of a table."""
+    print("| " + " | ".join(str(cell) for cell in cells) + " |", flush=True)
+
+
+def head(*cells: str) -> None:
+    """Print the head of a table."""
+    print()
+    row(*cells)
+    print("|" + "---|" * len(cells), flush=True)
+
+
+def mean(values: list[float]) -> str:
+    """Mean of the answers that came, and how many did not."""
+    there = [each for each in values if not np.isnan(each)]
+    never = f" ({len(values) - len(there)} never)" if len(there) < len(values) else ""
+    return f"{np.mean(there):.1f}{never}" if there else "never"
+
+
+def main(runs: int, names: tuple[str, ...]) -> None:
+    """All tables."""
+    head("feeder, meters", "step, %", "Lorden", "GLR", "not CLEAN", "named", "core alarms", "core names")
+    for feeder in names:
+        made = watcher(feeder, Meters.WHITE)
+        kernel = kernel_of(feeder, Meters.WHITE)
+        for part in STEPS:
+            each = [delay(made, kernel, part, seed) for seed in range(runs)]
+            cells = [mean([getattr(one, name) for one in each]) for name in Delays.__annotations__]
+            size = f"{100 * part:g}"
+            row(f"{feeder}, {kernel.modes.size}", size, f"{lorden(kernel, part):.1f}", *cells)
+    head(
+        "feeder, liars",
+        "lie",
+        "named",
+        "honest named",
+        "core named",
+        "honest",
+        "error, V",
+        "core",
+        "support known",
+        "bound",
+    )
+    for feeder in names:
+        made = watcher(feeder, Meters.WHITE)
+        kernel = kernel_of(feeder, Meters.WHITE)
+        for kind, part in LIES:
+            each_ = [attacked(made, kernel, kind, part, seed) for seed in range(max(1, runs // 4))]
+            liars = kernel.modes.size // 3 * len(each_)
+            counts = [sum(getattr(one, name) for one in each_) for name in list(Third.__annotations__)[:4]]
+            volts = [
+                np.mean([getattr(one, name) for one in each_]) for name in list(Third.__annotations__)[4:]
+            ]
+            texts = [f"{volt:.3f}" for volt in volts]
+            row(f"{feeder}, {liars}", f"{kind} {100 * part:g} %", *counts, *texts)
+    head(
+        "feeder",
+        "error, mV",
+        "core, mV",
+        "over std",
+        "core over std",
+        "step, ms",
+        "core, ms",
+        "ratio",
+        "log M",
+    )
+    for feeder in names:
+        found = [honest(feeder, seed) for seed in range(max(1, runs // 4))]
+        texts = [f"{np.mean([getattr(one, name) for one in found]):.2f}" for name in Honest.__annotations__]
+        ratio = np.mean([one.step_new / one.step_now for one in found])
+        row(feeder, *texts[:6], f"{ratio:.2f}", f"{max(one.most for one in found):.1f} < {log(3.16e7):.1f}")
+
+
+if __name__ == "__main__":
+    asked = arguments(__doc__, runs=20, feeders=("kerber-dorfnetz", "kerber-vorstadtnetz"))
+    main(asked.runs, tuple(asked.feeders))

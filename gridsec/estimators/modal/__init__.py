@@ -1,0 +1,1 @@
+"""Statistical core of the default monitor: one filter, one test, one search."""

@@ -1,0 +1,315 @@
+"""Statistical core of one feeder, in shadow operation beside the default monitor.
+
+    design(front) -> Core
+    init(core, t) -> CoreState
+    step(core, state, t, m, seen) -> (CoreState, Evidence)      every tick
+    identify(core, state, evidence) -> Suspicion                where `alarmed`
+    estimate(core, state, suspicion) -> Estimated               where asked for
+
+The front end is that of `gridsec.estimators.sequential`: cleaning of frames, observer of the inverters,
+loss-corrected power flow. `residuals` reads the residuals that it leaves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from math import inf, log
+
+import numpy as np
+
+from gridsec.arrays import Bools, Floats, Ints
+from gridsec.estimators.modal import detector, signatures, static
+from gridsec.estimators.modal import estimate as estimates
+from gridsec.estimators.modal import filter as modal
+from gridsec.estimators.modal.detector import SIZE, Detector, Evidence
+from gridsec.estimators.modal.estimate import Estimated, Estimator
+from gridsec.estimators.modal.filter import FilterState, Update
+from gridsec.estimators.modal.model import Modes, ResidualModel, modes, residual_model
+from gridsec.estimators.modal.search import Identification, Problem, cost, groups, search
+from gridsec.estimators.modal.signatures import Columns
+from gridsec.estimators.modal.static import Static
+from gridsec.estimators.sequential.design import YEAR_S, SequentialDesign
+from gridsec.estimators.sequential.state import SequentialState
+from gridsec.grid.network import Power
+
+ACCUSATIONS = 5.0
+"""Charge of a false power, in accusations of a meter: powers are promised to be within their limits."""
+FALSE_POWER = 0.05
+"""Prior standard deviation of a false power, pu of the feeder's base: 5 kW at 100 kVA, a large appliance."""
+MOST_POWER = 3.0
+"""Largest false power, in those that the customer can have, 1. False reports stay near the possible."""
+SHOCK = 10.0
+"""Variance of an unreported change of all loads, in those of the loads, 1: 2 kW where 0.6 kW is stated."""
+CONNECTION = 0.1
+"""Power of a customer where the files are not asked, pu of the feeder's base: 10 kW at 100 kVA."""
+CALM = 0.5
+"""Part of the limit of log M below which suspected onsets are given up, 1."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Core:
+    """Everything prepared offline. n places, p meters, N customers, q faults.
+
+    Attributes
+    ----------
+    model
+        The model of the residuals.
+    modes
+        Modes of all meters.
+    effect : (n, q)
+        Change of the model at every place by each fault: meters (none), false active powers, busbar.
+    faults
+        Columns of all faults. False reactive powers are left out: they move voltages nearly as active ones.
+    groups
+        Groups of neighbours, for the search.
+    estimator
+        Regression of all places on the modes.
+    bound : (q,)
+        Largest amount of each fault that is possible.
+    limit
+        Log gamma: the alarm is at log M >= limit.
+    """
+
+    model: ResidualModel
+    modes: Modes
+    effect: Floats = field(repr=False)
+    faults: Columns = field(repr=False)
+    groups: tuple[Ints, ...] = field(repr=False)
+    estimator: Estimator = field(repr=False)
+    bound: Floats = field(repr=False)
+    limit: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CoreState:
+    """State of the core.
+
+    Attributes
+    ----------
+    filter, static, detector
+        The states of the parts.
+    update
+        The filter's last step; None before the first.
+    """
+
+    filter: FilterState
+    static: Static
+    detector: Detector
+    update: Update | None
+
+
+def assemble(model: ResidualModel, powers: Floats, most: Floats, *, gamma: float) -> Core:
+    """Prepare a core.
+
+    Parameters
+    ----------
+    model
+        The model of the residuals.
+    powers : (n, N)
+        Effect of false active powers on all places, squared pu per pu.
+    most : (N,)
+        Largest active powers that the customers can have, pu.
+    gamma
+        Least average number of ticks from one false alarm to the next, at least 1.
+
+    Raises
+    ------
+    ValueError
+        If gamma is below 1.
+    """
+    if not 1.0 <= gamma < inf:
+        raise ValueError(f"gamma is {gamma}; it must be at least 1 and finite")
+    made, at = modes(model), model.meters
+    std = np.full(powers.shape[1], FALSE_POWER)
+    used = model.phases(made.at).any(axis=0)
+    return Core(
+        model=model,
+        modes=made,
+        effect=np.hstack([np.zeros((len(powers), at.size)), powers, model.busbar_of[:, used]]),
+        faults=signatures.columns(made, powers[at], std, SIZE),
+        groups=groups(made),
+        estimator=estimates.estimator(made),
+        bound=np.concatenate([np.full(at.size, inf), MOST_POWER * most, np.full(int(used.sum()), inf)]),
+        limit=log(gamma),
+    )
+
+
+def design(front: SequentialDesign, most: Floats | None = None) -> Core:
+    """Core of a feeder that the default monitor watches.
+
+    Parameters
+    ----------
+    front
+        Design of the default monitor, with its rate of false alarms.
+    most : (N,)
+        Largest active powers that the customers can have, pu; None: `CONNECTION` for each.
+    """
+    every = np.arange(front.customers)
+    most = np.full(every.size, CONNECTION) if most is None else most
+    powers = front.effects.columns(Power.ACTIVE, every)
+    gamma = max(1.0, YEAR_S / (front.step_s * front.options.alarms_per_year))
+    return assemble(residual_model(front), powers, most, gamma=gamma)
+
+
+def residuals(state: SequentialState) -> tuple[Floats, Bools]:
+    """Last residuals of the front end with fixed errors included, squared pu (p,), and where there is one.
+
+    Parameters
+    ----------
+    state
+        State of the default monitor after a tick.
+    """
+    window = state.window
+    seen = window.heard[-1]
+    return np.where(seen, window.residuals[-1] + state.learned.bias, 0.0), seen
+
+
+def init(core: Core, t: float) -> CoreState:
+    """State before the first reading.
+
+    Parameters
+    ----------
+    core
+        The core.
+    t
+        Time of the first reading, s.
+    """
+    made = core.modes
+    return CoreState(modal.start(made, t), static.start(made), detector.start(made), None)
+
+
+def step(
+    core: Core, state: CoreState, t: float, m: Floats, seen: Bools | None = None
+) -> tuple[CoreState, Evidence]:
+    """Take in the residuals of one tick.
+
+    Parameters
+    ----------
+    core, state
+        The core, and the state after the last tick.
+    t
+        Time, s; not before that of the last tick.
+    m : (p,)
+        Residuals, squared pu; any finite value where not seen.
+    seen : (p,)
+        Meters with a reading; None: all.
+
+    Raises
+    ------
+    ValueError
+        If t is before the last reading or not a number.
+    """
+    h = t - state.filter.t
+    after, update = modal.step(core.modes, state.filter, t, m, seen)
+    known = static.follow(core.modes, state.static, update)
+    test, evidence = detector.step(
+        core.modes, core.faults, state.detector, update, known, h=h, alert=CALM * core.limit
+    )
+    pinned = bool(test.pinned.any())
+    if evidence.log_m >= core.limit and not pinned:
+        test = detector.pin(test, evidence.rows)
+    elif pinned and evidence.log_m < CALM * core.limit:
+        test = detector.pin(test, evidence.rows[:0])
+    return CoreState(after, known, test, update), evidence
+
+
+def alarmed(core: Core, evidence: Evidence) -> bool:
+    """Decision of the detector at one tick.
+
+    Parameters
+    ----------
+    core, evidence
+        The core, and the answer of the tick.
+    """
+    return evidence.log_m >= core.limit
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Suspicion:
+    """Explanations since one onset.
+
+    Attributes
+    ----------
+    row
+        Row of the onset.
+    found
+        The explanations.
+    """
+
+    row: int
+    found: Identification
+
+
+def identify(core: Core, state: CoreState, evidence: Evidence) -> Suspicion:
+    """Sets of faults that explain the readings, since the onset that suits them best.
+
+    The search is made at the likeliest onset. The costs of what it finds are then compared at the pinned
+    onsets, and where another one is cheaper, the search is made there.
+
+    Parameters
+    ----------
+    core, state, evidence
+        The core, the state after a tick, and the answer of that tick.
+    """
+    test = state.detector
+    rows = [int(evidence.rows[0]), *np.flatnonzero(test.pinned & test.onsets.used).tolist()]
+    rows = list(dict.fromkeys(rows))
+    found = _searched(core, state, rows[0])
+    std = found.problems[0].std
+    costs = [cost(replace(_problem(core, state, row), std=std), found.chosen[0]) for row in rows]
+    best = int(np.argmin(costs))
+    if best:
+        found = _searched(core, state, rows[best])
+    return Suspicion(rows[best], found)
+
+
+def _searched(core: Core, state: CoreState, row: int) -> Identification:
+    """Explanations since one onset, with and without an unreported change of all loads."""
+    test, plain = state.detector, _problem(core, state, row)
+    now, ratio = signatures.shocked(core.modes, test.onsets, state.static, row, SHOCK)
+    y, F = now.matrix(0, core.faults.W)
+    charge = ACCUSATIONS * 2.0 * log(core.modes.size)
+    return search(plain, core.groups, (replace(plain, y=y, F=F), charge - 2.0 * ratio))
+
+
+def _problem(core: Core, state: CoreState, row: int) -> Problem:
+    """Scores, information and charges of all faults at one onset."""
+    faults, p = core.faults, core.modes.size
+    now = signatures.scores(core.modes, state.detector.onsets, state.static, np.array([row]))
+    y, F = now.matrix(0, faults.W)
+    accusation = 2.0 * log(p)
+    charge = np.zeros(y.size)
+    charge[p:] = accusation
+    charge[p : p + faults.powers] = ACCUSATIONS * accusation
+    return Problem(y, F, faults.std, p, charge, core.bound)
+
+
+def estimate(core: Core, state: CoreState, suspicion: Suspicion | None = None) -> Estimated:
+    """Errors of the front end's model at all places.
+
+    Parameters
+    ----------
+    core, state
+        The core, and the state after a tick.
+    suspicion
+        The explanations after the same tick; None: no fault.
+
+    Raises
+    ------
+    ValueError
+        Before the first tick.
+    """
+    if state.update is None:
+        raise ValueError("no reading has been taken in yet")
+    made, by = core.modes, core.estimator
+    plain = estimates.honest(made, by, state.filter, state.static, state.update)
+    if suspicion is None:
+        return plain
+    onsets = state.detector.onsets
+    # A change of all loads is one more fault for each mode, with an effect on all places.
+    W = np.hstack([core.faults.W, np.eye(made.size)])
+    effect = np.hstack([core.effect, by.of_w])
+    T = estimates.moves(made, by, state.static, onsets, suspicion.row, W, effect)
+    now = signatures.scores(made, onsets, state.static, np.array([suspicion.row]))
+    joint = (*now.matrix(0, W), np.sqrt(SHOCK * made.loads))
+    return estimates.corrected(plain, T, suspicion.found, joint)

@@ -1,0 +1,328 @@
+"""Detection of faults with a bounded rate of false alarms: an e-detector over onsets, faults and sizes.
+
+For an onset k and a distribution pi of faults, the mixture of likelihood ratios
+
+    Lambda_k(t) = integral exp(y' f - f' I f / 2) d pi(f)
+
+of `gridsec.estimators.modal.signatures` is a martingale with mean 1 while there is no fault. With f ~ N(0,
+s^2) in one column
+
+    log Lambda = s^2 y^2 / (2 (1 + s^2 I)) - log(1 + s^2 I) / 2
+
+and with f ~ N(0, s^2 D / d) in all members, d the mean of D's diagonal (the omnibus, which feels faults
+that are small everywhere), the same sum over the modes, corrected for theta by a determinant of r rows. The
+detector is
+
+    M_t = sum_j weight_j sum_k capital_jk Lambda_jk(t)         alarm at M_t >= gamma
+
+over the kinds j: members, omnibus, powers with busbar.
+
+**Average run length.** Assumptions: the model of `gridsec.estimators.modal.model` with Gaussian errors, and
+no fault. (1) Every Lambda_jk is a likelihood ratio of a mixture against the model, hence a nonnegative
+martingale from its onset on, with mean 1. (2) At each tick each kind is given the capital 1: by an onset of
+that tick, or for onsets at every n-th tick by the capital n at the last of the n ticks; the weights sum to 1.
+(3) A dropped onset gives its capital to another one so that the sum stays, ``c_2 += c_1 Lambda_1 /
+Lambda_2``; which one may depend on the readings so far. So M_t - t is a supermartingale, and for every
+stopping time with a finite mean E[M_tau] <= E[tau]. The alarm has M_tau >= gamma, so that ``E[tau] >= gamma``
+ticks. (4) What is not evaluated at a tick counts as zero, which only makes M smaller, whatever decides it.
+With more than `static.FEW` directions the Lambda of members and omnibus are no martingales, but have means of
+at most 1 at each fixed tick.
+
+References
+----------
+.. [1] Shin, Ramdas and Rinaldo, E-detectors: a nonparametric framework for sequential change detection,
+   arXiv:2203.03532, 2022.
+.. [2] Pollak, Average run lengths of an optimal method of detecting a change in distribution, Annals of
+   Statistics 15, 1987.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import inf, log, sqrt
+
+import numpy as np
+
+from gridsec.arrays import Bools, Floats, Ints
+from gridsec.estimators.modal import signatures
+from gridsec.estimators.modal.filter import Update
+from gridsec.estimators.modal.model import Modes
+from gridsec.estimators.modal.signatures import Columns, Onsets, Scores
+from gridsec.estimators.modal.static import Static
+
+SIZE = 0.01
+"""Prior standard deviation of a fault, squared pu: 0.5 % of the voltage, the class of ordinary meters."""
+WEIGHTS = (0.5, 0.35, 0.15)
+"""Weights of members, omnibus, and powers with busbar, 1. A weight w delays an alarm by log(1 / w) nats."""
+RAMPS = 0.1
+"""Share of ramps in all weights, 1: a ramp is also seen by steps, later."""
+STEP_ROWS, RAMP_ROWS = 18, 6
+"""Onsets of steps and of ramps that are kept. Ages grow by about 1.7 from row to row up to `OLDEST`."""
+EVERY = 4
+"""Ticks from one full evaluation to the next: powers and old onsets take most of the time and can wait."""
+RAMP_EVERY = 4 * EVERY
+"""Ticks from one onset of a ramp to the next: a ramp of fewer ticks is not told from a step."""
+YOUNG = 6 * EVERY
+"""Largest age of onsets that are evaluated at every tick, ticks: `EVERY` is a sixth of it."""
+JUMP = 12.25
+"""Squared standardised score of one innovation that has M evaluated at once, 1: 3.5 standard deviations."""
+OLDEST = 14400
+"""Largest age of an onset, ticks: beyond it the filter has learned a step as a fixed error."""
+PINS = 3
+"""Onsets that are kept while they are suspected. The likeliest one at the alarm may be a tick or two off."""
+
+_LOG_WEIGHTS = np.log(np.array(WEIGHTS))[:, None]
+# One row more: a row that is given back is free at the next tick only.
+_STEPS = STEP_ROWS + EVERY + PINS + 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Detector:
+    """State of the detector. k rows.
+
+    Attributes
+    ----------
+    onsets
+        The onsets: rows of steps, then rows of ramps.
+    capital : (3, k)
+        Logarithm of the capital of each kind and row; -inf for none.
+    ticks
+        Ticks since the start.
+    ratio : (3, k) or None
+        Log Lambda of each kind and row after a full evaluation; the next tick thins the onsets by it.
+    pinned : (k,)
+        Rows that are evaluated at every tick and not dropped.
+    log_m
+        log M when it was evaluated last.
+    """
+
+    onsets: Onsets
+    capital: Floats
+    ticks: int
+    ratio: Floats | None
+    pinned: Bools
+    log_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evidence:
+    """Answer of one tick. k rows.
+
+    Attributes
+    ----------
+    log_m
+        log M; -inf where not evaluated at this tick.
+    by_row : (3, k)
+        Logarithm of the part of each kind and row in M; -inf where not evaluated at this tick.
+    """
+
+    log_m: float
+    by_row: Floats
+
+    @property
+    def rows(self) -> Ints:
+        """Rows of the onsets with the largest parts in M, the largest first, (`PINS`,)."""
+        return np.asarray(np.argsort(-self.by_row.max(axis=0), kind="stable")[:PINS])
+
+
+def start(modes: Modes) -> Detector:
+    """Detector before the first tick.
+
+    Parameters
+    ----------
+    modes
+        The modes.
+    """
+    onsets = signatures.empty(modes, _STEPS, RAMP_ROWS + 2)
+    return Detector(onsets, np.full((3, onsets.age.size), -inf), 0, None, np.zeros_like(onsets.used), -inf)
+
+
+def pin(detector: Detector, rows: Ints) -> Detector:
+    """Keep some onsets, and no others.
+
+    Parameters
+    ----------
+    detector
+        The detector after a tick.
+    rows
+        Rows in use, at most `PINS`; () to keep none.
+    """
+    pinned = np.zeros_like(detector.pinned)
+    pinned[rows[:PINS]] = True
+    return replace(detector, pinned=pinned & detector.onsets.used)
+
+
+def step(
+    modes: Modes,
+    columns: Columns,
+    before: Detector,
+    update: Update,
+    static: Static,
+    *,
+    h: float,
+    alert: float,
+) -> tuple[Detector, Evidence]:
+    """Take in one step of the filter and evaluate M, if that is due.
+
+    All onsets are evaluated at every `EVERY`-th tick. Young and pinned ones are evaluated at every tick while
+    an onset is pinned, while log M was above `alert`, and where one innovation stands out by itself. The
+    choice may depend on the readings: what is left out only makes M smaller.
+
+    Parameters
+    ----------
+    modes, columns
+        The modes, and columns of faults in them.
+    before
+        So far.
+    update, static
+        The filter's step, and the information about the directions with it.
+    h
+        Interval, s.
+    alert
+        log M from which on it is evaluated at every tick.
+    """
+    ticks, capital = before.ticks + 1, before.capital.copy()
+    ended = () if before.ratio is None else _thin(before, capital, before.ratio)
+    free = before.onsets.used
+    begun = [int(free[:_STEPS].argmin())]
+    capital[:, begun[0]] = log(1.0 - RAMPS)
+    if (ticks - 1) % RAMP_EVERY == 0:
+        begun.append(_STEPS + int(free[_STEPS:].argmin()))
+        capital[:, begun[1]] = log(RAMPS * RAMP_EVERY)
+    onsets = signatures.follow(before.onsets, update, static, h, begun=begun, ended=ended)
+    full, none = ticks % EVERY == 0, np.full(capital.shape, -inf)
+    if not (full or before.log_m >= alert or before.pinned.any() or _stands_out(modes, update)):
+        return Detector(onsets, capital, ticks, None, before.pinned, before.log_m), Evidence(-inf, none)
+    young = (onsets.age <= YOUNG) & ~onsets.ramp
+    due = onsets.used if full else onsets.used & (young | before.pinned)
+    rows = np.flatnonzero(due)
+    ratio = none
+    ratio[:, rows] = log_ratios(columns, modes, signatures.scores(modes, onsets, static, rows), full)
+    by_row = capital + _LOG_WEIGHTS + ratio
+    if due[_STEPS:].any():
+        # A ramp has its capital at the last tick of those that it stands for.
+        by_row[:, onsets.ramp & (onsets.age < RAMP_EVERY)] = -inf
+    top = float(by_row.max())
+    log_m = top + log(float(np.exp(by_row - top).sum()))
+    test = Detector(onsets, capital, ticks, ratio if full else None, before.pinned, log_m)
+    return test, Evidence(log_m, by_row)
+
+
+def _stands_out(modes: Modes, update: Update) -> bool:
+    """A member, or all of them together, stand out in one innovation."""
+    weighed = update.innovation / update.variance
+    y, F = modes.U @ weighed, modes.squares @ update.precision
+    most = modes.size + sqrt(2.0 * JUMP * modes.size)
+    return bool((y * y > JUMP * F).any() or update.innovation @ weighed > most)
+
+
+def log_ratios(columns: Columns, modes: Modes, now: Scores, full: bool) -> Floats:
+    """Log Lambda of each kind and row, (3, k).
+
+    Parameters
+    ----------
+    columns, modes
+        The columns, and the modes.
+    now
+        Scores and information.
+    full
+        Evaluate powers and busbar as well; else their row is -inf.
+    """
+    t = columns.members
+    out = np.full((3, len(now.score)), -inf)
+    W, squares = (columns.W, columns.squares) if full else (columns.W[:, :t], columns.squares[:, :t])
+    y, F = now.of(W, squares)
+    each = log_lambda(y, F, columns.variance[: W.shape[1]])
+    out[0] = _log_mean(each[:, :t])
+    out[1] = omnibus(now, SIZE**2 / modes.white)
+    if full:
+        out[2] = _log_mean(each[:, t:])
+    return out
+
+
+def log_lambda(y: Floats, F: Floats, s2: Floats) -> Floats:
+    """Log Lambda of f ~ N(0, s2) in single columns, of the shape of y.
+
+    Parameters
+    ----------
+    y, F
+        Scores and information.
+    s2
+        Prior variances.
+    """
+    more = s2 * F
+    more += 1.0
+    out = y * y
+    out *= s2
+    out /= more
+    out -= np.log(more)
+    out *= 0.5
+    return out
+
+
+def _log_mean(each: Floats) -> Floats:
+    """Logarithm of the mean over the last axis."""
+    top = each.max(axis=1)
+    return np.asarray(top + np.log(np.exp(each - top[:, None]).sum(axis=1) / each.shape[1]))
+
+
+def omnibus(now: Scores, s2: float) -> Floats:
+    """Log Lambda of f ~ N(0, s2 I) in the modes, (k,).
+
+    Parameters
+    ----------
+    now
+        Scores and information.
+    s2
+        Prior variance in units of the white variance.
+    """
+    more = 1.0 + s2 * now.information
+    logs = np.log(more).sum(axis=1)
+    A = s2 / more
+    A *= now.score
+    out = np.einsum("kt,kt->k", A, now.score) - logs
+    if not now.cov.size:
+        return np.asarray(0.5 * out)
+    pull = np.einsum("krt,kt->kr", now.side, A)
+    inner = (now.side * (s2 / more)[:, None, :]) @ now.side.transpose(0, 2, 1)
+    # det(I - N X'AX) and (N^-1 - X'AX)^-1 = (I - N X'AX)^-1 N.
+    rest = np.eye(len(now.cov)) - now.cov @ inner
+    if len(now.cov) == 1:
+        one = rest[:, 0, 0]
+        return np.asarray(0.5 * (out + now.cov[0, 0] * pull[:, 0] ** 2 / one - np.log(one)))
+    gain = np.linalg.solve(rest, (pull @ now.cov.T)[..., None])[..., 0]
+    return np.asarray(0.5 * (out + np.einsum("kr,kr->k", pull, gain) - np.linalg.slogdet(rest)[1]))
+
+
+def _thin(detector: Detector, capital: Floats, ratio: Floats) -> list[int]:
+    """Rows to drop, so that those of the next ticks are free; `capital` is changed: it goes to neighbours."""
+    onsets, gone = detector.onsets, list[int]()
+    usable = onsets.used & ~detector.pinned
+    for ramp, most in ((False, STEP_ROWS), (True, RAMP_ROWS)):
+        rows = np.flatnonzero(usable & (onsets.ramp == ramp))
+        order = rows[np.argsort(-onsets.age[rows], kind="stable")].tolist()
+        ages = onsets.age[order].tolist()
+        # Ratio of the ages beside each onset but the first and the last.
+        beside = [ages[k - 1] / ages[k + 1] for k in range(1, len(ages) - 1)]
+        while len(order) > most or (ages and ages[0] > OLDEST):
+            at = 0 if ages[0] > OLDEST else 1 + beside.index(min(beside))
+            row = order.pop(at)
+            ages.pop(at)
+            beside = [ages[k - 1] / ages[k + 1] for k in range(1, len(ages) - 1)]
+            # The neighbours are now at the places at - 1 and at.
+            _hand_over(capital, ratio, row, order[max(at - 1, 0) : at + 1])
+            gone.append(row)
+    capital[:, gone] = -inf
+    return gone
+
+
+_KINDS = np.arange(len(WEIGHTS))
+
+
+def _hand_over(capital: Floats, ratio: Floats, row: int, near: list[int]) -> None:
+    """Move the capital of a row to the neighbour with the largest Lambda, kind by kind; M stays."""
+    if not near:
+        return
+    to = np.array(near)[ratio[:, near].argmax(axis=1)]
+    given = capital[:, row] + ratio[:, row] - ratio[_KINDS, to]
+    capital[_KINDS, to] = np.logaddexp(capital[_KINDS, to], given)

@@ -1,0 +1,202 @@
+"""Voltages at all places from the filter, corrected for suspected faults.
+
+The squared voltage at place x exceeds the front end's model by ``w_x + b_x + e_x``: errors of loads that
+come and go, what lasts (loads, and the class of the busbar's meter), and the flicker of the busbar's meter.
+Given the states w, b and the white errors e of the members, in their modes,
+
+    E w_x = S_xT U lam^-1 w        E b_x = C_x B^-1 b,  C = c S + s0^2 H H'        E e_x = phi H_x H' U e
+
+and what is left is independent of all readings: the loads have one correlation time, so that w_x beyond
+S_xT is another AR(1) process. With ``e = z - w - b``, z being the readings in the modes, the estimate is
+linear in the posterior of (w, b, theta), and its variance follows.
+
+A fault f at an onset moves the filter by its signature g and the residuals by u f; false powers and a false
+busbar voltage move the model as well, by ``effect``. With amounts of the mean f and the covariance of
+`gridsec.estimators.modal.search`, the estimate moves by ``T f`` and its variance grows by ``diag(T cov T')``.
+Several explanations are mixed with their weights; their disagreement is part of the variance.
+
+References
+----------
+Särkkä, Bayesian Filtering and Smoothing, 2013, A.1 (Gaussian conditioning).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gridsec.arrays import Bools, Floats
+from gridsec.estimators.modal.filter import FilterState, Update
+from gridsec.estimators.modal.model import Modes
+from gridsec.estimators.modal.search import Identification
+from gridsec.estimators.modal.signatures import Onsets
+from gridsec.estimators.modal.static import Static
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimator:
+    """Regression of the places on the modes. n places, t modes.
+
+    Attributes
+    ----------
+    of_w, of_b, of_e : (n, t)
+        Regression of the error of the model at each place on w, b and e.
+    rest : (n,)
+        Variance that no reading takes away, squared pu^2.
+    """
+
+    of_w: Floats = field(repr=False)
+    of_b: Floats = field(repr=False)
+    of_e: Floats = field(repr=False)
+    rest: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimated:
+    """Errors of the model at n places.
+
+    Attributes
+    ----------
+    mean, variance : (n,)
+        Expected true squared voltage minus that of the model, squared pu, and its variance.
+    """
+
+    mean: Floats
+    variance: Floats
+
+
+def estimator(modes: Modes) -> Estimator:
+    """Prepare the estimate at all places; O(n t^2).
+
+    Parameters
+    ----------
+    modes
+        The modes.
+    """
+    model, at = modes.model, modes.at
+    S, H = model.of_meters[:, at], model.phases(at)
+    known = modes.loads > 0.0
+    h = S @ modes.U
+    ratio = h * np.where(known, 1.0 / np.where(known, modes.loads, 1.0), 0.0)
+    C = model.lasting * S + model.busbar * (model.busbar_of @ H.T)
+    by_b = np.linalg.solve(model.static(at), C.T).T if C.any() else np.zeros_like(C)
+    by_e = model.flicker * (model.busbar_of @ (H.T @ modes.U))
+    phases = (model.busbar_of**2).sum(axis=1)
+    rest = (1.0 - model.lasting) * (model.variance - (ratio * h).sum(axis=1))
+    rest += model.lasting * model.variance + model.busbar * phases - (by_b * C).sum(axis=1)
+    rest += model.flicker * phases - (by_e * by_e).sum(axis=1)
+    return Estimator(ratio, by_b @ modes.back, by_e, np.maximum(rest, 0.0))
+
+
+def honest(modes: Modes, made: Estimator, state: FilterState, static: Static, update: Update) -> Estimated:
+    """Estimate without a fault; O(n t).
+
+    Parameters
+    ----------
+    modes, made
+        The modes, and the estimator of them.
+    state, static, update
+        The filter after the last tick, the information about the directions, and the filter's last step.
+    """
+    w, b = state.mean
+    e = update.innovation / update.variance
+    by_w, by_b = made.of_w - made.of_e, made.of_b - made.of_e
+    variance = (by_w * by_w) @ state.cov[0] + (by_b * by_b) @ state.cov[2]
+    variance += 2.0 * ((by_w * by_b) @ state.cov[1]) + made.rest
+    mean = made.of_w @ w + made.of_b @ b + made.of_e @ e
+    if modes.sign.size:
+        moved = _theta(modes, made, static)
+        mean += moved @ static.theta
+        variance += np.einsum("xr,rs,xs->x", moved, static.cov, moved)
+    return Estimated(mean, np.maximum(variance, 0.0))
+
+
+def _theta(modes: Modes, made: Estimator, static: Static) -> Floats:
+    """Change of the estimate per amount of each direction, (n, r)."""
+    g_w, g_b = static.signature
+    by = made.of_w * -g_w + made.of_b * (1.0 - g_b) - made.of_e * (1.0 - g_w - g_b)
+    return np.asarray(by @ modes.directions)
+
+
+def moves(  # noqa: PLR0917  # the states of all parts, and the faults
+    modes: Modes, made: Estimator, static: Static, onsets: Onsets, row: int, W: Floats, effect: Floats
+) -> Floats:
+    """Change T of the honest estimate per amount of each fault at one onset, (n, q).
+
+    Parameters
+    ----------
+    modes, made, static
+        The modes, the estimator of them, and the information about the directions.
+    onsets, row
+        The onsets, and the row.
+    W : (t, q)
+        Columns of the faults in the modes.
+    effect : (n, q)
+        Change of the model at each place by the faults: zero for meters.
+    """
+    g_w, g_b = onsets.signature[:, row]
+    felt = onsets.level[row] - g_w - g_b
+    by = made.of_w * g_w + made.of_b * g_b + made.of_e * felt
+    out = effect - by @ W
+    if modes.sign.size:
+        turned = static.cov @ (modes.directions.T @ (onsets.cross[row][:, None] * W))
+        out -= _theta(modes, made, static) @ turned
+    return np.asarray(out)
+
+
+def corrected(
+    before: Estimated, T: Floats, found: Identification, joint: tuple[Floats, Floats, Floats] | None = None
+) -> Estimated:
+    """Estimate mixed over the explanations.
+
+    Parameters
+    ----------
+    before
+        The honest estimate.
+    T : (n, q + t)
+        From `moves`, of all faults of the problem, and of a change of the loads in each mode.
+    found
+        The explanations.
+    joint
+        Scores (q + t,) and information (q + t, q + t) of all of them, and the standard deviations of that
+        change (t,); None where no explanation has one.
+    """
+    each = [
+        _one(before, T, _problem_of(found, k, joint), _set_of(found, k, T.shape[1]))
+        for k in range(found.weight.size)
+    ]
+    means = np.stack([one.mean for one in each])
+    mean = found.weight @ means
+    spread = found.weight @ (np.stack([one.variance for one in each]) + (means - mean) ** 2)
+    return Estimated(mean, spread)
+
+
+def _problem_of(
+    found: Identification, k: int, joint: tuple[Floats, Floats, Floats] | None
+) -> tuple[Floats, Floats, Floats]:
+    """Scores, information and prior standard deviations for one explanation."""
+    problem = found.problems[int(found.shock[k])]
+    if joint is None or not found.shock[k]:
+        return problem.y, problem.F, problem.std
+    y, F, std = joint
+    return y, F, np.concatenate([problem.std, std])
+
+
+def _set_of(found: Identification, k: int, size: int) -> Bools:
+    """Faults of one explanation among `size` of them: the chosen ones, and the loads where they changed."""
+    rest = np.full(size - found.chosen.shape[1], found.shock[k])
+    return np.concatenate([found.chosen[k], rest])
+
+
+def _one(before: Estimated, T: Floats, given: tuple[Floats, Floats, Floats], chosen: Bools) -> Estimated:
+    """Estimate under one explanation."""
+    y, F, std = given
+    at = np.flatnonzero(chosen)
+    at = at[std[at] > 0.0]
+    if not at.size:
+        return before
+    cov = np.linalg.inv(F[np.ix_(at, at)] + np.diag(std[at] ** -2.0))
+    moved = T[:, at]
+    more = np.einsum("xq,qr,xr->x", moved, cov, moved)
+    return Estimated(before.mean + moved @ (cov @ y[at]), before.variance + more)

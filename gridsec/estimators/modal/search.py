@@ -1,0 +1,568 @@
+"""Identification: the likeliest sets of manipulated meters, by exact likelihoods of subsets.
+
+At one onset, the scores y (q,) and the information F (q, q) of `gridsec.estimators.modal.signatures` say
+everything about the amounts of q possible faults: meters, false powers, busbar. For a subset J with amounts
+N(0, s_j^2), twice the negative logarithm of its posterior probability, up to a constant, is
+
+    cost(J) = -y_J' (F_JJ + diag(1 / s_J^2))^-1 y_J + log det(I + diag(s_J^2) F_JJ) + penalty(J)
+    penalty = 2 log binom(p, k) for k of p meters, plus a charge for every other fault
+
+Every number of meters is as likely as any other, and every set of one size as any other of that size.
+
+**Search.** The sweep operator keeps ``[F + 1 / s^2, y; y', 0]`` pivoted on J, so that the costs of all sets
+that differ by one addition, removal or exchange are read off, O(q) to O(k q); a step is O(q^2). A group of
+neighbours is added or removed at once. The descent starts from nothing, and from the meters that stand out
+when every one of them has a variance of its own (automatic relevance determination). The prior size of the
+meters' faults is then estimated from the set found, and the descent is repeated.
+
+A set of meters that are off by nearly the same amount needs one size instead of k. The likelihood of a set is
+the mean of that with independent amounts and that with amounts alike, which has the charge of a false
+power: loads without a report move neighbours alike as well.
+
+**Rivals.** Loads may change at once in ways that no report shows. With a change of the loads of the
+covariance ``SHOCK S`` integrated out, which is diagonal in the modes, the search is made a second time; its
+sets bear the cost of that change. A set without meter j is looked for from the best set by removing j, and
+the sets that differ by one whole group are tried. All sets met count with the weight exp(-cost / 2). A
+meter is named if the sets without it have together less than `DOUBT` of the weight.
+
+References
+----------
+.. [1] Goodnight, A tutorial on the SWEEP operator, The American Statistician 33, 1979.
+.. [2] Chen and Chen, Extended Bayesian information criteria, Biometrika 95, 2008.
+.. [3] Tipping, Sparse Bayesian learning and the relevance vector machine, JMLR 1, 2001.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from math import inf, log
+
+import numpy as np
+from scipy.cluster.hierarchy import linkage
+from scipy.linalg import blas, cho_solve, cholesky
+
+from gridsec.arrays import Bools, Floats, Ints
+from gridsec.estimators.modal.model import Modes
+
+DOUBT = 1e-3
+"""Largest weight of all explanations without a meter that is named, 1."""
+MAJORITY = 9.0
+"""Least penalty of a meter beyond a third of all, in units of the cost: three standard deviations."""
+BELIEVED = 1e-8
+"""Weight below which a set is not kept, 1: far below `DOUBT`."""
+ALIKE = 0.99
+"""Share of the variance of amounts that meters have in common where they are manipulated alike, 1."""
+SOME = 200
+"""Number of sets that are also tried with amounts alike, the cheapest ones first."""
+FAR = 150.0
+"""Cost above the best one, after one change, from which on a set without a meter is not followed, 1."""
+STEPS = 4
+"""Largest number of steps of a descent, in meters: each may be added, removed and exchanged."""
+RELEVANCE = 12
+"""Iterations of the start by relevance: variances of irrelevant meters halve in each."""
+STANDS_OUT = 9.0
+"""Squared standard deviations from which a meter is in that start, 1."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Problem:
+    """Scores and information of q faults at one onset; the meters come first.
+
+    Attributes
+    ----------
+    y : (q,)
+        Scores.
+    F : (q, q)
+        Information.
+    std : (q,)
+        Prior standard deviations of the amounts.
+    meters
+        Number of meters, p.
+    charge : (q,)
+        Penalty of each fault that is not a meter, in units of the cost; 0 for meters.
+    bound : (q,)
+        Largest amount that is possible; infinite for none.
+    """
+
+    y: Floats
+    F: Floats = field(repr=False)
+    std: Floats
+    meters: int
+    charge: Floats
+    bound: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidate:
+    """A set of faults.
+
+    Attributes
+    ----------
+    chosen : (q,)
+        The set.
+    cost
+        Its cost.
+    """
+
+    chosen: Bools
+    cost: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Identification:
+    """Sets of faults that explain the readings, the likeliest first.
+
+    Attributes
+    ----------
+    chosen : (k, q)
+        The sets.
+    shock : (k,)
+        Explanations in which all loads have changed at the onset as well.
+    weight : (k,)
+        Their posterior weights; they sum to 1.
+    named : (p,)
+        Meters without which nothing explains the readings.
+    problems
+        The problem with the estimated prior size, and that with a change of all loads integrated out.
+    """
+
+    chosen: Bools
+    shock: Bools
+    weight: Floats
+    named: Bools
+    problems: tuple[Problem, ...]
+
+
+def penalties(meters: int) -> Floats:
+    """Penalty of k of p meters, for k = 0 to p, (p + 1,).
+
+    Parameters
+    ----------
+    meters
+        p.
+    """
+    k = np.arange(meters)
+    more = 2.0 * np.log((meters - k) / (k + 1.0))
+    more = np.where(k >= max(1, meters // 3), np.maximum(more, MAJORITY), more)
+    return np.concatenate([[0.0], np.cumsum(more)])
+
+
+def cost(problem: Problem, chosen: Bools) -> float:
+    """Cost of one set; O(k^3).
+
+    Parameters
+    ----------
+    problem
+        The problem.
+    chosen : (q,)
+        The set.
+    """
+    at = np.flatnonzero(chosen)
+    out = float(penalties(problem.meters)[np.count_nonzero(at < problem.meters)] + problem.charge[at].sum())
+    if at.size:
+        half = cholesky(problem.F[np.ix_(at, at)] + np.diag(problem.std[at] ** -2.0), lower=True)
+        out -= float(problem.y[at] @ cho_solve((half, True), problem.y[at]))
+        out += 2.0 * float(np.log(np.diag(half)).sum() + np.log(problem.std[at]).sum())
+    return out
+
+
+def alike(problem: Problem, chosen: Bools) -> float:
+    """Cost of one set if its meters are off by nearly the same amount, as likely as if they are not; O(k^3).
+
+    The amounts have the prior covariance ``s^2 (ALIKE 1 1' + (1 - ALIKE) I)``. The set bears the largest
+    charge besides: an unreported load moves neighbours alike as well.
+
+    Parameters
+    ----------
+    problem
+        The problem.
+    chosen : (q,)
+        The set.
+    """
+    at = np.flatnonzero(chosen)
+    p, k = problem.meters, int(np.count_nonzero(chosen[: problem.meters]))
+    V = np.diag(problem.std[at] ** 2.0)
+    V[:k, :k] *= 1.0 - ALIKE
+    V[:k, :k] += ALIKE * np.outer(problem.std[at[:k]], problem.std[at[:k]])
+    half = np.linalg.cholesky(V)
+    y, inner = half.T @ problem.y[at], half.T @ problem.F[np.ix_(at, at)] @ half
+    inner[np.diag_indices(at.size)] += 1.0
+    lower = cholesky(inner, lower=True)
+    charge = float(penalties(p)[k] + problem.charge[at].sum() + problem.charge.max())
+    return charge - float(y @ cho_solve((lower, True), y)) + 2.0 * float(np.log(np.diag(lower)).sum())
+
+
+def amounts(problem: Problem, chosen: Bools) -> tuple[Floats, Floats]:
+    """Posterior mean (k,) and covariance (k, k) of the amounts of a set.
+
+    Parameters
+    ----------
+    problem
+        The problem.
+    chosen : (q,)
+        The set.
+    """
+    at = np.flatnonzero(chosen)
+    cov = np.asarray(np.linalg.inv(problem.F[np.ix_(at, at)] + np.diag(problem.std[at] ** -2.0)), np.float64)
+    return cov @ problem.y[at], cov
+
+
+class Tableau:
+    """Sweep tableau of one problem, pivoted on a set.
+
+    Parameters
+    ----------
+    problem
+        The problem.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        q = problem.y.size
+        self.problem, self.penalty = problem, penalties(problem.meters)
+        self.A = np.empty((q + 1, q + 1), order="F")
+        self.A[:q, :q] = problem.F
+        self.A[np.arange(q), np.arange(q)] += problem.std**-2.0
+        self.A[q, :q] = self.A[:q, q] = problem.y
+        self.A[q, q] = 0.0
+        self.chosen = np.zeros(q, dtype=np.bool_)
+        self.barred = np.zeros(q, dtype=np.bool_)
+        self.cost = 0.0
+        self.size = 2.0 * np.log(problem.std)
+
+    def copy(self) -> Tableau:
+        """A tableau that can be changed without changing this one."""
+        out = object.__new__(Tableau)
+        out.problem, out.penalty, out.size = self.problem, self.penalty, self.size
+        out.A, out.chosen, out.cost = self.A.copy(order="F"), self.chosen.copy(), self.cost
+        out.barred = self.barred.copy()
+        return out
+
+    @property
+    def count(self) -> int:
+        """Number of chosen meters."""
+        return int(np.count_nonzero(self.chosen[: self.problem.meters]))
+
+    def changes(self) -> Floats:
+        """Change of the cost by toggling each fault, (q,); inf where it is barred or would be impossible."""
+        q, k = self.chosen.size, self.count
+        a, v = self.A.diagonal()[:q], self.A[:q, q]
+        sign = np.where(self.chosen, -1.0, 1.0)
+        out = -v * v / a + np.where(self.chosen, np.log(np.abs(a)) - self.size, np.log(np.abs(a)) + self.size)
+        p = self.problem.meters
+        up = self.penalty[min(k + 1, p)] - self.penalty[k]
+        down = self.penalty[max(k - 1, 0)] - self.penalty[k]
+        out[:p] += np.where(self.chosen[:p], down, up)
+        out += sign * self.problem.charge
+        impossible = ~self.chosen & (np.abs(v) > self.problem.bound * np.abs(a))
+        return np.where(impossible | (self.barred & ~self.chosen) | (sign * a <= 0.0), inf, out)
+
+    def exchanges(self, out: Ints) -> Floats:
+        """Change of the cost by exchanging chosen meters `out` for other meters, (k, p); inf for itself.
+
+        Parameters
+        ----------
+        out : (k,)
+            Chosen meters.
+        """
+        p, q = self.problem.meters, self.chosen.size
+        a, v = self.A.diagonal()[:p], self.A[:p, q]
+        rows = self.A[out, :p] / a[out][:, None]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            pivot = a - rows * self.A[out, :p]
+            pull = v - rows * v[out][:, None]
+            first = -(v[out] ** 2) / a[out] + np.log(-a[out]) - self.size[out]
+            both = first[:, None] - pull**2 / pivot + np.log(pivot) + self.size[:p]
+        return np.where(self.chosen[:p] | self.barred[:p] | ~(pivot > 0.0), inf, both)
+
+    def bar(self, j: int) -> None:
+        """Keep a fault outside from now on, and remove it if it is inside.
+
+        Parameters
+        ----------
+        j
+            The fault.
+        """
+        self.barred[j] = True
+        if self.chosen[j]:
+            self.toggle(j)
+
+    def toggle(self, j: int) -> None:
+        """Add a fault to the set, or remove it; O(q^2).
+
+        Parameters
+        ----------
+        j
+            The fault.
+        """
+        k, column, d = self.count, self.A[:, j].copy(), self.A[j, j]
+        self.A = blas.dger(-1.0 / d, column, column, a=self.A, overwrite_a=True)
+        pivot = column / (-d if self.chosen[j] else d)
+        self.A[j] = self.A[:, j] = pivot
+        self.A[j, j] = -1.0 / d
+        size = log(abs(d)) + (-self.size[j] if self.chosen[j] else self.size[j])
+        added = -1 if self.chosen[j] else 1
+        self.cost += size - column[-1] ** 2 / d + added * self.problem.charge[j]
+        self.chosen[j] = not self.chosen[j]
+        self.cost += self.penalty[self.count] - self.penalty[k]
+
+    def group(self, members: Ints) -> float:
+        """Change of the cost by adding a group of meters, none of them chosen, O(g^3).
+
+        Parameters
+        ----------
+        members : (g,)
+            The group.
+        """
+        k, q = self.count, self.chosen.size
+        half, v = np.linalg.cholesky(self.A[np.ix_(members, members)]), self.A[members, q]
+        gain = np.linalg.solve(half, v)
+        more = 2.0 * np.log(half.diagonal()).sum() + self.size[members].sum() - gain @ gain
+        return float(more + self.penalty[k + members.size] - self.penalty[k])
+
+
+def descend(tableau: Tableau, groups: tuple[Ints, ...] = ()) -> Tableau:
+    """Lower the cost by additions, removals, exchanges and groups until none of them helps.
+
+    A fault with an amount that other changes have made impossible is removed and barred.
+
+    Parameters
+    ----------
+    tableau
+        Where to start; it is changed and returned.
+    groups
+        Groups of neighbours.
+    """
+    for _ in range(STEPS * tableau.problem.meters):
+        change = tableau.changes()
+        j = int(change.argmin())
+        if change[j] < -_GAIN:
+            tableau.toggle(j)
+        elif not (_possible(tableau) or _exchanged(tableau) or _grouped(tableau, groups)):
+            break
+    return tableau
+
+
+def _possible(tableau: Tableau) -> bool:
+    """Bar the faults with impossible amounts, if there are any."""
+    amount = tableau.A[:-1, -1]
+    beyond = np.flatnonzero(tableau.chosen & (np.abs(amount) > tableau.problem.bound))
+    for j in beyond:
+        tableau.bar(int(j))
+    return bool(beyond.size)
+
+
+_GAIN = 1e-9
+"""Least change of the cost that counts, 1: rounding."""
+
+
+def _exchanged(tableau: Tableau) -> bool:
+    """Make the best exchange of two meters, if one helps."""
+    out = np.flatnonzero(tableau.chosen[: tableau.problem.meters])
+    if not out.size:
+        return False
+    both = tableau.exchanges(out)
+    i, j = np.unravel_index(int(both.argmin()), both.shape)
+    if not both[i, j] < -_GAIN:
+        return False
+    tableau.toggle(int(out[i]))
+    tableau.toggle(int(j))
+    return True
+
+
+def _grouped(tableau: Tableau, groups: tuple[Ints, ...]) -> bool:
+    """Add the rest of the best group, if one helps."""
+    best, least = None, -_GAIN
+    for group in groups:
+        rest = group[~tableau.chosen[group]]
+        if rest.size > 1 and not tableau.barred[rest].any():
+            change = tableau.group(rest)
+            if change < least:
+                best, least = rest, change
+    if best is None:
+        return False
+    for j in best:
+        tableau.toggle(int(j))
+    return True
+
+
+def relevant(problem: Problem) -> Bools:
+    """Meters that stand out when each has a prior variance of its own, (q,); O(p^3) per iteration.
+
+    Parameters
+    ----------
+    problem
+        The problem.
+    """
+    p = problem.meters
+    F, y, alpha = problem.F[:p, :p], problem.y[:p], problem.std[:p] ** 2.0
+    least = 1e-8 * alpha
+    for _ in range(RELEVANCE):
+        cov = np.linalg.inv(F + np.diag(1.0 / alpha))
+        mean = cov @ y
+        alpha = np.maximum(mean * mean + cov.diagonal(), least)
+    out = np.zeros(problem.y.size, dtype=np.bool_)
+    out[:p] = mean * mean > STANDS_OUT * cov.diagonal()
+    return out
+
+
+def search(
+    problem: Problem, groups: tuple[Ints, ...] = (), shocked: tuple[Problem, float] | None = None
+) -> Identification:
+    """Find the likeliest sets and the meters without which nothing explains the readings.
+
+    Parameters
+    ----------
+    problem
+        The problem.
+    groups
+        Groups of neighbours, places of meters.
+    shocked
+        The problem with a change of all loads integrated out, and the cost of that change by itself.
+    """
+    plain, found = _explored(problem, groups)
+    if shocked is None:
+        return _identified((plain,), (found,))
+    other, more = _explored(shocked[0], groups)
+    return _identified((plain, other), (found, {key: each + shocked[1] for key, each in more.items()}))
+
+
+def _explored(problem: Problem, groups: tuple[Ints, ...]) -> tuple[Problem, dict[bytes, float]]:
+    """The problem with the estimated prior size, and all sets that were met with their costs."""
+    start = relevant(problem)
+    best = _best((Tableau(problem), _at(problem, start)), groups)
+    sized = _sized(problem, best.chosen)
+    if sized is not problem:
+        problem, best = sized, _best((_at(sized, best.chosen), _at(sized, start)), groups)
+    found = {best.chosen.tobytes(): best.cost}
+
+    def keep(tableau: Tableau) -> None:
+        found[tableau.chosen.tobytes()] = min(tableau.cost, found.get(tableau.chosen.tobytes(), inf))
+
+    for tableau in _flipped(best, groups):
+        keep(descend(tableau, groups))
+    top = min(found, key=lambda key: found[key])
+    if top != best.chosen.tobytes():
+        best = _at(problem, np.frombuffer(top, dtype=np.bool_))
+    _neighbours(best, found)
+    if best.chosen[problem.meters :].any():
+        # The best set of meters alone, which amounts alike may favour.
+        only = Tableau(problem)
+        only.barred[problem.meters :] = True
+        only = descend(only, groups)
+        keep(only)
+        _neighbours(only, found)
+    for j in np.flatnonzero(best.chosen[: problem.meters]):
+        rival = best.copy()
+        rival.bar(int(j))
+        if rival.cost + min(0.0, float(rival.changes().min())) < best.cost + FAR:
+            keep(descend(rival, groups))
+    for key in sorted(found, key=lambda key: found[key])[:SOME]:
+        chosen = np.frombuffer(key, dtype=np.bool_)
+        if np.count_nonzero(chosen[: problem.meters]) > 1:
+            # Twice the logarithm of the mean of both likelihoods.
+            both = np.logaddexp(-0.5 * found[key], -0.5 * alike(problem, chosen))
+            found[key] = 2.0 * (log(2.0) - float(both))
+    return problem, found
+
+
+def _best(starts: tuple[Tableau, ...], groups: tuple[Ints, ...]) -> Tableau:
+    """The cheapest end of descents."""
+    return min((descend(start, groups) for start in starts), key=lambda end: end.cost)
+
+
+def _at(problem: Problem, chosen: Bools) -> Tableau:
+    """A tableau pivoted on a set."""
+    out = Tableau(problem)
+    for j in np.flatnonzero(chosen):
+        out.toggle(int(j))
+    return out
+
+
+def _sized(problem: Problem, chosen: Bools) -> Problem:
+    """The problem with the prior size of the meters' faults estimated from a set of them."""
+    p = problem.meters
+    if not chosen[:p].any():
+        return problem
+    mean, cov = amounts(problem, chosen)
+    count = int(np.count_nonzero(chosen[:p]))
+    size = float(np.sqrt(np.mean((mean**2 + cov.diagonal())[:count])))
+    std = problem.std.copy()
+    std[:p] = size
+    return replace(problem, std=std)
+
+
+def _flipped(best: Tableau, groups: tuple[Ints, ...]) -> list[Tableau]:
+    """Tableaus in which the meters of one group are accused in place of the believed and the reverse."""
+    p, out = best.problem.meters, []
+    for group in groups:
+        inside = best.chosen[group]
+        if inside.any() and group.size > 1:
+            chosen = best.chosen.copy()
+            chosen[group] = ~inside
+            if np.count_nonzero(chosen[:p]) <= max(1, p // 2):
+                out.append((cost(best.problem, chosen), chosen))
+    out.sort(key=lambda each: each[0])
+    return [_at(best.problem, chosen) for _, chosen in out[:_FLIPS]]
+
+
+_FLIPS = 4
+"""Number of flipped groups from which a descent starts: the cheapest ones."""
+
+
+def _neighbours(best: Tableau, found: dict[bytes, float]) -> None:
+    """Add the sets that differ from the best by one addition, removal or exchange, if they weigh anything."""
+    limit = best.cost - 2.0 * log(BELIEVED)
+    change = best.changes()
+    for j in np.flatnonzero(best.cost + change < limit):
+        chosen = best.chosen.copy()
+        chosen[j] = not chosen[j]
+        found.setdefault(chosen.tobytes(), best.cost + float(change[j]))
+    out = np.flatnonzero(best.chosen[: best.problem.meters])
+    if not out.size:
+        return
+    both = best.exchanges(out)
+    for i, j in zip(*np.nonzero(best.cost + both < limit), strict=True):
+        chosen = best.chosen.copy()
+        chosen[out[i]], chosen[j] = False, True
+        found.setdefault(chosen.tobytes(), best.cost + float(both[i, j]))
+
+
+def _identified(problems: tuple[Problem, ...], found: tuple[dict[bytes, float], ...]) -> Identification:
+    """Weights of the sets found, and the meters without which nothing is left."""
+    every = sorted((each[key], k, key) for k, each in enumerate(found) for key in each)
+    costs = np.array([one for one, _, _ in every])
+    weight = np.exp(-0.5 * (costs - costs[0]))
+    weight /= weight.sum()
+    kept = weight >= BELIEVED
+    chosen = np.stack([np.frombuffer(key, dtype=np.bool_) for _, _, key in every])[kept]
+    weight = weight[kept] / weight[kept].sum()
+    without = weight @ ~chosen[:, : problems[0].meters]
+    shock = np.array([k > 0 for _, k, _ in every])[kept]
+    return Identification(chosen, shock, weight, np.asarray(without < DOUBT), problems)
+
+
+def groups(modes: Modes) -> tuple[Ints, ...]:
+    """Nested groups of neighbours: clusters of members by the correlation of their voltages, O(t^2 log t).
+
+    Any network has them; on a radial feeder they are nearly the subtrees.
+
+    Parameters
+    ----------
+    modes
+        The modes.
+    """
+    if modes.size < _FEWEST:
+        return ()
+    S = modes.model.loads(modes.at)
+    var = S.diagonal()
+    # Squared distance of two voltages: the variance of their difference.
+    distance = np.sqrt(np.maximum(var[:, None] + var - 2.0 * S, 0.0))
+    tree = linkage(distance[np.triu_indices(modes.size, 1)], method="average")
+    inside: list[Ints] = [np.array([k]) for k in range(modes.size)]
+    for one, other in tree[:, :2].astype(np.intp):
+        inside.append(np.sort(np.concatenate([inside[one], inside[other]])))
+    most = modes.size // 2
+    return tuple(each for each in inside[modes.size :] if each.size <= most)
+
+
+_FEWEST = 3

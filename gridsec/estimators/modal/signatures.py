@@ -1,0 +1,313 @@
+"""Signatures of faults: effect of a fault begun at an onset on the innovations, and the information about it.
+
+A fault ``f`` of the members begun at onset k adds ``u_t f`` to the residuals, ``u_t = 1`` for a step and
+``u_t = (t - k) / T_r`` for a ramp. Every mode answers by itself, so one number per mode stands for all
+faults:
+
+    gamma = u - rho g_w - rho_b g_b,   g <- (rho g_w, rho_b g_b) + k phi gamma
+    a += gamma nu / v,   i += gamma^2 phi / v,   c += gamma gamma_0 phi / v
+
+with the update (nu, v, k, phi) of `gridsec.estimators.modal.filter` and gamma_0 of
+`gridsec.estimators.modal.static`. For a column W of faults in the modes, ``W = U' F``, and theta integrated
+out, score and information of its amount are
+
+    y = W' (a - c * Gamma theta),   I = W' (diag(i) - diag(c) Gamma N Gamma' diag(c)) W
+
+and ``exp(y' f - f' I f / 2)`` is the likelihood ratio of the fault against none, given all readings so far.
+
+With many directions (more than `static.FEW`) I takes only those of the busbar into account. It is then too
+large by a positive semidefinite matrix, and mixtures of likelihood ratios are too small: their expectation
+without a fault is at most 1.
+
+References
+----------
+Willsky and Jones, A generalized likelihood ratio approach to the detection and estimation of jumps in linear
+systems, IEEE Trans. Automatic Control 21, 1976.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from gridsec.arrays import Bools, Floats, Ints
+from gridsec.estimators.modal.filter import Update
+from gridsec.estimators.modal.model import Modes
+from gridsec.estimators.modal.static import FEW, Static, offset
+
+RAMP_S = 600.0
+"""Time in which a unit ramp reaches 1, s: the time scale of the loads."""
+
+
+_ALL = slice(None)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Onsets:
+    """Rows of onsets, each a step or a ramp. k rows, t modes. A row that is not in use is zero.
+
+    Attributes
+    ----------
+    age : (k,)
+        Ticks since the onset, its own included; 0 where not in use.
+    used, ramp : (k,)
+        Rows in use, and rows of ramps.
+    level : (k,)
+        u of the last tick.
+    signature : (2, k, t)
+        g of w and of b, after the last update.
+    score, information, cross : (k, t)
+        a, i and c.
+    """
+
+    age: Ints
+    used: Bools
+    ramp: Bools
+    level: Floats
+    signature: Floats = field(repr=False)
+    score: Floats = field(repr=False)
+    information: Floats = field(repr=False)
+    cross: Floats = field(repr=False)
+
+
+def empty(modes: Modes, steps: int, ramps: int = 0) -> Onsets:
+    """Rows without onsets.
+
+    Parameters
+    ----------
+    modes
+        The modes.
+    steps, ramps
+        Numbers of rows.
+    """
+    k, t = steps + ramps, modes.size
+    none = np.zeros(k, dtype=np.bool_)
+    zero = np.zeros((k, t))
+    return Onsets(
+        age=np.zeros(k, dtype=np.intp),
+        used=none,
+        ramp=np.arange(k) >= steps,
+        level=np.zeros(k),
+        signature=np.zeros((2, k, t)),
+        score=zero,
+        information=zero,
+        cross=zero,
+    )
+
+
+def follow(
+    onsets: Onsets,
+    update: Update,
+    static: Static,
+    h: float,
+    *,
+    begun: Sequence[int] = (),
+    ended: Sequence[int] = (),
+) -> Onsets:
+    """Take in one step of the filter; O(k t).
+
+    Parameters
+    ----------
+    onsets
+        So far.
+    update
+        The filter's step.
+    static
+        Information about the directions, this step included.
+    h
+        Interval, s.
+    begun, ended
+        Rows, not in use so far, for onsets at this tick, and other rows that are given back.
+    """
+    rho, rho_b = update.decay
+    age, used, level = onsets.age, onsets.used, onsets.level
+    if begun or ended:
+        age, used, level = age.copy(), used.copy(), level.copy()
+        for row in begun:
+            used[row], level[row] = True, not onsets.ramp[row]
+        for row in ended:
+            used[row], level[row], age[row] = False, 0.0, 0
+    level = level + h / RAMP_S * (onsets.ramp & used)
+    g = onsets.signature * np.array([rho, rho_b])[:, None, None]
+    gamma = level[:, None] - g[0]
+    gamma -= g[1]
+    weighed = gamma / update.variance
+    score = weighed * update.innovation
+    score += onsets.score
+    told = weighed if update.kept is None else weighed * update.kept
+    information = told * gamma
+    information += onsets.information
+    cross = told * static.gamma
+    cross += onsets.cross
+    g += update.gain[:, None, :] * (gamma if update.kept is None else gamma * update.kept)
+    for row in ended:
+        g[:, row] = score[row] = information[row] = cross[row] = 0.0
+    return Onsets(age + used, used, onsets.ramp, level, g, score, information, cross)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scores:
+    """Scores and information of all modes with theta integrated out. k rows, t modes, r directions in use.
+
+    Attributes
+    ----------
+    score, information : (k, t)
+        ``a - c * Gamma theta`` and i.
+    side : (k, r, t)
+        ``diag(c) Gamma`` of the directions that count.
+    cov : (r, r)
+        Their N.
+    """
+
+    score: Floats
+    information: Floats
+    side: Floats
+    cov: Floats
+
+    def of(self, W: Floats, squares: Floats) -> tuple[Floats, Floats]:
+        """Scores and information of single columns, (k, q) each.
+
+        Parameters
+        ----------
+        W, squares : (t, q)
+            The columns in the modes, and their squares.
+        """
+        F = self.information @ squares
+        if self.cov.size == 1:
+            F -= self.cov[0, 0] * (self.side[:, 0] @ W) ** 2
+        elif self.cov.size:
+            side = self.side @ W
+            F -= np.einsum("krq,rs,ksq->kq", side, self.cov, side)
+        return self.score @ W, F
+
+    def matrix(self, row: int, W: Floats) -> tuple[Floats, Floats]:
+        """Scores (q,) and information (q, q) of columns together, at one row.
+
+        Parameters
+        ----------
+        row
+            The row.
+        W : (t, q)
+            The columns in the modes.
+        """
+        F = (W.T * self.information[row]) @ W
+        if self.cov.size:
+            side = self.side[row] @ W
+            F -= side.T @ self.cov @ side
+        return self.score[row] @ W, F
+
+
+def scores(modes: Modes, onsets: Onsets, static: Static, rows: Ints | slice = _ALL) -> Scores:
+    """Integrate the directions out.
+
+    Parameters
+    ----------
+    modes, onsets, static
+        The modes, and the information so far.
+    rows : (k,)
+        Rows to work on; all by default.
+    """
+    r = modes.sign.size
+    score, information = onsets.score[rows], onsets.information[rows]
+    if not r:
+        return Scores(score, information, np.zeros((len(score), 0, modes.size)), np.zeros((0, 0)))
+    cross = onsets.cross[rows]
+    score = score - cross * offset(modes, static)
+    G, cov = modes.directions, static.cov
+    if r > FEW:
+        G = G[:, : modes.busbar]
+        cov = np.asarray(
+            np.linalg.inv(np.diag(modes.sign[: modes.busbar]) + (G.T * static.information) @ G), np.float64
+        )
+    return Scores(score, information, cross[:, None, :] * G.T, cov)
+
+
+def shocked(modes: Modes, onsets: Onsets, static: Static, row: int, size: float) -> tuple[Scores, float]:
+    """Scores at one row with a change of all loads ``N(0, size S)`` at the onset integrated out.
+
+    Also the logarithm of the likelihood ratio of such a change against none. With ``s = size lam`` the change
+    is integrated out first, mode by mode: a, i and c are divided by ``1 + s i``, and the information about
+    theta loses ``s c^2 / (1 + s i)``.
+
+    Parameters
+    ----------
+    modes, onsets, static
+        The modes, and the information so far.
+    row
+        The row.
+    size
+        Variance of the change, in those of the loads.
+    """
+    a, i, c = onsets.score[row], onsets.information[row], onsets.cross[row]
+    s = size * modes.loads
+    more = 1.0 + s * i
+    ratio = 0.5 * float((s * a * a / more - np.log(more)).sum())
+    r = modes.sign.size
+    a, i, c = a / more, i / more, c / more
+    if not r:
+        return Scores(a[None], i[None], np.zeros((1, 0, modes.size)), np.zeros((0, 0))), ratio
+    G, sign = modes.directions, np.diag(modes.sign)
+    information = static.information - s * c * onsets.cross[row]
+    before, after = (sign + (G.T * each) @ G for each in (static.information, information))
+    right, left = static.score @ G, (static.score - s * c * onsets.score[row]) @ G
+    cov = np.asarray(np.linalg.inv(after), np.float64)
+    ratio += 0.5 * float(left @ cov @ left - right @ np.linalg.solve(before, right))
+    ratio += 0.5 * float(np.linalg.slogdet(before)[1] - np.linalg.slogdet(after)[1])
+    return Scores((a - c * (G @ (cov @ left)))[None], i[None], (c[:, None] * G).T[None], cov), ratio
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """Columns of faults in the modes: members, powers, busbar. t modes, q columns.
+
+    Attributes
+    ----------
+    W : (t, q)
+        ``U' [1, powers, H]``.
+    std : (q,)
+        Prior standard deviation of each amount.
+    members, powers
+        Numbers of columns of members and of powers; the rest are phases of the busbar.
+    """
+
+    W: Floats
+    std: Floats
+    members: int
+    powers: int
+
+    @cached_property
+    def squares(self) -> Floats:
+        """Squares of W, (t, q)."""
+        return np.asarray(self.W * self.W)
+
+    @cached_property
+    def variance(self) -> Floats:
+        """Squares of std, (q,)."""
+        return np.asarray(self.std * self.std)
+
+
+def columns(modes: Modes, powers: Floats, power_std: Floats, std: float) -> Columns:
+    """Columns of a set of members.
+
+    Parameters
+    ----------
+    modes
+        The modes.
+    powers : (p, m)
+        Effect of false powers on all meters, squared pu per pu.
+    power_std : (m,)
+        Prior standard deviation of false powers, pu.
+    std
+        Prior standard deviation of faults of meters and of the busbar, squared pu.
+    """
+    H = modes.model.phases(modes.at)
+    H = H[:, H.any(axis=0)]
+    return Columns(
+        W=np.hstack([modes.U.T, modes.U.T @ powers[modes.at], modes.U.T @ H]),
+        std=np.concatenate([np.full(modes.size, std), power_std, np.full(H.shape[1], std)]),
+        members=modes.size,
+        powers=power_std.size,
+    )

@@ -1,0 +1,142 @@
+"""Model of a designed feeder, and the core beside the default monitor."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks._residuals import Source, model_of, tree
+from gridsec.estimators import sequential
+from gridsec.estimators.modal import core
+from gridsec.estimators.modal.model import MOST_LASTING, modes, residual_model
+from gridsec.estimators.sequential import SequentialDesign
+from tests.gridsec.estimators.sequential.test_monitor import prepare
+from tests.gridsec.street import Street, make_plant
+
+MODEL = model_of(tree(12, np.random.default_rng(3)))
+LIAR = 4
+
+
+def front(customers: int = 12) -> tuple[SequentialDesign, Street]:
+    """A designed street and its truth."""
+    plant = make_plant(np.random.default_rng(5), customers=customers, drop=0.03)
+    return prepare(plant), Street(plant, np.random.default_rng(6))
+
+
+def test_modes_diagonalise_the_model() -> None:
+    """U'DU is the identity, U'SU and U'(kappa D + c S)U are diagonal, and B is put together again."""
+    model = replace(MODEL, fixed=MODEL.fixed * np.linspace(1.0, 3.0, 12), lasting=0.2)
+    made = modes(model)
+    D, S, B = model.noise(made.at), model.loads(made.at), model.static(made.at)
+    assert np.allclose(made.U.T @ D @ made.U, np.eye(12), atol=1e-10)
+    assert np.allclose(made.U.T @ S @ made.U, np.diag(made.loads), atol=1e-9 * made.loads.max())
+    assert np.allclose(made.back @ made.U.T, np.eye(12), atol=1e-9)
+    G = made.back @ made.directions
+    whole = (made.back * made.lasting) @ made.back.T + (G * made.sign) @ G.T
+    assert np.allclose(whole, B, atol=1e-9 * B.max())
+    assert np.isclose(made.varying.sum() / made.loads.sum(), 0.8)
+
+
+def test_the_model_is_that_of_the_front_end() -> None:
+    """Loads with the busbar are the prior of the default monitor."""
+    made, _ = front()
+    model = residual_model(made)
+    with_busbar = model.of_meters + model.busbar
+    assert np.allclose(with_busbar, made.prior.of_meters)
+    assert np.allclose(model.variance + model.busbar, made.prior.variance)
+    assert (model.white == made.white).all()
+    assert (model.fixed == made.fixed).all()
+
+
+def test_some_part_of_the_loads_always_changes() -> None:
+    """Errors of registers last, but as parts of loads that change."""
+    made, _ = front()
+    always = replace(made, doubt=replace(made.doubt, lasting=1.0))
+    assert residual_model(always).lasting == MOST_LASTING
+    assert residual_model(made).lasting == 0.0
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        ({"white": np.zeros(12)}, "white must be positive"),
+        ({"fixed": np.full(12, -1.0)}, "fixed must be at least 0"),
+        ({"busbar": -1.0}, "busbar must be at least 0"),
+        ({"flicker": np.nan}, "flicker must be at least 0"),
+        ({"lasting": 1.1}, "lasting must be from 0 to 1"),
+        ({"time_s": 0.0}, "time_s must be positive"),
+        ({"fixed_s": -1.0}, "fixed_s must be positive"),
+        ({"white": np.ones(3)}, "white has the shape"),
+        ({"of_meters": np.ones((3, 3))}, "of_meters has the shape"),
+    ],
+)
+def test_wrong_models_are_refused(change: dict[str, object], what: str) -> None:
+    with pytest.raises(ValueError, match=what):
+        replace(MODEL, **change)  # type: ignore[arg-type]
+
+
+def test_modes_need_a_member_and_gamma_is_at_least_1() -> None:
+    with pytest.raises(ValueError, match="at least one meter"):
+        modes(MODEL, np.zeros(0, dtype=np.intp))
+    with pytest.raises(ValueError, match="gamma"):
+        core.assemble(MODEL, np.zeros((13, 12)), np.ones(12), gamma=0.5)
+    kernel = core.design(front()[0])
+    with pytest.raises(ValueError, match="no reading"):
+        core.estimate(kernel, core.init(kernel, 0.0))
+
+
+def test_beside_the_default_monitor() -> None:
+    """AC power flow: no alarm without a lie; a lie of 3 % is named at once, and the voltage is put right."""
+    made, street = front()
+    kernel = core.design(made)
+    state, mine = sequential.init(made, street.t), None
+    for k in range(120):
+        street.advance(1.0)
+        lies = {LIAR: 0.03} if k >= 100 else None
+        frame = street.frame(lies)
+        state, _, _ = sequential.step(made, state, frame)
+        mine = core.init(kernel, frame.t) if mine is None else mine
+        m, seen = core.residuals(state)
+        mine, evidence = core.step(kernel, mine, frame.t, m, seen)
+        assert k >= 100 or not core.alarmed(kernel, evidence)
+    assert core.alarmed(kernel, evidence)
+    suspicion = core.identify(kernel, mine, evidence)
+    assert np.flatnonzero(suspicion.found.named).tolist() == [LIAR]
+    place = made.prior.meters[LIAR]
+    plain, right = core.estimate(kernel, mine), core.estimate(kernel, mine, suspicion)
+    lie = 1.03**2 - 1.0
+    assert abs(right.mean[place]) < 0.1 * lie
+    assert abs(plain.mean[place]) > abs(right.mean[place])
+    assert right.variance[place] > plain.variance[place]
+
+
+def test_residuals_hold_the_fixed_errors() -> None:
+    """Readings minus the model, whether or not fixed errors are learned; zero where not seen."""
+    made, street = front()
+    state = sequential.init(made, street.t)
+    street.advance(1.0)
+    frame = street.frame(None, (2,))
+    state, _, _ = sequential.step(made, state, frame)
+    m, seen = core.residuals(state)
+    assert seen.tolist() == [k != 2 for k in range(12)]
+    assert m[2] == 0.0
+    bias = np.full(12, 1e-3)
+    learned = replace(state.learned, bias=bias)
+    other = sequential.init(made, street.t, learned)
+    other, _, _ = sequential.step(made, replace(other, t=state.t - 1.0), frame)
+    assert np.allclose(core.residuals(other)[0][seen], m[seen], atol=1e-9)
+
+
+def test_a_suspected_onset_is_kept_and_given_up() -> None:
+    """The onset of the alarm stays pinned while the lie lasts; its age is that of the lie."""
+    kernel = core.assemble(MODEL, np.zeros((13, 12)), np.full(12, 0.1), gamma=1e6)
+    source, state = Source(MODEL, np.random.default_rng(1)), core.init(kernel, 0.0)
+    for k in range(400):
+        lie = 0.02 * (k >= 300) * np.eye(12)[LIAR]
+        state, evidence = core.step(kernel, state, float(k), source.tick() + lie)
+    suspicion = core.identify(kernel, state, evidence)
+    assert state.detector.pinned.any()
+    assert abs(int(state.detector.onsets.age[suspicion.row]) - 100) <= 1
+    assert np.flatnonzero(suspicion.found.named).tolist() == [LIAR]

@@ -1,0 +1,269 @@
+"""Scores, likelihood ratios and the detector against dense filters and by Monte Carlo."""
+
+from __future__ import annotations
+
+from math import inf, log, sqrt
+
+import numpy as np
+import pytest
+from tests.gridsec.estimators.modal.test_filter import mixed, proportional
+
+from benchmarks._residuals import Dense, Source, model_of, power_columns, root, tree
+from gridsec.arrays import Bools, Floats
+from gridsec.estimators.modal import detector, signatures, static
+from gridsec.estimators.modal import filter as modal
+from gridsec.estimators.modal.model import Modes, ResidualModel, modes
+from gridsec.estimators.modal.signatures import Columns, Onsets, Scores
+
+FEEDER = tree(12, np.random.default_rng(3))
+
+
+def busbar() -> ResidualModel:
+    """One class of meters, and a busbar with a class of its own."""
+    return model_of(FEEDER)
+
+
+def density(nu: Floats, V: Floats) -> float:
+    """Logarithm of the Gaussian density without its constant."""
+    return -0.5 * float(nu @ np.linalg.solve(V, nu)) - 0.5 * float(np.linalg.slogdet(V)[1])
+
+
+def played(
+    made: Modes, readings: Floats, begins: dict[int, int], onsets: Onsets, seen: Bools | None = None
+) -> tuple[Onsets, Scores]:
+    """Rows begun at some ticks, after all readings at intervals of 1 s."""
+    state, more = modal.start(made, 0.0), static.start(made)
+    for k, m in enumerate(readings):
+        begun = [row for row, tick in begins.items() if tick == k]
+        state, update = modal.step(made, state, float(k), m, None if seen is None else seen[k])
+        more = static.follow(made, more, update)
+        onsets = signatures.follow(onsets, update, more, 1.0 if k else 0.0, begun=begun)
+    return onsets, signatures.scores(made, onsets, more)
+
+
+def exact_ratio(  # noqa: PLR0917  # everything that moves the readings
+    model: ResidualModel, readings: Floats, G: Floats, std: float, onset: int, ramp: bool
+) -> float:
+    """Log likelihood ratio of amounts N(0, std^2) of faults G against none, by two dense filters."""
+    with_, without, out = Dense(model, G, std), Dense(model), 0.0
+    for k, m in enumerate(readings):
+        age = max(0, k - onset + 1)
+        level = age / signatures.RAMP_S if ramp else float(age > 0)
+        h = 1.0 if k else 0.0
+        out += density(*with_.step(h, m, level=level)) - density(*without.step(h, m))
+    return out
+
+
+@pytest.mark.parametrize("make", [proportional, busbar, mixed])
+@pytest.mark.parametrize("ramp", [False, True])
+def test_likelihood_ratios_equal_those_of_dense_filters(make: object, ramp: bool) -> None:
+    """Members, a false power and the busbar, at an onset between; theta integrated out."""
+    assert callable(make)
+    model = make()
+    made, onset, std = modes(model), 25, 0.7 if ramp else 0.01
+    readings = Source(model, np.random.default_rng(5)).ticks(60)
+    readings[onset:, 4] += 0.004
+    of = signatures.columns(made, power_columns(FEEDER), np.full(24, 0.05), std)
+    row = 1 if ramp else 0
+    _, now = played(made, readings, {row: onset}, signatures.empty(made, 1, 1))
+    y, F = now.of(of.W, of.squares)
+    found = detector.log_lambda(y, F, np.square(of.std))[row]
+    matrix = now.matrix(row, of.W)
+    assert np.allclose(matrix[0], y[row])
+    assert np.allclose(np.diag(matrix[1]), F[row])
+    H = model.phases(made.at)
+    faults = np.hstack([np.eye(12), power_columns(FEEDER), H])
+    for q in (0, 4, 11, 15, 30, 36):
+        exact = exact_ratio(model, readings, faults[:, [q]], float(of.std[q]), onset, ramp)
+        if made.sign.size <= static.FEW:
+            assert abs(found[q] - exact) <= 1e-8 * max(1.0, abs(exact))
+        else:
+            # The information is then that without the classes: the ratio is smaller, never larger by much.
+            assert found[q] <= exact + 0.05 * abs(exact) + 0.5
+
+
+@pytest.mark.parametrize("make", [proportional, busbar])
+def test_the_omnibus_equals_that_of_dense_filters(make: object) -> None:
+    """f ~ N(0, s^2 D) in all members."""
+    assert callable(make)
+    model = make()
+    made, onset, s2 = modes(model), 25, 20.0
+    readings = Source(model, np.random.default_rng(6)).ticks(50)
+    readings[onset:] += 0.002
+    _, now = played(made, readings, {0: onset}, signatures.empty(made, 1))
+    G = np.linalg.cholesky(model.noise(made.at))
+    exact = exact_ratio(model, readings, G, sqrt(s2), onset, False)
+    assert abs(detector.omnibus(now, s2)[0] - exact) <= 1e-8 * abs(exact)
+
+
+@pytest.mark.parametrize("make", [proportional, busbar, mixed])
+def test_a_change_of_all_loads_is_integrated_out(make: object) -> None:
+    """f ~ N(0, 10 S) beside one meter: both ratios against dense filters."""
+    assert callable(make)
+    model = make()
+    made, onset, size, std = modes(model), 15, 10.0, 0.01
+    readings = Source(model, np.random.default_rng(6)).ticks(40)
+    readings[onset:] += 0.002
+    state, more, rows = modal.start(made, 0.0), static.start(made), signatures.empty(made, 1)
+    for k, m in enumerate(readings):
+        state, update = modal.step(made, state, float(k), m)
+        more = static.follow(made, more, update)
+        h = 1.0 if k else 0.0
+        rows = signatures.follow(rows, update, more, h, begun=[0] if k == onset else [])
+    now, ratio = signatures.shocked(made, rows, more, 0, size)
+    loads = root(model.loads(made.at)) * sqrt(size) / std
+    exact = exact_ratio(model, readings, loads, std, onset, False)
+    assert abs(ratio - exact) <= 1e-7 * abs(exact)
+    of = signatures.columns(made, np.zeros((12, 0)), np.zeros(0), std)
+    y, F = now.of(of.W[:, :12], of.squares[:, :12])
+    found = detector.log_lambda(y, F, np.full(12, std**2))[0]
+    both = exact_ratio(model, readings, np.hstack([loads, np.eye(12)[:, [4]]]), std, onset, False)
+    assert abs(ratio + found[4] - both) <= 1e-7 * abs(both)
+
+
+def test_scores_with_missing_readings_are_nearly_those_of_dense_filters() -> None:
+    """A tenth missing at random: the amount of a fault is found with the stated information."""
+    model = proportional()
+    made, random, source = modes(model), np.random.default_rng(7), None
+    z = []
+    for _ in range(60):
+        source = Source(model, random)
+        seen = random.random((60, 12)) >= 0.1
+        _, now = played(made, source.ticks(60), {0: 20}, signatures.empty(made, 1), seen)
+        of = signatures.columns(made, power_columns(FEEDER), np.full(24, 0.05), 0.01)
+        y, F = now.of(of.W[:, :12], of.squares[:, :12])
+        z.append(y[0] / np.sqrt(F[0]))
+    spread = np.std(z)
+    assert 0.9 < spread < 1.1
+
+
+def test_rows_that_are_not_in_use_stay_zero() -> None:
+    made = modes(busbar())
+    readings = Source(busbar(), np.random.default_rng(8)).ticks(10)
+    onsets, _ = played(made, readings, {0: 3}, signatures.empty(made, 2))
+    assert onsets.age.tolist() == [7, 0]
+    assert not onsets.score[1].any()
+    assert not onsets.signature[:, 1].any()
+
+
+def test_rows_are_given_back_and_used_again() -> None:
+    """A row after its end is zero, and a new onset in it is as one in a fresh row."""
+    model = busbar()
+    made = modes(model)
+    state, more, rows = modal.start(made, 0.0), static.start(made), signatures.empty(made, 2, 1)
+    readings = Source(model, np.random.default_rng(8)).ticks(20)
+    begun, ended = {0: [0], 9: [0, 1]}, {5: [0]}
+    for k, m in enumerate(readings):
+        state, update = modal.step(made, state, float(k), m)
+        more = static.follow(made, more, update)
+        rows = signatures.follow(rows, update, more, 1.0, begun=begun.get(k, []), ended=ended.get(k, []))
+        if k == 5:
+            assert not rows.used.any()
+            assert not (rows.score.any())
+            assert not (rows.information.any())
+            assert not (rows.signature.any())
+            assert rows.age.tolist() == [0, 0, 0]
+    assert rows.age.tolist() == [11, 11, 0]
+    assert (rows.score[0] == rows.score[1]).all()
+    assert (rows.information[0] == rows.information[1]).all()
+
+
+def watch(made: Modes, of: Columns, readings: Floats) -> tuple[Floats, detector.Detector]:
+    """Log M of every tick, and the detector after the last."""
+    state, more, test = modal.start(made, 0.0), static.start(made), detector.start(made)
+    out = np.empty(len(readings))
+    for k, m in enumerate(readings):
+        state, update = modal.step(made, state, float(k), m)
+        more = static.follow(made, more, update)
+        test, evidence = detector.step(made, of, test, update, more, h=1.0, alert=-inf)
+        out[k] = evidence.log_m
+    return out, test
+
+
+def test_dropping_onsets_leaves_m_and_covers_all_ages() -> None:
+    """M after thinning equals M before; ages grow by less than 2.5 from row to row."""
+    made = modes(busbar())
+    of = signatures.columns(made, power_columns(FEEDER), np.full(24, 0.05), 0.01)
+    state, more, test = modal.start(made, 0.0), static.start(made), detector.start(made)
+    source = Source(busbar(), np.random.default_rng(9))
+    for k in range(1600):
+        state, update = modal.step(made, state, float(k), source.tick())
+        more = static.follow(made, more, update)
+        test, evidence = detector.step(made, of, test, update, more, h=1.0, alert=-inf)
+    assert test.ticks % detector.EVERY == 0
+    assert test.ratio is not None
+    capital, onsets = test.capital.copy(), test.onsets
+    gone = detector._thin(test, capital, test.ratio)
+    used = onsets.used & ~np.isin(np.arange(onsets.used.size), gone)
+    now = signatures.scores(made, onsets, more)
+    ratio = detector.log_ratios(of, made, now, full=True)
+    by_row = capital + np.log(np.array(detector.WEIGHTS))[:, None] + ratio
+    ripe = used & ~(onsets.ramp & (onsets.age < detector.RAMP_EVERY))
+    assert np.isclose(np.logaddexp.reduce(by_row[:, ripe], axis=None), evidence.log_m, atol=1e-9)
+    age = np.sort(onsets.age[used & ~onsets.ramp])[::-1]
+    assert age.size == detector.STEP_ROWS
+    assert age[0] == 1600
+    assert (age[:-1] <= np.maximum(2.5 * age[1:], age[1:] + 4)).all()
+    # Capital: one a tick and kind, moved at the ratio of likelihoods.
+    assert np.isfinite(evidence.log_m)
+
+
+def test_onsets_beyond_the_oldest_age_are_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(detector, "OLDEST", 100)
+    made = modes(busbar())
+    of = signatures.columns(made, power_columns(FEEDER), np.full(24, 0.05), 0.01)
+    _, test = watch(made, of, Source(busbar(), np.random.default_rng(10)).ticks(400))
+    assert test.onsets.age.max() <= 100 + 2 * detector.EVERY
+
+
+def test_a_fault_is_found() -> None:
+    """A step of one meter, a small one of all, a false power: log M rises beyond one false alarm a year."""
+    made, limit = modes(busbar()), log(3.2e7)
+    of = signatures.columns(made, power_columns(FEEDER), np.full(24, 0.05), 0.01)
+    alternating = np.where(np.arange(12) % 2 == 0, 0.003, -0.003)
+    power = power_columns(FEEDER)[:, 3] * 0.08
+    for fault in (0.01 * np.eye(12)[5], alternating, power):
+        readings = Source(busbar(), np.random.default_rng(11)).ticks(160)
+        readings[100:] += fault
+        log_m, _ = watch(made, of, readings)
+        assert (log_m[:100] < limit).all()
+        assert log_m[100:].max() >= limit
+
+
+def run_lengths(model: ResidualModel, gamma: float, runs: int, seed: int) -> Floats:
+    """Ticks to the first alarm; at most 8 gamma, at which a run is cut."""
+    made = modes(model)
+    of = signatures.columns(made, power_columns(FEEDER), np.full(24, 0.05), 0.01)
+    random, out = np.random.default_rng(seed), np.empty(runs)
+    for run in range(runs):
+        source, longest = Source(model, random), int(8 * gamma)
+        state, more, test = modal.start(made, 0.0), static.start(made), detector.start(made)
+        for k in range(longest):
+            state, update = modal.step(made, state, float(k), source.tick())
+            more = static.follow(made, more, update)
+            test, evidence = detector.step(made, of, test, update, more, h=1.0, alert=log(gamma) / 2.0)
+            if evidence.log_m >= log(gamma):
+                break
+        out[run] = k + 1
+    return out
+
+
+@pytest.mark.canary("busbar-100.0-40", "mixed-100.0-40")
+@pytest.mark.parametrize(("gamma", "runs"), [(100.0, 40), (1000.0, 12)])
+@pytest.mark.parametrize("make", [busbar, mixed])
+def test_average_run_length_is_at_least_gamma(make: object, gamma: float, runs: int) -> None:
+    """The mean of run lengths cut at 8 gamma, less 2.33 standard errors (99 %), is at least gamma."""
+    assert callable(make)
+    lengths = run_lengths(make(), gamma, runs, 12)
+    lower = lengths.mean() - 2.33 * lengths.std(ddof=1) / sqrt(runs)
+    assert lower >= gamma
+
+
+def test_no_onset_no_evidence() -> None:
+    """Rows that are not in use add nothing to M."""
+    made = modes(busbar())
+    now = signatures.scores(made, signatures.empty(made, 2), static.start(made))
+    of = signatures.columns(made, power_columns(FEEDER), np.full(24, 0.05), 0.01)
+    ratio = detector.log_ratios(of, made, now, full=False)
+    assert np.allclose(ratio[:2], 0.0)
+    assert (ratio[2] == -inf).all()

@@ -1,0 +1,159 @@
+"""Estimates at all places against the joint Gaussian of all readings, and their coverage."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks._residuals import Source, model_of, power_columns, root, tree
+from gridsec.arrays import Floats
+from gridsec.estimators.modal import estimate, signatures, static
+from gridsec.estimators.modal import filter as modal
+from gridsec.estimators.modal.model import ResidualModel, modes
+from gridsec.estimators.modal.search import Identification, Problem, amounts
+from gridsec.grid.network import Power, columns
+
+FEEDER = tree(9, np.random.default_rng(1))
+
+
+def some_meters(meters: int = 5, **given: float) -> ResidualModel:
+    """A model with meters at some of the customers only."""
+    whole = model_of(FEEDER, **given)
+    at = np.sort(np.random.default_rng(2).choice(9, meters, replace=False))
+    return replace(
+        whole,
+        of_meters=whole.of_meters[:, at],
+        meters=whole.meters[at],
+        white=whole.white[at] * np.linspace(1.0, 2.0, meters),
+        fixed=whole.fixed[at],
+    )
+
+
+def joint(  # noqa: PLR0917  # everything that moves the readings
+    model: ResidualModel, m: Floats, G: Floats, effect: Floats, onset: int, std: float
+) -> tuple[Floats, Floats]:
+    """Mean and variance at all places from the joint Gaussian of all readings at intervals of 1 s."""
+    at, T = np.arange(model.meters.size), len(m)
+    p, c, n = at.size, model.lasting, model.variance.size
+    rho = np.exp(-1.0 / model.time_s)
+    S, D, B = model.loads(at), model.noise(at), model.static(at)
+    V, cross = np.empty((T, p, T, p)), np.empty((n, T, p))
+    u = (np.arange(T) >= onset).astype(np.float64)
+    H = model.phases(at)
+    lasts = c * model.of_meters + model.busbar * model.busbar_of @ H.T
+    for t in range(T):
+        for s in range(T):
+            V[t, :, s] = rho ** abs(t - s) * (1 - c) * S + B + (t == s) * D
+            V[t, :, s] += std**2 * u[t] * u[s] * G @ G.T
+        cross[:, t] = rho ** (T - 1 - t) * (1 - c) * model.of_meters + lasts
+        cross[:, t] += std**2 * u[t] * effect @ G.T
+    cross[:, T - 1] += model.flicker * model.busbar_of @ H.T
+    flat = cross.reshape(n, T * p)
+    gain = np.linalg.solve(V.reshape(T * p, T * p), flat.T).T
+    own = model.variance + model.busbar + model.flicker + std**2 * (effect**2).sum(axis=1)
+    return gain @ m.ravel(), own - (gain * flat).sum(axis=1)
+
+
+@pytest.mark.parametrize("lasting", [0.0, 0.3])
+@pytest.mark.parametrize("fault", ["none", "meter", "power", "busbar"])
+def test_equals_the_joint_gaussian(lasting: float, fault: str) -> None:
+    """Mean and variance at all buses, without a fault and with a known one; two classes by the jitter."""
+    model = some_meters(lasting=lasting)
+    made, onset, std = modes(model), 4, 0.01
+    assert made.sign.size > 0
+    every, n = np.arange(9), model.variance.size
+    G, effect = np.zeros((5, 1)), np.zeros((n, 1))
+    if fault == "meter":
+        G[2] = 1.0
+    elif fault == "power":
+        effect = columns(FEEDER, Power.ACTIVE, every[3:4])
+        G, std = effect[model.meters], 0.05
+    elif fault == "busbar":
+        effect = model.busbar_of
+        G = effect[model.meters]
+    m = 0.01 * np.random.default_rng(3).standard_normal((12, 5))
+    state, more, rows = modal.start(made, 0.0), static.start(made), signatures.empty(made, 1)
+    for k, reading in enumerate(m):
+        state, update = modal.step(made, state, float(k), reading)
+        more = static.follow(made, more, update)
+        rows = signatures.follow(rows, update, more, 1.0, begun=[0] if k == onset else [])
+    prepared = estimate.estimator(made)
+    found = estimate.honest(made, prepared, state, more, update)
+    if fault != "none":
+        W = made.U.T @ G
+        y, F = signatures.scores(made, rows, more).matrix(0, W)
+        problem = Problem(y, F, np.array([std]), 1, np.zeros(1), np.full(1, np.inf))
+        T = estimate.moves(made, prepared, more, rows, 0, W, effect)
+        one = Identification(
+            np.ones((1, 1), bool), np.zeros(1, bool), np.ones(1), np.ones(1, bool), (problem,)
+        )
+        found = estimate.corrected(found, T, one)
+        assert amounts(problem, np.ones(1, bool))[0].shape == (1,)
+    mean, variance = joint(model, m, G, effect, onset, std if fault != "none" else 0.0)
+    if made.sign.size <= static.FEW:
+        assert np.abs(found.mean - mean).max() <= 1e-9 * np.abs(mean).max()
+        assert np.abs(found.variance - variance).max() <= 1e-8 * variance.max()
+
+
+def test_a_mixture_contains_the_disagreement() -> None:
+    """Variance of two explanations: the mean of the variances and the spread of the means."""
+    F = np.diag([100.0, 100.0])
+    problem = Problem(np.array([50.0, 50.0]), F, np.ones(2), 2, np.zeros(2), np.full(2, np.inf))
+    chosen = np.array([[True, False], [False, True]])
+    found = Identification(chosen, np.zeros(2, bool), np.array([0.5, 0.5]), np.zeros(2, bool), (problem,))
+    before = estimate.Estimated(np.zeros(1), np.array([1e-4]))
+    after = estimate.corrected(before, np.array([[1.0, -1.0]]), found)
+    f, own = 50.0 / 101.0, 1.0 / 101.0
+    assert np.allclose(after.mean, 0.0)
+    assert np.allclose(after.variance, 1e-4 + own + f**2)
+
+
+def test_coverage_in_simulation() -> None:
+    """Errors over their standard deviations at buses without meters: root mean square near 1."""
+    model = some_meters()
+    made, random, z = modes(model), np.random.default_rng(4), []
+    prepared = estimate.estimator(made)
+    places = model.variance.size
+    whole = replace(
+        model,
+        of_meters=covariance_of_all(),
+        meters=np.arange(places),
+        white=np.full(places, 1e-9),
+        fixed=np.zeros(places),
+    )
+    draw = root(whole.of_meters)
+    rho = np.exp(-1.0 / model.time_s)
+    for _ in range(120):
+        w = draw @ random.standard_normal(places)
+        b = np.sqrt(model.fixed) * random.standard_normal(5)
+        busbar = np.sqrt(model.busbar) * random.standard_normal()
+        state, more = modal.start(made, 0.0), static.start(made)
+        for k in range(40):
+            flick = np.sqrt(model.flicker) * random.standard_normal()
+            truth = w + busbar + flick
+            m = truth[model.meters] + b + np.sqrt(model.white) * random.standard_normal(5)
+            state, update = modal.step(made, state, float(k), m)
+            more = static.follow(made, more, update)
+            w = rho * w + np.sqrt(1 - rho**2) * (draw @ random.standard_normal(places))
+        found = estimate.honest(made, prepared, state, more, update)
+        z.append((found.mean - truth) / np.sqrt(found.variance))
+    spread = np.sqrt(np.mean(np.square(z), axis=0))
+    assert ((spread > 0.75) & (spread < 1.3)).all()
+
+
+def covariance_of_all() -> Floats:
+    """Covariance of the voltages at all buses."""
+    effect = np.hstack([columns(FEEDER, power, np.arange(9)) for power in Power])
+    return np.asarray((effect * np.repeat([0.006**2, 0.002**2], 9)) @ effect.T)
+
+
+def test_the_honest_source_agrees_with_its_model() -> None:
+    """The simulation of the tests: second moments of residuals."""
+    model = model_of(FEEDER)
+    m = np.stack([Source(model, np.random.default_rng(seed)).tick() for seed in range(4000)])
+    at = np.arange(9)
+    exact = model.loads(at) + model.static(at) + model.noise(at)
+    assert np.abs(np.cov(m.T) - exact).max() < 0.1 * exact.max()
+    assert power_columns(FEEDER).shape == (9, 18)

@@ -1,0 +1,156 @@
+"""The subset search against brute force, and naming."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from math import comb
+
+import numpy as np
+import pytest
+from tests.gridsec.estimators.modal.test_detector import FEEDER, busbar
+
+from gridsec.arrays import Bools
+from gridsec.estimators.modal import search as s
+from gridsec.estimators.modal.model import modes
+from gridsec.estimators.modal.search import Problem, Tableau
+
+
+def problem(seed: int, p: int = 8, others: int = 2, liars: int = 2, size: float = 1.0) -> Problem:
+    """Scores of random faults whose information is that of correlated readings."""
+    random = np.random.default_rng(seed)
+    q, common = p + others, random.standard_normal((p + others, 3))
+    F = np.linalg.inv(0.02 * np.eye(q) + 0.3 * common @ common.T)
+    f = np.zeros(q)
+    f[random.choice(p, liars, replace=False)] = size * random.choice([-1.0, 1.0], liars)
+    y = F @ f + np.linalg.cholesky(F) @ random.standard_normal(q)
+    charge = np.where(np.arange(q) < p, 0.0, 10.0)
+    return Problem(y, F, np.full(q, 1.0), p, charge, np.full(q, np.inf))
+
+
+def every(given: Problem) -> list[tuple[float, Bools]]:
+    """All sets with their costs, by determinants and solves; independent amounts or amounts alike."""
+    q, p, out = given.y.size, given.meters, []
+    for k in range(q + 1):
+        for some in combinations(range(q), k):
+            at = list(some)
+            n = sum(j < p for j in at)
+            beyond = sum(max(0.0, 9.0 - 2.0 * np.log((p - i) / (i + 1))) for i in range(max(1, p // 3), n))
+            penalty = 2.0 * np.log(comb(p, n)) + beyond + given.charge[at].sum()
+            both = []
+            for share, charge in ((0.0, 0.0), (0.99, given.charge.max())) if n > 1 else ((0.0, 0.0),):
+                V = np.diag(given.std[at] ** 2)
+                for i in range(n):
+                    for j in range(n):
+                        V[i, j] *= 1.0 if i == j else 0.0
+                        V[i, j] += share * given.std[at[i]] * given.std[at[j]] * (i != j)
+                F = given.F[np.ix_(at, at)]
+                fit = given.y[at] @ np.linalg.solve(np.linalg.inv(V) + F, given.y[at]) if at else 0.0
+                both.append(-fit + np.linalg.slogdet(np.eye(k) + V @ F)[1] + penalty + charge)
+            cost = both[0] if n < 2 else 2.0 * (np.log(2.0) - np.logaddexp(*(-0.5 * np.array(both))))
+            out.append((cost, np.isin(np.arange(q), at)))
+    return sorted(out, key=lambda each: each[0])
+
+
+def total(given: Problem, chosen: Bools) -> float:
+    """Cost of one set, with amounts alike as likely as not."""
+    one = s.cost(given, chosen)
+    if np.count_nonzero(chosen[: given.meters]) < 2:
+        return one
+    return 2.0 * (np.log(2.0) - np.logaddexp(-0.5 * one, -0.5 * s.alike(given, chosen)))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_costs_changes_and_exchanges_are_exact(seed: int) -> None:
+    """Every entry of the tableau against the cost of the set it stands for."""
+    given, random = problem(seed), np.random.default_rng(seed)
+    tableau = Tableau(given)
+    for _ in range(12):
+        tableau.toggle(int(random.integers(given.y.size)))
+        assert tableau.cost == pytest.approx(s.cost(given, tableau.chosen), abs=1e-8)
+        for j, change in enumerate(tableau.changes()):
+            other = tableau.chosen.copy()
+            other[j] = not other[j]
+            assert tableau.cost + change == pytest.approx(s.cost(given, other), abs=1e-7)
+        out = np.flatnonzero(tableau.chosen[: given.meters])
+        both = tableau.exchanges(out)
+        for i, j in zip(*np.nonzero(np.isfinite(both)), strict=True):
+            other = tableau.chosen.copy()
+            other[out[i]], other[j] = False, True
+            assert tableau.cost + both[i, j] == pytest.approx(s.cost(given, other), abs=1e-7)
+        free = np.flatnonzero(~tableau.chosen[: given.meters])[:3]
+        if free.size:
+            other = tableau.chosen.copy()
+            other[free] = True
+            assert tableau.cost + tableau.group(free) == pytest.approx(s.cost(given, other), abs=1e-7)
+    assert np.isfinite(tableau.A).all()
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("liars", [0, 1, 2, 3])
+def test_the_best_set_is_that_of_brute_force(seed: int, liars: int) -> None:
+    """Ten faults, all 1024 subsets: the cheapest one is found, and with it at least 70 % of the weight."""
+    given = problem(seed, liars=liars)
+    found = s.search(given)
+    sets = every(found.problems[0])
+    assert total(found.problems[0], found.chosen[0]) == pytest.approx(sets[0][0], abs=1e-8)
+    costs = np.array([each for each, _ in sets])
+    weight = np.exp(-0.5 * (costs - costs[0]))
+    weight /= weight.sum()
+    kept = {each.tobytes(): w for each, w in zip(found.chosen, found.weight, strict=True)}
+    missed = sum(w for w, (_, chosen) in zip(weight, sets, strict=True) if chosen.tobytes() not in kept)
+    assert missed < 0.3
+    without = np.array(
+        [weight @ np.array([not chosen[j] for _, chosen in sets]) for j in range(given.meters)]
+    )
+    # What brute force doubts by far more than the limit is never named.
+    assert not (found.named & (without > 10.0 * s.DOUBT)).any()
+
+
+def test_large_faults_are_named_and_nothing_else() -> None:
+    """Three of nine, far beyond noise: these and no others."""
+    for seed in range(4):
+        given = problem(seed, p=9, liars=3, size=4.0)
+        found = s.search(given)
+        truth = every(found.problems[0])[0][1][:9]
+        assert (found.named <= truth).all()
+        assert found.named.sum() >= 2
+
+
+def test_honest_scores_name_nothing() -> None:
+    """Scores without a fault: the named of 200 draws."""
+    named = sum(int(s.search(problem(seed, liars=0)).named.any()) for seed in range(200))
+    assert named <= 2
+
+
+def test_impossible_amounts_are_not_chosen() -> None:
+    """A power that would have to be beyond its bound is left out, and a meter explains it."""
+    F = np.array([[50.0, 49.0], [49.0, 50.0]])
+    f = np.array([0.0, 3.0])
+    given = Problem(F @ f, F, np.ones(2), 1, np.array([0.0, 1.0]), np.array([np.inf, 0.5]))
+    assert not s.search(given).chosen[0][1]
+    free = Problem(F @ f, F, np.ones(2), 1, np.array([0.0, 1.0]), np.array([np.inf, np.inf]))
+    assert s.search(free).chosen[0][1]
+
+
+def test_amounts_that_become_impossible_are_removed() -> None:
+    """A power that is possible beside a meter, but not without it: it is barred when the meter goes."""
+    given = problem(3, p=6, others=2, liars=2, size=3.0)
+    tight = Problem(given.y, given.F, given.std, 6, np.zeros(8), np.where(np.arange(8) < 6, np.inf, 0.05))
+    tableau = Tableau(tight)
+    tableau.toggle(7)
+    end = s.descend(tableau)
+    amount = s.amounts(tight, end.chosen)[0]
+    assert (np.abs(amount) <= tight.bound[end.chosen]).all()
+
+
+def test_groups_are_nested_and_cover_neighbours() -> None:
+    made = modes(busbar())
+    found = s.groups(made)
+    assert all(2 <= each.size <= made.size // 2 for each in found)
+    for one, other in combinations(found, 2):
+        shared = np.intersect1d(one, other).size
+        assert shared in {0, one.size, other.size}
+    parent = np.concatenate([[-1], FEEDER.parent])
+    # The two nearest meters are neighbours on the tree.
+    i, j = (int(FEEDER.bus[k]) for k in found[0])
+    assert parent[i] == j or parent[j] == i or parent[i] == parent[j]
