@@ -157,8 +157,8 @@ def test_a_busbar_that_is_not_clear(
     [
         ("nowhere.json", None, 6, "nowhere.json: there is no such file"),
         ("nowhere.dss", None, 6, "nowhere.dss: there is no such file"),
-        ("empty.json", "", 6, "empty.json: no valid JSON"),
-        ("half.json", '{"_module": "pandapower.auxiliary", "_cl', 6, "half.json: no valid JSON"),
+        ("empty.json", "", 6, "empty.json: invalid JSON"),
+        ("half.json", '{"_module": "pandapower.auxiliary", "_cl', 6, "half.json: invalid JSON"),
         ("net.json", '{"_class": "pandapowerNet"}', 6, "net.json: "),
         ("empty.dss", "", 6, "finds no circuit in it"),
         ("simbench:7-LV--0-sw", None, 6, "SimBench has no grid '7-LV--0-sw'"),
