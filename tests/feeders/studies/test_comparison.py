@@ -108,7 +108,7 @@ def test_a_family_that_fails_while_it_watches_leaves_the_others_alone(
     (alone,) = compare(site, replace(plan, families=("sequential",)))
     monkeypatch.setitem(FAMILIES._known, "exact-bank", replace(made, step=step))
     row, broken = compare(site, plan)
-    assert broken.reason == "it failed while it watched: ZeroDivisionError: a defect of the other package"
+    assert broken.reason == "failed in a step: ZeroDivisionError: a defect of the other package"
     assert (broken.case, broken.observers) == ("clean", 0)
     assert replace(row, step_ms=0.0, step_ms_95=0.0) == replace(alone, step_ms=0.0, step_ms_95=0.0)
 

@@ -142,7 +142,7 @@ def test_what_a_study_cannot_answer_is_in_the_report(
         (("--studies", "protect,palmistry"), "--studies is 'palmistry'; expected one of"),
         (("--studies", "calibrate"), "calibrate needs --readings"),
         (("--goal", "all"), "expected one of identify, notice, bound, contain"),
-        (("--goal", "bound"), "lie_volt is nan; to bound lies it must be a positive number"),
+        (("--goal", "bound"), "lie_volt is nan; a bound of attacks must be a positive number"),
         (("--goal", "notice", "--lie-volt", "3"), "lie_volt goes with goals in volts, not with notice"),
         (("--studies", "redundancy", "--hosting"), "--hosting goes with droop"),
         (("--studies", "redundancy,droop", "--readings", "pyproject.toml"), "--readings goes with calibrate"),
