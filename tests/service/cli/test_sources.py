@@ -196,7 +196,7 @@ def test_a_report_tells_what_was_not_carried_over(
     changes = pd.read_csv(folder / "feeder" / "conversion.csv")
     pd.testing.assert_frame_equal(pd.read_csv(folder / "tables" / "feeder-conversion.csv"), changes)
     html = page.read_text(encoding="utf-8")
-    assert "What was not carried over from its source" in html
+    assert "Changes of the conversion" in html
     for cell in changes["element"]:
         assert f"<td>{cell}</td>" in html
     source = (folder / "feeder" / "SOURCE.md").read_text(encoding="utf-8")

@@ -53,7 +53,7 @@ def test_a_report_and_everything_beside_it(
 
     code, _, _ = run(monkeypatch, capsys, *again[3:])
     assert code == 0
-    assert "with work kept from before" in page.read_text(encoding="utf-8")
+    assert "with reused earlier work" in page.read_text(encoding="utf-8")
     assert {path.name: path.read_bytes() for path in (folder / "figures").iterdir()} == first
 
     # Of another question the same report keeps nothing that is not in it.
@@ -104,7 +104,7 @@ def test_an_interrupted_report_goes_on(
     assert run(monkeypatch, capsys, *words)[0] == 0
 
     def timeless(text: str) -> str:
-        return re.sub(r"redundancy: [0-9.]+ s(, with work kept from before)?", "", text)
+        return re.sub(r"redundancy: [0-9.]+ s(, with reused earlier work)?", "", text)
 
     assert timeless(page.read_text(encoding="utf-8")) == timeless(whole)
     assert journal.read_bytes().splitlines() == [line.strip() for line in lines]
