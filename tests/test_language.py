@@ -24,14 +24,17 @@ QUESTION = re.compile(r"(What|Who|Whom|Whose|Whether|How|Which|Where|When|Why|If
 PERSON = re.compile(
     r"\b(who|whom|whose|whoever|whomever|nobody|somebody|everybody|anybody|someone|everyone|anyone)\b", re.I
 )
-PUBLIC = re.compile(r"--[a-z-]+|[`\"]who[`\"]")
-"""Options of the command line and fields of REST: public words, not counted in documents."""
+PUBLIC = re.compile(r"--[a-z-]+|[`\"][wW]ho[`\"]|(?m:^ *(?:\w+, )*who(?:, \w+)*$)")
+"""Options of the command line, columns of tables and fields of REST, and lists of parameters: public words.
+
+They are not counted in documents and in feeders.
+"""
 
 # Indirect questions as titles, and personal pronouns for equipment.
 LIMITS = {
     "gridsec": (0, 0),
     "default monitor": (166, 220),
-    "feeders": (206, 246),
+    "feeders": (0, 0),
     "service": (87, 188),
     "documents": (0, 0),
 }
@@ -53,6 +56,11 @@ def prose(source: str) -> Iterator[str]:
             yield token.string
 
 
+def persons(text: str, name: str) -> int:
+    """Number of personal pronouns in a text of an area."""
+    return len(PERSON.findall(PUBLIC.sub("", text) if name in ("feeders", "documents") else text))
+
+
 def area(path: Path) -> str:
     """Area of a file."""
     parts = path.relative_to(ROOT).parts
@@ -67,15 +75,15 @@ def counts() -> dict[str, tuple[Counter[str], Counter[str]]]:
     for package in ("gridsec", "feeders", "service"):
         for path in sorted((ROOT / package).rglob("*.py")):
             source, place = path.read_text(), str(path.relative_to(ROOT))
-            titles, persons = out[area(path)]
+            titles, pronouns = out[area(path)]
             titles[place] += sum(bool(QUESTION.match(text)) for text in documented(ast.parse(source)))
-            persons[place] += sum(len(PERSON.findall(text)) for text in prose(source))
+            pronouns[place] += sum(persons(text, area(path)) for text in prose(source))
         for suffix in ("*.js", "*.html", "*.css"):
             for path in sorted((ROOT / package).rglob(suffix)):
-                out[package][1][str(path.relative_to(ROOT))] += len(PERSON.findall(path.read_text()))
+                out[package][1][str(path.relative_to(ROOT))] += persons(path.read_text(), package)
     for path in sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "docs").rglob("*.py")]):
         place = str(path.relative_to(ROOT))
-        out["documents"][1][place] += len(PERSON.findall(PUBLIC.sub("", path.read_text())))
+        out["documents"][1][place] += persons(path.read_text(), "documents")
     return out
 
 
@@ -90,13 +98,13 @@ def test_titles_are_no_indirect_questions(name: str) -> None:
 
 @pytest.mark.parametrize("name", LIMITS)
 def test_equipment_has_no_personal_pronouns(name: str) -> None:
-    persons = +FOUND[name][1]
-    assert persons.total() <= LIMITS[name][1], persons.most_common(20)
+    pronouns = +FOUND[name][1]
+    assert pronouns.total() <= LIMITS[name][1], pronouns.most_common(20)
 
 
 def test_limits_are_tight() -> None:
     """A limit above its count would let it rise again."""
-    counted = {name: (titles.total(), persons.total()) for name, (titles, persons) in FOUND.items()}
+    counted = {name: (titles.total(), pronouns.total()) for name, (titles, pronouns) in FOUND.items()}
     assert counted == LIMITS
 
 
@@ -104,3 +112,10 @@ def test_both_kinds_are_recognised() -> None:
     source = '"""What is kept of a feeder."""\n# Whoever lies.\nX = "nobody knows; the whole"\n'
     assert [bool(QUESTION.match(text)) for text in documented(ast.parse(source))] == [True]
     assert sum(len(PERSON.findall(text)) for text in prose(source)) == 2
+
+
+def test_public_words_are_no_pronouns() -> None:
+    source = (
+        '"""Answer.\n\nParameters\n----------\nt, who\n    Whoever asks.\n"""\nX = {"who": "--who and who"}\n'
+    )
+    assert [sum(persons(text, name) for text in prose(source)) for name in ("feeders", "gridsec")] == [2, 5]

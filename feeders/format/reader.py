@@ -239,9 +239,7 @@ def _json_rows(name: str, table: object, problems: list[Problem]) -> Rows | None
     if isinstance(table, Mapping):
         if not all(isinstance(cells, (list, tuple)) for cells in table.values()):
             problems.append(
-                Problem(
-                    "wrong-type", f"{name}: expected a list of rows, or an object whose columns are lists"
-                )
+                Problem("wrong-type", f"{name}: expected a list of rows, or an object with lists as columns")
             )
             return None
         lengths = {column: len(cells) for column, cells in table.items()}

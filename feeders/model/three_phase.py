@@ -269,9 +269,9 @@ def _fuses(line: LineRow) -> bool:
 
 def _why(tables: FeederTables) -> str:
     """First cause of a model in three phases, as the end of a sentence."""
-    who = [f"customer {row.customer!r}" for row in tables.customers if row.phases != "abc"]
-    who += [f"line {row.line!r}" for row in tables.lines if row.closed and row.in_phases]
-    return f" ({who[0]} makes the feeder one in three phases)" if who else ""
+    causes = [f"customer {row.customer!r}" for row in tables.customers if row.phases != "abc"]
+    causes += [f"line {row.line!r}" for row in tables.lines if row.closed and row.in_phases]
+    return f" ({causes[0]} makes the feeder one in three phases)" if causes else ""
 
 
 def unsupported(tables: FeederTables) -> tuple[Problem, ...]:

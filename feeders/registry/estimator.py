@@ -47,7 +47,7 @@ class Learner:
     commission
         `commission(state)`: present knowledge of the fixed errors.
     renew
-        `renew(design, state, which)`: state after replacement of meters, whose learning restarts.
+        `renew(design, state, which)`: state after replacement of meters; their learning restarts.
     read
         `read(design, arrays)`: inverse of `gridsec.estimators.sequential.to_arrays`; a `ValueError` names
         every contradiction to the design.

@@ -260,7 +260,7 @@ def _delay_chart(liars: pd.DataFrame, width: float) -> Drawing:
 def _error_chart(table: pd.DataFrame, width: float) -> Drawing:
     data = []
     for row in table.to_dict("records"):
-        liars, others = (float(row[f"error_{who}_worst"]) for who in ("liars", "others"))
+        liars, others = (float(row[f"error_{place}_worst"]) for place in ("liars", "others"))
         bars = [
             Bar(0.0, value, look, meaning, f"{number(value)} %", inset)
             for value, look, meaning, inset in (

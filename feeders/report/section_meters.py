@@ -94,13 +94,13 @@ def _invisible(found: Redundancy) -> Finding:
         elif math.isinf(index):
             sentences.append((f"{prefix}{by}, no number of manipulated meters can stay invisible.",))
         else:
-            who = f": {listed(str(row['liars']).split(' '))}" if row["liars"] else ""
+            meters = f": {listed(str(row['liars']).split(' '))}" if row["liars"] else ""
             verb = "manipulated meter can" if index == 1 else "manipulated meters together can"
             sentences.append(
                 (
                     prefix,
                     value,
-                    f" {verb} stay invisible {kind}{who}{'' if index == 1 else '; fewer cannot'}.",
+                    f" {verb} stay invisible {kind}{meters}{'' if index == 1 else '; fewer cannot'}.",
                 )
             )
         if row["blind"]:
@@ -267,9 +267,9 @@ def _sizes(site: Site, meters: pd.DataFrame, liars: int, sure: tuple[str, str]) 
 
 def _picture(site: Site, customers: pd.DataFrame, liars: int, sure: str) -> Finding:
     name = "detectable-customers"
-    who = "a single manipulated meter" if liars == 1 else f"{liars} meters manipulated together"
+    attacked = "a single manipulated meter" if liars == 1 else f"{liars} meters manipulated together"
     lead: Sentence = (
-        f"Largest error of the shown voltage by {who} without notice: ",
+        f"Largest error of the shown voltage by {attacked} without notice: ",
         least(customers, name, "error", "V", side=Side.ABOVE),
         f" (at {_extreme(customers, 'customer', 'error', smallest=True)}) to ",
         most(customers, name, "error", "V", side=Side.ABOVE),

@@ -295,13 +295,13 @@ def _wrong_units(
     problems = []
     for (name, doubt), meters in found.items():
         one, middle, limit = meters[0]
-        whose = (one or "the busbar") + (f" and {len(meters) - 1} more" if len(meters) > 1 else "")
+        sources = (one or "the busbar") + (f" and {len(meters) - 1} more" if len(meters) > 1 else "")
         than = (
             f"where {limit:.4g} is nominal"
             if name == "v_volt"
             else f"where {limit:.4g} is the largest plausible value"
         )
-        problems.append(Problem("doubtful", f"{name} of {whose} is usually {middle:.4g} {than}; {doubt}"))
+        problems.append(Problem("doubtful", f"{name} of {sources} is usually {middle:.4g} {than}; {doubt}"))
     return problems
 
 

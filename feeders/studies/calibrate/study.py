@@ -270,15 +270,15 @@ def present(tables: FeederTables, wrong: Correction) -> str:
 
 def described(wrong: Correction) -> str:
     """Short description of an alternative."""
-    who = _who(wrong)
+    subject = _who(wrong)
     if wrong.kind is Kind.BUS:
-        return f"{who} at {wrong.bus}"
+        return f"{subject} at {wrong.bus}"
     if wrong.exchange:
-        return f"{who} with exchanged phases"
+        return f"{subject} with exchanged phases"
     if wrong.kind is Kind.PHASE:
-        return f"{who} on {wrong.phases}"
-    return {Kind.SWAP: f"{who} swapped", Kind.LENGTH: f"length of {who}"}.get(
-        wrong.kind, f"error of {who} changes"
+        return f"{subject} on {wrong.phases}"
+    return {Kind.SWAP: f"{subject} swapped", Kind.LENGTH: f"length of {subject}"}.get(
+        wrong.kind, f"error of {subject} changes"
     )
 
 

@@ -44,10 +44,10 @@ __all__ = [
     "checked",
     "curve",
     "draw",
-    "nobody",
     "ratings_pu",
     "safety",
     "shares_of",
+    "without_inverters",
 ]
 
 
@@ -92,7 +92,7 @@ class Safety:
     witness: list[dict[str, Any]]
 
 
-def nobody(droop: Droop) -> Droop:
+def without_inverters(droop: Droop) -> Droop:
     """Fleet without inverters, for comparison."""
     return droop.take(np.zeros(0, dtype=np.intp))
 

@@ -25,9 +25,9 @@ from feeders.studies.droop.limits import (
     capacity,
     curve,
     draw,
-    nobody,
     safety,
     shares_of,
+    without_inverters,
 )
 from feeders.studies.droop.verdict import (
     Run,
@@ -140,8 +140,9 @@ class DroopOptions:
                 yield Problem(
                     "unknown-name", f"preset {name!r} does not exist; expected one of {', '.join(PRESETS)}"
                 )
-        if self.who not in tuple(Who):
-            yield Problem("unknown-name", f"`who` is {self.who!r}; expected one of {', '.join(Who)}")
+        chosen, known = self.who, tuple(Who)
+        if chosen not in known:
+            yield Problem("unknown-name", f"`who` is {chosen!r}; expected one of {', '.join(known)}")
         try:
             Update(self.interval_s, self.dead)
         except InputInvalid as error:
@@ -344,7 +345,7 @@ def _tasks(study: _Study) -> Iterator[Task]:
     yield "inverters", partial(inverter_rows, study.subject, study.fleet, study.update, study.box, ANY)
     yield "steps", partial(_steps, study)
     yield "band|with the fleet", partial(_band, study, study.fleet)
-    yield "band|without", partial(_band, study, nobody(study.fleet))
+    yield "band|without", partial(_band, study, without_inverters(study.fleet))
     for name in given.presets:
         yield f"presets|{name}", partial(_preset, study, name)
     for times in given.tau_factors:

@@ -341,7 +341,7 @@ def test_a_line_of_a_folder_is_opened_and_what_a_folder_cannot_take_is_refused(t
         "root",
         "droop",
         "one_voltage",
-        "there",
+        "line 'nosuch' to open does not exist",
     ]
     assert not (tmp_path / "c").exists()
 

@@ -229,7 +229,10 @@ def test_nobody_among_none_left_invisible_is_told_as_such(site: Site, outcomes: 
     assert isinstance(found, Protect)
     goal = {"goal": Goal.IDENTIFY, "before": 1.0, "after": math.inf, "alone": math.nan}
     text = told(protection(site, replace(found, **goal)), Question.PROTECT)
-    assert "Fewest manipulated meters that stay invisible: 1 without protection, none with it, for any number" in text
+    assert (
+        "Fewest manipulated meters that stay invisible: 1 without protection, none with it, for any number"
+        in text
+    )
 
 
 def test_who_lies_alone_has_nobody_with_it(site: Site, outcomes: list[Outcome]) -> None:
