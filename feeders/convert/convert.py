@@ -146,7 +146,7 @@ def source_again(
     else:
         about, (source, _, package) = before.about, before.source.rpartition(", ")
         told = before.check.removeprefix(AGAIN).removesuffix(".")
-        check = f"{AGAIN}{told or 'not told'}"
+        check = f"{AGAIN}{told or 'unknown'}"
         command = f"{before.command}`, then `{command}" if before.command else command
     return feeder_source(
         tables, about=about, origin=source, package=package, command=command, notes=notes, check=check
@@ -227,8 +227,8 @@ RECIPES: dict[str, Recipe] = {
         "pandapower:ieee_european_lv_asymmetric",
         "IEEE European low-voltage test feeder",
         "The European low-voltage test feeder of the IEEE PES Distribution Test Feeder Working Group\n"
-        "(2015): 55 customers of one phase each. load_kw is what they draw in the minute 566 of its day,\n"
-        "09:26, when the feeder carries the most; it is not the peak of each.",
+        "(2015): 55 customers of one phase each. load_kw is their load in the minute 566 of its day,\n"
+        "09:26, the largest of the feeder; it is not the peak of each.",
         fleet=Fleet(3, 4.6),
         mend=_reactive_powers,
     ),

@@ -278,7 +278,7 @@ def solve(net: Any, buses: dict[int, str], network: Network) -> Any:
                     network.as_found = _volts(solved, buses)
                 pandapower.runpp(solved, numba=False, tolerance_mva=1e-10, voltage_depend_loads=False)
         volts = _volts(solved, buses)
-    except Exception as error:  # noqa: BLE001  # whatever the foreign solver raises on a foreign net
+    except Exception as error:  # noqa: BLE001  # external solvers may raise anything
         text = " ".join(str(error).split()) or type(error).__name__
         network.unsolved = f"pandapower's own power flow fails: {text[:200]}"
         return None
@@ -397,7 +397,7 @@ FIXED: Final = {"gen": -1.0, "storage": 1.0, "motor": 1.0, "ward": 1.0, "xward":
 
 MEASURE: Final = "every customer has a meter of the feeder's own kind instead"
 MONEY: Final = "prices change no voltage"
-DIRECT: Final = "direct current; what it exchanges with the feeder is left out with its converters"
+DIRECT: Final = "direct current; left out with its converters"
 NOTED: Final = {
     "measurement": MEASURE,
     "controller": "taps and set points as in the file",
@@ -636,7 +636,7 @@ def _two_ports(net: Any) -> dict[int, TwoPort]:
         bench.trafo_characteristic_table = net.trafo_characteristic_table
     try:
         found = [_alone(bench, loaded=loaded) for loaded in (False, True)]
-    except Exception:  # noqa: BLE001  # whatever the foreign solver raises on foreign tables
+    except Exception:  # noqa: BLE001  # external solvers may raise anything
         return {}
     return {
         int(i): TwoPort.measured(idle[:2], loaded) for i, idle, loaded in zip(own.index, *found, strict=True)

@@ -280,7 +280,7 @@ def _picture(site: Site, customers: pd.DataFrame, liars: int, sure: str) -> Find
     if not all(math.isfinite(v) for v in customers["error"]):
         return Finding(Standing.OPEN, (("No bound of the error is proved for every customer.",),))
     whoever: Sentence = (
-        "Whatever the method, two voltages up to ",
+        "For any method, two voltages up to ",
         most(customers, name, "error_fits", "V", side=Side.ABOVE),
         " apart apart can fit the same readings.",
     )
