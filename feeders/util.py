@@ -18,29 +18,17 @@ __all__ = ["command_line", "extra", "own_numbers", "plain", "replace_file", "wor
 
 
 def word(value: object) -> str:
-    """Return a value as one word, from which the same value is read: a float keeps all its digits.
-
-    Parameters
-    ----------
-    value
-        A number, a name, a path, ...
-    """
+    """Format a value as one word that parses back to the same value; a float keeps all digits."""
     return repr(float(value)).removesuffix(".0") if isinstance(value, float) else str(value)
 
 
 def command_line(words: Iterable[object]) -> str:
-    """Return words as one line for a shell, quoted where that is needed.
-
-    Parameters
-    ----------
-    words
-        The command, its options and their values.
-    """
+    """Join words to one line for a shell, with quotes where needed."""
     return shlex.join(map(word, words))
 
 
 def extra(name: str) -> str:
-    """Return what is missing, and how to get it, as the end of a sentence.
+    """Name of a missing extra and its installation command, as the end of a sentence.
 
     Parameters
     ----------
@@ -51,21 +39,22 @@ def extra(name: str) -> str:
 
 
 def replace_file(path: Path, write: Callable[[Path], object]) -> None:
-    """Replace a file when its new content is complete; what cannot be completed leaves the old one.
+    """Replace a file once its new content is complete; an incomplete write leaves the old file.
 
-    A link stays one. What is no file, as a pipe or a terminal, cannot be replaced: it is written.
+    A symbolic link stays a link. A path that is not a regular file, such as a pipe or a terminal, cannot be
+    replaced: it is written directly.
 
     Parameters
     ----------
     path
         The file.
     write
-        Writes it, into another file beside it.
+        Function that writes the content to the path that it is given.
 
     Raises
     ------
     OSError
-        If it cannot be written.
+        If the file cannot be written.
     """
     if path.exists() and not path.is_file():
         write(path)
@@ -81,7 +70,7 @@ def replace_file(path: Path, write: Callable[[Path], object]) -> None:
 
 
 def plain(value: Any) -> Any:
-    """Return a value as JSON has it, all the way down.
+    """Convert a value to plain JSON types, recursively.
 
     Parameters
     ----------
@@ -96,12 +85,12 @@ def plain(value: Any) -> Any:
 
 
 def own_numbers(given: DataclassInstance) -> None:
-    """Make NumPy's numbers in a frozen dataclass Python's: those of 32 bits hold no Unix time.
+    """Convert NumPy numbers of a frozen dataclass to Python's; a 32-bit float cannot hold a Unix time.
 
     Parameters
     ----------
     given
-        The instance, which is being made.
+        The instance, called in its `__post_init__`.
     """
     for each in fields(given):
         value = getattr(given, each.name)

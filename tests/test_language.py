@@ -24,17 +24,15 @@ QUESTION = re.compile(r"(What|Who|Whom|Whose|Whether|How|Which|Where|When|Why|If
 PERSON = re.compile(
     r"\b(who|whom|whose|whoever|whomever|nobody|somebody|everybody|anybody|someone|everyone|anyone)\b", re.I
 )
-PUBLIC = re.compile(r"--[a-z-]+|[`\"]who[`\"]|\bwho:|[.-]who\b|(?m:^ *(?:\w+, )*who(?:, \w+)*$)")
-"""Options of the command line, and fields of REST in JavaScript and in lists of parameters: public words.
-
-They are not counted in documents and in the service.
+    "feeders": (0, 0),
+    "service": (0, 0),
 """
 
 # Indirect questions as titles, and personal pronouns for equipment.
 LIMITS = {
     "gridsec": (0, 0),
     "default monitor": (166, 220),
-    "feeders": (206, 245),
+    "feeders": (0, 0),
     "service": (0, 0),
     "documents": (0, 0),
 }
@@ -58,7 +56,8 @@ def prose(source: str) -> Iterator[str]:
 
 def persons(text: str, name: str) -> int:
     """Number of personal pronouns in a text of an area."""
-    return len(PERSON.findall(PUBLIC.sub("", text) if name in ("service", "documents") else text))
+    "feeders": (0, 0),
+    "service": (0, 0),
 
 
 def area(path: Path) -> str:
@@ -118,4 +117,5 @@ def test_public_words_are_no_pronouns() -> None:
     source = (
         '"""Answer.\n\nParameters\n----------\nt, who\n    Whoever asks.\n"""\nX = {"who": "--who and who"}\n'
     )
-    assert [sum(persons(text, name) for text in prose(source)) for name in ("service", "feeders")] == [2, 5]
+    "feeders": (0, 0),
+    "service": (0, 0),

@@ -1,9 +1,9 @@
 """Conversion of other formats into feeder folders.
 
-Sources: the name of a feeder that comes with the project (builds that folder again), `profiles` (builds
-the profile library again), `pandapower:<network>`, `simbench:<code>` or the code alone, the path of a
-pandapower JSON file, of an OpenDSS master file (.dss) or of a power-grid-model JSON file, or a feeder's
-folder. pandapower, simbench and OpenDSS are the optional extra `convert`.
+Sources: the name of a bundled feeder (builds that folder again), `profiles` (builds the profile library
+again), `pandapower:<network>`, `simbench:<code>` or the code alone, the path of a pandapower JSON file, of an
+OpenDSS master file (.dss) or of a power-grid-model JSON file, or a feeder's folder. pandapower, simbench and
+OpenDSS are the optional extra `convert`.
 """
 
 from __future__ import annotations
@@ -76,27 +76,27 @@ def from_folder(
     one_voltage: bool = False,
     meshed: bool = False,
 ) -> Converted:
-    """Return a feeder of our own form, with all that an earlier conversion had changed.
+    """Copy a feeder in the project's own format, with the changes of its earlier conversion.
 
     Parameters
     ----------
     folder
-        The feeder's.
+        Folder of the feeder.
     name
-        Its new name; empty: it keeps its own.
+        New name; empty: the old one.
     opened
-        Lines to take as open.
+        Lines to open.
     root, droop, one_voltage
-        As `feeders.convert.convert.convert` takes them: only for networks of other tools.
+        As in `feeders.convert.convert.convert`; only for networks of other tools.
     meshed
-        Whether loops stay closed, whatever it says itself.
+        True: loops stay closed, with any `meshed` of the file.
 
     Raises
     ------
     FeederInvalid
-        If it is no feeder, or with every option that makes nothing of one.
+        For an invalid feeder, or with every option that does not apply to a feeder.
     GridsecError
-        If its conversion.csv is none.
+        For an invalid conversion.csv.
     """
     tables = read(folder)
     given = {"root": root is not None, "droop": droop is not None, "one_voltage": one_voltage}
@@ -127,18 +127,18 @@ def from_folder(
 def source_again(
     before: Origin | None, tables: FeederTables, folder: Path, command: str, notes: tuple[str, ...]
 ) -> str:
-    """Return the SOURCE.md of a feeder's folder that was written again.
+    """Content of the SOURCE.md of a folder that is written again.
 
     Parameters
     ----------
     before
-        What the folder told of its source before it was written.
+        Origin of the folder before.
     tables
         The feeder.
     folder, command
-        The folder, and the command line that wrote it again.
+        The folder, and the command line of the new conversion.
     notes
-        What was left out, added or changed, earlier and now.
+        Omissions, additions and changes, earlier and now.
     """
     if before is None or not before.source:
         about, source, package = "A feeder in the project's own form.", str(folder), versioned("gridsec")
@@ -146,7 +146,7 @@ def source_again(
     else:
         about, (source, _, package) = before.about, before.source.rpartition(", ")
         told = before.check.removeprefix(AGAIN).removesuffix(".")
-        check = f"{AGAIN}{told or 'not told'}"
+        check = f"{AGAIN}{told or 'unknown'}"
         command = f"{before.command}`, then `{command}" if before.command else command
     return feeder_source(
         tables, about=about, origin=source, package=package, command=command, notes=notes, check=check
@@ -157,7 +157,7 @@ PROFILES = "profiles"
 OPENDSS, PGM = "opendss", "power-grid-model"
 SIMBENCH_CODE = re.compile(r"[0-9]-[A-Za-z0-9.]+(-[A-Za-z0-9.]+)*--[0-9]-(no_)?sw")
 WRITTEN = (META_FILE, LINES_FILE, CUSTOMERS_FILE, CHANGES_FILE, SOURCE_FILE)
-"""What a converted feeder's folder has."""
+"""Files of a converted feeder's folder."""
 
 SEED = 1
 KERBER = "(G. Kerber, dissertation, TU Munich 2011)"
@@ -165,7 +165,7 @@ KERBER = "(G. Kerber, dissertation, TU Munich 2011)"
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """How one of the project's own feeders was made."""
+    """Options of the conversion to a bundled feeder."""
 
     source: str
     title: str
@@ -174,18 +174,18 @@ class Recipe:
     fleet: Fleet | None = None
     max_attacked: int = 1
     mend: Callable[[Any], Change] | None = None
-    """Corrects what is wrong in the source, and says what."""
+    """Corrects an error of the source; returns the change."""
 
 
 def _reactive_powers(net: Any) -> Change:
-    """Bring the reactive powers of two phases to the unit of the third."""
+    """Convert the reactive powers of two phases to the unit of the third."""
     net.asymmetric_load[["q_b_mvar", "q_c_mvar"]] *= 1000.0
     return Change(
         "the loads of phases b and c",
         "reactive power",
         "changed",
-        "a thousandth of what it should be in pandapower's file; taken 1000 times, which gives everybody the "
-        "power factor 0.95 that phase a has there",
+        "too small by a factor of 1000 in pandapower's file; multiplied by 1000, which gives every load the "
+        "power factor 0.95 of phase a",
     )
 
 
@@ -227,8 +227,8 @@ RECIPES: dict[str, Recipe] = {
         "pandapower:ieee_european_lv_asymmetric",
         "IEEE European low-voltage test feeder",
         "The European low-voltage test feeder of the IEEE PES Distribution Test Feeder Working Group\n"
-        "(2015): 55 customers of one phase each. load_kw is what they draw in the minute 566 of its day,\n"
-        "09:26, when the feeder carries the most; it is not the peak of each.",
+        "(2015): 55 customers of one phase each. load_kw is their load in the minute 566 of its day,\n"
+        "09:26, the largest of the feeder; it is not the peak of each.",
         fleet=Fleet(3, 4.6),
         mend=_reactive_powers,
     ),
@@ -250,16 +250,16 @@ RECIPES: dict[str, Recipe] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Conversion:
-    """What became of a source.
+    """Result of a conversion.
 
     Attributes
     ----------
     changes
-        What was left out, approximated, added or changed; also in conversion.csv beside the feeder.
+        Omissions, approximations, additions and changes; also in conversion.csv beside the feeder.
     check
-        The feeder's AC power flow beside the source's own; None if there is none.
+        Comparison of the AC power flows of feeder and source; None without one.
     unchecked
-        Why there is none.
+        Reason for a missing comparison.
     """
 
     changes: tuple[Change, ...]
@@ -268,7 +268,7 @@ class Conversion:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """The changes in words, as in SOURCE.md."""
+        """Changes as sentences, as in SOURCE.md."""
         return sentences(self.changes)
 
 
@@ -283,47 +283,50 @@ def convert(
     meshed: bool = False,
     one_voltage: bool = False,
 ) -> Conversion:
-    """Convert a source into a feeder's folder (or the profile library) with its SOURCE.md.
+    """Convert a source to a feeder's folder (or the profile library) with its SOURCE.md.
 
     Parameters
     ----------
     source
-        See the module.
+        Source, see the module.
     out
-        Folder to write; made if it does not exist.
+        Output folder; created if it does not exist.
     root
-        Bus that becomes the metered busbar, where the source leaves a choice.
+        Bus that becomes the metered busbar, if the source has several candidates.
     name
-        Name of the feeder; default: the name of the folder, or that of a source that is a feeder's folder.
+        Name of the feeder; default: that of the source if it is a feeder's folder, else that of the output
+        folder.
     droop
         Preset of the source's generators.
     opened
-        Lines to take as open, so that a mesh becomes radial.
+        Lines to open, so that a mesh becomes radial.
     meshed
-        Whether loops stay closed, as `meshed = true` in feeder.toml.
+        True: loops stay closed, as with `meshed = true` in feeder.toml.
     one_voltage
-        Whether it ends where another nominal voltage begins: a transformer to that is then a customer.
+        True: the feeder ends at transformers to another nominal voltage, which become customers.
 
     Raises
     ------
     FeederInvalid
-        If the result is no feeder that can be loaded: a loop, an island, no zero sequence where one is
-        needed, ...; or with every option that makes nothing of a feeder's folder.
+        If the result is not a valid feeder: a loop, an island, a missing zero sequence, ...; or with every
+        option that does not apply to a feeder's folder.
     SourceUnreadable
         If the source does not exist, or its own tool cannot read it.
     GridsecError
-        If its own power flow fails where that is needed, or the extra `convert` is not installed.
+        If a required power flow of the source fails, or the extra `convert` is not installed.
     FileExistsError
-        If the folder holds a feeder that no conversion has written.
+        If the folder has a feeder that is not from a conversion.
     """
     folder = Path(out)
     if source == PROFILES:
         _convert_profiles(folder)
         return Conversion((), None, "profiles have no power flow")
     if (folder / META_FILE).exists() and not (folder / CHANGES_FILE).is_file():
-        raise FileExistsError(f"{folder}: a feeder that no conversion has written; expected another folder")
+        raise FileExistsError(
+            f"{folder}: holds a feeder that is not from a conversion; expected another folder"
+        )
     recipe = RECIPES.get(source)
-    again = recipe is None and Path(source).is_dir()  # such a feeder has a name, and tells where it is from
+    again = recipe is None and Path(source).is_dir()  # a feeder's folder has a name and an origin
     before = origin_of(source) if again else None
     usual = "" if again else re.sub(r"[^A-Za-z0-9_-]+", "-", folder.resolve().name)
     chosen = name or (source if recipe is not None else usual)
@@ -360,7 +363,7 @@ def convert(
 
 
 def _problems(tables: FeederTables) -> tuple[str, ...]:
-    """Everything that is wrong with a feeder: not every valid one can be loaded, and a folder must be."""
+    """All problems of a feeder: some valid tables cannot be loaded, and the result must be."""
     try:
         from_tables(tables)
     except FeederInvalid as error:
@@ -376,25 +379,25 @@ def check_against_source(
     opened: Sequence[str] = (),
     one_voltage: bool = False,
 ) -> SourceCheck:
-    """Compare a folder's AC power flow with that of the source it was made from, at the source's loads.
+    """Compare a folder's AC power flow with that of its source, at the source's loads.
 
     Parameters
     ----------
     source
-        As `convert` takes it.
+        As in `convert`.
     folder
         The feeder.
     root, opened, one_voltage
-        As `convert` was given them.
+        As in the conversion.
 
     Raises
     ------
     SourceUnreadable
         If the source cannot be read.
     GridsecError
-        If its own power flow fails.
+        If the source's power flow fails.
     PowerFlowDiverged
-        If the feeder's does.
+        If the feeder's power flow fails.
     """
     tables = read(folder)
     extent = Extent(one_voltage, tables.meta.meshed)
@@ -405,7 +408,7 @@ def check_against_source(
 
 
 def _checked(converted: Converted, folder: Path) -> Conversion:
-    """Compare what was written with the source's power flow."""
+    """Compare the written feeder with the source's power flow."""
     if converted.state is None:
         return Conversion(converted.changes, None, converted.unchecked)
     try:
@@ -423,7 +426,7 @@ def _converted(
     droop: str | None = None,
     extent: Extent = EVERYTHING,
 ) -> tuple[Converted, str]:
-    """Return a source as a feeder, and the package that holds its data or reads its file."""
+    """Source as a feeder, and the package that has its data or reads its file."""
     recipe = RECIPES.get(source)
     origin = recipe.source if recipe else source
     path = Path(origin)
@@ -457,12 +460,12 @@ def _converted(
 
 
 def _kind(path: Path) -> str:
-    """Tell from a file's name and content which tool it is for.
+    """Tool of a file, by its name and content.
 
     Raises
     ------
     SourceUnreadable
-        If it is for none of them.
+        For any other file.
     """
     if path.suffix.lower() == ".dss":
         return OPENDSS
@@ -470,7 +473,7 @@ def _kind(path: Path) -> str:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         raise SourceUnreadable(
-            f"{path}: no valid JSON ({error}); expected a pandapower or power-grid-model JSON file, "
+            f"{path}: invalid JSON ({error}); expected a pandapower or power-grid-model JSON file, "
             "or an OpenDSS master file with the ending .dss"
         ) from error
     if isinstance(content, dict):
@@ -479,13 +482,13 @@ def _kind(path: Path) -> str:
         if "data" in content and "version" in content:
             return PGM
     raise SourceUnreadable(
-        f"{path}: JSON, but neither a pandapower net (which says _class pandapowerNet) nor input data of "
-        "power-grid-model (which has version, type and data)"
+        f"{path}: JSON, but neither a pandapower net (with _class pandapowerNet) nor input data of "
+        "power-grid-model (with version, type and data)"
     )
 
 
 def _options(root: str | None, name: str | None, droop: str | None, opened: Sequence[str]) -> list[str]:
-    """Return the options of the command line that were given."""
+    """Given options as words of the command line."""
     given = (("--root", root), ("--name", name), ("--droop", droop), *(("--open", line) for line in opened))
     return [word for option, value in given if value for word in (option, value)]
 
@@ -496,7 +499,7 @@ def _flags(extent: Extent) -> list[str]:
 
 
 def _seeded(make: Callable[[], Any]) -> Any:
-    """Build a network whose maker draws cables at random; the caller's random state stays as it was."""
+    """Build a network with random cable types; the caller's random state is restored."""
     state = random.getstate()
     random.seed(SEED)
     try:
@@ -518,7 +521,7 @@ def _convert_profiles(folder: Path) -> None:
 
 
 def _open(origin: str) -> tuple[Any, str]:
-    """Return the pandapower net of a source and the name of the package that holds its data."""
+    """Pandapower net of a source, and the name of the package with its data."""
     kind, _, rest = origin.partition(":")
     path = Path(origin)
     if path.suffix.lower() in (".json", ".dss") and not path.is_file():
@@ -534,7 +537,7 @@ def _open(origin: str) -> tuple[Any, str]:
         return _named(rest), "pandapower"
     if not path.is_file():
         raise SourceUnreadable(
-            f"{origin!r} is no source; expected {', '.join(RECIPES)}, pandapower:<network>, "
+            f"{origin!r} is not a source; expected {', '.join(RECIPES)}, pandapower:<network>, "
             "simbench:<code>, a pandapower or power-grid-model JSON file, an OpenDSS master file (.dss), "
             "or a feeder's folder",
             code="unknown-name",
@@ -543,15 +546,15 @@ def _open(origin: str) -> tuple[Any, str]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             net = pandapower.from_json(str(path))
-    except Exception as error:  # whatever the foreign reader raises on a foreign file
+    except Exception as error:  # an external reader may raise anything on an external file
         raise SourceUnreadable(f"{origin}: pandapower cannot read it: {error}") from error
     if not isinstance(net, pandapower.pandapowerNet):
-        raise SourceUnreadable(f"{origin}: holds no pandapower net")
+        raise SourceUnreadable(f"{origin}: not a pandapower net")
     return net, "pandapower"
 
 
 def _named(name: str) -> Any:
-    """Build one of pandapower's own networks."""
+    """Build one of pandapower's bundled networks."""
     from pandapower import networks
 
     found = [getattr(networks, maker, None) for maker in (name, f"create_{name}")]
@@ -565,10 +568,10 @@ def _named(name: str) -> Any:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             net = _seeded(makers[0])
-    except Exception as error:  # whatever a maker that needs arguments, or is none, raises
+    except Exception as error:  # a maker with required arguments may raise anything
         raise SourceUnreadable(f"pandapower cannot build {name!r} by itself: {error}") from error
     finally:
         talk.setLevel(level)
     if not hasattr(net, "bus"):
-        raise SourceUnreadable(f"pandapower's {name!r} is no network")
+        raise SourceUnreadable(f"pandapower's {name!r} is not a network")
     return net

@@ -15,41 +15,41 @@ from feeders.model.profiles import envelopes
 from gridsec.arrays import Phasors
 
 HOUSEHOLDS: Final = ("H0-A", "H0-B", "H0-C", "H0-G", "H0-L")
-# Trade and agriculture whose reactive power follows the active power closely, as that of large loads does.
+# Trade and agriculture with reactive power close to proportional to active power, as of large loads.
 TRADE: Final = ("G1-A", "G2-A", "G6-A", "L1-A", "L2-A")
 HOUSEHOLD_KW: Final = 30.0
 USUAL_POWER_FACTOR: Final = 0.93
 LEAST_POWER_FACTOR: Final = 0.01
-"""The least that customers.csv can say."""
+"""Smallest power factor of customers.csv."""
 
 SMALL_KVA: Final = 4.6
 
 
 def rounded(value: float) -> float:
-    """Nine significant digits: enough for any cable, and free of the noise of the unit's conversion."""
+    """Round to nine significant digits: exact enough for any cable, and without rounding errors of units."""
     return float(f"{value:.9g}")
 
 
 def usual_profile(number: int, *, household: bool) -> str:
-    """Profile of the load of this number, dealt out in the order of the loads."""
+    """Profile of the load of this number, by turns in the order of the loads."""
     kinds = HOUSEHOLDS if household else TRADE
     return kinds[number % len(kinds)]
 
 
 def reactive(customer: CustomerRow, power_factor: float | None) -> CustomerRow:
-    """Fill in what the load's profile is known to do to the reactive power.
+    """Set power factors and reactive floor from the history of the load's profile.
 
     Parameters
     ----------
     customer
-        With its load and its profile.
+        Customer with a load and its profile.
     power_factor
         At the peak, lagging; None: the usual one.
     """
     factor = USUAL_POWER_FACTOR if power_factor is None else max(round(power_factor, 4), LEAST_POWER_FACTOR)
     tan = math.tan(math.acos(factor))
     history = envelopes()[customer.load_profile]
-    # Rounded outwards, so that the interval still holds the history.
+    # Rounded outwards, so that the interval still contains the history.
     return replace(
         customer,
         power_factor=factor,
@@ -63,74 +63,75 @@ def reactive(customer: CustomerRow, power_factor: float | None) -> CustomerRow:
 
 
 def droop_preset(kva: float) -> str:
-    """Droop curve of an inverter of this size whose own is not known."""
+    """Droop curve of an inverter of this size without a known curve."""
     return "vde4105" if kva > SMALL_KVA else "vde4105-small"
 
 
 def with_meters(rows: list[CustomerRow]) -> list[CustomerRow]:
-    """Give every customer a meter: m01, m02, ... in their order."""
+    """Give every customer a meter: m01, m02, ... in order."""
     digits = max(2, len(str(len(rows))))
     return [replace(row, meter=f"m{k:0{digits}d}") for k, row in enumerate(rows, start=1)]
 
 
 def base_kva(volt: float, load_kw: float) -> float:
-    """Base power of the per-unit system that suits a feeder of this voltage and load."""
+    """Base power of the per-unit system for a feeder of this voltage and load."""
     return 100.0 if volt < 1000.0 else 10.0 ** max(2, math.ceil(math.log10(max(load_kw, 1.0))))
 
 
 NO_POWER: Final = 1e-9
-"""Share of a load's power that is a solver's last digits."""
+"""Relative power below which a load's power is a rounding error of a solver."""
 
 UNSURE: Final = 0.5
-"""Part by which a transformer's no-load power is not known: without a reading a customer is taken at half."""
+"""Relative standard deviation of a transformer's no-load power: without a reading, a customer has half of it.
+"""
 
 SWITCHED_OFF: Final = (
     "in service",
     "changed",
-    "switched off in the source; a customer who is expected to draw nothing",
+    "switched off in the source; a customer with an expected load of zero",
 )
-"""What becomes of a load that is switched off: property, what was done, effect."""
+"""Change of a load that is switched off: property, action, effect."""
 
 ONLY_REACTIVE: Final = (
     "reactive power",
     "left out",
-    "draws no active power, to which what is expected of the reactive power is tied",
+    "has no active power, to which the expected reactive power is proportional",
 )
-"""The same of a load that draws reactive power only."""
+"""The same for a load of reactive power only."""
 
 BY_DROOP: Final = (
     "reactive power",
     "left out",
     "its droop curve decides; in the check it is that of the source",
 )
-"""The same of the reactive power of a generator with an inverter."""
+"""The same for the reactive power of a generator with an inverter."""
 
 EVEN: Final = 1e-6
-"""Spread of the phases' powers, as a share of the largest, below which a connection is of three phases."""
+"""Spread of the phases' powers, relative to the largest, up to which a connection has three phases."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Draw:
-    """A load or a generator at a bus.
+    """Load or generator at a bus.
 
     Attributes
     ----------
     name, bus
-        Its name and where it is.
+        Name and bus.
     power_kva : (3,)
-        What it takes from each phase at the source's operating point, P + jQ, kVA.
+        Power from each phase at the source's operating point, P + jQ, kVA.
     even
-        It is one connection of all three phases.
+        True for one connection of all three phases.
     rating_kva
-        Rating of a generator's inverter; 0: it has none; None: no generator.
+        Rating of a generator's inverter, kVA; 0: without inverter; None: not a generator.
     idle
-        It is what a transformer takes without load, which no customer pays for and no meter reads.
+        True for a transformer's no-load power, which is unmetered.
     peak_kw
-        Rated peak of a generator; what it feeds in now may be less.
+        Rated peak of a generator, kW; the present power may be less.
     phases
-        Those that it is connected to, whether it draws anything there or not.
+        Connected phases, with or without power.
     noun
-        What it is called where it is told about; empty: load or generator.
+        Noun for messages; empty: load or generator.
     """
 
     name: str
@@ -145,23 +146,23 @@ class Draw:
 
     @property
     def label(self) -> str:
-        """What it is called where it is told about."""
+        """Noun and name for messages."""
         return f"{self.noun or ('load' if self.rating_kva is None else 'generator')} {self.name}"
 
 
 def is_even(power: Phasors) -> bool:
-    """Return whether all phases draw the same, and anything at all."""
+    """True if all phases have the same nonzero power."""
     size = float(np.abs(power).max())
     return size > 0 and float(np.abs(power - power.mean()).max()) <= EVEN * size
 
 
 def as_it_stands(power: Phasors) -> str:
-    """Return in words what becomes of something that draws or feeds in by rules of its own.
+    """Effect on a load or generator with a control of its own, for a change.
 
     Parameters
     ----------
     power : (3,)
-        What it takes from each phase at the source's operating point, kVA.
+        Power from each phase at the source's operating point, kVA.
     """
     p, q = (round(float(part), 6) + 0.0 for part in (power.sum().real, power.sum().imag))
     if p < 0:
@@ -176,7 +177,7 @@ def customers_of(
     changes: list[Change],
     taken: Collection[str] = (),
 ) -> tuple[list[CustomerRow], dict[str, complex]]:
-    """Return rows of customers.csv, and what each draws at the source's operating point, kVA.
+    """Rows of customers.csv, and the power of each at the source's operating point, kVA.
 
     Parameters
     ----------
@@ -187,9 +188,9 @@ def customers_of(
     droop
         Preset of the generators' inverters; None: by their size.
     changes
-        Takes what is not carried over exactly.
+        Receives inexact conversions.
     taken
-        Names that other customers have.
+        Names of other customers.
     """
     rows: list[CustomerRow] = []
     power: dict[str, complex] = {}
@@ -215,7 +216,7 @@ def customers_of(
 def _generator(
     row: CustomerRow, kva: complex, draw: Draw, number: int, *, droop: str | None, changes: list[Change]
 ) -> CustomerRow:
-    """Give a customer a generator's peak, and the inverter that it has."""
+    """Give a customer a generator's peak, and its inverter."""
     parts = len(_connections(draw))
     rating = (draw.rating_kva or 0.0) / parts
     peak = rounded(max(draw.peak_kw / parts, -kva.real, 0.0))
@@ -234,14 +235,14 @@ def _generator(
 def idle_customers(
     draws: Iterable[Draw], taken: Collection[str]
 ) -> tuple[list[CustomerRow], dict[str, complex]]:
-    """Return what transformers take without load as customers without meters, and their powers, kVA.
+    """No-load powers of transformers as customers without meters, and their powers, kVA.
 
     Parameters
     ----------
     draws
-        Of which those are taken that are idle.
+        Loads and generators; only those with `idle` count.
     taken
-        Names that customers have.
+        Names of customers.
     """
     rows: list[CustomerRow] = []
     power: dict[str, complex] = {}
@@ -249,7 +250,7 @@ def idle_customers(
         for phases, kva in _connections(draw) if draw.idle else ():
             row = CustomerRow(_unique(draw, phases, {*taken, *power}), draw.bus, rounded(max(kva.real, 0.0)))
             factor = max(kva.real / abs(kva), LEAST_POWER_FACTOR)
-            # What the power factor does not say: all of it where no active power is drawn.
+            # Reactive power beyond the power factor: all of it without active power.
             beside = abs(kva.imag) - row.load_kw * math.tan(math.acos(factor))
             row = replace(row, phases=phases, q_floor_kvar=rounded(max(beside, 0.0)))
             one = rounded(factor)
@@ -272,10 +273,10 @@ def _connections(draw: Draw) -> list[tuple[str, complex]]:
 
 
 def in_star(pairs: Phasors, volts: Phasors) -> Phasors:
-    """Return what a load between phases draws from each phase, kVA.
+    """Powers of a load between phases, from each phase, kVA.
 
-    Between the phases k and k + 1 flows ``conj(S_k / (V_k - V_k+1))``; each phase gives what flows out of it
-    less what flows back into it.
+    The current between the phases k and k + 1 is ``conj(S_k / (V_k - V_k+1))``; the current of a phase is the
+    difference of two of these.
 
     Parameters
     ----------

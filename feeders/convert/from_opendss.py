@@ -1,9 +1,8 @@
 """OpenDSS master files, read and solved by OpenDSS.
 
-All of it stands at the operating point that OpenDSS found; what moves with the voltage or over
-time is named.
+All elements are at the operating point of OpenDSS; dependence on the voltage or on time is reported.
 
-OpenDSS is one global state. Everything here runs in an engine of its own, which is cleared before and after,
+OpenDSS is one global state. The conversion has an engine of its own, which is cleared before and after. It
 opens no windows, starts no programs and writes nothing outside a temporary folder.
 """
 
@@ -31,15 +30,15 @@ from gridsec.errors import FeederInvalid, GridsecError, Problem
 
 PHASES: Final = 3
 SAME_POWER: Final = 1e-6
-"""Relative difference of two powers below which they are the same."""
+"""Relative difference of two powers that count as equal."""
 
 LOADS: Final = {"load", "indmach012"}
 GENERATORS: Final = {"generator", "pvsystem"}
 STORAGE: Final = {"storage"}
 
 PROFILE: Final = "a profile of the library instead"
-STANDS: Final = "its power stands as the source's power flow has it"
-RATED: Final = "the peak is the rated one, and what it feeds in now as the source's power flow has it"
+STANDS: Final = "its power is that of the source's power flow"
+RATED: Final = "the peak is the rated one, the present power that of the source's power flow"
 OVER_TIME: Final = {
     "load": {"yearly": "", "daily": "", "duty": "", "growth": STANDS, "cvrcurve": STANDS},
     "generator": {"yearly": "", "daily": "", "duty": ""},
@@ -50,12 +49,12 @@ OVER_TIME: Final = {
     "storage": dict.fromkeys(("yearly", "daily", "duty", "effcurve"), STANDS),
     "indmach012": dict.fromkeys(("yearly", "daily", "duty"), STANDS),
 }
-"""Properties that name a curve, and what the feeder does instead; empty: a profile of the library."""
+"""Properties that refer to a curve, and the feeder's replacement; empty: a profile of the library."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Element:
-    """One element of the circuit as solved, terminal by terminal."""
+    """One element of the solved circuit, terminal by terminal."""
 
     name: str
     kind: str
@@ -67,22 +66,22 @@ class Element:
 
     @property
     def closed(self) -> bool:
-        """Whether it is connected at all its ends."""
+        """True if all ends are connected."""
         return self.enabled and len(self.on) == len(self.buses)
 
     @property
     def label(self) -> str:
-        """What it is called where it is told about."""
+        """Kind and name for messages."""
         return f"{self.kind} {self.name}"
 
 
 def voltage_dependence(dss: Any) -> list[tuple[str, Change]]:
-    """Return the loads that are not of constant power, each with its bus.
+    """Loads that are not of constant power, each with its bus.
 
     Parameters
     ----------
     dss
-        The engine, with the circuit as it was read.
+        The engine, with the circuit of the file.
     """
     effect = "depends on the voltage in the source; taken as constant power"
     changes = []
@@ -98,14 +97,14 @@ def voltage_dependence(dss: Any) -> list[tuple[str, Change]]:
 
 
 def beyond_limits(found: list[Element], constant: list[Element], known: set[str]) -> list[tuple[str, Change]]:
-    """Return loads and generators that become impedances at their voltages, though of constant power.
+    """Loads and generators of constant power that become impedances at their voltages.
 
     Parameters
     ----------
     found, constant
         All elements as the source solves them, and with loads of constant power.
     known
-        Those that are told about already.
+        Labels of elements that are reported already.
     """
     out = []
     for one, other in zip(found, constant, strict=True):
@@ -119,7 +118,7 @@ def beyond_limits(found: list[Element], constant: list[Element], known: set[str]
 
 
 def add_draw(dss: Any, each: Element, network: Network) -> None:
-    """Add a load, a generator or a battery to a network, with everything that a customer cannot hold.
+    """Add a load, a generator or a battery to a network, and report properties that a customer lacks.
 
     Parameters
     ----------
@@ -128,14 +127,14 @@ def add_draw(dss: Any, each: Element, network: Network) -> None:
     each
         The element.
     network
-        Takes it.
+        Receives the element.
     """
     power, bus = each.power_kva[0], each.buses[0]
     used = [node for node in each.nodes[0] if 1 <= node <= PHASES]
     even = len(used) == PHASES and (is_even(power) or not power.any())
     told = list(_curves(dss, each))
     if len(used) > 1 and not even:
-        effect = "in star, its phases' powers as the source's power flow has them; exact at these loads only"
+        effect = "in star, with its phases' powers of the source's power flow; exact at these loads only"
         told.append(Change(each.label, "delta", "approximated", effect))
     rating: float | None = None
     peak = 0.0
@@ -153,7 +152,7 @@ def add_draw(dss: Any, each: Element, network: Network) -> None:
 
 
 def _curves(dss: Any, each: Element) -> Iterator[Change]:
-    """Name every curve that an element follows over time, temperature or voltage, each once."""
+    """Every curve of an element over time, temperature or voltage, each once."""
     told: set[str] = set()
     known = _properties(dss, each)
     for prop, effect in OVER_TIME[each.kind].items():
@@ -165,7 +164,7 @@ def _curves(dss: Any, each: Element) -> Iterator[Change]:
 
 
 def _sunlight(dss: Any, each: Element, peak: float) -> Iterator[Change]:
-    """Say what a solar plant feeds in now, where that is not its rated peak."""
+    """Present power of a solar plant, if it is not the rated peak."""
     now = 0.0 - round(float(each.power_kva[0].sum().real), 6)
     if abs(now - peak) > SAME_POWER * peak:
         sun = _number(dss, each, "irradiance")
@@ -192,16 +191,16 @@ CONSTANT_POWER: Final = (
     "batchedit generator..* model=1 vminpu=0.01 vmaxpu=10",
 )
 UNNAMED_KV: Final = (0.208, 0.48, 12.47, 24.9, 34.5, 115.0, 230.0)
-"""Voltage bases of a circuit whose file names none."""
+"""Voltage bases, kV, of a circuit without bases in its file."""
 
 DEAD: Final = 1e-4
-"""Voltage, pu, below which nothing energises a phase: only open lines end there."""
+"""Voltage, pu, below which a phase is not energised: only open lines end there."""
 
 APART: Final = 1e-6
-"""Part of a transformer's largest admittance below which its phases have nothing in common."""
+"""Coupling between a transformer's phases, relative to its largest admittance, that counts as zero."""
 
 NO_LOAD: Final = 1e-5
-"""Part of a transformer's rating that it takes without load, from which on it is told that it is left out."""
+"""No-load power relative to a transformer's rating from which on it is reported."""
 
 SERIES: Final = {"line", "reactor"}
 COUPLINGS: Final = {"transformer", "autotrans"}
@@ -211,38 +210,38 @@ TOLD: Final = {
     "monitor": MEASURE,
     "energymeter": MEASURE,
     "sensor": MEASURE,
-    "regcontrol": "taps stand where the source's power flow left them",
-    "capcontrol": "switched as the source's power flow left them",
-    "swtcontrol": "stays as the source's power flow left it",
+    "regcontrol": "taps as in the source's power flow",
+    "capcontrol": "switched as in the source's power flow",
+    "swtcontrol": "switched as in the source's power flow",
     "fuse": "never blows",
     "relay": "never trips",
     "recloser": "never trips",
     "invcontrol": DROOP,
     "expcontrol": DROOP,
-    "storagecontroller": "storage stays as the source's power flow left it",
-    "gendispatcher": "generators stay as the source's power flow left them",
-    "espvlcontrol": "plants stay as the source's power flow left them",
-    "upfccontrol": "what it controls is left out",
+    "storagecontroller": "storage as in the source's power flow",
+    "gendispatcher": "generators as in the source's power flow",
+    "espvlcontrol": "plants as in the source's power flow",
+    "upfccontrol": "left out with its UPFC",
 }
-"""Classes that carry no current, and what a feeder does without them."""
+"""Classes without current, and their replacement in a feeder."""
 
-UNLIKE: Final = "has no place in a feeder; the check shows what that does"
+UNLIKE: Final = "has no place in a feeder; the check shows the effect"
 NO_PLACE: Final = {
     *("isource", "vccs", "fault", "upfc", "vsconverter"),
     *("gicsource", "gicline", "gictransformer"),
 }
-"""Classes that carry current and are left out; named, as whatever a later OpenDSS knows besides."""
+"""Classes with current that are left out; reported like any unknown class."""
 
 DEFINITIONS: Final = {
     *("linecode", "wiredata", "cndata", "tsdata", "linespacing", "linegeometry", "xfmrcode", "spectrum"),
     *("loadshape", "tshape", "priceshape", "growthshape", "xycurve", "tcc_curve", "dynamicexp"),
 }
-"""Classes of data that mean nothing until an element refers to them, and are told about there."""
+"""Classes of data without an effect of their own; elements that refer to them report them."""
 
 
 @contextmanager
 def _engine() -> Iterator[Any]:
-    """Yield an OpenDSS engine of its own, empty and without effects on anything else."""
+    """OpenDSS engine of its own, empty and without effects on anything else."""
     try:
         from opendssdirect import dss
     except ImportError as error:
@@ -250,7 +249,7 @@ def _engine() -> Iterator[Any]:
     here = Path.cwd()
     with tempfile.TemporaryDirectory() as scratch:
         engine = dss.NewContext()
-        os.chdir(here)  # a new context goes back to where the process began
+        os.chdir(here)  # a new context changes to the start folder of the process
         engine.Basic.AllowForms(False)
         engine.Basic.AllowEditor(False)
         engine.Basic.AllowDOScmd(False)
@@ -279,14 +278,14 @@ def read_opendss(path: Path) -> Network:
     GridsecError
         If OpenDSS cannot solve it.
     FeederInvalid
-        With everything in it that no feeder can be.
+        With all content that a feeder cannot have.
     """
     with _engine() as dss:
         try:
             return _read(dss, path)
         except (FeederInvalid, GridsecError):
             raise
-        except Exception as error:  # whatever the foreign engine raises on a foreign file
+        except Exception as error:  # the external engine may raise anything on an external file
             raise SourceUnreadable(f"{path}: OpenDSS: {' '.join(str(error).split())}") from error
 
 
@@ -334,7 +333,7 @@ def _run(dss: Any, commands: tuple[str, ...]) -> None:
 
 
 def _solved(dss: Any) -> dict[str, Phasors]:
-    """Solve, and return the voltages of all buses, V; none if there is no solution."""
+    """Solve; voltages of all buses, V, none without a solution."""
     dss.Solution.Solve()
     if not dss.Solution.Converged():
         return {}
@@ -352,7 +351,7 @@ def _solved(dss: Any) -> dict[str, Phasors]:
 
 
 def _voltage_bases(dss: Any) -> tuple[str, ...]:
-    """Return what is missing where a file names its voltage bases and does not take them, as saved ones."""
+    """Missing commands for a file with voltage bases that it does not apply, such as a saved one."""
     named = set(dss.Settings.VoltageBases()) != set(UNNAMED_KV)
     bare = any(not volt > 0 for volt in _nominal(dss, []).values())
     return ("calcvoltagebases",) if named and bare else ()
@@ -397,7 +396,7 @@ def _element(dss: Any, full: str, problems: list[Problem]) -> Element:
     nodes = tuple(tuple(order[k * conductors : (k + 1) * conductors]) for k in range(len(buses)))
     parts = np.array(element.Powers()).reshape(-1, 2) if live else np.empty((0, 2))
     flat = parts[:, 0] + 1j * parts[:, 1]
-    # The other half of an autotransformer's conductors is what its windings have between them.
+    # The second half of an autotransformer's conductors belongs to the voltages between its windings.
     own = conductors // 2 if kind == "autotrans" else conductors
     powers = []
     for k, here in enumerate(nodes):
@@ -419,7 +418,7 @@ def _element(dss: Any, full: str, problems: list[Problem]) -> Element:
 
 
 def _build_everything(dss: Any, elements: list[Element]) -> None:
-    """Close what is open, after everything else has been read: matrices are only of what is closed."""
+    """Close open elements, after everything else has been read: only closed elements have matrices."""
     for each in elements:
         if each.kind in SERIES and each.enabled and not each.closed:
             dss.Circuit.SetActiveElement(f"{each.kind}.{each.name}")
@@ -429,7 +428,7 @@ def _build_everything(dss: Any, elements: list[Element]) -> None:
 
 
 def _take(dss: Any, each: Element, network: Network, problems: list[Problem]) -> None:
-    """Add an element to the network, or say what becomes of it."""
+    """Add an element to the network, or report its omission."""
     label = f"{each.kind} {each.name}"
     if not each.enabled:
         network.changes.append(Change(label, WHOLE, "left out", "disabled in the source"))
@@ -453,14 +452,14 @@ def _take(dss: Any, each: Element, network: Network, problems: list[Problem]) ->
         change = Change(label, WHOLE, "left out", TOLD.get(each.kind, UNLIKE))
         at = [bus for bus in each.buses if bus in network.nominal]
         network.of_bus.extend((bus, change) for bus in at)
-        network.changes += [] if at else [change]  # on no bus, as controllers of several elements
+        network.changes += [] if at else [change]  # without a bus, as controllers of several elements
 
 
 def _regulator(dss: Any, each: Element, network: Network) -> tuple[LineRow | None, Draw | None]:
-    """A transformer that is a line with a tap: two ends of the same phases, each phase apart, none turned.
+    """Transformer as a line with a tap: two ends of the same phases, without coupling or phase shift.
 
     With the admittance y behind a ratio t its admittances are ``y / t^2``, ``-y / t`` and, at the far end, y
-    beside what flows into it without load, which is a draw there.
+    and the no-load admittance. The latter becomes a draw there.
     """
     ends = [sorted((node, k) for k, node in enumerate(nodes) if node > 0) for nodes in each.nodes]
     nodes = [node for node, _ in ends[0]]
@@ -506,7 +505,7 @@ def _regulator(dss: Any, each: Element, network: Network) -> tuple[LineRow | Non
 
 
 def _amps(dss: Any, each: Element, count: int) -> float | None:
-    """Rated current of a transformer's second winding, A; its voltage is said between phases, if several."""
+    """Rated current of a transformer's second winding, A; for several phases kV is between phases."""
     dss.Transformers.Name(each.name)
     dss.Transformers.Wdg(2)
     kva, kv = float(dss.Transformers.kVA()), float(dss.Transformers.kV())
@@ -527,7 +526,7 @@ def _yprim(dss: Any, each: Element) -> Phasors:
 
 
 def _line(dss: Any, each: Element, network: Network, problems: list[Problem]) -> None:
-    """A line or a series reactor: its series impedance and its charging from its primitive admittances."""
+    """Line or series reactor: series impedance and charging from its primitive admittances."""
     label = each.name if each.kind == "line" else f"{each.kind}.{each.name}"
     here, there = each.nodes
     if here != there or len(set(here)) != len(here) or not all(1 <= node <= PHASES for node in here):
@@ -592,7 +591,7 @@ def _shunt(dss: Any, each: Element, network: Network) -> None:
         effect = f"{-kvar:.4g} kvar" if each.closed else "switched off in the source"
         network.of_bus.append((bus, Change(label, WHOLE, "left out", effect)))
         return
-    # Both terminals may be at phases of the bus: what is between phases is where their conductors meet.
+    # Both terminals may be at phases of the bus: entries between phases are where their conductors meet.
     meet = np.equal.outer(np.arange(1, PHASES + 1), np.concatenate(each.nodes)).astype(np.float64)
     here = np.flatnonzero(meet.any(axis=1))
     block = (meet @ _yprim(dss, each).imag @ meet.T)[np.ix_(here, here)]

@@ -1,6 +1,6 @@
-"""A pandapower net as a feeder's tables.
+"""Feeder's tables from a pandapower net.
 
-Nothing is dropped in silence: whatever a feeder's format cannot hold is named in the changes.
+Nothing is dropped silently: everything that the feeder format lacks is in the changes.
 """
 
 from __future__ import annotations
@@ -37,17 +37,17 @@ from gridsec.arrays import Phasors
 from gridsec.errors import GridsecError
 
 SOLAR: Final = {"pv", "wye", "delta"}
-"""Types of static generators that say nothing against the sun."""
+"""Types of static generators that are compatible with a solar profile."""
 
 
 @dataclass(frozen=True, slots=True)
 class Fleet:
-    """Synthetic PV inverters for a source that has none.
+    """Synthetic PV inverters for a source without any.
 
     Attributes
     ----------
     every
-        Every how many-th of the customers without generation gets one, starting with the first.
+        Interval among the customers without generation, from the first one on.
     kva
         Rating, kVA; 0: half of the customer's load_kw.
     droop
@@ -61,7 +61,7 @@ class Fleet:
 
 @dataclass(slots=True)
 class _Source:
-    """A net and the part of it below the busbar.
+    """Net, and the part of it below the busbar.
 
     Attributes
     ----------
@@ -72,11 +72,11 @@ class _Source:
     inside
         Its buses in the feeder.
     changes
-        Takes what is not carried over as it is.
+        Receives inexact conversions.
     volts
-        Of the buses, as pandapower solved them, V.
+        Voltages of the buses by pandapower's power flow, V.
     power
-        What each customer draws, kVA.
+        Power of each customer, kVA.
     """
 
     net: Any
@@ -99,34 +99,34 @@ def from_pandapower(
     fleet: Fleet | None = None,
     max_attacked: int = 1,
 ) -> Converted:
-    """Return a net's feeder as tables, and what was left out, added or changed.
+    """Convert a net to a feeder's tables, with all omissions, additions and changes.
 
     Parameters
     ----------
     net
         A pandapower net.
     name, title
-        Of the feeder.
+        Name and title of the feeder.
     root
         Name or index of the bus that becomes the metered busbar; None: the low-voltage side of the only
         transformer, or without transformers the bus of the external grid.
     opened
-        Lines to take as open, so that the feeder is radial.
+        Lines to open, so that the feeder is radial.
     droop
         Preset of the inverters in the source (static generators); None: vde4105 or vde4105-small by size.
     extent
-        How far down it goes.
+        Extent of the feeder.
     fleet
         Synthetic inverters to add.
     max_attacked
-        For the monitor.
+        `max_attacked` of the monitor.
 
     Raises
     ------
     GridsecError
-        If there is no such bus, or more than one that could be meant.
+        For an unknown or ambiguous bus.
     FeederInvalid
-        With every reason why there is no feeder below it.
+        With every problem of the feeder below it.
     """
     net = with_truths(net)
     network = network_of(net)
@@ -215,7 +215,7 @@ def _customers(source: _Source, droop: str | None) -> list[CustomerRow]:
 
 
 def _phase_rows(source: _Source, number: int) -> Iterable[CustomerRow]:
-    """Loads of single phases and between phases: one customer for each phase that draws power."""
+    """Loads of single phases and between phases: one customer for each phase with power."""
     net = source.net
     taken = ids(net.load, "load")
     names = ids(net.asymmetric_load, "phase load", taken.values())
@@ -251,7 +251,7 @@ def _phase_rows(source: _Source, number: int) -> Iterable[CustomerRow]:
 
 
 def _known(source: _Source, customer: CustomerRow, s: complex) -> CustomerRow:
-    """Note what a load draws, kVA, and say what of it the format cannot hold."""
+    """Store a load's power, kVA, and report parts of it that the format lacks."""
     source.power[customer.customer] = s
     label = f"load {customer.customer}"
     if s.real < 0:
@@ -300,7 +300,7 @@ def _load_row(source: _Source, index: int, name: str, number: int) -> CustomerRo
 def _generators(
     source: _Source, rows: list[CustomerRow], at_bus: dict[str, list[int]], droop: str | None
 ) -> None:
-    """Give each static generator to the first customer of its bus, or make it a customer of its own."""
+    """Add each static generator to the first customer of its bus, or make it a customer of its own."""
     net = source.net
     names = ids(net.sgen, "generator", ids(net.load, "load").values())
     for i in map(int, net.sgen.index):
@@ -341,7 +341,7 @@ def _generators(
 
 
 def _sun(source: _Source, generator: Any, label: str, usual: str) -> str:
-    """Profile of a static generator: its own if the library has it; otherwise the usual one, and a note."""
+    """Profile of a static generator: its own if the library has it; otherwise the usual one, and a change."""
     given = {column: generator.get(column) for column in ("profile", "type")}
     named = {column: text for column, text in given.items() if isinstance(text, str) and text}
     profile = named.get("profile", "")

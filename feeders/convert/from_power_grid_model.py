@@ -32,7 +32,7 @@ from gridsec.arrays import Floats, Phasors
 from gridsec.errors import FeederInvalid, GridsecError, Problem
 
 OMEGA: Final = 2.0 * np.pi * 50.0
-"""power-grid-model's angular frequency; its files do not say another."""
+"""Angular frequency of power-grid-model; its files state none."""
 
 LOADS: Final = ("sym_load", "asym_load")
 GENERATORS: Final = ("sym_gen", "asym_gen")
@@ -45,21 +45,21 @@ CARRIED: Final = {
     *("node", "source", "line", "asym_line", "link", "shunt"),
     *(*LOADS, *GENERATORS, *COUPLINGS),
 }
-"""Tables that are told about row by row."""
+"""Tables that are reported row by row."""
 
 MEASURE: Final = "every customer has a meter of the feeder's own kind instead"
-UNLIKE: Final = "has no place in a feeder; the check shows what that does"
+UNLIKE: Final = "has no place in a feeder; the check shows the effect"
 NOTED: Final = {
-    "transformer_tap_regulator": "taps stand as the file has them",
+    "transformer_tap_regulator": "taps as in the file",
     "fault": "not part of a power flow",
 }
-"""Tables without a place in the network, and what a feeder does without them."""
+"""Tables without a place in the network, and their replacement in a feeder."""
 
 STATUS: Final = ("status", "from_status", "to_status", "status_1", "status_2", "status_3")
 TOLERANCES: Final = (1e-11, 1e-9, 1e-7)
 """Largest voltage corrections of the last Newton step, pu; links, almost short circuits, limit them."""
 STIFF_VA: Final = 1e20
-"""Short-circuit power of a source in front of one transformer."""
+"""Short-circuit power of a source in front of one transformer, VA."""
 
 TURN: Final = np.exp(-2j * np.pi / 3.0 * np.arange(3))
 
@@ -81,7 +81,7 @@ def read_pgm(path: Path) -> Network:
     GridsecError
         If power-grid-model cannot solve it.
     FeederInvalid
-        With everything that is wrong with its data.
+        With all problems of its data.
     """
     tables = _tables(path)
     symmetric = not any(
@@ -125,7 +125,7 @@ def _tables(path: Path) -> Tables:
         data = json_deserialize(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         raise SourceUnreadable(f"{path}: cannot be read: {error}") from error
-    except Exception as error:  # whatever the foreign reader raises on a foreign file
+    except Exception as error:  # an external reader may raise anything on an external file
         raise SourceUnreadable(
             f"{path}: power-grid-model cannot read it: {' '.join(str(error).split())}"
         ) from error
@@ -155,7 +155,7 @@ def _solve(path: Path, tables: Tables, symmetric: bool) -> Tables:
                 max_iterations=30,
                 calculation_method=CalculationMethod.newton_raphson,
             )
-        except Exception as error:  # whatever the foreign solver raises on foreign data
+        except Exception as error:  # an external solver may raise anything on external data
             if tolerance == TOLERANCES[-1]:
                 text = " ".join(str(error).split()).partition(" Try ")[0]
                 raise GridsecError(
@@ -234,7 +234,7 @@ def _add_line(row: Any, made: LineRow, network: Network) -> None:
 
 
 def _asymmetric_lines(tables: Tables, network: Network) -> None:
-    """Lines given by matrices; a neutral is grounded at both ends and eliminated."""
+    """Lines with matrices; a neutral is grounded at both ends and eliminated."""
     for row in _rows(tables, "asym_line"):
         name, ends = f"asym_line {row['id']}", (str(row["from_node"]), str(row["to_node"]))
         letters = "abc" if np.isnan(row["r_na"]) else "abcn"
@@ -292,10 +292,10 @@ def _couplings(tables: Tables, solved: Tables, network: Network, *, symmetric: b
 
 
 def _two_ports(tables: Tables, symmetric: bool) -> dict[int, TwoPort]:
-    """Every transformer alone: between a source and nothing, and between a source and a load.
+    """Two-ports of the transformers, each alone: without load, and with a load.
 
-    In three phases only those that turn no phase and pass the zero sequence as the positive one, with both
-    neutrals solidly grounded.
+    In three phases only those without a phase shift and with equal zero and positive sequence, both neutrals
+    solidly grounded.
     """
     rows = [row for row in _rows(tables, "transformer") if _closed(row) and (symmetric or _passing(row))]
     if not rows:
@@ -408,7 +408,7 @@ def _shunts(tables: Tables, solved: Tables, network: Network) -> None:
 
 
 def _rest(tables: Tables, network: Network) -> None:
-    """Name the sources that feed nothing, and the tables that say nothing about the network itself."""
+    """Report sources out of service, and tables without network elements."""
     for row in _rows(tables, "source"):
         if not row["status"]:
             off = Change(f"source {row['id']}", WHOLE, "left out", "switched off in the source")

@@ -1,6 +1,6 @@
 """SimBench data: grids with the profile of each load, and the slices of the profile library.
 
-Needs the optional extra `convert`; nothing here runs while a feeder is watched.
+Needs the optional extra `convert`; the monitor does not use it.
 """
 
 from __future__ import annotations
@@ -32,19 +32,20 @@ DIGITS = 4
 
 NEW_YEAR = date(2016, 1, 1)
 SUMMER_TIME = (date(2016, 3, 27), date(2016, 10, 30))
-"""The year counts local time: its clock goes an hour forward on the first day, back on the other."""
+"""Daylight saving time of the year in local time: the clock goes forward on the first day, back on the other.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Stretch:
-    """Some days of the year.
+    """Consecutive days of the year.
 
     Attributes
     ----------
     monday
-        The first, from 00:00 local time.
+        First day, from 00:00 local time.
     days
-        How many.
+        Number of days.
     """
 
     monday: date
@@ -52,13 +53,13 @@ class Stretch:
 
     @property
     def rows(self) -> slice:
-        """Its samples within the year's."""
+        """Samples of the stretch within the year's."""
         forward, back = SUMMER_TIME
         first = (self.monday - NEW_YEAR).days * STEPS_PER_DAY - 4 * (forward < self.monday <= back)
         return slice(first, first + self.days * STEPS_PER_DAY)
 
 
-# Weeks without public holidays in Germany, where SimBench's loads are from.
+# Weeks without public holidays in Germany, the country of SimBench's loads.
 STRETCHES = {
     Season.WINTER: Stretch(date(2016, 1, 11), 7),
     Season.SPRING: Stretch(date(2016, 4, 18), 7),
@@ -68,12 +69,12 @@ STRETCHES = {
 
 
 def grid(code: str) -> Any:
-    """Return a SimBench grid as a pandapower net, with its profiles in `net.profiles`.
+    """SimBench grid as a pandapower net, with its profiles in `net.profiles`.
 
     Raises
     ------
     SourceUnreadable
-        If SimBench has no grid of this code.
+        For an unknown code.
     GridsecError
         If simbench is not installed.
     """
@@ -86,14 +87,14 @@ def grid(code: str) -> Any:
 
 
 def version() -> str:
-    """Return the installed version of simbench."""
+    """Installed version of simbench."""
     from importlib.metadata import version as installed
 
     return installed("simbench")
 
 
 def year() -> dict[str, Floats]:
-    """Return every low-voltage profile of the year: load profiles as `_pload`, `_qload`, and PV.
+    """Every low-voltage profile of the year: load profiles as `_pload`, `_qload`, and PV.
 
     Raises
     ------
@@ -121,14 +122,14 @@ def _simbench() -> Any:
 
 
 def library_csv(columns: Mapping[str, Floats], season: Season) -> bytes:
-    """Return a season of the library as gzipped CSV: t_s, then `<load>_p`, `<load>_q`, `<pv>`.
+    """Season of the library as gzipped CSV: t_s, then `<load>_p`, `<load>_q`, `<pv>`.
 
     Parameters
     ----------
     columns
-        As `year` returns them.
+        Profiles of `year`.
     season
-        Which slice of them.
+        Season of the slice.
     """
     rows = STRETCHES[season].rows
     names: list[tuple[str, str]] = []
@@ -145,17 +146,16 @@ def library_csv(columns: Mapping[str, Floats], season: Season) -> bytes:
 
 
 def load_profiles(columns: Mapping[str, Floats]) -> list[str]:
-    """Return the names of the load profiles."""
+    """Names of the load profiles."""
     return sorted(name.removesuffix("_pload") for name in columns if name.endswith("_pload"))
 
 
 def envelope(p: Floats, q: Floats) -> Envelope:
-    """Return the smallest wedge with a floor that holds every point of a load profile.
+    """Smallest wedge with a floor that contains every point of a load profile.
 
-    Minimises the mean width ``(high - low) w + 2 floor`` subject to
-    ``low p - floor <= q <= high p + floor`` for all points, ``0 <= low <= 1 <= high``, at
-    ``w = max(mean p, 0.3)``: at a weight as small as a household's mean, the upper slope would be
-    several times the nominal one, and useless for a load that is not known itself.
+    Minimises the mean width ``(high - low) w + 2 floor`` subject to ``low p - floor <= q <= high p + floor``
+    for all points, ``0 <= low <= 1 <= high``, at ``w = max(mean p, 0.3)``: at a weight as small as a
+    household's mean, the upper slope would be several times the nominal one, and useless for an unknown load.
 
     Parameters
     ----------
@@ -165,7 +165,7 @@ def envelope(p: Floats, q: Floats) -> Envelope:
     Raises
     ------
     GridsecError
-        If there is none.
+        Without a solution.
     """
     points = np.column_stack([p, q])
     try:
@@ -194,7 +194,7 @@ def envelope(p: Floats, q: Floats) -> Envelope:
 
 
 def envelopes_csv(columns: Mapping[str, Floats]) -> str:
-    """Return the envelope of every load profile, from the whole year, as CSV."""
+    """Envelope of every load profile, from the whole year, as CSV."""
     out = io.StringIO(newline="")
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(["load_profile", "q_low", "q_high", "q_floor"])

@@ -1,4 +1,4 @@
-"""Connections of a network of another tool, and its lines as rows of lines.csv."""
+"""Connections of another tool's network, and its lines as rows of lines.csv."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from gridsec.arrays import Floats, Ints, Phasors
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Coupling:
-    """A transformer, or anything else that joins buses and is no line.
+    """Transformer, or another element that joins buses and is not a line.
 
     Attributes
     ----------
     name, buses
-        Its name, with its kind, and the buses it joins.
+        Kind and name, and the buses that it joins.
     power_kva
-        What flows into it from each of them, by phase, kVA.
+        Power into it from each bus, by phase, kVA.
     line
-        The line from the first of its two buses to the second that it may be, with its tap relative to their
-        nominal voltages, and `to_volt` still open; None: it is none.
+        Equivalent line from the first of its two buses to the second, with its tap relative to their nominal
+        voltages, without `to_volt`; None without an equivalent.
     idle
-        What it takes without load, beside that line.
+        No-load power beside that line.
     turn
-        Degrees by which it turns the phases from the first bus to the second.
+        Phase shift from the first bus to the second, degrees.
     """
 
     name: str
@@ -46,16 +46,16 @@ class Coupling:
 
 
 def reached(start: str, rows: Iterable[LineRow], without: Collection[str] = ()) -> dict[str, int]:
-    """Return the buses that closed lines connect, with how many lines away; nothing passes `without`.
+    """Buses that closed lines connect, with their distances in lines; ways end at `without`.
 
     Parameters
     ----------
     start
-        The bus to begin with.
+        First bus.
     rows
         Lines.
     without
-        Buses that end a way.
+        Buses at which a way ends.
     """
     near: dict[str, list[str]] = defaultdict(list)
     for row in rows:
@@ -73,12 +73,12 @@ def reached(start: str, rows: Iterable[LineRow], without: Collection[str] = ()) 
 
 
 def fused_with(bus: str, rows: Iterable[LineRow]) -> dict[str, int]:
-    """Return the buses that closed switches make one with a bus."""
+    """Buses that closed switches fuse with a bus."""
     return reached(bus, (row for row in rows if row.r_ohm == row.x_ohm == 0.0))
 
 
 def as_rows(couplings: Iterable[Coupling]) -> list[LineRow]:
-    """Return couplings as lines, where only what is connected matters."""
+    """Couplings as lines, for questions of connection only."""
     return [
         LineRow(each.name, each.buses[0], other, 0.0, 0.0) for each in couplings for other in each.buses[1:]
     ]
@@ -87,14 +87,14 @@ def as_rows(couplings: Iterable[Coupling]) -> list[LineRow]:
 def above_busbar(
     busbar: str, sources: Iterable[str], rows: list[LineRow], couplings: Iterable[Coupling]
 ) -> set[str]:
-    """Return what is connected to the sources without passing a busbar.
+    """Buses that are connected to the sources without passing the busbar.
 
     Parameters
     ----------
     busbar, sources
         The busbar, and the buses with a voltage source.
     rows, couplings
-        All that joins buses.
+        Everything that joins buses.
     """
     fused = fused_with(busbar, rows)
     everything = [*rows, *as_rows(couplings)]
@@ -105,7 +105,7 @@ VOLT_DIGITS: Final = 6
 """Decimals of nominal voltages."""
 
 CYCLIC: Final = 1e-7
-"""Deviation from cyclic symmetry, as a share of the largest impedance, below which a line is symmetric."""
+"""Deviation from cyclic symmetry, relative to the largest impedance, up to which a line is symmetric."""
 
 
 def line_row(
@@ -117,23 +117,23 @@ def line_row(
     shunt: Floats,
     changes: list[Change],
 ) -> LineRow:
-    """Return the row of a line given by matrices.
+    """Row of a line with matrices.
 
-    Matrices of the series impedances that are cyclically symmetric become sequence values, and of charging
-    that is the same in every phase and goes to earth only, one number.
+    Cyclically symmetric series impedances become sequence values. Charging that is equal in every phase and
+    goes to earth only becomes one number.
 
     Parameters
     ----------
     name, ends
-        Of the line.
+        Name and buses of the line.
     phases : (k,)
-        Its phases, ascending, 0 for a.
+        Phases of the line, ascending, 0 for a.
     series : (k, k)
         Series impedances, ohm.
     shunt : (k, k)
         Total shunt susceptances, S.
     changes
-        Takes what is not carried over exactly.
+        Receives inexact conversions.
     """
     own, mutual = _means(series)
     row = LineRow(
@@ -164,7 +164,7 @@ _NAMES: Final = {(0,): "a", (1,): "b", (2,): "c", (0, 1): "ab", (1, 2): "bc", (0
 
 
 def cyclic(matrix: Phasors | Floats) -> bool:
-    """Whether phases are interchangeable: one value on the diagonal, one beside it."""
+    """True for interchangeable phases: one value on the diagonal, one beside it."""
     own, mutual = _means(matrix)
     alike = np.full(matrix.shape, mutual)
     np.fill_diagonal(alike, own)
@@ -172,7 +172,7 @@ def cyclic(matrix: Phasors | Floats) -> bool:
 
 
 def _means(matrix: Phasors | Floats) -> tuple[complex, complex]:
-    """Mean of the diagonal and of the rest."""
+    """Mean of the diagonal and of the other entries."""
     count = len(matrix)
     own = complex(np.trace(matrix)) / count
     return own, (complex(matrix.sum()) - count * own) / max(count * (count - 1), 1)
@@ -186,12 +186,12 @@ def _cells(symbol: str, unit: str, matrix: Floats, phases: Ints) -> dict[str, An
 
 
 def charging_cells(name: str, phases: Ints, shunt: Floats, changes: list[Change]) -> dict[str, Any]:
-    """Return the cells of a line's charging: one number, or a matrix beside its positive sequence.
+    """Cells of a line's charging: one number, or a matrix beside its positive sequence.
 
     Parameters
     ----------
     name, phases, shunt, changes
-        As `line_row` takes them.
+        As in `line_row`.
     """
     own, mutual = (part.real for part in _means(shunt))
     one = {"b_us": rounded(max(own - mutual, 0.0) * 1e6)}
@@ -204,12 +204,12 @@ def charging_cells(name: str, phases: Ints, shunt: Floats, changes: list[Change]
 
 
 def by_sequence(one: float, zero: float) -> Floats:
-    """Return the susceptances of three phases that are alike; without a zero sequence none knows of another.
+    """Susceptances of three equal phases; without a zero sequence the phases are not coupled.
 
     Parameters
     ----------
     one, zero
-        Of the positive and the zero sequence, S; NaN where the latter is not known.
+        Positive and zero sequence, S; NaN for an unknown zero sequence.
     """
     apart = zero if np.isfinite(zero) else one
     return np.asarray(one * np.eye(3) + (apart - one) / 3.0)
@@ -220,14 +220,14 @@ IN_EVERY_PHASE: Final = "the positive-sequence charging in every phase; exact wh
 
 
 def balanced_charging(lines: Sequence[LineRow], changes: list[Change]) -> list[LineRow]:
-    """Return the lines with charging of their positive sequence only, if nothing else needs three phases.
+    """Reduce charging to its positive sequence, if nothing else needs three phases.
 
     Parameters
     ----------
     lines
-        Rows of a feeder whose customers all have three phases.
+        Rows of a feeder on which all customers have three phases.
     changes
-        Takes what that leaves out.
+        Receives the omissions.
     """
     matrices = [shunt_us(cells_of(row)) for row in lines]
     if any(
@@ -241,16 +241,16 @@ def balanced_charging(lines: Sequence[LineRow], changes: list[Change]) -> list[L
 
 
 def capacitor(name: str, bus: str, siemens: float | Floats, phases: str = "abc") -> LineRow:
-    """Return a capacitor as the charging of a line to nowhere, so short that its voltage is that of its bus.
+    """Capacitor as the charging of a line to nowhere, so short that its voltage is that of its bus.
 
     Parameters
     ----------
     name, bus
-        Of the capacitor.
+        Name and bus of the capacitor.
     siemens : scalar or (k, k)
-        Its susceptance per phase, S, or those of and between its phases.
+        Susceptance per phase, S, or matrix of its phases.
     phases
-        Phases it is connected to.
+        Connected phases.
     """
     here = np.array(["abc".index(phase) for phase in sorted(phases)])
     shunt = siemens * np.eye(here.size) if isinstance(siemens, float) else siemens
@@ -260,7 +260,7 @@ def capacitor(name: str, bus: str, siemens: float | Floats, phases: str = "abc")
 
 
 def open_end(row: LineRow, bus: str, volt: float) -> LineRow | None:
-    """Return a line that is open at one end only as a line to nowhere: its charging goes on.
+    """Line that is open at one end only, as a line to nowhere with its charging; None if negligible.
 
     Parameters
     ----------
@@ -269,7 +269,7 @@ def open_end(row: LineRow, bus: str, volt: float) -> LineRow | None:
     bus
         Its closed end.
     volt
-        Nominal voltage, V; below 1000 the charging is too small to matter.
+        Nominal voltage, V; below 1000 the charging is negligible.
     """
     if row.b_us == 0 or volt < 1000.0 or not (row.r_ohm or row.x_ohm):
         return None
@@ -278,14 +278,14 @@ def open_end(row: LineRow, bus: str, volt: float) -> LineRow | None:
 
 
 def turned(row: LineRow, nominal: Mapping[str, float]) -> LineRow:
-    """Return a line given from its other end; a tap t becomes 1/t, with the impedance on its other side.
+    """Line in the reverse direction; a tap t becomes 1/t, with the impedance on its other side.
 
     Parameters
     ----------
     row
         The line.
     nominal
-        Nominal voltages of the buses, V; looked at only if the line leads to another one.
+        Nominal voltages of the buses, V; used only if they differ at the two ends.
     """
     away = replace(row, from_bus=row.to_bus, to_bus=row.from_bus)
     level = 1.0
@@ -320,7 +320,7 @@ def turned(row: LineRow, nominal: Mapping[str, float]) -> LineRow:
 
 
 def with_taps(row: LineRow, taps: Floats) -> LineRow:
-    """Return a line with a transformer at its first end: one ratio, or where they differ one for each phase.
+    """Line with a transformer at its first end: one ratio, or if they differ one for each phase.
 
     Parameters
     ----------
@@ -338,14 +338,14 @@ def with_taps(row: LineRow, taps: Floats) -> LineRow:
 
 
 def phases_of(row: LineRow) -> Ints:
-    """Return the phases of a line, ascending, 0 for a."""
+    """Phases of a line, ascending, 0 for a."""
     return np.array(["abc".index(phase) for phase in sorted(row.phases)], dtype=np.intp)
 
 
 def merged(
     lines: Sequence[LineRow], busbar: str, changes: list[Change], nominal: Mapping[str, float]
 ) -> list[LineRow]:
-    """Return the lines with those in parallel as one, and those that switches short-circuit open.
+    """Merge parallel lines to one, and open lines that switches short-circuit.
 
     Parameters
     ----------
@@ -354,7 +354,7 @@ def merged(
     busbar
         Its busbar.
     changes
-        Takes what was joined.
+        Receives the merged lines.
     nominal
         Nominal voltages of the buses, V.
     """
@@ -400,7 +400,7 @@ def merged(
 
 
 def _parallel(rows: list[LineRow], changes: list[Change]) -> LineRow:
-    """Join lines between the same buses."""
+    """Merge lines between the same buses."""
     names = " + ".join(row.line for row in rows)
     first = rows[0]
     alike = len({row.phases for row in rows}) == 1
@@ -428,7 +428,7 @@ def _parallel(rows: list[LineRow], changes: list[Change]) -> LineRow:
 
 
 def _side_by_side(rows: list[LineRow], names: str, changes: list[Change]) -> LineRow:
-    """Join lines of any phases and matrices between the same buses: their admittances add up."""
+    """Merge lines of any phases and matrices between the same buses: their admittances add up."""
     first = rows[0]
     each: list[Phasors] = []
     charge = np.zeros((3, 3))
@@ -457,7 +457,7 @@ def _side_by_side(rows: list[LineRow], names: str, changes: list[Change]) -> Lin
         changes=changes,
     )
     parts = [own[there] @ series for own in each]
-    # Of currents that are alike in all phases, as ratings are meant; single ones share by the diagonal.
+    # Shares of balanced currents, to which ratings refer; single phases share by the diagonal.
     balanced = np.exp(-2j * np.pi / 3.0 * phases)
     limits = np.array([_shared(rows, share) for share in np.abs(parts @ balanced).T])
     limit = None if np.isnan(limits).any() else rounded(float(limits.min()))

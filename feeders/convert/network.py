@@ -1,8 +1,8 @@
 """Network of any tool, and the feeder below one of its buses.
 
-The readers of other tools' files make a `Network` in SI; here it becomes a feeder's tables: the busbar is
-found, the rest of the network cut off, parallel lines become one, and transformers below the busbar become
-customers that draw what flows into them.
+The readers of other tools' files build a `Network` in SI, which is converted to a feeder's tables. The steps:
+find the busbar, cut off the rest of the network, merge parallel lines, and replace transformers below the
+busbar by customers with their power.
 """
 
 from __future__ import annotations
@@ -66,27 +66,27 @@ __all__ = [
 Busbar = TypeVar("Busbar")
 
 TURNED: Final = 1.0
-"""Degrees up to which the angles between a busbar's phases may be others than those of a feeder."""
+"""Largest deviation of the angles between a busbar's phases from those of a feeder, degrees."""
 
 
 def chosen(network: Network, find: Callable[[], Busbar], opened: Sequence[str], droop: str | None) -> Busbar:
-    """Return the busbar that was chosen, unless something else that was chosen does not exist either.
+    """Busbar of the conversion; reports all other unknown choices together with an unknown busbar.
 
     Parameters
     ----------
     network
         The network.
     find
-        Finds the busbar; raises a GridsecError if there is none.
+        Finds the busbar, or raises a GridsecError.
     opened, droop
-        As `feeder_of` takes them.
+        As in `feeder_of`.
 
     Raises
     ------
     FeederInvalid
-        With all that does not exist.
+        With all unknown names.
     GridsecError
-        As `find`, if nothing else is wrong.
+        As `find`, without further problems.
     """
     problems = _unknown(network.lines, opened)
     try:
@@ -106,7 +106,7 @@ def chosen(network: Network, find: Callable[[], Busbar], opened: Sequence[str], 
 
 
 def opened_rows(lines: Iterable[LineRow], opened: Sequence[str], changes: list[Change]) -> list[LineRow]:
-    """Open the lines that were asked for.
+    """Open the requested lines.
 
     Parameters
     ----------
@@ -115,41 +115,41 @@ def opened_rows(lines: Iterable[LineRow], opened: Sequence[str], changes: list[C
     opened
         Names of lines.
     changes
-        Takes what was opened.
+        Receives the opened lines.
 
     Raises
     ------
     FeederInvalid
-        With every line that does not exist.
+        With every unknown line.
     """
     rows = list(lines)
     if unknown := _unknown(rows, opened):
         raise FeederInvalid(unknown)
     changes.extend(
-        Change(f"line {line}", "closed", "changed", "open, as asked for; the check shows what that does")
+        Change(f"line {line}", "closed", "changed", "open, as requested; the check shows the effect")
         for line in opened
     )
     return [replace(row, closed=False) if row.line in opened else row for row in rows]
 
 
 def busbar_of(network: Network, rows: list[LineRow], root: str | None) -> str:
-    """Return the bus asked for, or the first from the source on that has lines.
+    """Requested bus, or the first bus with lines below the source.
 
     Parameters
     ----------
     network
         The network.
     rows
-        Its lines, with those open that shall be.
+        Its lines, after opening.
     root
-        The bus asked for.
+        Requested bus, or None.
 
     Raises
     ------
     GridsecError
-        If there is no such bus.
+        For an unknown bus.
     BusbarUnclear
-        If none was asked for, and it is not clear which one is meant.
+        Without a request, if several buses are possible.
     """
     if root is not None:
         return named_bus(network, root)
@@ -164,7 +164,7 @@ def busbar_of(network: Network, rows: list[LineRow], root: str | None) -> str:
 
 
 def named_bus(network: Network, root: str) -> str:
-    """Return the bus asked for.
+    """Requested bus.
 
     Parameters
     ----------
@@ -174,53 +174,47 @@ def named_bus(network: Network, root: str) -> str:
     Raises
     ------
     GridsecError
-        If there is no such bus, or more than one that could be meant.
+        For an unknown or ambiguous bus.
     """
     hits = [bus for bus in network.nominal if bus == root] or [
         bus for bus in network.nominal if bus.lower() == root.lower()
     ]
     if len(hits) != 1:
-        raise GridsecError(f"there is no bus {root!r}", code="unknown-name")
+        raise GridsecError(f"bus {root!r} does not exist", code="unknown-name")
     return hits[0]
 
 
 def _unknown(lines: Iterable[LineRow], opened: Sequence[str]) -> list[str]:
     return [
-        Problem("unknown-name", f"there is no line {line!r} to open")
+        Problem("unknown-name", f"line {line!r} to open does not exist")
         for line in sorted(set(opened) - {row.line for row in lines})
     ]
 
 
 def below_source(network: Network) -> str | None:
-    """Return the bus of the only source's only transformer on its other side; None if there is no such bus.
-
-    Parameters
-    ----------
-    network
-        The network.
-    """
+    """Bus behind the only transformer of the only source; None without such a bus."""
     way = _way_down(network, network.lines) if len(network.sources) == 1 else []
     return way[-1] if len(way) > 1 and _has_lines(way[-1], network.lines) else None
 
 
 def angles_of(volts: Phasors, busbar: str, changes: list[Change]) -> Phasors:
-    """Return the busbar's voltages as the feeder can have them.
+    """Busbar voltages with the angles of a feeder.
 
-    The busbar's meter reads magnitudes; simulations and monitors take angles of 0, -120 and 120 degrees.
+    The busbar meter reads magnitudes; simulations and monitors assume angles of 0, -120 and 120 degrees.
 
     Parameters
     ----------
     volts : (3,)
-        The source's, V; NaN where a phase is absent.
+        Voltages of the source, V; NaN where a phase is absent.
     busbar
         The bus.
     changes
-        Takes a row where phases are turned otherwise against each other.
+        Receives a row for other angles between phases.
 
     Returns
     -------
     (3,)
-        The same, turned where they have to be.
+        The voltages, with other angles if necessary.
     """
     there = np.isfinite(volts)
     if not there.any():
@@ -230,7 +224,7 @@ def angles_of(volts: Phasors, busbar: str, changes: list[Change]) -> Phasors:
     if np.ptp(np.angle((volts / first / of_feeder)[there], deg=True)) <= TURNED:
         return volts
     theirs, ours = (_degrees(each[there]) for each in (volts / first, of_feeder))
-    effect = f"{ours} degrees, in the source {theirs}; the check shows what that does"
+    effect = f"{ours} degrees, in the source {theirs}; the check shows the effect"
     changes.append(Change(f"bus {busbar}", "angles between its phases", "approximated", effect))
     return np.asarray(np.abs(volts) * of_feeder)
 
@@ -241,20 +235,12 @@ def _degrees(phasors: Phasors) -> str:
 
 
 def one_busbar(buses: Collection[str], rows: Iterable[LineRow]) -> bool:
-    """Return whether buses are one, joined by closed switches.
-
-    Parameters
-    ----------
-    buses
-        Some buses.
-    rows
-        The network's lines.
-    """
+    """True if closed switches join the buses to one."""
     return bool(buses) and fused_with(min(buses), rows).keys() >= set(buses)
 
 
 def _way_down(network: Network, rows: list[LineRow]) -> list[str]:
-    """Follow transformers from the source, as long as there is only one way and no line."""
+    """Follow transformers from the source to the first bus with lines or with several transformers."""
     way = [network.sources[0]]
     while not _has_lines(way[-1], rows):
         beyond = _beyond(network, way)
@@ -273,13 +259,13 @@ def _beyond(network: Network, way: list[str]) -> set[str]:
 
 
 UNFED: Final = "not supplied in the source"
-BEYOND: Final = "supplied in the source, but not through what the feeder has: see what is left out or opened"
-"""Why somebody below the busbar is no customer."""
+BEYOND: Final = "supplied in the source, but not through the feeder: see the elements left out or opened"
+"""Reasons for loads below the busbar that are not customers."""
 
 
 @dataclass(slots=True)
 class Network:
-    """A network in SI, with the state its own tool found.
+    """Network in SI, with the state by its own tool.
 
     Attributes
     ----------
@@ -292,21 +278,21 @@ class Network:
     lines
         Rows of lines.csv, in any direction.
     draws, couplings
-        What is connected to the buses besides.
+        Loads, generators and transformers.
     xy
         Positions.
     volts : (3,)
         Complex voltages of the buses, V; NaN where a phase is absent. Loads of constant power.
     as_found : (3,)
-        The same with the loads' dependence on the voltage; empty if there is none.
+        The same with the loads' dependence on the voltage; empty without one.
     changes
-        What could not be carried over so far.
+        Inexact conversions so far.
     of_bus
-        Changes that matter if their bus is in the feeder.
+        Changes that count if their bus is in the feeder.
     connected
-        Buses and labels of loads and generators that are no draws: the reader makes them customers itself.
+        Buses and labels of loads and generators that the reader itself converts to customers.
     unsolved
-        Why the source's own power flow gave no voltages.
+        Reason for missing voltages of the source's own power flow.
     """
 
     tool: str
@@ -326,18 +312,18 @@ class Network:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Converted:
-    """A feeder made from another tool's network.
+    """Feeder from another tool's network.
 
     Attributes
     ----------
     tables
         The feeder.
     changes
-        What could not be carried over as it was.
+        Inexact conversions.
     state
-        What the source's tool found at its own loads.
+        State by the source's tool at its own loads.
     unchecked
-        Why there is no state.
+        Reason for a missing state.
     """
 
     tables: FeederTables
@@ -348,20 +334,20 @@ class Converted:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Part:
-    """What a busbar feeds.
+    """Part of a network below a busbar.
 
     Attributes
     ----------
     busbar
-        Its bus.
+        Bus of the busbar.
     inside
-        The buses, nearest first, and how many lines away each is.
+        The buses, nearest first, with their distances in lines.
     lines
         Rows of lines.csv, pointing away from the busbar.
     draws
-        Loads and generators, and what flows into transformers.
+        Loads and generators, and powers into transformers.
     changes
-        What could not be carried over as it was.
+        Inexact conversions.
     """
 
     busbar: str
@@ -380,27 +366,27 @@ def feeder_of(
     droop: str | None = None,
     extent: Extent = EVERYTHING,
 ) -> Converted:
-    """Return the feeder below a bus of a network.
+    """Convert the part of a network below a bus to a feeder.
 
     Parameters
     ----------
     network
         The network.
     name
-        Of the feeder.
+        Name of the feeder.
     root
-        Bus that becomes the metered busbar; None: the first below the source that has lines.
+        Bus that becomes the metered busbar; None: the first with lines below the source.
     opened
-        Lines to take as open, so that the feeder is radial.
+        Lines to open, so that the feeder is radial.
     droop
         Preset of the generators' inverters; None: by their size.
     extent
-        How far down it goes.
+        Extent of the feeder.
 
     Raises
     ------
     FeederInvalid
-        With every reason why there is no feeder.
+        With every problem of the feeder.
     """
     busbar = chosen(network, lambda: None if root is None else named_bus(network, root), opened, droop)
     part = below(network, busbar, opened, extent)
@@ -432,14 +418,14 @@ def below(network: Network, root: str | None, opened: Sequence[str], extent: Ext
     Parameters
     ----------
     network, root, opened, extent
-        As `feeder_of` takes them.
+        As in `feeder_of`.
 
     Raises
     ------
     FeederInvalid
-        If something else feeds it too, or its lines join buses of different nominal voltages.
+        For a second infeed, or lines between buses of different nominal voltages.
     GridsecError
-        If there is no such bus, or more than one that could be meant.
+        For an unknown or ambiguous bus.
     """
     changes = list(network.changes)
     rows = opened_rows(network.lines, opened, changes)
@@ -462,21 +448,21 @@ def below(network: Network, root: str | None, opened: Sequence[str], extent: Ext
 
 
 def finished(network: Network, part: Part, tables: FeederTables, power: Mapping[str, complex]) -> Converted:
-    """Put a conversion together.
+    """Assemble the result of a conversion.
 
     Parameters
     ----------
     network, part
-        Where it is from.
+        Source network, and its part below the busbar.
     tables
         The feeder.
     power
-        What each customer draws in the source's power flow, kVA.
+        Power of each customer in the source's power flow, kVA.
 
     Raises
     ------
     FeederInvalid
-        If values are doubtful, and no power flow of the source speaks for them.
+        For doubtful values without a power flow of the source.
     """
     unchecked = "" if network.volts else network.unsolved
     given = network.volts.get(part.busbar, np.full(3, np.nan + 0j))
@@ -502,22 +488,22 @@ def finished(network: Network, part: Part, tables: FeederTables, power: Mapping[
 
 
 def accepting(tables: FeederTables, changes: list[Change], unchecked: str) -> FeederTables:
-    """Accept what is doubtful only because it might be in the wrong unit: the source's tool knows its units.
+    """Accept values that are doubtful only for their unit: the source's tool knows its units.
 
     Parameters
     ----------
     tables
         A feeder.
     changes
-        Takes every value that was doubted.
+        Receives every doubtful value.
     unchecked
-        Why the source's power flow says nothing of the feeder; empty if it has a solution. Without one,
-        somebody may have given the source itself a wrong unit.
+        Reason for a missing power flow of the source; empty with one. Without one, the source itself may have
+        a wrong unit.
 
     Raises
     ------
     FeederInvalid
-        If there are doubts and no solution, with all that is wrong besides.
+        For doubts without a power flow, with all other problems.
     """
     doubts: set[str] = set()
     problems = []
@@ -526,17 +512,17 @@ def accepting(tables: FeederTables, changes: list[Change], unchecked: str) -> Fe
         problems.append(Problem(problem.code, sentence))
         if found:
             doubts.add(doubt.partition('"')[0])
-            changes.append(Change("feeder", sentence, "accepted", "as the source has it"))
+            changes.append(Change("feeder", sentence, "accepted", "as in the source"))
     if doubts and unchecked:
         raise FeederInvalid(
-            [*problems, Problem("doubtful", f"{unchecked}; nothing else speaks for what is doubtful")]
+            [*problems, Problem("doubtful", f"{unchecked}; doubtful values cannot be confirmed")]
         )
     accept = tuple(name for name in SUSPICIONS if name in doubts)
     return replace(tables, meta=replace(tables.meta, accept=accept)) if accept else tables
 
 
 def _infeeds(network: Network, rows: list[LineRow], busbar: str, inside: Mapping[str, int]) -> list[Problem]:
-    """Return what else feeds the feeder besides its busbar."""
+    """Further infeeds besides the busbar."""
     problems = []
     everything = [*rows, *as_rows(network.couplings)]
     fused = fused_with(busbar, rows)
@@ -545,8 +531,8 @@ def _infeeds(network: Network, rows: list[LineRow], busbar: str, inside: Mapping
             problems.append(
                 Problem(
                     "several-sources",
-                    f"bus {source!r} has another voltage source; the feeder is fed by its busbar "
-                    f"{busbar!r} alone",
+                    f"bus {source!r} has another voltage source; expected the "
+                    f"busbar {busbar!r} as the only one",
                 )
             )
         elif source != busbar:
@@ -578,7 +564,9 @@ def _kept(
             kept.append(replace(away, to_x=place[0], to_y=place[1]) if place else away)
         elif a or b:
             changes.append(
-                Change(f"line {row.line}", WHOLE, "left out", "open towards what the busbar does not feed")
+                Change(
+                    f"line {row.line}", WHOLE, "left out", "open, towards buses that the busbar does not feed"
+                )
             )
     outside = len(network.nominal.keys() - inside.keys())
     if outside:
@@ -594,7 +582,7 @@ def _kept(
 
 
 def _not_fed(network: Network, elsewhere: Collection[str]) -> Iterator[Change]:
-    """Name who is connected neither to the feeder nor, as far as can be seen, `elsewhere`."""
+    """Loads and generators that are connected neither to the feeder nor, as far as known, `elsewhere`."""
     everybody = [(draw.bus, draw.label) for draw in network.draws if not draw.idle]
     for bus, label in dict.fromkeys([*network.connected, *everybody]):
         if bus not in elsewhere:
@@ -609,7 +597,7 @@ def _buses(count: int) -> str:
 def _behind(
     network: Network, rows: list[LineRow], inside: Mapping[str, int], changes: list[Change]
 ) -> tuple[list[Draw], set[str]]:
-    """Couplings below the busbar, as what flows into them, and the buses whose powers that sums up."""
+    """Couplings below the busbar as powers into them, and the buses behind them."""
     everything = [*rows, *as_rows(network.couplings)]
     above = above_busbar(next(iter(inside)), network.sources, rows, network.couplings)
     draws: list[Draw] = []
@@ -627,7 +615,7 @@ def _behind(
             )
         }
         if not np.isfinite(np.array([each.power_kva[k] for k in ends])).all():
-            effect = f"{_buses(len(far))}; what flows there is not known"
+            effect = f"{_buses(len(far))}; the power into it is not known"
             changes.append(Change(each.name, "load side", "left out", effect))
             continue
         summed |= far
@@ -636,13 +624,13 @@ def _behind(
             name = each.name if len(ends) == 1 else f"{each.name} {each.buses[k]}"
             draws.append(Draw(name, each.buses[k], power, even=is_even(power)))
         total = sum((each.power_kva[k].sum() for k in ends), start=0j)
-        what = f"{_buses(len(far))} became a customer that draws" if far else "in a loop; customers draw"
+        what = f"{_buses(len(far))} became a customer with" if far else "in a loop; customers with"
         changes.append(
             Change(
                 each.name,
                 "load side",
                 "changed",
-                f"{what} what flows there, "
+                f"{what} the power into it, "
                 f"{total.real:.4g} kW and {total.imag:.4g} kvar; exact at these loads only",
             )
         )

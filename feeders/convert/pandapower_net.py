@@ -55,7 +55,7 @@ __all__ = [
 ]
 
 
-# Tables that are carried over, or told about one by one; every other row in the feeder earns a note.
+# Tables that are carried over, or reported one by one; every row of another table in the feeder is reported.
 CARRIED: Final = {
     "bus", "line", "load", "asymmetric_load", "asymmetric_sgen", "sgen", "switch", "trafo", "trafo3w",
     "ext_grid", "gen", "storage", "motor", "ward", "xward", "shunt", "impedance",
@@ -75,10 +75,10 @@ COLUMNS: Final = {
     "trafo3w": "name hv_bus mv_bus lv_bus in_service",
     "shunt": "name bus p_mw q_mvar vn_kv step in_service",
 }
-"""What is needed of a net's tables."""
+"""Required columns of a net's tables."""
 
 LEAST: Final = {"a number": -math.inf, "at least 0": 0.0, "at least 1": 1.0, "above 0": math.ulp(0.0)}
-"""The least that a number can be, by what is said of it."""
+"""Smallest value of a number, by its description."""
 
 POWERS: Final = dict.fromkeys(("p_mw", "q_mvar", "scaling"), "a number")
 PHASE_POWERS: Final = dict.fromkeys(
@@ -101,23 +101,23 @@ NUMBERS: Final = {
     "asymmetric_sgen": PHASE_POWERS,
     "shunt": {**dict.fromkeys(("p_mw", "q_mvar", "step"), "a number"), "vn_kv": "above 0"},
 }
-"""Numbers without which a row says nothing, and what they can be."""
+"""Required numbers of a row, and their ranges."""
 
 TRUTHS: Final = ("in_service", "closed")
-"""Columns that are true or false in every table."""
+"""Columns of truth values, in every table."""
 
 
 def ids(table: Any, noun: str, taken: Iterable[str] = ()) -> dict[int, str]:
-    """Return an id per row: the source's name where there is a unique one, otherwise with its index.
+    """Id of each row: the source's name if unique, otherwise with its index.
 
     Parameters
     ----------
     table
         A table of a net.
     noun
-        What a row is called that has no name.
+        Noun for a row without a name.
     taken
-        Names that others have.
+        Names in use elsewhere.
     """
     given = {int(i): _clean(name) for i, name in zip(table.index, table["name"], strict=True)}
     count = Counter([*given.values(), *taken])
@@ -137,12 +137,12 @@ def _clean(name: object) -> str:
 
 
 def problems_of(net: Any) -> list[Problem]:
-    """Return everything that keeps a net's tables from being read.
+    """All problems of a net's tables.
 
     Parameters
     ----------
     net
-        What a file held.
+        Content of a file.
     """
     missing = [
         Problem("missing", f"the table {table!r} is missing")
@@ -164,21 +164,21 @@ def problems_of(net: Any) -> list[Problem]:
         for column in ends:
             strange = net[table].index[~net[table][column].isin(net.bus.index)]
             problems += [
-                Problem("unknown-index", f"{table} {i}: {column} {net[table].at[i, column]} is no bus")
+                Problem("unknown-index", f"{table} {i}: {column} {net[table].at[i, column]} is not a bus")
                 for i in strange
             ]
     for kind, table in (("b", "bus"), ("l", "line")):
         given = net.switch[net.switch.et == kind]
         strange = given.index[~given.element.isin(net[table].index)]
         problems += [
-            Problem("unknown-index", f"switch {i}: element {net.switch.at[i, 'element']} is no {table}")
+            Problem("unknown-index", f"switch {i}: element {net.switch.at[i, 'element']} is not a {table}")
             for i in strange
         ]
     return [*problems, *_numbers(net)]
 
 
 def _numbers(net: Any) -> Iterator[Problem]:
-    """Whatever is not a number or a truth, or not one that it can be."""
+    """Cells that are not numbers or truth values of the valid range."""
     if not isinstance(net.get("f_hz"), Real) or not 0.0 < net.f_hz < math.inf:
         yield Problem("not-positive", f"f_hz is {net.get('f_hz')}; expected a frequency")
     for table, columns in NUMBERS.items():
@@ -196,12 +196,12 @@ def _numbers(net: Any) -> Iterator[Problem]:
 
 
 def with_truths(net: Any) -> Any:
-    """Return a net whose columns of 0 and 1 are of truths, as pandapower itself takes them.
+    """Convert columns of 0 and 1 to truth values, as pandapower itself does.
 
     Parameters
     ----------
     net
-        A pandapower net; stays as it is.
+        A pandapower net; not changed.
     """
     numeric = [
         (table, column)
@@ -227,50 +227,38 @@ def _is_truth(cell: object) -> bool:
 
 
 def number(cell: object) -> float:
-    """Return a cell's number; NaN if it has none.
-
-    Parameters
-    ----------
-    cell
-        Of a table.
-    """
+    """Number of a cell; NaN without one."""
     return float(cell) if isinstance(cell, Real | np.bool_) else math.nan
 
 
 CONNECTED: Final = ("load", "sgen", "asymmetric_load", "asymmetric_sgen")
 CONNECTIONS: Final = ("wye", "delta")
-"""Tables of what pandapower connects in star or between phases, and how their types say so."""
+"""Tables with connections in star or between phases, and the names of their types."""
 
 BASE_MVA: Final = 0.1
-"""Base of power flows of three phases: pandapower ends them at a mismatch of 3e-8 pu of it."""
+"""Base power of three-phase power flows, MVA: pandapower ends them at a mismatch of 3e-8 pu of it."""
 
 TURN: Final = np.exp(-2j * np.pi / 3.0 * np.arange(3))
 
 
 def unbalanced(net: Any) -> bool:
-    """Return whether a net has loads or generators of single phases.
-
-    Parameters
-    ----------
-    net
-        The net.
-    """
+    """True for a net with loads or generators of single phases."""
     return any(
         len(net[table]) and net[table].in_service.any() for table in ("asymmetric_load", "asymmetric_sgen")
     )
 
 
 def solve(net: Any, buses: dict[int, str], network: Network) -> Any:
-    """Run the net's own power flow; return the solved copy, or None with the reason in the network.
+    """Run the net's own power flow; the solved copy, or None with the reason in the network.
 
     Parameters
     ----------
     net
-        The net; stays as it is.
+        The net; not changed.
     buses
         Ids of its buses.
     network
-        Takes the voltages.
+        Receives the voltages.
     """
     import pandapower
 
@@ -290,7 +278,7 @@ def solve(net: Any, buses: dict[int, str], network: Network) -> Any:
                     network.as_found = _volts(solved, buses)
                 pandapower.runpp(solved, numba=False, tolerance_mva=1e-10, voltage_depend_loads=False)
         volts = _volts(solved, buses)
-    except Exception as error:  # noqa: BLE001  # whatever the foreign solver raises on a foreign net
+    except Exception as error:  # noqa: BLE001  # external solvers may raise anything
         text = " ".join(str(error).split()) or type(error).__name__
         network.unsolved = f"pandapower's own power flow fails: {text[:200]}"
         return None
@@ -302,7 +290,7 @@ def solve(net: Any, buses: dict[int, str], network: Network) -> Any:
 
 
 def _three_phases(solved: Any) -> None:
-    """Solve in three phases; where lines to buses out of service leave nothing but NaN, without them."""
+    """Solve in three phases; if lines to buses out of service make every voltage NaN, without these lines."""
     import pandapower
 
     solved.sn_mva = BASE_MVA
@@ -315,12 +303,12 @@ def _three_phases(solved: Any) -> None:
 
 
 def _named_connections(solved: Any, network: Network) -> None:
-    """Say which connections are in star: what is of another type, pandapower takes for nothing."""
+    """Set unknown connection types to star: pandapower ignores such rows."""
     for table in CONNECTED:
         others = ~solved[table].type.isin(CONNECTIONS)
         if others.any():
             solved[table].loc[others, "type"] = "wye"
-            effect = "in star; pandapower's own power flow of three phases leaves them out unless told so"
+            effect = "in star; pandapower's own three-phase power flow ignores other types"
             network.changes.append(Change(f"{others.sum()} {table}(s)", "type", "changed", effect))
 
 
@@ -339,7 +327,7 @@ def _volts(net: Any, buses: dict[int, str]) -> dict[str, Phasors]:
 
 
 def _flow(solved: Any, table: str, index: int, side: str) -> Phasors:
-    """What flows into an element, by phase, kVA."""
+    """Power into an element, by phase, kVA."""
     tail = f"_{side}" if side else ""
     if unbalanced(solved):
         row = solved[f"res_{table}_3ph"].loc[index]
@@ -350,7 +338,7 @@ def _flow(solved: Any, table: str, index: int, side: str) -> Phasors:
 
 
 def flow_into(solved: Any, table: str, index: int, side: str) -> Phasors:
-    """Return what flows into an element, by phase, kVA; NaN where that is not known.
+    """Power into an element, by phase, kVA; NaN if unknown.
 
     Parameters
     ----------
@@ -359,7 +347,7 @@ def flow_into(solved: Any, table: str, index: int, side: str) -> Phasors:
     table, index
         The element.
     side
-        Its end, as the results' columns have it; empty if it has only one.
+        Its end, as in the names of result columns; empty for a single end.
     """
     unknown: Phasors = np.full(3, np.nan, dtype=np.complex128)
     if solved is None:
@@ -371,31 +359,23 @@ def flow_into(solved: Any, table: str, index: int, side: str) -> Phasors:
 
 
 def between_phases(net: Any, row: Any) -> bool:
-    """Return whether a load or generator is connected between phases, and that matters.
-
-    Parameters
-    ----------
-    net
-        Its net.
-    row
-        Its row.
-    """
+    """True for a load or generator between phases in a three-phase power flow."""
     return row.get("type") == "delta" and unbalanced(net)
 
 
 def phase_powers(net: Any, row: Any, label: str, volts: Phasors | None) -> tuple[Phasors, list[Change]]:
-    """Return what a load draws from each phase, or a generator gives, kVA; and what is approximated in it.
+    """Powers of a load from each phase, or of a generator into it, kVA, and approximations.
 
     Parameters
     ----------
     net
         Its net.
     row
-        Its row; if it is one of all three phases, each has a third.
+        Its row; one of all three phases has a third in each.
     label
-        What it is called where it is told about.
+        Noun and name for messages.
     volts : (3,)
-        Voltages at its bus as pandapower solved them, V; None: it did not.
+        Voltages at its bus by pandapower's power flow, V; None without one.
     """
     scale = 1e3 * float(row.scaling) * float(row.in_service)
     if "p_mw" in row:
@@ -405,7 +385,7 @@ def phase_powers(net: Any, row: Any, label: str, volts: Phasors | None) -> tuple
     power: Phasors = scale * np.array(given, dtype=np.complex128)
     if not between_phases(net, row):
         return power, []
-    effect = "in star, its phases' powers as the source's power flow has them; exact at these loads only"
+    effect = "in star, with its phases' powers of the source's power flow; exact at these loads only"
     known = volts is not None and bool(np.isfinite(volts).all())
     return in_star(power, volts if known and volts is not None else TURN), [
         Change(label, "delta", "approximated", effect)
@@ -413,15 +393,15 @@ def phase_powers(net: Any, row: Any, label: str, volts: Phasors | None) -> tuple
 
 
 FIXED: Final = {"gen": -1.0, "storage": 1.0, "motor": 1.0, "ward": 1.0, "xward": 1.0}
-"""Tables of what becomes a customer as the source's power flow has it, and the sign of its results."""
+"""Tables of elements that become customers with the source's power, and the sign of their results."""
 
 MEASURE: Final = "every customer has a meter of the feeder's own kind instead"
 MONEY: Final = "prices change no voltage"
-DIRECT: Final = "direct current; what it exchanges with the feeder is left out with its converters"
+DIRECT: Final = "direct current; left out with its converters"
 NOTED: Final = {
     "measurement": MEASURE,
-    "controller": "taps and set points stand as the file has them",
-    "group": "names of sets; their elements stand for themselves",
+    "controller": "taps and set points as in the file",
+    "group": "names of sets; their elements are converted one by one",
     "poly_cost": MONEY,
     "pwl_cost": MONEY,
     "bus_dc": DIRECT,
@@ -430,14 +410,14 @@ NOTED: Final = {
     "source_dc": DIRECT,
     "loadcases": "the loads are those of the net's own tables",
 }
-"""Tables without a place in the network, and what a feeder does without them."""
+"""Tables without a place in the network, and their replacement in a feeder."""
 
 CURVES: Final = ("characteristic", "capability", "_table", "_spline")
-"""Parts of the names of tables that other tables look values up in: those in force are carried over."""
+"""Parts of the names of lookup tables; their values in force are carried over."""
 
 UNLIMITED_KA: Final = 1000.0
 SWITCH_RX: Final = 2.0
-"""R / X of the impedance of switches between buses, which pandapower's power flow takes by itself."""
+"""R / X of the impedance of switches between buses, the default of pandapower's power flow."""
 
 SHUNTS: Final = ("gf_pu", "bf_pu", "gt_pu", "bt_pu")
 """Shunts at the two ends of an impedance."""
@@ -446,17 +426,17 @@ SIDES: Final = {"trafo": ("hv", "lv"), "trafo3w": ("hv", "mv", "lv")}
 
 
 def network_of(net: Any) -> Network:
-    """Return a net as a network; its loads and static generators are left to `convert.from_pandapower`.
+    """Convert a net to a network; `convert.from_pandapower` converts its loads and static generators.
 
     Parameters
     ----------
     net
-        A pandapower net; stays as it is.
+        A pandapower net; not changed.
 
     Raises
     ------
     FeederInvalid
-        With everything that keeps its tables from being read.
+        With all problems of its tables.
     """
     problems = problems_of(net)
     if problems:
@@ -485,7 +465,7 @@ def network_of(net: Any) -> Network:
 
 
 def _dead(net: Any) -> set[int]:
-    """Buses that are out of service: whatever ends there is open."""
+    """Buses out of service: every element that ends there is open."""
     return {int(bus) for bus in net.bus.index[~net.bus.in_service.astype(bool)]}
 
 
@@ -496,7 +476,7 @@ def _place(net: Any, bus: int) -> tuple[float, float] | None:
     try:
         x, y = json.loads(geo)["coordinates"][:2]
         return round(float(x), 6), round(float(y), 6)
-    except (ValueError, TypeError, KeyError):  # a bus may have a place or none; the network is the same
+    except (ValueError, TypeError, KeyError):  # a bus without a position leaves the network unchanged
         return None
 
 
@@ -543,7 +523,7 @@ def _opened(net: Any, kind: str) -> set[tuple[int, int]]:
 
 
 def _side_effects(row: dict[str, Any], label: str, bus: str, closed: bool, network: Network) -> None:
-    """Say what a row of lines.csv cannot hold."""
+    """Report properties that a row of lines.csv lacks."""
     length, parallel = float(row["length_km"]), float(row["parallel"])
     if row["g_us_per_km"] > 0 and closed:
         effect = f"{row['g_us_per_km'] * length * parallel:.3g} microsiemens"
@@ -564,10 +544,10 @@ def _switch_rows(net: Any, buses: dict[int, str], network: Network) -> Iterator[
             ohm = float(row.z_ohm) if "z_ohm" in row and row.z_ohm > 0 else 0.0
             r, x = (rounded(ohm * part / math.hypot(1.0, SWITCH_RX)) for part in (SWITCH_RX, 1.0))
             made = LineRow(names[i], buses[ends[0]], buses[ends[1]], r, x)
-            zero = (r, x) if ohm else (None, None)  # three conductors that know nothing of each other
+            zero = (r, x) if ohm else (None, None)  # three conductors without coupling
             closed = bool(row.closed) and dead.isdisjoint(ends)
             if ohm and closed and unbalanced(net):
-                effect = "as it stands; pandapower's own power flow of three phases takes a third of it"
+                effect = "as in the table; pandapower's own three-phase power flow takes a third of it"
                 change = Change(f"switch {names[i]}", "impedance", "changed", effect)
                 network.of_bus.append((buses[ends[0]], change))
             yield replace(made, r0_ohm=zero[0], x0_ohm=zero[1], closed=closed)
@@ -578,7 +558,7 @@ def _switch_names(net: Any) -> dict[int, str]:
 
 
 def _impedances(net: Any, buses: dict[int, str], network: Network) -> None:
-    """Impedances between buses: a line, if it is the same seen from both ends and has no shunts."""
+    """Impedances between buses: lines, if equal from both ends and without shunts."""
     table = net.get("impedance")
     if table is None or not len(table):
         return
@@ -590,7 +570,7 @@ def _impedances(net: Any, buses: dict[int, str], network: Network) -> None:
         (r, x), back = _series(row, "ft"), _series(row, "tf")
         plain = (r, x) == back and min(r, x) >= 0 and not any(row.get(name) for name in SHUNTS)
         if not (plain and same_level(network.nominal[a], network.nominal[b])):
-            effect = "its two ends are not alike, or it has shunts; has no place in a feeder"
+            effect = "asymmetric, or with shunts; has no place in a feeder"
             change = Change(f"impedance {names[i]}", WHOLE, "left out", effect)
             network.of_bus.extend((bus, change) for bus in (a, b))
             continue
@@ -603,7 +583,7 @@ def _impedances(net: Any, buses: dict[int, str], network: Network) -> None:
 
 
 def _series(row: dict[str, Any], way: str) -> tuple[float, float]:
-    """R and X of an impedance, pu of its own base; NaN where they are not known."""
+    """R and X of an impedance, pu of its own base; NaN if unknown."""
     r, x = (number(row.get(f"{part}{way}_pu")) for part in "rx")
     return r, x
 
@@ -636,9 +616,9 @@ def _rating(row: Any) -> float:
 
 
 def _two_ports(net: Any) -> dict[int, TwoPort]:
-    """Every transformer of two windings alone: between a source and nothing, and between a source and a load.
+    """Two-ports of the transformers of two windings, each alone: without load, and with a load.
 
-    A net without a balanced power flow has none, and neither has one whose tables pandapower does not take.
+    Empty for a net without a balanced power flow, and for tables that pandapower does not accept.
     """
     import pandapower
 
@@ -656,7 +636,7 @@ def _two_ports(net: Any) -> dict[int, TwoPort]:
         bench.trafo_characteristic_table = net.trafo_characteristic_table
     try:
         found = [_alone(bench, loaded=loaded) for loaded in (False, True)]
-    except Exception:  # noqa: BLE001  # whatever the foreign solver raises on foreign tables
+    except Exception:  # noqa: BLE001  # external solvers may raise anything
         return {}
     return {
         int(i): TwoPort.measured(idle[:2], loaded) for i, idle, loaded in zip(own.index, *found, strict=True)
@@ -680,7 +660,7 @@ def _alone(bench: Any, *, loaded: bool) -> list[tuple[complex, complex, complex]
 
 
 def _fixed(net: Any, solved: Any, buses: dict[int, str], network: Network) -> None:
-    """What draws or feeds in by rules of its own becomes a customer at the source's operating point."""
+    """Elements with a control of their own become customers with the source's power."""
     for table, sign in FIXED.items():
         names = ids(net[table], table)
         for i in map(int, net[table].index):
@@ -688,9 +668,7 @@ def _fixed(net: Any, solved: Any, buses: dict[int, str], network: Network) -> No
             power = sign * flow_into(solved, table, i, "")
             if not np.isfinite(power).all():
                 effect = (
-                    "its power is not known; the check shows what that does"
-                    if solved is not None
-                    else "unknown"
+                    "its power is not known; the check shows the effect" if solved is not None else "unknown"
                 )
                 network.of_bus.append((bus, Change(label, WHOLE, "left out", effect)))
                 network.connected.append((bus, label))
@@ -711,7 +689,7 @@ def _fixed(net: Any, solved: Any, buses: dict[int, str], network: Network) -> No
 
 
 def _connections(net: Any, buses: dict[int, str], network: Network) -> None:
-    """Whose customers `feeders.convert.from_pandapower` makes, by the names that it tells of them."""
+    """Buses and labels of the customers of `feeders.convert.from_pandapower`."""
     loads = ids(net.load, "load")
     for table, noun, label in (
         ("load", "load", "load"),
@@ -746,7 +724,7 @@ def _shunts(net: Any, buses: dict[int, str], network: Network) -> None:
 
 
 def _at_its_step(net: Any, row: Any) -> tuple[float, float]:
-    """Powers of a shunt at nominal voltage, MW and Mvar: so many steps, or what a table has for its step."""
+    """Powers of a shunt at nominal voltage, MW and Mvar: by the number of steps, or by a table."""
     by_table = row.get("step_dependency_table")  # NaN in files of older versions
     if isinstance(by_table, bool | np.bool_) and by_table and "shunt_characteristic_table" in net:
         table = net.shunt_characteristic_table
@@ -756,7 +734,7 @@ def _at_its_step(net: Any, row: Any) -> tuple[float, float]:
 
 
 def _rest(net: Any, buses: dict[int, str], network: Network) -> None:
-    """Name every other table with rows: what is there has no place in the format."""
+    """Report every other table with rows: the format has no place for it."""
     for i, row in net.ext_grid[~net.ext_grid.in_service.astype(bool)].iterrows():
         off = Change(f"ext_grid {i}", WHOLE, "left out", "switched off in the source")
         network.of_bus.append((buses[int(row.bus)], off))
@@ -766,7 +744,7 @@ def _rest(net: Any, buses: dict[int, str], network: Network) -> None:
             continue
         ends = [column for column in ("bus", "from_bus", "to_bus") if column in content.columns]
         if table in NOTED or not ends:
-            effect = NOTED.get(table, "no table of a feeder")
+            effect = NOTED.get(table, "has no place in a feeder")
             if len(content) and not any(part in table for part in CURVES):
                 label = f"table {table}, {len(content)} row{'s' if len(content) > 1 else ''}"
                 network.changes.append(Change(label, WHOLE, "left out", effect))

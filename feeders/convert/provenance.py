@@ -48,40 +48,40 @@ __all__ = [
 CHANGES_FILE: Final = "conversion.csv"
 COLUMNS: Final = ("element", "property", "done", "effect")
 WHOLE: Final = "all of it"
-"""The property of an element that is meant as a whole."""
+"""Property value for a whole element."""
 
 NAMED: Final = 8
-"""Elements that a sentence names; the file names all of them."""
+"""Largest number of elements that a sentence names; the file names all of them."""
 
 Done = Literal["left out", "approximated", "changed", "added", "accepted"]
 
 
 class BusbarUnclear(GridsecError):
-    """There are several buses, or none, that could be the metered busbar."""
+    """There are several possible busbars, or none."""
 
     code = "busbar-unclear"
 
 
 class SourceUnreadable(GridsecError):
-    """What is to be converted does not exist, or is nothing that can be read as a network."""
+    """The source does not exist, or is not a readable network."""
 
     code = "unreadable"
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """One element of the source that is not, or not exactly, in the feeder.
+    """Element of the source that is not, or not exactly, in the feeder.
 
     Attributes
     ----------
     element
-        Its name, with its kind.
+        Kind and name.
     prop
-        Which property of it; WHOLE where all of it is meant.
+        Property of the element; WHOLE for all of it.
     done
-        What was done.
+        Kind of the change.
     effect
-        What the feeder does instead, and what that does to its voltages.
+        Replacement in the feeder, and its effect on the voltages.
     """
 
     element: str
@@ -91,12 +91,12 @@ class Change:
 
 
 def sentences(changes: Iterable[Change]) -> tuple[str, ...]:
-    """Return the changes in words, elements of the same fate together.
+    """Changes as sentences, with equal changes of several elements together.
 
     Parameters
     ----------
     changes
-        In the order in which they are to be told.
+        Changes in the order of the sentences.
     """
     fates: dict[tuple[str, str, str], list[str]] = {}
     for change in changes:
@@ -113,7 +113,7 @@ def _listed(elements: list[str]) -> str:
 
 
 def changes_csv(changes: Iterable[Change]) -> str:
-    """Return the table of all changes, one row for each element and property."""
+    """Table of all changes, one row for each element and property."""
     out = io.StringIO(newline="")
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(COLUMNS)
@@ -131,7 +131,7 @@ Copyright (c) 2019-2026 by University of Kassel, TU Dortmund, RWTH Aachen Univer
 Institute for Energy Economics and Energy System Technology (IEE) Kassel and individual contributors.
 
 {this} contains information from SimBench and is made available under the same Open Database License.
-Who publishes a changed version of it must do so under that license too."""
+A changed version of it must be published under that license too."""
 
 PANDAPOWER = """\
 The network data come with pandapower, which is under the 3-clause BSD license:
@@ -171,7 +171,7 @@ LICENCES = {"simbench": ODBL.format(this="This folder"), "pandapower": PANDAPOWE
 ASSUMED = """\
 Every customer has a meter. The transformer is upstream of the metered busbar and not part of the feeder.
 Where the source gives no load profile or no reactive power, the load follows a profile of the library
-(data/profiles), dealt out in the order of the loads: households H0, above 30 kW or at medium voltage trade
+(data/profiles), by turns in the order of the loads: households H0, above 30 kW or at medium voltage trade
 G and agriculture L; its power factor at the peak is then 0.93, as everywhere in SimBench's low voltage.
 power_factor_min, power_factor_max and q_floor_kvar hold every point of the profile's history in SimBench
 (data/profiles/envelopes.csv)."""
@@ -192,13 +192,7 @@ from the seed 1."""
 
 
 def versioned(package: str) -> str:
-    """Return a package's name with its version.
-
-    Parameters
-    ----------
-    package
-        Its name.
-    """
+    """Name and version of a package."""
     try:
         return f"{package} {version(package)}"
     except PackageNotFoundError:
@@ -215,7 +209,7 @@ def feeder_source(
     notes: tuple[str, ...],
     check: str,
 ) -> str:
-    """Return the SOURCE.md of a converted feeder.
+    """Content of the SOURCE.md of a converted feeder.
 
     Parameters
     ----------
@@ -224,15 +218,15 @@ def feeder_source(
     about
         One sentence on the network.
     origin
-        What was converted, as `convert` takes it.
+        The source, as in `convert`.
     package
-        The package that holds the data, or that reads the file, with its version.
+        Package with the data, or that reads the file, and its version.
     command
-        Command line that makes the folder again.
+        Command line of the conversion.
     notes
-        What was left out, added or changed.
+        Omissions, additions and changes.
     check
-        How the AC power flow compares with the source's.
+        Comparison of the AC power flow with the source's.
     """
     licence = LICENCES.get(origin.partition(":")[0], OWN_FILE)
     return f"""# {tables.meta.title}
@@ -260,7 +254,7 @@ def feeder_source(
 
 
 def profiles_source(stretches: Iterable[tuple[str, date, int]], loads: int, generators: int) -> str:
-    """Return the SOURCE.md of the profile library.
+    """Content of the SOURCE.md of the profile library.
 
     Parameters
     ----------
@@ -296,18 +290,19 @@ seconds from the first sample, which is at 00:00 local time.
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Origin:
-    """Where a converted feeder is from.
+    """Origin of a converted feeder.
 
     Attributes
     ----------
     source
-        What was converted, with the package that holds or reads it; empty if that is not told.
+        The source, with the package that has or reads it; empty if unknown.
     check
-        How the feeder's AC power flow compares with the source's, or why it was not compared; the same.
+        Comparison of the feeder's AC power flow with the source's, or the reason for a missing one; empty if
+        unknown.
     changes
-        What was left out, approximated, added or changed; one row each, as in conversion.csv.
+        Omissions, approximations, additions and changes; one row each, as in conversion.csv.
     about, command
-        What the network is, and the command line that made the folder; empty if that is not told.
+        Description of the network, and the command line of the conversion; empty if unknown.
     """
 
     source: str
@@ -318,17 +313,17 @@ class Origin:
 
 
 def origin(path_or_name: Path | str) -> Origin | None:
-    """Return where a feeder is from; None if it was not converted.
+    """Origin of a feeder; None if it was not converted.
 
     Parameters
     ----------
     path_or_name
-        Its folder, or the name of a feeder that comes with the project.
+        Its folder, or the name of a bundled feeder.
 
     Raises
     ------
     GridsecError
-        If its conversion.csv is not what `feeders.convert.convert` writes.
+        If its conversion.csv is not from `feeders.convert.convert`.
     """
     folder = folder_of(path_or_name)
     if folder is None or not (folder / CHANGES_FILE).is_file():

@@ -1,7 +1,7 @@
-"""Round trip of a conversion: the source tool's own AC power flow beside that of the feeder it became.
+"""Round trip of a conversion: AC power flow of the source's tool and of the feeder.
 
-Both see the same loads, of constant power, and the same voltage at the busbar: what is left between them is
-what the conversion did to the network.
+Both have the same loads, of constant power, and the same voltage at the busbar. The difference is the effect
+of the conversion on the network.
 """
 
 from __future__ import annotations
@@ -23,28 +23,28 @@ from gridsec.errors import GridsecError
 
 BALANCED_PU: Final = 1e-6
 UNBALANCED_PU: Final = 1e-5
-"""Differences that a conversion with nothing left out stays below."""
+"""Limits of the differences of a conversion without omissions, pu."""
 
 UNIFORM: Final = 1e-8
-"""Spread of the phases' voltages below which a state is balanced."""
+"""Relative spread of the phases' voltages up to which a state is balanced."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SourceState:
-    """The source tool's power flow at the source's own loads.
+    """Power flow by the source's tool at the source's own loads.
 
     Attributes
     ----------
     tool
         Name and version.
     power_kva
-        Net import P + jQ of each customer, kVA; the others draw nothing.
+        Net import P + jQ of each customer, kVA; 0 for the others.
     busbar_volt : (3,)
         Voltages of the busbar, phase to neutral, V; NaN where a phase is absent.
     volts
         Voltage magnitudes (3,) of each bus, V, all loads of constant power; NaN where a phase is absent.
     as_found
-        The same with the loads' dependence on the voltage; empty if there is none.
+        The same with the loads' dependence on the voltage; empty without one.
     """
 
     tool: str
@@ -56,24 +56,24 @@ class SourceState:
 
 @dataclass(frozen=True, slots=True)
 class SourceCheck:
-    """How far a feeder's AC voltages are from those of its source.
+    """Differences between a feeder's AC voltages and those of its source.
 
     Attributes
     ----------
     tool
         The source's tool and its version.
     buses
-        How many buses were compared.
+        Number of compared buses.
     three_phase
-        Whether phase by phase.
+        True for a comparison phase by phase.
     largest_pu
         Largest difference of a voltage's magnitude, all loads of constant power, pu.
     at
         Bus of the largest difference.
     as_found_pu
-        Largest difference from the source with its loads' dependence on the voltage, pu; None: there is none.
+        Largest difference from the source with its loads' dependence on the voltage, pu; None without one.
     unmatched
-        Buses where, in a phase at least, only one of the two has a voltage.
+        Buses at which, in at least one phase, only one of the two has a voltage.
     """
 
     tool: str
@@ -86,13 +86,13 @@ class SourceCheck:
 
     @property
     def exact(self) -> bool:
-        """Whether the difference is no more than that of two solvers, and no voltage is without the other."""
+        """True if the difference is within the solvers' accuracy, and every voltage has its counterpart."""
         limit = UNBALANCED_PU if self.three_phase else BALANCED_PU
         return not self.unmatched and self.largest_pu <= limit
 
     @property
     def sentence(self) -> str:
-        """The finding in words; the difference is rounded up to a power of ten, the same on every machine."""
+        """Result as a sentence; the difference is rounded up to a power of ten, the same on every machine."""
         text = (
             f"AC power flow of {self.tool} and of this folder at the source's loads, {self.buses} buses"
             f"{', phase by phase' if self.three_phase else ''}: |v| differs by less than "
@@ -118,18 +118,18 @@ def compare(state: SourceState, tables: FeederTables) -> SourceCheck:
     Parameters
     ----------
     state
-        What the source's tool found.
+        State by the source's tool.
     tables
         The feeder.
 
     Raises
     ------
     PowerFlowDiverged
-        When the feeder has no solution at these loads.
+        If the feeder has no solution at these loads.
     FeederInvalid
-        If neither the balanced nor the three-phase model takes the feeder.
+        If neither the balanced nor the three-phase model supports the feeder.
     GridsecError
-        If there is no bus where both have a voltage.
+        If there is no bus at which both have a voltage.
     """
     power = np.array([state.power_kva.get(row.customer, 0.0) for row in tables.customers])
     v0 = np.nan_to_num(np.asarray(state.busbar_volt, dtype=np.complex128))
@@ -154,7 +154,8 @@ def compare(state: SourceState, tables: FeederTables) -> SourceCheck:
     common, ours = [bus for bus, compared in zip(common, both, strict=True) if compared], ours[both]
     if not common:
         raise GridsecError(
-            "there is no bus where the source's power flow and the feeder both have a voltage", code="missing"
+            "there is no bus at which the source's power flow and the feeder both have a voltage",
+            code="missing",
         )
     nominal = level[[index[bus] for bus in common]]
     apart = _apart(ours, [state.volts[bus] for bus in common]) / nominal
@@ -171,7 +172,7 @@ def _apart(ours: Floats, theirs: list[Floats]) -> Floats:
 
 
 def _uniform(state: SourceState) -> bool:
-    """Whether all phases are alike wherever there is a voltage; buses without any say nothing."""
+    """True if all phases are equal at every bus with a voltage."""
     volts = np.array(list(state.volts.values())).reshape(-1, 3)
     volts = volts[np.isfinite(volts).any(axis=1)]
     return bool((np.ptp(volts, axis=1) <= UNIFORM * volts.max(axis=1)).all())

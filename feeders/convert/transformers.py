@@ -1,20 +1,20 @@
 """Transformers of other tools as lines: two-ports, regulators, stations.
 
-However a tool describes a transformer (short-circuit tests, tables of taps, equivalent circuits), balanced it
-is a linear two-port. Two power flows of it alone say everything: one with nothing behind it, one with an
-impedance. The same two-port is a shunt at its first end, an ideal transformer of complex ratio t and a series
-impedance behind that::
+Every tool describes transformers differently (short-circuit tests, tables of taps, equivalent circuits).
+Balanced, a transformer is a linear two-port, and two power flows of it alone identify it: one without load,
+one with an impedance. The equivalent circuit is a shunt at its first end, an ideal transformer of complex
+ratio t and a series impedance behind that::
 
     V_1 = t (V_2 + z I_2),    I_1 = y V_1 + I_2 / t
 
-so that nothing is left out: t makes the line's tap and the turn of its phases, z its impedance, and what y
-takes is a customer. The angle of t that comes from y rather than from the vector group has no lossless
-transformer; at a known operating point the customer takes what balances the powers.
+t is the line's tap and phase shift, z its impedance, and the power of y is a customer. A lossless transformer
+lacks the part of t's angle that comes from y rather than from the vector group. At a known operating point
+the customer has the power that restores the balance.
 
-A transformer is a line where no phase of it meets another, its ratio with a fixed tap and, if the voltage is
-another one, `to_volt`. The vector group of a balanced feeder's transformer turns all phases alike, which
-nothing in a radial feeder notices. Where a transformer closes a loop, it becomes two customers that draw what
-flows there, unless the loop is asked for and the transformers around it drive no current by themselves.
+A transformer is a line if its phases are not coupled. Its ratio is then a fixed tap and, for another nominal
+voltage, `to_volt`. The vector group of a balanced feeder's transformer shifts all phases equally, without an
+effect in a radial feeder. A transformer that closes a loop becomes two customers with the power through it.
+It stays a line if the loop is requested and the ratios around it multiply to 1.
 """
 
 from __future__ import annotations
@@ -40,25 +40,25 @@ if TYPE_CHECKING:
 
 
 TAP_DIGITS: Final = 9
-"""Decimals of a ratio: the same for transformers that are the same."""
+"""Decimals of a ratio, the same for equal transformers."""
 
 TURN_DIGITS: Final = 6
-"""The same of the degrees by which phases are turned."""
+"""Decimals of the phase shift in degrees."""
 
 NO_LOAD_KVA: Final = 1e-6
-"""Power below which a transformer takes nothing without load."""
+"""Power below which a no-load power counts as zero, kVA."""
 
 
 @dataclass(frozen=True, slots=True)
 class TwoPort:
-    """A transformer, balanced.
+    """Balanced transformer.
 
     Attributes
     ----------
     ratio
         Complex ratio t of the voltage at its first end to that behind it, without load.
     series
-        z behind it, ohm.
+        Impedance z behind it, ohm.
     """
 
     ratio: complex
@@ -66,12 +66,12 @@ class TwoPort:
 
     @classmethod
     def measured(cls, idle: tuple[complex, complex], loaded: tuple[complex, complex, complex]) -> TwoPort:
-        """Identify it by two power flows.
+        """Identify a transformer from two power flows.
 
         Parameters
         ----------
         idle
-            Voltages at both ends, V, with nothing behind.
+            Voltages at both ends, V, without load.
         loaded
             Voltages at both ends, V, and current out of the second one, A.
         """
@@ -80,16 +80,16 @@ class TwoPort:
 
     @property
     def turn(self) -> float:
-        """Degrees by which it turns the phases."""
+        """Phase shift, degrees."""
         return round(math.degrees(cmath.phase(self.ratio)), TURN_DIGITS)
 
     def line(self, name: str, ends: tuple[str, str], nominal: tuple[float, float]) -> LineRow | None:
-        """Return it as a line, its tap relative to the nominal voltages of its ends; None if it is none.
+        """Equivalent line, with its tap relative to the nominal voltages of its ends; None without one.
 
         Parameters
         ----------
         name, ends
-            Of the transformer.
+            Name and buses of the transformer.
         nominal
             Nominal voltages at its ends, V.
         """
@@ -100,14 +100,14 @@ class TwoPort:
         return LineRow(name, *ends, r, x, tap=tap)
 
     def idle(self, name: str, bus: str, flows: tuple[Phasors, Phasors], volts: Phasors) -> Draw | None:
-        """Return what it takes beside the losses in z as a draw at its first end; None if that is nothing.
+        """Power beyond the losses in z, as a draw at its first end; None if negligible.
 
         Parameters
         ----------
         name, bus
-            Of the transformer, and its first end.
+            Name of the transformer, and its first bus.
         flows : (3,)
-            What flows into it from each end, by phase, kVA.
+            Power into it from each end, by phase, kVA.
         volts : (3,)
             Voltages behind it, V.
         """
@@ -127,18 +127,18 @@ def coupling_of(
     rating_a: float,
     network: Network,
 ) -> Coupling:
-    """Return a transformer, and the line that it may be.
+    """Transformer with its equivalent line, if there is one.
 
     Parameters
     ----------
     name, buses, power_kva
         As in `Coupling`.
     port
-        What it does to its first two buses; None: not known.
+        Two-port between its first two buses; None if unknown.
     rating_a
-        Rated current at the second, A.
+        Rated current at the second bus, A.
     network
-        Has nominal voltages, and voltages if there are any.
+        Network with nominal voltages, and voltages if known.
     """
     if port is None:
         return Coupling(name, buses, power_kva)
@@ -154,14 +154,14 @@ def coupling_of(
 
 @dataclass(frozen=True, slots=True)
 class Extent:
-    """How far down a feeder goes.
+    """Extent of a feeder.
 
     Attributes
     ----------
     one_voltage
-        Only as far as its busbar's nominal voltage: a transformer to another one is a customer.
+        True: only the busbar's nominal voltage; a transformer to another one is a customer.
     meshed
-        Transformers may close loops.
+        True: transformers may close loops.
     """
 
     one_voltage: bool = False
@@ -171,27 +171,27 @@ class Extent:
 EVERYTHING: Final = Extent()
 
 AROUND: Final = 1e-9
-"""Part by which the ratios around a loop may differ from 1: the feeder format's own."""
+"""Tolerance of the ratio around a loop, that of the feeder format."""
 
-HERE: Final = "a line with the fixed ratio {} that the source's power flow left it at"
-THERE: Final = "a line to {:.6g} V, its ratio {} of the nominal one as the source's power flow left it"
+HERE: Final = "a line with the fixed ratio {} of the source's power flow"
+THERE: Final = "a line to {:.6g} V, its ratio {} of the nominal one as in the source's power flow"
 
 
 def transformed(
     network: Network, rows: list[LineRow], busbar: str, extent: Extent, changes: list[Change]
 ) -> tuple[Network, list[LineRow]]:
-    """Take transformers below the busbar as the lines that they are, where they are such.
+    """Replace transformers below the busbar by their equivalent lines, where possible.
 
     Parameters
     ----------
     network, rows
-        The network, and its lines as they are opened.
+        The network, and its lines after opening.
     busbar
         The busbar.
     extent
-        How far down.
+        Extent of the feeder.
     changes
-        Takes what was done.
+        Receives the changes.
     """
     fused = fused_with(busbar, rows)
     above = above_busbar(busbar, network.sources, rows, network.couplings)
@@ -217,7 +217,7 @@ def transformed(
         backwards = away.get(line.from_bus, 0) > away.get(line.to_bus, 0)
         changes.append(_told(each, turned(line, network.nominal) if backwards else line))
         if each.idle is None and not network.volts:
-            effect = "without the source's power flow not known"
+            effect = "not known without the source's power flow"
             changes.append(Change(each.name, "no-load current", "left out", effect))
     return replace(network, couplings=left, draws=[*network.draws, *draws]), [*rows, *lines]
 
@@ -229,25 +229,25 @@ def _told(each: Coupling, line: LineRow) -> Change:
 
 
 def _leads_on(network: Network, rows: Iterable[LineRow], each: Coupling, busbar: str) -> bool:
-    """Whether lines begin behind a transformer: without any, its customers are one load at its terminals."""
+    """True if lines begin behind a transformer; otherwise its customers are one load at its terminals."""
     beside = set(each.buses)
     others = [*rows, *as_rows(other for other in network.couplings if set(other.buses) != beside)]
     ways = [reached(bus, others) for bus in each.buses]
     behind = next((way for way in ways if busbar not in way), None)
-    if behind is None:  # it closes a loop
+    if behind is None:  # the transformer closes a loop
         return True
     return any(row.closed and (row.r_ohm or row.x_ohm) and row.from_bus in behind for row in rows)
 
 
 class _Joined:
-    """Which buses are joined already, and by which complex ratios of their voltages.
+    """Joined buses, and the complex ratios of their voltages.
 
     Parameters
     ----------
     rows
-        Lines; without any ratio but their taps.
+        Lines, with no ratio other than their taps.
     loops
-        Whether a transformer may close one.
+        True: a transformer may close a loop.
     """
 
     def __init__(self, rows: Iterable[LineRow], *, loops: bool) -> None:
@@ -261,7 +261,7 @@ class _Joined:
                 self._solid.join(row.from_bus, row.to_bus, 1.0 + 0j)
 
     def takes(self, line: LineRow, ratio: complex) -> bool:
-        """Add a transformer, ``V_from = ratio V_to``; return whether it fits to what is joined."""
+        """Add a transformer, ``V_from = ratio V_to``; False if it contradicts the joined buses."""
         pair = frozenset(self._solid.at(bus)[0] for bus in (line.from_bus, line.to_bus))
         (one, here), (other, there) = self._all.at(line.from_bus), self._all.at(line.to_bus)
         if one == other:
@@ -272,14 +272,14 @@ class _Joined:
 
 
 class _Groups:
-    """Buses that are joined, each with the ratio of its voltage to that of its group's first bus."""
+    """Joined buses, each with the ratio of its voltage to that of its group's first bus."""
 
     def __init__(self) -> None:
         self._at: dict[str, tuple[str, complex]] = {}
         self._members: dict[str, list[str]] = {}
 
     def at(self, bus: str) -> tuple[str, complex]:
-        """The first bus of its group, and the ratio to it."""
+        """First bus of its group, and the ratio to it."""
         if bus not in self._at:
             self._at[bus], self._members[bus] = (bus, 1.0 + 0j), [bus]
         return self._at[bus]
@@ -298,12 +298,12 @@ class _Groups:
 
 
 def levels_of(rows: Iterable[LineRow], nominal: Mapping[str, float]) -> list[Problem]:
-    """Return what is wrong with the nominal voltages that lines join.
+    """Problems of the nominal voltages that lines join.
 
     Parameters
     ----------
     rows
-        The feeder's lines.
+        Lines of the feeder.
     nominal
         Nominal voltages of the buses, V.
     """

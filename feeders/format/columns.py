@@ -1,8 +1,8 @@
-"""What each key of feeder.toml and each column of lines.csv and customers.csv may hold.
+"""Columns of lines.csv and customers.csv and keys of feeder.toml: types, limits, defaults.
 
-One table of columns serves the files, the JSON form of the REST interface, the reader, the writer
-and the documentation, so that they cannot disagree. A cell arrives as text (CSV) or as a JSON or
-TOML value; `parse` turns it into the column's type or into a sentence that says what is wrong.
+One table of columns serves the files, the JSON form of the REST interface, the reader, the writer and the
+documentation. A cell arrives as text (CSV) or as a JSON or TOML value. `parse` converts it to the column's
+type, or returns a problem.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ SHOWN = 60
 
 
 class Kind(Enum):
-    """The type of a cell."""
+    """Type of a cell."""
 
     TEXT = "text of at most 200 characters"
     ID = "an id: printable text of at most 128 characters"
@@ -58,15 +58,15 @@ class Column:
     kind
         Type of the cell.
     meaning
-        What the cell says, with its unit; used in messages and in the documentation.
+        Meaning of the cell, with its unit; used in messages and in the documentation.
     default
-        Value of an empty or absent cell; REQUIRED if there is none.
+        Value of an empty or absent cell; REQUIRED without a default.
     low, high
         Inclusive limits of a number.
     above
         Exclusive lower limit of a number.
     choices
-        The only values allowed, if not None.
+        The only valid values, if not None.
     """
 
     name: str
@@ -80,7 +80,7 @@ class Column:
 
     @property
     def right(self) -> str:
-        """What would be right, in words."""
+        """Description of a valid value."""
         if self.choices is not None:
             return "one of " + ", ".join(self.choices)
         if self.low is not None and self.low == self.high:
@@ -93,7 +93,7 @@ class Column:
         return f"{self.kind.value} {limits}".strip()
 
     def complaint(self, what: Problem) -> Problem:
-        """Return a problem of this column's cell as a sentence, with what would be right."""
+        """Problem of this column's cell as a sentence, with the expected value."""
         return Problem(what.code, f"{what}; expected {self.right} ({self.meaning})")
 
 
@@ -104,7 +104,7 @@ PAIRS = ("aa", "ab", "ac", "bb", "bc", "cc")
 
 
 def _matrix(symbol: str, unit: str, what: tuple[str, str], high: float) -> tuple[Column, ...]:
-    """Columns of a symmetric matrix in phases; what is on its diagonal is never negative."""
+    """Columns of a symmetric matrix in phases; entries of the diagonal are never negative."""
     return tuple(
         Column(
             f"{symbol}_{pair}_{unit}",
@@ -134,7 +134,7 @@ TAP_COLUMNS = tuple(
 )
 MATRIX_NAMES = frozenset(column.name for column in (*SERIES_COLUMNS, *SHUNT_COLUMNS))
 PHASE_NAMES = MATRIX_NAMES | {column.name for column in TAP_COLUMNS}
-"""Columns that only feeders in three phases have."""
+"""Columns of feeders in three phases only."""
 
 LINE_COLUMNS: tuple[Column, ...] = (
     Column("line", Kind.ID, "id of the line or switch"),
@@ -392,7 +392,7 @@ META_COLUMNS: dict[str, tuple[Column, ...]] = {
 
 
 def shown(cell: object) -> str:
-    """Return a cell's value for a message: quoted, and cut where it is long."""
+    """Value of a cell for a message: quoted, and shortened to SHOWN characters."""
     try:
         text = repr(cell)
     except (ValueError, RecursionError):  # integers of thousands of digits, nested JSON
@@ -401,19 +401,19 @@ def shown(cell: object) -> str:
 
 
 def parse(column: Column, cell: object) -> tuple[Any, Problem | None]:
-    """Turn one cell into the column's type.
+    """Convert one cell to the column's type.
 
     Parameters
     ----------
     column
-        What the cell should be.
+        Column of the cell.
     cell
-        Text of a CSV file, a TOML or JSON value, or None where there is nothing.
+        Text of a CSV file, a TOML or JSON value, or None for an absent cell.
 
     Returns
     -------
     value, problem
-        The value, or BAD together with a sentence that names the value and what would be right.
+        The value, or BAD and a problem with the value and the expected one.
     """
     if isinstance(cell, str):
         cell = cell.strip()
@@ -429,7 +429,7 @@ def parse(column: Column, cell: object) -> tuple[Any, Problem | None]:
 
 
 def _outside(column: Column, value: Any) -> Problem | None:
-    """Return what is wrong with a value of the right type, None if nothing is."""
+    """Problem of a value of the right type, None without one."""
     if column.choices is not None:
         given: Iterable[Any] = value if isinstance(value, tuple) else (value,)
         strange = (item for item in given if item not in column.choices)

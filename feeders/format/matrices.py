@@ -1,4 +1,4 @@
-"""Matrices of lines that are not transposed: from columns, to columns, and what is wrong with them."""
+"""Matrices of lines that are not transposed: from columns, to columns, and their checks."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 PHASES: Final = "abc"
 
 ROUNDING: Final = 1e-6
-"""Part of its largest entry by which a matrix may be less than passive, or nearly singular."""
+"""Tolerance of passivity and singularity, relative to the largest entry of a matrix."""
 
 AGREEMENT: Final = 1e-3
-"""Part of the largest entry by which r_ohm, x_ohm and b_us may differ from the positive sequence."""
+"""Tolerance of r_ohm, x_ohm and b_us against the positive sequence, relative to the largest entry."""
 
 UPPER: Final = np.triu_indices(3)
 
@@ -33,24 +33,18 @@ _cells = attrgetter(*NAMES)
 
 
 def cells_of(line: LineRow) -> dict[str, float | None]:
-    """Return a row's cells of matrices by the names of their columns."""
+    """Matrix cells of a row by column name."""
     return dict(zip(NAMES, _cells(line), strict=True))
 
 
 def series_ohm(cells: Mapping[str, Any]) -> Phasors | None:
-    """Return a row's impedances in phases, ohm, with 0 in absent ones; None: it has no matrix.
-
-    Parameters
-    ----------
-    cells
-        The row by columns.
-    """
+    """Impedance matrix of a row in phases, ohm, with 0 in absent ones; None without a matrix."""
     r, x = _symmetric(cells, "r", "ohm"), _symmetric(cells, "x", "ohm")
     return None if r is None or x is None else r + 1j * x
 
 
 def shunt_us(cells: Mapping[str, Any]) -> Floats | None:
-    """Return the total shunt susceptances of a row in phases, microsiemens; as `series_ohm`."""
+    """Matrix of the total shunt susceptances of a row in phases, microsiemens; as `series_ohm`."""
     return _symmetric(cells, "b", "us")
 
 
@@ -64,16 +58,16 @@ def _symmetric(cells: Mapping[str, Any], symbol: str, unit: str) -> Floats | Non
 
 
 def columns_of(symbol: str, unit: str, matrix: Floats, present: Bools) -> dict[str, float]:
-    """Return the cells of a symmetric matrix, those of absent phases left out.
+    """Cells of a symmetric matrix by column name, without those of absent phases.
 
     Parameters
     ----------
     symbol, unit
         "r" and "ohm", "x" and "ohm", or "b" and "us".
     matrix : (3, 3)
-        In this unit.
+        Matrix in this unit.
     present : (3,)
-        The phases.
+        Mask of the phases.
     """
     return {
         f"{symbol}_{pair}_{unit}": float(matrix[i, j])
@@ -83,12 +77,12 @@ def columns_of(symbol: str, unit: str, matrix: Floats, present: Bools) -> dict[s
 
 
 def positive_sequence(matrix: Phasors | Floats) -> complex:
-    """Mean of the diagonal less the mean of the rest: what counts where currents are balanced.
+    """Mean of the diagonal less the mean of the other entries: the value for balanced currents.
 
     Parameters
     ----------
     matrix : (k, k)
-        Of the phases that are there.
+        Matrix of the present phases.
     """
     count = len(matrix)
     own = complex(np.trace(matrix))
@@ -96,20 +90,12 @@ def positive_sequence(matrix: Phasors | Floats) -> complex:
 
 
 def passive(matrix: Floats) -> bool:
-    """Whether a real symmetric matrix is positive semidefinite, up to rounding."""
+    """True for a positive semidefinite matrix, real and symmetric, up to rounding."""
     return bool(np.linalg.eigvalsh(matrix)[0] >= -ROUNDING * np.abs(matrix).max())
 
 
 def check(parsed: Parsed, report: Report) -> None:
-    """Report every matrix that no line has.
-
-    Parameters
-    ----------
-    parsed
-        The tables.
-    report
-        Takes the sentences.
-    """
+    """Report every matrix that is incomplete, inconsistent or physically impossible."""
     needed = ("phases", "r_ohm", "x_ohm", "r0_ohm", "x0_ohm", "b_us", *NAMES)
     for where, cells in rows(parsed.lines, *needed):
         for columns, matrix in ((SERIES_COLUMNS, series_ohm(cells)), (SHUNT_COLUMNS, shunt_us(cells))):
@@ -119,7 +105,7 @@ def check(parsed: Parsed, report: Report) -> None:
 
 
 def _layout(cells: Mapping[str, Any], columns: tuple[Column, ...]) -> Iterator[Problem]:
-    """What is missing, and what is too much."""
+    """Missing and surplus cells of a matrix."""
     phases = cells["phases"]
     if len(phases) == 1:
         first = next(column.name for column in columns if cells[column.name] is not None)
@@ -142,7 +128,7 @@ def _layout(cells: Mapping[str, Any], columns: tuple[Column, ...]) -> Iterator[P
 
 
 def _content(cells: Mapping[str, Any], whole: Phasors | Floats | None) -> Iterator[Problem]:
-    """What no line can be."""
+    """Entries that no passive line has, and contradictions to the row's other cells."""
     if whole is None:
         return
     here = [PHASES.index(phase) for phase in sorted(cells["phases"])]
@@ -172,7 +158,7 @@ def _content(cells: Mapping[str, Any], whole: Phasors | Floats | None) -> Iterat
     if series and (cells["r0_ohm"] is not None or cells["x0_ohm"] is not None):
         yield Problem(
             "inconsistent",
-            ", columns r0_ohm and x0_ohm: beside a matrix, which says it already; expected one of the two",
+            ", columns r0_ohm and x0_ohm: beside a matrix; expected one of the two",
         )
     if series and min(np.linalg.svd(matrix, compute_uv=False)[-1], abs(one)) <= ROUNDING * largest:
         yield Problem(

@@ -19,7 +19,7 @@ SHOWN = 10
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """One row: the sentence that names its place, and the cells that could be parsed."""
+    """One row: its place for messages, and its valid cells."""
 
     where: str
     cells: dict[str, Any]
@@ -27,12 +27,12 @@ class Record:
 
 @dataclass(frozen=True, slots=True)
 class Parsed:
-    """An input after parsing; what could not be read at all is None.
+    """Input after parsing; unreadable parts are None.
 
     Attributes
     ----------
     place
-        Name of the file or object that holds the feeder's own keys.
+        Name of the file or object with the feeder's own keys.
     meta
         Cells of each section of feeder.toml; "" is the top.
     lines, customers
@@ -45,47 +45,47 @@ class Parsed:
     customers: list[Record] | None
 
     def top(self, key: str) -> Any:
-        """Return a key of feeder.toml's top, None where it is bad or absent."""
+        """Value of a key at the top of feeder.toml, None if invalid or absent."""
         return None if self.meta is None else self.meta[""].get(key)
 
     def accepted(self, suspicion: str) -> bool:
-        """Return whether feeder.toml says that this suspicion was checked."""
+        """True if `accept` in feeder.toml lists this suspicion."""
         return suspicion in (self.top("accept") or ())
 
 
 @dataclass(slots=True)
 class Report:
-    """What the checks found so far."""
+    """Problems and notes of the checks."""
 
     problems: list[Problem] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
 
 def rows(records: list[Record] | None, *columns: str) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield place and cells of the rows whose cells in these columns could be parsed."""
+    """Yield place and cells of the rows with valid cells in these columns."""
     for record in records or ():
         if all(column in record.cells for column in columns):
             yield record.where, record.cells
 
 
 def some(items: list[str]) -> str:
-    """Return a list of ids for a message, cut where it is long."""
+    """List of ids for a message, shortened to SHOWN."""
     tail = f" and {len(items) - SHOWN} more" if len(items) > SHOWN else ""
     return ", ".join(items[:SHOWN]) + tail
 
 
 META_FILE, LINES_FILE, CUSTOMERS_FILE = "feeder.toml", "lines.csv", "customers.csv"
 FOREIGN = re.compile(r".+\.(json|dss)|(pandapower|simbench):.+|.+--[0-9]-(no_)?sw", re.IGNORECASE)
-"""Names of what holds a network of another tool."""
+"""Sources with a network of another tool."""
 MAX_BYTES = 64 * 1024 * 1024
 
-# Rows with their numbers as a person counts them.
+# Rows with their line numbers, from 1.
 Rows = list[tuple[int, Mapping[str, Any]]]
 
 
 @dataclass(slots=True)
 class Raw:
-    """Cells before parsing; tables that could not be had at all are None."""
+    """Cells before parsing; unreadable tables are None."""
 
     meta_name: str
     meta: Mapping[str, Any] | None
@@ -97,13 +97,13 @@ class Raw:
 
 
 def advice(source: object) -> str:
-    """Return how to make a feeder of a network of another tool; nothing for any other source."""
+    """Command that converts a network of another tool to a feeder; empty for any other source."""
     name = str(source)
     return f"; make one by: gridsec feeders convert {name} FOLDER" if FOREIGN.fullmatch(name) else ""
 
 
 def from_folder(folder: Path) -> Raw:
-    """Read the files of a feeder; what cannot be read is a problem, never an exception."""
+    """Read the files of a feeder; an unreadable file is a problem, never an exception."""
     raw = Raw(META_FILE, None, LINES_FILE, None, CUSTOMERS_FILE, None, [])
     if not folder.is_dir():
         there = folder.exists()
@@ -121,7 +121,7 @@ def from_folder(folder: Path) -> Raw:
         try:
             raw.meta = tomllib.loads(text)
         except (tomllib.TOMLDecodeError, RecursionError) as error:
-            raw.problems.append(Problem("unreadable", f"{META_FILE}: no valid TOML: {error}"))
+            raw.problems.append(Problem("unreadable", f"{META_FILE}: invalid TOML: {error}"))
     text = _file_text(folder / LINES_FILE, raw.problems)
     if text is not None:
         raw.lines = _csv_rows(LINES_FILE, text, raw.problems)
@@ -199,7 +199,7 @@ def _csv_rows(name: str, text: str, problems: list[Problem]) -> Rows | None:
                 continue
             rows.append((reader.line_num, dict(zip(header, cells, strict=True))))
     except csv.Error as error:
-        problems.append(Problem("unreadable", f"{name}, row {reader.line_num}: no valid CSV: {error}"))
+        problems.append(Problem("unreadable", f"{name}, row {reader.line_num}: invalid CSV: {error}"))
         return None
     if not rows:
         problems.append(Problem("missing", f"{name}: there is no row below the header"))
@@ -208,13 +208,13 @@ def _csv_rows(name: str, text: str, problems: list[Problem]) -> Rows | None:
 
 
 def from_object(obj: object) -> Raw:
-    """Take the JSON form apart, already decoded; a table is a list of rows or an object of columns."""
+    """Split the decoded JSON form; a table is a list of rows or an object of columns."""
     raw = Raw("feeder", None, "lines", None, "customers", None, [])
     if not isinstance(obj, Mapping):
         raw.problems.append(
             Problem(
                 "wrong-type",
-                f"{shown(obj)} is no feeder; expected an object with feeder, lines and customers",
+                f"{shown(obj)} is not a feeder; expected an object with feeder, lines and customers",
             )
         )
         return raw
@@ -227,7 +227,7 @@ def from_object(obj: object) -> Raw:
     if isinstance(meta, Mapping):
         raw.meta = meta
     elif meta is not None:
-        raw.problems.append(Problem("wrong-type", f"feeder: {shown(meta)} is no object"))
+        raw.problems.append(Problem("wrong-type", f"feeder: {shown(meta)} is not an object"))
     raw.lines = _json_rows("lines", obj.get("lines"), raw.problems)
     raw.customers = _json_rows("customers", obj.get("customers"), raw.problems)
     return raw
@@ -239,9 +239,7 @@ def _json_rows(name: str, table: object, problems: list[Problem]) -> Rows | None
     if isinstance(table, Mapping):
         if not all(isinstance(cells, (list, tuple)) for cells in table.values()):
             problems.append(
-                Problem(
-                    "wrong-type", f"{name}: expected a list of rows, or an object whose columns are lists"
-                )
+                Problem("wrong-type", f"{name}: expected a list of rows, or an object with lists as columns")
             )
             return None
         lengths = {column: len(cells) for column, cells in table.items()}
@@ -251,7 +249,9 @@ def _json_rows(name: str, table: object, problems: list[Problem]) -> Rows | None
         count = next(iter(lengths.values()), 0)
         table = [{column: cells[k] for column, cells in table.items()} for k in range(count)]
     if not isinstance(table, (list, tuple)):
-        problems.append(Problem("wrong-type", f"{name}: {shown(table)} is no table; expected a list of rows"))
+        problems.append(
+            Problem("wrong-type", f"{name}: {shown(table)} is not a table; expected a list of rows")
+        )
         return None
     if not table:
         problems.append(Problem("missing", f"{name}: there is no row"))
@@ -261,5 +261,5 @@ def _json_rows(name: str, table: object, problems: list[Problem]) -> Rows | None
         if isinstance(row, Mapping):
             rows.append((number, row))
         else:
-            problems.append(Problem("wrong-type", f"{name}, row {number}: {shown(row)} is no object"))
+            problems.append(Problem("wrong-type", f"{name}, row {number}: {shown(row)} is not an object"))
     return rows

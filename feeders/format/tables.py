@@ -1,8 +1,8 @@
-"""A feeder's tables: typed rows, files and JSON, and every problem of an input at once.
+"""Tables of a feeder: typed rows, files and JSON, and every problem of an input at once.
 
-A feeder is a folder with `feeder.toml`, `lines.csv` and `customers.csv` (docs/feeder-format.md), or
-the same as JSON: ``{"feeder": {...}, "lines": [...], "customers": [...]}``, where a table is a list
-of rows or an object of columns. Values are in SI units here; only feeders/model/site.py knows per unit.
+A feeder is a folder with `feeder.toml`, `lines.csv` and `customers.csv` (docs/feeder-format.md), or the same
+as JSON: ``{"feeder": {...}, "lines": [...], "customers": [...]}``. A table is a list of rows or an object of
+columns. Values are in SI units; only feeders/model/site.py converts to per unit.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ from gridsec.errors import FeederInvalid, Problem
 
 MAX_PROBLEMS = 1000
 SELDOM = frozenset({"forecast", "utc_offset_h"})
-"""Keys of [load] that are written only where they say something."""
+"""Keys of [load] that are written only if they differ from the default."""
 
 
 @dataclass(frozen=True, slots=True)
 class LineRow:
-    """One row of lines.csv; units are in the names, meanings in `feeders.format.columns.LINE_COLUMNS`."""
+    """One row of lines.csv; units in the names, meanings in `feeders.format.columns.LINE_COLUMNS`."""
 
     line: str
     from_bus: str
@@ -84,14 +84,14 @@ class LineRow:
 
     @property
     def in_phases(self) -> bool:
-        """Whether it needs three phases: not all of them, not transposed, or not the same tap in each."""
+        """True if the line requires a model in three phases: missing phases, a matrix, or taps by phase."""
         own = (self.r_aa_ohm, self.b_aa_us, self.tap_a)
         return self.phases != "abc" or any(value is not None for value in own)
 
 
 @dataclass(frozen=True, slots=True)
 class CustomerRow:
-    """One row of customers.csv; None means: the default of feeder.toml."""
+    """One row of customers.csv; None for the default of feeder.toml."""
 
     customer: str
     bus: str
@@ -127,7 +127,7 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class MeterDefaults:
-    """What the customers' meters are, where customers.csv does not say otherwise."""
+    """Properties of the customers' meters, for empty cells of customers.csv."""
 
     class_percent: float = 0.5
     resolution_volt: float = 0.1
@@ -140,7 +140,7 @@ class MeterDefaults:
 
 @dataclass(frozen=True, slots=True)
 class LoadDefaults:
-    """What is known about the loads' reactive power, where customers.csv does not say otherwise."""
+    """Reactive power, correlation time and forecast of the loads, for empty cells of customers.csv."""
 
     power_factor: float = 0.95
     power_factor_min: float = 0.9
@@ -153,7 +153,7 @@ class LoadDefaults:
 
 @dataclass(frozen=True, slots=True)
 class MonitorDefaults:
-    """How the feeder is watched."""
+    """Settings of the monitor."""
 
     estimator: str = "sequential"
     max_attacked: int = 1
@@ -168,7 +168,7 @@ class MonitorDefaults:
 
 @dataclass(frozen=True, slots=True)
 class FeederMeta:
-    """The content of feeder.toml."""
+    """Content of feeder.toml."""
 
     format: int
     name: str
@@ -190,7 +190,7 @@ class FeederMeta:
 
 @dataclass(frozen=True, slots=True)
 class FeederTables:
-    """A feeder as its files say it: SI units, the source's ids."""
+    """Content of a feeder's files: SI units, the source's ids."""
 
     meta: FeederMeta
     lines: tuple[LineRow, ...]
@@ -198,23 +198,23 @@ class FeederTables:
 
     @property
     def in_phases(self) -> bool:
-        """Whether it is one in three phases: what is open carries nothing, and makes it none."""
+        """True if the model is in three phases; open lines do not count."""
         lines = any(row.in_phases for row in self.lines if row.closed)
         return lines or any(row.phases != "abc" for row in self.customers)
 
 
 @dataclass(frozen=True, slots=True)
 class Examination:
-    """What came out of reading an input.
+    """Result of reading an input.
 
     Attributes
     ----------
     tables
-        The feeder, or None if there are problems.
+        The feeder, or None with problems.
     problems
-        Everything that is wrong, one sentence each.
+        Every problem, one sentence each.
     notes
-        What is right but worth knowing: ignored columns, fused buses, unmetered customers.
+        Valid but notable content: ignored columns, fused buses, unmetered customers.
     """
 
     tables: FeederTables | None
@@ -223,18 +223,18 @@ class Examination:
 
 
 def validate(source: FeederTables | Path | str | Mapping[str, Any]) -> tuple[Problem, ...]:
-    """Return every problem of a feeder at once, each naming file, row, column and value.
+    """Every problem of a feeder, each with file, row, column and value.
 
     Parameters
     ----------
     source
-        A folder, the JSON form, or tables made in memory.
+        A folder, the JSON form, or tables in memory.
     """
     return examine(source).problems
 
 
 def examine(source: FeederTables | Path | str | Mapping[str, Any]) -> Examination:
-    """Read and check a feeder; never raises on its content."""
+    """Read and check a feeder; invalid content never raises."""
     if isinstance(source, FeederTables):
         return _examine(reader.from_object(to_json(source)))
     if isinstance(source, (Path, str)):
@@ -254,21 +254,20 @@ def read(path: Path | str) -> FeederTables:
 
 
 def from_json(obj: object) -> FeederTables:
-    """Take a feeder from its JSON form, already decoded.
+    """Read a feeder from its decoded JSON form.
 
     Raises
     ------
     FeederInvalid
-        With every problem of the tables, also if `obj` is no feeder at all.
+        With every problem of the tables, also if `obj` is not a feeder.
     """
     return _tables(_examine(reader.from_object(obj)))
 
 
 def to_json(tables: FeederTables) -> dict[str, Any]:
-    """Return the JSON form: the same names as in the files, a list of rows per table.
+    """JSON form: the names of the files, a list of rows per table.
 
-    Matrices, taps of single phases, voltages behind transformers and forecasts are left out where there are
-    none.
+    Absent matrices, taps of single phases, voltages behind transformers and forecasts are left out.
     """
     meta = asdict(tables.meta)
     meta["accept"] = list(tables.meta.accept)
@@ -283,7 +282,7 @@ def to_json(tables: FeederTables) -> dict[str, Any]:
 
 
 def write(tables: FeederTables, path: Path | str) -> None:
-    """Write a feeder's folder; columns that hold only their default are left out."""
+    """Write a feeder's folder, without columns that hold only their default."""
     folder = Path(path)
     folder.mkdir(parents=True, exist_ok=True)
     obj = to_json(tables)
@@ -337,7 +336,7 @@ def _examine(given: reader.Raw) -> Examination:
 
 
 def _capped(problems: list[Problem]) -> tuple[Problem, ...]:
-    """Return each problem once, at most MAX_PROBLEMS of them."""
+    """Each problem once, at most MAX_PROBLEMS of them."""
     once = tuple(dict.fromkeys(problems))
     if len(once) <= MAX_PROBLEMS:
         return once
@@ -355,7 +354,9 @@ def _parse_meta(
         cells: object = given.meta if section == "" else given.meta.get(section, {})
         if not isinstance(cells, Mapping):
             problems.append(
-                Problem("wrong-type", f"{given.meta_name}, [{section}]: {shown(cells)} is no table of keys")
+                Problem(
+                    "wrong-type", f"{given.meta_name}, [{section}]: {shown(cells)} is not a table of keys"
+                )
             )
             cells = {}
         if section:
@@ -397,14 +398,14 @@ def _parse_table(
 
 
 def _can_be_read(key: object) -> TypeGuard[str]:
-    """Whether a row's name says which one it is."""
+    """True for an id that can be shown."""
     return isinstance(key, str) and bool(key.strip()) and len(key) <= 128 and key.strip().isprintable()
 
 
 def _parse_cells(
     where: str, noun: str, columns: Iterable[Column], cells: Mapping[str, Any], problems: list[Problem]
 ) -> dict[str, Any]:
-    """Parse the cells of one row; bad ones are reported and left out."""
+    """Parse the cells of one row; invalid ones are reported and left out."""
     parsed: dict[str, Any] = {}
     for column in columns:
         value, problem = parse(column, cells.get(column.name))
@@ -461,5 +462,5 @@ def _toml_value(value: object) -> str:
         return "[" + ", ".join(map(_toml_value, value)) + "]"
     if isinstance(value, float):
         return repr(value)
-    # Basic strings of TOML take JSON's escapes; booleans and whole numbers look the same in both.
+    # Basic strings of TOML take JSON's escapes; booleans and integers have the same form in both.
     return json.dumps(value, ensure_ascii=False)

@@ -1,6 +1,6 @@
-"""The feeder as a graph: fused buses, a tree below the busbar, what closes loops in it, and islands.
+"""Graph of the feeder: fused buses, a tree below the busbar, loops, islands.
 
-Works on ids alone, so that the checks and the loader see the same graph.
+Works on ids alone: the checks and the loader use the same graph.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ LOOPS_SHOWN = 20
 
 @dataclass(frozen=True, slots=True)
 class Edge:
-    """A closed line: its id, its buses, whether it has any impedance, the voltage it leads to, its phases."""
+    """Closed line: id, buses, impedance zero or not, nominal voltage at its end, number of phases."""
 
     line: str
     from_bus: str
@@ -25,12 +25,12 @@ class Edge:
 
 @dataclass(frozen=True, slots=True)
 class Tree:
-    """What is connected to the busbar, in topological order.
+    """Part of the feeder that is connected to the busbar, in topological order.
 
     Attributes
     ----------
     group
-        Fused bus index of every bus that can be reached; 0 is the busbar.
+        Fused bus index of every connected bus; 0 is the busbar.
     buses
         One id per fused bus: the first of its members in the order of the input.
     parent
@@ -38,12 +38,12 @@ class Tree:
     branch
         Index (into the edges given) of the line that feeds bus k + 1.
     ties
-        Indices of the edges that close loops: each would join two buses that the edges before it connect.
+        Indices of the edges that close loops: each joins two buses that are connected without it.
     loops
         Indices of the edges of each loop: of every tie that joins a bus to itself, and of at most LOOPS_SHOWN
         others. A radial feeder has none.
     islands
-        Buses that cannot be reached, one tuple for each connected piece.
+        Unconnected buses, one tuple for each connected piece.
     """
 
     group: dict[str, int]
@@ -71,7 +71,7 @@ class _Sets:
         return root
 
     def join(self, one: str, other: str) -> bool:
-        """Unite the sets of two buses; return False if they were one already."""
+        """Unite the sets of two buses; False if both are in one set already."""
         a, b = self.find(one), self.find(other)
         if a == b:
             return False
@@ -81,7 +81,7 @@ class _Sets:
 
 
 def tree(busbar: str, edges: Sequence[Edge], others: Iterable[str] = ()) -> Tree:
-    """Fuse the buses at both ends of zero-impedance lines and walk the rest from the busbar.
+    """Fuse the buses at both ends of lines without impedance and walk the others from the busbar.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def tree(busbar: str, edges: Sequence[Edge], others: Iterable[str] = ()) -> Tree
     edges
         The closed lines.
     others
-        Buses that must be reached too (ends of open lines).
+        Further buses that need a connection (ends of open lines).
     """
     order = [busbar, *(bus for edge in edges for bus in (edge.from_bus, edge.to_bus)), *others]
     fused, connected = _Sets(order), _Sets(order)
@@ -125,10 +125,11 @@ def tree(busbar: str, edges: Sequence[Edge], others: Iterable[str] = ()) -> Tree
 
 
 def _closing(edges: Sequence[Edge], connected: _Sets) -> list[int]:
-    """Edges that close loops, those of fewer phases and the later ones rather than others (Kruskal).
+    """Edges that close loops, preferably those of fewer phases and the later ones (Kruskal).
 
-    If any tree brings every phase to wherever it goes, this one does: its lines have the most phases together
-    that a tree can have, one less for each phase than buses have it.
+    The tree of the other edges has the largest possible sum of phases. If any tree brings every phase of each
+    bus, this one does: such a tree has that sum, the number of buses with the phase less one, over the
+    phases.
     """
     order = sorted((k for k, edge in enumerate(edges) if not edge.zero), key=lambda k: -edges[k].phases)
     return sorted(k for k in order if not connected.join(edges[k].from_bus, edges[k].to_bus))
@@ -137,7 +138,7 @@ def _closing(edges: Sequence[Edge], connected: _Sets) -> list[int]:
 def _walk(
     root: str, neighbours: dict[str, list[tuple[int, str]]]
 ) -> tuple[dict[str, int], tuple[int, ...], tuple[int, ...]]:
-    """Number the buses depth first, feeder by feeder, as an operator would read the diagram."""
+    """Number the buses depth first, branch by branch, as in an operator's diagram."""
     index: dict[str, int] = {}
     parent: list[int] = []
     branch: list[int] = []
@@ -155,7 +156,7 @@ def _walk(
 def _loop(
     closing: int, edge: Edge, fused: _Sets, neighbours: dict[str, list[tuple[int, str]]]
 ) -> tuple[int, ...]:
-    """Return the edges of the loop that one more edge closes: that edge and the path between its ends."""
+    """Edges of the loop that one more edge closes: that edge and the path between its ends."""
     start, goal = fused.find(edge.from_bus), fused.find(edge.to_bus)
     came: dict[str, tuple[int, str] | None] = {start: None}
     stack = [start]

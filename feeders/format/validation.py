@@ -1,12 +1,11 @@
 """Checks between cells: duplicates, references, graph, nominal voltages, doubtful units.
 
-`to_volt` of a line is the nominal voltage of its `to_bus` where that of its `from_bus` is another one. It is
-stated on the way from the busbar; a line that closes a loop must find it at both its ends.
+`to_volt` of a line is the nominal voltage of its `to_bus`, where that of its `from_bus` differs. It applies
+on the way from the busbar; a line that closes a loop must agree with both its ends.
 
-Each doubt has a name; `accept = ["<name>"]` in feeder.toml says that the value was checked and is right.
-
-Each takes the cells that could be parsed and returns sentences. A row with a bad cell takes part
-wherever that cell does not matter, so that one run names everything there is to mend.
+Each doubt has a name; `accept = ["<name>"]` in feeder.toml turns it into a note. Each check takes the valid
+cells. A row with an invalid cell takes part in every check that does not need that cell, so that one run
+reports all problems.
 """
 
 from __future__ import annotations
@@ -29,46 +28,46 @@ if TYPE_CHECKING:
 
 
 SAME_LEVEL: Final = 1e-6
-"""Part by which two nominal voltages may differ and still be one: 230.94 and 400 / sqrt(3)."""
+"""Relative difference of two nominal voltages that count as equal: 230.94 and 400 / sqrt(3)."""
 
 
 def same_level(one: float, other: float) -> bool:
-    """Return whether two nominal voltages are one."""
+    """True if two nominal voltages count as equal."""
     return abs(one - other) <= SAME_LEVEL * max(one, other)
 
 
 def told(nominal_volt: Floats, form: str = ".1f") -> str:
-    """Return a feeder's nominal voltages in words: "11547.0 V and 230.9 V".
+    """Nominal voltages of a feeder for messages: "11547.0 V and 230.9 V".
 
     Parameters
     ----------
     nominal_volt : (n,)
-        Of its places, V, the busbar first.
+        Nominal voltages of the places, V, the busbar first.
     form
-        How numbers are written.
+        Format of the numbers.
     """
     several = dict.fromkeys(f"{volt:{form}} V" for volt in nominal_volt.tolist())
     return " and ".join(several)
 
 
 def nominal_volts(found: Tree, edges: Sequence[Edge | LineRow], volt: float) -> list[float]:
-    """Return the nominal voltage of every bus, V, phase to neutral.
+    """Nominal voltage of every bus, V, phase to neutral.
 
     Parameters
     ----------
     found, edges
-        The tree, and the closed lines that it was made of.
+        The tree, and its closed lines.
     volt
-        That of the busbar, V.
+        Nominal voltage of the busbar, V.
     """
     nominal = _found(found, edges, volt)
-    for k, above in enumerate(found.parent):  # only what `problems` tells is not known by now
+    for k, above in enumerate(found.parent):  # missing only where `problems` reports a line
         nominal.setdefault(k + 1, nominal[above])
     return [nominal[k] for k in range(len(found.buses))]
 
 
 def _found(found: Tree, edges: Sequence[Edge | LineRow], volt: float) -> dict[int, float]:
-    """Return the nominal voltages that a way from the busbar leads to, which passes transformers forwards."""
+    """Nominal voltages along ways from the busbar that pass transformers forwards only."""
     near: dict[int, list[tuple[int, float | None]]] = defaultdict(list)
     for line in edges:
         if line.from_bus in found.group:
@@ -86,7 +85,7 @@ def _found(found: Tree, edges: Sequence[Edge | LineRow], volt: float) -> dict[in
 
 
 def problems(found: Tree, edges: Sequence[Edge | LineRow], volt: float) -> Iterator[tuple[int, Problem]]:
-    """Yield every line whose `to_volt` cannot be, with what is wrong; arguments as of `nominal_volts`."""
+    """Yield every line with an inconsistent `to_volt`, and its problem; arguments as of `nominal_volts`."""
     nominal, known = nominal_volts(found, edges, volt), _found(found, edges, volt).keys()
     above = dict(zip(found.branch, found.parent, strict=True))
     for k, line in enumerate(edges):
@@ -125,13 +124,13 @@ _TURN: Final = (
 
 
 LOW_VOLTAGE = 1000.0
-# Nominal voltages between phases; nobody's voltage to neutral is called like that.
+# Nominal voltages between phases; none is a usual voltage to neutral.
 PHASE_TO_PHASE = (
     380.0, 400.0, 415.0, 3300.0, 6000.0, 6600.0, 10000.0, 11000.0, 12470.0, 12660.0, 13200.0, 13800.0,
     15000.0, 20000.0, 22000.0, 24900.0, 30000.0, 33000.0, 34500.0,
 )  # fmt: skip
-# Resistance and reactance per km of the low-voltage lines that grid data sets use most (VDE cable
-# tables; pandapower's standard types). A column full of them is a column per km, not per line.
+# Resistance and reactance per km of the low-voltage lines that are most frequent in grid data sets (VDE cable
+# tables; pandapower's standard types). A column that holds only these is per km, not per line.
 PER_KM = (
     (0.642, 0.083), (0.6417, 0.0848), (0.225, 0.08), (0.2067, 0.0804), (0.208, 0.08), (0.868, 0.086),
     (0.443, 0.069), (0.868, 0.079), (1.2, 0.088), (0.32, 0.08), (0.253, 0.08), (0.164, 0.08), (0.125, 0.08),
@@ -139,22 +138,22 @@ PER_KM = (
 )  # fmt: skip
 
 LINE_XR, TRANSFORMER_XR = 20.0, 100.0
-"""Reactance by resistance beyond which a line, or a large transformer, has neither."""
+"""Ratio of reactance to resistance beyond which a line, or a large transformer, is doubtful."""
 
 Doubts = Iterator[tuple[str, str]]
 
 
 def check_units(parsed: Parsed, edges: Sequence[Edge], found: Tree | None, report: Report) -> None:
-    """Report every doubtful value, as a problem or, where feeder.toml accepts it, as a note.
+    """Report every doubtful value, as a problem or, if feeder.toml accepts it, as a note.
 
     Parameters
     ----------
     parsed
         The tables.
     edges, found
-        The closed lines and their tree, or None where the graph could not be had.
+        The closed lines and their tree, or None without a graph.
     report
-        Takes the sentences.
+        Receives the sentences.
     """
     volt = parsed.top("voltage_volt")
     level: dict[str, float] = {}
@@ -203,7 +202,7 @@ def _voltage(parsed: Parsed) -> Doubts:
 
 
 def _impedances(parsed: Parsed, level: Mapping[str, float], volt: float) -> Doubts:
-    """A line's impedance is that of its `to_bus`'s side, at the nominal voltage there."""
+    """Doubts of impedances, which are those of `to_bus`'s side, at the nominal voltage there."""
     for where, cells in rows(parsed.lines, "r_ohm", "x_ohm"):
         r, x = cells["r_ohm"], cells["x_ohm"]
         transformer = cells.get("to_volt") is not None
@@ -255,7 +254,7 @@ def _line_extras(parsed: Parsed) -> Doubts:
     for name in ("tap", "tap_a", "tap_b", "tap_c"):
         for where, cells in rows(parsed.lines, name):
             if cells[name] is not None and not 0.5 <= cells[name] <= 2.0:
-                yield "ratio", f"{where}, column {name}: {cells[name]:g} is no ratio near 1; 5 % up is 0.95"
+                yield "ratio", f"{where}, column {name}: {cells[name]:g} is not near 1; 5 % up is 0.95"
 
 
 def _powers(parsed: Parsed, level: Mapping[str, float], volt: float) -> Doubts:
@@ -283,7 +282,7 @@ def _classes(parsed: Parsed) -> Doubts:
 
 
 def _drop(parsed: Parsed, edges: Sequence[Edge], found: Tree, level: Mapping[str, float]) -> Doubts:
-    """Whether the lines could carry the loads at all: ``sum of r p / (3 V^2)`` along the worst path."""
+    """Check the voltage drop with every load at its peak: ``sum of r p / (3 V^2)`` on the worst path."""
     ohm = {cells["line"]: cells["r_ohm"] for _, cells in rows(parsed.lines, "line", "r_ohm")}
     if not level or found.loops or any(edges[k].line not in ohm for k in found.branch):
         return
@@ -307,11 +306,11 @@ def _drop(parsed: Parsed, edges: Sequence[Edge], found: Tree, level: Mapping[str
 
 
 RESERVED_METER = "substation"
-"""What the busbar meter is called on the wire and in alarms."""
+"""Name of the busbar meter on the wire and in alarms."""
 
 
 def feeder(parsed: Parsed) -> tuple[list[Problem], list[str]]:
-    """Return every problem between cells, and notes on what is right but worth knowing."""
+    """Every problem between cells, and notes on notable content."""
     report = Report()
     for check in (_duplicates, _reserved, _limits, _power_factors, _presets, _profiles, _positions, _taps):
         check(parsed, report)
@@ -358,7 +357,7 @@ def _reserved(parsed: Parsed, report: Report) -> None:
             report.problems.append(
                 Problem(
                     "duplicate",
-                    f"{where}, column meter: {RESERVED_METER!r} is what the busbar meter is called; "
+                    f"{where}, column meter: {RESERVED_METER!r} is the name of the busbar meter; "
                     "expected another id",
                 )
             )
@@ -437,13 +436,7 @@ def _profiles(parsed: Parsed, report: Report) -> None:
 
 
 def loops(busbar: str, lines: Iterable[LineRow]) -> list[Problem]:
-    """Return what is wrong with the loops of a radial feeder's lines.
-
-    Parameters
-    ----------
-    busbar, lines
-        The busbar, and rows of lines.csv.
-    """
+    """Problems of the loops of a radial feeder's lines."""
     edges = [
         Edge(row.line, row.from_bus, row.to_bus, row.r_ohm == row.x_ohm == 0.0, phases=len(row.phases))
         for row in lines
@@ -455,7 +448,7 @@ def loops(busbar: str, lines: Iterable[LineRow]) -> list[Problem]:
 
 
 def _graph(parsed: Parsed, report: Report) -> tuple[list[Edge], Tree | None]:
-    """Check the graph; return its closed lines and its tree, None if its buses are not all known."""
+    """Check the graph; its closed lines and its tree, the tree None if some buses are unknown."""
     busbar = parsed.top("busbar")
     known: dict[str, None] = {} if busbar is None else {busbar: None}
     edges: list[Edge] = []

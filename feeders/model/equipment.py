@@ -1,14 +1,13 @@
 """Equipment of a feeder: accuracies, loads, taps and transformers.
 
-Powers in units of the three-phase base.
+Powers are in units of the three-phase base.
 
-Behind a tap t, ``V_from = t V``, every voltage has another base: ``a_k V_k`` with V_k the nominal voltage of
-bus k, which transformers may have changed on the way, and a_k the product of ``1 / t`` over the taps between
-the busbar and bus k. With the impedances in the base of their own side, ``3 (a V)^2 / (1000 S)``, the ideal
-transformer is gone: in per unit this is a feeder without it. Each phase may have a tap of its own; a mutual
-impedance is then in ``3 a_φ a_ψ V^2 / (1000 S)``, so that matrices stay symmetric. Only what goes between
-volts and per unit, customer by customer, needs a_k V_k; what is standardised in parts of the nominal voltage
-needs V_k.
+Behind a tap t, ``V_from = t V``, every voltage has another base: ``a_k V_k``. V_k is the nominal voltage of
+bus k, which a transformer may change. a_k is the product of ``1 / t`` over the taps between the busbar and
+bus k. With impedances in the base of their own side, ``3 (a V)^2 / (1000 S)``, the per-unit model has no
+ideal transformer. Each phase may have a tap of its own. A mutual impedance is then in ``3 a_φ a_ψ V^2 / (1000
+S)``, so that matrices stay symmetric. The conversion between volts and per unit needs a_k V_k, customer by
+customer. Values that are standardised in parts of the nominal voltage need V_k.
 """
 
 from __future__ import annotations
@@ -33,14 +32,14 @@ from gridsec.errors import FeederInvalid, Problem
 from gridsec.grid.droop import Droop, fleet
 from gridsec.grid.meter import MeterAccuracy
 
-# An active power this far beyond what a customer can draw or feed in is no measurement of it.
+# Reported active powers beyond this factor of the customer's range, and this power, are implausible.
 CREDIBLE_FACTOR = 10.0
 CREDIBLE_KW = 50.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadModel:
-    """What is known of the customers' powers without and with a reading, pu. N customers.
+    """Limits of the customers' powers without and with a reading, pu. N customers.
 
     Attributes
     ----------
@@ -51,16 +50,16 @@ class LoadModel:
     q_floor : (N,)
         Reactive power of the load that does not follow p.
     p_fraction, p_floor : (N,)
-        A metered p is within ``p_fraction |reading| + p_floor`` of the truth.
+        Error limit of a metered p: ``p_fraction |reading| + p_floor``.
     q_error : (N,)
-        Half-width of a metered q: a fraction of the customer's range.
+        Error limit of a metered q: a fraction of the customer's range.
     q_fraction : (N,)
         The same fraction, for readings beyond that range.
     credible : (N,)
-        Largest |p| that is taken for a measurement.
+        Largest plausible |p| of a reading.
     p_unread, q_unread : (N,)
-        Half-width of what is known of p without a reading, and limit of that of q: the range, or what the
-        files say of the powers of a customer that has no meter.
+        Half-width of p without a reading, and upper limit of that of q: the range, or the standard deviation
+        of the files for a customer without a meter.
     """
 
     load_peak: Floats
@@ -78,12 +77,12 @@ class LoadModel:
 
 
 def names(*, balanced: bool = True) -> list[str]:
-    """Return the feeders that come with the project.
+    """Names of the bundled feeders.
 
     Parameters
     ----------
     balanced
-        Only those that are not in three phases, which every study and estimator takes.
+        Leave out feeders in three phases.
     """
     folder = data_root() / "feeders"
     found = (entry for entry in folder.iterdir() if (entry / META_FILE).is_file())
@@ -91,14 +90,14 @@ def names(*, balanced: bool = True) -> list[str]:
 
 
 def _names_phases(folder: Traversable) -> bool:
-    """Whether a folder of ours is in three phases: the writer leaves out default columns."""
+    """True if a bundled feeder has columns of three phases; the writer leaves out default columns."""
     tables = ((folder / name).read_text(encoding="utf-8") for name in (LINES_FILE, CUSTOMERS_FILE))
     columns = {column for table in tables for column in table.partition("\n")[0].split(",")}
     return not columns.isdisjoint({"phases", *PHASE_NAMES})
 
 
 def folder_of(path_or_name: Path | str) -> Path | None:
-    """Return a feeder's folder, or that of a feeder that comes with the project; None if there is neither."""
+    """Folder of a feeder, given by its path or by the name of a bundled feeder; None without a match."""
     path = Path(path_or_name)
     if path.is_dir():
         return path
@@ -109,7 +108,7 @@ def folder_of(path_or_name: Path | str) -> Path | None:
 
 
 def find(path_or_name: Path | str) -> FeederTables:
-    """Read the tables of a feeder's folder, or of a feeder that comes with the project.
+    """Read the tables of a feeder's folder, or of a bundled feeder.
 
     Raises
     ------
@@ -127,36 +126,36 @@ def find(path_or_name: Path | str) -> FeederTables:
 
 
 def indices(values: Sequence[int]) -> Ints:
-    """Return indices as an array."""
+    """Indices as a frozen array."""
     return frozen_ints(np.array(values, dtype=np.intp))
 
 
 def _either(rows: list[CustomerRow], column: str, default: float) -> Floats:
-    """One column of customers.csv, with the default of feeder.toml where it is empty."""
+    """One column of customers.csv; empty cells have the default of feeder.toml."""
     cells = (getattr(row, column) for row in rows)
     return np.array([default if cell is None else cell for cell in cells], dtype=np.float64)
 
 
 def digest(tables: FeederTables) -> str:
-    """Return the SHA-256 of a feeder's content, see `Site`."""
+    """SHA-256 of a feeder's content, see `Site`."""
     text = json.dumps(to_json(tables), sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def metered_customers(tables: FeederTables) -> Ints:
-    """Return the indices of the customers with a meter, ascending."""
+    """Indices of the customers with a meter, ascending."""
     return indices([k for k, row in enumerate(tables.customers) if row.meter])
 
 
 def inverters(tables: FeederTables, ratio: Floats) -> Droop:
-    """Return the inverters with a droop curve, in the order of the customers.
+    """Inverters with a droop curve, in the order of the customers.
 
     Parameters
     ----------
     tables
         The feeder's tables.
     ratio : (N,)
-        Of each customer's voltage base and its nominal voltage, in which curves are standardised.
+        Voltage base by nominal voltage of each customer; curves are standardised in the latter.
     """
     own = [k for k, row in enumerate(tables.customers) if row.inverter_kva > 0]
     rows = [tables.customers[k] for k in own]
@@ -172,14 +171,14 @@ def inverters(tables: FeederTables, ratio: Floats) -> Droop:
 
 
 def accuracy(tables: FeederTables, base_volt: Floats, nominal_volt: Floats) -> MeterAccuracy:
-    """Return what the meters promise, in the voltage base of each.
+    """Accuracies of the meters, each in its voltage base.
 
     Parameters
     ----------
     tables
         The feeder's tables.
     base_volt, nominal_volt : (N,)
-        1 pu at each customer, and its nominal voltage, V.
+        1 pu and nominal voltage at each customer, V.
     """
     meta = tables.meta
     metered = metered_customers(tables)
@@ -199,7 +198,7 @@ def accuracy(tables: FeederTables, base_volt: Floats, nominal_volt: Floats) -> M
 
 
 def load_model(tables: FeederTables) -> LoadModel:
-    """Return what is known of the customers' powers, in units of `base_kva`."""
+    """Limits of the customers' powers, in units of `base_kva`."""
     meta, rows = tables.meta, list(tables.customers)
     base = meta.base_kva
     load = _either(rows, "load_kw", 0.0)
@@ -215,7 +214,7 @@ def load_model(tables: FeederTables) -> LoadModel:
     # A register within f |p| + h of the truth p shows r: |p| <= (|r| + h) / (1 - f), so the error is at
     # most (f |r| + h) / (1 - f).
     p_fraction = _either(rows, "p_error_percent", meta.meters.p_error_percent) / 100.0
-    # The range of the reactive register: the largest apparent power at the connection point.
+    # Range of the reactive register: the largest apparent power at the connection point.
     span = np.maximum.reduce([load * np.hypot(1.0, tan["power_factor_min"]), pv, inverter])
     fields = {
         "load_peak": load / base,
@@ -235,14 +234,14 @@ def load_model(tables: FeederTables) -> LoadModel:
 
 
 def _unread(rows: list[CustomerRow], column: str, most: Floats) -> Floats:
-    """Half-width of a uniform error with the standard deviation of the files, where there is no meter."""
+    """Half-width of a uniform error with the standard deviation of the files, for unmetered customers."""
     told = [None if row.meter else getattr(row, column) for row in rows]
     width = [np.inf if std is None else np.sqrt(3.0) * std for std in told]
     return np.minimum(most, np.array(width, dtype=np.float64))
 
 
 def positions(tables: FeederTables, found: Tree) -> Floats | None:
-    """Return where the buses are (b + 1, 2), or None unless the files place every one of them."""
+    """Positions of the buses (b + 1, 2), None unless the files have all of them."""
     xy = np.full((len(found.buses), 2), np.nan)
     for line in tables.lines:
         if line.to_x is not None and line.to_y is not None:
@@ -254,12 +253,12 @@ def positions(tables: FeederTables, found: Tree) -> Floats | None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Referred:
-    """A feeder's tree with its voltages. N customers, b + 1 buses.
+    """Tree of a feeder with its voltage bases. N customers, b + 1 buses.
 
     Attributes
     ----------
     lines
-        The line that feeds bus k + 1.
+        Lines; line k feeds bus k + 1.
     ties
         The t lines that close loops.
     nominal : (b + 1,)
@@ -267,7 +266,7 @@ class Referred:
     bus : (b + 1, 3)
         Voltage base of every phase of every bus, V.
     branch : (b, 3)
-        That of each line's impedance and charging, which are behind its tap as seen from `from_bus`.
+        Voltage base of each line's impedance and charging, which are behind its tap as seen from `from_bus`.
     tie : (t, 3)
         The same of each tie.
     customer, customer_nominal : (N,)
@@ -285,7 +284,7 @@ class Referred:
 
 
 def refer(tables: FeederTables, closed: Sequence[LineRow], found: Tree) -> Referred:
-    """Refer a feeder to its busbar.
+    """Refer voltages and impedances of a feeder to its busbar.
 
     Parameters
     ----------
@@ -297,7 +296,7 @@ def refer(tables: FeederTables, closed: Sequence[LineRow], found: Tree) -> Refer
     Raises
     ------
     FeederInvalid
-        If a tap is where it cannot be.
+        For a tap on a line without impedance, or taps around a loop with a product other than 1.
     """
     lines, ties = [closed[k] for k in found.branch], [closed[k] for k in found.ties]
     nominal = np.array(nominal_volts(found, closed, tables.meta.voltage_volt))
@@ -319,23 +318,23 @@ def refer(tables: FeederTables, closed: Sequence[LineRow], found: Tree) -> Refer
 
 
 def of_customers(base: Floats, connected: Bools) -> Floats:
-    """Return what 1 pu of each customer is, V, (N,): the mean of its phases, which is what its meter reads.
+    """Voltage base of each customer, V, (N,): the mean of its phases, as its meter reads.
 
     Parameters
     ----------
     base : (N, 3)
         Voltage bases of the phases of their buses, V.
     connected : (N, 3)
-        Which phases they have.
+        Mask of the customers' phases.
     """
     first = np.take_along_axis(base, connected.argmax(axis=1)[:, None], axis=1)
-    # Where all are the same the mean is, to the last bit.
+    # For equal bases this form of the mean is exact to the last bit.
     apart = np.where(connected, base - first, 0.0).sum(axis=1) / connected.sum(axis=1)
     return np.asarray(first[:, 0] + apart)
 
 
 def _factors(lines: Sequence[LineRow], found: Tree) -> tuple[Floats, Floats]:
-    """The products of taps, ``a`` of every bus and of every line's impedance, in each phase."""
+    """Products of taps, ``a`` of every bus and of every line's impedance, in each phase."""
     bus, branch = np.ones((len(found.buses), 3)), np.ones((len(lines), 3))
     for k, (line, above) in enumerate(zip(lines, found.parent, strict=True)):
         if found.group[line.from_bus] == above:
@@ -363,7 +362,7 @@ def _problems(closed: Sequence[LineRow]) -> list[Problem]:
 
 
 def _around(ties: Sequence[LineRow], ratio: Floats) -> list[Problem]:
-    """Loops whose taps drive a current around without any load, which the model does not have."""
+    """Loops with taps that drive a current around without any load; the model excludes them."""
     return [
         Problem(
             "inconsistent",
@@ -376,9 +375,9 @@ def _around(ties: Sequence[LineRow], ratio: Floats) -> list[Problem]:
 
 
 def _farthest(ratio: Floats) -> float:
-    """The one that is the least 1."""
+    """Ratio with the largest distance from 1."""
     return float(ratio[np.abs(ratio - 1.0).argmax()])
 
 
-# Ratios around a loop are products of a few numbers of the files.
+# Rounding: ratios around a loop are products of a few numbers of the files.
 _ROUNDING = 1e-9

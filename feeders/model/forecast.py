@@ -1,8 +1,8 @@
-"""Powers of customers whom nobody reads: those of the library's profiles at this time of the week and year.
+"""Forecasts of unread powers: library profiles at the time of the week and year.
 
 A forecast is the profile's mean over the season's days of that kind (working day, Saturday, Sunday) at that
-time of day, times the customer's peak. It is a pure function of Unix time, so that a replay has the
-forecasts that the service had.
+time of day, times the customer's peak. It is a pure function of Unix time: a replay has the forecasts of the
+service.
 """
 
 from __future__ import annotations
@@ -38,25 +38,25 @@ _LOAD_P, _LOAD_Q, _PV = "load_p", "load_q", "pv"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Forecast:
-    """What the library says of the customers' powers. N customers, pu, as drawn: net import positive.
+    """Forecasts of the customers' powers. N customers, pu, net import positive.
 
     Attributes
     ----------
     p_std, q_std : (N,)
         Standard deviations of the forecast's errors: `p_std_kw` and `q_std_kvar` of a customer without a
-        meter where its row has them, else what `spread` says of its profiles, times its peaks.
+        meter where its row has them, else `spread` of its profiles times its peaks.
     p_range, q_range : (2, N)
-        Least and most that the customers can draw, of q the load alone.
+        Least and largest power of the customers, of q the load alone.
     peaks : (3, N)
-        Peak of the load, reactive power that belongs to it, and peak of the generation.
+        Peak of the load, its reactive power, and peak of the generation.
     which : (3, N)
-        Which of the curves each of these follows.
+        Index of the curve of each of these.
     weeks
-        By season: the K curves over a week, parts of the peak, (672, K).
+        By season: the K curves over a week, relative to the peak, (672, K).
     origin
-        Unix time at which a week began, s: Monday 00:00 of local time.
+        Unix time of the begin of a week, s: Monday 00:00 of local time.
     season
-        The season that it is all the time; None: that of the calendar.
+        Fixed season; None: that of the calendar.
     """
 
     p_std: Floats
@@ -75,7 +75,7 @@ class Forecast:
         Parameters
         ----------
         t
-            Unix time, s; one that is none gives the powers of the first moment.
+            Unix time, s; NaN counts as 0.
         """
         local = float(np.clip(np.nan_to_num(t), -_LONGEST_S, _LONGEST_S)) - self.origin
         season = season_of(local + FIRST_MONDAY_S) if self.season is None else self.season
@@ -85,7 +85,7 @@ class Forecast:
         return self._powers(week[here] + share * (week[(here + 1) % len(week)] - week[here]))
 
     def farthest(self) -> tuple[Floats, Floats]:
-        """Half-widths of intervals about p and q that hold their ranges at any time, (N,)."""
+        """Half-widths of intervals about p and q that contain their ranges at any time, (N,)."""
         found = [self._powers(week) for week in self.weeks.values()]
         p, q = (
             np.max([_farther(powers[k], limits).max(axis=0) for powers in found], axis=0)
@@ -99,29 +99,29 @@ class Forecast:
         return np.clip(load - pv, *self.p_range), np.clip(q, *self.q_range)
 
     def played(self, origin: float, season: Season) -> Forecast:
-        """The same in a simulation, whose calendar is its own.
+        """Forecast with the calendar of a simulation.
 
         Parameters
         ----------
         origin
-            Unix time at which the season's profiles begin, s.
+            Unix time of the begin of the season's profiles, s.
         season
-            Which profiles are played.
+            Season of the profiles.
         """
         return replace(self, origin=origin, season=season)
 
     def fill(self, frame: Frame, unread: Bools) -> Frame:
-        """The frame with forecasts where nobody reads.
+        """Frame with forecasts in place of unread powers.
 
-        Intervals go as far as the ranges do on the farther side, so that they hold everything that is
-        possible; how far off forecasts usually are stands beside them.
+        Half-widths reach to the farther end of the range, so that intervals contain every possible power. The
+        forecasts' standard deviations are separate fields.
 
         Parameters
         ----------
         frame
-            The frame of the readings.
+            Frame of the readings.
         unread : (N,)
-            Whose powers are not read.
+            Mask of the unread powers.
         """
         p, q = self.at(frame.t)
         return replace(
@@ -136,19 +136,19 @@ class Forecast:
 
 
 def forecast(tables: FeederTables, loads: LoadModel) -> Forecast | None:
-    """Prepare what the feeder's file asks for.
+    """Prepare the forecasts of a feeder.
 
     Parameters
     ----------
     tables
-        The feeder's tables; `[load] forecast` and `utc_offset_h` decide.
+        The feeder's tables, with `[load] forecast` and `utc_offset_h`.
     loads
-        What is known of the customers' powers.
+        Limits of the customers' powers.
 
     Returns
     -------
     Forecast or None
-        None with "none": all that is known of powers that nobody reads is their range.
+        None with "none": unread powers have their range only.
     """
     meta, rows = tables.meta, tables.customers
     if meta.load.forecast == "none":
@@ -176,16 +176,16 @@ def forecast(tables: FeederTables, loads: LoadModel) -> Forecast | None:
 
 
 def always(given: Forecast | None, frame: Frame, unread: Bools) -> Frame:
-    """A frame whose intervals of powers that nobody reads hold at any time, for designs and studies.
+    """Frame with intervals of unread powers that hold at any time, for designs and studies.
 
     Parameters
     ----------
     given
-        The feeder's forecast.
+        Forecast of the feeder.
     frame
         A frame of any time.
     unread : (N,)
-        Whose powers are not read.
+        Mask of the unread powers.
     """
     if given is None:
         return frame
@@ -198,7 +198,7 @@ def always(given: Forecast | None, frame: Frame, unread: Bools) -> Frame:
 
 
 def season_of(local_s: float) -> Season:
-    """Season of the northern hemisphere by the calendar: winter is December to February, and so on.
+    """Season of the northern hemisphere by the calendar; winter is December to February.
 
     Parameters
     ----------
@@ -211,17 +211,18 @@ def season_of(local_s: float) -> Season:
 
 @cache
 def spread(what: str, name: str) -> float:
-    """Standard deviation of a profile's forecast, as a part of the peak.
+    """Standard deviation of a profile's forecast, relative to the peak.
 
-    How far all profiles of its class (its first letter: households, trades, farms, roofs) are off on every
-    day of a season, in the worst season; generation by day. Without a name it is that of all classes.
+    Root mean square error of all profiles of its class (first letter: households, trades, farms, roofs) on
+    every day of a season, in the worst season; generation by day only. Without a name it is that of all
+    classes.
 
     Parameters
     ----------
     what
         "load_p", "load_q" or "pv".
     name
-        The profile that the forecast is made of; empty: the mean of all.
+        Profile of the forecast; empty: the mean of all.
     """
     worst = 0.0
     for season in Season:
@@ -253,7 +254,7 @@ def _farther(power: Floats, limits: Floats) -> Floats:
 
 
 def _told(own: Floats, tables: FeederTables, column: str) -> Floats:
-    """What the files say of forecasts; of a customer with a meter they speak of what it reports."""
+    """Standard deviations of the files, pu; those of metered customers describe readings, not forecasts."""
     told = [None if row.meter else getattr(row, column) for row in tables.customers]
     base = tables.meta.base_kva
     return np.array([std if each is None else each / base for std, each in zip(own, told, strict=True)])

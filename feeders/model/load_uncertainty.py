@@ -1,4 +1,4 @@
-"""How wrong the powers may be that a feeder's readings give: from its files, or from its history."""
+"""Load uncertainty of a feeder, from its files or from a history."""
 
 from __future__ import annotations
 
@@ -17,34 +17,30 @@ from gridsec.estimators.sequential import LoadDoubt
 from gridsec.interface import Frame
 
 TYPICAL: Final = 0.5
-"""Share of its peak at which a load's errors are sized where they grow with the load."""
+"""Share of the peak at which errors that grow with the load are sized."""
 
 ALIKE: Final = 0.5
-"""Share of a variance that customers have in common, of reactive power where only power factors are known,
-and of all powers that nobody meters: seasons, hours and habits move all of them the same way."""
+"""Common share of the customers' variance: of reactive power known by power factors, and of unmetered powers.
+
+Seasons, hours and habits move these together.
+"""
 
 LONGEST_S: Final = next(
     column.high for column in META_COLUMNS["load"] if column.name == "correlation_s" and column.high
 )
-"""The longest correlation time that files can say, s."""
+"""Longest correlation time of the format, s."""
 
 
 def load_doubt(site: Site) -> LoadDoubt:
-    """What a feeder's files say about its customers' powers.
+    """Standard deviations of the customers' powers by a feeder's files.
 
-    Metered active power is as wrong as its register may be, the load's reactive power as the limits of its
-    power factor allow; taken as uniform within these, and as lasting: a register and a power factor err in
-    the same direction all the time. Without a meter powers are uniform in the range that `to_frame` has for
-    them, so that design and frames say the same. `p_std_kw` and `q_std_kvar` say it directly, and then of
-    errors that come and go within `correlation_s`; they are believed as they are: with a meter as the error
-    of what it reports, without one as the distance from the middle of the range. Where powers are forecast it
-    is the distance from the forecast, and that of the library where the files say nothing. With
-    `p_interval_s` the powers of metered customers are off by what loads do meanwhile, too.
-
-    Parameters
-    ----------
-    site
-        The feeder.
+    Metered active power has the error of its register, the load's reactive power that of its power factor
+    limits. Both are uniform within these limits and lasting: a register and a power factor err in one
+    direction all the time. Unmetered powers are uniform in the range of `to_frame`, so that design and frames
+    agree. `p_std_kw` and `q_std_kvar` take precedence; their errors have the correlation time
+    `correlation_s`. They describe a metered customer's reported power, and the distance of an unmetered one
+    from the middle of its range. With forecasts it is the distance from the forecast, by default that of the
+    library. With `p_interval_s` the metered powers also have the load change over that interval.
     """
     rows, loads, base = site.tables.customers, site.loads, site.feeder.base_kva
     typical = TYPICAL * loads.load_peak
@@ -70,14 +66,9 @@ def load_doubt(site: Site) -> LoadDoubt:
 
 
 def unread(site: Site) -> Frame:
-    """A frame without readings of meters: all that is known of powers is their range.
+    """Frame without readings of meters: powers have their range only.
 
-    Intervals about forecasts are those that hold at any time.
-
-    Parameters
-    ----------
-    site
-        The feeder.
+    Intervals about forecasts hold at any time.
     """
     none = np.full(site.meters.size, np.nan)
     frame = to_frame(site, Snapshot(0.0, none, none, none, np.nan))
@@ -85,13 +76,13 @@ def unread(site: Site) -> Frame:
 
 
 def _usual(half_width: Floats, std: Floats | None) -> Floats:
-    """Standard deviation of what is uniform in an interval, or as stated beside it."""
+    """Standard deviation of a uniform error in an interval, or the stated one."""
     uniform = half_width / np.sqrt(3.0)
     return uniform if std is None else np.where(np.isnan(std), uniform, std)
 
 
 def forecast_errors(site: Site, t: Floats, p_kw: Floats, q_kvar: Floats) -> tuple[Floats, Floats]:
-    """What customers drew beyond what frames without any reading of them say, pu: a history to learn from.
+    """Deviations of true powers from frames without readings, pu: a history for `from_history`.
 
     Parameters
     ----------
@@ -100,7 +91,7 @@ def forecast_errors(site: Site, t: Floats, p_kw: Floats, q_kvar: Floats) -> tupl
     t : (T,)
         Unix times, s.
     p_kw, q_kvar : (T, N)
-        Net active import and reactive import of the loads as they were found later, kW and kvar.
+        True net active import and reactive import of the loads, kW and kvar.
     """
     none, base = np.full(site.meters.size, np.nan), site.feeder.base_kva
     frames = [to_frame(site, Snapshot(float(now), none, none, none, np.nan)) for now in t]
@@ -109,18 +100,18 @@ def forecast_errors(site: Site, t: Floats, p_kw: Floats, q_kvar: Floats) -> tupl
 
 
 def tell(tables: FeederTables, doubt: LoadDoubt, base_kva: float) -> FeederTables:
-    """Write into customers without a meter how far their powers are off, and into `[load]` for how long.
+    """Write standard deviations to customers without a meter, and the correlation time to `[load]`.
 
-    Longer than files can say is as long as they can say.
+    The correlation time is at most LONGEST_S.
 
     Parameters
     ----------
     tables
         The feeder's tables.
     doubt
-        What was learned of all of its customers.
+        Load uncertainty of all customers.
     base_kva
-        Its 1 pu, kVA.
+        1 pu, kVA.
     """
     told = zip(tables.customers, doubt.p * base_kva, doubt.q * base_kva, strict=True)
     rows = tuple(
@@ -131,11 +122,11 @@ def tell(tables: FeederTables, doubt: LoadDoubt, base_kva: float) -> FeederTable
 
 
 def from_history(error_p: Floats, error_q: Floats, step_s: float) -> LoadDoubt:
-    """Learn from a history of errors, true powers minus those that were assumed.
+    """Estimate the load uncertainty from a history of errors, true powers less the assumed ones.
 
-    The correlation time is that of a first-order process with the same correlation from sample to sample,
-    the median over the customers, and no longer than the history; the common share is what the customers'
-    mean varies more than independent ones would.
+    The correlation time is that of a first-order process with the same correlation between successive
+    samples: the median over the customers, at most the length of the history. The common share follows from
+    the variance of the customers' mean beyond that of independent errors.
 
     Parameters
     ----------
@@ -171,7 +162,7 @@ def from_history(error_p: Floats, error_q: Floats, step_s: float) -> LoadDoubt:
 
 
 _FEWEST = 3
-# Correlations outside these are no first-order process that a history could show.
+# Limits of the correlation between samples that a history can resolve.
 _RANGE = (1e-3, 1.0 - 1e-6)
 
 

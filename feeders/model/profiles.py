@@ -1,4 +1,4 @@
-"""The library of load and generation profiles: some days of every season at 15 min, relative to the peak."""
+"""Library of load and generation profiles: some weeks of every season at 15 min, relative to the peak."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PROFILE_STEP_S: Final = 900.0
 
 
 class Season(StrEnum):
-    """The time of the year that profiles are from."""
+    """Season of a profile."""
 
     WINTER = "winter"
     SPRING = "spring"
@@ -40,22 +40,22 @@ class Season(StrEnum):
 
 
 def data_root() -> Traversable:
-    """Return the folder of the data: beside the packages in a checkout, inside them in a wheel."""
+    """Folder of the data: beside the packages in a checkout, inside them in a wheel."""
     packaged = resources.files("feeders") / "data"
     return packaged if packaged.is_dir() else Path(__file__).resolve().parents[2] / "data"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Profiles:
-    """Profiles over time; between two samples they are meant to be interpolated.
+    """Profiles over time, for linear interpolation between samples.
 
     Attributes
     ----------
     t_s : (T,)
         Time since the first sample, s; the first sample is at 00:00 of a Monday.
     load_p, load_q : name -> (T,)
-        Active and reactive power of a load, as a fraction of its peak `load_kw` and of the reactive
-        power that belongs to `load_kw` at its expected power factor.
+        Active and reactive power of a load, as a fraction of its peak `load_kw` and of the reactive power of
+        `load_kw` at its expected power factor.
     pv : name -> (T,)
         Generation, fraction of its peak `pv_kw`.
     """
@@ -70,8 +70,8 @@ class Profiles:
 class Envelope:
     """Limits of a load profile's reactive power, known from its history.
 
-    With p and q as fractions of `load_kw` and of the reactive power that belongs to `load_kw` at the
-    expected power factor: ``low p - floor <= q <= high p + floor``.
+    With p and q as fractions of `load_kw` and of the reactive power of `load_kw` at the expected power
+    factor: ``low p - floor <= q <= high p + floor``.
     """
 
     low: float
@@ -81,7 +81,7 @@ class Envelope:
 
 @cache
 def envelopes() -> dict[str, Envelope]:
-    """Return the envelope of every load profile; see data/profiles/SOURCE.md."""
+    """Envelope of every load profile; see data/profiles/SOURCE.md."""
     text = (data_root() / "profiles" / ENVELOPES).read_text(encoding="ascii")
     rows = csv.DictReader(io.StringIO(text))
     return {
@@ -91,17 +91,17 @@ def envelopes() -> dict[str, Envelope]:
 
 
 def library(season: Season = Season.SUMMER) -> Profiles:
-    """Return one season of the library that comes with the project; see data/profiles/SOURCE.md.
+    """One season of the bundled library; see data/profiles/SOURCE.md.
 
     Parameters
     ----------
     season
-        Which; summer has two weeks, the others have one.
+        The season; summer has two weeks, the others have one.
 
     Raises
     ------
     ValueError
-        If there is no such season.
+        For an unknown season.
     """
     return _read(choice("season", Season, season))
 
@@ -122,23 +122,23 @@ def _read(season: Season) -> Profiles:
 
 
 def profile(curves: dict[str, Floats], name: str) -> Floats:
-    """One profile; without a name the mean of all of them.
+    """One profile, or without a name the mean of all.
 
     Parameters
     ----------
     curves
         `Profiles.load_p`, `load_q` or `pv`.
     name
-        Which.
+        Name of the profile, or "".
     """
     return curves[name] if name else np.asarray(np.mean(list(curves.values()), axis=0))
 
 
 def load_names() -> tuple[str, ...]:
-    """Names that `load_profile` may hold."""
+    """Valid names of `load_profile`."""
     return tuple(library().load_p)
 
 
 def pv_names() -> tuple[str, ...]:
-    """Names that `pv_profile` may hold."""
+    """Valid names of `pv_profile`."""
     return tuple(library().pv)

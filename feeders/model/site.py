@@ -6,10 +6,10 @@ reading and the farther end of the range at once. The change over an age a > 0 h
 
     s(a) = sqrt(2 sigma^2 (1 - exp(-a / tau)) + (J / SWITCHED)^2).
 
-A power with s of sigma and more is worth no more than no reading.
+A power with s of sigma or more is no better than no reading.
 
-The only place where SI and per unit meet, and where the wire's sign (net import positive) turns into
-the model's (injection positive).
+This module alone converts between SI and per unit, and from the wire's sign (net import positive) to the
+model's (injection positive).
 
 References
 ----------
@@ -81,10 +81,10 @@ __all__ = [
 
 
 SWITCHED: Final = 5.0
-"""Standard deviations that switching the whole difference to the end of the range amounts to.
+"""Difference to the end of the range by the standard deviation of switching it, 1.
 
 The limits of one meter begin at 5.2: no single device exceeds them. A larger value names honest meters, a
-smaller one hides lies.
+smaller one hides attacks.
 """
 
 
@@ -95,9 +95,9 @@ class Late:
     Attributes
     ----------
     which : (N,)
-        Customers with a late power that is worth something.
+        Customers with a late power that is better than none.
     useless : (N,)
-        Customers with a power that is worth no more than none.
+        Customers with a power that is too late to be better than none.
     stated : (N,)
         Customers with a power no older than `[meters] p_interval_s`.
     std : (N,)
@@ -113,16 +113,16 @@ class Late:
     reach: Floats
 
     def widen(self, site: Site, frame: Frame) -> Frame:
-        """The frame with the uncertainty of the late powers.
+        """Frame with the uncertainty of the late powers.
 
-        Intervals reach to the ends of what is possible. Metered reactive powers are as old, and are not used.
+        Intervals reach to the ends of the range. Metered reactive powers of the same age are not used.
 
         Parameters
         ----------
         site
             The feeder.
         frame
-            The frame of the readings, as if all were of the same moment.
+            Frame of the readings, before widening.
         """
         loads, which, none = site.loads, self.which, np.full(self.std.size, np.nan)
         root, tan = np.sqrt(3.0), np.maximum(np.abs(loads.tan_min), np.abs(loads.tan_max))
@@ -145,7 +145,7 @@ class Late:
 
 
 def late(site: Site, snapshot: Snapshot) -> Late | None:
-    """Late powers of a tick; None: all are of the moment of their voltage.
+    """Late powers of a tick; None if all have the time of their voltage.
 
     Parameters
     ----------
@@ -197,7 +197,7 @@ def spread(site: Site) -> Floats:
 
 
 def expected(site: Site) -> Floats:
-    """Standard deviation of the change over `[meters] p_interval_s` that the design supposes, (N,), pu."""
+    """Standard deviation of the change over `[meters] p_interval_s` in the design, (N,), pu."""
     if site.tables.meta.meters.p_interval_s == 0.0:
         return np.zeros(site.loads.load_peak.size)
     reach = site.loads.load_peak + site.loads.pv_peak
@@ -232,19 +232,19 @@ class Registered:
 
 
 def registered(site: Site, metered: Floats) -> Registered:
-    """Return the powers that the frame states.
+    """Power intervals of the frame.
 
-    A reading is used up to ``LoadModel.credible``. Readings beyond the declared range are used only while
-    the model error has a finite bound with all of them. Otherwise those with the largest voltage effect
-    ``R_ii excess_i`` are replaced by the declared range, the fewest that restore the bound. The busbar has
-    its nominal voltage there: no meter of the busbar decides on powers.
+    A reading is used up to ``LoadModel.credible``. Readings beyond the declared range are used only while the
+    model error has a finite bound with all of them. Otherwise those with the largest voltage effect ``R_ii
+    excess_i`` are replaced by the declared range, the fewest that restore the bound. The bound is at nominal
+    busbar voltage, so that a busbar meter cannot affect it.
 
     Parameters
     ----------
     site
         The feeder.
     metered : (N,)
-        Net active power that each register shows, pu; NaN: no usable reading.
+        Net active power by each register, pu; NaN: no usable reading.
     """
     known = np.abs(metered) <= site.loads.credible  # False for NaN
     found = _intervals(site.loads, metered, known)
@@ -267,14 +267,14 @@ def registered(site: Site, metered: Floats) -> Registered:
 
 
 def _bounded(site: Site, powers: Registered) -> bool:
-    """Existence of a finite error bound of the loss-corrected model, at nominal busbar voltage."""
+    """True with a finite error bound of the loss-corrected model at nominal busbar voltage."""
     with np.errstate(all="ignore"):
         bound = model_error_bound(site.feeder, -powers.p, -powers.q, site.droop.vbar**2)
     return all_of(np.isfinite(bound))
 
 
 def _intervals(model: LoadModel, metered: Floats, known: Bools) -> Registered:
-    """Intervals of the powers, `feeders.model.site.to_frame`; the declared range where not `known`."""
+    """Intervals of the powers, see `feeders.model.site.to_frame`; the declared range where not `known`."""
     p = np.where(known, metered, 0.5 * (model.load_peak - model.pv_peak))
     excess = np.maximum(p - model.load_peak, 0.0) + np.maximum(-p - model.pv_peak, 0.0)
     doubt = np.minimum(2.0 * excess, np.abs(p))
@@ -298,21 +298,21 @@ def _intervals(model: LoadModel, metered: Floats, known: Bools) -> Registered:
     )
 
 
-# A reading is evidence even when it is absurd, but its square must stay a number.
+# An absurd reading is evidence too, but its square must stay finite.
 ABSURD_PU = 100.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Site:
-    """A feeder ready to be watched or simulated. N customers, p meters, b + 1 buses.
+    """Feeder for monitoring and simulation. N customers, p meters, b + 1 buses.
 
-    With single-phase lines or customers or lines that are not transposed, it is one in three phases, all of
-    whose customers have one phase: a customer of three is three, see `one_phase_each`.
+    With single-phase lines or customers, or lines that are not transposed, it is in three phases, and each
+    customer has one phase. A customer of three phases becomes three, see `one_phase_each`.
 
     Attributes
     ----------
     tables
-        The feeder in SI, as its files say it; in three phases with customers of one phase.
+        Content of the files in SI; in three phases with customers of one phase.
     feeder
         The radial tree, pu; or with closed ties, or in three phases.
     droop
@@ -322,22 +322,23 @@ class Site:
     meter_ids : (p,)
         Ids of the meters.
     accuracy
-        What the meters promise, pu.
+        Accuracies of the meters, pu.
     bus_of_file
         Fused bus index of every bus id of the files.
     xy : (b + 1, 2)
-        Positions of the buses, or None unless the files place every one of them.
+        Positions of the buses, None unless the files have all of them.
     loads
-        What is known of the customers' powers.
+        Limits of the customers' powers.
     base_volt : (n,)
-        1 pu of every place, V: the nominal voltage, but behind taps its part, see `feeders.model.equipment`.
+        1 pu of every place, V: the nominal voltage, times the taps' ratio behind taps, see
+        `feeders.model.equipment`.
     nominal_volt : (n,)
-        Nominal voltage of every place, V: another one than the busbar's behind a transformer.
+        Nominal voltage of every place, V; behind a transformer it differs from the busbar's.
     digest
         SHA-256 of the content: key of design caches. It changes with every value and with the order of
         the rows (which is the order of all arrays), not with layout, comments or unknown columns.
     forecast
-        Of powers that nobody reads; None: all that is known of them is their range.
+        Forecast of unread powers; None: they have their range only.
     """
 
     tables: FeederTables
@@ -366,7 +367,7 @@ class Site:
 
     @property
     def spanning(self) -> Feeder | ThreePhaseFeeder:
-        """A tree that reaches all its buses, whatever the number of their phases: all lines but the ties."""
+        """Tree that reaches all buses with all their phases: all lines but the ties."""
         return self.feeder if isinstance(self.feeder, Feeder) else self.feeder.tree
 
     @property
@@ -376,7 +377,7 @@ class Site:
 
     @property
     def tree(self) -> Feeder | ThreePhaseFeeder:
-        """The tree of its buses, for what takes radial feeders only.
+        """Tree of the buses, for methods of radial feeders.
 
         Raises
         ------
@@ -385,13 +386,13 @@ class Site:
         """
         if isinstance(self.feeder, Meshed):
             raise FeederInvalid(
-                [Problem("not-radial", "lines: closed lines form loops, and this takes radial feeders only")]
+                [Problem("not-radial", "lines: closed lines form loops; a radial feeder is required")]
             )
         return self.spanning
 
     @property
     def balanced(self) -> Feeder:
-        """The radial tree, for what only takes balanced feeders.
+        """Radial tree, for methods of balanced feeders.
 
         Raises
         ------
@@ -401,11 +402,7 @@ class Site:
         if isinstance(self.tree, Feeder):
             return self.tree
         raise FeederInvalid(
-            [
-                Problem(
-                    "not-balanced", "lines, customers: in three phases, and this takes balanced feeders only"
-                )
-            ]
+            [Problem("not-balanced", "lines, customers: in three phases; a balanced feeder is required")]
         )
 
 
@@ -428,9 +425,9 @@ class Snapshot:
     p_age_s : (p,) or None
         Age of the powers at the voltage readings beside them, s; NaN, or None for all, where not stated.
     clock_offset_s : (p,) or None
-        By how much each meter's clock is ahead, s; NaN, or None for all, where that is not measurable.
+        Clock offset of each meter, s, positive ahead; NaN, or None for all, where not measurable.
     busbar_offset_s
-        By how much the clock of the busbar's meter is ahead, s; NaN where that is not measurable.
+        Clock offset of the busbar meter, s, positive ahead; NaN where not measurable.
     """
 
     t: float
@@ -449,18 +446,18 @@ def load(path_or_name: Path | str) -> Site:
     Parameters
     ----------
     path_or_name
-        A folder, or the name of a feeder that comes with the project (`names()`).
+        A folder, or the name of a bundled feeder (`names()`).
 
     Raises
     ------
     FeederInvalid
-        With every problem of the files, or if there is no such feeder.
+        With every problem of the files, or for an unknown feeder.
     """
     return from_tables(find(path_or_name))
 
 
 def from_tables(tables: FeederTables) -> Site:
-    """Turn a feeder's tables into the per-unit model.
+    """Build the per-unit model from a feeder's tables.
 
     With ``z_base = 3 V^2 / (1000 S)`` ohm for V volts phase to neutral and S kVA of all three phases:
     ``r = r_ohm / z_base``, ``b = 1e-6 b_us z_base``, and powers in kW divide by S. Behind taps V is that of
@@ -469,7 +466,7 @@ def from_tables(tables: FeederTables) -> Site:
     Raises
     ------
     FeederInvalid
-        If the tables are not valid, or need what the model cannot do yet.
+        For invalid tables, or for content that the model does not support.
     """
     if tables.in_phases:
         try:
@@ -508,11 +505,11 @@ def from_tables(tables: FeederTables) -> Site:
 
 
 def one_phase_each(tables: FeederTables) -> FeederTables:
-    """The same feeder with a customer and a meter for every phase, each with its part of the power.
+    """Split customers and meters of three phases into one for each phase, with its part of the power.
 
-    A meter of three phases reads three voltages and three powers; they are the channels "X-a", "X-b" and
-    "X-c". Standard deviations of what is not known are parted as those of independent phases, and an
-    inverter of three phases into three that follow their own phase's voltage.
+    A meter of three phases reads three voltages and three powers; they become the channels "X-a", "X-b" and
+    "X-c". Standard deviations are split as those of independent phases. An inverter of three phases becomes
+    three that follow the voltage of their own phase.
 
     Parameters
     ----------
@@ -545,7 +542,7 @@ def _parts(row: CustomerRow) -> list[CustomerRow]:
 
 
 def _channels(tables: FeederTables) -> list[Problem]:
-    """Ids that customers or meters of three phases give to their phases and that cannot be."""
+    """Problems of ids that customers or meters of three phases give to their phases."""
     problems = []
     for column in (column for column in CUSTOMER_COLUMNS if column.name in {"customer", "meter"}):
         first: dict[str, str] = {}
@@ -569,7 +566,7 @@ def _channels(tables: FeederTables) -> list[Problem]:
 
 
 def _in_phases(tables: FeederTables) -> Site:
-    """The site of a feeder whose customers have one phase each."""
+    """Site of a feeder with one phase per customer."""
     found, ties = spanned(tables)
     parts = {f.name: getattr(found, f.name) for f in fields(found)}
     feeder = PhasedMesh(found.feeder, *ties) if ties.ends.size else PhasedFeeder(found.feeder)
@@ -583,52 +580,44 @@ def _in_phases(tables: FeederTables) -> Site:
 
 
 def plant(site: Site) -> Plant:
-    """Return the site as the monitor's design takes it."""
+    """Plant of the site, for the monitor's design."""
     return Plant(site.feeder, site.droop, site.meters, site.accuracy, 1)
 
 
 def volts(base_volt: Floats, v2_pu: Floats) -> Floats:
-    """Return voltages from squared voltages: ``v = base_volt sqrt(v2)``.
+    """Convert squared voltages to volts: ``v = base_volt sqrt(v2)``.
 
     Parameters
     ----------
     base_volt : (n,)
         1 pu of each, V: `Site.base_volt` or `Site.customer_volt`.
     v2_pu : (…, n)
-        Squared voltages, pu; a negative one (no voltage has it) gives 0.
+        Squared voltages, pu; a negative one gives 0.
     """
     return np.asarray(base_volt * np.sqrt(np.maximum(v2_pu, 0.0)), dtype=np.float64)
 
 
 def to_frame(site: Site, snapshot: Snapshot) -> Frame:
-    """Turn one tick's readings into what an estimator takes; total on any readings, absurd ones too.
+    """Convert one tick's readings to a frame; valid for any readings, absurd ones included.
 
-    Voltages: ``y = v |v|`` in pu, so that a negative reading stays a bad one.
+    Voltages: ``y = v |v|`` in pu, so that a negative reading stays implausible.
 
-    Active power: a register of f = `p_error_percent` and steps of 2 h shows r; the truth is within
-    ``(f |r| + h) / (1 - f)`` of it. Beyond the customer's largest load or generation it is believed less and
-    less, and at twice of that not at all: a load that is not there is the cover of colluding voltage meters,
-    and a connection limits what it can pretend. Without a finite bound of the model error it is not used
-    (`feeders.model.site`). Where there is no reading, or one that is not finite or
-    beyond anything the customer could draw, all that is known is the interval from full generation without
-    load to full load without generation. Its middle is p; `p_std_kw` of a customer without a meter says how
-    far from that the truth is, and the half-width is `sqrt(3)` of it if that is less. With
-    `forecast = "profiles"` p and q are those of `feeders.model.forecast`, with the whole range as interval
-    about them. A power older than its voltage reading is widened by what loads do meanwhile
-    (`feeders.model.site`).
+    Active power: a register of f = `p_error_percent` and steps of 2 h shows r; the truth is within ``(f |r| +
+    h) / (1 - f)`` of it. Beyond the customer's largest load or generation the interval widens by twice the
+    excess, at most by the reading itself. A false load can hide a common attack of voltage meters, and the
+    connection limits its size. Without a finite bound of the model error the reading is not used
+    (`feeders.model.site`). Without a reading, or with one that is not finite or implausible, the interval is
+    from full generation without load to full load without generation. Its middle is p. `p_std_kw` of a
+    customer without a meter is the standard deviation from the middle, and the half-width is `sqrt(3)` of it
+    if that is less. With `forecast = "profiles"` p and q are those of `feeders.model.forecast`, with the
+    whole range as interval about them. A power older than its voltage reading is widened by the load change
+    in that time (`feeders.model.site`).
 
-    Reactive power of the load (the inverter's is the observer's business): with net import P, the load
-    alone lies in ``[max(P, 0), max(P, min(P + pv, load_kw))]``, each end widened by the error of P;
-    its reactive power in ``[load_low tan_min - floor, load_high tan_max + floor]``. Without generation
-    the load is P itself. Centre and half-width of that interval go into the frame; `q_std_kvar` of a customer
-    without a meter narrows it as `p_std_kw` does.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    snapshot
-        The readings.
+    Reactive power of the load, without the inverter's, which the observer estimates: with net import P, the
+    load alone is in ``[max(P, 0), max(P, min(P + pv, load_kw))]``, each end widened by the error of P. Its
+    reactive power is in ``[load_low tan_min - floor, load_high tan_max + floor]``. Without generation the
+    load is P itself. The frame has centre and half-width of that interval. `q_std_kvar` of a customer without
+    a meter narrows it as `p_std_kw` does.
     """
     base_volt, base_kva, model = site.customer_volt[site.meters], site.feeder.base_kva, site.loads
     seen = np.isfinite(snapshot.v_volt)
@@ -666,7 +655,7 @@ def to_frame(site: Site, snapshot: Snapshot) -> Frame:
 
 
 def _busbar(v0_volt: Floats | float, base_volt: float) -> tuple[float, Floats | None]:
-    """Squared busbar voltage, the mean of the phases, pu; and that of each phase where there are several."""
+    """Squared busbar voltage, pu: the mean of the phases, and in three phases that of each."""
     with np.errstate(invalid="ignore"):
         v0 = np.clip(np.where(np.isfinite(v0_volt), v0_volt, np.nan) / base_volt, 0.0, ABSURD_PU) ** 2
     return (float(v0), None) if v0.ndim == 0 else (float(v0.mean()), v0)
@@ -676,14 +665,14 @@ def _busbar(v0_volt: Floats | float, base_volt: float) -> tuple[float, Floats | 
 
 
 def _unsupported(tables: FeederTables) -> tuple[Problem, ...]:
-    """What the format can say and the model cannot do yet."""
+    """Problems of valid tables that the model does not support."""
     problems = []
     closed = [line for line in tables.lines if line.closed]
     if all(line.r_ohm == line.x_ohm == 0.0 for line in closed):
         problems.append(
             Problem(
                 "nothing-to-design",
-                "lines: no closed line has an impedance; there is nothing to watch below the busbar",
+                "lines: no closed line has an impedance; there is nothing to monitor below the busbar",
             )
         )
     return tuple(problems)

@@ -1,7 +1,7 @@
-"""From a feeder's tables to the three-phase model in per unit.
+"""Three-phase model in per unit from a feeder's tables.
 
-Customers have one phase or all three. What the monitors run on, `feeders.model.site.load`, has one for each
-phase.
+Customers have one phase or all three. The model of the monitors, `feeders.model.site.load`, has one customer
+for each phase.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 
 class Ties(NamedTuple):
-    """Lines that close loops, as `grid.meshed.PhasedMesh` takes them: ends, phases, z and charging."""
+    """Lines that close loops, in the form of `grid.meshed.PhasedMesh`: ends, phases, z and charging."""
 
     ends: Ints
     phases: Bools
@@ -51,12 +51,12 @@ class Ties(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ThreePhaseSite:
-    """A feeder in three phases. N customers, p meters, b + 1 buses.
+    """Feeder in three phases. N customers, p meters, b + 1 buses.
 
     Attributes
     ----------
     tables
-        The feeder in SI, as its files say it.
+        Content of the files in SI.
     feeder
         The radial tree, pu; powers of single phases in thirds of `base_kva`.
     base_volt : (b + 1, 3)
@@ -64,8 +64,7 @@ class ThreePhaseSite:
     nominal_volt : (b + 1,)
         Nominal voltage of every bus, V.
     droop, meters, meter_ids, accuracy, bus_of_file, xy, loads, digest
-        As in `feeders.model.site.Site`, in units of `base_kva`: `gridsec.grid.three_phase.per_customer` fits
-        them.
+        As in `feeders.model.site.Site`, in units of `base_kva`: as `gridsec.grid.three_phase.per_customer`.
     """
 
     tables: FeederTables
@@ -98,26 +97,26 @@ def load_three_phase(path_or_name: Path | str) -> ThreePhaseSite:
     Parameters
     ----------
     path_or_name
-        A folder, or the name of a feeder that comes with the project (`feeders.model.site.names`).
+        A folder, or the name of a bundled feeder (`feeders.model.site.names`).
 
     Raises
     ------
     FeederInvalid
-        With every problem of the files, or if there is no such feeder.
+        With every problem of the files, or for an unknown feeder.
     """
     return three_phase(find(path_or_name))
 
 
 def three_phase_names() -> list[str]:
-    """Return the feeders of the project that only the three-phase model takes."""
+    """Names of the bundled feeders in three phases."""
     return sorted(set(names(balanced=False)) - set(names()))
 
 
 def three_phase(tables: FeederTables) -> ThreePhaseSite:
-    """Turn a feeder's tables into the three-phase model.
+    """Build the three-phase model from a feeder's tables.
 
-    A line has the matrix of its columns, or without one is cyclically symmetric: `sequence_matrix` of its
-    positive and zero sequence. That of a single phase has the self-impedance ``(2 z1 + z0) / 3``, or without
+    A line has the matrix of its columns, or `sequence_matrix` of its positive and zero sequence, which is
+    cyclically symmetric. A line of one phase has the self-impedance ``(2 z1 + z0) / 3``, or without
     zero-sequence values ``r_ohm + j x_ohm`` of the conductor and its return together. Charging without a
     matrix is that of cores screened from each other, ``b_us`` in each phase.
 
@@ -132,18 +131,18 @@ def three_phase(tables: FeederTables) -> ThreePhaseSite:
     Raises
     ------
     FeederInvalid
-        If the tables are not valid, lack what three phases need, or have closed loops.
+        For invalid tables, missing zero sequences or matrices, or closed loops.
     """
     site, ties = spanned(tables)
     if ties.ends.size:
         raise FeederInvalid(
-            [Problem("not-radial", "lines: closed lines form loops, and this takes radial feeders only")]
+            [Problem("not-radial", "lines: closed lines form loops; a radial feeder is required")]
         )
     return site
 
 
 def spanned(tables: FeederTables) -> tuple[ThreePhaseSite, Ties]:
-    """`three_phase` of a tree that brings every phase of every bus, and the lines that close loops in it.
+    """`three_phase` of a tree with every phase of every bus, and the lines that close loops.
 
     Parameters
     ----------
@@ -153,7 +152,7 @@ def spanned(tables: FeederTables) -> tuple[ThreePhaseSite, Ties]:
     Raises
     ------
     FeederInvalid
-        If the tables are not valid, or no tree does.
+        For invalid tables, or without such a tree.
     """
     problems = validate(tables) or unsupported(tables)
     if problems:
@@ -221,7 +220,7 @@ def _blocks(lines: Sequence[LineRow], side: Floats, base_kva: float) -> tuple[Bo
 
 
 def _beyond(lines: Sequence[LineRow], ties: Sequence[LineRow], found: Tree) -> list[Problem]:
-    """Phases that reach a bus only through a line that closes a loop: what the tree cannot say."""
+    """Phases that reach a bus only through a line that closes a loop, and not through the tree."""
     there = [set(PHASES), *(set(line.phases) for line in lines)]
     return [
         Problem(
@@ -238,12 +237,12 @@ def _beyond(lines: Sequence[LineRow], ties: Sequence[LineRow], found: Tree) -> l
 
 
 def series_of(line: LineRow) -> Phasors:
-    """Return the impedances of a line in phases, ohm.
+    """Impedance matrix of a line in phases, ohm.
 
     Parameters
     ----------
     line
-        Its row; only what is of its phases counts.
+        Row of the line; only cells of its phases count.
     """
     matrix = series_ohm(cells_of(line))
     if matrix is not None:
@@ -255,7 +254,7 @@ def series_of(line: LineRow) -> Phasors:
 
 
 def shunt_of(line: LineRow) -> Floats:
-    """Return the total shunt susceptances of a line in phases, microsiemens; as `series_of`."""
+    """Total shunt susceptances of a line in phases, microsiemens; as `series_of`."""
     matrix = shunt_us(cells_of(line))
     return line.b_us * np.eye(3) if matrix is None else matrix
 
@@ -269,20 +268,14 @@ def _fuses(line: LineRow) -> bool:
 
 
 def _why(tables: FeederTables) -> str:
-    """The first that makes it a feeder in three phases, as the end of a sentence."""
-    who = [f"customer {row.customer!r}" for row in tables.customers if row.phases != "abc"]
-    who += [f"line {row.line!r}" for row in tables.lines if row.closed and row.in_phases]
-    return f" ({who[0]} makes the feeder one in three phases)" if who else ""
+    """First cause of a model in three phases, as the end of a sentence."""
+    causes = [f"customer {row.customer!r}" for row in tables.customers if row.phases != "abc"]
+    causes += [f"line {row.line!r}" for row in tables.lines if row.closed and row.in_phases]
+    return f" ({causes[0]} makes the feeder one in three phases)" if causes else ""
 
 
 def unsupported(tables: FeederTables) -> tuple[Problem, ...]:
-    """Return what the format can say and the three-phase model cannot do, or needs and does not find.
-
-    Parameters
-    ----------
-    tables
-        Valid tables.
-    """
+    """Problems of valid tables that the three-phase model does not support, and missing cells."""
     problems, why = [], _why(tables)
     closed = [line for line in tables.lines if line.closed]
     for line in closed:
@@ -323,7 +316,7 @@ def unsupported(tables: FeederTables) -> tuple[Problem, ...]:
         problems.append(
             Problem(
                 "nothing-to-design",
-                "lines: no closed line has an impedance; there is nothing to watch below the busbar",
+                "lines: no closed line has an impedance; there is nothing to monitor below the busbar",
             )
         )
     return tuple(problems)

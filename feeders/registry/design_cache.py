@@ -1,9 +1,9 @@
-"""A folder of finished designs, so that a bank is designed once per feeder and not once per start.
+"""Cache of finished designs: one design per feeder, independent of the number of starts.
 
-Entries are named by the content of plant, meter sets and options
-(`gridsec.observers.design_archive.design_key`), and nothing that comes out of the folder is used before its
-proofs have been recomputed: a damaged or foreign entry costs time, never correctness. Where the folder cannot
-be written, the design is returned all the same, together with the reason.
+The name of an entry is the digest of plant, meter sets and options
+(`gridsec.observers.design_archive.design_key`). Every entry is used only after its proofs have been
+recomputed: a damaged or foreign entry costs time, never correctness. If the folder cannot be written, the
+design is returned with the reason.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ from gridsec.observers.lure import Lure
 from gridsec.secure.subsets import subsets
 
 _SUFFIX = ".gains"
-# Entries kept; the ones unused for longest go first. A bank of 255 observers takes half a megabyte.
+# Largest number of entries; the least recently used are removed first. A bank of 255 observers is 0.5 MB.
 _KEEP = 64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BankGains:
-    """Gains of a whole bank and where they came from.
+    """Gains of a whole bank and their origin.
 
     Attributes
     ----------
     gains
-        Stacked, in the order of `gridsec.secure.subsets.Subsets.masks`: what
-        `gridsec.estimators.exact_bank.bank.design` takes.
+        Stacked, in the order of `gridsec.secure.subsets.Subsets.masks`, for
+        `gridsec.estimators.exact_bank.bank.design`.
     designs
         The single designs with their proofs, in the same order.
     origin
-        "stored", "new", or "redesigned: …" with what was wrong with the stored ones.
+        "stored", "new", or "redesigned: …" with the problem of the stored ones.
     problem
-        Why the designs could not be read or kept; empty if all went well.
+        Problem of reading or storing the designs; empty without one.
     """
 
     gains: Gains
@@ -53,7 +53,7 @@ class BankGains:
 
 
 def folder(environment: Mapping[str, str] = os.environ, platform: str = sys.platform) -> Path:
-    """Where designs are kept: `GRIDSEC_CACHE_DIR`, or the platform's place for caches.
+    """Folder of the cache: `GRIDSEC_CACHE_DIR`, or the platform's place for caches.
 
     Parameters
     ----------
@@ -75,12 +75,12 @@ def folder(environment: Mapping[str, str] = os.environ, platform: str = sys.plat
 
 
 class DesignCache:
-    """Bytes under keys in one folder. Failures are remembered in `problems`, not raised.
+    """Bytes under keys in one folder; failures go to `problems` and are not raised.
 
     Parameters
     ----------
     where
-        The folder; made when first written to.
+        The folder; created by the first write.
     """
 
     def __init__(self, where: Path) -> None:
@@ -88,7 +88,7 @@ class DesignCache:
         self.problems: list[str] = []
 
     def get(self, key: str) -> bytes | None:
-        """Bytes under a key, None if there are none or they cannot be read.
+        """Bytes under a key, None if absent or unreadable.
 
         Parameters
         ----------
@@ -110,7 +110,7 @@ class DesignCache:
         return blob
 
     def put(self, key: str, blob: bytes) -> None:
-        """Keep bytes under a key, whole or not at all, and drop what was unused for longest.
+        """Store bytes under a key atomically, and remove the least recently used entries.
 
         Parameters
         ----------
@@ -122,7 +122,7 @@ class DesignCache:
         path = self._path(key)
         try:
             self.where.mkdir(parents=True, exist_ok=True)
-            # Beside its goal, so that the rename stays within one file system.
+            # In the same folder, so that the rename stays within one file system.
             handle, draft = tempfile.mkstemp(dir=self.where, prefix=".")
             try:
                 with os.fdopen(handle, "wb") as file:
@@ -133,11 +133,11 @@ class DesignCache:
                 raise
             self._prune()
         except OSError as error:
-            self.problems.append(f"designs cannot be kept: {error}")
+            self.problems.append(f"designs cannot be stored: {error}")
 
     def _path(self, key: str) -> Path:
         if not (key.isalnum() and key.isascii()):
-            raise InputInvalid([Problem("wrong-text", f"{key!r} is no key of a design")])
+            raise InputInvalid([Problem("wrong-text", f"{key!r} is not a key of a design")])
         return self.where / (key + _SUFFIX)
 
     def _prune(self) -> None:
@@ -155,7 +155,7 @@ def bank_gains(
     where: Path | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> BankGains:
-    """Gains by LMI for both banks of chong2020, from the cache if they are there and still hold.
+    """Gains by LMI for both banks of chong2020, from the cache if a valid entry exists.
 
     Parameters
     ----------
@@ -170,14 +170,14 @@ def bank_gains(
     where
         Folder of the cache; by default `folder()`.
     progress
-        Called with (done, total) while designing.
+        Called with (done, total) during the design.
 
     Raises
     ------
     NotObservable
-        Unless p > 2M.
+        For p <= 2M.
     DesignInfeasible
-        If some observer does not exist, or there would be too many.
+        If some observer does not exist, or their number is too large.
     """
     meters = len(lure.C)
     masks = subsets(meters, max_attacked, most=MOST_OBSERVERS).masks()

@@ -1,4 +1,4 @@
-"""What an estimator family is: its functions, what it can do besides, and a design ready to watch."""
+"""Estimators: functions, optional abilities, and a design with its estimator."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["Family", "Job", "Learner", "Memory", "Watcher"]
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """How a design is made, apart from what for.
+    """Options of a design that do not change its result.
 
     Attributes
     ----------
@@ -26,7 +26,7 @@ class Job:
     where
         Folder of the cache of such designs; None: that of `feeders.registry.design_cache.folder`.
     progress
-        Called with (done, total) while such designs are made.
+        Called with (done, total) during such designs.
     """
 
     workers: int = 1
@@ -36,23 +36,23 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class Learner:
-    """What a family can do besides that learns the fixed errors of its meters.
+    """Functions of an estimator that learns the fixed errors of its meters.
 
     Attributes
     ----------
     needed_s
-        `needed_s(design)`: over what time they are learned, s; 0 for never.
+        `needed_s(design)`: learning time, s; 0 for never.
     init
-        `init(design, t, commission)` begins to watch with what is known from before.
+        `init(design, t, commission)`: initial state with earlier knowledge of the fixed errors.
     commission
-        `commission(state)`: what is known now.
+        `commission(state)`: present knowledge of the fixed errors.
     renew
-        `renew(design, state, which)`: some meters were replaced and are learned anew.
+        `renew(design, state, which)`: state after replacement of meters; their learning restarts.
     read
-        `read(design, arrays)`: what `gridsec.estimators.sequential.to_arrays` gave, if it fits the design; a
-        `ValueError` names every problem.
+        `read(design, arrays)`: inverse of `gridsec.estimators.sequential.to_arrays`; a `ValueError` names
+        every contradiction to the design.
     progress
-        `progress(design, commission)`: state and reason of each meter, and the time expected.
+        `progress(design, commission)`: state and reason of each meter, and the expected time.
     """
 
     needed_s: Callable[[Any], float]
@@ -65,14 +65,14 @@ class Learner:
 
 @dataclass(frozen=True, slots=True)
 class Memory:
-    """What a family can do besides that can go on distrusting who was.
+    """Functions of an estimator that keeps suspects over a restart.
 
     Attributes
     ----------
     distrusted
-        `distrusted(design, state)`: who is not believed now.
+        `distrusted(design, state)`: present suspicion record.
     restore
-        `restore(design, state, distrust)`: a state from `init`, in which these are not believed.
+        `restore(design, state, distrust)`: state from `init` with these devices distrusted.
     """
 
     distrusted: Callable[[Any, Any], Distrust]
@@ -81,31 +81,31 @@ class Memory:
 
 @dataclass(frozen=True, slots=True)
 class Family:
-    """An estimator family: three functions and a name.
+    """Estimator: three functions, a name, and optional abilities.
 
     Attributes
     ----------
     name
         As in `feeder.toml`.
     summary
-        One line for people.
+        One-line description.
     design
-        `design(site, job)` prepares; raises `NotObservable` or `DesignInfeasible`. Whatever else another
-        package's raises becomes `EstimatorUnusable` in `feeders.registry.registry.design`.
+        `design(site, job)`: the design; raises `NotObservable` or `DesignInfeasible`. Any other exception of
+        an external estimator becomes `EstimatorUnusable` in `feeders.registry.registry.design`.
     init
-        `init(design, t)` begins to watch.
+        `init(design, t)`: initial state.
     step
-        `step(design, state, frame)` takes one frame in and never raises on data.
+        `step(design, state, frame)`: next state, estimate and verdict; never raises on data.
     observers
-        How many observers, or candidate sets, a design runs.
+        Number of observers, or candidate sets, of a design.
     proof
-        One line on why its estimate converges; empty where nothing is proven.
+        One-line proof of convergence of a design's estimate; empty without one.
     withstands
-        How many manipulated meters a design tells apart; None: as many as the feeder's file asks for.
+        Number of manipulated meters that a design identifies; None: `max_attacked` of the feeder's file.
     learner
-        How it learns its meters' fixed errors; None: it does not.
+        Learning of the meters' fixed errors; None without it.
     memory
-        How it goes on distrusting who was; None: it begins anew.
+        Restoring of suspects after a restart; None without it.
     """
 
     name: str
@@ -122,14 +122,14 @@ class Family:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Watcher:
-    """A finished design, ready to watch one feeder.
+    """Finished design of one feeder, with its estimator.
 
     Attributes
     ----------
     family
-        What kind.
+        The estimator.
     design
-        The family's own design.
+        Design by the estimator.
     asked
         M of the feeder's file.
     """
@@ -140,47 +140,39 @@ class Watcher:
 
     @property
     def max_attacked(self) -> int:
-        """How many manipulated meters it tells apart."""
+        """Number of manipulated meters that it identifies."""
         return self.asked if self.family.withstands is None else self.family.withstands(self.design)
 
     @property
     def observers(self) -> int:
-        """How many observers, or candidate sets, run."""
+        """Number of observers, or candidate sets."""
         return self.family.observers(self.design)
 
     @property
     def proof(self) -> str:
-        """One line on why the estimate converges; empty where nothing is proven."""
+        """One-line proof of convergence; empty without one."""
         return self.family.proof(self.design)
 
     @property
     def learner(self) -> Learner | None:
-        """How the meters' fixed errors are learned; None where they are not."""
+        """Learning of the meters' fixed errors; None without it."""
         learner = self.family.learner
         return learner if learner is not None and learner.needed_s(self.design) > 0 else None
 
     def init(self, t: float, commission: Commission | None = None) -> Any:
-        """Begin to watch.
+        """Initial state.
 
         Parameters
         ----------
         t
             Unix time, s.
         commission
-            What is known of the meters' fixed errors from before, for families that learn them.
+            Earlier knowledge of the meters' fixed errors, for estimators that learn them.
         """
         if self.learner is None or commission is None:
             return self.family.init(self.design, t)
         return self.learner.init(self.design, t, commission)
 
     def step(self, state: Any, frame: Frame) -> tuple[Any, Estimate, Verdict]:
-        """Take one frame in.
-
-        Parameters
-        ----------
-        state
-            From `init` or the last step.
-        frame
-            Everything known at one tick.
-        """
+        """Process one frame."""
         return self.family.step(self.design, state, frame)

@@ -1,7 +1,7 @@
 """Estimators of other packages: entry points of the group `gridsec.estimators`.
 
-The name of an entry point is the estimator's name; what it points to is a `feeders.registry.registry.Family`
-of that name. Names are known without running anybody's code; a family is loaded when it is asked for.
+The name of an entry point is the estimator's name; it refers to a `feeders.registry.registry.Family` of that
+name. Names are read without running external code; an estimator is loaded on first use.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ GROUP: Final = "gridsec.estimators"
 
 
 class EstimatorUnusable(GridsecError):
-    """Another package offers an estimator that cannot be used."""
+    """An estimator of another package cannot be used."""
 
     code = "estimator-unusable"
 
@@ -35,68 +35,68 @@ def names(own: Collection[str]) -> tuple[str, ...]:
     Parameters
     ----------
     own
-        Names that are taken. Entry points of such a name, or of one that is not made of small letters,
-        digits and hyphens, are passed over.
+        Reserved names. Entry points with such a name, or with characters other than lower-case letters,
+        digits and hyphens, are ignored.
     """
     found = {point.name for point in entry_points(group=GROUP)}
     return tuple(sorted(name for name in found - set(own) if _NAME.fullmatch(name)))
 
 
 def load(name: str, kind: type) -> Any:
-    """The estimator of that name.
+    """Load the estimator of that name.
 
     Parameters
     ----------
     name
         One of `names`.
     kind
-        What it has to be.
+        Required type.
 
     Raises
     ------
     EstimatorUnusable
-        If there is none or more than one, if its code fails, or if it is something else.
+        If there is none or more than one, if its code fails, or if its type or name is wrong.
     """
     points = tuple(entry_points(group=GROUP, name=name))
     if len(points) != 1:
         raise EstimatorUnusable(f"estimator {name!r}: {len(points)} packages offer it; expected one")
     try:
         made = points[0].load()
-    except Exception as failure:  # the code of others may do anything
+    except Exception as failure:  # external code may raise anything
         raise EstimatorUnusable(
             f"estimator {name!r} ({_where(points[0])}) cannot be loaded: {failure}"
         ) from failure
     if not isinstance(made, kind) or getattr(made, "name", None) != name:
         raise EstimatorUnusable(
-            f"estimator {name!r} ({_where(points[0])}) is no {kind.__name__} of that name"
+            f"estimator {name!r} ({_where(points[0])}) is not a {kind.__name__} of that name"
         )
     return made
 
 
 def design(name: str, make: Callable[[Site, Job], Any], site: Site, job: Job) -> Any:
-    """What an estimator of another package prepares for a feeder.
+    """Design by an estimator of another package.
 
     Parameters
     ----------
     name
         The estimator's name.
     make
-        Its function.
+        Its design function.
     site, job
-        What it is given.
+        Arguments of the function.
 
     Raises
     ------
     NotObservable, DesignInfeasible
-        If it says so.
+        If the function raises it.
     EstimatorUnusable
-        If it raises anything else.
+        If the function raises anything else.
     """
     try:
         return make(site, job)
     except (NotObservable, DesignInfeasible):
         raise
-    except Exception as failure:  # the code of others may do anything
+    except Exception as failure:  # external code may raise anything
         why = " ".join(f"{type(failure).__name__}: {failure}".split())
         raise EstimatorUnusable(
             f"estimator {name!r} cannot be designed for {site.feeder.name}: {why}"

@@ -1,4 +1,4 @@
-"""The estimators that a feeder can be watched with, by the names that `feeder.toml` uses."""
+"""Registry of estimators by their names in `feeder.toml`."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ __all__ = [
 ]
 
 SEQUENTIAL: Final = "sequential"
-"""One observer, a decoder that knows how loads are correlated, evidence on several time scales."""
+"""One observer, a decoder with correlated load errors, evidence on several time scales."""
 
 DIRECT: Final = "exact-bank"
 """The two banks of chong2020 with direct injection and a closed-form certificate for all sets at once."""
@@ -57,10 +57,10 @@ LMI: Final = "exact-bank-lmi"
 """The same banks with gains from the corrected matrix inequality (12), one design for every set."""
 
 RATE_PART: Final = 0.25
-"""Decay asked of every observer, as a part of the rate that the feeder has by itself."""
+"""Decay rate required of every observer, relative to that of the feeder itself, 1."""
 
 FLOOR: Final = 0.5
-"""Least sensitivity to its own meter that an observer must keep, see `observers.gains.CircleOptions`."""
+"""Smallest sensitivity of an observer to its own meter, see `observers.gains.CircleOptions`."""
 
 
 def design(
@@ -70,21 +70,21 @@ def design(
     where: Path | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Watcher:
-    """Design the estimator that the feeder's file names.
+    """Design the estimator of the feeder's file.
 
     Parameters
     ----------
     site
-        The feeder; `[monitor] estimator`, `max_attacked` and `tick_s` of its file decide.
+        The feeder, with `[monitor] estimator`, `max_attacked` and `tick_s` of its file.
     workers, where, progress
         As in `Job`.
 
     Raises
     ------
     NotObservable, DesignInfeasible
-        If the feeder cannot be watched as its file asks for.
+        If the feeder cannot be monitored with these settings.
     EstimatorUnusable
-        If the estimator is another package's, and its code fails.
+        If the code of another package's estimator fails.
     """
     settings = site.tables.meta.monitor
     family, job = FAMILIES[settings.estimator], Job(workers, where, progress)
@@ -138,7 +138,7 @@ def _bank(name: str, summary: str, make: Callable[[Site, Job], exact_bank.Monito
 
 
 def choose(site: Site, *, estimator: str | None = None, max_attacked: int | None = None) -> Site:
-    """The same feeder, watched differently from what its file says.
+    """Copy a feeder with other settings of the monitor.
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ def choose(site: Site, *, estimator: str | None = None, max_attacked: int | None
     Raises
     ------
     FeederInvalid
-        If there is no such estimator, or M is negative.
+        For an unknown estimator, or a negative M.
     """
     meta = site.tables.meta
     problems = []
@@ -163,7 +163,7 @@ def choose(site: Site, *, estimator: str | None = None, max_attacked: int | None
             )
         )
     if max_attacked is not None and max_attacked < 0:
-        problems.append(Problem("negative", f"max_attacked is {max_attacked}; it cannot be negative"))
+        problems.append(Problem("negative", f"max_attacked is {max_attacked}; it must not be negative"))
     if problems:
         raise FeederInvalid(problems)
     changed = replace(
@@ -177,12 +177,12 @@ def choose(site: Site, *, estimator: str | None = None, max_attacked: int | None
 
 
 def lmi_options(site: Site, lure: Lure) -> CircleOptions:
-    """What the observers of a feeder are designed against: its meters' noise and its loads' uncertainty.
+    """Design options of a feeder's observers: the meters' noise and the load uncertainty.
 
-    Noise is what changes from reading to reading, jitter and rounding; the fixed bias inside the class is
-    no noise and is dealt with by the thresholds. The load error has one column for every customer's p and
-    one for its q, each with the largest error that the file allows at the customer's peak, or without any
-    reading where there is no meter.
+    Noise is jitter and rounding, which change from reading to reading. The fixed bias inside the class is
+    part of the thresholds instead. The load error has one column for every customer's p and one for its q.
+    Each is the largest error of the file at the customer's peak, or that without a reading for a customer
+    without a meter.
 
     Parameters
     ----------
@@ -233,7 +233,7 @@ def _partial(site: Site, _: Job) -> partial.PartialDesign:
 
 
 def _ticks(name: str, summary: str, decoder: Decoder) -> Family:
-    """A family that judges every tick by itself."""
+    """Estimator that tests every tick by itself."""
 
     def make(site: Site, _: Job) -> sequential.SequentialDesign:
         settings = site.tables.meta.monitor
@@ -257,12 +257,12 @@ def _unknown_input(site: Site, _: Job) -> unknown_input.UnknownInputDesign:
 
 
 class Families(Mapping[str, Family]):
-    """Our families, and those of other packages, each loaded when it is first asked for.
+    """Bundled estimators and those of other packages, which are loaded on first use.
 
     Parameters
     ----------
     own
-        Ours.
+        Bundled estimators.
     """
 
     def __init__(self, own: Iterable[Family]) -> None:
@@ -349,4 +349,4 @@ FAMILIES: Final = Families(
         ),
     )
 )
-"""All families by name; the same names as `feeders.format.columns.ESTIMATORS`."""
+"""All estimators by name; the names of `feeders.format.columns.ESTIMATORS`."""

@@ -1,1 +1,1 @@
-"""The report on a feeder: what its studies found, as one page for people who decide."""
+"""Report of a feeder's studies on one page."""

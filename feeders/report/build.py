@@ -1,4 +1,4 @@
-"""The whole report: from a feeder and what its studies found to a page, figures and tables."""
+"""Report of a feeder: page, figures and tables from the results of its studies."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ __all__ = ["Report", "report"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Report:
-    """A report.
+    """Report of a feeder.
 
     Attributes
     ----------
     html
         The page.
     pictures
-        Files of its figures by name: SVG, and PNG where matplotlib is installed.
+        Figure files by name: SVG, and PNG with matplotlib.
     tables
-        Its tables, by the names of their files.
+        Tables by file name.
     """
 
     html: str
@@ -45,18 +45,18 @@ class Report:
 
 
 def report(site: Site, outcomes: Sequence[Outcome], about: About, origin: Origin | None = None) -> Report:
-    """Make the report; the same arguments give the same bytes.
+    """Build the report; equal arguments give equal bytes.
 
     Parameters
     ----------
     site
         The feeder.
     outcomes
-        What became of its studies, in the order of the sections.
+        Outcomes of its studies, in the order of the sections.
     about
-        What the report says of itself.
+        Data on the report itself.
     origin
-        Where the feeder is from, if it was converted.
+        Origin of the feeder, if it was converted.
     """
     chapters = [Chapter(outcome, section(site, outcome)) for outcome in outcomes]
     chart = _chart(site)
@@ -104,7 +104,7 @@ def _facts(site: Site) -> dict[str, str]:
 
 
 def _chart(site: Site) -> Figure:
-    real = "where they are" if site.xy is not None else "as a tree"
+    real = "at their positions" if site.xy is not None else "as a tree"
     return Figure(
         "feeder-map",
         "Map",

@@ -1,4 +1,4 @@
-"""Charts: one row for each thing, and curves; axes with round numbers, legends, no more than that."""
+"""Charts: rows of bars, and curves; axes with round numbers, and legends."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from feeders.report.drawing import Area, Disc, Drawing, Line, Mark, Text, regula
 __all__ = ["LINES", "Bar", "Curve", "Row", "curves", "rows", "ticks"]
 
 LINES: Final = ("line-a", "line-b", "line-c", "line-d", "line-ink", "line-bad", "line-wire", "line-s")
-"""Looks of curves, told apart by colour and by dashes."""
+"""Looks of curves, different in colour and dashes."""
 
 _LETTERS: Final = 11.5
 _ROW: Final = 19.0
@@ -20,7 +20,7 @@ _ROW: Final = 19.0
 
 @dataclass(frozen=True, slots=True)
 class Bar:
-    """A part of a row, from one value to another.
+    """Part of a row, from one value to another.
 
     Attributes
     ----------
@@ -29,11 +29,11 @@ class Bar:
     look
         One of the looks of drawings.
     meaning
-        For the legend.
+        Text in the legend.
     tip
-        For whoever points at it.
+        Text of the tooltip.
     inset
-        Px that the bar keeps from the row's edges.
+        Distance of the bar from the row's edges, px.
     """
 
     low: float
@@ -46,7 +46,7 @@ class Bar:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A row of a chart: bars, and a number at their end."""
+    """Row of a chart: bars, and a number at their end."""
 
     label: str
     bars: tuple[Bar, ...]
@@ -69,13 +69,13 @@ def rows(
     data
         The rows, from above. Values are finite.
     width
-        Of the sheet, px.
+        Width of the sheet, px.
     axis
-        What the axis is, with its unit.
+        Label of the axis, with its unit.
     start
-        Where the axis begins.
+        Begin of the axis.
     limits
-        Values with a line through all rows, by what they mean; those beyond the axis are left out.
+        Values with a line through all rows, by meaning; values beyond the axis are left out.
     """
     left = min(max((width_of(row.label, _LETTERS) for row in data), default=0.0), 0.36 * width) + 12.0
     right = max((width_of(row.shown, _LETTERS) for row in data), default=0.0) + 14.0
@@ -111,7 +111,7 @@ def rows(
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """A curve; `look` is one of LINES, or limit; a shape marks its points where it has some."""
+    """Curve; `look` is one of LINES, or limit; with `points` its points have a shape."""
 
     x: tuple[float, ...]
     y: tuple[float, ...]
@@ -135,13 +135,13 @@ def curves(
     Parameters
     ----------
     data
-        The curves; where a value is not finite, a curve has a gap.
+        The curves; a value that is not finite makes a gap.
     width
-        Of the sheet, px.
+        Width of the sheet, px.
     x, y
-        What the axes are, with their units.
+        Labels of the axes, with their units.
     low, high
-        Where the ordinate begins and ends at the latest.
+        Values within the range of the ordinate.
     decades
         Abscissas are decimal logarithms.
     """
@@ -194,7 +194,7 @@ def _curve(curve: Curve, at: Callable[[float, float], tuple[float, float]]) -> l
 
 
 def _point(look: str, x: float, y: float) -> Mark:
-    """Points of different curves differ in shape too."""
+    """Mark of a point; curves also differ in the shape of their points."""
     fill = look.replace("line-", "fill-") if look in {"line-a", "line-b", "line-c", "line-d"} else "fill-bad"
     if look == "line-b":
         return Area(regular(x, y, 4.6, 4, turn=0.5), fill)
@@ -238,7 +238,7 @@ def _tick(value: float, every: Sequence[float]) -> str:
 
 
 def _cut(text: str, room: float) -> str:
-    """As much of a label's end as there is room for."""
+    """Label, shortened at its begin to the available width."""
     if width_of(text, _LETTERS) <= room:
         return text
     while text and width_of(f"…{text}", _LETTERS) > room:

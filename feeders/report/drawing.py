@@ -1,7 +1,7 @@
 """Drawings as lists of marks, as SVG and PNG, and figures of the report.
 
-A mark says what it is by the name of a look; colours come from two palettes, for light and for dark
-surroundings. Marks know nothing of feeders.
+A mark has a named look. Colours are from two palettes, for light and for dark surroundings. Marks are
+independent of feeders.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ __all__ = [
 Point = tuple[float, float]
 
 STEPS: Final = 5
-"""How many steps a scale of sizes has; each has its own colour, and its own size."""
+"""Number of steps of a size scale; each has its own colour and size."""
 
 LIGHT: Final = {
     "card": "#ffffff",
@@ -85,7 +85,7 @@ DARK: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """How a mark looks. Colours are names of the palettes; empty: none."""
+    """Look of a mark. Colours are names of the palettes; empty: none."""
 
     fill: str = ""
     stroke: str = ""
@@ -136,7 +136,7 @@ LOOKS: Final[dict[str, Look]] = {
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A polyline; `tip` is shown to whoever points at it."""
+    """Polyline; `tip` is its tooltip."""
 
     points: tuple[Point, ...]
     look: str
@@ -194,19 +194,19 @@ def regular(x: float, y: float, r: float, corners: int, *, turn: float = 0.0) ->
 
 
 def width_of(text: str, size: float = 12.0) -> float:
-    """About how wide a text is, px: letters of a plain sans serif, rather too wide than too narrow."""
+    """Approximate width of a text, px, for a plain sans serif; rather too wide than too narrow."""
     narrow = sum(letter in "iljtf.,:;'|!()[] " for letter in text)
     wide = sum(letter in "mwMW%@" or ord(letter) > 0x2E80 for letter in text)
     return size * (0.59 * (len(text) - narrow - wide) + 0.34 * narrow + 0.95 * wide)
 
 
 def style(scope: str = "") -> str:
-    """The style sheet of all looks, light and dark.
+    """Style sheet of all looks, light and dark.
 
     Parameters
     ----------
     scope
-        Selector of what holds the drawings; empty: the whole document is one drawing.
+        Selector of the drawings' container; empty: the whole document is one drawing.
     """
     root = scope or ":root"
     before = f"{scope} " if scope else ""
@@ -243,13 +243,13 @@ def svg(drawing: Drawing, *, title: str, text: str, key: str, alone: bool = Fals
     Parameters
     ----------
     drawing
-        What to write.
+        The drawing.
     title, text
-        Its title, and what it shows, in words for those who cannot see it.
+        Title, and description for screen readers.
     key
-        Makes ids unique in a document: letters, digits and hyphens.
+        Prefix of ids, unique in the document: letters, digits and hyphens.
     alone
-        As a file of its own, with its style sheet and background.
+        True: a file of its own, with style sheet and background.
     """
     width, height = _number(drawing.width), _number(drawing.height)
     head = [
@@ -265,7 +265,7 @@ def svg(drawing: Drawing, *, title: str, text: str, key: str, alone: bool = Fals
 
 
 def _merged(marks: Sequence[Mark]) -> Iterable[str]:
-    """Write marks; neighbours of the same look without a tip share one path."""
+    """Write marks; successive ones of equal look without a tip share one path."""
     held: tuple[str, list[str]] | None = None
     for mark in marks:
         if isinstance(mark, Line | Area) and not mark.tip:
@@ -315,30 +315,30 @@ def _number(value: float) -> str:
 
 
 def _plain(text: str) -> str:
-    """Text for XML: escaped, and without the characters that XML does not have."""
+    """Text for XML: escaped, and without characters that are invalid in XML."""
     return escape("".join(c if c >= " " and c not in "\ufffe\uffff" else "\ufffd" for c in text))
 
 
 WIDE: Final = 720.0
 """Width of a drawing on a screen or on paper, px."""
 NARROW: Final = 350.0
-"""The same on a phone: drawn anew, not shrunk, so that it can be read."""
+"""Width on a phone, px: a separate drawing, not a smaller image, so that it is legible."""
 
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """A figure.
+    """Figure of the report.
 
     Attributes
     ----------
     name
-        Of its files: letters, digits and hyphens.
+        Name of its files: letters, digits and hyphens.
     title
-        What it is, in a few words.
+        Title in a few words.
     text
-        What it shows, in words, for those who cannot see it; also printed below it.
+        Description, for screen readers; also printed below it.
     draw
-        Draws it, so wide.
+        Draws it for a width, px.
     """
 
     name: str
@@ -348,29 +348,29 @@ class Figure:
 
 
 SCALE: Final = 2.0
-_POINTS: Final = 0.72  # of one px on a sheet of 100 px per inch
+_POINTS: Final = 0.72  # points per px on a sheet of 100 px per inch
 _SIDES: Final = 48
 
 
 def available() -> bool:
-    """Whether PNG can be made: matplotlib is installed."""
+    """True if PNG is available: matplotlib is installed."""
     return draw.available()
 
 
 def png(drawing: Drawing, *, title: str, text: str) -> bytes:
-    """Make a PNG of a drawing; the same drawing gives the same bytes.
+    """Draw a PNG; equal drawings give equal bytes.
 
     Parameters
     ----------
     drawing
-        What to draw.
+        The drawing.
     title, text
-        Kept in the file.
+        Metadata of the file.
 
     Raises
     ------
     ModuleNotFoundError
-        matplotlib is not installed; see `available`.
+        Without matplotlib; see `available`.
     """
 
     def marks(axes: Any) -> None:
@@ -404,7 +404,7 @@ def _draw(axes: Any, mark: Mark, order: float) -> None:
             mark.y,
             mark.text,
             color=fill,
-            fontsize=_POINTS * mark.size * 0.94,  # DejaVu is wider than what screens use
+            fontsize=_POINTS * mark.size * 0.94,  # DejaVu is wider than the fonts of screens
             ha=side,
             va="baseline",
             weight="bold" if look.bold else "normal",

@@ -1,6 +1,6 @@
 """Report as one self-contained HTML page, with one section for each study.
 
-A section is made by `function(site, result) -> Section`. Results are those of `feeders.studies`: they have
+A section is the result of `function(site, result) -> Section`. Results are those of `feeders.studies`, with
 `feeder` and `tables`.
 """
 
@@ -45,7 +45,7 @@ __all__ = [
 
 
 class Result(Protocol):
-    """What every study returns."""
+    """Result of a study."""
 
     @property
     def feeder(self) -> str:
@@ -53,29 +53,29 @@ class Result(Protocol):
 
     @property
     def tables(self) -> Mapping[str, pd.DataFrame]:
-        """All numbers, by name of the table."""
+        """All numbers, by table name."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Outcome:
-    """What became of a study.
+    """Outcome of a study.
 
     Attributes
     ----------
     study
         Its name, as on the command line.
     result
-        What it found; None if it failed.
+        Result; None after a failure.
     problem
-        Why it failed; empty if it did not.
+        Reason of the failure; empty without one.
     command
-        Runs it again, alone.
+        Command line of this study alone.
     seconds
-        How long it took.
+        Duration, s.
     resumed
-        Whether some of the work was kept from before, and is not in `seconds`.
+        True if earlier work was reused, which is not in `seconds`.
     absent
-        Whether there is nothing on this feeder that it could study; `problem` says what.
+        True if the study does not apply to this feeder; `problem` is the reason.
     """
 
     study: str
@@ -104,37 +104,37 @@ ANSWERS: Final[dict[str, tuple[Question, ...]]] = {
     "campaign": (Question.MONITOR,),
     "calibrate": (Question.RECORDS,),
 }
-"""What a study answers: asked although it failed, or was not run."""
+"""Questions of each study; they remain after a failure or without a run."""
 
 
 TITLES: Final = {
-    "redundancy": "Who can lie without ever being noticed",
-    "protect": "Which meters to protect",
-    "detectable": "How large a lie must be",
+    "redundancy": "Attacks that stay invisible",
+    "protect": "Meters to protect",
+    "detectable": "Sizes of attacks",
     "droop": "The inverters",
     "campaign": "Simulated attacks",
-    "calibrate": "What the readings say about the files",
+    "calibrate": "Readings against the files",
 }
-"""Headings of sections that could not be made."""
+"""Headings of sections without a result."""
 
 
 def section(site: Site, outcome: Outcome) -> Section:
-    """The section of a study, whatever became of it.
+    """Section of a study, for any outcome.
 
     Parameters
     ----------
     site, outcome
-        The feeder, and what became of the study.
+        The feeder, and the outcome of the study.
     """
     if outcome.result is None:
         questions = ANSWERS.get(outcome.study, (Question.OTHER,))
         if outcome.absent:
             nothing = Finding(Standing.ABSENT, ((f"{outcome.problem[:1].upper()}{outcome.problem[1:]}.",),))
             return Section(_title(outcome.study), dict.fromkeys(questions, nothing))
-        problem = outcome.problem or "it ended without a result"
+        problem = outcome.problem or "the study ended without a result"
         finding = Finding(
             Standing.FAILED,
-            ((f"No answer: {problem}. ", "This says nothing about whether there is a danger."),),
+            ((f"No answer: {problem}. ", "This is no evidence of safety or danger."),),
         )
         return Section(_title(outcome.study), dict.fromkeys(questions, finding))
     make = SECTIONS.get(outcome.study, _generic(outcome.study))
@@ -147,8 +147,8 @@ def _generic(study: str) -> Callable[[Site, Result], Section]:
         for name, table in found.tables.items():
             rows = Value(len(table), str(len(table)), f"{study}-{name}:rows")
             sizes += [", " if sizes else "", f"{name} (", rows, f" {plural(len(table), 'row')})"]
-        lead = f"The study {study} left {len(found.tables)} {plural(len(found.tables), 'table')}: "
-        end = ". They are below as they are; nothing is concluded from them here."
+        lead = f"The study {study} has {len(found.tables)} {plural(len(found.tables), 'table')}: "
+        end = ". They are shown below without conclusions."
         told = Finding(Standing.MEASURED, ((lead, *sizes, end),))
         where = ANSWERS.get(study, (Question.OTHER,))
         return Section(_title(study), {where[0]: told}, tables=dict(found.tables))
@@ -164,7 +164,7 @@ _VOID: Final = {"meta", "br"}
 
 
 class Markup(str):
-    """Text that is markup already; only this module and drawings make it."""
+    """Text that is markup already; only this module and drawings create it."""
 
     __slots__ = ()
 
@@ -178,11 +178,11 @@ def el(tag: str, *children: Child, **attributes: str | bool | None) -> Markup:
     Parameters
     ----------
     tag
-        Its name.
+        Name of the element.
     children
-        Text, which is escaped; markup, which is not; or several of either. None: nothing.
+        Text, which is escaped; markup, which is not; or several of either; None is skipped.
     attributes
-        A trailing underscore goes, the others become hyphens. None and False: not there.
+        A trailing underscore is removed, others become hyphens. None and False are skipped.
     """
     parts = [tag]
     for name, value in attributes.items():
@@ -206,7 +206,7 @@ def join(children: Iterable[Child]) -> Markup:
 
 
 def _text(text: str) -> str:
-    """Escape; control characters become visible, directions cannot be turned around."""
+    """Escape; control characters become visible, and text direction cannot change."""
     return escape("".join(c if _harmless(c) else "\ufffd" for c in text))
 
 
@@ -218,30 +218,30 @@ def _harmless(letter: str) -> bool:
 
 FEEDER: Final = "feeder"
 CONVERSION: Final = "conversion"
-"""Where the table of what a conversion did not carry over belongs, and its name."""
+"""Section and name of the table of conversion changes."""
 
 MOST_COLUMNS: Final = 13
-"""It shows so many columns at most, and more than FEW_COLUMNS in small print."""
+"""Largest number of columns of a table on the page; more than FEW_COLUMNS are in small print."""
 FEW_COLUMNS: Final = 8
 OPEN_ROWS: Final = 14
-"""Tables up to this many rows are open, and printed."""
+"""Tables up to this number of rows are open, and printed."""
 LOST_ROWS: Final = 40
-"""The same of what a conversion did not carry over."""
+"""The same for conversion changes."""
 LONG_WORD: Final = 24
-"""Words of tables that are longer may be broken on paper."""
+"""Longer words of tables may be broken on paper."""
 DIGITS: Final = 4
-"""Numbers of tables have so many significant digits, and decimals, at most."""
+"""Largest number of significant digits, and of decimals, in tables."""
 MOST_ROWS: Final = 500
 HEAD_ROWS: Final = 60
-"""Of tables with more than MOST_ROWS rows the page shows the first ones; the files beside it have all."""
+"""Of tables with more than MOST_ROWS rows the page shows the first HEAD_ROWS; the files have all."""
 
 MEANING: Final = (
     "Proved: follows from the feeder's model under the assumptions that each section states. Partly proved: "
-    "some of it does, or follows from the linear model only; the answer says what. Measured: seen in "
-    "simulation or in readings. Not proved, no answer, not studied: it may be either way."
+    "some of it does, or follows from the linear model only; the answer states which. Measured: observed in "
+    "simulation or in readings. Not proved, no answer, not studied: unknown."
 )
 
-UNKNOWN: Final = "not known, or nothing to be known: it was not asked, or there was no case of it"
+UNKNOWN: Final = "not known, not asked for, or without a case"
 
 MARK: Final = Markup(
     '<svg viewBox="0 0 24 24" aria-hidden="true"><path d="M3 4v16M3 8h11M3 16h7"/>'
@@ -251,20 +251,20 @@ MARK: Final = Markup(
 
 @dataclass(frozen=True, slots=True)
 class About:
-    """What the report says of itself.
+    """Data on the report itself.
 
     Attributes
     ----------
     made
-        When it was made, as it is to be written.
+        Date of the report, as text.
     command
-        Makes it again.
+        Command line of the report.
     versions
-        Of gridsec and of what computes in it.
+        Versions of gridsec and of its numerical libraries.
     seeds
-        Everything random began with these.
+        Seeds of all random numbers.
     folder
-        Name of the folder beside the page with figures and tables; empty: there is none.
+        Name of the folder beside the page with figures and tables; empty without one.
     """
 
     made: str
@@ -276,7 +276,7 @@ class About:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chapter:
-    """A section, and the study it is about."""
+    """Section, and the outcome of its study."""
 
     outcome: Outcome
     section: Section
@@ -296,17 +296,17 @@ def page(
     Parameters
     ----------
     title
-        The feeder's.
+        Title of the feeder.
     facts
-        What there is to say of the feeder in general.
+        General data on the feeder.
     chart
-        Its map.
+        Map of the feeder.
     chapters
-        What its studies found.
+        Sections of its studies.
     about
-        What the report says of itself.
+        Data on the report itself.
     origin
-        Where the feeder is from, if it was converted.
+        Origin of the feeder, if it was converted.
     """
     script = _file("sort.js")
     seal = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
@@ -320,7 +320,7 @@ def page(
         el("meta", http_equiv="Content-Security-Policy", content=policy),
         el("meta", name="viewport", content="width=device-width, initial-scale=1"),
         el("meta", name="color-scheme", content="light dark"),
-        el("title", f"{title}: how far its meters can be trusted"),
+        el("title", f"{title}: trust in its meters"),
         el("style", Markup(_file("style.css") + style("figure svg"))),
     )
     body = el(
@@ -350,7 +350,7 @@ def _front(title: str, facts: Mapping[str, str], chapters: Sequence[Chapter], ab
         el("h1", title),
         el(
             "p",
-            f"How far its meters can be trusted. {few}. ",
+            f"Trust in its meters. {few}. ",
             el("span", about.made, class_="once"),
             class_="lead",
         ),
@@ -362,7 +362,7 @@ def _front(title: str, facts: Mapping[str, str], chapters: Sequence[Chapter], ab
 
 
 def _answers(chapters: Sequence[Chapter]) -> list[tuple[Question, str, Finding]]:
-    """What every question of a committee gets: an answer, or that there is none."""
+    """Answers of every question; a question without a study has a pointer to it."""
     out: list[tuple[Question, str, Finding]] = []
     for question in Question:
         given = [
@@ -373,7 +373,7 @@ def _answers(chapters: Sequence[Chapter]) -> list[tuple[Question, str, Finding]]
         out += [(question, study, finding) for study, finding in given]
         asked = [study for study, questions in ANSWERS.items() if question in questions]
         if not given and asked and question is not Question.RECORDS:
-            words = f"This report does not answer it; gridsec study {asked[0]} does."
+            words = f"Not part of this report; see gridsec study {asked[0]}."
             out.append((question, "", Finding(Standing.ABSENT, ((words,),))))
     return out
 
@@ -403,7 +403,7 @@ def _part(part: str | Value) -> str:
 
 def _contents(chapters: Sequence[Chapter]) -> Markup:
     links = [(FEEDER, "The feeder"), *((_id(c.outcome.study), c.section.title) for c in chapters)]
-    links.append(("made", "How this was made"))
+    links.append(("made", "Origin of this report"))
     items = [el("li", el("a", name, href=f"#{key}")) for key, name in links]
     return el("nav", el("ul", items), class_="card", aria_label="Contents")
 
@@ -429,11 +429,11 @@ def _feeder(facts: Mapping[str, str], chart: Figure, source: Sequence[Markup]) -
 
 
 def _origin(origin: Origin, folder: str) -> list[Markup]:
-    """What a conversion did not carry over, and what that does to the voltages."""
+    """Changes of a conversion, and their effect on the voltages."""
     fates = [f"{count} {fate}" for fate, count in origin.changes["done"].value_counts(sort=False).items()]
     table = _table(FEEDER, CONVERSION, origin.changes, folder, (), most_open=LOST_ROWS)
     return [
-        el("h3", "What was not carried over from its source"),
+        el("h3", "Changes of the conversion"),
         el(
             "p",
             f"Converted from {origin.source or 'a network of another tool'}: "
@@ -441,7 +441,7 @@ def _origin(origin: Origin, folder: str) -> list[Markup]:
         ),
         table,
         el("h3", "Checked against the source's power flow"),
-        el("p", origin.check or "Nothing is told of a check."),
+        el("p", origin.check or "No comparison is recorded."),
     ]
 
 
@@ -471,9 +471,9 @@ def _chapter(chapter: Chapter, folder: str) -> Markup:
             for name, table in told.tables.items()
         ],
         el("dl", meanings, class_="columns") if meanings else None,
-        el("h3", "What was assumed") if told.assumptions else None,
+        el("h3", "Assumptions") if told.assumptions else None,
         el("ul", [el("li", each) for each in told.assumptions], class_="plain") if told.assumptions else None,
-        el("h3", "To run it again") if outcome.command else None,
+        el("h3", "Command") if outcome.command else None,
         _command(outcome.command) if outcome.command else None,
         class_="card",
         id=_id(outcome.study),
@@ -481,7 +481,7 @@ def _chapter(chapter: Chapter, folder: str) -> Markup:
 
 
 def _figure(figure: Figure) -> Markup:
-    """Twice, for two widths; the style sheet shows one."""
+    """Figure in two widths; the style sheet shows one."""
     drawings = [
         el(
             "div",
@@ -505,8 +505,8 @@ def _table(
     *,
     most_open: int = OPEN_ROWS,
 ) -> Markup:
-    """A table; long ones are closed, and what is too long or too wide for a page stays in its file."""
-    own = [column for column in table.columns if column != FEEDER]  # the page is about one
+    """Table; long ones are closed, and rows or columns beyond the limits are in the file only."""
+    own = [column for column in table.columns if column != FEEDER]  # the page is about one feeder
     said = [column for column in own if table.empty or not table[column].map(_silent).all()]
     kept = [column for column in chosen or said if column in said][:MOST_COLUMNS]
     shown = table[kept].head(len(table) if len(table) <= MOST_ROWS else HEAD_ROWS)
@@ -553,7 +553,7 @@ def _numeric(column: pd.Series[Any]) -> bool:
 
 
 def _decimals(column: pd.Series[Any]) -> int:
-    """How many decimals a column needs: all its numbers have as many, so that their points stand in line."""
+    """Number of decimals of a column, the same for all its numbers."""
     if not _numeric(column):
         return 0
     sizes = [abs(v) for v in column.astype(float).tolist() if math.isfinite(v) and not v.is_integer()]
@@ -577,7 +577,7 @@ def _td(cell: Any, decimals: int) -> Markup:
 
 
 def _written(value: float, decimals: int) -> str:
-    """A number of a table; what is there but too small for its column does not become nothing."""
+    """Number of a table; a small nonzero number is not written as zero."""
     if not math.isfinite(value) or value == 0.0:
         return number(value)
     least = 10.0**-decimals
@@ -590,12 +590,12 @@ def _written(value: float, decimals: int) -> str:
 
 
 def _made(about: About, chapters: Sequence[Chapter]) -> Markup:
-    seeds = ", ".join(f"{name} {seed}" for name, seed in about.seeds.items()) or "nothing is random"
+    seeds = ", ".join(f"{name} {seed}" for name, seed in about.seeds.items()) or "no random numbers"
     took = [
         el(
             "li",
             f"{c.outcome.study}: {_seconds(c.outcome.seconds)}",
-            ", with work kept from before" * c.outcome.resumed,
+            ", with reused earlier work" * c.outcome.resumed,
         )
         for c in chapters
     ]
@@ -610,8 +610,8 @@ def _made(about: About, chapters: Sequence[Chapter]) -> Markup:
     )
     return el(
         "section",
-        el("div", el("h2", "How this was made"), class_="head"),
-        el("h3", "The whole report again"),
+        el("div", el("h2", "Origin of this report"), class_="head"),
+        el("h3", "Command of the whole report"),
         _command(about.command),
         el("h3", "Versions"),
         el("p", ", ".join(f"{name} {version}" for name, version in about.versions.items())),
@@ -627,7 +627,7 @@ def _made(about: About, chapters: Sequence[Chapter]) -> Markup:
 
 
 def _command(text: str) -> Markup:
-    """A command whose options are not broken at their hyphens."""
+    """Command line without line breaks at the hyphens of options."""
     words = [join([" " if k else "", el("span", word)]) for k, word in enumerate(text.split(" "))]
     return el("pre", words)
 

@@ -1,11 +1,11 @@
 """Maps of a feeder: layout, streets, customers, and marks from tables.
 
-The tree: every street becomes a row, customers hang below it. Along a row goes the branch with the most
-customers; what branches off gets a row of its own, as near as it fits.
+In a tree every street is a row, with its customers below it. A row follows the branch with the most
+customers; other branches have rows of their own, as near as possible.
 
-A customer is told apart by shape and size, and by a word or a number beside it; colour comes on top. In three
-phases everybody has one leg of a star, that of the phase: a to the upper right, b downwards, c to the upper
-left.
+Customers differ in shape and size, and have a word or a number beside them; colour is an addition. In three
+phases every customer has one leg of a star, that of its phase: a to the upper right, b downwards, c to the
+upper left.
 """
 
 from __future__ import annotations
@@ -50,30 +50,30 @@ __all__ = [
 Point = tuple[float, float]
 
 FEW: Final = 8
-"""Maps of so many customers at most get no more than HALF_PAGE, px: two of them, with captions, fit on A4."""
+"""Number of customers up to which a map has at most HALF_PAGE px: two maps with captions fit on A4."""
 HALF_PAGE: Final = 400.0
 
 
 @dataclass(frozen=True, slots=True)
 class Placed:
-    """A feeder on a sheet, px.
+    """Layout of a feeder on a sheet, px.
 
     Attributes
     ----------
     width, height
-        Of the sheet.
+        Size of the sheet.
     wires, drops
-        Polylines of lines, and of the last metres to customers.
+        Polylines of lines, and of the connections of customers.
     ties
         Polylines of the lines that close loops.
     busbar
-        The busbar's two ends.
+        Both ends of the busbar.
     customers
-        Place of each customer.
+        Position of each customer.
     room
-        How much room a customer has.
+        Available room of a customer.
     real
-        Whether places are those of the files.
+        True: positions of the files.
     """
 
     width: float
@@ -88,25 +88,19 @@ class Placed:
 
 
 def has_places(site: Site) -> bool:
-    """Whether the files place every bus, and not most of them on top of each other.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    """
+    """True if the files have positions of all buses, and most of them are different."""
     return site.xy is not None and len({tuple(row) for row in site.xy.tolist()}) > len(site.xy) / 4
 
 
 def place(site: Site, width: float) -> Placed:
-    """Place a feeder on a sheet of a given width.
+    """Lay out a feeder on a sheet of a given width.
 
     Parameters
     ----------
     site
         The feeder.
     width
-        Of the sheet, px; narrow sheets get trees that grow downwards.
+        Width of the sheet, px; on narrow sheets trees grow downwards.
     """
     return _real(site, width) if has_places(site) else _tree(site, width)
 
@@ -116,7 +110,7 @@ def _real(site: Site, width: float) -> Placed:
     xy = np.array(site.xy, dtype=np.float64)
     span = np.ptp(xy, axis=0)
     if np.abs(xy[:, 0]).max() <= 180.0 and np.abs(xy[:, 1]).max() <= 90.0 and span.max() < 1.0:
-        xy[:, 0] *= math.cos(math.radians(float(xy[:, 1].mean())))  # degrees: a meridian's metres for both
+        xy[:, 0] *= math.cos(math.radians(float(xy[:, 1].mean())))  # degrees: equal metres in both directions
         span = np.ptp(xy, axis=0)
     pad = 34.0
     span = np.where(span > 0.0, span, 1.0)
@@ -138,7 +132,7 @@ def _real(site: Site, width: float) -> Placed:
 
 
 def _room(spots: Sequence[Point]) -> float:
-    """Distance from customers to their nearest neighbour; nine in ten have more, within reason."""
+    """Room of a customer: lower decile of the distances to the nearest neighbour, within limits."""
     at = np.array(spots)
     apart = np.hypot(*(at[:, None, :] - at[None, :, :]).transpose(2, 0, 1))
     np.fill_diagonal(apart, np.inf)
@@ -146,7 +140,7 @@ def _room(spots: Sequence[Point]) -> float:
 
 
 def _fans(at: Sequence[Point], bus: Sequence[int]) -> tuple[tuple[Point, ...], tuple[tuple[Point, ...], ...]]:
-    """Customers of one bus stand around it."""
+    """Positions of several customers of one bus around it."""
     here: dict[int, list[int]] = {}
     for customer, k in enumerate(bus):
         here.setdefault(k, []).append(customer)
@@ -173,7 +167,7 @@ class _Items:
     ties: list[tuple[int, int, int, int]] = field(default_factory=list)  # column, row above, column, row
 
     def take(self, other: _Items, rows: int) -> None:
-        """Add another block, so many rows lower."""
+        """Add another block, `rows` rows lower."""
         self.customers += [(k, x, row + rows) for k, x, row in other.customers]
         self.streets += [(a, b, row + rows) for a, b, row in other.streets]
         self.poles += [(bus, x, row + rows) for bus, x, row in other.poles]
@@ -181,7 +175,7 @@ class _Items:
 
 
 class _Grid:
-    """Places the tree of a feeder on a grid."""
+    """Layout of a feeder's tree on a grid."""
 
     def __init__(self, site: Site) -> None:
         parent = site.spanning.parent.tolist()
@@ -201,7 +195,7 @@ class _Grid:
             self.children[parent[k - 1]].append(k)
 
     def place(self) -> tuple[_Items, int, int]:
-        """All parts, and how many rows and columns they take."""
+        """All parts, and their numbers of rows and columns."""
         every, row, columns = _Items(), 0, 1
         if self.at[0]:
             every.customers += [(who, 1 + k, 0) for k, who in enumerate(self.at[0])]
@@ -216,14 +210,14 @@ class _Grid:
         return every, max(row, 1), columns
 
     def _block(self, start: int, x0: int) -> tuple[_Items, list[list[tuple[int, int]]]]:
-        """A street with what branches off it, and the columns taken in each of its rows."""
+        """Street with its branches, and the occupied columns in each of its rows."""
         items, branches, x = _Items(), [], x0
         bus: int | None = start
         while bus is not None:
             following = sorted(self.children[bus], key=lambda k: (-self.weight[k], -self.depth[k], k))
             ahead = [k for k in following if self.children[k]][:1] or following[:1]
             if ahead and not self.children[ahead[0]] and not self.at[bus] and len(following) > 1:
-                ahead = []  # the last pole of a street: all its houses hang
+                ahead = []  # last pole of a street: all its houses are below it
             others = [k for k in following if k not in ahead]
             slots = self.at[bus] + [who for k in others if not self.children[k] for who in self.at[k]]
             sides = [k for k in others if self.children[k]]
@@ -236,7 +230,7 @@ class _Grid:
         last = max(x - 1, x0)
         items.streets.append((x0, last, 0))
         taken = [[(x0, last)]]
-        for side, origin in reversed(branches):  # far ones first: no tie then crosses a row
+        for side, origin in reversed(branches):  # far branches first: connections then cross no row
             inner, spans = self._block(side, origin + 1)
             wider = [[(a - 1, b) for a, b in row] for row in spans]
             offset = 1
@@ -253,7 +247,7 @@ class _Grid:
 
 
 def _outwards(parent: Sequence[int]) -> list[int]:
-    """Buses but the busbar, each after its parent."""
+    """Buses except the busbar, each after its parent."""
     depth = [0] * (len(parent) + 1)
     for k in range(1, len(depth)):
         steps, at = 0, k
@@ -299,7 +293,7 @@ def _tree(site: Site, width: float) -> Placed:
     poles = {bus: (x, row) for bus, x, row in items.poles}
     closing = []
     for one, other in site.ties.tolist():
-        # The busbar is met in the row of the other end.
+        # The busbar's end of a tie is in the row of the other end.
         a, b = (at(*poles.get(k, (0, poles.get(far, (0, 0))[1]))) for k, far in ((one, other), (other, one)))
         mid = (0.5 * (a[0] + b[0]), 0.5 * (a[1] + b[1]))
         closing.append((a, (mid[0] - 14.0, mid[1]) if upright else (mid[0], mid[1] - 14.0), b))
@@ -324,7 +318,7 @@ def _tree(site: Site, width: float) -> Placed:
 
 
 class Shape(Enum):
-    """What a customer looks like."""
+    """Kind of mark of a customer."""
 
     METER = "meter"
     SUN = "meter with an inverter"
@@ -337,22 +331,22 @@ class Shape(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Spot:
-    """What a map says of a customer.
+    """Mark of a customer on a map.
 
     Attributes
     ----------
     shape
-        What it is.
+        Kind of mark.
     label
-        Beside it; empty: nothing.
+        Text beside it, or empty.
     tip
-        For whoever points at it.
+        Text of the tooltip.
     step
-        For a size on a scale: which step.
+        Step of a size on a scale.
     weight
-        Labels of heavier customers get their place first.
+        Priority of the label's position.
     phase
-        Its phase, a, b or c, where the feeder has several; empty: none is shown.
+        Phase a, b or c on a feeder of several phases; empty: none shown.
     """
 
     shape: Shape
@@ -364,22 +358,22 @@ class Spot:
 
 
 LEGS: Final = {"a": 60.0, "b": 180.0, "c": 300.0}
-"""Where the leg of a phase points, degrees clockwise from above."""
+"""Direction of the leg of a phase, degrees clockwise from above."""
 
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """Limits of the steps of a scale, ascending, STEPS + 1 of them, and how they are written."""
+    """Scale with STEPS + 1 ascending limits of its steps, and their unit."""
 
     limits: tuple[float, ...]
     unit: str
 
     def step(self, value: float) -> int:
-        """Which step a finite value is on."""
+        """Step of a finite value."""
         return bisect_right(self.limits[1:-1], value)
 
     def names(self) -> list[str]:
-        """What each step means."""
+        """Text of each step."""
         digits = _digits(self.limits[1] - self.limits[0])
         return [
             f"{a:.{digits}f}–{b:.{digits}f} {self.unit}"
@@ -388,12 +382,12 @@ class Scale:
 
 
 def steps_of(values: Sequence[float], unit: str) -> Scale:
-    """A scale of even steps of a round size over finite values.
+    """Scale of equal steps of a round size over finite values.
 
     Parameters
     ----------
     values, unit
-        What it is for, at least one finite value, and its unit.
+        Values, at least one of them finite, and their unit.
     """
     finite = [value for value in values if math.isfinite(value)]
     least, most = min(finite), max(finite)
@@ -405,7 +399,7 @@ def steps_of(values: Sequence[float], unit: str) -> Scale:
         for factor in (1.0, 2.0, 2.5, 5.0, 10.0):
             step = factor * size
             first = math.floor(low / step + 1e-9) * step
-            # What makes all but no difference is on one step, not on two.
+            # Nearly equal values are on one step, not on two.
             apart = same and least // step != most // step
             if first + STEPS * step >= high * (1.0 - 1e-12) and not apart:
                 return Scale(tuple(first + k * step for k in range(STEPS + 1)), unit)
@@ -418,14 +412,14 @@ def _digits(step: float) -> int:
 
 
 def legend_of(meanings: Mapping[str, Shape], spots: Sequence[Spot]) -> dict[str, Spot]:
-    """What the shapes mean that are on a map.
+    """Legend of the shapes on a map.
 
     Parameters
     ----------
     meanings
-        Shapes by what they mean.
+        Shapes by meaning.
     spots
-        What the map shows.
+        Marks of the map.
     """
     there = {spot.shape for spot in spots}
     return {name: Spot(shape) for name, shape in meanings.items() if shape in there}
@@ -439,13 +433,13 @@ def draw_map(
     Parameters
     ----------
     site, spots
-        The feeder, and what to say of each of its customers.
+        The feeder, and the mark of each customer.
     width
-        Of the sheet, px.
+        Width of the sheet, px.
     legend
-        What looks mean.
+        Marks of the legend by meaning.
     note
-        Above the picture.
+        Text above the drawing.
     """
     at = place(site, width)
     top = 22.0 if note else 0.0
@@ -476,7 +470,7 @@ def draw_map(
 def _with_phases(
     site: Site, spots: Sequence[Spot], legend: Mapping[str, Spot]
 ) -> tuple[Sequence[Spot], Mapping[str, Spot]]:
-    """Spots and legend with everybody's phase, where there are several."""
+    """Marks and legend with each customer's phase, for several phases."""
     phases = [row.phases for row in site.tables.customers]
     if not set(phases) <= LEGS.keys():
         return spots, legend
@@ -522,7 +516,7 @@ def _glyph(spot: Spot, x: float, y: float, size: float) -> list[Mark]:
 
 
 def _leg(spot: Spot, x: float, y: float, size: float) -> list[Mark]:
-    """From below its glyph to a little beyond it."""
+    """Leg of a phase, from below the mark to a little beyond it."""
     if not spot.phase:
         return []
     angle = math.radians(LEGS[spot.phase])
@@ -534,9 +528,9 @@ Box = tuple[float, float, float, float]
 
 
 def _labels(spots: Sequence[Spot], at: Placed, size: float, top: float) -> list[Mark]:
-    """Labels where there is room, off the lines if possible: right, left, below, above, in this order.
+    """Labels with enough room, off the lines if possible: right, left, below, above, in this order.
 
-    Those of trees are below first.
+    Labels of trees are below first.
     """
     lit = np.array([(*a, *b) for wire in (*at.wires, *at.ties, *at.drops) for a, b in pairwise(wire)])
     taken: list[Box] = [_around(x, y, size) for x, y in at.customers]
@@ -575,13 +569,13 @@ def _around(x: float, y: float, r: float) -> Box:
 
 
 def _crossed(box: Box, lines: Floats) -> bool:
-    """Whether any of the lines, (n, 4) from x, y to x, y, crosses a box."""
+    """True if any of the lines, (n, 4) from x, y to x, y, crosses a box."""
     if not lines.size:
         return False
     x0, y0, x1, y1 = lines.T
     near = (np.minimum(x0, x1) < box[2]) & (np.maximum(x0, x1) > box[0])
     near &= (np.minimum(y0, y1) < box[3]) & (np.maximum(y0, y1) > box[1])
-    # A line misses a box that it is near to where all corners are on one side of it.
+    # A near line does not cross a box if all corners are on one side of it.
     sides = [(x1 - x0) * (y - y0) - (y1 - y0) * (x - x0) for x in box[::2] for y in box[1::2]]
     apart = (np.min(sides, axis=0) > 0.0) | (np.max(sides, axis=0) < 0.0)
     return bool(np.any(near & ~apart))
@@ -592,7 +586,7 @@ def _overlap(a: Box, b: Box) -> bool:
 
 
 def _legend(legend: Mapping[str, Spot], top: float, width: float) -> tuple[list[Mark], float]:
-    """Glyphs with their meanings, in as many rows as they need; and where the sheet ends."""
+    """Legend in the required number of rows, and the lower end of the sheet."""
     x, y, marks = 14.0, top + 18.0, list[Mark]()
     for meaning, spot in legend.items():
         long = 18.0 + width_of(meaning, 12.0)
@@ -604,22 +598,22 @@ def _legend(legend: Mapping[str, Spot], top: float, width: float) -> tuple[list[
 
 
 FEW_LABELS: Final = 40
-"""Up to so many numbers stand in a map themselves."""
+"""Number of values up to which a map shows them as labels."""
 
 
 def size_map(
     site: Site, table: pd.DataFrame, width: float, *, who: str, column: str, unit: str = "V"
 ) -> Drawing:
-    """A map of the feeder with a number for each customer or meter.
+    """Map of the feeder with a number for each customer or meter.
 
     Parameters
     ----------
     site
         The feeder.
     width
-        Of the sheet, px.
-    table, who, column, unit
-        As in `spots_by_size`.
+        Width of the sheet, px.
+    table, column, unit
+        As in `spots_by_size`, with `who`.
     """
     spots, legend = spots_by_size(site, table, who, column, unit)
     return draw_map(site, spots, width, legend=legend)
@@ -628,14 +622,14 @@ def size_map(
 def spots_by_size(
     site: Site, table: pd.DataFrame, who: str, column: str, unit: str
 ) -> tuple[list[Spot], dict[str, Spot]]:
-    """Spots of a map, each as large as a number of a table says, and their legend.
+    """Marks of a map with sizes from a column of a table, and their legend.
 
     Parameters
     ----------
     site
         The feeder.
-    table, who, column, unit
-        The numbers, the column that says whose they are ("meter" or "customer"), theirs, and their unit.
+    table, column, unit
+        Table, its column of numbers, and their unit. `who` is its column of ids, "meter" or "customer".
     """
     names = names_of(site, who)
     sizes = dict(zip(table[who].astype(str), table[column].astype(float), strict=True))
@@ -663,14 +657,14 @@ def spots_by_size(
 
 
 def comparable(site: Site, table: pd.DataFrame) -> tuple[pd.DataFrame, str]:
-    """A table of volts and their unit: in parts of the nominal voltage where there are several.
+    """Table of volts and its unit; with several nominal voltages relative to these.
 
     Parameters
     ----------
     site
         The feeder.
     table
-        With a column `customer`; columns of numbers whose name ends in `_s` stay as they are.
+        Table with a column `customer`; columns of numbers with a name in `_s` are not changed.
     """
     if bool((site.nominal_volt == site.nominal_volt[0]).all()):
         return table, "V"
@@ -682,24 +676,12 @@ def comparable(site: Site, table: pd.DataFrame) -> tuple[pd.DataFrame, str]:
 
 
 def single_phase(site: Site) -> bool:
-    """Whether a balanced feeder is spoken of, by its single-phase equivalent.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    """
+    """True for a balanced feeder, which has a single-phase equivalent."""
     return all(row.phases == "abc" for row in site.tables.customers)
 
 
 def names_of(site: Site, who: str) -> list[str]:
-    """What each customer is called: its own id, or its meter's; empty where there is none.
-
-    Parameters
-    ----------
-    site, who
-        The feeder, and "customer" or "meter".
-    """
+    """Id of each customer, or of its meter; empty without one. `who` is "customer" or "meter"."""
     if who == "customer":
         return list(site.feeder.customers)
     ids = dict(zip(site.meters.tolist(), site.meter_ids, strict=True))
@@ -707,7 +689,7 @@ def names_of(site: Site, who: str) -> list[str]:
 
 
 def _short(name: str, names: Sequence[str]) -> str:
-    """A name with only the last of the words that all of them begin with."""
+    """Name with only the last of the words that are common to the begin of all names."""
     some = [each for each in names if each]
     words = name.split(" ")
     same = 0

@@ -1,4 +1,4 @@
-"""Section of the calibration: what recorded readings say against the files."""
+"""Section of the calibration: errors of the files by recorded readings."""
 
 from __future__ import annotations
 
@@ -20,57 +20,51 @@ if TYPE_CHECKING:
 __all__ = ["calibrate"]
 
 ROWS = 40
-"""So many meters a chart has at most: those that are off most."""
+"""Largest number of meters in a chart: those with the largest errors."""
 
 UNTOLD, PROPOSED, EXCLUDED, AS_FILED = "cannot be told", "proposed", "excluded", "as in the files"
-# Words of `feeders.studies.calibrate.study`; `tests/feeders/report` holds them together.
+# Words of `feeders.studies.calibrate.study`; a test in `tests/feeders/report` compares them.
 
 
 def calibrate(site: Site, found: Calibrate) -> Section:
-    """What recorded readings say against the files.
-
-    Parameters
-    ----------
-    site, found
-        The feeder, and what was found.
-    """
+    """Section of the calibration."""
     known = found.meters[[math.isfinite(v) for v in found.meters["std_percent"]]]
     figures = [
         Figure(
             "calibrate-map",
-            "Whose place is in doubt",
-            "Diamonds: the files should be corrected. Triangles: the readings cannot tell, or not all of it "
-            "was looked for. Discs: as in the files.",
+            "Doubtful places of customers",
+            "Diamonds: the files need a correction. Triangles: not determined by the readings, or not fully "
+            "searched. Discs: as in the files.",
             partial(_doubt_map, site, found.customers),
         )
     ]
     if len(known):
-        shown = " Those that are off most." if len(known) > ROWS else ""
+        shown = " Those with the largest errors." if len(known) > ROWS else ""
         figures.append(
             Figure(
                 "calibrate-bias",
-                "By how much meters are off",
-                f"Error of each meter's voltage against the busbar's meter, %, with 95 % intervals.{shown}",
+                "Errors of the meters",
+                f"Error of each meter's voltage relative to the busbar meter, %, with 95 % intervals.{shown}",
                 partial(_bias_chart, known),
             )
         )
     return Section(
-        title="What the readings say about the files",
+        title="Readings against the files",
         answers={Question.RECORDS: _said(found)},
         figures=tuple(figures),
         tables=found.tables,
         columns={
-            "confidence": "probability that it is this correction and no other that explains as much",
+            "confidence": "probability of this correction among all others",
             "log factor": "gain of the log-likelihood",
-            "alternatives": "corrections that explain the readings as well: then nothing is proposed as sure",
-            "bias percent": "of the voltage; an error that all meters have in common cannot be told",
+            "alternatives": "corrections that explain the readings as well; then none is decided",
+            "bias percent": "of the voltage; a common error of all meters cannot be determined",
             "factor": "of the length in the files",
-            "verdict": "'cannot be told' is neither right nor wrong: the readings are silent about it",
+            "verdict": "'cannot be told' is neither right nor wrong: the readings do not determine it",
         },
         assumptions=(
-            f"{found.frames} moments over {number(found.span_h, 1)} h were compared; if the files are right, "
-            f"there is any proposal with a probability of {100.0 * found.risk:g} %.",
-            "Nothing was changed in the files.",
+            f"{found.frames} frames over {number(found.span_h, 1)} h were compared; for correct files "
+            f"the probability of any proposal is {100.0 * found.risk:g} %.",
+            "The files were not changed.",
             *_left_out(found),
         ),
     )
@@ -79,7 +73,7 @@ def calibrate(site: Site, found: Calibrate) -> Section:
 def _left_out(found: Calibrate) -> list[str]:
     if not found.unread:
         return []
-    return [f"The busbar has no voltages of phase {listed(found.unread)}: the meters on it were left out."]
+    return [f"The busbar has no voltages of phase {listed(found.unread)}: the meters on it are left out."]
 
 
 def _said(found: Calibrate) -> Finding:
@@ -92,11 +86,11 @@ def _said(found: Calibrate) -> Finding:
         verb = plural(len(sure), "correction of the files is", "corrections of the files are")
         sentences.append((count, f" {verb} proposed: {listed(what)}."))
     else:
-        sentences.append(("The readings ask for no correction that is sure.",))
+        sentences.append(("No correction of the files is decided.",))
     if len(vague):
         count = Value(len(vague), str(len(vague)), f"calibrate-proposals:verdict:count {UNTOLD}")
         noun = plural(len(vague), "error")
-        sentences.append((count, f" {noun} shown by the readings could be one of several."))
+        sentences.append((count, f" {noun} in the readings could be one of several."))
     changing = found.proposals[found.proposals["verdict"] == EXCLUDED]
     if len(changing):
         count = Value(len(changing), str(len(changing)), f"calibrate-proposals:verdict:count {EXCLUDED}")
@@ -105,27 +99,27 @@ def _said(found: Calibrate) -> Finding:
         sentences.append(
             (
                 count,
-                f" {verb} off in a way that errors of the files explain less well: {listed(what)}. "
-                "A lie looks like that. The voltages were left out of account.",
+                f" {verb} inconsistent, and errors of the files explain it less well: {listed(what)}. "
+                "An attack has this effect. The voltages were not used.",
             )
         )
     outside = found.meters[found.meters["verdict"] == "outside its class"]["meter"].tolist()
     if outside:
         count = Value(len(outside), str(len(outside)), "calibrate-meters:verdict:count outside its class")
         verb = plural(len(outside), "meter is", "meters are")
-        sentences.append((count, f" {verb} outside the class: {listed(outside)}."))
+        sentences.append((count, f" {verb} outside the accuracy class: {listed(outside)}."))
     silent: list[str | Value] = []
     for name in ("lines", "customers", "meters"):
         table = found.tables[name]
         untold = int((table["verdict"] == UNTOLD).sum())
         if untold:
             silent += [
-                ", " if silent else "Not told by the readings: ",
+                ", " if silent else "Not determined by the readings: ",
                 Value(untold, str(untold), f"calibrate-{name}:verdict:count {UNTOLD}"),
                 f" of {len(table)} {name}",
             ]
     if silent:
-        sentences.append((*silent, ". About these nothing is known, right or wrong."))
+        sentences.append((*silent, ". These may be right or wrong."))
     return Finding(Standing.MEASURED, tuple(sentences))
 
 

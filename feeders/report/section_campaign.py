@@ -1,4 +1,4 @@
-"""Section of the campaign: how the monitor behaved in simulated attacks."""
+"""Section of the campaign: the monitor in simulated attacks."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ if TYPE_CHECKING:
 
 __all__ = ["campaign"]
 
-# What a page has room for; the files have all.
+# Columns on the page; the files have all.
 _BY = {"by_kind": "kind", "by_size": "size", "by_place": "place", "by_liars": "liars"}
 _SIZES = (
-    "bias, scaling: % of nominal; drift: % of nominal a minute; replay: how old reports are, s; coordinated: "
-    "% of nominal by which the load that liars pretend moves the least affected of them; stuck: none"
+    "bias, scaling: % of nominal; drift: % of nominal per minute; replay: age of the reports, s; "
+    "coordinated: displacement of the least affected meter by a false load, % of nominal; stuck: none"
 )
 _UNITS = {
     **dict.fromkeys((Trick.BIAS, Trick.TOGETHER, Trick.SCALING, Trick.COORDINATED), " %"),
     **{Trick.DRIFT: " %/min", Trick.REPLAY: " s", Trick.CLOCK_SHIFT: " s", Trick.INVERTER: " %"},
 }
 _ERRORS = {
-    Meters.SITE: "as the feeder's files say",
-    Meters.WHITE: "white noise of 0.2 %, nothing fixed",
+    Meters.SITE: "those of the feeder's files",
+    Meters.WHITE: "white noise of 0.2 %, no fixed error",
     Meters.REAL: "fixed within 0.5 %, and jitter of 0.05 %",
 }
 _SHOWN = (
@@ -50,13 +50,7 @@ _SCENARIOS = (
 
 
 def campaign(_: Site, found: Campaign) -> Section:
-    """How the monitor behaved in simulated attacks.
-
-    Parameters
-    ----------
-    found
-        What was found.
-    """
+    """Section of the campaign."""
     plan = found.plan
     rate = min(plan.alarms_per_year)
     return Section(
@@ -68,31 +62,31 @@ def campaign(_: Site, found: Campaign) -> Section:
         | {"scenarios": _SCENARIOS},
         columns={
             "size": _SIZES,
-            "exact": "share of scenarios in which all liars and nobody else were named",
-            "named": "share of the liars that were named",
-            "false": "share of scenarios in which somebody honest was named",
+            "exact": "share of scenarios with all manipulated devices named, and no others",
+            "named": "share of the manipulated devices that were named",
+            "false": "share of scenarios with an honest device named",
             "… low, … high": "limits that hold the true share in 95 of 100 cases",
-            "delay": "from the beginning of a lie until the liar was named, s; ∞: never; "
+            "delay": "from the onset of an attack to the naming of the device, s; ∞: never; "
             "medians are of those that were named",
             "error": "of the reconstructed voltage, % of nominal",
-            "undecided": "share of the time in which the monitor said that it cannot tell",
-            "clean lying s": "for how long it said CLEAN although somebody lied",
-            "reason": "why a scenario could not be played",
-            "per year": "false names a year, from so many hours without a lie; with limits for these few",
+            "undecided": "share of the time with the verdict UNDECIDED",
+            "clean lying s": "time with the verdict CLEAN during an attack",
+            "reason": "reason for a missing simulation",
+            "per year": "false names per year, from `hours` without an attack; with limits for this number",
         },
         assumptions=(
             f"{plan.scenarios} scenarios of {plan.duration_s:g} s at {plan.step_s:g} s on days of profiles, "
             f"seed {plan.seed}; the truth is full AC power flow with the inverters in closed loop.",
-            f"Watched by the {plan.estimator} monitor, set for {rate:g} {plural(rate, 'false alarm')} a "
+            f"Monitor: {plan.estimator}, set for {rate:g} {plural(rate, 'false alarm')} per "
             f"year; powers known {_known(plan.load_error)}; errors of meters: {_ERRORS[plan.meters]}.",
-            "A simulated attack is one that somebody thought of: others may fare differently.",
+            "Simulated attacks are examples: the outcome of others may differ.",
         ),
     )
 
 
 def _known(error: LoadError | None) -> str:
     if error is None:
-        return "as well as the feeder's files say, of registers, power factors and customers without a meter"
+        return "as stated in the feeder's files for registers, power factors and unmetered customers"
     return f"within {error.p_kw:g} kW and {error.q_kvar:g} kvar (1 sigma)"
 
 
@@ -100,23 +94,23 @@ def _figures(found: Campaign, rate: float) -> tuple[Figure, ...]:
     return (
         Figure(
             "campaign-named",
-            "Who is named, by what they do and how much",
-            "Share of the liars that were named, with the interval that holds the true share in 95 of "
-            "100 cases; on the right how many of how many. Percentages on the left are of nominal voltage.",
+            "Manipulated devices named, by kind and size",
+            "Share of the manipulated devices that were named, with the 95 % interval of the true share; "
+            "on the right the numbers. Percentages on the left are of nominal voltage.",
             partial(_named_chart, found.plan, _at(found.by_size, rate)),
         ),
         Figure(
             "campaign-delay",
-            "How soon",
-            "Share of the liars named within some time of the beginning of their lie, by kind. A curve "
-            "that stays below 100 % has liars that were never named.",
+            "Delay",
+            "Share of the manipulated devices named within some time of the onset, by kind. A curve "
+            "that stays below 100 % has devices that were never named.",
             partial(_delay_chart, _at(found.liars, rate)),
         ),
         Figure(
             "campaign-error",
-            "How wrong the voltage shown was",
-            "Largest error of the reconstructed voltage, % of nominal, by kind; liars' own voltages / those "
-            "of the others.",
+            "Error of the shown voltage",
+            "Largest error of the reconstructed voltage, % of nominal, by kind; at manipulated meters / at "
+            "the others.",
             partial(_error_chart, _at(found.by_kind, rate)),
         ),
     )
@@ -138,7 +132,7 @@ def _behaved(found: Campaign, rate: float) -> Finding:
             (
                 "Of ",
                 Value(len(liars), str(len(liars)), "campaign-liars:rows"),
-                " lying meters in ",
+                " manipulated devices in ",
                 Value(len(played), str(len(played)), "campaign-scenarios:reason:empty"),
                 " simulated scenarios, the monitor named ",
                 Value(share, _percent(share), "campaign-false_names:named:row 0"),
@@ -147,13 +141,13 @@ def _behaved(found: Campaign, rate: float) -> Finding:
         )
         sentences += _missed(found, rate)
     else:
-        sentences.append(("Nobody lied in any scenario: nothing was learned about attacks.",))
+        sentences.append(("No scenario has an attack: no result on attacks.",))
     wronged = int((played["falsely_named"] != "").sum())
     sentences.append(
         (
-            "Somebody honest was named in ",
+            "False accusations: ",
             Value(wronged, str(wronged), "campaign-scenarios:falsely_named:filled"),
-            f" {plural(wronged, 'scenario')}.",
+            f" of {len(played)} {plural(len(played), 'scenario')}.",
             *_worst(played),
         )
     )
@@ -162,15 +156,13 @@ def _behaved(found: Campaign, rate: float) -> Finding:
 
 
 def _missed(found: Campaign, rate: float) -> list[Sentence]:
-    """Who was not named; and how soon the others were."""
+    """Missed devices, and delays of the others."""
     liars = _at(found.liars, rate)
     never = liars[~np.isfinite(liars["delay_s"].to_numpy())]
     delay = liars["delay_s"][np.isfinite(liars["delay_s"].to_numpy())]
-    soon = (
-        f" Of the others, half were named within {number(float(delay.median()), 1)} s." if len(delay) else ""
-    )
+    soon = f" Median delay of the others: {number(float(delay.median()), 1)} s." if len(delay) else ""
     if never.empty:
-        return [(f"None was missed.{soon.replace('Of the others, half', 'Half')}",)]
+        return [(f"None was missed.{soon.replace('Median delay of the others', 'Median delay')}",)]
     total = liars.groupby("kind").size()
     kinds = [f"{kind} ({count} of {total[kind]})" for kind, count in never.groupby("kind").size().items()]
     missed = Value(len(never), str(len(never)), "campaign-liars:delay_s:infinite")
@@ -184,16 +176,16 @@ def _worst(played: pd.DataFrame) -> Sentence:
     if lied.empty or not (played["error_liars"].notna()).any():
         return ()
     worst = played["error_liars"].max()
-    shown = f"{number(float(worst))} %" if math.isfinite(worst) else "without bound"
+    shown = f"{number(float(worst))} %" if math.isfinite(worst) else "unbounded,"
     return (
-        " The voltage shown for lying meters was wrong by at most ",
+        " Largest error of the shown voltage at manipulated meters: ",
         Value(float(worst), shown, "campaign-scenarios:error_liars:max"),
         " of nominal.",
     )
 
 
 def _open(played: pd.DataFrame, impossible: int) -> list[Sentence]:
-    """What the monitor did not say, and what could not be tried."""
+    """Undecided time, undetected time, and scenarios without a simulation."""
     out: list[Sentence] = []
     total, clean = float(played["undecided_s"].sum()), float(played["clean_lying_s"].sum())
     watched = float(played["watched_s"].sum())
@@ -201,11 +193,11 @@ def _open(played: pd.DataFrame, impossible: int) -> list[Sentence]:
         (
             "Of ",
             Value(watched, f"{number(watched, 0)} s", "campaign-scenarios:watched_s:sum"),
-            " watched, it said UNDECIDED for ",
+            " monitored, the verdict was UNDECIDED for ",
             Value(total, f"{number(total, 0)} s", "campaign-scenarios:undecided_s:sum"),
             ", and CLEAN for ",
             Value(clean, f"{number(clean, 0)} s", "campaign-scenarios:clean_lying_s:sum"),
-            " in which somebody lied who was not noticed yet, or never.",
+            " with an attack that was not noticed yet, or never.",
         )
     )
     if impossible:
@@ -214,7 +206,7 @@ def _open(played: pd.DataFrame, impossible: int) -> list[Sentence]:
         out.append(
             (
                 count,
-                f" {noun} could not be played: nothing is known about them.",
+                f" {noun} could not be simulated: no result for these.",
             )
         )
     return out
@@ -244,7 +236,7 @@ def _named_chart(plan: Plan, table: pd.DataFrame, width: float) -> Drawing:
         unit = "" if kind is None or kind.volts or kind.together else _UNITS.get(kind.trick, "")
         size = "" if kind is not None and kind.trick is Trick.STUCK else f" {row['size']:g}{unit}"
         data.append(Row(f"{row['kind']}{size}", bars, f"{round(share * told / 100.0)} of {told}"))
-    return rows(data, width, axis="liars named, %")
+    return rows(data, width, axis="manipulated devices named, %")
 
 
 def _delay_chart(liars: pd.DataFrame, width: float) -> Drawing:
@@ -261,22 +253,22 @@ def _delay_chart(liars: pd.DataFrame, width: float) -> Drawing:
         y.append(y[-1])
         drawn.append(Curve(tuple(x), tuple(y), LINES[k % len(LINES)], str(kind)))
     return curves(
-        drawn, width, x="s after the beginning of the lie", y="liars named, %", high=100.0, decades=True
+        drawn, width, x="s after the onset", y="manipulated devices named, %", high=100.0, decades=True
     )
 
 
 def _error_chart(table: pd.DataFrame, width: float) -> Drawing:
     data = []
     for row in table.to_dict("records"):
-        liars, others = (float(row[f"error_{who}_worst"]) for who in ("liars", "others"))
+        liars, others = (float(row[f"error_{place}_worst"]) for place in ("liars", "others"))
         bars = [
             Bar(0.0, value, look, meaning, f"{number(value)} %", inset)
             for value, look, meaning, inset in (
-                (liars, "fill-b", "liars", 3.0),
+                (liars, "fill-b", "manipulated meters", 3.0),
                 (others, "fill-a", "others", 6.5),
             )
             if math.isfinite(value)
         ]
         shown = " / ".join(number(v) for v in (liars, others) if not math.isnan(v))
         data.append(Row(str(row["kind"]), tuple(bars), shown))
-    return rows(data, width, axis="largest error of the voltage shown, % of nominal")
+    return rows(data, width, axis="largest error of the shown voltage, % of nominal")

@@ -1,4 +1,4 @@
-"""Section of the droop fleet: whether it is stable, keeps the voltage band, and what it hosts."""
+"""Section of the droop fleet: stability, voltage band, hosting capacity."""
 
 from __future__ import annotations
 
@@ -32,19 +32,13 @@ if TYPE_CHECKING:
 __all__ = ["droop"]
 
 ROWS = 30
-"""So many customers a chart has at most: those whose voltage can move most."""
+"""Largest number of customers in a chart: those with the widest voltage limits."""
 
 STABLE, UNSTABLE, KEPT, VIOLATED, UNDECIDED = "stable", "unstable", "kept", "violated", "undecided"
 
 
 def droop(site: Site, found: DroopStudy) -> Section:
-    """Whether the inverters are stable and keep the voltage band.
-
-    Parameters
-    ----------
-    site, found
-        The feeder, and what was found.
-    """
+    """Section of the droop fleet."""
     given, own = found.options, site.tables.meta.limits
     low, high = (
         mine if asked is None else asked
@@ -55,7 +49,7 @@ def droop(site: Site, found: DroopStudy) -> Section:
     band = f"{number(low * volt, 1)} to {number(high * volt, 1)} V" if one else f"{low:g} to {high:g} pu"
     ends = given.v0_low, given.v0_high
     busbar = f"at {ends[0]:g} pu" if ends[0] == ends[1] else f"from {ends[0]:g} to {ends[1]:g} pu"
-    alone = "" if ends[0] == ends[1] or single_phase(site) else ", each phase on its own"
+    alone = "" if ends[0] == ends[1] or single_phase(site) else ", each phase independently"
     every = "continuously" if not given.interval_s else f"every {given.interval_s:g} s"
     delay = f", with a dead time of {given.dead} intervals" if given.dead else ""
     hosts = "hosting" in found.tables
@@ -65,25 +59,25 @@ def droop(site: Site, found: DroopStudy) -> Section:
         figures=_figures(site, found, (low, high), band),
         tables=found.tables,
         columns={
-            "verdict": "stable: proved to come to one rest from every state; unstable: leaves its rest, "
-            "proved and simulated; undecided: neither is proved",
-            "gain, growth": "of the loop at rest; factor of a small deviation in one update",
+            "verdict": "stable: proved to converge to one equilibrium from every state; unstable: leaves its "
+            "equilibrium, proved and simulated; undecided: neither is proved",
+            "gain, growth": "of the loop in equilibrium; factor of a small deviation in one update",
             "margin": "all curves stay proved stable up to this factor on their slopes",
-            "certified, unstable": "the same for these curves made steeper: proved up to the one, unstable "
-            "from the other on",
-            "longest interval s": "longest sampling interval found that is proved stable; ∞: every one",
-            "rest, always": "is the band kept while loads move slowly, and however they move",
+            "certified, unstable": "factors on the slopes of these curves: proved stable up to the first, "
+            "unstable from the second on",
+            "longest interval s": "longest sampling interval found with a proof of stability; ∞: every one",
+            "rest, always": "band kept for slow, and for arbitrary load changes",
             "low volt, high volt": "proved limits of the voltage",
-            "part, alone": "share of the loop gain; what one inverter's slope may be multiplied with",
-            "point": "evening: full loads, no sun; noon: a fifth of the loads, full sun; half: half of both",
-            "settling, overshoot": "until the change is over but for 2 %; % of the change",
-            "change volt": "how far the inverters move the voltage after the step, V",
-            "tau factor": "all time constants multiplied with it",
-            **({"capacity kw": "most generation in all; the limit is what breaks next"} if hosts else {}),
+            "part, alone": "share of the loop gain; admissible factor on one inverter's slope",
+            "point": "evening: full loads, no generation; noon: 0.2 of the loads, full generation; half: 0.5",
+            "settling, overshoot": "time until 2 % of the change remain; % of the change",
+            "change volt": "change of the voltage by the inverters after the step, V",
+            "tau factor": "factor on all time constants",
+            **({"capacity kw": "largest total generation; `limit` is the next violation"} if hosts else {}),
             **({"confirmed volt": "difference from a second power flow there, V"} if hosts else {}),
         },
         assumptions=(
-            f"Inverters: {given.preset or 'as in the files'}; they act {every}{delay}. "
+            f"Inverters: {given.preset or 'as in the files'}; sampled {every}{delay}. "
             f"{'Balanced' if single_phase(site) else 'Three-phase'} power flow.",
             f"Any loads up to {100.0 * given.load_high:g} % and generation up to {100.0 * given.pv_high:g} % "
             f"of their peaks; busbar {busbar}{alone}; band {band}.",
@@ -93,11 +87,11 @@ def droop(site: Site, found: DroopStudy) -> Section:
 
 
 def _conditions(given: DroopOptions) -> str:
-    """What generation is hosted under."""
+    """Conditions of hosting, as a sentence."""
     return (
         f"Hosting: loads at {100.0 * given.hosting_load:g} % of their peaks, the busbar at "
-        f"{given.v0_high:g} pu, all generation at its peak and with new inverters. In random orders, units "
-        f"of {given.unit_kw:g} kW come to one customer after the other."
+        f"{given.v0_high:g} pu, all generation at its peak and with new inverters. In random orders, one "
+        f"customer after the other gets a unit of {given.unit_kw:g} kW."
     )
 
 
@@ -114,7 +108,7 @@ def _fleet(site: Site, found: DroopStudy, band: str, busbar: str) -> Finding:
     without = [row for row in kept if row["case"] == "without"]
     if without and (rest, always) != (str(without[0]["rest"]), str(without[0]["always"])):
         bare = str(without[0]["always"])
-        word = "not proved to be kept, nor broken" if bare == UNDECIDED else bare
+        word = "neither proved to be kept nor violated" if bare == UNDECIDED else bare
         sentences.append((f"Without the inverters' reactive power the band is {word}.",))
     sentences += _hosting(found)
     open_ = [verdict == UNDECIDED, UNDECIDED in (rest, always)]
@@ -128,40 +122,40 @@ def _stability(stability: pd.DataFrame, verdict: str, busbar: str) -> Sentence:
         margin: Sentence = ()
         if math.isfinite(float(stability["margin"].min())):
             times = least(stability, name, "margin", digits=1, side=Side.BELOW)
-            margin = (" All curves could be ", times, " times as steep and still be proved stable.")
+            margin = (" Proved margin: all slopes may be ", times, " times as large.")
         lead = f"Stable: proved for constant loads anywhere within their limits, the busbar {busbar}."
         return (lead, *margin)
     which = [str(p) for p, v in zip(stability["point"], stability["verdict"], strict=True) if v == verdict]
     count = Value(len(which), str(len(which)), f"{name}:verdict:count {verdict}")
     where: Sentence = (" (", count, f" of {len(stability)} cases: {listed(which)})")
     if verdict == UNSTABLE:
-        return ("Unstable: the fleet leaves its rest, in the proof and in AC simulation", *where, ".")
+        return ("Unstable: the fleet leaves its equilibrium, in the proof and in AC simulation", *where, ".")
     why = listed(list(dict.fromkeys(str(w) for w in stability["why"].dropna() if w)))
     reason = f": {why}" if why else ""
-    return ("Whether the fleet is stable is not proved", *where, f"{reason}. It may oscillate.")
+    return ("Stability of the fleet: not proved", *where, f"{reason}. It may oscillate.")
 
 
 def _band(kept: tuple[str, str], band: str, busbar: str, *, limits: Sentence, broken: Sentence) -> Sentence:
     rest, always = kept
     if always == KEPT:
-        lead = f"The band from {band} is kept, however loads move within their limits, the busbar {busbar}"
+        lead = f"Voltage band from {band}: kept for arbitrary changes of loads within limits, busbar {busbar}"
         return (lead, *limits, ".")
     if rest == KEPT:
-        sudden = (
-            "sudden changes can break it"
-            if always == VIOLATED
-            else "during sudden changes that is not proved"
-        )
-        lead = f"The band from {band} is kept while loads move slowly, the busbar {busbar}; {sudden}"
+        sudden = "sudden changes can violate it" if always == VIOLATED else "not proved for sudden changes"
+        lead = f"Voltage band from {band}: kept for slow load changes, busbar {busbar}; {sudden}"
         return (lead, *limits, *broken, ".")
     if VIOLATED in (rest, always):
-        when = "at rest" if rest == VIOLATED else "while loads change"
-        return (f"The band from {band} can be broken {when}, the busbar {busbar}", *broken, ".")
-    return (f"Whether the band from {band} is kept is not proved, and no loads that break it were found.",)
+        when = "in equilibrium" if rest == VIOLATED else "during load changes"
+        return (
+            f"Voltage band from {band}: violations are possible {when}, busbar {busbar}",
+            *broken,
+            ".",
+        )
+    return (f"Voltage band from {band}: not proved, and no loads that violate it were found.",)
 
 
 def _witness(site: Site, table: pd.DataFrame | None) -> Sentence:
-    """How far beyond the band loads were found that AC power flow confirms."""
+    """Largest violation of the band by a witness, as the end of a sentence."""
     if table is None or not table["beyond"].any():
         return ()
     nominal = dict(zip(site.feeder.customers, site.customer_nominal, strict=True))
@@ -170,17 +164,17 @@ def _witness(site: Site, table: pd.DataFrame | None) -> Sentence:
     row = table.iloc[k]
     size = float(row["v_volt"])
     volt = Value(size, f"{number(size, 1)} V", f"droop-witness:v_volt:row {k}")
-    return ("; loads among the tables (witness) lead to ", volt, f" at {row['customer']}, by AC power flow")
+    return ("; the loads of table witness give ", volt, f" at {row['customer']}, by AC power flow")
 
 
 def _limits(site: Site, fleet: dict[str, object], always: str) -> Sentence:
-    """Proved limits: at all times where that keeps the band, at rest otherwise."""
+    """Proved limits: at all times if that keeps the band, in equilibrium otherwise."""
     which = "" if always == KEPT else "_rest"
     low, high = (float(str(fleet[f"{end}{which}_volt"])) for end in ("low", "high"))
     if not (math.isfinite(low) and math.isfinite(high)):
         return ()
     several = bool((site.nominal_volt != site.nominal_volt[0]).any())
-    there = f" where that is nearest to the band's ends (nominal: {told(site.nominal_volt)}):"
+    there = f" at the places nearest to the band's ends (nominal: {told(site.nominal_volt)}):"
     return (
         f"; proved limits{there if several else ''} ",
         Value(low, f"{number(low, 1, Side.BELOW)} V", f"droop-band:low{which}_volt:row 0"),
@@ -194,14 +188,14 @@ def _hosting(found: DroopStudy) -> list[Sentence]:
     if table is None:
         return []
     words: list[str | Value] = [
-        "Generation that the feeder hosts, placed like its own, before a limit breaks: "
+        "Hosting capacity, with generation distributed as in the files, up to the first violated limit: "
     ]
     for k, row in enumerate(table.to_dict("records")):
         kw = float(row["capacity_kw"])
         name = "without reactive power" if row["preset"] == "none" else f"with {row['preset']}"
         size = Value(kw, f"{number(kw, 0, Side.BELOW)} kW", f"droop-hosting:capacity_kw:row {k}")
         words += ["; " if k else "", size]
-        unsure = {UNDECIDED: "; that the fleet is stable there is not proved", UNSTABLE: "; unstable there"}
+        unsure = {UNDECIDED: "; stability of the fleet there not proved", UNSTABLE: "; unstable there"}
         limit = row["limit"] or "no limit found"
         words.append(f" {name} ({limit}{unsure.get(str(row.get('verdict')), '')})")
     return [(*words, ".")]
@@ -231,9 +225,9 @@ def _figures(site: Site, found: DroopStudy, limits: tuple[float, float], band: s
         out.append(
             Figure(
                 "droop-steps",
-                "What the inverters do after a step",
-                "AC simulation from right after the step on, at the customer whose voltage is worst in the "
-                "end. Load: from 20 to 80 % of its peak; cloud: generation from its peak to 20 %; tap: the "
+                "Step responses of the inverters",
+                "AC simulation from just after the step on, at the customer with the worst final voltage. "
+                "Load: from 20 to 80 % of its peak; cloud: generation from its peak to 20 %; tap: the "
                 f"busbar up by 0.025 pu. {'; '.join(steps)}.",
                 partial(_steps_chart, tables["steps"], *comparable(site, tables["trajectories"])),
             )
@@ -242,8 +236,8 @@ def _figures(site: Site, found: DroopStudy, limits: tuple[float, float], band: s
         out.append(
             Figure(
                 "droop-hosting",
-                "How much generation the feeder hosts",
-                "Share of random orders of units in which so much generation breaks a limit, by preset.",
+                "Hosting capacity",
+                "Share of random orders of units in which this generation violates a limit, by preset.",
                 partial(_hosting_chart, tables["hosting_probability"]),
             )
         )
@@ -259,7 +253,7 @@ def _band_chart(customers: pd.DataFrame, unit: str, ends: tuple[float, float], w
         )
         bars = [Bar(low, high, "band1", "at all times")]
         if math.isfinite(low_rest + high_rest):
-            bars.append(Bar(low_rest, high_rest, "fill-a", "while loads move slowly", inset=6.0))
+            bars.append(Bar(low_rest, high_rest, "fill-a", "for slow load changes", inset=6.0))
         data.append(
             Row(
                 f"{row['customer']}, {row['phase']}" if "phase" in row else str(row["customer"]),
@@ -291,4 +285,4 @@ def _hosting_chart(table: pd.DataFrame, width: float) -> Drawing:
             y += [y[-1], 100.0 * float(share)]
         name = "without reactive power" if preset == "none" else str(preset)
         drawn.append(Curve(tuple(x), tuple(y), LINES[k % len(LINES)], name))
-    return curves(drawn, width, x="generation, kW", y="orders in which a limit is broken, %", high=100.0)
+    return curves(drawn, width, x="generation, kW", y="orders with a violated limit, %", high=100.0)

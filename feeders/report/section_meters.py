@@ -39,43 +39,37 @@ __all__ = ["detectable", "protect", "redundancy"]
 
 
 def redundancy(site: Site, found: Redundancy) -> Section:
-    """Who can lie without ever being noticed.
-
-    Parameters
-    ----------
-    site, found
-        The feeder, and what was found.
-    """
+    """Section of the study redundancy."""
     first = found.meters[found.meters["case"] == "all live"]
     return Section(
-        title="Who can lie without ever being noticed",
+        title="Attacks that stay invisible",
         answers={Question.INVISIBLE: _invisible(found)},
         figures=(
             Figure(
                 "redundancy-map",
-                "How many must lie together to stay invisible",
-                "At each meter: the fewest liars, itself among them, whose lies stay invisible, by any "
-                "attack (∞: no set of liars; ?: the search gave up).",
+                "Fewest manipulated meters of an invisible attack",
+                "At each meter: size of the smallest set of manipulated meters with it that can stay "
+                "invisible, for any attack (∞: no set; ?: the search was stopped).",
                 partial(_index_map, site, first),
             ),
         ),
         tables=found.tables,
         columns={
-            "index": "fewest liars that stay invisible; ∞: there are none",
-            "attack": "persistent: its effect stays; any: those too that the inverters forget by themselves",
-            "patterns": "dimensions in which a lie can hide",
-            "detected, identified": "most liars that cannot hide, and that can be told who they are",
-            "critical": "without this meter nobody else sees some pattern",
-            "identified without": "most liars that are identified by the others once this meter is silent",
-            "with": "meters that it can stay invisible together with, by an attack whose effect stays",
-            "branch": "whether the part begins at the busbar",
-            "blind": "customers whose voltage no meter tells, whoever lies",
+            "index": "fewest manipulated meters that stay invisible; ∞: none",
+            "attack": "persistent: with a lasting effect; any: also those that the inverters forget",
+            "patterns": "dimension of hidden attacks",
+            "detected, identified": "most manipulated meters that cannot hide, and that are identified",
+            "critical": "without this meter some pattern is invisible to all others",
+            "identified without": "most manipulated meters that the others identify without this one",
+            "with": "meters together with which it can stay invisible, for persistent attacks",
+            "branch": "yes: the part begins at the busbar",
+            "blind": "customers with a voltage that no meter determines, even without an attack",
         },
         assumptions=(
-            f"Nobody knows the powers of: {listed(found.unknown) or 'nobody; all are known'}.",
+            f"Customers with unknown powers: {listed(found.unknown) or 'none'}.",
             f"Inverters on their {'steepest slopes' if str(found.curves) == 'steepest' else 'deadbands'}.",
-            "Whoever looks knows the feeder, all other loads and all meters' errors exactly: the best that "
-            "any method could do. How large a lie must be to stand out of honest errors is another question.",
+            "Feeder, all other loads and all meters' errors are assumed to be known exactly: the limit of "
+            "any method. The size from which an attack exceeds honest errors is not part of this study.",
         ),
     )
 
@@ -87,7 +81,7 @@ def _invisible(found: Redundancy) -> Finding:
         index, case = float(row["index"]), str(row["case"])
         value = Value(index, number(index), f"redundancy-summary:index:row {k}")
         kind = (
-            "by attacks whose effect stays"
+            "by attacks with a lasting effect"
             if row["attack"] == "persistent"
             else "by any attack, those included that the inverters forget within seconds"
         )
@@ -95,22 +89,22 @@ def _invisible(found: Redundancy) -> Finding:
         prefix = "" if case == "all live" else f"Without {listed(found.silent)}: "
         if math.isnan(index):
             open_ = True
-            gave_up = "how many liars it takes is not proved: the search gave up. Some may well be able to"
+            gave_up = "the fewest invisible meters are not proved: the search was stopped. There may be some"
             sentences.append((f"{prefix}{by}, {gave_up}.",))
         elif math.isinf(index):
-            sentences.append((f"{prefix}{by}, no number of liars can stay invisible.",))
+            sentences.append((f"{prefix}{by}, no number of manipulated meters can stay invisible.",))
         else:
-            who = f": {listed(str(row['liars']).split(' '))}" if row["liars"] else ""
-            verb = "liar can" if index == 1 else "liars together can"
+            meters = f": {listed(str(row['liars']).split(' '))}" if row["liars"] else ""
+            verb = "manipulated meter can" if index == 1 else "manipulated meters together can"
             sentences.append(
                 (
                     prefix,
                     value,
-                    f" {verb} stay invisible {kind}{who}{'' if index == 1 else '; fewer cannot'}.",
+                    f" {verb} stay invisible {kind}{meters}{'' if index == 1 else '; fewer cannot'}.",
                 )
             )
         if row["blind"]:
-            sentences.append((f"{prefix}No meter tells the voltage of {row['blind']}.",))
+            sentences.append((f"{prefix}No meter determines the voltage of {row['blind']}.",))
     return Finding(Standing.OPEN if open_ else Standing.PROVED, tuple(dict.fromkeys(sentences)))
 
 
@@ -129,7 +123,7 @@ def _index_map(site: Site, meters: pd.DataFrame, width: float) -> Drawing:
         else:
             spots.append(Spot(Shape.METER, f"{name}: {shown}", f"{name}: {shown}"))
     meanings = {
-        "can stay invisible, with so many": Shape.ALARM,
+        "can stay invisible, in a set of this size": Shape.ALARM,
         "cannot": Shape.METER,
         "not known": Shape.OPEN,
         "no meter": Shape.NONE,
@@ -138,23 +132,17 @@ def _index_map(site: Site, meters: pd.DataFrame, width: float) -> Drawing:
 
 
 ROWS = 30
-"""So many rows a chart has at most; the largest are shown."""
+"""Largest number of rows in a chart; the largest values are shown."""
 
 
 # --- detectable ---------------------------------------------------------------------------------
 
 
 def detectable(site: Site, found: Detectable) -> Section:
-    """Which lies stay unnoticed, in volts; and what they do to the picture.
-
-    Parameters
-    ----------
-    site, found
-        The feeder, and what was found.
-    """
+    """Section of the study detectable."""
     once, twice = _sure(found.risk), _sure(2.0 * found.risk)
     return Section(
-        title="How large a lie must be",
+        title="Sizes of attacks",
         answers={
             Question.LIES: _sizes(site, found.meters, found.max_attacked, (once, twice)),
             Question.PICTURE: _picture(site, found.customers, found.max_attacked, twice),
@@ -162,17 +150,17 @@ def detectable(site: Site, found: Detectable) -> Section:
         figures=_size_figures(site, found, once, twice),
         tables=found.tables,
         columns={
-            "hidden": f"up to this, V, with probability {once} at any one moment, nobody is named",
-            "noticed": "beyond this somebody is beyond a limit of the monitor, with that probability",
-            "named": "beyond this no other explanation is a rival, whoever else lies, with probability "
+            "hidden": f"up to this, V, with probability {once} at any one moment, no meter is named",
+            "noticed": "beyond this a meter exceeds a limit of the monitor, with that probability",
+            "named": "beyond this no other explanation is a rival, for any accomplices, with probability "
             f"{twice} at any one moment",
             "fits": "up to this the readings are those of some honest feeder, all errors at their worst: "
-            "no test without false alarms can object",
-            "identified": "beyond this every explanation by so few liars accuses the meter",
-            "… alone": "the same without accomplices",
+            "no test without false alarms can detect it",
+            "identified": "beyond this every explanation by at most M meters accuses the meter",
+            "… alone": "the same for a single manipulated meter",
             "error": f"largest error of the monitor's reconstructed voltage, V, with probability {twice} for "
             "each customer at any one moment",
-            "error fits": "how far apart two voltages can be that fit to the same readings, V",
+            "error fits": "largest distance of two voltages that fit the same readings, V",
         },
         assumptions=_assumed(site, found, once),
     )
@@ -185,25 +173,27 @@ def _size_figures(site: Site, found: Detectable, once: str, twice: str) -> tuple
     return (
         Figure(
             "detectable-sizes",
-            "What becomes of a lie, by its size",
-            f"Each meter lying {together}. Left: nobody is named. Middle: it depends on the honest errors of "
-            "the moment. Right: noticed, but another meter may be blamed. Beyond the number no explanation "
-            f"without the lying meter is left.{_largest_only(meters)}",
+            "Outcome of an attack, by its size",
+            f"Each meter manipulated {together}. Left: no meter is named. Middle: depends on the honest "
+            "errors of the moment. Right: noticed, but another meter may be named. Beyond the number no "
+            f"explanation without the manipulated meter remains.{_largest_only(meters)}",
             partial(_sizes_chart, meters, unit=unit),
         ),
         Figure(
             "detectable-map",
-            "Where lies may stay unnoticed",
-            f"Size from which a lie is noticed with {once}, {unit}, {liars} {plural(liars, 'liar')}"
-            f"{' together' * (liars > 1)}. Larger discs, larger lies. "
+            "Attacks that may stay unnoticed",
+            f"Size from which an attack is noticed with {once}, {unit}, {liars} "
+            f"{plural(liars, 'manipulated meter')}"
+            f"{' together' * (liars > 1)}. Larger discs, larger attacks. "
             f"Largest at {_extreme(meters, 'meter', 'noticed')}.",
             partial(size_map, site, meters, who="meter", column="noticed", unit=unit),
         ),
         Figure(
             "detectable-picture",
-            "How wrong the picture of the voltage can be",
+            "Errors of the shown voltages",
             f"Largest error of each customer's reconstructed voltage, with {twice}, under {liars} unnoticed "
-            f"{plural(liars, 'liar')}, {unit}. Largest at {_extreme(customers, 'customer', 'error')}.",
+            f"{plural(liars, 'manipulated meter')}, {unit}. "
+            f"Largest at {_extreme(customers, 'customer', 'error')}.",
             partial(size_map, site, customers, who="customer", column="error", unit=unit),
         ),
     )
@@ -212,19 +202,19 @@ def _size_figures(site: Site, found: Detectable, once: str, twice: str) -> tuple
 def _assumed(site: Site, found: Detectable, once: str) -> tuple[str, ...]:
     liars = found.max_attacked
     return (
-        f"At most {liars} {plural(liars, 'meter lies', 'meters lie together')}; liars know the feeder, but "
-        "not the honest errors of the moment.",
+        f"At most {liars} manipulated {plural(liars, 'meter', 'meters together')}; attackers know "
+        "the feeder, but not the honest errors of the moment.",
         "Sequential monitor, before it has learned the fixed errors of its meters; "
         f"{'balanced' if single_phase(site) else 'three-phase'} model; "
         "inverters in their deadbands; nominal voltage.",
         f"Sizes for the monitor hold with {once} at any one moment: honest errors Gaussian or uniform "
         f"with the deviations of the files, and every load draws {100.0 * found.share:g} % of its peak. "
-        "Powers of customers without a meter are unknown within what they can draw and feed in.",
-        "Proofs are for the linear effect of errors of loads; AC power flow was only simulated.",
-        "That the monitor, once it looks, finds the liar, and that it goes on to, is not proved but was "
-        "checked by simulation (gridsec study detectable --trials, and campaigns).",
-        "Where the search for the worst collusion was cut short, sizes are what was proved until there: "
-        "on the safe side.",
+        "Powers of unmetered customers are unknown within their range.",
+        "Proofs are for the linear effect of load errors; AC power flow was only simulated.",
+        "Identification of the manipulated meter by the monitor's search, at this and later moments, is not "
+        "proved but was checked by simulation (gridsec study detectable --trials, and campaigns).",
+        "After a stopped search for the worst collusion, sizes are the limits proved until then: on the "
+        "safe side.",
     )
 
 
@@ -235,41 +225,41 @@ def _sure(risk: float) -> str:
 def _sizes(site: Site, meters: pd.DataFrame, liars: int, sure: tuple[str, str]) -> Finding:
     name = "detectable-meters"
     levels = f" Volts are those of each meter's own level{_percent(site)}." if _percent(site) else ""
-    together = "alone" if liars == 1 else f"with up to {liars} lying together"
+    together = "alone" if liars == 1 else f"with up to {liars} manipulated together"
     never = meters[[math.isinf(v) or math.isnan(v) for v in meters["noticed"]]]
     lead: Sentence = (
         "All ",
         how_many(meters, name),
-        f" meters, {together}, can be lied about by a little: for lies up to ",
+        f" meters, {together}, can hide a small attack: up to ",
         least(meters, name, "hidden", "V", digits=3, side=Side.BELOW),
         f" ({_extreme(meters, 'meter', 'hidden', smallest=True)}) to ",
         most(meters, name, "hidden", "V", digits=3, side=Side.BELOW),
-        f" ({_extreme(meters, 'meter', 'hidden')}) nobody is named, with {sure[0]} at any one moment.",
+        f" ({_extreme(meters, 'meter', 'hidden')}) no meter is named, with {sure[0]} at any one moment.",
         levels,
     )
     if len(never):
         noticed: Sentence = (
             f"For {listed(never['meter'].tolist())} no size is proved to be noticed. "
-            "That is no proof that lies there are harmless.",
+            "This is no proof that attacks there are harmless.",
         )
         return Finding(Standing.PART, (lead, noticed))
     noticed = (
-        "Larger lies may go unnoticed too, depending on the honest errors of the moment. Somebody is beyond "
-        "a limit of the monitor, as surely, from ",
+        "Larger attacks may stay unnoticed too, depending on the honest errors of the moment. A meter "
+        "exceeds a limit of the monitor, with the same probability, from ",
         least(meters, name, "noticed", "V", side=Side.ABOVE),
         f" ({_extreme(meters, 'meter', 'noticed', smallest=True)}) to ",
         most(meters, name, "noticed", "V", side=Side.ABOVE),
         f" ({_extreme(meters, 'meter', 'noticed')}) on.",
     )
     if not all(math.isfinite(v) for v in meters["named"]):
-        named: Sentence = ("Not every liar is proved to be named, however large the lie.",)
+        named: Sentence = ("Not every manipulated meter is proved to be named, for any size of the attack.",)
         return Finding(Standing.PART, (lead, noticed, named))
     named = (
-        "No explanation without the lying meter is left from ",
+        "No explanation without the manipulated meter remains from ",
         least(meters, name, "named", "V", side=Side.ABOVE),
         " to ",
         most(meters, name, "named", "V", side=Side.ABOVE),
-        f" on, with {sure[1]}. That much is proved; that the monitor's search then finds and names it is "
+        f" on, with {sure[1]}. This is proved; the identification by the monitor's search is "
         "not, but was checked by simulation.",
     )
     return Finding(Standing.PART, (lead, noticed, named))
@@ -277,9 +267,9 @@ def _sizes(site: Site, meters: pd.DataFrame, liars: int, sure: tuple[str, str]) 
 
 def _picture(site: Site, customers: pd.DataFrame, liars: int, sure: str) -> Finding:
     name = "detectable-customers"
-    who = "a single lying meter" if liars == 1 else f"{liars} meters that lie together"
+    attacked = "a single manipulated meter" if liars == 1 else f"{liars} meters manipulated together"
     lead: Sentence = (
-        f"Unnoticed, {who} can make the voltage that the monitor shows wrong by at most ",
+        f"Largest error of the shown voltage by {attacked} without notice: ",
         least(customers, name, "error", "V", side=Side.ABOVE),
         f" (at {_extreme(customers, 'customer', 'error', smallest=True)}) to ",
         most(customers, name, "error", "V", side=Side.ABOVE),
@@ -290,16 +280,16 @@ def _picture(site: Site, customers: pd.DataFrame, liars: int, sure: str) -> Find
     if not all(math.isfinite(v) for v in customers["error"]):
         return Finding(Standing.OPEN, (("No bound of the error is proved for every customer.",),))
     whoever: Sentence = (
-        "Whatever the method, two voltages up to ",
+        "For any method, two voltages up to ",
         most(customers, name, "error_fits", "V", side=Side.ABOVE),
-        " apart can fit to the same readings.",
+        " apart apart can fit the same readings.",
     )
-    how: Sentence = ("Proved for the linear effect of errors of loads, and checked by AC power flow.",)
+    how: Sentence = ("Proved for the linear effect of load errors, and checked by AC power flow.",)
     return Finding(Standing.PART, (lead, whoever, how))
 
 
 def _percent(site: Site) -> str:
-    """Where there are several, what 1 % of each is: volts of different levels do not compare."""
+    """With several nominal voltages, 1 % of each in volts: volts of different levels are not comparable."""
     levels = dict.fromkeys(site.nominal_volt.tolist())
     return f"; 1 % is {' and '.join(f'{0.01 * volt:.1f} V' for volt in levels)}" if len(levels) > 1 else ""
 
@@ -325,26 +315,26 @@ def _sizes_chart(meters: pd.DataFrame, width: float, *, unit: str) -> Drawing:
                 0.0,
                 a,
                 "fill-bad",
-                "nobody is named",
-                f"to {number(row['hidden'], 3, Side.BELOW)} {unit} nobody is named",
+                "no meter is named",
+                f"to {number(row['hidden'], 3, Side.BELOW)} {unit} no meter is named",
             ),
             Bar(
                 a,
                 b,
                 "band0",
-                "it depends on honest errors",
+                "depends on honest errors",
                 f"noticed from {number(row['noticed'], 2, Side.ABOVE)} {unit} on",
             ),
             Bar(
                 b,
                 max(b, c),
                 "band2",
-                "noticed, another may be blamed",
+                "noticed, another may be named",
                 f"no explanation without it from {number(row['named'], 2, Side.ABOVE)} {unit} on",
             ),
         )
         data.append(Row(str(row["meter"]), bars, f"{number(row['named'], 2, Side.ABOVE)} {unit[0]}"))
-    axis = "size of the lie, V at nominal voltage" if unit == "V" else f"size of the lie, {unit}"
+    axis = "size of the attack, V at nominal voltage" if unit == "V" else f"size of the attack, {unit}"
     return rows(data, width, axis=axis)
 
 
@@ -352,16 +342,10 @@ def _sizes_chart(meters: pd.DataFrame, width: float, *, unit: str) -> Drawing:
 
 
 def protect(site: Site, found: Protect) -> Section:
-    """Which meters to protect.
-
-    Parameters
-    ----------
-    site, found
-        The feeder, and what was found.
-    """
+    """Section of the study protect."""
     chosen = set(found.meters["meter"]) if len(found.meters) else set()
     return Section(
-        title="Which meters to protect",
+        title="Meters to protect",
         answers={Question.PROTECT: _protection(site, found)},
         figures=(
             Figure(
@@ -369,24 +353,24 @@ def protect(site: Site, found: Protect) -> Section:
                 "Meters to protect",
                 f"Shields: {listed(sorted(chosen))}."
                 if chosen
-                else "What was asked says nothing of this feeder."
+                else "The goal does not apply to this feeder."
                 if found.no_answer
-                else "None needs protection for what was asked.",
+                else "No meter needs protection for this goal.",
                 partial(_protect_map, site, chosen),
             ),
         ),
         tables=found.tables,
         columns={
-            "before, after": "largest hidden lie, V of the busbar's level, without and with protection"
+            "before, after": "largest hidden attack, V of the busbar's level, without and with protection"
             if found.goal.in_volts
-            else "fewest liars that stay invisible, without and with protection; ∞: none can, however many",
-            **({"alone": ALONE, "lie volt": "what was asked, V"} if found.goal.in_volts else {}),
+            else "fewest manipulated meters that stay invisible, without and with protection; ∞: no number",
+            **({"alone": ALONE, "lie volt": "requested bound, V"} if found.goal.in_volts else {}),
             "least": "no fewer protected meters suffice",
-            "attacks": "in how many of the listed attacks the meter takes part",
-            "liars": "meters whose attack rules out anything cheaper",
+            "attacks": "number of the listed attacks with this meter",
+            "liars": "meters of an attack that excludes any smaller set",
         },
         assumptions=(
-            f"At most {found.max_attacked} of the other meters lie; a protected meter cannot.",
+            f"At most {found.max_attacked} of the other meters are manipulated; a protected meter cannot be.",
             *(
                 (
                     f"All errors at their worst, every load at {100.0 * found.share:g} % of its peak, "
@@ -399,21 +383,19 @@ def protect(site: Site, found: Protect) -> Section:
     )
 
 
-ALONE = (
-    "largest lie, V, that one unprotected meter hides by itself within honest errors, its powers being true"
-)
+ALONE = "largest attack, V, that one unprotected meter hides by itself within honest errors, with true powers"
 
 
 def _no_protection(found: Protect) -> Finding:
-    """A goal that asks nothing of this feeder."""
+    """Finding for a goal that requires no protection on this feeder."""
     what = "identified" if found.goal is Goal.IDENTIFY else "noticed"
     lead: Sentence = (
-        f"No answer by this criterion, and no safety: that liars be {what} is asked of lies that fit exactly "
-        "to powers that are known exactly, and none does, however small and however many lie.",
+        f"No answer by this criterion, and no safety: attacks to be {what} are those that fit exactly known "
+        "powers exactly, and there are none, of any size and by any number of meters.",
     )
     instead: Sentence = (
-        "Lies that fit within honest errors were not looked at; to bound these, --goal contain. What hides "
-        "behind a load that nobody knows: --unknown CUSTOMER. Lies that inverters forget within seconds: "
+        "Attacks within honest errors are not part of this goal; to bound these, --goal contain. Attacks "
+        "behind an unknown load: --unknown CUSTOMER. Attacks that inverters forget within seconds: "
         "--attack any.",
     )
     return Finding(Standing.OPEN, (lead, instead))
@@ -423,19 +405,19 @@ def _protection(site: Site, found: Protect) -> Finding:
     if found.no_answer:
         return _no_protection(found)
     count, liars = len(found.meters), found.max_attacked
-    others = f"any {liars} liars" if liars > 1 else "any single liar"
+    others = f"any {liars} manipulated meters" if liars > 1 else "any single manipulated meter"
     among = " among the other meters" if count else ""
     several = bool((site.nominal_volt != site.nominal_volt[0]).any())
     there = f" where {site.nominal_volt[0]:.1f} V are nominal, or the same part elsewhere," if several else ""
     purpose = {
         Goal.IDENTIFY: f"{others}{among} would be identified",
-        Goal.NOTICE: f"the lies of {others}{among} would be noticed",
-        Goal.BOUND: f"no lie above {number(found.lie_volt)} V{there} of {others}{among} fits to an honest "
-        "feeder, if all powers are reported truly",
-        Goal.CONTAIN: f"no lie above {number(found.lie_volt)} V{there} of {others}{among} fits to an honest "
-        "feeder, whatever powers they report",
+        Goal.NOTICE: f"attacks on {others}{among} would be noticed",
+        Goal.BOUND: f"no attack above {number(found.lie_volt)} V{there} on {others}{among} fits an honest "
+        "feeder, with true powers",
+        Goal.CONTAIN: f"no attack above {number(found.lie_volt)} V{there} on {others}{among} fits an honest "
+        "feeder, with any reported powers",
     }[found.goal]
-    scope = "" if found.goal.in_volts else " by someone who knows all other loads and errors exactly"
+    scope = "" if found.goal.in_volts else ", given exact knowledge of all other loads and errors"
     if not count:
         lead: Sentence = (f"None for this purpose: even without protection, {purpose}{scope}.",)
     else:
@@ -447,15 +429,15 @@ def _protection(site: Site, found: Protect) -> Finding:
             f"Then {purpose}{scope}.",
         )
     effect = _effect(found)
-    proof: Sentence = ("No fewer suffice; other choices of as many may be as good.",)
-    # What is proved in volts is proved for the linear effect of errors.
+    proof: Sentence = ("No fewer suffice; other sets of this size may be as good.",)
+    # Results in volts are proved for the linear effect of errors.
     sure = Standing.PART if found.gap or found.goal.in_volts else Standing.PROVED
     if not count and not math.isnan(found.before):
         return Finding(sure, (lead, effect))
     if found.gap:
         needed = Value(found.least, str(found.least), "protect-summary:least:row 0")
         proof = (
-            "These suffice, but that they are the fewest is not proved; at least ",
+            "These suffice; their number is not proved to be the smallest; at least ",
             needed,
             " are needed.",
         )
@@ -463,18 +445,24 @@ def _protection(site: Site, found: Protect) -> Finding:
 
 
 def _effect(found: Protect) -> Sentence:
-    """What protection changes."""
+    """Effect of protection."""
     before, after, alone = (
         Value(value, _cell(value, found.goal), f"protect-summary:{name}:row 0")
         for name, value in (("before", found.before), ("after", found.after), ("alone", found.alone))
     )
     if found.goal.in_volts:
-        lead: Sentence = ("Largest lie that can hide: ", before, " without protection, ", after, " with it.")
+        lead: Sentence = ("Largest hidden attack: ", before, " without protection, ", after, " with it.")
         if math.isnan(found.alone):
             return lead
-        return (*lead, " Unprotected, one meter hides up to ", alone, " by itself with its powers true.")
-    lead = ("Fewest liars that stay invisible: ", before, " without protection, ", after, " with it")
-    return (*lead, ", however many lie." if math.isinf(found.after) else ".")
+        return (*lead, " Unprotected, one meter hides up to ", alone, " by itself, with true powers.")
+    lead = (
+        "Fewest manipulated meters that stay invisible: ",
+        before,
+        " without protection, ",
+        after,
+        " with it",
+    )
+    return (*lead, ", for any number of meters." if math.isinf(found.after) else ".")
 
 
 def _cell(value: float, goal: Goal) -> str:

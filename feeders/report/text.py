@@ -1,6 +1,6 @@
 """Texts of the report: sentences with sourced numbers, and sections of studies.
 
-A number in a sentence names the table it was taken from, so that whoever doubts it can look, and a test can.
+A number in a sentence names its table, for readers and for a test.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ __all__ = [
 
 
 MANY: Final = 12
-"""So many names are listed in a sentence at most."""
+"""Largest number of names in a sentence."""
 
 
 class Standing(Enum):
-    """How sure an answer is."""
+    """Certainty of an answer."""
 
     PROVED = "proved"
     MEASURED = "measured"
@@ -52,16 +52,16 @@ class Standing(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Value:
-    """A number in a sentence.
+    """Number in a sentence.
 
     Attributes
     ----------
     value
         The number.
     shown
-        As it is written, with its unit.
+        Text of the number, with its unit.
     source
-        Table, column, and what was done with it: `detectable-meters:noticed:max`.
+        Table, column, and operation: `detectable-meters:noticed:max`.
     """
 
     value: float
@@ -74,12 +74,12 @@ Sentence = tuple[str | Value, ...]
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """An answer of a study.
+    """Answer of a study.
 
     Attributes
     ----------
     standing
-        How sure it is.
+        Certainty of the answer.
     sentences
         The answer, the most important first.
     """
@@ -89,12 +89,12 @@ class Finding:
 
 
 def said(sentence: Sentence) -> str:
-    """A sentence as plain text."""
+    """Sentence as plain text."""
     return "".join(part if isinstance(part, str) else part.shown for part in sentence)
 
 
 class Side(Enum):
-    """Where rounding goes: what is proved up to a number is written with a smaller one, and so on."""
+    """Direction of rounding: a proved upper limit of safety is rounded down, and so on."""
 
     NEAR = "near"
     BELOW = "below"
@@ -102,7 +102,7 @@ class Side(Enum):
 
 
 def number(value: Any, digits: int = 2, side: Side = Side.NEAR) -> str:
-    """Write a number: ∞ for none that is finite, a question mark for one that is not known."""
+    """Write a number: ∞ for an infinite one, a question mark for an unknown one."""
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return "?"
     if math.isinf(value):
@@ -121,12 +121,12 @@ def number(value: Any, digits: int = 2, side: Side = Side.NEAR) -> str:
 
 
 def plural(size: float, one: str, several: str = "") -> str:
-    """One meter, two meters: the noun that goes with a number."""
+    """Noun of a number: one meter, two meters."""
     return one if size == 1 else several or f"{one}s"
 
 
 def listed(names: Sequence[str]) -> str:
-    """Names in a sentence; from too many on, the first and how many more."""
+    """Names in a sentence; beyond MANY, the first ones and the number of the others."""
     some = list(names)
     if len(some) > MANY:
         return f"{', '.join(some[: MANY - 2])} and {len(some) - MANY + 2} more"
@@ -134,14 +134,14 @@ def listed(names: Sequence[str]) -> str:
 
 
 def rows(table: pd.DataFrame, name: str) -> Value:
-    """How many rows a table has."""
+    """Number of rows of a table."""
     return Value(len(table), str(len(table)), f"{name}:rows")
 
 
 def most(
     table: pd.DataFrame, name: str, column: str, unit: str = "", *, digits: int = 2, side: Side = Side.NEAR
 ) -> Value:
-    """The largest of a column."""
+    """Largest value of a column."""
     value = float(table[column].max())
     return Value(value, f"{number(value, digits, side)} {unit}".strip(), f"{name}:{column}:max")
 
@@ -149,44 +149,44 @@ def most(
 def least(
     table: pd.DataFrame, name: str, column: str, unit: str = "", *, digits: int = 2, side: Side = Side.NEAR
 ) -> Value:
-    """The smallest of a column."""
+    """Smallest value of a column."""
     value = float(table[column].min())
     return Value(value, f"{number(value, digits, side)} {unit}".strip(), f"{name}:{column}:min")
 
 
 class Question(Enum):
-    """What a committee asks, in the order in which the summary answers."""
+    """Questions of a committee, in the order of the summary."""
 
-    LIES = "Which meters can be lied about without anyone noticing, and by how much?"
-    PROTECT = "Which few meters should be protected?"
-    PICTURE = "What can an attacker do to the picture of the voltage?"
+    LIES = "Which meters can be manipulated without notice, and by how much?"
+    PROTECT = "Which meters should be protected?"
+    PICTURE = "How large an error of the shown voltages can an attack cause?"
     FLEET = "Are the inverters stable, and do they keep the voltage band?"
     MONITOR = "How did the monitor behave in simulated attacks?"
-    INVISIBLE = "Could liars stay invisible for ever, even to someone who knows everything else?"
-    RECORDS = "What do the recorded readings say about the files?"
-    OTHER = "What else was studied?"
+    INVISIBLE = "Can attacks stay invisible for ever, even with exact knowledge of everything else?"
+    RECORDS = "Which errors of the files do the recorded readings show?"
+    OTHER = "Which other studies were run?"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Section:
-    """A section of the report.
+    """Section of the report.
 
     Attributes
     ----------
     title
-        Its heading.
+        Heading.
     answers
-        What it answers.
+        Answers by question.
     figures
-        Its figures; their names begin with the study's.
+        Figures; their names begin with the study's.
     tables
-        Its tables by name.
+        Tables by name.
     shown
-        Columns of a table that the page shows, where it is not to be the first ones; files have all.
+        Columns of a table on the page, if not the first ones; files have all.
     columns
-        What columns of the tables mean, in the order in which that is told.
+        Meanings of the tables' columns, in the order of the page.
     assumptions
-        What was assumed, sentences.
+        Assumptions, as sentences.
     """
 
     title: str

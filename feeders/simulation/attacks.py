@@ -1,7 +1,7 @@
 """Attacks on a given feeder: random and coordinated campaigns, and attacks stated in one line.
 
-Everything here knows the feeder and no estimator. The coordinated attack asks the same AC power flow that the
-truth comes from what an extra load would look like, droop inverters included: the strongest lie that leaves
+The attacks depend on the feeder and on no estimator. The trace of a coordinated attack is that of an extra
+load in the AC power flow of the simulation, droop inverters included. It is the strongest attack, as it has
 the shape of a real event.
 """
 
@@ -41,23 +41,23 @@ if TYPE_CHECKING:
 
 
 LARGEST: Final = 1.5
-"""Random displacements lie between `size` and this times `size`."""
+"""Largest random displacement relative to `size`, 1."""
 
 LARGEST_SIZE_PU: Final = 0.5
-"""A size beyond this is hardly meant: it was said in per cent."""
+"""Largest plausible size, pu; larger ones are taken for per cent."""
 
 LARGEST_SHIFT_PU: Final = 0.2
-"""A fake load that drops any voltage by more than this would be absurd at first sight."""
+"""Largest voltage change by a fake load, pu; beyond it the trace is obviously false."""
 
 TYPICAL_LOAD: Final = 0.3
-"""Share of `load_kw` that customers draw where no scenario says more."""
+"""Load relative to `load_kw` without a scenario, 1."""
 
 SIZING_TOLERANCE: Final = 1e-4
 SIZING_ROUNDS: Final = 30
 
 
 class Kind(StrEnum):
-    """Kinds of attack that `random_attacks` makes."""
+    """Kinds of attack of `random_attacks`."""
 
     BIAS = "bias"
     SCALING = "scaling"
@@ -70,12 +70,12 @@ class Kind(StrEnum):
 
 
 def no_size(size: float) -> list[Problem]:
-    """Return what is wrong with a size that somebody asks for: one that was said in per cent.
+    """Problem of a size that is probably given in per cent.
 
     Parameters
     ----------
     size
-        A part of nominal.
+        Size relative to nominal, 1.
     """
     if abs(size) <= LARGEST_SIZE_PU:
         return []
@@ -85,19 +85,19 @@ def no_size(size: float) -> list[Problem]:
 
 
 class NoSuchAttack(GridsecError):
-    """An attack of the size asked for cannot be made on this feeder."""
+    """An attack of the requested size does not exist on this feeder."""
 
     code = "no-such-attack"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FakeLoad:
-    """A load that does not exist, and the trace that it would leave. p meters.
+    """A load that does not exist, and its trace. p meters.
 
     Attributes
     ----------
     customer
-        Index of the customer who would draw it.
+        Index of the customer with the load.
     p_kw, q_kvar
         The load.
     shift : (p,)
@@ -121,7 +121,7 @@ def random_attacks(
     t_off: float,
     scenario: Scenario | None = None,
 ) -> tuple[Attack, ...]:
-    """Attack random meters of a feeder.
+    """Choose random meters of a feeder and their attack.
 
     Parameters
     ----------
@@ -130,24 +130,24 @@ def random_attacks(
     seed
         Chooses the meters, their displacements and the place of a fake load.
     kind
-        What the attack does. Bias, scaling and random displacements have random signs and sizes between
-        `size` and 1.5 `size`; a drift arrives at such a size after a third of the attack; a replay plays
-        the hour before; a fake load moves the least affected of its meters by just `size`. Scaling moves
-        a meter by at least `size` while its voltage is within the feeder's limits. Stuck and replayed
-        meters are displaced by what has changed since, whatever `size` says.
+        Kind of the attack. Bias, scaling and random displacements have random signs and sizes between `size`
+        and 1.5 `size`. A drift reaches such a size after a third of the attack. A replay repeats the hour
+        before. A fake load moves the least affected of its meters by `size`. Scaling moves a meter by at
+        least `size` while its voltage is within the feeder's limits. The displacement of stuck and replayed
+        meters is the change of the voltage since, independent of `size`.
     count
-        How many meters lie.
+        Number of manipulated meters.
     size
         Smallest displacement of a manipulated meter, pu of nominal, > 0.
     t_on, t_off
-        When they lie, Unix s.
+        Begin and end, Unix s.
     scenario
-        Where the loads beneath a fake load are taken from, at `t_on`; typical ones by default.
+        Source of the true loads at `t_on` under a fake load; typical loads by default.
 
     Raises
     ------
     NoSuchAttack
-        When there are fewer meters than `count`, or no place for a fake load of this size.
+        For fewer meters than `count`, or without a place for a fake load of this size.
     """
     kind = Kind(kind)
     if not 0 < count <= site.meters.size:
@@ -167,24 +167,24 @@ def random_attacks(
 
 
 def busbar_attack(site: Site, kind: Kind | str, size: float, *, t_on: float, t_off: float) -> Attack:
-    """Attack the busbar's own meter, in all of its phases.
+    """Attack the busbar meter, in all of its phases.
 
     Parameters
     ----------
     site
         The feeder.
     kind
-        Bias, scaling or drift: what it reads is too high by `size`, by this part of it, or comes to be so
-        by `size` after a third of the attack.
+        Bias, scaling or drift: the reading is too high by `size`, or by this part of itself, or by `size`
+        from a third of the attack on.
     size
-        Displacement, pu of nominal; negative if it reads too little.
+        Displacement, pu of nominal; negative for a low reading.
     t_on, t_off
-        When it lies, Unix s.
+        Begin and end, Unix s.
 
     Raises
     ------
     NoSuchAttack
-        When it is of another kind.
+        For another kind.
     """
     phases = np.arange(busbar_places(site.feeder).stop)
     signed = np.full(phases.size, size)
@@ -195,7 +195,7 @@ def busbar_attack(site: Site, kind: Kind | str, size: float, *, t_on: float, t_o
             return _plain(plain, phases, signed, site, t_on=t_on, t_off=t_off, seed=0)
         case other:
             raise NoSuchAttack(
-                f"the busbar's meter is manipulated by bias, scaling or drift, not by {other}",
+                f"the busbar meter is manipulated by bias, scaling or drift, not by {other}",
                 code="unknown-name",
             )
 
@@ -203,7 +203,7 @@ def busbar_attack(site: Site, kind: Kind | str, size: float, *, t_on: float, t_o
 def fake_load(
     site: Site, customer: int, meters: Ints | int, size: float, *, loads: Loads | None = None
 ) -> tuple[Ints, FakeLoad]:
-    """Size a load at one customer whose trace moves every lying meter by at least `size`.
+    """Size a load at one customer with a trace of at least `size` at every manipulated meter.
 
     Parameters
     ----------
@@ -212,25 +212,25 @@ def fake_load(
     customer
         Index of the customer.
     meters : (k,) or k
-        The meters that will lie, or how many: then those that the load affects most, the customer's own
-        among them if it has one.
+        The meters to manipulate, or their number. A number selects those that the load affects most, with the
+        customer's own meter if there is one.
     size
         Smallest displacement, pu, > 0.
     loads
-        What customers draw at the time; typical loads by default.
+        True loads at the time; typical loads by default.
 
     Returns
     -------
     meters : (k,)
-        Those that lie.
+        The manipulated meters.
     fake
         The load, and its trace at all meters: the difference of two AC power flows in equilibrium with the
-        droop inverters, scaled at the very end (by less than SIZING_TOLERANCE) to `size`.
+        droop inverters. A final scaling by less than SIZING_TOLERANCE makes its size exact.
 
     Raises
     ------
     NoSuchAttack
-        When no load moves the meters that far, or only one that is absurd at first sight.
+        If no load moves the meters that far, or only one beyond LARGEST_SHIFT_PU.
     """
     loads = _typical(site) if loads is None else loads
     loop = ClosedLoop(power_flow(site), site.droop, site.feeder.base_kva, site.customer_volt)
@@ -243,7 +243,7 @@ def fake_load(
     pattern = (load_pattern(R, X, 0, ratio, v) * (site.customer_volt / nominal))[site.meters]
     chosen = _affected(site, customer, pattern, meters) if isinstance(meters, int) else meters
     try:
-        power = coordinate(pattern, chosen, size)  # pu, to first order; AC has the last word below
+        power = coordinate(pattern, chosen, size)  # pu, to first order; AC power flow corrects it below
     except InputInvalid as error:
         raise NoSuchAttack(
             f"{site.feeder.name}, load at {site.feeder.customers[customer]}: {error}", code=error.codes[0]
@@ -277,20 +277,20 @@ def fake_load(
 def coordinated(
     site: Site, meters: Ints, fake: FakeLoad, *, t_on: float, t_off: float, power: bool
 ) -> Coordinated:
-    """Let meters tell the story of a fake load.
+    """Build the attack with the trace of a fake load.
 
     Parameters
     ----------
     site
         The feeder.
     meters : (k,)
-        Those that lie.
+        The manipulated meters.
     fake
-        The story; see `fake_load`.
+        The load; see `fake_load`.
     t_on, t_off
-        When they lie, Unix s.
+        Begin and end, Unix s.
     power
-        Whether the customer's own meter, if it is among them, also reports the load's p and q.
+        True: the customer's own meter, if manipulated, also reports the load's p and q.
     """
     own = (site.meters[meters] == fake.customer) & power
     return Coordinated(
@@ -310,7 +310,7 @@ def _somewhere(
     size: float,
     loads: Loads,
 ) -> tuple[Ints, FakeLoad]:
-    """A fake load at the first customer, in random order, at whom it can be made."""
+    """Fake load at the first possible customer, in random order."""
     why: NoSuchAttack | None = None
     for customer in random.permutation(site.meters):
         try:
@@ -321,14 +321,14 @@ def _somewhere(
 
 
 def _affected(site: Site, customer: int, pattern: Floats, count: int) -> Ints:
-    """The customer's own meter, and those that feel its load most: all lines to it are theirs too."""
+    """The customer's own meter, and the meters with the strongest effect of its load."""
     return most_affected(np.where(site.meters == customer, np.inf, pattern), count)
 
 
 def _plain(
     kind: Kind, meters: Ints, signed: Floats, site: Site, *, t_on: float, t_off: float, seed: int
 ) -> Attack:
-    """One attack in which every meter lies for itself."""
+    """One attack with independent manipulations of the meters."""
     attack: Attack
     match kind:
         case Kind.BIAS:
@@ -357,7 +357,7 @@ def _typical(site: Site) -> Loads:
 
 
 def present_loads(site: Site, scenario: Scenario, t: float) -> Loads:
-    """What customers draw at time t, Unix s, without what readings do not show."""
+    """Loads at time t, Unix s, without hidden powers."""
     customers = Customers(
         site, scenario.variation, scenario.seed, scenario.start, scenario.profile_s, season=scenario.season
     )
@@ -366,7 +366,7 @@ def present_loads(site: Site, scenario: Scenario, t: float) -> Loads:
 
 
 class Trick(StrEnum):
-    """How meters lie."""
+    """Manipulation of the devices."""
 
     BIAS = "bias"
     TOGETHER = "together"
@@ -383,21 +383,20 @@ class Trick(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Lie:
-    """Who lies, how and when; the seed of the run chooses the liars.
+    """Attack stated in one line: manipulation, count, size and time; the run's seed chooses the devices.
 
     Attributes
     ----------
     trick
-        What they do.
+        The manipulation.
     count
-        How many meters, or inverters, do it.
+        Number of meters, or inverters.
     size
-        How much. Bias (random signs), together (the sign of `size` for all) and scaling: % of nominal.
-        Drift: % of nominal per minute, random signs. Coordinated: % of nominal by which the trace of a load
-        that does not exist moves the least affected liar; it is at a customer whose meter would be believed
-        to read it, if there is one. Power: the same load, but only that meter lies, and only about the power.
-        Replay and clock shift: how old the reports are,
-        s. Inverter: % of its rating, random signs. Stuck: nothing.
+        Size. Bias (random signs), together (the sign of `size` for all) and scaling: % of nominal. Drift: %
+        of nominal per minute, random signs. Coordinated: displacement of the least affected manipulated meter
+        by the trace of a false load, % of nominal. The load is at a customer with a plausible reading of it,
+        if there is one. Power: the same load, with only the power of that meter falsified. Replay and clock
+        shift: age of the reports, s. Inverter: % of its rating, random signs. Stuck: unused.
     onset_s, end_s
         Seconds after the start of the run.
     """
@@ -415,21 +414,21 @@ class Lie:
 def manipulations(
     site: Site, lie: Lie | None, scenario: Scenario
 ) -> tuple[tuple[Attack, ...], tuple[InverterAttack, ...]]:
-    """Turn a lie into attacks.
+    """Build the attacks of one statement.
 
     Parameters
     ----------
     site
         The feeder.
     lie
-        Who lies; None: nobody.
+        The attack; None without one.
     scenario
-        The run without attacks: its seed chooses the liars, its loads lie beneath one that does not exist.
+        The run without attacks: its seed chooses the devices, and a false load adds to its loads.
 
     Raises
     ------
     NoSuchAttack
-        When the feeder has too few meters or inverters, or no place for such a load.
+        For too few meters or inverters, or without a place for such a load.
     """
     if lie is None:
         return (), ()
@@ -440,7 +439,8 @@ def manipulations(
     there = site.droop.tau.size if lie.trick is Trick.INVERTER else site.meters.size
     if not 0 < lie.count <= there:
         raise NoSuchAttack(
-            f"{site.feeder.name} has {there} of what {lie.count} should lie", code="too-few-meters"
+            f"{site.feeder.name} has {there} of these devices; cannot manipulate {lie.count}",
+            code="too-few-meters",
         )
     liars = np.sort(random.choice(there, lie.count, replace=False)).astype(np.intp)
     signs = random.choice([-1.0, 1.0], lie.count)
@@ -452,10 +452,11 @@ def manipulations(
 
 
 def _coordinated(site: Site, lie: Lie, scenario: Scenario, t_on: float, t_off: float) -> Attack:
-    """All liars tell one story, the trace of a load at a random customer."""
+    """Attack with the trace of a load at a random customer."""
     if not 0 < lie.count <= site.meters.size:
         raise NoSuchAttack(
-            f"{site.feeder.name} has {site.meters.size} meters; {lie.count} cannot lie", code="too-few-meters"
+            f"{site.feeder.name} has {site.meters.size} meters; cannot manipulate {lie.count}",
+            code="too-few-meters",
         )
     loads = present_loads(site, scenario, t_on)
     told: list[Attack] = []
@@ -478,7 +479,7 @@ def _coordinated(site: Site, lie: Lie, scenario: Scenario, t_on: float, t_off: f
 
 
 def _powers_of(told: Coordinated) -> Coordinated:
-    """What of a story is about powers."""
+    """Part of an attack that manipulates powers."""
     own = (told.p_shift != 0.0) | (told.q_shift != 0.0)
     return replace(
         told,
@@ -490,16 +491,16 @@ def _powers_of(told: Coordinated) -> Coordinated:
 
 
 def each_alone(lie: Lie, liars: Ints, signs: Floats, t_on: float, t_off: float) -> Attack:
-    """A lie that every meter tells for itself.
+    """Attack with independent manipulations of the meters.
 
     Parameters
     ----------
     lie
-        The trick, neither of inverters nor coordinated, and its size.
+        Manipulation and size; neither of inverters nor coordinated.
     liars, signs : (k,)
-        Which meters, and by which multiple of the size each; signs for most.
+        The meters, and the multiple of the size for each, usually a sign.
     t_on, t_off
-        When, Unix s.
+        Begin and end, Unix s.
     """
     share = lie.size / 100.0
     attack: Attack
@@ -515,6 +516,6 @@ def each_alone(lie: Lie, liars: Ints, signs: Floats, t_on: float, t_off: float) 
             attack = Drift(liars, t_on, t_off, rate, np.abs(rate) * (t_off - t_on))
         case Trick.STUCK:
             attack = Stuck(liars, t_on, t_off)
-        case _:  # Replay and a clock that is late differ only in how far back they look.
+        case _:  # Replay and a late clock differ only in the age of the reports.
             attack = Replay(liars, t_on, t_off, lie.size)
     return attack

@@ -1,11 +1,11 @@
-"""What customers draw and what the busbar does, as functions of time.
+"""Loads, generation and busbar voltage as functions of time.
 
-Every quantity is a pure function of the seed and of Unix time: any stretch can be asked for, in any order
-and any chunks, and gives the same numbers. The integrator may therefore take substeps of any length, and a
-run with an attack sees exactly the loads of the run without it.
+Every quantity is a pure function of the seed and of Unix time: any stretch, in any order and any chunks, has
+the same numbers. The integrator may therefore take substeps of any length, and a run with an attack has
+exactly the loads of the run without it.
 
-Profiles of 15 min are interpolated; on top of them comes a faster variation, an Ornstein-Uhlenbeck process
-for every customer, so that readings of 1 s are no staircases.
+Profiles of 15 min are interpolated. A faster variation is added, an Ornstein-Uhlenbeck process for every
+customer, so that readings at intervals of 1 s change from one to the next.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ GRID_S: Final = 1.0
 """Spacing of the random processes, s; linear in between."""
 
 CHUNK_CORRELATIONS: Final = 16
-"""Length of a chunk of a random process, in correlation times: its ends are independent (e^-16)."""
+"""Length of a chunk of a random process, in correlation times; its ends are independent (e^-16)."""
 
 FARTHEST_INDEX: Final = 2**63
-"""Indices of random streams stay below this number, and above its negative."""
+"""Bound of the absolute index of random streams."""
 
 STAGGER_S: Final = 1800.0
-"""Customers with the same profile follow it up to this much earlier or later, s."""
+"""Largest time shift between customers with the same profile, s, both ways."""
 
 
 class Stream(IntEnum):
-    """The independent random streams of a seed."""
+    """Independent random streams of a seed."""
 
     LOAD = 0
     CLOUD = 1
@@ -56,7 +56,7 @@ class Stream(IntEnum):
 
 
 def generator(seed: int, stream: Stream, index: int = 0) -> np.random.Generator:
-    """Random numbers of one stream, at one index of it; negative ones have numbers of their own."""
+    """Random generator of one stream, at one index; negative indices have numbers of their own."""
     place = index if index >= 0 else FARTHEST_INDEX - index
     sequence = np.random.SeedSequence(entropy=seed, spawn_key=(int(stream), place))
     return np.random.Generator(np.random.Philox(sequence))
@@ -64,7 +64,7 @@ def generator(seed: int, stream: Stream, index: int = 0) -> np.random.Generator:
 
 @dataclass(frozen=True, slots=True)
 class Variation:
-    """How loads, generation and the busbar vary.
+    """Variation of loads, generation and the busbar.
 
     Attributes
     ----------
@@ -81,15 +81,15 @@ class Variation:
     busbar_spread_pu, busbar_correlation_s
         Standard deviation and correlation time of its slow variation, pu and s.
     busbar_unbalance_pu
-        In three phases: standard deviation of a variation as slow in each phase by itself, pu.
+        In three phases: standard deviation of an equally slow variation of each phase, pu.
     tap_step_pu
         Height of one step of the transformer's tap changer upstream, pu; 0: none.
     tap_interval_s
-        There is one tap event in each interval of this length, at a random time in it, s.
+        Length of the intervals with one tap event each, at a random time, s.
     hidden_kw, hidden_kvar, hidden_correlation_s
-        Standard deviations and correlation time, s, of what every customer with a meter draws beyond the
-        power that its readings show: readings that are forecasts rather than metered. None: as the feeder's
-        files say (`p_std_kw`, `q_std_kvar`), and nothing where they do not.
+        Standard deviations and correlation time, s, of the power of every metered customer beyond its
+        readings, for readings that are forecasts. None: those of the feeder's files (`p_std_kw`,
+        `q_std_kvar`), 0 for empty cells.
     """
 
     load_scale: float = 1.0
@@ -110,16 +110,16 @@ class Variation:
 
 
 class Fluctuation:
-    """A stationary Ornstein-Uhlenbeck process of unit variance, in `count` independent copies.
+    """Stationary Ornstein-Uhlenbeck process of unit variance, in `count` independent copies.
 
-    Sampled exactly every GRID_S, autocorrelation exp(-abs(dt) / correlation_s). It is made in chunks that are
-    tied together as bridges: the values at the chunks' ends are drawn first, independently, and the path
-    between them is conditioned on both.
+    Sampled exactly every GRID_S, autocorrelation exp(-abs(dt) / correlation_s). It consists of chunks that
+    are joined as bridges: the values at the chunks' ends are independent, and the path between them is
+    conditioned on both.
 
     Parameters
     ----------
     seed, stream
-        Choose the path.
+        Seed and stream of the path.
     count
         Number of copies.
     correlation_s
@@ -135,7 +135,7 @@ class Fluctuation:
         self._chunks: dict[int, Floats] = {}
 
     def at(self, t: Floats) -> Floats:
-        """The process at times t (T,), Unix s, not necessarily sorted: (T, count)."""
+        """Process at times t (T,), Unix s, not necessarily sorted: (T, count)."""
         place = t / GRID_S
         below = np.floor(place)
         share = (place - below)[:, None]
@@ -149,7 +149,7 @@ class Fluctuation:
         return out
 
     def _chunk(self, number: int) -> Floats:
-        """The path of one chunk including both ends, (steps + 1, count)."""
+        """Path of one chunk including both ends, (steps + 1, count)."""
         if number not in self._chunks:
             if len(self._chunks) >= 4:
                 self._chunks.pop(next(iter(self._chunks)))
@@ -163,7 +163,8 @@ class Fluctuation:
         path = np.empty((self._steps + 1, self._count))
         path[0] = start
         path[1:], _ = lfilter([1.0], [1.0, -self._decay], noise, axis=0, zi=(self._decay * start)[None, :])
-        # Conditioning a Gaussian path on its last value: add covariance(k, n) / variance(n) times the miss.
+        # Gaussian path conditioned on its last value: add covariance(k, n) / variance(n) times the
+        # difference.
         k = np.arange(self._steps + 1)
         n = self._steps
         weight = (self._decay ** (n - k) - self._decay ** (n + k)) / (1.0 - self._decay ** (2 * n))
@@ -176,7 +177,7 @@ class Fluctuation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Demand:
-    """What all customers draw at T times, without the droop inverters' reactive power.
+    """Powers of all customers at T times, without the droop inverters' reactive power.
 
     Attributes
     ----------
@@ -196,24 +197,24 @@ class Demand:
 class Customers:
     """Loads, generation and busbar of a feeder over time.
 
-    Loads stay between 0 and `load_kw`, generation between 0 and `pv_kw`. Each customer has a constant ratio
-    q / p inside the interval of power factors that the feeder's files state, and a constant reactive power
-    within plus or minus the stated one that does not follow p. The monitor knows neither.
+    Loads are between 0 and `load_kw`, generation between 0 and `pv_kw`. Each customer has a constant ratio q
+    / p inside the interval of power factors of the feeder's files. It also has a constant reactive power
+    within plus or minus the floor of the files. The monitor knows neither.
 
     Parameters
     ----------
     site
         The feeder.
     variation
-        How things vary.
+        Variation of loads, generation and the busbar.
     seed
-        Chooses everything random.
+        Seed of all random numbers.
     start
-        Unix time at which the profiles are at `profile_s`, s.
+        Unix time of the profiles' position `profile_s`, s.
     profile_s
         Position within the season's profiles, s; they repeat.
     season
-        Which of the profiles.
+        Season of the profiles.
     """
 
     def __init__(
@@ -255,7 +256,7 @@ class Customers:
         self._hidden_q = Fluctuation(seed, Stream.HIDDEN_Q, count, variation.hidden_correlation_s)
 
     def at(self, t: Floats) -> Demand:
-        """Everything at times t (T,), Unix s."""
+        """Powers and busbar voltage at times t (T,), Unix s."""
         load = self._loads(t)
         return Demand(
             p_kw=load - self._generation(t),
@@ -264,7 +265,7 @@ class Customers:
         )
 
     def hidden(self, t: Floats) -> tuple[Floats | float, Floats | float]:
-        """What is drawn at times t (T,) beyond `at`, kW and kvar, (T, N) each; 0.0 where nothing is."""
+        """Powers at times t (T,) beyond `at`, kW and kvar, (T, N) each; 0.0 without any."""
         kw, kvar = self._hidden_kw, self._hidden_kvar
         return (
             kw * self._hidden_p.at(t) if kw.any() else 0.0,
@@ -319,13 +320,13 @@ class Customers:
         return out
 
     def _event(self, number: int) -> tuple[float, int]:
-        """When in its interval an event falls (0 to 1), and the position after it."""
+        """Relative time of an event in its interval (0 to 1), and the tap position after it."""
         random = generator(self._seed, Stream.TAP, number)
         return float(random.random()), int(random.integers(-1, 2))
 
 
 def _told(size: float | None, files: list[float | None]) -> Floats:
-    """A standard deviation for all, or what the files say of each."""
+    """One standard deviation for all, or those of the files."""
     return np.array([0.0 if told is None else told for told in files] if size is None else [size])
 
 

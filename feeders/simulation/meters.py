@@ -1,8 +1,8 @@
-"""Meters with the errors that data sheets promise, and the channel that carries their readings.
+"""Meters with the errors of data sheets, and the channel of their readings.
 
 An honest voltage reading is ``round(v (1 + c) + n)``: a fixed bias c inside the accuracy class, drawn once
-per meter, white jitter n, and the step of the register. Powers carry a fixed gain error. Then a reading may
-be lost, late, duplicated, or stamped by a clock that is off.
+per meter, white jitter n, and the step of the register. Powers have a fixed gain error. The channel loses,
+delays and duplicates readings, and clocks have offsets.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from feeders.model.site import Site
 
 BUSBAR: Final = ""
-"""Meter id of the busbar's meter. No customer's meter can have it: ids have at least one character."""
+"""Meter id of the busbar meter; ids of customers' meters have at least one character."""
 
 NOISE_TICKS: Final = 256
-"""Ticks that share one draw of random numbers."""
+"""Ticks per draw of random numbers."""
 
 EARLIEST_TICK: Final = 2**40
 """Ticks from minus this number on have random numbers of their own."""
@@ -32,20 +32,20 @@ EARLIEST_TICK: Final = 2**40
 
 @dataclass(frozen=True, slots=True)
 class MeterErrors:
-    """How much of the errors that the feeder's files promise the simulated meters have; 0: none.
+    """Errors of the simulated meters relative to those of the feeder's files; 0: none.
 
     Attributes
     ----------
     bias
-        Fixed biases are uniform within plus or minus this times the class, 1.
+        Limit of the fixed biases relative to the class, 1; uniform.
     jitter
         Factor on the jitter, 1.
     resolution
         Factor on the registers' steps, 1.
     power
-        Fixed gain errors of p and q are uniform within plus or minus this times the promised error, 1.
+        Limit of the fixed gain errors of p and q relative to the stated error, 1; uniform.
     report_q
-        Whether meters report reactive power.
+        True: meters report reactive power.
     """
 
     bias: float = 1.0
@@ -57,7 +57,7 @@ class MeterErrors:
 
 @dataclass(frozen=True, slots=True)
 class Silence:
-    """A meter sends nothing while t_on <= t < t_off.
+    """Silence of a meter for t_on <= t < t_off.
 
     Attributes
     ----------
@@ -74,29 +74,29 @@ class Silence:
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """What happens to readings on their way.
+    """Loss, delay and duplication of readings, clock offsets and silences.
 
     Attributes
     ----------
     loss
-        Probability that a reading never arrives, 1.
+        Probability of the loss of a reading, 1.
     delay_s
         Shortest delay, s.
     delay_mean_s
         Mean of the exponentially distributed delay on top of it, s.
     late, late_s
-        Probability (1) that a reading takes `late_s` longer; with more than a tick this reorders readings.
+        Probability (1) of an additional delay `late_s`; more than a tick reorders readings.
     duplicate
-        Probability that a reading arrives twice, 1; the copy takes a delay of its own.
+        Probability of a second arrival of a reading, 1; the copy has a delay of its own.
     clock_s
-        Each meter's clock is off by a constant, uniform within plus or minus this, s.
+        Limit of the constant clock offset of each meter, s; uniform.
     silences
-        Intervals in which a meter says nothing. Its sequence numbers count on.
+        Intervals without readings of a meter; its sequence numbers count on.
 
     Raises
     ------
     ValueError
-        If a probability is outside [0, 1], or a time negative or not finite.
+        For a probability outside [0, 1], or a time that is negative or not finite.
     """
 
     loss: float = 0.0
@@ -127,7 +127,7 @@ class Channel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Registers:
-    """What meters read at T ticks, before any manipulation. p meters.
+    """Readings of the meters at T ticks, before any manipulation. p meters.
 
     Attributes
     ----------
@@ -147,16 +147,16 @@ class Registers:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Delivery:
-    """When readings arrive. p meters and, as the last column, the busbar's.
+    """Arrival times of readings. p meters and, as the last column, the busbar meter.
 
     Attributes
     ----------
     stamp : (T, p + 1)
-        Time that the meter's clock shows, Unix s.
+        Time by the meter's clock, Unix s.
     arrival : (T, p + 1)
-        Unix time, s; infinite for a reading that never arrives.
+        Unix time, s; infinite for a lost reading.
     copy : (T, p + 1)
-        Arrival of a duplicate; infinite where there is none.
+        Arrival of a duplicate; infinite without one.
     """
 
     stamp: Floats
@@ -170,26 +170,26 @@ class Meters:
     Parameters
     ----------
     site
-        The feeder, whose files say how accurate the meters are.
+        The feeder, with the meters' accuracies.
     errors, channel
-        What of that is simulated, and what happens on the way.
+        Share of these errors, and effects of the channel.
     seed
-        Chooses everything random. What one tick draws depends on the tick's number alone.
+        Seed of all random numbers. Those of one tick depend on its number alone.
 
     Attributes
     ----------
     bias : (p,)
         Fixed relative bias of each voltage register, 1.
     busbar_bias
-        The same for the busbar's; in three phases (3,).
+        The same for the busbar meter; in three phases (3,).
     p_gain, q_gain : (p,)
-        Fixed relative errors of the power registers, 1: the truth is the reading times 1 + gain, because
-        data sheets state the error as a fraction of the reading.
+        Fixed relative errors of the power registers, 1: the true power is the reading times 1 + gain. Data
+        sheets state the error as a fraction of the reading.
 
     Raises
     ------
     ValueError
-        If a meter is silent that there is not.
+        For the silence of an unknown meter.
     """
 
     def __init__(self, site: Site, errors: MeterErrors, channel: Channel, seed: int) -> None:
@@ -234,9 +234,9 @@ class Meters:
         ticks : (T,)
             Numbers of the ticks, consecutive.
         v_volt, p_kw, q_kvar : (T, N)
-            The truth at every customer, V, kW, kvar (net imports).
+            True values at every customer, V, kW, kvar (net imports).
         v0_volt : (T,) or (T, 3)
-            The truth at the busbar, V.
+            True voltage of the busbar, V.
         """
         true = np.column_stack(
             [
@@ -253,14 +253,14 @@ class Meters:
         return Registers(shown[:, : self.count], p, q, shown[:, self.count :].reshape(v0_volt.shape))
 
     def deliver(self, ticks: Ints, t: Floats) -> Delivery:
-        """When the readings of some ticks arrive.
+        """Arrival times of the readings of some ticks.
 
         Parameters
         ----------
         ticks : (T,)
             Numbers of the ticks, consecutive.
         t : (T,)
-            Their times, Unix s.
+            Times of the ticks, Unix s.
         """
         channel, width = self._channel, self.count + 1
         uniform = self._draws(Stream.CHANNEL, ticks, 5 * width).reshape(ticks.size, 5, width)
@@ -282,7 +282,7 @@ class Meters:
         return self._draws(Stream.JITTER, ticks, self.count + self._busbars)
 
     def _draws(self, stream: Stream, ticks: Ints, width: int) -> Floats:
-        """Numbers of each tick: normal for JITTER, uniform on [0, 1) otherwise."""
+        """Random numbers of each tick: normal for JITTER, uniform on [0, 1) otherwise."""
         block, row = np.divmod(ticks + EARLIEST_TICK, NOISE_TICKS)
         out = np.empty((ticks.size, width))
         for number in np.unique(block):
@@ -294,9 +294,9 @@ class Meters:
 
 
 def _round(values: Floats, step: Floats) -> Floats:
-    """To the nearest multiple of each column's step; unchanged where the step is 0."""
+    """Round to the nearest multiple of each column's step; a step of 0 leaves values unchanged."""
     rounded = values.copy()
     some = step > 0.0
-    # The second rounding only removes the last bits: 230.1 instead of 230.10000000000002.
+    # The second rounding removes the last bits: 230.1 instead of 230.10000000000002.
     rounded[:, some] = np.round(np.round(values[:, some] / step[some]) * step[some], 9)
     return rounded

@@ -7,10 +7,10 @@ exponential trapezoid
 
     x+ = e^(-h/tau) x + (1 - e^(-h/tau) - c) K(v) + c K(v+),   c = 1 - (1 - e^(-h/tau)) tau / h.
 
-It is of second order for h << tau and turns into the quasi-static answer x+ = K(v+) for h >> tau, without a
-limit on h for stability. A step and an equilibrium are the same problem, x = a + c K(v(x)), the latter with
-a = 0 and c = 1; `ClosedLoop.settle` solves it, by plain iteration while that contracts and by Newton's
-method with the feeder's measured sensitivities where it does not.
+It is of second order for h << tau and approaches the quasi-static solution x+ = K(v+) for h >> tau, without a
+stability limit of h. A step and an equilibrium are the same problem, x = a + c K(v(x)), the latter with a = 0
+and c = 1. `ClosedLoop.settle` solves it by plain iteration while that contracts, and otherwise by Newton's
+method with the feeder's measured sensitivities.
 """
 
 from __future__ import annotations
@@ -35,29 +35,29 @@ if TYPE_CHECKING:
 
 
 TOLERANCE_PU: Final = 1e-7
-"""How far x may be from solving its equation, pu of the base power: 0.01 var of 100 kVA."""
+"""Tolerance of the solution x, pu of the base power: 0.01 var of 100 kVA."""
 
 MAX_ITERATIONS: Final = 200
 
 CONTRACTS: Final = 0.3
-"""Plain iteration goes on while the residual falls at least by this factor from one solve to the next."""
+"""Largest ratio of successive residuals with which plain iteration continues."""
 
 SMALLEST_SHARE: Final = 2.0**-7
-"""A Newton step is not shortened below this share of itself."""
+"""Smallest share of a Newton step."""
 
 PROBE_PU: Final = 1e-3
-"""Reactive power by which the sensitivities are measured, pu of the base power."""
+"""Reactive power of the probes for the sensitivities, pu of the base power."""
 
 
 class NoEquilibrium(GridsecError):
-    """The inverters and the feeder found no common answer."""
+    """No common solution of the inverters and the feeder was found."""
 
     code = "not-converged"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Loads:
-    """What customers draw without their inverters' reactive power. N customers.
+    """Powers of the customers without their inverters' reactive power. N customers.
 
     Attributes
     ----------
@@ -76,14 +76,14 @@ class Loads:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Point:
-    """The feeder at one instant. N customers, b + 1 buses, m inverters.
+    """State of the feeder at one instant. N customers, b + 1 buses, m inverters.
 
     Attributes
     ----------
     x : (m,)
         Reactive injection of each inverter, pu.
     setpoint : (m,)
-        What each inverter's curve asks for at this voltage, K(v), pu.
+        Set-point of each inverter at this voltage, K(v), pu.
     v_volt : (N,)
         Voltage at each customer, V.
     v_bus_volt : (b + 1,)
@@ -98,7 +98,7 @@ class Point:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Trial:
-    """A point, by how much it misses x = kept + new K(v), and the largest entry of that, pu."""
+    """A point, its defect in x = kept + new K(v), and the largest absolute entry of the defect, pu."""
 
     point: Point
     defect: Floats
@@ -115,7 +115,7 @@ class ClosedLoop:
     droop
         The inverters; their curves are evaluated here as piecewise linear functions of the voltage.
     base_kva, base_volt
-        What 1 pu means for `droop`; the voltage as one number, or for each customer, (N,).
+        Base values of `droop`; the voltage as one number, or for each customer, (N,).
     """
 
     def __init__(
@@ -136,7 +136,7 @@ class ClosedLoop:
         self._sensitivity: Floats | None = None
 
     def reactive(self, q_kvar: Floats, x: Floats) -> Floats:
-        """Net reactive import (…, N), kvar: the loads' q (…, N) minus what inverters inject, x (…, m)."""
+        """Net reactive import (…, N), kvar: the loads' q (…, N) less the inverters' injections x (…, m)."""
         return q_kvar - self._base_kva * (x @ self._owner)
 
     def setpoint(self, v_volt: Floats) -> Floats:
@@ -146,12 +146,12 @@ class ClosedLoop:
         return self._start + climbed
 
     def point(self, loads: Loads, x: Floats) -> Point:
-        """The feeder with given injections x, pu, whatever the inverters would like."""
+        """Point with given injections x, pu, independent of the droop curves."""
         v_volt, v_bus_volt = self.flow.solve(loads.p_kw, self.reactive(loads.q_kvar, x), loads.v0_volt)
         return Point(x, self.setpoint(v_volt), v_volt, v_bus_volt)
 
     def held(self, demand: Demand, rows: slice, x: Floats) -> tuple[Floats, Floats, Floats]:
-        """The feeder at many instants at once with given injections x (T, m), pu.
+        """Points at many instants with given injections x (T, m), pu.
 
         Returns
         -------
@@ -165,29 +165,29 @@ class ClosedLoop:
         return v_volt, v_bus_volt, self.setpoint(v_volt)
 
     def equilibrium(self, loads: Loads, start: Floats | None = None) -> Point:
-        """The point where every inverter injects what its curve asks for: x = K(v(x)).
+        """Equilibrium of inverters and feeder: x = K(v(x)).
 
         Parameters
         ----------
         loads
-            What the customers draw.
+            Powers of the customers.
         start : (m,)
-            Where to begin, pu; zero by default.
+            Start of the iteration, pu; zero by default.
         """
         zero, one = np.zeros(self.count), np.ones(self.count)
         return self.settle(loads, zero, one, zero if start is None else start)
 
     def advance(self, loads: Loads, now: Point, before: Point | None, h: float) -> Point:
-        """The feeder one step later.
+        """Point one step later.
 
         Parameters
         ----------
         loads
-            What the customers draw at the end of the step.
+            Powers of the customers at the end of the step.
         now
-            The feeder at its beginning.
+            Point at the begin of the step.
         before
-            One equal step earlier, if known. Only helps to guess.
+            Point one equal step earlier, if known; only improves the first guess.
         h
             Length of the step, s, > 0.
         """
@@ -197,7 +197,7 @@ class ClosedLoop:
         return self.settle(loads, kept, new, kept + new * ahead)
 
     def weights(self, h: float) -> tuple[Floats, Floats, Floats]:
-        """Weights of x, K(v) and K(v+) in a step of h seconds; each (m,), together 1."""
+        """Weights of x, K(v) and K(v+) in a step of h seconds; each (m,), sum 1."""
         decay = np.exp(-h / self.tau)
         new = 1.0 + np.expm1(-h / self.tau) * self.tau / h
         return decay, 1.0 - decay - new, new
@@ -208,7 +208,7 @@ class ClosedLoop:
         Parameters
         ----------
         loads
-            What the customers draw.
+            Powers of the customers.
         kept, new : (m,)
             The coefficients: pu, and 1 between 0 and 1.
         guess : (m,)
@@ -217,9 +217,9 @@ class ClosedLoop:
         Raises
         ------
         NoEquilibrium
-            When no x solves it within TOLERANCE_PU after MAX_ITERATIONS solves.
+            Without a solution within TOLERANCE_PU after MAX_ITERATIONS solves.
         PowerFlowDiverged
-            When the feeder has no voltages at all for these loads.
+            Without a power flow solution for these loads.
         """
         here = self._trial(loads, kept, new, guess)
         for _ in range(MAX_ITERATIONS):
@@ -230,7 +230,7 @@ class ClosedLoop:
                 there = self._newton(loads, kept, new, here)
             here = there
         raise NoEquilibrium(
-            f"inverters and feeder do not settle: {here.size:.2g} pu of reactive power are left over"
+            f"inverters and feeder do not settle: {here.size:.2g} pu of reactive power remain"
         )
 
     def _trial(self, loads: Loads, kept: Floats, new: Floats, x: Floats) -> _Trial:
@@ -239,7 +239,7 @@ class ClosedLoop:
         return _Trial(point, defect, float(np.max(np.abs(defect), initial=0.0)))
 
     def _attempt(self, loads: Loads, kept: Floats, new: Floats, x: Floats) -> _Trial | None:
-        """A trial that may overshoot to where the feeder has no voltages at all: then None."""
+        """Trial with possible overshoot: None without a power flow solution."""
         try:
             return self._trial(loads, kept, new, x)
         except PowerFlowDiverged:
@@ -257,7 +257,7 @@ class ClosedLoop:
             if there is not None and there.size < (1.0 - 0.1 * share) * here.size:
                 return there
             share *= 0.5
-        # The last resort moves all the same, so that a kink at which no step helps is left behind.
+        # Move even if no share reduces the residual, to leave a kink of the curves.
         return self._trial(loads, kept, new, here.point.x + share * step)
 
     def _slope(self, v_volt: Floats) -> Floats:
@@ -279,42 +279,42 @@ class ClosedLoop:
 BLOCK_TICKS: Final = 256
 
 SUBSTEPS_PER_TAU: Final = 2.0
-"""Substeps per smallest time constant; see docs/simulation.md for the error that this leaves."""
+"""Substeps per smallest time constant; docs/simulation.md states the remaining error."""
 
 SHORTEST_STRETCH: Final = 8
 LONGEST_STRETCH: Final = 64
-"""Fewest and most steps that are solved together."""
+"""Limits of the number of steps that are solved together."""
 
 MAX_SWEEPS: Final = 12
-"""Sweeps over a stretch before it is given up."""
+"""Largest number of sweeps over a stretch."""
 
 VANISHED_PU: Final = 1e-30
-"""What decays below this is zero; otherwise it would become denormal, and arithmetic slow."""
+"""Smaller values are set to zero; otherwise they become denormal, and arithmetic slow."""
 
 QUASI_STATIC_TAUS: Final = 10.0
-"""A tick longer than this many of the largest time constants is one quasi-static step."""
+"""Tick length, in the largest time constant, from which on a tick is one quasi-static step."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Block:
-    """The truth at T consecutive ticks. N customers, m inverters, b + 1 buses.
+    """True state at T consecutive ticks. N customers, m inverters, b + 1 buses.
 
     Attributes
     ----------
     ticks : (T,)
-        Their numbers.
+        Numbers of the ticks.
     t : (T,)
-        Their times, Unix s.
+        Times of the ticks, Unix s.
     v_volt : (T, N)
         Voltage at each customer, V.
     v_bus_volt : (T, b + 1)
-        Voltage of each bus, V; in three phases of each phase of each.
+        Voltage of each bus, V; in three phases of each phase of each bus.
     x : (T, m)
-        Reactive injection of each inverter as its droop curve has it, pu.
+        Reactive injection of each inverter by its droop curve, pu.
     demand
-        What customers draw without their inverters' reactive power, and the busbar's voltage.
+        Powers without the inverters' reactive power, and the busbar voltage.
     shown_kw : (T, N)
-        The active power that readings show.
+        Active power without hidden powers: the basis of the readings.
     """
 
     ticks: Ints
@@ -327,7 +327,7 @@ class Block:
 
 
 def truth(site: Site, scenario: Scenario, first: int, end: float) -> Iterator[Block]:
-    """The truth from tick `first` up to tick `end`, which may be infinite; begins in equilibrium."""
+    """True state from tick `first` up to tick `end`, which may be infinite; begins in equilibrium."""
     customers = Customers(
         site, scenario.variation, scenario.seed, scenario.start, scenario.profile_s, season=scenario.season
     )
@@ -339,7 +339,7 @@ def truth(site: Site, scenario: Scenario, first: int, end: float) -> Iterator[Bl
         ticks = np.arange(begin, min(begin + BLOCK_TICKS, end), dtype=np.intp)
         t = scenario.start + ticks.astype(np.float64) * scenario.dt_s
         back = scenario.dt_s * np.arange(steps - 1, -1, -1) / steps
-        # The very first tick is where the course begins: nothing has to lead up to it.
+        # The course begins at the very first tick, without substeps before it.
         skip = steps - 1 if begin == first else 0
         moments = (t[:, None] - back).ravel()[skip:]
         told = customers.at(moments)
@@ -354,7 +354,7 @@ def truth(site: Site, scenario: Scenario, first: int, end: float) -> Iterator[Bl
 
 
 def injected(site: Site, attacks: tuple[InverterAttack, ...], t: Floats) -> Floats | float:
-    """What attacked inverters inject beside their droop curves at times t (T,), pu per customer, (T, N)."""
+    """Injections of attacked inverters beyond their droop curves at times t (T,), pu per customer, (T, N)."""
     if not attacks:
         return 0.0
     count = len(site.tables.customers)
@@ -367,11 +367,11 @@ def injected(site: Site, attacks: tuple[InverterAttack, ...], t: Floats) -> Floa
 
 
 class _Course:
-    """The closed loop carried forward in equal steps of h seconds; begins in equilibrium.
+    """Closed loop in equal steps of h seconds, from equilibrium on.
 
-    Solving many power flows at once costs little more than solving one. So a stretch of steps is guessed
-    first, all of it is solved, the inverters' course is computed from the voltages found, and so on until it
-    no longer changes. Where that does not converge quickly, the same equations are solved step by step.
+    Many power flows at once take little longer than one. So all steps of a stretch are solved together from a
+    first guess. The inverters' course follows from the voltages, until it no longer changes. Where that
+    converges slowly, the same equations are solved step by step.
     """
 
     def __init__(self, loop: ClosedLoop, h: float) -> None:
@@ -384,7 +384,7 @@ class _Course:
         self._single = 0
 
     def run(self, demand: Demand) -> tuple[Floats, Floats, Floats]:
-        """One step to each row of `demand`.
+        """Advance one step per row of `demand`.
 
         Returns
         -------
@@ -414,7 +414,7 @@ class _Course:
         return after.v_volt[None], after.v_bus_volt[None], after.x[None]
 
     def _relax(self, demand: Demand, rows: slice) -> tuple[Floats, Floats, Floats] | None:
-        """A stretch of steps at once; None where it has to be done step by step."""
+        """Solve a stretch of steps together; None if it requires single steps."""
         now = self._now
         if now is None or self._single > 0:
             self._single = max(self._single - 1, 0)
@@ -432,11 +432,11 @@ class _Course:
             course = found
         self._stretch = max(self._stretch // 2, SHORTEST_STRETCH)
         if self._stretch == SHORTEST_STRETCH:
-            self._single = BLOCK_TICKS  # hopeless for now: do not pay for the attempt before every step
+            self._single = BLOCK_TICKS  # slow convergence: skip the attempt for BLOCK_TICKS steps
         return None
 
     def _follow(self, now: Point, setpoint: Floats) -> Floats:
-        """The course x (T, m) of the inverters from `now` on, for given set-points (T, m)."""
+        """Course x (T, m) of the inverters from `now` on, for given set-points (T, m)."""
         decay, old, new = self._weights
         drive = new * setpoint
         drive[0] += old * now.setpoint
@@ -450,7 +450,7 @@ class _Course:
 
 
 def substeps(site: Site, scenario: Scenario) -> int:
-    """How many steps the integrator takes per tick, at least 1."""
+    """Number of integration steps per tick, at least 1."""
     tau = site.droop.tau
     if tau.size == 0:
         return 1

@@ -1,8 +1,8 @@
-"""Full AC power flow of a feeder: the truth that everything else is judged by.
+"""Full AC power flow of a feeder: the truth of simulations and tests.
 
-Built from the SI columns of the feeder's files alone, and solved by power-grid-model. It shares no code
-with the linear model in `gridsec`: an error in the per-unit conversion, in fusing buses or in LinDistFlow
-shows as a disagreement. Balanced three-phase, slack at the metered busbar, loads of constant power.
+It uses only the SI columns of the feeder's files, and power-grid-model as solver. It shares no code with the
+linear model in `gridsec`: an error in the per-unit conversion, in fusing buses or in LinDistFlow shows as a
+disagreement. Balanced three-phase, slack at the metered busbar, loads of constant power.
 """
 
 from __future__ import annotations
@@ -27,24 +27,24 @@ if TYPE_CHECKING:
 Phasors = NDArray[np.complex128]
 
 FREQUENCY_HZ: Final = 50.0
-"""Only turns susceptance into the capacitance that power-grid-model asks for, and back; cancels out."""
+"""Frequency of the conversion from susceptance to capacitance for power-grid-model; it cancels out."""
 
 TOLERANCE_PU: Final = 1e-10
-"""Largest voltage correction of the last Newton step; the error behind it is of its square."""
+"""Largest voltage correction of the last Newton step; the remaining error is of its square."""
 
 SLACK_VA: Final = 1e16
-"""Short-circuit power of the slack: 1 MVA moves it by 1e-10 pu, and nothing cancels in double precision."""
+"""Short-circuit power of the slack: 1 MVA moves it by 1e-10 pu, and double precision suffices."""
 
 
 class PowerFlowDiverged(GridsecError):
-    """The AC equations were not solved: most often the load is beyond what the feeder can carry."""
+    """The AC equations have no solution, usually because of too much load, or Newton's method failed."""
 
     code = "not-converged"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Grid:
-    """The feeder as AC power flow needs it, in SI. L lines, B buses, N customers.
+    """Feeder for AC power flow, in SI. L lines, B buses, N customers.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class Grid:
     b_siemens : (L,)
         Total shunt susceptance per phase, S.
     busbar
-        The bus whose voltage is given.
+        Bus of the given voltage.
     customer_bus : (N,)
         Bus of each customer.
     bus_count
@@ -64,7 +64,7 @@ class Grid:
         Nominal phase-to-neutral voltage, V; or that of each bus.
     tap : (L,), optional
         Ratio of an ideal transformer at the first end of each line: the voltage there by that behind it, each
-        in parts of its nominal voltage.
+        relative to its nominal voltage.
     """
 
     ends: Ints
@@ -79,17 +79,17 @@ class Grid:
 
 
 class PowerFlow:
-    """AC power flow of one feeder, prepared once and solved many times.
+    """AC power flow of one feeder, for repeated solutions.
 
     Parameters
     ----------
     site
-        The feeder. Voltages come back in the order of its customers and of `site.feeder.buses`.
+        The feeder. Voltages are in the order of its customers and of `site.feeder.buses`.
 
     Notes
     -----
-    A solve starts flat every time, so that its result depends on its arguments alone. One object is not
-    safe for use by several threads at once: its input arrays are reused.
+    A solve starts flat every time, so that its result depends on its arguments alone. An object is not
+    thread-safe: its input arrays are reused.
     """
 
     def __init__(self, site: Site) -> None:
@@ -98,7 +98,7 @@ class PowerFlow:
 
     @classmethod
     def of(cls, grid: Grid) -> Self:
-        """Power flow of bare arrays; voltages of buses come back in the grid's own order."""
+        """Power flow of bare arrays; voltages of buses are in the grid's own order."""
         flow = cls.__new__(cls)
         flow._prepare(grid, np.arange(grid.bus_count))
         return flow
@@ -131,7 +131,7 @@ class PowerFlow:
         Raises
         ------
         PowerFlowDiverged
-            When there is no solution, or Newton's method does not find it.
+            Without a solution, or if Newton's method does not find it.
         """
         by_node = self._solve(p_kw, q_kvar, v0_volt, "u_pu") * self._scale
         return by_node[self.grid.customer_bus], by_node[self._order]
@@ -146,7 +146,7 @@ class PowerFlow:
     def solve_batch(
         self, p_kw: Floats, q_kvar: Floats, v0_volt: Floats, *, threads: int = 1
     ) -> tuple[Floats, Floats]:
-        """Voltages for T sets of loads at once: the same numbers as T calls of `solve`, many times faster.
+        """Voltages for T sets of loads: the numbers of T calls of `solve`, many times faster.
 
         Parameters
         ----------
@@ -155,7 +155,7 @@ class PowerFlow:
         v0_volt : (T,)
             Voltages of the busbar, V.
         threads
-            How many threads share the work.
+            Number of threads.
 
         Returns
         -------
@@ -167,7 +167,7 @@ class PowerFlow:
         Raises
         ------
         PowerFlowDiverged
-            When any of the sets has no solution; names the first of them.
+            If any set has no solution; names the first of them.
         """
         count = p_kw.shape[0]
         if count == 0:
@@ -212,7 +212,7 @@ class PowerFlow:
 
 
 def _grid(site: Site) -> tuple[Grid, Ints]:
-    """Read the SI arrays of a feeder, and for each bus of the model the node that stands for it."""
+    """SI arrays of a feeder, and the node of each bus of the model."""
     tables = site.tables
     closed = [line for line in tables.lines if line.closed]
     names = sorted({tables.meta.busbar} | {bus for line in closed for bus in (line.from_bus, line.to_bus)})
@@ -245,14 +245,14 @@ def _grid(site: Site) -> tuple[Grid, Ints]:
 
 
 def levels(ends: Ints, to_volt: Floats, busbar: int, volt: float, count: int) -> Floats:
-    """Return the nominal voltage of every bus, V: from the busbar on, until a transformer changes it.
+    """Nominal voltage of every bus, V: from the busbar on, until a transformer changes it.
 
     Parameters
     ----------
     ends : (L, 2)
         The buses at both ends of each line.
     to_volt : (L,)
-        Nominal voltage of the second of them, V; NaN where it is that of the first.
+        Nominal voltage of the second bus, V; NaN where it is that of the first.
     busbar, volt
         The busbar, and its nominal voltage, V.
     count

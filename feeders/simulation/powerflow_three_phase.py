@@ -1,13 +1,13 @@
-"""Full AC power flow of an unbalanced feeder: the truth that three-phase models are judged by.
+"""Full AC power flow of an unbalanced feeder: the reference of three-phase models.
 
-Built from the SI columns of the feeder's files alone, and solved with nodal admittances in phases. It shares
-no code with `gridsec.grid.three_phase`: an error in the per-unit conversion, in fusing buses or in the sweeps
-there shows as a disagreement. Loads of constant power between phase and grounded neutral, slack at the
-metered busbar or behind the impedance of the transformer.
+It uses only the SI columns of the feeder's files, and nodal admittances in phases. It shares no code with
+`gridsec.grid.three_phase`: an error in the per-unit conversion, in fusing buses or in the sweeps there shows
+as a disagreement. Loads of constant power between phase and grounded neutral, slack at the metered busbar or
+behind the impedance of the transformer.
 
-With V_0 the given voltages and S the powers of the connections, ``V = A V_0 + B conj(S / V)``, where A and B
-are columns of the inverse of the nodal admittances, found once by sparse factors. That is iterated for the
-voltages of the connections alone, any number of operating points at once; the feeder need not be radial.
+With V_0 the given voltages and S the powers of the connections, ``V = A V_0 + B conj(S / V)``. A and B are
+columns of the inverse of the nodal admittances, from one sparse factorisation. The iteration is over the
+voltages of the connections alone, any number of operating points at once. The feeder need not be radial.
 
 References
 ----------
@@ -37,14 +37,14 @@ if TYPE_CHECKING:
 PHASES: Final = "abc"
 
 TOLERANCE_PU: Final = 1e-11
-"""Largest change of a voltage in the last iteration; each is a small fraction of the one before."""
+"""Largest change of a voltage in the last iteration; each change is a small fraction of the one before."""
 
 ITERATIONS: Final = 200
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UnbalancedGrid:
-    """The feeder as asymmetric AC power flow needs it, in SI. L lines, B buses, N customers.
+    """Feeder for asymmetric AC power flow, in SI. L lines, B buses, N customers.
 
     Attributes
     ----------
@@ -53,11 +53,11 @@ class UnbalancedGrid:
     present : (L, 3)
         Phases a, b, c that a line has.
     z_ohm : (L, 3, 3)
-        Series impedance of each line, ohm; looked at only where its phases are.
+        Series impedance of each line, ohm; only entries of its phases count.
     b_siemens : (L, 3, 3)
-        Total shunt susceptance of each line, S; half of it sits at each end.
+        Total shunt susceptance of each line, S, half at each end.
     busbar
-        The bus whose voltage is given.
+        Bus of the given voltage.
     customer_bus : (N,)
         Bus of each customer.
     connected : (N, 3)
@@ -71,7 +71,7 @@ class UnbalancedGrid:
     source_ohm : (3, 3), optional
         Impedance between the given voltage and the busbar, ohm. For a transformer Dyn, `sequence_ohm` of its
         short-circuit impedance (with that of the grid above) and its zero-sequence impedance, both seen from
-        the low-voltage side: the delta keeps the zero sequence of the grid above out.
+        the low-voltage side: the delta blocks the zero sequence of the grid above.
     """
 
     ends: Ints
@@ -88,14 +88,14 @@ class UnbalancedGrid:
 
 
 class UnbalancedPowerFlow:
-    """Asymmetric AC power flow of one feeder, prepared once and solved many times.
+    """Asymmetric AC power flow of one feeder, for repeated solutions.
 
     Parameters
     ----------
     site
-        The feeder. Voltages come back in the order of its buses.
+        The feeder. Voltages are in the order of its buses.
     source_ohm : (3, 3)
-        See `UnbalancedGrid`; without it the voltage of the busbar itself is given.
+        See `UnbalancedGrid`; without it the given voltage is that of the busbar.
 
     Notes
     -----
@@ -111,7 +111,7 @@ class UnbalancedPowerFlow:
 
     @classmethod
     def of(cls, grid: UnbalancedGrid) -> Self:
-        """Power flow of bare arrays; voltages of buses come back in the grid's own order."""
+        """Power flow of bare arrays; voltages of buses are in the grid's own order."""
         flow = cls.__new__(cls)
         flow._prepare(grid, np.arange(grid.bus_count))
         return flow
@@ -170,7 +170,7 @@ class UnbalancedPowerFlow:
         Raises
         ------
         PowerFlowDiverged
-            When there is no solution, or the iteration does not find it.
+            Without a solution, or if the iteration does not find it.
         """
         all_of_them = self.phasors(p_kw[None], q_kvar[None], np.asarray(v0_volt)[None])
         connections, buses = self._magnitudes(all_of_them)
@@ -196,7 +196,7 @@ class UnbalancedPowerFlow:
         Raises
         ------
         PowerFlowDiverged
-            When any of the sets has no solution; names the first of them.
+            If any set has no solution; names the first of them.
         """
         return self._magnitudes(self.phasors(p_kw, q_kvar, v0_volt))
 
@@ -213,7 +213,7 @@ class UnbalancedPowerFlow:
         return out.reshape(-1, self.grid.bus_count, 3)
 
     def _currents(self, idle: Phasors, power: Phasors) -> Phasors:
-        """Currents that the connections inject, from their powers and their voltages without load."""
+        """Injected currents of the connections, from their powers and their voltages without load."""
         level = np.broadcast_to(self.grid.nominal_volt, (self.grid.bus_count,))
         tolerance = TOLERANCE_PU * level[self._node // 3]
         transfer = self._transfer[self._node].T
@@ -238,12 +238,12 @@ class UnbalancedPowerFlow:
 
 
 class PlacesFlow:
-    """The same in the places of a feeder in three phases, with the methods of the balanced power flow.
+    """Asymmetric power flow by places, with the methods of the balanced power flow.
 
     Parameters
     ----------
     site
-        A feeder in three phases whose customers have one each.
+        A feeder in three phases, with one phase per customer.
     """
 
     def __init__(self, site: Site) -> None:
@@ -256,19 +256,13 @@ class PlacesFlow:
         return customers, buses.ravel()
 
     def solve_batch(self, p_kw: Floats, q_kvar: Floats, v0_volt: Floats) -> tuple[Floats, Floats]:
-        """The same for T sets of loads, (T, N) and (T, n)."""
+        """Voltages for T sets of loads, (T, N) and (T, n), V."""
         customers, buses = self._flow.solve_batch(p_kw, q_kvar, v0_volt)
         return customers, buses.reshape(len(buses), -1)
 
 
 def power_flow(site: Site) -> PowerFlow | PlacesFlow:
-    """Return the AC power flow that is a feeder's truth, prepared.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    """
+    """AC power flow of a feeder."""
     return PlacesFlow(site) if isinstance(site.feeder, InPhases) else PowerFlow(site)
 
 
@@ -279,7 +273,7 @@ def sequence_ohm(positive: complex, zero: complex) -> Phasors:
 
 
 def _admittances(grid: UnbalancedGrid) -> csc_array:
-    """Nodal admittances between phases of buses, node ``3 bus + phase``; the slack is outside."""
+    """Nodal admittances between phases of buses, node ``3 bus + phase``, without the slack."""
     rows, columns, values = [], [], []
 
     def stamp(one: int, other: int, here: Ints, block: Phasors) -> None:
@@ -293,7 +287,7 @@ def _admittances(grid: UnbalancedGrid) -> csc_array:
         here = np.flatnonzero(present)
         series: Phasors = np.linalg.inv(z[np.ix_(here, here)])
         own: Phasors = series + 0.5j * b[np.ix_(here, here)]
-        # Behind the transformer a voltage is v / tap, and before it a current i / tap.
+        # Behind the transformer the voltage is v / tap, before it the current is i / tap.
         before, behind = 1.0 / tap[here], np.ones(here.size)
         for end, far, mine, its in ((one, other, before, behind), (other, one, behind, before)):
             stamp(end, end, here, own * np.outer(mine, mine))
@@ -309,7 +303,7 @@ def _admittances(grid: UnbalancedGrid) -> csc_array:
 
 
 def _grid(tables: FeederTables, source_ohm: Phasors | None) -> tuple[UnbalancedGrid, dict[str, int]]:
-    """Read the SI arrays of a feeder, and the node that each bus of the files became."""
+    """SI arrays of a feeder, and the node of each bus of the files."""
     closed = [line for line in tables.lines if line.closed]
     above: dict[str, str] = {}
 
@@ -370,7 +364,7 @@ def _shunt(line: LineRow) -> Floats:
 
 
 def _entries(line: LineRow, symbol: str, unit: str) -> Floats:
-    """A symmetric matrix of a line, entry by entry; 0 where its columns are empty."""
+    """Symmetric matrix of a line, entry by entry; 0 for empty columns."""
     return np.array(
         [
             [getattr(line, f"{symbol}_{''.join(sorted(one + other))}_{unit}") or 0.0 for other in PHASES]

@@ -1,9 +1,8 @@
 """Recordings of scenarios and of real feeders as Parquet files.
 
-One row is one arrived reading; rows are in the order of arrival, so that a replay is a loop. The truth, where
-there is one, lies beside it in ``<name>.truth.parquet`` with one row per tick. What was simulated, and with
-which versions, stands in the metadata of both files under the key ``gridsec``; docs/simulation.md lists the
-columns.
+One row is one arrived reading, in the order of arrival: a replay is a loop over the rows. The truth of a
+simulation is in ``<name>.truth.parquet``, with one row per tick. Scenario and package versions are in the
+metadata of both files under the key ``gridsec``. docs/simulation.md lists the columns.
 """
 
 from __future__ import annotations
@@ -64,7 +63,7 @@ _LISTS = ("attacks", "busbar_attacks")
 
 
 def scenario_to_json(scenario: Scenario) -> dict[str, Any]:
-    """Turn a scenario into what JSON can hold; infinite times become the text "inf"."""
+    """Convert a scenario to JSON types; infinite times become the text "inf"."""
     told = {field.name: getattr(scenario, field.name) for field in fields(scenario)}
     told["variation"] = asdict(scenario.variation)
     told["errors"] = asdict(scenario.errors)
@@ -84,12 +83,12 @@ def scenario_to_json(scenario: Scenario) -> dict[str, Any]:
 
 
 def scenario_from_json(obj: dict[str, Any]) -> Scenario:
-    """Turn it back; `scenario_to_json` has made it.
+    """Convert the result of `scenario_to_json` back to a scenario.
 
     Raises
     ------
     KeyError, TypeError, ValueError
-        When it is something else.
+        For any other content.
     """
     given = {"busbar_attacks": ()} | _heard(obj)
     channel = dict(given["channel"])
@@ -143,7 +142,7 @@ _INFINITE: Final = ("inf", "-inf")
 
 
 def _told(value: Any) -> Any:
-    """Infinities to text, all the way down."""
+    """Convert infinities to text, recursively."""
     if isinstance(value, dict):
         return {name: _told(item) for name, item in value.items()}
     if isinstance(value, list):
@@ -152,7 +151,7 @@ def _told(value: Any) -> Any:
 
 
 def _heard(value: Any, name: str = "") -> Any:
-    """The reverse; a meter may have any name."""
+    """Inverse of `_told`; a meter may have any name."""
     if isinstance(value, dict):
         return {key: _heard(item, key) for key, item in value.items()}
     if isinstance(value, list):
@@ -181,18 +180,18 @@ PHASES: Final = pa.field("v_phases", pa.list_(pa.float64()))
 
 REQUIRED: Final = ("meter", "t", "v_volt")
 T_POWER: Final = pa.field("t_power", pa.float64())
-"""Time of the powers, a column of foreign recordings whose powers are older than their voltages."""
+"""Time of the powers, a column of external recordings with powers older than their voltages."""
 REGISTERS: Final = ("seq", "p_kw", "q_kvar", "t_power")
-"""Columns in which NaN says, as null does, that nothing was reported: tables of floats have nothing else."""
+"""Columns in which NaN means null, not reported: tables of floats have no null."""
 
 
 class RecordingInvalid(Problems, GridsecError):
-    """A file is no recording, or its truth is not there.
+    """A file is not a recording, or has no truth.
 
     Parameters
     ----------
     problems
-        One clause each: what is wrong, and what would be right.
+        One clause each, with the expected content.
     where
         Place of all problems, at the begin of the sentence.
     """
@@ -205,7 +204,7 @@ class RecordingInvalid(Problems, GridsecError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """The truth of a recording at its T ticks; columns as in `feeders.simulation.scenario.Sample`.
+    """Truth of a recording at its T ticks; columns as in `feeders.simulation.scenario.Sample`.
 
     Attributes
     ----------
@@ -218,7 +217,7 @@ class Truth:
     x_kvar : (T, m)
         Injection of each inverter, kvar.
     manipulated : (T, p)
-        Which meters are under attack.
+        Mask of the meters under attack.
     shift_volt : (T, p)
         Reported minus honest reading, V.
     """
@@ -235,7 +234,7 @@ class Truth:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recording:
-    """A recorded file. Reads lazily: nothing but the metadata is in memory.
+    """Recorded file, read lazily: only the metadata is in memory.
 
     Attributes
     ----------
@@ -244,13 +243,13 @@ class Recording:
     count
         Number of readings.
     feeder, digest
-        Name and content digest of the feeder it was made on; None for a foreign file.
+        Name and content digest of its feeder; None for an external file.
     scenario
-        What was simulated; None for a foreign file.
+        The simulated scenario; None for an external file.
     versions
-        Versions of the packages that made it.
+        Versions of the packages at its writing.
     timed
-        Whether it says when its readings arrived.
+        True with arrival times of the readings.
     """
 
     path: Path
@@ -262,67 +261,65 @@ class Recording:
     timed: bool = False
 
     def readings(self) -> Iterator[Reading]:
-        """All readings in the order of the file, which is that of arrival."""
+        """All readings in the order of the file, that of arrival."""
         with pq.ParquetFile(self.path) as file:
             for batch in file.iter_batches():
                 yield from _readings(batch)
 
     def frame(self) -> pd.DataFrame:
-        """All readings as a table of pandas, one row each, columns as in `Reading`."""
+        """All readings as a pandas table, one row each, columns as in `Reading`."""
         table: pd.DataFrame = pq.read_table(self.path).to_pandas()
         return table
 
     def truth(self) -> Truth:
-        """The truth that was recorded with the readings.
+        """Truth of a simulated recording.
 
         Raises
         ------
         RecordingInvalid
-            When there is none, or it is that of another recording.
+            Without a truth, or with that of another recording.
         """
         path = truth_path(self.path)
         try:
             table, own = pq.read_table(path), pq.read_schema(self.path)
         except (OSError, pa.ArrowException) as error:
             raise RecordingInvalid(
-                Problem("missing", f"{path}: no truth of this recording: {error}")
+                Problem("missing", f"{path}: no truth for this recording: {error}")
             ) from error
         if (table.schema.metadata or {}).get(KEY) != (own.metadata or {}).get(KEY):
-            raise RecordingInvalid(
-                Problem("other-origin", f"{path}: no truth of this recording, but of another one")
-            )
+            raise RecordingInvalid(Problem("other-origin", f"{path}: the truth of another recording"))
         there = {name: _matrix(table.column(name)) for name in table.column_names}
-        # Parquet has no lists without entries: of no inverter, or no meter, there is no column.
+        # Parquet has no lists without entries: without inverters, or without meters, the column is absent.
         none = np.empty((table.num_rows, 0))
         return Truth(**{field.name: there.get(field.name, none) for field in fields(Truth)})
 
 
 def truth_path(path: Path) -> Path:
-    """Where the truth of a recording lies: day.parquet -> day.truth.parquet."""
+    """Path of the truth of a recording: day.parquet -> day.truth.parquet."""
     return path.with_name(f"{path.stem}.truth.parquet")
 
 
 def record(site: Site, scenario: Scenario, path: Path | str) -> Recording:
-    """Play a scenario into a file, and its truth into a second one beside it.
+    """Write the readings of a scenario to a file, and its truth to a second one beside it.
 
-    Both are written under temporary names first, so that a file with the right name is complete. Where they
-    replace others, the old truth goes first: it never stands beside new readings.
+    Both have temporary names first, so that a file with the final name is complete. An old truth is removed
+    first: it never accompanies new readings.
 
     Parameters
     ----------
     site
         The feeder.
     scenario
-        What happens to it; must end.
+        The scenario, of finite length.
     path
-        Where the readings go, with the ending .parquet.
+        File of the readings, with the ending .parquet.
 
     Raises
     ------
     ValueError
-        When the scenario does not end.
+        For a scenario of infinite length.
     OSError
-        When the files cannot be written.
+        If the files cannot be written.
     """
     if not math.isfinite(scenario.duration_s):
         raise InputInvalid([Problem("not-finite", "a scenario without an end cannot be recorded")])
@@ -354,16 +351,16 @@ def record(site: Site, scenario: Scenario, path: Path | str) -> Recording:
 
 
 def read_recording(path: Path | str) -> Recording:
-    """Open a recording, ours or a foreign one.
+    """Open a simulated or an external recording.
 
-    A foreign file needs the columns `meter`, `t` and `v_volt`. Without `arrival` readings arrive at their own
-    time; `seq`, `p_kw`, `q_kvar` and `t_power` may be absent, and null or NaN where they are not reported.
+    An external file needs the columns `meter`, `t` and `v_volt`. Without `arrival` readings arrive at their
+    own time. `seq`, `p_kw`, `q_kvar` and `t_power` may be absent, and null or NaN if not reported.
 
     Raises
     ------
     RecordingInvalid
-        When the file is not Parquet, lacks a column or has one of another type, has numbers of readings that
-        are not whole, or has a newer format.
+        If the file is not Parquet, lacks a column or has one of another type, has fractional numbers of
+        readings, or has another format.
     """
     path = Path(path)
     try:
@@ -371,7 +368,7 @@ def read_recording(path: Path | str) -> Recording:
             schema, count = file.schema_arrow, file.metadata.num_rows
             problems = [*_wrong_columns(schema), *_wrong_numbers(file)]
     except (OSError, pa.ArrowException) as error:
-        raise RecordingInvalid(Problem("unreadable", f"{path}: no recording: {error}")) from error
+        raise RecordingInvalid(Problem("unreadable", f"{path}: not a recording: {error}")) from error
     if problems:
         raise RecordingInvalid(*problems, where=f"{path}: ")
     timed = "arrival" in schema.names and not pa.types.is_null(schema.field("arrival").type)
@@ -392,7 +389,7 @@ def read_recording(path: Path | str) -> Recording:
 
 
 def is_simulated(path: Path) -> bool:
-    """Return whether a file is what `record` writes, readings or truth.
+    """True for a file of `record`, readings or truth.
 
     Parameters
     ----------
@@ -411,7 +408,7 @@ def is_simulated(path: Path) -> bool:
 
 
 def _wrong_columns(schema: Any) -> list[Problem]:
-    """What is wrong with the columns of a file, all at once."""
+    """All problems of a file's columns."""
     missing = [name for name in REQUIRED if name not in schema.names]
     problems = [Problem("missing", f"columns {', '.join(missing)} are missing")] if missing else []
     for name in (*READINGS.names, PHASES.name, T_POWER.name):
@@ -425,7 +422,7 @@ def _wrong_columns(schema: Any) -> list[Problem]:
             fits, expected = _is_list(kind) and _is_number(kind.value_type), "lists of numbers"
         else:
             fits, expected = _is_number(kind), "Unix time in seconds" if name in _TIMES else "numbers"
-        # A column in which nothing is has no type.
+        # A column without any value has no type.
         if not fits and not (pa.types.is_null(kind) and name not in REQUIRED):
             problems.append(Problem("wrong-type", f"column {name} is of type {given}; expected {expected}"))
     return problems
@@ -435,14 +432,14 @@ _TIMES: Final = ("t", "arrival", "t_power")
 
 
 def _wrong_numbers(file: Any) -> list[Problem]:
-    """What is wrong with the numbers of readings, which tables write as floats where one is missing."""
+    """Problems of the numbers of readings, which tables with gaps write as floats."""
     if "seq" not in file.schema_arrow.names or not _is_floating(file.schema_arrow.field("seq").type):
         return []
     for batch in file.iter_batches(columns=["seq"]):
         try:
             _column(batch, "seq")
         except pa.ArrowInvalid as error:
-            return [Problem("not-integer", f"column seq has numbers that are not whole: {error}")]
+            return [Problem("not-integer", f"column seq has fractional numbers: {error}")]
     return []
 
 
@@ -464,13 +461,13 @@ def _is_list(kind: Any) -> bool:
 
 
 def _write(samples: Iterator[Sample], dt_s: float, readings: Any, truth: Any) -> None:
-    """Write all samples; readings that arrive late wait for their turn."""
+    """Write all samples; readings with a late arrival wait for their turn."""
     waiting: dict[str, Any] | None = None
     ids: list[str] = []
     while chunk := list(islice(samples, CHUNK_TICKS)):
         ids = [*chunk[0].meter_ids, BUSBAR]
         rows = _sorted(_join(waiting, _rows(chunk)))
-        # Nothing of the next tick or a later one arrives before the next tick.
+        # Readings of the next tick or a later one arrive no earlier than the next tick.
         ready = rows["arrival"] < chunk[-1].t + dt_s
         readings.write_table(_table(ids, {name: column[ready] for name, column in rows.items()}))
         waiting = {name: column[~ready] for name, column in rows.items()}
@@ -522,7 +519,7 @@ def _table(ids: list[str], rows: dict[str, Any]) -> Any:
     columns = {
         "meter": pa.DictionaryArray.from_arrays(pa.array(rows["meter"]), pa.array(ids)),
         **{name: pa.array(rows[name]) for name in ("t", "seq", "arrival", "v_volt")},
-        # NaN in a register means: not reported.
+        # NaN in a register: not reported.
         **{name: pa.array(rows[name], from_pandas=True) for name in ("p_kw", "q_kvar")},
     }
     if "v_phases" not in rows:
@@ -562,7 +559,7 @@ def _truth_table(chunk: list[Sample], schema: Any) -> Any:
 
 
 def _matrix(column: Any) -> Any:
-    """A column of the truth as an array: (T,) for numbers, (T, width) for lists."""
+    """Column of the truth as an array: (T,) for numbers, (T, width) for lists."""
     joined = column.combine_chunks()
     if not pa.types.is_fixed_size_list(joined.type):
         return joined.to_numpy(zero_copy_only=False)
@@ -594,7 +591,7 @@ def _readings(batch: Any) -> Iterator[Reading]:
 
 
 def _column(batch: Any, name: str) -> Any:
-    """A column as its readings have it: nothing for NaN in `REGISTERS`, and whole numbers as such."""
+    """Column with null in place of NaN in `REGISTERS`, and integers for `seq`."""
     column = batch.column(name)
     if name not in REGISTERS or not _is_floating(column.type):
         return column

@@ -1,8 +1,8 @@
-"""Scenarios: a real feeder, its loads, inverters, meters and attackers, played tick by tick.
+"""Scenarios: a real feeder, its loads, inverters, meters and attackers, tick by tick.
 
-The truth is full AC power flow with the droop inverters in closed loop (`feeders.simulation.plant`); what
-comes out are readings as a service would receive them, beside the truth that they should have told. The same
-scenario gives the same numbers every time; no clock is read.
+The truth is full AC power flow with the droop inverters in closed loop (`feeders.simulation.plant`). The
+output is readings as a service receives them, beside the true values. A scenario has the same numbers every
+time; no clock is read.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ START: Final = 1_780_272_000.0
 """Monday, 1 June 2026, 00:00 UTC."""
 
 LATEST_S: Final = 1e10
-"""Times from here on, in the year 2286, are in another unit than seconds."""
+"""Upper bound of times, s, in the year 2286; larger ones have another unit."""
 
 SUNNY_NOON_S: Final = 216_000.0
 """Noon of the first Wednesday of a season's profiles; in summer a sunny day in June."""
@@ -59,12 +59,12 @@ LONGEST_LOOK_BACK_S: Final = 7 * 86_400.0
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """What happens to a feeder.
+    """Simulated run: length, profiles, variation, meter errors, channel and attacks.
 
     Attributes
     ----------
     seed
-        Chooses everything random, >= 0.
+        Seed of all random numbers, >= 0.
     start
         Unix time of the first tick, s.
     duration_s
@@ -72,27 +72,27 @@ class Scenario:
     dt_s
         Interval between readings, s.
     profile_s
-        Position within the season's profiles at `start`, s; they begin on a Monday at 00:00, are two weeks in
-        summer and one in the other seasons, and repeat. By default the noon of a Wednesday.
+        Position within the season's profiles at `start`, s. They begin on a Monday at 00:00, have two weeks
+        in summer and one in the other seasons, and repeat. By default the noon of a Wednesday.
     substep_s
-        Longest step of the integrator, s; None: half the smallest time constant of the inverters, or one
-        quasi-static step where a tick is more than ten of the largest.
+        Longest step of the integrator, s. None: half the smallest time constant of the inverters, or one
+        quasi-static step for a tick of more than QUASI_STATIC_TAUS of the largest.
     variation, errors, channel
-        How loads and busbar vary, what errors meters have, what happens to readings on the way.
+        Variation of loads and busbar, errors of the meters, effects of the channel.
     attacks
-        Who lies, when and how, applied in this order. Meters are indices into `Site.meters`.
+        Attacks on meters, applied in this order. Meters are indices into `Site.meters`.
     inverter_attacks
-        Which inverters inject a wrong reactive power; they add up. Inverters are indices into `Site.droop`.
+        Wrong injections of inverters; they add up. Inverters are indices into `Site.droop`.
     season
-        The time of the year of loads and generation; the calendar of `start` plays no part.
+        Season of loads and generation, independent of the date of `start`.
     busbar_attacks
-        How the busbar's meter lies, applied in this order; none may look back. Their meters are its phases, 0
-        to 2, or 0 on a balanced feeder.
+        Attacks on the busbar meter, applied in this order; none may use earlier readings. Their meters are
+        its phases, 0 to 2, or 0 on a balanced feeder.
 
     Raises
     ------
     ValueError
-        If there is no such season, or a number cannot be meant.
+        For an unknown season, or an invalid number.
     """
 
     seed: int = 0
@@ -139,22 +139,22 @@ class Reading:
     Attributes
     ----------
     meter
-        Id of the meter; BUSBAR (the empty string) for the busbar's.
+        Id of the meter; BUSBAR (the empty string) for the busbar meter.
     t
         Time by the meter's clock, Unix s.
     seq
-        Number of the reading; rises by one with every tick, also while nothing arrives. None in foreign
+        Number of the reading; rises by one with every tick, also without an arrival. None in external
         recordings without numbers.
     arrival
-        When the reading arrives, Unix s.
+        Arrival time, Unix s.
     v_volt
-        Voltage, phase to neutral, V; the mean of the phases where there are several.
+        Voltage, phase to neutral, V; for several phases their mean.
     p_kw, q_kvar
         Net import, kW and kvar; None where not reported.
     v_phases
         Busbar voltage of each phase, V; None on a balanced feeder.
     t_power
-        Time of the powers by the meter's clock, Unix s; None where it is `t`.
+        Time of the powers by the meter's clock, Unix s; None for `t`.
     """
 
     meter: str
@@ -170,7 +170,7 @@ class Reading:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sample:
-    """One tick: the truth, and what is reported of it. N customers, m inverters, p meters, b + 1 buses.
+    """One tick: the truth, and the reports. N customers, m inverters, p meters, b + 1 buses.
 
     Attributes
     ----------
@@ -183,20 +183,20 @@ class Sample:
     v_volt : (N,)
         True voltage at each customer, V.
     v_bus_volt : (b + 1,)
-        True voltage of each bus, the busbar first, V; in three phases (3 (b + 1),), those of a bus side by
-        side, NaN for one that it does not have.
+        True voltage of each bus, the busbar first, V; in three phases (3 (b + 1),), the phases of a bus side
+        by side, NaN for an absent one.
     x_kvar : (m,)
-        Reactive injection of each inverter as its droop curve has it, kvar; attacks come on top.
+        Reactive injection of each inverter by its droop curve, kvar, without attacks.
     p_kw, q_kvar : (N,)
         True net import of each customer, inverter included, kW and kvar.
     manipulated : (p,)
-        Which meters are under attack.
+        Mask of the meters under attack.
     shift_volt : (p,)
         Reported minus honest reading, V; 0 for honest meters.
     reported
-        What the meters report, manipulations included, as one row: whether or not it arrives.
+        Reports of the meters, manipulations included, as one row, with or without arrival.
     delivery
-        When it arrives, as one row.
+        Arrival times, as one row.
     """
 
     t: float
@@ -214,7 +214,7 @@ class Sample:
 
     @property
     def readings(self) -> list[Reading]:
-        """The readings of this tick that arrive, duplicates included, in the order of their arrival."""
+        """Arriving readings of this tick, duplicates included, in the order of their arrival."""
         out = [
             self._reading(j, meter, float(arrival))
             for j, meter in enumerate((*self.meter_ids, BUSBAR))
@@ -242,14 +242,14 @@ class Sample:
 
 
 def simulate(site: Site, scenario: Scenario) -> Iterator[Sample]:
-    """Play a scenario.
+    """Simulate a scenario.
 
     Parameters
     ----------
     site
         The feeder.
     scenario
-        What happens to it.
+        The scenario.
 
     Yields
     ------
@@ -259,11 +259,11 @@ def simulate(site: Site, scenario: Scenario) -> Iterator[Sample]:
     Raises
     ------
     PowerFlowDiverged
-        When the loads are beyond what the feeder can carry.
+        If the power flow has no solution for the loads.
     NoEquilibrium
-        When inverters and feeder find no common answer.
+        Without a common solution of inverters and feeder.
     ValueError
-        When an attack or a silence names a meter that the feeder does not have, or looks too far back.
+        For an attack on, or the silence of, an unknown meter, or an attack that uses too old readings.
     """
     check(site, scenario)
     meters = Meters(site, scenario.errors, scenario.channel, scenario.seed)
@@ -285,7 +285,7 @@ def simulate(site: Site, scenario: Scenario) -> Iterator[Sample]:
 def _samples(
     site: Site, block: Block, honest: Registers, reported: Registers, *, delivery: Delivery, lies: Bools
 ) -> Iterator[Sample]:
-    """Take a block apart, tick by tick."""
+    """Split a block into ticks."""
     shift = reported.v_volt - honest.v_volt
     q_net = net_reactive(site, block)
     x_kvar = block.x * site.feeder.base_kva
@@ -310,9 +310,9 @@ def _samples(
 
 
 def snapshots(samples: Iterable[Sample]) -> Iterator[Snapshot]:
-    """Turn samples into what `feeders.model.site.to_frame` takes: one row of readings per tick.
+    """Convert samples to the input of `feeders.model.site.to_frame`: one row of readings per tick.
 
-    Lost readings and silences are missing; delay and clock errors play no part.
+    Lost readings and silences are missing. Delays and clock errors have no effect.
     """
     for sample in samples:
         there = np.isfinite(sample.delivery.arrival[0])
@@ -327,11 +327,11 @@ def snapshots(samples: Iterable[Sample]) -> Iterator[Snapshot]:
 
 
 def by_arrival(samples: Iterable[Sample]) -> Iterator[Reading]:
-    """Readings of many ticks in the order of their arrival; equal ones in the order of time and meters."""
+    """Readings of many ticks in the order of arrival; equal ones in the order of time and meters."""
     waiting: list[tuple[float, int, Reading]] = []
     number = count()
     for sample in samples:
-        # Nothing of this tick or a later one arrives before its own time.
+        # Readings of this tick or a later one arrive no earlier than their own time.
         while waiting and waiting[0][0] < sample.t:
             yield heappop(waiting)[2]
         for reading in sample.readings:
@@ -341,13 +341,12 @@ def by_arrival(samples: Iterable[Sample]) -> Iterator[Reading]:
 
 
 class _Past:
-    """The honest voltage reports that attacks may still want to see, pu, in blocks of consecutive ticks.
+    """Honest voltage reports that attacks may still use, pu, in blocks of consecutive ticks.
 
     Attributes
     ----------
     first
-        The first tick that any attack will ask for; 0 or negative. Ticks before 0 have to be played before
-        the scenario begins.
+        First tick that any attack uses; 0 or negative. Ticks before 0 are simulated before the scenario.
     """
 
     def __init__(self, meters: int, scenario: Scenario) -> None:
@@ -358,7 +357,7 @@ class _Past:
         self.first = min(self._oldest(scenario.start), 0)
 
     def add(self, ticks: Ints, honest: Floats) -> None:
-        """Keep the reports (T, p) of some ticks and forget those that nobody can ask for any more."""
+        """Add the reports (T, p) of some ticks and remove those that no attack can use any more."""
         if not self._attacks:
             return
         self._blocks[int(ticks[0])] = honest
@@ -367,7 +366,7 @@ class _Past:
             del self._blocks[start]
 
     def __call__(self, t: Floats) -> Floats:
-        """The reports at the ticks at or just before times t (T,): (T, p)."""
+        """Reports at the ticks at or just before times t (T,): (T, p)."""
         wanted = np.array([self._tick(float(when)) for when in t], dtype=np.intp)
         out = np.full((t.size, self._meters), np.nan)
         for start, v in self._blocks.items():
@@ -376,7 +375,7 @@ class _Past:
         return out
 
     def _oldest(self, now: float) -> int:
-        """The oldest tick that can still be asked for from time `now` on."""
+        """Oldest tick that an attack can use from time `now` on."""
         looks = []
         for attack in self._attacks:
             if attack.t_off > now:
@@ -402,7 +401,7 @@ def _honest(site: Site, meters: Meters, block: Block) -> Registers:
 def _attacked(
     site: Site, scenario: Scenario, t: Floats, honest: Registers, *, past: _Past, lies: Bools
 ) -> Registers:
-    """What is reported; honest meters keep their registers to the last bit."""
+    """Reported values; honest meters keep their registers to the last bit."""
     if not lies.any():
         return honest
     nominal = site.customer_nominal[site.meters]
@@ -413,7 +412,7 @@ def _attacked(
 
 
 def _busbar_attacked(site: Site, scenario: Scenario, t: Floats, reported: Registers) -> Registers:
-    """What is reported, by the busbar's meter too."""
+    """Reported values with attacks on the busbar meter."""
     nominal = site.nominal_volt[busbar_places(site.feeder)]
     lies = manipulated(scenario.busbar_attacks, t, nominal.size)
     if not lies.any():
@@ -426,17 +425,12 @@ def _busbar_attacked(site: Site, scenario: Scenario, t: Floats, reported: Regist
 
 
 def check(site: Site, scenario: Scenario) -> None:
-    """Refuse attacks that cannot be played on a feeder.
-
-    Parameters
-    ----------
-    site, scenario
-        The feeder, and what happens to it.
+    """Check the attacks of a scenario against the feeder.
 
     Raises
     ------
     ValueError
-        With everything that is wrong.
+        With all problems.
     """
     name, phases = site.feeder.name, busbar_places(site.feeder).stop
     problems = [
@@ -454,7 +448,7 @@ def check(site: Site, scenario: Scenario) -> None:
         problems.append(
             Problem(
                 "unknown-index",
-                f"an attack on the busbar's meter looks back, or names phases that {name} has not",
+                f"an attack on the busbar meter uses earlier readings, or phases that {name} does not have",
             )
         )
     for attack in scenario.attacks:
@@ -469,7 +463,10 @@ def check(site: Site, scenario: Scenario) -> None:
         if attack.t_off > then and reach(attack, then) > LONGEST_LOOK_BACK_S:
             back = reach(attack, then)
             problems.append(
-                Problem("out-of-range", f"an attack looks back {back:.0f} s, further than can be played")
+                Problem(
+                    "out-of-range",
+                    f"an attack uses readings {back:.0f} s old, more than the simulation supports",
+                )
             )
     every = (*scenario.attacks, *scenario.busbar_attacks, *scenario.inverter_attacks)
     problems += [

@@ -1,9 +1,9 @@
-"""Trials: short simulated runs with known liars, by which any estimator family is judged.
+"""Trials: short simulated runs with known attacks, for the comparison of estimators.
 
 A trial is a `feeders.simulation.scenario.Scenario` with one load situation that varies slowly. Its frames
-hold the powers of the profiles of all customers whose meter is heard, and the true loads differ from these by
-an Ornstein-Uhlenbeck process; of all others they know what the service does, the range that these can draw or
-feed in, or a forecast. The truth is full AC power flow with the droop inverters in closed loop.
+have the profiles' powers of all customers with an available meter. The true loads differ from these by an
+Ornstein-Uhlenbeck process. The powers of all other customers are as in the service: the range, or a forecast.
+The truth is full AC power flow with the droop inverters in closed loop.
 """
 
 from __future__ import annotations
@@ -44,29 +44,29 @@ __all__ = [
 ]
 
 NO_CLASS_PERCENT: Final = 1e-4
-"""Accuracy class of meters without a fixed error: the files have no class of zero."""
+"""Accuracy class of meters without a fixed error, %: the format has no class of zero."""
 
 STEADY: Final = Variation(load_spread=0.0, cloud_spread=0.0, tap_step_pu=0.0)
 """Loads and generation follow their profiles, the busbar changes slowly."""
 
 SETTLING_S: Final = 10.0
-"""How long after the start, and after the onset of a lie, reconstructions do not count yet, s."""
+"""Settling time after the start and after the onset of an attack, without reconstruction errors, s."""
 
 
 class Meters(StrEnum):
-    """What errors the meters of a trial have, and are known to have."""
+    """Errors of the meters of a trial, in truth and in the design."""
 
     WHITE = "white"
     """White noise of 0.2 % (busbar 0.02 %), no fixed error, no resolution."""
     REAL = "real"
-    """A fixed error within 0.5 % (busbar 0.1 %), a resolution of 0.1 V, jitter of 0.05 % (busbar 0.02 %)."""
+    """Fixed error within 0.5 % (busbar 0.1 %), resolution 0.1 V, jitter 0.05 % (busbar 0.02 %)."""
     SITE = "site"
-    """As the feeder's files say."""
+    """Errors of the feeder's files."""
 
 
 @dataclass(frozen=True, slots=True)
 class LoadError:
-    """What the powers in the frames do not show.
+    """Differences between true powers and those of the frames.
 
     Attributes
     ----------
@@ -75,8 +75,8 @@ class LoadError:
     correlation_s
         Correlation time, s.
     half_width
-        Half-width of the intervals that frames state, in standard deviations. The default is that of a
-        uniform distribution with this standard deviation.
+        Half-width of the frames' intervals, in standard deviations. The default is that of a uniform
+        distribution.
     """
 
     p_kw: float = 0.6
@@ -87,27 +87,27 @@ class LoadError:
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One run.
+    """Short simulated run.
 
     Attributes
     ----------
     site
-        The feeder. Watchers are to be designed for `stated`, which says how wrong meters and loads are.
+        The feeder. Designs are for `stated`, with the errors of meters and loads.
     seed
-        Chooses everything random.
+        Seed of all random numbers.
     duration_s, step_s
         Length and interval of the frames, s.
     load_error, meters
-        What nobody knows, and what meters make of the truth. No `load_error`: registers, power factors and
-        what comes and go beside them err as the feeder's files say, and frames are those of `to_frame`.
+        Load errors, and errors of the meters. Without `load_error`, registers, power factors and hidden
+        powers have the errors of the feeder's files, and frames are those of `to_frame`.
     lie
-        Who lies; None: nobody.
+        The attack; None without one.
     profile_s
-        Position within the fourteen days of the summer's profiles, s.
+        Position within the 14 days of the summer profiles, s.
     variation
-        What changes beside, known to all; `hidden_*` of it are those of `load_error`.
+        Known variation of loads and busbar; its `hidden_*` are those of `load_error`.
     report_q
-        Whether meters report the net reactive power.
+        True: meters report the net reactive power.
     """
 
     site: Site
@@ -127,7 +127,7 @@ class Trial:
 
     @property
     def stated(self) -> Site:
-        """The feeder whose files say what the trial does: errors of meters and loads, and the interval."""
+        """Feeder with the errors of meters and loads, and the interval, of the trial."""
         meta, rows, error = self.site.tables.meta, self.site.tables.customers, self.load_error
         load, registers = meta.load, meta.meters
         if error is not None:
@@ -164,7 +164,7 @@ class Trial:
 
     @property
     def scenario(self) -> Scenario:
-        """What is played on `stated`."""
+        """Scenario of the trial, on `stated`."""
         error, told = self.load_error, self.site.tables.meta.load.correlation_s
         honest = Scenario(
             seed=self.seed,
@@ -192,11 +192,11 @@ class Truth:
     v2 : (N,)
         Squared voltages, pu.
     liars : (p,)
-        Which meters are manipulated at present.
+        Mask of the manipulated meters.
     attack : (p,)
         Reported minus honest squared voltage, pu.
     inverters : (m,)
-        Which inverters are manipulated at present.
+        Mask of the manipulated inverters.
     """
 
     v2: Floats
@@ -208,28 +208,28 @@ class Truth:
 def frames(
     trial: Trial, scenario: Scenario | None = None, *, stated: Site | None = None
 ) -> Iterator[tuple[Frame, Truth]]:
-    """Play a trial.
+    """Simulate a trial.
 
     Parameters
     ----------
     trial
         The trial.
     scenario
-        What is played in place of `trial.scenario`: another season, other attacks.
+        Scenario in place of `trial.scenario`: another season, other attacks.
     stated
-        `trial.stated`, where it is known already.
+        `trial.stated`, if known already.
 
     Yields
     ------
     Frame, Truth
-        One pair per tick. Frames hold the powers of the profiles (as falsified where the lie says so), and
-        intervals of `LoadError.half_width`, of customers whose meter is heard; the others', and all where
-        there is no `load_error`, are those of `to_frame`.
+        One pair per tick. Customers with an available meter have the powers of the profiles, falsified by the
+        attack, and intervals of `LoadError.half_width`. The others, and all without `load_error`, have those
+        of `to_frame`.
 
     Raises
     ------
     NoSuchAttack, PowerFlowDiverged, NoEquilibrium
-        When the lie cannot be told on this feeder, or the feeder not be solved.
+        If the attack does not exist on this feeder, or the feeder has no solution.
     """
     site = trial.stated if stated is None else stated
     scenario = trial.scenario if scenario is None else scenario
@@ -253,12 +253,12 @@ def frames(
 
 
 def _powers(error: LoadError, site: Site, frame: Frame, powers: tuple[Floats, Floats], read: Bools) -> Frame:
-    """The frame with powers as told; those that nobody reads, or would believe, stay what they are."""
+    """Frame with the reported powers; unread and implausible ones stay as they are."""
     (p_kw, q_kvar), base = powers, site.feeder.base_kva
     believed = np.zeros(frame.p.size, dtype=np.bool_)
     believed[site.meters] = read & (np.abs(p_kw) <= site.loads.credible * base)[site.meters]
     p_error = np.full(frame.p.size, error.half_width * error.p_kw / base)
-    # Registers are exact here, so that what a frame does not believe of them is what no connection carries.
+    # Registers are exact here: the error of the frame beyond it is the excess over the connection's limit.
     p_error[site.meters] = np.maximum(p_error[site.meters], frame.p_error[site.meters])
     forecast = (
         None if std is None else np.where(believed, np.nan, std) for std in (frame.p_std, frame.q_std)
@@ -276,7 +276,7 @@ def _powers(error: LoadError, site: Site, frame: Frame, powers: tuple[Floats, Fl
 
 
 def _fake_load(site: Site, scenario: Scenario, t: Floats) -> tuple[Floats, Floats]:
-    """Loads that do not exist, where their powers are reported, kW and kvar, (T, N) each."""
+    """Reported powers of false loads, kW and kvar, (T, N) each."""
     p_kw, q_kvar = np.zeros((2, t.size, len(site.tables.customers)))
     for attack in scenario.attacks:
         if isinstance(attack, Coordinated):
@@ -302,33 +302,34 @@ def _truth(site: Site, scenario: Scenario, sample: Sample) -> Truth:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Outcome:
-    """How a watcher did in one trial. T ticks, p meters, k liars, l manipulated inverters.
+    """Result of an estimator in one trial. T ticks, p meters, k manipulated meters, l manipulated inverters.
 
     Attributes
     ----------
     liars : (k,)
-        Meters that lied at some time.
+        Meters manipulated at some time.
     delay_s : (k,)
-        From the onset of each one's lie until it was first named while lying, s; infinite if never.
+        Time from the onset of each attack to the first naming of the meter during it, s; infinite without
+        one.
     inverters, inverter_delay_s : (l,)
         The same for inverters.
     accused : (p,)
-        Meters that were named before they lied, or without ever lying.
+        Meters named before their manipulation, or without one.
     accused_inverters : (m,)
         The same for inverters.
     false_names : (T,)
-        How many meters were falsely named at each tick.
+        Number of falsely named meters at each tick.
     error_liars, error_all
-        Reconstruction errors of the voltage at lying meters and at all customers, % of nominal, one per
-        tick and place after settling; infinite where the estimate is not finite.
+        Reconstruction errors of the voltage at manipulated meters and at all customers, % of nominal, one per
+        tick and place after settling; infinite if the estimate is not finite.
     step_ms : (T,)
         Processor time of each step, ms.
     clean_while_lying : (T,)
-        Ticks with a lie at which the verdict was CLEAN and named nobody.
+        Ticks with an attack and the verdict CLEAN without named devices.
     lying : (T,)
-        Ticks with a lie.
+        Ticks with an attack.
     undecided : (T,)
-        Ticks at which the verdict was UNDECIDED.
+        Ticks with the verdict UNDECIDED.
     """
 
     liars: Ints
@@ -347,12 +348,12 @@ class Outcome:
 
     @property
     def missed(self) -> int:
-        """How many liars, inverters included, were never named."""
+        """Number of manipulated devices, inverters included, that were never named."""
         return int(np.isinf(self.delay_s).sum() + np.isinf(self.inverter_delay_s).sum())
 
     @property
     def false_clean(self) -> float:
-        """Share of the ticks with a lie at which the answer was CLEAN; NaN without a lie."""
+        """Share of the ticks with an attack at which the verdict was CLEAN; NaN without an attack."""
         return float(self.clean_while_lying.sum() / self.lying.sum()) if self.lying.any() else np.nan
 
 
@@ -363,7 +364,7 @@ def judge(
     settling_s: float = SETTLING_S,
     played: Iterable[tuple[Frame, Truth]] | None = None,
 ) -> Outcome:
-    """Let a watcher watch a trial.
+    """Run an estimator on a trial.
 
     Parameters
     ----------
@@ -372,9 +373,9 @@ def judge(
     trial
         The trial.
     settling_s
-        How long after the start and after each onset reconstructions do not count, s.
+        Settling time after the start and after each onset, without reconstruction errors, s.
     played
-        The frames of this trial, if they have been made already.
+        Frames of this trial, if known already.
     """
     state = watcher.init(START)
     ticks: list[tuple[float, Verdict, Truth]] = []
@@ -384,7 +385,7 @@ def judge(
     step_ms: list[float] = []
     settled, lied = START + settling_s, False
     for frame, truth in frames(trial) if played is None else played:
-        begun = time.process_time()  # what other programs do meanwhile does not count
+        begun = time.process_time()  # processor time: other programs have no effect
         state, estimate, verdict = watcher.step(state, frame)
         step_ms.append(1e3 * (time.process_time() - begun))
         ticks.append((frame.t, verdict, truth))
@@ -429,17 +430,17 @@ def _error_percent(v2: Floats, truth: Floats) -> Floats:
 
 
 def _inverters(verdict: Verdict, truth: Truth) -> Bools:
-    """The inverters named; none by estimators that do not judge them."""
+    """Mask of the named inverters; none for estimators without inverter tests."""
     return verdict.inverters if verdict.inverters.size else np.zeros_like(truth.inverters)
 
 
 def _since(lies: Bools) -> Bools:
-    """Whether each has begun to lie, (T, k): a name that stays a while after the lie is not false."""
+    """True from the begin of each attack on, (T, k): a name just after an attack is not false."""
     return np.logical_or.accumulate(lies, axis=0)
 
 
 def _delays(t: Floats, named: Bools, lies: Bools) -> Floats:
-    """From each one's first lie to its first name during a lie, s."""
+    """Time from each device's first manipulation to its first naming during one, s."""
     out = []
     for j in np.flatnonzero(lies.any(axis=0)):
         caught = np.flatnonzero(named[:, j] & lies[:, j])

@@ -1,8 +1,8 @@
-"""All estimator families side by side, on the same trials of one feeder.
+"""Comparison of all estimators on the same trials of one feeder.
 
-Every family of `feeders.registry.registry.FAMILIES` watches the same frames: full AC power flow as truth,
-meters as accurate as the feeder's files say, loads known up to a stated error. A family that cannot be
-designed for the feeder, or that fails while it watches, keeps its rows, with the reason in them.
+Every estimator of `feeders.registry.registry.FAMILIES` processes the same frames: full AC power flow as
+truth, meters with the accuracy of the feeder's files, loads known up to a stated error. An estimator without
+a design for the feeder, or with a failure in a step, keeps its rows, with the reason.
 """
 
 from __future__ import annotations
@@ -47,30 +47,32 @@ __all__ = [
 FEEDER: Final = "simbench-lv-rural1"
 
 ONSET_S: Final = 60.0
-"""When the lies begin, s after the start: what needs to settle has settled."""
+"""Onset of the attacks, s after the start; the estimators have settled by then."""
 
 BEGIN: Final = "<!-- comparison: begin -->"
 END: Final = "<!-- comparison: end -->"
 
 LIVELY: Final = Variation(tap_interval_s=300.0)
-"""Loads and clouds as in every scenario; the transformer upstream may step every five minutes, so that runs
-of minutes see what meters that repeat themselves would miss in hours."""
+"""Loads and clouds of the usual scenarios; the transformer upstream may step every five minutes.
+
+Runs of minutes then include steps that make repeated readings visible.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One way to lie, or none.
+    """Case of the comparison: one kind of attack, or none.
 
     Attributes
     ----------
     name
         Short name.
     meaning
-        What happens, for people; `{meters}` stands for how many lie.
+        Description; `{meters}` is replaced by the number of manipulated meters.
     trick, size
-        As in `feeders.simulation.attacks.Lie`; no trick: nobody lies.
+        As in `feeders.simulation.attacks.Lie`; None: no attack.
     one
-        Whether just one lies, however many the estimators are asked to withstand.
+        True: one manipulated device, for any M.
     """
 
     name: str
@@ -80,18 +82,18 @@ class Case:
     one: bool = False
 
     def told(self, count: int) -> str:
-        """What happens when `count` may lie, as a phrase."""
+        """Description of the case for this number of manipulated meters."""
         return self.meaning.format(meters=f"{count} meter" if count == 1 else f"{count} meters")
 
     def lie(self, count: int) -> Lie | None:
-        """Who lies when `count` may."""
+        """Attack for this number of manipulated meters, None without one."""
         if self.trick is None:
             return None
         return Lie(self.trick, 1 if self.one else count, self.size, ONSET_S)
 
 
 CASES: Final = (
-    Case("clean", "nobody lies"),
+    Case("clean", "no attack"),
     Case("bias", "readings of {meters} at random are 3 % too high or too low", Trick.BIAS, 3.0),
     Case(
         "coordinated",
@@ -110,25 +112,25 @@ CASES: Final = (
     Case("replay", "readings of {meters} at random are those of 10 minutes earlier", Trick.REPLAY, 600.0),
     Case(
         "inverter",
-        "one inverter at random injects its rating beside what its droop curve says; all meters are honest",
+        "one inverter at random injects its rating in addition to its droop curve; all meters are honest",
         Trick.INVERTER,
         100.0,
         one=True,
     ),
 )
-"""What families are compared on."""
+"""Cases of the comparison."""
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What is compared.
+    """Options of a comparison.
 
     Attributes
     ----------
     max_attacked
-        M that designs are asked for, and how many meters lie.
+        M of the designs, and number of manipulated meters.
     seeds
-        How many runs of each case.
+        Number of runs of each case.
     duration_s, step_s
         Length of a run and interval of its frames, s.
     load_error, meters, variation, report_q
@@ -141,7 +143,7 @@ class Plan:
     Raises
     ------
     ValueError
-        If there is no such family or case, or no run; names every problem.
+        For an unknown estimator or case, or no run, with all problems.
     """
 
     max_attacked: int = 2
@@ -157,7 +159,7 @@ class Plan:
     workers: int = 1
 
     def __post_init__(self) -> None:
-        """Refuse what would compare nothing."""
+        """Reject an empty comparison."""
         refuse(
             [
                 *no_choice("family", FAMILIES, *self.families),
@@ -187,33 +189,34 @@ class Plan:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """How one family did in one case, all seeds together. NaN: there is nothing to tell.
+    """Result of one estimator in one case, over all seeds. NaN: not applicable.
 
     Attributes
     ----------
     family, case
         Names.
     reason
-        Why there are no numbers; empty where there are.
+        Reason for missing numbers; empty with numbers.
     liars, named, missed
-        How many meters or inverters lied, were named while lying, and were not, summed over seeds.
+        Number of manipulated meters and inverters, of those named during the attack, and of those not named,
+        sums over seeds.
     falsely_named
-        How many honest meters and inverters were ever named, summed over seeds.
+        Number of honest meters and inverters ever named, sum over seeds.
     false_share
-        Share of ticks at which an honest meter was named, 1.
+        Share of ticks with an honest meter named, 1.
     delay_s
-        Median time from onset to name of those named, s.
+        Median time from onset to naming of those named, s.
     error_liars, error_all
-        95th percentile of the voltage's reconstruction error at lying meters and at all customers, % of
-        nominal.
+        95th percentile of the reconstruction error of the voltage at manipulated meters and at all customers,
+        % of nominal.
     step_ms, step_ms_95
         Median and 95th percentile of the processor time per step, ms.
     observers
-        How many observers, or candidate sets, ran.
+        Number of observers, or candidate sets.
     false_clean
-        Share of the ticks with a lie at which the answer was CLEAN, 1.
+        Share of the ticks with an attack and the verdict CLEAN, 1.
     undecided
-        Share of all ticks at which it was UNDECIDED, 1.
+        Share of all ticks with the verdict UNDECIDED, 1.
     """
 
     family: str
@@ -237,18 +240,18 @@ class Row:
 def compare(
     site: Site, plan: Plan, *, journal: Where = None, progress: Callable[[str], None] | None = None
 ) -> list[Row]:
-    """Let all families watch all cases.
+    """Run all estimators on all cases.
 
     Parameters
     ----------
     site
         The feeder.
     plan
-        What is compared.
+        Options of the comparison.
     journal
-        File in which finished cases are kept; an interrupted comparison goes on from it.
+        File of finished cases; an interrupted comparison resumes from it.
     progress
-        Called with a line for people before each design and each case.
+        Called with a line of text before each design and each case.
 
     Returns
     -------
@@ -258,9 +261,9 @@ def compare(
     Raises
     ------
     OtherStudy
-        If the journal is another study's.
+        If the journal is that of another study.
     InUse
-        If another process is writing it.
+        If another process writes the journal.
     """
     tell = progress or (lambda _: None)
     cases = [case for case in CASES if case.name in plan.cases]
@@ -269,7 +272,7 @@ def compare(
 
     @cache
     def watchers() -> dict[str, Watcher | str]:
-        # What a trial states does not depend on its seed or lie: one design serves all.
+        # The stated errors are independent of seed and attack: one design serves all trials.
         stated = plan.trial(site, CASES[0], 0).stated
         found: dict[str, Watcher | str] = {}
         for name in plan.families:
@@ -310,7 +313,7 @@ def _case(site: Site, case: Case, plan: Plan, watchers: dict[str, Watcher | str]
                     continue
                 try:
                     outcomes[name].append(judge(watcher, trial, played=played))
-                except Exception as failure:  # noqa: BLE001  # the code of others may do anything
+                except Exception as failure:  # noqa: BLE001  # external code may raise anything
                     reasons[name] = _failed(failure)
     except NoSuchAttack as error:
         return [Row(name, case.name, str(error)) for name in watchers]
@@ -323,7 +326,7 @@ def _case(site: Site, case: Case, plan: Plan, watchers: dict[str, Watcher | str]
 
 
 def _failed(failure: Exception) -> str:
-    return "it failed while it watched: " + " ".join(f"{type(failure).__name__}: {failure}".split())
+    return "failed in a step: " + " ".join(f"{type(failure).__name__}: {failure}".split())
 
 
 def _row(family: str, case: str, observers: int, outcomes: Sequence[Outcome]) -> Row:
@@ -352,15 +355,15 @@ def _row(family: str, case: str, observers: int, outcomes: Sequence[Outcome]) ->
 
 
 def _most(values: Floats) -> float:
-    """95th percentile; one of the values, so that infinite ones stay what they are."""
+    """95th percentile; one of the values, so that infinite ones remain."""
     return float(np.percentile(values, 95, method="higher")) if values.size else math.nan
 
 
-# ---------------------------------------------------------------------------------------------- on paper
+# -------------------------------------------------------------------------------------------------- tables
 
 
 def write_csv(rows: Iterable[Row], path: Path) -> None:
-    """Write all numbers as they are; a file that is there is replaced when the new one is complete.
+    """Write all numbers; an existing file is replaced when the new one is complete.
 
     Parameters
     ----------
@@ -396,13 +399,7 @@ HEADERS: Final = (
 
 
 def cells(row: Row) -> tuple[str, ...]:
-    """Turn a row into the texts under HEADERS; a row without numbers has the reason as its second and last.
-
-    Parameters
-    ----------
-    row
-        From `compare`.
-    """
+    """Texts of a row under HEADERS; a row without numbers has the reason as its second and last."""
     if row.reason:
         return row.family, row.reason
     return (
@@ -421,22 +418,22 @@ def cells(row: Row) -> tuple[str, ...]:
 
 
 def markdown(rows: Sequence[Row], plan: Plan) -> str:
-    """One overview, and one table for each case; every family has a row, also if it did not take part.
+    """Overview, and one table for each case; every estimator has a row, with or without numbers.
 
     Parameters
     ----------
     rows
         From `compare`.
     plan
-        What was compared.
+        Options of the comparison.
     """
     names = list(dict.fromkeys(row.case for row in rows))
     found = {(family, name): Row(family, name, "not run") for family in FAMILIES for name in names}
     found |= {(row.family, row.case): row for row in rows}
     meanings = {case.name: case.told(plan.max_attacked) for case in CASES}
     lines = [
-        "Named of those who lied, and in brackets how many honest ones were ever named; none: there are no",
-        "numbers, the tables below say why.",
+        "Manipulated devices named, and in brackets the number of honest ones ever named; none: there are no",
+        "numbers, the tables below state the reason.",
         "",
     ]
     lines += _head(("family", *names))
@@ -452,19 +449,19 @@ def markdown(rows: Sequence[Row], plan: Plan) -> str:
 
 
 def splice(text: str, table: str) -> str:
-    """Replace what stands between BEGIN and END.
+    """Replace the text between BEGIN and END.
 
     Parameters
     ----------
     text
         The document.
     table
-        What shall stand there.
+        New text.
 
     Raises
     ------
     GridsecError
-        When the document does not have both markers, once each and in this order.
+        Without both markers, once each and in this order.
     """
     before, _, rest = text.partition(BEGIN)
     _, end, after = rest.partition(END)
@@ -482,7 +479,7 @@ def _head(headers: tuple[str, ...]) -> list[str]:
 
 
 def _line(texts: Iterable[str]) -> str:
-    # The tables of Markdown know no line breaks, and a bar ends a cell.
+    # Tables of Markdown have no line breaks, and a bar ends a cell.
     return "| " + " | ".join(" ".join(text.split()).replace("|", "\\|") for text in texts) + " |"
 
 

@@ -1,4 +1,4 @@
-"""Which lies stay unnoticed, which are surely noticed and named, in volts; and what they do to the picture.
+"""Sizes of attacks that stay unnoticed, are noticed and are named, in volts; resulting estimation errors.
 
 References
 ----------
@@ -39,20 +39,20 @@ if TYPE_CHECKING:
 __all__ = ["MANY", "RISK", "Detectable", "detectable", "monitor_rule", "workers"]
 
 RISK = 1e-3
-"""Probability, at one moment, with which honest errors are beyond what the monitor's figures allow for."""
+"""Probability at one moment that honest errors exceed the monitor's limits."""
 
 MANY = 50
-"""From so many meters on, the work is worth more than the seconds in which processes begin."""
+"""Number of meters from which on several processes are faster than one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Detectable:
-    """What `detectable` found. All sizes are voltages at nominal voltage, V.
+    """Result of `detectable`. All sizes are voltages at nominal voltage, V.
 
     Attributes
     ----------
     feeder, digest
-        The feeder's name, and its content.
+        Name and content digest of the feeder.
     max_attacked
         M.
     risk, share
@@ -60,18 +60,20 @@ class Detectable:
     meters
         One row for each meter, `alone` or in collusion with M - 1 others of the attacker's choice:
 
-        - `hidden_alone`, `hidden`: up to this, with probability `1 - risk` at any one moment, no meter is
-          beyond the sequential monitor's limits, so that nobody is named;
-        - `noticed_alone`, `noticed`: beyond this somebody is, with that probability;
-        - `named_alone`, `named`: beyond this, with probability `1 - 2 risk`, no explanation that believes the
-          meter is a rival, and it is beyond its limit;
-        - `fits_alone`, `fits`: the largest lie that fits to an honest feeder, all errors within their worst
-          cases: no test without false alarms notices it for sure; every larger one is inconsistent;
-        - `identified_alone`, `identified`: every larger one makes all explanations by at most M liars accuse
-          this meter.
+        - `hidden_alone`, `hidden`: up to this size, with probability `1 - risk` at any one moment, no meter
+        exceeds the sequential monitor's limits, so that no meter is named;
+        - `noticed_alone`, `noticed`: beyond this size a meter does, with that probability;
+        - `named_alone`, `named`: beyond this size, with probability `1 - 2 risk`, no explanation that trusts
+        the meter is a rival, and it exceeds its limit;
+        - `fits_alone`, `fits`: the largest attack that is consistent with an honest feeder, all errors within
+        their worst cases: no test without false alarms is sure to detect it; every larger one is
+        inconsistent;
+        - `identified_alone`, `identified`: for every larger attack, all explanations by at most M meters
+        accuse this meter.
     customers
-        One row for each customer: `error`, the largest error of the sequential monitor's reconstruction
-        under M unnoticed liars; `error_fits`, the distance of two voltages that fit to the same readings.
+        One row for each customer: `error`, the largest error of the sequential monitor's reconstruction under
+        M unnoticed manipulated meters; `error_fits`, the largest distance of two voltages that are consistent
+        with the same readings.
     """
 
     feeder: str
@@ -98,35 +100,35 @@ def detectable(
     journal: Where = None,
     progress: Progress | None = None,
 ) -> Detectable:
-    """Find the smallest lies that are surely named, and the largest that stay unnoticed.
+    """Find the smallest attacks that are named for sure, and the largest that stay unnoticed.
 
     Parameters
     ----------
     site
         The feeder.
     max_attacked
-        M: how many meters lie together at most.
+        M: largest number of manipulated meters.
     share
-        Share of its peak that every load draws; inverters are in their deadbands.
+        Load relative to its peak, the same for all, 1; inverters are in their deadbands.
     risk
-        Probability with which honest errors may be beyond what the monitor's figures allow for.
+        Probability that honest errors exceed the monitor's limits.
     runner
-        Where: `workers.Here`, `Processes` or `Dask`; the results are the same.
+        `workers.Here`, `Processes` or `Dask`; the results are equal.
     journal
-        File in which finished work is kept; an interrupted study goes on from it.
+        File of finished work; an interrupted study resumes from it.
     progress
-        Told how far it is.
+        Called with (done, total).
 
     Raises
     ------
     NotObservable, DesignInfeasible
-        If the feeder cannot be watched.
+        If the feeder cannot be monitored.
     ValueError
         If `max_attacked`, `share` or `risk` is out of range.
     OtherStudy
-        If the journal is another study's.
+        If the journal is that of another study.
     InUse
-        If another process is writing it.
+        If another process writes the journal.
     """
     if not 1 <= max_attacked <= site.meters.size:
         raise InputInvalid(
@@ -148,7 +150,7 @@ def detectable(
         "risk": risk,
     }
     asked = _Asked(site.tables, max_attacked, share, risk)
-    given = _Given.of(site, asked)  # whatever is wrong with it is told here, and not by a worker
+    given = _Given.of(site, asked)  # errors of the arguments occur here, not in a worker
     keys = [f"meter|{j}" for j in range(site.meters.size)]
     keys += [f"customer|{i}" for i in range(site.feeder.bus.size)]
     here = runner is None or isinstance(runner, Here)
@@ -177,21 +179,21 @@ def detectable(
 
 
 def workers(site: Site, count: int | None) -> Runner:
-    """Where the study of a feeder is done soonest.
+    """Fastest runner for a feeder's study.
 
     Parameters
     ----------
     site
         The feeder.
     count
-        So many processes; by default all cores, from MANY meters on.
+        Number of processes; by default all cores, from MANY meters on.
     """
     return Here() if count is None and site.meters.size < MANY else cores(count)
 
 
 @dataclass(frozen=True, slots=True)
 class _Asked:
-    """What is asked of which feeder, as workers are told."""
+    """Arguments of the study, for workers."""
 
     tables: FeederTables
     max_attacked: int
@@ -201,7 +203,7 @@ class _Asked:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Given:
-    """What all rows share. Corridors are by whether somebody is seen, and how many lie."""
+    """Common data of all rows. Corridors are by detection and number of manipulated meters."""
 
     site: Site
     max_attacked: int
@@ -227,12 +229,12 @@ class _Given:
         )
 
 
-# What the worker of this process prepared last, and for what.
+# Last preparation of this process, and its arguments.
 _prepared: list[tuple[_Asked, _Given]] = []
 
 
 def _worked(asked: _Asked, piece: int) -> dict[str, Any]:
-    """One row, wherever this is: what all rows share is worked out once in each process."""
+    """One row in any process; the common data are computed once in each."""
     given = next((made for what, made in _prepared if what == asked), None)
     if given is None:
         given = _Given.of(from_tables(asked.tables), asked)
@@ -241,13 +243,13 @@ def _worked(asked: _Asked, piece: int) -> dict[str, Any]:
 
 
 def _row(given: _Given, piece: int) -> dict[str, Any]:
-    """First the meters, then the customers."""
+    """Row of a piece: the meters first, then the customers."""
     p = given.site.meters.size
     return _meter(given, piece) if piece < p else _customer(given, piece - p)
 
 
 def monitor_rule(site: Site, *, risk: float = RISK, share: float = SHARE) -> Rule:
-    """The rule of the sequential monitor that this feeder's files ask for.
+    """Rule of the sequential monitor with the settings of the feeder's files.
 
     Parameters
     ----------
@@ -257,7 +259,7 @@ def monitor_rule(site: Site, *, risk: float = RISK, share: float = SHARE) -> Rul
     Raises
     ------
     NotObservable, DesignInfeasible
-        If the feeder cannot be watched.
+        If the feeder cannot be monitored.
     """
     settings = site.tables.meta.monitor
     found = design_sequential(
@@ -279,7 +281,7 @@ def monitor_rule(site: Site, *, risk: float = RISK, share: float = SHARE) -> Rul
 
 
 def _claims(site: Site, given: Rule, share: float) -> Floats:
-    """Sizes that the monitor gives false powers, as it rounds them up, pu."""
+    """Sizes of false powers in the monitor, as it rounds them up, pu."""
     least = given.design.options.hidden_power
     return np.asarray(np.exp2(np.ceil(np.log2(np.maximum(share * site.loads.load_peak, least)))))
 

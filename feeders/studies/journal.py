@@ -1,7 +1,7 @@
-"""What a long study has done so far, in a file: interrupted at half, it goes on where it was.
+"""Journal of a long study, in a file; an interrupted study resumes from it.
 
-JSON lines: first what is studied and with which program, then one line for each piece of work that is done.
-A line that was cut off while it was written is done again. One process at a time writes a journal.
+JSON lines: first the subject of the study and the versions of the program, then one line for each finished
+piece of work. An incomplete last line is repeated. One process at a time writes a journal.
 """
 
 from __future__ import annotations
@@ -32,47 +32,47 @@ else:
 __all__ = ["InUse", "Journal", "Keeper", "OtherStudy", "Progress", "Where", "remove", "versions", "worked"]
 
 Progress = Callable[[int, int], None]
-"""Told how many pieces of work are done, and of how many."""
+"""Called with the number of finished pieces of work, and of all."""
 
 
 class OtherStudy(GridsecError):
-    """A journal belongs to another study, feeder, version or to other arguments, or is no journal."""
+    """A journal of another study, feeder, version or other arguments, or not a journal."""
 
     code = "other-origin"
 
 
 class InUse(GridsecError):
-    """Another process is writing a journal."""
+    """Another process writes the journal."""
 
     code = "in-use"
 
 
 class Keeper(Protocol):
-    """Who has journals for several studies, and looks after them."""
+    """Owner of the journals of several studies."""
 
     def file(self, study: str, digest: str) -> Path | None:
-        """Where the journal of a study is, or is to be; None: nothing is kept."""
+        """Path of the journal of a study; None: no file."""
 
     def opened(self, journal: Journal) -> None:
-        """A journal is open: its `path`, what is `done` of it, and of how much."""
+        """A journal is open: its `path`, the number `done`, and the total."""
 
     def refused(self, path: Path, why: OSError | OtherStudy | InUse) -> bool:
-        """It cannot be used, or no more. True: try again; False: go on without it; or raise."""
+        """A journal cannot be used (any more). True: try again; False: continue without it; or raise."""
 
 
 Where = Path | str | Keeper | None
-"""A journal's file, or who has one; None: nothing is kept."""
+"""Journal file, or owner of journals; None: no file."""
 
 
 def versions() -> dict[str, str]:
-    """Versions of everything that numbers depend on."""
+    """Versions of all libraries that numbers depend on."""
     names = ("gridsec", "numpy", "scipy", "power-grid-model", "cvxpy", "clarabel")
     return {"python": platform.python_version(), **{name: version(name) for name in names}}
 
 
 @cache
 def edition() -> str:
-    """Digest of the code, others' estimators included: it may be edited while its version stays the same."""
+    """Digest of the code, external estimators included: it may change without a new version."""
     content = hashlib.sha256()
     for name in sorted(
         {"gridsec", "feeders"} | {point.module.split(".")[0] for point in entry_points(group=GROUP)}
@@ -84,7 +84,7 @@ def edition() -> str:
 
 
 def _sources(name: str) -> list[Path]:
-    """The files of a package or module, without running it."""
+    """Files of a package or module, without running it."""
     found = find_spec(name)
     if found is None:
         return []
@@ -94,30 +94,30 @@ def _sources(name: str) -> list[Path]:
 
 
 class Journal:
-    """Results by key; kept in memory, and in a file if there is one. To be closed, as by `with`.
+    """Results by key, in memory and optionally in a file. Close it, for example by `with`.
 
     Parameters
     ----------
     where
-        The file, which is made if it does not exist; or who has one. None: nothing is kept.
+        The file, created if it does not exist; or the owner of journals. None: no file.
     subject
-        What is studied, with every argument that changes a result; `study` is its name.
+        Subject of the study, with every argument that changes a result; `study` is its name.
     of
-        How many pieces of work there are, if that is known.
+        Number of pieces of work, if known.
 
     Attributes
     ----------
     path
-        The file; None: there is none.
+        The file; None without one.
     of
         As above.
 
     Raises
     ------
     OtherStudy
-        If the file is about something else.
+        If the file is that of another study.
     InUse
-        If another process is writing it.
+        If another process writes it.
     OSError
         If it cannot be written.
     """
@@ -153,7 +153,7 @@ class Journal:
         self.close()
 
     def close(self) -> None:
-        """Let others write the file; what is done stays known."""
+        """Release the file for other processes; results stay in memory."""
         if self._handle is not None:
             os.close(self._handle)
             self._handle = None
@@ -163,7 +163,7 @@ class Journal:
 
     @property
     def done(self) -> int:
-        """How many pieces of work are done."""
+        """Number of finished pieces of work."""
         return len(self._done)
 
     def __contains__(self, key: str) -> bool:
@@ -173,26 +173,26 @@ class Journal:
         return self._done[key]
 
     def get(self, key: str, work: Callable[[], Any]) -> Any:
-        """Return the result of a piece of work, which is done now if it was not before.
+        """Result of a piece of work, computed now if it is not in the journal.
 
         Parameters
         ----------
         key
-            Its name, of this study's.
+            Key of the piece, unique in this study.
         work
-            Makes it; its result survives JSON.
+            Computes the result, in plain JSON types.
         """
         if key not in self._done:
             self.put(key, work())
         return self._done[key]
 
     def put(self, key: str, value: Any) -> None:
-        """Keep the result of a piece of work that was done elsewhere.
+        """Store the result of a piece of work.
 
         Parameters
         ----------
         key, value
-            Its name, and its result, which survives JSON.
+            Key of the piece, and its result, in plain JSON types.
 
         Raises
         ------
@@ -211,13 +211,13 @@ class Journal:
             self._again(path, error)
 
     def _again(self, path: Path, error: OSError | OtherStudy | InUse) -> bool:
-        """Ask whose journal it is whether to try again; nobody's is an error."""
+        """Retry by the owner's decision; without an owner the error is raised."""
         if self._keeper is None:
             raise error
         return self._keeper.refused(path, error)
 
 
-# A place far beyond the end, which stands for the file: what is locked on Windows nobody else can read.
+# Lock position far beyond the end: on Windows a locked range cannot be read by other processes.
 _FAR: Final = 1 << 40
 
 
@@ -228,7 +228,7 @@ def _opened(path: Path, head: str) -> tuple[int, dict[str, Any]]:
         handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | getattr(os, "O_BINARY", 0), 0o666)
         try:
             _lock(handle, path)
-            # Who had it until now may have come to an end, and removed it.
+            # The previous process may have finished and removed the file.
             with suppress(FileNotFoundError):
                 if os.path.samestat(os.fstat(handle), path.stat()):
                     return handle, _read(handle, path, head)
@@ -239,7 +239,7 @@ def _opened(path: Path, head: str) -> tuple[int, dict[str, Any]]:
 
 
 def _lock(handle: int, path: Path) -> None:
-    """Keep others out until the file is closed, be it by the death of this process."""
+    """Lock the file until it is closed, also by the end of this process."""
     try:
         if sys.platform == "win32":
             os.lseek(handle, _FAR, os.SEEK_SET)
@@ -253,7 +253,7 @@ def _lock(handle: int, path: Path) -> None:
 
 
 def _read(handle: int, path: Path, head: str) -> dict[str, Any]:
-    """What is in a journal; one that is empty, or was interrupted in its first line, is begun."""
+    """Content of a journal; an empty one, or one with an incomplete first line, is initialised."""
     with open(handle, "rb", closefd=False) as file:
         file.seek(0)
         content = file.read()
@@ -268,8 +268,8 @@ def _read(handle: int, path: Path, head: str) -> dict[str, Any]:
     try:
         done = dict(json.loads(line) for line in lines[1:-1])
     except (ValueError, TypeError) as error:
-        raise OtherStudy(f"{path}: a line is no result of a study: {error}") from error
-    # What follows the last end of line was cut off: it goes, and so the next line begins a new one.
+        raise OtherStudy(f"{path}: a line is not a result of a study: {error}") from error
+    # An incomplete line after the last line end is removed, so that the next line begins a new one.
     if lines[-1]:
         os.ftruncate(handle, len(content) - len(lines[-1]))
     return done
@@ -281,13 +281,7 @@ def _write(handle: int, line: str) -> None:
 
 
 def remove(path: Path) -> None:
-    """Remove a journal, unless somebody is writing it or it cannot be.
-
-    Parameters
-    ----------
-    path
-        The file.
-    """
+    """Remove a journal, unless another process writes it or the removal fails."""
     with suppress(InUse, OSError):
         handle = os.open(path, os.O_RDWR)
         try:
@@ -298,7 +292,7 @@ def remove(path: Path) -> None:
 
 
 def _other(found: str, expected: str) -> Problem:
-    """In what a journal's first line is not the one expected."""
+    """Difference between a journal's first line and the expected one."""
     try:
         theirs, ours = json.loads(found), json.loads(expected)
         same = {key: ours[key] for key in ("versions", "edition")}
@@ -308,7 +302,7 @@ def _other(found: str, expected: str) -> Problem:
                     "other-version", "written before this program was changed; begin a new journal"
                 )
             made = ", ".join(f"{name} {each}" for name, each in theirs.get("versions", {}).items())
-            made = made or "which, it does not say"
+            made = made or "unknown"
             return Problem("other-version", f"written with other versions ({made}); begin a new journal")
     except (ValueError, TypeError, AttributeError):
         pass
@@ -321,16 +315,16 @@ def worked(
     tasks: Iterable[tuple[str, Callable[[], Any]]],
     progress: Progress | None,
 ) -> dict[str, Any]:
-    """Do pieces of work in order, and tell how far it is.
+    """Do pieces of work in order, and report progress.
 
     Parameters
     ----------
     where, subject
         As in `Journal`.
     tasks
-        Key and work of each.
+        Key and function of each piece.
     progress
-        Told before the first and after each.
+        Called before the first piece and after each.
 
     Raises
     ------

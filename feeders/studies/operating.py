@@ -1,6 +1,6 @@
 """Operating points of studies: volts per customer, and errors of honest loads and meters as a box.
 
-A limit or a curve is in parts of the nominal voltage, the model in parts of each place's own base
+Limits and curves are relative to the nominal voltage, the model to each place's own base
 (`feeders.model.equipment`).
 """
 
@@ -34,7 +34,7 @@ __all__ = ["SHARE", "SIGMAS", "Bases", "box", "false_powers", "line_rows", "squa
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bases:
-    """What 1 pu is, for N customers.
+    """Voltage bases of N customers.
 
     Attributes
     ----------
@@ -49,25 +49,25 @@ class Bases:
 
     @classmethod
     def of(cls, site: Site) -> Self:
-        """The bases of a feeder."""
+        """Bases of a feeder."""
         return cls(site.customer_volt, site.customer_nominal)
 
     @property
     def ratio(self) -> Floats:
-        """What 1 pu is of the nominal voltage, (N,): 1 but for taps."""
+        """1 pu relative to the nominal voltage, (N,): 1 except behind taps."""
         return np.asarray(self.volt / self.nominal)
 
     def band(self, low: float, high: float) -> tuple[Floats, Floats]:
-        """Limits in parts of the nominal voltage as pu of every customer, (N,) each."""
+        """Limits relative to the nominal voltage, in pu of every customer, (N,) each."""
         return low / self.ratio, high / self.ratio
 
     def extremes(self, v: Floats) -> tuple[float, float]:
-        """The voltages that are lowest and highest of their nominal voltage, V.
+        """Voltages with the smallest and largest ratio to their nominal voltage, V.
 
         Parameters
         ----------
         v : (…, N)
-            Voltages, pu; NaN is that of both.
+            Voltages, pu; a NaN becomes both extremes.
         """
         told = (v * self.ratio).reshape(-1, self.volt.size)
         lows, highs = told.min(axis=0), told.max(axis=0)
@@ -79,17 +79,11 @@ class Bases:
 
 
 def line_rows(site: Site | ThreePhaseSite) -> list[int]:
-    """Row in lines.csv of every branch of the feeder's tree, and then of every line that closes a loop.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    """
+    """Rows in lines.csv of the branches of the feeder's tree, and then of the lines that close loops."""
     rows, group = site.tables.lines, site.bus_of_file
     closed = [k for k, line in enumerate(rows) if line.closed]
     lines = [rows[k] for k in closed]
-    # Buses that are one for the model are joined by lines without impedance.
+    # Buses that the model fuses are joined by lines without impedance.
     joins = [group[row.from_bus] == group[row.to_bus] for row in lines]
     edges = [
         Edge(row.line, row.from_bus, row.to_bus, zero, phases=len(row.phases))
@@ -100,32 +94,32 @@ def line_rows(site: Site | ThreePhaseSite) -> list[int]:
 
 
 SHARE: Final = 0.5
-"""Share of its peak that every load draws where nothing else is said; nothing is generated."""
+"""Default load relative to its peak, the same for all, 1, without generation."""
 
 SIGMAS: Final = 4.0
-"""Standard deviations of jitter that an honest reading may be off, as in `estimators.plant.Options`."""
+"""Limit of an honest reading's jitter in standard deviations, as in `estimators.plant.Options`."""
 
 
 def box(site: Site, *, share: float = SHARE, curves: Curves = Curves.DEADBAND) -> Box:
-    """The worst cases of the exact bank's thresholds, at nominal voltage.
+    """Worst cases of the exact bank's thresholds, at nominal voltage.
 
-    Intervals of powers are those of a frame in which every metered load draws `share` of its peak and reports
-    active power only. Inverters answer along their droop curves, linearised. In three phases each voltage of
-    the busbar errs on its own.
+    Intervals of powers are those of a frame with every metered load at `share` of its peak, active power
+    only. Inverters follow their linearised droop curves. In three phases each voltage of the busbar has its
+    own error.
 
     Parameters
     ----------
     site
         The feeder.
     share
-        Of the peak load.
+        Load relative to its peak, 1.
     curves
-        Where the inverters work; at nominal voltage that is the deadband.
+        Operating region of the inverters; at nominal voltage the deadband.
 
     Raises
     ------
     ValueError
-        If they have no such part.
+        For an unknown region.
     """
     frame = _frame(site, share)
     return _box(site, curves, frame.p_error, frame.q_error)
@@ -138,19 +132,19 @@ def false_powers(
     share: float = SHARE,
     curves: Curves = Curves.DEADBAND,
 ) -> FalsePowers:
-    """The same where liars report any powers that their customers could draw or feed in.
+    """Worst cases in which manipulated meters report any powers within their customers' range.
 
     Parameters
     ----------
     site, share, curves
         As in `box`.
     unknown
-        Customers whose powers nobody knows, whoever lies, besides those without a meter.
+        Customers with unknown powers, besides those without a meter.
 
     Raises
     ------
     ValueError
-        If there is no such customer or part of the curves.
+        For an unknown customer or region of the curves.
     """
     frame, silent = _frame(site, share), unread(site)
     p, q = np.maximum(frame.p_error, silent.p_error), np.maximum(frame.q_error, silent.q_error)
@@ -170,7 +164,7 @@ def false_powers(
 
 
 def _frame(site: Site, share: float) -> Frame:
-    """What honest meters say."""
+    """Frame of honest meters."""
     drawn = np.array([share * row.load_kw for row in site.tables.customers])[site.meters]
     nominal = site.customer_volt[site.meters]
     frame = to_frame(
@@ -182,7 +176,7 @@ def _frame(site: Site, share: float) -> Frame:
 
 
 def _box(site: Site, curves: Curves, p_error: Floats, q_error: Floats) -> Box:
-    """What powers, off by so much, the busbar and the meters do."""
+    """Effect of errors of the powers, the busbar and the meters."""
     R, X = (between(site.feeder, power) for power in Power)
     own = site.droop.customer
     steepest = choice("curves", Curves, curves) is Curves.STEEPEST
@@ -201,22 +195,22 @@ def _box(site: Site, curves: Curves, p_error: Floats, q_error: Floats) -> Box:
 
 
 def volts_of_lie(base_volt: Floats | float, size: Floats | float) -> Floats:
-    """What a change of the squared voltage is in volts, at 1 pu and downwards: the larger way, V.
+    """Change of the squared voltage in volts, at 1 pu and downwards: the larger direction, V.
 
     Parameters
     ----------
     base_volt, size
-        1 pu, V, as `Site.customer_volt` has it; and squared pu.
+        1 pu, V, as in `Site.customer_volt`; and size, squared pu.
     """
     return np.asarray(base_volt * (1.0 - np.sqrt(np.maximum(1.0 - np.asarray(size), 0.0))))
 
 
 def squared(base_volt: Floats | float, volt: Floats | float) -> Floats:
-    """The reverse of `volts_of_lie`.
+    """Inverse of `volts_of_lie`.
 
     Parameters
     ----------
     base_volt, volt
-        1 pu, V; and volts.
+        1 pu, V; and size, V.
     """
     return np.asarray(1.0 - np.maximum(1.0 - np.asarray(volt) / base_volt, 0.0) ** 2)

@@ -1,4 +1,4 @@
-"""Which meters to protect: the fewest such that liars are identified, are noticed, or can only lie a little.
+"""Fewest meters to protect such that attacks are identified, are noticed, or have a bounded size.
 
 References
 ----------
@@ -33,7 +33,7 @@ __all__ = ["Goal", "Protect", "check", "protect"]
 
 
 class Goal(StrEnum):
-    """What protection is for."""
+    """Goal of protection."""
 
     IDENTIFY = "identify"
     NOTICE = "notice"
@@ -42,36 +42,36 @@ class Goal(StrEnum):
 
     @property
     def in_volts(self) -> bool:
-        """Whether it is about sizes of lies, and not about whether they can be seen at all."""
+        """True for goals about sizes of attacks, not about their detectability."""
         return self in {Goal.BOUND, Goal.CONTAIN}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Protect:
-    """What `protect` found.
+    """Result of `protect`.
 
     Attributes
     ----------
     feeder, digest
-        The feeder's name, and its content.
+        Name and content digest of the feeder.
     goal, max_attacked, attack, lie_volt
-        What was asked, or chosen where nothing was: M, which attacks count, and the bound of lies (NaN where
-        the goal is none).
+        Requested or default question: M, the attacks that count, and the bound of attacks (NaN for goals
+        without one).
     alone
-        Where lies are bounded: the largest that one meter hides by itself, with its powers true, V. No
-        protection of others lowers it.
+        With a bound: the largest attack that one meter hides by itself, with true powers, V. No protection of
+        other meters lowers it.
     before, after
-        Without and with protection: the fewest liars that stay invisible, or the largest hidden lie, V; it
-        too as the busbar's level has it.
+        Without and with protection: the fewest manipulated meters that stay invisible, or the largest hidden
+        attack, V, referred to the busbar's level.
     least
-        No fewer meters suffice. Equal to the number of meters where they are proven the fewest.
+        Proven lower bound of the number of meters; equal to their number if they are the fewest.
     meters
-        One row for each meter to protect: `meter`, `customer`, `bus`, `attacks` (in how many of the attacks
-        below it takes part).
+        One row for each meter to protect: `meter`, `customer`, `bus`, `attacks` (number of the attacks below
+        with this meter).
     attacks
-        Attacks that rule out anything cheaper: `liars`.
+        Attacks that exclude any smaller set: `liars`.
     share
-        Share of its peak that every load draws.
+        Load relative to its peak, the same for all, 1.
     """
 
     feeder: str
@@ -90,21 +90,22 @@ class Protect:
 
     @property
     def gap(self) -> int:
-        """How many more than necessary there can be; 0: these are the fewest."""
+        """Largest possible number of superfluous meters; 0: these are the fewest."""
         return len(self.meters) - self.least
 
     @property
     def no_answer(self) -> bool:
-        """Whether the goal asks nothing of this feeder, which is no safety.
+        """True if the goal requires no protection on this feeder, which is no safety.
 
-        Liars who are to be identified or noticed hide behind powers that nobody knows. Where all are known,
-        no lie fits exactly, however small; how large lies are that fit within honest errors is not asked.
+        Attacks that are to be identified or noticed hide behind unknown powers. With all powers known no
+        attack is exactly consistent, however small. Sizes of attacks within honest errors are not part of
+        these goals.
         """
         return not self.goal.in_volts and math.isinf(self.before)
 
     @property
     def tables(self) -> dict[str, pd.DataFrame]:
-        """All tables by name; `summary` is one row: what was asked, how many, what that does."""
+        """All tables by name; `summary` is one row: question, number of meters, and effect."""
         asked = {"goal": str(self.goal), "max_attacked": self.max_attacked}
         asked |= (
             {"lie_volt": self.lie_volt, "alone": self.alone}
@@ -140,50 +141,50 @@ def protect(
     journal: Where = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Protect:
-    """Find the fewest meters to protect; a protected meter cannot lie.
+    """Find the fewest meters to protect; a protected meter cannot be manipulated.
 
     Parameters
     ----------
     site
         The feeder.
     max_attacked
-        M: how many of the other meters lie at most.
+        M: largest number of manipulated meters among the others.
     goal
-        `IDENTIFY`: the liars follow from the readings. `NOTICE`: some lie is noticed. Both as in
-        `feeders.studies.redundancy`. `BOUND`: no lie larger than `lie_volt` fits to an honest feeder while
-        all report their powers truly. `CONTAIN`: nor does one while liars report any powers that their
-        customers could have. By default `IDENTIFY` if liars can stay invisible at all and there is no bound,
-        otherwise `CONTAIN`.
+        `IDENTIFY`: the readings determine the manipulated meters. `NOTICE`: every attack is detected. Both as
+        in `feeders.studies.redundancy`. `BOUND`: no attack larger than `lie_volt` is consistent with an
+        honest feeder, with true powers. `CONTAIN`: the same with any reported powers within the customers'
+        range. By default `IDENTIFY` if attacks can stay invisible at all and there is no bound, otherwise
+        `CONTAIN`.
     lie_volt
-        Bound of the lie, V, at nominal voltage; behind a transformer to another level, where volts do not
-        compare with the busbar's, the same part of the nominal voltage there. For `CONTAIN` by default such
-        that half of what company and false powers add to the lie of a meter is gone.
+        Bound of the attack, V, at nominal voltage of the busbar; behind a transformer to another level, the
+        same part of the nominal voltage there. Default for `CONTAIN`: halfway between `alone` and `before`.
     attack, unknown, busbar_known
-        For `IDENTIFY` and `NOTICE`: which attacks count, and what nobody knows. `CONTAIN` takes the unknown
-        powers too; `BOUND` has none. Both, and every `lie_volt`, need the busbar's voltage.
+        For `IDENTIFY` and `NOTICE`: the attacks that count, and the unknowns. `CONTAIN` also has the unknown
+        powers; `BOUND` has none. Both, and every `lie_volt`, need the busbar voltage.
     curves
-        Where inverters work. By default on the steepest part for the first two, in the deadband in volts.
+        Operating region of the inverters. By default the steepest part for the first two goals, the deadband
+        for the others.
     share
-        For `BOUND` and `CONTAIN`: share of its peak that every load draws.
+        For `BOUND` and `CONTAIN`: load relative to its peak, the same for all, 1.
     never
         Meters that cannot be protected.
     exact
-        Prove that there are no fewer; otherwise greedy, with `gap`.
+        True: prove the smallest number; otherwise greedy, with `gap`.
     journal
-        File in which attacks are kept; an interrupted study goes on from it.
+        File of attacks found; an interrupted study resumes from it.
     progress
-        Told how many attacks are known, and how many meters are protected against them.
+        Called with the number of known attacks, and of meters protected against them.
 
     Raises
     ------
     DesignInfeasible
-        If no protection of the other meters is enough.
+        If no protection of the other meters suffices.
     ValueError
-        If there is no such customer or meter, or as `check`.
+        For an unknown customer or meter, or as `check`.
     OtherStudy
-        If the journal is another study's.
+        If the journal is that of another study.
     InUse
-        If another process is writing it.
+        If another process writes the journal.
     """
     check(
         max_attacked=max_attacked,
@@ -260,7 +261,7 @@ def check(
     curves: Curves | str | None = None,
     share: float = SHARE,
 ) -> None:
-    """Refuse a question that has no answer, or says things that the goal would leave out of account.
+    """Check the arguments of `protect`: contradictions, and arguments without effect for the goal.
 
     Parameters
     ----------
@@ -270,7 +271,7 @@ def check(
     Raises
     ------
     ValueError
-        With everything that is wrong.
+        With all problems.
     """
     problems = [
         *no_choice("goal", Goal, *([] if goal is None else [goal])),
@@ -284,7 +285,8 @@ def check(
         (Problem("not-positive", f"max_attacked is {max_attacked}; it must be at least 1"), max_attacked < 1),
         (
             Problem(
-                "not-positive", f"lie_volt is {lie_volt}; to bound lies it must be a positive number of volts"
+                "not-positive",
+                f"lie_volt is {lie_volt}; a bound of attacks must be a positive number of volts",
             ),
             not 0.0 < lie_volt < math.inf and (bounded or goal == Goal.BOUND),
         ),
@@ -293,7 +295,7 @@ def check(
             not 0.0 <= share < math.inf,
         ),
         (
-            Problem("inconsistent", "to bound lies the busbar's voltage must be known"),
+            Problem("inconsistent", "a bound of attacks requires a known busbar voltage"),
             in_volts and not busbar_known,
         ),
         (Problem("inconsistent", f"lie_volt goes with goals in volts, not with {goal}"), bounded and hiding),
@@ -302,11 +304,11 @@ def check(
             share != SHARE and hiding,
         ),
         (
-            Problem("inconsistent", "attack goes with goals identify and notice, not with bounds of lies"),
+            Problem("inconsistent", "attack goes with goals identify and notice, not with bounds of attacks"),
             in_volts and attack == Attack.ANY,
         ),
         (
-            Problem("inconsistent", "unknown powers do not go with bound, for which all are reported truly"),
+            Problem("inconsistent", "unknown powers do not go with bound, which assumes true powers"),
             goal == Goal.BOUND and unknown,
         ),
     ):
@@ -316,7 +318,7 @@ def check(
 
 
 def _unmet(liars: Sequence[str]) -> str:
-    """Who succeeds in spite of all protection."""
+    """Attack that succeeds in spite of all protection, as a sentence."""
     if len(liars) == 1:
         return f"{liars[0]} alone succeeds whatever else is protected, and it cannot be"
     return f"{', '.join(liars)} succeed together whatever else is protected, and none of them can be"
@@ -324,7 +326,7 @@ def _unmet(liars: Sequence[str]) -> str:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Asked:
-    """What is asked of a protection: who succeeds in spite of it, and what it is worth. See `Protect`."""
+    """Question of a protection: the attacks that succeed in spite of it, and its value. See `Protect`."""
 
     attacker: Attacker
     measure: Callable[[Bools], float]
@@ -336,12 +338,12 @@ class _Asked:
 def _nobody_hides(given: Patterns) -> bool:
     try:
         return math.isinf(fewest_meters(given).count)
-    except DesignInfeasible:  # the search gave up
+    except DesignInfeasible:  # the search was stopped
         return False
 
 
 def _hidden(given: Patterns, max_attacked: int, goal: Goal) -> _Asked:
-    """Who imitates a pattern, and the fewest who do."""
+    """Question of hidden patterns: the meters that imitate one, and their fewest number."""
 
     def fewest(protected: Bools) -> float:
         return fewest_meters(given, honest=protected).count
@@ -350,7 +352,7 @@ def _hidden(given: Patterns, max_attacked: int, goal: Goal) -> _Asked:
     return _Asked(hides(given, liars), fewest, fewest_meters(given).count)
 
 
-def _in_volts(  # what is asked, and of what
+def _in_volts(  # question and its options
     site: Site,
     goal: Goal,
     max_attacked: int,
@@ -360,9 +362,9 @@ def _in_volts(  # what is asked, and of what
     share: float,
     curves: Curves,
 ) -> _Asked:
-    """Whose lie is too large, and the largest there is, V; every level counted in volts of the busbar's."""
+    """Question in volts: attacks beyond the bound, and the largest one, V, in volts of the busbar's level."""
     count, nobody = site.meters.size, np.zeros(site.meters.size, dtype=np.bool_)
-    # Around a tap or a transformer, 1 pu of a customer is so many volts where the busbar's level is nominal.
+    # Base of a customer in volts at the busbar's level, behind taps and transformers.
     base = (site.customer_volt / site.customer_nominal)[site.meters] * site.tables.meta.voltage_volt
     told = false_powers(site, unknown=unknown, share=share, curves=curves)
     given: Box | FalsePowers = told if goal is Goal.CONTAIN else box(site, share=share, curves=curves)
@@ -379,7 +381,7 @@ def _in_volts(  # what is asked, and of what
 
 
 def _kept(attacker: Attacker, journal: Journal) -> Attacker:
-    """Ask the journal first."""
+    """Look up attacks in the journal first."""
 
     def attack(protected: Bools) -> Ints | None:
         def work() -> list[int] | None:

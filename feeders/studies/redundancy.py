@@ -1,4 +1,4 @@
-"""How many lying meters a feeder withstands: as a whole, by meter, by part, and with meters missing.
+"""Number of manipulated meters that a feeder withstands: in total, by meter, by part, with silent meters.
 
 References
 ----------
@@ -40,33 +40,34 @@ SILENT: Final = "silent"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Redundancy:
-    """What `redundancy` found.
+    """Result of `redundancy`.
 
-    Every table has a column `case`: "all live", or "silent" with the given meters missing. `index_persistent`
-    and `index_any`: the fewest liars that stay invisible while some voltage that is measured is not what
-    it seems, by an attack whose effect stays and by any; infinity where there are none, NaN where the
-    search gave up (`note` says why).
+    Every table has a column `case`: "all live", or "silent" without the given meters. `index_persistent` and
+    `index_any`: the fewest manipulated meters that stay invisible with some measured voltage falsified, for
+    attacks with a lasting effect and for any; infinity without such an attack, NaN if the search was stopped
+    (`note` has the reason).
 
     Attributes
     ----------
     feeder, digest
-        The feeder's name, and its content.
+        Name and content digest of the feeder.
     unknown, unknown_silent
-        Customers whose powers nobody knows, in the two cases.
+        Customers with unknown powers, in the two cases.
     silent
-        Meters that are missing in the second case.
+        Meters without readings in the second case.
     curves
-        Where the inverters work.
+        Operating region of the inverters.
     summary
-        One row for each case and kind of attack: `patterns` (dimensions to hide in), `blind` (customers whose
-        voltage no meter tells, whoever lies), `index`, `detected` (most liars that cannot hide; if nobody is
-        blind, the pair is still detectable, or observable, after the loss of any so many meters),
-        `identified` (most liars that are identified), `liars`.
+        One row for each case and kind of attack: `patterns` (dimension of hidden attacks), `blind` (customers
+        with a voltage that no meter determines, even without an attack), `index`, `detected` (largest number
+        of manipulated meters that cannot hide; without blind customers, the pair is still detectable, or
+        observable, after the loss of any `detected` meters), `identified` (largest number of manipulated
+        meters that are identified), `liars`.
     meters
-        One row for each case and meter: its own indices, `critical`, `identified_without` (what the others
-        identify, persistently, once it is silent).
+        One row for each case and meter: its own indices, `critical`, `identified_without` (number that the
+        others identify, for persistent attacks, without it).
     parts
-        One row for each case and part: what liars inside it can do while all outside are honest.
+        One row for each case and part: the same for manipulated meters inside it, all meters outside honest.
     """
 
     feeder: str
@@ -81,7 +82,7 @@ class Redundancy:
 
     @property
     def changes(self) -> pd.DataFrame:
-        """Parts that identify fewer liars with the given meters missing: `identified` before and after."""
+        """Parts that identify fewer manipulated meters without the silent ones: before and after."""
         columns = ["bus", "meters", "identified"]
         before = self.parts[self.parts["case"] == ALL][columns]
         after = self.parts[self.parts["case"] == SILENT][["bus", "meters", "identified"]]
@@ -90,7 +91,7 @@ class Redundancy:
 
     @property
     def tables(self) -> dict[str, pd.DataFrame]:
-        """All tables by name; `changes` where there are missing meters."""
+        """All tables by name; `changes` with silent meters only."""
         found = {"summary": self.summary, "meters": self.meters, "parts": self.parts}
         return found | ({"changes": self.changes} if self.silent else {})
 
@@ -105,7 +106,7 @@ def redundancy(
     journal: Where = None,
     progress: Progress | None = None,
 ) -> Redundancy:
-    """Count liars that stay invisible to whoever knows the feeder, its honest loads and all readings.
+    """Count manipulated meters that stay invisible even with exact knowledge of feeder and honest loads.
 
     Parameters
     ----------
@@ -114,18 +115,18 @@ def redundancy(
     unknown, silent, busbar_known, curves
         As in `feeders.studies.unobservable.knowledge`.
     journal
-        File in which finished work is kept; an interrupted study goes on from it.
+        File of finished work; an interrupted study resumes from it.
     progress
-        Told how far it is.
+        Called with (done, total).
 
     Raises
     ------
     ValueError
-        If there is no such customer, meter or part of the curves.
+        For an unknown customer, meter or region of the curves.
     OtherStudy
-        If the journal is another study's.
+        If the journal is that of another study.
     InUse
-        If another process is writing it.
+        If another process writes the journal.
     """
     see_names(site, unknown=unknown, meters=silent, curves=curves)
     curves = Curves(curves)
@@ -229,7 +230,7 @@ def _part(site: Site, case: str, what: Knowledge, piece: Part) -> dict[str, Any]
 
 
 def _or_note(search: Callable[[], Index]) -> tuple[Index, str]:
-    """A search's answer, or why it gave up."""
+    """Answer of a search, or the reason for its stop."""
     try:
         return search(), ""
     except DesignInfeasible as error:

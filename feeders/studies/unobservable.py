@@ -1,4 +1,4 @@
-"""The patterns of a feeder in which lies can hide: what nobody knows of its loads, its silent meters."""
+"""Patterns of a feeder that hide attacks: unknown powers, unknown busbar voltages, silent meters."""
 
 from __future__ import annotations
 
@@ -29,21 +29,21 @@ __all__ = [
 ]
 
 TOLERANCE: Final = 1e-9
-"""Products of unit vectors up to this count as zero, and rows up to this part of the longest.
+"""Tolerance for zero of products of unit vectors, and of rows relative to the longest.
 
 Feeders' smallest singular values are above 1e-6.
 """
 
 
 class Curves(StrEnum):
-    """Where on their droop curves inverters work."""
+    """Operating region of the inverters on their droop curves."""
 
     STEEPEST = "steepest"
     DEADBAND = "deadband"
 
 
 class Attack(StrEnum):
-    """Which attacks count: those whose effect stays, or those too that the inverters forget by themselves."""
+    """Attacks that count: those with a lasting effect, or also those that the inverters forget."""
 
     PERSISTENT = "persistent"
     ANY = "any"
@@ -51,18 +51,18 @@ class Attack(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Knowledge:
-    """Who knows what of a feeder. p meters.
+    """Unknowns of a feeder, and patterns that they hide. p meters.
 
     Attributes
     ----------
     unknown
-        Customers whose powers nobody knows.
+        Customers with unknown powers.
     silent : (p,)
-        Meters that are not there.
+        Mask of meters without readings.
     found
         The patterns for each kind of attack.
     everywhere : (N, n)
-        What a meter at each customer would see, rows of length one; zero where nothing moves the voltage.
+        Effect at a meter of each customer, rows of length one; zero without an effect on the voltage.
     """
 
     unknown: tuple[str, ...]
@@ -71,7 +71,7 @@ class Knowledge:
     everywhere: Floats
 
     def blind(self, attack: Attack) -> Bools:
-        """Customers whose voltage some pattern moves that none of the live meters sees, (N,)."""
+        """Mask (N,) of customers with a voltage moved by some pattern that no live meter sees."""
         lost = self.found[attack].blind(~self.silent)
         if not lost.size:
             return np.zeros(len(self.everywhere), dtype=np.bool_)
@@ -86,26 +86,26 @@ def knowledge(
     busbar_known: bool,
     curves: Curves,
 ) -> Knowledge:
-    """Work out the patterns in which lies can hide.
+    """Compute the patterns that hide attacks.
 
     Parameters
     ----------
     site
         The feeder.
     unknown
-        Customers whose active and reactive powers nobody knows; by default those without a meter, unless the
-        file says how well they are known (`p_std_kw` and `q_std_kvar`), as of a transformer without load.
+        Customers with unknown active and reactive powers; by default those without a meter, except those with
+        `p_std_kw` and `q_std_kvar`, such as no-load powers of transformers.
     silent
-        Meters that are missing. Nobody knows the powers of their customers either.
+        Meters without readings. The powers of their customers are unknown, too.
     busbar_known
-        Whether the busbar's voltage is metered and honest; in three phases all of them, or none.
+        True: the busbar voltage is metered and honest; in three phases all of them, or none.
     curves
-        Where the inverters work.
+        Operating region of the inverters.
 
     Raises
     ------
     ValueError
-        If there is no such customer, meter or part of the curves.
+        For an unknown customer, meter or region of the curves.
     """
     curves = choice("curves", Curves, curves)
     gone = meter_mask(site, silent)
@@ -119,7 +119,7 @@ def knowledge(
     open_[site.meters[gone]] = True
     which = np.flatnonzero(open_)
     W = unknown_voltages(site.feeder, which, busbar=not busbar_known, tol=TOLERANCE)
-    # A meter for everybody: what is rounding is so by what the feeder does, not by what its meters see of it.
+    # A meter at every customer: rounding limits depend on the feeder, not on its meters.
     lure = close_loop(site.feeder, site.droop, np.arange(metered.size))
     slope = lure.slope if curves is Curves.STEEPEST else np.zeros_like(lure.slope)
     A, every = unknown_pair(lure, slope, W)
@@ -134,7 +134,7 @@ def knowledge(
 
 
 def customer_indices(site: Site, names: Sequence[str]) -> Ints:
-    """Indices of customers by name.
+    """Indices of customers by id.
 
     Parameters
     ----------
@@ -144,7 +144,7 @@ def customer_indices(site: Site, names: Sequence[str]) -> Ints:
     Raises
     ------
     ValueError
-        If there is no such customer.
+        For an unknown customer.
     """
     return _indices(site.feeder.customers, names, "customer")
 
@@ -156,21 +156,21 @@ def see_names(
     meters: Sequence[str] = (),
     curves: Curves | str = "",
 ) -> None:
-    """Refuse, all at once, names of what a feeder does not have.
+    """Check ids of customers and meters, and the region of the curves, all at once.
 
     Parameters
     ----------
     site
         The feeder.
     unknown, meters
-        Names of customers and of meters.
+        Ids of customers and of meters.
     curves
-        Where the inverters work; empty: not asked.
+        Operating region of the inverters; empty: not checked.
 
     Raises
     ------
     ValueError
-        If there is no such customer, meter or part of the curves.
+        For an unknown customer, meter or region of the curves.
     """
     refuse(
         [
@@ -182,7 +182,7 @@ def see_names(
 
 
 def meter_mask(site: Site, names: Sequence[str]) -> Bools:
-    """Which meters are named, (p,).
+    """Mask of meters by id, (p,).
 
     Parameters
     ----------
@@ -192,7 +192,7 @@ def meter_mask(site: Site, names: Sequence[str]) -> Bools:
     Raises
     ------
     ValueError
-        If there is no such meter.
+        For an unknown meter.
     """
     out = np.zeros(site.meters.size, dtype=np.bool_)
     out[_indices(site.meter_ids, names, "meter")] = True

@@ -1,7 +1,7 @@
-"""Where pieces of a long study are worked on: here, in processes of this machine, or on a Dask cluster.
+"""Runners of the pieces of a long study: this process, processes of this machine, or a Dask cluster.
 
-A runner is given a function and numbers, and yields each number with what the function made of it, in any
-order. A worker that dies takes no result with it: what it had in hand is done again, a few times at most.
+A runner has a function and numbers, and yields each number with its result, in any order. When a worker dies,
+its pieces are repeated, RETRIES times at most.
 """
 
 from __future__ import annotations
@@ -40,26 +40,26 @@ Work = Callable[[int], Any]
 Made = Generator[tuple[int, Any], None, None]
 
 RETRIES: Final = 3
-"""How often a piece is tried again after its worker died."""
+"""Largest number of repetitions of a piece after the death of its worker."""
 
 
 class WorkerLost(GridsecError):
-    """The workers of a piece died again and again."""
+    """The workers of a piece died repeatedly."""
 
     code = "worker-lost"
 
 
 class ClusterUnusable(GridsecError):
-    """There is no Dask cluster that could be used."""
+    """No usable Dask cluster."""
 
     code = "cluster-unusable"
 
 
 class Runner(Protocol):
-    """Whatever can work on pieces."""
+    """Runner of pieces of work."""
 
     def run(self, work: Work, pieces: Sequence[int]) -> Made:
-        """Work on all pieces; yield each with its result when it is done."""
+        """Work on all pieces; yield each with its result when finished."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +69,7 @@ class Here:
     def run(self, work: Work, pieces: Sequence[int]) -> Made:
         """As `Runner`."""
         for piece in pieces:
-            # Sums of several threads are added in another order, and have other last bits.
+            # Several threads sum in another order, with other last bits.
             with threadpool_limits(limits=1):
                 made = work(piece)
             yield piece, made
@@ -77,14 +77,14 @@ class Here:
 
 @dataclass(frozen=True, slots=True)
 class Processes:
-    """Processes of this machine, begun anew rather than forked: so they are the same on every system.
+    """Processes of this machine, spawned rather than forked: equal on every system.
 
     Attributes
     ----------
     count
-        How many.
+        Number of processes.
     retries
-        How often a piece is tried again after its process died.
+        Largest number of repetitions of a piece after the death of its process.
     """
 
     count: int
@@ -96,7 +96,7 @@ class Processes:
         Raises
         ------
         WorkerLost
-            When the processes of a piece died again and again.
+            If the processes of a piece died repeatedly.
         """
         waiting, lost = deque(pieces), Counter[int]()
         while waiting:
@@ -108,13 +108,13 @@ class Processes:
             waiting.extendleft(reversed(died))
 
     def _until_one_dies(self, work: Work, waiting: deque[int]) -> Generator[tuple[int, Any], None, list[int]]:
-        """Work until nothing is left, or a process has died; returns what was in hand then."""
+        """Work until all pieces are finished, or a process has died; returns the unfinished pieces."""
         context = multiprocessing.get_context("spawn")
         pool = ProcessPoolExecutor(min(self.count, len(waiting)), context, initializer=_begin)
         running: dict[Future[Any], int] = {}
         try:
             while waiting or running:
-                # What is worked on, and one for each to go on with: little is lost with a process.
+                # Pieces in work, and one more for each process: little is lost with a process.
                 while waiting and len(running) < 2 * self.count:
                     with deaf():
                         running[pool.submit(_single, work, waiting[0])] = waiting[0]
@@ -126,32 +126,32 @@ class Processes:
                 if any(future in running for future in done):
                     break
         except BrokenProcessPool:
-            pass  # while a piece was handed over; it is still waiting
+            pass  # during a submission; the piece is still waiting
         finally:
             stop(pool)
         return sorted(running.values())
 
 
 def cores(count: int | None = None) -> Runner:
-    """Processes of this machine, or this one where there is but one.
+    """Processes of this machine, or this process if there is one core.
 
     Parameters
     ----------
     count
-        How many; by default one for each core.
+        Number of processes; by default one for each core.
     """
     count = count or os.cpu_count() or 1
     return Processes(count) if count > 1 else Here()
 
 
 def _begin() -> None:
-    """Prepare a process: an interruption of the first one is not its own, but the end of that one is."""
+    """Prepare a process: it ignores interruptions, and ends with the first process."""
     listen()
     Thread(target=_follow, daemon=True).start()
 
 
 def _follow() -> None:
-    """End with the process that began this one, even if that was killed and could not say so."""
+    """End with the parent process, even after its forced end."""
     first = multiprocessing.parent_process()
     if first is not None:
         first.join()
@@ -159,26 +159,26 @@ def _follow() -> None:
 
 
 def _single(work: Work, piece: int) -> Any:
-    """Work on a piece in a process of its own, with one thread: only now are all libraries loaded."""
+    """Work on a piece in a separate process, with one thread; all libraries are loaded by now."""
     threadpool_limits(limits=1)
     return work(piece)
 
 
 @dataclass(frozen=True, slots=True)
 class Dask:
-    """A Dask cluster; it needs the extra `cluster`, and gridsec on its workers.
+    """Dask cluster; requires the extra `cluster`, and gridsec on its workers.
 
     Attributes
     ----------
     address
-        Of its scheduler, such as tcp://10.0.0.1:8786.
+        Address of its scheduler, such as tcp://10.0.0.1:8786.
     timeout_s
-        How long to wait for its answer, s.
+        Longest wait for its answer, s.
 
     Notes
     -----
-    The scheduler gives what a dead worker had in hand to another one, as often as it is configured to
-    (`distributed.scheduler.allowed-failures`, 3).
+    The scheduler repeats the pieces of a dead worker, up to `distributed.scheduler.allowed-failures` times
+    (3).
     """
 
     address: str
@@ -190,10 +190,10 @@ class Dask:
         Raises
         ------
         ClusterUnusable
-            When `distributed` is not installed, nobody answers at the address, there are no workers, or they
-            have other versions of what numbers depend on.
+            Without `distributed`, a scheduler at the address, or workers, or for workers with other versions
+            of the libraries that numbers depend on.
         WorkerLost
-            When the workers of a piece died again and again.
+            If the workers of a piece died repeatedly.
         """
         try:
             dask: Any = import_module("distributed")
@@ -209,8 +209,8 @@ class Dask:
             done = dask.as_completed(loop=client.loop)
 
             def hand_out() -> None:
-                # Each piece brings the feeder along: the scheduler holds a few for each worker only, and one
-                # at least, which waits where all workers have gone.
+                # Each piece contains the feeder: the scheduler has a few per worker, and at least one, which
+                # waits for a worker if there is none.
                 while waiting and len(running) < max(4 * sum(client.nthreads().values()), 1):
                     future = client.submit(_one, work, waiting[0], pure=False)
                     running[future] = waiting.popleft()
@@ -229,7 +229,7 @@ class Dask:
                 client.cancel(list(running))
 
     def _check(self, client: Any) -> None:
-        """Whether there are workers, who compute as this process would; who comes later is asked then."""
+        """Check that there are workers with equal versions; later ones are checked with their results."""
         try:
             client.wait_for_workers(1, timeout=self.timeout_s)
         except TimeoutError as error:
@@ -239,17 +239,17 @@ class Dask:
 
 
 def agree(worker: str, theirs: Any) -> None:
-    """Refuse a worker with other versions, or without any.
+    """Reject a worker with other versions, or without any.
 
     Parameters
     ----------
     worker, theirs
-        Its name, and its versions or what went wrong when it was asked.
+        Its name, and its versions or the error of the request.
 
     Raises
     ------
     ClusterUnusable
-        If they are not those of this process.
+        For versions other than those of this process.
     """
     mine = versions()
     if theirs != mine:
@@ -257,5 +257,5 @@ def agree(worker: str, theirs: Any) -> None:
 
 
 def _one(work: Work, piece: int) -> tuple[dict[str, str], Any]:
-    """Work on a piece in a worker that is not ours."""
+    """Work on a piece in an external worker."""
     return versions(), _single(work, piece)

@@ -1,4 +1,4 @@
-"""Feeder, radial, meshed or in three phases, with its single-phase parts, as calibration compares it.
+"""Feeder, radial, meshed or in three phases, with its single-phase parts, for calibration.
 
 References
 ----------
@@ -36,18 +36,18 @@ __all__ = ["Lateral", "Network", "alone", "laterals", "network", "site_of"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lateral:
-    """Part of a feeder behind a line of one phase that begins at a bus of several; or a customer there.
+    """Part of a feeder behind a single-phase line from a bus of several phases; or a customer there.
 
     Attributes
     ----------
     customers
-        All on it, by index.
+        All its customers, by index.
     lines
-        All its lines, indices into the tables, the first line first; none of a customer.
+        All its lines, indices into the tables, the first line first; none for a customer.
     phase
         Its phase.
     place
-        The place that feeds it.
+        Place that feeds it.
     others
         Places of the other phases at the same bus, by phase.
     """
@@ -59,7 +59,7 @@ class Lateral:
     others: Mapping[str, int]
 
     def to(self, phase: str) -> tuple[Ints, int, int]:
-        """Its customers, the place that feeds it, and the place of another phase there."""
+        """Customers, place that feeds the part, and place of another phase there."""
         return self.customers, self.place, self.others[phase]
 
 
@@ -116,25 +116,25 @@ def alone(feeder: ThreePhaseFeeder, phases: Sequence[str], place: Ints) -> tuple
 
 
 def _below(feeder: ThreePhaseFeeder, buses: Ints, first: int) -> Bools:
-    """Whether buses are this one or behind it."""
+    """Mask of the buses that are this one or behind it."""
     start = feeder.start[buses]
     return np.asarray((feeder.start[first] <= start) & (start < feeder.stop[first]))
 
 
 MOST_BUSES: Final = 150
-"""In larger feeders lines in series without customers between them are one."""
+"""Number of buses above which lines in series without customers between them are merged."""
 
 IDLE: Final = 0.25
-"""Share of its peak that a customer without meter is taken to draw."""
+"""Assumed load of an unmetered customer, relative to its peak."""
 
 HIDDEN: Final = 3.0**-0.5
-"""Share of the load that generation may hide, by which the sunniest roof misleads: uniform in its limits."""
+"""Standard deviation of the load hidden by generation, relative to its limit: uniform within it."""
 
 CLOUDS: Final = 0.1
-"""The part of that share that comes and goes."""
+"""Part of it that varies in time."""
 
 STEEP_PU: Final = 0.003
-"""Half of the voltage over which the slope of an inverter's curve is taken, pu."""
+"""Half of the voltage range for the slope of an inverter's curve, pu."""
 
 _STEPS: Final = 2
 _ROUNDS: Final = 4
@@ -143,12 +143,12 @@ _CHUNK: Final = 64
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Network:
-    """A feeder whose lines in series are merged where that is needed.
+    """Feeder, in which lines in series are merged if it is large.
 
     Attributes
     ----------
     site
-        The feeder as its files say.
+        Feeder of the files.
     feeder
         Its tree, merged; or with closed loops.
     lines : (L,)
@@ -158,11 +158,12 @@ class Network:
     place : (Q, 2)
         Bus of the feeder and phase of each place.
     places
-        What readings see of it.
+        Model of the readings.
     laterals
         Its single-phase laterals.
     parts
-        The same, and single-phase customers at buses of several phases: all whose phase may be wrong.
+        Laterals, and single-phase customers at buses of several phases: all parts with a possibly wrong
+        phase.
     """
 
     site: Site | ThreePhaseSite
@@ -176,7 +177,7 @@ class Network:
 
     @property
     def meter_of(self) -> dict[int, int]:
-        """Meter of each customer with one."""
+        """Meter index of each metered customer."""
         return {int(customer): j for j, customer in enumerate(self.site.meters)}
 
     def weight(self, bus: int, phases: str) -> Floats:
@@ -187,20 +188,19 @@ class Network:
         return np.asarray(at / at.sum())
 
     def reaches(self, bus: int, phases: str) -> bool:
-        """Whether a bus of the feeder has these phases."""
+        """True if a bus of the feeder has these phases."""
         if isinstance(self.feeder, ThreePhaseFeeder):
             return bool(all(self.feeder.phases[bus][PHASES.index(phase)] for phase in phases))
         return True
 
 
 def site_of(path_or_name: Path | str) -> Site | ThreePhaseSite:
-    """Load a feeder, balanced or of three phases.
+    """Load a feeder, balanced or in three phases.
 
     Parameters
     ----------
     path_or_name
-        As in `feeders.model.site.load`, which says what it raises; closed loops in three phases are invalid,
-        too.
+        As in `feeders.model.site.load`, with the same errors; closed loops in three phases are invalid, too.
     """
     return _site(find(path_or_name))
 
@@ -214,9 +214,9 @@ def _site(tables: FeederTables) -> Site | ThreePhaseSite:
             [
                 Problem(
                     "not-radial",
-                    "lines: closed lines form loops, and in three phases calibration takes radial "
-                    "feeders only: "
-                    "in a loop a longer line changes all phases everywhere, which it has no model of",
+                    "lines: closed lines form loops; in three phases calibration requires a radial "
+                    "feeder: "
+                    "in a loop a longer line changes all phases everywhere, without a model of it",
                 )
             ]
         )
@@ -224,12 +224,12 @@ def _site(tables: FeederTables) -> Site | ThreePhaseSite:
 
 
 def network(tables: FeederTables) -> Network:
-    """Prepare a feeder.
+    """Prepare a feeder for calibration.
 
     Parameters
     ----------
     tables
-        Its files; with single-phase customers or zero-sequence impedances it is one of three phases.
+        Its files; with single-phase customers or zero-sequence impedances it is in three phases.
 
     Raises
     ------
@@ -253,7 +253,7 @@ Model = Feeder | MeshedFeeder | ThreePhaseFeeder
 
 
 def _model(site: Site | ThreePhaseSite) -> Model:
-    """A site's feeder, which in three phases is a tree."""
+    """Feeder of a site, in three phases a tree."""
     if isinstance(site.feeder, MeshedFeeder):
         return site.feeder
     return site.tree if isinstance(site, Site) else site.feeder
@@ -264,7 +264,7 @@ def _branches(feeder: ThreePhaseFeeder) -> Ints:
 
 
 def _merged(feeder: Model, rows: tuple[tuple[int, ...], ...]) -> tuple[Model, tuple[tuple[int, ...], ...]]:
-    """Join lines in series without customers between them, in large feeders without loops."""
+    """Merge lines in series without customers between them, in large feeders without loops."""
     count = len(feeder.buses)
     if count <= MOST_BUSES or isinstance(feeder, MeshedFeeder):
         return feeder, rows
@@ -314,7 +314,7 @@ def _places(site: Site | ThreePhaseSite, feeder: Model, place: Ints) -> Places:
     else:
         everywhere = replace(feeder, bus=bus, customers=ids, connected=phase[:, None] == np.arange(3))
         flow3 = lindist3flow(everywhere)
-        # Powers in units of the three-phase base instead of a third of it.
+        # Powers in units of the three-phase base rather than a third of it.
         active, reactive = 6.0 * flow3.R, 6.0 * flow3.X
         at = {(int(k), int(f)): q for q, (k, f) in enumerate(place)}
         where = [at[int(k), int(f)] for k, f in zip(feeder.at, feeder.phase, strict=True)]
@@ -327,10 +327,10 @@ def _places(site: Site | ThreePhaseSite, feeder: Model, place: Ints) -> Places:
 
 
 def _shares(feeder: Model, bus: Ints) -> Floats | Phasors:
-    """What of each line's drop a bus has, (Q, L): all that are behind it, or what loops make of it.
+    """Share of each line's drop at each place, (Q, L): 1 behind a line and 0 elsewhere, or complex in loops.
 
-    A line of impedance z from i to j whose length grows is one with a source in it, so that bus k has
-    ``(Z_kj - Z_ki) / z`` of its drop.
+    A longer line of impedance z from i to j is equivalent to a voltage source in it: bus k has ``(Z_kj -
+    Z_ki) / z`` of its drop.
     """
     if isinstance(feeder, MeshedFeeder):
         (one, other), z = lines(feeder)[0].T, lines(feeder)[1]
@@ -343,16 +343,16 @@ def _shares(feeder: Model, bus: Ints) -> Floats | Phasors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Powers:
-    """What the readings and the files say of the customers' powers. T frames, N customers, pu.
+    """Customers' powers by the readings and the files. T frames, N customers, pu.
 
     Attributes
     ----------
     p, q, load, roof, steep : (T, N)
         See `gridsec.planning.calibration.Series`.
     metered_q : (N,)
-        Whose reactive power is metered.
+        Mask of customers with metered reactive power.
     missing : (T, N)
-        Powers of a customer with a meter that were interpolated.
+        Interpolated powers of metered customers.
     """
 
     p: Floats
@@ -365,10 +365,10 @@ class Powers:
 
 
 def powers(site: Site | ThreePhaseSite, given: Frames) -> Powers:
-    """Powers of all customers.
+    """Compute the powers of all customers.
 
-    Without a reading of q it is that of the load, by the middle of the limits of its power factor, less what
-    the inverter's curve gives at the voltage read.
+    Without a reading of q it is that of the load, by the middle of the limits of its power factor, less the
+    injection of the inverter's curve at the voltage read.
 
     Parameters
     ----------
@@ -422,7 +422,7 @@ def powers(site: Site | ThreePhaseSite, given: Frames) -> Powers:
 
 
 def _sun(draws: Floats, pv_peak: Floats) -> Floats:
-    """Generation relative to its peak: the largest that any roof feeds in beyond its load, (T,)."""
+    """Generation relative to its peak, (T,): the largest feed-in of any roof beyond its load."""
     roofs = pv_peak > 0.0
     feeds = -draws[:, roofs] / pv_peak[roofs]
     return np.asarray(np.clip(feeds.max(axis=1, initial=0.0), 0.0, 1.0))
@@ -440,7 +440,7 @@ def series(net: Network, given: Frames, drawn: Powers, excluded: Collection[str]
     drawn
         From `powers`.
     excluded
-        Meters whose voltages are not looked at.
+        Meters with voltages that are not used.
     """
     site = net.site
     order = [given.meter_ids.index(name) for name in site.meter_ids]
@@ -448,7 +448,7 @@ def series(net: Network, given: Frames, drawn: Powers, excluded: Collection[str]
     seen = np.isfinite(v) & ~np.isin(site.meter_ids, list(excluded))
     busbar = given.v0_volt
     if isinstance(net.feeder, ThreePhaseFeeder):
-        # Nobody looks at phases that are not read, and what they do to others is of second order.
+        # Unread phases are not used, and their effect on the others is of second order.
         busbar = np.where(np.isfinite(given.v0_phases), given.v0_phases, busbar[:, None])
     U, drop = _voltages(net, drawn.p, drawn.q, busbar / site.feeder.base_volt)
     bus, phase = net.place.T
@@ -469,7 +469,7 @@ def series(net: Network, given: Frames, drawn: Powers, excluded: Collection[str]
 def _voltages(net: Network, p: Floats, q: Floats, v0: Floats) -> tuple[Floats, Floats | Phasors]:
     """Squared voltages of all buses with their losses, (T, F, b + 1), and `Series.drop`, (T, F, L).
 
-    From the busbar's voltages (T,) or (T, 3).
+    The input is the busbar voltage (T,) or (T, 3).
     """
     feeder, (one, other) = net.feeder, net.ends.T
     if isinstance(feeder, MeshedFeeder):
@@ -489,7 +489,7 @@ def _voltages(net: Network, p: Floats, q: Floats, v0: Floats) -> tuple[Floats, F
 
 
 def _phasors(feeder: MeshedFeeder, s: Phasors, v0: Floats) -> Phasors:
-    """Voltages of all buses, (T, b + 1): as `gridsec.grid.meshed.bus_voltages`, which has their squares."""
+    """Complex voltages of all buses, (T, b + 1); `gridsec.grid.meshed.bus_voltages` has their squares."""
     idle = v0[:, None] * feeder.idle
     here = V = idle[:, feeder.bus]
     for _ in range(_ROUNDS):
@@ -498,7 +498,7 @@ def _phasors(feeder: MeshedFeeder, s: Phasors, v0: Floats) -> Phasors:
 
 
 def doubts(net: Network, drawn: Powers, tolerance: float, free: Collection[int], spread: float) -> Doubts:
-    """What the files leave open; uniform within the limits they state.
+    """Prior standard deviations of the errors of the files, uniform within the stated limits.
 
     Parameters
     ----------
@@ -507,11 +507,11 @@ def doubts(net: Network, drawn: Powers, tolerance: float, free: Collection[int],
     drawn
         From `powers`.
     tolerance
-        Relative error of lines' lengths that is no mistake.
+        Relative error of lengths that counts as correct, 1 sigma.
     free
-        Branches whose length is estimated.
+        Branches with estimated lengths.
     spread
-        Prior of their relative error.
+        Prior standard deviation of their relative error.
     """
     site, model = net.site, net.site.loads
     without = np.ones(model.load_peak.size, dtype=np.bool_)
@@ -534,15 +534,7 @@ def doubts(net: Network, drawn: Powers, tolerance: float, free: Collection[int],
 
 
 def field(net: Network, drawn: Powers) -> Field:
-    """What errors of the loads do at the meters.
-
-    Parameters
-    ----------
-    net
-        The feeder.
-    drawn
-        From `powers`.
-    """
+    """Effect of load errors at the meters."""
     site, model = net.site, net.site.loads
     A, B = net.places.at_meters
     metered = np.zeros(model.load_peak.size)
@@ -557,9 +549,9 @@ def field(net: Network, drawn: Powers) -> Field:
 
 
 def meter_noise(net: Network, given: Frames) -> tuple[Floats, Floats]:
-    """Variances of the readings' own noise (T, p), squared pu^2, and what the busbar's does, (T, p, F).
+    """Variances of the readings' own noise (T, p), squared pu^2, and effect of the busbar's, (T, p, F).
 
-    Each phase of the busbar is metered apart, and a place has the error of its own phase.
+    Each phase of the busbar has a register of its own, and a place has the error of its own phase.
     """
     site, accuracy = net.site, net.site.accuracy
     order = [given.meter_ids.index(name) for name in site.meter_ids]
@@ -571,7 +563,7 @@ def meter_noise(net: Network, given: Frames) -> tuple[Floats, Floats]:
 
 
 def gaps(net: Network, drawn: Powers) -> list[Floats]:
-    """What interpolated powers of each frame may do, T times (p, g): their changes from frame to frame."""
+    """Effect of interpolated powers in each frame, T times (p, g): their changes from frame to frame."""
     A, B = net.places.at_meters
     change_p, change_q = (np.diff(power, axis=0).std(axis=0) for power in (drawn.p, drawn.q))
     effect = A * change_p + B * np.where(drawn.metered_q, change_q, 0.0)

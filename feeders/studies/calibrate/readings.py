@@ -1,4 +1,4 @@
-"""Readings of a recording or a table as frames of all meters, ready to be compared with a feeder."""
+"""Readings of a recording or a table as frames of all meters, for the comparison with a feeder."""
 
 from __future__ import annotations
 
@@ -34,19 +34,19 @@ if TYPE_CHECKING:
 __all__ = ["Frames", "blind", "frames", "open_readings"]
 
 MOST_FRAMES: Final = 720
-"""More frames than these are averaged."""
+"""Number of frames from which on frames are averaged."""
 
 FEWEST_FRAMES: Final = 48
-"""Fewer frames than these say nothing about what varies."""
+"""Smallest number of frames that determines the varying errors."""
 
 FARTHEST_S: Final = 10.0 * 365.25 * 86400.0
-"""Times farther than this from the median of all, s, are of a clock that was not set."""
+"""Largest distance of times from their median, s; beyond it a clock was not set."""
 
 NUMBERS: Final = ("t", "v_volt", "p_kw", "q_kvar")
 """Columns of numbers."""
 
 USUAL: Final = (0.5, 1.5)
-"""A meter's median voltage is within these parts of nominal, or not in V from phase to neutral."""
+"""Range of a meter's median voltage, relative to nominal, for volts from phase to neutral."""
 
 _PAIR: Final = (0.9 * 3.0**0.5, 1.1 * 3.0**0.5)
 _KILOVOLT: Final = (0.5e-3, 2e-3)
@@ -54,15 +54,15 @@ _KILOVOLT: Final = (0.5e-3, 2e-3)
 _EXPECTED: Final = {"t": "expected Unix time in seconds"}
 
 OFTEN: Final = 0.5
-"""A phase of the busbar with voltages in fewer of the frames than this part is not read."""
+"""Smallest share of frames with voltages of a phase of the busbar that counts as read."""
 
 FEWEST_SPANS: Final = 6.0
-"""The recording is at least so many correlation times of the loads' errors long."""
+"""Smallest length of a recording in correlation times of the load errors."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frames:
-    """Readings of T frames in SI, net import positive. p meters; NaN where there is none.
+    """Readings of T frames in SI, net import positive. p meters; NaN for missing values.
 
     Attributes
     ----------
@@ -73,11 +73,12 @@ class Frames:
     v_volt, p_kw, q_kvar : (T, p)
         Means of the readings.
     v0_volt : (T,)
-        The busbar's.
+        Busbar voltage.
     v0_phases : (T, 3)
-        Those of its phases; NaN in all frames for one that is not read.
+        Phase voltages of the busbar; NaN in all frames for an unread phase.
     count : (T, p + 1)
-        Readings of each mean, the busbar's last; of a meter of three channels those of all.
+        Number of readings of each mean, the busbar's last; of a meter of three channels their effective
+        number.
     step_s
         Interval between readings, s.
     """
@@ -94,27 +95,27 @@ class Frames:
 
     @property
     def unread(self) -> str:
-        """Phases of which the busbar has no voltage."""
+        """Phases without a voltage of the busbar."""
         missing = ~np.isfinite(self.v0_phases).all(axis=0)
         return "".join(PHASES[k] for k in np.flatnonzero(missing))
 
 
 def open_readings(path: Path | str) -> pd.DataFrame | Recording:
-    """Open a recording (Parquet, ours or a foreign one) or a CSV table with the same columns.
+    """Open a recording (Parquet, simulated or external) or a CSV table with the same columns.
 
     Raises
     ------
     RecordingInvalid
-        If it is neither.
+        For any other file.
     """
     path = Path(path)
     if path.suffix.lower() != ".csv":
         return read_recording(path)
     try:
-        # A converter keeps ids as they are: "NA" and "null" are names like others.
+        # The converter keeps ids as text: "NA" and "null" are valid names.
         return pd.read_csv(path, converters={"meter": str})
     except (OSError, ValueError) as error:
-        raise RecordingInvalid(Problem("unreadable", f"{path}: no table of readings: {error}")) from error
+        raise RecordingInvalid(Problem("unreadable", f"{path}: not a table of readings: {error}")) from error
 
 
 def frames(
@@ -123,11 +124,11 @@ def frames(
     *,
     exclude: Collection[str] = (),
 ) -> Frames:
-    """Put readings into frames.
+    """Average readings to frames.
 
-    In three phases a meter of a customer of all of them may be read as a whole, or as its three channels
-    (`feeders.model.site.one_phase_each`): its voltage is then their mean, and its powers are their sums, each
-    where all three are there.
+    A meter of a three-phase customer may be read as a whole, or as its three channels
+    (`feeders.model.site.one_phase_each`). Its voltage is then their mean and its powers are their sums, where
+    all three exist.
 
     Parameters
     ----------
@@ -136,15 +137,15 @@ def frames(
     readings
         A recording, a table, or a file with one.
     exclude
-        Meters whose values may be of any size.
+        Meters without a check of their values.
 
     Raises
     ------
     RecordingInvalid
-        If columns are missing or hold no numbers, times are not Unix seconds, voltages and powers are hardly
-        in V from phase to neutral, kW and kvar, meters are unknown or are read both as a whole and by
-        channels, the recording is another feeder's, the busbar has no reading, in three phases none of the
-        phases of any meter, or there are too few.
+        For missing columns, columns without numbers, times other than Unix seconds, voltages and powers not
+        in V from phase to neutral, kW and kvar, unknown meters, meters read both as a whole and by channels,
+        a recording of another feeder, a busbar without readings (in three phases of the phases of any meter),
+        or too few frames.
     """
     given = open_readings(readings) if isinstance(readings, (Path, str)) else readings
     if not isinstance(given, pd.DataFrame):
@@ -172,7 +173,9 @@ def frames(
             Problem("unknown-name", f"there are meters that {site.feeder.name} does not have: {shown}")
         )
     if "meter" in given and not (column == len(site.meter_ids)).any():
-        problems.append(Problem("missing", "none of the busbar (an empty meter); nothing to compare with"))
+        problems.append(
+            Problem("missing", "no reading of the busbar (empty meter id); it is the reference of all others")
+        )
     if "meter" in given:
         problems += _twice(meter, channels)
         problems += _wrong_units(
@@ -194,7 +197,7 @@ def frames(
 
 
 def blind(site: Site | ThreePhaseSite, unread: str) -> tuple[str, ...]:
-    """Return the meters on phases of which the busbar has no voltage: how far they are off cannot be told.
+    """Meters on phases without a voltage of the busbar; their errors cannot be determined.
 
     Parameters
     ----------
@@ -208,7 +211,7 @@ def blind(site: Site | ThreePhaseSite, unread: str) -> tuple[str, ...]:
 
 
 def _channels(site: Site | ThreePhaseSite) -> dict[str, str]:
-    """Meter of each channel of those that customers of three phases have in a feeder of one phase each."""
+    """Meter of each channel, for meters of three-phase customers in a feeder of three phases."""
     if not site.tables.in_phases:
         return {}
     rows = [site.tables.customers[k] for k in site.meters]
@@ -221,7 +224,7 @@ def _channels(site: Site | ThreePhaseSite) -> dict[str, str]:
 
 
 def _twice(meter: pd.Series, channels: Mapping[str, str]) -> list[Problem]:
-    """Meters that are read as a whole and by channels."""
+    """Problems of meters that are read both as a whole and by channels."""
     names = set(meter)
     both = sorted(names & {whole for channel, whole in channels.items() if channel in names})
     return [
@@ -231,7 +234,7 @@ def _twice(meter: pd.Series, channels: Mapping[str, str]) -> list[Problem]:
 
 
 def _numbers(column: pd.Series, problems: list[Problem]) -> Floats | None:
-    """A column as numbers, NaN where there is none; None, and told, where it holds something else."""
+    """Column as numbers, NaN for missing ones; None, with a problem, for other content."""
     expected = _EXPECTED.get(str(column.name), "expected numbers")
     if is_numeric_dtype(column) and not is_bool_dtype(column) and not is_complex_dtype(column):
         return column.to_numpy(dtype=np.float64, na_value=np.nan)
@@ -240,7 +243,7 @@ def _numbers(column: pd.Series, problems: list[Problem]) -> Floats | None:
         return None
     text = column.astype("string")
     values = pd.to_numeric(text, errors="coerce").to_numpy(dtype=np.float64, na_value=np.nan)
-    # Where there is nothing, there is no wrong number.
+    # An empty cell is not a wrong number.
     nothing = text.fillna("").str.strip().str.lower().isin(["", "nan"]).to_numpy()
     wrong = np.flatnonzero(np.isnan(values) & ~nothing)
     if wrong.size:
@@ -252,7 +255,7 @@ def _numbers(column: pd.Series, problems: list[Problem]) -> Floats | None:
 
 
 def _wrong_times(t: Floats) -> list[Problem]:
-    """What is wrong with times: those that are none, of another unit, or far from all others."""
+    """Problems of times: not finite, in another unit, or far from all others."""
     finite = np.isfinite(t)
     plain = finite & (t >= 0.0) & (t < LATEST_S)
     middle = float(np.median(t[plain])) if plain.any() else 0.0
@@ -272,7 +275,7 @@ def _wrong_times(t: Floats) -> list[Problem]:
 def _wrong_units(
     site: Site | ThreePhaseSite, numbers: dict[str, Floats], meter: pd.Series, exclude: Collection[str]
 ) -> list[Problem]:
-    """Columns that are hardly in their unit: the medians of meters show it, which no short fault moves."""
+    """Columns that are probably in another unit, by medians of meters, which short faults do not move."""
     nominal = dict(zip(site.meter_ids, site.customer_nominal[site.meters].tolist(), strict=True))
     nominal[BUSBAR] = site.tables.meta.voltage_volt
     most = site.loads.credible[site.meters] * site.tables.meta.base_kva
@@ -292,16 +295,18 @@ def _wrong_units(
     problems = []
     for (name, doubt), meters in found.items():
         one, middle, limit = meters[0]
-        whose = (one or "the busbar") + (f" and {len(meters) - 1} more" if len(meters) > 1 else "")
+        sources = (one or "the busbar") + (f" and {len(meters) - 1} more" if len(meters) > 1 else "")
         than = (
-            f"where {limit:.4g} is nominal" if name == "v_volt" else f"where {limit:.4g} is the most credible"
+            f"where {limit:.4g} is nominal"
+            if name == "v_volt"
+            else f"where {limit:.4g} is the largest plausible value"
         )
-        problems.append(Problem("doubtful", f"{name} of {whose} is usually {middle:.4g} {than}; {doubt}"))
+        problems.append(Problem("doubtful", f"{name} of {sources} is usually {middle:.4g} {than}; {doubt}"))
     return problems
 
 
 def _doubt(name: str, part: float) -> str:
-    """What a median may be in place of its unit, by its part of the nominal voltage or the largest power."""
+    """Probable unit of a median, by its ratio to the nominal voltage or the largest power."""
     if name != "v_volt":
         return "" if part <= 1.0 else "in W?" if name == "p_kw" else "in var?"
     if USUAL[0] <= part <= USUAL[1]:
@@ -312,7 +317,7 @@ def _doubt(name: str, part: float) -> str:
 
 
 def _rows(which: Ints) -> str:
-    """The first of some rows, counted from 1, and how many there are."""
+    """First of some rows, counted from 1, and the number of others."""
     return f"row {which[0] + 1}" + (f" and {which.size - 1} more" if which.size > 1 else "")
 
 
@@ -326,12 +331,12 @@ def _binned(
     t = numbers["t"]
     width, step = len(site.meter_ids) + 1 + 3 * len(whole), _step(t, column)
     first = float(t.min())
-    # Clocks are off by a little: frames are centred on the first tick.
+    # Clocks have small offsets: frames are centred on the first tick.
     number = np.floor((t - first) / step + 0.5).astype(np.intp)
     together = max(1, int(np.ceil(np.unique(number).size / MOST_FRAMES)))
     tau = site.tables.meta.load.correlation_s
     together = max(1, min(together, int(tau / 3.0 / step))) if together > 1 else 1
-    # Only frames with readings: between the first and the last there may be years without any.
+    # Frames with readings only: between the first and the last there may be years without any.
     used, number = np.unique(number // together, return_inverse=True)
     size = (used.size, width)
     cell = number * width + column
@@ -350,7 +355,7 @@ def _binned(
             Problem(
                 "too-little-data",
                 f"too little data: {T} frames over {span / 3600:.3g} h; at least {FEWEST_FRAMES} frames over "
-                f"{wanted / 3600:.3g} h are needed, and days tell more than hours",
+                f"{wanted / 3600:.3g} h are required; days give more information than hours",
             )
         )
     middle = first + (used * together + 0.5 * (together - 1)) * step
@@ -368,7 +373,7 @@ def _binned(
 
 
 def _phases(given: pd.DataFrame, number: Ints, ticks: int) -> Floats:
-    """Means of the busbar's voltages of each phase, (T, 3); NaN where there is none."""
+    """Means of the busbar's phase voltages, (T, 3); NaN for missing ones."""
     if "v_phases" not in given:
         return np.full((ticks, 3), np.nan)
     there = given["v_phases"].notna().to_numpy()
@@ -386,10 +391,10 @@ def _phases(given: pd.DataFrame, number: Ints, ticks: int) -> Floats:
 
 
 def _joined(mean: Floats, count: Floats, whole: list[int], share: float) -> tuple[Floats, Floats]:
-    """Means and counts (T, p + 1) from those of the channels behind them: `share` of the channels' sum.
+    """Means and counts (T, p + 1) with those of the channels: `share` of the channels' sum.
 
     With n_f readings of independent channels the variance of their mean is that of ``9 / sum(1 / n_f)``
-    readings of one.
+    readings of one channel.
     """
     width = mean.shape[1] - 3 * len(whole)
     three, n = (x[:, width:].reshape(len(x), -1, 3) for x in (mean, count))
@@ -403,9 +408,9 @@ def _joined(mean: Floats, count: Floats, whole: list[int], share: float) -> tupl
 
 
 def _complete(phases: Floats, there: Bools) -> Bools:
-    """Frames (T,) with voltages of all phases that are read; the others' are forgotten.
+    """Frames (T,) with voltages of all read phases; voltages of the others become NaN.
 
-    In a frame without one of them its meters would be compared with another voltage than their own.
+    In a frame without one of these phases its meters would be compared with the voltage of another phase.
     """
     read = np.isfinite(phases[there]).sum(axis=0) >= max(1.0, OFTEN * there.sum())
     phases[:, ~read] = np.nan
@@ -425,7 +430,7 @@ def _step(t: Floats, column: Ints) -> float:
 
 
 def _means(cell: Ints, x: Floats, size: tuple[int, int]) -> tuple[Floats, Floats]:
-    """Mean of the finite values of each cell, NaN where there is none; and how many there are."""
+    """Mean of the finite values of each cell, NaN without any; and their number."""
     good = np.isfinite(x)
     count = np.bincount(cell[good], minlength=size[0] * size[1]).astype(np.float64)
     total = np.bincount(cell[good], weights=x[good], minlength=size[0] * size[1])

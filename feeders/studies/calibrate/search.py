@@ -66,7 +66,7 @@ __all__ = [
 
 
 class Kind(StrEnum):
-    """What may be wrong."""
+    """Kinds of errors of the files."""
 
     BUS = "bus"
     PHASE = "phase"
@@ -76,27 +76,27 @@ class Kind(StrEnum):
 
 
 PLACES: Final = (Kind.BUS, Kind.PHASE)
-"""Errors about where a customer is: of one customer there is at most one of each."""
+"""Errors of a customer's place; a customer has at most one of each."""
 
 
 @dataclass(frozen=True, slots=True)
 class Correction:
-    """An error of the files in their own words.
+    """Error of the files in terms of their ids.
 
     Attributes
     ----------
     kind
-        What it is.
+        Kind of the error.
     names
-        The customer, both customers of a swap, the meter, or the lines; all customers on a lateral.
+        The customer, both customers of a swap, the meter, or the lines; all customers of a lateral.
     bus, phases
-        Place of the customer. In an exchange `phases` has one letter for each name and then for each line;
-        otherwise all of them are on the same phases.
+        Correct place of the customer. In an exchange `phases` has one letter for each name and then for each
+        line; otherwise the phases of all of them.
     factor
-        On the lines' length.
+        Factor on the lines' length.
     lines
-        The lines of a single-phase lateral that is on these phases with all its customers, its first one
-        first; none, if only the customer is.
+        The lines of a single-phase lateral that is on these phases with all its customers, the first line
+        first; none for a single customer.
     """
 
     kind: Kind
@@ -108,7 +108,7 @@ class Correction:
 
     @property
     def exchange(self) -> bool:
-        """Exchange of the phases of two customers or laterals: each has a letter of its own."""
+        """True for an exchange of the phases of two customers or laterals: each has a letter of its own."""
         return self.kind is Kind.PHASE and len(self.phases) > 1
 
     @property
@@ -120,14 +120,14 @@ class Correction:
 
 
 def apply(tables: FeederTables, wrong: Correction) -> FeederTables:
-    """Correct the files.
+    """Correct an error of the files.
 
     Parameters
     ----------
     tables
         The files.
     wrong
-        Their error; that of a meter changes nothing in them.
+        The error; that of a meter changes no file.
     """
     if wrong.kind is Kind.METER:
         return tables
@@ -151,14 +151,14 @@ def apply(tables: FeederTables, wrong: Correction) -> FeederTables:
 
 
 def longer(line: LineRow, factor: float) -> LineRow:
-    """A line of another length.
+    """Line of another length.
 
     Parameters
     ----------
     line
         The line.
     factor
-        On its length.
+        Factor on its length.
     """
     scaled: dict[str, Any] = {
         name: None if (value := getattr(line, name)) is None else value * factor
@@ -168,7 +168,7 @@ def longer(line: LineRow, factor: float) -> LineRow:
 
 
 def _on(line: LineRow, phase: str) -> LineRow:
-    """A line of one phase on another one, its own columns with it."""
+    """Single-phase line on another phase, with its columns."""
     own = {name: name.split("_") for name in PHASE_NAMES}
     cells: dict[str, Any] = {name: None for name, parts in own.items() if set(parts[1]) == {line.phases}}
     there = {
@@ -180,15 +180,15 @@ def _on(line: LineRow, phase: str) -> LineRow:
 
 
 def left(earlier: Correction, later: Correction) -> Correction | None:
-    """What a later correction leaves of an earlier one; None: nothing.
+    """Part of an earlier correction that a later one leaves; None without any.
 
     Parameters
     ----------
     earlier, later
-        Both about one feeder; of a customer's place the later one holds.
+        Corrections of one feeder; for a customer's place the later one is valid.
     """
     if later.kind is Kind.BUS and set(earlier.names) <= set(later.names) and earlier.lines:
-        # No customer is left on the lateral to confirm the phase of its lines.
+        # No customer remains on the lateral to confirm the phase of its lines.
         return _without_lines(earlier)
     if earlier.kind is not later.kind or later.kind not in PLACES:
         return earlier
@@ -203,7 +203,7 @@ def _without_lines(earlier: Correction) -> Correction:
 
 
 def _of_phases(earlier: Correction, on: dict[str, str], lines_on: dict[str, str]) -> Correction:
-    """The correction of these names and lines alone."""
+    """Correction of these names and lines only."""
     phases = earlier.phases
     if earlier.exchange:
         phases = "".join((*on.values(), *lines_on.values()))
@@ -212,7 +212,7 @@ def _of_phases(earlier: Correction, on: dict[str, str], lines_on: dict[str, str]
 
 
 def as_filed(tables: FeederTables, wrong: Correction, bus_of_file: Mapping[str, int]) -> bool:
-    """Whether files already say what a correction of a customer's place does.
+    """True if the files agree with a correction of a customer's place already.
 
     Parameters
     ----------
@@ -235,19 +235,19 @@ def as_filed(tables: FeederTables, wrong: Correction, bus_of_file: Mapping[str, 
 
 
 LENGTH_SPREAD: Final = 0.3
-"""Prior standard deviation of the relative error of a length that is a mistake."""
+"""Prior standard deviation of the relative error of a wrong length."""
 
 CHANGE_SPREAD: Final = 0.005
-"""The same of a change of a meter's relative error."""
+"""Prior standard deviation of a change of a meter's relative error."""
 
 SHORTEST: Final = 0.05
-"""No line is shorter than this part of what its files say."""
+"""Smallest factor on a line's length."""
 
 LIE_SPREAD: Final = 0.05
-"""The same of an error that is there all the time and that no honest meter of its class has."""
+"""Prior standard deviation of a constant relative error beyond that of honest meters of the class."""
 
 PIECES: Final = 8
-"""Stretches of time in which a meter's error may differ."""
+"""Number of time intervals with possibly different errors of a meter."""
 
 _CHUNK: Final = 128
 _REFIT: Final = 3
@@ -256,26 +256,25 @@ _NOISE_ROUNDS: Final = 2
 
 @dataclass(frozen=True, slots=True)
 class Guess:
-    """An error of the files that is looked at.
+    """Hypothesis of an error of the files.
 
     Attributes
     ----------
     kind
-        What it is.
+        Kind of the error.
     subject
-        Customer, customer and customer of a swap, meter, or branch; by index in the present network. Of an
-        exchange of phases the first part, by index into `Network.parts`.
+        Customer, first customer of a swap, meter, or branch, by index in the present network. For an exchange
+        of phases the first part, by index into `Network.parts`.
     other
-        The second customer, the bus of the merged tree, the lateral, or nothing: -1. Of an exchange the
-        second part.
+        Second customer, bus of the merged tree, or lateral; -1 for none. For an exchange the second part.
     phases
-        Phases of the customer; of an exchange those of both parts, one letter each.
+        Phases of the customer; for an exchange those of both parts, one letter each.
     lateral
-        Whether `other` is a lateral, which is on these phases with all its customers.
+        True: `other` is a lateral, which is on these phases with all its customers.
     exchange
-        Two customers or laterals have each other's phase.
+        True: two customers or laterals have each other's phase.
     since, until
-        When the meter's error is different, Unix s.
+        Time interval of the meter's different error, Unix s.
     """
 
     kind: Kind
@@ -290,18 +289,18 @@ class Guess:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
-    """Files as corrected so far, and what is left out of account.
+    """Files with all corrections so far, and excluded meters.
 
     Attributes
     ----------
     tables
         The files.
     excluded
-        Meters whose errors change, or that the caller does not trust.
+        Meters with changing errors, or excluded by the caller.
     lengths
-        Factor on each line that was found to be of another length, by its id.
+        Factor on the length of each line with a corrected length, by id.
     unread
-        Phases of which the busbar has no voltage; the meters on them are among the excluded ones.
+        Phases without a voltage of the busbar; the meters on them are excluded.
     """
 
     tables: FeederTables
@@ -310,12 +309,12 @@ class State:
     unread: str = ""
 
     def same(self, other: State) -> bool:
-        """Whether both say the same."""
+        """True for equal files and excluded meters."""
         mine, others = ((each.tables.lines, each.tables.customers, each.excluded) for each in (self, other))
         return mine == others
 
     def after(self, wrong: Correction) -> State:
-        """Correct one error more."""
+        """Correct one more error."""
         if wrong.kind is Kind.METER:
             return replace(self, excluded=(*self.excluded, *wrong.names))
         lengths = dict(self.lengths)
@@ -326,7 +325,7 @@ class State:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Round:
-    """All that is known with the files as corrected so far."""
+    """Model, fit and readings for the files with all corrections so far."""
 
     state: State
     net: Network
@@ -341,20 +340,20 @@ class Round:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Verdict:
-    """What comparing all guesses has brought.
+    """Comparison of all hypotheses.
 
     Attributes
     ----------
     guesses
-        All of them.
+        All hypotheses.
     found
-        What the readings say about each.
+        Evidence of the readings for each.
     confidence : (H,)
         See `gridsec.planning.calibration.Weighed`.
     any
         Logarithm of the mean Bayes factor.
     kept : (k,)
-        The guesses that cannot be told apart, the best first.
+        Hypotheses that cannot be distinguished, best first.
     """
 
     guesses: list[Guess]
@@ -365,7 +364,7 @@ class Verdict:
 
 
 def prepare(state: State, frames: Frames, *, tolerance: float, errors: bool = False) -> Round:
-    """Fit the meters, loads and lines of files that are taken to be right.
+    """Fit meters, loads and lines under the assumption of correct files.
 
     Parameters
     ----------
@@ -374,9 +373,9 @@ def prepare(state: State, frames: Frames, *, tolerance: float, errors: bool = Fa
     frames
         The readings.
     tolerance
-        Relative error of a line's length that is no mistake.
+        Relative error of a length that counts as correct, 1 sigma.
     errors
-        Whether the standard errors of the loads' errors are wanted.
+        True: also compute standard errors of the load errors' parameters.
     """
     net = model.network(state.tables)
     drawn = model.powers(net.site, frames)
@@ -424,7 +423,7 @@ def _typical(net: Network) -> float:
 
 
 def _spread_out(found: Fit, used: Ints, given: Regressors) -> Fit:
-    """Coefficients that are known to be 0 take their places again."""
+    """Fit with all coefficients, those with a prior of zero included."""
     estimate, std = np.zeros((2, given.spread.size))
     estimate[used], std[used] = found.estimate, found.std
     return replace(found, estimate=estimate, std=std)
@@ -437,24 +436,24 @@ def compare(
     tell: Callable[[int, int], None],
     kinds: Collection[Kind] = tuple(Kind),
 ) -> Verdict:
-    """Weigh every error of the files that can be thought of.
+    """Compare all hypotheses of an error of the files.
 
     Parameters
     ----------
     now
-        The present files.
+        Fit of the present files.
     frames
         The readings.
     risk
         Probability of a proposal for files without errors.
     tell
-        Told how far it is.
+        Called with (done, total).
     kinds
-        What to look for.
+        Kinds of errors to consider.
     """
     guesses: list[Guess] = []
     parts: list[Evidence] = []
-    # Of some kinds there may be none: phases on a balanced feeder, meters if all are excluded.
+    # Some kinds may have no hypothesis: phases on a balanced feeder, meters if all are excluded.
     chunks = [chunk for chunk in _chunks(now, kinds) if chunk[0]]
     for k, (some, make, spread) in enumerate(chunks):
         tell(k, len(chunks))
@@ -473,7 +472,7 @@ def compare(
 
 
 def _family(guess: Guess) -> int:
-    """Group of hypotheses that share one prior weight: exchanges of phases are a group beside single ones."""
+    """Group of hypotheses with a common prior weight; exchanges of phases are a group of their own."""
     return len(Kind) if guess.exchange else list(Kind).index(guess.kind)
 
 
@@ -481,7 +480,7 @@ _MOVES: Final = (Kind.BUS, Kind.PHASE, Kind.SWAP)
 
 
 def _close(now: Round, guesses: list[Guess], factor: Floats) -> list[int]:
-    """Moves that the linear flow makes likely, and before a meter is excluded its customer's likeliest."""
+    """Moves that are likely by the linear flow; for an excluded meter also the likeliest of its customer."""
     if not guesses:
         return []
     order = np.argsort(-factor).tolist()
@@ -495,12 +494,12 @@ def _close(now: Round, guesses: list[Guess], factor: Floats) -> list[int]:
 
 
 def concerned(now: Round, guess: Guess) -> list[int]:
-    """Customers that a move is about.
+    """Customers of a move.
 
     Parameters
     ----------
     now
-        The files that it is about.
+        Fit of the present files.
     guess
         The move.
     """
@@ -520,7 +519,7 @@ Chunk = tuple[list[Guess], Callable[[], Floats], float]
 
 
 def _chunks(now: Round, kinds: Collection[Kind]) -> Iterator[Chunk]:
-    """Guesses of like kind, and how their effects are made; (T, p, H)."""
+    """Hypotheses of one kind, and a function that computes their effects, (T, p, H)."""
     net, series = now.net, now.series
     trusted = np.flatnonzero(series.seen.any(axis=0)).tolist()
     read = [phase for phase in PHASES if phase not in now.state.unread]
@@ -621,11 +620,11 @@ def _seen(now: Round, columns: Floats) -> Floats:
 
 
 def _exactly(now: Round, frames: Frames, guess: Guess) -> float:
-    """Gain of the log-likelihood with the power flow of the files as corrected."""
+    """Gain of the log-likelihood with the power flow of the corrected files."""
     after = model.network(apply(now.state.tables, correction(now, guess)))
     drawn = model.powers(after.site, frames)
     series = model.series(after, frames, drawn, now.state.excluded)
-    # The meters of a swap have changed places; their readings are compared in the old order.
+    # The meters of a swap have exchanged places; their readings are compared in the old order.
     order = [after.site.meter_ids.index(name) for name in now.net.site.meter_ids]
     rest = series.residual(after.places)[:, order] * (after.places.unit[order] / now.net.places.unit) ** 2
     z = now.readings - now.whiten(rest[:, :, None]).ravel()
@@ -633,16 +632,16 @@ def _exactly(now: Round, frames: Frames, guess: Guess) -> float:
 
 
 def correction(now: Round, guess: Guess, factor: float = 1.0) -> Correction:
-    """A guess in the words of the files.
+    """Hypothesis as a correction of the files.
 
     Parameters
     ----------
     now
-        The files that it is about.
+        Fit of the present files.
     guess
         The error.
     factor
-        On the length, for a length.
+        Factor on the length, for a length.
     """
     net, tables = now.net, now.state.tables
     if guess.kind is Kind.METER:

@@ -1,9 +1,8 @@
 """Calibration of a feeder's files by recorded readings: stepwise selection, proposals, tables.
 
-A forward step corrects the error that the readings support most. An early step is compared while later
-errors are still in the files, so that it may stand in for them. Re-examination therefore withdraws each
-error alone, with all others corrected, and compares all hypotheses again: the error stays, another one takes
-its place, or none is needed.
+A forward step corrects the error that the readings support most. At an early step later errors are still in
+the files, and it may stand in for them. Re-examination therefore withdraws each error alone, with all others
+corrected, and compares all hypotheses again: the error stays, is replaced, or is dropped.
 
 References
 ----------
@@ -82,13 +81,13 @@ WIDE: Final = 1.96
 """Half-width of intervals, in standard errors: 95 %."""
 
 VAGUE: Final = 0.7
-"""What the readings leave of a prior standard deviation if they say nothing: more than this."""
+"""Ratio of posterior to prior standard deviation above which the readings give no information."""
 
 ALIKE: Final = 0.98
-"""Correlation of the effects of two lines that are the same."""
+"""Correlation from which on the effects of two lines count as equal."""
 
 UNSURE_LENGTH: Final = 0.25
-"""A length less certain than this is not known."""
+"""Standard error from which on a length is unknown."""
 
 _SHOWN: Final = 5
 
@@ -99,11 +98,11 @@ _COLUMNS: Final = (
 
 
 def meters(now: Round, risk: float) -> pd.DataFrame:
-    """Bias of every meter."""
+    """Table of meters: bias of every meter."""
     at, site = now.given.where["bias"], now.net.site
     bias, std, prior = 100.0 * now.fit.estimate[at], 100.0 * now.fit.std[at], 100.0 * now.given.spread[at]
     count = now.series.seen.sum(axis=0)
-    # A bias is told relative to the busbar's meter, which may be off the other way.
+    # A bias is relative to the busbar meter, which may have an error of the opposite sign.
     limit = 100.0 * (site.accuracy.class_fraction + site.accuracy.busbar_class)
     sure = norm.isf(risk / (2.0 * max(at.size, 1)))
 
@@ -137,7 +136,7 @@ def meters(now: Round, risk: float) -> pd.DataFrame:
 def line_table(
     now: Round, tolerance: float, kinds: Collection[Kind]
 ) -> tuple[pd.DataFrame, list[tuple[str, ...]]]:
-    """Length of every line, or lines in series, alone; and the ids of the lines of each row."""
+    """Table of lines: length of each line, or lines in series, alone; and the ids of each row's lines."""
     net, rows = now.net, now.state.tables.lines
     names = [tuple(rows[k].line for k in chain) for chain in net.lines]
     free = np.array([any(name in now.state.lengths for name in chain) for chain in names])
@@ -175,7 +174,7 @@ def final(
     length: pd.DataFrame,
     ids: Sequence[tuple[str, ...]],
 ) -> tuple[pd.DataFrame, tuple[Correction, ...]]:
-    """Proposals, lengths as they were estimated last, and those corrections that are sure."""
+    """Table of proposals, with the last estimates of lengths, and the decided corrections."""
     rows = zip(length.to_dict("records"), ids, strict=True)
     by_line = {name: row for row, chain in rows for name in chain}
     vague = {
@@ -205,7 +204,7 @@ def final(
                 "high": estimate + WIDE * std,
             }
         decided = not row["alternatives"] and wrong.factor >= SHORTEST
-        # A customer's bus and phases belong together: one is not written without the other.
+        # A customer's bus and phases belong together: neither is written without the other.
         decided &= wrong.kind not in PLACES or vague.isdisjoint(wrong.names)
         verdict = EXCLUDED if wrong.kind is Kind.METER else PROPOSED if decided else UNTOLD
         if decided and wrong.kind is not Kind.METER:
@@ -229,7 +228,7 @@ def final(
 def _proposed(wrong: Correction, row: dict[str, Any]) -> str:
     if wrong.kind is Kind.METER:
         when = pd.to_datetime([row["since"], row["until"]], unit="s", utc=True).strftime("%Y-%m-%d %H:%M")
-        return f"its error is another from {when[0]} to {when[1]} UTC"
+        return f"another error from {when[0]} to {when[1]} UTC"
     if wrong.kind is Kind.LENGTH:
         return f"{wrong.factor:.3g} times as long"
     if wrong.exchange:
@@ -238,7 +237,7 @@ def _proposed(wrong: Correction, row: dict[str, Any]) -> str:
 
 
 def _who(wrong: Correction) -> str:
-    """Subject of an error; of a lateral its first line and its customers."""
+    """Subject of an error; for a lateral its first line and its customers."""
     if wrong.exchange:
         on, lines_on = wrong.on
         parts = []
@@ -253,7 +252,7 @@ def _who(wrong: Correction) -> str:
 
 
 def present(tables: FeederTables, wrong: Correction) -> str:
-    """What files say about it."""
+    """Present content of the files for an error."""
     rows = {row.customer: row for row in tables.customers}
     if wrong.kind is Kind.BUS:
         return rows[wrong.names[0]].bus
@@ -270,23 +269,23 @@ def present(tables: FeederTables, wrong: Correction) -> str:
 
 
 def described(wrong: Correction) -> str:
-    """An alternative in a few words."""
-    who = _who(wrong)
+    """Short description of an alternative."""
+    subject = _who(wrong)
     if wrong.kind is Kind.BUS:
-        return f"{who} at {wrong.bus}"
+        return f"{subject} at {wrong.bus}"
     if wrong.exchange:
-        return f"{who} with exchanged phases"
+        return f"{subject} with exchanged phases"
     if wrong.kind is Kind.PHASE:
-        return f"{who} on {wrong.phases}"
-    return {Kind.SWAP: f"{who} swapped", Kind.LENGTH: f"length of {who}"}.get(
-        wrong.kind, f"error of {who} changes"
+        return f"{subject} on {wrong.phases}"
+    return {Kind.SWAP: f"{subject} swapped", Kind.LENGTH: f"length of {subject}"}.get(
+        wrong.kind, f"error of {subject} changes"
     )
 
 
 def customers(
     now: Round, said: Verdict, wrongs: Sequence[Correction], risk: float, kinds: Collection[Kind]
 ) -> pd.DataFrame:
-    """Place of every customer, and which others the readings do not rule out."""
+    """Table of customers: place of every customer, and alternatives that the readings do not exclude."""
     net, right = now.net, _as_filed(now.state.tables, kinds)
     moved = {name for wrong in wrongs if wrong.kind in (*PLACES, Kind.SWAP) for name in wrong.names}
     excluded = {*now.state.excluded}.difference(blind(net.site, now.state.unread))
@@ -323,7 +322,7 @@ def customers(
 
 
 def _as_filed(tables: FeederTables, kinds: Collection[Kind]) -> str:
-    """The verdict on a place against which nothing speaks: of what was not looked for, nothing is known."""
+    """Verdict on a place without evidence against it; kinds that were not searched are named."""
     possible = PLACES if tables.in_phases else (Kind.BUS,)
     missing = [kind for kind in possible if kind not in kinds]
     if len(missing) == len(possible):
@@ -332,7 +331,7 @@ def _as_filed(tables: FeederTables, kinds: Collection[Kind]) -> str:
 
 
 def loads(now: Round) -> pd.DataFrame:
-    """Power factor of every load whose q is not metered, and the gain of its register of p."""
+    """Table of loads: power factor of every load without metered q, and gain of its register of p."""
     model, given, found = now.net.site.loads, now.given, now.fit
     at, gain = given.where["tan"], given.where["p_gain"]
     middle = 0.5 * (model.tan_min + model.tan_max)
@@ -358,13 +357,13 @@ def loads(now: Round) -> pd.DataFrame:
 
 
 def errors(now: Round) -> pd.DataFrame:
-    """Sizes and correlation time of the errors of the customers' powers."""
+    """Table of errors: sizes and correlation time of the errors of the customers' powers."""
     noise, base = now.noise, now.net.site.feeder.base_kva
     named = (
         ("error of p", noise.p * base, "kW"),
         ("error of q", noise.q * base, "kvar"),
         ("correlation time", noise.time_s, "s"),
-        ("noise of meters", noise.white, "of what they promise"),
+        ("noise of meters", noise.white, "of that of the files"),
     )
     return pd.DataFrame(
         [
@@ -387,13 +386,13 @@ def _some(items: Sequence[str]) -> str:
 
 
 MOST_ERRORS: Final = 24
-"""Largest number of errors; with more the files are another feeder's."""
+"""Largest number of errors; with more, the files are those of another feeder."""
 
 MOST_REVISIONS: Final = 3
 """Largest number of re-examinations of all errors; most searches need one."""
 
 Row = dict[str, Any]
-"""One error in plain JSON types, as the journal holds it."""
+"""One error in plain JSON types, for the journal."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -405,7 +404,7 @@ class Found:
     now
         The files with all errors corrected, fitted.
     said
-        Comparison of all further hypotheses there.
+        Comparison of all further hypotheses for these files.
     rows
         The errors, in the order of their corrections.
     """
@@ -423,11 +422,11 @@ class Search:
     files
         The files.
     fitted
-        Fits files that are taken for right.
+        Fits files under the assumption that they are correct.
     weighed
-        Compares all hypotheses at such a fit.
+        Compares all hypotheses for such a fit.
     risk
-        Probability of any proposal if the files are right.
+        Probability of any proposal for correct files.
     kept
         Journal of the steps; an interrupted search resumes from it.
     """
@@ -448,7 +447,7 @@ class Search:
         self._steps = 0
 
     def run(self) -> Found:
-        """Forward steps and re-examinations until both change nothing."""
+        """Forward steps and re-examinations until neither changes anything."""
         found, settled = self._forward(self._files, [])
         for _ in range(MOST_REVISIONS if settled else 0):
             rows = self._revised(found.rows)
@@ -461,7 +460,7 @@ class Search:
         return found
 
     def _after(self, rows: Sequence[Row]) -> State:
-        """The files with these errors corrected."""
+        """Files with these errors corrected."""
         state = self._files
         for row in rows:
             state = state.after(read(row["correction"]))
@@ -484,7 +483,7 @@ class Search:
         return now, verdict, row
 
     def _forward(self, state: State, rows: list[Row]) -> tuple[Found, bool]:
-        """One error after the other; False where the search comes back to files that it has seen."""
+        """Forward steps; False if the search returns to earlier files."""
         been, settled = [self._files, state], True
         for step in range(MOST_ERRORS + 1):
             now, verdict, row = self._step(state)
@@ -492,12 +491,12 @@ class Search:
                 break
             wrong = read(row["correction"])
             if wrong.kind is Kind.METER:
-                # All that was found may rest on this meter's readings: the search restarts without it.
+                # All errors so far may rest on this meter's readings: the search restarts without it.
                 meters = [each for each in rows if each["correction"]["kind"] == Kind.METER]
                 rows = [*meters, row]
                 state = self._after(rows)
             elif any(state.after(wrong).same(before) for before in been):
-                # The readings support each of two places once the other one is taken for right.
+                # The readings support each of two places under the assumption of the other one.
                 rows, settled = [_doubted(each, wrong) for each in rows], False
                 break
             else:
@@ -507,7 +506,7 @@ class Search:
         return Found(now, verdict(), rows), settled
 
     def _revised(self, rows: list[Row]) -> list[Row]:
-        """The errors, each compared again with all others corrected."""
+        """Errors after a new comparison of each, with all others corrected."""
         for row in rows:
             wrong = read(row["correction"])
             alone = [each for each in rows if _same_subject(read(each["correction"]), wrong)]
@@ -517,7 +516,7 @@ class Search:
             try:
                 now, _, again = self._step(self._after(rest))
             except FeederInvalid:
-                continue  # A bus and a phase that need each other cannot be withdrawn alone.
+                continue  # A bus and a phase that require each other cannot be withdrawn alone.
             if again is None:
                 rows = rest
             elif again["correction"]["kind"] != Kind.METER:
@@ -526,17 +525,17 @@ class Search:
 
 
 def _files_of(rows: Sequence[Row]) -> bool:
-    """Any of the errors is one of the files: otherwise nothing has changed since the first comparison."""
+    """True if any error is one of the files; otherwise nothing has changed since the first comparison."""
     return any(row["correction"]["kind"] != Kind.METER for row in rows)
 
 
 def _same_subject(one: Correction, other: Correction) -> bool:
-    """Equal errors, or lengths of the same lines, which are found in several steps."""
+    """True for equal errors, and for lengths of the same lines, which are found in several steps."""
     return one == other or (one.kind is other.kind is Kind.LENGTH and one.names == other.names)
 
 
 def _chained(wrong: Correction, rest: Sequence[Row]) -> bool:
-    """An exchange of meters is relative to others of the same customers: it cannot be withdrawn alone."""
+    """True for an exchange of meters relative to another one: it cannot be withdrawn alone."""
     others = [read(row["correction"]) for row in rest]
     return wrong.kind is Kind.SWAP and any(
         other.kind is Kind.SWAP and set(other.names) & set(wrong.names) for other in others
@@ -544,9 +543,9 @@ def _chained(wrong: Correction, rest: Sequence[Row]) -> bool:
 
 
 def _together(found: list[Row], row: Row, files: FeederTables, bus_of_file: Mapping[str, int]) -> list[Row]:
-    """Errors that do not contradict each other: of a customer's place the last one holds.
+    """Combine errors without contradictions: for a customer's place the last one is valid.
 
-    Its gain includes that of those it replaces. One that leads back to what the files say is none.
+    Its gain includes that of the replaced errors. A correction that restores the files is dropped.
     """
     wrong, gain, rest = read(row["correction"]), row["log_factor"], []
     for each in found:
@@ -561,7 +560,7 @@ def _together(found: list[Row], row: Row, files: FeederTables, bus_of_file: Mapp
 
 
 def _doubted(row: Row, wrong: Correction) -> Row:
-    """An error that cannot be told from another one, if it is about the same customers."""
+    """Add an alternative to an error of the same kind and names."""
     told = read(row["correction"])
     if (told.kind, told.names) != (wrong.kind, wrong.names):
         return row
@@ -569,7 +568,7 @@ def _doubted(row: Row, wrong: Correction) -> Row:
 
 
 def _best(now: Round, said: Verdict, risk: float, files: FeederTables) -> Row | None:
-    """The error that the readings support most; None where they support none."""
+    """Error that the readings support most; None without sufficient evidence."""
     if said.any < math.log(1.0 / risk):
         return None
     best = int(said.kept[0])
@@ -594,12 +593,12 @@ def _best(now: Round, said: Verdict, risk: float, files: FeederTables) -> Row | 
 
 
 def _unread(wrong: Correction, guess: Guess, unread: str) -> list[Correction]:
-    """Phases without a voltage of the busbar to compare with: a single part may be on one of them."""
+    """Alternatives on phases without a voltage of the busbar, for a single part."""
     return [] if guess.exchange else [replace(wrong, phases=phase) for phase in unread]
 
 
 def read(row: Row) -> Correction:
-    """A correction from the plain types of the journal."""
+    """Correction from the plain types of the journal."""
     return Correction(
         Kind(row["kind"]),
         tuple(row["names"]),
@@ -611,48 +610,48 @@ def read(row: Row) -> Correction:
 
 
 class OtherFeeder(InputInvalid):
-    """A folder holds another feeder than the one that was studied."""
+    """A folder holds another feeder than the studied one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibrate:
-    """What `calibrate` found.
+    """Result of `calibrate`.
 
     Attributes
     ----------
     feeder, digest
-        The feeder's name, and its content.
+        Name and content digest of the feeder.
     frames, span_h
-        How many moments were compared, and over what time, h.
+        Number of frames, and their time span, h.
     risk
-        Probability of any proposal if the files are right.
+        Probability of any proposal for correct files.
     meters
         One row for each meter: `meter`, `customer`, `frames` (readings used), `bias_percent`, `std_percent`,
-        `low_percent`, `high_percent` (95 %; of the voltage, relative to the busbar's meter: an error that all
-        have in common cannot be told), `verdict`.
+        `low_percent`, `high_percent` (95 %; of the voltage, relative to the busbar meter: a common error of
+        all meters cannot be determined), `verdict`.
     lines
         One row for each line, or lines in series: `lines`, `from_bus`, `to_bus`, `factor`, `std`, `low`,
-        `high` (of the length in the files, if all others are right), `same` (lines whose effect is the same),
+        `high` (of the length in the files, if all others are correct), `same` (lines with the same effect),
         `verdict`.
     customers
         One row for each customer: `customer`, `meter`, `bus`, `phases` (as corrected), `alternative` (the
-        best other place), `log_factor` (of it against this one), `open` (places that are not ruled out),
+        best other place), `log_factor` (of it against this one), `open` (places that are not excluded),
         `verdict`.
     loads
         One row for each customer: `customer`, `power_factor`, `low`, `high`, `p_gain_percent`,
         `p_gain_std_percent`, `verdict`.
     errors
         `quantity`, `estimate`, `low`, `high`, `unit`, `verdict`: standard deviations and correlation time of
-        the errors of the customers' powers, and the meters' noise relative to what they promise.
+        the errors of the customers' powers, and the meters' noise relative to the files.
     proposals
-        What to correct, in the order it was found: `kind`, `what` (of a lateral its first line and its
-        customers), `now`, `proposed`, `estimate`, `std` (of a length, the factor; otherwise how much of the
-        proposed change the readings show: 1 is all), `low`, `high`, `log_factor` (gain of the
-        log-likelihood), `confidence`, `verdict`, `alternatives`.
+        Proposals in the order of the search: `kind`, `what` (for a lateral its first line and its customers),
+        `now`, `proposed`, `estimate`, `std` (of a length, the factor; otherwise the share of the proposed
+        change in the readings: 1 is all), `low`, `high`, `log_factor` (gain of the log-likelihood),
+        `confidence`, `verdict`, `alternatives`.
     corrections
-        The proposals that are sure, in the words of the files.
+        Decided proposals, as corrections of the files.
     unread
-        Phases of which the busbar has no voltage: the meters on them are left out.
+        Phases without a voltage of the busbar; the meters on them are left out.
     """
 
     feeder: str
@@ -676,31 +675,31 @@ class Calibrate:
         return {name: getattr(self, name) for name in names}
 
     def corrected(self, site_folder: Path | str, out: Path | str) -> None:
-        """Write a corrected copy of a feeder's folder; only what is sure is corrected.
+        """Write a copy of a feeder's folder with the decided corrections.
 
         Parameters
         ----------
         site_folder
-            The feeder that was studied: its folder, or its name.
+            Folder or name of the studied feeder.
         out
             A new or empty folder.
 
         Raises
         ------
         OtherFeeder
-            If it is not the feeder that was studied.
+            If it is not the studied feeder.
         FileExistsError
-            If there is something in the folder.
+            If the folder is not empty.
         FeederInvalid, OSError
-            If it cannot be read or written.
+            If the feeder cannot be read or written.
         """
         tables, target = find(site_folder), Path(out)
         if digest(tables) != self.digest:
             raise OtherFeeder(
-                [Problem("other-origin", f"{site_folder}: not the feeder that was studied, or changed since")]
+                [Problem("other-origin", f"{site_folder}: not the studied feeder, or changed since")]
             )
         if target.exists() and (not target.is_dir() or any(target.iterdir())):
-            raise FileExistsError(f"{target}: already there; a corrected copy goes into a new folder")
+            raise FileExistsError(f"{target}: is not empty; expected a new folder")
         for wrong in self.corrections:
             tables = apply(tables, wrong)
         write(tables, target)
@@ -726,31 +725,32 @@ def calibrate(
     readings
         A recording, a table with its columns, or a Parquet or CSV file.
     risk
-        Probability of any proposal if the files are right, 0 to 1.
+        Probability of any proposal for correct files, 0 to 1.
     tolerance
-        Relative error (1 sigma) of lines' lengths that is no mistake.
+        Relative error (1 sigma) of lines' lengths that counts as correct.
     exclude
-        Meters that are not trusted. Their powers are still believed.
+        Meters with voltages that are not used; their powers are used.
     kinds
-        Which errors to look for; fewer take less time, and what is not looked for may pass for another.
+        Kinds of errors to search; fewer take less time, and an error of another kind may pass for one of
+        these.
     journal
-        File in which each error that is found is kept; an interrupted study goes on from it.
+        File for each error found; an interrupted study resumes from it.
     progress
-        Told how much of the present comparison is done.
+        Called with (done, total) of the present comparison.
 
     Raises
     ------
     RecordingInvalid
-        If the readings are another feeder's, name unknown meters, lack the busbar, are hardly in V, kW and
-        kvar, or are too few.
+        For readings of another feeder or of unknown meters, without the busbar, in other units than V, kW and
+        kvar, or too few.
     ValueError
-        If there is no such meter, or a number is out of range.
+        For an unknown meter, or a number out of range.
     FeederInvalid
         If closed lines form loops in three phases.
     OtherStudy
-        If the journal is another study's.
+        If the journal is that of another study.
     InUse
-        If another process is writing it.
+        If another process writes the journal.
     """
     problems = wrong_numbers(risk, tolerance)
     if unknown := sorted(set(exclude) - set(site.meter_ids)):
@@ -791,12 +791,12 @@ def calibrate(
 
 
 def wrong_numbers(risk: float, tolerance: float) -> list[Problem]:
-    """Return what is wrong with numbers of a calibration.
+    """Problems of the numbers of a calibration.
 
     Parameters
     ----------
     risk, tolerance
-        As `calibrate` takes them.
+        As in `calibrate`.
     """
     problems = []
     if not 0.0 < risk < 1.0:
@@ -809,7 +809,7 @@ def wrong_numbers(risk: float, tolerance: float) -> list[Problem]:
 
 
 def _quiet(done: int, total: int) -> None:
-    """Tell nobody."""
+    """Progress without effect."""
 
 
 def _subject(site: Site | ThreePhaseSite, given: Frames, risk: float, tolerance: float) -> dict[str, Any]:

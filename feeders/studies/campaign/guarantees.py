@@ -1,8 +1,8 @@
 """Test of the sizes that `detectable` guarantees by simulated attacks and in campaigns.
 
-Every trial draws errors of loads, meters and busbar anew, Gaussian in even trials and as bounded as their
-standard deviations allow in odd ones, solves the feeder with its inverters at rest, and lets the monitor
-watch a few honest frames and then the lie.
+Every trial draws errors of loads, meters and busbar: Gaussian in even trials, uniform with the same standard
+deviations in odd ones. The feeder is solved with its inverters in equilibrium. The monitor processes some
+honest frames and then the attack.
 """
 
 from __future__ import annotations
@@ -38,25 +38,25 @@ __all__ = ["Rehearsal", "promised", "rehearse", "rehearse_everywhere"]
 
 
 _HONEST, _LYING = 4, 16
-"""Frames before and after a lie begins."""
+"""Number of frames before and after the onset of an attack."""
 _SETTLING = 25
-"""Rounds in which inverters come to rest; their loop gain is below one."""
+"""Iterations to the inverters' equilibrium; their loop gain is below one."""
 
 
 @dataclass(frozen=True, slots=True)
 class Rehearsal:
-    """What became of lies of the promised sizes.
+    """Outcome of attacks of the guaranteed sizes.
 
     Attributes
     ----------
     trials
-        How many of each kind.
+        Number of trials of each kind.
     hidden_named
-        Trials with a lie of at most the hidden size after which somebody was named.
+        Trials with an attack of at most the hidden size and a named meter.
     large_missed
-        Trials with a lie of at least the named size in which its meter was not named.
+        Trials with an attack of at least the named size and its meter not named.
     honest_named
-        Of the latter, those in which a meter that did not lie was named.
+        Of the latter, those with an honest meter named.
     """
 
     trials: int
@@ -66,7 +66,7 @@ class Rehearsal:
 
     @property
     def table(self) -> pd.DataFrame:
-        """All of it as a table of one row."""
+        """Result as a table of one row."""
         return pd.DataFrame([asdict(self)])
 
 
@@ -80,32 +80,32 @@ def rehearse(
     journal: Where = None,
     progress: Progress | None = None,
 ) -> Rehearsal:
-    """Let the monitor watch lies at the limits that were found, by M meters and by one.
+    """Simulate the monitor under attacks at the limits found, by M meters and by one.
 
-    Hidden lies are the worst of their size: those of the mixed-integer program. Large ones are told by one
-    meter beyond its size; in every second trial M - 1 others lie as well, by anything up to twice of that.
+    Hidden attacks are the worst of their size, from the mixed-integer program. Large ones are on one meter,
+    beyond its size. In every second trial M - 1 other meters are attacked as well, by up to twice their size.
 
     Parameters
     ----------
     site, found
-        The feeder, and what was found for it.
+        The feeder, and the result of `detectable`.
     trials
-        How many of each kind.
+        Number of trials of each kind.
     seed
-        Chooses everything random.
+        Seed of all random numbers.
     share
-        As `found` was made with.
+        As for `found`.
     journal
-        File in which finished trials are kept; an interrupted rehearsal goes on from it, also to more trials.
+        File of finished trials; an interrupted run resumes from it, also with more trials.
     progress
-        Told how many trials are done.
+        Called with (done, total) trials.
 
     Raises
     ------
     OtherStudy
-        If the journal is another study's.
+        If the journal is that of another study.
     InUse
-        If another process is writing it.
+        If another process writes the journal.
     """
     sizes = [float(size) for name in ("hidden", "named", "named_alone") for size in found.meters[name]]
     told = {"max_attacked": found.max_attacked, "risk": found.risk, "sizes": sizes}
@@ -130,7 +130,7 @@ def rehearse(
 
 
 def _large(site: Site, found: Detectable, rng: np.random.Generator, j: int, *, together: bool) -> Floats:
-    """A lie of meter j beyond its named size, and others in collusion; squared pu."""
+    """Attack on meter j beyond its named size, and on others in collusion; squared pu."""
     column = "named" if together else "named_alone"
     sizes = squared(site.customer_volt[site.meters], found.meters[column].to_numpy())
     lies = np.zeros(sizes.size)
@@ -142,7 +142,7 @@ def _large(site: Site, found: Detectable, rng: np.random.Generator, j: int, *, t
 
 
 def _named(given: Rule, site: Site, share: float, rng: np.random.Generator, lies: Floats) -> Bools:
-    """Who is named in one trial."""
+    """Mask of the meters named in one trial."""
     design = given.design
     frame = _world(given, site, share, rng)
     state = sequential.init(design, 0.0)
@@ -156,7 +156,7 @@ def _named(given: Rule, site: Site, share: float, rng: np.random.Generator, lies
 
 
 def _world(given: Rule, site: Site, share: float, rng: np.random.Generator) -> Callable[[int, Floats], Frame]:
-    """Frames of a feeder at rest whose true powers, busbar and meters are off by fixed errors."""
+    """Frames of a feeder in equilibrium, with fixed errors of true powers, busbar and meters."""
     design, doubt, loads = given.design, given.design.doubt, site.loads
     accuracy, own = site.accuracy, site.droop.customer
     draw = _bounded if rng.integers(2) else _gaussian
@@ -196,7 +196,7 @@ def _world(given: Rule, site: Site, share: float, rng: np.random.Generator) -> C
 def _errors(
     doubt: LoadDoubt, draw: Callable[[np.random.Generator, int], Floats], rng: np.random.Generator
 ) -> tuple[Floats, Floats]:
-    """What the powers are off, pu, (N,) each."""
+    """Errors of the powers, pu, (N,) each."""
     own = [
         np.sqrt(1.0 - common) * draw(rng, std.size) + np.sqrt(common) * draw(rng, 1)
         for std, common in ((doubt.p, doubt.common_p), (doubt.q, doubt.common_q))
@@ -216,37 +216,37 @@ def _bounded(rng: np.random.Generator, size: int) -> Floats:
 
 
 PIECE = 1_000
-"""Trials of a piece."""
+"""Trials per piece of work."""
 
 HIDDEN, NAMED = (0.5, 1.0), (1.0, 1.2)
-"""Factors on the sizes up to which lies stay hidden, and beyond which liars are named."""
+"""Factors on the sizes of attacks to stay hidden, and of attacks to be named."""
 
 NOTHING = 1e-6
-"""What a solver leaves where nobody lies, V."""
+"""Numerical error of a solver for zero, V."""
 
 
 def promised(site: Site, found: Detectable, *, share: float = SHARE) -> tuple[Kind, ...]:
-    """Lies of the sizes that `detectable` found, in a campaign.
+    """Attacks of the sizes of `detectable`, for a campaign.
 
     Parameters
     ----------
     site
-        The feeder, as stated: with the campaign's errors of loads and meters.
+        The feeder, with the campaign's errors of loads and meters.
     found
-        What was found for it.
+        Result of `detectable` for it.
     share
-        As `found` was made with.
+        As for `found`.
 
     Returns
     -------
     hidden_alone, hidden
-        One meter, and M of them in the worst collusion of this size; nobody is to be named.
+        One meter, and M meters in the worst collusion of this size; no device is to be named.
     named_alone, named
-        One meter, and any M of them, each by its size; all are to be named.
+        One meter, and any M meters, each by its size; all are to be named.
 
     Notes
     -----
-    For M = 1 there are only those alone, and where no lie stays hidden for sure there are none of these.
+    For M = 1 there are only attacks on one meter. Kinds without an attack of guaranteed outcome are left out.
     """
     most, alone = found.max_attacked, (1,)
     kinds = [
@@ -267,7 +267,7 @@ def _volts(found: Detectable, column: str) -> tuple[float, ...]:
 
 
 def _collusions(site: Site, found: Detectable, share: float) -> tuple[tuple[float, ...], ...]:
-    """Lies of all meters, V: for each of them the worst that stay hidden although it takes part."""
+    """Attacks on all meters, V: for each meter the worst hidden one with this meter in it."""
     rule, p = monitor_rule(site, risk=found.risk, share=share), site.meters.size
     worst = [largest_shift(rule, np.eye(p)[j], found.max_attacked, seen=False, must=j).lies for j in range(p)]
     base = site.customer_volt[site.meters]
@@ -288,31 +288,31 @@ def rehearse_everywhere(
     journal: Where = None,
     progress: Progress | None = None,
 ) -> Rehearsal:
-    """As `guarantees.rehearse`, in pieces that are worked on anywhere.
+    """`guarantees.rehearse` in pieces, for any runner.
 
     Parameters
     ----------
     site, found, trials, share
-        As `rehearse`.
+        As in `rehearse`.
     seed
-        Chooses everything random; piece k has the seed `seed + k piece` of its own.
+        Seed of all random numbers; piece k has the seed `seed + k piece`.
     runner
-        Where; see `feeders.studies.workers`.
+        Runner of the pieces, see `feeders.studies.workers`.
     piece
-        Trials of a piece.
+        Trials per piece.
     journal
-        File in which finished pieces are kept.
+        File of finished pieces.
     progress
-        Told how many trials are done.
+        Called with (done, total) trials.
 
     Raises
     ------
     OtherStudy
-        If the journal is another study's.
+        If the journal is that of another study.
     InUse
-        If another process is writing it.
+        If another process writes the journal.
     ClusterUnusable, WorkerLost
-        From the runner; what is finished is in the journal.
+        From the runner; finished pieces are in the journal.
     """
     subject = {
         "study": "rehearsal",

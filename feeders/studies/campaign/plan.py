@@ -1,7 +1,8 @@
-"""What a campaign of simulated attacks consists of: scenes, and the cases that are played in each of them.
+"""Plan of a campaign of simulated attacks: scenes, and their scenarios.
 
-A scene is a moment of the profiles with errors of loads and meters of its own. All its cases begin alike, and
-differ from their onsets on. Everything random follows from the plan's seed and the numbers of scene and case.
+A scene is a moment of the profiles with errors of loads and meters of its own. All its scenarios begin equal,
+and differ from their onsets on. Everything random follows from the plan's seed and the numbers of scene and
+scenario.
 """
 
 from __future__ import annotations
@@ -33,69 +34,70 @@ if TYPE_CHECKING:
 __all__ = ["CLEAN", "KINDS", "LEARN_STEP_S", "Case", "Design", "Kind", "Moment", "Place", "Plan", "Promise"]
 
 CLEAN: Final = "clean"
-"""Name of the kind of case in which nobody lies."""
+"""Kind of the scenario without an attack."""
 
 
 LEARN_STEP_S: Final = 10.0
-"""Interval of the readings from which meters' fixed errors are learned, s, unless readings are rarer."""
+"""Interval of the readings for learning of fixed errors, s, unless readings are rarer."""
 
 
 class Place(StrEnum):
-    """Which meters lie."""
+    """Choice of the manipulated meters."""
 
     RANDOM = "random"
-    """Any."""
+    """Any meters."""
     STREET = "street"
-    """A random one and those that are electrically nearest to it."""
+    """A random meter and those electrically nearest to it."""
     SENSITIVE = "sensitive"
-    """Those that loads move most: at the far ends."""
+    """Meters with the largest sensitivity to loads: at the far ends."""
     COLLUDING = "colluding"
-    """Those that a load at a random customer moves most, all in the same direction."""
+    """Meters with the largest sensitivity to a load at a random customer, all in the same direction."""
 
 
 class Design(StrEnum):
-    """How cases are chosen from all combinations of kind, size, number of liars and place."""
+    """Choice of scenarios from all combinations of kind, size, number of manipulated devices and place."""
 
     FACTORIAL = "factorial"
     """All combinations in random order, then all of them again."""
     RANDOM = "random"
-    """Any, independently."""
+    """Independent random combinations."""
 
 
 class Promise(StrEnum):
-    """What `detectable` says of lies of a size."""
+    """Guarantees of `detectable` for attacks of a size."""
 
     HIDDEN = "hidden"
-    """Nobody is named because of it."""
+    """No device is named because of the attack."""
     NAMED = "named"
-    """Each liar is named."""
+    """Each manipulated meter is named."""
 
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """One way to lie.
+    """Kind of attack.
 
     Attributes
     ----------
     name
-        In the tables.
+        Name in the tables.
     trick
-        What liars do.
+        Manipulation of the devices.
     sizes
-        As `feeders.simulation.attacks.Lie.size`; with `volts`, as factors on these.
+        As `feeders.simulation.attacks.Lie.size`; with `volts`, factors on these.
     volts
-        A bias of each meter, V; empty: sizes are the same for all meters.
+        Bias of each meter, V; empty: the same size for all meters.
     together
-        Biases of all meters, V, of which one tuple is drawn, and a sign; who lies, it says itself.
+        Tuples with a bias of each meter, V. One tuple and a sign are drawn; its nonzero entries are the
+        manipulated meters.
     liars
-        How many lie; empty: as the plan says.
+        Numbers of manipulated devices; empty: those of the plan.
     promise
-        What is to become of such lies, if anything is promised.
+        Guaranteed outcome of such attacks, or None.
 
     Raises
     ------
     ValueError
-        If there is no such trick or no size, the name is taken, or volts are given for no bias.
+        For an unknown manipulation, no size, a reserved name, or volts for other than a bias.
     """
 
     name: str
@@ -123,7 +125,7 @@ class Kind:
             )
 
     def every(self, step_s: float) -> Kind:
-        """The same where readings come every so many seconds: ages and rates are counted in readings.
+        """Kind for another interval of the readings: ages and rates are counted in readings.
 
         Parameters
         ----------
@@ -142,19 +144,19 @@ KINDS: Final = (
     Kind("replay", Trick.REPLAY, (60.0,)),
     Kind("coordinated", Trick.COORDINATED, (1.0, 3.0)),
 )
-"""What a campaign consists of where nothing else is said."""
+"""Default kinds of a campaign."""
 
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """When a scene is, and what its random numbers are.
+    """Time and random numbers of a scene.
 
     Attributes
     ----------
     season, profile_s
-        Which profiles, and the position within them, s.
+        Season of the profiles, and position within them, s.
     seed
-        Of loads, busbar and meters.
+        Seed of loads, busbar and meters.
     """
 
     season: Season
@@ -169,13 +171,13 @@ class Case:
     Attributes
     ----------
     number
-        From 0.
+        Number, from 0.
     kind, size, liars, place
-        The combination; kind CLEAN: nobody lies.
+        The combination; kind CLEAN: no attack.
     onset_s
-        When lies begin, s after the beginning of the scene.
+        Onset of the attack, s after the begin of the scene.
     seed
-        Chooses the liars and their signs.
+        Seed of the manipulated devices and their signs.
     """
 
     number: int
@@ -189,43 +191,42 @@ class Case:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """A campaign. The defaults are 160 scenarios of ten minutes; `Plan.of` takes what it can from the files.
+    """Campaign. The defaults are 160 scenarios of ten minutes; `Plan.of` uses the settings of the files.
 
     Attributes
     ----------
     scenes, together
-        How many scenes, and how many scenarios in each, of which the first is without a lie.
+        Number of scenes, and number of scenarios in each; the first scenario has no attack.
     seed
-        Chooses everything random.
+        Seed of all random numbers.
     kinds, liars, places, design
-        What is combined, and how.
+        Kinds, numbers of manipulated devices and places to combine, and the choice of combinations.
     duration_s, step_s
         Length of a scenario and interval of its frames, s.
     onset_s
-        Between which times lies begin, s.
+        Earliest and latest onset of attacks, s.
     lying_s
-        How long they last at most, s.
+        Largest duration of attacks, s.
     settling_s
-        How long after an onset errors of the voltage do not count yet, s.
+        Settling time after an onset, without errors of the voltage, s.
     seasons
-        Whose profiles are drawn from.
+        Seasons of the profiles.
     estimator
-        Name of an estimator family.
+        Name of an estimator.
     alarms_per_year
-        False alarms that the estimator may raise in a year; every case is watched once for each.
+        False-alarm rates of the estimator, 1/year; every scenario is monitored once for each.
     learn_s
-        How long the estimator has learned its meters' fixed errors before each scene, from honest readings
-        every `learn_step_s`; 0: not at all.
+        Learning time of the meters' fixed errors before each scene, s, from honest readings every
+        `learn_step_s`; 0: no learning.
     settings
         Other settings of the feeder's `[monitor]`, by name.
     meters, load_error, variation, report_q
-        As in `feeders.simulation.trial.Trial`; no `load_error`: as the feeder's files say.
+        As in `feeders.simulation.trial.Trial`; without `load_error`, the errors of the feeder's files.
 
     Raises
     ------
     ValueError
-        If there is no such place, season, design or kind of meters, or numbers cannot be meant; these are
-        named at once.
+        For an unknown place, season, design or kind of meters, or invalid numbers, all of which are reported.
     """
 
     scenes: int = 10
@@ -265,13 +266,16 @@ class Plan:
             ),
             (Problem("negative", "the seed must not be negative"), self.seed < 0),
             (
-                Problem("missing", "there are no kinds of lies, numbers of liars or places"),
+                Problem("missing", "there are no kinds of attack, numbers of manipulated devices or places"),
                 not self._combined and self.together > 1,
             ),
-            (Problem("not-positive", "numbers of liars must be positive"), min((*self.liars, 1)) < 1),
+            (
+                Problem("not-positive", "numbers of manipulated devices must be positive"),
+                min((*self.liars, 1)) < 1,
+            ),
             (Problem("missing", "there are no seasons"), not self.seasons),
             (
-                Problem("duplicate", "kinds of lies need different names"),
+                Problem("duplicate", "kinds of attack need different names"),
                 len({k.name for k in self.kinds}) < len(self.kinds),
             ),
             (
@@ -288,7 +292,7 @@ class Plan:
                 0.0 != self.learn_s < self.learn_step_s,
             ),
             (
-                Problem("out-of-range", "lies must begin after the first frame and before the last"),
+                Problem("out-of-range", "attacks must begin after the first frame and before the last"),
                 not self.step_s <= self.onset_s[0] <= self.onset_s[1] <= self.duration_s - self.step_s,
             ),
             (
@@ -304,17 +308,19 @@ class Plan:
 
     @classmethod
     def of(cls, site: Site, **chosen: Any) -> Plan:
-        """A campaign as the feeder's files say, but for what is chosen.
+        """Campaign with the settings of the feeder's files, except for the given attributes.
 
-        Estimator, interval of readings and false alarms are those of `[monitor]`, and powers are known as in
-        service. Times are counted in readings: where these come every second, those of `Plan()`.
+        Estimator, interval of readings and false alarms are those of `[monitor]`, and powers have the
+        uncertainty of the service. Times are counted in readings: with one reading per second they are those
+        of `Plan()`.
 
         Parameters
         ----------
         site
             The feeder.
         chosen
-            Attributes by name. With a `duration_s`, lies begin after 0.1 to 0.3 of it and last for half.
+            Attributes by name. With a `duration_s`, attacks begin after 0.1 to 0.3 of it and last for half of
+            it.
         """
         monitor, usual = site.tables.meta.monitor, cls()
         step_s = float(chosen.get("step_s", monitor.tick_s))
@@ -334,17 +340,17 @@ class Plan:
 
     @property
     def scenarios(self) -> int:
-        """How many scenarios there are."""
+        """Number of scenarios."""
         return self.scenes * self.together
 
     @property
     def learn_step_s(self) -> float:
-        """Interval of the readings from which fixed errors are learned, s."""
+        """Interval of the readings for learning of fixed errors, s."""
         return max(LEARN_STEP_S, self.step_s)
 
     @property
     def _combined(self) -> list[tuple[Kind, float, int, Place]]:
-        """Every combination of kind, size, number of liars and place, which for some kinds is given."""
+        """Every combination of kind, size, number of devices and place; some kinds determine their places."""
         return [
             (kind, size, count, place)
             for kind in self.kinds
@@ -354,12 +360,12 @@ class Plan:
         ]
 
     def moment(self, scene: int) -> Moment:
-        """When a scene is.
+        """Time of a scene.
 
         Parameters
         ----------
         scene
-            Its number.
+            Number of the scene.
         """
         random = np.random.default_rng([self.seed, _MOMENT, scene])
         season = self.seasons[int(random.integers(len(self.seasons)))]
@@ -367,12 +373,12 @@ class Plan:
         return Moment(season, float(random.uniform(0.0, t[-1])), int(random.integers(2**31)))
 
     def cases(self, scene: int) -> list[Case]:
-        """What is played in a scene; first that nobody lies.
+        """Scenarios of a scene, the first without an attack.
 
         Parameters
         ----------
         scene
-            Its number.
+            Number of the scene.
         """
         first = scene * self.together
         found = [Case(first, CLEAN, 0.0, 0, "", self.duration_s, (self.seed, first))]
@@ -380,7 +386,7 @@ class Plan:
         low, high = (round(t / self.step_s) for t in self.onset_s)
         for number in range(first + 1, first + self.together):
             random = np.random.default_rng([self.seed, _CASE, number])
-            attack = number - scene - 1  # of the attacks only
+            attack = number - scene - 1  # number among the attacks
             kind, size, count, place = combined[self._chosen(attack, len(combined), random)]
             onset_s = self.step_s * int(random.integers(low, high, endpoint=True))
             seed = (self.seed, _LIARS, number)
@@ -395,18 +401,18 @@ class Plan:
         return int(order[place])
 
     def kind(self, name: str) -> Kind:
-        """The kind of this name."""
+        """Kind of this name."""
         return next(kind for kind in self.kinds if kind.name == name)
 
     def trial(self, site: Site, moment: Moment) -> Trial:
-        """A scene in which nobody lies, but for its season.
+        """Scene without an attack, without its season.
 
         Parameters
         ----------
         site
             The feeder.
         moment
-            When it is.
+            Time of the scene.
         """
         return Trial(
             site,
@@ -421,26 +427,26 @@ class Plan:
         )
 
     def watched(self, stated: Site, alarms_per_year: float) -> Site:
-        """The feeder as the estimator is designed for it.
+        """Feeder with the settings of the estimator's design.
 
         Parameters
         ----------
         stated
-            The feeder whose files say what a scene does.
+            The feeder with the scene's errors of loads and meters.
         alarms_per_year
-            One of the plan's.
+            One of the plan's rates.
 
         Raises
         ------
         ValueError
-            If there is no such setting, or it is a whole number and not given one.
+            For an unknown setting, or a fraction for an integer.
         FeederInvalid
-            If a setting has a value that it cannot have.
+            For a setting out of range.
         """
         meta = stated.tables.meta
         refuse(wrong_settings(stated, self.settings))
         known = asdict(meta.monitor)
-        # A whole number stays one, whatever the setting was written as.
+        # An integer setting stays one, in any spelling.
         chosen = {name: type(known[name])(value) for name, value in self.settings}
         if self.learn_s:
             chosen["commission_s"] = self.learn_s
@@ -449,24 +455,18 @@ class Plan:
 
     @property
     def subject(self) -> dict[str, Any]:
-        """The plan as JSON has it."""
+        """Plan in plain JSON types."""
         told: dict[str, Any] = json.loads(json.dumps(plain(asdict(self))))
         return told
 
 
 def wrong_settings(site: Site, settings: Iterable[tuple[str, float]]) -> list[Problem]:
-    """Return what is wrong with settings of `[monitor]`, one sentence each.
-
-    Parameters
-    ----------
-    site, settings
-        The feeder, and settings by name.
-    """
+    """Problems of settings of `[monitor]`, one sentence each."""
     known = asdict(site.tables.meta.monitor)
     problems = []
     for name, value in settings:
         if name not in known or name in ("estimator", "tick_s", "alarms_per_year"):
-            problems.append(Problem("unknown-name", f"{name!r} is no setting of an estimator"))
+            problems.append(Problem("unknown-name", f"{name!r} is not a setting of an estimator"))
         elif isinstance(known[name], int) and not float(value).is_integer():
             problems.append(Problem("not-integer", f"{name} is {value}; expected a whole number"))
     return problems
@@ -475,7 +475,7 @@ def wrong_settings(site: Site, settings: Iterable[tuple[str, float]]) -> list[Pr
 # Streams of random numbers.
 _MOMENT, _CASE, _ORDER, _LIARS = range(4)
 
-# The trace of a load that is not there says itself who lies, and inverters have no such places.
+# The trace of a false load determines its meters, and inverters have no such places.
 _PLACED = (Trick.COORDINATED, Trick.COORDINATED_POWER, Trick.INVERTER)
 
 

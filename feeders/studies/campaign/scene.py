@@ -1,8 +1,8 @@
-"""One scene of a campaign: cases with their attacks, played against AC power flow.
+"""One scene of a campaign: scenarios with their attacks, simulated with AC power flow.
 
-Until its onset a case is to the last bit the scene without lies: that is watched once, and each case goes on
-from the state in which the estimator then is; states are values. Lies of meters do not change the truth:
-it is computed once for each scene; what inverters do, and powers that are told wrong, are played in full.
+Until its onset a scenario equals the scene without an attack to the last bit. That part is monitored once,
+and each scenario continues from the estimator's state. The truth is computed once for each scene; attacks on
+inverters and false powers are simulated in full.
 """
 
 from __future__ import annotations
@@ -54,25 +54,26 @@ __all__ = ["Prepared", "attacks", "liars", "prepare", "risings", "watch"]
 def attacks(
     site: Site, plan: Plan, case: Case, honest: Scenario
 ) -> tuple[tuple[Attack, ...], tuple[InverterAttack, ...]]:
-    """Turn a case into attacks.
+    """Build the attacks of a scenario.
 
     Parameters
     ----------
     site, plan, case
-        The feeder, and what is to happen; somebody lies.
+        The feeder, the campaign, and a scenario with an attack.
     honest
-        The scene without it.
+        The scene without the attack.
 
     Raises
     ------
     NoSuchAttack
-        When the feeder has too few meters or inverters, or no place for a load that does not exist.
+        For too few meters or inverters, or without a place for a false load.
     """
     kind, random = plan.kind(case.kind), np.random.default_rng(case.seed)
     there = site.droop.tau.size if kind.trick is Trick.INVERTER else site.meters.size
     if case.liars > there:
         raise NoSuchAttack(
-            f"{site.feeder.name} has {there} of what {case.liars} should lie", code="too-few-meters"
+            f"{site.feeder.name} has {there} of these devices; cannot manipulate {case.liars}",
+            code="too-few-meters",
         )
     t_on = honest.start + case.onset_s
     t_off = honest.start + min(case.onset_s + plan.lying_s, plan.duration_s)
@@ -104,26 +105,26 @@ def attacks(
 
 
 def liars(site: Site, case: Case, random: np.random.Generator) -> tuple[Ints, Floats]:
-    """Choose who lies by a case's rule.
+    """Choose the manipulated meters by a scenario's rule.
 
     Parameters
     ----------
     site, case
-        The feeder, and what is to happen.
+        The feeder, and the scenario.
     random
-        Chooses.
+        Random generator.
 
     Returns
     -------
     meters : (k,)
-        Who lies, ascending.
+        Manipulated meters, ascending.
     signs : (k,)
-        In which direction.
+        Sign of each attack.
 
     Raises
     ------
     NoSuchAttack
-        When no load is felt by so many meters.
+        If no load affects that number of meters.
     """
     p, count = site.meters.size, case.liars
     signs: Floats = random.choice([-1.0, 1.0], count)
@@ -131,7 +132,7 @@ def liars(site: Site, case: Case, random: np.random.Generator) -> tuple[Ints, Fl
         return np.sort(random.choice(p, count, replace=False)).astype(np.intp), signs
     R, X = (between(site.feeder, power) for power in Power)
     if case.place == Place.SENSITIVE:
-        # What loads of equal and independent uncertainty do to each voltage.
+        # Effect of loads with equal and independent uncertainty on each voltage.
         felt = np.sqrt((R**2).sum(axis=1) + (X**2).sum(axis=1))
         return most_affected(felt[site.meters], count), signs
     if case.place == Place.STREET:
@@ -143,11 +144,11 @@ def liars(site: Site, case: Case, random: np.random.Generator) -> tuple[Ints, Fl
         some = most_affected(pattern, count)
         if pattern[some].min() > 0.0:
             return some, np.full(count, signs[0])
-    raise NoSuchAttack(f"{site.feeder.name} has no load that {count} meters feel")
+    raise NoSuchAttack(f"{site.feeder.name} has no load with an effect on {count} meters")
 
 
 def _nearest(R: Floats, meters: Ints, one: int, count: int) -> Ints:
-    """A meter and those with the least resistance between them and it."""
+    """A meter and those with the smallest resistance to it."""
     own = np.diagonal(R)[meters]
     apart = own[one] + own - 2.0 * R[meters[one], meters]
     apart[one] = -1.0
@@ -164,7 +165,7 @@ def _story(
     t_off: float,
     power: bool,
 ) -> Attack:
-    """The trace of a load at the first customer, in random order, who could draw it."""
+    """Trace of a load at the first possible customer, in random order."""
     why: NoSuchAttack | None = None
     for customer in random.permutation(site.meters):
         try:
@@ -179,12 +180,12 @@ def _story(
 ERROR_PERCENTILE = 95.0
 
 IMPOSSIBLE = (NoSuchAttack, PowerFlowDiverged, NoEquilibrium)
-"""What keeps a case from being played, and the others not."""
+"""Errors that prevent one scenario, and not the others."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prepared:
-    """What all scenes of a campaign share.
+    """Common data of all scenes of a campaign.
 
     Attributes
     ----------
@@ -193,11 +194,11 @@ class Prepared:
     plan
         The campaign.
     stated
-        The feeder whose files say how wrong loads and meters are.
+        The feeder with the errors of loads and meters.
     watchers
-        By false-alarm rate.
+        Designed estimators by false-alarm rate.
     learners
-        The same, with the interval of the readings that they learn from; none where nothing is learned.
+        The same for the interval of the readings for learning; empty without learning.
     """
 
     site: Site
@@ -218,7 +219,7 @@ def prepare(site: Site, plan: Plan) -> Prepared:
     Raises
     ------
     NotObservable, DesignInfeasible, EstimatorUnusable, FeederInvalid, ValueError
-        If the estimator cannot watch this feeder with these settings.
+        If the estimator cannot monitor this feeder with these settings.
     """
     scene = plan.trial(site, plan.moment(0))
     watchers = _designed(plan, scene.stated)
@@ -235,19 +236,19 @@ def _designed(plan: Plan, stated: Site) -> dict[float, Watcher]:
 
 
 def watch(given: Prepared, scene: int) -> list[dict[str, Any]]:
-    """Play and watch all cases of one scene.
+    """Simulate and monitor all scenarios of one scene.
 
     Parameters
     ----------
     given
         From `prepare`.
     scene
-        Its number.
+        Number of the scene.
 
     Returns
     -------
     list of dict
-        One for each case and false-alarm rate; values that JSON can hold. See `study.Campaign`.
+        One for each scenario and false-alarm rate, in plain JSON types. See `study.Campaign`.
     """
     plan, moment, cases = given.plan, given.plan.moment(scene), given.plan.cases(scene)
     trial = plan.trial(given.site, moment)
@@ -285,7 +286,7 @@ def watch(given: Prepared, scene: int) -> list[dict[str, Any]]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Played:
-    """What is watched, and the truth. T frames, N customers, p meters, m inverters."""
+    """Frames of a scenario, and the truth. T frames, N customers, p meters, m inverters."""
 
     frames: list[Frame]
     v2: Floats  # (T, N)
@@ -306,7 +307,7 @@ class _Played:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Seen:
-    """What an estimator said. T frames."""
+    """Output of an estimator. T frames."""
 
     named: Bools  # (T, p)
     inverters: Bools  # (T, m)
@@ -316,9 +317,9 @@ class _Seen:
 
 
 def _learned(given: Prepared, trial: Trial, honest: Scenario) -> dict[float, Commission]:
-    """What estimators learn of their meters in the honest time before a scene."""
+    """Fixed errors that estimators learn in the honest time before a scene."""
     learn_s, step_s = given.plan.learn_s, given.plan.learn_step_s
-    # One frame more than what is asked for, and quasi-static inverters: they settle between two readings.
+    # One frame more than required, and quasi-static inverters: they settle between two readings.
     before = replace(
         honest,
         start=honest.start - learn_s - step_s,
@@ -339,7 +340,7 @@ def _learned(given: Prepared, trial: Trial, honest: Scenario) -> dict[float, Com
 
 
 def _clean(watcher: Watcher, state: Any, played: _Played, onsets: set[int]) -> tuple[_Seen, dict[int, Any]]:
-    """Watch the scene without lies, and keep the states before some frames."""
+    """Monitor the scene without an attack, and keep the states before some frames."""
     states, parts, begin = {}, [], 0
     for end in sorted({*onsets, len(played.frames)}):
         seen, state = _step(watcher, state, played.frames[begin:end])
@@ -364,11 +365,11 @@ def _step(watcher: Watcher, state: Any, some: list[Frame]) -> tuple[_Seen, Any]:
     return _Seen(np.array(named), np.array(inverters), clean, undecided, np.array(v2)), state
 
 
-# ------------------------------------------------------------------------------------------ what is told
+# ------------------------------------------------------------------------------------------ reports
 
 
 def _lied(given: Prepared, played: _Played, honest: Scenario, case: Case) -> _Played:
-    """The scene with the lies of a case."""
+    """Scene with the attack of a scenario."""
     some, wrong = attacks(given.stated, given.plan, case, honest)
     if wrong or not all(_simple(attack, honest.start) for attack in some):
         trial = given.plan.trial(given.site, given.plan.moment(case.number // given.plan.together))
@@ -376,7 +377,8 @@ def _lied(given: Prepared, played: _Played, honest: Scenario, case: Case) -> _Pl
         return _Played.of(list(frames(trial, lying, stated=given.stated)))
     t = np.array([frame.t for frame in played.frames])
     y = np.array([frame.y for frame in played.frames])
-    # Lies have sizes in parts of the nominal voltage, as in scenarios, frames in parts of each place's base.
+    # Attacks have sizes relative to the nominal voltage, as in scenarios; frames are relative to each place's
+    # base.
     of_nominal = (given.site.customer_volt / given.site.customer_nominal)[given.site.meters]
     # The root of a rounded square is the number itself.
     v = np.sqrt(y) * of_nominal
@@ -403,17 +405,17 @@ def _lied(given: Prepared, played: _Played, honest: Scenario, case: Case) -> _Pl
 
 
 def _shift(y: Floats, attack: Floats) -> Floats:
-    """Reported minus honest voltage, pu, of squared ones."""
+    """Reported minus honest voltage, pu, from squared voltages."""
     return np.asarray(np.sqrt(y) - np.sqrt(y - attack))
 
 
 def _simple(attack: Attack, start: float) -> bool:
-    """Whether only voltages are told wrong, by what the scene itself has seen."""
+    """True if only voltages are falsified, from readings of the scene itself."""
     powers = isinstance(attack, Coordinated) and bool(attack.p_shift.any() or attack.q_shift.any())
     return not powers and reach(attack, attack.t_on) <= attack.t_on - start
 
 
-# --------------------------------------------------------------------------------------- what came of it
+# --------------------------------------------------------------------------------------- results
 
 
 def _row(head: dict[str, Any], case: Case, rate: float) -> dict[str, Any]:
@@ -431,7 +433,7 @@ def _row(head: dict[str, Any], case: Case, rate: float) -> dict[str, Any]:
 
 
 def _nothing(error: Exception) -> dict[str, Any]:
-    """The rest of a row of which there is nothing to tell but why."""
+    """Remaining columns of a row without a simulation, with the reason."""
     nothing = dict.fromkeys(("delay_s", "clear_s", *_ERRORS), float("nan"))
     times = dict.fromkeys(("watched_s", "undecided_s", "clean_lying_s"), 0.0)
     counts = dict.fromkeys(("named", "false_events", "most_named"), 0)
@@ -452,7 +454,7 @@ def _told(  # noqa: PLR0917  # one row needs all that is known of the case
     begin: int,
     control: _Seen,
 ) -> dict[str, Any]:
-    """One row: what an estimator made of a case from frame `begin` on, and of the scene without lies."""
+    """One row: outcome of a scenario from frame `begin` on, and of the scene without the attack."""
     plan, site, step_s = given.plan, given.site, given.plan.step_s
     names = (*site.meter_ids, *(site.feeder.customers[k] for k in site.droop.customer))
     lies = np.hstack([played.liars[begin:], played.inverters[begin:]])
@@ -460,7 +462,7 @@ def _told(  # noqa: PLR0917  # one row needs all that is known of the case
     anyway: Bools = np.any(_everybody(control, lies), axis=0)
     because = named.any(axis=0) & ~anyway
     told = _each(played, begin, site, lies, named, anyway, names, step_s)
-    # A name that stays a while after the lie is not false.
+    # A name just after the attack is not false.
     wrong_names = named & ~np.logical_or.accumulate(lies, axis=0)
     false = wrong_names.any(axis=0)
     delays = np.array([one["delay_s"] for one in told])
@@ -487,15 +489,15 @@ def _told(  # noqa: PLR0917  # one row needs all that is known of the case
 
 
 def _everybody(seen: _Seen, lies: Bools) -> Bools:
-    """Which meters and inverters (T, p + m) were named in the last frames."""
-    # Families that do not judge inverters name none.
+    """Mask (T, p + m) of the meters and inverters named in the last frames."""
+    # Estimators without inverter tests name none.
     inverters = np.zeros((len(seen.named), lies.shape[1] - seen.named.shape[1]), dtype=np.bool_)
     some = np.hstack([seen.named, seen.inverters if seen.inverters.shape[1] else inverters])
     return np.asarray(some[len(some) - len(lies) :], dtype=np.bool_)
 
 
 def risings(flags: Bools) -> int:
-    """How often any of some flags goes up, from down before the first row.
+    """Number of rises of any flag; all are down before the first row.
 
     Parameters
     ----------
@@ -516,7 +518,7 @@ def _each(  # noqa: PLR0917  # meters and inverters alike
     names: tuple[str, ...],
     step_s: float,
 ) -> list[dict[str, Any]]:
-    """One row for every liar."""
+    """One row for every manipulated device."""
     rows = []
     for j in np.flatnonzero(lies.any(axis=0)):
         lying = lies[:, j]
@@ -540,7 +542,7 @@ def _each(  # noqa: PLR0917  # meters and inverters alike
 def _errors(  # noqa: PLR0917  # the same
     plan: Plan, site: Site, seen: _Seen, played: _Played, begin: int, lies: Bools
 ) -> dict[str, float]:
-    """Errors of the voltage, % of nominal, at liars while they lie and at everybody else."""
+    """Errors of the voltage, % of nominal, at manipulated meters during the attack and elsewhere."""
     with np.errstate(invalid="ignore"):
         error = 100.0 * np.abs(np.sqrt(seen.v2) - np.sqrt(played.v2[begin:]))
     error *= site.customer_volt / site.customer_nominal

@@ -45,7 +45,7 @@ __all__ = [
 
 
 CONFIDENCE: Final = 0.95
-"""Of every interval."""
+"""Confidence level of every interval, 1."""
 
 WITHIN_S: Final = (1.0, 2.0, 5.0, 10.0, 30.0, 60.0, 120.0, 300.0)
 """Times of the operating curve, s after the onset."""
@@ -54,12 +54,12 @@ YEAR_S: Final = 365.25 * 86_400.0
 
 
 def scenarios(rows: Sequence[dict[str, Any]]) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Tables of all scenarios, and of all their liars.
+    """Tables of all scenarios, and of all manipulated devices.
 
     Parameters
     ----------
     rows
-        As `scene.watch` gives them.
+        From `scene.watch`.
     """
     kept = ("scenario", "alarms_per_year", "kind", "size", "liars", "place")
     each = [{name: row[name] for name in kept} | one for row in rows for one in row.get("each", ())]
@@ -76,7 +76,7 @@ def grouped(found: pd.DataFrame, liars: pd.DataFrame, by: Sequence[str]) -> pd.D
     found, liars
         From `scenarios`.
     by
-        Columns that tell the groups apart, besides the false-alarm rate.
+        Columns of the groups, besides the false-alarm rate.
     """
     keys = ["alarms_per_year", *by]
     tried = found[found["reason"] == ""]
@@ -109,7 +109,7 @@ def grouped(found: pd.DataFrame, liars: pd.DataFrame, by: Sequence[str]) -> pd.D
 
 
 def delays(liars: pd.DataFrame) -> pd.DataFrame:
-    """Share of the liars that are named within some time of their onset, by kind and size.
+    """Share of the manipulated devices named within some time of their onset, by kind and size.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ def delays(liars: pd.DataFrame) -> pd.DataFrame:
 
 
 def false_names(found: pd.DataFrame, liars: pd.DataFrame) -> pd.DataFrame:
-    """What a false-alarm rate costs and gains: false names per year while nobody lies, and liars named.
+    """Operating curve: false names per year without an attack, and share of manipulated devices named.
 
     Parameters
     ----------
@@ -168,20 +168,20 @@ def false_names(found: pd.DataFrame, liars: pd.DataFrame) -> pd.DataFrame:
 
 
 def promises(found: pd.DataFrame, liars: pd.DataFrame, promised: Mapping[str, Promise]) -> pd.DataFrame:
-    """What became of lies of which something is promised; columns as in `study.Campaign`.
+    """Outcome of attacks with a guarantee; columns as in `study.Campaign`.
 
     Parameters
     ----------
     found, liars
         From `scenarios`.
     promised
-        By kind.
+        Guarantee by kind.
 
     Notes
     -----
-    Lies of a scene have their loads and the errors of their meters in common; scenes have nothing in common.
-    So the limit is that of the scenes with a broken promise, each of which counts once: it holds for the
-    probability that a lie breaks it, however alike the lies of a scene fare.
+    Attacks of a scene have loads and errors of meters in common; scenes are independent. So the limit is that
+    of the scenes with a broken guarantee, each of which counts once. It is valid for the probability that an
+    attack breaks it, for any dependence within a scene.
     """
     rows = []
     tried = found[(found["reason"] == "") & found["kind"].isin(list(promised))]
@@ -214,7 +214,7 @@ def promises(found: pd.DataFrame, liars: pd.DataFrame, promised: Mapping[str, Pr
 
 
 def _share(name: str, count: int, of: int) -> dict[str, float]:
-    """A share, and its interval by Clopper and Pearson; NaN of nothing."""
+    """Share, and its interval by Clopper and Pearson; NaN of nothing."""
     if not of:
         return dict.fromkeys((name, f"{name}_low", f"{name}_high"), np.nan)
     limits = binomtest(count, of).proportion_ci(CONFIDENCE, method="exact")
@@ -223,7 +223,7 @@ def _share(name: str, count: int, of: int) -> dict[str, float]:
 
 def _median(values: np.ndarray) -> float:
     known = values[~np.isnan(values)]
-    # One of the values, so that infinite ones stay what they are.
+    # One of the values, so that infinite ones remain.
     return float(np.percentile(known, 50.0, method="lower")) if known.size else np.nan
 
 
@@ -237,57 +237,58 @@ def _largest(values: np.ndarray) -> float:
 
 
 ROWS: Final = 2
-"""Edition of the rows that journals hold."""
+"""Version of the rows in journals."""
 
 
 class NothingPlayed(GridsecError):
-    """Not one scenario of a campaign could be played."""
+    """No scenario of a campaign could be simulated."""
 
     code = "nothing-played"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Campaign:
-    """What became of all scenarios. Shares have limits `_low` and `_high`, Clopper and Pearson's at 95 %.
+    """Results of all scenarios. Shares have limits `_low` and `_high`, Clopper and Pearson's at 95 %.
 
     Attributes
     ----------
     feeder, digest
-        The feeder's name, and its content.
+        Name and content digest of the feeder.
     plan
-        What was played.
+        The campaign.
     versions
-        Of everything that numbers depend on.
+        Versions of all libraries that numbers depend on.
     scenarios
         One row for each scenario and false-alarm rate: `scenario`, `scene`, `season`, `weekday` (0 is
-        Monday), `hour` of its beginning; `alarms_per_year`; `kind`, `size`, `liars`, `place`, `onset_s`;
-        `reason` why it could not be played, or empty;
-        `exact`: all liars and nobody else were named; `named`, how many liars, `missed` and `falsely_named`,
-        who; `because`, who was named from the onset on, and not in the same scene without the lie;
-        `false_events`, how often an honest meter or inverter became named; `delay_s` from the onset
-        until the last liar had been named; `clear_s` from the end of the lies until nobody was named;
-        `most_named` at once; `watched_s`, `undecided_s`, and `clean_lying_s`, CLEAN during a lie;
-        `error_liars` and `error_others` of the reconstructed voltage, the largest and (`_95`) the 95th
-        percentile, % of nominal, from `settling_s` after the onset on. What never came is infinite, what
-        there was nothing of is NaN.
+        Monday), `hour` of its begin; `alarms_per_year`; `kind`, `size`, `liars`, `place`, `onset_s`; `reason`
+        for a missing simulation, or empty; `exact`: all manipulated devices and no others were named;
+        `named`, number of manipulated devices named, `missed` and `falsely_named`, their names; `because`,
+        devices named from the onset on, and not in the same scene without the attack; `false_events`, number
+        of times that an honest meter or inverter became named; `delay_s` from the onset to the naming of the
+        last manipulated device; `clear_s` from the end of the attack until no device was named; `most_named`
+        at once; `watched_s`, `undecided_s`, and `clean_lying_s`, CLEAN during an attack; `error_liars` and
+        `error_others` of the reconstructed voltage at manipulated meters and elsewhere, the largest and
+        (`_95`) the 95th percentile, % of nominal, from `settling_s` after the onset on. Times of events that
+        did not occur are infinite; values without data are NaN.
     liars
-        One row for each liar: `who`, whether an `inverter`, `lie_volt`, the largest displacement, and
-        `delay_s`; `anyway`, whether it is named without the lie too.
+        One row for each manipulated device: `who`, its id; `inverter`, true for inverters; `lie_volt`, the
+        largest displacement; `delay_s`; `anyway`, true if it is named without the attack too.
     by_kind, by_size, by_place, by_liars
-        The same together: shares `exact` and `false` (somebody honest was named) of the scenarios, `named`
-        of the liars; median and 95th percentile of the delays of those that were named; median `_95` and
-        `_worst` of the errors; the share of the time that was `undecided`.
+        Groups of scenarios: shares `exact` and `false` (an honest device was named) of the scenarios, `named`
+        of the manipulated devices; median and 95th percentile of the delays of those named; median `_95` and
+        `_worst` of the errors; share of the `undecided` time.
     delays
-        Operating curve: share of liars `named` within `within_s`, by kind and size.
+        Operating curve: share of manipulated devices `named` within `within_s`, by kind and size.
     false_names
-        Operating curve: false names `per_year` while nobody lies, with Poisson limits at 95 %, and the
-        share of liars named, by `alarms_per_year`.
+        Operating curve: false names `per_year` without an attack, with Poisson limits at 95 %, and the share
+        of manipulated devices named, by `alarms_per_year`.
     promises
-        Lies of which something is promised, one row for each `promise`: how many `lies`, how many that were
-        to stay hidden somebody was named because of, or that were to be named left a liar unnamed (`broken`);
-        `by_chance`, a liar was named without the lie too, which proves nothing: not among the lies that were
-        to be named; `honest_named`, scenarios with a false name; of how many independent `scenes` how many
-        have a broken promise, and the upper limit of its probability, Clopper and Pearson's at 95 %.
+        Attacks with a guarantee, one row for each `promise`: `lies`, the number of attacks; `broken`, attacks
+        to stay hidden with a device named because of them, or attacks to be named with a missed device;
+        `by_chance`, attacks with a device that is named without the attack too, which prove nothing and do
+        not count among those to be named; `honest_named`, scenarios with a false name; `scenes`, the number
+        of independent scenes, `scenes_broken` with a broken guarantee, and the upper limit of its
+        probability, Clopper and Pearson's at 95 %.
     """
 
     feeder: str
@@ -306,7 +307,7 @@ class Campaign:
 
     @property
     def seed(self) -> int:
-        """What chose everything random."""
+        """Seed of all random numbers."""
         return self.plan.seed
 
     @property
@@ -326,39 +327,39 @@ def campaign(
     journal: Where = None,
     progress: Progress | None = None,
 ) -> Campaign:
-    """Play a campaign on a feeder.
+    """Run a campaign on a feeder.
 
     Parameters
     ----------
     site
         The feeder.
     plan
-        What is played.
+        The campaign.
     seed
-        In place of the plan's.
+        Seed in place of the plan's.
     runner
-        Where: `workers.Here`, `Processes` or `Dask`; the results are the same.
+        `workers.Here`, `Processes` or `Dask`; the results are equal.
     journal
-        File in which finished scenes are kept; an interrupted campaign goes on from it.
+        File of finished scenes; an interrupted campaign resumes from it.
     progress
-        Told how many scenarios are done.
+        Called with (done, total) scenarios.
 
     Raises
     ------
     NotObservable, DesignInfeasible, EstimatorUnusable, FeederInvalid, ValueError
-        If the estimator cannot watch this feeder with these settings, or the plan is none.
+        If the estimator cannot monitor this feeder with these settings, or for an invalid plan.
     NothingPlayed
-        If the feeder can carry its loads at no moment that was drawn.
+        If the power flow has no solution at any scene.
     OtherStudy
-        If the journal is another study's.
+        If the journal is that of another study.
     InUse
-        If another process is writing it.
+        If another process writes the journal.
     ClusterUnusable, WorkerLost
-        From the runner; what is finished is in the journal.
+        From the runner; finished scenes are in the journal.
     """
     plan = Plan() if plan is None else plan
     plan = plan if seed is None else replace(plan, seed=seed)
-    prepare(site, plan)  # whatever is wrong with it is told here, and not by a worker
+    prepare(site, plan)  # errors of the plan occur here, not in a worker
     used = versions()
     subject = {
         "study": "campaign",
@@ -374,7 +375,7 @@ def campaign(
 def _played(
     site: Site, plan: Plan, runner: Runner, kept: Journal, progress: Progress | None
 ) -> list[dict[str, Any]]:
-    """The rows of all scenes; those that the journal does not have are played."""
+    """Rows of all scenes; scenes that the journal lacks are simulated."""
     keys = [f"scene|{scene}" for scene in range(plan.scenes)]
     todo = [scene for scene, key in enumerate(keys) if key not in kept]
     done = plan.scenes - len(todo)
@@ -389,12 +390,12 @@ def _played(
     return [row for key in keys for row in kept[key]]
 
 
-# What the worker of this process prepared last, and for what.
+# Last preparation of this process, and its arguments.
 _prepared: list[tuple[str, Prepared]] = []
 
 
 def _scene(tables: FeederTables, plan: Plan, scene: int) -> list[dict[str, Any]]:
-    """Work on a scene, wherever this is: designs are made once in each process."""
+    """Simulate a scene in any process; designs are made once in each process."""
     asked = repr((tables, plan))
     given = next((made for what, made in _prepared if what == asked), None)
     if given is None:
@@ -405,7 +406,9 @@ def _scene(tables: FeederTables, plan: Plan, scene: int) -> list[dict[str, Any]]
 
 def _campaign(site: Site, plan: Plan, used: dict[str, str], rows: list[dict[str, Any]]) -> Campaign:
     if all(row["reason"] for row in rows):
-        raise NothingPlayed(f"{site.feeder.name}: no scenario can be played; the first: {rows[0]['reason']}")
+        raise NothingPlayed(
+            f"{site.feeder.name}: no scenario can be simulated; the first: {rows[0]['reason']}"
+        )
     found, liars = scenarios(rows)
     by = {
         name: grouped(found, liars, columns)

@@ -1,4 +1,4 @@
-"""A feeder's droop fleet, or one of a preset; its operating points, and the box that its loads stay in."""
+"""A feeder's droop fleet, or one of a preset; its operating points, and the box of its loads."""
 
 from __future__ import annotations
 
@@ -35,21 +35,21 @@ __all__ = [
 ]
 
 KVA_PER_KW: Final = 1.1
-"""Rating of an inverter for each kW of generation behind it: at full sun 0.46 of it is left for q."""
+"""Rating of an inverter per kW of its generation, kVA/kW: at full sun 0.46 of it remains for q."""
 
 SMALLEST_KVA: Final = 5.0
-"""Rating of inverters given to customers without generation, kVA."""
+"""Rating of inverters of customers without generation, kVA."""
 
-NOTHING: Final = "no inverters: nothing to be stable"
-"""What there is to say of a feeder without them."""
+NOTHING: Final = "no inverters: stability does not apply"
+"""Statement for a feeder without inverters."""
 
 
 class NoInverters(FeederInvalid):
-    """There is no droop inverter on a feeder, and so nothing that could be unstable."""
+    """A feeder without droop inverters: no fleet to study."""
 
 
 class Who(StrEnum):
-    """Which customers a preset equips."""
+    """Customers with an inverter of a preset."""
 
     PV = "pv"
     ALL = "all"
@@ -73,7 +73,7 @@ def equip(
     customers: Sequence[str] | None = None,
     kva: float | None = None,
 ) -> Droop:
-    """Give inverters of one preset to customers of a feeder, in place of those that it has.
+    """Equip customers of a feeder with inverters of one preset, in place of its own fleet.
 
     A customer's own inverter keeps its rating; others get 1.1 kVA for each kW of generation, or 5 kVA.
 
@@ -93,9 +93,9 @@ def equip(
     Raises
     ------
     FeederInvalid
-        If there is no such preset, or nobody to equip.
+        For an unknown preset, or without a customer to equip.
     ValueError
-        If there is no such customer.
+        For an unknown customer.
     """
     rows = site.tables.customers
     if customers is not None:
@@ -120,7 +120,7 @@ def equip(
 
 
 def made(site: Site, own: Ints, preset: str, kva: Floats) -> Droop:
-    """Inverters of a preset, whose curve is one of the nominal voltage at their customer.
+    """Inverters of a preset, with the curve in the nominal voltage at each customer.
 
     Parameters
     ----------
@@ -149,9 +149,9 @@ def chosen_fleet(site: Site, preset: str | None, who: Who = Who.PV) -> Droop:
     Raises
     ------
     NoInverters
-        If there is none.
+        Without inverters and without a preset.
     FeederInvalid
-        If a preset has nobody to equip.
+        If a preset has no customer to equip.
     """
     if preset is not None:
         return equip(site, preset, who)
@@ -170,7 +170,7 @@ def chosen_fleet(site: Site, preset: str | None, who: Who = Who.PV) -> Droop:
 
 
 def points(site: Site, v0: float = 1.0) -> dict[str, Box]:
-    """The operating points that are looked at, each a box without width.
+    """Operating points of the study, each a box without width.
 
     Evening: full load, no generation. Noon: a fifth of the load, full generation. Half: half of both.
 
@@ -185,7 +185,7 @@ def points(site: Site, v0: float = 1.0) -> dict[str, Box]:
 
 
 def point(site: Site, load: Floats | float, pv: Floats | float, v0: float = 1.0) -> Box:
-    """One operating point without the inverters' reactive power, the loads at their expected power factor.
+    """Operating point without the inverters' reactive power, the loads at their expected power factor.
 
     Parameters
     ----------
@@ -213,7 +213,7 @@ def box(
     v0_low: float = 1.0,
     v0_high: float = 1.0,
 ) -> Box:
-    """All powers that the feeder's files allow for, each customer's on its own.
+    """Box of all powers within the feeder's files, independent for each customer.
 
     Loads from `load_low load_kw` to `load_high load_kw`, with q from `load tan_min - floor` to
     `load tan_max + floor`; generation from `pv_low pv_kw` to `pv_high pv_kw` at unity power factor.
@@ -230,7 +230,7 @@ def box(
     Raises
     ------
     ValueError
-        If limits are the wrong way round.
+        For limits in the wrong order.
     """
     problems = [
         *range_problem("load", load_low, load_high),
@@ -250,12 +250,12 @@ def box(
 
 
 def range_problem(what: str, low: float, high: float) -> list[Problem]:
-    """What is wrong with two limits; empty if nothing is.
+    """Problem of two limits; empty without one.
 
     Parameters
     ----------
     what, low, high
-        Of what they are, and the limits.
+        Name of the quantity, and the limits.
     """
     if 0.0 <= low <= high < math.inf:
         return []

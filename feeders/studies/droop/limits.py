@@ -1,10 +1,10 @@
 """Voltage band for all loads within their limits, and hosting capacity of a droop fleet.
 
-Proven by limits of the AC power flow with the fleet (`gridsec.planning.droop.equilibrium`), or refuted by
-loads with which the AC power flow of `feeders.simulation.powerflow` leaves the band.
+A band is proven by limits of the AC power flow with the fleet (`gridsec.planning.droop.equilibrium`), or
+refuted by loads with which the AC power flow of `feeders.simulation.powerflow` leaves the band.
 
-Generation runs at its peak while loads draw a small share of theirs. Every operating point is an AC power
-flow with the inverters at rest.
+Hosting has generation at its peak and loads at a small share of theirs. Every operating point is an AC power
+flow with the inverters in equilibrium.
 
 References
 ----------
@@ -44,19 +44,19 @@ __all__ = [
     "checked",
     "curve",
     "draw",
-    "nobody",
     "ratings_pu",
     "safety",
     "shares_of",
+    "without_inverters",
 ]
 
 
 EXACT: Final = 1e-6
-"""How far set-points by the second power flow may be from the injections of a witness, pu."""
+"""Largest difference between the set-points of the second power flow and a witness's injections, pu."""
 
 
 class Kept(StrEnum):
-    """What is known of the band."""
+    """Proof status of the band."""
 
     KEPT = "kept"
     VIOLATED = "violated"
@@ -65,22 +65,20 @@ class Kept(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Safety:
-    """What is known of a fleet's voltages.
+    """Proof status of a fleet's voltages.
 
     Attributes
     ----------
     rest
-        While loads move slowly against the time constants.
+        For load changes that are slow against the time constants.
     always
-        At all times, however loads move within their limits.
+        For arbitrary load changes within the limits.
     why
-        What kept the bounds from being found; empty if they were.
+        Reason for missing bounds; empty with bounds.
     low_volt, high_volt, low_rest_volt, high_rest_volt
-        The extremes of the proven limits, V; NaN if there are none.
+        Extremes of the proven limits, V; NaN without any.
     rows
-        One for each customer.
-    witness
-        One for each customer: the loads that break the band, if such were found.
+        One row for each customer. witness One row for each customer: loads that violate the band, if found.
     """
 
     rest: Kept
@@ -94,8 +92,8 @@ class Safety:
     witness: list[dict[str, Any]]
 
 
-def nobody(droop: Droop) -> Droop:
-    """A fleet without inverters, to compare with."""
+def without_inverters(droop: Droop) -> Droop:
+    """Fleet without inverters, for comparison."""
     return droop.take(np.zeros(0, dtype=np.intp))
 
 
@@ -107,11 +105,11 @@ def safety(subject: Subject, droop: Droop, loads: Box, limits: tuple[float, floa
     subject
         The feeder.
     droop
-        The fleet, from rest with any loads of the box.
+        The fleet, from an equilibrium with any loads of the box.
     loads
-        Limits of the injections without the fleet; every customer moves in them as it likes.
+        Limits of the injections without the fleet; customers vary independently within them.
     limits
-        The band, parts of the nominal voltage.
+        The band, relative to the nominal voltage.
     """
     bases, reasons = Bases.of(subject.site), list[str]()
     within = bases.band(*limits)
@@ -122,7 +120,7 @@ def safety(subject: Subject, droop: Droop, loads: Box, limits: tuple[float, floa
         name: None if _inside(band, within) else _witness(subject, droop, loads, within, jump=jump)
         for name, band, jump in (("rest", still, False), ("always", ever, True))
     }
-    # What happens at rest happens.
+    # A violation in equilibrium is also one for arbitrary changes.
     found["always"] = found["always"] or found["rest"]
     nothing = Band(*np.full((2, loads.p_low.size), np.nan))
     e, r = ever or nothing, still or nothing
@@ -163,7 +161,7 @@ def _or_none(
 
 
 Limits = tuple[Floats, Floats]
-"""The band, pu of every customer."""
+"""Band, pu of every customer."""
 
 
 def _inside(band: Band | None, limits: Limits) -> bool:
@@ -179,11 +177,11 @@ def _verdict(band: Band | None, limits: Limits, witness: list[dict[str, Any]] | 
 def _witness(
     subject: Subject, droop: Droop, loads: Box, limits: Limits, *, jump: bool
 ) -> list[dict[str, Any]] | None:
-    """Loads in the box with which a voltage is beyond the band, at rest or after a jump of all loads."""
+    """Loads in the box with a voltage outside the band, in equilibrium or after a jump of all loads."""
     s, v0 = _candidates(subject.net, droop, loads)
     x, V = rest(subject.net, droop, s, v0)
     if jump:
-        # From rest at the other end of the box: pairs (low, high), (high, low).
+        # From the equilibrium at the other end of the box: pairs (low, high), (high, low).
         x = x[np.arange(len(x)) ^ 1]
         V = solve(subject.net, injected(droop, s, x), v0)
     beyond = np.max(np.maximum(limits[0] - np.abs(V), np.abs(V) - limits[1]), axis=1)
@@ -197,7 +195,7 @@ def _witness(
 
 
 def _candidates(net: Network, droop: Droop, loads: Box) -> tuple[Complex, Floats]:
-    """Corners of the box in pairs (low, high): of all loads, and what one customer's voltage asks for."""
+    """Corners of the box in pairs (low, high): of all loads, and by the sensitivities of each voltage."""
     low, high = loads.p_low + 1j * loads.q_low, loads.p_high + 1j * loads.q_high
     middle: Complex = np.asarray(0.5 * (low + high))
     v0 = 0.5 * (loads.v0_low + loads.v0_high)
@@ -224,7 +222,7 @@ def _confirmed(
     *,
     jump: bool,
 ) -> list[dict[str, Any]]:
-    """The witness as rows, if the power flow of `feeders.simulation.powerflow` agrees; none otherwise."""
+    """Witness as rows, if the power flow of `feeders.simulation.powerflow` confirms it; otherwise none."""
     (s, v0, x), feeder = at, subject.site.feeder
     net = injected(droop, s, x)
     try:
@@ -257,23 +255,23 @@ RESOLUTION: Final = 1e-3
 """Relative accuracy of a capacity."""
 
 MOST: Final = 2.0**14
-"""Largest capacity that is looked for, kW for each customer who may have generation."""
+"""Upper limit of the search for a capacity, kW per possible customer."""
 
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """When generation is at its peak.
+    """Conditions at the peak of generation.
 
     Attributes
     ----------
     load
-        Share of its peak that every load draws.
+        Load relative to its peak, the same for all, 1.
     v0
         Voltage of the busbar, pu.
     v_min, v_max
-        The band, parts of the nominal voltage.
+        The band, relative to the nominal voltage.
     update
-        When inverters act.
+        Sampling of the inverters.
     """
 
     load: float
@@ -285,12 +283,12 @@ class Conditions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plan:
-    """Who gets generation, and what inverters they have.
+    """Distribution of generation, and its inverters.
 
     Attributes
     ----------
     share : (N,)
-        Every customer's part of the generation; together 1.
+        Share of the generation of each customer; sum 1.
     preset
         Droop preset of all of them; empty: inverters without reactive power.
     """
@@ -300,19 +298,19 @@ class Plan:
 
 
 def shares_of(site: Site, customers: Sequence[str] | None) -> Floats:
-    """How generation is distributed: as in the feeder's files, or equally among customers, (N,).
+    """Distribution of generation: as in the feeder's files, or equal among customers, (N,).
 
     Parameters
     ----------
     site
         The feeder.
     customers
-        Who gets it; by default those who have some, in proportion, or everybody if nobody has.
+        Customers with generation; by default those of the files, in proportion, or all if there are none.
 
     Raises
     ------
     ValueError
-        If there is no such customer.
+        For an unknown customer.
     """
     out = np.array([row.pv_kw for row in site.tables.customers])
     if customers is not None:
@@ -324,9 +322,9 @@ def shares_of(site: Site, customers: Sequence[str] | None) -> Floats:
 
 
 def ratings_pu(site: Site) -> Floats:
-    """Largest current of every conductor of every line, pu; infinity where the files give none, (L, k).
+    """Largest current of every conductor of every line, pu, (L, k); infinity for an empty rating.
 
-    In the order and the units of `gridsec.planning.droop.ac_sensitivity.currents`.
+    Order and units are those of `gridsec.planning.droop.ac_sensitivity.currents`.
     """
     lines = [site.tables.lines[k] for k in line_rows(site)]
     amps = np.array([np.inf if line.rating_a is None else line.rating_a for line in lines])
@@ -348,16 +346,16 @@ def _loads(site: Site, plan: Plan, kw: float, at: Conditions) -> Box:
 
 
 def checked(subject: Subject, plan: Plan, kw: float, at: Conditions, ratings: Floats) -> dict[str, Any]:
-    """What so much generation does: extreme voltages, the fullest line, and what is broken.
+    """Effect of an amount of generation: extreme voltages, fullest line, and first violated limit.
 
     Parameters
     ----------
     subject
         The feeder.
     plan
-        Who gets it.
+        Distribution of the generation.
     kw
-        All of it, kW.
+        Total generation, kW.
     at
         Loads, busbar, limits.
     ratings : (L, k)
@@ -407,7 +405,7 @@ def checked(subject: Subject, plan: Plan, kw: float, at: Conditions, ratings: Fl
 
 
 def _named(site: Site, line: int) -> str:
-    """A line of `currents` in words."""
+    """Name of a line of `currents`."""
     tree = site.spanning
     if line < tree.parent.size:
         return f"line to {tree.buses[line + 1]}"
@@ -416,7 +414,7 @@ def _named(site: Site, line: int) -> str:
 
 
 def _largest(holds: Callable[[float], bool], most: float) -> float:
-    """The largest amount found at which nothing is broken, to a thousandth; 0 if something is without any."""
+    """Largest amount without a violation, relative accuracy RESOLUTION; 0 if the amount 0 has one."""
     if not holds(0.0):
         return 0.0
     if holds(most):
@@ -433,7 +431,7 @@ def _largest(holds: Callable[[float], bool], most: float) -> float:
 
 
 def capacity(subject: Subject, plan: Plan, at: Conditions, *, seed: int = 0) -> dict[str, Any]:
-    """The most generation before something is broken, by bisection; confirmed by the other power flow.
+    """Largest generation without a violation, by bisection; confirmed by the other power flow.
 
     Parameters
     ----------
@@ -445,7 +443,7 @@ def capacity(subject: Subject, plan: Plan, at: Conditions, *, seed: int = 0) -> 
     Returns
     -------
     dict
-        `capacity_kw`, `limit` (what breaks next), `verdict` and `proof` (is the fleet stable there?),
+        `capacity_kw`, `limit` (the next violation), `verdict` and `proof` (stability of the fleet there),
         `v_high_volt`, `v_low_volt`, `line_percent`, and `confirmed`: the largest difference of a voltage in
         the power flow of `feeders.simulation.powerflow`, V.
     """
@@ -468,7 +466,7 @@ def capacity(subject: Subject, plan: Plan, at: Conditions, *, seed: int = 0) -> 
 
 
 def _confirmed_hosting(subject: Subject, droop: Droop, loads: Box) -> float:
-    """Largest difference between the two power flows, V; infinity where the second finds none."""
+    """Largest difference between the two power flows, V; infinity if the second has no solution."""
     feeder, s = subject.site.feeder, loads.p_low + 1j * loads.q_low
     x, V = rest(subject.net, droop, s, loads.v0_low)
     net = -feeder.base_kva * injected(droop, s, x)
@@ -480,14 +478,14 @@ def _confirmed_hosting(subject: Subject, droop: Droop, loads: Box) -> float:
 
 
 def curve(subject: Subject, plan: Plan, amounts: Sequence[float], at: Conditions) -> list[dict[str, Any]]:
-    """What growing generation does, one row for each amount.
+    """Effect of increasing generation, one row for each amount.
 
     Parameters
     ----------
     subject, plan, at
         As in `checked`.
     amounts
-        Of all generation, kW.
+        Total generation of each row, kW.
     """
     ratings = ratings_pu(subject.site)
     return [
@@ -499,10 +497,10 @@ def curve(subject: Subject, plan: Plan, amounts: Sequence[float], at: Conditions
 def draw(  # noqa: PLR0917  # which feeder, which fleet, which order of places
     subject: Subject, preset: str, unit_kw: float, at: Conditions, seed: int, number: int
 ) -> dict[str, Any]:
-    """How many units of generation a feeder hosts that come to its customers in a random order.
+    """Number of generation units that a feeder hosts at customers in a random order.
 
-    Every customer gets one before anybody gets a second. The order is that of `seed` and `number` alone, so
-    that all presets see the same ones.
+    Every customer gets one unit before any gets a second. The order depends on `seed` and `number` alone, so
+    that all presets have the same ones.
 
     Parameters
     ----------
@@ -513,7 +511,7 @@ def draw(  # noqa: PLR0917  # which feeder, which fleet, which order of places
     unit_kw
         Size of a unit, kW.
     seed, number
-        Choose the order.
+        Seed and number of the order.
     """
     count = len(subject.site.feeder.customers)
     order: Ints = np.random.default_rng([seed, number]).permutation(count)

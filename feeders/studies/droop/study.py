@@ -25,9 +25,9 @@ from feeders.studies.droop.limits import (
     capacity,
     curve,
     draw,
-    nobody,
     safety,
     shares_of,
+    without_inverters,
 )
 from feeders.studies.droop.verdict import (
     Run,
@@ -66,25 +66,25 @@ HOSTING: Final = {
     "unit_kw": "--unit-kw",
     "draws": "--draws",
 }
-"""What only the search for hosting capacities asks, and the options of the command line for it."""
+"""Options of the search for hosting capacities only, with their names on the command line."""
 
 
 @dataclass(frozen=True, slots=True)
 class DroopOptions:
-    """What is studied.
+    """Options of the study.
 
     Attributes
     ----------
     preset
         Preset of all inverters; None: the feeder's own fleet.
     who
-        Whom a preset equips: customers with generation (`pv`), or `all`.
+        Customers that a preset equips: those with generation (`pv`), or `all`.
     interval_s, dead
         Sampling interval of the inverters, s (0: continuous), and dead time in whole intervals.
     v0_low, v0_high
-        Limits of the busbar's voltage, pu; points of operation have the middle, hosting the upper one.
+        Limits of the busbar voltage, pu; operating points have the middle, hosting the upper one.
     v_min, v_max
-        The band, parts of the nominal voltage; None: the limits of the feeder's files.
+        The band, relative to the nominal voltage; None: the limits of the feeder's files.
     load_high, pv_high
         Largest shares of the peaks in the box of all loads.
     presets
@@ -92,22 +92,22 @@ class DroopOptions:
     tau_factors
         Factors on all time constants to compare.
     hosting
-        Whether to look for hosting capacities.
+        True: search for hosting capacities.
     hosting_presets
-        Fleets that new generation comes with; empty: without reactive power.
+        Presets of new generation; empty: without reactive power.
     hosting_load
-        Share of their peak that loads draw meanwhile.
+        Loads relative to their peaks meanwhile, 1.
     hosting_customers
-        Who gets the generation; None: who has some, in proportion.
+        Customers with the generation; None: those of the files, in proportion.
     unit_kw
-        Size of a unit that comes to a random customer, kW.
+        Size of a unit at a random customer, kW.
     draws
-        How many random orders of customers.
+        Number of random orders of customers.
 
     Raises
     ------
     ValueError
-        With everything that is out of range, or would be ignored.
+        With every option that is out of range or has no effect.
     """
 
     preset: str | None = None
@@ -138,10 +138,11 @@ class DroopOptions:
         for name in dict.fromkeys([*presets, *filter(None, self.hosting_presets)]):
             if name not in PRESETS:
                 yield Problem(
-                    "unknown-name", f"there is no preset {name!r}; expected one of {', '.join(PRESETS)}"
+                    "unknown-name", f"preset {name!r} does not exist; expected one of {', '.join(PRESETS)}"
                 )
-        if self.who not in tuple(Who):
-            yield Problem("unknown-name", f"who: {self.who!r}; expected one of {', '.join(Who)}")
+        chosen, known = self.who, tuple(Who)
+        if chosen not in known:
+            yield Problem("unknown-name", f"`who` is {chosen!r}; expected one of {', '.join(known)}")
         try:
             Update(self.interval_s, self.dead)
         except InputInvalid as error:
@@ -155,7 +156,7 @@ class DroopOptions:
     def _limit_problems(self) -> Iterator[Problem]:
         yield from range_problem("busbar voltage", self.v0_low, self.v0_high)
         if self.v0_low == 0.0:
-            yield Problem("not-positive", "a busbar at 0 pu feeds nothing")
+            yield Problem("not-positive", "the busbar voltage must be above 0 pu")
         if self.v_min is not None and self.v_max is not None:
             yield from band_problem(self.v_min, self.v_max)
         shares = {"load": self.load_high, "generation": self.pv_high, "load while hosting": self.hosting_load}
@@ -184,53 +185,53 @@ class DroopOptions:
 
 
 def band_problem(low: float, high: float) -> list[Problem]:
-    """What is wrong with a band of voltages; empty if nothing is.
+    """Problem of a band of voltages; empty without one.
 
     Parameters
     ----------
     low, high
-        Its limits, parts of the nominal voltage.
+        Its limits, relative to the nominal voltage.
     """
     if 0.0 < low < high < math.inf:
         return []
-    text = f"the band from {low:g} to {high:g} is none; expected two ascending voltages, pu"
+    text = f"the band from {low:g} to {high:g} is empty; expected two ascending voltages, pu"
     return [Problem("order", text)]
 
 
 ANY = "any loads"
-"""The row about all loads within their limits."""
+"""Row for all loads within their limits."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DroopStudy:
-    """What `droop` found.
+    """Result of `droop`.
 
     Attributes
     ----------
     feeder, digest
-        The feeder's name, and its content.
+        Name and content digest of the feeder.
     seed, options
         As in `droop`.
     verdict
-        Of the fleet, with constant loads anywhere within their limits.
+        Stability of the fleet with constant loads anywhere within their limits.
     rest, always
-        Is the band kept while loads move slowly, and however they move?
+        Proof status of the band for slow and for arbitrary load changes.
     tables
         - `stability`: a row for each operating point, and one for any loads. `verdict`, `proof`, `gain` (of
           the loop at rest), `growth` (of a small deviation in one update), `margin` (all curves with the same
-          limits are stable up to this factor on their slopes), `slope_certified` and `slope_unstable` (this
-          fleet's curves, made steeper: proven up to the one, rest unstable from the other), `size_certified`
-          and `size_unstable` (the same with larger inverters), `longest_interval_s`, `tau_factor` (all time
-          constants may be multiplied with it), `why`.
-        - `inverters`: `part` of the loop gain, and `alone`, what one's slope may be multiplied with.
+          limits are stable up to this factor on their slopes), `slope_certified` and `slope_unstable`
+          (factors on the slopes of this fleet's curves: proven stable up to the first, equilibrium unstable
+          from the second), `size_certified` and `size_unstable` (the same with larger inverters),
+          `longest_interval_s`, `tau_factor` (admissible factor on all time constants), `why`.
+        - `inverters`: `part` of the loop gain, and `alone`, the admissible factor on one inverter's slope.
         - `steps`: `settling_s`, `overshoot_percent`, `change_volt`, by AC simulation.
         - `trajectories`: the voltages of the steps.
-        - `band`: with and without the fleet, is the band kept, and the extremes of the proven limits, V.
+        - `band`: with and without the fleet, proof status, and extremes of the proven limits, V.
         - `customers`: the proven limits of each customer's voltage, V.
-        - `witness`: loads that break the band, if some were found.
+        - `witness`: loads that violate the band, if found.
         - `presets`, `time_constants`: verdict, margin, settling, overshoot, voltages of the worst customers.
         - `hosting`, `hosting_curve`, `hosting_draws`: see `feeders.studies.droop.limits`;
-          `hosting_probability`: the share of random orders in which so much generation breaks something.
+          `hosting_probability`: share of random orders in which this generation violates a limit.
 
         In three phases `inverters`, `customers` and `witness` have a column `phase`.
     """
@@ -247,7 +248,7 @@ class DroopStudy:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Study:
-    """A fleet on a feeder, and what is asked of it."""
+    """Fleet on a feeder, with the options of the study."""
 
     subject: Subject
     fleet: Droop
@@ -295,28 +296,28 @@ def droop(
     site
         The feeder.
     options
-        What is studied; by default the feeder's own fleet, sampled once a second.
+        Options; by default the feeder's own fleet, sampled once a second.
     seed
-        Chooses small deviations from rest, and the orders in which generation comes.
+        Seed of small deviations from equilibrium, and of the orders of generation.
     journal
-        File in which finished work is kept; an interrupted study goes on from it.
+        File of finished work; an interrupted study resumes from it.
     progress
-        Told how far it is.
+        Called with (done, total).
 
     Raises
     ------
     NoInverters
-        If the feeder has no inverters and no preset is given.
+        Without inverters and without a preset.
     ValueError
-        If the band is none, or new generation is for somebody who is no customer.
+        For an invalid band, or new generation at an unknown customer.
     OtherStudy
-        If the journal is another study's.
+        If the journal is that of another study.
     InUse
-        If another process is writing it.
+        If another process writes the journal.
     """
     given = options or DroopOptions()
     study = _Study(Subject.of(site), chosen_fleet(site, given.preset, given.who), given, seed)
-    refuse(band_problem(*study.limits))  # one limit may be given, and the other the file's
+    refuse(band_problem(*study.limits))  # one limit may be an option, and the other the file's
     subject = {"study": "droop", "digest": site.digest, "seed": seed, "options": asdict(given)}
     done = worked(journal, subject, _tasks(study), progress)
     tables = _tables(site, done)
@@ -344,7 +345,7 @@ def _tasks(study: _Study) -> Iterator[Task]:
     yield "inverters", partial(inverter_rows, study.subject, study.fleet, study.update, study.box, ANY)
     yield "steps", partial(_steps, study)
     yield "band|with the fleet", partial(_band, study, study.fleet)
-    yield "band|without", partial(_band, study, nobody(study.fleet))
+    yield "band|without", partial(_band, study, without_inverters(study.fleet))
     for name in given.presets:
         yield f"presets|{name}", partial(_preset, study, name)
     for times in given.tau_factors:
@@ -378,7 +379,7 @@ def _any_loads(study: _Study) -> dict[str, Any]:
 
 
 def _runs(study: _Study, fleet: Droop) -> dict[str, Run]:
-    """The steps, each from rest."""
+    """Step responses, each from equilibrium."""
     site, net, out = study.subject.site, study.subject.net, {}
     for name, step in steps(site, study.v0).items():
         x, _ = rest(net, fleet, step.before.p_low + 1j * step.before.q_low, step.before.v0_low)
@@ -414,7 +415,7 @@ def _time_constant(study: _Study, times: float) -> dict[str, Any]:
 
 
 def _compared(study: _Study, fleet: Droop) -> dict[str, Any]:
-    """One line about a fleet."""
+    """Figures of one fleet for a comparison."""
     site, subject = study.subject.site, study.subject
     at = points(site, study.v0)
     told = [judge(subject, fleet, study.update, each, seed=study.seed) for each in at.values()]
@@ -439,7 +440,7 @@ def _compared(study: _Study, fleet: Droop) -> dict[str, Any]:
 
 
 def _most(rows: list[dict[str, Any]], column: str) -> float:
-    """The largest number in a column; NaN if one is not known."""
+    """Largest number in a column; NaN if one is unknown."""
     return float(np.max([row.get(column, math.nan) for row in rows], initial=0.0)) if rows else math.nan
 
 
@@ -462,13 +463,13 @@ def _hosting_tasks(study: _Study) -> Iterator[Task]:
 
 
 def _curve(study: _Study, plan: Plan, at: Conditions) -> list[dict[str, Any]]:
-    """A dozen amounts, up to a third beyond the capacity without reactive power."""
+    """Hosting curve of 13 amounts, up to a third beyond the capacity without reactive power."""
     most = capacity(study.subject, replace(plan, preset=""), at)["capacity_kw"]
     return curve(study.subject, plan, list(np.linspace(0.0, 4.0 / 3.0 * most or 1.0, 13)), at)
 
 
 def _probability(draws: pd.DataFrame) -> pd.DataFrame:
-    """For every capacity that occurs, the share of orders in which more than that breaks something."""
+    """For every capacity found, the share of orders in which more generation violates a limit."""
     parts = []
     for preset, some in draws.groupby("preset", sort=False):
         kw = np.sort(some["capacity_kw"].to_numpy())
@@ -511,7 +512,7 @@ def _tables(site: Site, done: dict[str, Any]) -> dict[str, pd.DataFrame]:
 
 
 def _add_phases(site: Site, tables: Sequence[pd.DataFrame]) -> None:
-    """A column `phase` beside the customers, where they have single phases."""
+    """Add a column `phase` beside the customers, for customers of single phases."""
     of = {row.customer: row.phases for row in site.tables.customers}
     for table in tables:
         if len(table) and set(of.values()) != {"abc"}:
@@ -527,7 +528,7 @@ def presets_of(
     journal: Where = None,
     progress: Progress | None = None,
 ) -> pd.DataFrame:
-    """The table `presets` of several feeders, one under the other.
+    """Table `presets` of several feeders, one below the other.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """Stability of a droop fleet at an operating point: proofs, margins, step responses.
 
 The inverters are those of `gridsec.planning.droop.stability`: sampled, with dead time. Continuous filters are
-simulated with intervals of a small part of their time constants. The power flow is that of
-`feeders.simulation.powerflow`, which shares nothing with the proofs.
+simulated at intervals of a small part of their time constants. The power flow is that of
+`feeders.simulation.powerflow`, which is independent of the proofs.
 
 References
 ----------
@@ -56,23 +56,23 @@ __all__ = [
 
 
 FINE: Final = 40.0
-"""Continuous filters are simulated with so many intervals in the shortest time constant / (1 + gain)."""
+"""Number of simulation intervals of continuous filters in the shortest time constant / (1 + gain)."""
 
 SETTLED: Final = 1e-6
-"""Injections that move by less than this part of the largest limit within a window have settled."""
+"""Largest movement within a window, relative to the largest limit, of settled injections."""
 
 DECAYS: Final = 0.9
-"""A movement that is not smaller than this part of what it was a window before does not die out."""
+"""Smallest ratio of movements in successive windows that do not decay."""
 
 BAND: Final = 0.02
-"""Voltages have settled when they stay this near to their end, as a part of the largest change."""
+"""Largest distance from the final voltage, relative to the largest change, of settled voltages."""
 
 LEAST_PU: Final = 1e-5
-"""Changes of voltages below this are none, pu."""
+"""Voltage change that counts as zero, pu."""
 
 
 class Outcome(StrEnum):
-    """What became of a simulated fleet."""
+    """Outcome of a simulation of a fleet."""
 
     SETTLES = "settles"
     OSCILLATES = "oscillates"
@@ -82,7 +82,7 @@ class Outcome(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Step:
-    """A sudden change of loads, generation or busbar. From rest before it.
+    """Sudden change of loads, generation or busbar, from an equilibrium.
 
     Attributes
     ----------
@@ -101,11 +101,11 @@ class Run:
     Attributes
     ----------
     outcome
-        How it ended.
+        Outcome of the simulation.
     t : (T + 1,)
-        Time, s; the step comes at 0.
+        Time, s; the step is at 0.
     v : (T + 1, N)
-        Voltages of the customers, pu; the first row is right after the step, before any inverter has moved.
+        Voltages of the customers, pu; the first row is just after the step, before any change of injections.
     x : (T + 1, m)
         Reactive injections, pu.
     """
@@ -117,7 +117,7 @@ class Run:
 
 
 def steps(site: Site, v0: float = 1.0, *, tap: float = 0.025) -> dict[str, Step]:
-    """The steps that are looked at.
+    """Steps of the study.
 
     Load: from 0.2 to 0.8 of the peak, no generation. Cloud: generation from its peak to 0.2 of it, at 0.2
     of the load. Tap: the busbar up by one tap, at the same load and full generation.
@@ -149,22 +149,22 @@ def simulate(
     gain: float = 0.0,
     updates: int = 400,
 ) -> Run:
-    """Let the inverters act on the AC power flow with constant loads, until they rest or time is up.
+    """Simulate the inverters on the AC power flow with constant loads, until equilibrium or `updates`.
 
     Parameters
     ----------
     plant
         The feeder, and its AC power flow.
     droop, update
-        The fleet, and when it acts.
+        The fleet, and its sampling.
     loads
         Operating point, a box without width.
     x : (m,)
-        Injections at the beginning, and what the inverters last asked for, pu.
+        Initial injections and last set-points, pu.
     gain
-        Gain of the loop at rest; only continuous filters need it, for the interval.
+        Gain of the loop in equilibrium; used for the interval of continuous filters only.
     updates
-        How many updates at most.
+        Largest number of updates.
     """
     site, flow = plant
     base_kva, own = site.feeder.base_kva, droop.customer
@@ -204,7 +204,7 @@ def _moved(xs: list[Floats]) -> float:
 
 
 def _told(xs: list[Floats], window: int, still: float) -> Outcome:
-    """What the last two windows say."""
+    """Outcome by the last two windows."""
     late, before = _moved(xs[-window:]), _moved(xs[-2 * window : -window])
     if late <= still:
         return Outcome.SETTLES
@@ -219,7 +219,7 @@ def step_rows(site: Site, runs: Mapping[str, Run]) -> list[dict[str, Any]]:
     site
         The feeder.
     runs
-        By name.
+        Step responses by name.
     """
     rows: list[dict[str, Any]] = []
     bases = Bases.of(site)
@@ -228,7 +228,7 @@ def step_rows(site: Site, runs: Mapping[str, Run]) -> list[dict[str, Any]]:
         if not len(run.v):
             rows.append(row)
             continue
-        v = bases.ratio * run.v  # parts of the nominal voltage
+        v = bases.ratio * run.v  # relative to the nominal voltage
         end = v[-1] if run.outcome is not Outcome.OSCILLATES else v[len(v) // 2 :].mean(axis=0)
         change = end - v[0]
         most = int(np.argmax(np.abs(change)))
@@ -275,23 +275,23 @@ def trajectories(site: Site, runs: Mapping[str, Run]) -> pd.DataFrame:
 
 
 KICK: Final = 1e-3
-"""Largest deviation from rest from which an unstable fleet is simulated, part of each limit."""
+"""Largest deviation from equilibrium in simulations of an unstable fleet, relative to each limit."""
 
 CLEARLY: Final = 1e-4
-"""Growth in one update must be beyond 1 by this before a fleet counts as unstable."""
+"""Smallest growth per update beyond 1 of an unstable fleet."""
 
 _AWAY: Final = 80
-"""Updates in which a fleet that grows is simulated."""
+"""Number of updates in simulations of an unstable fleet."""
 
 MOST: Final = 1024.0
-"""Slopes grow up to this factor."""
+"""Largest factor on slopes."""
 
 PLACES: Final = 4
-"""How often an interval of factor 2 is halved: factors are found to 4 %."""
+"""Number of bisections of an interval of factor 2: factors have an accuracy of 4 %."""
 
 
 class Verdict(StrEnum):
-    """What is known of a fleet."""
+    """Stability of a fleet."""
 
     STABLE = "stable"
     UNSTABLE = "unstable"
@@ -300,7 +300,7 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Subject:
-    """A feeder whose fleets are judged: its power flow twice, for simulation and for proofs.
+    """Feeder of the study, with one power flow for simulations and one for proofs.
 
     Attributes
     ----------
@@ -324,23 +324,24 @@ class Subject:
 
 @dataclass(frozen=True, slots=True)
 class Judgement:
-    """What is proven of a fleet with given loads.
+    """Stability of a fleet with given loads.
 
     Attributes
     ----------
     verdict
-        STABLE: from every state the fleet comes to the same rest. UNSTABLE: rest is unstable, and the
-        simulation moves away from it for good. UNDECIDED: neither is proven.
+        STABLE: the fleet converges from every state to the same equilibrium. UNSTABLE: the equilibrium is
+        unstable, and the simulation moves away from it permanently. UNDECIDED: neither is proven.
     proof
         The certificate, as in `gridsec.planning.droop.stability.Proof`.
     gain
-        Largest gain of the loop at rest within reach, 1; NaN if nothing can be said of what is within reach.
+        Largest gain of the loop within the reachable voltages, 1; NaN without bounds of these.
     growth
-        Factor by which a small deviation from rest grows in one update; NaN for loads in a box, or no rest.
+        Growth factor of a small deviation from equilibrium in one update; NaN for a box of loads, or without
+        an equilibrium.
     outcome
-        What the simulation of an unstable fleet did after a small deviation from rest.
+        Outcome of the simulation of an unstable fleet after a small deviation from equilibrium.
     why
-        Why nothing is proven.
+        Reason for a missing proof.
     """
 
     verdict: Verdict
@@ -352,18 +353,18 @@ class Judgement:
 
 
 def judge(subject: Subject, droop: Droop, update: Update, loads: Box, *, seed: int = 0) -> Judgement:
-    """Judge a fleet with constant loads, somewhere in a box or at a point.
+    """Determine the stability of a fleet with constant loads, anywhere in a box or at a point.
 
     Parameters
     ----------
     subject
         The feeder.
     droop, update
-        The fleet, and when it acts.
+        The fleet, and its sampling.
     loads
-        Injections without it.
+        Injections without the fleet.
     seed
-        Chooses the deviation from rest that is simulated.
+        Seed of the simulated deviation from equilibrium.
     """
     given, why = _loop(subject.net, droop, update, loads)
     gain = math.nan if given is None else given.gain
@@ -374,17 +375,17 @@ def judge(subject: Subject, droop: Droop, update: Update, loads: Box, *, seed: i
         found = proof(given)
         if found.kind:
             return Judgement(Verdict.STABLE, found.kind, gain, grows[1])
-        why = f"the loop gain may be {gain:.3g}, and the certificates end at {found.factor:.3g} of it"
+        why = f"the loop gain may be {gain:.3g}; the certificates are valid up to {found.factor:.3g} of it"
     if not pointlike:
         return Judgement(Verdict.UNDECIDED, "", gain, math.nan, why=why)
     if steady is None:
-        return Judgement(Verdict.UNDECIDED, "", gain, math.nan, why=f"{why}; no equilibrium was found")
+        return Judgement(Verdict.UNDECIDED, "", gain, math.nan, why=f"{why}; no equilibrium found")
     if grows[0] > 1.0 + CLEARLY:
         x, plant = _kicked(droop, steady[0], seed), (subject.site, subject.flow)
         run = simulate(plant, droop, update, loads, x, gain=0.0 if math.isnan(gain) else gain, updates=_AWAY)
         if run.outcome in {Outcome.OSCILLATES, Outcome.COLLAPSES}:
             return Judgement(Verdict.UNSTABLE, "", gain, grows[0], str(run.outcome))
-        why += f"; rest is unstable, but the simulation {run.outcome}"
+        why += f"; the equilibrium is unstable, but the simulation: {run.outcome}"
     return Judgement(Verdict.UNDECIDED, "", gain, grows[1], why=why)
 
 
@@ -403,7 +404,7 @@ def _loop(net: Network, droop: Droop, update: Update, loads: Box) -> tuple[Loop 
 def _linearised(
     net: Network, droop: Droop, update: Update, loads: Box
 ) -> tuple[Floats, tuple[float, float]] | None:
-    """Injections at rest; least and largest growth around it, which differ only on breakpoints."""
+    """Injections in equilibrium, and least and largest growth around it, which differ only on breakpoints."""
     s, own = loads.p_low + 1j * loads.q_low, droop.customer
     x, V = rest(net, droop, s, loads.v0_low)
     if not np.isfinite(x).all():
@@ -416,7 +417,7 @@ def _linearised(
 
 
 def _kicked(droop: Droop, x: Floats, seed: int) -> Floats:
-    """A small deviation from rest, in every direction."""
+    """Small deviation from equilibrium, in every direction."""
     kick = KICK * np.random.default_rng(seed).choice([-1.0, 1.0], x.size) * droop.limit
     return np.asarray(np.clip(x + kick, droop.q[:, 3], droop.q[:, 0]))
 
@@ -431,7 +432,7 @@ def edge(
     loads: Box,
     change: Callable[[Droop, float], Droop] = steepened,
 ) -> tuple[float, float]:
-    """Between which factors on all slopes a fleet ceases to be stable, by doubling and bisection.
+    """Factors on all slopes at which a fleet ceases to be stable, by doubling and bisection.
 
     Parameters
     ----------
@@ -440,13 +441,13 @@ def edge(
     loads
         An operating point.
     change
-        How slopes grow: `steepened` with the same limits, or `enlarged` with the same breakpoints.
+        Change of the slopes: `steepened` with the same limits, or `enlarged` with the same breakpoints.
 
     Returns
     -------
     tuple
-        The largest factor found with which the fleet is proven to be stable, 0 if none; the smallest found
-        with which its rest is unstable, infinity if none up to 1024.
+        The largest factor found with a proof of stability, 0 without one; the smallest found with an unstable
+        equilibrium, infinity if none up to 1024.
     """
 
     def proven(times: float) -> bool:
@@ -461,13 +462,13 @@ def edge(
         return steady is not None and steady[1][0] > 1.0 + CLEARLY
 
     certified = _last(proven, PLACES)
-    # Up to there nothing grows: what is proven need not be looked at again.
+    # Deviations do not grow up to the certified factor: no second test is needed there.
     unstable = _last(lambda times: times <= certified or not grows(times), PLACES)
     return certified, math.inf if unstable >= MOST else unstable * 2.0 ** (0.5**PLACES)
 
 
 def _last(holds: Callable[[float], bool], places: int) -> float:
-    """The largest factor found at which something holds, 0 if it does not even at a quarter."""
+    """Largest factor found with the property, 0 without it at a quarter."""
     times = 1.0
     while times >= 0.25 and not holds(times):
         times *= 0.5
@@ -486,7 +487,7 @@ def _last(holds: Callable[[float], bool], places: int) -> float:
 
 
 def longest_interval(subject: Subject, droop: Droop, update: Update, loads: Box) -> float:
-    """The longest sampling interval found with which the fleet is proven to be stable, s.
+    """Longest sampling interval found with a proof of stability, s.
 
     Infinity: the certificate covers every interval. The time constants may be shorter in the same ratio.
 
@@ -505,7 +506,7 @@ def longest_interval(subject: Subject, droop: Droop, update: Update, loads: Box)
         return bool(proof(loop(droop, within, replace(update, interval_s=interval))).kind)
 
     jumping = loop(droop, within, replace(update, interval_s=50.0 * longest))
-    # e^-50 is nothing: as if inverters jumped to their set-points.
+    # e^-50 is negligible: inverters jump to their set-points.
     if proof(jumping).kind and jumping.covers_shorter:
         return math.inf
     start = update.interval_s or 1e-3 * float(np.min(droop.tau))
@@ -515,7 +516,7 @@ def longest_interval(subject: Subject, droop: Droop, update: Update, loads: Box)
 def inverter_rows(
     subject: Subject, droop: Droop, update: Update, loads: Box, where: str
 ) -> list[dict[str, Any]]:
-    """Who contributes how much to the loop gain, and how much steeper each alone may be.
+    """Share of each inverter in the loop gain, and admissible factor on its slope alone.
 
     Parameters
     ----------
@@ -543,17 +544,17 @@ def inverter_rows(
 
 
 def _shares(site: Site, given: Loop) -> Share:
-    """By the modes of a loop of reactances in common; in three phases by its gain without regard to sign."""
+    """Shares by common modes of the loop of reactances; in three phases by absolute values of its gain."""
     limit = proof(given).factor
     if not isinstance(site.feeder, InPhases):
         return shares(given, limit * float(np.linalg.norm(0.5 * (given.S + given.S.T), 2)))
     own = shares_of_gain(given)
-    # What all may do together, one may do alone.
+    # A factor that is admissible for all is admissible for one.
     return replace(own, factor=np.fmax(own.factor, limit if limit >= 1.0 else math.nan))
 
 
 def margin(subject: Subject, droop: Droop, update: Update, loads: Box) -> float:
-    """Factor on the steepest slopes up to which all curves with the same limits are proven to be stable.
+    """Factor on the steepest slopes up to which all curves with the same limits are proven stable.
 
     Parameters
     ----------
@@ -563,7 +564,7 @@ def margin(subject: Subject, droop: Droop, update: Update, loads: Box) -> float:
     Returns
     -------
     float
-        0 if nothing can be said of all that such curves can do.
+        0 without bounds for all such curves.
     """
     try:
         within = reach(subject.net, droop, loads, rounds=0)
@@ -575,13 +576,7 @@ def margin(subject: Subject, droop: Droop, update: Update, loads: Box) -> float:
 
 
 def worst(verdicts: Iterable[str]) -> Verdict:
-    """One verdict of several: unstable if one is, stable if all are.
-
-    Parameters
-    ----------
-    verdicts
-        At least one.
-    """
+    """Combined verdict: unstable if one is, stable if all are."""
     known = set(verdicts)
     if Verdict.UNSTABLE in known:
         return Verdict.UNSTABLE

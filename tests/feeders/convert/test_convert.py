@@ -206,7 +206,7 @@ def test_everything_is_carried_over_or_named() -> None:
         "left out: impedance choke",
         "control of gen gen-0; a customer that feeds in 10 kW",
         "control of storage storage-0; a customer that draws 1 kW",
-        "line across; open towards what the busbar does not feed",
+        "line across; open, towards buses that the busbar does not feed",
         "left out: 3 buses; above the busbar, behind a transformer or without supply",
     ):
         assert part in said, part
@@ -341,7 +341,7 @@ def test_a_line_of_a_folder_is_opened_and_what_a_folder_cannot_take_is_refused(t
         "root",
         "droop",
         "one_voltage",
-        "there",
+        "line 'nosuch' to open does not exist",
     ]
     assert not (tmp_path / "c").exists()
 

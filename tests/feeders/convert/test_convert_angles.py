@@ -69,7 +69,7 @@ def test_phases_that_follow_each_other_the_other_way_round_are_told_and_checked_
     ways: dict[str, str], tmp_path: Path
 ) -> None:
     done = converted(tmp_path, TOWN, **ways)
-    effect = "0, -120 and 120 degrees, in the source 0, 120 and -119.9; the check shows what that does"
+    effect = "0, -120 and 120 degrees, in the source 0, 120 and -119.9; the check shows the effect"
     assert angles(done) == [Change("bus board", "angles between its phases", "approximated", effect)]
     assert effect in (tmp_path / "out" / CHANGES_FILE).read_text()
     assert done.check is not None

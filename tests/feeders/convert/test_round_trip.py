@@ -269,9 +269,9 @@ def test_a_source_without_solution_is_converted_and_not_checked(tmp_path: Path) 
     assert done.check is None
     assert "own power flow fails" in done.unchecked
     said = "\n".join(done.notes)
-    assert "no-load current of transformer T1; without the source's power flow not known" in said
+    assert "no-load current of transformer T1; not known without the source's power flow" in said
     done = convert(str(path), tmp_path / "y", root="root", one_voltage=True)
-    assert "load side of transformer T1; 2 buses; what flows there is not known" in "\n".join(done.notes)
+    assert "load side of transformer T1; 2 buses; the power into it is not known" in "\n".join(done.notes)
     with refused(GridsecError, "not-converged"):
         check_against_source(str(path), tmp_path / "x", root="root")
 

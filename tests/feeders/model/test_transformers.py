@@ -193,7 +193,7 @@ def test_a_transformer_given_from_its_far_end_is_refused_although_its_voltage_is
         ({"T1": {"to_volt": 400.0}}, "phase-to-phase voltage; expected phase to neutral, 230.94"),
         ({"T1": {"r_ohm": 8.75, "x_ohm": 24.0}}, "8.75 ohm is very large"),  # of its other side
         ({"A1": {"r_ohm": 5.5, "x_ohm": 4.0}}, "5.5 ohm is very large"),
-        ({"T2": {"tap": 48.75}}, "48.75 is no ratio near 1"),
+        ({"T2": {"tap": 48.75}}, "48.75 is not near 1"),
         ({"A2": {"r_ohm": 4.9, "x_ohm": 0.5}, "A1": {"r_ohm": 4.9, "x_ohm": 0.5}}, "the voltage at bus 'a2'"),
     ],
 )

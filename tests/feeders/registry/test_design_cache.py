@@ -94,7 +94,7 @@ def test_an_entry_that_cannot_be_read_is_a_reason_not_a_crash(tmp_path: Path) ->
     assert cache.get("abc") is None
     assert "cannot be read" in cache.problems[0]
     cache.put("abc", b"1")
-    assert "cannot be kept" in cache.problems[1]
+    assert "cannot be stored" in cache.problems[1]
     assert [p.name for p in tmp_path.iterdir()] == ["abc.gains"], "no draft is left behind"
 
 

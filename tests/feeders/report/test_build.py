@@ -205,7 +205,7 @@ def test_names_stay_text(hostile: Site) -> None:
 
 
 def test_no_answer_never_looks_like_no_attack(site: Site, made: Report) -> None:
-    assert "This says nothing about whether there is a danger" in made.html
+    assert "This is no evidence of safety or danger" in made.html
     assert "too few readings &lt;b&gt;here&lt;/b&gt;" in made.html
     silent = Page(report(site, [], ABOUT).html)
     told = [a["data-standing"] for _, a in silent.tags if "data-standing" in a]

@@ -76,7 +76,7 @@ def test_widths_are_rather_too_wide() -> None:
     fonts = pytest.importorskip("matplotlib.textpath")
     from matplotlib.font_manager import FontProperties
 
-    for text in ("m001", "LV1.101 Load 13", "noticed, another may be blamed", "0.11 V"):
+    for text in ("m001", "LV1.101 Load 13", "noticed, another may be named", "0.11 V"):
         path = fonts.TextPath((0.0, 0.0), text, size=100.0, prop=FontProperties(family="DejaVu Sans"))
         wide = path.get_extents().width / 100.0
         assert 0.8 * wide < width_of(text, 1.0) < 1.25 * wide

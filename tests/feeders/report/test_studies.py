@@ -63,7 +63,7 @@ def test_what_is_said_of_a_fleet_is_what_is_known(
     text, finding = told(section, Question.FLEET), section.answers[Question.FLEET]
     assert ("Stable: proved" in text) == (verdict is Verdict.STABLE)
     assert ("It may oscillate" in text) == (verdict is Verdict.UNDECIDED)
-    assert ("is kept, however loads move" in text) == (always is Kept.KEPT)
+    assert ("kept for arbitrary changes of loads" in text) == (always is Kept.KEPT)
     if Verdict.UNDECIDED in (verdict, rest, always):
         assert finding.standing in {Standing.PART, Standing.OPEN}
 
@@ -99,10 +99,10 @@ def test_what_cannot_be_told_is_neither_right_nor_wrong(site: Site, *, sure: boo
     section = section_calibrate.calibrate(site, calibration(site, sure=sure))
     text = told(section, Question.RECORDS)
     assert ("1 correction of the files is proposed" in text) == sure
-    assert ("no correction that is sure" in text) == (not sure)
+    assert ("No correction of the files is decided" in text) == (not sure)
     assert "1 of 2 lines" in text
     assert f"{1 if sure else 2} of {site.feeder.bus.size} customers" in text
-    assert "nothing is known, right or wrong" in text
+    assert "These may be right or wrong" in text
     assert all(figure.draw(NARROW).marks for figure in section.figures)
 
 
@@ -194,7 +194,7 @@ def test_a_search_that_gave_up_is_not_an_all_clear(site: Site, outcomes: list[Ou
     meters.loc[0, "index_any"] = math.nan
     section = invisible(site, replace(found, summary=summary, meters=meters))
     assert section.answers[Question.INVISIBLE].standing is Standing.OPEN
-    assert "is not proved: the search gave up" in told(section, Question.INVISIBLE)
+    assert "are not proved: the search was stopped" in told(section, Question.INVISIBLE)
     drawing = section.figures[0].draw(WIDE)
     assert any(getattr(mark, "text", "") == "not known" for mark in drawing.marks)
 
@@ -219,9 +219,9 @@ def test_protection_against_false_powers_is_told(site: Site) -> None:
     found = protect(site, max_attacked=2)
     text = told(protection(site, found), Question.PROTECT)
     assert text.startswith("Protect 2 of 6 meters: m03 and m06.")
-    assert "whatever powers they report" in text
+    assert "with any reported powers" in text
     assert "Unprotected, one meter hides up to" in text
-    assert "by itself with its powers true" in text
+    assert "by itself, with true powers" in text
 
 
 def test_nobody_among_none_left_invisible_is_told_as_such(site: Site, outcomes: list[Outcome]) -> None:
@@ -229,15 +229,18 @@ def test_nobody_among_none_left_invisible_is_told_as_such(site: Site, outcomes: 
     assert isinstance(found, Protect)
     goal = {"goal": Goal.IDENTIFY, "before": 1.0, "after": math.inf, "alone": math.nan}
     text = told(protection(site, replace(found, **goal)), Question.PROTECT)
-    assert "Fewest liars that stay invisible: 1 without protection, none with it, however many lie." in text
+    assert (
+        "Fewest manipulated meters that stay invisible: 1 without protection, none with it, for any number"
+        in text
+    )
 
 
 def test_who_lies_alone_has_nobody_with_it(site: Site, outcomes: list[Outcome]) -> None:
     found = result(outcomes, "detectable")
     assert isinstance(found, Detectable)
     for liars, words in (
-        (1, "Each meter lying alone."),
-        (3, "Each meter lying together with at most 2 more."),
+        (1, "Each meter manipulated alone."),
+        (3, "Each meter manipulated together with at most 2 more."),
     ):
         assert sizes(site, replace(found, max_attacked=liars)).figures[0].text.startswith(words)
 
@@ -262,7 +265,7 @@ def test_attacks_that_could_not_be_played_are_told(site: Site, played: Campaign)
     scenarios = played.scenarios.copy()
     scenarios.loc[1, "reason"] = "no such place"
     text = told(attacks(site, replace(played, scenarios=scenarios)), Question.MONITOR)
-    assert "1 scenario could not be played: nothing is known" in text
+    assert "1 scenario could not be simulated: no result" in text
     missed = int(np.isinf(played.liars["delay_s"]).sum())
     assert missed
     assert re.search(rf"\b{missed} (was|were) missed\b", text)
@@ -271,7 +274,7 @@ def test_attacks_that_could_not_be_played_are_told(site: Site, played: Campaign)
 def test_a_campaign_without_liars_tells_nothing_about_attacks(site: Site, played: Campaign) -> None:
     section = attacks(site, replace(played, liars=played.liars.head(0)))
     assert section.answers[Question.MONITOR].standing is Standing.OPEN
-    assert "nothing was learned about attacks" in told(section, Question.MONITOR)
+    assert "No scenario has an attack: no result on attacks" in told(section, Question.MONITOR)
 
 
 @pytest.mark.parametrize(("verdict", "words"), [("undecided", "not proved"), ("unstable", "unstable there")])
@@ -283,19 +286,19 @@ def test_hosted_generation_is_not_called_stable_where_that_is_not_proved(
         hosting = pd.DataFrame([row | {"verdict": known}])
         tables = {**studied.tables, "hosting": hosting}
         text = told(fleet(site, replace(studied, tables=tables)), Question.FLEET)
-        hosted = text[text.index("Generation that the feeder hosts") :]
+        hosted = text[text.index("Hosting capacity, with generation") :]
         assert (words in hosted) == there
 
 
 def test_a_meter_that_seems_to_lie_is_said(site: Site) -> None:
     found = calibration(site, sure=False)
     meter = str(site.meter_ids[0])
-    row = {"what": [meter], "proposed": ["its error is another"], "verdict": [EXCLUDED]}
+    row = {"what": [meter], "proposed": ["another error"], "verdict": [EXCLUDED]}
     customers = found.customers.assign(verdict=[EXCLUDED, *["as in the files"] * (len(found.customers) - 1)])
     section = section_calibrate.calibrate(
         site, replace(found, proposals=pd.DataFrame(row), customers=customers)
     )
     text = told(section, Question.RECORDS)
-    assert f"1 meter is off in a way that errors of the files explain less well: {meter}" in text
+    assert f"1 meter is inconsistent, and errors of the files explain it less well: {meter}" in text
     drawing = section.figures[0].draw(WIDE)
     assert any(getattr(mark, "text", "") == "cannot be told" for mark in drawing.marks)

@@ -90,7 +90,7 @@ def test_a_family_that_cannot_be_designed_keeps_its_row_with_the_reason() -> Non
 def test_a_lie_that_cannot_be_told_is_a_reason_too() -> None:
     plan = replace(SHORT, max_attacked=2, seeds=1, cases=("bias",), families=("sequential",))
     (row,) = compare(without_meters(load(FEEDER), 1), plan)
-    assert "lie" in row.reason
+    assert "manipulate" in row.reason
 
 
 def test_a_family_that_fails_while_it_watches_leaves_the_others_alone(
@@ -108,7 +108,7 @@ def test_a_family_that_fails_while_it_watches_leaves_the_others_alone(
     (alone,) = compare(site, replace(plan, families=("sequential",)))
     monkeypatch.setitem(FAMILIES._known, "exact-bank", replace(made, step=step))
     row, broken = compare(site, plan)
-    assert broken.reason == "it failed while it watched: ZeroDivisionError: a defect of the other package"
+    assert broken.reason == "failed in a step: ZeroDivisionError: a defect of the other package"
     assert (broken.case, broken.observers) == ("clean", 0)
     assert replace(row, step_ms=0.0, step_ms_95=0.0) == replace(alone, step_ms=0.0, step_ms_95=0.0)
 

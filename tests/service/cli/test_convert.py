@@ -48,7 +48,7 @@ def test_an_opendss_file_with_a_loop(tmp_path: Path) -> None:
         app, ["feeders", "convert", str(source), str(tmp_path / "out"), "--open", "ring", "--name", "town"]
     )
     assert done.exit_code == 0, done.output
-    assert "as asked for" in done.output
+    assert "as requested" in done.output
     assert 'name = "town"' in (tmp_path / "out" / "feeder.toml").read_text()
 
 
@@ -62,7 +62,7 @@ def test_a_feeder_written_by_hand_is_never_replaced(tmp_path: Path) -> None:
     for given in (source, own):
         done = run(app, ["feeders", "convert", str(given), str(own)])
         assert isinstance(done.exception, FileExistsError)
-        assert "that no conversion has written" in str(done.exception)
+        assert "that is not from a conversion" in str(done.exception)
         assert {path.name: path.read_bytes() for path in own.iterdir()} == before
     assert sorted(path.name for path in tmp_path.iterdir()) == ["grid.json", "mine"]
 

@@ -183,13 +183,13 @@ def test_without_inverters_nothing_could_be_unstable(
     write(village_without_inverters().tables, folder)
     code, told, _ = run(monkeypatch, capsys, "droop", str(folder), "--no-journal")
     assert code == 0
-    assert "no inverters: nothing to be stable" in told
+    assert "no inverters: stability does not apply" in told
     code, told, error = run(
         monkeypatch, capsys, "report", str(folder), "--studies", "droop", "--out", str(page)
     )
     assert (code, error) == (0, "")
-    assert "droop: no inverters: nothing to be stable" in told
-    assert "No inverters: nothing to be stable." in page.read_text(encoding="utf-8")
+    assert "droop: no inverters: stability does not apply" in told
+    assert "No inverters: stability does not apply." in page.read_text(encoding="utf-8")
     # Who asks for hosting asks for more than there is.
     code, _, error = run(monkeypatch, capsys, "droop", str(folder), "--no-journal", "--hosting")
     assert code != 0

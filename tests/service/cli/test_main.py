@@ -265,7 +265,7 @@ def test_all_that_is_wrong_with_a_scenario_is_told_at_once(gridsec: Run, tmp_pat
     assert not out.exists()
     done = gridsec("simulate", FEEDER, "--attack=stuck:1:0:-1e9:5", "--out", str(out))
     assert done.returncode == 2
-    assert "further than can be played" in plain(done.stderr)
+    assert "more than the simulation supports" in plain(done.stderr)
     late = ("--attack=bias:1:0.03:500:600", "--attack=bias:substation:0.03:60:inf")
     late += ("--inverter-attack=LV1.101 Load 2:4:70:90",)
     done = gridsec("simulate", FEEDER, "--duration", "60", *late, "--out", str(out))

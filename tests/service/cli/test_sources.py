@@ -157,8 +157,8 @@ def test_a_busbar_that_is_not_clear(
     [
         ("nowhere.json", None, 6, "nowhere.json: there is no such file"),
         ("nowhere.dss", None, 6, "nowhere.dss: there is no such file"),
-        ("empty.json", "", 6, "empty.json: no valid JSON"),
-        ("half.json", '{"_module": "pandapower.auxiliary", "_cl', 6, "half.json: no valid JSON"),
+        ("empty.json", "", 6, "empty.json: invalid JSON"),
+        ("half.json", '{"_module": "pandapower.auxiliary", "_cl', 6, "half.json: invalid JSON"),
         ("net.json", '{"_class": "pandapowerNet"}', 6, "net.json: "),
         ("empty.dss", "", 6, "finds no circuit in it"),
         ("simbench:7-LV--0-sw", None, 6, "SimBench has no grid '7-LV--0-sw'"),
@@ -196,7 +196,7 @@ def test_a_report_tells_what_was_not_carried_over(
     changes = pd.read_csv(folder / "feeder" / "conversion.csv")
     pd.testing.assert_frame_equal(pd.read_csv(folder / "tables" / "feeder-conversion.csv"), changes)
     html = page.read_text(encoding="utf-8")
-    assert "What was not carried over from its source" in html
+    assert "Changes of the conversion" in html
     for cell in changes["element"]:
         assert f"<td>{cell}</td>" in html
     source = (folder / "feeder" / "SOURCE.md").read_text(encoding="utf-8")

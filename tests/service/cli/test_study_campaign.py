@@ -69,7 +69,7 @@ def test_wrong_arguments_are_told(
         (("--place", "nowhere"), "expected one of random, street, sensitive, colluding"),
         (("--season", "carnival"), "expected one of winter, spring, summer, autumn"),
         (("--estimator", "oracle"), "estimator 'oracle' does not exist"),
-        (("--setting", "colour=3"), "'colour' is no setting"),
+        (("--setting", "colour=3"), "'colour' is not a setting"),
         (("--setting", "colour"), "expected NAME=NUMBER"),
         (("--dask", "tcp://127.0.0.1:1"), "a Dask cluster has its own workers"),
     ):

@@ -41,7 +41,7 @@ def test_a_feeder_without_inverters_says_which_option_helps(
     write(village_without_inverters().tables, folder)
     code, told, _ = run(monkeypatch, capsys, folder, *FEW)
     assert code == 0
-    assert "no inverters: nothing to be stable (--preset" in told
+    assert "no inverters: stability does not apply (--preset" in told
     code, answer, _ = run(
         monkeypatch, capsys, folder, *FEW, "--preset", "vde4105", "--interval", "0", "--also", "cigre-lv"
     )

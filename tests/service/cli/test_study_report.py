@@ -53,7 +53,7 @@ def test_a_report_and_everything_beside_it(
 
     code, _, _ = run(monkeypatch, capsys, *again[3:])
     assert code == 0
-    assert "with work kept from before" in page.read_text(encoding="utf-8")
+    assert "with reused earlier work" in page.read_text(encoding="utf-8")
     assert {path.name: path.read_bytes() for path in (folder / "figures").iterdir()} == first
 
     # Of another question the same report keeps nothing that is not in it.
@@ -104,7 +104,7 @@ def test_an_interrupted_report_goes_on(
     assert run(monkeypatch, capsys, *words)[0] == 0
 
     def timeless(text: str) -> str:
-        return re.sub(r"redundancy: [0-9.]+ s(, with work kept from before)?", "", text)
+        return re.sub(r"redundancy: [0-9.]+ s(, with reused earlier work)?", "", text)
 
     assert timeless(page.read_text(encoding="utf-8")) == timeless(whole)
     assert journal.read_bytes().splitlines() == [line.strip() for line in lines]
@@ -142,7 +142,7 @@ def test_what_a_study_cannot_answer_is_in_the_report(
         (("--studies", "protect,palmistry"), "--studies is 'palmistry'; expected one of"),
         (("--studies", "calibrate"), "calibrate needs --readings"),
         (("--goal", "all"), "expected one of identify, notice, bound, contain"),
-        (("--goal", "bound"), "lie_volt is nan; to bound lies it must be a positive number"),
+        (("--goal", "bound"), "lie_volt is nan; a bound of attacks must be a positive number"),
         (("--goal", "notice", "--lie-volt", "3"), "lie_volt goes with goals in volts, not with notice"),
         (("--studies", "redundancy", "--hosting"), "--hosting goes with droop"),
         (("--studies", "redundancy,droop", "--readings", "pyproject.toml"), "--readings goes with calibrate"),
