@@ -16,6 +16,7 @@ number; 500 MB for 2 000.
 from __future__ import annotations
 
 import argparse
+import gc
 import os
 import resource
 import subprocess
@@ -39,7 +40,6 @@ from gridsec.grid.droop import fleet
 from gridsec.grid.meter import MeterAccuracy
 from gridsec.grid.radial import Feeder
 from gridsec.interface import Frame
-from service.engine.design_jobs import settle
 
 SIZES = (13, 30, 60, 146, 300, 600, 1000, 2000)
 STEADY_MS, ATTACK_MS, MEMORY_MB, POWER = 0.5, 5.0, 500.0, 2.0
@@ -190,7 +190,7 @@ def measure(customers: int) -> Measured:
     if customers > 1000:
         quiet, attack, onsets = 1700, 20, 0
     street.play(0, 60)
-    settle()
+    gc.freeze()  # as the service does: full collections stop every thread
     steady = street.play(60, quiet)
     longest = []
     for k in range(60 + quiet, 60 + quiet + onsets):

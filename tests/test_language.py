@@ -31,7 +31,7 @@ PUBLIC = re.compile(r"--[a-z-]+|[`\"]who[`\"]")
 LIMITS = {
     "gridsec": (0, 0),
     "default monitor": (166, 220),
-    "feeders": (206, 246),
+    "feeders": (206, 245),
     "service": (87, 188),
     "documents": (0, 0),
 }

@@ -252,7 +252,7 @@ META_COLUMNS: dict[str, tuple[Column, ...]] = {
             low=0.001,
             high=1e9,
         ),
-        Column("busbar", Kind.ID, "bus whose voltage the busbar meter reads; root of the feeder"),
+        Column("busbar", Kind.ID, "bus of the busbar meter; root of the feeder"),
         Column("busbar_xy", Kind.PAIR, "position of the busbar", None),
         Column("meshed", Kind.TRUTH, "whether closed lines may form loops", False),
         Column(
@@ -327,7 +327,7 @@ META_COLUMNS: dict[str, tuple[Column, ...]] = {
         Column(
             "correlation_s",
             Kind.NUMBER,
-            "how long what is not known of the loads lasts, s",
+            "correlation time of the load errors, s",
             600.0,
             above=0.0,
             high=1e7,
@@ -337,7 +337,14 @@ META_COLUMNS: dict[str, tuple[Column, ...]] = {
     ),
     "monitor": (
         Column("estimator", Kind.TEXT, "estimator family", "sequential", choices=ESTIMATORS),
-        Column("max_attacked", Kind.WHOLE, "liars to withstand; `sequential`: a third", 1, low=0, high=1000),
+        Column(
+            "max_attacked",
+            Kind.WHOLE,
+            "manipulated meters to withstand; `sequential`: a third",
+            1,
+            low=0,
+            high=1000,
+        ),
         Column("tick_s", Kind.NUMBER, "period of the frames, s", 1.0, low=0.01, high=1e5),
         Column(
             "on_delay_s",

@@ -17,9 +17,6 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 from rich.markup import escape
 
-from feeders.report.build import Report
-from feeders.report.html import FEEDER, Outcome, Result
-from feeders.studies.droop.fleets import NOTHING, NoInverters
 from feeders.util import command_line, replace_file, word
 from gridsec.errors import GridsecError, InputInvalid, Problem
 from service.cli import console
@@ -33,6 +30,8 @@ from service.cli.study_planning import BusbarUnknown, GoalOf, LieVolt, Silent, U
 
 if TYPE_CHECKING:
     from feeders.model.site import Site
+    from feeders.report.build import Report
+    from feeders.report.html import Outcome, Result
     from feeders.studies.campaign.plan import Plan
     from feeders.studies.journal import Progress, Where
     from service.cli.session import Keeping
@@ -340,6 +339,9 @@ def outcome(
     bar
         Shows how far it is.
     """
+    from feeders.report.html import Outcome
+    from feeders.studies.droop.fleets import NOTHING, NoInverters
+
     study = STUDIES[name]
     words = ["gridsec", "study", name, asked.feeder, *study.options(asked)]
     start = time.perf_counter()
@@ -404,6 +406,8 @@ def write(made: Report, out: Path, folder: Path) -> None:
     OSError
         If something cannot be written.
     """
+    from feeders.report.html import FEEDER
+
     figures = folder / "figures"
     out.parent.mkdir(parents=True, exist_ok=True)
     figures.mkdir(parents=True, exist_ok=True)

@@ -130,7 +130,7 @@ def test_error_bound_holds_and_is_no_constant(seed: int) -> None:
     # Third order in the size of the flows: at a tenth of the load, far below a tenth of the bound.
     small = feeder.model_error_bound(0.1 * p, 0.1 * q, 1.0)
     if not feeder.charging.any():
-        assert np.all(small <= 2e-3 * bound + 1e-15)
+        assert np.all(small <= 3e-3 * bound + 1e-15)
 
 
 @given(seeds, st.integers(1, 3))

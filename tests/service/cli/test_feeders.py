@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -89,3 +91,10 @@ def test_what_cannot_be_watched_is_said(
     code, _, error = run(monkeypatch, capsys, "design", "cigre-lv", *bank)
     assert code == 3
     assert "more than 6 meters are needed" in error
+
+
+def test_the_command_line_starts_without_numerical_libraries() -> None:
+    """They take a second; commands that need them import them in their bodies."""
+    code = "import sys, service.cli.main; print(*{'pandas', 'scipy', 'sqlalchemy', 'cvxpy'} & {*sys.modules})"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
