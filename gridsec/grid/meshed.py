@@ -209,18 +209,20 @@ class Meshed(OfMatrices):
             Change of the correction, and distance of its first step from the AC power flow, pu:
             `gridsec.grid.intervals.bounds`.
         """
-        with np.errstate(all="ignore"):
+        with np.errstate(all="ignore"):  # NaN gets an infinite bound without a warning
             s, _, idle = _start(self, p, q, v0_squared)
             first = idle + np.conj(s / idle) @ self.transfer_between.T
             second = idle + np.conj(s / first) @ self.transfer_between.T
-        error = np.hypot(p_error, q_error)
-        sweeps = Sweeps(idle, first, second, np.abs(s), lambda current: self.size @ current, np.zeros_like)
-        moved, rest = bounds(sweeps, error)
-        # The linear power flow assumes no charging and equal phases of the busbar; the first sweep has the
-        # actual ones.
-        linear = (self.R + 1j * self.X)[self.bus]
-        apart = np.abs(np.conj(idle)[:, None] * self.transfer_between / np.conj(idle) - linear)
-        return unbounded(moved + 2.0 * (apart @ error)), unbounded(rest)
+            error = np.hypot(p_error, q_error)
+            sweeps = Sweeps(
+                idle, first, second, np.abs(s), lambda current: self.size @ current, np.zeros_like
+            )
+            moved, rest = bounds(sweeps, error)
+            # The linear power flow assumes no charging and equal phases; the first sweep has the actual ones.
+            linear = (self.R + 1j * self.X)[self.bus]
+            apart = np.abs(np.conj(idle)[:, None] * self.transfer_between / np.conj(idle) - linear)
+            moved = moved + 2.0 * (apart @ error)
+        return unbounded(moved), unbounded(rest)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

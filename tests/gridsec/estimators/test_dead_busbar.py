@@ -12,6 +12,7 @@ from gridsec.estimators import exact_bank, partial, set_search, unknown_input
 from gridsec.estimators.plant import Plant
 from gridsec.grid.meshed import MeshedFeeder
 from gridsec.grid.network import Network
+from gridsec.grid.phased import PhasedFeeder
 from gridsec.grid.radial import Feeder
 from gridsec.interface import Decision, Frame
 from tests.gridsec.street import Street, make_plant
@@ -102,7 +103,7 @@ def test_a_threshold_that_is_none_is_never_clean(family: ModuleType, monkeypatch
         street.advance(1.0)
         with monkeypatch.context() as patch:
             if tick == 6:
-                patch.setattr("gridsec.estimators.inputs.interval_bounds", lambda *_, **__: (none, none))
+                patch.setattr(PhasedFeeder, "interval_bounds", lambda *_, **__: (none, none))
             state, _, verdict = family.step(design, state, street.frame())
         if np.isnan(verdict.threshold).any():
             assert verdict.decision is not Decision.CLEAN, tick
