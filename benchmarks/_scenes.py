@@ -26,7 +26,6 @@ from gridsec.arrays import Bools, Floats, Ints
 from gridsec.attack import Attack
 from gridsec.estimators.sequential import SequentialDesign, SequentialState, init, step
 from gridsec.estimators.sequential.commission import Learned
-from gridsec.grid.network import InPhases
 from gridsec.interface import Frame, PowerOrigin
 
 ONSET_S = 20.0
@@ -267,7 +266,7 @@ def _graph(where: Site) -> tuple[csr_array, Ints]:
 
 def phase_of(where: Site) -> Ints:
     """Phase of each meter, (p,); 0 for all on a balanced feeder."""
-    if not isinstance(where.feeder, InPhases):
+    if where.feeder.busbar_phases == 1:
         return np.zeros(where.meters.size, dtype=np.intp)
     rows = where.tables.customers
     return np.array(["abc".index(rows[c].phases) for c in where.meters], dtype=np.intp)

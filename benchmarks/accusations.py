@@ -56,7 +56,6 @@ from gridsec.arrays import Floats, Ints
 from gridsec.attack import Attack, Coordinated, Drift, Scaling
 from gridsec.attack import Bias as Shift
 from gridsec.estimators.sequential import SequentialDesign, SequentialState, step
-from gridsec.grid.network import InPhases
 from gridsec.interface import Decision, Estimate, Frame, Verdict
 
 T_ON = START + ONSET_S
@@ -200,7 +199,7 @@ def stealthy_misfit(stage: Stage) -> Manipulation:
 
 def busbar(stage: Stage) -> Manipulation:
     """One phase of the busbar's meter is off by `size` %."""
-    phases = 3 if isinstance(stage.where.feeder, InPhases) else 1
+    phases = stage.where.feeder.busbar_phases
     which = np.array([stage.random.integers(phases)], dtype=np.intp)
     return (), (Scaling(which, T_ON, T_OFF, factor=np.array([stage.size / 100.0])),)
 

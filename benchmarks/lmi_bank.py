@@ -23,7 +23,7 @@ import numpy as np
 
 from feeders.registry.design_cache import bank_gains
 from gridsec.grid.droop import fleet
-from gridsec.grid.radial import Feeder, lindistflow
+from gridsec.grid.radial import Feeder
 from gridsec.observers.gains import CircleOptions, margin, options_for
 from gridsec.observers.lmi import circle
 from gridsec.observers.lure import Lure, close_loop
@@ -48,7 +48,7 @@ def street(customers: int) -> tuple[Lure, CircleOptions]:
         charging=np.zeros(customers),
     )
     lure = close_loop(feeder, fleet(branches, "ieee1547-b", np.full(customers, 10.0), 100.0), branches)
-    model = lindistflow(feeder)
+    model = feeder.linear()
     # Loads are known within 0.6 kW and 0.2 kvar, meters within 0.05 % of the voltage.
     shape = 2.0 * np.hstack([model.R * 6e-3, model.X * 2e-3])
     load = np.linalg.cholesky(shape @ shape.T)

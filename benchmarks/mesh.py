@@ -22,8 +22,7 @@ from feeders.simulation.attacks import Lie, Trick
 from feeders.simulation.powerflow_three_phase import power_flow
 from feeders.simulation.trial import LoadError, Trial, judge
 from gridsec.arrays import Floats
-from gridsec.grid.meshed import Meshed, sensitivities
-from gridsec.grid.network import bus_voltages, linear, model_error_bound
+from gridsec.grid.meshed import Meshed
 
 LOADS = (0.25, 0.5, 1.0)
 SEEDS = range(5)
@@ -92,9 +91,9 @@ def errors(site: Site, part: float) -> str:
     def off(v2: Floats, bus: Floats) -> float:
         return float(np.abs(np.sqrt(v2[bus]) - truth).max())
 
-    found = [off(bus_voltages(feeder, p, q, 1.0, steps=steps), feeder.bus) for steps in (0, 1)]
-    found.append(float((model_error_bound(feeder, p, q, 1.0) / (2.0 * truth)).max()))
-    found.append(off(bus_voltages(radial, p, q, 1.0), radial.bus))
+    found = [off(feeder.bus_voltages(p, q, 1.0, steps=steps), feeder.bus) for steps in (0, 1)]
+    found.append(float((feeder.model_error_bound(p, q, 1.0) / (2.0 * truth)).max()))
+    found.append(off(radial.bus_voltages(p, q, 1.0), radial.bus))
     return f"| {feeder.name} | {part:g} | {100 * (1 - truth.min()):.1f} % | " + " | ".join(
         f"{value:.1e}" for value in found
     )
@@ -109,7 +108,7 @@ def sensitivity(site: Site, part: float) -> str:
     assert isinstance(feeder, Meshed)
     p_kw = part * site.loads.load_peak * feeder.base_kva
     p, there = -p_kw / feeder.base_kva, np.arange(p_kw.size)
-    models = linear(feeder), sensitivities(feeder, p, 0.33 * p, 1.0)
+    models = feeder.linear(), feeder.sensitivities(p, 0.33 * p, 1.0)
     cells = []
     for power, name in enumerate("RX"):
         moved = np.zeros((2, p_kw.size, 2, p_kw.size))

@@ -38,7 +38,7 @@ from gridsec.estimators.plant import Plant
 from gridsec.estimators.sequential import LoadDoubt
 from gridsec.grid.droop import fleet
 from gridsec.grid.meter import MeterAccuracy
-from gridsec.grid.radial import Feeder, bus_voltages
+from gridsec.grid.radial import Feeder
 from gridsec.interface import Frame
 
 SIZES = (13, 30, 60, 146, 300, 600, 1000, 2000)
@@ -167,7 +167,7 @@ class Watched:
         for k in range(ticks):
             injected = self.state.x
             x: Floats = zero if injected is None else np.bincount(made.plant.droop.customer, injected, size)
-            v = np.sqrt(bus_voltages(made.plant.feeder, p, x, 1.0, steps=3)[1:])
+            v = np.sqrt(made.plant.feeder.bus_voltages(p, x, 1.0, steps=3)[1:])
             y = (v * (1.0 + lies) + 5e-4 * self.rng.normal(size=size)) ** 2
             frame = Frame(float(first + k), y, seen, 1.0, p, zero, zero, zero, none, none)
             begun = time.thread_time()

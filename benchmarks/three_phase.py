@@ -28,7 +28,6 @@ from feeders.model.three_phase import ThreePhaseSite, load_three_phase
 from feeders.simulation.powerflow_three_phase import UnbalancedPowerFlow, sequence_ohm
 from gridsec.arrays import Floats, Phasors, spectral_radius
 from gridsec.errors import DesignInfeasible
-from gridsec.grid import radial as balanced
 from gridsec.grid.droop import fleet
 from gridsec.grid.three_phase import bus_voltages, corrected, lindist3flow, model_error_bound, sensitivities
 from gridsec.observers.certificates import reactance, small_gain
@@ -61,7 +60,7 @@ class Case:
         p, q = -3.0 * p_kw / base, -3.0 * q_kvar / base
         plain, once = (np.sqrt(bus_voltages(feeder, p, q, measured, steps=n)).T for n in (0, 1))
         bound = model_error_bound(feeder, p, q, measured) / (2.0 * np.sqrt(measured.min()))
-        one = balanced.bus_voltages(self.single, -p_kw / base, -q_kvar / base, float(measured.mean()))
+        one = self.single.bus_voltages(-p_kw / base, -q_kvar / base, float(measured.mean()))
         there = truth[feeder.at, feeder.phase]
         return (
             float(np.max(truth[0] - truth)),

@@ -11,13 +11,13 @@ from benchmarks.peers.scene import Reading, Scene
 from gridsec.arrays import Bools, Floats
 from gridsec.estimators.sequential.conditional import Prior
 from gridsec.estimators.sequential.snapshot import FalsePowers, Lies, identify
-from gridsec.grid.radial import Feeder, lindistflow
+from gridsec.grid.radial import Feeder
 
 _STEPS = 2
 
 
 class Flow:
-    """`grid.radial.bus_voltages` at the customers, by matrices made once: on few buses that is faster."""
+    """`Feeder.bus_voltages` at the customers, by matrices made once: on few buses that is faster."""
 
     def __init__(self, feeder: Feeder) -> None:
         at = feeder.start
@@ -69,7 +69,7 @@ class Covariance:
         paths, last = on_path[feeder.bus], len(feeder.buses) - 1
         self.part = last - np.argmax((paths[:, None] & paths)[:, :, ::-1], axis=2)
         everywhere = replace(feeder, bus=np.arange(last + 1), customers=feeder.buses)
-        model = lindistflow(everywhere)
+        model = everywhere.linear()
         at_bus = [2.0 * each for each in (model.R, model.X)]
         self.of_bus = np.hstack(
             [(each**2 - 2.0 * each.diagonal()[:, None] * each)[:, feeder.bus] for each in at_bus]
@@ -89,7 +89,7 @@ class Ours:
     """One feeder, prepared once: matrices of the feeder, nothing of any reading or its noise."""
 
     def __init__(self, here: Scene, lies: Lies | None = None, *, false_powers: bool = True) -> None:
-        self.flow, model = Flow(here.feeder), lindistflow(here.feeder)
+        self.flow, model = Flow(here.feeder), here.feeder.linear()
         self.lies = Lies() if lies is None else lies
         self.R, self.X = (np.ascontiguousarray(2.0 * each) for each in (model.R, model.X))
         self.covariance = Covariance(here.feeder, self.R, self.X)

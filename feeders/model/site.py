@@ -48,10 +48,11 @@ from feeders.model.three_phase import spanned, unsupported
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, frozen
 from gridsec.errors import FeederInvalid, Problem
 from gridsec.estimators.plant import Plant
+from gridsec.grid import AnyNetwork
 from gridsec.grid.droop import Droop
-from gridsec.grid.meshed import Meshed, MeshedFeeder, PhasedMesh
+from gridsec.grid.meshed import MeshedFeeder, PhasedMesh
 from gridsec.grid.meter import MeterAccuracy
-from gridsec.grid.network import Network, Power, model_error_bound, own
+from gridsec.grid.network import Power
 from gridsec.grid.phased import PhasedFeeder
 from gridsec.grid.radial import Feeder
 from gridsec.grid.three_phase import PHASES, ThreePhaseFeeder
@@ -251,7 +252,7 @@ def registered(site: Site, metered: Floats) -> Registered:
     over = np.flatnonzero(known & (found.excess > 0.0))
     if not over.size or _bounded(site, found):
         return found
-    effect = own(site.feeder, Power.ACTIVE)[over] * found.excess[over]
+    effect = site.feeder.self_impedance(Power.ACTIVE)[over] * found.excess[over]
     over = over[np.argsort(-effect, kind="stable")]
 
     def without(count: int) -> Registered:
@@ -269,7 +270,7 @@ def registered(site: Site, metered: Floats) -> Registered:
 def _bounded(site: Site, powers: Registered) -> bool:
     """True with a finite error bound of the loss-corrected model at nominal busbar voltage."""
     with np.errstate(all="ignore"):
-        bound = model_error_bound(site.feeder, -powers.p, -powers.q, site.droop.vbar**2)
+        bound = site.feeder.model_error_bound(-powers.p, -powers.q, site.droop.vbar**2)
     return all_of(np.isfinite(bound))
 
 
@@ -342,7 +343,7 @@ class Site:
     """
 
     tables: FeederTables
-    feeder: Network
+    feeder: AnyNetwork
     droop: Droop
     meters: Ints
     meter_ids: tuple[str, ...]
@@ -373,7 +374,11 @@ class Site:
     @property
     def ties(self) -> Ints:
         """Buses at both ends of the lines that close loops in `spanning`, (t, 2)."""
-        return self.feeder.ends if isinstance(self.feeder, Meshed) else np.zeros((0, 2), dtype=np.intp)
+        return (
+            self.feeder.ends
+            if isinstance(self.feeder, MeshedFeeder | PhasedMesh)
+            else np.zeros((0, 2), dtype=np.intp)
+        )
 
     @property
     def tree(self) -> Feeder | ThreePhaseFeeder:
@@ -384,7 +389,7 @@ class Site:
         FeederInvalid
             If closed lines form loops.
         """
-        if isinstance(self.feeder, Meshed):
+        if isinstance(self.feeder, MeshedFeeder | PhasedMesh):
             raise FeederInvalid(
                 [Problem("not-radial", "lines: closed lines form loops; a radial feeder is required")]
             )

@@ -27,7 +27,6 @@ from gridsec.estimators import (
     windowed,
 )
 from gridsec.estimators.sequential.decoder import Decoder
-from gridsec.grid.network import linear
 from gridsec.observers.certificates import certify
 from gridsec.observers.gains import CircleOptions, options_for
 from gridsec.observers.lure import Lure, close_loop
@@ -208,7 +207,7 @@ def lmi_options(site: Site, lure: Lure) -> CircleOptions:
 
 def _load_columns(site: Site) -> Floats:
     """Error of w for unit errors of all powers, (N, 2N): `2 R dp` and `2 X dq`."""
-    model, loads = linear(site.feeder), site.loads
+    model, loads = site.feeder.linear(), site.loads
     dp = loads.p_fraction * loads.load_peak + loads.p_floor
     dq = 0.5 * (loads.tan_max - loads.tan_min) * loads.load_peak + loads.q_floor
     silent, unmetered = unread(site), np.ones(dp.size, dtype=np.bool_)

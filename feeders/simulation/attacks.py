@@ -33,7 +33,7 @@ from gridsec.attack import (
     most_affected,
 )
 from gridsec.errors import GridsecError, InputInvalid, Problem, choice
-from gridsec.grid.network import Power, busbar_places, columns
+from gridsec.grid.network import Power
 
 if TYPE_CHECKING:
     from feeders.model.site import Site
@@ -186,7 +186,7 @@ def busbar_attack(site: Site, kind: Kind | str, size: float, *, t_on: float, t_o
     NoSuchAttack
         For another kind.
     """
-    phases = np.arange(busbar_places(site.feeder).stop)
+    phases = np.arange(site.feeder.busbar_places().stop)
     signed = np.full(phases.size, size)
     match Kind(kind):
         case Kind.SCALING:
@@ -237,7 +237,7 @@ def fake_load(
     without = loop.equilibrium(loads)
     ratio = 0.5 * float(site.loads.tan_min[customer] + site.loads.tan_max[customer])
     one = np.array([customer])
-    R, X = (0.5 * columns(site.feeder, power, one)[site.feeder.bus] for power in Power)
+    R, X = (0.5 * site.feeder.columns(power, one)[site.feeder.bus] for power in Power)
     v = without.v_volt / site.customer_volt
     nominal = site.customer_nominal
     pattern = (load_pattern(R, X, 0, ratio, v) * (site.customer_volt / nominal))[site.meters]

@@ -27,7 +27,6 @@ from scipy.sparse.linalg import splu
 from feeders.simulation.powerflow import PowerFlow, PowerFlowDiverged, levels
 from gridsec.arrays import Bools, Floats, Ints, Phasors
 from gridsec.errors import InputInvalid, Problem
-from gridsec.grid.network import InPhases
 
 if TYPE_CHECKING:
     from feeders.format.tables import FeederTables, LineRow
@@ -263,7 +262,7 @@ class PlacesFlow:
 
 def power_flow(site: Site) -> PowerFlow | PlacesFlow:
     """AC power flow of a feeder."""
-    return PlacesFlow(site) if isinstance(site.feeder, InPhases) else PowerFlow(site)
+    return PlacesFlow(site) if site.feeder.busbar_phases == 3 else PowerFlow(site)
 
 
 def sequence_ohm(positive: complex, zero: complex) -> Phasors:

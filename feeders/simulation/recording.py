@@ -30,7 +30,6 @@ from feeders.util import plain
 from gridsec import attack as attacks
 from gridsec.arrays import Bools, Floats
 from gridsec.errors import GridsecError, InputInvalid, Problem, Problems
-from gridsec.grid.network import InPhases
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -529,7 +528,7 @@ def _table(ids: list[str], rows: dict[str, Any]) -> Any:
 
 
 def _readings_schema(site: Site) -> Any:
-    return READINGS.append(PHASES) if isinstance(site.feeder, InPhases) else READINGS
+    return READINGS.append(PHASES) if site.feeder.busbar_phases == 3 else READINGS
 
 
 def _truth_schema(site: Site) -> Any:

@@ -25,7 +25,6 @@ from feeders.util import own_numbers
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.attack import Attack, InverterAttack, Reports, apply_all, manipulated, reach
 from gridsec.errors import InputInvalid, Problem, choice, refuse
-from gridsec.grid.network import busbar_places
 
 if TYPE_CHECKING:
     from feeders.model.site import Site
@@ -413,7 +412,7 @@ def _attacked(
 
 def _busbar_attacked(site: Site, scenario: Scenario, t: Floats, reported: Registers) -> Registers:
     """Reported values with attacks on the busbar meter."""
-    nominal = site.nominal_volt[busbar_places(site.feeder)]
+    nominal = site.nominal_volt[site.feeder.busbar_places()]
     lies = manipulated(scenario.busbar_attacks, t, nominal.size)
     if not lies.any():
         return reported
@@ -432,7 +431,7 @@ def check(site: Site, scenario: Scenario) -> None:
     ValueError
         With all problems.
     """
-    name, phases = site.feeder.name, busbar_places(site.feeder).stop
+    name, phases = site.feeder.name, site.feeder.busbar_places().stop
     problems = [
         Problem(
             "unknown-index",

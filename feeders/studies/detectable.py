@@ -28,7 +28,6 @@ from gridsec.arrays import Floats
 from gridsec.errors import DesignInfeasible, InputInvalid, Problem
 from gridsec.estimators.sequential import SequentialOptions
 from gridsec.estimators.sequential import design as design_sequential
-from gridsec.grid.network import model_error_bound
 from gridsec.planning.collusion import Corridor, furthest
 from gridsec.planning.detectability import Rule, named_size, rule, within
 from gridsec.planning.stealthy_attacks import Box, largest_lie, worst_error
@@ -270,7 +269,7 @@ def monitor_rule(site: Site, *, risk: float = RISK, share: float = SHARE) -> Rul
     )
     p = -share * site.loads.load_peak
     q = 0.5 * (site.loads.tan_min + site.loads.tan_max) * p
-    model = model_error_bound(site.feeder, p, q, 1.0)[site.meters]
+    model = site.feeder.model_error_bound(p, q, 1.0)[site.meters]
     if not np.isfinite(model).all():
         raise DesignInfeasible(
             f"rule of {site.feeder.name}'s monitor",

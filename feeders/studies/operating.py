@@ -20,7 +20,7 @@ from feeders.studies.unobservable import Curves, customer_indices
 from gridsec.arrays import Floats
 from gridsec.errors import choice
 from gridsec.grid.meter import busbar_error, reading_error
-from gridsec.grid.network import Power, between
+from gridsec.grid.network import Power
 from gridsec.interface import Frame
 from gridsec.planning.redundancy import from_busbar
 from gridsec.planning.stealthy_attacks import Box, FalsePowers
@@ -177,7 +177,7 @@ def _frame(site: Site, share: float) -> Frame:
 
 def _box(site: Site, curves: Curves, p_error: Floats, q_error: Floats) -> Box:
     """Effect of errors of the powers, the busbar and the meters."""
-    R, X = (between(site.feeder, power) for power in Power)
+    R, X = (site.feeder.between(power) for power in Power)
     own = site.droop.customer
     steepest = choice("curves", Curves, curves) is Curves.STEEPEST
     slope = site.droop.slope if steepest else np.zeros(own.size)

@@ -25,7 +25,6 @@ from gridsec.planning.redundancy import (
     meter_redundancy,
     part_redundancy,
     parts,
-    tree_bus,
 )
 from gridsec.secure.index import Index
 
@@ -142,7 +141,7 @@ def redundancy(
     cases = {ALL: known(silent=())}
     if silent:
         cases[SILENT] = known(silent=silent)
-    pieces = parts(site.spanning, tree_bus(site.feeder)[site.meters], site.ties)
+    pieces = parts(site.spanning, site.feeder.customer_bus[site.meters], site.ties)
     tasks = [task for case, what in cases.items() for task in _tasks(site, case, what, pieces)]
     done = worked(journal, subject, tasks, progress)
     return Redundancy(

@@ -31,9 +31,8 @@ from scipy.special import chdtri
 from gridsec.arrays import Bools, Floats, Ints, frozen, frozen_ints
 from gridsec.estimators.plant import Plant
 from gridsec.grid.meshed import PhasedMesh
-from gridsec.grid.network import InPhases, Network, bus_voltages, linear, one_busbar
+from gridsec.grid.network import Network
 from gridsec.grid.phased import PhasedFeeder
-from gridsec.grid.radial import Feeder
 from gridsec.interface import Frame, PowerOrigin, Verdict
 
 __all__ = ["DataError", "DataErrorDesign", "DataErrorKind", "Window", "accused", "begin", "design", "follow"]
@@ -260,13 +259,13 @@ def design(plant: Plant, base_volt: Floats, step_s: float) -> DataErrorDesign | 
         Interval between frames, s.
     """
     feeder = plant.feeder
-    places = _places(feeder, np.arange(len(feeder.buses) // _phases(feeder)))
+    places = feeder.places(np.arange(len(feeder.buses) // feeder.busbar_phases))
     if places.size > MOST_PLACES:
-        places = _places(feeder, np.unique(feeder.bus // _phases(feeder)))
+        places = feeder.places(np.unique(feeder.bus // feeder.busbar_phases))
     if places.size > MOST_PLACES:
         return None
-    anywhere = _at(feeder, places)
-    model = linear(anywhere)
+    anywhere = feeder.with_customers_at(places)
+    model = anywhere.linear()
     return DataErrorDesign(
         plant=plant,
         anywhere=anywhere,
@@ -285,31 +284,6 @@ def accused(verdict: Verdict) -> Bools:
     for explanation in verdict.explanations:
         out |= explanation.meters
     return out
-
-
-def _phases(feeder: Network) -> int:
-    """Number of places of a bus."""
-    return 3 if isinstance(feeder, InPhases) else 1
-
-
-def _places(feeder: Network, buses: Ints) -> Ints:
-    """Places of some buses, ascending: in three phases those of the phases that they have."""
-    if not isinstance(feeder, InPhases):
-        return buses
-    at, phase = np.nonzero(feeder.tree.phases[buses])
-    return np.asarray(3 * buses[at] + phase)
-
-
-def _at(feeder: Network, places: Ints) -> Network:
-    """The feeder with one customer at each of these places."""
-    ids = tuple(map(str, range(places.size)))
-    if isinstance(feeder, Feeder):
-        return replace(feeder, bus=places, customers=ids)
-    if not isinstance(feeder, InPhases):
-        return replace(feeder, tree=replace(feeder.tree, bus=places, customers=ids))
-    connected = np.equal.outer(places % 3, np.arange(3))
-    tree = replace(feeder.tree, bus=places // 3, connected=connected, customers=ids)
-    return PhasedFeeder(tree) if isinstance(feeder, PhasedFeeder) else replace(feeder, tree=tree)
 
 
 def follow(design: DataErrorDesign, window: Window, frame: Frame, x: Floats, accused: Bools) -> Window:
@@ -336,7 +310,7 @@ def follow(design: DataErrorDesign, window: Window, frame: Frame, x: Floats, acc
         window = _closed(design, window, window.sums)
         if window.since_accused > MOST_BLOCKS:
             return Window()
-    v0 = frame.v0_phases if isinstance(design.plant.feeder, InPhases) else np.array([frame.v0_squared])
+    v0 = frame.v0_phases if design.plant.feeder.busbar_phases == 3 else np.array([frame.v0_squared])
     if v0 is None or not np.isfinite(v0).all():
         return replace(window, t=frame.t)
     return replace(
@@ -423,10 +397,10 @@ def _solved(design: DataErrorDesign, at: Ints, p: Floats, q: Floats, *, v0: Floa
     with np.errstate(all="ignore"):
         if isinstance(feeder, PhasedMesh):  # one operating point at a time
             each = zip(P, Q, v0, strict=True)
-            v2 = np.array([bus_voltages(feeder, *one, steps=_LOSS_STEPS) for one in each])
+            v2 = np.array([feeder.bus_voltages(*one, steps=_LOSS_STEPS) for one in each])
         else:
             busbar = v0 if isinstance(feeder, PhasedFeeder) else v0[:, 0]
-            v2 = bus_voltages(feeder, P, Q, busbar, steps=_LOSS_STEPS)
+            v2 = feeder.bus_voltages(P, Q, busbar, steps=_LOSS_STEPS)
     return np.asarray(v2[:, design.places])
 
 
@@ -551,7 +525,7 @@ def _scene(design: DataErrorDesign, rows: Rows) -> _Scene | None:
     busbar = (
         4.0 * (accuracy.busbar_jitter**2 + accuracy.busbar_resolution**2 / 12.0) * (1.0 / rows.count).mean()
     )
-    together = one_busbar(plant.feeder, design.places[at], design.places[at])
+    together = plant.feeder.same_busbar_phase(design.places[at], design.places[at])
     varying = loads + np.diag(jitter + MODEL_STD**2) + busbar * together
     fixed = varying + np.diag(4.0 / 3.0 * v2**2 * accuracy.class_fraction[k] ** 2)
     fixed += 4.0 / 3.0 * accuracy.busbar_class**2 * together
@@ -617,7 +591,7 @@ def _of_customer(design: DataErrorDesign, i: int) -> Iterator[_Move]:
     place = int(design.places[here])
     index = {int(q): k for k, q in enumerate(design.places)}
     level = np.flatnonzero(design.unit == design.unit[here]).tolist()
-    phases = _phases(feeder)
+    phases = feeder.busbar_phases
     for k in level:
         other = int(design.places[k])
         if other == place:

@@ -11,8 +11,7 @@ from gridsec.estimators import thresholds
 from gridsec.estimators.plant import Plant, Setting
 from gridsec.estimators.thresholds import Uncertainty
 from gridsec.grid.meter import busbar_error, reading_error
-from gridsec.grid.network import InPhases, Network, by_place, interval_bounds, loss_correction
-from gridsec.grid.radial import Feeder, corrected
+from gridsec.grid.network import Network
 from gridsec.interface import Cause, Decision, Estimate, Frame, Verdict
 
 
@@ -92,7 +91,7 @@ def nothing_new(  # noqa: PLR0917  # the last answer, and the values without one
         estimate, verdict = last
         return estimate, replace(verdict, decision=Decision.UNDECIDED, cause=Cause.SETTLING, reason=reason)
     at, p = plant.feeder.bus, plant.meters.size
-    v2_bus, nobody = by_place(plant.feeder, v0_squared), np.zeros(p, dtype=np.bool_)
+    v2_bus, nobody = plant.feeder.broadcast_busbar(v0_squared), np.zeros(p, dtype=np.bool_)
     estimate = Estimate(t, v2_bus[at], np.full(at.size, NO_VOLTAGE), v2_bus, nobody, x)
     score, threshold = np.full(p, np.nan), np.full(p, NO_VOLTAGE)
     verdict = Verdict(Decision.UNDECIDED, Cause.SETTLING, reason, nobody, score, threshold, np.zeros(p))
@@ -145,11 +144,11 @@ def reconstruct(setting: Setting, frame: Frame, inputs: Inputs, q: Floats) -> Re
     plant, model, correction = setting.plant, setting.model, inputs.correction
     if plant.loss_correction:
         with np.errstate(all="ignore"):
-            correction = loss_correction(
-                plant.feeder, frame.p, q, inputs.v0_squared, steps=plant.loss_correction
+            correction = plant.feeder.loss_correction(
+                frame.p, q, inputs.v0_squared, steps=plant.loss_correction
             )
         correction = np.where(np.isfinite(correction), correction, inputs.correction)
-    base = by_place(plant.feeder, inputs.v0_squared)
+    base = plant.feeder.broadcast_busbar(inputs.v0_squared)
     v2_bus = base + 2.0 * (model.R_bus @ frame.p + model.X_bus @ q) + correction
     return Reconstruction(v2_bus, v2_bus[plant.feeder.bus], correction)
 
@@ -192,7 +191,7 @@ def _busbar(
 ) -> tuple[Floats | float, Bools | bool]:
     """Squared voltage of the busbar as given, and its validity; in three phases (3,) each."""
     low, high = limits
-    if not isinstance(feeder, InPhases):
+    if feeder.busbar_phases == 1:
         return frame.v0_squared, bool(np.isfinite(frame.v0_squared) and low <= frame.v0_squared <= high)
     if frame.v0_phases is None:
         # A mean determines no phase.
@@ -208,7 +207,7 @@ def busbar_errors(plant: Plant, v0_squared: Floats | float, sigmas: float) -> Fl
     v0_squared, sigmas
         As in `gridsec.grid.meter.busbar_error`.
     """
-    if not isinstance(plant.feeder, InPhases):
+    if plant.feeder.busbar_phases == 1:
         return busbar_error(plant.accuracy, float(v0_squared), sigmas)
     each = np.broadcast_to(v0_squared, 3).tolist()
     return np.array([busbar_error(plant.accuracy, one, sigmas) for one in each])
@@ -216,7 +215,7 @@ def busbar_errors(plant: Plant, v0_squared: Floats | float, sigmas: float) -> Fl
 
 def _of_customers(feeder: Network, of_busbar: Floats | float) -> Floats:
     """Value of the busbar, repeated for every customer, (N,)."""
-    return np.asarray(by_place(feeder, of_busbar)[feeder.bus])
+    return np.asarray(feeder.broadcast_busbar(of_busbar)[feeder.bus])
 
 
 # Room for the motion of inverters since the last estimate, in the voltage that scales a meter's accuracy.
@@ -267,25 +266,10 @@ def losses(
         Correction of the linear model at every place, and the bound at every customer, squared pu.
     """
     feeder, steps = plant.feeder, plant.loss_correction
-    if isinstance(feeder, Feeder):
-        # The correction is nearly quadratic in the loads: extremes lie where all errors have the same sign.
-        ends = np.array([0.0, -1.0, 1.0])[:, None]
-        with np.errstate(all="ignore"):
-            three, left = corrected(feeder, p + ends * p_error, q + ends * q_error, v0, steps=max(steps, 1))
-        # The remainder grows with the cube of the load, so the centre does not bound the ends.
-        rest = left.max(axis=0)
-        three = _finite(three, 0.0)
-        moved = np.abs(three[1:] - three[0]).max(axis=0)[feeder.bus]
-        once = three[0]
-    else:
-        # Loads on other phases, or around a loop, may raise as well as lower voltages: no corner is the
-        # worst.
-        with np.errstate(all="ignore"):
-            once = loss_correction(feeder, p, q, v0, steps=max(steps, 1))
-        once = _finite(once, 0.0)
-        moved, rest = interval_bounds(feeder, p, q, v0, p_error=p_error, q_error=q_error)
-        if steps > 1:
-            moved = moved + 2.0 * rest
+    once, moved, rest = feeder.correction_bounds(
+        p, q, v0, p_error=p_error, q_error=q_error, steps=max(steps, 1)
+    )
+    once = _finite(once, 0.0)
     rest = _finite(rest, NO_VOLTAGE)
     if steps == 0:
         rest = rest + np.abs(once[feeder.bus])
@@ -325,6 +309,6 @@ def _implied(
             error[k] = NO_VOLTAGE
         else:
             v0[k], error[k] = np.median(implied[use]), np.max((stale + now.reading)[use])
-    if isinstance(feeder, InPhases):
+    if feeder.busbar_phases == 3:
         return v0, error
     return float(v0[0]), float(error[0])

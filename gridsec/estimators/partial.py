@@ -65,7 +65,6 @@ from gridsec.estimators.inputs import (
 from gridsec.estimators.plant import Options, Plant, Setting, check_plant, setting
 from gridsec.estimators.thresholds import ErrorBound, Motion, Uncertainty
 from gridsec.grid.meter import reading_error
-from gridsec.grid.network import busbar_places, by_place, hangs_on
 from gridsec.interface import Cause, Decision, Estimate, Explanation, Frame, Verdict
 from gridsec.observers import circle
 from gridsec.observers.certificates import Certificate, verify
@@ -241,7 +240,9 @@ def code_word(  # noqa: PLR0917  # as _conclude
     shared, rest_ = _split(setting, frame, inputs, alone)
     scale = np.concatenate([parts.bound.free, frame.p_error, frame.q_error, shared])
     scale = np.minimum(scale, _LARGEST)
-    voltage = np.hstack([2.0 * lines.X[:, own], 2.0 * lines.R, 2.0 * lines.X, hangs_on(plant.feeder)])
+    voltage = np.hstack(
+        [2.0 * lines.X[:, own], 2.0 * lines.R, 2.0 * lines.X, plant.feeder.busbar_incidence()]
+    )
     at = np.flatnonzero(inputs.live)
     where = plant.meters[at]
     driven = inputs.live[errors.meter_of] if at.size else np.zeros(m, dtype=np.bool_)
@@ -296,9 +297,9 @@ def _split(setting: Setting, frame: Frame, inputs: Inputs, alone: Uncertainty) -
     rest_ = np.where(alone.base >= NO_VOLTAGE, NO_VOLTAGE, rest_)
     if not inputs.busbar:
         # The implied busbar voltage has no separate error: count the rest in both.
-        return np.full(busbar_places(feeder).stop, rest_.max(initial=0.0)), rest_
+        return np.full(feeder.busbar_places().stop, rest_.max(initial=0.0)), rest_
     shared = np.atleast_1d(busbar_errors(setting.plant, inputs.v0_squared, setting.options.sigmas))
-    own = by_place(feeder, shared)[feeder.bus]
+    own = feeder.broadcast_busbar(shared)[feeder.bus]
     return np.minimum(shared, NO_VOLTAGE), np.where(rest_ < NO_VOLTAGE, np.maximum(rest_ - own, 0.0), rest_)
 
 
@@ -414,7 +415,7 @@ def design(
         why = f"{p} meters, {max_attacked} of them manipulated; more than {2 * max_attacked} are needed"
         raise NotObservable(range(p), p, why, code="too-few-meters")
     sets, rows = comb(p, max_attacked), 3 * p
-    unknowns = plant.droop.tau.size + 2 * len(plant.feeder.customers) + busbar_places(plant.feeder).stop
+    unknowns = plant.droop.tau.size + 2 * len(plant.feeder.customers) + plant.feeder.busbar_places().stop
     if sets > MOST_SUBSETS or sets * rows * (rows + unknowns) > MOST_WORK * step_s:
         said = f"{sets} sets of up to {rows} rows every {step_s:g} s are too many"
         raise DesignInfeasible(f"fits without every {max_attacked} of {p} meters", said, code="too-many")
@@ -580,7 +581,7 @@ def _estimate(  # noqa: PLR0917  # as _conclude
     step_ = word.scale * found.xi[index]
     dx, dp, dq, d0 = np.split(step_, [m, m + n, m + 2 * n])
     dq = dq + np.bincount(own, weights=dx, minlength=n)
-    v2_bus = model.v2_bus + 2.0 * (lines.R_bus @ dp + lines.X_bus @ dq) + by_place(plant.feeder, d0)
+    v2_bus = model.v2_bus + 2.0 * (lines.R_bus @ dp + lines.X_bus @ dq) + plant.feeder.broadcast_busbar(d0)
     v2 = v2_bus[plant.feeder.bus]
     # Under any attack, the bound of the observer without meters holds; and so does that of one credible fit.
     gap = thresholds.gap(design.setting.errors, alone, after.parts.bound)

@@ -12,8 +12,7 @@ from gridsec.errors import Problem, refuse
 from gridsec.estimators.thresholds import ErrorModel, error_model
 from gridsec.grid.droop import Droop
 from gridsec.grid.meter import MeterAccuracy
-from gridsec.grid.network import Network, linear
-from gridsec.grid.radial import LinDistFlow
+from gridsec.grid.network import LinDistFlow, Network
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -216,6 +215,6 @@ def setting(
     plant: Plant, *, max_attacked: int, options: Options | None = None, believes_q: bool = False
 ) -> Setting:
     """Compute the setting of a plant; `options` are the defaults if None."""
-    model = linear(plant.feeder)
+    model = plant.feeder.linear()
     errors = error_model(plant.droop, model, plant.meters, max_attacked)
     return Setting(plant, model, errors, Options() if options is None else options, max_attacked, believes_q)

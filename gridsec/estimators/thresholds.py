@@ -18,7 +18,7 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, frozen
 from gridsec.grid.droop import Droop, voltage_curve
-from gridsec.grid.radial import LinDistFlow
+from gridsec.grid.network import LinDistFlow
 
 
 @dataclass(frozen=True, slots=True, eq=False)

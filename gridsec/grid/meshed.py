@@ -35,7 +35,8 @@ References
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import numpy as np
 from scipy.sparse import coo_array, csc_array, diags_array
@@ -44,15 +45,188 @@ from scipy.sparse.linalg import splu
 from gridsec.arrays import Bools, Floats, Ints, Phasors, frozen, frozen_ints
 from gridsec.errors import FeederInvalid, Problem
 from gridsec.grid.intervals import Sweeps, bounds
+from gridsec.grid.network import Balanced, InPhases, LinDistFlow, OfMatrices, WithMatrices, unbounded
 from gridsec.grid.phased import PhasedFeeder
-from gridsec.grid.radial import Feeder, LinDistFlow, common_paths
-from gridsec.grid.three_phase import PHASES, ROTATION, ThreePhaseFeeder, line_problems, named
+from gridsec.grid.radial import Feeder, common_paths
+from gridsec.grid.three_phase import PHASES, ROTATION, ThreePhaseFeeder, customers_at, line_problems, named
 from gridsec.grid.three_phase import common_paths as phase_paths
 from gridsec.grid.trees import OnTree
 
 
+class _Admittances(WithMatrices, Protocol):
+    @property
+    def idle(self) -> Phasors: ...
+    @property
+    def transfer(self) -> Phasors: ...
+    @property
+    def transfer_between(self) -> Phasors: ...
+    @property
+    def size(self) -> Floats: ...
+    def without_load(self, v0_squared: Floats | float) -> Phasors: ...
+    def without_drop(self, v0_squared: Floats | float) -> Floats: ...
+
+
+class Meshed(OfMatrices):
+    """Methods of feeders with closed loops, by the inverse of their admittances."""
+
+    __slots__ = ()
+
+    def bus_voltages(
+        self: _Admittances, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 1
+    ) -> Floats:
+        """Squared voltage of every place, corrected for losses, charging and unequal phases.
+
+        The fixed-point iteration ``V <- W + Z conj(s / V)`` from ``V = W``: its first iterate has the
+        voltages of the linear power flow and the square of its drops, and every step after it gains one order
+        in the load, as a step of `Feeder.loss_correction` does.
+
+        Parameters
+        ----------
+        p, q : (…, N)
+            Net active and reactive injection of each customer (generation positive), pu.
+        v0_squared : (…) or scalar
+            Squared busbar voltage, pu; in three phases (3,), one for each, or scalar.
+        steps
+            Steps after the first iterate; 0 gives the linear power flow.
+
+        Returns
+        -------
+        (…, n)
+            Squared voltages, pu; on a balanced feeder n = b + 1.
+        """
+        if not steps:
+            base = self.without_drop(v0_squared)
+            return np.asarray(base + 2.0 * (p @ self.R.T + q @ self.X.T))
+        s, idle, here = _start(self, p, q, v0_squared)
+        V = here
+        for _ in range(steps):
+            V = here + np.conj(s / V) @ self.transfer_between.T
+        V = idle + np.conj(s / V) @ self.transfer.T
+        return np.asarray(V.real**2 + V.imag**2)
+
+    def sensitivities(
+        self: _Admittances, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 4
+    ) -> LinDistFlow:
+        """Derivatives of squared voltages at an operating point, halved: R and X under load.
+
+        A change ds of one customer's power changes all currents, because powers are constant. The
+        differential of the fixed point,
+
+            dV + Z diag(conj(s / V^2)) conj(dV) = Z conj(ds / V),
+
+        is a real linear system for real and imaginary parts of dV at the customers, solved for all of them at
+        once; Re(conj(V) dV) is half the derivative of ``|V|^2``. Without load and charging it is R and X.
+        O(N^3).
+
+        Parameters
+        ----------
+        p, q : (N,)
+            Net active and reactive injection of each customer at the operating point, pu.
+        v0_squared
+            As in `bus_voltages`.
+        steps
+            Steps to the voltages of the operating point, as in `bus_voltages`.
+
+        Returns
+        -------
+        LinDistFlow
+            The matrices; ``v^2`` then changes by ``2 R dp + 2 X dq``.
+        """
+        s, idle, here = _start(self, p, q, v0_squared)
+        V = here
+        for _ in range(steps + 1):
+            V = here + self.transfer_between @ np.conj(s / V)
+        turned, alone = self.transfer_between * np.conj(s / V**2), np.eye(s.size)
+        own: Phasors = np.concatenate([np.diag(unit / np.conj(V)) for unit in (1.0, -1j)], axis=1)
+        system = np.block([[alone + turned.real, turned.imag], [turned.imag, alone - turned.real]])
+        driven = self.transfer_between @ own
+        moved = np.linalg.solve(system, np.concatenate([driven.real, driven.imag]))
+        change = moved[: s.size] + 1j * moved[s.size :]
+        currents = own - np.conj((s / V**2)[:, None] * change)
+        volts = idle + self.transfer @ np.conj(s / V)
+        R, X = np.split((np.conj(volts)[:, None] * (self.transfer @ currents)).real, 2, axis=1)
+        return LinDistFlow(*(frozen(each) for each in (R[self.bus], X[self.bus], R, X)))
+
+    def model_error_bound(self: _Admittances, p: Floats, q: Floats, v0_squared: Floats | float) -> Floats:
+        """Bound of the error of `v^2` after one correction against the AC power flow, for every customer.
+
+        V1 and V2 are the iterates of `bus_voltages`, ``d = |V2 - V1|``, and ``M_ij = |Z_ij| |s_j| / (c_j
+        min(|V1_j|, c_j))`` with ``c = 0.9 |V2|``. A step maps all voltages within ``rho <= 0.1 |V2|`` of V2
+        to a distance of at most ``M (rho + d)`` from V2. So if ``M M d <= theta M d`` for a theta below 1,
+        and ``rho = M d / (1 - theta)``, the disks of radius rho around V2 are mapped into themselves. They
+        contain a solution of the AC power flow (Brouwer), and only one, because theta also bounds the
+        contraction there. If theta is 1 or more, or rho above 0.1 |V2|, the bound is infinite.
+
+        Parameters
+        ----------
+        p, q, v0_squared
+            As in `bus_voltages`.
+
+        Returns
+        -------
+        (…, N)
+            Bound on the error of `v^2`, pu.
+
+        References
+        ----------
+        Wang et al. 2018, for the existence of the solution; the componentwise bound: docs/theory-mesh.md.
+        """
+        with np.errstate(all="ignore"):
+            s, _, idle = _start(self, p, q, v0_squared)
+            first = idle + np.conj(s / idle) @ self.transfer_between.T
+            second = idle + np.conj(s / first) @ self.transfer_between.T
+            low = (1.0 - _NEAR) * np.abs(second)
+            weight = np.abs(s) / (low * np.minimum(low, np.abs(first)))
+            once = (weight * np.abs(second - first)) @ self.size.T
+            twice = (weight * once) @ self.size.T
+            theta = np.max(np.where(twice > 0.0, twice / once, 0.0), axis=-1, keepdims=True, initial=0.0)
+            rho = once / (1.0 - theta)
+            holds = (theta < 1.0) & np.all(rho <= _NEAR * np.abs(second), axis=-1, keepdims=True)
+            bound = np.where(holds, rho * (2.0 * np.abs(second) + rho), np.inf)
+        return np.asarray(bound)
+
+    def interval_bounds(
+        self: _Admittances,
+        p: Floats,
+        q: Floats,
+        v0_squared: Floats | float,
+        *,
+        p_error: Floats,
+        q_error: Floats,
+    ) -> tuple[Floats, Floats]:
+        """Error bounds of the correction of `bus_voltages` for powers within intervals.
+
+        Parameters
+        ----------
+        self, p, q : (N,), v0_squared
+            As in `bus_voltages`, one operating point.
+        p_error, q_error : (N,)
+            Largest errors of the powers, pu.
+
+        Returns
+        -------
+        (N,), (N,)
+            Change of the correction, and distance of its first step from the AC power flow, pu:
+            `gridsec.grid.intervals.bounds`.
+        """
+        with np.errstate(all="ignore"):  # NaN gets an infinite bound without a warning
+            s, _, idle = _start(self, p, q, v0_squared)
+            first = idle + np.conj(s / idle) @ self.transfer_between.T
+            second = idle + np.conj(s / first) @ self.transfer_between.T
+            error = np.hypot(p_error, q_error)
+            sweeps = Sweeps(
+                idle, first, second, np.abs(s), lambda current: self.size @ current, np.zeros_like
+            )
+            moved, rest = bounds(sweeps, error)
+            # The linear power flow assumes no charging and equal phases; the first sweep has the actual ones.
+            linear = (self.R + 1j * self.X)[self.bus]
+            apart = np.abs(np.conj(idle)[:, None] * self.transfer_between / np.conj(idle) - linear)
+            moved = moved + 2.0 * (apart @ error)
+        return unbounded(moved), unbounded(rest)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
-class MeshedFeeder(OnTree):
+class MeshedFeeder(Balanced, Meshed, OnTree):
     """Feeder with closed loops. N customers, b + 1 buses, t ties.
 
     Attributes
@@ -73,7 +247,7 @@ class MeshedFeeder(OnTree):
         Derived. Voltage of every bus without load, per voltage of the busbar; 1 without charging.
     transfer : (b + 1, N)
         Derived. From an injected current of a customer to the voltage of every bus, charging included, pu.
-    between : (N, N)
+    transfer_between : (N, N)
         Derived. The same to the customers' voltages.
     size : (N, N)
         Derived. Its absolute values.
@@ -94,7 +268,7 @@ class MeshedFeeder(OnTree):
     X: Floats = field(init=False, repr=False)
     idle: Phasors = field(init=False, repr=False)
     transfer: Phasors = field(init=False, repr=False)
-    between: Phasors = field(init=False, repr=False)
+    transfer_between: Phasors = field(init=False, repr=False)
     size: Floats = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -114,10 +288,14 @@ class MeshedFeeder(OnTree):
         put("R", frozen(Z.real))
         put("X", frozen(Z.imag))
         idle, transfer = _charged(self) if half.any() else (np.ones(half.size, np.complex128), Z)
-        for name, values in (("idle", idle), ("transfer", transfer), ("between", transfer[self.bus])):
+        for name, values in (
+            ("idle", idle),
+            ("transfer", transfer),
+            ("transfer_between", transfer[self.bus]),
+        ):
             values.flags.writeable = False
             put(name, values)
-        put("size", frozen(np.abs(self.between)))
+        put("size", frozen(np.abs(self.transfer_between)))
 
     @property
     def bus(self) -> Ints:
@@ -128,6 +306,18 @@ class MeshedFeeder(OnTree):
     def buses(self) -> tuple[str, ...]:
         """Identifiers of the buses, the busbar first, (b + 1,)."""
         return self.tree.buses
+
+    def without_load(self, v0_squared: Floats | float) -> Phasors:
+        """Voltage of every place without load, (…, n), pu."""
+        return np.asarray(np.sqrt(np.asarray(v0_squared, dtype=np.float64))[..., None] * self.idle)
+
+    def with_customers_at(self, places: Ints) -> MeshedFeeder:
+        """See `Network`."""
+        return replace(self, tree=self.tree.with_customers_at(places))
+
+    def without_drop(self, v0_squared: Floats | float) -> Floats:
+        """Squared busbar voltage for every place, by broadcasting."""
+        return np.asarray(v0_squared, dtype=np.float64)[..., None]
 
 
 def _problems(feeder: MeshedFeeder) -> list[Problem]:
@@ -223,7 +413,7 @@ def _charged(feeder: MeshedFeeder) -> tuple[Phasors, Phasors]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PhasedMesh(OnTree):
+class PhasedMesh(InPhases, Meshed, OnTree):
     """Feeder of single-phase customers with closed ties. N customers, t ties, n = 3 (b + 1) places.
 
     Attributes
@@ -254,7 +444,7 @@ class PhasedMesh(OnTree):
     transfer : (n, N)
         Derived. From an injected current of a customer, in units of S, to the voltage of every place,
         charging included, pu.
-    between : (N, N)
+    transfer_between : (N, N)
         Derived. The same to the customers' voltages.
     size : (N, N)
         Derived. Its absolute values.
@@ -277,7 +467,7 @@ class PhasedMesh(OnTree):
     X: Floats = field(init=False, repr=False)
     idle: Phasors = field(init=False, repr=False)
     transfer: Phasors = field(init=False, repr=False)
-    between: Phasors = field(init=False, repr=False)
+    transfer_between: Phasors = field(init=False, repr=False)
     size: Floats = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -307,8 +497,20 @@ class PhasedMesh(OnTree):
         idle, transfer = _phased_charged(self) if half.any() else (quiet, Z)
         put("idle", idle)
         put("transfer", transfer)
-        put("between", transfer[self.bus])
-        put("size", np.abs(self.between))
+        put("transfer_between", transfer[self.bus])
+        put("size", np.abs(self.transfer_between))
+
+    def without_load(self, v0_squared: Floats | float) -> Phasors:
+        """Voltage of every place without load, (n,), pu."""
+        return np.asarray(self.idle @ (np.sqrt(np.asarray(v0_squared, dtype=np.float64)) * ROTATION))
+
+    def with_customers_at(self, places: Ints) -> PhasedMesh:
+        """See `Network`."""
+        return replace(self, tree=customers_at(self.tree, places))
+
+    def without_drop(self, v0_squared: Floats | float) -> Floats:
+        """Squared busbar voltage of its phase for every place, (n,)."""
+        return self.broadcast_busbar(v0_squared)
 
 
 def _phased_problems(feeder: PhasedMesh) -> list[Problem]:
@@ -434,174 +636,13 @@ def _phased_charged(feeder: PhasedMesh) -> tuple[Phasors, Phasors]:
     return idle[stands.ravel()], transfer[stands.ravel()]
 
 
-Meshed = MeshedFeeder | PhasedMesh
-"""A feeder with closed loops."""
-
-
-def bus_voltages(
-    feeder: Meshed, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 1
-) -> Floats:
-    """Squared voltage of every place, corrected for losses, charging and, in three phases, unequal phases.
-
-    The fixed-point iteration ``V <- W + Z conj(s / V)`` from ``V = W``: its first iterate has the voltages of
-    the linear power flow and the square of its drops, and every step after it gains one order in the load, as
-    a step of `gridsec.grid.radial.loss_correction` does.
-
-    Parameters
-    ----------
-    p, q : (…, N)
-        Net active and reactive injection of each customer (generation positive), pu.
-    v0_squared : (…) or scalar
-        Squared busbar voltage, pu; in three phases (3,), one for each, or scalar.
-    steps
-        Steps after the first iterate; 0 gives the linear power flow.
-
-    Returns
-    -------
-    (…, n)
-        Squared voltages, pu; on a balanced feeder n = b + 1.
-    """
-    if not steps:
-        base = np.asarray(v0_squared, dtype=np.float64)[..., None]
-        if isinstance(feeder, PhasedMesh):
-            base = np.tile(np.broadcast_to(v0_squared, len(PHASES)), len(feeder.tree.buses))
-        return np.asarray(base + 2.0 * (p @ feeder.R.T + q @ feeder.X.T))
-    s, idle, here = _start(feeder, p, q, v0_squared)
-    V = here
-    for _ in range(steps):
-        V = here + np.conj(s / V) @ feeder.between.T
-    V = idle + np.conj(s / V) @ feeder.transfer.T
-    return np.asarray(V.real**2 + V.imag**2)
-
-
-def sensitivities(
-    feeder: Meshed, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 4
-) -> LinDistFlow:
-    """Derivatives of squared voltages at an operating point, halved: R and X under load.
-
-    A change ds of one customer's power changes all currents, because powers are constant. The
-    differential of the fixed point,
-
-        dV + Z diag(conj(s / V^2)) conj(dV) = Z conj(ds / V),
-
-    is a real linear system for real and imaginary parts of dV at the customers, solved for all of them at
-    once; Re(conj(V) dV) is half the derivative of ``|V|^2``. Without load and charging it is R and X. O(N^3).
-
-    Parameters
-    ----------
-    p, q : (N,)
-        Net active and reactive injection of each customer at the operating point, pu.
-    v0_squared
-        As in `bus_voltages`.
-    steps
-        Steps to the voltages of the operating point, as in `bus_voltages`.
-
-    Returns
-    -------
-    LinDistFlow
-        The matrices; ``v^2`` then changes by ``2 R dp + 2 X dq``.
-    """
-    s, idle, here = _start(feeder, p, q, v0_squared)
-    V = here
-    for _ in range(steps + 1):
-        V = here + feeder.between @ np.conj(s / V)
-    turned, alone = feeder.between * np.conj(s / V**2), np.eye(s.size)
-    own: Phasors = np.concatenate([np.diag(unit / np.conj(V)) for unit in (1.0, -1j)], axis=1)
-    system = np.block([[alone + turned.real, turned.imag], [turned.imag, alone - turned.real]])
-    driven = feeder.between @ own
-    moved = np.linalg.solve(system, np.concatenate([driven.real, driven.imag]))
-    change = moved[: s.size] + 1j * moved[s.size :]
-    currents = own - np.conj((s / V**2)[:, None] * change)
-    volts = idle + feeder.transfer @ np.conj(s / V)
-    R, X = np.split((np.conj(volts)[:, None] * (feeder.transfer @ currents)).real, 2, axis=1)
-    return LinDistFlow(*(frozen(each) for each in (R[feeder.bus], X[feeder.bus], R, X)))
-
-
-def model_error_bound(feeder: Meshed, p: Floats, q: Floats, v0_squared: Floats | float) -> Floats:
-    """Bound of the error of `v^2` after one correction against the AC power flow, for every customer.
-
-    V1 and V2 are the iterates of `bus_voltages`, ``d = |V2 - V1|``, and ``M_ij = |Z_ij| |s_j| / (c_j
-    min(|V1_j|, c_j))`` with ``c = 0.9 |V2|``. A step maps all voltages within ``rho <= 0.1 |V2|`` of V2 to a
-    distance of at most ``M (rho + d)`` from V2. So if ``M M d <= theta M d`` for a theta below 1, and ``rho =
-    M d / (1 - theta)``, the disks of radius rho around V2 are mapped into themselves. They contain a solution
-    of the AC power flow (Brouwer), and only one, because theta also bounds the contraction there. If theta is
-    1 or more, or rho above 0.1 |V2|, the bound is infinite.
-
-    Parameters
-    ----------
-    feeder, p, q, v0_squared
-        As in `bus_voltages`.
-
-    Returns
-    -------
-    (…, N)
-        Bound on the error of `v^2`, pu.
-
-    References
-    ----------
-    Wang et al. 2018, for the existence of the solution; the componentwise bound: docs/theory-mesh.md.
-    """
-    with np.errstate(all="ignore"):
-        s, _, idle = _start(feeder, p, q, v0_squared)
-        first = idle + np.conj(s / idle) @ feeder.between.T
-        second = idle + np.conj(s / first) @ feeder.between.T
-        low = (1.0 - _NEAR) * np.abs(second)
-        weight = np.abs(s) / (low * np.minimum(low, np.abs(first)))
-        once = (weight * np.abs(second - first)) @ feeder.size.T
-        twice = (weight * once) @ feeder.size.T
-        theta = np.max(np.where(twice > 0.0, twice / once, 0.0), axis=-1, keepdims=True, initial=0.0)
-        rho = once / (1.0 - theta)
-        holds = (theta < 1.0) & np.all(rho <= _NEAR * np.abs(second), axis=-1, keepdims=True)
-        bound = np.where(holds, rho * (2.0 * np.abs(second) + rho), np.inf)
-    return np.asarray(bound)
-
-
-def interval_bounds(
-    feeder: Meshed,
-    p: Floats,
-    q: Floats,
-    v0_squared: Floats | float,
-    *,
-    p_error: Floats,
-    q_error: Floats,
-) -> tuple[Floats, Floats]:
-    """Error bounds of the correction of `bus_voltages` for powers within intervals.
-
-    Parameters
-    ----------
-    feeder, p, q : (N,), v0_squared
-        As in `bus_voltages`, one operating point.
-    p_error, q_error : (N,)
-        Largest errors of the powers, pu.
-
-    Returns
-    -------
-    (N,), (N,)
-        Change of the correction, and distance of its first step from the AC power flow, pu:
-        `gridsec.grid.intervals.bounds`.
-    """
-    with np.errstate(all="ignore"):
-        s, _, idle = _start(feeder, p, q, v0_squared)
-        first = idle + np.conj(s / idle) @ feeder.between.T
-        second = idle + np.conj(s / first) @ feeder.between.T
-    error = np.hypot(p_error, q_error)
-    sweeps = Sweeps(idle, first, second, np.abs(s), lambda current: feeder.size @ current, np.zeros_like)
-    moved, rest = bounds(sweeps, error)
-    # The linear power flow assumes no charging and equal phases of the busbar; the first sweep has the actual
-    # ones.
-    linear = (feeder.R + 1j * feeder.X)[feeder.bus]
-    apart = np.abs(np.conj(idle)[:, None] * feeder.between / np.conj(idle) - linear)
-    return np.asarray(moved + 2.0 * (apart @ error)), rest
-
-
 # Radius around the second iterate, as a fraction of it, within which a solution is located.
 _NEAR = 0.1
 
 
 def _start(
-    feeder: Meshed, p: Floats, q: Floats, v0_squared: Floats | float
+    feeder: _Admittances, p: Floats, q: Floats, v0_squared: Floats | float
 ) -> tuple[Phasors, Phasors, Phasors]:
     """Powers of the customers (…, N), and voltages without load of all places (…, n) and of the customers."""
-    v0 = np.sqrt(np.asarray(v0_squared, dtype=np.float64))
-    idle = feeder.idle @ (v0 * ROTATION) if isinstance(feeder, PhasedMesh) else v0[..., None] * feeder.idle
-    return np.asarray(p + 1j * q), np.asarray(idle), np.asarray(idle[..., feeder.bus])
+    idle = feeder.without_load(v0_squared)
+    return np.asarray(p + 1j * q), idle, np.asarray(idle[..., feeder.bus])

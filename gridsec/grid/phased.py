@@ -14,12 +14,13 @@ import numpy as np
 from gridsec.arrays import Floats, Ints, frozen, frozen_ints
 from gridsec.errors import FeederInvalid, Problem
 from gridsec.grid import three_phase
-from gridsec.grid.three_phase import PHASES, ThreePhaseFeeder, lindist3flow
+from gridsec.grid.network import InPhases, OfMatrices, unbounded
+from gridsec.grid.three_phase import PHASES, ThreePhaseFeeder, customers_at, lindist3flow
 from gridsec.grid.trees import OnTree
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PhasedFeeder(OnTree):
+class PhasedFeeder(InPhases, OfMatrices, OnTree):
     """Feeder of single-phase customers. N customers, b + 1 buses, n = 3 (b + 1) places.
 
     Attributes
@@ -67,62 +68,63 @@ class PhasedFeeder(OnTree):
             by_place = 3.0 * np.moveaxis(found, 0, 1).reshape(len(names), tree.at.size)
             object.__setattr__(self, name, frozen(by_place))
 
+    def bus_voltages(self, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 1) -> Floats:
+        """Squared voltage of every place, corrected for losses, charging and unequal phases.
 
-def bus_voltages(
-    feeder: PhasedFeeder, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 1
-) -> Floats:
-    """Squared voltage of every place, corrected for losses, charging and unequal phases.
+        Parameters
+        ----------
+        p, q : (…, N)
+            Net active and reactive injection of each customer (generation positive), pu.
+        v0_squared : (…, 3) or scalar
+            Squared busbar voltage of each phase, pu.
+        steps
+            As in `gridsec.grid.three_phase.loss_correction`; 0 gives LinDist3Flow.
 
-    Parameters
-    ----------
-    p, q : (…, N)
-        Net active and reactive injection of each customer (generation positive), pu.
-    v0_squared : (…, 3) or scalar
-        Squared busbar voltage of each phase, pu.
-    steps
-        As in `gridsec.grid.three_phase.loss_correction`; 0 gives LinDist3Flow.
+        Returns
+        -------
+        (…, n)
+            Squared voltages, pu.
+        """
+        given = np.asarray(v0_squared, dtype=np.float64)
+        v0 = np.broadcast_to(given, (*given.shape[:-1], len(PHASES)))
+        by_phase = three_phase.bus_voltages(self.tree, 3.0 * p, 3.0 * q, v0, steps=steps)
+        return np.moveaxis(by_phase, -2, -1).reshape(*by_phase.shape[:-2], len(self.buses))
 
-    Returns
-    -------
-    (…, n)
-        Squared voltages, pu.
-    """
-    given = np.asarray(v0_squared, dtype=np.float64)
-    v0 = np.broadcast_to(given, (*given.shape[:-1], len(PHASES)))
-    by_phase = three_phase.bus_voltages(feeder.tree, 3.0 * p, 3.0 * q, v0, steps=steps)
-    return np.moveaxis(by_phase, -2, -1).reshape(*by_phase.shape[:-2], len(feeder.buses))
+    def with_customers_at(self, places: Ints) -> PhasedFeeder:
+        """See `Network`."""
+        return PhasedFeeder(customers_at(self.tree, places))
 
+    def model_error_bound(self, p: Floats, q: Floats, v0_squared: Floats | float) -> Floats:
+        """See `gridsec.grid.network.Network`; by `gridsec.grid.three_phase.model_error_bound`."""
+        v0 = np.broadcast_to(np.asarray(v0_squared, dtype=np.float64), len(PHASES))
+        return three_phase.model_error_bound(self.tree, 3.0 * p, 3.0 * q, v0)
 
-def model_error_bound(feeder: PhasedFeeder, p: Floats, q: Floats, v0_squared: Floats | float) -> Floats:
-    """Bound (…, N) of the error of `v^2` after one correction against the AC power flow, by customer, pu."""
-    v0 = np.broadcast_to(np.asarray(v0_squared, dtype=np.float64), len(PHASES))
-    return three_phase.model_error_bound(feeder.tree, 3.0 * p, 3.0 * q, v0)
+    def interval_bounds(
+        self,
+        p: Floats,
+        q: Floats,
+        v0_squared: Floats | float,
+        *,
+        p_error: Floats,
+        q_error: Floats,
+    ) -> tuple[Floats, Floats]:
+        """`gridsec.grid.three_phase.interval_bounds`, for every customer.
 
+        Parameters
+        ----------
+        self, p, q : (N,), v0_squared
+            As in `bus_voltages`, one operating point.
+        p_error, q_error : (N,)
+            Largest errors of the powers, pu.
 
-def interval_bounds(
-    feeder: PhasedFeeder,
-    p: Floats,
-    q: Floats,
-    v0_squared: Floats | float,
-    *,
-    p_error: Floats,
-    q_error: Floats,
-) -> tuple[Floats, Floats]:
-    """`gridsec.grid.three_phase.interval_bounds`, for every customer.
-
-    Parameters
-    ----------
-    feeder, p, q : (N,), v0_squared
-        As in `bus_voltages`, one operating point.
-    p_error, q_error : (N,)
-        Largest errors of the powers, pu.
-
-    Returns
-    -------
-    (N,), (N,)
-        Change of the correction, and distance of its first step from the AC power flow, pu.
-    """
-    v0 = np.broadcast_to(np.asarray(v0_squared, dtype=np.float64), len(PHASES))
-    return three_phase.interval_bounds(
-        feeder.tree, 3.0 * p, 3.0 * q, v0, p_error=3.0 * p_error, q_error=3.0 * q_error
-    )
+        Returns
+        -------
+        (N,), (N,)
+            Change of the correction, and distance of its first step from the AC power flow, pu.
+        """
+        v0 = np.broadcast_to(np.asarray(v0_squared, dtype=np.float64), len(PHASES))
+        with np.errstate(all="ignore"):  # NaN gets an infinite bound without a warning
+            moved, rest = three_phase.interval_bounds(
+                self.tree, 3.0 * p, 3.0 * q, v0, p_error=3.0 * p_error, q_error=3.0 * q_error
+            )
+        return unbounded(moved), unbounded(rest)

@@ -13,18 +13,19 @@ References
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import prod
 
 import numpy as np
 
-from gridsec.arrays import Floats, Ints, any_of, frozen, frozen_ints
+from gridsec.arrays import Floats, Ints, all_of, any_of, frozen, frozen_ints
 from gridsec.errors import FeederInvalid, InputInvalid, Problem
+from gridsec.grid.network import Balanced, LinDistFlow, Power
 from gridsec.grid.trees import below, from_root, shrinking, walk
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Feeder:
+class Feeder(Balanced):
     """Radial feeder: a tree of b branches and b + 1 buses, rooted at the metered busbar (bus 0).
 
     Attributes
@@ -114,6 +115,228 @@ class Feeder:
         object.__setattr__(self, "alone", np.unique(self.bus).size == self.bus.size)
         object.__setattr__(self, "squared", frozen(self.r**2 + self.x**2))
 
+    def linear(self) -> LinDistFlow:
+        """Matrices of the linear power flow of a feeder.
+
+        `R_bus[k, j] = sum of r over the branches on both paths to the busbar`, from bus k and from the bus of
+        customer j.
+
+        References
+        ----------
+        chong2020, equation (15), for any tree.
+        """
+        R_bus = common_paths(self, self.r, self.bus)
+        X_bus = common_paths(self, self.x, self.bus)
+        return LinDistFlow(
+            R=frozen(R_bus[self.bus]), X=frozen(X_bus[self.bus]), R_bus=frozen(R_bus), X_bus=frozen(X_bus)
+        )
+
+    def bus_voltages(self, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 1) -> Floats:
+        """Squared voltage of every bus, corrected for losses and charging; O(b), without the N x N matrices.
+
+        Parameters
+        ----------
+        p, q, v0_squared, steps
+            As in `loss_correction`; `steps` = 0 gives LinDistFlow.
+
+        Returns
+        -------
+        (…, b + 1)
+            Squared voltages, pu.
+        """
+        flows = _linear_flows(self, p, q, v0_squared)
+        return _lossy(self, flows, flows, steps).v2
+
+    def loss_correction(self, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 1) -> Floats:
+        """Correction of the linear squared voltage of every bus for branch losses and charging.
+
+        From the linear flows `P, Q` (towards the child, at its end of the branch) and the linear `v^2`:
+        the squared current `l = (P^2 + Q^2) / v^2`, the losses `r l`, `x l`, and
+
+            v_child^2 = v_parent^2 - 2 (r P + x Q) - (r^2 + x^2) l
+
+        with the losses of the branches below added to `P` and `Q`. This is one step of the fixed-point
+        iteration with the AC power flow of a balanced radial feeder as its limit; `steps` repeats it. O(b)
+        for each operating point.
+
+        Parameters
+        ----------
+        p, q : (…, N)
+            Net active and reactive injection of each customer (generation positive, droop inverters
+            included), pu.
+        v0_squared : (…) or scalar
+            Squared busbar voltage, pu.
+        steps
+            Number of fixed-point steps, at least 1.
+
+        Returns
+        -------
+        (…, b + 1)
+            Additive correction of `v^2`, pu; 0 at the busbar.
+
+        Raises
+        ------
+        ValueError
+            If `steps` is below 1.
+
+        References
+        ----------
+        Baran and Wu 1989, the DistFlow equations. Derivation: docs/theory-model.md.
+        """
+        if steps < 1:
+            raise InputInvalid([Problem("out-of-range", f"steps is {steps}; it must be at least 1")])
+        flows = _linear_flows(self, p, q, v0_squared)
+        return np.asarray(_lossy(self, flows, flows, steps).v2 - flows.v2)
+
+    def corrected(
+        self, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 1
+    ) -> tuple[Floats, Floats]:
+        """`loss_correction` and `model_error_bound` of the same operating points, faster than separately.
+
+        Parameters
+        ----------
+        p, q, v0_squared, steps
+            As in `loss_correction`.
+
+        Returns
+        -------
+        (…, b + 1), (…, N)
+            Additive correction of `v^2`, and a bound on the error that remains after its first step, pu.
+
+        Raises
+        ------
+        ValueError
+            If `steps` is below 1.
+        """
+        if steps < 1:
+            raise InputInvalid([Problem("out-of-range", f"steps is {steps}; it must be at least 1")])
+        flows = _linear_flows(self, p, q, v0_squared)
+        once = _lossy(self, flows, flows, 1)
+        return np.asarray(_lossy(self, flows, once, steps - 1).v2 - flows.v2), _remainder(self, flows, once)
+
+    def model_error_bound(self, p: Floats, q: Floats, v0_squared: Floats | float) -> Floats:
+        """Bound of the error of `v^2` after one loss correction against the AC power flow.
+
+        Twice the size of the second fixed-point step, with magnitudes summed: the steps shrink geometrically,
+        and twice the next step bounds the sum of all later ones while each is at most half its predecessor
+        (in practice a few hundredths). Under heavy loads the quotients grow from step to step, so the second
+        step must be below a fifth of the first. Otherwise, towards voltage collapse, the bound is infinite.
+
+        Parameters
+        ----------
+        p, q, v0_squared
+            As in `loss_correction`.
+
+        Returns
+        -------
+        (…, N)
+            Bound on the remaining error of `v^2`, pu.
+        """
+        flows = _linear_flows(self, p, q, v0_squared)
+        with np.errstate(all="ignore"):
+            return _remainder(self, flows, _lossy(self, flows, flows, 1))
+
+    def reach(self, p: Floats, q: Floats) -> Floats:
+        """Largest change of the squared voltages by powers of given sizes: ``2 |R| p + 2 |X| q``; O(b).
+
+        Parameters
+        ----------
+        p, q : (…, N)
+            Sizes of the customers' active and reactive powers, not negative, pu.
+
+        Returns
+        -------
+        (…, b + 1)
+            Change at every bus, pu.
+        """
+        both = np.empty((2, *np.broadcast(p, q).shape))
+        both[0], both[1] = p, q
+        P, Q = below(self, _at_buses(self, both))[..., 1:]
+        return from_root(self, 2.0 * (np.abs(self.r) * P + np.abs(self.x) * Q))
+
+    def with_customers_at(self, places: Ints) -> Feeder:
+        """See `Network`."""
+        return replace(self, bus=places, customers=tuple(map(str, range(places.size))))
+
+    @property
+    def extremes_at_ends(self) -> bool:
+        """See `Network`. The correction is nearly quadratic in the loads."""
+        return True
+
+    def correction_bounds(
+        self,
+        p: Floats,
+        q: Floats,
+        v0_squared: Floats | float,
+        *,
+        p_error: Floats,
+        q_error: Floats,
+        steps: int,
+    ) -> tuple[Floats, Floats, Floats]:
+        """See `Network`. Extremes lie where all errors have the same sign."""
+        ends = np.array([0.0, -1.0, 1.0])[:, None]
+        with np.errstate(all="ignore"):
+            three, left = self.corrected(p + ends * p_error, q + ends * q_error, v0_squared, steps=steps)
+        if not all_of(np.isfinite(three)):
+            three = np.where(np.isfinite(three), three, 0.0)
+        # The remainder grows with the cube of the load, so the centre does not bound the ends.
+        return three[0], np.abs(three[1:] - three[0]).max(axis=0)[self.bus], left.max(axis=0)
+
+    def columns(self, power: Power, customers: Ints) -> Floats:
+        """See `Network`."""
+        return 2.0 * common_paths(self, self._branch(power), self.bus[customers])
+
+    def between(self, power: Power) -> Floats:
+        """See `Network`."""
+        return 0.5 * self.columns(power, np.arange(self.bus.size))[self.bus]
+
+    def weighted_sensitivity(self, power: Power, customers: Ints, weights: Floats) -> Floats:
+        """See `Network`. R and X are symmetric: the voltages by powers `weights`."""
+        injected = np.zeros((2, self.bus.size))
+        injected[0, customers] = weights
+        p, q = injected if power is Power.ACTIVE else injected[::-1]
+        return np.asarray(self.bus_voltages(p, q, 0.0, steps=0)[self.bus])
+
+    def squared_sensitivity(self, power: Power, customers: Ints) -> Floats:
+        """See `Network`."""
+        weight = np.zeros(self.bus.size)
+        weight[customers] = 1.0
+        return self.variances(power, weight)[self.bus]
+
+    def self_impedance(self, power: Power) -> Floats:
+        """See `Network`."""
+        return path_sums(self, self._branch(power))[self.bus]
+
+    def covariance(self, power: Power, at: Ints, variance: Floats) -> Floats:
+        """See `Network`; O(n p).
+
+        A voltage is that of the bus above less the drop on the branch between. The drop depends on the flow,
+        the sum of the powers below. So covariances with flows are summed up the tree, those with voltages
+        down.
+        """
+        branch = self._branch(power)
+        there = np.bincount(self.bus, weights=variance, minlength=len(self.buses))
+        parent, double = self.parent.tolist(), (2.0 * branch).tolist()
+        out: Floats = np.multiply(common_paths(self, branch, at), 2.0 * there[:, None], order="C")
+        for k in range(len(parent), 0, -1):
+            out[parent[k - 1]] += out[k]
+        out[0] = 0.0
+        for k, (above, factor) in enumerate(zip(parent, double, strict=True), 1):
+            out[k] *= factor
+            out[k] += out[above]
+        return out
+
+    def variances(self, power: Power, variance: Floats) -> Floats:
+        """See `Network`; O(n): a power below a bus shares all of that bus's path."""
+        below = np.bincount(self.bus, weights=variance, minlength=len(self.buses))
+        for k in range(self.parent.size, 0, -1):
+            below[self.parent[k - 1]] += below[k]
+        whole = path_sums(self, self._branch(power))
+        return path_sums(self, 4.0 * below[1:] * (whole[1:] ** 2 - whole[self.parent] ** 2))
+
+    def _branch(self, power: Power) -> Floats:
+        return self.r if power is Power.ACTIVE else self.x
+
 
 def _problems(feeder: Feeder) -> list[Problem]:
     """Problems of the fields of `feeder`."""
@@ -175,41 +398,6 @@ def _shape_problems(feeder: Feeder) -> list[Problem]:
         for what, has, wants in expected
         if has != wants
     ]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LinDistFlow:
-    """Linear power flow `v^2 = v0^2 + 2 R p + 2 X q` of one feeder.
-
-    Attributes
-    ----------
-    R, X : (N, N)
-        Resistance and reactance of the path from the busbar that two customers share, pu.
-    R_bus, X_bus : (b + 1, N)
-        The same for a bus and a customer.
-    """
-
-    R: Floats
-    X: Floats
-    R_bus: Floats
-    X_bus: Floats
-
-
-def lindistflow(feeder: Feeder) -> LinDistFlow:
-    """Matrices of the linear power flow of a feeder.
-
-    `R_bus[k, j] = sum of r over the branches on both paths to the busbar`, from bus k and from the bus of
-    customer j.
-
-    References
-    ----------
-    chong2020, equation (15), for any tree.
-    """
-    R_bus = common_paths(feeder, feeder.r, feeder.bus)
-    X_bus = common_paths(feeder, feeder.x, feeder.bus)
-    return LinDistFlow(
-        R=frozen(R_bus[feeder.bus]), X=frozen(X_bus[feeder.bus]), R_bus=frozen(R_bus), X_bus=frozen(X_bus)
-    )
 
 
 def common_paths(feeder: Feeder, branch: Floats, buses: Ints) -> Floats:
@@ -292,96 +480,6 @@ def squared_voltages(model: LinDistFlow, p: Floats, q: Floats, v0_squared: Float
     return base + 2.0 * (p @ model.R.T + q @ model.X.T)
 
 
-def loss_correction(
-    feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 1
-) -> Floats:
-    """Correction of the linear squared voltage of every bus for branch losses and charging.
-
-    From the linear flows `P, Q` (towards the child, at its end of the branch) and the linear `v^2`:
-    the squared current `l = (P^2 + Q^2) / v^2`, the losses `r l`, `x l`, and
-
-        v_child^2 = v_parent^2 - 2 (r P + x Q) - (r^2 + x^2) l
-
-    with the losses of the branches below added to `P` and `Q`. This is one step of the fixed-point iteration
-    with the AC power flow of a balanced radial feeder as its limit; `steps` repeats it. O(b) for each
-    operating point.
-
-    Parameters
-    ----------
-    p, q : (…, N)
-        Net active and reactive injection of each customer (generation positive, droop inverters
-        included), pu.
-    v0_squared : (…) or scalar
-        Squared busbar voltage, pu.
-    steps
-        Number of fixed-point steps, at least 1.
-
-    Returns
-    -------
-    (…, b + 1)
-        Additive correction of `v^2`, pu; 0 at the busbar.
-
-    Raises
-    ------
-    ValueError
-        If `steps` is below 1.
-
-    References
-    ----------
-    Baran and Wu 1989, the DistFlow equations. Derivation: docs/theory-model.md.
-    """
-    if steps < 1:
-        raise InputInvalid([Problem("out-of-range", f"steps is {steps}; it must be at least 1")])
-    flows = _linear_flows(feeder, p, q, v0_squared)
-    return np.asarray(_lossy(feeder, flows, flows, steps).v2 - flows.v2)
-
-
-def bus_voltages(
-    feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 1
-) -> Floats:
-    """Squared voltage of every bus, corrected for losses and charging; O(b), without the N x N matrices.
-
-    Parameters
-    ----------
-    feeder, p, q, v0_squared, steps
-        As in `loss_correction`; `steps` = 0 gives LinDistFlow.
-
-    Returns
-    -------
-    (…, b + 1)
-        Squared voltages, pu.
-    """
-    flows = _linear_flows(feeder, p, q, v0_squared)
-    return _lossy(feeder, flows, flows, steps).v2
-
-
-def corrected(
-    feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 1
-) -> tuple[Floats, Floats]:
-    """`loss_correction` and `model_error_bound` of the same operating points, faster than separately.
-
-    Parameters
-    ----------
-    feeder, p, q, v0_squared, steps
-        As in `loss_correction`.
-
-    Returns
-    -------
-    (…, b + 1), (…, N)
-        Additive correction of `v^2`, and a bound on the error that remains after its first step, pu.
-
-    Raises
-    ------
-    ValueError
-        If `steps` is below 1.
-    """
-    if steps < 1:
-        raise InputInvalid([Problem("out-of-range", f"steps is {steps}; it must be at least 1")])
-    flows = _linear_flows(feeder, p, q, v0_squared)
-    once = _lossy(feeder, flows, flows, 1)
-    return np.asarray(_lossy(feeder, flows, once, steps - 1).v2 - flows.v2), _remainder(feeder, flows, once)
-
-
 def _lossy(feeder: Feeder, flows: _Flows, now: _Flows, steps: int) -> _Flows:
     """The linear power flow with the losses of the flows `now`, repeated `steps` times."""
     for _ in range(steps):
@@ -392,48 +490,6 @@ def _lossy(feeder: Feeder, flows: _Flows, now: _Flows, steps: int) -> _Flows:
         Q = flows.Q + loss_q
         now = _Flows(flows.P + loss_p, Q, Q, flows.v2 - from_root(feeder, drop))
     return now
-
-
-def model_error_bound(feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats | float) -> Floats:
-    """Bound of the error of `v^2` after one loss correction against the AC power flow, for every customer.
-
-    Twice the size of the second fixed-point step, with magnitudes summed: the steps shrink geometrically, and
-    twice the next step bounds the sum of all later ones while each is at most half its predecessor (in
-    practice a few hundredths). Under heavy loads the quotients grow from step to step, so the second step
-    must be below a fifth of the first. Otherwise, towards voltage collapse, the bound is infinite.
-
-    Parameters
-    ----------
-    feeder, p, q, v0_squared
-        As in `loss_correction`.
-
-    Returns
-    -------
-    (…, N)
-        Bound on the remaining error of `v^2`, pu.
-    """
-    flows = _linear_flows(feeder, p, q, v0_squared)
-    with np.errstate(all="ignore"):
-        return _remainder(feeder, flows, _lossy(feeder, flows, flows, 1))
-
-
-def reach(feeder: Feeder, p: Floats, q: Floats) -> Floats:
-    """Largest change of the squared voltages by powers of given sizes: ``2 |R| p + 2 |X| q``; O(b).
-
-    Parameters
-    ----------
-    p, q : (…, N)
-        Sizes of the customers' active and reactive powers, not negative, pu.
-
-    Returns
-    -------
-    (…, b + 1)
-        Change at every bus, pu.
-    """
-    both = np.empty((2, *np.broadcast(p, q).shape))
-    both[0], both[1] = p, q
-    P, Q = below(feeder, _at_buses(feeder, both))[..., 1:]
-    return from_root(feeder, 2.0 * (np.abs(feeder.r) * P + np.abs(feeder.x) * Q))
 
 
 def _remainder(feeder: Feeder, flows: _Flows, once: _Flows) -> Floats:

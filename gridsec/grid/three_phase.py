@@ -34,7 +34,7 @@ References
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -302,6 +302,13 @@ def _customer_problems(feeder: ThreePhaseFeeder) -> list[Problem]:
 def named(present: Bools) -> str:
     """Letters of the phases that are present, (3,)."""
     return "".join(phase for phase, there in zip(PHASES, present, strict=True) if there)
+
+
+def customers_at(feeder: ThreePhaseFeeder, places: Ints) -> ThreePhaseFeeder:
+    """The feeder with one single-phase customer at each of these places (k,): phase j mod 3 of bus j // 3."""
+    connected = np.equal.outer(places % 3, np.arange(3))
+    names = tuple(map(str, range(places.size)))
+    return replace(feeder, bus=places // 3, connected=connected, customers=names)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

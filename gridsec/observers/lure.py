@@ -26,8 +26,7 @@ from scipy.linalg import expm
 from gridsec.arrays import Floats, Ints, exponential_integrals, frozen, perron_bound
 from gridsec.errors import FeederInvalid, InputInvalid, Problem, refuse
 from gridsec.grid.droop import Droop
-from gridsec.grid.network import Network, Power, columns
-from gridsec.grid.radial import LinDistFlow
+from gridsec.grid.network import LinDistFlow, Network, Power
 from gridsec.grid.three_phase import CustomerFlow, ThreePhaseFeeder, lindist3flow, per_customer
 from gridsec.observers.newton import Nonlinearity, settle
 
@@ -287,7 +286,7 @@ def _reactances(feeder: Network | ThreePhaseFeeder, own: Ints) -> Floats:
     """Reactances from the reactive powers of the customers `own` to all squared voltages, (N, m)."""
     if isinstance(feeder, ThreePhaseFeeder):
         return per_customer(feeder, lindist3flow(feeder)).X[:, own]
-    return 0.5 * columns(feeder, Power.REACTIVE, own)[feeder.bus]
+    return 0.5 * feeder.columns(Power.REACTIVE, own)[feeder.bus]
 
 
 def known_input(  # noqa: PLR0917  # every argument is a term of chong2020 (19), in its order

@@ -24,7 +24,7 @@ from gridsec.arrays import Floats, Ints
 from gridsec.errors import InputInvalid, Problem
 from gridsec.estimators.exact_bank import bank as banks
 from gridsec.grid.droop import Droop, fleet
-from gridsec.grid.radial import Feeder, lindistflow
+from gridsec.grid.radial import Feeder
 from gridsec.observers.certificates import reactance
 from gridsec.observers.gains import CircleGains, margin, options_for
 from gridsec.observers.gains import stacked as in_one
@@ -91,7 +91,7 @@ def setting(customers: int = CUSTOMERS) -> Setting:
     every = np.arange(customers)
     droop = fleet(every, "ieee1547-b", np.full(customers, 20.0), base_kva)
     load = np.full(customers, 1.0 / base_kva)
-    w = known_input(lindistflow(feeder), droop.vbar, -6.0 * load, -2.0 * load, 0.97**2)
+    w = known_input(feeder.linear(), droop.vbar, -6.0 * load, -2.0 * load, 0.97**2)
     return Setting(feeder, droop, close_loop(feeder, droop, every), w)
 
 

@@ -26,7 +26,7 @@ from scipy.sparse.csgraph import connected_components
 
 from gridsec.arrays import Bools, Floats, Ints, unit_rows
 from gridsec.errors import InputInvalid, Problem
-from gridsec.grid.network import InPhases, Network, Power, between, busbar_places, one_busbar
+from gridsec.grid.network import Network, Power
 from gridsec.grid.radial import Feeder
 from gridsec.grid.three_phase import ThreePhaseFeeder
 from gridsec.observers.lure import Lure
@@ -43,7 +43,6 @@ __all__ = [
     "part_redundancy",
     "parts",
     "patterns",
-    "tree_bus",
     "unknown_pair",
     "unknown_voltages",
 ]
@@ -98,7 +97,7 @@ def unknown_voltages(feeder: Network, unknown: Ints, *, busbar: bool, tol: float
         Columns up to this fraction of the longest have no effect. Singular values up to this fraction of the
         largest, of columns of unit length, are zero.
     """
-    powers = np.hstack([between(feeder, power)[:, unknown] for power in Power])
+    powers = np.hstack([feeder.between(power)[:, unknown] for power in Power])
     columns = unit_rows(powers.T, tol=tol).T
     if busbar:
         columns = np.hstack([columns, unit_rows(from_busbar(feeder).T, tol=tol).T])
@@ -113,8 +112,8 @@ def unknown_voltages(feeder: Network, unknown: Ints, *, busbar: bool, tol: float
 
 def from_busbar(feeder: Network) -> Floats:
     """Effect of each busbar voltage on the customers' squared voltages, (N, 1), or (N, 3) in phases."""
-    first = busbar_places(feeder)
-    of_each = one_busbar(feeder, feeder.bus, np.arange(first.stop))
+    first = feeder.busbar_places()
+    of_each = feeder.same_busbar_phase(feeder.bus, np.arange(first.stop))
     return np.array(np.broadcast_to(of_each, (feeder.bus.size, first.stop)))
 
 
@@ -334,11 +333,6 @@ def part_redundancy(given: Patterns, part: Part, silent: Bools) -> Index:
     honest = np.ones(silent.size, dtype=np.bool_)
     honest[part.meters] = False
     return fewest_meters(given, honest=honest, silent=silent)
-
-
-def tree_bus(feeder: Network) -> Ints:
-    """Bus of each customer in the feeder's tree, for any phase, (N,)."""
-    return feeder.tree.at if isinstance(feeder, InPhases) else feeder.bus
 
 
 def parts(feeder: Feeder | ThreePhaseFeeder, buses: Ints, ties: Ints) -> Sequence[Part]:

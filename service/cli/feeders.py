@@ -32,14 +32,13 @@ SHOWN = 40
 def feeders_list() -> None:
     """List the feeders of the project."""
     from feeders.model.site import load, names
-    from gridsec.grid.network import InPhases
 
     table = Table("name", "title", "phases", "customers", "meters", "inverters", "M")
     for name in names(balanced=False):
         site = load(name)
         counts = (len(site.feeder.customers), len(site.meter_ids), site.droop.customer.size)
         cells = (*map(str, counts), str(site.tables.meta.monitor.max_attacked))
-        phases = "single-phase" if isinstance(site.feeder, InPhases) else "balanced"
+        phases = "single-phase" if site.feeder.busbar_phases == 3 else "balanced"
         table.add_row(name, escape(site.tables.meta.title), phases, *cells)
     out.print(table)
 

@@ -14,7 +14,6 @@ from feeders.model.site import Site, plant
 from gridsec.arrays import Bools
 from gridsec.estimators import data_errors
 from gridsec.estimators.data_errors import DataError, DataErrorKind
-from gridsec.grid.network import InPhases
 from gridsec.grid.three_phase import PHASES
 from gridsec.interface import Cause, Estimate, Frame, Verdict
 from service.ingest.align import Tick
@@ -144,7 +143,7 @@ def _in_words(site: Site, error: DataError) -> DataErrorReport:
 
 def _place(site: Site, place: int) -> str:
     """Bus and phase of a place."""
-    if not isinstance(site.feeder, InPhases):
+    if site.feeder.busbar_phases == 1:
         return f"bus {site.feeder.buses[place]}"
     bus, phase = divmod(place, len(PHASES))
     return f"bus {site.spanning.buses[bus]}, phase {PHASES[phase]}"

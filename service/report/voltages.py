@@ -10,7 +10,7 @@ import numpy as np
 
 from feeders.model.site import Site, Snapshot, volts
 from gridsec.arrays import Bools, Floats
-from gridsec.grid.network import InPhases, busbar_places, hangs_on
+from gridsec.grid import Feeder
 from gridsec.interface import Cause, Estimate, Verdict
 from service.ingest.align import Tick
 
@@ -44,13 +44,13 @@ def busbar_volt(site: Site, tick: Tick) -> Floats | float:
         return math.nan
     phases = tick.busbar.v_phases
     # A balanced feeder has one voltage, also if single phases are not measured.
-    one = phases is None or not isinstance(site.feeder, InPhases)
+    one = phases is None or site.feeder.busbar_phases == 1
     return tick.busbar.v_volt if one else np.array(phases)
 
 
 def busbar_phases(site: Site) -> tuple[Phase | None, ...]:
     """Return the phases of the busbar, (b,): a, b and c, or None on a balanced feeder."""
-    return ("a", "b", "c") if isinstance(site.feeder, InPhases) else (None,)
+    return ("a", "b", "c") if site.feeder.busbar_phases == 3 else (None,)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,7 +78,7 @@ class Grounds:
 
     def model_only(self, site: Site) -> Bools:
         """Return the customers with model-only values, (N,)."""
-        return np.asarray(~(hangs_on(site.feeder) * self.measured).any(axis=1), dtype=np.bool_)
+        return np.asarray(~(site.feeder.busbar_incidence() * self.measured).any(axis=1), dtype=np.bool_)
 
 
 def grounds(
@@ -98,7 +98,7 @@ def grounds(
     if verdict is not None:
         busbar = busbar & (verdict.cause is not Cause.NO_BUSBAR)
         busbar = busbar & ~verdict.busbar if verdict.busbar.size else busbar
-    of_meters = hangs_on(site.feeder)[site.meters[used]].any(axis=0)
+    of_meters = site.feeder.busbar_incidence()[site.meters[used]].any(axis=0)
     return Grounds(np.asarray(of_meters, dtype=np.bool_), busbar)
 
 
@@ -122,11 +122,12 @@ def bus_volts(site: Site, v2_bus: Floats, measured: Bools) -> tuple[Floats, Floa
         The first is model only.
     """
     v = volts(site.base_volt, v2_bus)
-    if not isinstance(site.feeder, InPhases):
+    tree = site.spanning
+    if isinstance(tree, Feeder):
         return v, np.zeros((v.size, 0)), np.full(v.size, not measured[0])
-    phases = np.where(site.feeder.tree.phases, v.reshape(-1, 3), np.nan)
-    there = site.feeder.tree.phases & measured
-    among = np.where(there.any(axis=1, keepdims=True), there, site.feeder.tree.phases)
+    phases = np.where(tree.phases, v.reshape(-1, 3), np.nan)
+    there = tree.phases & measured
+    among = np.where(there.any(axis=1, keepdims=True), there, tree.phases)
     off = np.where(among, np.nan_to_num(np.abs(phases - site.nominal_volt.reshape(-1, 3)), nan=-0.5), -1.0)
     one = np.take_along_axis(phases, off.argmax(axis=1)[:, None], axis=1)[:, 0]
     return one, phases, np.asarray(~there.any(axis=1), dtype=np.bool_)
@@ -235,7 +236,7 @@ def busbar_report(
     if verdict is not None and judges:
         suspect, attack = verdict.busbar, _attack_volts(site, reported, verdict)
     if estimate is not None:
-        places = busbar_places(site.feeder)
+        places = site.feeder.busbar_places()
         estimated = volts(site.base_volt[places], estimate.v2_bus[places])
     k = _furthest(suspect, attack if suspect.any() else reported - estimated)
 
@@ -294,5 +295,5 @@ def _reported(site: Site, tick: Tick) -> Floats:
 
 def _attack_volts(site: Site, reported: Floats, verdict: Verdict) -> Floats:
     """Excess of the busbar meter in phases named as manipulated, V, (b,)."""
-    base = site.base_volt[busbar_places(site.feeder)]
+    base = site.base_volt[site.feeder.busbar_places()]
     return excess_volts(base, reported, verdict.busbar_attack, verdict.busbar)

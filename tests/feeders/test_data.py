@@ -16,7 +16,7 @@ from feeders.model import profiles
 from feeders.model.profiles import Season
 from feeders.model.site import Site, Snapshot, load, names, to_frame
 from feeders.model.three_phase import three_phase_names
-from gridsec.grid.radial import lindistflow, loss_correction, model_error_bound, squared_voltages
+from gridsec.grid.radial import squared_voltages
 from gridsec.observers.certificates import certify, reactance, small_gain, verify
 from gridsec.observers.lure import close_loop
 
@@ -122,7 +122,7 @@ def ac_net(site: Site) -> Any:
 def test_corrected_lindistflow_is_within_its_stated_error_of_ac(name: str) -> None:
     site = load(name)
     net = ac_net(site)
-    model = lindistflow(site.feeder)
+    model = site.feeder.linear()
     rng = np.random.default_rng(7)
     base, loads = site.feeder.base_kva, site.loads
     plain, corrected, stated = [], [], []
@@ -136,8 +136,8 @@ def test_corrected_lindistflow_is_within_its_stated_error_of_ac(name: str) -> No
         pp.runpp(net, tolerance_mva=1e-10, numba=False)
         truth = net.res_bus.vm_pu.to_numpy()[net.load.bus] ** 2
         linear = squared_voltages(model, -p, -q, v0**2)
-        better = linear + loss_correction(site.feeder, -p, -q, v0**2)[site.feeder.bus]
-        bound = model_error_bound(site.feeder, -p, -q, v0**2)
+        better = linear + site.feeder.loss_correction(-p, -q, v0**2)[site.feeder.bus]
+        bound = site.feeder.model_error_bound(-p, -q, v0**2)
         assert (np.abs(better - truth) <= bound + 1e-9).all()
         plain.append(np.abs(linear - truth).max() / 2)
         corrected.append(np.abs(better - truth).max() / 2)
@@ -155,7 +155,7 @@ def test_corrected_lindistflow_is_within_its_stated_error_of_ac(name: str) -> No
 def test_unknown_powers_leave_room_to_see_a_lie(name: str) -> None:
     """Worst case over all customers at once, in per cent of voltage."""
     site = load(name)
-    model, loads, base = lindistflow(site.feeder), site.loads, site.feeder.base_kva
+    model, loads, base = site.feeder.linear(), site.loads, site.feeder.base_kva
     largest = 0.1 if name == "simbench-lv-rural1" else 0.6
     for share in (0.05, 0.2, 0.5):
         p_kw = (share * loads.load_peak - 0.5 * (share > 0.1) * loads.pv_peak)[site.meters] * base

@@ -29,7 +29,6 @@ from benchmarks.peers.ours import Covariance
 from benchmarks.peers.scene import SIZE, Cell, Scene, mean, scene, snapshot
 from benchmarks.peers.served import frame, suspects, watch
 from gridsec.estimators import sequential
-from gridsec.grid.radial import lindistflow
 
 FEEDER = "rural1-behind"
 Prepared = tuple[Scene, dict[str, Method]]
@@ -83,7 +82,7 @@ def test_ours_names_whose_powers_are_false_too(ready: Prepared) -> None:
 @pytest.mark.parametrize("feeder", [FEEDER, "rural3-behind"])
 def test_the_covariance_of_a_tree_is_that_of_its_matrices(feeder: str) -> None:
     here = scene(feeder)
-    model = lindistflow(here.feeder)
+    model = here.feeder.linear()
     R, X = 2.0 * model.R, 2.0 * model.X
     p, q = np.random.default_rng(4).uniform(0.0, 1.0, (2, len(R)))
     dense = R @ np.diag(p) @ R.T + X @ np.diag(q) @ X.T + 0.01

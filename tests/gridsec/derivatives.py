@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from gridsec.arrays import Floats
-from gridsec.grid.radial import LinDistFlow
+from gridsec.grid.network import LinDistFlow
 
 STEP = 1e-3
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from gridsec.arrays import Floats, Ints
 from gridsec.grid.droop import fleet
-from gridsec.grid.radial import Feeder, lindistflow
+from gridsec.grid.radial import Feeder
 from gridsec.observers.lure import Lure, close_loop
 
 
@@ -60,7 +60,7 @@ def street(  # noqa: PLR0917
         base_kva,
         tau=rng.uniform(*tau, len(inverters)),
     )
-    model = lindistflow(feeder)
+    model = feeder.linear()
     shape = 2.0 * np.hstack([model.R * (0.6 / base_kva), model.X * (0.2 / base_kva)])
     values, vectors = np.linalg.eigh(shape @ shape.T)
     load = vectors * np.sqrt(np.maximum(values, 0.0))

@@ -10,7 +10,6 @@ import numpy as np
 from gridsec.estimators.plant import Plant
 from gridsec.grid.droop import Droop
 from gridsec.grid.meshed import PhasedMesh
-from gridsec.grid.network import InPhases
 from gridsec.grid.phased import PhasedFeeder
 from gridsec.grid.three_phase import ThreePhaseFeeder
 from gridsec.interface import Frame
@@ -82,7 +81,7 @@ class PhasedStreet(Street):
     def voltages(self) -> np.ndarray:
         """|v| of every place."""
         feeder = self.plant.feeder
-        assert isinstance(feeder, InPhases)
+        assert feeder.busbar_phases == 3
         q = self.p * self.tan
         np.add.at(q, self.plant.droop.customer, self.x)
         return np.nan_to_num(np.sqrt(ac_places(feeder, self.p, q, (self.v0 * self.phases) ** 2)))

@@ -22,7 +22,7 @@ from gridsec.estimators.sequential import LoadDoubt, SequentialOptions
 from gridsec.grid.droop import Droop, fleet, preset
 from gridsec.grid.meshed import MeshedFeeder
 from gridsec.grid.phased import PhasedFeeder
-from gridsec.grid.radial import Feeder, loss_correction
+from gridsec.grid.radial import Feeder
 from gridsec.grid.three_phase import ThreePhaseFeeder
 from gridsec.observers import circle, luenberger
 from gridsec.observers.certificates import certify
@@ -227,8 +227,8 @@ CALLS: dict[str, Callable[[], Any]] = {
     "wrong left inverse": no_left_inverse,
     "no attacked meter": lambda: windowed.design(street(), max_attacked=0, step_s=1.0),
     "attack that ends first": lambda: Stuck(WHO, 1.0, 0.0),
-    "no step of a loss correction": lambda: loss_correction(
-        random_feeder(0, customers=2), np.zeros(2), np.zeros(2), 1.0, steps=0
+    "no step of a loss correction": lambda: random_feeder(0, customers=2).loss_correction(
+        np.zeros(2), np.zeros(2), 1.0, steps=0
     ),
     "customer on no phase": lambda: three_phases(
         connected=np.zeros_like(random_three_phase(1, charging=0.0).connected)

@@ -22,7 +22,7 @@ from gridsec.errors import FeederInvalid, Problem
 from gridsec.grid import three_phase as three
 from gridsec.grid.droop import voltage_curve
 from gridsec.grid.meshed import MeshedFeeder, impedances
-from gridsec.grid.radial import Feeder, bus_voltages, lindistflow
+from gridsec.grid.radial import Feeder
 from gridsec.grid.three_phase import PHASES, ThreePhaseFeeder, lindist3flow
 from gridsec.planning.calibration import Doubts, Field, Places, Series
 from gridsec.planning.droop.ac_sensitivity import lines
@@ -308,7 +308,7 @@ def _places(site: Site | ThreePhaseSite, feeder: Model, place: Ints) -> Places:
         active, reactive = 2.0 * Z.real, 2.0 * Z.imag
         weight[np.arange(feeder.bus.size), feeder.bus] = 1.0
     elif isinstance(feeder, Feeder):
-        flow = lindistflow(replace(feeder, bus=bus, customers=ids))
+        flow = replace(feeder, bus=bus, customers=ids).linear()
         active, reactive = 2.0 * flow.R, 2.0 * flow.X
         weight[np.arange(feeder.bus.size), feeder.bus] = 1.0
     else:
@@ -477,7 +477,7 @@ def _voltages(net: Network, p: Floats, q: Floats, v0: Floats) -> tuple[Floats, F
         apart = V[:, one] - V[:, other]
         return (V.real**2 + V.imag**2)[:, None], (np.conj(V[:, one] + V[:, other]) * apart)[:, None]
     if isinstance(feeder, Feeder):
-        U = bus_voltages(feeder, p, q, v0**2, steps=_STEPS)[:, None, :]
+        U = feeder.bus_voltages(p, q, v0**2, steps=_STEPS)[:, None, :]
     else:
         parts = [slice(k, k + _CHUNK) for k in range(0, len(v0), _CHUNK)]
         # 1 pu of a phase's power is a third of the feeder's base.
@@ -489,11 +489,11 @@ def _voltages(net: Network, p: Floats, q: Floats, v0: Floats) -> tuple[Floats, F
 
 
 def _phasors(feeder: MeshedFeeder, s: Phasors, v0: Floats) -> Phasors:
-    """Complex voltages of all buses, (T, b + 1); `gridsec.grid.meshed.bus_voltages` has their squares."""
+    """Complex voltages of all buses, (T, b + 1); `Meshed.bus_voltages` has their squares."""
     idle = v0[:, None] * feeder.idle
     here = V = idle[:, feeder.bus]
     for _ in range(_ROUNDS):
-        V = here + np.conj(s / V) @ feeder.between.T
+        V = here + np.conj(s / V) @ feeder.transfer_between.T
     return np.asarray(idle + np.conj(s / V) @ feeder.transfer.T)
 
 

@@ -27,7 +27,6 @@ from feeders.studies.workers import Here, Runner
 from gridsec.arrays import Bools, Floats
 from gridsec.estimators import sequential
 from gridsec.estimators.sequential import LoadDoubt
-from gridsec.grid.network import bus_voltages, busbar_places
 from gridsec.interface import Frame
 from gridsec.planning.detectability import Rule, largest_shift
 
@@ -166,10 +165,10 @@ def _world(given: Rule, site: Site, share: float, rng: np.random.Generator) -> C
     x = np.zeros(own.size)
     for _ in range(_SETTLING):
         injected = q + off_q + np.bincount(own, weights=x, minlength=q.size)
-        v2 = bus_voltages(site.feeder, p + off_p, injected, 1.0, steps=3)[site.feeder.bus]
+        v2 = site.feeder.bus_voltages(p + off_p, injected, 1.0, steps=3)[site.feeder.bus]
         x = 0.5 * x + 0.5 * site.droop(site.droop.vbar**2 - v2[own])
     v = np.sqrt(v2[site.meters]) * (1.0 + accuracy.class_fraction * rng.uniform(-1.0, 1.0, site.meters.size))
-    busbar = (1.0 + design.busbar / 2.0 * draw(rng, busbar_places(site.feeder).stop)) ** 2
+    busbar = (1.0 + design.busbar / 2.0 * draw(rng, site.feeder.busbar_places().stop)) ** 2
     root3 = np.sqrt(3.0)
 
     def frame(tick: int, lies: Floats) -> Frame:

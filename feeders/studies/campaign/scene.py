@@ -42,7 +42,7 @@ from gridsec.attack import (
 )
 from gridsec.errors import InputInvalid, Problem
 from gridsec.estimators.sequential import Commission
-from gridsec.grid.network import Power, between
+from gridsec.grid.network import Power
 from gridsec.interface import Decision, Frame
 
 if TYPE_CHECKING:
@@ -130,7 +130,7 @@ def liars(site: Site, case: Case, random: np.random.Generator) -> tuple[Ints, Fl
     signs: Floats = random.choice([-1.0, 1.0], count)
     if case.place == Place.RANDOM:
         return np.sort(random.choice(p, count, replace=False)).astype(np.intp), signs
-    R, X = (between(site.feeder, power) for power in Power)
+    R, X = (site.feeder.between(power) for power in Power)
     if case.place == Place.SENSITIVE:
         # Effect of loads with equal and independent uncertainty on each voltage.
         felt = np.sqrt((R**2).sum(axis=1) + (X**2).sum(axis=1))

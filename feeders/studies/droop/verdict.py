@@ -27,7 +27,6 @@ from feeders.studies.operating import Bases
 from gridsec.arrays import Floats
 from gridsec.errors import DesignInfeasible, FeederInvalid
 from gridsec.grid.droop import Droop, voltage_curve
-from gridsec.grid.network import InPhases
 from gridsec.planning.droop.ac_sensitivity import Box, Network, network, sensitivity
 from gridsec.planning.droop.equilibrium import Share, injected, rest, shares, shares_of_gain
 from gridsec.planning.droop.stability import Loop, Update, growth, loop, proof, reach, slopes, steepened
@@ -546,7 +545,7 @@ def inverter_rows(
 def _shares(site: Site, given: Loop) -> Share:
     """Shares by common modes of the loop of reactances; in three phases by absolute values of its gain."""
     limit = proof(given).factor
-    if not isinstance(site.feeder, InPhases):
+    if site.feeder.busbar_phases == 1:
         return shares(given, limit * float(np.linalg.norm(0.5 * (given.S + given.S.T), 2)))
     own = shares_of_gain(given)
     # A factor that is admissible for all is admissible for one.

@@ -31,8 +31,7 @@ from gridsec.estimators.inputs import Inputs, Past, clean, injections, known, no
 from gridsec.estimators.plant import Options, Plant, Setting, check_plant
 from gridsec.estimators.thresholds import ErrorBound, ErrorModel, Majorant, Motion
 from gridsec.grid.meter import reading_error
-from gridsec.grid.network import linear
-from gridsec.grid.radial import LinDistFlow
+from gridsec.grid.network import LinDistFlow
 from gridsec.interface import Estimate, Frame, Verdict
 from gridsec.observers.certificates import Certificate, certify, small_gain, verify
 from gridsec.observers.lmi import contraction
@@ -176,7 +175,7 @@ def design(
     if options is None:
         options = Options() if step_s <= 30.0 else Options(release=4)
     lure = close_loop(plant.feeder, plant.droop, meters)
-    model = linear(plant.feeder)
+    model = plant.feeder.linear()
     bank = banks.design(lure, max_attacked, gains=gains, reactive=_reactive(model, meters, gains))
     errors = thresholds.error_model(plant.droop, model, meters, max_attacked)
     proven = lure

@@ -36,7 +36,6 @@ from gridsec.estimators.inputs import NO_VOLTAGE, busbar_errors, losses
 from gridsec.estimators.plant import Plant
 from gridsec.estimators.sequential.design import SequentialDesign
 from gridsec.grid.meter import told_error
-from gridsec.grid.network import bus_voltages, by_place, hangs_on, reach
 from gridsec.interface import Estimate, Frame
 
 FALSE_Q = 0.5
@@ -115,7 +114,7 @@ class Powers:
         injected : (N,)
             How far the inverters' injections may be off, pu.
         """
-        return reach(plant.feeder, *self.errors(plant, injected))[plant.feeder.bus]
+        return plant.feeder.reach(*self.errors(plant, injected))[plant.feeder.bus]
 
     def lost(self, plant: Plant, injected: Floats) -> tuple[Floats, Floats]:
         """What the loss correction can be off at each customer, (N,), and the correction itself.
@@ -147,8 +146,8 @@ class Powers:
             return np.zeros(plant.meters.size)
         p, q = (np.stack([of, np.where(which, 0.0, of)]) for of in (self.frame.p, self.q))
         with np.errstate(all="ignore"):
-            all_ = bus_voltages(plant.feeder, p, q, self.v0_squared, steps=plant.loss_correction)
-            active = bus_voltages(plant.feeder, p, q[0], self.v0_squared, steps=0)
+            all_ = plant.feeder.bus_voltages(p, q, self.v0_squared, steps=plant.loss_correction)
+            active = plant.feeder.bus_voltages(p, q[0], self.v0_squared, steps=0)
             off: Floats = np.abs((all_[1] - all_[0]) - (active[1] - active[0]))
         at = plant.feeder.bus[plant.meters]
         return np.minimum(np.nan_to_num(off[at], nan=NO_VOLTAGE), NO_VOLTAGE)
@@ -216,7 +215,7 @@ def follow(
         lost, _ = powers.lost(plant, droop.per_customer(top, size))
         meter = np.minimum(busbar_errors(plant, powers.v0_squared, design.sigmas[0]), NO_VOLTAGE)
         known = np.where(metered, meter, NO_VOLTAGE)
-        busbar = by_place(plant.feeder, known)[plant.feeder.bus]
+        busbar = plant.feeder.broadcast_busbar(known)[plant.feeder.bus]
         for _ in range(_ROUNDS):
             model = powers.linear(plant, droop.per_customer(top, size)) + lost + busbar
             width = np.where(which, model[droop.customer], width)
@@ -276,10 +275,10 @@ class Grounds:
         spread = np.minimum(self.powers.linear(plant, injected) + lost, NO_VOLTAGE)
         reading, use = told_error(plant.accuracy, self.y, self.sigmas), self.trusted & self.reads()
         ends = self._busbar(spread, reading, use)
-        low, high = (by_place(plant.feeder, end)[plant.feeder.bus] for end in ends)
+        low, high = (plant.feeder.broadcast_busbar(end)[plant.feeder.bus] for end in ends)
         # What losses take off is that of the assumed busbar voltage.
         moved = np.minimum(np.maximum(np.abs(low), np.abs(high)), NO_VOLTAGE)
-        base = by_place(plant.feeder, self.powers.v0_squared)[plant.feeder.bus]
+        base = plant.feeder.broadcast_busbar(self.powers.v0_squared)[plant.feeder.bus]
         spread = spread + np.abs(correction) * moved / np.maximum(base - moved, _LEAST)
         low, high = self.model + low - spread, self.model + high + spread
         own = np.where(use, reading, np.inf)
@@ -292,7 +291,7 @@ class Grounds:
         known = np.atleast_1d(busbar_errors(plant, self.powers.v0_squared, self.sigmas))
         known = np.where(self.busbar, known, np.inf)
         off, room = self.y - self.model[at], np.where(use, reading + spread[at], np.inf)
-        heard = np.where(hangs_on(plant.feeder)[at] > 0.0, room[:, None], np.inf)
+        heard = np.where(plant.feeder.busbar_incidence()[at] > 0.0, room[:, None], np.inf)
         low = (off[:, None] - heard).max(axis=0, initial=-np.inf)
         high = (off[:, None] + heard).min(axis=0, initial=np.inf)
         return _both(-known, known, low, high)

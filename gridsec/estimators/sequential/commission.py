@@ -36,7 +36,6 @@ from gridsec.errors import Problem, refuse
 from gridsec.estimators.sequential.conditional import invert
 from gridsec.estimators.sequential.design import SequentialDesign
 from gridsec.estimators.sequential.search import Recent
-from gridsec.grid.network import one_busbar
 
 
 class LearningReason(StrEnum):
@@ -349,7 +348,7 @@ def _lasting(design: SequentialDesign, heard: Ints, some: slice) -> Floats:
     of_loads = submatrix(design.prior.of_meters, design.prior.meters[heard], heard[some])
     lasting = design.doubt.lasting
     places, feeder = design.prior.meters, design.plant.feeder
-    same = one_busbar(feeder, places[heard], places[heard[some]])
+    same = feeder.same_busbar_phase(places[heard], places[heard[some]])
     return lasting * of_loads + (1.0 - lasting) * design.busbar**2 * same
 
 

@@ -27,7 +27,6 @@ from gridsec.estimators.sequential.release import Released, release
 from gridsec.estimators.sequential.scales import needed
 from gridsec.estimators.sequential.skew import Skew, largest, unusable
 from gridsec.estimators.sequential.state import SequentialState, Trust
-from gridsec.grid.network import busbar_places, one_busbar, over_places
 from gridsec.interface import Cause, Decision, Estimate, Explanation, Frame, PowerOrigin, Verdict
 
 
@@ -135,7 +134,7 @@ def _busbar(design: SequentialDesign, state: SequentialState, heard: Heard, esti
     fits = (state.fits[s] for s in before.scale.tolist())
     left = np.array([np.nan if fit is None else fit.variance[k] for k, fit in enumerate(fits)])
     judged = heard.says & np.isfinite(left)
-    v0_squared = estimate.v2_bus[busbar_places(design.plant.feeder)]
+    v0_squared = estimate.v2_bus[design.plant.feeder.busbar_places()]
     allowed = float(state.learned.allowed.max())
     return follow(design, before, heard.said, judged, v0_squared, np.where(judged, left, 0.0), allowed)
 
@@ -168,7 +167,7 @@ def _estimate(
     heard = tick.heard
     w, variance, released = _reconstructed(design, state, tick, s, moved)
     v2_bus = tick.v2_bus + w
-    first = busbar_places(plant.feeder)
+    first = plant.feeder.busbar_places()
     v2_bus[first] = np.where(heard.busbar, heard.v0_squared, v2_bus[first])
     # That is a reading, however well the others know the voltage.
     variance = variance.copy()
@@ -249,7 +248,7 @@ class _Differs:
 def _differs(design: SequentialDesign, busbar: Busbar, estimate: Estimate) -> _Differs:
     if all_of(busbar.believed):
         return _Differs(busbar.named)
-    doubted, v0_squared = ~busbar.believed, estimate.v2_bus[busbar_places(design.plant.feeder)]
+    doubted, v0_squared = ~busbar.believed, estimate.v2_bus[design.plant.feeder.busbar_places()]
     off = words.busbar_off(busbar.off, v0_squared, doubted)
     return _Differs(busbar.named, words.busbar_meter(doubted), off)
 
@@ -265,7 +264,7 @@ def _unvouched(
     if said[0] is not Decision.CLEAN or all_of(np.asarray(busbar)):
         return said
     feeder, meters = design.plant.feeder, design.prior.meters[live]
-    heard = one_busbar(feeder, np.arange(np.size(busbar)), meters) * np.ones(meters.size)
+    heard = feeder.same_busbar_phase(np.arange(np.size(busbar)), meters) * np.ones(meters.size)
     count = np.where(busbar, meters.size, heard.sum(axis=-1)).min()
     most = max(1, min(design.most, meters.size // 3))
     if count > 2 * most:
@@ -407,7 +406,7 @@ def _reconstructed(
     judged = judge(now, _mean(state, s)) if view is None else view.judged
     # The model begins at this reading of the busbar, a mean takes only its part of that one's jitter off.
     jitter = (1.0 - 1.0 / design.lengths[s]) * design.flicker
-    flicker = over_places(design.plant.feeder, np.where(tick.heard.busbar, jitter, 0.0))
+    flicker = design.plant.feeder.broadcast_busbar(np.where(tick.heard.busbar, jitter, 0.0))
     after = moved * prior_.variance + _hidden(state, prior_) + flicker
     beside = state.apart[s]
     if beside is not None:

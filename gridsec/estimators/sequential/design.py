@@ -25,7 +25,7 @@ from gridsec.estimators.sequential.loads import UNMETERED, LoadDoubt, injection_
 from gridsec.estimators.sequential.repeats import rules
 from gridsec.estimators.thresholds import curve_mismatch
 from gridsec.grid.meter import ToldError, busbar_error, steady_rounding
-from gridsec.grid.network import Network, Power, hangs_on, own, sizes
+from gridsec.grid.network import Network, Power
 from gridsec.observers.certificates import Certificate, certify, verify
 from gridsec.observers.lmi import contraction
 from gridsec.observers.lure import Lure, close_loop
@@ -324,7 +324,7 @@ def design(
         fixed=fixed,
         allowed=slope * accuracy.class_fraction + rounded,
         rounded=rounded,
-        hangs_on=hangs_on(plant.feeder)[meters],
+        hangs_on=plant.feeder.busbar_incidence()[meters],
         reach=np.abs(lure.C) @ (2.0 * plant.droop.limit),
         meter_of=_meter_of(plant),
         mismatch=curve_mismatch(plant.droop),
@@ -361,7 +361,7 @@ _COLLAPSE, _NO_POWER = 1.0, 1e4
 
 
 def _most_power(feeder: Network, power: Power) -> Floats:
-    return np.asarray(_COLLAPSE / np.maximum(2.0 * own(feeder, power), _COLLAPSE / _NO_POWER))
+    return np.asarray(_COLLAPSE / np.maximum(2.0 * feeder.self_impedance(power), _COLLAPSE / _NO_POWER))
 
 
 # Least variance of a reading, squared pu^2: two perfect meters at one bus are equal, and such a matrix has no
@@ -427,7 +427,7 @@ def _tail(rate: float, plant: Plant, look_s: float, scales: int) -> float:
     A look at a scale every `look_s` seconds tests each meter, each phase of the busbar, and the misfit of all
     trusted meters. Each of the scales and of the two tests of repetition has an equal share of the rate.
     """
-    tests = plant.meters.size + hangs_on(plant.feeder).shape[1] + 1
+    tests = plant.meters.size + plant.feeder.busbar_incidence().shape[1] + 1
     return min(float(rate * look_s / (YEAR_S * tests * (scales + _REPEATS))), 0.5)
 
 
@@ -435,7 +435,7 @@ def _shapes(plant: Plant, effects: Effects, rate: float, step_s: float, lengths:
     """What manipulations look like at this feeder's meters."""
     accuracy, slope = plant.accuracy, 2.0 * _HIGH * plant.droop.vbar
     tests = plant.meters.size * (len(lengths) + _REPEATS) * YEAR_S / step_s
-    active, reactive = (2.0 * own(plant.feeder, power)[plant.meters] for power in Power)
+    active, reactive = (2.0 * plant.feeder.self_impedance(power)[plant.meters] for power in Power)
     return Shapes(
         rules=rules(accuracy.resolution, accuracy.jitter, min(rate / tests, 0.5), step_s),
         traces=Traces(effects, plant.feeder.bus[plant.meters]),
@@ -458,7 +458,7 @@ def _suspicions(plant: Plant, effects: Effects, options: SequentialOptions) -> D
     def towards(weights: Floats) -> Floats:
         return np.asarray(effects.along(meters, weights)[of])
 
-    load, injection = (sizes(feeder, power, meters) for power in Power)
+    load, injection = (feeder.squared_sensitivity(power, meters) for power in Power)
     return Dictionary(
         std=np.concatenate([np.full(customers, options.hidden_power), 2.0 * plant.droop.limit]),
         charge=np.repeat([options.hidden_charge, 1.0], [customers, owner.size]),

@@ -19,7 +19,6 @@ from gridsec.estimators.inputs import usual
 from gridsec.estimators.sequential.conditional import Prior
 from gridsec.estimators.sequential.design import SequentialDesign
 from gridsec.estimators.sequential.loads import EXACT, UNMETERED, prior
-from gridsec.grid.network import reach
 from gridsec.interface import Frame, PowerOrigin
 
 
@@ -162,7 +161,7 @@ def _withheld(design: SequentialDesign, frame: Frame, live: Bools) -> tuple[Bool
     doubted = out & (origins != PowerOrigin.UNREAD)
     if any_of(doubted):
         power = np.where(_customers(design, doubted), frame.p_error, 0.0)
-        moved = reach(design.plant.feeder, power, np.zeros_like(power))[design.prior.meters]
+        moved = design.plant.feeder.reach(power, np.zeros_like(power))[design.prior.meters]
         out = out & ~(doubted & (moved <= _FELT * design.allowed))
     unread = out & (origins != PowerOrigin.LATE)
     return out if any_of(out) else None, unread if any_of(unread) else None

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gridsec.arrays import Floats, Ints, frozen
-from gridsec.grid.network import Network, Power, along, columns
+from gridsec.grid.network import Network, Power
 
 # Entries of 2R and 2X together up to which both are kept: 4 MB.
 _KEPT = 1 << 19
@@ -43,7 +43,7 @@ class Effects:
     def __post_init__(self) -> None:
         table, every = None, np.arange(self.feeder.bus.size)
         if 2 * len(self.feeder.buses) * every.size <= _KEPT:
-            table = frozen(np.hstack([columns(self.feeder, power, every) for power in Power]))
+            table = frozen(np.hstack([self.feeder.columns(power, every) for power in Power]))
         object.__setattr__(self, "table", table)
 
     def columns(self, power: Power, customers: Ints) -> Floats:
@@ -57,7 +57,7 @@ class Effects:
             The customers.
         """
         if self.table is None:
-            return columns(self.feeder, power, customers)
+            return self.feeder.columns(power, customers)
         return self.table.take(customers + self.feeder.bus.size * (power is Power.REACTIVE), axis=1)
 
     def of(self, which: Ints) -> Floats:
@@ -72,7 +72,7 @@ class Effects:
             return self.table.take(which, axis=1)
         count, out = self.feeder.bus.size, np.empty((len(self.feeder.buses), which.size))
         for power, some in ((Power.ACTIVE, which < count), (Power.REACTIVE, which >= count)):
-            out[:, some] = columns(self.feeder, power, which[some] % count)
+            out[:, some] = self.feeder.columns(power, which[some] % count)
         return out
 
     def along(self, customers: Ints, weights: Floats) -> Floats:
@@ -84,7 +84,9 @@ class Effects:
             The customers whose voltages are summed, each once, and their weights.
         """
         if self.table is None:
-            return np.concatenate([along(self.feeder, power, customers, weights) for power in Power])
+            return np.concatenate(
+                [self.feeder.weighted_sensitivity(power, customers, weights) for power in Power]
+            )
         at = self.feeder.bus[customers]
         if at.size < _SOME * len(self.table):
             return np.asarray(weights @ self.table[at])
@@ -105,4 +107,4 @@ class Effects:
         every = np.arange(self.feeder.bus.size)
         for power in Power:
             for first in range(0, every.size, _PART):
-                yield columns(self.feeder, power, every[first : first + _PART])[places]
+                yield self.feeder.columns(power, every[first : first + _PART])[places]

@@ -27,7 +27,6 @@ from gridsec.estimators.sequential.robust import covers, robust
 from gridsec.estimators.sequential.scales import Scales, View, adapt, believe, view_of
 from gridsec.estimators.sequential.search import Explanation, Found, Limits, Solution, likelier
 from gridsec.estimators.sequential.state import Trust
-from gridsec.grid.network import by_place
 
 # With more meters than this beyond their limits at once, moving one after the other is no good start.
 _FEW = 32
@@ -202,7 +201,7 @@ class Search:
         """
         design, trust = self.design, self.trust
         here = np.arange(design.hangs_on.shape[1]) == phase
-        scales = self.scales.wider(UNMETERED * by_place(design.plant.feeder, here))
+        scales = self.scales.wider(UNMETERED * design.plant.feeder.broadcast_busbar(here))
         wide = scales[self.s]
         there = adapt(None, wide, now.trusted, self.scales.loosened(trust.accused))
         lying = Search(design, scales, self.wholes, trust, self.s)

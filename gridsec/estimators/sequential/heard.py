@@ -12,7 +12,6 @@ from gridsec.estimators.inputs import NO_VOLTAGE
 from gridsec.estimators.sequential.design import SequentialDesign
 from gridsec.estimators.sequential.skew import unusable
 from gridsec.estimators.sequential.state import SequentialState
-from gridsec.grid.network import InPhases
 from gridsec.interface import Frame
 
 
@@ -135,7 +134,7 @@ def _busbar(
     """The last four of `Heard`."""
     low, high = design.options.v2_limits
     believed = state.busbar.believed
-    if not isinstance(design.plant.feeder, InPhases):
+    if design.plant.feeder.busbar_phases == 1:
         v0 = frame.v0_squared
         there = bool(low <= v0 <= high)  # False for NaN
         metered = there and bool(believed[0])

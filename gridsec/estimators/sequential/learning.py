@@ -25,7 +25,7 @@ from gridsec.estimators.sequential.commission import COUNTED, REASONS, Commissio
 from gridsec.estimators.sequential.design import SequentialDesign
 from gridsec.estimators.sequential.doubts import Doubts
 from gridsec.estimators.sequential.loads import EXACT, UNMETERED
-from gridsec.grid.network import Power, variances
+from gridsec.grid.network import Power
 from gridsec.interface import Frame, PowerOrigin
 
 _WIDER = 2.0
@@ -197,7 +197,7 @@ def _unknown(design: SequentialDesign, tick: Tick) -> Ints:
         ):
             part = np.where(which, more, 0.0)
             if any_of(part > 0.0):
-                found = variances(design.plant.feeder, power, part)[at]
+                found = design.plant.feeder.variances(power, part)[at]
                 added[cause] = added.get(cause, np.zeros(at.size)) + found
     rows = np.array([REASONS.index(cause) for cause in added], dtype=np.intp)
     return np.asarray(rows[np.argmax(np.stack(list(added.values())), axis=0)])

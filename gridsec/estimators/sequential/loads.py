@@ -20,7 +20,7 @@ from gridsec.errors import Problem, refuse
 from gridsec.estimators.sequential.conditional import Prior
 from gridsec.grid.droop import Droop
 from gridsec.grid.meter import MeterAccuracy
-from gridsec.grid.network import Network, Power, bus_voltages, by_place, covariance, one_busbar, variances
+from gridsec.grid.network import Network, Power
 
 EXACT = 1e-6
 """Standard deviation of a power that is known exactly, pu: none is known better."""
@@ -115,21 +115,21 @@ def prior(
     alone, together = (np.sqrt(part) for part in (1.0 - doubt.together, doubt.together))
     p, q = alone * doubt.p, alone * doubt.q
     q = q if inverters is None else np.hypot(q, inverters)
-    variance = by_place(feeder, busbar**2)
+    variance = feeder.broadcast_busbar(busbar**2)
     of_meters: Floats = np.repeat(variance[:, None], at.size, axis=1)
-    of_meters *= one_busbar(feeder, np.arange(variance.size), at)
+    of_meters *= feeder.same_busbar_phase(np.arange(variance.size), at)
     none = np.zeros_like(q)
     for power, std, common, shared in (
-        (Power.ACTIVE, p, doubt.common_p, bus_voltages(feeder, p, none, 0.0, steps=0)),
-        (Power.REACTIVE, q, doubt.common_q, bus_voltages(feeder, none, q, 0.0, steps=0)),
+        (Power.ACTIVE, p, doubt.common_p, feeder.bus_voltages(p, none, 0.0, steps=0)),
+        (Power.REACTIVE, q, doubt.common_q, feeder.bus_voltages(none, q, 0.0, steps=0)),
     ):
-        of_meters += covariance(feeder, power, at, (1.0 - common) * std**2)
-        variance += variances(feeder, power, (1.0 - common) * std**2)
+        of_meters += feeder.covariance(power, at, (1.0 - common) * std**2)
+        variance += feeder.variances(power, (1.0 - common) * std**2)
         if common:
             of_meters += np.multiply.outer(common * shared, shared[at])
             variance += common * shared**2
     if np.any(together):
-        shared = bus_voltages(feeder, together * doubt.p, together * doubt.q, 0.0, steps=0)
+        shared = feeder.bus_voltages(together * doubt.p, together * doubt.q, 0.0, steps=0)
         of_meters += np.multiply.outer(shared, shared[at])
         variance += shared**2
     return Prior(of_meters, at, variance)

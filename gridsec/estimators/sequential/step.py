@@ -28,7 +28,6 @@ from gridsec.estimators.sequential.scales import Scales, needed
 from gridsec.estimators.sequential.skew import follow as follow_clocks
 from gridsec.estimators.sequential.state import SequentialState, Trust
 from gridsec.estimators.sequential.windows import Window, empty, forget, push, shift
-from gridsec.grid.network import bus_voltages, by_place, model_error_bound, over_places
 from gridsec.interface import Estimate, Explanation, Frame, Verdict
 
 
@@ -252,10 +251,12 @@ def _voltages(design: SequentialDesign, frame: Frame, heard: Heard, x: Floats) -
     plant = design.plant
     q = _net(design, heard, x)
     with np.errstate(all="ignore"):
-        v2_bus = bus_voltages(plant.feeder, frame.p, q, heard.v0_squared, steps=plant.loss_correction)
+        v2_bus = plant.feeder.bus_voltages(frame.p, q, heard.v0_squared, steps=plant.loss_correction)
         v2_bus = np.minimum(np.maximum(v2_bus, 0.0), NO_VOLTAGE)
     none = np.isnan(v2_bus)
-    return q, np.where(none, over_places(plant.feeder, heard.v0_squared), v2_bus) if any_of(none) else v2_bus
+    return q, np.where(none, plant.feeder.broadcast_busbar(heard.v0_squared), v2_bus) if any_of(
+        none
+    ) else v2_bus
 
 
 def _net(design: SequentialDesign, heard: Heard, x: Floats) -> Floats:
@@ -266,7 +267,7 @@ def _net(design: SequentialDesign, heard: Heard, x: Floats) -> Floats:
 
 def _swing(design: SequentialDesign, v2_bus: Floats, v0_squared: Floats | float) -> float:
     """By how much the powers change a squared voltage at most."""
-    return float(np.abs(v2_bus - over_places(design.plant.feeder, v0_squared)).max())
+    return float(np.abs(v2_bus - design.plant.feeder.broadcast_busbar(v0_squared)).max())
 
 
 def _distrust(trust: Trust, copies: Ints) -> Trust:
@@ -371,7 +372,7 @@ def _inverters(
     driven = (meter >= 0) & believed[meter]
     y = heard.y[meter] if meter.size else np.zeros(0)
     if not all_of(driven):
-        here = by_place(design.plant.feeder, heard.v0_squared)[design.plant.feeder.bus[droop.customer]]
+        here = design.plant.feeder.broadcast_busbar(heard.v0_squared)[design.plant.feeder.bus[droop.customer]]
         y = np.where(driven, y, here)
     if state.x is None:
         return np.asarray(droop(droop.vbar**2 - y)), None, begin(design.plant, y)
@@ -400,12 +401,12 @@ def _given(
 def _linear(design: SequentialDesign, p: Floats, q: Floats, v0_squared: Floats | float) -> Floats:
     """Squared voltages of the customers by the linear model, (…, N) as q."""
     feeder = design.plant.feeder
-    return np.asarray(bus_voltages(feeder, p, q, v0_squared, steps=0)[..., feeder.bus])
+    return np.asarray(feeder.bus_voltages(p, q, v0_squared, steps=0)[..., feeder.bus])
 
 
 def _model_error(design: SequentialDesign, p: Floats, q: Floats, v0_squared: Floats | float) -> Floats:
     """What the loss-corrected model may be off at each meter, (p,)."""
     plant = design.plant
     with np.errstate(all="ignore"):
-        error = model_error_bound(plant.feeder, p, q, v0_squared)[plant.meters]
+        error = plant.feeder.model_error_bound(p, q, v0_squared)[plant.meters]
     return np.where(np.isfinite(error), error, design.options.widest)

@@ -59,8 +59,6 @@ from gridsec.estimators.unknown_input.pairs import (
     spread,
     try_pair,
 )
-from gridsec.grid.network import by_place, hangs_on, interval_bounds, loss_correction
-from gridsec.grid.radial import Feeder
 from gridsec.interface import Cause, Decision, Estimate, Explanation, Frame, Verdict
 
 __all__ = [
@@ -188,7 +186,7 @@ class Tick:
         own = (of[:, None] == plant.droop.customer).astype(np.float64)
         gain = self.design.gain[at]
         net = (np.arange(frame.q.size) == of[:, None]).astype(np.float64)
-        v, q, v0 = at.size, of.size, hangs_on(plant.feeder)[at]
+        v, q, v0 = at.size, of.size, plant.feeder.busbar_incidence()[at]
         E = np.block(
             [
                 [
@@ -274,7 +272,7 @@ def _without_inverters(
     if plant.loss_correction and state.x.size:
         moved = _with_inverters(design, state, frame, inputs)
     # The busbar shifts all places (of a phase) alike, and has an error of its own.
-    busbar = by_place(plant.feeder, busbar_errors(plant, inputs.v0_squared, now.options.sigmas))
+    busbar = plant.feeder.broadcast_busbar(busbar_errors(plant, inputs.v0_squared, now.options.sigmas))
     rest = rest - busbar[plant.feeder.bus]
     rest = np.where(inputs.now.base < NO_VOLTAGE, np.maximum(rest, 0.0), NO_VOLTAGE)
     error = np.minimum(inputs.now.base + moved, NO_VOLTAGE)
@@ -287,20 +285,20 @@ def _with_inverters(
     """Largest change of the loss correction by possible injections, attacked or not; (N,)."""
     plant, reach = design.setting.plant, design.doubt.reach
     feeder, droop, steps = plant.feeder, plant.droop, plant.loss_correction
-    if not isinstance(feeder, Feeder):
+    if not feeder.extremes_at_ends:
         count_ = frame.q.size
         q = frame.q + droop.per_customer(state.x, count_)
         room = droop.per_customer(reach + np.abs(state.x), count_)
-        far = interval_bounds(
-            feeder, frame.p, q, inputs.v0_squared, p_error=frame.p_error, q_error=frame.q_error + room
+        _, moved, rest = feeder.correction_bounds(
+            frame.p, q, inputs.v0_squared, p_error=frame.p_error, q_error=frame.q_error + room, steps=1
         )
-        return np.minimum(far[0] + 3.0 * far[1], NO_VOLTAGE)
+        return np.minimum(moved + 3.0 * rest, NO_VOLTAGE)
     # Losses depend on the injections of inverters: all at either end, one beyond.
     ends = np.vstack([droop.limit, -droop.limit, state.x + np.diag(reach), state.x - np.diag(reach)])
     customers = np.zeros((droop.customer.size, frame.q.size))
     customers[np.arange(droop.customer.size), droop.customer] = 1.0
     with np.errstate(all="ignore"):
-        found = loss_correction(feeder, frame.p, frame.q + ends @ customers, inputs.v0_squared, steps=steps)
+        found = feeder.loss_correction(frame.p, frame.q + ends @ customers, inputs.v0_squared, steps=steps)
     far_off = np.nan_to_num(np.abs(found - inputs.correction), nan=NO_VOLTAGE, posinf=NO_VOLTAGE)
     moved = far_off[:2].max(axis=0) + max(design.max_inverters, 1) * far_off[2:].max(axis=0)
     return np.asarray(moved[feeder.bus])

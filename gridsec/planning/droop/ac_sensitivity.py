@@ -28,7 +28,8 @@ from numpy.typing import NDArray
 
 from gridsec.arrays import Floats, Ints
 from gridsec.errors import DesignInfeasible
-from gridsec.grid.meshed import Meshed, MeshedFeeder, PhasedMesh
+from gridsec.grid import AnyNetwork
+from gridsec.grid.meshed import MeshedFeeder, PhasedMesh
 from gridsec.grid.phased import PhasedFeeder
 from gridsec.grid.radial import Feeder, common_paths
 from gridsec.grid.three_phase import ROTATION
@@ -85,7 +86,7 @@ class Network:
     E_bus: Complex
 
 
-def network(feeder: Feeder | Meshed | PhasedFeeder) -> Network:
+def network(feeder: AnyNetwork) -> Network:
     """Impedances of a feeder, `(I + j Z0 B)^-1 Z0` with series impedances Z0 and charging B.
 
     Raises
@@ -95,7 +96,7 @@ def network(feeder: Feeder | Meshed | PhasedFeeder) -> Network:
     """
     if isinstance(feeder, PhasedFeeder):
         return _phased(feeder)
-    if isinstance(feeder, Meshed):
+    if isinstance(feeder, MeshedFeeder | PhasedMesh):
         return _meshed(feeder)
     everywhere = np.arange(len(feeder.buses))
     Z0 = common_paths(feeder, feeder.r, everywhere) + 1j * common_paths(feeder, feeder.x, everywhere)
@@ -107,7 +108,7 @@ def network(feeder: Feeder | Meshed | PhasedFeeder) -> Network:
     return Network(Z_bus[feeder.bus], E, E[:, None], Z_bus, E_bus)
 
 
-def _meshed(feeder: Meshed) -> Network:
+def _meshed(feeder: MeshedFeeder | PhasedMesh) -> Network:
     """Inverses of a meshed feeder, in three phases turned back by the angles of the busbar."""
     idle, Z_bus = feeder.idle.reshape(len(feeder.buses), -1), feeder.transfer
     if isinstance(feeder, PhasedMesh):
@@ -176,9 +177,7 @@ def solve(net: Network, s: Complex, v0: Floats | float) -> Complex:
     return V
 
 
-def currents(
-    feeder: Feeder | Meshed | PhasedFeeder, net: Network, s: Complex, V: Complex, v0: Floats | float
-) -> Floats:
+def currents(feeder: AnyNetwork, net: Network, s: Complex, V: Complex, v0: Floats | float) -> Floats:
     """Largest current at either end of every conductor of every line, pu. L lines: branches, then ties.
 
     Parameters

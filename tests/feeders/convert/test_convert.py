@@ -27,7 +27,6 @@ from feeders.model.profiles import Season, data_root, envelopes
 from feeders.model.site import from_tables, load, names
 from gridsec.errors import FeederInvalid, GridsecError
 from gridsec.grid.phased import PhasedFeeder
-from gridsec.grid.radial import lindistflow
 from tests.codes import refused
 
 FROM_PANDAPOWER = [name for name, recipe in RECIPES.items() if recipe.source.startswith("pandapower:")]
@@ -102,7 +101,7 @@ def test_impedances_are_pandapowers_own(name: str) -> None:
     site = load(name)
     ids = [str(n) if n is not None else f"load-{i}" for i, n in net.load.name.items()]
     order = [site.feeder.customers.index(customer) for customer in ids]
-    model = lindistflow(site.feeder)
+    model = site.feeder.linear()
     scale = site.feeder.base_kva / 1000.0 / net.sn_mva  # from pandapower's base power to the feeder's
     np.testing.assert_allclose(
         model.R[np.ix_(order, order)], Z.real[np.ix_(at, at)] * scale, rtol=1e-7, atol=1e-12

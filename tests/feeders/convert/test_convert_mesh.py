@@ -21,7 +21,6 @@ from feeders.simulation.powerflow_three_phase import power_flow
 from feeders.simulation.trial import LoadError, Meters, Trial, judge
 from gridsec.errors import FeederInvalid
 from gridsec.grid.meshed import MeshedFeeder, PhasedMesh
-from gridsec.grid.network import bus_voltages, model_error_bound
 from tests.codes import refused
 from tests.feeders.convert.test_from_power_grid_model import line, written
 from tests.feeders.convert.test_from_power_grid_model import load as pgm_load
@@ -64,9 +63,9 @@ def test_a_pandapower_net_with_rings_is_as_pandapower_solves_it(tmp_path: Path) 
     np.testing.assert_allclose(ours / base, theirs, rtol=0, atol=1e-7)
     # The model by itself, after one correction.
     powers = (-p / site.feeder.base_kva, -q / site.feeder.base_kva, float(theirs[0] ** 2))
-    off = np.abs(bus_voltages(site.feeder, *powers) - theirs**2)
+    off = np.abs(site.feeder.bus_voltages(*powers) - theirs**2)
     assert off.max() < 2e-4
-    assert (off[site.feeder.bus] <= model_error_bound(site.feeder, *powers) + 1e-9).all()
+    assert (off[site.feeder.bus] <= site.feeder.model_error_bound(*powers) + 1e-9).all()
 
 
 def test_a_ring_behind_a_transformer(tmp_path: Path) -> None:
@@ -120,8 +119,8 @@ def test_the_ieee_13_node_feeder_with_three_loops(lie: Lie | None, tmp_path: Pat
     _, places = power_flow(site).solve(-p * site.feeder.base_kva, -0.4 * p * site.feeder.base_kva, 2400.0)
     exact = (places / site.base_volt) ** 2
     v0 = np.square(2400.0 / site.feeder.base_volt)
-    off = np.abs(bus_voltages(site.feeder, p, 0.4 * p, v0) - exact)[site.feeder.bus]
-    assert (off <= model_error_bound(site.feeder, p, 0.4 * p, v0) + 1e-9).all()
+    off = np.abs(site.feeder.bus_voltages(p, 0.4 * p, v0) - exact)[site.feeder.bus]
+    assert (off <= site.feeder.model_error_bound(p, 0.4 * p, v0) + 1e-9).all()
     assert off.max() < 3e-3
     trial = Trial(site, 2, 22.0, load_error=LoadError(20.0, 7.0), meters=Meters.WHITE, lie=lie)
     found = judge(design(trial.stated), trial, settling_s=3.0)

@@ -16,7 +16,6 @@ from feeders.simulation.scenario import START
 from gridsec.errors import InputInvalid
 from gridsec.estimators.sequential import LoadDoubt, SequentialDesign, SequentialState
 from gridsec.estimators.sequential.loads import prior
-from gridsec.grid.radial import lindistflow
 from tests.codes import refused
 from tests.feeders.unmetered import CIGRE, played, unmetered
 
@@ -77,7 +76,7 @@ def test_what_goes_up_and_down_together_moves_voltages_together() -> None:
     rng, n = np.random.default_rng(4), feeder.bus.size
     together = np.where(np.arange(n) < 5, 0.4, 0.0)
     doubt = LoadDoubt(rng.random(n), rng.random(n), 1.0, common_q=0.5, together=together)
-    model = lindistflow(feeder)
+    model = feeder.linear()
     own = np.sqrt(1.0 - together)
     zero = np.zeros((n, n))
     roots = np.vstack(

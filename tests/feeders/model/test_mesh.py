@@ -23,7 +23,6 @@ from feeders.studies.detectable import detectable
 from feeders.studies.redundancy import redundancy
 from gridsec.errors import FeederInvalid
 from gridsec.grid.meshed import MeshedFeeder
-from gridsec.grid.network import bus_voltages, model_error_bound
 from tests.codes import refused
 from tests.feeders import villages
 from tests.feeders.watched import names_the_liar_alone
@@ -102,9 +101,9 @@ def test_taps_that_cancel_around_every_loop(taps: dict[str, float]) -> None:
     _, buses = power_flow(site).solve(p_kw, q_kvar, 233.0)
     p, q, v0 = -p_kw / base, -q_kvar / base, (233.0 / 230.0) ** 2
     exact = (buses / site.base_volt) ** 2
-    found, bound = bus_voltages(feeder, p, q, v0), model_error_bound(feeder, p, q, v0)
+    found, bound = feeder.bus_voltages(p, q, v0), feeder.model_error_bound(p, q, v0)
     assert (np.abs(found - exact)[feeder.bus] <= bound + 1e-9).all()
-    np.testing.assert_allclose(bus_voltages(feeder, p, q, v0, steps=30), exact, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(feeder.bus_voltages(p, q, v0, steps=30), exact, rtol=0, atol=1e-8)
 
 
 @pytest.mark.parametrize("make", [*SITES, lambda: from_tables(closed(villages.tables()))])
@@ -120,11 +119,11 @@ def test_the_power_flow_is_within_the_bound(make: Callable[[], Site], seed: int,
     customers, buses = flow.solve(p_kw, q_kvar, v0 * feeder.base_volt)
     exact = (buses / feeder.base_volt) ** 2
     p, q = -p_kw / feeder.base_kva, -q_kvar / feeder.base_kva
-    found, bound = bus_voltages(feeder, p, q, v0**2), model_error_bound(feeder, p, q, v0**2)
+    found, bound = feeder.bus_voltages(p, q, v0**2), feeder.model_error_bound(p, q, v0**2)
     np.testing.assert_array_equal(buses[feeder.bus], customers)
     assert (np.abs(found - exact)[feeder.bus] <= bound + 1e-9).all()
     assert bound.max() < 1e-3
-    linear = bus_voltages(feeder, p, q, v0**2, steps=0)
+    linear = feeder.bus_voltages(p, q, v0**2, steps=0)
     assert np.abs(linear - exact).max() < 3e-3
 
 
@@ -136,7 +135,7 @@ def test_a_tie_that_the_model_does_not_know_makes_honest_meters_look_wrong() -> 
     p = -p_kw / site.feeder.base_kva
     off = {}
     for name, feeder in (("meshed", site.feeder), ("radial", radial.feeder)):
-        v = np.sqrt(bus_voltages(feeder, p, 0.4 * p, 1.0)[feeder.bus])
+        v = np.sqrt(feeder.bus_voltages(p, 0.4 * p, 1.0)[feeder.bus])
         off[name] = np.abs(v - truth / site.feeder.base_volt).max()
     assert off["meshed"] < 1e-4
     assert off["radial"] > 0.02

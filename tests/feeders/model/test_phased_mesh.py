@@ -25,7 +25,6 @@ from feeders.studies.protect import protect
 from feeders.studies.redundancy import redundancy
 from gridsec.errors import FeederInvalid
 from gridsec.grid.meshed import MeshedFeeder, PhasedMesh
-from gridsec.grid.network import bus_voltages, model_error_bound
 from gridsec.grid.phased import PhasedFeeder
 from tests.codes import refused
 from tests.feeders import asymmetric, villages
@@ -151,7 +150,7 @@ def test_a_tie_that_hardly_conducts_is_none() -> None:
         there = getattr(mesh(one), name), getattr(other.feeder, name)
         np.testing.assert_allclose(*there, rtol=0, atol=2e-6)
     p = -one.loads.load_peak
-    voltages = [bus_voltages(site.feeder, p, 0.3 * p, 1.0, steps=40) for site in (one, other)]
+    voltages = [site.feeder.bus_voltages(p, 0.3 * p, 1.0, steps=40) for site in (one, other)]
     np.testing.assert_allclose(*voltages, rtol=0, atol=1e-6)
 
 
@@ -166,8 +165,8 @@ def test_customers_of_three_phases_alone_are_the_balanced_mesh() -> None:
     p, q = np.random.default_rng(3).uniform(-0.2, 0.1, (2, len(rows)))
     split = [np.append(np.repeat(each / 3.0, 3), 0.0) for each in (p, q)]
     for steps in (0, 1, 3):
-        one = bus_voltages(balanced.feeder, p, q, 1.02, steps=steps)
-        found = bus_voltages(three.feeder, *split, 1.02, steps=steps)
+        one = balanced.feeder.bus_voltages(p, q, 1.02, steps=steps)
+        found = three.feeder.bus_voltages(*split, 1.02, steps=steps)
         np.testing.assert_allclose(found, np.repeat(one, 3), rtol=0, atol=1e-12)
     base = balanced.feeder.base_kva
     flows = [power_flow(site) for site in (balanced, three)]
@@ -194,11 +193,11 @@ def test_the_power_flow_is_within_the_bound(make: Callable[[], Site], seed: int,
     customers, places = flow.solve(p_kw, q_kvar, v0 * feeder.base_volt)
     exact = (places / feeder.base_volt) ** 2
     p, q = -p_kw / feeder.base_kva, -q_kvar / feeder.base_kva
-    found, bound = bus_voltages(feeder, p, q, v0**2), model_error_bound(feeder, p, q, v0**2)
+    found, bound = feeder.bus_voltages(p, q, v0**2), feeder.model_error_bound(p, q, v0**2)
     np.testing.assert_array_equal(places[feeder.bus], customers)
     assert (np.abs(found - exact)[feeder.bus] <= bound + 1e-9).all()
     assert bound.max() < 2e-3
-    np.testing.assert_allclose(bus_voltages(feeder, p, q, v0**2, steps=40), exact, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(feeder.bus_voltages(p, q, v0**2, steps=40), exact, rtol=0, atol=1e-9)
 
 
 def test_the_european_feeder_with_a_ring() -> None:
@@ -207,10 +206,10 @@ def test_the_european_feeder_with_a_ring() -> None:
     feeder, peak = mesh(site), site.loads.load_peak
     base = feeder.base_kva
     truth, _ = power_flow(site).solve(peak * base, 0.33 * peak * base, feeder.base_volt)
-    v = np.sqrt(bus_voltages(feeder, -peak, -0.33 * peak, 1.0)[feeder.bus])
+    v = np.sqrt(feeder.bus_voltages(-peak, -0.33 * peak, 1.0)[feeder.bus])
     assert np.abs(v - truth / feeder.base_volt).max() < 1e-3
     radial = load("ieee-european-lv").feeder
-    alone = np.sqrt(bus_voltages(radial, -peak, -0.33 * peak, 1.0)[feeder.bus])
+    alone = np.sqrt(radial.bus_voltages(-peak, -0.33 * peak, 1.0)[feeder.bus])
     assert np.abs(alone - truth / feeder.base_volt).max() > 5e-3
     for part, most in ((0.0, 1e-6), (0.25, 0.02), (1.0, 0.1)):
         *linear, r, x = (float(cell.strip(" %")) / 100.0 for cell in sensitivity(site, part).split("|")[3:])
@@ -228,7 +227,7 @@ def test_against_power_grid_model(make: Callable[[], Site]) -> None:
     expected = asymmetric.solve(site.tables, p, q, 1.02)
     for bus, k in site.bus_of_file.items():
         np.testing.assert_allclose(places.reshape(-1, 3)[k] / base, expected[bus], rtol=0, atol=1e-8)
-    exact = bus_voltages(site.feeder, -p / site.feeder.base_kva, -q / site.feeder.base_kva, 1.02**2, steps=60)
+    exact = site.feeder.bus_voltages(-p / site.feeder.base_kva, -q / site.feeder.base_kva, 1.02**2, steps=60)
     np.testing.assert_allclose((places / base) ** 2, exact, rtol=0, atol=1e-9)
 
 
@@ -241,7 +240,7 @@ def test_taps_that_cancel_around_every_loop(taps: dict[str, float]) -> None:
     base, feeder = site.feeder.base_kva, site.feeder
     p = -site.loads.load_peak
     _, places = power_flow(site).solve(-p * base, -0.3 * p * base, 233.0)
-    found = bus_voltages(feeder, p, 0.3 * p, (233.0 / 230.0) ** 2, steps=40)
+    found = feeder.bus_voltages(p, 0.3 * p, (233.0 / 230.0) ** 2, steps=40)
     np.testing.assert_allclose(found, (places / site.base_volt) ** 2, rtol=0, atol=1e-9)
     wrong = [replace(row, tap=1.05 if row.line == "l5" else 1.0) for row in tables.lines]
     with refused(FeederInvalid, "inconsistent") as caught:
@@ -260,7 +259,7 @@ def test_a_tie_of_one_phase_asks_for_the_taps_of_that_phase_alone() -> None:
     p = -site.loads.load_peak
     base = site.feeder.base_kva
     _, places = power_flow(site).solve(-p * base, -0.3 * p * base, 230.0)
-    found = bus_voltages(site.feeder, p, 0.3 * p, 1.0, steps=40)
+    found = site.feeder.bus_voltages(p, 0.3 * p, 1.0, steps=40)
     np.testing.assert_allclose(found, (places / site.base_volt) ** 2, rtol=0, atol=1e-9)
     other = tuple(replace(row, phases="b") if row.line == "tie" else row for row in lines)
     with pytest.raises(FeederInvalid, match=r"'tie' closes a loop around which the taps multiply to 1\.03;"):

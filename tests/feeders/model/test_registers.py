@@ -12,7 +12,6 @@ from feeders.model.site import Site, Snapshot, load, to_frame
 from feeders.registry.registry import Watcher, design
 from feeders.simulation.scenario import START, Scenario, simulate, snapshots
 from gridsec.arrays import Floats
-from gridsec.grid.network import model_error_bound
 from gridsec.interface import Frame, PowerOrigin
 
 LIE_S = 30.0
@@ -75,7 +74,7 @@ def frame_of(name: str, false: dict[int, float], peak: float, honest: int = 0) -
     given = np.full(site.loads.credible.size, 0.0)
     given[site.meters] = p_kw / site.feeder.base_kva
     with np.errstate(all="ignore"):
-        bound = model_error_bound(site.feeder, -given, -0.3 * given, 1.0).max()
+        bound = site.feeder.model_error_bound(-given, -0.3 * given, 1.0).max()
     return to_frame(site, replace(said[-1], p_kw=p_kw)), float(bound)
 
 
@@ -89,7 +88,7 @@ def test_every_frame_has_a_model_with_a_finite_error(name: str) -> None:
         false = {int(j): float(random.uniform(-1.0, 1.0)) for j in liars}
         frame, _ = frame_of(name, false, 0.0)
         with np.errstate(all="ignore"):
-            bound = model_error_bound(site.feeder, frame.p, frame.q, site.droop.vbar**2)
+            bound = site.feeder.model_error_bound(frame.p, frame.q, site.droop.vbar**2)
         assert np.isfinite(bound).all()
 
 

@@ -20,7 +20,6 @@ from feeders.format.columns import CUSTOMER_COLUMNS, LINE_COLUMNS, META_COLUMNS,
 from feeders.format.tables import CustomerRow, FeederTables, from_json, read, to_json, write
 from feeders.model.site import Site, Snapshot, from_tables, load, names, plant, to_frame, volts
 from gridsec.errors import FeederInvalid
-from gridsec.grid.radial import lindistflow
 from gridsec.interface import Frame
 from tests.codes import refused
 
@@ -49,7 +48,7 @@ def test_per_unit_by_hand(three: Site) -> None:
     np.testing.assert_allclose(feeder.x, [0.02, 0.04, 0.06], rtol=1e-12)
     np.testing.assert_allclose(feeder.charging, [1e-4, 0.0, 0.0], rtol=1e-12)
     expected = [[0.1, 0.1, 0.1], [0.1, 0.3, 0.1], [0.1, 0.1, 0.4]]
-    np.testing.assert_allclose(lindistflow(feeder).R, expected, rtol=1e-12)
+    np.testing.assert_allclose(feeder.linear().R, expected, rtol=1e-12)
     assert three.xy is not None
     np.testing.assert_array_equal(three.xy, [[0, 0], [1, 0], [2, 0], [1, 1]])
 

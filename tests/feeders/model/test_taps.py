@@ -22,7 +22,6 @@ from feeders.studies.protect import Goal, protect
 from gridsec.errors import FeederInvalid
 from gridsec.grid.droop import preset
 from gridsec.grid.phased import PhasedFeeder
-from gridsec.grid.radial import bus_voltages, model_error_bound
 from gridsec.grid.three_phase import bus_voltages as phase_voltages
 from gridsec.grid.three_phase import model_error_bound as phase_error_bound
 from tests.codes import codes_of, refused
@@ -96,9 +95,9 @@ def test_two_power_flows_and_the_model_agree(seed: int) -> None:
     np.testing.assert_allclose(phases, np.repeat(buses[:, None], 3, axis=1), rtol=0, atol=1e-6)
     p, q, v0 = -p_kw / 100.0, -q_kvar / 100.0, (233.0 / 230.0) ** 2
     np.testing.assert_allclose(
-        volts(site.base_volt, bus_voltages(site.balanced, p, q, v0, steps=40)), buses, rtol=0, atol=1e-6
+        volts(site.base_volt, site.balanced.bus_voltages(p, q, v0, steps=40)), buses, rtol=0, atol=1e-6
     )
-    once, bound = bus_voltages(site.balanced, p, q, v0), model_error_bound(site.balanced, p, q, v0)
+    once, bound = site.balanced.bus_voltages(p, q, v0), site.balanced.model_error_bound(p, q, v0)
     assert (np.abs(once - (buses / site.base_volt) ** 2)[site.feeder.bus] <= bound + 1e-9).all()
     np.testing.assert_array_equal(customers, buses[site.feeder.bus])
 

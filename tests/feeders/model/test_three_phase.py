@@ -16,9 +16,7 @@ from feeders.simulation.powerflow_three_phase import UnbalancedPowerFlow
 from feeders.studies.calibrate.search import longer
 from gridsec.arrays import Floats, Phasors
 from gridsec.errors import FeederInvalid
-from gridsec.grid import radial as balanced
 from gridsec.grid.phased import PhasedFeeder
-from gridsec.grid.radial import lindistflow
 from gridsec.grid.three_phase import bus_voltages, lindist3flow, per_customer, sensitivities, sequence_matrix
 from tests.codes import refused
 
@@ -180,7 +178,7 @@ def test_a_balanced_feeder_has_the_matrices_of_the_balanced_loader() -> None:
     tables = find("kerber-dorfnetz")
     lines = tuple(replace(line, r0_ohm=4 * line.r_ohm, x0_ohm=3 * line.x_ohm) for line in tables.lines)
     tables = replace(tables, lines=lines)
-    one, three = lindistflow(from_tables(tables).feeder), lindist3flow(three_phase(tables).feeder)
+    one, three = from_tables(tables).feeder.linear(), lindist3flow(three_phase(tables).feeder)
     # The voltage of phase a by equal powers in the three phases of a customer.
     count = one.R.shape[0]
     for matrix, expected in ((three.R, one.R), (three.X, one.X)):
@@ -264,7 +262,7 @@ def test_equipment_is_that_of_the_balanced_loader() -> None:
             mine, theirs = (getattr(getattr(site, part), name) for site in (three, one))
             np.testing.assert_array_equal(mine, theirs)
     flow = per_customer(three.feeder, lindist3flow(three.feeder))
-    model = lindistflow(one.feeder)
+    model = one.feeder.linear()
     np.testing.assert_allclose(flow.R, model.R, rtol=0, atol=1e-13)
     np.testing.assert_allclose(flow.X, model.X, rtol=0, atol=1e-13)
 
@@ -324,7 +322,7 @@ def errors(site: ThreePhaseSite, p_kw: Floats, q_kvar: Floats) -> tuple[float, f
     )
     everywhere = tuple(replace(row, phases="abc") for row in site.tables.customers)
     single = from_tables(replace(site.tables, customers=everywhere)).feeder
-    one = np.sqrt(balanced.bus_voltages(single, -p_kw / 100, -q_kvar / 100, 1.05**2))
+    one = np.sqrt(single.bus_voltages(-p_kw / 100, -q_kvar / 100, 1.05**2))
     apart = np.abs(one[feeder.at] - truth[feeder.at, feeder.phase])
     return float(np.abs(plain - truth).max()), float(np.abs(once - truth).max()), float(apart.max())
 

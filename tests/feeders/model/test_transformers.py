@@ -20,7 +20,6 @@ from feeders.simulation.powerflow_three_phase import UnbalancedPowerFlow, power_
 from gridsec.arrays import Floats
 from gridsec.errors import FeederInvalid
 from gridsec.grid.droop import preset
-from gridsec.grid.radial import bus_voltages, lindistflow, model_error_bound
 from tests.feeders import stations
 from tests.feeders.stations import LV, MV
 
@@ -92,9 +91,9 @@ def test_three_power_flows_agree(site: Site) -> None:
 def test_the_model_is_that_power_flow(site: Site) -> None:
     _, buses = PowerFlow(site).solve(P_KW, Q_KVAR, 1.02 * MV)
     p, q, v0 = -P_KW / 1000.0, -Q_KVAR / 1000.0, 1.02**2
-    settled = volts(site.base_volt, bus_voltages(site.balanced, p, q, v0, steps=40))
+    settled = volts(site.base_volt, site.balanced.bus_voltages(p, q, v0, steps=40))
     np.testing.assert_allclose(settled / site.nominal_volt, buses / site.nominal_volt, rtol=0, atol=1e-9)
-    once, bound = bus_voltages(site.balanced, p, q, v0), model_error_bound(site.balanced, p, q, v0)
+    once, bound = site.balanced.bus_voltages(p, q, v0), site.balanced.model_error_bound(p, q, v0)
     assert (np.abs(once - (buses / site.base_volt) ** 2)[site.feeder.bus] <= bound + 1e-9).all()
 
 
@@ -103,7 +102,7 @@ def test_sensitivities_are_finite_differences_in_true_volts(site: Site) -> None:
     flow, count = PowerFlow(site), len(site.tables.customers)
     nothing = np.zeros(count)
     here, _ = flow.solve(nothing, nothing, MV)
-    model = lindistflow(site.balanced)
+    model = site.balanced.linear()
     for matrix, axis in ((model.R, 0), (model.X, 1)):
         for k in range(count):
             step = np.zeros((2, count))
@@ -279,6 +278,5 @@ def test_a_level_of_any_voltage_is_the_same_in_per_unit(volt: float) -> None:
 
 
 def _meshed_volts(site: Site, p: Floats, q: Floats) -> Floats:
-    from gridsec.grid.meshed import bus_voltages as settled
 
-    return volts(site.base_volt, settled(site.feeder, p, q, 1.0, steps=40))  # type: ignore[arg-type]
+    return volts(site.base_volt, site.feeder.bus_voltages(p, q, 1.0, steps=40))  # type: ignore[arg-type]

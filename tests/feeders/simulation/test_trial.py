@@ -20,7 +20,6 @@ from feeders.simulation.scenario import START, simulate
 from feeders.simulation.trial import LoadError, Meters, Trial, Truth, frames, judge
 from gridsec.arrays import Floats
 from gridsec.attack import Coordinated
-from gridsec.grid.radial import lindistflow
 from gridsec.interface import Cause, Decision, Estimate, Frame, Verdict
 from tests.codes import refused
 
@@ -259,7 +258,7 @@ def test_coordinated_meters_show_the_trace_of_a_load() -> None:
     assert attack.meters.tolist() == who.tolist()
     (k,) = np.nonzero(attack.p_shift)[0]
     customer = small().meters[who[k]]
-    model = lindistflow(small().feeder)
+    model = small().feeder.linear()
     ratio = attack.q_shift[k] / attack.p_shift[k]
     trace = -(model.R[:, customer] + ratio * model.X[:, customer])[small().meters[who]]
     found = change[-1, who]

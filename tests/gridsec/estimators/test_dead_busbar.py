@@ -11,7 +11,8 @@ import pytest
 from gridsec.estimators import exact_bank, partial, set_search, unknown_input
 from gridsec.estimators.plant import Plant
 from gridsec.grid.meshed import MeshedFeeder
-from gridsec.grid.network import InPhases, Network, interval_bounds
+from gridsec.grid.network import Network
+from gridsec.grid.phased import PhasedFeeder
 from gridsec.grid.radial import Feeder
 from gridsec.interface import Decision, Frame
 from tests.gridsec.street import Street, make_plant
@@ -86,9 +87,9 @@ def test_a_liar_on_a_ring_is_not_clean_after_an_outage(family: ModuleType) -> No
 def test_bounds_are_infinite_without_a_busbar_voltage(plant: Plant, v0_squared: float) -> None:
     feeder = plant.feeder
     assert not isinstance(feeder, Feeder)
-    v0 = np.array([1.0, v0_squared, 1.0]) if isinstance(feeder, InPhases) else v0_squared
+    v0 = np.array([1.0, v0_squared, 1.0]) if feeder.busbar_phases == 3 else v0_squared
     p = np.full(len(feeder.customers), 0.01)
-    for each in interval_bounds(feeder, p, 0.0 * p, v0, p_error=p, q_error=p):
+    for each in feeder.interval_bounds(p, 0.0 * p, v0, p_error=p, q_error=p):
         assert np.isposinf(each).all()
 
 
@@ -102,7 +103,7 @@ def test_a_threshold_that_is_none_is_never_clean(family: ModuleType, monkeypatch
         street.advance(1.0)
         with monkeypatch.context() as patch:
             if tick == 6:
-                patch.setattr("gridsec.estimators.inputs.interval_bounds", lambda *_, **__: (none, none))
+                patch.setattr(PhasedFeeder, "interval_bounds", lambda *_, **__: (none, none))
             state, _, verdict = family.step(design, state, street.frame())
         if np.isnan(verdict.threshold).any():
             assert verdict.decision is not Decision.CLEAN, tick

@@ -27,7 +27,6 @@ from gridsec.estimators.sequential.decoder import Decoder, Evidence
 from gridsec.estimators.sequential.loads import prior
 from gridsec.estimators.sequential.search import Limits
 from gridsec.estimators.single_tick import fewest, least_squares, match, pursue
-from gridsec.grid.radial import lindistflow
 from gridsec.interface import Cause, Decision, Estimate, Frame, Verdict
 from gridsec.secure.decode.gaussian import design_test, detect
 from gridsec.secure.decode.stacks import Stack
@@ -65,7 +64,7 @@ class Bench:
 
 def bench(rng: np.random.Generator, p: int = 8, sigmas: float = 3.5, most: int = 3) -> Bench:
     tree = random_tree(p, rng, drop=0.04)
-    model = lindistflow(tree)
+    model = tree.linear()
     R, X = model.R_bus[1:], model.X_bus[1:]
     A = np.hstack([2.0 * R * P_STD, 2.0 * X * Q_STD, np.full((p, 1), BUSBAR)])
     doubt = LoadDoubt(np.full(p, P_STD), np.full(p, Q_STD), 600.0)

@@ -16,7 +16,6 @@ from gridsec.estimators import thresholds
 from gridsec.estimators.thresholds import ErrorBound, Motion, Uncertainty
 from gridsec.grid.droop import PRESETS, fleet
 from gridsec.grid.meter import MeterAccuracy, busbar_error, reading_error
-from gridsec.grid.radial import lindistflow
 from tests.codes import refused
 from tests.gridsec.street import make_plant, random_tree
 
@@ -116,7 +115,7 @@ def problem(
     rng: np.random.Generator, *, customers: int = 7, M: int = 1
 ) -> tuple[thresholds.ErrorModel, Uncertainty]:
     plant = make_plant(rng, customers=customers, drop=0.04)
-    model = thresholds.error_model(plant.droop, lindistflow(plant.feeder), plant.meters, M)
+    model = thresholds.error_model(plant.droop, plant.feeder.linear(), plant.meters, M)
     nobody = np.zeros(customers, dtype=bool)
     now = Uncertainty(
         base=rng.uniform(0.0, 0.01, customers),
@@ -168,7 +167,7 @@ class TestGap:
     def test_at_the_inverters(self) -> None:
         rng = np.random.default_rng(2)
         plant = make_plant(rng, customers=6, inverters=np.array([1, 4, 4]), meters=np.array([0, 1, 3, 4, 5]))
-        model = thresholds.error_model(plant.droop, lindistflow(plant.feeder), plant.meters, 1)
+        model = thresholds.error_model(plant.droop, plant.feeder.linear(), plant.meters, 1)
         live, none = np.ones(5, dtype=bool), np.zeros(5, dtype=bool)
         now = Uncertainty(rng.uniform(0.0, 0.01, 6), np.full(5, 0.01), live, none, np.zeros(5))
         bound = ErrorBound(rng.uniform(0.0, 0.01, 3), rng.uniform(0.0, 0.02, 3))
@@ -191,9 +190,9 @@ class TestErrorBound:
         plant = make_plant(rng, customers=5, drop=rng.choice([0.02, 0.1]), presets=("ieee1547-b", "vde4105"))
         droop, n = plant.droop, 5
         model = replace(
-            thresholds.error_model(droop, lindistflow(plant.feeder), plant.meters, 1), mismatch=np.zeros(n)
+            thresholds.error_model(droop, plant.feeder.linear(), plant.meters, 1), mismatch=np.zeros(n)
         )
-        S = 2.0 * lindistflow(plant.feeder).X
+        S = 2.0 * plant.feeder.linear().X
         out = rng.choice(n, 2, replace=False)
         left = np.isin(np.arange(n), out)
         base, reading = rng.uniform(0.0, 0.01, n), rng.uniform(0.005, 0.02, n)
@@ -232,7 +231,7 @@ class TestErrorBound:
         rng = np.random.default_rng(8)
         plant = make_plant(rng, customers=5, drop=0.1, presets=("ieee1547-b", "vde4105"))
         droop, h = plant.droop, 900.0
-        lin = lindistflow(plant.feeder)
+        lin = plant.feeder.linear()
         model = replace(thresholds.error_model(droop, lin, plant.meters, 1), mismatch=np.zeros(5))
         S, zero, none = 2.0 * lin.X, np.zeros(5), np.zeros(5, dtype=bool)
         exact = Uncertainty(zero, zero, ~none, none, zero)
@@ -291,7 +290,7 @@ class TestErrorBound:
         rng = np.random.default_rng(5)
         tree = random_tree(5, rng, drop=0.01)
         droop = fleet(np.arange(5), "asnzs4777-a", np.full(5, 5.0), 100.0)
-        model = thresholds.error_model(droop, lindistflow(tree), np.arange(5), 1)
+        model = thresholds.error_model(droop, tree.linear(), np.arange(5), 1)
         now = Uncertainty(
             np.full(5, 0.003), np.full(5, 0.015), np.ones(5, dtype=bool), np.zeros(5, dtype=bool), np.zeros(5)
         )

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from gridsec.arrays import Floats
 from gridsec.grid.intervals import Sweeps, bounds
 from gridsec.grid.meshed import MeshedFeeder
-from gridsec.grid.network import InPhases, bus_voltages, interval_bounds, loss_correction
+from gridsec.grid.network import InPhases
 from gridsec.grid.phased import PhasedFeeder
 from tests.gridsec.meshes import ac, random_mesh
 from tests.gridsec.unbalanced import ac_places, random_phased_mesh, random_three_phase
@@ -30,17 +30,17 @@ def contained(
     count = feeder.bus.size
     p, q = size * rng.normal(-0.5, 1.0, (2, count))
     p_error, q_error = size * rng.uniform(0.0, 0.6, (2, count))
-    moved, rest = interval_bounds(feeder, p, q, v0, p_error=p_error, q_error=q_error)
+    moved, rest = feeder.interval_bounds(p, q, v0, p_error=p_error, q_error=q_error)
     assert np.isfinite(rest).all()
-    centre = loss_correction(feeder, p, q, v0, steps=1)[feeder.bus]
+    centre = feeder.loss_correction(p, q, v0, steps=1)[feeder.bus]
     for k in range(12):
         sign = rng.choice([-1.0, 1.0], (2, count)) if k else np.ones((2, count))
         sign = sign if k % 3 else sign * rng.uniform(0.0, 1.0, (2, count))
         there = p + sign[0] * p_error, q + sign[1] * q_error
-        found = loss_correction(feeder, *there, v0, steps=1)[feeder.bus]
+        found = feeder.loss_correction(*there, v0, steps=1)[feeder.bus]
         assert (np.abs(found - centre) <= moved + 1e-13).all()
         for steps in (1, 2):
-            v2 = bus_voltages(feeder, *there, v0, steps=steps)[feeder.bus]
+            v2 = feeder.bus_voltages(*there, v0, steps=steps)[feeder.bus]
             assert (np.abs(v2 - exact(feeder, *there, v0)) <= rest + 2e-9).all()
 
 
@@ -94,11 +94,11 @@ def test_without_intervals_only_the_model_is_left() -> None:
     """Near collapse, and with powers of which nothing is known, the bounds are infinite."""
     feeder = PhasedFeeder(random_three_phase(3, single=True))
     none, p = np.zeros(feeder.bus.size), np.full(feeder.bus.size, -0.01)
-    moved, rest = interval_bounds(feeder, p, p, 1.0, p_error=none, q_error=none)
+    moved, rest = feeder.interval_bounds(p, p, 1.0, p_error=none, q_error=none)
     np.testing.assert_array_equal(moved, none)
     assert (rest < 1e-3).all()
     for q, error in ((p, none + 1e4), (100.0 * p, none)):
-        for bound in interval_bounds(feeder, q, q, 1.0, p_error=error, q_error=error):
+        for bound in feeder.interval_bounds(q, q, 1.0, p_error=error, q_error=error):
             assert np.isinf(bound).all()
 
 
@@ -110,10 +110,10 @@ def test_an_end_where_all_err_alike_is_not_the_worst() -> None:
         feeder = PhasedFeeder(random_three_phase(seed, single=True, branches=6))
         count = feeder.bus.size
         p, q, error = *0.01 * rng.normal(-0.5, 1.0, (2, count)), np.full(count, 0.005)
-        centre = loss_correction(feeder, p, q, 1.0, steps=1)[feeder.bus]
+        centre = feeder.loss_correction(p, q, 1.0, steps=1)[feeder.bus]
 
         def moved(sign: Floats) -> Floats:
-            found = loss_correction(feeder, p + sign * error, q + sign * error, 1.0, steps=1)  # noqa: B023
+            found = feeder.loss_correction(p + sign * error, q + sign * error, 1.0, steps=1)  # noqa: B023
             return np.abs(found[feeder.bus] - centre)  # noqa: B023
 
         alike = np.maximum(moved(np.ones(count)), moved(-np.ones(count)))

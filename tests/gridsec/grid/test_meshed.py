@@ -11,10 +11,8 @@ from hypothesis import given, settings
 
 from gridsec.arrays import Floats
 from gridsec.errors import FeederInvalid
-from gridsec.grid import meshed, radial
 from gridsec.grid.droop import fleet
-from gridsec.grid.meshed import MeshedFeeder, admittance, bus_voltages, impedances, model_error_bound
-from gridsec.grid.radial import lindistflow
+from gridsec.grid.meshed import MeshedFeeder, admittance, impedances
 from gridsec.observers.certificates import certify, verify
 from gridsec.observers.lure import close_loop
 from tests.codes import refused
@@ -35,15 +33,15 @@ def loads(feeder: MeshedFeeder, seed: int, size: float = 0.02) -> tuple[Floats, 
 @settings(max_examples=20, deadline=None)
 def test_without_ties_it_is_the_radial_feeder(seed: int) -> None:
     feeder = random_mesh(seed, ties=0, charging=0.01)
-    model = lindistflow(feeder.tree)
+    model = feeder.tree.linear()
     np.testing.assert_array_equal(feeder.R, model.R_bus)
     np.testing.assert_array_equal(feeder.X, model.X_bus)
     np.testing.assert_array_equal(feeder.half, feeder.tree.half)
     p, q = loads(feeder, seed)
-    linear = radial.bus_voltages(feeder.tree, p, q, 1.03, steps=0)
-    np.testing.assert_allclose(bus_voltages(feeder, p, q, 1.03, steps=0), linear, rtol=0, atol=1e-12)
+    linear = feeder.tree.bus_voltages(p, q, 1.03, steps=0)
+    np.testing.assert_allclose(feeder.bus_voltages(p, q, 1.03, steps=0), linear, rtol=0, atol=1e-12)
     # Both iterations end in the AC power flow.
-    far = [bus_voltages(feeder, p, q, 1.03, steps=60), radial.bus_voltages(feeder.tree, p, q, 1.03, steps=60)]
+    far = [feeder.bus_voltages(p, q, 1.03, steps=60), feeder.tree.bus_voltages(p, q, 1.03, steps=60)]
     np.testing.assert_allclose(*far, rtol=0, atol=1e-11)
 
 
@@ -73,7 +71,7 @@ def test_two_equal_lines_in_parallel_are_one_of_half_the_impedance() -> None:
     tree = random_feeder(5)
     ends = np.column_stack([tree.parent, np.arange(1, len(tree.buses))])
     twice = MeshedFeeder(tree, ends, tree.r, tree.x, tree.charging)
-    half = lindistflow(replace(tree, r=0.5 * tree.r, x=0.5 * tree.x))
+    half = replace(tree, r=0.5 * tree.r, x=0.5 * tree.x).linear()
     np.testing.assert_allclose(twice.R, half.R_bus, rtol=0, atol=1e-15)
     np.testing.assert_allclose(twice.X, half.X_bus, rtol=0, atol=1e-15)
 
@@ -94,7 +92,7 @@ def test_a_ring_of_unlike_cables_can_couple_with_a_negative_sign() -> None:
     assert feeder.R[1, 1] < 0.0 < feeder.R[2, 1]
     p, q = np.array([0.0, -0.05]), np.zeros(2)
     assert ac(feeder, p, q, 1.0)[1] > 1.0  # A load at b raises a.
-    assert bus_voltages(feeder, p, q, 1.0)[1] == pytest.approx(ac(feeder, p, q, 1.0)[1], abs=1e-5)
+    assert feeder.bus_voltages(p, q, 1.0)[1] == pytest.approx(ac(feeder, p, q, 1.0)[1], abs=1e-5)
 
 
 @pytest.mark.parametrize("charging", [0.0, 0.02])
@@ -104,14 +102,14 @@ def test_the_power_flow_is_within_the_bound(charging: float, seed: int, size: fl
     feeder = random_mesh(seed, charging=charging)
     p, q = loads(feeder, seed, size)
     v0 = float(np.random.default_rng(seed).uniform(0.95, 1.05) ** 2)
-    bound = model_error_bound(feeder, p, q, v0)
+    bound = feeder.model_error_bound(p, q, v0)
     assert np.isfinite(bound).all()
-    exact, found = ac(feeder, p, q, v0), bus_voltages(feeder, p, q, v0)
+    exact, found = ac(feeder, p, q, v0), feeder.bus_voltages(p, q, v0)
     error = np.abs(found - exact)[feeder.bus]
     assert (error <= bound + 2e-9).all()
     reach = float((feeder.size @ np.hypot(p, q)).max())
     assert (bound <= 10.0 * reach**3 + 1e-12).all()
-    far = bus_voltages(feeder, p, q, v0, steps=40)
+    far = feeder.bus_voltages(p, q, v0, steps=40)
     np.testing.assert_allclose(far, exact, rtol=0, atol=2e-9)
 
 
@@ -120,8 +118,8 @@ def test_the_power_flow_is_within_the_bound(charging: float, seed: int, size: fl
 def test_a_correction_gains_an_order(seed: int) -> None:
     feeder = random_mesh(seed)
     p, q = loads(feeder, seed, 0.01)
-    exact = bus_voltages(feeder, p, q, 1.0, steps=60)
-    errors = [np.abs(bus_voltages(feeder, p, q, 1.0, steps=k) - exact).max() for k in range(3)]
+    exact = feeder.bus_voltages(p, q, 1.0, steps=60)
+    errors = [np.abs(feeder.bus_voltages(p, q, 1.0, steps=k) - exact).max() for k in range(3)]
     reach = float((feeder.size @ np.hypot(p, q)).max())
     for k, error in enumerate(errors):
         assert error <= 6.0 * reach ** (k + 2) + 1e-13
@@ -147,12 +145,12 @@ def test_operating_points_are_taken_together() -> None:
     p, q = (np.stack([each, 0.5 * each, 0.0 * each]) for each in loads(feeder, 11))
     v0 = np.array([1.0, 1.02, 0.97])
     for steps in (0, 1, 3):
-        many = bus_voltages(feeder, p, q, v0, steps=steps)
-        one = [bus_voltages(feeder, p[k], q[k], v0[k], steps=steps) for k in range(3)]
+        many = feeder.bus_voltages(p, q, v0, steps=steps)
+        one = [feeder.bus_voltages(p[k], q[k], v0[k], steps=steps) for k in range(3)]
         np.testing.assert_allclose(many, one, rtol=0, atol=1e-14)
-    many = model_error_bound(feeder, p, q, v0)
+    many = feeder.model_error_bound(p, q, v0)
     np.testing.assert_allclose(
-        many, [model_error_bound(feeder, p[k], q[k], v0[k]) for k in range(3)], atol=1e-15
+        many, [feeder.model_error_bound(p[k], q[k], v0[k]) for k in range(3)], atol=1e-15
     )
     assert (many[2] == 0.0).all()
 
@@ -164,9 +162,9 @@ def test_sensitivities_are_the_derivatives_under_load(charging: float, seed: int
     feeder = random_mesh(seed, charging=charging)
     p, q = loads(feeder, seed, 0.01)
     v0 = 1.02
-    found = meshed.sensitivities(feeder, p, q, v0, steps=20)
+    found = feeder.sensitivities(p, q, v0, steps=20)
     derivatives_are(found, lambda p, q: ac(feeder, p, q, v0), p, q, atol=2e-5)
-    none = meshed.sensitivities(feeder, 0.0 * p, 0.0 * q, 1.0)
+    none = feeder.sensitivities(0.0 * p, 0.0 * q, 1.0)
     if not charging:
         np.testing.assert_allclose(none.R_bus, feeder.R, rtol=0, atol=1e-12)
         np.testing.assert_allclose(none.X_bus, feeder.X, rtol=0, atol=1e-12)
@@ -175,8 +173,8 @@ def test_sensitivities_are_the_derivatives_under_load(charging: float, seed: int
 def test_beyond_what_the_feeder_carries_nothing_is_promised() -> None:
     feeder = random_mesh(11)
     p, q = np.full((2, feeder.bus.size), -50.0)
-    assert np.isinf(model_error_bound(feeder, p, q, 1.0)).all()
-    assert np.isinf(model_error_bound(feeder, np.full(p.shape, np.nan), q, 1.0)).all()
+    assert np.isinf(feeder.model_error_bound(p, q, 1.0)).all()
+    assert np.isinf(feeder.model_error_bound(np.full(p.shape, np.nan), q, 1.0)).all()
 
 
 @given(seeds)

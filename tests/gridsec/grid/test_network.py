@@ -12,24 +12,9 @@ from hypothesis import given, settings
 from gridsec.arrays import Floats
 from gridsec.errors import FeederInvalid
 from gridsec.grid.meshed import MeshedFeeder, impedances
-from gridsec.grid.network import (
-    InPhases,
-    Network,
-    Power,
-    along,
-    bus_voltages,
-    busbar_places,
-    by_place,
-    columns,
-    covariance,
-    model_error_bound,
-    one_busbar,
-    own,
-    sizes,
-    variances,
-)
+from gridsec.grid.network import InPhases, Network, Power
 from gridsec.grid.phased import PhasedFeeder
-from gridsec.grid.radial import Feeder, lindistflow
+from gridsec.grid.radial import Feeder
 from gridsec.grid.three_phase import PHASES
 from tests.codes import refused
 from tests.gridsec.meshes import ac, random_mesh
@@ -47,7 +32,7 @@ def phased(seed: int) -> PhasedFeeder:
 def dense(feeder: Network, power: Power) -> Floats:
     """R or X from customers to places: by `lindistflow`, `impedances`, or differences of AC power flows."""
     if isinstance(feeder, Feeder):
-        model = lindistflow(feeder)
+        model = feeder.linear()
         return model.R_bus if power is Power.ACTIVE else model.X_bus
     if isinstance(feeder, MeshedFeeder):
         Z = impedances(feeder, feeder.bus)
@@ -70,7 +55,7 @@ def test_every_word_is_that_of_the_dense_matrix(kind: object, seed: int) -> None
     rng, count = np.random.default_rng(seed), feeder.bus.size
     metered = np.sort(rng.choice(count, max(1, count // 2), replace=False))
     weights, variance = rng.normal(size=metered.size), rng.uniform(0.0, 2.0, count)
-    tol = 1e-7 if isinstance(feeder, InPhases) else 1e-9
+    tol = 1e-7 if feeder.busbar_phases == 3 else 1e-9
     for power in Power:
         M = dense(feeder, power)
         there = ~np.isnan(M).any(axis=1)
@@ -79,15 +64,15 @@ def test_every_word_is_that_of_the_dense_matrix(kind: object, seed: int) -> None
         def same(found: Floats, expected: Floats, size: float = size) -> None:
             np.testing.assert_allclose(found, expected, rtol=0, atol=tol * size)
 
-        same(columns(feeder, power, metered)[there], 2.0 * M[np.ix_(there, metered)])
+        same(feeder.columns(power, metered)[there], 2.0 * M[np.ix_(there, metered)])
         rows = M[feeder.bus]
-        same(own(feeder, power), rows.diagonal())
-        same(along(feeder, power, metered, weights), 2.0 * weights @ rows[metered])
-        same(sizes(feeder, power, metered), ((2.0 * rows[metered]) ** 2).sum(axis=0))
+        same(feeder.self_impedance(power), rows.diagonal())
+        same(feeder.weighted_sensitivity(power, metered, weights), 2.0 * weights @ rows[metered])
+        same(feeder.squared_sensitivity(power, metered), ((2.0 * rows[metered]) ** 2).sum(axis=0))
         whole = 4.0 * (M * variance) @ M.T
         places = feeder.bus[metered]
-        same(covariance(feeder, power, places, variance)[there], whole[np.ix_(there, places)])
-        same(variances(feeder, power, variance)[there], whole.diagonal()[there])
+        same(feeder.covariance(power, places, variance)[there], whole[np.ix_(there, places)])
+        same(feeder.variances(power, variance)[there], whole.diagonal()[there])
 
 
 @pytest.mark.parametrize("kind", [phased, random_phased_mesh])
@@ -101,25 +86,25 @@ def test_voltages_of_the_places_within_their_bound_of_the_power_flow(
     p, q = 0.01 * rng.normal(-0.5, 1.0, (2, feeder.bus.size)) / 3.0
     v0 = rng.uniform(0.95, 1.05, 3) ** 2
     exact = ac_places(feeder, p, q, v0)
-    found, bound = bus_voltages(feeder, p, q, v0), model_error_bound(feeder, p, q, v0)
-    np.testing.assert_allclose(found[busbar_places(feeder)], v0, rtol=1e-14)
+    found, bound = feeder.bus_voltages(p, q, v0), feeder.model_error_bound(p, q, v0)
+    np.testing.assert_allclose(found[feeder.busbar_places()], v0, rtol=1e-14)
     assert (np.abs(found - exact)[feeder.bus] <= bound + 1e-12).all()
-    many = bus_voltages(feeder, np.stack([p, 0.0 * p]), np.stack([q, 0.0 * q]), v0)
+    many = feeder.bus_voltages(np.stack([p, 0.0 * p]), np.stack([q, 0.0 * q]), v0)
     np.testing.assert_allclose(many[0], found, rtol=0, atol=1e-14)
-    linear = by_place(feeder, v0) + 2.0 * (feeder.R @ p + feeder.X @ q)
-    np.testing.assert_allclose(bus_voltages(feeder, p, q, v0, steps=0), linear, rtol=0, atol=1e-12)
+    linear = feeder.broadcast_busbar(v0) + 2.0 * (feeder.R @ p + feeder.X @ q)
+    np.testing.assert_allclose(feeder.bus_voltages(p, q, v0, steps=0), linear, rtol=0, atol=1e-12)
 
 
 def test_voltages_of_a_meshed_feeder_within_their_bound_of_the_power_flow() -> None:
     feeder = random_mesh(4, charging=0.01)
     p, q = 0.01 * np.random.default_rng(4).normal(-0.5, 1.0, (2, feeder.bus.size))
     exact = ac(feeder, p, q, 1.04)
-    found, bound = bus_voltages(feeder, p, q, 1.04), model_error_bound(feeder, p, q, 1.04)
-    assert found[busbar_places(feeder)] == pytest.approx(1.04, abs=1e-14)
+    found, bound = feeder.bus_voltages(p, q, 1.04), feeder.model_error_bound(p, q, 1.04)
+    assert found[feeder.busbar_places()] == pytest.approx(1.04, abs=1e-14)
     assert (np.abs(found - exact)[feeder.bus] <= bound + 2e-9).all()
-    linear = by_place(feeder, 1.04) + 2.0 * (feeder.R @ p + feeder.X @ q)
-    np.testing.assert_allclose(bus_voltages(feeder, p, q, 1.04, steps=0), linear, rtol=0, atol=1e-12)
-    assert one_busbar(feeder, feeder.bus, feeder.bus) == 1.0
+    linear = feeder.broadcast_busbar(1.04) + 2.0 * (feeder.R @ p + feeder.X @ q)
+    np.testing.assert_allclose(feeder.bus_voltages(p, q, 1.04, steps=0), linear, rtol=0, atol=1e-12)
+    assert feeder.same_busbar_phase(feeder.bus, feeder.bus) == 1.0
 
 
 def test_places_know_their_bus_and_their_phase() -> None:
@@ -128,12 +113,12 @@ def test_places_know_their_bus_and_their_phase() -> None:
         feeder.customers, feeder.bus.tolist(), feeder.tree.phase, feeder.tree.bus, strict=True
     ):
         assert feeder.buses[place] == f"{feeder.tree.buses[bus]}.{PHASES[phase]}", name
-    same = np.asarray(one_busbar(feeder, feeder.bus, feeder.bus))
+    same = np.asarray(feeder.same_busbar_phase(feeder.bus, feeder.bus))
     np.testing.assert_array_equal(same, np.equal.outer(feeder.tree.phase, feeder.tree.phase))
     np.testing.assert_array_equal(
-        by_place(feeder, np.array([1.0, 2.0, 3.0]))[feeder.bus], feeder.tree.phase + 1.0
+        feeder.broadcast_busbar(np.array([1.0, 2.0, 3.0]))[feeder.bus], feeder.tree.phase + 1.0
     )
-    np.testing.assert_array_equal(by_place(feeder, 4.0), np.full(len(feeder.buses), 4.0))
+    np.testing.assert_array_equal(feeder.broadcast_busbar(4.0), np.full(len(feeder.buses), 4.0))
 
 
 def test_what_is_refused() -> None:

@@ -12,9 +12,7 @@ from hypothesis import given, settings
 
 from gridsec.arrays import Floats
 from gridsec.errors import FeederInvalid
-from gridsec.grid import meshed
 from gridsec.grid.meshed import MeshedFeeder, PhasedMesh, phased_admittance
-from gridsec.grid.network import bus_voltages, hangs_on, model_error_bound, one_busbar
 from gridsec.grid.phased import PhasedFeeder
 from gridsec.grid.three_phase import ROTATION, ThreePhaseFeeder, sequence_matrix
 from tests.codes import refused
@@ -72,7 +70,7 @@ def test_without_ties_it_is_the_radial_feeder(seed: int) -> None:
     v0 = np.array([1.03, 1.0, 0.98])
     # Corrections of one step are of the same order, and both iterations end in the AC power flow.
     for steps, atol in ((0, 1e-12), (60, 1e-11)):
-        found = [bus_voltages(each, p, q, v0, steps=steps) for each in (feeder, radial)]
+        found = [each.bus_voltages(p, q, v0, steps=steps) for each in (feeder, radial)]
         np.testing.assert_allclose(*found, rtol=0, atol=atol)
 
 
@@ -85,7 +83,7 @@ def test_a_tie_that_hardly_conducts_changes_nothing(seed: int) -> None:
     np.testing.assert_allclose(far.R, radial.R, rtol=0, atol=1e-9)
     np.testing.assert_allclose(far.X, radial.X, rtol=0, atol=1e-9)
     p, q = loads(feeder, seed, 0.003)
-    found = [bus_voltages(each, p, q, 1.02, steps=40) for each in (far, radial)]
+    found = [each.bus_voltages(p, q, 1.02, steps=40) for each in (far, radial)]
     np.testing.assert_allclose(*found, rtol=0, atol=1e-9)
     # Nor does it where others conduct.
     scale = np.where(np.arange(len(feeder.ends)) % 2, 1.0, 1e12)
@@ -123,8 +121,8 @@ def test_equal_loads_in_all_phases_are_the_balanced_mesh(charging: float, seed: 
     p, q = 0.02 * np.random.default_rng(seed).normal([[-0.5], [-0.2]], 1.0, (2, one.bus.size))
     split = [np.repeat(each / 3.0, 3) for each in (p, q)]
     for steps in (0, 1, 2):
-        balanced = meshed.bus_voltages(one, p, q, 1.03, steps=steps)
-        found = meshed.bus_voltages(three, *split, 1.03, steps=steps)
+        balanced = one.bus_voltages(p, q, 1.03, steps=steps)
+        found = three.bus_voltages(*split, 1.03, steps=steps)
         np.testing.assert_allclose(found, np.repeat(balanced, 3), rtol=0, atol=1e-12)
 
 
@@ -144,13 +142,13 @@ def test_the_power_flow_is_within_the_bound(charging: float, seed: int, size: fl
     feeder = random_phased_mesh(seed, charging=charging)
     p, q = loads(feeder, seed, size)
     v0 = np.random.default_rng(seed).uniform(0.95, 1.05, 3) ** 2
-    bound = model_error_bound(feeder, p, q, v0)
+    bound = feeder.model_error_bound(p, q, v0)
     assert np.isfinite(bound).all()
-    exact, found = ac_places(feeder, p, q, v0), bus_voltages(feeder, p, q, v0)
+    exact, found = ac_places(feeder, p, q, v0), feeder.bus_voltages(p, q, v0)
     assert (np.abs(found - exact)[feeder.bus] <= bound + 1e-12).all()
     reach = float((feeder.size @ np.hypot(p, q)).max())
     assert (bound <= 10.0 * reach**3 + 1e-12).all()
-    far, there = bus_voltages(feeder, p, q, v0, steps=60), ~np.isnan(exact)
+    far, there = feeder.bus_voltages(p, q, v0, steps=60), ~np.isnan(exact)
     np.testing.assert_allclose(far[there], exact[there], rtol=0, atol=1e-9)
 
 
@@ -159,8 +157,8 @@ def test_the_power_flow_is_within_the_bound(charging: float, seed: int, size: fl
 def test_a_correction_gains_an_order(seed: int) -> None:
     feeder = random_phased_mesh(seed)
     p, q = loads(feeder, seed, 0.003)
-    exact = bus_voltages(feeder, p, q, 1.0, steps=60)
-    errors = [np.abs(bus_voltages(feeder, p, q, 1.0, steps=k) - exact).max() for k in range(3)]
+    exact = feeder.bus_voltages(p, q, 1.0, steps=60)
+    errors = [np.abs(feeder.bus_voltages(p, q, 1.0, steps=k) - exact).max() for k in range(3)]
     reach = float((feeder.size @ np.hypot(p, q)).max())
     for k, error in enumerate(errors):
         assert error <= 10.0 * reach ** (k + 2) + 1e-13
@@ -187,7 +185,7 @@ def test_a_tie_of_one_phase_closes_a_loop_in_that_phase_alone() -> None:
     assert moved[0::3].max() > 1e-4
     p, q = loads(mixed, 5, 0.002)
     exact = ac_places(mixed, p, q, 1.0)
-    np.testing.assert_allclose(bus_voltages(mixed, p, q, 1.0, steps=60), exact, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(mixed.bus_voltages(p, q, 1.0, steps=60), exact, rtol=0, atol=1e-12)
 
 
 def test_two_equal_lines_in_parallel_are_one_of_half_the_impedance() -> None:
@@ -201,9 +199,9 @@ def test_two_equal_lines_in_parallel_are_one_of_half_the_impedance() -> None:
 
 def test_customers_hang_on_the_phase_of_the_busbar_that_they_have() -> None:
     feeder = random_phased_mesh(3)
-    np.testing.assert_array_equal(hangs_on(feeder).argmax(axis=1), feeder.tree.phase)
+    np.testing.assert_array_equal(feeder.busbar_incidence().argmax(axis=1), feeder.tree.phase)
     same = np.equal.outer(feeder.tree.phase, feeder.tree.phase)
-    np.testing.assert_array_equal(one_busbar(feeder, feeder.bus, feeder.bus), same)
+    np.testing.assert_array_equal(feeder.same_busbar_phase(feeder.bus, feeder.bus), same)
 
 
 @pytest.mark.parametrize("charging", [0.0, 0.02])
@@ -213,9 +211,9 @@ def test_sensitivities_are_the_derivatives_under_load(charging: float, seed: int
     feeder = random_phased_mesh(seed, charging=charging)
     p, q = loads(feeder, seed, 0.01)
     v0 = np.array([1.02, 1.0, 0.97])
-    found = meshed.sensitivities(feeder, p, q, v0, steps=20)
+    found = feeder.sensitivities(p, q, v0, steps=20)
     derivatives_are(found, lambda p, q: ac_places(feeder, p, q, v0), p, q, atol=1e-6)
-    none = meshed.sensitivities(feeder, 0.0 * p, 0.0 * q, 1.0)
+    none = feeder.sensitivities(0.0 * p, 0.0 * q, 1.0)
     if not charging:
         np.testing.assert_allclose(none.R_bus, feeder.R, rtol=0, atol=1e-12)
         np.testing.assert_allclose(none.X_bus, feeder.X, rtol=0, atol=1e-12)
@@ -224,8 +222,8 @@ def test_sensitivities_are_the_derivatives_under_load(charging: float, seed: int
 def test_beyond_what_the_feeder_carries_nothing_is_promised() -> None:
     feeder = random_phased_mesh(11)
     p, q = np.full((2, feeder.bus.size), -50.0)
-    assert np.isinf(model_error_bound(feeder, p, q, 1.0)).all()
-    assert np.isinf(model_error_bound(feeder, np.full(p.shape, np.nan), q, 1.0)).all()
+    assert np.isinf(feeder.model_error_bound(p, q, 1.0)).all()
+    assert np.isinf(feeder.model_error_bound(np.full(p.shape, np.nan), q, 1.0)).all()
 
 
 def test_arrays_cannot_be_changed() -> None:

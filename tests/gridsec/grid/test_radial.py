@@ -12,15 +12,7 @@ import pytest
 from hypothesis import given
 
 from gridsec.errors import FeederInvalid, InputInvalid
-from gridsec.grid.radial import (
-    Feeder,
-    bus_voltages,
-    corrected,
-    lindistflow,
-    loss_correction,
-    model_error_bound,
-    squared_voltages,
-)
+from gridsec.grid.radial import Feeder, squared_voltages
 from tests.codes import refused
 from tests.gridsec.radial import random_feeder, sweep
 
@@ -39,7 +31,7 @@ def path(feeder: Feeder, bus: int) -> set[int]:
 @given(seeds)
 def test_matrices_are_sums_over_common_branches(seed: int) -> None:
     feeder = random_feeder(seed)
-    model = lindistflow(feeder)
+    model = feeder.linear()
     for k in range(len(feeder.buses)):
         for j, bus in enumerate(feeder.bus):
             common = list(path(feeder, k) & path(feeder, int(bus)))
@@ -76,12 +68,12 @@ def test_line_of_chong2020() -> None:
         charging=np.zeros(6),
     )
     expected = np.array([[0.11, 0.1, 0.1], [0.1, 0.32, 0.3], [0.1, 0.3, 0.63]])
-    assert np.allclose(lindistflow(feeder).X, expected, rtol=0, atol=1e-15)
+    assert np.allclose(feeder.linear().X, expected, rtol=0, atol=1e-15)
 
 
 def test_two_customers_on_one_bus_and_one_on_the_busbar() -> None:
     feeder = replace(random_feeder(3, customers=3), bus=np.array([1, 1, 0]))
-    model = lindistflow(feeder)
+    model = feeder.linear()
     assert np.array_equal(model.X[0], model.X[1])
     assert not model.X[2].any()
     v2 = squared_voltages(model, np.array([0.1, -0.3, 5.0]), np.zeros(3), 1.02)
@@ -95,11 +87,11 @@ def test_batches_equal_single_evaluations(seed: int) -> None:
     rng = np.random.default_rng(seed)
     p, q = rng.uniform(-0.1, 0.1, (2, 2, 3, len(feeder.customers)))
     v0 = rng.uniform(0.9, 1.1, (2, 3))
-    model = lindistflow(feeder)
+    model = feeder.linear()
     for function in (
         lambda p, q, v: squared_voltages(model, p, q, v),
-        lambda p, q, v: loss_correction(feeder, p, q, v),
-        lambda p, q, v: model_error_bound(feeder, p, q, v),
+        feeder.loss_correction,
+        feeder.model_error_bound,
     ):
         together = function(p, q, v0)
         for i, j in np.ndindex(2, 3):
@@ -111,7 +103,7 @@ def operating_point(seed: int) -> tuple[Feeder, np.ndarray, np.ndarray]:
     feeder = random_feeder(seed, charging=float(seed % 2) * 0.03)
     rng = np.random.default_rng([seed, 2])
     p, q = rng.uniform(-1.0, 1.0, (2, len(feeder.customers)))
-    model = lindistflow(feeder)
+    model = feeder.linear()
     # Counted without regard to signs, so that cancelling flows stay far from voltage collapse.
     size = float(np.max(2 * model.R @ np.abs(p) + 2 * model.X @ np.abs(q)))
     scale = rng.uniform(0.005, 0.15) / size if size > 0 else 1.0
@@ -121,22 +113,22 @@ def operating_point(seed: int) -> tuple[Feeder, np.ndarray, np.ndarray]:
 @given(seeds)
 def test_correction_converges_to_the_ac_power_flow(seed: int) -> None:
     feeder, p, q = operating_point(seed)
-    model = lindistflow(feeder)
+    model = feeder.linear()
     exact = sweep(feeder, p, q, 1.04)
     linear = 1.04 + 2 * (model.R_bus @ p + model.X_bus @ q)
-    assert np.allclose(linear + loss_correction(feeder, p, q, 1.04, steps=60), exact, rtol=0, atol=1e-12)
+    assert np.allclose(linear + feeder.loss_correction(p, q, 1.04, steps=60), exact, rtol=0, atol=1e-12)
 
 
 @given(seeds)
 def test_error_bound_holds_and_is_no_constant(seed: int) -> None:
     feeder, p, q = operating_point(seed)
-    model = lindistflow(feeder)
+    model = feeder.linear()
     exact = sweep(feeder, p, q, 1.0)[feeder.bus]
-    found = squared_voltages(model, p, q, 1.0) + loss_correction(feeder, p, q, 1.0)[feeder.bus]
-    bound = model_error_bound(feeder, p, q, 1.0)
+    found = squared_voltages(model, p, q, 1.0) + feeder.loss_correction(p, q, 1.0)[feeder.bus]
+    bound = feeder.model_error_bound(p, q, 1.0)
     assert np.all(np.abs(found - exact) <= bound + 1e-13)
     # Third order in the size of the flows: at a tenth of the load, far below a tenth of the bound.
-    small = model_error_bound(feeder, 0.1 * p, 0.1 * q, 1.0)
+    small = feeder.model_error_bound(0.1 * p, 0.1 * q, 1.0)
     if not feeder.charging.any():
         assert np.all(small <= 3e-3 * bound + 1e-15)
 
@@ -144,28 +136,28 @@ def test_error_bound_holds_and_is_no_constant(seed: int) -> None:
 @given(seeds, st.integers(1, 3))
 def test_correction_and_its_bound_together(seed: int, steps: int) -> None:
     feeder, p, q = operating_point(seed)
-    both = corrected(feeder, p, q, 1.02, steps=steps)
-    assert np.array_equal(both[0], loss_correction(feeder, p, q, 1.02, steps=steps))
-    assert np.array_equal(both[1], model_error_bound(feeder, p, q, 1.02))
+    both = feeder.corrected(p, q, 1.02, steps=steps)
+    assert np.array_equal(both[0], feeder.loss_correction(p, q, 1.02, steps=steps))
+    assert np.array_equal(both[1], feeder.model_error_bound(p, q, 1.02))
 
 
 def test_several_busbar_voltages_for_the_same_powers() -> None:
     feeder, p, q = operating_point(3)
     each = np.array([0.95, 1.0, 1.05])
-    corrections, bounds = corrected(feeder, p, q, each)
-    many = model_error_bound(feeder, np.stack([p, 0.5 * p])[:, None], q, each)
+    corrections, bounds = feeder.corrected(p, q, each)
+    many = feeder.model_error_bound(np.stack([p, 0.5 * p])[:, None], q, each)
     assert many.shape == (2, 3, p.size)
     for k, v0 in enumerate(each.tolist()):
-        np.testing.assert_allclose(corrections[k], loss_correction(feeder, p, q, v0), rtol=1e-12)
-        np.testing.assert_allclose(bounds[k], model_error_bound(feeder, p, q, v0), rtol=1e-12)
-        np.testing.assert_allclose(many[1, k], model_error_bound(feeder, 0.5 * p, q, v0), rtol=1e-12)
+        np.testing.assert_allclose(corrections[k], feeder.loss_correction(p, q, v0), rtol=1e-12)
+        np.testing.assert_allclose(bounds[k], feeder.model_error_bound(p, q, v0), rtol=1e-12)
+        np.testing.assert_allclose(many[1, k], feeder.model_error_bound(0.5 * p, q, v0), rtol=1e-12)
 
 
 def test_bound_is_infinite_beyond_voltage_collapse() -> None:
     feeder = replace(random_feeder(1, customers=1), bus=np.array([1]))
-    assert model_error_bound(feeder, np.array([-1e3]), np.array([0.0]), 1.0)[0] == np.inf
+    assert feeder.model_error_bound(np.array([-1e3]), np.array([0.0]), 1.0)[0] == np.inf
     heavy = -0.4 / feeder.r[0]
-    assert model_error_bound(feeder, np.array([heavy]), np.array([0.0]), 1.0)[0] == np.inf
+    assert feeder.model_error_bound(np.array([heavy]), np.array([0.0]), 1.0)[0] == np.inf
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.3, 0.8, 1.2, 1.5])
@@ -186,8 +178,8 @@ def test_bound_holds_up_to_voltage_collapse(angle: float) -> None:
     grid = np.meshgrid(np.linspace(0.01, 2.0, 200), np.linspace(-3.1, 3.1, 41))
     size, turn = (each.ravel() for each in grid)
     p, q = size * np.cos(turn), size * np.sin(turn)
-    bound = model_error_bound(line, p[:, None], q[:, None], np.ones(size.size))[:, 0]
-    found = bus_voltages(line, p[:, None], q[:, None], np.ones(size.size))[:, 1]
+    bound = line.model_error_bound(p[:, None], q[:, None], np.ones(size.size))[:, 0]
+    found = line.bus_voltages(p[:, None], q[:, None], np.ones(size.size))[:, 1]
     there = 1.0 + 2.0 * (line.r * p + line.x * q)
     left = there**2 - 4.0 * size**2
     assert np.isinf(bound[left < 0.0]).all()
@@ -200,8 +192,8 @@ def test_bound_holds_up_to_voltage_collapse(angle: float) -> None:
 def test_no_flow_no_correction() -> None:
     feeder = random_feeder(5)
     still = np.zeros(len(feeder.customers))
-    assert not loss_correction(feeder, still, still, 1.0).any()
-    assert not model_error_bound(feeder, still, still, 1.0).any()
+    assert not feeder.loss_correction(still, still, 1.0).any()
+    assert not feeder.model_error_bound(still, still, 1.0).any()
 
 
 def test_charging_alone_lifts_the_end_of_a_cable() -> None:
@@ -220,14 +212,14 @@ def test_charging_alone_lifts_the_end_of_a_cable() -> None:
     still = np.zeros(1)
     # v1 = v0 / (1 - x b / 2): the voltage divider of series reactance and half the shunt.
     exact = (1.0 / (1.0 - 0.1 * 0.1)) ** 2
-    assert 1.0 + loss_correction(feeder, still, still, 1.0, steps=50)[1] == pytest.approx(exact, abs=1e-14)
+    assert 1.0 + feeder.loss_correction(still, still, 1.0, steps=50)[1] == pytest.approx(exact, abs=1e-14)
 
 
 def test_at_least_one_step() -> None:
     feeder = random_feeder(0)
     still = np.zeros(len(feeder.customers))
     with refused(InputInvalid, "out-of-range"):
-        loss_correction(feeder, still, still, 1.0, steps=0)
+        feeder.loss_correction(still, still, 1.0, steps=0)
 
 
 def from_pandapower(
@@ -280,13 +272,13 @@ def test_against_pandapower(name: str, scale: float) -> None:
     feeder, p, q, order = from_pandapower(net, source, 1e4 if name == "case33bw" else 100.0)
     exact = net.res_bus.vm_pu.loc[order].to_numpy()
     v0 = float(exact[0] ** 2)
-    model = lindistflow(feeder)
+    model = feeder.linear()
     linear = v0 - 2 * (model.R_bus @ p + model.X_bus @ q)
-    corrected = linear + loss_correction(feeder, -p, -q, v0)
+    corrected = linear + feeder.loss_correction(-p, -q, v0)
     before, after = (np.max(np.abs(np.sqrt(v2) - exact)) for v2 in (linear, corrected))
     # Measured 23 to 127 times on these; the worst is case33bw at full load with 8.7 % drop.
     assert after < before / 15
-    assert np.all(np.abs(corrected - exact**2)[feeder.bus] <= model_error_bound(feeder, -p, -q, v0) + 1e-9)
+    assert np.all(np.abs(corrected - exact**2)[feeder.bus] <= feeder.model_error_bound(-p, -q, v0) + 1e-9)
     assert 2 * after < 0.1 * 0.03  # far below the smallest lie to be named
 
 

@@ -11,7 +11,6 @@ from hypothesis import given, settings
 
 from gridsec.arrays import Floats
 from gridsec.errors import InputInvalid
-from gridsec.grid import radial as balanced
 from gridsec.grid.three_phase import (
     ThreePhaseFeeder,
     bus_voltages,
@@ -145,8 +144,8 @@ def test_a_balanced_feeder_is_the_single_phase_equivalent(seed: int, charging: f
     p, q = 0.1 * rng.normal(size=(2, one.bus.size))
     # kW / S on the balanced feeder, kW / (S / 3) here.
     own_p, own_q = three.connections(3 * p), three.connections(3 * q)
-    linear = balanced.bus_voltages(one, p, q, 1.02, steps=0)
-    limit = balanced.bus_voltages(one, p, q, 1.02, steps=40)
+    linear = one.bus_voltages(p, q, 1.02, steps=0)
+    limit = one.bus_voltages(p, q, 1.02, steps=40)
     v0 = np.full(3, 1.02)
     for phase in range(3):
         got = bus_voltages(three, own_p, own_q, v0, steps=0)[phase]

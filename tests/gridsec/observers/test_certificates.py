@@ -14,7 +14,7 @@ from scipy.linalg import expm
 from gridsec.arrays import spectral_radius
 from gridsec.errors import DesignInfeasible
 from gridsec.grid.droop import Droop, fleet
-from gridsec.grid.radial import Feeder, lindistflow
+from gridsec.grid.radial import Feeder
 from gridsec.observers.certificates import (
     Certificate,
     certify,
@@ -363,7 +363,7 @@ def test_published_village_feeders(name: str) -> None:
     assert certificate.kind == "reactance"
     assert certificate.rate * droop.tau[0] > 0.98
     # The statement behind it: S T^-1 Delta Pi S is positive semidefinite for every set and slope.
-    S = 2.0 * lindistflow(feeder).X
+    S = 2.0 * feeder.linear().X
     rng = np.random.default_rng(0)
     for _ in range(20):
         weight = droop.slope * rng.random(p.size) * (rng.random(p.size) < 0.5)

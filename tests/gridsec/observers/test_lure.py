@@ -15,7 +15,7 @@ from scipy.optimize import minimize
 from gridsec.arrays import spectral_radius
 from gridsec.errors import DesignInfeasible, FeederInvalid, InputInvalid
 from gridsec.grid.droop import PRESETS, Droop, fleet
-from gridsec.grid.radial import lindistflow, loss_correction, squared_voltages
+from gridsec.grid.radial import squared_voltages
 from gridsec.observers.lure import (
     POLICY,
     Lure,
@@ -55,10 +55,10 @@ def test_outputs_of_the_loop_are_the_voltages_of_the_power_flow(seed: int) -> No
     own, meters = rng.integers(0, count, 3), rng.integers(0, count, 4)
     droop = fleet(own, list(rng.choice(PRESETS, 3)), rng.uniform(3, 10, 3), 100.0, vbar=1.01)
     lure = close_loop(feeder, droop, meters)
-    model = lindistflow(feeder)
+    model = feeder.linear()
     p, q = rng.uniform(-0.1, 0.1, (2, count))
     x = rng.uniform(-0.05, 0.05, 3)
-    correction = loss_correction(feeder, p, q, 1.03)[feeder.bus]
+    correction = feeder.loss_correction(p, q, 1.03)[feeder.bus]
     u = known_input(model, 1.01, p, q, 1.03, correction)
     total = q.copy()
     np.add.at(total, own, x)
@@ -71,7 +71,7 @@ def test_outputs_of_the_loop_are_the_voltages_of_the_power_flow(seed: int) -> No
 
 
 def test_known_input_in_batches() -> None:
-    model = lindistflow(random_feeder(4))
+    model = random_feeder(4).linear()
     rng = np.random.default_rng(0)
     p, q = rng.uniform(-1, 1, (2, 2, 3, len(model.R)))
     v0 = rng.uniform(0.9, 1.1, (2, 3))

@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from gridsec.estimators.exact_bank import bank as banks
-from gridsec.grid.radial import lindistflow, squared_voltages
+from gridsec.grid.radial import squared_voltages
 from gridsec.observers.gains import circle_matrix
 from gridsec.observers.lmi import circle
 from gridsec.observers.lure import advance, close_loop, equilibrium, known_input
@@ -209,7 +209,7 @@ class TestErrata:
         # The project's own loop and known input, on a line with these impedances, give the same voltages.
         of = chong2020.setting(N)
         line = replace(of.feeder, r=np.concatenate([R, Rp]), x=np.concatenate([X, Xp]))
-        lure, model = close_loop(line, of.droop, np.arange(N)), lindistflow(line)
+        lure, model = close_loop(line, of.droop, np.arange(N)), line.linear()
         np.testing.assert_allclose(lure.H, H, atol=1e-15)
         ours = known_input(model, 1.0, rho, -qc, v0**2)
         np.testing.assert_allclose(ours, w, atol=1e-15)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gridsec.arrays import Floats
-from gridsec.grid.radial import Feeder, bus_voltages, lindistflow
+from gridsec.grid.radial import Feeder
 from gridsec.planning.calibration import Doubts, Places, Series, lengthened, regressors, steps
 from tests.gridsec.planning.small import tree
 
@@ -20,7 +20,7 @@ def scene(seed: int) -> tuple[Feeder, Places, Series]:
     feeder, _, meters, _ = tree(seed)
     rng = np.random.default_rng(seed)
     buses = np.arange(len(feeder.buses))
-    flow = lindistflow(replace(feeder, bus=buses, customers=tuple(map(str, buses))))
+    flow = replace(feeder, bus=buses, customers=tuple(map(str, buses))).linear()
     weight = np.zeros((feeder.bus.size, buses.size))
     weight[np.arange(feeder.bus.size), feeder.bus] = 1.0
     start = feeder.start[:, None]
@@ -47,7 +47,7 @@ def scene(seed: int) -> tuple[Feeder, Places, Series]:
 
 
 def voltages(feeder: Feeder, p: Floats, q: Floats) -> Floats:
-    return bus_voltages(feeder, p, q, np.ones(len(p)), steps=0)
+    return feeder.bus_voltages(p, q, np.ones(len(p)), steps=0)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -19,7 +19,6 @@ from gridsec.planning.redundancy import (
     part_redundancy,
     parts,
     patterns,
-    tree_bus,
     unknown_pair,
     unknown_voltages,
 )
@@ -71,7 +70,7 @@ def test_parts_and_silent_meters_equal_brute_force(seed: int, persistent: bool, 
     found = given(A, C, persistent=persistent)
     silent = np.arange(len(C)) == seed % len(C)
     live = np.flatnonzero(~silent).tolist()
-    for part in parts(whole, tree_bus(feeder)[meters], NONE):
+    for part in parts(whole, feeder.customer_bus[meters], NONE):
         inside = [j for j in part.meters.tolist() if not silent[j]]
         counted = part_redundancy(found, part, silent).count
         assert counted == brute(A, C, inside, live, persistent=persistent)

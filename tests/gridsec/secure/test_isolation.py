@@ -18,7 +18,6 @@ from feeders.simulation.powerflow import PowerFlow
 from gridsec.arrays import Floats
 from gridsec.errors import DesignInfeasible, InputInvalid, NotObservable
 from gridsec.grid.droop import Droop, curve_gap, voltage_curve
-from gridsec.grid.radial import lindistflow, loss_correction
 from gridsec.interface import Cause, Decision
 from gridsec.observers.lmi.sampled import DiscreteLure, advance
 from gridsec.observers.lure import close_loop, known_input
@@ -371,7 +370,7 @@ def test_both_are_named_under_ac_power_flow() -> None:
     keep = [2, 3, 5]
     full = site.droop
     droop = Droop(full.customer[keep], full.v[keep], full.q[keep], full.tau[keep], full.vbar)
-    lure, model, flow = close_loop(site.feeder, droop, site.meters), lindistflow(site.feeder), PowerFlow(site)
+    lure, model, flow = close_loop(site.feeder, droop, site.meters), site.feeder.linear(), PowerFlow(site)
     base, volt = site.feeder.base_kva, site.feeder.base_volt
     plant = inverters(
         lure,
@@ -401,7 +400,7 @@ def test_both_are_named_under_ac_power_flow() -> None:
         for _ in range(3):
             known = q.copy()
             known[droop.customer] += guess
-            losses = loss_correction(site.feeder, p, known, 1.0, steps=5)[site.feeder.bus]
+            losses = site.feeder.loss_correction(p, known, 1.0, steps=5)[site.feeder.bus]
             u = known_input(model, droop.vbar, p, q, 1.0, losses)
             after, answer = step(made, state, y, u, np.ones(6, dtype=np.bool_))
             guess = answer.x

@@ -31,7 +31,6 @@ from feeders.studies.campaign.study import Campaign, NothingPlayed, campaign, fa
 from feeders.studies.journal import OtherStudy, edition
 from feeders.studies.workers import ClusterUnusable, Dask, Here, Processes, WorkerLost, agree, versions
 from gridsec.errors import InputInvalid
-from gridsec.grid.radial import lindistflow
 from tests.codes import refused
 from tests.feeders import stations
 from tests.feeders.model.test_taps import village
@@ -172,7 +171,7 @@ def test_cases_follow_from_their_numbers_alone() -> None:
 
 def test_places() -> None:
     site = load("kerber-dorfnetz")
-    model = lindistflow(site.feeder)
+    model = site.feeder.linear()
     own = np.diagonal(model.R)
     random = np.random.default_rng(1)
 

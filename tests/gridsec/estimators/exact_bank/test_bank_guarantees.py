@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from gridsec.errors import DesignInfeasible, InputInvalid
 from gridsec.estimators.exact_bank import bank as banks
-from gridsec.grid.radial import lindistflow
 from gridsec.observers import lure as lures
 from gridsec.observers.lure import Lure, close_loop, equilibrium
 from tests.codes import refused
@@ -114,7 +113,7 @@ class TestNetReactivePower:
         own = np.asarray(CASES[name].get("inverters", np.arange(6)))
         droop = mixed_fleet(own, rng)
         lure = close_loop(feeder, droop, np.arange(6))
-        column = -2.0 * lindistflow(feeder).X
+        column = -2.0 * feeder.linear().X
         bank = banks.design(lure, 2, reactive=column)
         seen = np.ones(6, dtype=bool)
         net = np.array([0.01, np.nan, 0.02, -0.01, np.nan, 0.03])

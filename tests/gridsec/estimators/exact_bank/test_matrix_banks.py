@@ -12,7 +12,7 @@ from gridsec.estimators.exact_bank import bank as banks
 from gridsec.estimators.exact_bank.bank import Gains
 from gridsec.estimators.plant import Plant
 from gridsec.grid.meshed import MeshedFeeder
-from gridsec.grid.network import Power, between
+from gridsec.grid.network import Power
 from gridsec.interface import Decision
 from gridsec.observers.certificates import certify, verify
 from gridsec.observers.gains import margin, options_for, stacked
@@ -52,7 +52,7 @@ class TestAsymmetricLoop:
 
     def test_every_observer_by_matrix_inequality_forgets_as_fast_as_it_says(self) -> None:
         plant, lure = loop()
-        load = 0.01 * np.hstack([2.0 * between(plant.feeder, power) for power in Power])
+        load = 0.01 * np.hstack([2.0 * plant.feeder.between(power) for power in Power])
         options = options_for(lure, rate=0.25 * certify(lure).rate, noise=0.002, load=load, floor=0.5)
         masks = banks.subsets(5, 1, most=100).masks()
         made = solve_many(lure, [np.flatnonzero(mask).tolist() for mask in masks], options, workers=1)

@@ -15,7 +15,6 @@ from gridsec.estimators.exact_bank import bank as banks
 from gridsec.estimators.exact_bank.step import MonitorDesign, MonitorState
 from gridsec.estimators.plant import Options
 from gridsec.grid.droop import Droop
-from gridsec.grid.radial import lindistflow
 from gridsec.interface import Cause, Decision, Frame
 from gridsec.observers.certificates import Certificate, certify
 from gridsec.observers.gains import stacked
@@ -258,7 +257,7 @@ class TestDesign:
         rng = np.random.default_rng(46)
         plant = make_plant(rng, customers=4, drop=0.02, presets=("ieee1547-b",))
         lure = exact_bank.design(plant, max_attacked=1, step_s=1.0).bank.lure
-        model = lindistflow(plant.feeder)
+        model = plant.feeder.linear()
         options = {"rate": 0.05, "noise": 5e-4, "load": 2.0 * np.hstack([model.R * 6e-3, model.X * 2e-3])}
         masks = banks.subsets(4, 1, most=100).masks()
         designs = [circle(lure, np.flatnonzero(mask), **options) for mask in masks]

@@ -6,7 +6,6 @@ from math import inf, log, sqrt
 
 import numpy as np
 import pytest
-from tests.gridsec.estimators.modal.test_filter import mixed, proportional
 
 from benchmarks._residuals import Dense, Source, model_of, power_columns, root, tree
 from gridsec.arrays import Bools, Floats
@@ -14,6 +13,7 @@ from gridsec.estimators.modal import detector, signatures, static
 from gridsec.estimators.modal import filter as modal
 from gridsec.estimators.modal.model import Modes, ResidualModel, modes
 from gridsec.estimators.modal.signatures import Columns, Onsets, Scores
+from tests.gridsec.estimators.modal.test_filter import mixed, proportional
 
 FEEDER = tree(12, np.random.default_rng(3))
 

@@ -7,12 +7,12 @@ from math import comb
 
 import numpy as np
 import pytest
-from tests.gridsec.estimators.modal.test_detector import FEEDER, busbar
 
 from gridsec.arrays import Bools
 from gridsec.estimators.modal import search as s
 from gridsec.estimators.modal.model import modes
 from gridsec.estimators.modal.search import Problem, Tableau
+from tests.gridsec.estimators.modal.test_detector import FEEDER, busbar
 
 
 def problem(seed: int, p: int = 8, others: int = 2, liars: int = 2, size: float = 1.0) -> Problem:

@@ -16,8 +16,6 @@ from gridsec.estimators.sequential.conditional import fit, judge
 from gridsec.estimators.sequential.loads import prior
 from gridsec.estimators.sequential.words import ways
 from gridsec.grid.meter import busbar_error
-from gridsec.grid.network import bus_voltages
-from gridsec.grid.radial import lindistflow
 from gridsec.interface import Cause, Decision, Explanation, Frame
 from tests.gridsec.estimators.sequential.test_monitor import Answers, prepare, watch
 from tests.gridsec.estimators.sequential.test_phases import apart
@@ -104,7 +102,7 @@ class TestOneMore:
     def test_errors_of_powers_at_their_ends_explain_what_they_can_and_no_more(self, active: bool) -> None:
         """By the matrices of the linear model: all that errs does so in the worst direction."""
         design, rng = self.design, np.random.default_rng(8)
-        plant, model = design.plant, lindistflow(design.plant.feeder)
+        plant, model = design.plant, design.plant.feeder.linear()
         everybody, none = np.ones(CUSTOMERS, dtype=np.bool_), np.zeros(CUSTOMERS, dtype=np.bool_)
         now, fixed = fit(design.prior, self.noise, everybody), rng.uniform(0.0, 1e-3, CUSTOMERS)
         errors, nothing = rng.uniform(0.01, 0.05, CUSTOMERS), np.zeros(CUSTOMERS)
@@ -232,7 +230,7 @@ class TestPhases:
         design = sequential.design(whole, doubt=doubt, step_s=1.0, max_attacked=most)
         v0 = np.array([1.0, 1.02, 0.99])
         p, q = -0.01 * rng.random(count), np.zeros(count)
-        v2 = bus_voltages(whole.feeder, p, q, v0**2, steps=3)[whole.feeder.bus]
+        v2 = whole.feeder.bus_voltages(p, q, v0**2, steps=3)[whole.feeder.bus]
         state, none, zero = sequential.init(design, 0.0), np.full(count, np.nan), np.zeros(count)
         for k in range(1, 60):
             y = v2 * (1.0 + 0.001 * rng.normal(size=count))

@@ -7,7 +7,7 @@ import pytest
 
 from gridsec.estimators.sequential import effects as module
 from gridsec.estimators.sequential.effects import Effects
-from gridsec.grid.network import Network, Power, columns
+from gridsec.grid.network import Network, Power
 from tests.gridsec.grid.test_network import phased
 from tests.gridsec.meshes import random_mesh
 from tests.gridsec.radial import random_feeder
@@ -31,7 +31,7 @@ def test_numbers_are_active_powers_first(name: str, kept: bool, monkeypatch: pyt
         monkeypatch.setattr(module, "_PART", 2)
     effects, rng = Effects(feeder), np.random.default_rng(5)
     assert (effects.table is not None) is kept
-    both = [columns(feeder, power, np.arange(count)) for power in Power]
+    both = [feeder.columns(power, np.arange(count)) for power in Power]
     expected = np.hstack(both)
     assert not np.allclose(*both)
     which = rng.permutation(2 * count)[: count + 1]

@@ -21,7 +21,7 @@ from gridsec.estimators.sequential.search import Explanation, Found, Solution, d
 from gridsec.estimators.sequential.windows import push
 from gridsec.grid.droop import fleet
 from gridsec.grid.meter import MeterAccuracy
-from gridsec.grid.network import Power, columns
+from gridsec.grid.network import Power
 from gridsec.grid.radial import Feeder
 from gridsec.interface import Frame
 
@@ -219,7 +219,7 @@ def test_a_street_is_turned_round_where_powers_are_accused_too() -> None:
         w = rng.multivariate_normal(np.zeros(count), design.prior.between + 1e-18 * np.eye(count))
         group = NEAR + rng.choice(FAR, 7, replace=False)
         m = w + np.sqrt(design.white) * rng.normal(size=count)
-        m -= 0.2 * columns(feeder, Power.ACTIVE, group[:1])[feeder.bus, 0]
+        m -= 0.2 * feeder.columns(Power.ACTIVE, group[:1])[feeder.bus, 0]
         m[group] -= 0.018
         made, now, _ = prepared(design, m)
         for each in made._turned(made._descend(now, np.zeros(count, dtype=bool), design.book)):

@@ -22,7 +22,6 @@ from gridsec.attack import Bias, Replay
 from gridsec.estimators.sequential import kinds, repeats
 from gridsec.estimators.sequential.kinds import Shapes
 from gridsec.estimators.sequential.repeats import BLOCKS, BYTES, ROWS, SPAN, Block, Memory, Rules
-from gridsec.grid.radial import lindistflow
 from gridsec.interface import Kind
 
 STEP = 0.1 / 230.0
@@ -271,7 +270,7 @@ class TestShapes:
 
     def test_one_load_s_trace_and_offsets_that_are_none(self) -> None:
         made = design(choose(load("kerber-dorfnetz"), estimator=SEQUENTIAL)).design
-        model, at = lindistflow(made.plant.feeder), made.plant.feeder.bus[made.plant.meters]
+        model, at = made.plant.feeder.linear(), made.plant.feeder.bus[made.plant.meters]
         traces, rng = 2.0 * np.hstack([model.R_bus[at], model.X_bus[at]]), np.random.default_rng(0)
         tried = found = chance = 0
         for _ in range(200):

@@ -18,7 +18,6 @@ from gridsec.estimators.sequential.drive import Free, drive
 from gridsec.estimators.sequential.loads import injection_doubt, prior
 from gridsec.estimators.sequential.windows import empty, forget, push, shift
 from gridsec.grid.droop import fleet
-from gridsec.grid.radial import lindistflow
 from tests.codes import refused
 from tests.gridsec.street import ac_voltages, accuracy, make_plant, random_tree
 
@@ -47,7 +46,7 @@ class TestLoads:
     def test_the_prior_is_that_of_the_matrices(self) -> None:
         rng = np.random.default_rng(2)
         tree = random_tree(12, rng, drop=0.04)
-        model, doubt = lindistflow(tree), LoadDoubt(rng.random(12), rng.random(12), 1.0, 0.3, 0.6)
+        model, doubt = tree.linear(), LoadDoubt(rng.random(12), rng.random(12), 1.0, 0.3, 0.6)
         at, inverters = rng.permutation(13)[:7], rng.random(12)
         found = prior(tree, at, doubt, busbar=0.01, inverters=inverters)
         expected = np.full((13, 13), 1e-4)
@@ -64,7 +63,7 @@ class TestLoads:
         doubt = LoadDoubt(np.full(9, 0.006), np.full(9, 0.002), 600.0)
         made = design(make_plant(rng), doubt=doubt, step_s=1.0)
         plant, book = made.plant, made.book
-        model, at = lindistflow(plant.feeder), plant.feeder.bus[plant.meters]
+        model, at = plant.feeder.linear(), plant.feeder.bus[plant.meters]
         columns = 2.0 * np.hstack([model.R_bus, model.X_bus[:, plant.droop.customer]])
         every = rng.permutation(columns.shape[1])
         np.testing.assert_allclose(book.columns(every), columns[:, every], rtol=1e-12)
@@ -103,7 +102,7 @@ class TestInverters:
         plant = make_plant(rng, drop=0.06)
         doubt = LoadDoubt(np.full(9, 0.01), np.full(9, 0.01), 600.0)
         made = design(plant, doubt=doubt, step_s=1.0)
-        X, droop = 2.0 * lindistflow(plant.feeder).X, plant.droop
+        X, droop = 2.0 * plant.feeder.linear().X, plant.droop
         known, y, who = rng.uniform(*w, 9), np.full(9, 0.9), np.isin(np.arange(9), driven)
         x, free = np.zeros(9), None
         for h in steps:

@@ -20,7 +20,7 @@ from gridsec.estimators.sequential.loads import prior
 from gridsec.grid.droop import Droop
 from gridsec.grid.meshed import MeshedFeeder, PhasedMesh
 from gridsec.grid.meter import MeterAccuracy
-from gridsec.grid.network import InPhases, bus_voltages
+from gridsec.grid.network import InPhases
 from gridsec.grid.phased import PhasedFeeder
 from gridsec.grid.radial import Feeder
 from gridsec.grid.three_phase import ThreePhaseFeeder
@@ -194,8 +194,8 @@ def test_balanced_phases_are_the_single_phase_equivalent() -> None:
     p, q = rng.normal(-0.02, 0.01, (2, count))
     thirds = [np.repeat(each, 3) / 3.0 for each in (p, q)]
     for steps, tolerance in ((0, 1e-13), (1, 1e-5)):
-        expected = bus_voltages(one.feeder, p, q, 1.02, steps=steps)[one.feeder.bus]
-        found = bus_voltages(three.feeder, *thirds, 1.02, steps=steps)[three.feeder.bus]
+        expected = one.feeder.bus_voltages(p, q, 1.02, steps=steps)[one.feeder.bus]
+        found = three.feeder.bus_voltages(*thirds, 1.02, steps=steps)[three.feeder.bus]
         np.testing.assert_allclose(found, np.repeat(expected, 3), rtol=0, atol=tolerance)
     # Errors of the loads as well: the mean over a customer's phases is as uncertain as its balanced voltage.
     made = [design_site(site).design for site in (one, three)]

@@ -18,7 +18,6 @@ from gridsec.estimators.sequential.loads import LoadDoubt, prior
 from gridsec.estimators.sequential.robust import covers, robust
 from gridsec.estimators.sequential.scales import Scale
 from gridsec.estimators.sequential.search import Limits
-from gridsec.grid.radial import lindistflow
 from tests.gridsec.street import random_tree
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -99,7 +98,7 @@ def test_a_fit_of_something_else_covers_nothing(what: str) -> None:
         drop(whole, 2)
         assert not covers(whole, p, noise, live & whole.trusted)
     else:
-        loosen(whole, lindistflow(random_tree(8, np.random.default_rng(5), drop=0.04)).R_bus[:, 0], 1.0)
+        loosen(whole, random_tree(8, np.random.default_rng(5), drop=0.04).linear().R_bus[:, 0], 1.0)
         assert not covers(whole, p, noise, live)
 
 

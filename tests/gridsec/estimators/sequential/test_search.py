@@ -17,7 +17,6 @@ from gridsec.estimators.sequential.exchanges import swaps
 from gridsec.estimators.sequential.loads import LoadDoubt, prior
 from gridsec.estimators.sequential.robust import robust
 from gridsec.estimators.sequential.search import Limits, Recent, Solution, descend, price
-from gridsec.grid.radial import lindistflow
 from tests.gridsec.street import random_tree
 
 SIGMAS = 3.5
@@ -26,7 +25,7 @@ SIGMAS = 3.5
 def street(rng: np.random.Generator, customers: int) -> tuple[Floats, Prior]:
     """A random tree; 2R, and what errors of 0.6 kW do to its voltages."""
     tree = random_tree(customers, rng, drop=0.04)
-    model = lindistflow(tree)
+    model = tree.linear()
     doubt = LoadDoubt(np.full(customers, 0.006), np.full(customers, 0.002), 600.0)
     return 2.0 * model.R_bus, prior(tree, np.arange(1, customers + 1), doubt, busbar=4e-4)
 

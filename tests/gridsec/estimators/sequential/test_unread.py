@@ -13,7 +13,6 @@ from feeders.simulation.scenario import Scenario, simulate, snapshots
 from gridsec.attack import Attack, Replay, Stuck
 from gridsec.estimators.sequential import distrusted, init, nobody, restore
 from gridsec.estimators.sequential.doubts import doubted, none
-from gridsec.grid.radial import lindistflow
 from gridsec.interface import Decision, Frame
 from tests.gridsec.estimators.sequential.test_gaps import LIAR, calm
 from tests.gridsec.estimators.sequential.test_monitor import prepare, watch
@@ -86,7 +85,7 @@ def test_only_those_who_feel_an_inverter_clear_it() -> None:
     """A meter at the other end of the feeder says nothing of it."""
     plant = make_plant(np.random.default_rng(4), customers=12, drop=0.03, inverters=np.arange(5))
     made, street = prepare(plant), Street(plant, np.random.default_rng(6))
-    felt = lindistflow(plant.feeder).X[plant.meters, plant.droop.customer[1]]
+    felt = plant.feeder.linear().X[plant.meters, plant.droop.customer[1]]
     far = int(np.argmin(felt))
     assert felt[far] < 0.2 * felt.max()
     state = restore(made, init(made, street.t), replace(nobody(12, 5), inverters=np.arange(5) == 1))
