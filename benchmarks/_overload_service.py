@@ -3,7 +3,7 @@
     python benchmarks/_overload_service.py TOTALS OPTION...
 
 OPTION are those of `gridsec serve`. On SIGUSR1 the processor time of the judging thread since the start is
-written to the file TOTALS as JSON, {"round": s, "keep_states": s}. The program is run by its path, so that
+written to the file TOTALS as JSON, {"cycle": s, "keep_states": s}. The program is run by its path, so that
 PYTHONPATH chooses the source tree under test.
 """
 
@@ -42,11 +42,11 @@ def timed(totals: dict[str, float], name: str, run: Callable[..., Any]) -> Calla
 def main() -> None:
     """Run the service."""
     from service.cli import main as cli
-    from service.engine.engine import Rounds
+    from service.engine.engine import Engine
 
-    path, totals = Path(sys.argv[1]), {"round": 0.0, "keep_states": 0.0}
+    path, totals = Path(sys.argv[1]), {"cycle": 0.0, "keep_states": 0.0}
     for name in totals:
-        setattr(Rounds, name, timed(totals, name, getattr(Rounds, name)))
+        setattr(Engine, name, timed(totals, name, getattr(Engine, name)))
 
     def write(*_: object) -> None:
         part = path.with_suffix(".part")

@@ -18,10 +18,10 @@ from scipy.sparse.csgraph import breadth_first_order, depth_first_order, dijkstr
 from feeders.format.tables import CustomerRow, FeederMeta, FeederTables, LineRow
 from feeders.model.load_uncertainty import unread
 from feeders.model.site import Site, from_tables, load
-from feeders.registry.registry import SEQUENTIAL, Watcher, design
+from feeders.registry.registry import SEQUENTIAL, DesignedEstimator, design
 from feeders.simulation.demand import Variation
 from feeders.simulation.scenario import START, Scenario
-from feeders.simulation.trial import LoadError, Meters, Trial, Truth, frames
+from feeders.simulation.trial import FrameTruth, LoadError, Trial, TrialMeterErrors, frames
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.attack import Attack
 from gridsec.estimators.sequential import SequentialDesign, SequentialState, init, step
@@ -91,12 +91,16 @@ def _trial(feeder: str, model: Model, step_s: float) -> tuple[Trial, Site]:
     """A trial of a feeder, and its stated site."""
     errors = LoadError() if model is Model.LOADS else None
     variation = Variation(tap_step_pu=0.0)
-    trial = Trial(site(feeder), step_s=step_s, load_error=errors, meters=Meters.SITE, variation=variation)
+    trial = Trial(
+        site(feeder), step_s=step_s, load_error=errors, meters=TrialMeterErrors.SITE, variation=variation
+    )
     return trial, trial.stated
 
 
 @lru_cache(maxsize=32)
-def watcher(feeder: str, model: Model, *, step_s: float = 1.0, commission_s: float = 0.0) -> Watcher:
+def watcher(
+    feeder: str, model: Model, *, step_s: float = 1.0, commission_s: float = 0.0
+) -> DesignedEstimator:
     """The default monitor of a feeder."""
     _, stated = _trial(feeder, model, step_s)
     meta = stated.tables.meta
@@ -122,7 +126,7 @@ def play(
     busbar: tuple[Attack, ...] = (),
     step_s: float = 1.0,
     start: float = START,
-) -> Iterator[tuple[Frame, Truth]]:
+) -> Iterator[tuple[Frame, FrameTruth]]:
     """Frames and truth of a setting.
 
     Parameters

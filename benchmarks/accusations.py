@@ -51,7 +51,7 @@ from benchmarks._scenes import (
 )
 from feeders.model.site import Site
 from feeders.simulation.scenario import START
-from feeders.simulation.trial import Truth
+from feeders.simulation.trial import FrameTruth
 from gridsec.arrays import Floats, Ints
 from gridsec.attack import Attack, Coordinated, Drift, Scaling
 from gridsec.attack import Bias as Shift
@@ -324,7 +324,7 @@ def run(name: str, seed: int, *, trace: bool = False) -> Run:
 
 
 def _tick(
-    out: Run, where: Site, estimate: Estimate, verdict: Verdict, truth: Truth, *, honest_busbar: bool
+    out: Run, where: Site, estimate: Estimate, verdict: Verdict, truth: FrameTruth, *, honest_busbar: bool
 ) -> None:
     error = np.abs(estimate.v2 - truth.v2)
     out.decisions[verdict.decision] += 1
@@ -339,12 +339,12 @@ def _tick(
     out.others += bool(verdict.inverters.any() or (honest_busbar and verdict.busbar.any()))
 
 
-def _volts(where: Site, estimate: Estimate, truth: Truth) -> float:
+def _volts(where: Site, estimate: Estimate, truth: FrameTruth) -> float:
     apart = np.sqrt(np.maximum(estimate.v2, 0.0)) - np.sqrt(truth.v2)
     return float((where.customer_volt * np.abs(apart)).max())
 
 
-def _line(where: Site, frame: Frame, estimate: Estimate, verdict: Verdict, truth: Truth) -> str:
+def _line(where: Site, frame: Frame, estimate: Estimate, verdict: Verdict, truth: FrameTruth) -> str:
     """One tick: seconds since the onset, decision, error in V and in std, names; honest ones with "!"."""
     ids, liars = where.meter_ids, truth.liars
     who = [f"{'' if liars[j] else '!'}{ids[j]}" for j in np.flatnonzero(verdict.suspects)]

@@ -23,7 +23,7 @@ import numpy as np
 
 from benchmarks._arguments import arguments
 from feeders.model.site import Site, load, to_frame
-from feeders.registry.registry import DIRECT, SEQUENTIAL, Watcher, choose, design
+from feeders.registry.registry import DIRECT, SEQUENTIAL, DesignedEstimator, choose, design
 from feeders.simulation.attacks import NoSuchAttack
 from feeders.simulation.scenario import START, Scenario, random_attacks, simulate, snapshots
 from gridsec.interface import Verdict
@@ -56,7 +56,9 @@ def scenario(site: Site, seed: int) -> Scenario:
     return Scenario(seed=seed, duration_s=DURATION_S, profile_s=quiet.profile_s, attacks=attacks)
 
 
-def compare(site: Site, watchers: tuple[Watcher, Watcher], seed: int) -> tuple[list[Verdict], set[int]]:
+def compare(
+    site: Site, watchers: tuple[DesignedEstimator, DesignedEstimator], seed: int
+) -> tuple[list[Verdict], set[int]]:
     """The last verdicts of both on the same readings, and who lied.
 
     Parameters

@@ -27,8 +27,8 @@ import numpy as np
 from benchmarks._arguments import arguments
 from feeders.model.site import load
 from feeders.registry.registry import design
-from feeders.simulation.attacks import Lie, Trick
-from feeders.simulation.trial import Meters, Trial, frames
+from feeders.simulation.attacks import AttackKind, AttackSpec
+from feeders.simulation.trial import Trial, TrialMeterErrors, frames
 from gridsec.interface import Frame
 
 FEEDERS = ("simbench-lv-rural1", "kerber-dorfnetz", "kerber-vorstadtnetz", "ieee-european-lv")
@@ -47,7 +47,7 @@ class Run:
     error: float
 
 
-def run(feeder: str, meters: Meters, percent: float, lie: Lie | None, seed: int) -> Run:
+def run(feeder: str, meters: TrialMeterErrors, percent: float, lie: AttackSpec | None, seed: int) -> Run:
     """Watch one run.
 
     Parameters
@@ -87,7 +87,7 @@ def _lying(frame: Frame, factor: float) -> Frame:
     return replace(frame, v0_squared=frame.v0_squared * factor, v0_phases=v0_phases)
 
 
-def row(case: tuple[str, Meters, float], what: str, lie: Lie | None, seeds: int) -> str:
+def row(case: tuple[str, TrialMeterErrors, float], what: str, lie: AttackSpec | None, seeds: int) -> str:
     """One line of the table."""
     feeder, meters, percent = case
     runs = [run(feeder, meters, percent, lie, seed) for seed in range(seeds)]
@@ -105,13 +105,16 @@ def main(seeds: int) -> None:
     print("| feeder | meters | busbar, % | liars | named | after, s | liars named | honest | error, % |")
     print("|---|---|---|---|---|---|---|---|---|")
     for feeder in FEEDERS:
-        for meters in (Meters.WHITE, Meters.REAL):
+        for meters in (TrialMeterErrors.WHITE, TrialMeterErrors.REAL):
             for percent in SIZES:
                 print(row((feeder, meters, percent), "honest", None, seeds), flush=True)
             for percent in (1.0, -3.0):
-                print(row((feeder, meters, percent), "a third, +-3 %", Lie(Trick.BIAS), seeds), flush=True)
+                print(
+                    row((feeder, meters, percent), "a third, +-3 %", AttackSpec(AttackKind.BIAS), seeds),
+                    flush=True,
+                )
             for size in (3.0, -1.5):
-                lie = Lie(Trick.TOGETHER, size=size)
+                lie = AttackSpec(AttackKind.TOGETHER, size=size)
                 print(row((feeder, meters, 0.0), f"a third, {size:+g} % all", lie, seeds), flush=True)
 
 

@@ -42,7 +42,7 @@ from feeders.model.equipment import find
 from feeders.model.site import from_tables
 from feeders.model.three_phase import three_phase
 from feeders.simulation.recording import Recording, record
-from feeders.studies.calibrate.search import Kind, apply, longer
+from feeders.studies.calibrate.search import FileErrorKind, apply, longer
 from feeders.studies.calibrate.study import Calibrate, calibrate
 
 FEEDERS: Final = ("cigre-lv", "kerber-landnetz", "simbench-lv-rural1")
@@ -60,7 +60,7 @@ NEAR: Final = 0.15
 class Recorded(intervals.Recorded):
     """The same, and the searched kinds."""
 
-    kinds: tuple[Kind, ...] = tuple(Kind)
+    kinds: tuple[FileErrorKind, ...] = tuple(FileErrorKind)
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,7 +163,9 @@ def judged(truth: FeederTables, files: FeederTables, line: str, found: Calibrate
     if not line:
         same = tables == truth
     else:
-        factors = {wrong.names[0]: wrong.factor for wrong in found.corrections if wrong.kind is Kind.LENGTH}
+        factors = {
+            wrong.names[0]: wrong.factor for wrong in found.corrections if wrong.kind is FileErrorKind.LENGTH
+        }
         same = set(factors) == {line} and abs(factors[line] / LONGER - 1.0) < NEAR and others == 0
     return same, false_lengths, others
 
@@ -218,11 +220,15 @@ if __name__ == "__main__":
     parser.add_argument("--days", type=positive, default=1.0)
     parser.add_argument("--step", type=positive, default=900.0, help="interval of the readings, s")
     parser.add_argument("--hidden-kw", type=float, default=0.1)
-    parser.add_argument("--look-for", nargs="+", choices=list(map(str, Kind)), default=list(map(str, Kind)))
+    parser.add_argument(
+        "--look-for", nargs="+", choices=list(map(str, FileErrorKind)), default=list(map(str, FileErrorKind))
+    )
     wanted = parser.parse_args()
     main(
         range(wanted.first, wanted.first + wanted.seeds),
         wanted.feeders,
         wanted.errors,
-        Recorded(wanted.days, wanted.step, wanted.hidden_kw, tuple(Kind(each) for each in wanted.look_for)),
+        Recorded(
+            wanted.days, wanted.step, wanted.hidden_kw, tuple(FileErrorKind(each) for each in wanted.look_for)
+        ),
     )

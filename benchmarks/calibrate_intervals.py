@@ -25,7 +25,7 @@ import numpy as np
 from benchmarks._arguments import count, positive
 from feeders.model.site import Site, load
 from feeders.simulation.demand import Variation
-from feeders.simulation.meters import Channel, MeterErrors, Meters
+from feeders.simulation.meters import Channel, MeterErrors, SimulatedMeters
 from feeders.simulation.recording import record
 from feeders.simulation.scenario import Scenario
 from feeders.studies.calibrate.study import calibrate
@@ -61,7 +61,7 @@ def errors(site: Site, what: Recorded, seed: int, folder: Path) -> tuple[Floats,
     """Errors of one calibration's estimates in their standard errors, and whether anything was proposed."""
     given = what.scenario(seed)
     found = calibrate(site, record(site, given, folder / "readings.parquet"))
-    meters = Meters(site, given.errors, given.channel, seed)
+    meters = SimulatedMeters(site, given.errors, given.channel, seed)
     bias = 100.0 * (meters.bias - meters.busbar_bias)
     known = found.meters["std_percent"].to_numpy() > 0.0
     of_meters = ((found.meters["bias_percent"] - bias) / found.meters["std_percent"]).to_numpy()[known]

@@ -27,7 +27,7 @@ from distributed import LocalCluster
 
 from benchmarks._arguments import arguments
 from feeders.model.site import load
-from feeders.studies.campaign.plan import Plan
+from feeders.studies.campaign.plan import CampaignPlan
 from feeders.studies.campaign.study import Campaign, campaign
 from feeders.studies.workers import Dask, Processes, Runner
 
@@ -54,7 +54,7 @@ class Measured:
     each_s: float
 
 
-def measure(name: str, where: AbstractContextManager[Runner], plan: Plan) -> Measured:
+def measure(name: str, where: AbstractContextManager[Runner], plan: CampaignPlan) -> Measured:
     """Play a plan, and print what it took.
 
     Parameters
@@ -99,7 +99,7 @@ def main(scenes: int, *, full: bool) -> int:
     full
         Whether to play 10 000 scenarios rather than to extrapolate.
     """
-    plan = Plan(scenes=scenes)
+    plan = CampaignPlan(scenes=scenes)
     one = measure("one process", nullcontext(Processes(1)), plan)
     two = measure("two processes", nullcontext(Processes(2)), plan)
     far = measure("Dask, two workers", dask(), plan)

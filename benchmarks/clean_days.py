@@ -36,13 +36,13 @@ from scipy.stats import poisson
 
 from feeders.model.profiles import Season, library
 from feeders.model.site import Site, from_tables, load, names
-from feeders.simulation.scenario import START, Reading, Scenario, simulate
+from feeders.simulation.scenario import START, Scenario, SimulatedReading, simulate
 from gridsec.arrays import Floats
 from gridsec.interface import Decision
 from service.alarms.alarm import Change
 from service.alarms.conditions import AlarmKind
 from service.engine.feeder_monitor import TickResult
-from service.engine.replay import Tally, replay
+from service.engine.replay import ReplayCounts, replay
 
 DAY_S, YEAR_S = 86_400.0, 365.25 * 86_400.0
 SETTLED_S = 120.0
@@ -117,7 +117,7 @@ def play(run: Run) -> Seen:
     seen.learned_s = max(seen.span_s - meta.monitor.commission_s, 0.0)
     truth: dict[float, Floats] = {}
 
-    def readings() -> Iterator[Reading]:
+    def readings() -> Iterator[SimulatedReading]:
         samples = simulate(site, run.scenario)
         while True:
             began = process_time()
@@ -129,7 +129,7 @@ def play(run: Run) -> Seen:
             yield from sample.readings
 
     began = process_time()
-    for result in replay(site, readings(), Tally()):
+    for result in replay(site, readings(), ReplayCounts()):
         _count(seen, site, result, truth)
         for t in [t for t in truth if t <= result.report.t]:
             del truth[t]

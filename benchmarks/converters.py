@@ -36,7 +36,7 @@ from power_grid_model.utils import json_serialize_to_file
 
 from benchmarks._arguments import arguments
 from feeders.convert.convert import Conversion, convert
-from feeders.convert.provenance import WHOLE, Change
+from feeders.convert.provenance import WHOLE, ConversionChange
 from feeders.format.tables import FeederTables, LineRow, read
 from feeders.model.site import load
 from gridsec.errors import GridsecError
@@ -184,7 +184,7 @@ def power_grid_model(path: Path, tables: FeederTables) -> Path:
     return path
 
 
-def left_out(changes: tuple[Change, ...]) -> str:
+def left_out(changes: tuple[ConversionChange, ...]) -> str:
     """What was left out or approximated, by kind."""
     found: Counter[str] = Counter()
     for each in changes:

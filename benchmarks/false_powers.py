@@ -26,22 +26,22 @@ import numpy as np
 
 from benchmarks._arguments import arguments
 from feeders.model.site import Site, load, to_frame
-from feeders.registry.registry import SEQUENTIAL, Watcher, choose, design
-from feeders.simulation.attacks import Lie, NoSuchAttack, Trick, manipulations
+from feeders.registry.registry import SEQUENTIAL, DesignedEstimator, choose, design
+from feeders.simulation.attacks import AttackKind, AttackSpec, NoSuchAttack, manipulations
 from feeders.simulation.scenario import START, Scenario, simulate, snapshots
 
 FEEDERS = ("cigre-lv", "simbench-lv-rural1", "kerber-landnetz", "simbench-lv-rural3")
 DURATION_S, ONSET_S, MOST = 90.0, 30.0, 2
 LIES = (
-    Lie(Trick.COORDINATED_POWER, 2, 3.0, ONSET_S),
-    Lie(Trick.POWER, 1, 2.0, ONSET_S),
-    Lie(Trick.COORDINATED, 2, 3.0, ONSET_S),
-    Lie(Trick.BIAS, 2, 3.0, ONSET_S),
+    AttackSpec(AttackKind.COORDINATED_POWER, 2, 3.0, ONSET_S),
+    AttackSpec(AttackKind.POWER, 1, 2.0, ONSET_S),
+    AttackSpec(AttackKind.COORDINATED, 2, 3.0, ONSET_S),
+    AttackSpec(AttackKind.BIAS, 2, 3.0, ONSET_S),
 )
 OUTCOMES = ("exactly", "some", "explained", "undecided", "honest named", "clean")
 
 
-def outcome(site: Site, watcher: Watcher, lie: Lie, seed: int) -> str:
+def outcome(site: Site, watcher: DesignedEstimator, lie: AttackSpec, seed: int) -> str:
     """What came of one run.
 
     Parameters

@@ -15,7 +15,7 @@ from time import process_time
 import numpy as np
 
 from feeders.model.site import Site, load, to_frame
-from feeders.registry.registry import SEQUENTIAL, Watcher, choose, design
+from feeders.registry.registry import SEQUENTIAL, DesignedEstimator, choose, design
 from feeders.simulation.attacks import NoSuchAttack
 from feeders.simulation.meters import MeterErrors
 from feeders.simulation.scenario import START, Scenario, random_attacks, simulate, snapshots
@@ -58,7 +58,7 @@ def attacks(site: Site, kind: str, seed: int) -> tuple[tuple[Attack, ...], float
     return tuple(replace(one, delay_s=DELAY_S) if isinstance(one, Replay) else one for one in drawn), off
 
 
-def watch(site: Site, watcher: Watcher, scenario: Scenario) -> Seen:
+def watch(site: Site, watcher: DesignedEstimator, scenario: Scenario) -> Seen:
     """Play a scenario and remember what was said of whom."""
     liars = {int(j) for attack in scenario.attacks for j in attack.meters}
     on = min((attack.t_on for attack in scenario.attacks), default=START)

@@ -32,7 +32,7 @@ import numpy as np
 
 from benchmarks._arguments import arguments
 from feeders.model.site import Site, Snapshot, from_tables, load, to_frame
-from feeders.registry.registry import Watcher, design
+from feeders.registry.registry import DesignedEstimator, design
 from feeders.simulation.demand import Customers, Variation
 from feeders.simulation.powerflow import PowerFlow
 from feeders.simulation.scenario import START
@@ -78,7 +78,7 @@ def site(interval_s: float) -> Site:
 
 
 @lru_cache(maxsize=4)
-def watcher(interval_s: float) -> Watcher:
+def watcher(interval_s: float) -> DesignedEstimator:
     """The default monitor of that feeder."""
     return design(site(interval_s))
 

@@ -39,8 +39,8 @@ import numpy as np
 
 from benchmarks._arguments import arguments
 from feeders.model.site import Site, from_tables, load
-from feeders.registry.registry import Watcher, design
-from feeders.simulation.trial import LoadError, Meters, Trial, frames
+from feeders.registry.registry import DesignedEstimator, design
+from feeders.simulation.trial import LoadError, Trial, TrialMeterErrors, frames
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.estimators.modal import core, estimate, signatures, static
 from gridsec.estimators.modal import filter as modal
@@ -72,7 +72,7 @@ def site(feeder: str) -> Site:
 
 
 @lru_cache(maxsize=8)
-def watcher(feeder: str, meters: Meters) -> Watcher:
+def watcher(feeder: str, meters: TrialMeterErrors) -> DesignedEstimator:
     """The default monitor of a feeder; fixed errors are not learned."""
     stated = Trial(site(feeder), meters=meters).stated
     settings = replace(stated.tables.meta.monitor, commission_s=0.0)
@@ -80,7 +80,7 @@ def watcher(feeder: str, meters: Meters) -> Watcher:
 
 
 @lru_cache(maxsize=8)
-def kernel_of(feeder: str, meters: Meters) -> Core:
+def kernel_of(feeder: str, meters: TrialMeterErrors) -> Core:
     """The core beside `watcher`, with the connections of the files."""
     where = site(feeder)
     kw = np.array([max(row.load_kw, row.pv_kw) for row in where.tables.customers])
@@ -150,7 +150,7 @@ class Delays:
     named_new: float
 
 
-def delay(made: Watcher, kernel: Core, part: float, seed: int) -> Delays:
+def delay(made: DesignedEstimator, kernel: Core, part: float, seed: int) -> Delays:
     """One step of one meter."""
     world, f = World(made.design, seed), squared(part)
     p = kernel.modes.size
@@ -266,7 +266,7 @@ class Third:
     bound: float
 
 
-def attacked(made: Watcher, kernel: Core, kind: str, part: float, seed: int) -> Third:
+def attacked(made: DesignedEstimator, kernel: Core, kind: str, part: float, seed: int) -> Third:
     """One run."""
     world, lie = World(made.design, seed), third(kernel, kind, part, seed)
     state, mine, liars = made.init(0.0), core.init(kernel, 0.0), lie != 0.0
@@ -357,11 +357,11 @@ class Honest:
 def honest(feeder: str, seed: int, ticks: int = 240) -> Honest:
     """AC power flow as the truth; the core beside the default monitor."""
     trial = Trial(
-        site(feeder), seed=seed, duration_s=float(ticks), meters=Meters.REAL, load_error=LoadError()
+        site(feeder), seed=seed, duration_s=float(ticks), meters=TrialMeterErrors.REAL, load_error=LoadError()
     )
-    made = watcher(feeder, Meters.REAL)
+    made = watcher(feeder, TrialMeterErrors.REAL)
     front: SequentialDesign = made.design
-    kernel = kernel_of(feeder, Meters.REAL)
+    kernel = kernel_of(feeder, TrialMeterErrors.REAL)
     state, mine, most = None, None, -np.inf
     errors: list[Floats] = []
     took: list[tuple[float, float]] = []
@@ -425,8 +425,8 @@ def main(runs: int, names: tuple[str, ...]) -> None:
     """All tables."""
     head("feeder, meters", "step, %", "Lorden", "GLR", "not CLEAN", "named", "core alarms", "core names")
     for feeder in names:
-        made = watcher(feeder, Meters.WHITE)
-        kernel = kernel_of(feeder, Meters.WHITE)
+        made = watcher(feeder, TrialMeterErrors.WHITE)
+        kernel = kernel_of(feeder, TrialMeterErrors.WHITE)
         for part in STEPS:
             each = [delay(made, kernel, part, seed) for seed in range(runs)]
             cells = [mean([getattr(one, name) for one in each]) for name in Delays.__annotations__]
@@ -445,8 +445,8 @@ def main(runs: int, names: tuple[str, ...]) -> None:
         "bound",
     )
     for feeder in names:
-        made = watcher(feeder, Meters.WHITE)
-        kernel = kernel_of(feeder, Meters.WHITE)
+        made = watcher(feeder, TrialMeterErrors.WHITE)
+        kernel = kernel_of(feeder, TrialMeterErrors.WHITE)
         for kind, part in LIES:
             each_ = [attacked(made, kernel, kind, part, seed) for seed in range(max(1, runs // 4))]
             liars = kernel.modes.size // 3 * len(each_)

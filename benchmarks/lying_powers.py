@@ -25,9 +25,9 @@ import numpy as np
 from benchmarks._arguments import arguments
 from feeders.model.site import load
 from feeders.registry.registry import design
-from feeders.simulation.attacks import Lie, Trick
+from feeders.simulation.attacks import AttackKind, AttackSpec
 from feeders.simulation.scenario import START
-from feeders.simulation.trial import LoadError, Meters, Trial, frames
+from feeders.simulation.trial import LoadError, Trial, TrialMeterErrors, frames
 from gridsec.arrays import Floats
 from gridsec.interface import Decision
 
@@ -59,9 +59,14 @@ def play(feeder: str, size_kw: float, seed: int) -> Run:
     """
     site = load(feeder)
     at, count = site.meters, max(1, site.meters.size // 3)
-    lie = Lie(Trick.BIAS, count, 3.0, onset_s=ONSET_S)
+    lie = AttackSpec(AttackKind.BIAS, count, 3.0, onset_s=ONSET_S)
     trial = Trial(
-        site, seed=seed, duration_s=DURATION_S, load_error=LoadError(0.3, 0.1), meters=Meters.REAL, lie=lie
+        site,
+        seed=seed,
+        duration_s=DURATION_S,
+        load_error=LoadError(0.3, 0.1),
+        meters=TrialMeterErrors.REAL,
+        lie=lie,
     )
     watcher = design(trial.stated)
     state = watcher.init(START)

@@ -18,7 +18,7 @@ import numpy as np
 from feeders.format.tables import FeederTables, LineRow
 from feeders.model.site import Site, from_tables, load
 from feeders.registry.registry import design
-from feeders.simulation.attacks import Lie, Trick
+from feeders.simulation.attacks import AttackKind, AttackSpec
 from feeders.simulation.powerflow_three_phase import power_flow
 from feeders.simulation.trial import LoadError, Trial, judge
 from gridsec.arrays import Floats
@@ -121,18 +121,18 @@ def sensitivity(site: Site, part: float) -> str:
     return f"| {feeder.name} | {part:g} | " + " | ".join(f"{100 * v:.2g} %" for v in np.ravel(cells, "F"))
 
 
-def named(site: Site, trick: Trick, percent: float) -> str:
+def named(site: Site, trick: AttackKind, percent: float) -> str:
     """One row: liars, those missed, the slowest, the honest who were named, time of a step."""
     kw, count = LOAD_KW[site.feeder.name], LIARS.get(site.feeder.name, site.meters.size // 3)
     outcomes = []
     for seed in SEEDS:
-        lie = Lie(trick, count, percent, onset_s=10.0)
+        lie = AttackSpec(trick, count, percent, onset_s=10.0)
         trial = Trial(site, seed, 30.0, load_error=LoadError(kw, kw / 3.0), lie=lie)
         outcomes.append(judge(design(trial.stated), trial, settling_s=3.0))
     missed, accused = sum(o.missed for o in outcomes), sum(int(o.accused.sum()) for o in outcomes)
     slowest = max(float(o.delay_s.max()) for o in outcomes)
     step = np.median(np.concatenate([o.step_ms for o in outcomes]))
-    words = f"±{percent:g} %" if trick is Trick.BIAS else f"{percent:g} % all"
+    words = f"±{percent:g} %" if trick is AttackKind.BIAS else f"{percent:g} % all"
     return (
         f"| {site.feeder.name} | {count} of {site.meters.size} | {words} | "
         f"{missed} | {slowest:g} s | {accused} | {step:.1f} ms |"
@@ -159,7 +159,7 @@ def main() -> None:
         for part in (0.0, 0.25, 1.0):
             print(sensitivity(site, part), "|")
     for site in sites:
-        for trick, percent in ((Trick.BIAS, 3.0), (Trick.TOGETHER, -2.0)):
+        for trick, percent in ((AttackKind.BIAS, 3.0), (AttackKind.TOGETHER, -2.0)):
             print(named(site, trick, percent))
         print(clean(site))
 

@@ -43,7 +43,7 @@ from feeders.simulation.meters import BUSBAR
 from feeders.simulation.scenario import Scenario, simulate
 from service.cli.simulate import key_of
 from service.ingest.queues import BusConfig
-from service.ingest.zenoh_bus import Meters
+from service.ingest.zenoh_bus import MeterClient
 
 FEEDER = "kerber-vorstadtnetz"
 STAGE_S, SETTLE_S, OVERLOAD_S, RECOVERY_S = 6.0, 2.0, 8.0, 10.0
@@ -174,7 +174,7 @@ class Sender(threading.Thread):
         """Publish."""
         dice = random.Random(1)
         width = len(self.load.fields[0])
-        with Meters(BusConfig("client", connect=(self.zenoh,)), "gridsec") as meters:
+        with MeterClient(BusConfig("client", connect=(self.zenoh,)), "gridsec") as meters:
             begun = due = time.monotonic()
             for number in count():
                 if self.ended.is_set():
@@ -270,7 +270,7 @@ def measure(tree: Path, folder: Path, names: Sequence[str], load: Load) -> Outco
         finally:
             sender.ended.set()
             sender.join(STOP_S)
-    kept = share["keep_states"] / share["round"]
+    kept = share["keep_states"] / share["cycle"]
     print(f"sustained {sustained:.0f}/s, keep_states {kept:.1%}, recovery {recovery_s:.1f} s", flush=True)
     return Outcome(sustained, kept, overload, recovery_s)
 

@@ -19,7 +19,7 @@ from feeders.simulation.scenario import START, Scenario, simulate, snapshots
 from gridsec.errors import NotObservable
 from gridsec.estimators import exact_bank, partial
 from gridsec.estimators import partial as partial_observers
-from gridsec.estimators.inputs import Past, clean
+from gridsec.estimators.inputs import PreviousStep, clean
 from gridsec.estimators.partial import CodeWord, Parts
 from gridsec.interface import Frame
 from gridsec.secure.decode import cospark
@@ -48,7 +48,7 @@ def last_word(made: partial.PartialDesign, seen: list[Frame]) -> tuple[CodeWord,
     state = partial.init(made, START)
     for frame in seen[:-1]:
         state, _, _ = partial.step(made, state, frame)
-    inputs = clean(made.setting, Past(state.parts.x, state.v0_squared, state.tally.named), seen[-1])
+    inputs = clean(made.setting, PreviousStep(state.parts.x, state.v0_squared, state.tally.named), seen[-1])
     h = seen[-1].t - state.t
     alone, model, parts, _ = partial_observers.observe(
         made.setting, made.model, state.parts, seen[-1], inputs, h

@@ -25,13 +25,13 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from feeders.model.site import load
 from feeders.studies.campaign.guarantees import promised
-from feeders.studies.campaign.plan import Place, Plan
+from feeders.studies.campaign.plan import CampaignPlan, Place
 from feeders.studies.campaign.study import campaign
 from feeders.studies.detectable import detectable
 from feeders.studies.workers import Here, Processes
 
 FEEDER, LIES, LIARS = "simbench-lv-rural1", 10_000, 2
-PLAN = Plan(
+PLAN = CampaignPlan(
     together=3,
     duration_s=18.0,
     onset_s=(4.0, 6.0),

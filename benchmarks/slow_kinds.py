@@ -19,7 +19,7 @@ import numpy as np
 
 from benchmarks._arguments import arguments
 from feeders.model.site import Site, Snapshot, from_tables, load, to_frame
-from feeders.registry.registry import SEQUENTIAL, Watcher, choose, design
+from feeders.registry.registry import SEQUENTIAL, DesignedEstimator, choose, design
 from feeders.simulation.scenario import Scenario, simulate, snapshots
 from gridsec.arrays import Floats, Ints
 
@@ -152,7 +152,7 @@ def _voltages(what: str, v: Floats, at: Ints, size: Floats, period: int) -> Floa
             return v[at]
 
 
-def watch(site: Site, watcher: Watcher, days: Days, who: Ints, on: int) -> Seen:
+def watch(site: Site, watcher: DesignedEstimator, days: Days, who: Ints, on: int) -> Seen:
     """Let the monitor hear some days."""
     liars, seen = set(who.tolist()), Seen()
     state = watcher.init(float(days.t[0]) - site.tables.meta.monitor.tick_s)

@@ -22,13 +22,13 @@ from itertools import product
 import numpy as np
 
 from feeders.model.site import load
-from feeders.registry.registry import Watcher, choose, design
-from feeders.simulation.attacks import Lie, Trick
-from feeders.simulation.trial import LoadError, Meters, Outcome, Trial, frames, judge
+from feeders.registry.registry import DesignedEstimator, choose, design
+from feeders.simulation.attacks import AttackKind, AttackSpec
+from feeders.simulation.trial import LoadError, Trial, TrialMeterErrors, TrialResult, frames, judge
 from gridsec.estimators.sequential import SequentialDesign
 
 DECODERS = ("weighted-least-squares", "l0-decoder", "basis-pursuit", "matching-pursuit")
-TRICKS = (Trick.BIAS, Trick.TOGETHER, Trick.COORDINATED)
+TRICKS = (AttackKind.BIAS, AttackKind.TOGETHER, AttackKind.COORDINATED)
 SEEDS, DURATION_S, ONSET_S, GROSS = 8, 30.0, 10.0, 4.0
 
 
@@ -38,28 +38,30 @@ class Scene:
 
     name: str
     feeder: str
-    meters: Meters
+    meters: TrialMeterErrors
     loads: LoadError
     sizes: tuple[float, ...]
     counts: tuple[int, ...]
 
-    def trial(self, lie: Lie | None = None, seed: int = 0) -> Trial:
+    def trial(self, lie: AttackSpec | None = None, seed: int = 0) -> Trial:
         """One run."""
         site = load(self.feeder)
         return Trial(
             site, seed=seed, duration_s=DURATION_S, load_error=self.loads, meters=self.meters, lie=lie
         )
 
-    def lies(self, count: int) -> Iterator[Lie | None]:
+    def lies(self, count: int) -> Iterator[AttackSpec | None]:
         """Nobody, then all lies of so many meters."""
         yield None
         for trick, size in product(TRICKS[: None if count > 1 else 1], self.sizes):
-            yield Lie(trick, count, size, ONSET_S)
+            yield AttackSpec(trick, count, size, ONSET_S)
 
 
 SCENES = (
-    Scene("stiff", "simbench-lv-rural1", Meters.SITE, LoadError(0.6, 0.2), (1.0, 1.5, 4.0), (2,)),
-    Scene("soft", "kerber-landnetz", Meters.WHITE, LoadError(2.0, 0.7), (1.0, 1.5, 2.0, 4.0), (2, 4)),
+    Scene("stiff", "simbench-lv-rural1", TrialMeterErrors.SITE, LoadError(0.6, 0.2), (1.0, 1.5, 4.0), (2,)),
+    Scene(
+        "soft", "kerber-landnetz", TrialMeterErrors.WHITE, LoadError(2.0, 0.7), (1.0, 1.5, 2.0, 4.0), (2, 4)
+    ),
 )
 
 
@@ -70,9 +72,11 @@ def correlation(made: SequentialDesign) -> float:
     return float((S / np.multiply.outer(std, std) - np.diag(np.diag(S) / std**2)).max())
 
 
-def run(scene: Scene, lie: Lie | None, watchers: dict[str, Watcher]) -> dict[str, list[Outcome]]:
+def run(
+    scene: Scene, lie: AttackSpec | None, watchers: dict[str, DesignedEstimator]
+) -> dict[str, list[TrialResult]]:
     """All seeds, by decoder."""
-    found: dict[str, list[Outcome]] = {name: [] for name in watchers}
+    found: dict[str, list[TrialResult]] = {name: [] for name in watchers}
     for seed in range(SEEDS):
         trial = scene.trial(lie, seed)
         played = list(frames(trial))
@@ -81,7 +85,7 @@ def run(scene: Scene, lie: Lie | None, watchers: dict[str, Watcher]) -> dict[str
     return found
 
 
-def cell(outcomes: list[Outcome]) -> str:
+def cell(outcomes: list[TrialResult]) -> str:
     """Liars named, honest meters ever named, and ticks with a lie that were CLEAN."""
     liars = sum(one.liars.size for one in outcomes)
     named = sum(int(np.isfinite(one.delay_s).sum()) for one in outcomes)
@@ -108,7 +112,7 @@ def main() -> int:
                 print(f"{label:<18}" + "".join(f"{cell(found[name]):>24}" for name in DECODERS), flush=True)
                 for name, outcomes in found.items():
                     times[name] += [float(np.median(one.step_ms)) for one in outcomes]
-                    gross = lie is not None and lie.size >= GROSS and lie.trick is not Trick.COORDINATED
+                    gross = lie is not None and lie.size >= GROSS and lie.trick is not AttackKind.COORDINATED
                     bad += gross * sum(int(one.clean_while_lying.sum()) for one in outcomes)
     print()
     for name in DECODERS:

@@ -34,9 +34,9 @@ import numpy as np
 from benchmarks._arguments import arguments
 from feeders.model.site import Site, from_tables, load
 from feeders.registry.registry import design
-from feeders.simulation.meters import Channel, Silence
+from feeders.simulation.meters import Channel, MeterOutage
 from feeders.simulation.scenario import START
-from feeders.simulation.trial import Trial, Truth, frames
+from feeders.simulation.trial import FrameTruth, Trial, frames
 from gridsec.arrays import Bools
 from gridsec.interface import Frame
 
@@ -70,10 +70,10 @@ def channel(site: Site, there: Bools, step_s: float) -> Channel:
     """One that loses whatever is not heard, voltages and powers."""
     lost = np.argwhere(~there).tolist()
     begins = [(START + (tick - 0.5) * step_s, site.meter_ids[j]) for tick, j in lost]
-    return Channel(silences=tuple(Silence(meter, t, t + step_s) for t, meter in begins))
+    return Channel(silences=tuple(MeterOutage(meter, t, t + step_s) for t, meter in begins))
 
 
-def played(trial: Trial, pattern: str) -> Iterator[tuple[Frame, Truth, Bools]]:
+def played(trial: Trial, pattern: str) -> Iterator[tuple[Frame, FrameTruth, Bools]]:
     """Frames of what is heard, the truth, and who lies."""
     rng = np.random.default_rng([3, trial.seed])
     count = trial.site.meters.size

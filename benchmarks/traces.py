@@ -41,7 +41,7 @@ from service.app import Running, serve
 from service.cli.main import main as gridsec
 from service.cli.simulate import Pace, play
 from service.ingest.queues import BusConfig
-from service.ingest.zenoh_bus import Meters
+from service.ingest.zenoh_bus import MeterClient
 from service.settings import settings
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -132,7 +132,7 @@ def sample_to_alarm() -> Trip:
                     raise RuntimeError("the service does not start")
                 with httpx.Client(base_url=found["running"].url, timeout=10.0) as http:
                     _until(lambda: http.get("/readyz").json()["ok"])
-                    with Meters(BusConfig("client", connect=(zenoh,)), chosen.prefix) as meters:
+                    with MeterClient(BusConfig("client", connect=(zenoh,)), chosen.prefix) as meters:
                         _raise_alarm(trip, http, meters)
             finally:
                 found["loop"].call_soon_threadsafe(found["running"].stop)
@@ -140,7 +140,7 @@ def sample_to_alarm() -> Trip:
     return trip
 
 
-def _raise_alarm(trip: Trip, http: httpx.Client, meters: Meters) -> None:
+def _raise_alarm(trip: Trip, http: httpx.Client, meters: MeterClient) -> None:
     """Play a manipulation in step with the service; trace from its onset to the alarm in REST."""
     site = load(FEEDER)
     quiet = Scenario(seed=1, start=START, duration_s=float("inf"), dt_s=site.tables.meta.monitor.tick_s)

@@ -28,9 +28,18 @@ import numpy as np
 
 from benchmarks._arguments import arguments
 from feeders.model.site import Site, from_tables, load
-from feeders.registry.registry import Watcher, design
+from feeders.registry.registry import DesignedEstimator, design
 from feeders.simulation.scenario import START
-from feeders.simulation.trial import Lie, LoadError, Meters, Outcome, Trial, Trick, frames, judge
+from feeders.simulation.trial import (
+    AttackKind,
+    AttackSpec,
+    LoadError,
+    Trial,
+    TrialMeterErrors,
+    TrialResult,
+    frames,
+    judge,
+)
 from gridsec.arrays import Floats, Ints
 from gridsec.estimators import sequential
 from gridsec.estimators.sequential.commission import Learned
@@ -62,23 +71,23 @@ class Cell:
     """
 
     name: str
-    trick: Trick
+    trick: AttackKind
     percent: float
     limit_s: float
-    meters: Meters = Meters.WHITE
+    meters: TrialMeterErrors = TrialMeterErrors.WHITE
     learned: bool = False
 
 
 CELLS = (
-    Cell("white, +-3 %", Trick.BIAS, 3.0, 3.0),
-    Cell("white, -2 % all", Trick.TOGETHER, -2.0, 3.0),
-    Cell("white, +-1 %", Trick.BIAS, 1.0, 10.0),
-    Cell("white, +-0.5 %", Trick.BIAS, 0.5, 60.0),
-    Cell("white, -0.5 % all", Trick.TOGETHER, -0.5, 60.0),
-    Cell("real, +-1.5 %", Trick.BIAS, 1.5, 60.0, Meters.REAL),
-    Cell("real, -1.5 % all", Trick.TOGETHER, -1.5, 60.0, Meters.REAL),
-    Cell("learned, +-0.5 %", Trick.BIAS, 0.5, 60.0, Meters.REAL, learned=True),
-    Cell("learned, -0.5 % all", Trick.TOGETHER, -0.5, 60.0, Meters.REAL, learned=True),
+    Cell("white, +-3 %", AttackKind.BIAS, 3.0, 3.0),
+    Cell("white, -2 % all", AttackKind.TOGETHER, -2.0, 3.0),
+    Cell("white, +-1 %", AttackKind.BIAS, 1.0, 10.0),
+    Cell("white, +-0.5 %", AttackKind.BIAS, 0.5, 60.0),
+    Cell("white, -0.5 % all", AttackKind.TOGETHER, -0.5, 60.0),
+    Cell("real, +-1.5 %", AttackKind.BIAS, 1.5, 60.0, TrialMeterErrors.REAL),
+    Cell("real, -1.5 % all", AttackKind.TOGETHER, -1.5, 60.0, TrialMeterErrors.REAL),
+    Cell("learned, +-0.5 %", AttackKind.BIAS, 0.5, 60.0, TrialMeterErrors.REAL, learned=True),
+    Cell("learned, -0.5 % all", AttackKind.TOGETHER, -0.5, 60.0, TrialMeterErrors.REAL, learned=True),
 )
 
 
@@ -94,7 +103,7 @@ def trial(cell: Cell, seed: int, feeder: str = FEEDER, kw: float = LOAD_KW) -> T
     """
     site = load(feeder)
     moment = float(np.random.default_rng([146, seed]).uniform(0.0, 13.9 * 86_400.0))
-    lie = Lie(cell.trick, site.meters.size // 3, cell.percent, onset_s=ONSET_S)
+    lie = AttackSpec(cell.trick, site.meters.size // 3, cell.percent, onset_s=ONSET_S)
     return Trial(
         site,
         seed=seed,
@@ -128,18 +137,18 @@ def learn(this: Trial) -> Learned:
 
 
 @cache
-def _learned(meters: Meters, seed: int, feeder: str, kw: float) -> Learned:
+def _learned(meters: TrialMeterErrors, seed: int, feeder: str, kw: float) -> Learned:
     """Learn from honest hours, which are the same whatever lie follows them."""
-    return learn(trial(Cell("honest", Trick.BIAS, 0.0, 0.0, meters), seed, feeder, kw))
+    return learn(trial(Cell("honest", AttackKind.BIAS, 0.0, 0.0, meters), seed, feeder, kw))
 
 
-def _commissioned(site: Site, commission_s: float) -> Watcher:
+def _commissioned(site: Site, commission_s: float) -> DesignedEstimator:
     tables = site.tables
     settings = replace(tables.meta.monitor, estimator="sequential", commission_s=commission_s)
     return design(from_tables(replace(tables, meta=replace(tables.meta, monitor=settings))))
 
 
-def run(cell: Cell, seed: int, feeder: str = FEEDER, kw: float = LOAD_KW) -> Outcome:
+def run(cell: Cell, seed: int, feeder: str = FEEDER, kw: float = LOAD_KW) -> TrialResult:
     """Watch one seed of a cell.
 
     Parameters
@@ -214,11 +223,11 @@ def main(seeds: int, feeder: str, kw: float) -> int:
             flush=True,
         )
         good &= named == liars and not false
-        good &= cell.meters is not Meters.WHITE or max(error) <= LARGEST_ERROR_PERCENT
+        good &= cell.meters is not TrialMeterErrors.WHITE or max(error) <= LARGEST_ERROR_PERCENT
     return 0 if good else 1
 
 
-def _counts(cell: Cell, outcomes: list[Outcome]) -> tuple[int, int, int]:
+def _counts(cell: Cell, outcomes: list[TrialResult]) -> tuple[int, int, int]:
     """How many are named in time, of how many liars, and how many honest meters are ever named."""
     named = sum(int((each.delay_s <= cell.limit_s).sum()) for each in outcomes)
     return named, sum(each.liars.size for each in outcomes), sum(int(each.accused.sum()) for each in outcomes)

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from feeders.model.site import Site, load, to_frame
-from feeders.registry.registry import Watcher, choose, design
+from feeders.registry.registry import DesignedEstimator, choose, design
 from feeders.simulation.meters import MeterErrors
 from feeders.simulation.scenario import START, Scenario, simulate, snapshots
 from gridsec.attack import Bias, InverterAttack
@@ -42,7 +42,9 @@ class Row:
     ms: list[float] = field(default_factory=list)
 
 
-def run(site: Site, watcher: Watcher, row: Row, seed: int, options: argparse.Namespace, *, q: bool) -> None:
+def run(
+    site: Site, watcher: DesignedEstimator, row: Row, seed: int, options: argparse.Namespace, *, q: bool
+) -> None:
     """One scenario; counts go into the row."""
     rng = np.random.default_rng(seed)
     liar, wrong = int(rng.integers(site.meters.size)), int(rng.integers(site.droop.tau.size))

@@ -20,7 +20,7 @@ __all__ = [
     "choice",
     "each_choice",
     "no_choice",
-    "refuse",
+    "raise_if_any",
 ]
 
 
@@ -176,7 +176,7 @@ class DesignInfeasible(GridsecError):
         super().__init__(f"{what}: {status}{tail}", code=code)
 
 
-def refuse(problems: Iterable[str]) -> None:
+def raise_if_any(problems: Iterable[str]) -> None:
     """Raise one error with all problems of an input; return if there are none.
 
     Parameters
@@ -225,7 +225,7 @@ def each_choice(name: str, kind: type[Choice], values: Iterable[str]) -> tuple[C
     """
     given = tuple(values)
     problems = no_choice(name, kind, *given)
-    refuse(problems)
+    raise_if_any(problems)
     return tuple(kind(value) for value in given)
 
 

@@ -48,7 +48,7 @@ class Cause(StrEnum):
     DESIGN_INVALID = "design-invalid"
 
 
-class Kind(StrEnum):
+class ManipulationKind(StrEnum):
     """Class of a manipulation, where the data show it."""
 
     OFFSET = "offset"
@@ -243,7 +243,7 @@ class Verdict:
     attack: Floats
     inverters: Bools = field(default_factory=_none)
     inverter_attack: Floats = field(default_factory=_nothing)
-    kinds: tuple[Kind | None, ...] = ()
+    kinds: tuple[ManipulationKind | None, ...] = ()
     explanations: tuple[Explanation, ...] = ()
     unjudged: Bools = field(default_factory=_none)
     busbar: Bools = field(default_factory=_none)

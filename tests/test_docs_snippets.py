@@ -22,10 +22,10 @@ import pytest
 
 from benchmarks.mesh import european, landnetz
 from feeders.model.site import Site, load
-from feeders.registry.registry import Family, Job, Watcher
+from feeders.registry.registry import DesignedEstimator, DesignOptions, Estimator
 from feeders.simulation import trial as trials
-from feeders.simulation.attacks import Lie, Trick
-from feeders.simulation.trial import Meters, Trial
+from feeders.simulation.attacks import AttackKind, AttackSpec
+from feeders.simulation.trial import Trial, TrialMeterErrors
 from gridsec.interface import Decision
 from tests.acceptance.live import serve
 from tests.feeders.registry.test_bad_frames import BEFORE, frames, put
@@ -139,21 +139,21 @@ def test_the_estimator_serves(installed: Path) -> None:
         assert live.get("/api/v1/feeders/simbench-lv-rural1/commissioning")["estimator"] == "neighbours"
 
 
-def neighbours() -> Family:
+def neighbours() -> Estimator:
     """The estimator of the page."""
     space: dict[str, Any] = {"__name__": "neighbours"}
     exec(compile(MODULE[1], "neighbours", "exec", dont_inherit=True), space)
     family = space["FAMILY"]
-    assert isinstance(family, Family)
+    assert isinstance(family, Estimator)
     return family
 
 
 @pytest.mark.parametrize("make", [partial(load, "ieee-european-lv"), landnetz, european])
 def test_the_estimator_watches_three_phases_and_meshes(make: Callable[[], Site]) -> None:
-    family, lie = neighbours(), Lie(Trick.BIAS, count=1, size=6.0, onset_s=5.0)
-    trial = Trial(make(), seed=1, lie=lie, meters=Meters.SITE, duration_s=10.0)
-    made, played = family.design(trial.stated, Job()), list(trials.frames(trial))
-    outcome = trials.judge(Watcher(family, made), trial, settling_s=3.0, played=played)
+    family, lie = neighbours(), AttackSpec(AttackKind.BIAS, count=1, size=6.0, onset_s=5.0)
+    trial = Trial(make(), seed=1, lie=lie, meters=TrialMeterErrors.SITE, duration_s=10.0)
+    made, played = family.design(trial.stated, DesignOptions()), list(trials.frames(trial))
+    outcome = trials.judge(DesignedEstimator(family, made), trial, settling_s=3.0, played=played)
     assert (outcome.missed, outcome.false_names.max()) == (0, 0)
     assert outcome.delay_s.tolist() == [2.0]
     # The model is wrong by far less than the 6 % of the lie.
@@ -170,7 +170,7 @@ def test_the_estimator_watches_three_phases_and_meshes(make: Callable[[], Site])
 
 def test_the_estimator_owes_what_the_page_says() -> None:
     family = neighbours()
-    made, t = family.design(load("simbench-lv-rural1"), Job()), frames()[0].t - 1.0
+    made, t = family.design(load("simbench-lv-rural1"), DesignOptions()), frames()[0].t - 1.0
     last = frames()[-1]
     silent = replace(last, y=np.full(last.y.shape, np.nan), seen=np.zeros(last.seen.shape, dtype=np.bool_))
     lost = [silent, replace(last, v0_squared=np.nan)]

@@ -26,7 +26,7 @@ from feeders.convert.network import Converted, feeder_of, opened_rows
 from feeders.convert.provenance import (
     CHANGES_FILE,
     SOURCE_FILE,
-    Change,
+    ConversionChange,
     Origin,
     SourceUnreadable,
     changes_csv,
@@ -107,7 +107,7 @@ def from_folder(
         for option, value in given.items()
         if value
     ]
-    changes: list[Change] = []
+    changes: list[ConversionChange] = []
     try:
         lines = opened_rows(tables.lines, opened, changes)
     except FeederInvalid as error:
@@ -115,7 +115,9 @@ def from_folder(
     if problems:
         raise FeederInvalid(problems)
     before = origin(folder)
-    earlier = [] if before is None else [Change(*row) for row in before.changes.itertuples(index=False)]
+    earlier = (
+        [] if before is None else [ConversionChange(*row) for row in before.changes.itertuples(index=False)]
+    )
     meta = tables.meta
     if name:
         meta = replace(meta, name=name, title=name if meta.title == meta.name else meta.title)
@@ -173,14 +175,14 @@ class Recipe:
     root: str | None = None
     fleet: Fleet | None = None
     max_attacked: int = 1
-    mend: Callable[[Any], Change] | None = None
+    mend: Callable[[Any], ConversionChange] | None = None
     """Corrects an error of the source; returns the change."""
 
 
-def _reactive_powers(net: Any) -> Change:
+def _reactive_powers(net: Any) -> ConversionChange:
     """Convert the reactive powers of two phases to the unit of the third."""
     net.asymmetric_load[["q_b_mvar", "q_c_mvar"]] *= 1000.0
-    return Change(
+    return ConversionChange(
         "the loads of phases b and c",
         "reactive power",
         "changed",
@@ -262,7 +264,7 @@ class Conversion:
         Reason for a missing comparison.
     """
 
-    changes: tuple[Change, ...]
+    changes: tuple[ConversionChange, ...]
     check: SourceCheck | None
     unchecked: str = ""
 

@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from feeders.convert.provenance import WHOLE, Change
+from feeders.convert.provenance import WHOLE, ConversionChange
 from feeders.format.tables import CustomerRow
 from feeders.model.profiles import envelopes
 from gridsec.arrays import Phasors
@@ -174,7 +174,7 @@ def customers_of(
     draws: Iterable[Draw],
     nominal: Mapping[str, float],
     droop: str | None,
-    changes: list[Change],
+    changes: list[ConversionChange],
     taken: Collection[str] = (),
 ) -> tuple[list[CustomerRow], dict[str, complex]]:
     """Rows of customers.csv, and the power of each at the source's operating point, kVA.
@@ -199,7 +199,7 @@ def customers_of(
         connections = _connections(draw)
         if not connections:
             effect = "draws nothing in the source's power flow"
-            changes.append(Change(draw.label, WHOLE, "left out", effect))
+            changes.append(ConversionChange(draw.label, WHOLE, "left out", effect))
         for phases, kva in connections:
             row = CustomerRow(_unique(draw, phases, {*taken, *power}), draw.bus, 0.0, phases=phases)
             power[row.customer] = kva
@@ -214,7 +214,13 @@ def customers_of(
 
 
 def _generator(
-    row: CustomerRow, kva: complex, draw: Draw, number: int, *, droop: str | None, changes: list[Change]
+    row: CustomerRow,
+    kva: complex,
+    draw: Draw,
+    number: int,
+    *,
+    droop: str | None,
+    changes: list[ConversionChange],
 ) -> CustomerRow:
     """Give a customer a generator's peak, and its inverter."""
     parts = len(_connections(draw))
@@ -223,12 +229,12 @@ def _generator(
     row = replace(row, pv_kw=peak, pv_profile=f"PV{number % 8 + 1}")
     if not rating > 0:
         effect = f"{row.pv_profile}, not in the source: a feeder's generation follows the sun"
-        changes.append(Change(draw.label, "profile", "added", effect))
+        changes.append(ConversionChange(draw.label, "profile", "added", effect))
         return row
     row = replace(row, inverter_kva=rounded(rating), droop=droop or droop_preset(rating))
-    changes.append(Change(draw.label, "droop curve", "added", f"{row.droop}, not in the source"))
+    changes.append(ConversionChange(draw.label, "droop curve", "added", f"{row.droop}, not in the source"))
     if abs(kva.imag) > EVEN * rating:
-        changes.append(Change(draw.label, *BY_DROOP))
+        changes.append(ConversionChange(draw.label, *BY_DROOP))
     return row
 
 
@@ -298,19 +304,23 @@ def _unique(draw: Draw, phases: str, taken: Collection[str]) -> str:
 
 
 def _load(
-    row: CustomerRow, kva: complex, number: int, *, volt: float, changes: list[Change], noun: str
+    row: CustomerRow, kva: complex, number: int, *, volt: float, changes: list[ConversionChange], noun: str
 ) -> CustomerRow:
     p, q = kva.real, kva.imag
     if p < 0:
         changes.append(
-            Change(f"{noun} {row.customer}", "p_kw", "changed", "feeds in; its expected load is taken as 0")
+            ConversionChange(
+                f"{noun} {row.customer}", "p_kw", "changed", "feeds in; its expected load is taken as 0"
+            )
         )
     if q < -NO_POWER * abs(kva):
         changes.append(
-            Change(f"{noun} {row.customer}", "power factor", "approximated", "leading; expected to be 1")
+            ConversionChange(
+                f"{noun} {row.customer}", "power factor", "approximated", "leading; expected to be 1"
+            )
         )
     if p <= 0.0 and q > NO_POWER:
-        changes.append(Change(f"{noun} {row.customer}", *ONLY_REACTIVE))
+        changes.append(ConversionChange(f"{noun} {row.customer}", *ONLY_REACTIVE))
     household = volt < 1000.0 and p <= HOUSEHOLD_KW
     row = replace(row, load_kw=rounded(max(p, 0.0)), load_profile=usual_profile(number, household=household))
     return reactive(row, p / math.hypot(p, q) if p > 0 and q > 0 else None)

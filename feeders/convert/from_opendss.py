@@ -21,8 +21,8 @@ import numpy as np
 
 from feeders.convert.customers import Draw, as_it_stands, is_even, rounded
 from feeders.convert.lines import Coupling, capacitor, line_row, open_end, with_taps
-from feeders.convert.network import Network
-from feeders.convert.provenance import WHOLE, Change, SourceUnreadable
+from feeders.convert.network import SourceNetwork
+from feeders.convert.provenance import WHOLE, ConversionChange, SourceUnreadable
 from feeders.format.tables import LineRow
 from feeders.util import extra
 from gridsec.arrays import Floats, Phasors
@@ -75,7 +75,7 @@ class Element:
         return f"{self.kind} {self.name}"
 
 
-def voltage_dependence(dss: Any) -> list[tuple[str, Change]]:
+def voltage_dependence(dss: Any) -> list[tuple[str, ConversionChange]]:
     """Loads that are not of constant power, each with its bus.
 
     Parameters
@@ -91,12 +91,16 @@ def voltage_dependence(dss: Any) -> list[tuple[str, Change]]:
         dss.Loads.Name(name)
         bus = str(dss.CktElement.BusNames()[0]).partition(".")[0].lower()
         if int(dss.Loads.Model()) != 1:
-            change = Change(f"load {name}", f"model {int(dss.Loads.Model())}", "approximated", effect)
+            change = ConversionChange(
+                f"load {name}", f"model {int(dss.Loads.Model())}", "approximated", effect
+            )
             changes.append((bus, change))
     return changes
 
 
-def beyond_limits(found: list[Element], constant: list[Element], known: set[str]) -> list[tuple[str, Change]]:
+def beyond_limits(
+    found: list[Element], constant: list[Element], known: set[str]
+) -> list[tuple[str, ConversionChange]]:
     """Loads and generators of constant power that become impedances at their voltages.
 
     Parameters
@@ -113,11 +117,11 @@ def beyond_limits(found: list[Element], constant: list[Element], known: set[str]
         power = other.power_kva[0].sum()
         if one.label not in known and abs(one.power_kva[0].sum() - power) > SAME_POWER * abs(power):
             effect = "beyond them it depends on the voltage in the source; taken as constant power"
-            out.append((one.buses[0], Change(one.label, "vminpu, vmaxpu", "approximated", effect)))
+            out.append((one.buses[0], ConversionChange(one.label, "vminpu, vmaxpu", "approximated", effect)))
     return out
 
 
-def add_draw(dss: Any, each: Element, network: Network) -> None:
+def add_draw(dss: Any, each: Element, network: SourceNetwork) -> None:
     """Add a load, a generator or a battery to a network, and report properties that a customer lacks.
 
     Parameters
@@ -135,7 +139,7 @@ def add_draw(dss: Any, each: Element, network: Network) -> None:
     told = list(_curves(dss, each))
     if len(used) > 1 and not even:
         effect = "in star, with its phases' powers of the source's power flow; exact at these loads only"
-        told.append(Change(each.label, "delta", "approximated", effect))
+        told.append(ConversionChange(each.label, "delta", "approximated", effect))
     rating: float | None = None
     peak = 0.0
     if each.kind == "pvsystem":
@@ -143,7 +147,7 @@ def add_draw(dss: Any, each: Element, network: Network) -> None:
         told += _sunlight(dss, each, peak)
     elif each.kind != "load":
         rating = 0.0 if each.kind in GENERATORS else None
-        told.append(Change(each.label, "control", "changed", as_it_stands(power)))
+        told.append(ConversionChange(each.label, "control", "changed", as_it_stands(power)))
     network.of_bus.extend((bus, change) for change in told)
     phases = "".join("abc"[node - 1] for node in sorted(used))
     noun = "" if each.kind in {"load", *GENERATORS} else each.kind
@@ -151,7 +155,7 @@ def add_draw(dss: Any, each: Element, network: Network) -> None:
     network.draws.append(draw)
 
 
-def _curves(dss: Any, each: Element) -> Iterator[Change]:
+def _curves(dss: Any, each: Element) -> Iterator[ConversionChange]:
     """Every curve of an element over time, temperature or voltage, each once."""
     told: set[str] = set()
     known = _properties(dss, each)
@@ -160,10 +164,10 @@ def _curves(dss: Any, each: Element) -> Iterator[Change]:
         if value and value.lower() not in told:
             told.add(value.lower())
             what = f"load shape {value}" if prop in {"yearly", "daily", "duty"} else f"{prop} {value}"
-            yield Change(each.label, what, "left out", effect or PROFILE)
+            yield ConversionChange(each.label, what, "left out", effect or PROFILE)
 
 
-def _sunlight(dss: Any, each: Element, peak: float) -> Iterator[Change]:
+def _sunlight(dss: Any, each: Element, peak: float) -> Iterator[ConversionChange]:
     """Present power of a solar plant, if it is not the rated peak."""
     now = 0.0 - round(float(each.power_kva[0].sum().real), 6)
     if abs(now - peak) > SAME_POWER * peak:
@@ -171,7 +175,7 @@ def _sunlight(dss: Any, each: Element, peak: float) -> Iterator[Change]:
         effect = (
             f"feeds in {now:.4g} kW at this moment, as in the check; pv_kw is its rated peak of {peak:.6g}"
         )
-        yield Change(each.label, f"irradiance {sun:g}", "changed", effect)
+        yield ConversionChange(each.label, f"irradiance {sun:g}", "changed", effect)
 
 
 def _properties(dss: Any, each: Element) -> dict[str, str]:
@@ -263,7 +267,7 @@ def _engine() -> Iterator[Any]:
             os.chdir(here)
 
 
-def read_opendss(path: Path) -> Network:
+def read_opendss(path: Path) -> SourceNetwork:
     """Read and solve a master file.
 
     Parameters
@@ -289,7 +293,7 @@ def read_opendss(path: Path) -> Network:
             raise SourceUnreadable(f"{path}: OpenDSS: {' '.join(str(error).split())}") from error
 
 
-def _read(dss: Any, path: Path) -> Network:
+def _read(dss: Any, path: Path) -> SourceNetwork:
     dss.Text.Command(f'redirect "{path.resolve()}"')
     if not dss.Basic.NumCircuits():
         raise SourceUnreadable(f"{path}: OpenDSS finds no circuit in it; expected 'new circuit...'")
@@ -307,7 +311,7 @@ def _read(dss: Any, path: Path) -> Network:
         elements = [_element(dss, name, problems) for name in dss.Circuit.AllElementNames()]
         changes += beyond_limits(before, elements, {change.element for _, change in changes})
     nominal = _nominal(dss, problems)
-    network = Network(
+    network = SourceNetwork(
         tool=f"OpenDSS {version('dss_python_backend')}",
         sources=[each.buses[0] for each in elements if each.kind == "vsource" and each.enabled],
         nominal=nominal,
@@ -427,11 +431,11 @@ def _build_everything(dss: Any, elements: list[Element]) -> None:
     dss.Solution.BuildYMatrix(1, 0)
 
 
-def _take(dss: Any, each: Element, network: Network, problems: list[Problem]) -> None:
+def _take(dss: Any, each: Element, network: SourceNetwork, problems: list[Problem]) -> None:
     """Add an element to the network, or report its omission."""
     label = f"{each.kind} {each.name}"
     if not each.enabled:
-        network.changes.append(Change(label, WHOLE, "left out", "disabled in the source"))
+        network.changes.append(ConversionChange(label, WHOLE, "left out", "disabled in the source"))
     elif each.kind in {"capacitor", "reactor"} and _is_shunt(each):
         _shunt(dss, each, network)
     elif each.kind in SERIES:
@@ -449,13 +453,13 @@ def _take(dss: Any, each: Element, network: Network, problems: list[Problem]) ->
     elif each.kind in LOADS | GENERATORS | STORAGE:
         add_draw(dss, each, network)
     elif each.kind != "vsource":
-        change = Change(label, WHOLE, "left out", TOLD.get(each.kind, UNLIKE))
+        change = ConversionChange(label, WHOLE, "left out", TOLD.get(each.kind, UNLIKE))
         at = [bus for bus in each.buses if bus in network.nominal]
         network.of_bus.extend((bus, change) for bus in at)
         network.changes += [] if at else [change]  # without a bus, as controllers of several elements
 
 
-def _regulator(dss: Any, each: Element, network: Network) -> tuple[LineRow | None, Draw | None]:
+def _regulator(dss: Any, each: Element, network: SourceNetwork) -> tuple[LineRow | None, Draw | None]:
     """Transformer as a line with a tap: two ends of the same phases, without coupling or phase shift.
 
     With the admittance y behind a ratio t its admittances are ``y / t^2``, ``-y / t`` and, at the far end, y
@@ -525,7 +529,7 @@ def _yprim(dss: Any, each: Element) -> Phasors:
     return matrix
 
 
-def _line(dss: Any, each: Element, network: Network, problems: list[Problem]) -> None:
+def _line(dss: Any, each: Element, network: SourceNetwork, problems: list[Problem]) -> None:
     """Line or series reactor: series impedance and charging from its primitive admittances."""
     label = each.name if each.kind == "line" else f"{each.kind}.{each.name}"
     here, there = each.nodes
@@ -557,7 +561,7 @@ def _line(dss: Any, each: Element, network: Network, problems: list[Problem]) ->
             Problem("negative", f"line {label} has a negative resistance or reactance; expected none")
         )
         return
-    changes: list[Change] = []
+    changes: list[ConversionChange] = []
     row = line_row(
         label,
         (each.buses[0], each.buses[1]),
@@ -583,13 +587,13 @@ def _rated(dss: Any, each: Element, row: LineRow) -> LineRow:
     return replace(row, closed=each.closed, rating_a=limit if limit > 0 else None)
 
 
-def _shunt(dss: Any, each: Element, network: Network) -> None:
+def _shunt(dss: Any, each: Element, network: SourceNetwork) -> None:
     """A capacitor at a bus becomes the charging of a line to nowhere; a reactor is left out."""
     label, bus = f"{each.kind} {each.name}", each.buses[0]
     kvar = -sum(power.sum() for power in each.power_kva).imag
     if not each.closed or each.kind == "reactor" or kvar <= 0:
         effect = f"{-kvar:.4g} kvar" if each.closed else "switched off in the source"
-        network.of_bus.append((bus, Change(label, WHOLE, "left out", effect)))
+        network.of_bus.append((bus, ConversionChange(label, WHOLE, "left out", effect)))
         return
     # Both terminals may be at phases of the bus: entries between phases are where their conductors meet.
     meet = np.equal.outer(np.arange(1, PHASES + 1), np.concatenate(each.nodes)).astype(np.float64)
@@ -597,5 +601,5 @@ def _shunt(dss: Any, each: Element, network: Network) -> None:
     block = (meet @ _yprim(dss, each).imag @ meet.T)[np.ix_(here, here)]
     phases = "".join("abc"[k] for k in here)
     effect = f"{kvar:.4g} kvar as the charging of a line to nowhere"
-    network.of_bus.append((bus, Change(label, "connection", "changed", effect)))
+    network.of_bus.append((bus, ConversionChange(label, "connection", "changed", effect)))
     network.lines.append(capacitor(f"capacitor.{each.name}", bus, block, phases))

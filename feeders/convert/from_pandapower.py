@@ -27,9 +27,17 @@ from feeders.convert.customers import (
     with_meters,
 )
 from feeders.convert.lines import as_rows, balanced_charging, reached
-from feeders.convert.network import Converted, Network, below, below_source, chosen, finished, one_busbar
+from feeders.convert.network import (
+    Converted,
+    SourceNetwork,
+    below,
+    below_source,
+    chosen,
+    finished,
+    one_busbar,
+)
 from feeders.convert.pandapower_net import between_phases, ids, network_of, phase_powers, with_truths
-from feeders.convert.provenance import WHOLE, BusbarUnclear, Change
+from feeders.convert.provenance import WHOLE, BusbarUnclear, ConversionChange
 from feeders.convert.transformers import EVERYTHING, Extent
 from feeders.format.tables import CustomerRow, FeederMeta, FeederTables, LoadDefaults, MonitorDefaults
 from feeders.model.profiles import envelopes, pv_names
@@ -82,7 +90,7 @@ class _Source:
     net: Any
     names: dict[int, str]
     inside: set[int]
-    changes: list[Change]
+    changes: list[ConversionChange]
     volts: Mapping[str, Phasors]
     power: dict[str, complex] = field(default_factory=dict)
 
@@ -163,7 +171,7 @@ def from_pandapower(
     return finished(network, part, tables, source.power | drawn | taken)
 
 
-def _root(net: Any, network: Network, names: dict[int, str], wanted: str | None) -> str:
+def _root(net: Any, network: SourceNetwork, names: dict[int, str], wanted: str | None) -> str:
     if wanted is not None:
         named = [i for i in names if str(net.bus.at[i, "name"]) == wanted]
         hits = named or [i for i in names if str(i) == wanted] or [i for i in names if names[i] == wanted]
@@ -232,9 +240,9 @@ def _phase_rows(source: _Source, number: int) -> Iterable[CustomerRow]:
         used = [phase for phase, s in zip("abc", whole, strict=True) if s != 0]
         if not used:
             effect = "draws nothing on any phase in the source"
-            source.changes.append(Change(f"load {name}", WHOLE, "left out", effect))
+            source.changes.append(ConversionChange(f"load {name}", WHOLE, "left out", effect))
         elif not row.in_service:
-            source.changes.append(Change(f"load {name}", *SWITCHED_OFF))
+            source.changes.append(ConversionChange(f"load {name}", *SWITCHED_OFF))
         source.changes.extend(told)
         for phase, s in zip("abc", power, strict=True):
             if phase not in used:
@@ -256,11 +264,13 @@ def _known(source: _Source, customer: CustomerRow, s: complex) -> CustomerRow:
     label = f"load {customer.customer}"
     if s.real < 0:
         effect = "feeds in; its expected load is taken as 0"
-        source.changes.append(Change(label, "p_mw", "changed", effect))
+        source.changes.append(ConversionChange(label, "p_mw", "changed", effect))
     if s.real <= 0.0 and s.imag > 0.0:
-        source.changes.append(Change(label, *ONLY_REACTIVE))
+        source.changes.append(ConversionChange(label, *ONLY_REACTIVE))
     if s.imag < 0:
-        source.changes.append(Change(label, "power factor", "approximated", "leading; expected to be 1"))
+        source.changes.append(
+            ConversionChange(label, "power factor", "approximated", "leading; expected to be 1")
+        )
     return reactive(customer, s.real / abs(s) if s.real > 0 and s.imag > 0 else None)
 
 
@@ -269,7 +279,7 @@ def _load_row(source: _Source, index: int, name: str, number: int) -> CustomerRo
     scale = float(row.scaling) * float(row.in_service) * 1000.0
     s = complex(row.p_mw, row.q_mvar) * scale
     source.changes.extend(
-        Change(
+        ConversionChange(
             f"load {name}",
             column,
             "approximated",
@@ -279,7 +289,7 @@ def _load_row(source: _Source, index: int, name: str, number: int) -> CustomerRo
         if str(column).startswith("const_") and float(row[column]) > 0
     )
     if not row.in_service:
-        source.changes.append(Change(f"load {name}", *SWITCHED_OFF))
+        source.changes.append(ConversionChange(f"load {name}", *SWITCHED_OFF))
     low_voltage = float(source.net.bus.at[int(row.bus), "vn_kv"]) < 1.0
     profile = str(row["profile"]) if "profile" in row and isinstance(row["profile"], str) else ""
     if profile not in envelopes():
@@ -287,7 +297,7 @@ def _load_row(source: _Source, index: int, name: str, number: int) -> CustomerRo
         profile = usual_profile(number, household=low_voltage and s.real <= HOUSEHOLD_KW)
         if wanted:
             effect = f"is not in the library; {profile} instead"
-            source.changes.append(Change(f"load {name}", f"profile {wanted}", "changed", effect))
+            source.changes.append(ConversionChange(f"load {name}", f"profile {wanted}", "changed", effect))
     customer = CustomerRow(
         customer=name,
         bus=source.names[int(row.bus)],
@@ -309,13 +319,13 @@ def _generators(
             continue
         bus, label = source.names[int(generator.bus)], f"generator {names[i]}"
         if not generator.in_service:
-            source.changes.append(Change(label, WHOLE, "left out", "switched off in the source"))
+            source.changes.append(ConversionChange(label, WHOLE, "left out", "switched off in the source"))
             continue
         s = complex(generator.p_mw, generator.q_mvar) * float(generator.scaling)
         kw = rounded(max(s.real * 1000.0, 0.0))
         if s.real < 0.0:
             effect = "draws; its expected generation is taken as 0"
-            source.changes.append(Change(label, "p_mw", "changed", effect))
+            source.changes.append(ConversionChange(label, "p_mw", "changed", effect))
         kva = float(generator.sn_mva) * 1000.0
         kva = rounded(kva) if math.isfinite(kva) and kva > 0 else kw
         alone = [k for k in at_bus[bus] if rows[k].phases == "abc"]
@@ -324,11 +334,11 @@ def _generators(
             at_bus[bus].append(len(rows))
             rows.append(CustomerRow(customer=names[i], bus=bus, load_kw=0.0))
             effect = "has no load at its bus and became a customer of its own"
-            source.changes.append(Change(label, "customer", "changed", effect))
+            source.changes.append(ConversionChange(label, "customer", "changed", effect))
         k = alone[0]
         source.power[rows[k].customer] = source.power.get(rows[k].customer, 0j) - 1000.0 * s
         if s.imag != 0.0:
-            source.changes.append(Change(label, "q_mvar", "left out", "its droop curve decides"))
+            source.changes.append(ConversionChange(label, "q_mvar", "left out", "its droop curve decides"))
         rows[k] = replace(
             rows[k],
             pv_kw=rounded(rows[k].pv_kw + kw),
@@ -337,7 +347,7 @@ def _generators(
             droop=droop or droop_preset(rows[k].inverter_kva + kva),
         )
         effect = f"{rows[k].droop}, not in the source; at the first customer of its bus"
-        source.changes.append(Change(label, "droop curve", "added", effect))
+        source.changes.append(ConversionChange(label, "droop curve", "added", effect))
 
 
 def _sun(source: _Source, generator: Any, label: str, usual: str) -> str:
@@ -348,14 +358,18 @@ def _sun(source: _Source, generator: Any, label: str, usual: str) -> str:
     if profile in pv_names():
         return profile
     source.changes.extend(
-        Change(label, f"{column} {text}", "changed", f"in simulations generation by the sun, {usual}")
+        ConversionChange(
+            label, f"{column} {text}", "changed", f"in simulations generation by the sun, {usual}"
+        )
         for column, text in named.items()
         if column == "profile" or text.lower() not in SOLAR
     )
     return usual
 
 
-def _with_fleet(customers: list[CustomerRow], fleet: Fleet, changes: list[Change]) -> list[CustomerRow]:
+def _with_fleet(
+    customers: list[CustomerRow], fleet: Fleet, changes: list[ConversionChange]
+) -> list[CustomerRow]:
     rows = list(customers)
     bare = [k for k, row in enumerate(rows) if row.inverter_kva == 0.0]
     for k in bare[:: fleet.every]:
@@ -369,5 +383,5 @@ def _with_fleet(customers: list[CustomerRow], fleet: Fleet, changes: list[Change
                 droop=fleet.droop,
             )
             effect = f"synthetic, with droop curve {fleet.droop}; not in the source"
-            changes.append(Change(rows[k].customer, f"PV inverter of {kva:g} kVA", "added", effect))
+            changes.append(ConversionChange(rows[k].customer, f"PV inverter of {kva:g} kVA", "added", effect))
     return rows

@@ -22,8 +22,8 @@ from power_grid_model.validation import validate_input_data
 
 from feeders.convert.customers import SWITCHED_OFF, Draw, rounded
 from feeders.convert.lines import ALL, Coupling, by_sequence, capacitor, charging_cells, line_row, open_end
-from feeders.convert.network import Network
-from feeders.convert.provenance import WHOLE, Change, SourceUnreadable
+from feeders.convert.network import SourceNetwork
+from feeders.convert.provenance import WHOLE, ConversionChange, SourceUnreadable
 from feeders.convert.transformers import TwoPort, coupling_of
 from feeders.format.reader import some
 from feeders.format.tables import LineRow
@@ -66,7 +66,7 @@ TURN: Final = np.exp(-2j * np.pi / 3.0 * np.arange(3))
 Tables = dict[str, Any]
 
 
-def read_pgm(path: Path) -> Network:
+def read_pgm(path: Path) -> SourceNetwork:
     """Read and solve a file of input data.
 
     Parameters
@@ -95,11 +95,11 @@ def read_pgm(path: Path) -> Network:
         )
     dependent = [kind for kind in (*LOADS, *GENERATORS) if kind in tables and tables[kind]["type"].any()]
     found = _solve(path, tables, symmetric) if dependent else {}
-    network = Network(f"power-grid-model {version('power-grid-model')}", [], _nominal(tables))
+    network = SourceNetwork(f"power-grid-model {version('power-grid-model')}", [], _nominal(tables))
     for kind in dependent:
         for row in tables[kind][tables[kind]["type"] != 0]:
             law = "impedance" if row["type"] == 1 else "current"
-            change = Change(
+            change = ConversionChange(
                 f"{kind} {row['id']}",
                 f"constant {law}",
                 "approximated",
@@ -199,7 +199,7 @@ def _finite(value: float) -> float | None:
     return rounded(float(value)) if np.isfinite(value) else None
 
 
-def _lines(tables: Tables, network: Network) -> None:
+def _lines(tables: Tables, network: SourceNetwork) -> None:
     for kind in ("line", "link"):
         for row in _rows(tables, kind):
             name, ends = f"{kind} {row['id']}", (str(row["from_node"]), str(row["to_node"]))
@@ -209,7 +209,9 @@ def _lines(tables: Tables, network: Network) -> None:
             b1, b0 = OMEGA * float(row["c1"]), OMEGA * float(row["c0"])
             if row["tan1"] > 0 and b1 > 0:
                 effect = f"{1e6 * b1 * float(row['tan1']):.3g} microsiemens"
-                network.of_bus.append((ends[0], Change(name, "shunt conductance", "left out", effect)))
+                network.of_bus.append(
+                    (ends[0], ConversionChange(name, "shunt conductance", "left out", effect))
+                )
             limit = _finite(row["i_n"])
             made = LineRow(
                 name,
@@ -225,7 +227,7 @@ def _lines(tables: Tables, network: Network) -> None:
             _add_line(row, made, network)
 
 
-def _add_line(row: Any, made: LineRow, network: Network) -> None:
+def _add_line(row: Any, made: LineRow, network: SourceNetwork) -> None:
     network.lines.append(made)
     if bool(row["from_status"]) != bool(row["to_status"]):
         bus = made.from_bus if row["from_status"] else made.to_bus
@@ -233,7 +235,7 @@ def _add_line(row: Any, made: LineRow, network: Network) -> None:
         network.lines += [stub] if stub else []
 
 
-def _asymmetric_lines(tables: Tables, network: Network) -> None:
+def _asymmetric_lines(tables: Tables, network: SourceNetwork) -> None:
     """Lines with matrices; a neutral is grounded at both ends and eliminated."""
     for row in _rows(tables, "asym_line"):
         name, ends = f"asym_line {row['id']}", (str(row["from_node"]), str(row["to_node"]))
@@ -244,7 +246,7 @@ def _asymmetric_lines(tables: Tables, network: Network) -> None:
                 z[i, j] = z[j, i] = complex(row[f"r_{one}{other}"], row[f"x_{one}{other}"])
         if len(letters) > 3:
             z = z[:3, :3] - np.outer(z[:3, 3], z[3, :3]) / z[3, 3]
-        changes: list[Change] = []
+        changes: list[ConversionChange] = []
         made = line_row(name, ends, np.arange(3), series=z, shunt=_capacitances(row), changes=changes)
         network.of_bus.extend((ends[0], change) for change in changes)
         limit = _finite(row["i_n"])
@@ -261,7 +263,7 @@ def _capacitances(row: Any) -> Floats:
     return np.asarray(OMEGA * c)
 
 
-def _couplings(tables: Tables, solved: Tables, network: Network, *, symmetric: bool) -> None:
+def _couplings(tables: Tables, solved: Tables, network: SourceNetwork, *, symmetric: bool) -> None:
     ports = _two_ports(tables, symmetric)
     for kind, sides in COUPLINGS.items():
         for row, flow in zip(_rows(tables, kind), _rows(solved, kind), strict=True):
@@ -274,7 +276,9 @@ def _couplings(tables: Tables, solved: Tables, network: Network, *, symmetric: b
             ]
             joined = [k for k, ok in enumerate(on) if ok]
             if len(joined) < 2:
-                network.changes.append(Change(label, WHOLE, "left out", "switched off in the source"))
+                network.changes.append(
+                    ConversionChange(label, WHOLE, "left out", "switched off in the source")
+                )
                 continue
             ends = tuple(str(row[sides[k][0]]) for k in joined)
             flows = tuple(_by_phase(flow[sides[k][1]], flow[sides[k][2]]) for k in joined)
@@ -376,45 +380,47 @@ def _by_phase(p: Any, q: Any) -> Phasors:
     return np.asarray(np.full(3, s / 3.0) if s.ndim == 0 else s, dtype=np.complex128)
 
 
-def _draws(tables: Tables, network: Network) -> None:
+def _draws(tables: Tables, network: SourceNetwork) -> None:
     for kind in (*LOADS, *GENERATORS):
         sign = -1.0 if kind in GENERATORS else 1.0
         for row in _rows(tables, kind):
             power = sign * float(row["status"]) * _by_phase(row["p_specified"], row["q_specified"])
             even = bool((power == power[0]).all())
             if not row["status"]:
-                off = Change(f"{kind} {row['id']}", *SWITCHED_OFF)
+                off = ConversionChange(f"{kind} {row['id']}", *SWITCHED_OFF)
                 network.of_bus.append((str(row["node"]), off))
             rating = float(np.abs(power.sum())) if kind in GENERATORS else None
             network.draws.append(Draw(f"{kind} {row['id']}", str(row["node"]), power, even, rating))
 
 
-def _shunts(tables: Tables, solved: Tables, network: Network) -> None:
+def _shunts(tables: Tables, solved: Tables, network: SourceNetwork) -> None:
     for row, flow in zip(_rows(tables, "shunt"), _rows(solved, "shunt"), strict=True):
         label, bus = f"shunt {row['id']}", str(row["node"])
         p, q = (1e-3 * float(np.sum(flow[name])) for name in ("p", "q"))
         if not row["status"]:
-            network.of_bus.append((bus, Change(label, WHOLE, "left out", "switched off in the source")))
+            network.of_bus.append(
+                (bus, ConversionChange(label, WHOLE, "left out", "switched off in the source"))
+            )
             continue
         if row["g1"] != 0:
-            network.of_bus.append((bus, Change(label, "conductance", "left out", f"{p:.4g} kW")))
+            network.of_bus.append((bus, ConversionChange(label, "conductance", "left out", f"{p:.4g} kW")))
         if row["b1"] > 0:
             block = by_sequence(float(row["b1"]), float(row["b0"]))
             network.lines.append(capacitor(f"{label}", bus, block))
             effect = f"{-q:.4g} kvar as the charging of a line to nowhere"
-            network.of_bus.append((bus, Change(label, "connection", "changed", effect)))
+            network.of_bus.append((bus, ConversionChange(label, "connection", "changed", effect)))
         elif row["b1"] < 0:
-            network.of_bus.append((bus, Change(label, "inductance", "left out", f"{q:.4g} kvar")))
+            network.of_bus.append((bus, ConversionChange(label, "inductance", "left out", f"{q:.4g} kvar")))
 
 
-def _rest(tables: Tables, network: Network) -> None:
+def _rest(tables: Tables, network: SourceNetwork) -> None:
     """Report sources out of service, and tables without network elements."""
     for row in _rows(tables, "source"):
         if not row["status"]:
-            off = Change(f"source {row['id']}", WHOLE, "left out", "switched off in the source")
+            off = ConversionChange(f"source {row['id']}", WHOLE, "left out", "switched off in the source")
             network.of_bus.append((str(row["node"]), off))
     for kind, rows in tables.items():
         if not len(rows) or kind in CARRIED:
             continue
         effect = MEASURE if kind.endswith("_sensor") else NOTED.get(kind, UNLIKE)
-        network.changes.append(Change(f"{len(rows)} {kind}(s)", WHOLE, "left out", effect))
+        network.changes.append(ConversionChange(f"{len(rows)} {kind}(s)", WHOLE, "left out", effect))

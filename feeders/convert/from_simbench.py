@@ -19,7 +19,7 @@ from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, QhullError
 
 from feeders.convert.provenance import SourceUnreadable
-from feeders.model.profiles import Envelope, Season
+from feeders.model.profiles import ReactiveEnvelope, Season
 from feeders.util import extra
 from gridsec.arrays import Floats
 from gridsec.errors import GridsecError
@@ -150,7 +150,7 @@ def load_profiles(columns: Mapping[str, Floats]) -> list[str]:
     return sorted(name.removesuffix("_pload") for name in columns if name.endswith("_pload"))
 
 
-def envelope(p: Floats, q: Floats) -> Envelope:
+def envelope(p: Floats, q: Floats) -> ReactiveEnvelope:
     """Smallest wedge with a floor that contains every point of a load profile.
 
     Minimises the mean width ``(high - low) w + 2 floor`` subject to ``low p - floor <= q <= high p + floor``
@@ -190,7 +190,7 @@ def envelope(p: Floats, q: Floats) -> Envelope:
         raise GridsecError(f"no envelope of the load profile: {found.message}", code="no-solution")
     low, high, bottom = map(float, found.x)
     # Rounded outwards, and wide enough for the rounded samples of the slices.
-    return Envelope(floor(low * 1e3) / 1e3, ceil(high * 1e3) / 1e3, ceil((bottom + 1e-3) * 1e3) / 1e3)
+    return ReactiveEnvelope(floor(low * 1e3) / 1e3, ceil(high * 1e3) / 1e3, ceil((bottom + 1e-3) * 1e3) / 1e3)
 
 
 def envelopes_csv(columns: Mapping[str, Floats]) -> str:

@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from feeders.convert.customers import Draw, rounded
-from feeders.convert.provenance import WHOLE, Change
+from feeders.convert.provenance import WHOLE, ConversionChange
 from feeders.format.matrices import SERIES_NAMES, SHUNT_NAMES, cells_of, columns_of, passive, shunt_us
 from feeders.format.tables import LineRow
 from feeders.model.three_phase import series_of, shunt_of
@@ -115,7 +115,7 @@ def line_row(
     *,
     series: Phasors,
     shunt: Floats,
-    changes: list[Change],
+    changes: list[ConversionChange],
 ) -> LineRow:
     """Row of a line with matrices.
 
@@ -149,7 +149,7 @@ def line_row(
     like_each_other = cyclic(series)
     if not like_each_other and not passive(series.real):
         effect = "its resistances generate power; taken as transposed"
-        changes.append(Change(f"line {name}", "impedance matrix", "approximated", effect))
+        changes.append(ConversionChange(f"line {name}", "impedance matrix", "approximated", effect))
         like_each_other = True
     if like_each_other:
         zero = own + 2.0 * mutual
@@ -185,7 +185,7 @@ def _cells(symbol: str, unit: str, matrix: Floats, phases: Ints) -> dict[str, An
     return {name: rounded(value) for name, value in found.items()}
 
 
-def charging_cells(name: str, phases: Ints, shunt: Floats, changes: list[Change]) -> dict[str, Any]:
+def charging_cells(name: str, phases: Ints, shunt: Floats, changes: list[ConversionChange]) -> dict[str, Any]:
     """Cells of a line's charging: one number, or a matrix beside its positive sequence.
 
     Parameters
@@ -198,7 +198,9 @@ def charging_cells(name: str, phases: Ints, shunt: Floats, changes: list[Change]
     if len(phases) == 1 or (cyclic(shunt) and abs(mutual) <= CYCLIC * abs(own)):
         return one
     if not passive(shunt):
-        changes.append(Change(f"line {name}", CHARGING, "approximated", "no capacitances; " + IN_EVERY_PHASE))
+        changes.append(
+            ConversionChange(f"line {name}", CHARGING, "approximated", "no capacitances; " + IN_EVERY_PHASE)
+        )
         return one
     return one | _cells("b", "us", 1e6 * shunt, phases)
 
@@ -219,7 +221,7 @@ CHARGING: Final = "charging between phases"
 IN_EVERY_PHASE: Final = "the positive-sequence charging in every phase; exact where the voltages are balanced"
 
 
-def balanced_charging(lines: Sequence[LineRow], changes: list[Change]) -> list[LineRow]:
+def balanced_charging(lines: Sequence[LineRow], changes: list[ConversionChange]) -> list[LineRow]:
     """Reduce charging to its positive sequence, if nothing else needs three phases.
 
     Parameters
@@ -235,7 +237,9 @@ def balanced_charging(lines: Sequence[LineRow], changes: list[Change]) -> list[L
     ) or not all(matrix is None or cyclic(matrix) for matrix in matrices):
         return list(lines)
     given = [row.line for row, matrix in zip(lines, matrices, strict=True) if matrix is not None]
-    changes.extend(Change(f"line {name}", CHARGING, "approximated", IN_EVERY_PHASE) for name in given)
+    changes.extend(
+        ConversionChange(f"line {name}", CHARGING, "approximated", IN_EVERY_PHASE) for name in given
+    )
     nothing: dict[str, Any] = dict.fromkeys(SHUNT_NAMES)
     return [replace(row, **nothing) if row.line in given else row for row in lines]
 
@@ -343,7 +347,7 @@ def phases_of(row: LineRow) -> Ints:
 
 
 def merged(
-    lines: Sequence[LineRow], busbar: str, changes: list[Change], nominal: Mapping[str, float]
+    lines: Sequence[LineRow], busbar: str, changes: list[ConversionChange], nominal: Mapping[str, float]
 ) -> list[LineRow]:
     """Merge parallel lines to one, and open lines that switches short-circuit.
 
@@ -371,7 +375,9 @@ def merged(
         one, other = fused(row.from_bus), fused(row.to_bus)
         if solid and one == other:
             changes.append(
-                Change(f"switch {row.line}", "closed", "changed", "open; others join the same buses")
+                ConversionChange(
+                    f"switch {row.line}", "closed", "changed", "open; others join the same buses"
+                )
             )
             row = replace(row, closed=False)  # noqa: PLW2901
         elif solid:
@@ -387,7 +393,9 @@ def merged(
             for k in members:
                 rows[k] = replace(rows[k], closed=False)
                 changes.append(
-                    Change(f"line {rows[k].line}", "closed", "changed", "open; switches join its two ends")
+                    ConversionChange(
+                        f"line {rows[k].line}", "closed", "changed", "open; switches join its two ends"
+                    )
                 )
         elif len(members) > 1:
             start = fused(rows[members[0]].from_bus)
@@ -399,7 +407,7 @@ def merged(
     return [row for k, row in enumerate(rows) if k not in gone]
 
 
-def _parallel(rows: list[LineRow], changes: list[Change]) -> LineRow:
+def _parallel(rows: list[LineRow], changes: list[ConversionChange]) -> LineRow:
     """Merge lines between the same buses."""
     names = " + ".join(row.line for row in rows)
     first = rows[0]
@@ -407,7 +415,9 @@ def _parallel(rows: list[LineRow], changes: list[Change]) -> LineRow:
     tapped = len({row.taps for row in rows}) > 1
     if not alike or any((row.in_phases and len(row.phases) > 1) or tapped for row in rows):
         return _side_by_side(rows, names, changes)
-    changes.append(Change(f"lines {names}", WHOLE, "changed", f"in parallel; one line {first.line}"))
+    changes.append(
+        ConversionChange(f"lines {names}", WHOLE, "changed", f"in parallel; one line {first.line}")
+    )
     positive = [complex(row.r_ohm, row.x_ohm) for row in rows]
     total = 1.0 / sum(1.0 / z for z in positive)
     limit = _shared(rows, [abs(total) / abs(z) for z in positive])
@@ -427,7 +437,7 @@ def _parallel(rows: list[LineRow], changes: list[Change]) -> LineRow:
     return replace(joined, r0_ohm=rounded(zero.real), x0_ohm=rounded(zero.imag))
 
 
-def _side_by_side(rows: list[LineRow], names: str, changes: list[Change]) -> LineRow:
+def _side_by_side(rows: list[LineRow], names: str, changes: list[ConversionChange]) -> LineRow:
     """Merge lines of any phases and matrices between the same buses: their admittances add up."""
     first = rows[0]
     each: list[Phasors] = []
@@ -442,12 +452,14 @@ def _side_by_side(rows: list[LineRow], names: str, changes: list[Change]) -> Lin
         taps[own] = np.where(np.isnan(taps[own]), np.array(row.taps)[own], taps[own])
         if np.abs(taps[own] - np.array(row.taps)[own]).max() > CYCLIC:
             effect = f"that of {first.line} beside it; the current that their difference drives is left out"
-            changes.append(Change(f"line {row.line}", "tap", "approximated", effect))
+            changes.append(ConversionChange(f"line {row.line}", "tap", "approximated", effect))
     admittance = np.sum(each, axis=0)
     phases = np.flatnonzero(admittance.diagonal())
     there = np.ix_(phases, phases)
     series = np.asarray(np.linalg.inv(admittance[there]))
-    changes.append(Change(f"lines {names}", WHOLE, "changed", f"side by side; one line {first.line}"))
+    changes.append(
+        ConversionChange(f"lines {names}", WHOLE, "changed", f"side by side; one line {first.line}")
+    )
     joined = line_row(
         first.line,
         (first.from_bus, first.to_bus),
@@ -464,7 +476,7 @@ def _side_by_side(rows: list[LineRow], names: str, changes: list[Change]) -> Lin
     even = all(np.abs(part - np.diag(part.diagonal())).max() <= CYCLIC for part in parts)
     if limit is not None and not (even and np.ptp(limits) <= CYCLIC * limit):
         effect = f"{limit:g} A, the least of its conductors' in balanced currents"
-        changes.append(Change(f"lines {names}", "rating", "approximated", effect))
+        changes.append(ConversionChange(f"lines {names}", "rating", "approximated", effect))
     joined = replace(joined, rating_a=limit, to_x=first.to_x, to_y=first.to_y, to_volt=first.to_volt)
     return with_taps(joined, taps)
 

@@ -1,8 +1,8 @@
 """Network of any tool, and the feeder below one of its buses.
 
-The readers of other tools' files build a `Network` in SI, which is converted to a feeder's tables. The steps:
-find the busbar, cut off the rest of the network, merge parallel lines, and replace transformers below the
-busbar by customers with their power.
+The readers of other tools' files build a `SourceNetwork` in SI, which is converted to a feeder's tables. The
+steps: find the busbar, cut off the rest of the network, merge parallel lines, and replace transformers below
+the busbar by customers with their power.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from feeders.convert.lines import (
     reached,
     turned,
 )
-from feeders.convert.provenance import WHOLE, BusbarUnclear, Change
+from feeders.convert.provenance import WHOLE, BusbarUnclear, ConversionChange
 from feeders.convert.round_trip import SourceState
 from feeders.convert.transformers import EVERYTHING, Extent, levels_of, transformed
 from feeders.format.columns import SUSPICIONS
@@ -47,8 +47,8 @@ __all__ = [
     "BEYOND",
     "UNFED",
     "Converted",
-    "Network",
-    "Part",
+    "SourceNetwork",
+    "SuppliedArea",
     "accepting",
     "angles_of",
     "below",
@@ -69,7 +69,9 @@ TURNED: Final = 1.0
 """Largest deviation of the angles between a busbar's phases from those of a feeder, degrees."""
 
 
-def chosen(network: Network, find: Callable[[], Busbar], opened: Sequence[str], droop: str | None) -> Busbar:
+def chosen(
+    network: SourceNetwork, find: Callable[[], Busbar], opened: Sequence[str], droop: str | None
+) -> Busbar:
     """Busbar of the conversion; reports all other unknown choices together with an unknown busbar.
 
     Parameters
@@ -105,7 +107,9 @@ def chosen(network: Network, find: Callable[[], Busbar], opened: Sequence[str], 
     return busbar
 
 
-def opened_rows(lines: Iterable[LineRow], opened: Sequence[str], changes: list[Change]) -> list[LineRow]:
+def opened_rows(
+    lines: Iterable[LineRow], opened: Sequence[str], changes: list[ConversionChange]
+) -> list[LineRow]:
     """Open the requested lines.
 
     Parameters
@@ -126,13 +130,15 @@ def opened_rows(lines: Iterable[LineRow], opened: Sequence[str], changes: list[C
     if unknown := _unknown(rows, opened):
         raise FeederInvalid(unknown)
     changes.extend(
-        Change(f"line {line}", "closed", "changed", "open, as requested; the check shows the effect")
+        ConversionChange(
+            f"line {line}", "closed", "changed", "open, as requested; the check shows the effect"
+        )
         for line in opened
     )
     return [replace(row, closed=False) if row.line in opened else row for row in rows]
 
 
-def busbar_of(network: Network, rows: list[LineRow], root: str | None) -> str:
+def busbar_of(network: SourceNetwork, rows: list[LineRow], root: str | None) -> str:
     """Requested bus, or the first bus with lines below the source.
 
     Parameters
@@ -163,7 +169,7 @@ def busbar_of(network: Network, rows: list[LineRow], root: str | None) -> str:
     return way[-1]
 
 
-def named_bus(network: Network, root: str) -> str:
+def named_bus(network: SourceNetwork, root: str) -> str:
     """Requested bus.
 
     Parameters
@@ -191,13 +197,13 @@ def _unknown(lines: Iterable[LineRow], opened: Sequence[str]) -> list[str]:
     ]
 
 
-def below_source(network: Network) -> str | None:
+def below_source(network: SourceNetwork) -> str | None:
     """Bus behind the only transformer of the only source; None without such a bus."""
     way = _way_down(network, network.lines) if len(network.sources) == 1 else []
     return way[-1] if len(way) > 1 and _has_lines(way[-1], network.lines) else None
 
 
-def angles_of(volts: Phasors, busbar: str, changes: list[Change]) -> Phasors:
+def angles_of(volts: Phasors, busbar: str, changes: list[ConversionChange]) -> Phasors:
     """Busbar voltages with the angles of a feeder.
 
     The busbar meter reads magnitudes; simulations and monitors assume angles of 0, -120 and 120 degrees.
@@ -225,7 +231,7 @@ def angles_of(volts: Phasors, busbar: str, changes: list[Change]) -> Phasors:
         return volts
     theirs, ours = (_degrees(each[there]) for each in (volts / first, of_feeder))
     effect = f"{ours} degrees, in the source {theirs}; the check shows the effect"
-    changes.append(Change(f"bus {busbar}", "angles between its phases", "approximated", effect))
+    changes.append(ConversionChange(f"bus {busbar}", "angles between its phases", "approximated", effect))
     return np.asarray(np.abs(volts) * of_feeder)
 
 
@@ -239,7 +245,7 @@ def one_busbar(buses: Collection[str], rows: Iterable[LineRow]) -> bool:
     return bool(buses) and fused_with(min(buses), rows).keys() >= set(buses)
 
 
-def _way_down(network: Network, rows: list[LineRow]) -> list[str]:
+def _way_down(network: SourceNetwork, rows: list[LineRow]) -> list[str]:
     """Follow transformers from the source to the first bus with lines or with several transformers."""
     way = [network.sources[0]]
     while not _has_lines(way[-1], rows):
@@ -254,7 +260,7 @@ def _has_lines(bus: str, rows: list[LineRow]) -> bool:
     return any(row.closed and bus in (row.from_bus, row.to_bus) for row in rows)
 
 
-def _beyond(network: Network, way: list[str]) -> set[str]:
+def _beyond(network: SourceNetwork, way: list[str]) -> set[str]:
     return {bus for each in network.couplings if way[-1] in each.buses for bus in each.buses} - set(way)
 
 
@@ -264,7 +270,7 @@ BEYOND: Final = "supplied in the source, but not through the feeder: see the ele
 
 
 @dataclass(slots=True)
-class Network:
+class SourceNetwork:
     """Network in SI, with the state by its own tool.
 
     Attributes
@@ -304,8 +310,8 @@ class Network:
     xy: dict[str, tuple[float, float]] = field(default_factory=dict)
     volts: dict[str, Phasors] = field(default_factory=dict)
     as_found: dict[str, Phasors] = field(default_factory=dict)
-    changes: list[Change] = field(default_factory=list)
-    of_bus: list[tuple[str, Change]] = field(default_factory=list)
+    changes: list[ConversionChange] = field(default_factory=list)
+    of_bus: list[tuple[str, ConversionChange]] = field(default_factory=list)
     connected: list[tuple[str, str]] = field(default_factory=list)
     unsolved: str = ""
 
@@ -327,13 +333,13 @@ class Converted:
     """
 
     tables: FeederTables
-    changes: tuple[Change, ...]
+    changes: tuple[ConversionChange, ...]
     state: SourceState | None
     unchecked: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Part:
+class SuppliedArea:
     """Part of a network below a busbar.
 
     Attributes
@@ -354,11 +360,11 @@ class Part:
     inside: dict[str, int]
     lines: list[LineRow]
     draws: list[Draw]
-    changes: list[Change]
+    changes: list[ConversionChange]
 
 
 def feeder_of(
-    network: Network,
+    network: SourceNetwork,
     name: str,
     *,
     root: str | None = None,
@@ -412,7 +418,9 @@ def feeder_of(
     return finished(network, part, tables, power)
 
 
-def below(network: Network, root: str | None, opened: Sequence[str], extent: Extent = EVERYTHING) -> Part:
+def below(
+    network: SourceNetwork, root: str | None, opened: Sequence[str], extent: Extent = EVERYTHING
+) -> SuppliedArea:
     """Cut the part below a bus out of a network.
 
     Parameters
@@ -444,10 +452,12 @@ def below(network: Network, root: str | None, opened: Sequence[str], extent: Ext
     elsewhere = above_busbar(busbar, network.sources, rows, network.couplings) | summed | inside.keys()
     changes.extend(_not_fed(network, elsewhere))
     changes.extend(change for bus, change in network.of_bus if bus in inside)
-    return Part(busbar, inside, merged(kept, busbar, changes, network.nominal), draws, changes)
+    return SuppliedArea(busbar, inside, merged(kept, busbar, changes, network.nominal), draws, changes)
 
 
-def finished(network: Network, part: Part, tables: FeederTables, power: Mapping[str, complex]) -> Converted:
+def finished(
+    network: SourceNetwork, part: SuppliedArea, tables: FeederTables, power: Mapping[str, complex]
+) -> Converted:
     """Assemble the result of a conversion.
 
     Parameters
@@ -487,7 +497,7 @@ def finished(network: Network, part: Part, tables: FeederTables, power: Mapping[
     return Converted(accepted, changes, state)
 
 
-def accepting(tables: FeederTables, changes: list[Change], unchecked: str) -> FeederTables:
+def accepting(tables: FeederTables, changes: list[ConversionChange], unchecked: str) -> FeederTables:
     """Accept values that are doubtful only for their unit: the source's tool knows its units.
 
     Parameters
@@ -512,7 +522,7 @@ def accepting(tables: FeederTables, changes: list[Change], unchecked: str) -> Fe
         problems.append(Problem(problem.code, sentence))
         if found:
             doubts.add(doubt.partition('"')[0])
-            changes.append(Change("feeder", sentence, "accepted", "as in the source"))
+            changes.append(ConversionChange("feeder", sentence, "accepted", "as in the source"))
     if doubts and unchecked:
         raise FeederInvalid(
             [*problems, Problem("doubtful", f"{unchecked}; doubtful values cannot be confirmed")]
@@ -521,7 +531,9 @@ def accepting(tables: FeederTables, changes: list[Change], unchecked: str) -> Fe
     return replace(tables, meta=replace(tables.meta, accept=accept)) if accept else tables
 
 
-def _infeeds(network: Network, rows: list[LineRow], busbar: str, inside: Mapping[str, int]) -> list[Problem]:
+def _infeeds(
+    network: SourceNetwork, rows: list[LineRow], busbar: str, inside: Mapping[str, int]
+) -> list[Problem]:
     """Further infeeds besides the busbar."""
     problems = []
     everything = [*rows, *as_rows(network.couplings)]
@@ -551,7 +563,7 @@ def _infeeds(network: Network, rows: list[LineRow], busbar: str, inside: Mapping
 
 
 def _kept(
-    network: Network, rows: list[LineRow], inside: Mapping[str, int], changes: list[Change]
+    network: SourceNetwork, rows: list[LineRow], inside: Mapping[str, int], changes: list[ConversionChange]
 ) -> list[LineRow]:
     """Lines of the feeder, each pointing away from the busbar, with positions."""
     kept = []
@@ -564,14 +576,14 @@ def _kept(
             kept.append(replace(away, to_x=place[0], to_y=place[1]) if place else away)
         elif a or b:
             changes.append(
-                Change(
+                ConversionChange(
                     f"line {row.line}", WHOLE, "left out", "open, towards buses that the busbar does not feed"
                 )
             )
     outside = len(network.nominal.keys() - inside.keys())
     if outside:
         changes.append(
-            Change(
+            ConversionChange(
                 _buses(outside),
                 WHOLE,
                 "left out",
@@ -581,13 +593,13 @@ def _kept(
     return kept
 
 
-def _not_fed(network: Network, elsewhere: Collection[str]) -> Iterator[Change]:
+def _not_fed(network: SourceNetwork, elsewhere: Collection[str]) -> Iterator[ConversionChange]:
     """Loads and generators that are connected neither to the feeder nor, as far as known, `elsewhere`."""
     everybody = [(draw.bus, draw.label) for draw in network.draws if not draw.idle]
     for bus, label in dict.fromkeys([*network.connected, *everybody]):
         if bus not in elsewhere:
             fed = bool(np.isfinite(network.volts.get(bus, np.nan)).any())
-            yield Change(label, WHOLE, "left out", BEYOND if fed else UNFED)
+            yield ConversionChange(label, WHOLE, "left out", BEYOND if fed else UNFED)
 
 
 def _buses(count: int) -> str:
@@ -595,7 +607,7 @@ def _buses(count: int) -> str:
 
 
 def _behind(
-    network: Network, rows: list[LineRow], inside: Mapping[str, int], changes: list[Change]
+    network: SourceNetwork, rows: list[LineRow], inside: Mapping[str, int], changes: list[ConversionChange]
 ) -> tuple[list[Draw], set[str]]:
     """Couplings below the busbar as powers into them, and the buses behind them."""
     everything = [*rows, *as_rows(network.couplings)]
@@ -616,7 +628,7 @@ def _behind(
         }
         if not np.isfinite(np.array([each.power_kva[k] for k in ends])).all():
             effect = f"{_buses(len(far))}; the power into it is not known"
-            changes.append(Change(each.name, "load side", "left out", effect))
+            changes.append(ConversionChange(each.name, "load side", "left out", effect))
             continue
         summed |= far
         for k in ends:
@@ -626,7 +638,7 @@ def _behind(
         total = sum((each.power_kva[k].sum() for k in ends), start=0j)
         what = f"{_buses(len(far))} became a customer with" if far else "in a loop; customers with"
         changes.append(
-            Change(
+            ConversionChange(
                 each.name,
                 "load side",
                 "changed",

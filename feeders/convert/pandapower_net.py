@@ -17,8 +17,8 @@ import numpy as np
 
 from feeders.convert.customers import Draw, as_it_stands, in_star, rounded
 from feeders.convert.lines import ALL, by_sequence, capacitor, charging_cells, open_end
-from feeders.convert.network import Network
-from feeders.convert.provenance import WHOLE, Change
+from feeders.convert.network import SourceNetwork
+from feeders.convert.provenance import WHOLE, ConversionChange
 from feeders.convert.transformers import TwoPort, coupling_of
 from feeders.format.tables import LineRow
 from feeders.format.validation import same_level
@@ -248,7 +248,7 @@ def unbalanced(net: Any) -> bool:
     )
 
 
-def solve(net: Any, buses: dict[int, str], network: Network) -> Any:
+def solve(net: Any, buses: dict[int, str], network: SourceNetwork) -> Any:
     """Run the net's own power flow; the solved copy, or None with the reason in the network.
 
     Parameters
@@ -302,14 +302,14 @@ def _three_phases(solved: Any) -> None:
         pandapower.runpp_3ph(solved, numba=False, tolerance_mva=1e-11)
 
 
-def _named_connections(solved: Any, network: Network) -> None:
+def _named_connections(solved: Any, network: SourceNetwork) -> None:
     """Set unknown connection types to star: pandapower ignores such rows."""
     for table in CONNECTED:
         others = ~solved[table].type.isin(CONNECTIONS)
         if others.any():
             solved[table].loc[others, "type"] = "wye"
             effect = "in star; pandapower's own three-phase power flow ignores other types"
-            network.changes.append(Change(f"{others.sum()} {table}(s)", "type", "changed", effect))
+            network.changes.append(ConversionChange(f"{others.sum()} {table}(s)", "type", "changed", effect))
 
 
 def _volts(net: Any, buses: dict[int, str]) -> dict[str, Phasors]:
@@ -363,7 +363,9 @@ def between_phases(net: Any, row: Any) -> bool:
     return row.get("type") == "delta" and unbalanced(net)
 
 
-def phase_powers(net: Any, row: Any, label: str, volts: Phasors | None) -> tuple[Phasors, list[Change]]:
+def phase_powers(
+    net: Any, row: Any, label: str, volts: Phasors | None
+) -> tuple[Phasors, list[ConversionChange]]:
     """Powers of a load from each phase, or of a generator into it, kVA, and approximations.
 
     Parameters
@@ -388,7 +390,7 @@ def phase_powers(net: Any, row: Any, label: str, volts: Phasors | None) -> tuple
     effect = "in star, with its phases' powers of the source's power flow; exact at these loads only"
     known = volts is not None and bool(np.isfinite(volts).all())
     return in_star(power, volts if known and volts is not None else TURN), [
-        Change(label, "delta", "approximated", effect)
+        ConversionChange(label, "delta", "approximated", effect)
     ]
 
 
@@ -425,7 +427,7 @@ SHUNTS: Final = ("gf_pu", "bf_pu", "gt_pu", "bt_pu")
 SIDES: Final = {"trafo": ("hv", "lv"), "trafo3w": ("hv", "mv", "lv")}
 
 
-def network_of(net: Any) -> Network:
+def network_of(net: Any) -> SourceNetwork:
     """Convert a net to a network; `convert.from_pandapower` converts its loads and static generators.
 
     Parameters
@@ -445,14 +447,16 @@ def network_of(net: Any) -> Network:
     nominal = {buses[int(i)]: float(kv) * 1000.0 / math.sqrt(3.0) for i, kv in net.bus.vn_kv.items()}
     dead = _dead(net)
     feeds = net.ext_grid.bus[net.ext_grid.in_service.astype(bool) & ~net.ext_grid.bus.isin(dead)]
-    network = Network(
+    network = SourceNetwork(
         f"pandapower {version('pandapower')}",
         list(dict.fromkeys(buses[int(bus)] for bus in feeds)),
         nominal,
     )
     network.xy = {buses[int(i)]: place for i in net.bus.index if (place := _place(net, int(i))) is not None}
     off = "out of service in the source"
-    network.changes.extend(Change(f"bus {buses[bus]}", WHOLE, "left out", off) for bus in sorted(dead))
+    network.changes.extend(
+        ConversionChange(f"bus {buses[bus]}", WHOLE, "left out", off) for bus in sorted(dead)
+    )
     network.lines = [*_line_rows(net, buses, network), *_switch_rows(net, buses, network)]
     _impedances(net, buses, network)
     solved = solve(net, buses, network)
@@ -483,7 +487,7 @@ def _place(net: Any, bus: int) -> tuple[float, float] | None:
 # --- lines and switches -------------------------------------------------------------------------
 
 
-def _line_rows(net: Any, buses: dict[int, str], network: Network) -> Iterator[LineRow]:
+def _line_rows(net: Any, buses: dict[int, str], network: SourceNetwork) -> Iterator[LineRow]:
     names = ids(net.line, "line")
     opened = _opened(net, "l")
     dead = _dead(net)
@@ -522,12 +526,12 @@ def _opened(net: Any, kind: str) -> set[tuple[int, int]]:
     return {(int(element), int(bus)) for element, bus in zip(switches.element, switches.bus, strict=True)}
 
 
-def _side_effects(row: dict[str, Any], label: str, bus: str, closed: bool, network: Network) -> None:
+def _side_effects(row: dict[str, Any], label: str, bus: str, closed: bool, network: SourceNetwork) -> None:
     """Report properties that a row of lines.csv lacks."""
     length, parallel = float(row["length_km"]), float(row["parallel"])
     if row["g_us_per_km"] > 0 and closed:
         effect = f"{row['g_us_per_km'] * length * parallel:.3g} microsiemens"
-        network.of_bus.append((bus, Change(label, "shunt conductance", "left out", effect)))
+        network.of_bus.append((bus, ConversionChange(label, "shunt conductance", "left out", effect)))
 
 
 def _zero_sequence(row: dict[str, Any], column: str, factor: float) -> float | None:
@@ -535,7 +539,7 @@ def _zero_sequence(row: dict[str, Any], column: str, factor: float) -> float | N
     return rounded(value * factor) if math.isfinite(value) else None
 
 
-def _switch_rows(net: Any, buses: dict[int, str], network: Network) -> Iterator[LineRow]:
+def _switch_rows(net: Any, buses: dict[int, str], network: SourceNetwork) -> Iterator[LineRow]:
     names, dead = _switch_names(net), _dead(net)
     for i in map(int, net.switch.index):
         row = net.switch.loc[i]
@@ -548,7 +552,7 @@ def _switch_rows(net: Any, buses: dict[int, str], network: Network) -> Iterator[
             closed = bool(row.closed) and dead.isdisjoint(ends)
             if ohm and closed and unbalanced(net):
                 effect = "as in the table; pandapower's own three-phase power flow takes a third of it"
-                change = Change(f"switch {names[i]}", "impedance", "changed", effect)
+                change = ConversionChange(f"switch {names[i]}", "impedance", "changed", effect)
                 network.of_bus.append((buses[ends[0]], change))
             yield replace(made, r0_ohm=zero[0], x0_ohm=zero[1], closed=closed)
 
@@ -557,7 +561,7 @@ def _switch_names(net: Any) -> dict[int, str]:
     return ids(net.switch, "switch", ids(net.line, "line").values())
 
 
-def _impedances(net: Any, buses: dict[int, str], network: Network) -> None:
+def _impedances(net: Any, buses: dict[int, str], network: SourceNetwork) -> None:
     """Impedances between buses: lines, if equal from both ends and without shunts."""
     table = net.get("impedance")
     if table is None or not len(table):
@@ -571,7 +575,7 @@ def _impedances(net: Any, buses: dict[int, str], network: Network) -> None:
         plain = (r, x) == back and min(r, x) >= 0 and not any(row.get(name) for name in SHUNTS)
         if not (plain and same_level(network.nominal[a], network.nominal[b])):
             effect = "asymmetric, or with shunts; has no place in a feeder"
-            change = Change(f"impedance {names[i]}", WHOLE, "left out", effect)
+            change = ConversionChange(f"impedance {names[i]}", WHOLE, "left out", effect)
             network.of_bus.extend((bus, change) for bus in (a, b))
             continue
         ohm = float(net.bus.at[ends[0], "vn_kv"]) ** 2 / float(row["sn_mva"])
@@ -591,7 +595,7 @@ def _series(row: dict[str, Any], way: str) -> tuple[float, float]:
 # --- transformers ---------------------------------------------------------------------------------
 
 
-def _transformers(net: Any, solved: Any, buses: dict[int, str], network: Network) -> None:
+def _transformers(net: Any, solved: Any, buses: dict[int, str], network: SourceNetwork) -> None:
     ports, dead = _two_ports(net), _dead(net)
     for table, sides in SIDES.items():
         names = ids(net[table], table)
@@ -601,7 +605,9 @@ def _transformers(net: Any, solved: Any, buses: dict[int, str], network: Network
             ends = [(side, bus) for side, bus in ends if (int(i), bus) not in opened and bus not in dead]
             label = f"{'transformer' if table == 'trafo' else 'three-winding transformer'} {names[int(i)]}"
             if not row.in_service or len(ends) < 2:
-                network.changes.append(Change(label, WHOLE, "left out", "switched off in the source"))
+                network.changes.append(
+                    ConversionChange(label, WHOLE, "left out", "switched off in the source")
+                )
                 continue
             joined = tuple(buses[bus] for _, bus in ends)
             flows = tuple(flow_into(solved, table, int(i), side) for side, _ in ends)
@@ -659,7 +665,7 @@ def _alone(bench: Any, *, loaded: bool) -> list[tuple[complex, complex, complex]
     return [(complex(a), complex(b), complex(i)) for (a, b), i in zip(v, current, strict=True)]
 
 
-def _fixed(net: Any, solved: Any, buses: dict[int, str], network: Network) -> None:
+def _fixed(net: Any, solved: Any, buses: dict[int, str], network: SourceNetwork) -> None:
     """Elements with a control of their own become customers with the source's power."""
     for table, sign in FIXED.items():
         names = ids(net[table], table)
@@ -670,12 +676,12 @@ def _fixed(net: Any, solved: Any, buses: dict[int, str], network: Network) -> No
                 effect = (
                     "its power is not known; the check shows the effect" if solved is not None else "unknown"
                 )
-                network.of_bus.append((bus, Change(label, WHOLE, "left out", effect)))
+                network.of_bus.append((bus, ConversionChange(label, WHOLE, "left out", effect)))
                 network.connected.append((bus, label))
                 continue
             plant = table == "gen" and power.real.sum() < 0
             network.draws.append(Draw(label, bus, power, rating_kva=0.0 if plant else None, noun="customer"))
-            network.of_bus.append((bus, Change(label, "control", "changed", as_it_stands(power))))
+            network.of_bus.append((bus, ConversionChange(label, "control", "changed", as_it_stands(power))))
     for table in ("asymmetric_sgen", "sgen"):
         names = ids(net[table], table)
         for i, row in net[table].iterrows():
@@ -688,7 +694,7 @@ def _fixed(net: Any, solved: Any, buses: dict[int, str], network: Network) -> No
                 network.of_bus.extend((draw.bus, change) for change in told)
 
 
-def _connections(net: Any, buses: dict[int, str], network: Network) -> None:
+def _connections(net: Any, buses: dict[int, str], network: SourceNetwork) -> None:
     """Buses and labels of the customers of `feeders.convert.from_pandapower`."""
     loads = ids(net.load, "load")
     for table, noun, label in (
@@ -701,26 +707,34 @@ def _connections(net: Any, buses: dict[int, str], network: Network) -> None:
         network.connected.extend((buses[bus], f"{label} {names[int(i)]}") for i, bus in known)
 
 
-def _shunts(net: Any, buses: dict[int, str], network: Network) -> None:
+def _shunts(net: Any, buses: dict[int, str], network: SourceNetwork) -> None:
     """Capacitors become the charging of lines to nowhere."""
     names = ids(net.shunt, "shunt")
     for i in map(int, net.shunt.index):
         row = net.shunt.loc[i]
         bus, label = buses[int(row.bus)], f"shunt {names[i]}"
         if not row.in_service:
-            network.of_bus.append((bus, Change(label, WHOLE, "left out", "switched off in the source")))
+            network.of_bus.append(
+                (bus, ConversionChange(label, WHOLE, "left out", "switched off in the source"))
+            )
             continue
         p, q = _at_its_step(net, row)
         if p == q == 0.0:
-            network.of_bus.append((bus, Change(label, WHOLE, "left out", "draws nothing at its step")))
+            network.of_bus.append(
+                (bus, ConversionChange(label, WHOLE, "left out", "draws nothing at its step"))
+            )
         if p != 0:
-            network.of_bus.append((bus, Change(label, "conductance", "left out", f"{1e3 * p:.4g} kW")))
+            network.of_bus.append(
+                (bus, ConversionChange(label, "conductance", "left out", f"{1e3 * p:.4g} kW"))
+            )
         if q > 0:
-            network.of_bus.append((bus, Change(label, "inductance", "left out", f"{1e3 * q:.4g} kvar")))
+            network.of_bus.append(
+                (bus, ConversionChange(label, "inductance", "left out", f"{1e3 * q:.4g} kvar"))
+            )
         elif q < 0:
             network.lines.append(capacitor(label, bus, -q / float(row.vn_kv) ** 2))
             effect = f"{-1e3 * q:.4g} kvar as the charging of a line to nowhere"
-            network.of_bus.append((bus, Change(label, "connection", "changed", effect)))
+            network.of_bus.append((bus, ConversionChange(label, "connection", "changed", effect)))
 
 
 def _at_its_step(net: Any, row: Any) -> tuple[float, float]:
@@ -733,10 +747,10 @@ def _at_its_step(net: Any, row: Any) -> tuple[float, float]:
     return float(row.p_mw) * float(row.step), float(row.q_mvar) * float(row.step)
 
 
-def _rest(net: Any, buses: dict[int, str], network: Network) -> None:
+def _rest(net: Any, buses: dict[int, str], network: SourceNetwork) -> None:
     """Report every other table with rows: the format has no place for it."""
     for i, row in net.ext_grid[~net.ext_grid.in_service.astype(bool)].iterrows():
-        off = Change(f"ext_grid {i}", WHOLE, "left out", "switched off in the source")
+        off = ConversionChange(f"ext_grid {i}", WHOLE, "left out", "switched off in the source")
         network.of_bus.append((buses[int(row.bus)], off))
     for table in sorted(net.keys()):
         content = net[table]
@@ -747,9 +761,9 @@ def _rest(net: Any, buses: dict[int, str], network: Network) -> None:
             effect = NOTED.get(table, "has no place in a feeder")
             if len(content) and not any(part in table for part in CURVES):
                 label = f"table {table}, {len(content)} row{'s' if len(content) > 1 else ''}"
-                network.changes.append(Change(label, WHOLE, "left out", effect))
+                network.changes.append(ConversionChange(label, WHOLE, "left out", effect))
             continue
         for i, row in content.iterrows():
             known = [buses[int(row[end])] for end in ends if row[end] in buses]
-            change = Change(f"{table} {i}", WHOLE, "left out", "has no place in a feeder")
+            change = ConversionChange(f"{table} {i}", WHOLE, "left out", "has no place in a feeder")
             network.of_bus.extend((bus, change) for bus in known)

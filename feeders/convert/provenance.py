@@ -32,7 +32,7 @@ __all__ = [
     "SOURCE_FILE",
     "WHOLE",
     "BusbarUnclear",
-    "Change",
+    "ConversionChange",
     "Done",
     "Origin",
     "SourceUnreadable",
@@ -69,7 +69,7 @@ class SourceUnreadable(GridsecError):
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class ConversionChange:
     """Element of the source that is not, or not exactly, in the feeder.
 
     Attributes
@@ -90,7 +90,7 @@ class Change:
     effect: str
 
 
-def sentences(changes: Iterable[Change]) -> tuple[str, ...]:
+def sentences(changes: Iterable[ConversionChange]) -> tuple[str, ...]:
     """Changes as sentences, with equal changes of several elements together.
 
     Parameters
@@ -112,7 +112,7 @@ def _listed(elements: list[str]) -> str:
     return ", ".join(elements[:NAMED]) + tail
 
 
-def changes_csv(changes: Iterable[Change]) -> str:
+def changes_csv(changes: Iterable[ConversionChange]) -> str:
     """Table of all changes, one row for each element and property."""
     out = io.StringIO(newline="")
     writer = csv.writer(out, lineterminator="\n")

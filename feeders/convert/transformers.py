@@ -29,14 +29,14 @@ import numpy as np
 
 from feeders.convert.customers import Draw, is_even, rounded
 from feeders.convert.lines import VOLT_DIGITS, Coupling, above_busbar, as_rows, fused_with, reached, turned
-from feeders.convert.provenance import WHOLE, Change
+from feeders.convert.provenance import WHOLE, ConversionChange
 from feeders.format.tables import LineRow
 from feeders.format.validation import same_level
 from gridsec.arrays import Phasors
 from gridsec.errors import Problem
 
 if TYPE_CHECKING:
-    from feeders.convert.network import Network
+    from feeders.convert.network import SourceNetwork
 
 
 TAP_DIGITS: Final = 9
@@ -125,7 +125,7 @@ def coupling_of(
     *,
     port: TwoPort | None,
     rating_a: float,
-    network: Network,
+    network: SourceNetwork,
 ) -> Coupling:
     """Transformer with its equivalent line, if there is one.
 
@@ -178,8 +178,8 @@ THERE: Final = "a line to {:.6g} V, its ratio {} of the nominal one as in the so
 
 
 def transformed(
-    network: Network, rows: list[LineRow], busbar: str, extent: Extent, changes: list[Change]
-) -> tuple[Network, list[LineRow]]:
+    network: SourceNetwork, rows: list[LineRow], busbar: str, extent: Extent, changes: list[ConversionChange]
+) -> tuple[SourceNetwork, list[LineRow]]:
     """Replace transformers below the busbar by their equivalent lines, where possible.
 
     Parameters
@@ -218,17 +218,17 @@ def transformed(
         changes.append(_told(each, turned(line, network.nominal) if backwards else line))
         if each.idle is None and not network.volts:
             effect = "not known without the source's power flow"
-            changes.append(Change(each.name, "no-load current", "left out", effect))
+            changes.append(ConversionChange(each.name, "no-load current", "left out", effect))
     return replace(network, couplings=left, draws=[*network.draws, *draws]), [*rows, *lines]
 
 
-def _told(each: Coupling, line: LineRow) -> Change:
+def _told(each: Coupling, line: LineRow) -> ConversionChange:
     ratios = " ".join(f"{tap:.6g}" for tap in dict.fromkeys(line.taps))
     effect = HERE.format(ratios) if line.to_volt is None else THERE.format(line.to_volt, ratios)
-    return Change(each.name, "tap" if line.to_volt is None else WHOLE, "changed", effect)
+    return ConversionChange(each.name, "tap" if line.to_volt is None else WHOLE, "changed", effect)
 
 
-def _leads_on(network: Network, rows: Iterable[LineRow], each: Coupling, busbar: str) -> bool:
+def _leads_on(network: SourceNetwork, rows: Iterable[LineRow], each: Coupling, busbar: str) -> bool:
     """True if lines begin behind a transformer; otherwise its customers are one load at its terminals."""
     beside = set(each.buses)
     others = [*rows, *as_rows(other for other in network.couplings if set(other.buses) != beside)]

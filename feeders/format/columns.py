@@ -25,7 +25,7 @@ LONGEST_TEXT = 200
 SHOWN = 60
 
 
-class Kind(Enum):
+class CellType(Enum):
     """Type of a cell."""
 
     TEXT = "text of at most 200 characters"
@@ -70,7 +70,7 @@ class Column:
     """
 
     name: str
-    kind: Kind
+    kind: CellType
     meaning: str
     default: Any = REQUIRED
     low: float | None = None
@@ -108,7 +108,7 @@ def _matrix(symbol: str, unit: str, what: tuple[str, str], high: float) -> tuple
     return tuple(
         Column(
             f"{symbol}_{pair}_{unit}",
-            Kind.NUMBER,
+            CellType.NUMBER,
             what[0 if own else 1].format(*pair),
             None,
             low=0.0 if own else -high,
@@ -129,7 +129,7 @@ SHUNT_COLUMNS = _matrix(
     1e9,
 )
 TAP_COLUMNS = tuple(
-    Column(f"tap_{phase}", Kind.NUMBER, f"the same of phase {phase} alone", None, low=0.001, high=1e3)
+    Column(f"tap_{phase}", CellType.NUMBER, f"the same of phase {phase} alone", None, low=0.001, high=1e3)
     for phase in "abc"
 )
 MATRIX_NAMES = frozenset(column.name for column in (*SERIES_COLUMNS, *SHUNT_COLUMNS))
@@ -137,78 +137,105 @@ PHASE_NAMES = MATRIX_NAMES | {column.name for column in TAP_COLUMNS}
 """Columns of feeders in three phases only."""
 
 LINE_COLUMNS: tuple[Column, ...] = (
-    Column("line", Kind.ID, "id of the line or switch"),
-    Column("from_bus", Kind.ID, "bus at one end"),
-    Column("to_bus", Kind.ID, "bus at the other end"),
-    Column("phases", Kind.TEXT, "conductors", "abc", choices=LINE_PHASES),
-    Column("r_ohm", Kind.NUMBER, "series resistance of the whole line, per phase, ohm", low=0.0, high=1e6),
-    Column("x_ohm", Kind.NUMBER, "series reactance of the whole line, per phase, ohm", low=0.0, high=1e6),
-    Column("r0_ohm", Kind.NUMBER, "zero-sequence resistance, ohm", None, low=0.0, high=1e6),
-    Column("x0_ohm", Kind.NUMBER, "zero-sequence reactance, ohm", None, low=0.0, high=1e6),
+    Column("line", CellType.ID, "id of the line or switch"),
+    Column("from_bus", CellType.ID, "bus at one end"),
+    Column("to_bus", CellType.ID, "bus at the other end"),
+    Column("phases", CellType.TEXT, "conductors", "abc", choices=LINE_PHASES),
+    Column(
+        "r_ohm", CellType.NUMBER, "series resistance of the whole line, per phase, ohm", low=0.0, high=1e6
+    ),
+    Column("x_ohm", CellType.NUMBER, "series reactance of the whole line, per phase, ohm", low=0.0, high=1e6),
+    Column("r0_ohm", CellType.NUMBER, "zero-sequence resistance, ohm", None, low=0.0, high=1e6),
+    Column("x0_ohm", CellType.NUMBER, "zero-sequence reactance, ohm", None, low=0.0, high=1e6),
     *SERIES_COLUMNS,
-    Column("b_us", Kind.NUMBER, "total shunt susceptance, microsiemens per phase", 0.0, low=0.0, high=1e9),
+    Column(
+        "b_us", CellType.NUMBER, "total shunt susceptance, microsiemens per phase", 0.0, low=0.0, high=1e9
+    ),
     *SHUNT_COLUMNS,
-    Column("tap", Kind.NUMBER, "ratio of an ideal transformer at from_bus", 1.0, low=0.001, high=1e3),
+    Column("tap", CellType.NUMBER, "ratio of an ideal transformer at from_bus", 1.0, low=0.001, high=1e3),
     *TAP_COLUMNS,
     Column(
         "to_volt",
-        Kind.NUMBER,
+        CellType.NUMBER,
         "nominal voltage of to_bus where another than from_bus's: a transformer; phase to neutral, V",
         None,
         low=0.001,
         high=1e6,
     ),
-    Column("closed", Kind.TRUTH, "whether the line carries current", True),
-    Column("rating_a", Kind.NUMBER, "thermal limit, ampere", None, above=0.0, high=1e9),
-    Column("to_x", Kind.NUMBER, "horizontal position of to_bus, any unit", None, low=-1e12, high=1e12),
-    Column("to_y", Kind.NUMBER, "vertical position of to_bus, any unit", None, low=-1e12, high=1e12),
+    Column("closed", CellType.TRUTH, "whether the line carries current", True),
+    Column("rating_a", CellType.NUMBER, "thermal limit, ampere", None, above=0.0, high=1e9),
+    Column("to_x", CellType.NUMBER, "horizontal position of to_bus, any unit", None, low=-1e12, high=1e12),
+    Column("to_y", CellType.NUMBER, "vertical position of to_bus, any unit", None, low=-1e12, high=1e12),
 )
 
 CUSTOMER_COLUMNS: tuple[Column, ...] = (
-    Column("customer", Kind.ID, "id of the customer"),
-    Column("bus", Kind.ID, "bus of the connection point"),
-    Column("phases", Kind.TEXT, "connected phases", "abc", choices=PHASES),
-    Column("meter", Kind.NAME, "id of the meter; empty: no meter", ""),
+    Column("customer", CellType.ID, "id of the customer"),
+    Column("bus", CellType.ID, "bus of the connection point"),
+    Column("phases", CellType.TEXT, "connected phases", "abc", choices=PHASES),
+    Column("meter", CellType.NAME, "id of the meter; empty: no meter", ""),
     Column(
-        "class_percent", Kind.NUMBER, "accuracy class of the voltage register, %", None, above=0.0, high=100.0
+        "class_percent",
+        CellType.NUMBER,
+        "accuracy class of the voltage register, %",
+        None,
+        above=0.0,
+        high=100.0,
     ),
-    Column("resolution_volt", Kind.NUMBER, "resolution of the voltage register, V", None, low=0.0, high=1e6),
     Column(
-        "jitter_percent", Kind.NUMBER, "1 sigma noise of the voltage, % of nominal", None, low=0.0, high=100.0
+        "resolution_volt", CellType.NUMBER, "resolution of the voltage register, V", None, low=0.0, high=1e6
     ),
-    Column("p_error_percent", Kind.NUMBER, "error of the active power, % of it", None, low=0.0, high=50.0),
     Column(
-        "q_error_percent", Kind.NUMBER, "error of the reactive power, % of range", None, low=0.0, high=100.0
+        "jitter_percent",
+        CellType.NUMBER,
+        "1 sigma noise of the voltage, % of nominal",
+        None,
+        low=0.0,
+        high=100.0,
     ),
-    Column("load_kw", Kind.NUMBER, "expected peak of the load, kW", low=0.0, high=1e9),
-    Column("load_profile", Kind.TEXT, "load profile of the library", ""),
-    Column("power_factor", Kind.NUMBER, "expected power factor of the load", None, low=0.01, high=1.0),
-    Column("power_factor_min", Kind.NUMBER, "its smallest value", None, low=0.01, high=1.0),
-    Column("power_factor_max", Kind.NUMBER, "its largest value", None, low=0.01, high=1.0),
+    Column(
+        "p_error_percent", CellType.NUMBER, "error of the active power, % of it", None, low=0.0, high=50.0
+    ),
+    Column(
+        "q_error_percent",
+        CellType.NUMBER,
+        "error of the reactive power, % of range",
+        None,
+        low=0.0,
+        high=100.0,
+    ),
+    Column("load_kw", CellType.NUMBER, "expected peak of the load, kW", low=0.0, high=1e9),
+    Column("load_profile", CellType.TEXT, "load profile of the library", ""),
+    Column("power_factor", CellType.NUMBER, "expected power factor of the load", None, low=0.01, high=1.0),
+    Column("power_factor_min", CellType.NUMBER, "its smallest value", None, low=0.01, high=1.0),
+    Column("power_factor_max", CellType.NUMBER, "its largest value", None, low=0.01, high=1.0),
     Column(
         "q_floor_kvar",
-        Kind.NUMBER,
+        CellType.NUMBER,
         "load's reactive power that does not follow p, kvar",
         None,
         low=0.0,
         high=1e9,
     ),
-    Column("p_std_kw", Kind.NUMBER, "1 sigma error of the active power known, kW", None, low=0.0, high=1e9),
+    Column(
+        "p_std_kw", CellType.NUMBER, "1 sigma error of the active power known, kW", None, low=0.0, high=1e9
+    ),
     Column(
         "q_std_kvar",
-        Kind.NUMBER,
+        CellType.NUMBER,
         "1 sigma error of the load's reactive power known, kvar",
         None,
         low=0.0,
         high=1e9,
     ),
-    Column("pv_kw", Kind.NUMBER, "peak of the generation, kW", 0.0, low=0.0, high=1e9),
-    Column("pv_profile", Kind.TEXT, "generation profile of the library", ""),
-    Column("inverter_kva", Kind.NUMBER, "rating of the droop inverter, kVA; 0: none", 0.0, low=0.0, high=1e9),
-    Column("droop", Kind.TEXT, "droop preset of the inverter", ""),
+    Column("pv_kw", CellType.NUMBER, "peak of the generation, kW", 0.0, low=0.0, high=1e9),
+    Column("pv_profile", CellType.TEXT, "generation profile of the library", ""),
+    Column(
+        "inverter_kva", CellType.NUMBER, "rating of the droop inverter, kVA; 0: none", 0.0, low=0.0, high=1e9
+    ),
+    Column("droop", CellType.TEXT, "droop preset of the inverter", ""),
     Column(
         "tau_s",
-        Kind.NUMBER,
+        CellType.NUMBER,
         "time constant of the inverter, s; empty: the preset's",
         None,
         low=0.001,
@@ -234,78 +261,94 @@ SUSPICIONS = ("voltage", "impedance", "ratio", "rating", "load", "class")
 
 META_COLUMNS: dict[str, tuple[Column, ...]] = {
     "": (
-        Column("format", Kind.WHOLE, "version of this format", low=1, high=1),
-        Column("name", Kind.NAME, "name of the feeder"),
-        Column("title", Kind.TEXT, "title for people", ""),
+        Column("format", CellType.WHOLE, "version of this format", low=1, high=1),
+        Column("name", CellType.NAME, "name of the feeder"),
+        Column("title", CellType.TEXT, "title for people", ""),
         Column(
             "voltage_volt",
-            Kind.NUMBER,
+            CellType.NUMBER,
             "nominal voltage of the busbar, phase to neutral, V",
             low=0.001,
             high=1e6,
         ),
         Column(
             "base_kva",
-            Kind.NUMBER,
+            CellType.NUMBER,
             "three-phase base power of the per-unit system, kVA",
             100.0,
             low=0.001,
             high=1e9,
         ),
-        Column("busbar", Kind.ID, "bus of the busbar meter; root of the feeder"),
-        Column("busbar_xy", Kind.PAIR, "position of the busbar", None),
-        Column("meshed", Kind.TRUTH, "whether closed lines may form loops", False),
+        Column("busbar", CellType.ID, "bus of the busbar meter; root of the feeder"),
+        Column("busbar_xy", CellType.PAIR, "position of the busbar", None),
+        Column("meshed", CellType.TRUTH, "whether closed lines may form loops", False),
         Column(
             "busbar_class_percent",
-            Kind.NUMBER,
+            CellType.NUMBER,
             "accuracy class of the busbar meter, %",
             0.1,
             above=0.0,
             high=100.0,
         ),
-        Column("busbar_resolution_volt", Kind.NUMBER, "its resolution, V", 0.1, low=0.0, high=1e6),
+        Column("busbar_resolution_volt", CellType.NUMBER, "its resolution, V", 0.1, low=0.0, high=1e6),
         Column(
-            "busbar_jitter_percent", Kind.NUMBER, "its 1 sigma noise, % of nominal", 0.02, low=0.0, high=100.0
+            "busbar_jitter_percent",
+            CellType.NUMBER,
+            "its 1 sigma noise, % of nominal",
+            0.02,
+            low=0.0,
+            high=100.0,
         ),
-        Column("accept", Kind.NAMES, "suspicions that were checked and are right", (), choices=SUSPICIONS),
+        Column(
+            "accept", CellType.NAMES, "suspicions that were checked and are right", (), choices=SUSPICIONS
+        ),
     ),
     "limits": (
-        Column("v_min_pu", Kind.NUMBER, "lowest allowed voltage, pu", 0.9, above=0.0, high=2.0),
-        Column("v_max_pu", Kind.NUMBER, "highest allowed voltage, pu", 1.1, above=0.0, high=2.0),
+        Column("v_min_pu", CellType.NUMBER, "lowest allowed voltage, pu", 0.9, above=0.0, high=2.0),
+        Column("v_max_pu", CellType.NUMBER, "highest allowed voltage, pu", 1.1, above=0.0, high=2.0),
     ),
     "meters": (
         Column(
             "class_percent",
-            Kind.NUMBER,
+            CellType.NUMBER,
             "accuracy class of the voltage registers, %",
             0.5,
             above=0.0,
             high=100.0,
         ),
         Column(
-            "resolution_volt", Kind.NUMBER, "resolution of the voltage registers, V", 0.1, low=0.0, high=1e6
+            "resolution_volt",
+            CellType.NUMBER,
+            "resolution of the voltage registers, V",
+            0.1,
+            low=0.0,
+            high=1e6,
         ),
         Column(
             "jitter_percent",
-            Kind.NUMBER,
+            CellType.NUMBER,
             "1 sigma noise of the voltage, % of nominal",
             0.05,
             low=0.0,
             high=100.0,
         ),
-        Column("p_error_percent", Kind.NUMBER, "error of the active power, % of it", 1.0, low=0.0, high=50.0),
+        Column(
+            "p_error_percent", CellType.NUMBER, "error of the active power, % of it", 1.0, low=0.0, high=50.0
+        ),
         Column(
             "q_error_percent",
-            Kind.NUMBER,
+            CellType.NUMBER,
             "error of the reactive power, % of range",
             2.0,
             low=0.0,
             high=100.0,
         ),
-        Column("p_resolution_kw", Kind.NUMBER, "resolution of the active power, kW", 0.01, low=0.0, high=1e6),
+        Column(
+            "p_resolution_kw", CellType.NUMBER, "resolution of the active power, kW", 0.01, low=0.0, high=1e6
+        ),
         Column(
             "p_interval_s",
-            Kind.NUMBER,
+            CellType.NUMBER,
             "largest age of a power at its voltage reading, s; 0: of the same moment",
             0.0,
             low=0.0,
@@ -313,12 +356,12 @@ META_COLUMNS: dict[str, tuple[Column, ...]] = {
         ),
     ),
     "load": (
-        Column("power_factor", Kind.NUMBER, "expected power factor, lagging", 0.95, low=0.01, high=1.0),
-        Column("power_factor_min", Kind.NUMBER, "its smallest value", 0.9, low=0.01, high=1.0),
-        Column("power_factor_max", Kind.NUMBER, "its largest value", 1.0, low=0.01, high=1.0),
+        Column("power_factor", CellType.NUMBER, "expected power factor, lagging", 0.95, low=0.01, high=1.0),
+        Column("power_factor_min", CellType.NUMBER, "its smallest value", 0.9, low=0.01, high=1.0),
+        Column("power_factor_max", CellType.NUMBER, "its largest value", 1.0, low=0.01, high=1.0),
         Column(
             "q_floor_percent",
-            Kind.NUMBER,
+            CellType.NUMBER,
             "reactive power that does not follow p, % of load_kw",
             2.0,
             low=0.0,
@@ -326,38 +369,42 @@ META_COLUMNS: dict[str, tuple[Column, ...]] = {
         ),
         Column(
             "correlation_s",
-            Kind.NUMBER,
+            CellType.NUMBER,
             "correlation time of the load errors, s",
             600.0,
             above=0.0,
             high=1e7,
         ),
-        Column("forecast", Kind.TEXT, "where unread powers are from", "none", choices=("none", "profiles")),
-        Column("utc_offset_h", Kind.NUMBER, "local time less UTC, h", 0.0, low=-14.0, high=14.0),
+        Column(
+            "forecast", CellType.TEXT, "where unread powers are from", "none", choices=("none", "profiles")
+        ),
+        Column("utc_offset_h", CellType.NUMBER, "local time less UTC, h", 0.0, low=-14.0, high=14.0),
     ),
     "monitor": (
-        Column("estimator", Kind.TEXT, "estimator family", "sequential", choices=ESTIMATORS),
+        Column("estimator", CellType.TEXT, "estimator family", "sequential", choices=ESTIMATORS),
         Column(
             "max_attacked",
-            Kind.WHOLE,
+            CellType.WHOLE,
             "manipulated meters to withstand; `sequential`: a third",
             1,
             low=0,
             high=1000,
         ),
-        Column("tick_s", Kind.NUMBER, "period of the frames, s", 1.0, low=0.01, high=1e5),
+        Column("tick_s", CellType.NUMBER, "period of the frames, s", 1.0, low=0.01, high=1e5),
         Column(
             "on_delay_s",
-            Kind.NUMBER,
+            CellType.NUMBER,
             "how long a condition must last to raise an alarm, s",
             2.0,
             low=0.0,
             high=1e6,
         ),
-        Column("off_delay_s", Kind.NUMBER, "how long it must be gone to clear it, s", 5.0, low=0.0, high=1e6),
+        Column(
+            "off_delay_s", CellType.NUMBER, "how long it must be gone to clear it, s", 5.0, low=0.0, high=1e6
+        ),
         Column(
             "silence_s",
-            Kind.NUMBER,
+            CellType.NUMBER,
             "silence after which a meter counts as lost, s",
             10.0,
             above=0.0,
@@ -365,7 +412,7 @@ META_COLUMNS: dict[str, tuple[Column, ...]] = {
         ),
         Column(
             "alarms_per_year",
-            Kind.NUMBER,
+            CellType.NUMBER,
             "false alarms allowed by chance, per feeder and year",
             1.0,
             above=0.0,
@@ -373,7 +420,7 @@ META_COLUMNS: dict[str, tuple[Column, ...]] = {
         ),
         Column(
             "commission_s",
-            Kind.NUMBER,
+            CellType.NUMBER,
             "time over which the meters' fixed errors are learned, s; 0: never",
             86400.0,
             low=0.0,
@@ -381,7 +428,7 @@ META_COLUMNS: dict[str, tuple[Column, ...]] = {
         ),
         Column(
             "unread_std_percent",
-            Kind.NUMBER,
+            CellType.NUMBER,
             "largest standard deviation of a voltage beside a withheld power at CLEAN, %",
             0.5,
             low=0.0,
@@ -520,13 +567,13 @@ def _names(cell: object) -> tuple[Any, Problem | None]:
     return tuple(cell), None
 
 
-_PARSERS: dict[Kind, Callable[[object], tuple[Any, Problem | None]]] = {
-    Kind.TEXT: _text,
-    Kind.ID: _id,
-    Kind.NAME: _name,
-    Kind.NUMBER: _number,
-    Kind.WHOLE: _whole,
-    Kind.TRUTH: _truth,
-    Kind.PAIR: _pair,
-    Kind.NAMES: _names,
+_PARSERS: dict[CellType, Callable[[object], tuple[Any, Problem | None]]] = {
+    CellType.TEXT: _text,
+    CellType.ID: _id,
+    CellType.NAME: _name,
+    CellType.NUMBER: _number,
+    CellType.WHOLE: _whole,
+    CellType.TRUTH: _truth,
+    CellType.PAIR: _pair,
+    CellType.NAMES: _names,
 }

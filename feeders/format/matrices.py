@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from feeders.format.columns import PAIRS, SERIES_COLUMNS, SHUNT_COLUMNS, Column
-from feeders.format.reader import Parsed, Report, rows
+from feeders.format.reader import CheckReport, Parsed, rows
 from gridsec.arrays import Bools, Floats, Phasors
 from gridsec.errors import Problem
 
@@ -94,7 +94,7 @@ def passive(matrix: Floats) -> bool:
     return bool(np.linalg.eigvalsh(matrix)[0] >= -ROUNDING * np.abs(matrix).max())
 
 
-def check(parsed: Parsed, report: Report) -> None:
+def check(parsed: Parsed, report: CheckReport) -> None:
     """Report every matrix that is incomplete, inconsistent or physically impossible."""
     needed = ("phases", "r_ohm", "x_ohm", "r0_ohm", "x0_ohm", "b_us", *NAMES)
     for where, cells in rows(parsed.lines, *needed):

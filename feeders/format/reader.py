@@ -18,7 +18,7 @@ SHOWN = 10
 
 
 @dataclass(frozen=True, slots=True)
-class Record:
+class ParsedRow:
     """One row: its place for messages, and its valid cells."""
 
     where: str
@@ -41,8 +41,8 @@ class Parsed:
 
     place: str
     meta: dict[str, dict[str, Any]] | None
-    lines: list[Record] | None
-    customers: list[Record] | None
+    lines: list[ParsedRow] | None
+    customers: list[ParsedRow] | None
 
     def top(self, key: str) -> Any:
         """Value of a key at the top of feeder.toml, None if invalid or absent."""
@@ -54,14 +54,14 @@ class Parsed:
 
 
 @dataclass(slots=True)
-class Report:
+class CheckReport:
     """Problems and notes of the checks."""
 
     problems: list[Problem] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
 
-def rows(records: list[Record] | None, *columns: str) -> Iterator[tuple[str, dict[str, Any]]]:
+def rows(records: list[ParsedRow] | None, *columns: str) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield place and cells of the rows with valid cells in these columns."""
     for record in records or ():
         if all(column in record.cells for column in columns):
@@ -84,7 +84,7 @@ Rows = list[tuple[int, Mapping[str, Any]]]
 
 
 @dataclass(slots=True)
-class Raw:
+class RawTables:
     """Cells before parsing; unreadable tables are None."""
 
     meta_name: str
@@ -102,9 +102,9 @@ def advice(source: object) -> str:
     return f"; make one by: gridsec feeders convert {name} FOLDER" if FOREIGN.fullmatch(name) else ""
 
 
-def from_folder(folder: Path) -> Raw:
+def from_folder(folder: Path) -> RawTables:
     """Read the files of a feeder; an unreadable file is a problem, never an exception."""
-    raw = Raw(META_FILE, None, LINES_FILE, None, CUSTOMERS_FILE, None, [])
+    raw = RawTables(META_FILE, None, LINES_FILE, None, CUSTOMERS_FILE, None, [])
     if not folder.is_dir():
         there = folder.exists()
         what = "is a file, not a folder" if there else "does not exist"
@@ -207,9 +207,9 @@ def _csv_rows(name: str, text: str, problems: list[Problem]) -> Rows | None:
     return rows
 
 
-def from_object(obj: object) -> Raw:
+def from_object(obj: object) -> RawTables:
     """Split the decoded JSON form; a table is a list of rows or an object of columns."""
-    raw = Raw("feeder", None, "lines", None, "customers", None, [])
+    raw = RawTables("feeder", None, "lines", None, "customers", None, [])
     if not isinstance(obj, Mapping):
         raw.problems.append(
             Problem(

@@ -26,7 +26,7 @@ from feeders.format.columns import (
     parse,
     shown,
 )
-from feeders.format.reader import CUSTOMERS_FILE, LINES_FILE, META_FILE, Parsed, Record, Rows
+from feeders.format.reader import CUSTOMERS_FILE, LINES_FILE, META_FILE, Parsed, ParsedRow, Rows
 from feeders.util import plain
 from gridsec.errors import FeederInvalid, Problem
 
@@ -310,7 +310,7 @@ def _ordered(row: dict[str, Any], columns: tuple[Column, ...]) -> dict[str, Any]
 # --- from cells to typed rows -------------------------------------------------------------------
 
 
-def _examine(given: reader.Raw) -> Examination:
+def _examine(given: reader.RawTables) -> Examination:
     problems = given.problems
     notes: list[str] = []
     meta = _parse_meta(given, problems, notes)
@@ -344,7 +344,7 @@ def _capped(problems: list[Problem]) -> tuple[Problem, ...]:
 
 
 def _parse_meta(
-    given: reader.Raw, problems: list[Problem], notes: list[str]
+    given: reader.RawTables, problems: list[Problem], notes: list[str]
 ) -> dict[str, dict[str, Any]] | None:
     if given.meta is None:
         return None
@@ -375,7 +375,7 @@ def _parse_table(
     rows: Rows | None,
     problems: list[Problem],
     notes: list[str],
-) -> list[Record] | None:
+) -> list[ParsedRow] | None:
     if rows is None:
         return None
     known = {column.name for column in columns}
@@ -393,7 +393,7 @@ def _parse_table(
         key = row.get(columns[0].name)
         label = f" ({key.strip()})" if _can_be_read(key) else ""
         where = f"{name}, row {number}{label}"
-        records.append(Record(where, _parse_cells(where, "column", wanted, row, problems)))
+        records.append(ParsedRow(where, _parse_cells(where, "column", wanted, row, problems)))
     return records
 
 

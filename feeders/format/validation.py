@@ -16,7 +16,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from feeders.format import matrices
-from feeders.format.reader import Parsed, Report, rows, some
+from feeders.format.reader import CheckReport, Parsed, rows, some
 from feeders.format.topology import Edge, Tree, tree
 from feeders.model import profiles
 from gridsec.errors import Problem
@@ -143,7 +143,7 @@ LINE_XR, TRANSFORMER_XR = 20.0, 100.0
 Doubts = Iterator[tuple[str, str]]
 
 
-def check_units(parsed: Parsed, edges: Sequence[Edge], found: Tree | None, report: Report) -> None:
+def check_units(parsed: Parsed, edges: Sequence[Edge], found: Tree | None, report: CheckReport) -> None:
     """Report every doubtful value, as a problem or, if feeder.toml accepts it, as a note.
 
     Parameters
@@ -174,7 +174,7 @@ def check_units(parsed: Parsed, edges: Sequence[Edge], found: Tree | None, repor
         _doubt(parsed, report, name, sentence)
 
 
-def _doubt(parsed: Parsed, report: Report, name: str, sentence: str) -> None:
+def _doubt(parsed: Parsed, report: CheckReport, name: str, sentence: str) -> None:
     if parsed.accepted(name):
         report.notes.append(f"accepted: {sentence}")
     else:
@@ -311,7 +311,7 @@ RESERVED_METER = "substation"
 
 def feeder(parsed: Parsed) -> tuple[list[Problem], list[str]]:
     """Every problem between cells, and notes on notable content."""
-    report = Report()
+    report = CheckReport()
     for check in (_duplicates, _reserved, _limits, _power_factors, _presets, _profiles, _positions, _taps):
         check(parsed, report)
     matrices.check(parsed, report)
@@ -323,7 +323,7 @@ def feeder(parsed: Parsed) -> tuple[list[Problem], list[str]]:
 # --- ids and references -------------------------------------------------------------------------
 
 
-def _duplicates(parsed: Parsed, report: Report) -> None:
+def _duplicates(parsed: Parsed, report: CheckReport) -> None:
     for records, column in (
         (parsed.lines, "line"),
         (parsed.customers, "customer"),
@@ -351,7 +351,7 @@ def _duplicates(parsed: Parsed, report: Report) -> None:
         report.notes.append(f"{len(bare)} customer(s) without a meter: {some(bare)}")
 
 
-def _reserved(parsed: Parsed, report: Report) -> None:
+def _reserved(parsed: Parsed, report: CheckReport) -> None:
     for where, cells in rows(parsed.customers, "meter"):
         if cells["meter"] == RESERVED_METER:
             report.problems.append(
@@ -363,7 +363,7 @@ def _reserved(parsed: Parsed, report: Report) -> None:
             )
 
 
-def _limits(parsed: Parsed, report: Report) -> None:
+def _limits(parsed: Parsed, report: CheckReport) -> None:
     limits = {} if parsed.meta is None else parsed.meta["limits"]
     low, high = limits.get("v_min_pu"), limits.get("v_max_pu")
     if low is not None and high is not None and low >= high:
@@ -376,7 +376,7 @@ def _limits(parsed: Parsed, report: Report) -> None:
         )
 
 
-def _power_factors(parsed: Parsed, report: Report) -> None:
+def _power_factors(parsed: Parsed, report: CheckReport) -> None:
     load = {} if parsed.meta is None else parsed.meta["load"]
     names = ("power_factor_min", "power_factor", "power_factor_max")
     places: list[tuple[str, dict[str, Any], dict[str, Any]]]
@@ -396,7 +396,7 @@ def _power_factors(parsed: Parsed, report: Report) -> None:
             )
 
 
-def _presets(parsed: Parsed, report: Report) -> None:
+def _presets(parsed: Parsed, report: CheckReport) -> None:
     for where, cells in rows(parsed.customers, "droop"):
         preset, rating = cells["droop"], cells.get("inverter_kva")
         if preset and preset not in PRESETS:
@@ -418,7 +418,7 @@ def _presets(parsed: Parsed, report: Report) -> None:
             report.notes.append(f"{where}: droop {preset!r} has no effect, inverter_kva is 0")
 
 
-def _profiles(parsed: Parsed, report: Report) -> None:
+def _profiles(parsed: Parsed, report: CheckReport) -> None:
     known = {"load_profile": profiles.load_names(), "pv_profile": profiles.pv_names()}
     for column, names in known.items():
         for where, cells in rows(parsed.customers, column):
@@ -442,12 +442,12 @@ def loops(busbar: str, lines: Iterable[LineRow]) -> list[Problem]:
         for row in lines
         if row.closed
     ]
-    report = Report()
+    report = CheckReport()
     _loops(tree(busbar, edges), edges, meshed=False, report=report)
     return report.problems
 
 
-def _graph(parsed: Parsed, report: Report) -> tuple[list[Edge], Tree | None]:
+def _graph(parsed: Parsed, report: CheckReport) -> tuple[list[Edge], Tree | None]:
     """Check the graph; its closed lines and its tree, the tree None if some buses are unknown."""
     busbar = parsed.top("busbar")
     known: dict[str, None] = {} if busbar is None else {busbar: None}
@@ -488,7 +488,7 @@ def _graph(parsed: Parsed, report: Report) -> tuple[list[Edge], Tree | None]:
     return edges, found
 
 
-def _levels(found: Tree, edges: list[Edge], parsed: Parsed, report: Report) -> None:
+def _levels(found: Tree, edges: list[Edge], parsed: Parsed, report: CheckReport) -> None:
     volt = parsed.top("voltage_volt")
     places = {cells["line"]: where for where, cells in rows(parsed.lines, "line")}
     for k, problem in problems(found, edges, volt) if volt is not None else ():
@@ -496,7 +496,7 @@ def _levels(found: Tree, edges: list[Edge], parsed: Parsed, report: Report) -> N
         report.problems.append(Problem(problem.code, f"{where}, column to_volt: {problem}"))
 
 
-def _loops(found: Tree, edges: list[Edge], meshed: bool, report: Report) -> None:
+def _loops(found: Tree, edges: list[Edge], meshed: bool, report: CheckReport) -> None:
     for loop in found.loops:
         names = some([edges[k].line for k in loop])
         if len(loop) == 1:
@@ -520,7 +520,7 @@ def _loops(found: Tree, edges: list[Edge], meshed: bool, report: Report) -> None
             )
 
 
-def _islands(found: Tree, parsed: Parsed, report: Report) -> None:
+def _islands(found: Tree, parsed: Parsed, report: CheckReport) -> None:
     loads: dict[str, list[str]] = defaultdict(list)
     for _, cells in rows(parsed.customers, "bus", "customer"):
         loads[cells["bus"]].append(cells["customer"])
@@ -539,7 +539,7 @@ def _islands(found: Tree, parsed: Parsed, report: Report) -> None:
         report.problems.append(Problem("not-connected", text))
 
 
-def _fused(found: Tree, report: Report) -> None:
+def _fused(found: Tree, report: CheckReport) -> None:
     members: dict[int, list[str]] = defaultdict(list)
     for bus, index in found.group.items():
         members[index].append(bus)
@@ -548,7 +548,7 @@ def _fused(found: Tree, report: Report) -> None:
             report.notes.append(f"buses {some(buses)} are one: lines without impedance join them")
 
 
-def _positions(parsed: Parsed, report: Report) -> None:
+def _positions(parsed: Parsed, report: CheckReport) -> None:
     for where, cells in rows(parsed.lines, "to_x", "to_y"):
         if (cells["to_x"] is None) != (cells["to_y"] is None):
             report.problems.append(
@@ -559,7 +559,7 @@ def _positions(parsed: Parsed, report: Report) -> None:
             )
 
 
-def _taps(parsed: Parsed, report: Report) -> None:
+def _taps(parsed: Parsed, report: CheckReport) -> None:
     names = {phase: f"tap_{phase}" for phase in "abc"}
     for where, cells in rows(parsed.lines, "phases", "tap", *names.values()):
         given = [name for name in names.values() if cells[name] is not None]

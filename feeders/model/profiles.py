@@ -67,7 +67,7 @@ class Profiles:
 
 
 @dataclass(frozen=True, slots=True)
-class Envelope:
+class ReactiveEnvelope:
     """Limits of a load profile's reactive power, known from its history.
 
     With p and q as fractions of `load_kw` and of the reactive power of `load_kw` at the expected power
@@ -80,12 +80,14 @@ class Envelope:
 
 
 @cache
-def envelopes() -> dict[str, Envelope]:
+def envelopes() -> dict[str, ReactiveEnvelope]:
     """Envelope of every load profile; see data/profiles/SOURCE.md."""
     text = (data_root() / "profiles" / ENVELOPES).read_text(encoding="ascii")
     rows = csv.DictReader(io.StringIO(text))
     return {
-        row["load_profile"]: Envelope(float(row["q_low"]), float(row["q_high"]), float(row["q_floor"]))
+        row["load_profile"]: ReactiveEnvelope(
+            float(row["q_low"]), float(row["q_high"]), float(row["q_floor"])
+        )
         for row in rows
     }
 

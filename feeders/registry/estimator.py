@@ -9,14 +9,14 @@ from typing import Any
 
 from feeders.model.site import Site
 from gridsec.arrays import Bools, Floats
-from gridsec.estimators.sequential import Commission, Distrust, LearningProgress
+from gridsec.estimators.sequential import Commission, LearningProgress, SuspicionRecord
 from gridsec.interface import Estimate, Frame, Verdict
 
-__all__ = ["Family", "Job", "Learner", "Memory", "Watcher"]
+__all__ = ["BiasLearning", "DesignOptions", "DesignedEstimator", "Estimator", "WarmStart"]
 
 
 @dataclass(frozen=True, slots=True)
-class Job:
+class DesignOptions:
     """Options of a design that do not change its result.
 
     Attributes
@@ -35,7 +35,7 @@ class Job:
 
 
 @dataclass(frozen=True, slots=True)
-class Learner:
+class BiasLearning:
     """Functions of an estimator that learns the fixed errors of its meters.
 
     Attributes
@@ -64,23 +64,23 @@ class Learner:
 
 
 @dataclass(frozen=True, slots=True)
-class Memory:
+class WarmStart:
     """Functions of an estimator that keeps suspects over a restart.
 
     Attributes
     ----------
     distrusted
         `distrusted(design, state)`: present suspicion record.
-    restore
+    warm_start
         `restore(design, state, distrust)`: state from `init` with these devices distrusted.
     """
 
-    distrusted: Callable[[Any, Any], Distrust]
-    restore: Callable[[Any, Any, Distrust], Any]
+    distrusted: Callable[[Any, Any], SuspicionRecord]
+    warm_start: Callable[[Any, Any, SuspicionRecord], Any]
 
 
 @dataclass(frozen=True, slots=True)
-class Family:
+class Estimator:
     """Estimator: three functions, a name, and optional abilities.
 
     Attributes
@@ -102,26 +102,26 @@ class Family:
         One-line proof of convergence of a design's estimate; empty without one.
     withstands
         Number of manipulated meters that a design identifies; None: `max_attacked` of the feeder's file.
-    learner
+    bias_learning
         Learning of the meters' fixed errors; None without it.
-    memory
+    warm_start
         Restoring of suspects after a restart; None without it.
     """
 
     name: str
     summary: str
-    design: Callable[[Site, Job], Any]
+    design: Callable[[Site, DesignOptions], Any]
     init: Callable[[Any, float], Any]
     step: Callable[[Any, Any, Frame], tuple[Any, Estimate, Verdict]]
     observers: Callable[[Any], int]
     proof: Callable[[Any], str]
     withstands: Callable[[Any], int] | None = None
-    learner: Learner | None = None
-    memory: Memory | None = None
+    bias_learning: BiasLearning | None = None
+    warm_start: WarmStart | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Watcher:
+class DesignedEstimator:
     """Finished design of one feeder, with its estimator.
 
     Attributes
@@ -134,7 +134,7 @@ class Watcher:
         M of the feeder's file.
     """
 
-    family: Family
+    family: Estimator
     design: Any
     asked: int = 0
 
@@ -154,9 +154,9 @@ class Watcher:
         return self.family.proof(self.design)
 
     @property
-    def learner(self) -> Learner | None:
+    def bias_learning(self) -> BiasLearning | None:
         """Learning of the meters' fixed errors; None without it."""
-        learner = self.family.learner
+        learner = self.family.bias_learning
         return learner if learner is not None and learner.needed_s(self.design) > 0 else None
 
     def init(self, t: float, commission: Commission | None = None) -> Any:
@@ -169,9 +169,9 @@ class Watcher:
         commission
             Earlier knowledge of the meters' fixed errors, for estimators that learn them.
         """
-        if self.learner is None or commission is None:
+        if self.bias_learning is None or commission is None:
             return self.family.init(self.design, t)
-        return self.learner.init(self.design, t, commission)
+        return self.bias_learning.init(self.design, t, commission)
 
     def step(self, state: Any, frame: Frame) -> tuple[Any, Estimate, Verdict]:
         """Process one frame."""

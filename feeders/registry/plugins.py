@@ -1,7 +1,7 @@
 """Estimators of other packages: entry points of the group `gridsec.estimators`.
 
-The name of an entry point is the estimator's name; it refers to a `feeders.registry.registry.Family` of that
-name. Names are read without running external code; an estimator is loaded on first use.
+The name of an entry point is the estimator's name; it refers to a `feeders.registry.registry.Estimator` of
+that name. Names are read without running external code; an estimator is loaded on first use.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from gridsec.errors import DesignInfeasible, GridsecError, NotObservable
 
 if TYPE_CHECKING:
     from feeders.model.site import Site
-    from feeders.registry.estimator import Job
+    from feeders.registry.estimator import DesignOptions
 
 GROUP: Final = "gridsec.estimators"
 
@@ -73,7 +73,7 @@ def load(name: str, kind: type) -> Any:
     return made
 
 
-def design(name: str, make: Callable[[Site, Job], Any], site: Site, job: Job) -> Any:
+def design(name: str, make: Callable[[Site, DesignOptions], Any], site: Site, job: DesignOptions) -> Any:
     """Design by an estimator of another package.
 
     Parameters

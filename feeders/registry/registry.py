@@ -14,7 +14,7 @@ from feeders.model.load_uncertainty import load_doubt, unread
 from feeders.model.site import Site, from_tables, plant
 from feeders.registry import plugins
 from feeders.registry.design_cache import bank_gains
-from feeders.registry.estimator import Family, Job, Learner, Memory, Watcher
+from feeders.registry.estimator import BiasLearning, DesignedEstimator, DesignOptions, Estimator, WarmStart
 from gridsec.arrays import Floats
 from gridsec.errors import FeederInvalid, Problem
 from gridsec.estimators import (
@@ -36,11 +36,11 @@ __all__ = [
     "FAMILIES",
     "LMI",
     "SEQUENTIAL",
-    "Family",
-    "Job",
-    "Learner",
-    "Memory",
-    "Watcher",
+    "BiasLearning",
+    "DesignOptions",
+    "DesignedEstimator",
+    "Estimator",
+    "WarmStart",
     "choose",
     "design",
     "lmi_options",
@@ -68,7 +68,7 @@ def design(
     workers: int = 1,
     where: Path | None = None,
     progress: Callable[[int, int], None] | None = None,
-) -> Watcher:
+) -> DesignedEstimator:
     """Design the estimator of the feeder's file.
 
     Parameters
@@ -76,7 +76,7 @@ def design(
     site
         The feeder, with `[monitor] estimator`, `max_attacked` and `tick_s` of its file.
     workers, where, progress
-        As in `Job`.
+        As in `DesignOptions`.
 
     Raises
     ------
@@ -86,13 +86,15 @@ def design(
         If the code of another package's estimator fails.
     """
     settings = site.tables.meta.monitor
-    family, job = FAMILIES[settings.estimator], Job(workers, where, progress)
+    family, job = FAMILIES[settings.estimator], DesignOptions(workers, where, progress)
     if family.name in OWN_ESTIMATORS:
-        return Watcher(family, family.design(site, job), settings.max_attacked)
-    return Watcher(family, plugins.design(family.name, family.design, site, job), settings.max_attacked)
+        return DesignedEstimator(family, family.design(site, job), settings.max_attacked)
+    return DesignedEstimator(
+        family, plugins.design(family.name, family.design, site, job), settings.max_attacked
+    )
 
 
-def _sequential(site: Site, _: Job) -> sequential.SequentialDesign:
+def _sequential(site: Site, _: DesignOptions) -> sequential.SequentialDesign:
     settings = site.tables.meta.monitor
     options = sequential.SequentialOptions(
         alarms_per_year=settings.alarms_per_year,
@@ -102,12 +104,12 @@ def _sequential(site: Site, _: Job) -> sequential.SequentialDesign:
     return sequential.design(plant(site), doubt=load_doubt(site), step_s=settings.tick_s, options=options)
 
 
-def _direct_bank(site: Site, _: Job) -> exact_bank.MonitorDesign:
+def _direct_bank(site: Site, _: DesignOptions) -> exact_bank.MonitorDesign:
     settings = site.tables.meta.monitor
     return exact_bank.design(plant(site), max_attacked=settings.max_attacked, step_s=settings.tick_s)
 
 
-def _lmi_bank(site: Site, job: Job) -> exact_bank.MonitorDesign:
+def _lmi_bank(site: Site, job: DesignOptions) -> exact_bank.MonitorDesign:
     settings = site.tables.meta.monitor
     lure = close_loop(site.feeder, site.droop, site.meters)
     found = bank_gains(
@@ -130,8 +132,10 @@ def _certificate(
     return f"{proof.kind} certificate, margin {proof.margin:.3g}, decay at least {proof.rate:.3g} 1/s"
 
 
-def _bank(name: str, summary: str, make: Callable[[Site, Job], exact_bank.MonitorDesign]) -> Family:
-    return Family(
+def _bank(
+    name: str, summary: str, make: Callable[[Site, DesignOptions], exact_bank.MonitorDesign]
+) -> Estimator:
+    return Estimator(
         name, summary, make, exact_bank.init, exact_bank.step, lambda d: int(d.observers), _certificate
     )
 
@@ -216,25 +220,25 @@ def _load_columns(site: Site) -> Floats:
     return np.hstack([2.0 * model.R * dp, 2.0 * model.X * dq])
 
 
-def _windowed(site: Site, _: Job) -> windowed.WindowedDesign:
+def _windowed(site: Site, _: DesignOptions) -> windowed.WindowedDesign:
     settings = site.tables.meta.monitor
     return windowed.design(plant(site), max_attacked=settings.max_attacked, step_s=settings.tick_s)
 
 
-def _set_search(site: Site, _: Job) -> set_search.SetSearchDesign:
+def _set_search(site: Site, _: DesignOptions) -> set_search.SetSearchDesign:
     settings = site.tables.meta.monitor
     return set_search.design(plant(site), max_attacked=settings.max_attacked, step_s=settings.tick_s)
 
 
-def _partial(site: Site, _: Job) -> partial.PartialDesign:
+def _partial(site: Site, _: DesignOptions) -> partial.PartialDesign:
     settings = site.tables.meta.monitor
     return partial.design(plant(site), max_attacked=settings.max_attacked, step_s=settings.tick_s)
 
 
-def _ticks(name: str, summary: str, decoder: Decoder) -> Family:
+def _ticks(name: str, summary: str, decoder: Decoder) -> Estimator:
     """Estimator that tests every tick by itself."""
 
-    def make(site: Site, _: Job) -> sequential.SequentialDesign:
+    def make(site: Site, _: DesignOptions) -> sequential.SequentialDesign:
         settings = site.tables.meta.monitor
         return single_tick.design(
             plant(site),
@@ -245,17 +249,17 @@ def _ticks(name: str, summary: str, decoder: Decoder) -> Family:
             alarms_per_year=settings.alarms_per_year,
         )
 
-    return Family(
+    return Estimator(
         name, summary, make, sequential.init, sequential.step, lambda d: int(d.observers), _certificate
     )
 
 
-def _unknown_input(site: Site, _: Job) -> unknown_input.UnknownInputDesign:
+def _unknown_input(site: Site, _: DesignOptions) -> unknown_input.UnknownInputDesign:
     settings = site.tables.meta.monitor
     return unknown_input.design(plant(site), max_attacked=settings.max_attacked, step_s=settings.tick_s)
 
 
-class Families(Mapping[str, Family]):
+class Families(Mapping[str, Estimator]):
     """Bundled estimators and those of other packages, which are loaded on first use.
 
     Parameters
@@ -264,12 +268,12 @@ class Families(Mapping[str, Family]):
         Bundled estimators.
     """
 
-    def __init__(self, own: Iterable[Family]) -> None:
+    def __init__(self, own: Iterable[Estimator]) -> None:
         self._known = {family.name: family for family in own}
 
-    def __getitem__(self, name: str) -> Family:
+    def __getitem__(self, name: str) -> Estimator:
         if name not in self._known and name in ESTIMATORS:
-            self._known[name] = plugins.load(name, Family)
+            self._known[name] = plugins.load(name, Estimator)
         return self._known[name]
 
     def __iter__(self) -> Iterator[str]:
@@ -281,7 +285,7 @@ class Families(Mapping[str, Family]):
 
 FAMILIES: Final = Families(
     (
-        Family(
+        Estimator(
             SEQUENTIAL,
             "one switched observer, correlated loads, evidence on several time scales",
             _sequential,
@@ -290,7 +294,7 @@ FAMILIES: Final = Families(
             lambda d: int(d.observers),
             _certificate,
             lambda d: int(d.most),
-            Learner(
+            BiasLearning(
                 needed_s=lambda d: float(d.options.commission_s),
                 init=lambda d, t, known: sequential.init(d, t, known.learned, known.learning),
                 commission=lambda state: state.commission,
@@ -298,11 +302,11 @@ FAMILIES: Final = Families(
                 read=sequential.from_arrays,
                 progress=sequential.progress,
             ),
-            Memory(sequential.distrusted, sequential.restore),
+            WarmStart(sequential.distrusted, sequential.warm_start),
         ),
         _bank(DIRECT, "banks of circle-criterion observers, direct injection (chong2020)", _direct_bank),
         _bank(LMI, "the same banks, gains by matrix inequality (chong2020)", _lmi_bank),
-        Family(
+        Estimator(
             "windowed-bank",
             "windows of consistency of discrete-time observers (yang2019)",
             _windowed,
@@ -319,7 +323,7 @@ FAMILIES: Final = Families(
         _ticks("l0-decoder", "the smallest set that explains a tick (lee2018, 2)", single_tick.fewest),
         _ticks("basis-pursuit", "the attack of smallest l1 norm (lee2018, 2)", single_tick.pursue),
         _ticks("matching-pursuit", "orthogonal matching pursuit (lee2018, 2)", single_tick.match),
-        Family(
+        Estimator(
             "partial-observers",
             "one observer per meter, l0 decoding of their stack (lee2018, 4)",
             _partial,
@@ -328,7 +332,7 @@ FAMILIES: Final = Families(
             lambda d: int(d.observers),
             lambda d: _certificate(d.model),
         ),
-        Family(
+        Estimator(
             "set-search",
             "one switched observer, a new set when its test fails (kim2018, lee2018, 5)",
             _set_search,
@@ -337,7 +341,7 @@ FAMILIES: Final = Families(
             lambda d: int(d.observers),
             _certificate,
         ),
-        Family(
+        Estimator(
             "unknown-input",
             "meters and inverters at once; suspected injections are unknown inputs (yang2021)",
             _unknown_input,

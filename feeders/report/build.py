@@ -13,7 +13,7 @@ import numpy as np
 from feeders.format.validation import told
 from feeders.report import drawing as drawings
 from feeders.report.drawing import WIDE, Drawing, Figure, svg
-from feeders.report.html import CONVERSION, FEEDER, About, Chapter, Outcome, page, section
+from feeders.report.html import CONVERSION, FEEDER, About, Chapter, StudyOutcome, page, section
 from feeders.report.maps import Shape, Spot, draw_map, legend_of
 
 if TYPE_CHECKING:
@@ -44,7 +44,9 @@ class Report:
     tables: dict[str, pd.DataFrame]
 
 
-def report(site: Site, outcomes: Sequence[Outcome], about: About, origin: Origin | None = None) -> Report:
+def report(
+    site: Site, outcomes: Sequence[StudyOutcome], about: About, origin: Origin | None = None
+) -> Report:
     """Build the report; equal arguments give equal bytes.
 
     Parameters

@@ -7,9 +7,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from feeders.report.drawing import Area, Disc, Drawing, Line, Mark, Text, regular, width_of
+from feeders.report.drawing import Area, Disc, Drawing, Mark, Polyline, Text, regular, width_of
 
-__all__ = ["LINES", "Bar", "Curve", "Row", "curves", "rows", "ticks"]
+__all__ = ["LINES", "Bar", "ChartRow", "Curve", "curves", "rows", "ticks"]
 
 LINES: Final = ("line-a", "line-b", "line-c", "line-d", "line-ink", "line-bad", "line-wire", "line-s")
 """Looks of curves, different in colour and dashes."""
@@ -45,7 +45,7 @@ class Bar:
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class ChartRow:
     """Row of a chart: bars, and a number at their end."""
 
     label: str
@@ -55,7 +55,7 @@ class Row:
 
 
 def rows(
-    data: Sequence[Row],
+    data: Sequence[ChartRow],
     width: float,
     *,
     axis: str,
@@ -89,7 +89,7 @@ def rows(
         return left + (value - start) * scale
 
     marks: list[Mark] = [Text(max(min(left, width - width_of(axis) - 4.0), 2.0), 13.0, axis, "quiet")]
-    marks += [Line(((at(v), 24.0), (at(v), bottom)), "grid") for v in steps]
+    marks += [Polyline(((at(v), 24.0), (at(v), bottom)), "grid") for v in steps]
     for k, row in enumerate(data):
         y = 30.0 + _ROW * k
         marks.append(Text(left - 7.0, y + 12.5, _cut(row.label, left - 12.0), "text", "end", _LETTERS))
@@ -103,7 +103,7 @@ def rows(
     meanings = {bar.meaning: bar.look for row in data for bar in row.bars}
     for meaning, values in (limits or {}).items():
         inside = [v for v in values if start <= v <= end]
-        marks += [Line(((at(v), 24.0), (at(v), bottom)), "limit", meaning) for v in inside]
+        marks += [Polyline(((at(v), 24.0), (at(v), bottom)), "limit", meaning) for v in inside]
         meanings |= dict.fromkeys([meaning] * len(inside), "limit")
     extra, height = _legend(meanings, bottom + 24.0, width) if len(meanings) > 1 else ([], bottom + 24.0)
     return Drawing(width, height, (*marks, *extra))
@@ -164,8 +164,8 @@ def curves(
         )
 
     marks: list[Mark] = [Text(2.0, 13.0, y, "quiet")]
-    marks += [Line((at(x0, v), at(x1, v)), "grid") for v in up]
-    marks.append(Line((at(x0, y0), at(x1, y0)), "axis"))
+    marks += [Polyline((at(x0, v), at(x1, v)), "grid") for v in up]
+    marks.append(Polyline((at(x0, y0), at(x1, y0)), "axis"))
     marks += [Text(left - 7.0, at(x0, v)[1] + 4.0, _tick(v, up), "quiet", "end", _LETTERS) for v in up]
     for v in across:
         name = f"{10.0**v:g}" if decades else _tick(v, across)
@@ -186,7 +186,7 @@ def _curve(curve: Curve, at: Callable[[float, float], tuple[float, float]]) -> l
             piece.append(at(x, y))
             continue
         if len(piece) > 1:
-            marks.append(Line(tuple(piece), curve.look))
+            marks.append(Polyline(tuple(piece), curve.look))
         if curve.points or len(piece) == 1:
             marks += [_point(curve.look, px, py) for px, py in piece]
         piece = []
@@ -212,7 +212,7 @@ def _legend(meanings: dict[str, str], top: float, width: float) -> tuple[list[Ma
         if x > 12.0 and x + long > width - 4.0:
             x, y = 12.0, y + 20.0
         if look.startswith("line") or look == "limit":
-            marks.append(Line(((x, y - 4.0), (x + 20.0, y - 4.0)), look))
+            marks.append(Polyline(((x, y - 4.0), (x + 20.0, y - 4.0)), look))
         else:
             corners = ((x, y - 10.0), (x + 16.0, y - 10.0), (x + 16.0, y + 1.0), (x, y + 1.0))
             marks.append(Area(corners, look))

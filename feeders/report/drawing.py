@@ -25,9 +25,9 @@ __all__ = [
     "Disc",
     "Drawing",
     "Figure",
-    "Line",
     "Look",
     "Mark",
+    "Polyline",
     "Text",
     "available",
     "png",
@@ -135,7 +135,7 @@ LOOKS: Final[dict[str, Look]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
+class Polyline:
     """Polyline; `tip` is its tooltip."""
 
     points: tuple[Point, ...]
@@ -175,7 +175,7 @@ class Text:
     size: float = 12.0
 
 
-Mark = Line | Area | Disc | Text
+Mark = Polyline | Area | Disc | Text
 
 
 @dataclass(frozen=True, slots=True)
@@ -268,7 +268,7 @@ def _merged(marks: Sequence[Mark]) -> Iterable[str]:
     """Write marks; successive ones of equal look without a tip share one path."""
     held: tuple[str, list[str]] | None = None
     for mark in marks:
-        if isinstance(mark, Line | Area) and not mark.tip:
+        if isinstance(mark, Polyline | Area) and not mark.tip:
             if held is not None and held[0] == mark.look:
                 held[1].append(_path(mark))
                 continue
@@ -304,7 +304,7 @@ def _element(mark: Mark) -> str:
     return f"{what}>{tip}</path>" if tip else f"{what}/>"
 
 
-def _path(mark: Line | Area) -> str:
+def _path(mark: Polyline | Area) -> str:
     steps = " ".join(f"{_number(x)} {_number(y)}" for x, y in mark.points)
     return f"M{steps}{'Z' if isinstance(mark, Area) else ''}"
 
@@ -384,7 +384,7 @@ def png(drawing: Drawing, *, title: str, text: str) -> bytes:
 def _draw(axes: Any, mark: Mark, order: float) -> None:
     look = LOOKS[mark.look]
     fill = LIGHT.get(look.fill, "none")
-    if isinstance(mark, Line):
+    if isinstance(mark, Polyline):
         stroke: dict[str, Any] = {"color": LIGHT[look.stroke], "linewidth": _POINTS * look.width}
         if look.dash:
             gaps = [float(length) / look.width for length in look.dash.split()]

@@ -35,8 +35,8 @@ __all__ = [
     "About",
     "Chapter",
     "Markup",
-    "Outcome",
     "Result",
+    "StudyOutcome",
     "el",
     "join",
     "page",
@@ -57,7 +57,7 @@ class Result(Protocol):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Outcome:
+class StudyOutcome:
     """Outcome of a study.
 
     Attributes
@@ -118,7 +118,7 @@ TITLES: Final = {
 """Headings of sections without a result."""
 
 
-def section(site: Site, outcome: Outcome) -> Section:
+def section(site: Site, outcome: StudyOutcome) -> Section:
     """Section of a study, for any outcome.
 
     Parameters
@@ -278,7 +278,7 @@ class About:
 class Chapter:
     """Section, and the outcome of its study."""
 
-    outcome: Outcome
+    outcome: StudyOutcome
     section: Section
 
 

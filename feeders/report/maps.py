@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from feeders.report.drawing import STEPS, Area, Disc, Drawing, Line, Mark, Text, regular, width_of
+from feeders.report.drawing import STEPS, Area, Disc, Drawing, Mark, Polyline, Text, regular, width_of
 from feeders.report.text import number
 
 if TYPE_CHECKING:
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from gridsec.arrays import Floats
 
 __all__ = [
+    "ColorScale",
     "Placed",
-    "Scale",
     "Shape",
     "Spot",
     "comparable",
@@ -362,7 +362,7 @@ LEGS: Final = {"a": 60.0, "b": 180.0, "c": 300.0}
 
 
 @dataclass(frozen=True, slots=True)
-class Scale:
+class ColorScale:
     """Scale with STEPS + 1 ascending limits of its steps, and their unit."""
 
     limits: tuple[float, ...]
@@ -381,7 +381,7 @@ class Scale:
         ]
 
 
-def steps_of(values: Sequence[float], unit: str) -> Scale:
+def steps_of(values: Sequence[float], unit: str) -> ColorScale:
     """Scale of equal steps of a round size over finite values.
 
     Parameters
@@ -402,7 +402,7 @@ def steps_of(values: Sequence[float], unit: str) -> Scale:
             # Nearly equal values are on one step, not on two.
             apart = same and least // step != most // step
             if first + STEPS * step >= high * (1.0 - 1e-12) and not apart:
-                return Scale(tuple(first + k * step for k in range(STEPS + 1)), unit)
+                return ColorScale(tuple(first + k * step for k in range(STEPS + 1)), unit)
         size *= 10.0
 
 
@@ -453,10 +453,10 @@ def draw_map(
         customers=tuple(_moved(point, top) for point in at.customers),
     )
     marks: list[Mark] = [Text(8.0, 15.0, note, "quiet", size=12.0)] if note else []
-    marks += [Line(points, "drop") for points in at.drops]
-    marks += [Line(points, "wire") for points in at.wires]
-    marks += [Line(points, "line-wire") for points in at.ties]
-    marks.append(Line(at.busbar, "busbar", tip=f"busbar: {site.feeder.buses[0]}"))
+    marks += [Polyline(points, "drop") for points in at.drops]
+    marks += [Polyline(points, "wire") for points in at.wires]
+    marks += [Polyline(points, "line-wire") for points in at.ties]
+    marks.append(Polyline(at.busbar, "busbar", tip=f"busbar: {site.feeder.buses[0]}"))
     spots, legend = _with_phases(site, spots, legend)
     size = min(max(at.room / 3.4, 3.2), 7.5)
     order = sorted(range(len(spots)), key=lambda k: (spots[k].step, spots[k].weight))
@@ -501,7 +501,7 @@ def _glyph(spot: Spot, x: float, y: float, size: float) -> list[Mark]:
             outline = [(-1, -0.8), (0, -1.15), (1, -0.8), (0.9, 0.2), (0, 1.15), (-0.9, 0.2)]
             tick = ((x - 0.45 * r, y), (x - 0.1 * r, y + 0.4 * r), (x + 0.5 * r, y - 0.4 * r))
             shield = tuple((x + r * a, y + r * b) for a, b in outline)
-            marks = [Area(shield, "shield", spot.tip), Line(tick, "tick")]
+            marks = [Area(shield, "shield", spot.tip), Polyline(tick, "tick")]
         case Shape.ALARM:
             marks = [Area(regular(x, y, 1.3 * size, 4), "alarm", spot.tip)]
         case Shape.SUN:
@@ -521,7 +521,7 @@ def _leg(spot: Spot, x: float, y: float, size: float) -> list[Mark]:
         return []
     angle = math.radians(LEGS[spot.phase])
     far = size * (1.3 if spot.shape is Shape.NONE else 2.1)
-    return [Line(((x, y), (x + far * math.sin(angle), y - far * math.cos(angle))), "line-ink")]
+    return [Polyline(((x, y), (x + far * math.sin(angle), y - far * math.cos(angle))), "line-ink")]
 
 
 Box = tuple[float, float, float, float]

@@ -6,7 +6,7 @@ import math
 from functools import partial
 from typing import TYPE_CHECKING
 
-from feeders.report.charts import Bar, Row, rows
+from feeders.report.charts import Bar, ChartRow, rows
 from feeders.report.drawing import Drawing, Figure
 from feeders.report.maps import Shape, Spot, draw_map, legend_of
 from feeders.report.text import Finding, Question, Section, Sentence, Standing, Value, listed, number, plural
@@ -140,7 +140,7 @@ def _bias_chart(meters: pd.DataFrame, width: float) -> Drawing:
     table = meters.loc[order]
     mark = 0.006 * float(table["high_percent"].max() - table["low_percent"].min())
     data = [
-        Row(
+        ChartRow(
             str(row["meter"]),
             (
                 Bar(

@@ -8,18 +8,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from feeders.report.charts import LINES, Bar, Curve, Row, curves, rows
+from feeders.report.charts import LINES, Bar, ChartRow, Curve, curves, rows
 from feeders.report.drawing import Drawing, Figure
 from feeders.report.text import Finding, Question, Section, Sentence, Standing, Value, listed, number, plural
-from feeders.simulation.attacks import Trick
-from feeders.simulation.trial import Meters
+from feeders.simulation.attacks import AttackKind
+from feeders.simulation.trial import TrialMeterErrors
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from feeders.model.site import Site
     from feeders.simulation.trial import LoadError
-    from feeders.studies.campaign.plan import Plan
+    from feeders.studies.campaign.plan import CampaignPlan
     from feeders.studies.campaign.study import Campaign
 
 __all__ = ["campaign"]
@@ -31,13 +31,18 @@ _SIZES = (
     "coordinated: displacement of the least affected meter by a false load, % of nominal; stuck: none"
 )
 _UNITS = {
-    **dict.fromkeys((Trick.BIAS, Trick.TOGETHER, Trick.SCALING, Trick.COORDINATED), " %"),
-    **{Trick.DRIFT: " %/min", Trick.REPLAY: " s", Trick.CLOCK_SHIFT: " s", Trick.INVERTER: " %"},
+    **dict.fromkeys((AttackKind.BIAS, AttackKind.TOGETHER, AttackKind.SCALING, AttackKind.COORDINATED), " %"),
+    **{
+        AttackKind.DRIFT: " %/min",
+        AttackKind.REPLAY: " s",
+        AttackKind.CLOCK_SHIFT: " s",
+        AttackKind.INVERTER: " %",
+    },
 }
 _ERRORS = {
-    Meters.SITE: "those of the feeder's files",
-    Meters.WHITE: "white noise of 0.2 %, no fixed error",
-    Meters.REAL: "fixed within 0.5 %, and jitter of 0.05 %",
+    TrialMeterErrors.SITE: "those of the feeder's files",
+    TrialMeterErrors.WHITE: "white noise of 0.2 %, no fixed error",
+    TrialMeterErrors.REAL: "fixed within 0.5 %, and jitter of 0.05 %",
 }
 _SHOWN = (
     *("scenarios", "exact", "named", "named_low", "named_high", "false", "delay_median_s"),
@@ -221,7 +226,7 @@ def _percent(share: float) -> str:
     return f"{text} %"
 
 
-def _named_chart(plan: Plan, table: pd.DataFrame, width: float) -> Drawing:
+def _named_chart(plan: CampaignPlan, table: pd.DataFrame, width: float) -> Drawing:
     tricks = {kind.name: kind for kind in plan.kinds}
     data = []
     for row in table[table["liars_told"] > 0].to_dict("records"):
@@ -234,8 +239,8 @@ def _named_chart(plan: Plan, table: pd.DataFrame, width: float) -> Drawing:
         kind = tricks.get(row["kind"])
         # Sizes of kinds in volts are factors.
         unit = "" if kind is None or kind.volts or kind.together else _UNITS.get(kind.trick, "")
-        size = "" if kind is not None and kind.trick is Trick.STUCK else f" {row['size']:g}{unit}"
-        data.append(Row(f"{row['kind']}{size}", bars, f"{round(share * told / 100.0)} of {told}"))
+        size = "" if kind is not None and kind.trick is AttackKind.STUCK else f" {row['size']:g}{unit}"
+        data.append(ChartRow(f"{row['kind']}{size}", bars, f"{round(share * told / 100.0)} of {told}"))
     return rows(data, width, axis="manipulated devices named, %")
 
 
@@ -270,5 +275,5 @@ def _error_chart(table: pd.DataFrame, width: float) -> Drawing:
             if math.isfinite(value)
         ]
         shown = " / ".join(number(v) for v in (liars, others) if not math.isnan(v))
-        data.append(Row(str(row["kind"]), tuple(bars), shown))
+        data.append(ChartRow(str(row["kind"]), tuple(bars), shown))
     return rows(data, width, axis="largest error of the shown voltage, % of nominal")

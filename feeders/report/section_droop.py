@@ -7,7 +7,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from feeders.format.validation import told
-from feeders.report.charts import LINES, Bar, Curve, Row, curves, rows
+from feeders.report.charts import LINES, Bar, ChartRow, Curve, curves, rows
 from feeders.report.drawing import Drawing, Figure
 from feeders.report.maps import comparable, single_phase
 from feeders.report.text import (
@@ -255,7 +255,7 @@ def _band_chart(customers: pd.DataFrame, unit: str, ends: tuple[float, float], w
         if math.isfinite(low_rest + high_rest):
             bars.append(Bar(low_rest, high_rest, "fill-a", "for slow load changes", inset=6.0))
         data.append(
-            Row(
+            ChartRow(
                 f"{row['customer']}, {row['phase']}" if "phase" in row else str(row["customer"]),
                 tuple(bars),
                 f"{number(low, 1, Side.BELOW)} to {number(high, 1, Side.ABOVE)} {unit[0]}",

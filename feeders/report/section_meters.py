@@ -7,7 +7,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from feeders.format.validation import told
-from feeders.report.charts import Bar, Row, rows
+from feeders.report.charts import Bar, ChartRow, rows
 from feeders.report.drawing import Drawing, Figure
 from feeders.report.maps import Shape, Spot, comparable, draw_map, legend_of, names_of, single_phase, size_map
 from feeders.report.text import (
@@ -333,7 +333,7 @@ def _sizes_chart(meters: pd.DataFrame, width: float, *, unit: str) -> Drawing:
                 f"no explanation without it from {number(row['named'], 2, Side.ABOVE)} {unit} on",
             ),
         )
-        data.append(Row(str(row["meter"]), bars, f"{number(row['named'], 2, Side.ABOVE)} {unit[0]}"))
+        data.append(ChartRow(str(row["meter"]), bars, f"{number(row['named'], 2, Side.ABOVE)} {unit[0]}"))
     axis = "size of the attack, V at nominal voltage" if unit == "V" else f"size of the attack, {unit}"
     return rows(data, width, axis=axis)
 

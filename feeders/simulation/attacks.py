@@ -56,7 +56,7 @@ SIZING_TOLERANCE: Final = 1e-4
 SIZING_ROUNDS: Final = 30
 
 
-class Kind(StrEnum):
+class RandomAttackKind(StrEnum):
     """Kinds of attack of `random_attacks`."""
 
     BIAS = "bias"
@@ -113,7 +113,7 @@ class FakeLoad:
 def random_attacks(
     site: Site,
     seed: int,
-    kind: Kind | str,
+    kind: RandomAttackKind | str,
     count: int,
     size: float,
     *,
@@ -149,16 +149,16 @@ def random_attacks(
     NoSuchAttack
         For fewer meters than `count`, or without a place for a fake load of this size.
     """
-    kind = Kind(kind)
+    kind = RandomAttackKind(kind)
     if not 0 < count <= site.meters.size:
         raise NoSuchAttack(
             f"{site.feeder.name} has {site.meters.size} meters; cannot attack {count}", code="too-few-meters"
         )
     random = generator(seed, Stream.ATTACK)
-    if kind in (Kind.COORDINATED, Kind.COORDINATED_POWER):
+    if kind in (RandomAttackKind.COORDINATED, RandomAttackKind.COORDINATED_POWER):
         loads = _typical(site) if scenario is None else present_loads(site, scenario, t_on)
         meters, fake = _somewhere(site, random, count, size, loads)
-        power = kind is Kind.COORDINATED_POWER
+        power = kind is RandomAttackKind.COORDINATED_POWER
         return (coordinated(site, meters, fake, t_on=t_on, t_off=t_off, power=power),)
     meters = np.sort(random.choice(site.meters.size, count, replace=False)).astype(np.intp)
     amount = size * random.uniform(1.0, LARGEST, count)
@@ -166,7 +166,9 @@ def random_attacks(
     return (_plain(kind, meters, signed, site, t_on=t_on, t_off=t_off, seed=seed),)
 
 
-def busbar_attack(site: Site, kind: Kind | str, size: float, *, t_on: float, t_off: float) -> Attack:
+def busbar_attack(
+    site: Site, kind: RandomAttackKind | str, size: float, *, t_on: float, t_off: float
+) -> Attack:
     """Attack the busbar meter, in all of its phases.
 
     Parameters
@@ -188,10 +190,10 @@ def busbar_attack(site: Site, kind: Kind | str, size: float, *, t_on: float, t_o
     """
     phases = np.arange(site.feeder.busbar_places().stop)
     signed = np.full(phases.size, size)
-    match Kind(kind):
-        case Kind.SCALING:
+    match RandomAttackKind(kind):
+        case RandomAttackKind.SCALING:
             return Scaling(phases, t_on, t_off, factor=signed)
-        case Kind.BIAS | Kind.DRIFT as plain:
+        case RandomAttackKind.BIAS | RandomAttackKind.DRIFT as plain:
             return _plain(plain, phases, signed, site, t_on=t_on, t_off=t_off, seed=0)
         case other:
             raise NoSuchAttack(
@@ -326,23 +328,23 @@ def _affected(site: Site, customer: int, pattern: Floats, count: int) -> Ints:
 
 
 def _plain(
-    kind: Kind, meters: Ints, signed: Floats, site: Site, *, t_on: float, t_off: float, seed: int
+    kind: RandomAttackKind, meters: Ints, signed: Floats, site: Site, *, t_on: float, t_off: float, seed: int
 ) -> Attack:
     """One attack with independent manipulations of the meters."""
     attack: Attack
     match kind:
-        case Kind.BIAS:
+        case RandomAttackKind.BIAS:
             attack = Bias(meters, t_on, t_off, size=signed)
-        case Kind.SCALING:
+        case RandomAttackKind.SCALING:
             attack = Scaling(meters, t_on, t_off, factor=signed / site.tables.meta.limits.v_min_pu)
-        case Kind.DRIFT:
+        case RandomAttackKind.DRIFT:
             rate = 3.0 * signed / (t_off - t_on)
             attack = Drift(meters, t_on, t_off, rate=rate, limit=np.abs(signed))
-        case Kind.STUCK:
+        case RandomAttackKind.STUCK:
             attack = Stuck(meters, t_on, t_off)
-        case Kind.REPLAY:
+        case RandomAttackKind.REPLAY:
             attack = Replay(meters, t_on, t_off, delay_s=3600.0)
-        case Kind.RANDOM:
+        case RandomAttackKind.RANDOM:
             low = np.abs(signed)
             attack = Random(meters, t_on, t_off, low=low, high=LARGEST * low, hold_s=1.0, seed=seed)
         case _:
@@ -365,7 +367,7 @@ def present_loads(site: Site, scenario: Scenario, t: float) -> Loads:
     return Loads(demand.p_kw[0], demand.q_kvar[0], demand.v0_volt[0])
 
 
-class Trick(StrEnum):
+class AttackKind(StrEnum):
     """Manipulation of the devices."""
 
     BIAS = "bias"
@@ -382,7 +384,7 @@ class Trick(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Lie:
+class AttackSpec:
     """Attack stated in one line: manipulation, count, size and time; the run's seed chooses the devices.
 
     Attributes
@@ -401,18 +403,18 @@ class Lie:
         Seconds after the start of the run.
     """
 
-    trick: Trick
+    trick: AttackKind
     count: int = 1
     size: float = 3.0
     onset_s: float = 30.0
     end_s: float = np.inf
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "trick", choice("trick", Trick, self.trick))
+        object.__setattr__(self, "trick", choice("trick", AttackKind, self.trick))
 
 
 def manipulations(
-    site: Site, lie: Lie | None, scenario: Scenario
+    site: Site, lie: AttackSpec | None, scenario: Scenario
 ) -> tuple[tuple[Attack, ...], tuple[InverterAttack, ...]]:
     """Build the attacks of one statement.
 
@@ -433,10 +435,10 @@ def manipulations(
     if lie is None:
         return (), ()
     t_on, t_off = scenario.start + lie.onset_s, scenario.start + min(lie.end_s, scenario.duration_s)
-    if lie.trick in (Trick.COORDINATED, Trick.COORDINATED_POWER, Trick.POWER):
+    if lie.trick in (AttackKind.COORDINATED, AttackKind.COORDINATED_POWER, AttackKind.POWER):
         return (_coordinated(site, lie, scenario, t_on, t_off),), ()
     random = generator(scenario.seed, Stream.ATTACK)
-    there = site.droop.tau.size if lie.trick is Trick.INVERTER else site.meters.size
+    there = site.droop.tau.size if lie.trick is AttackKind.INVERTER else site.meters.size
     if not 0 < lie.count <= there:
         raise NoSuchAttack(
             f"{site.feeder.name} has {there} of these devices; cannot manipulate {lie.count}",
@@ -444,14 +446,14 @@ def manipulations(
         )
     liars = np.sort(random.choice(there, lie.count, replace=False)).astype(np.intp)
     signs = random.choice([-1.0, 1.0], lie.count)
-    if lie.trick is Trick.INVERTER:
+    if lie.trick is AttackKind.INVERTER:
         rating = np.array([row.inverter_kva for row in site.tables.customers])[site.droop.customer]
         q = lie.size / 100.0 * signs * rating[liars] / site.feeder.base_kva
         return (), (InverterAttack(liars, q, t_on, t_off),)
     return (each_alone(lie, liars, signs, t_on, t_off),), ()
 
 
-def _coordinated(site: Site, lie: Lie, scenario: Scenario, t_on: float, t_off: float) -> Attack:
+def _coordinated(site: Site, lie: AttackSpec, scenario: Scenario, t_on: float, t_off: float) -> Attack:
     """Attack with the trace of a load at a random customer."""
     if not 0 < lie.count <= site.meters.size:
         raise NoSuchAttack(
@@ -465,9 +467,9 @@ def _coordinated(site: Site, lie: Lie, scenario: Scenario, t_on: float, t_off: f
             meters, fake = fake_load(site, int(customer), lie.count, lie.size / 100.0, loads=loads)
         except NoSuchAttack:
             continue
-        power = lie.trick is not Trick.COORDINATED
+        power = lie.trick is not AttackKind.COORDINATED
         attack = coordinated(site, meters, fake, t_on=t_on, t_off=t_off, power=power)
-        if lie.trick is Trick.POWER:
+        if lie.trick is AttackKind.POWER:
             attack = _powers_of(attack)
         read_kw = loads.p_kw[customer] + fake.p_kw
         if abs(read_kw) <= site.loads.credible[customer] * site.feeder.base_kva:
@@ -490,7 +492,7 @@ def _powers_of(told: Coordinated) -> Coordinated:
     )
 
 
-def each_alone(lie: Lie, liars: Ints, signs: Floats, t_on: float, t_off: float) -> Attack:
+def each_alone(lie: AttackSpec, liars: Ints, signs: Floats, t_on: float, t_off: float) -> Attack:
     """Attack with independent manipulations of the meters.
 
     Parameters
@@ -505,16 +507,16 @@ def each_alone(lie: Lie, liars: Ints, signs: Floats, t_on: float, t_off: float) 
     share = lie.size / 100.0
     attack: Attack
     match lie.trick:
-        case Trick.BIAS:
+        case AttackKind.BIAS:
             attack = Bias(liars, t_on, t_off, share * signs)
-        case Trick.TOGETHER:
+        case AttackKind.TOGETHER:
             attack = Bias(liars, t_on, t_off, share * np.abs(signs))
-        case Trick.SCALING:
+        case AttackKind.SCALING:
             attack = Scaling(liars, t_on, t_off, share * signs)
-        case Trick.DRIFT:
+        case AttackKind.DRIFT:
             rate = share / 60.0 * signs
             attack = Drift(liars, t_on, t_off, rate, np.abs(rate) * (t_off - t_on))
-        case Trick.STUCK:
+        case AttackKind.STUCK:
             attack = Stuck(liars, t_on, t_off)
         case _:  # Replay and a late clock differ only in the age of the reports.
             attack = Replay(liars, t_on, t_off, lie.size)

@@ -55,7 +55,7 @@ class MeterErrors:
 
 
 @dataclass(frozen=True, slots=True)
-class Silence:
+class MeterOutage:
     """Silence of a meter for t_on <= t < t_off.
 
     Attributes
@@ -105,7 +105,7 @@ class Channel:
     late_s: float = 0.0
     duplicate: float = 0.0
     clock_s: float = 0.0
-    silences: tuple[Silence, ...] = ()
+    silences: tuple[MeterOutage, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("loss", "late", "duplicate"):
@@ -163,7 +163,7 @@ class Delivery:
     copy: Floats
 
 
-class Meters:
+class SimulatedMeters:
     """All meters of a feeder and their channel.
 
     Parameters

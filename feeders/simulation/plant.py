@@ -296,7 +296,7 @@ QUASI_STATIC_TAUS: Final = 10.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Block:
+class PlantTrajectory:
     """True state at T consecutive ticks. N customers, m inverters, b + 1 buses.
 
     Attributes
@@ -326,7 +326,7 @@ class Block:
     shown_kw: Floats
 
 
-def truth(site: Site, scenario: Scenario, first: int, end: float) -> Iterator[Block]:
+def truth(site: Site, scenario: Scenario, first: int, end: float) -> Iterator[PlantTrajectory]:
     """True state from tick `first` up to tick `end`, which may be infinite; begins in equilibrium."""
     customers = Customers(
         site, scenario.variation, scenario.seed, scenario.start, scenario.profile_s, season=scenario.season
@@ -349,7 +349,7 @@ def truth(site: Site, scenario: Scenario, first: int, end: float) -> Iterator[Bl
         v_volt, v_bus_volt, x = course.run(fine)
         at = slice(steps - 1 - skip, None, steps)
         demand = Demand(fine.p_kw[at], fine.q_kvar[at], fine.v0_volt[at])
-        yield Block(ticks, t, v_volt[at], v_bus_volt[at], x[at], demand, told.p_kw[at])
+        yield PlantTrajectory(ticks, t, v_volt[at], v_bus_volt[at], x[at], demand, told.p_kw[at])
         begin += ticks.size
 
 
@@ -463,7 +463,7 @@ def substeps(site: Site, scenario: Scenario) -> int:
     return max(int(np.ceil(scenario.dt_s / longest - 1e-9)), 1)
 
 
-def net_reactive(site: Site, block: Block) -> Floats:
+def net_reactive(site: Site, block: PlantTrajectory) -> Floats:
     """Net reactive import of every customer, inverter included, kvar, (T, N)."""
     owner = np.eye(len(site.tables.customers))[site.droop.customer]
     return block.demand.q_kvar - site.feeder.base_kva * (block.x @ owner)

@@ -24,8 +24,8 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from feeders.simulation.demand import Variation
-from feeders.simulation.meters import BUSBAR, Channel, MeterErrors, Silence
-from feeders.simulation.scenario import Reading, Sample, Scenario, Season, simulate
+from feeders.simulation.meters import BUSBAR, Channel, MeterErrors, MeterOutage
+from feeders.simulation.scenario import Scenario, Season, SimulatedReading, SimulatedTick, simulate
 from feeders.util import plain
 from gridsec import attack as attacks
 from gridsec.arrays import Bools, Floats
@@ -46,9 +46,9 @@ __all__ = [
     "REGISTERS",
     "REQUIRED",
     "T_POWER",
+    "RecordedTruth",
     "Recording",
     "RecordingInvalid",
-    "Truth",
     "is_simulated",
     "read_recording",
     "record",
@@ -92,7 +92,7 @@ def scenario_from_json(obj: dict[str, Any]) -> Scenario:
     given = {"busbar_attacks": ()} | _heard(obj)
     channel = dict(given["channel"])
     channel["silences"] = tuple(
-        Silence(s["meter"], float(s["t_on"]), float(s["t_off"])) for s in channel["silences"]
+        MeterOutage(s["meter"], float(s["t_on"]), float(s["t_off"])) for s in channel["silences"]
     )
     given["channel"] = Channel(**channel)
     given["variation"] = Variation(**given["variation"])
@@ -202,8 +202,8 @@ class RecordingInvalid(Problems, GridsecError):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Truth:
-    """Truth of a recording at its T ticks; columns as in `feeders.simulation.scenario.Sample`.
+class RecordedTruth:
+    """Truth of a recording at its T ticks; columns as in `feeders.simulation.scenario.SimulatedTick`.
 
     Attributes
     ----------
@@ -259,18 +259,18 @@ class Recording:
     versions: dict[str, str]
     timed: bool = False
 
-    def readings(self) -> Iterator[Reading]:
+    def readings(self) -> Iterator[SimulatedReading]:
         """All readings in the order of the file, that of arrival."""
         with pq.ParquetFile(self.path) as file:
             for batch in file.iter_batches():
                 yield from _readings(batch)
 
     def frame(self) -> pd.DataFrame:
-        """All readings as a pandas table, one row each, columns as in `Reading`."""
+        """All readings as a pandas table, one row each, columns as in `SimulatedReading`."""
         table: pd.DataFrame = pq.read_table(self.path).to_pandas()
         return table
 
-    def truth(self) -> Truth:
+    def truth(self) -> RecordedTruth:
         """Truth of a simulated recording.
 
         Raises
@@ -290,7 +290,7 @@ class Recording:
         there = {name: _matrix(table.column(name)) for name in table.column_names}
         # Parquet has no lists without entries: without inverters, or without meters, the column is absent.
         none = np.empty((table.num_rows, 0))
-        return Truth(**{field.name: there.get(field.name, none) for field in fields(Truth)})
+        return RecordedTruth(**{field.name: there.get(field.name, none) for field in fields(RecordedTruth)})
 
 
 def truth_path(path: Path) -> Path:
@@ -459,7 +459,7 @@ def _is_list(kind: Any) -> bool:
     return any(is_this(kind) for is_this in is_any)
 
 
-def _write(samples: Iterator[Sample], dt_s: float, readings: Any, truth: Any) -> None:
+def _write(samples: Iterator[SimulatedTick], dt_s: float, readings: Any, truth: Any) -> None:
     """Write all samples; readings with a late arrival wait for their turn."""
     waiting: dict[str, Any] | None = None
     ids: list[str] = []
@@ -475,7 +475,7 @@ def _write(samples: Iterator[Sample], dt_s: float, readings: Any, truth: Any) ->
         readings.write_table(_table(ids, waiting))
 
 
-def _rows(chunk: list[Sample]) -> dict[str, Any]:
+def _rows(chunk: list[SimulatedTick]) -> dict[str, Any]:
     """Every arriving reading of some ticks, copies included, as columns; `meter` is a number."""
     width = len(chunk[0].meter_ids) + 1
     seq = np.repeat(np.array([sample.seq for sample in chunk], dtype=np.int64)[:, None], width, axis=1)
@@ -499,7 +499,7 @@ def _rows(chunk: list[Sample]) -> dict[str, Any]:
     return _join(parts[0], parts[1])
 
 
-def _registers(chunk: list[Sample], name: str) -> Floats:
+def _registers(chunk: list[SimulatedTick], name: str) -> Floats:
     return np.concatenate([getattr(sample.reported, name) for sample in chunk])
 
 
@@ -547,7 +547,7 @@ def _truth_schema(site: Site) -> Any:
     return pa.schema(columns)
 
 
-def _truth_table(chunk: list[Sample], schema: Any) -> Any:
+def _truth_table(chunk: list[SimulatedTick], schema: Any) -> Any:
     columns = {"t": pa.array([sample.t for sample in chunk])}
     for field in schema:
         if field.name != "t":
@@ -566,7 +566,7 @@ def _matrix(column: Any) -> Any:
     return flat.reshape(len(joined), joined.type.list_size)
 
 
-def _readings(batch: Any) -> Iterator[Reading]:
+def _readings(batch: Any) -> Iterator[SimulatedReading]:
     size = batch.num_rows
     there = {
         name: _column(batch, name).to_pylist()
@@ -586,7 +586,9 @@ def _readings(batch: Any) -> Iterator[Reading]:
         there.get(T_POWER.name, nothing),
         strict=True,
     ):
-        yield Reading(meter, t, seq, arrival, v_volt, p_kw, q_kvar, phases and tuple(phases), t_power)
+        yield SimulatedReading(
+            meter, t, seq, arrival, v_volt, p_kw, q_kvar, phases and tuple(phases), t_power
+        )
 
 
 def _column(batch: Any, name: str) -> Any:

@@ -19,12 +19,12 @@ from feeders.model.profiles import Season
 from feeders.model.site import Snapshot
 from feeders.simulation.attacks import random_attacks
 from feeders.simulation.demand import Variation
-from feeders.simulation.meters import BUSBAR, Channel, Delivery, MeterErrors, Meters, Registers
-from feeders.simulation.plant import Block, net_reactive, truth
+from feeders.simulation.meters import BUSBAR, Channel, Delivery, MeterErrors, Registers, SimulatedMeters
+from feeders.simulation.plant import PlantTrajectory, net_reactive, truth
 from feeders.util import own_numbers
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.attack import Attack, InverterAttack, Reports, apply_all, manipulated, reach
-from gridsec.errors import InputInvalid, Problem, choice, refuse
+from gridsec.errors import InputInvalid, Problem, choice, raise_if_any
 
 if TYPE_CHECKING:
     from feeders.model.site import Site
@@ -33,10 +33,10 @@ __all__ = [
     "LATEST_S",
     "START",
     "SUNNY_NOON_S",
-    "Reading",
-    "Sample",
     "Scenario",
     "Season",
+    "SimulatedReading",
+    "SimulatedTick",
     "by_arrival",
     "check",
     "random_attacks",
@@ -132,7 +132,7 @@ class Scenario:
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class SimulatedReading:
     """One reading on its way to a service; net import positive.
 
     Attributes
@@ -168,7 +168,7 @@ class Reading:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sample:
+class SimulatedTick:
     """One tick: the truth, and the reports. N customers, m inverters, p meters, b + 1 buses.
 
     Attributes
@@ -212,7 +212,7 @@ class Sample:
     delivery: Delivery
 
     @property
-    def readings(self) -> list[Reading]:
+    def readings(self) -> list[SimulatedReading]:
         """Arriving readings of this tick, duplicates included, in the order of their arrival."""
         out = [
             self._reading(j, meter, float(arrival))
@@ -222,14 +222,14 @@ class Sample:
         ]
         return sorted(out, key=lambda reading: reading.arrival)
 
-    def _reading(self, j: int, meter: str, arrival: float) -> Reading:
+    def _reading(self, j: int, meter: str, arrival: float) -> SimulatedReading:
         stamp, registers = float(self.delivery.stamp[0, j]), self.reported
         if meter == BUSBAR:
             v0 = registers.v0_volt[0]
             phases = tuple(v0.tolist()) if np.ndim(v0) else None
-            return Reading(meter, stamp, self.seq, arrival, float(np.mean(v0)), None, None, phases)
+            return SimulatedReading(meter, stamp, self.seq, arrival, float(np.mean(v0)), None, None, phases)
         q = float(registers.q_kvar[0, j])
-        return Reading(
+        return SimulatedReading(
             meter,
             stamp,
             self.seq,
@@ -240,7 +240,7 @@ class Sample:
         )
 
 
-def simulate(site: Site, scenario: Scenario) -> Iterator[Sample]:
+def simulate(site: Site, scenario: Scenario) -> Iterator[SimulatedTick]:
     """Simulate a scenario.
 
     Parameters
@@ -265,7 +265,7 @@ def simulate(site: Site, scenario: Scenario) -> Iterator[Sample]:
         For an attack on, or the silence of, an unknown meter, or an attack that uses too old readings.
     """
     check(site, scenario)
-    meters = Meters(site, scenario.errors, scenario.channel, scenario.seed)
+    meters = SimulatedMeters(site, scenario.errors, scenario.channel, scenario.seed)
     nominal = site.customer_nominal[site.meters]
     past = _Past(site.meters.size, scenario)
     if past.first < 0:
@@ -282,15 +282,21 @@ def simulate(site: Site, scenario: Scenario) -> Iterator[Sample]:
 
 
 def _samples(
-    site: Site, block: Block, honest: Registers, reported: Registers, *, delivery: Delivery, lies: Bools
-) -> Iterator[Sample]:
+    site: Site,
+    block: PlantTrajectory,
+    honest: Registers,
+    reported: Registers,
+    *,
+    delivery: Delivery,
+    lies: Bools,
+) -> Iterator[SimulatedTick]:
     """Split a block into ticks."""
     shift = reported.v_volt - honest.v_volt
     q_net = net_reactive(site, block)
     x_kvar = block.x * site.feeder.base_kva
     for k in range(block.t.size):
         row = slice(k, k + 1)
-        yield Sample(
+        yield SimulatedTick(
             t=float(block.t[k]),
             seq=int(block.ticks[k]),
             meter_ids=site.meter_ids,
@@ -308,7 +314,7 @@ def _samples(
         )
 
 
-def snapshots(samples: Iterable[Sample]) -> Iterator[Snapshot]:
+def snapshots(samples: Iterable[SimulatedTick]) -> Iterator[Snapshot]:
     """Convert samples to the input of `feeders.model.site.to_frame`: one row of readings per tick.
 
     Lost readings and silences are missing. Delays and clock errors have no effect.
@@ -325,9 +331,9 @@ def snapshots(samples: Iterable[Sample]) -> Iterator[Snapshot]:
         )
 
 
-def by_arrival(samples: Iterable[Sample]) -> Iterator[Reading]:
+def by_arrival(samples: Iterable[SimulatedTick]) -> Iterator[SimulatedReading]:
     """Readings of many ticks in the order of arrival; equal ones in the order of time and meters."""
-    waiting: list[tuple[float, int, Reading]] = []
+    waiting: list[tuple[float, int, SimulatedReading]] = []
     number = count()
     for sample in samples:
         # Readings of this tick or a later one arrive no earlier than their own time.
@@ -391,7 +397,7 @@ def _tick_count(scenario: Scenario) -> float:
     return float(np.ceil(scenario.duration_s / scenario.dt_s - 1e-9))
 
 
-def _honest(site: Site, meters: Meters, block: Block) -> Registers:
+def _honest(site: Site, meters: SimulatedMeters, block: PlantTrajectory) -> Registers:
     return meters.read(
         block.ticks, block.v_volt, block.shown_kw, net_reactive(site, block), block.demand.v0_volt
     )
@@ -477,4 +483,4 @@ def check(site: Site, scenario: Scenario) -> None:
         for attack in every
         if attack.t_on >= scenario.start + scenario.duration_s
     ]
-    refuse(problems)
+    raise_if_any(problems)

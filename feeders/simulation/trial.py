@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from feeders.model.site import Site, from_tables, to_frame
-from feeders.simulation.attacks import Lie, Trick, manipulations
+from feeders.simulation.attacks import AttackKind, AttackSpec, manipulations
 from feeders.simulation.demand import Customers, Variation
 from feeders.simulation.meters import MeterErrors
-from feeders.simulation.scenario import START, SUNNY_NOON_S, Sample, Scenario, simulate, snapshots
+from feeders.simulation.scenario import START, SUNNY_NOON_S, Scenario, SimulatedTick, simulate, snapshots
 from feeders.util import own_numbers
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.attack import Coordinated, active
@@ -28,17 +28,17 @@ from gridsec.errors import choice
 from gridsec.interface import Decision, Frame, Verdict
 
 if TYPE_CHECKING:
-    from feeders.registry.registry import Watcher
+    from feeders.registry.registry import DesignedEstimator
 
 __all__ = [
     "STEADY",
-    "Lie",
+    "AttackKind",
+    "AttackSpec",
+    "FrameTruth",
     "LoadError",
-    "Meters",
-    "Outcome",
     "Trial",
-    "Trick",
-    "Truth",
+    "TrialMeterErrors",
+    "TrialResult",
     "frames",
     "judge",
 ]
@@ -53,7 +53,7 @@ SETTLING_S: Final = 10.0
 """Settling time after the start and after the onset of an attack, without reconstruction errors, s."""
 
 
-class Meters(StrEnum):
+class TrialMeterErrors(StrEnum):
     """Errors of the meters of a trial, in truth and in the design."""
 
     WHITE = "white"
@@ -115,15 +115,15 @@ class Trial:
     duration_s: float = 120.0
     step_s: float = 1.0
     load_error: LoadError | None = field(default_factory=LoadError)
-    meters: Meters = Meters.WHITE
-    lie: Lie | None = None
+    meters: TrialMeterErrors = TrialMeterErrors.WHITE
+    lie: AttackSpec | None = None
     profile_s: float = SUNNY_NOON_S
     variation: Variation = STEADY
     report_q: bool = False
 
     def __post_init__(self) -> None:
         own_numbers(self)
-        object.__setattr__(self, "meters", choice("meters", Meters, self.meters))
+        object.__setattr__(self, "meters", choice("meters", TrialMeterErrors, self.meters))
 
     @property
     def stated(self) -> Site:
@@ -141,11 +141,11 @@ class Trial:
             registers = replace(registers, p_error_percent=0.0, p_resolution_kw=0.0)
         monitor = replace(meta.monitor, tick_s=self.step_s)
         meta = replace(meta, load=load, monitor=monitor, meters=registers)
-        if self.meters is not Meters.SITE:
+        if self.meters is not TrialMeterErrors.SITE:
             rows = tuple(
                 replace(row, class_percent=None, resolution_volt=None, jitter_percent=None) for row in rows
             )
-            white = self.meters is Meters.WHITE
+            white = self.meters is TrialMeterErrors.WHITE
             step = 0.0 if white else 0.1
             meta = replace(
                 meta,
@@ -184,7 +184,7 @@ class Trial:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Truth:
+class FrameTruth:
     """The truth of one frame. N customers, p meters, m inverters.
 
     Attributes
@@ -207,7 +207,7 @@ class Truth:
 
 def frames(
     trial: Trial, scenario: Scenario | None = None, *, stated: Site | None = None
-) -> Iterator[tuple[Frame, Truth]]:
+) -> Iterator[tuple[Frame, FrameTruth]]:
     """Simulate a trial.
 
     Parameters
@@ -286,13 +286,13 @@ def _fake_load(site: Site, scenario: Scenario, t: Floats) -> tuple[Floats, Float
     return p_kw, q_kvar
 
 
-def _truth(site: Site, scenario: Scenario, sample: Sample) -> Truth:
+def _truth(site: Site, scenario: Scenario, sample: SimulatedTick) -> FrameTruth:
     base = site.customer_volt
     reported = sample.reported.v_volt[0]
     inverters = np.zeros(site.droop.tau.size, dtype=np.bool_)
     for attack in scenario.inverter_attacks:
         inverters[attack.inverters] |= attack.t_on <= sample.t < attack.t_off
-    return Truth(
+    return FrameTruth(
         v2=(sample.v_volt / base) ** 2,
         liars=sample.manipulated,
         attack=(reported**2 - (reported - sample.shift_volt) ** 2) / base[site.meters] ** 2,
@@ -301,7 +301,7 @@ def _truth(site: Site, scenario: Scenario, sample: Sample) -> Truth:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Outcome:
+class TrialResult:
     """Result of an estimator in one trial. T ticks, p meters, k manipulated meters, l manipulated inverters.
 
     Attributes
@@ -358,12 +358,12 @@ class Outcome:
 
 
 def judge(
-    watcher: Watcher,
+    watcher: DesignedEstimator,
     trial: Trial,
     *,
     settling_s: float = SETTLING_S,
-    played: Iterable[tuple[Frame, Truth]] | None = None,
-) -> Outcome:
+    played: Iterable[tuple[Frame, FrameTruth]] | None = None,
+) -> TrialResult:
     """Run an estimator on a trial.
 
     Parameters
@@ -378,7 +378,7 @@ def judge(
         Frames of this trial, if known already.
     """
     state = watcher.init(START)
-    ticks: list[tuple[float, Verdict, Truth]] = []
+    ticks: list[tuple[float, Verdict, FrameTruth]] = []
     all_errors: list[Floats] = []
     liar_errors: list[Floats] = []
     of_nominal = trial.site.customer_volt / trial.site.customer_nominal
@@ -406,7 +406,7 @@ def judge(
     lying: Bools = np.any(liars, axis=1) | np.any(wrong, axis=1)
     clean = np.array([decision is Decision.CLEAN for decision in decisions])
     false = named & ~_since(liars)
-    return Outcome(
+    return TrialResult(
         liars=np.flatnonzero(liars.any(axis=0)),
         delay_s=_delays(t, named, liars),
         inverters=np.flatnonzero(wrong.any(axis=0)),
@@ -429,7 +429,7 @@ def _error_percent(v2: Floats, truth: Floats) -> Floats:
     return np.where(np.isfinite(error), error, np.inf)
 
 
-def _inverters(verdict: Verdict, truth: Truth) -> Bools:
+def _inverters(verdict: Verdict, truth: FrameTruth) -> Bools:
     """Mask of the named inverters; none for estimators without inverter tests."""
     return verdict.inverters if verdict.inverters.size else np.zeros_like(truth.inverters)
 

@@ -18,14 +18,14 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from feeders.registry.plugins import EstimatorUnusable
-from feeders.registry.registry import FAMILIES, Watcher, choose, design
-from feeders.simulation.attacks import Lie, NoSuchAttack, Trick
+from feeders.registry.registry import FAMILIES, DesignedEstimator, choose, design
+from feeders.simulation.attacks import AttackKind, AttackSpec, NoSuchAttack
 from feeders.simulation.demand import Variation
-from feeders.simulation.trial import LoadError, Meters, Outcome, Trial, frames, judge
+from feeders.simulation.trial import LoadError, Trial, TrialMeterErrors, TrialResult, frames, judge
 from feeders.studies.journal import Journal, Where
 from feeders.util import replace_file
 from gridsec.arrays import Floats
-from gridsec.errors import DesignInfeasible, GridsecError, NotObservable, Problem, no_choice, refuse
+from gridsec.errors import DesignInfeasible, GridsecError, NotObservable, Problem, no_choice, raise_if_any
 
 if TYPE_CHECKING:
     from feeders.model.site import Site
@@ -35,9 +35,9 @@ __all__ = [
     "CASES",
     "END",
     "FEEDER",
-    "Case",
-    "Plan",
-    "Row",
+    "ComparisonCase",
+    "ComparisonPlan",
+    "ComparisonRow",
     "compare",
     "markdown",
     "splice",
@@ -60,7 +60,7 @@ Runs of minutes then include steps that make repeated readings visible.
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class ComparisonCase:
     """Case of the comparison: one kind of attack, or none.
 
     Attributes
@@ -70,14 +70,14 @@ class Case:
     meaning
         Description; `{meters}` is replaced by the number of manipulated meters.
     trick, size
-        As in `feeders.simulation.attacks.Lie`; None: no attack.
+        As in `feeders.simulation.attacks.AttackSpec`; None: no attack.
     one
         True: one manipulated device, for any M.
     """
 
     name: str
     meaning: str
-    trick: Trick | None = None
+    trick: AttackKind | None = None
     size: float = 0.0
     one: bool = False
 
@@ -85,35 +85,41 @@ class Case:
         """Description of the case for this number of manipulated meters."""
         return self.meaning.format(meters=f"{count} meter" if count == 1 else f"{count} meters")
 
-    def lie(self, count: int) -> Lie | None:
+    def lie(self, count: int) -> AttackSpec | None:
         """Attack for this number of manipulated meters, None without one."""
         if self.trick is None:
             return None
-        return Lie(self.trick, 1 if self.one else count, self.size, ONSET_S)
+        return AttackSpec(self.trick, 1 if self.one else count, self.size, ONSET_S)
 
 
 CASES: Final = (
-    Case("clean", "no attack"),
-    Case("bias", "readings of {meters} at random are 3 % too high or too low", Trick.BIAS, 3.0),
-    Case(
+    ComparisonCase("clean", "no attack"),
+    ComparisonCase(
+        "bias", "readings of {meters} at random are 3 % too high or too low", AttackKind.BIAS, 3.0
+    ),
+    ComparisonCase(
         "coordinated",
         "readings of {meters} show the trace of a load that is not there, at least 3 % deep",
-        Trick.COORDINATED,
+        AttackKind.COORDINATED,
         3.0,
     ),
-    Case(
+    ComparisonCase(
         "coordinated-power",
         "the same, and the customer's meter reports the power of that load",
-        Trick.COORDINATED_POWER,
+        AttackKind.COORDINATED_POWER,
         3.0,
     ),
-    Case("drift", "readings of {meters} at random leave the truth by 1 % per minute", Trick.DRIFT, 1.0),
-    Case("stuck", "readings of {meters} at random stay as at the onset", Trick.STUCK),
-    Case("replay", "readings of {meters} at random are those of 10 minutes earlier", Trick.REPLAY, 600.0),
-    Case(
+    ComparisonCase(
+        "drift", "readings of {meters} at random leave the truth by 1 % per minute", AttackKind.DRIFT, 1.0
+    ),
+    ComparisonCase("stuck", "readings of {meters} at random stay as at the onset", AttackKind.STUCK),
+    ComparisonCase(
+        "replay", "readings of {meters} at random are those of 10 minutes earlier", AttackKind.REPLAY, 600.0
+    ),
+    ComparisonCase(
         "inverter",
         "one inverter at random injects its rating in addition to its droop curve; all meters are honest",
-        Trick.INVERTER,
+        AttackKind.INVERTER,
         100.0,
         one=True,
     ),
@@ -122,7 +128,7 @@ CASES: Final = (
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class ComparisonPlan:
     """Options of a comparison.
 
     Attributes
@@ -151,7 +157,7 @@ class Plan:
     duration_s: float = 480.0
     step_s: float = 1.0
     load_error: LoadError = field(default_factory=lambda: LoadError(0.1, 0.05))
-    meters: Meters = Meters.SITE
+    meters: TrialMeterErrors = TrialMeterErrors.SITE
     variation: Variation = LIVELY
     report_q: bool = False
     families: tuple[str, ...] = tuple(FAMILIES)
@@ -160,7 +166,7 @@ class Plan:
 
     def __post_init__(self) -> None:
         """Reject an empty comparison."""
-        refuse(
+        raise_if_any(
             [
                 *no_choice("family", FAMILIES, *self.families),
                 *no_choice("case", (case.name for case in CASES), *self.cases),
@@ -172,7 +178,7 @@ class Plan:
             ]
         )
 
-    def trial(self, site: Site, case: Case, seed: int) -> Trial:
+    def trial(self, site: Site, case: ComparisonCase, seed: int) -> Trial:
         """One run."""
         return Trial(
             site,
@@ -188,7 +194,7 @@ class Plan:
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class ComparisonRow:
     """Result of one estimator in one case, over all seeds. NaN: not applicable.
 
     Attributes
@@ -238,8 +244,8 @@ class Row:
 
 
 def compare(
-    site: Site, plan: Plan, *, journal: Where = None, progress: Callable[[str], None] | None = None
-) -> list[Row]:
+    site: Site, plan: ComparisonPlan, *, journal: Where = None, progress: Callable[[str], None] | None = None
+) -> list[ComparisonRow]:
     """Run all estimators on all cases.
 
     Parameters
@@ -265,44 +271,48 @@ def compare(
     InUse
         If another process writes the journal.
     """
-    tell = progress or (lambda _: None)
+    report_progress = progress or (lambda _: None)
     cases = [case for case in CASES if case.name in plan.cases]
     asked = {name: value for name, value in asdict(plan).items() if name != "workers"}
     subject = {"study": "compare", "digest": site.digest, "plan": asked}
 
     @cache
-    def watchers() -> dict[str, Watcher | str]:
+    def watchers() -> dict[str, DesignedEstimator | str]:
         # The stated errors are independent of seed and attack: one design serves all trials.
         stated = plan.trial(site, CASES[0], 0).stated
-        found: dict[str, Watcher | str] = {}
+        found: dict[str, DesignedEstimator | str] = {}
         for name in plan.families:
-            tell(f"design of {name}")
-            found[name] = _design(stated, name, plan, tell)
+            report_progress(f"design of {name}")
+            found[name] = _design(stated, name, plan, report_progress)
         return found
 
-    def work(case: Case) -> list[dict[str, Any]]:
+    def work(case: ComparisonCase) -> list[dict[str, Any]]:
         designed = watchers()
-        tell(f"case {case.name}")
+        report_progress(f"case {case.name}")
         return [asdict(row) for row in _case(site, case, plan, designed)]
 
     with Journal(journal, subject, of=len(cases)) as kept:
-        return [Row(**row) for case in cases for row in kept.get(case.name, partial(work, case))]
+        return [ComparisonRow(**row) for case in cases for row in kept.get(case.name, partial(work, case))]
 
 
-def _design(site: Site, name: str, plan: Plan, tell: Callable[[str], None]) -> Watcher | str:
+def _design(
+    site: Site, name: str, plan: ComparisonPlan, report_progress: Callable[[str], None]
+) -> DesignedEstimator | str:
     try:
         chosen = choose(site, estimator=name, max_attacked=plan.max_attacked)
         return design(
             chosen,
             workers=plan.workers,
-            progress=lambda done, total: tell(f"design of {name}: {done} of {total}"),
+            progress=lambda done, total: report_progress(f"design of {name}: {done} of {total}"),
         )
     except (NotObservable, DesignInfeasible, EstimatorUnusable) as error:
         return str(error)
 
 
-def _case(site: Site, case: Case, plan: Plan, watchers: dict[str, Watcher | str]) -> list[Row]:
-    outcomes: dict[str, list[Outcome]] = {name: [] for name in watchers}
+def _case(
+    site: Site, case: ComparisonCase, plan: ComparisonPlan, watchers: dict[str, DesignedEstimator | str]
+) -> list[ComparisonRow]:
+    outcomes: dict[str, list[TrialResult]] = {name: [] for name in watchers}
     reasons = {name: watcher for name, watcher in watchers.items() if isinstance(watcher, str)}
     try:
         for seed in range(plan.seeds):
@@ -316,9 +326,9 @@ def _case(site: Site, case: Case, plan: Plan, watchers: dict[str, Watcher | str]
                 except Exception as failure:  # noqa: BLE001  # external code may raise anything
                     reasons[name] = _failed(failure)
     except NoSuchAttack as error:
-        return [Row(name, case.name, str(error)) for name in watchers]
+        return [ComparisonRow(name, case.name, str(error)) for name in watchers]
     return [
-        Row(name, case.name, reasons[name])
+        ComparisonRow(name, case.name, reasons[name])
         if isinstance(watcher, str) or name in reasons
         else _row(name, case.name, watcher.observers, outcomes[name])
         for name, watcher in watchers.items()
@@ -329,13 +339,13 @@ def _failed(failure: Exception) -> str:
     return "failed in a step: " + " ".join(f"{type(failure).__name__}: {failure}".split())
 
 
-def _row(family: str, case: str, observers: int, outcomes: Sequence[Outcome]) -> Row:
+def _row(family: str, case: str, observers: int, outcomes: Sequence[TrialResult]) -> ComparisonRow:
     delays = np.concatenate([each for one in outcomes for each in (one.delay_s, one.inverter_delay_s)])
     named = delays[np.isfinite(delays)]
     step_ms = np.concatenate([one.step_ms for one in outcomes])
     lying = sum(int(one.lying.sum()) for one in outcomes)
     clean = sum(int(one.clean_while_lying.sum()) for one in outcomes)
-    return Row(
+    return ComparisonRow(
         family=family,
         case=case,
         liars=delays.size,
@@ -362,7 +372,7 @@ def _most(values: Floats) -> float:
 # -------------------------------------------------------------------------------------------------- tables
 
 
-def write_csv(rows: Iterable[Row], path: Path) -> None:
+def write_csv(rows: Iterable[ComparisonRow], path: Path) -> None:
     """Write all numbers; an existing file is replaced when the new one is complete.
 
     Parameters
@@ -375,7 +385,7 @@ def write_csv(rows: Iterable[Row], path: Path) -> None:
 
     def write(new: Path) -> None:
         with new.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, [each.name for each in fields(Row)])
+            writer = csv.DictWriter(file, [each.name for each in fields(ComparisonRow)])
             writer.writeheader()
             writer.writerows(asdict(row) for row in rows)
 
@@ -398,7 +408,7 @@ HEADERS: Final = (
 )
 
 
-def cells(row: Row) -> tuple[str, ...]:
+def cells(row: ComparisonRow) -> tuple[str, ...]:
     """Texts of a row under HEADERS; a row without numbers has the reason as its second and last."""
     if row.reason:
         return row.family, row.reason
@@ -417,7 +427,7 @@ def cells(row: Row) -> tuple[str, ...]:
     )
 
 
-def markdown(rows: Sequence[Row], plan: Plan) -> str:
+def markdown(rows: Sequence[ComparisonRow], plan: ComparisonPlan) -> str:
     """Overview, and one table for each case; every estimator has a row, with or without numbers.
 
     Parameters
@@ -428,7 +438,7 @@ def markdown(rows: Sequence[Row], plan: Plan) -> str:
         Options of the comparison.
     """
     names = list(dict.fromkeys(row.case for row in rows))
-    found = {(family, name): Row(family, name, "not run") for family in FAMILIES for name in names}
+    found = {(family, name): ComparisonRow(family, name, "not run") for family in FAMILIES for name in names}
     found |= {(row.family, row.case): row for row in rows}
     meanings = {case.name: case.told(plan.max_attacked) for case in CASES}
     lines = [
@@ -470,7 +480,7 @@ def splice(text: str, table: str) -> str:
     return f"{before}{BEGIN}\n\n{table.strip()}\n\n{END}{after}"
 
 
-def _short(row: Row) -> str:
+def _short(row: ComparisonRow) -> str:
     return "none" if row.reason else f"{row.named}/{row.liars} ({row.falsely_named})"
 
 

@@ -22,7 +22,7 @@ from feeders.model.load_uncertainty import load_doubt
 from feeders.model.site import from_tables, plant
 from feeders.studies.journal import Journal, Progress, Where
 from feeders.studies.operating import SHARE, box, volts_of_lie
-from feeders.studies.unobservable import Curves
+from feeders.studies.unobservable import CurvePositions
 from feeders.studies.workers import Here, Runner, cores
 from gridsec.arrays import Floats
 from gridsec.errors import DesignInfeasible, InputInvalid, Problem
@@ -30,7 +30,7 @@ from gridsec.estimators.sequential import SequentialOptions
 from gridsec.estimators.sequential import design as design_sequential
 from gridsec.planning.collusion import Corridor, furthest
 from gridsec.planning.detectability import Rule, named_size, rule, within
-from gridsec.planning.stealthy_attacks import Box, largest_lie, worst_error
+from gridsec.planning.stealthy_attacks import ErrorBox, largest_lie, worst_error
 
 if TYPE_CHECKING:
     from feeders.model.site import Site
@@ -208,7 +208,7 @@ class _Given:
     max_attacked: int
     rule: Rule
     corridors: Mapping[tuple[bool, int], Corridor]
-    worst: Box
+    worst: ErrorBox
     claims: Floats
 
     @classmethod
@@ -223,7 +223,7 @@ class _Given:
                 for seen in (False, True)
                 for count in (1, asked.max_attacked)
             },
-            box(site, share=asked.share, curves=Curves.DEADBAND),
+            box(site, share=asked.share, curves=CurvePositions.DEADBAND),
             _claims(site, given, asked.share),
         )
 

@@ -16,14 +16,14 @@ from feeders.format.topology import Edge, tree
 from feeders.model.forecast import always
 from feeders.model.load_uncertainty import unread
 from feeders.model.site import Snapshot, to_frame
-from feeders.studies.unobservable import Curves, customer_indices
+from feeders.studies.unobservable import CurvePositions, customer_indices
 from gridsec.arrays import Floats
 from gridsec.errors import choice
 from gridsec.grid.meter import busbar_error, reading_error
 from gridsec.grid.network import Power
 from gridsec.interface import Frame
 from gridsec.planning.redundancy import from_busbar
-from gridsec.planning.stealthy_attacks import Box, FalsePowers
+from gridsec.planning.stealthy_attacks import ErrorBox, PowerErrorModel
 
 if TYPE_CHECKING:
     from feeders.model.site import Site
@@ -100,7 +100,7 @@ SIGMAS: Final = 4.0
 """Limit of an honest reading's jitter in standard deviations, as in `estimators.plant.Options`."""
 
 
-def box(site: Site, *, share: float = SHARE, curves: Curves = Curves.DEADBAND) -> Box:
+def box(site: Site, *, share: float = SHARE, curves: CurvePositions = CurvePositions.DEADBAND) -> ErrorBox:
     """Worst cases of the exact bank's thresholds, at nominal voltage.
 
     Intervals of powers are those of a frame with every metered load at `share` of its peak, active power
@@ -130,8 +130,8 @@ def false_powers(
     *,
     unknown: Sequence[str] | None = None,
     share: float = SHARE,
-    curves: Curves = Curves.DEADBAND,
-) -> FalsePowers:
+    curves: CurvePositions = CurvePositions.DEADBAND,
+) -> PowerErrorModel:
     """Worst cases in which manipulated meters report any powers within their customers' range.
 
     Parameters
@@ -156,7 +156,7 @@ def false_powers(
     wide, narrow = np.concatenate([p, q]), np.concatenate([frame.p_error, frame.q_error])
     part = np.divide(narrow, wide, out=np.ones_like(wide), where=wide > 0.0)
     part[np.concatenate([open_, p.size + open_])] = 1.0
-    return FalsePowers(
+    return PowerErrorModel(
         made,
         np.concatenate([owner, owner, np.full(alone, -1, dtype=np.intp)]),
         np.concatenate([part, np.ones(alone)]),
@@ -175,11 +175,11 @@ def _frame(site: Site, share: float) -> Frame:
     return always(site.forecast, frame, unmetered)
 
 
-def _box(site: Site, curves: Curves, p_error: Floats, q_error: Floats) -> Box:
+def _box(site: Site, curves: CurvePositions, p_error: Floats, q_error: Floats) -> ErrorBox:
     """Effect of errors of the powers, the busbar and the meters."""
     R, X = (site.feeder.between(power) for power in Power)
     own = site.droop.customer
-    steepest = choice("curves", Curves, curves) is Curves.STEEPEST
+    steepest = choice("curves", CurvePositions, curves) is CurvePositions.STEEPEST
     slope = site.droop.slope if steepest else np.zeros(own.size)
     loop = np.eye(len(X))
     loop[:, own] += 2.0 * X[:, own] * slope
@@ -191,7 +191,7 @@ def _box(site: Site, curves: Curves, p_error: Floats, q_error: Floats) -> Box:
         ]
     )
     reading = reading_error(site.accuracy, np.ones(site.meters.size), SIGMAS)
-    return Box(np.asarray(np.linalg.solve(loop, open_loop)), site.meters, reading)
+    return ErrorBox(np.asarray(np.linalg.solve(loop, open_loop)), site.meters, reading)
 
 
 def volts_of_lie(base_volt: Floats | float, size: Floats | float) -> Floats:

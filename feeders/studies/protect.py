@@ -19,12 +19,12 @@ import pandas as pd
 
 from feeders.studies.journal import Journal, Where
 from feeders.studies.operating import SHARE, box, false_powers, squared, volts_of_lie
-from feeders.studies.unobservable import Attack, Curves, knowledge, meter_mask, see_names
+from feeders.studies.unobservable import Attack, CurvePositions, knowledge, meter_mask, see_names
 from gridsec.arrays import Bools, Ints
-from gridsec.errors import DesignInfeasible, Problem, choice, no_choice, refuse
+from gridsec.errors import DesignInfeasible, Problem, choice, no_choice, raise_if_any
 from gridsec.planning.protection import Attacker, Unprotectable, fewest_protected, hides, lies_beyond
 from gridsec.planning.redundancy import Patterns, fewest_meters
-from gridsec.planning.stealthy_attacks import Box, FalsePowers, largest_lie, largest_of
+from gridsec.planning.stealthy_attacks import ErrorBox, PowerErrorModel, largest_lie, largest_of
 
 if TYPE_CHECKING:
     from feeders.model.site import Site
@@ -134,7 +134,7 @@ def protect(
     attack: Attack = Attack.PERSISTENT,
     unknown: Sequence[str] | None = None,
     busbar_known: bool = True,
-    curves: Curves | None = None,
+    curves: CurvePositions | None = None,
     share: float = SHARE,
     never: Sequence[str] = (),
     exact: bool = True,
@@ -201,11 +201,11 @@ def protect(
     know = partial(knowledge, site, unknown=unknown, silent=(), busbar_known=busbar_known)
     if goal is None:
         bounded = busbar_known and (
-            lie_volt > 0.0 or _nobody_hides(know(curves=curves or Curves.STEEPEST).found[attack])
+            lie_volt > 0.0 or _nobody_hides(know(curves=curves or CurvePositions.STEEPEST).found[attack])
         )
         goal = Goal.CONTAIN if bounded else Goal.IDENTIFY
-    usual = Curves.DEADBAND if goal.in_volts else Curves.STEEPEST
-    where = usual if curves is None else choice("curves", Curves, curves)
+    usual = CurvePositions.DEADBAND if goal.in_volts else CurvePositions.STEEPEST
+    where = usual if curves is None else choice("curves", CurvePositions, curves)
     if goal.in_volts:
         asked = _in_volts(site, goal, max_attacked, lie_volt, unknown=unknown, share=share, curves=where)
     else:
@@ -258,7 +258,7 @@ def check(
     attack: Attack | str = Attack.PERSISTENT,
     unknown: Sequence[str] | None = None,
     busbar_known: bool = True,
-    curves: Curves | str | None = None,
+    curves: CurvePositions | str | None = None,
     share: float = SHARE,
 ) -> None:
     """Check the arguments of `protect`: contradictions, and arguments without effect for the goal.
@@ -276,7 +276,7 @@ def check(
     problems = [
         *no_choice("goal", Goal, *([] if goal is None else [goal])),
         *no_choice("attack", Attack, attack),
-        *no_choice("curves", Curves, *([] if curves is None else [curves])),
+        *no_choice("curves", CurvePositions, *([] if curves is None else [curves])),
     ]
     bounded = not math.isnan(lie_volt)
     hiding = goal in (Goal.IDENTIFY, Goal.NOTICE)
@@ -314,7 +314,7 @@ def check(
     ):
         if wrong:
             problems.append(problem)
-    refuse(problems)
+    raise_if_any(problems)
 
 
 def _unmet(liars: Sequence[str]) -> str:
@@ -360,14 +360,16 @@ def _in_volts(  # question and its options
     *,
     unknown: Sequence[str] | None,
     share: float,
-    curves: Curves,
+    curves: CurvePositions,
 ) -> _Asked:
     """Question in volts: attacks beyond the bound, and the largest one, V, in volts of the busbar's level."""
     count, nobody = site.meters.size, np.zeros(site.meters.size, dtype=np.bool_)
     # Base of a customer in volts at the busbar's level, behind taps and transformers.
     base = (site.customer_volt / site.customer_nominal)[site.meters] * site.tables.meta.voltage_volt
     told = false_powers(site, unknown=unknown, share=share, curves=curves)
-    given: Box | FalsePowers = told if goal is Goal.CONTAIN else box(site, share=share, curves=curves)
+    given: ErrorBox | PowerErrorModel = (
+        told if goal is Goal.CONTAIN else box(site, share=share, curves=curves)
+    )
 
     def largest(protected: Bools) -> float:
         sizes = [largest_of(given, j, max_attacked, honest=protected).bound for j in range(count)]

@@ -17,10 +17,10 @@ import numpy as np
 import pandas as pd
 
 from feeders.studies.journal import Progress, Where, worked
-from feeders.studies.unobservable import Attack, Curves, Knowledge, knowledge, see_names
+from feeders.studies.unobservable import Attack, CurvePositions, Knowledge, knowledge, see_names
 from gridsec.errors import DesignInfeasible
 from gridsec.planning.redundancy import (
-    Part,
+    FeederSection,
     fewest_meters,
     meter_redundancy,
     part_redundancy,
@@ -74,7 +74,7 @@ class Redundancy:
     unknown: tuple[str, ...]
     unknown_silent: tuple[str, ...]
     silent: tuple[str, ...]
-    curves: Curves
+    curves: CurvePositions
     summary: pd.DataFrame
     meters: pd.DataFrame
     parts: pd.DataFrame
@@ -101,7 +101,7 @@ def redundancy(
     unknown: Sequence[str] | None = None,
     silent: Sequence[str] = (),
     busbar_known: bool = True,
-    curves: Curves | str = Curves.STEEPEST,
+    curves: CurvePositions | str = CurvePositions.STEEPEST,
     journal: Where = None,
     progress: Progress | None = None,
 ) -> Redundancy:
@@ -128,7 +128,7 @@ def redundancy(
         If another process writes the journal.
     """
     see_names(site, unknown=unknown, meters=silent, curves=curves)
-    curves = Curves(curves)
+    curves = CurvePositions(curves)
     subject = {
         "study": "redundancy",
         "digest": site.digest,
@@ -160,7 +160,7 @@ def redundancy(
 Task = tuple[str, Callable[[], Any]]
 
 
-def _tasks(site: Site, case: str, what: Knowledge, pieces: Sequence[Part]) -> list[Task]:
+def _tasks(site: Site, case: str, what: Knowledge, pieces: Sequence[FeederSection]) -> list[Task]:
     out: list[Task] = [
         (f"summary|{case}|{attack}", partial(_summary, site, case, what, attack)) for attack in Attack
     ]
@@ -211,7 +211,7 @@ def _meter(site: Site, case: str, what: Knowledge, j: int) -> dict[str, Any]:
     return row | {"note": "; ".join(sorted(notes))}
 
 
-def _part(site: Site, case: str, what: Knowledge, piece: Part) -> dict[str, Any]:
+def _part(site: Site, case: str, what: Knowledge, piece: FeederSection) -> dict[str, Any]:
     row: dict[str, Any] = {
         "case": case,
         "bus": site.spanning.buses[piece.bus],

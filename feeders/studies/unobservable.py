@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, unit_rows
-from gridsec.errors import Problem, choice, no_choice, refuse
+from gridsec.errors import Problem, choice, no_choice, raise_if_any
 from gridsec.observers.lure import close_loop
 from gridsec.planning.redundancy import Patterns, patterns, unknown_pair, unknown_voltages
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 __all__ = [
     "TOLERANCE",
     "Attack",
-    "Curves",
+    "CurvePositions",
     "Knowledge",
     "customer_indices",
     "knowledge",
@@ -35,7 +35,7 @@ Feeders' smallest singular values are above 1e-6.
 """
 
 
-class Curves(StrEnum):
+class CurvePositions(StrEnum):
     """Operating region of the inverters on their droop curves."""
 
     STEEPEST = "steepest"
@@ -84,7 +84,7 @@ def knowledge(
     unknown: Sequence[str] | None,
     silent: Sequence[str],
     busbar_known: bool,
-    curves: Curves,
+    curves: CurvePositions,
 ) -> Knowledge:
     """Compute the patterns that hide attacks.
 
@@ -107,7 +107,7 @@ def knowledge(
     ValueError
         For an unknown customer, meter or region of the curves.
     """
-    curves = choice("curves", Curves, curves)
+    curves = choice("curves", CurvePositions, curves)
     gone = meter_mask(site, silent)
     metered = np.zeros(site.feeder.bus.size, dtype=np.bool_)
     metered[site.meters] = True
@@ -121,7 +121,7 @@ def knowledge(
     W = unknown_voltages(site.feeder, which, busbar=not busbar_known, tol=TOLERANCE)
     # A meter at every customer: rounding limits depend on the feeder, not on its meters.
     lure = close_loop(site.feeder, site.droop, np.arange(metered.size))
-    slope = lure.slope if curves is Curves.STEEPEST else np.zeros_like(lure.slope)
+    slope = lure.slope if curves is CurvePositions.STEEPEST else np.zeros_like(lure.slope)
     A, every = unknown_pair(lure, slope, W)
     everywhere = unit_rows(every, tol=TOLERANCE)
     C = everywhere[site.meters]
@@ -154,7 +154,7 @@ def see_names(
     *,
     unknown: Sequence[str] | None = None,
     meters: Sequence[str] = (),
-    curves: Curves | str = "",
+    curves: CurvePositions | str = "",
 ) -> None:
     """Check ids of customers and meters, and the region of the curves, all at once.
 
@@ -172,11 +172,11 @@ def see_names(
     ValueError
         For an unknown customer, meter or region of the curves.
     """
-    refuse(
+    raise_if_any(
         [
             *_strange(site.feeder.customers, unknown or (), "customer"),
             *_strange(site.meter_ids, meters, "meter"),
-            *no_choice("curves", Curves, *([curves] if curves else [])),
+            *no_choice("curves", CurvePositions, *([curves] if curves else [])),
         ]
     )
 
@@ -200,7 +200,7 @@ def meter_mask(site: Site, names: Sequence[str]) -> Bools:
 
 
 def _indices(known: Sequence[str], names: Sequence[str], what: str) -> Ints:
-    refuse(_strange(known, names, what))
+    raise_if_any(_strange(known, names, what))
     place = {name: k for k, name in enumerate(known)}
     return np.array([place[name] for name in names], dtype=np.intp)
 

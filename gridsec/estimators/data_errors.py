@@ -35,7 +35,16 @@ from gridsec.grid.network import Network
 from gridsec.grid.phased import PhasedFeeder
 from gridsec.interface import Frame, PowerOrigin, Verdict
 
-__all__ = ["DataError", "DataErrorDesign", "DataErrorKind", "Window", "accused", "begin", "design", "follow"]
+__all__ = [
+    "AccusationWindow",
+    "DataError",
+    "DataErrorDesign",
+    "DataErrorKind",
+    "accused",
+    "begin",
+    "design",
+    "follow",
+]
 
 BLOCK_S: Final = 60.0
 """Smallest duration of a block, s: the mean of a minute removes jitter and keeps the changes of the loads."""
@@ -223,7 +232,7 @@ class _Sums:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Window:
+class AccusationWindow:
     """Readings since the first accusation, and their result. Empty while no meter is accused.
 
     Attributes
@@ -243,9 +252,9 @@ class Window:
     since_accused: int = 0
 
 
-def begin() -> Window:
+def begin() -> AccusationWindow:
     """Return the empty window."""
-    return Window()
+    return AccusationWindow()
 
 
 def design(plant: Plant, base_volt: Floats, step_s: float) -> DataErrorDesign | None:
@@ -286,7 +295,9 @@ def accused(verdict: Verdict) -> Bools:
     return out
 
 
-def follow(design: DataErrorDesign, window: Window, frame: Frame, x: Floats, accused: Bools) -> Window:
+def follow(
+    design: DataErrorDesign, window: AccusationWindow, frame: Frame, x: Floats, accused: Bools
+) -> AccusationWindow:
     """Add one frame to the window; compare at the end of each block.
 
     Parameters
@@ -302,14 +313,14 @@ def follow(design: DataErrorDesign, window: Window, frame: Frame, x: Floats, acc
         From `accused`.
     """
     if window.t is not None and not window.t < frame.t <= window.t + MOST_BLOCKS * design.block_s:
-        window = Window()
+        window = AccusationWindow()
     if window.t is None and not accused.any():
         return window
     block = math.floor(frame.t / design.block_s)
     if window.sums is not None and window.sums.block != block:
         window = _closed(design, window, window.sums)
         if window.since_accused > MOST_BLOCKS:
-            return Window()
+            return AccusationWindow()
     v0 = frame.v0_phases if design.plant.feeder.busbar_phases == 3 else np.array([frame.v0_squared])
     if v0 is None or not np.isfinite(v0).all():
         return replace(window, t=frame.t)
@@ -363,7 +374,7 @@ def _variance(half_width: Floats, std: Floats | None) -> Floats:
     return uniform if std is None else np.where(np.isnan(std), uniform, std**2)
 
 
-def _closed(design: DataErrorDesign, window: Window, sums: _Sums) -> Window:
+def _closed(design: DataErrorDesign, window: AccusationWindow, sums: _Sums) -> AccusationWindow:
     """The window with one more complete block."""
     (p, p_var), (q, q_var), v0 = sums.p.value(sums.count), sums.q.value(sums.count), sums.v0 / sums.count
     model = _solved(design, design.at, p[None], q[None], v0=v0[None])[0]
@@ -385,7 +396,7 @@ def _closed(design: DataErrorDesign, window: Window, sums: _Sums) -> Window:
     )
     rows = now if window.rows is None else _joined(window.rows, now)
     since = 0 if sums.accused.any() else window.since_accused + 1
-    return Window(rows, compare(design, rows, window.error), window.t, None, since)
+    return AccusationWindow(rows, compare(design, rows, window.error), window.t, None, since)
 
 
 def _solved(design: DataErrorDesign, at: Ints, p: Floats, q: Floats, *, v0: Floats) -> Floats:

@@ -11,7 +11,7 @@ from gridsec.interface import Cause, Decision
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Tally:
+class Counters:
     """Counters of each meter's latest readings. p meters.
 
     Attributes
@@ -29,7 +29,7 @@ class Tally:
     named: Bools
 
 
-def count(tally: Tally, over: Bools, live: Bools, *, confirm: int, release: int) -> Tally:
+def count(tally: Counters, over: Bools, live: Bools, *, confirm: int, release: int) -> Counters:
     """Update the counters with the residuals of one frame.
 
     A reading above the threshold makes a meter suspect; only `release` consecutive readings below it end
@@ -50,11 +50,11 @@ def count(tally: Tally, over: Bools, live: Bools, *, confirm: int, release: int)
     below = np.where(live, np.where(over, 0, tally.below + 1), tally.below)
     above = np.where(below >= release, 0, tally.above + (live & over))
     named = (tally.named & (below < release)) | (above >= confirm)
-    return Tally(above, below, named)
+    return Counters(above, below, named)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Situation:
+class DecisionInputs:
     """Inputs of a verdict. p meters.
 
     Attributes
@@ -82,7 +82,7 @@ class Situation:
     busbar: bool
 
 
-def decide(now: Situation) -> tuple[Decision, Cause, str]:
+def decide(now: DecisionInputs) -> tuple[Decision, Cause, str]:
     """The answer, its cause, and one sentence for an operator.
 
     Causes that invalidate every other answer come first; CLEAN is the answer if no other cause applies.
@@ -99,7 +99,7 @@ def decide(now: Situation) -> tuple[Decision, Cause, str]:
     return Decision.CLEAN, Cause.AGREEMENT, "All meters agree with the feeder."
 
 
-def _blind(now: Situation) -> tuple[Cause, str] | None:
+def _blind(now: DecisionInputs) -> tuple[Cause, str] | None:
     """Cause and reason that prevent naming any meter; None if there are none."""
     # Unavailable meters, named or not, count neither for nor against others.
     live, named = int(np.count_nonzero(now.live)), int(np.count_nonzero(now.named & now.live))
@@ -128,7 +128,7 @@ def _blind(now: Situation) -> tuple[Cause, str] | None:
     return None
 
 
-def _doubt(now: Situation) -> tuple[Cause, str] | None:
+def _doubt(now: DecisionInputs) -> tuple[Cause, str] | None:
     """Cause and reason against CLEAN while no meter is named; None if there are none."""
     silent, pending = ~now.live, now.suspected & ~now.named
     if any_of(silent):
@@ -152,7 +152,7 @@ def _liars(most: int) -> str:
 _SHOWN = 5
 
 
-def _list(now: Situation, which: Bools) -> str:
+def _list(now: DecisionInputs, which: Bools) -> str:
     """Names of the meters, at most `_SHOWN` of them."""
     if not any_of(which):
         return ""

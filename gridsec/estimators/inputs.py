@@ -8,8 +8,8 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, all_of
 from gridsec.estimators import thresholds
-from gridsec.estimators.plant import Plant, Setting
-from gridsec.estimators.thresholds import Uncertainty
+from gridsec.estimators.plant import EstimatorContext, Plant
+from gridsec.estimators.thresholds import TickUncertainty
 from gridsec.grid.meter import busbar_error, reading_error
 from gridsec.grid.network import Network
 from gridsec.interface import Cause, Decision, Estimate, Frame, Verdict
@@ -28,11 +28,11 @@ class Inputs:
     v0_squared: Floats | float  # in three phases (3,)
     busbar: bool
     correction: Floats  # (n,) at the last estimate
-    now: Uncertainty
+    now: TickUncertainty
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Past:
+class PreviousStep:
     """State of the last step that prepares the next frame. m inverters, p meters.
 
     Attributes
@@ -133,7 +133,7 @@ def _power(power: Floats, error: Floats) -> tuple[Floats, Floats]:
     return np.where(good, power, 0.0), np.where(good & sure, error, NO_POWER)
 
 
-def reconstruct(setting: Setting, frame: Frame, inputs: Inputs, q: Floats) -> Reconstruction:
+def reconstruct(setting: EstimatorContext, frame: Frame, inputs: Inputs, q: Floats) -> Reconstruction:
     """Voltages for given injections, with the loss correction at these; chong2020 (19).
 
     Parameters
@@ -153,7 +153,7 @@ def reconstruct(setting: Setting, frame: Frame, inputs: Inputs, q: Floats) -> Re
     return Reconstruction(v2_bus, v2_bus[plant.feeder.bus], correction)
 
 
-def clean(setting: Setting, past: Past, frame: Frame) -> Inputs:
+def clean(setting: EstimatorContext, past: PreviousStep, frame: Frame) -> Inputs:
     """Prepare one frame and compute the uncertainty of the result."""
     plant, model, options = setting.plant, setting.model, setting.options
     at = plant.meters
@@ -174,7 +174,7 @@ def clean(setting: Setting, past: Past, frame: Frame) -> Inputs:
     rise = 2.0 * (model.R @ frame.p + model.X @ q_all) + correction[plant.feeder.bus]
     reading = reading_error(plant.accuracy, here[at] + rise[at] + base[at] + _ROOM, options.sigmas)
     extra = np.where(told, np.maximum(frame.q_error[at] - frame.q_net_error[at], 0.0), 0.0)
-    now = Uncertainty(np.minimum(base, NO_VOLTAGE), reading, live, told, extra)
+    now = TickUncertainty(np.minimum(base, NO_VOLTAGE), reading, live, told, extra)
     error = busbar_errors(plant, v0, options.sigmas)
     if not busbar:
         v0, error = _implied(setting, past, now, y - rise[at], (v0, error, there))
@@ -226,10 +226,10 @@ NO_VOLTAGE = 4.0
 NO_POWER = 1e4
 
 
-def _credible(setting: Setting, frame: Frame) -> Bools:
+def _credible(setting: EstimatorContext, frame: Frame) -> Bools:
     """Mask (p,) of net reactive powers that load and inverter can produce together."""
     plant = setting.plant
-    if not setting.believes_q:
+    if not setting.uses_reported_q:
         return np.zeros(plant.meters.size, dtype=np.bool_)
     least, most = plant.droop.saturated(frame.q.size)
     room = frame.q_error + np.nan_to_num(frame.q_net_error)
@@ -284,9 +284,9 @@ def _finite(values: Floats, instead: float) -> Floats:
 
 
 def _implied(
-    setting: Setting,
-    past: Past,
-    now: Uncertainty,
+    setting: EstimatorContext,
+    past: PreviousStep,
+    now: TickUncertainty,
     implied: Floats,
     busbar: tuple[Floats | float, Floats | float, Bools | bool],
 ) -> tuple[Floats | float, Floats | float]:

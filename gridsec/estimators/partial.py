@@ -49,11 +49,11 @@ import numpy as np
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import DesignInfeasible, NotObservable
 from gridsec.estimators import thresholds
-from gridsec.estimators.decision import Situation, Tally, count, decide
+from gridsec.estimators.decision import Counters, DecisionInputs, count, decide
 from gridsec.estimators.inputs import (
     NO_VOLTAGE,
     Inputs,
-    Past,
+    PreviousStep,
     Reconstruction,
     busbar_errors,
     clean,
@@ -62,8 +62,8 @@ from gridsec.estimators.inputs import (
     nothing_new,
     reconstruct,
 )
-from gridsec.estimators.plant import Options, Plant, Setting, check_plant, setting
-from gridsec.estimators.thresholds import ErrorBound, Motion, Uncertainty
+from gridsec.estimators.plant import EstimatorContext, Options, Plant, check_plant, estimator_context
+from gridsec.estimators.thresholds import ErrorBound, Motion, TickUncertainty
 from gridsec.grid.meter import reading_error
 from gridsec.interface import Cause, Decision, Estimate, Explanation, Frame, Verdict
 from gridsec.observers import circle
@@ -151,15 +151,15 @@ class CodeWord:
     rest: Floats
 
 
-def start(setting: Setting) -> Parts:
+def start(setting: EstimatorContext) -> Parts:
     """State before the first frame: only the saturation of the inverters is known."""
     zero, widest = np.zeros(setting.plant.droop.tau.size), thresholds.widest(setting.errors)
     return Parts(zero, zero, zero, widest, widest)
 
 
 def observe(  # noqa: PLR0917  # the observers, their state, and the inputs
-    setting: Setting, model: CircleDesign, before: Parts, frame: Frame, inputs: Inputs, h: float
-) -> tuple[Uncertainty, Reconstruction, Parts, bool]:
+    setting: EstimatorContext, model: CircleDesign, before: Parts, frame: Frame, inputs: Inputs, h: float
+) -> tuple[TickUncertainty, Reconstruction, Parts, bool]:
     """Advance all observers and their bounds to a frame.
 
     Parameters
@@ -206,7 +206,7 @@ def observe(  # noqa: PLR0917  # the observers, their state, and the inputs
     return alone, seen, Parts(x, z, driven, bound, level), _settled(setting, alone, motion, bound)
 
 
-def _settled(setting: Setting, alone: Uncertainty, motion: Motion, bound: ErrorBound) -> bool:
+def _settled(setting: EstimatorContext, alone: TickUncertainty, motion: Motion, bound: ErrorBound) -> bool:
     errors = setting.errors
     none = np.zeros(bound.free.shape)
     top = thresholds.ceiling(errors, alone, motion, ErrorBound(none, none))
@@ -217,11 +217,11 @@ def _settled(setting: Setting, alone: Uncertainty, motion: Motion, bound: ErrorB
 
 
 def code_word(  # noqa: PLR0917  # as _conclude
-    setting: Setting,
+    setting: EstimatorContext,
     parts: Parts,
     frame: Frame,
     inputs: Inputs,
-    alone: Uncertainty,
+    alone: TickUncertainty,
     model: Reconstruction,
 ) -> CodeWord:
     """Rows of all meters, each in units of its own bound.
@@ -272,12 +272,12 @@ def code_word(  # noqa: PLR0917  # as _conclude
     return CodeWord(B, value / unit, block, unit, scale, reading, voltage * scale, rest_)
 
 
-def _told(setting: Setting, frame: Frame, inputs: Inputs) -> Bools:
+def _told(setting: EstimatorContext, frame: Frame, inputs: Inputs) -> Bools:
     """Mask (p,) of meters that report net reactive power with a known error."""
     return np.asarray(inputs.live & np.isfinite(frame.q_net + frame.q_net_error)[setting.plant.meters])
 
 
-def disputed(setting: Setting, parts: Parts, frame: Frame, inputs: Inputs) -> Bools:
+def disputed(setting: EstimatorContext, parts: Parts, frame: Frame, inputs: Inputs) -> Bools:
     """Mask (p,) of meters with a reported reactive power that their inverters cannot have on their curves.
 
     Either the meter or its inverter is manipulated; these data do not tell which.
@@ -289,7 +289,9 @@ def disputed(setting: Setting, parts: Parts, frame: Frame, inputs: Inputs) -> Bo
     return np.asarray(_told(setting, frame, inputs) & off[setting.plant.meters])
 
 
-def _split(setting: Setting, frame: Frame, inputs: Inputs, alone: Uncertainty) -> tuple[Floats, Floats]:
+def _split(
+    setting: EstimatorContext, frame: Frame, inputs: Inputs, alone: TickUncertainty
+) -> tuple[Floats, Floats]:
     """Error of the busbar voltage, common to all (of a phase), and the error not explained by loads, (N,)."""
     errors, feeder = setting.errors, setting.plant.feeder
     p_error, q_error = np.minimum(frame.p_error, _LARGEST), np.minimum(frame.q_error, _LARGEST)
@@ -344,7 +346,7 @@ class PartialDesign:
         Expected interval between frames, s.
     """
 
-    setting: Setting
+    setting: EstimatorContext
     model: CircleDesign
     step_s: float
 
@@ -383,7 +385,7 @@ class PartialState:
     started: bool
     parts: Parts
     settled: bool
-    tally: Tally
+    tally: Counters
     v0_squared: Floats | float
     last: tuple[Estimate, Verdict] | None
 
@@ -422,7 +424,7 @@ def design(
     if options is None:
         options = Options() if step_s <= 30.0 else Options(release=4)
     model = circle.design(close_loop(plant.feeder, plant.droop, meters), np.zeros(p, dtype=np.bool_))
-    return PartialDesign(setting(plant, max_attacked=max_attacked, options=options), model, step_s)
+    return PartialDesign(estimator_context(plant, max_attacked=max_attacked, options=options), model, step_s)
 
 
 def init(design: PartialDesign, t: float) -> PartialState:
@@ -442,7 +444,7 @@ def init(design: PartialDesign, t: float) -> PartialState:
         started=False,
         parts=start(design.setting),
         settled=False,
-        tally=Tally(np.zeros(p, dtype=np.intp), np.zeros(p, dtype=np.intp), np.zeros(p, dtype=np.bool_)),
+        tally=Counters(np.zeros(p, dtype=np.intp), np.zeros(p, dtype=np.intp), np.zeros(p, dtype=np.bool_)),
         v0_squared=plant.droop.vbar**2,
         last=None,
     )
@@ -468,7 +470,7 @@ def step(design: PartialDesign, state: PartialState, frame: Frame) -> tuple[Part
         plant = design.setting.plant
         return state, *nothing_new(plant, frame, state.t, state.last, state.v0_squared, state.parts.x)
     setting, frame = design.setting, known(frame)
-    inputs = clean(setting, Past(state.parts.x, state.v0_squared, state.tally.named), frame)
+    inputs = clean(setting, PreviousStep(state.parts.x, state.v0_squared, state.tally.named), frame)
     h = frame.t - state.t if state.started else 0.0
     alone, model, parts, at_rest = observe(setting, design.model, state.parts, frame, inputs, h)
     word = code_word(setting, parts, frame, inputs, alone, model)
@@ -488,7 +490,7 @@ def _conclude(  # noqa: PLR0917  # the chain's values, in the order in which the
     after: PartialState,
     frame: Frame,
     inputs: Inputs,
-    alone: Uncertainty,
+    alone: TickUncertainty,
     model: Reconstruction,
     word: CodeWord,
 ) -> tuple[PartialState, Estimate, Verdict]:
@@ -510,7 +512,7 @@ def _conclude(  # noqa: PLR0917  # the chain's values, in the order in which the
     # A contradiction has a cause, even if no single meter can be named: never CLEAN.
     doubtful = contradicted if not found.certain.any() else np.zeros_like(live)
     decision, cause, reason = decide(
-        Situation(
+        DecisionInputs(
             names=tuple(plant.feeder.customers[c] for c in plant.meters),
             max_attacked=most,
             live=live,
@@ -569,7 +571,7 @@ def _estimate(  # noqa: PLR0917  # as _conclude
     design: PartialDesign,
     after: PartialState,
     frame: Frame,
-    alone: Uncertainty,
+    alone: TickUncertainty,
     model: Reconstruction,
     word: CodeWord,
     found: Fits,

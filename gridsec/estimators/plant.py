@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gridsec.arrays import Ints
-from gridsec.errors import Problem, refuse
+from gridsec.errors import Problem, raise_if_any
 from gridsec.estimators.thresholds import ErrorModel, error_model
 from gridsec.grid.droop import Droop
 from gridsec.grid.meter import MeterAccuracy
@@ -55,7 +55,7 @@ class Plant:
                     f"loss_correction is {self.loss_correction}; it must be a whole number from 0 on",
                 )
             )
-        refuse(problems)
+        raise_if_any(problems)
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +98,7 @@ class Options:
     v2_limits: tuple[float, float] = (0.25, 2.25)
 
     def __post_init__(self) -> None:
-        refuse(
+        raise_if_any(
             [
                 *(
                     Problem(
@@ -184,11 +184,11 @@ def check_plant(plant: Plant, *, max_attacked: int, step_s: float, more: Iterabl
         problems.append(
             Problem("not-positive", f"step_s is {step_s}; it must be a positive number of seconds")
         )
-    refuse([*problems, *more])
+    raise_if_any([*problems, *more])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Setting:
+class EstimatorContext:
     """Plant with its derived models, common to all estimators of a feeder.
 
     Attributes
@@ -199,7 +199,7 @@ class Setting:
         Propagation of errors.
     max_attacked
         M.
-    believes_q
+    uses_reported_q
         True if metered net reactive power replaces that of load and inverter.
     """
 
@@ -208,13 +208,15 @@ class Setting:
     errors: ErrorModel
     options: Options
     max_attacked: int
-    believes_q: bool
+    uses_reported_q: bool
 
 
-def setting(
-    plant: Plant, *, max_attacked: int, options: Options | None = None, believes_q: bool = False
-) -> Setting:
+def estimator_context(
+    plant: Plant, *, max_attacked: int, options: Options | None = None, uses_reported_q: bool = False
+) -> EstimatorContext:
     """Compute the setting of a plant; `options` are the defaults if None."""
     model = plant.feeder.linear()
     errors = error_model(plant.droop, model, plant.meters, max_attacked)
-    return Setting(plant, model, errors, Options() if options is None else options, max_attacked, believes_q)
+    return EstimatorContext(
+        plant, model, errors, Options() if options is None else options, max_attacked, uses_reported_q
+    )

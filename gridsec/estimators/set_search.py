@@ -42,12 +42,12 @@ import numpy as np
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import DesignInfeasible, NotObservable, Problem
 from gridsec.estimators import thresholds
-from gridsec.estimators.decision import Situation, Tally, count, decide
+from gridsec.estimators.decision import Counters, DecisionInputs, count, decide
 from gridsec.estimators.exact_bank import bank as banks
-from gridsec.estimators.inputs import Inputs, Past, clean, injections, known, nothing_new, reconstruct
-from gridsec.estimators.plant import Options, Plant, Setting, check_plant, setting
+from gridsec.estimators.inputs import Inputs, PreviousStep, clean, injections, known, nothing_new, reconstruct
+from gridsec.estimators.plant import EstimatorContext, Options, Plant, check_plant, estimator_context
 from gridsec.estimators.single_tick import MOST_SETS
-from gridsec.estimators.thresholds import ErrorBound, ErrorModel, Motion, Uncertainty
+from gridsec.estimators.thresholds import ErrorBound, ErrorModel, Motion, TickUncertainty
 from gridsec.grid.meter import reading_error
 from gridsec.interface import Cause, Decision, Estimate, Explanation, Frame, Verdict
 from gridsec.observers.certificates import Certificate, certify
@@ -56,7 +56,7 @@ from gridsec.observers.lure import close_loop, rest
 __all__ = [
     "SetSearchDesign",
     "SetSearchState",
-    "View",
+    "TrustedEstimate",
     "advance",
     "design",
     "driven_by",
@@ -85,7 +85,7 @@ class SetSearchDesign:
         Delta, s.
     """
 
-    setting: Setting
+    setting: EstimatorContext
     bank: banks.Bank
     errors: ErrorModel
     certificate: Certificate
@@ -146,7 +146,7 @@ class SetSearchState:
     dropped: Bools
     innocent: Floats
     readings: Ints
-    tally: Tally
+    tally: Counters
     v0_squared: Floats | float
     last: tuple[Estimate, Verdict] | None
 
@@ -204,7 +204,7 @@ def design(
         options = Options() if step_s <= 30.0 else Options(release=4)
     lure = close_loop(plant.feeder, plant.droop, plant.meters)
     proof = certify(lure)
-    watched = setting(plant, max_attacked=max_attacked, options=options)
+    watched = estimator_context(plant, max_attacked=max_attacked, options=options)
     slowest = float(np.max(plant.droop.tau, initial=0.0))
     dwell = slowest * float(np.log(1.0 / options.settled)) if dwell_s is None else dwell_s
     return SetSearchDesign(
@@ -230,14 +230,14 @@ def init(design: SetSearchDesign, t: float) -> SetSearchState:
         dropped=nobody,
         innocent=np.full(p, np.inf),
         readings=zero,
-        tally=Tally(zero, zero, nobody),
+        tally=Counters(zero, zero, nobody),
         v0_squared=plant.droop.vbar**2,
         last=None,
     )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class View:
+class TrustedEstimate:
     """Estimate of the feeder from the trusted set. N customers, p meters, m inverters.
 
     Attributes
@@ -269,7 +269,7 @@ class View:
     over: Bools
 
 
-def advance(design: SetSearchDesign, state: SetSearchState, frame: Frame, inputs: Inputs) -> View:
+def advance(design: SetSearchDesign, state: SetSearchState, frame: Frame, inputs: Inputs) -> TrustedEstimate:
     """Advance the observer to a frame, and compare all meters with it."""
     watched, errors, at = design.setting, design.errors, design.setting.plant.meters
     plant, droop = watched.plant, watched.plant.droop
@@ -293,7 +293,7 @@ def advance(design: SetSearchDesign, state: SetSearchState, frame: Frame, inputs
     error = thresholds.gap(errors, now, bound)
     threshold = threshold_of(design, seen.v2[at], error[at])
     score = np.where(inputs.live, np.abs(inputs.y - seen.v2[at]), np.nan)
-    return View(
+    return TrustedEstimate(
         bank=bank,
         x=x,
         z=z,
@@ -361,7 +361,7 @@ def threshold_of(design: SetSearchDesign, v2: Floats, error: Floats) -> Floats:
 
 
 def _settled(
-    design: SetSearchDesign, now: Uncertainty, motion: Motion, error: Floats, threshold: Floats
+    design: SetSearchDesign, now: TickUncertainty, motion: Motion, error: Floats, threshold: Floats
 ) -> bool:
     """True once the remaining transient is negligible against every threshold."""
     none, at = np.zeros(motion.after.shape), design.setting.plant.meters
@@ -403,7 +403,7 @@ def step(
         plant = design.setting.plant
         return state, *nothing_new(plant, frame, state.t, state.last, state.v0_squared, state.x)
     frame = known(frame)
-    inputs = clean(design.setting, Past(state.x, state.v0_squared, state.tally.named), frame)
+    inputs = clean(design.setting, PreviousStep(state.x, state.v0_squared, state.tally.named), frame)
     view = advance(design, state, frame, inputs)
     found = _Found(state.dropped, view.over & ~state.dropped, (), False)
     unsure = view.over & state.dropped & ~state.tally.named
@@ -422,7 +422,7 @@ class _Found:
     torn: bool  # no set passes
 
 
-def _search(design: SetSearchDesign, inputs: Inputs, view: View, state: SetSearchState) -> _Found:
+def _search(design: SetSearchDesign, inputs: Inputs, view: TrustedEstimate, state: SetSearchState) -> _Found:
     """Test all sets of at most M dropped meters by the injections that their own readings imply."""
     errors, at, live = design.errors, design.setting.plant.meters, inputs.live
     sets = design.dropped[~(design.dropped & ~live).any(axis=1)]
@@ -444,7 +444,12 @@ def _search(design: SetSearchDesign, inputs: Inputs, view: View, state: SetSearc
 
 
 def _conclude(  # noqa: PLR0917  # design, state and frame, then the results of this step
-    design: SetSearchDesign, state: SetSearchState, frame: Frame, inputs: Inputs, view: View, found: _Found
+    design: SetSearchDesign,
+    state: SetSearchState,
+    frame: Frame,
+    inputs: Inputs,
+    view: TrustedEstimate,
+    found: _Found,
 ) -> tuple[SetSearchState, Estimate, Verdict]:
     options, live = design.setting.options, inputs.live
     held = state.tally.named & view.over & found.dropped
@@ -485,7 +490,7 @@ def _conclude(  # noqa: PLR0917  # design, state and frame, then the results of 
     return after, estimate, verdict
 
 
-def _error(design: SetSearchDesign, view: View, torn: bool) -> Floats:
+def _error(design: SetSearchDesign, view: TrustedEstimate, torn: bool) -> Floats:
     """Half-width of the estimate for any M manipulated meters, detected or not; (N,)."""
     errors = design.errors
     if torn:
@@ -497,15 +502,15 @@ def _error(design: SetSearchDesign, view: View, torn: bool) -> Floats:
 def _verdict(  # noqa: PLR0917  # all results of one tick
     design: SetSearchDesign,
     inputs: Inputs,
-    view: View,
+    view: TrustedEstimate,
     found: _Found,
-    tally: Tally,
+    tally: Counters,
     dropped: Bools,
     switched: bool,
 ) -> Verdict:
     plant, live = design.setting.plant, inputs.live
     decision, cause, reason = decide(
-        Situation(
+        DecisionInputs(
             names=tuple(plant.feeder.customers[c] for c in plant.meters),
             max_attacked=design.setting.max_attacked,
             live=live,

@@ -39,7 +39,7 @@ MOST_SETS = 20_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Outcome:
+class SetMisfits:
     """Every set of one size. c sets of k meters.
 
     Attributes
@@ -80,7 +80,7 @@ def check(candidates: int, most: int) -> None:
         )
 
 
-def outcomes(evidence: Evidence, size: int) -> Outcome:
+def outcomes(evidence: Evidence, size: int) -> SetMisfits:
     """Evaluate every set of `size` meters."""
     Q, m = evidence.whole.Q, evidence.m
     weights = Q @ m
@@ -97,7 +97,7 @@ def outcomes(evidence: Evidence, size: int) -> Outcome:
         offset, std = np.abs(left / precision), 1.0 / np.sqrt(precision)
         excess = np.where(judged, offset / evidence.limits.of(std), 0.0)
     misfit = float(m @ weights) - np.einsum("cr,cr->c", b, solved[:, :, 0])
-    return Outcome(members, misfit, excess.max(axis=1, initial=0.0))
+    return SetMisfits(members, misfit, excess.max(axis=1, initial=0.0))
 
 
 def least_squares(evidence: Evidence) -> tuple[Accused, ...]:
@@ -141,7 +141,7 @@ def fewest(evidence: Evidence) -> tuple[Accused, ...]:
     lee2018 (2.2.8'): l0 decoding with bounded noise, the sets tried in the order of their size.
     """
     within = 2.0 * float(np.log(evidence.like))
-    found: Outcome | None = None
+    found: SetMisfits | None = None
     for size in range(min(evidence.most, int(np.count_nonzero(evidence.live))) + 1):
         found = outcomes(evidence, size)
         fine = np.flatnonzero(found.excess <= 1.0)
@@ -203,7 +203,7 @@ def _beyond(evidence: Evidence, at: Ints, attack: Floats) -> Accused:
     return Accused(accused)
 
 
-def _answer(live: Bools, found: Outcome, which: int, best: int) -> Accused:
+def _answer(live: Bools, found: SetMisfits, which: int, best: int) -> Accused:
     accused = np.zeros(live.size, dtype=np.bool_)
     accused[found.members[which]] = True
     return Accused(accused, float(found.misfit[which] - found.misfit[best]))

@@ -121,7 +121,7 @@ def curve_mismatch(droop: Droop) -> Floats:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Uncertainty:
+class TickUncertainty:
     """Uncertainty at one tick.
 
     Attributes
@@ -178,7 +178,7 @@ def widest(model: ErrorModel, x: Floats | None = None) -> ErrorBound:
     return ErrorBound(far, far.copy())
 
 
-def gap(model: ErrorModel, now: Uncertainty, bound: ErrorBound, *, own: bool = False) -> Floats:
+def gap(model: ErrorModel, now: TickUncertainty, bound: ErrorBound, *, own: bool = False) -> Floats:
     """Error of squared voltages in any observer without manipulated meters and at most 2M meters left out.
 
     `base_i + sum over undriven inverters 2 X_ik free_k + sum over meters 2 X_ij driven_j
@@ -241,7 +241,7 @@ class Motion:
     lag: Floats | float = 0.0
 
 
-def settled(model: ErrorModel, now: Uncertainty, motion: Motion, start: ErrorBound) -> ErrorBound:
+def settled(model: ErrorModel, now: TickUncertainty, motion: Motion, start: ErrorBound) -> ErrorBound:
     """Level to which the bounds converge, given that they never exceed `start`.
 
     Iterates the monotone map of `docs/theory-detection.md` downwards from `start`. Every iterate is a bound;
@@ -263,7 +263,7 @@ def settled(model: ErrorModel, now: Uncertainty, motion: Motion, start: ErrorBou
     return level
 
 
-def _image(model: ErrorModel, now: Uncertainty, motion: Motion, bound: ErrorBound) -> ErrorBound:
+def _image(model: ErrorModel, now: TickUncertainty, motion: Motion, bound: ErrorBound) -> ErrorBound:
     """Largest difference of the curves' values for errors within `bound`."""
     droop = model.droop
     # Readings and loads are held over the step; their motion within it is part of the error. All of it may
@@ -298,7 +298,7 @@ _ROOM = 1.05
 
 
 def advance(
-    model: ErrorModel, now: Uncertainty, motion: Motion, bound: ErrorBound, last: ErrorBound
+    model: ErrorModel, now: TickUncertainty, motion: Motion, bound: ErrorBound, last: ErrorBound
 ) -> tuple[ErrorBound, ErrorBound]:
     """Bounds at the end of a step.
 
@@ -342,7 +342,7 @@ def advance(
     return after, top
 
 
-def ceiling(model: ErrorModel, now: Uncertainty, motion: Motion, floor: ErrorBound) -> ErrorBound:
+def ceiling(model: ErrorModel, now: TickUncertainty, motion: Motion, floor: ErrorBound) -> ErrorBound:
     """A level above `floor` that the map of the bounds does not exceed.
 
     Without output injection, the saturation of the curves. With it, the map is at most `r + A bound` with a

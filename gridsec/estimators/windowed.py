@@ -34,7 +34,7 @@ from typing import get_args
 import numpy as np
 
 from gridsec.arrays import Bools, Floats
-from gridsec.errors import DesignInfeasible, Problem, no_choice, refuse
+from gridsec.errors import DesignInfeasible, Problem, no_choice, raise_if_any
 from gridsec.estimators import exact_bank
 from gridsec.estimators.exact_bank import bank as banks
 from gridsec.estimators.exact_bank.direct import SlotState
@@ -81,7 +81,7 @@ class WindowedDesign:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Window:
+class WindowResult:
     """Result of one full window. p meters.
 
     Attributes
@@ -121,7 +121,7 @@ class WindowedState:
     chain: MonitorState
     pi: Floats
     pi_sets: Floats
-    said: Window | None
+    said: WindowResult | None
 
 
 def design(
@@ -163,7 +163,7 @@ def design(
             code="nothing-to-design",
         )
     wrong = [Problem("out-of-range", "a window has at least one reading")] if length < 1 else []
-    refuse((*wrong, *no_choice("rule", get_args(Rule), rule)))
+    raise_if_any((*wrong, *no_choice("rule", get_args(Rule), rule)))
     return WindowedDesign(exact_bank.design(plant, max_attacked=max_attacked, step_s=step_s), length, rule)
 
 
@@ -256,22 +256,24 @@ def consistency(
     return float(pi), np.asarray(gaps.ravel()[sets.pairs].max(axis=1))
 
 
-def _judge(design: WindowedDesign, pi: Floats, pi_sets: Floats) -> Window:
+def _judge(design: WindowedDesign, pi: Floats, pi_sets: Floats) -> WindowResult:
     """Both algorithms on one full window."""
     bank = design.chain.bank
     masks = bank.masks[: bank.sets.count_large]
     detected = bool(detection(np.nan_to_num(pi), 1.0, design.length)[0])
     found = isolation(pi_sets, np.ones(len(masks)), masks, design.length, design.rule)
-    return Window(
+    return WindowResult(
         bool(np.isfinite(pi).all()), detected, bool(found.decided[0]), np.asarray(found.suspects[0])
     )
 
 
-def _answer(verdict: Verdict, said: Window | None, names: tuple[str, ...]) -> tuple[Decision, Cause, str]:
+def _answer(
+    verdict: Verdict, said: WindowResult | None, names: tuple[str, ...]
+) -> tuple[Decision, Cause, str]:
     """Answer of the windows, where that of the residuals leaves one; earlier entries override later ones."""
     undecided, open_ = Decision.UNDECIDED, verdict.decision is Decision.UNDECIDED
     first = verdict.cause in {Cause.DESIGN_INVALID, Cause.TOO_FEW_METERS, Cause.NO_BUSBAR}
-    known = Window(True, False, True, np.zeros(len(names), dtype=np.bool_)) if said is None else said
+    known = WindowResult(True, False, True, np.zeros(len(names), dtype=np.bool_)) if said is None else said
     named = ", ".join(name for name, bad in zip(names, known.suspects, strict=True) if bad)
     answers = (
         (first or (said is None and open_), undecided, verdict.cause, verdict.reason),
@@ -314,7 +316,7 @@ def _answer(verdict: Verdict, said: Window | None, names: tuple[str, ...]) -> tu
     return Decision.CLEAN, Cause.AGREEMENT, "All meters agree over a window of readings."
 
 
-def _combine(design: WindowedDesign, verdict: Verdict, said: Window | None, off: Floats) -> Verdict:
+def _combine(design: WindowedDesign, verdict: Verdict, said: WindowResult | None, off: Floats) -> Verdict:
     """Verdict of the windows; `off` is the signed distance of each reading from the reconstruction."""
     plant = design.chain.plant
     names = tuple(plant.feeder.customers[c] for c in plant.meters)

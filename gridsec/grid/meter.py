@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gridsec.arrays import Floats, Ints, frozen
-from gridsec.errors import Problem, refuse
+from gridsec.errors import Problem, raise_if_any
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,7 +66,7 @@ class MeterAccuracy:
             number = float(getattr(self, name))
             if not (np.isfinite(number) and number >= 0):
                 problems.append(Problem("negative", f"{name} must be finite and not negative, got {number}"))
-        refuse(problems)
+        raise_if_any(problems)
 
 
 def steady_rounding(accuracy: MeterAccuracy) -> Floats:

@@ -19,7 +19,7 @@ from typing import Literal
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, frozen
-from gridsec.errors import DesignInfeasible, InputInvalid, Problem, no_choice, refuse
+from gridsec.errors import DesignInfeasible, InputInvalid, Problem, no_choice, raise_if_any
 from gridsec.observers.certificates import Certificate, certify, error_bound, feeds
 from gridsec.observers.gains import CircleGains, CircleOptions, margin, sensitivity, state_bound
 from gridsec.observers.lmi import circle, contraction
@@ -128,7 +128,7 @@ def design(
             [Problem("shape", f"trusted has shape {trusted.shape}; the plant has {len(lure.C)} meters")]
         )
     if isinstance(gains, str):
-        refuse(no_choice("gains", ("direct", "lmi"), gains))
+        raise_if_any(no_choice("gains", ("direct", "lmi"), gains))
     if gains == "direct":
         return _direct(lure, trusted, options)
     meters = np.flatnonzero(trusted)

@@ -22,7 +22,7 @@ from typing import Literal
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, frozen
-from gridsec.errors import DesignInfeasible, InputInvalid, Problem, no_choice, refuse
+from gridsec.errors import DesignInfeasible, InputInvalid, Problem, no_choice, raise_if_any
 from gridsec.observers.circle import direct_gain
 from gridsec.observers.lmi.discrete import (
     DirectProof,
@@ -124,7 +124,7 @@ def design(
             [Problem("shape", f"trusted has shape {trusted.shape}; the plant has {len(system.C)} meters")]
         )
     if isinstance(gains, str):
-        refuse(no_choice("gains", ("lmi",), gains))
+        raise_if_any(no_choice("gains", ("lmi",), gains))
     if isinstance(gains, DirectProof):
         return _direct(system, trusted, gains)
     meters = np.flatnonzero(trusted)
@@ -266,7 +266,7 @@ def settling_steps(design: DiscreteDesign, *, start: float, epsilon: float) -> i
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Stack:
+class StackedObservers:
     """Several observers of one plant, on a leading axis. o observers.
 
     Attributes
@@ -285,7 +285,7 @@ class Stack:
     K: Floats
 
 
-def stack(designs: Sequence[DiscreteDesign]) -> Stack:
+def stack(designs: Sequence[DiscreteDesign]) -> StackedObservers:
     """Observers of one plant as stacked arrays.
 
     Parameters
@@ -300,7 +300,7 @@ def stack(designs: Sequence[DiscreteDesign]) -> Stack:
     """
     if any(one.system is not designs[0].system for one in designs):
         raise InputInvalid([Problem("wrong-design", "the observers belong to different plants")])
-    return Stack(
+    return StackedObservers(
         designs[0].system,
         np.stack([one.trusted for one in designs]),
         frozen(np.stack([one.L for one in designs])),
@@ -308,7 +308,7 @@ def stack(designs: Sequence[DiscreteDesign]) -> Stack:
     )
 
 
-def advance(stack: Stack, x: Floats, y: Floats, u: Floats, seen: Bools) -> Floats:
+def advance(stack: StackedObservers, x: Floats, y: Floats, u: Floats, seen: Bools) -> Floats:
     """One step of all observers.
 
     Parameters
@@ -366,7 +366,7 @@ class MonteCarlo:
 
 
 def monte_carlo(
-    stack: Stack,
+    stack: StackedObservers,
     *,
     half_width: Floats | float,
     start: Floats,
@@ -412,7 +412,7 @@ def monte_carlo(
                 "every observer needs a meter with noise: half_width is 0 for all meters of some observer",
             )
         )
-    refuse(problems)
+    raise_if_any(problems)
     everyone, truth = np.ones(p, dtype=np.bool_), np.asarray(start, dtype=np.float64)
     x = np.repeat(truth[:, None, :], len(stack.masks), axis=1)
     loudest, worst = np.zeros((runs, len(stack.masks))), np.zeros(len(stack.masks))

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gridsec.arrays import Floats, Ints, frozen
-from gridsec.errors import DesignInfeasible, InputInvalid, Problem, refuse
+from gridsec.errors import DesignInfeasible, InputInvalid, Problem, raise_if_any
 from gridsec.observers.lure import Lure
 
 # Sensitivity below which a meter counts as ignored.
@@ -79,7 +79,7 @@ class CircleOptions:
         ]
         if not np.any(self.noise > 0.0):
             problems.append(Problem("not-positive", "at least one meter must have a noise scale above zero"))
-        refuse(problems)
+        raise_if_any(problems)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -25,8 +25,8 @@ import numpy as np
 from scipy.linalg import block_diag, solve_discrete_lyapunov
 
 from gridsec.arrays import Bools, Floats, frozen, spectral_radius, symmetry_defect
-from gridsec.errors import DesignInfeasible, Problem, refuse
-from gridsec.observers.parts import Stack, decompose, heard, riccati, stack
+from gridsec.errors import DesignInfeasible, Problem, raise_if_any
+from gridsec.observers.parts import StackedDecompositions, decompose, heard, riccati, stack
 
 RESIDUAL = 1e-8
 """Largest accepted relative residual of a Riccati equation."""
@@ -50,7 +50,7 @@ class KalmanDesign:
         Sampling time, s.
     """
 
-    stack: Stack
+    stack: StackedDecompositions
     process: Floats
     noise: Floats
     own: Floats
@@ -146,7 +146,7 @@ def design(
                     "not-definite", f"{name} is not a covariance: not symmetric, or not positive semidefinite"
                 )
             )
-    refuse(problems)
+    raise_if_any(problems)
     whole = stack(decompose(A, C, slowest=slowest, tol=tol), B)
     own = block_diag(*(np.ones((part.t.size, 1)) for part in whole.parts))
     process = whole.phi @ Q @ whole.phi.T

@@ -22,8 +22,15 @@ from typing import Literal
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, frozen, spectral_radius
-from gridsec.errors import DesignInfeasible, InputInvalid, Problem, no_choice, refuse
-from gridsec.observers.parts import Part, Stack, decompose, heard, riccati, stack
+from gridsec.errors import DesignInfeasible, InputInvalid, Problem, no_choice, raise_if_any
+from gridsec.observers.parts import (
+    SensorDecomposition,
+    StackedDecompositions,
+    decompose,
+    heard,
+    riccati,
+    stack,
+)
 
 LONGEST = 1 << 17
 """Largest number of steps within which an observer's error must have halved for good."""
@@ -52,7 +59,7 @@ class Bounds:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Envelope:
+class ErrorEnvelope:
     """Bound of one observer's error without attack: |v(k)| <= |F^k| |v(0)| + limit.
 
     Attributes
@@ -101,11 +108,11 @@ class LuenbergerDesign:
         Sampling time, s.
     """
 
-    stack: Stack
+    stack: StackedDecompositions
     L: Floats
     F: Floats
     bounds: Bounds
-    envelopes: tuple[Envelope, ...]
+    envelopes: tuple[ErrorEnvelope, ...]
     step_norm: Floats
     period: float
 
@@ -132,7 +139,7 @@ class LuenbergerState:
     age: Ints
 
 
-def riccati_gain(part: Part, process: Floats, noise: float, *, rate: float) -> Floats:
+def riccati_gain(part: SensorDecomposition, process: Floats, noise: float, *, rate: float) -> Floats:
     """L of the stationary Kalman predictor, with a prescribed decay of the observable part.
 
     With rate 1 the Riccati equation is that of (S, t). Below 1 it is that of the observable block over
@@ -241,7 +248,7 @@ def design(
             [Problem("negative", "bounds of disturbance and noise must be numbers and cannot be negative")]
         )
     if isinstance(gains, str):
-        refuse(no_choice("gains", ("riccati",), gains))
+        raise_if_any(no_choice("gains", ("riccati",), gains))
         weight = bounds.process**2 * E @ E.T
         if np.any(noise == 0.0):
             raise InputInvalid(
@@ -277,7 +284,9 @@ def design(
     )
 
 
-def envelope(part: Part, gain: Floats, process: float, noise: float, E: Floats) -> Envelope:
+def envelope(
+    part: SensorDecomposition, gain: Floats, process: float, noise: float, E: Floats
+) -> ErrorEnvelope:
     """Bound of one partial observer's error without attack.
 
     Parameters
@@ -299,12 +308,12 @@ def envelope(part: Part, gain: Floats, process: float, noise: float, E: Floats) 
             "partial observer", f"spectral radius {radius:.6g} of S - L t", 1.0 - radius, code="unstable"
         )
     if not part.t.size:
-        return Envelope(frozen(np.array([1.0, 0.0])), 0.0)
+        return ErrorEnvelope(frozen(np.array([1.0, 0.0])), 0.0)
     powers, sizes = _powers(F)
     by_noise = np.linalg.norm(powers[:-1] @ gain, axis=1) * noise
     by_process = np.linalg.norm(powers[:-1] @ (part.basis.T @ E), 2, axis=(1, 2)) * process
     limit = float(np.sum(by_noise + by_process) / (1.0 - sizes[-1]))
-    return Envelope(frozen(sizes), limit)
+    return ErrorEnvelope(frozen(sizes), limit)
 
 
 def _powers(F: Floats) -> tuple[Floats, Floats]:
@@ -322,7 +331,9 @@ def _powers(F: Floats) -> tuple[Floats, Floats]:
     return powers, sizes
 
 
-def geometric(part: Part, gain: Floats, process: float, noise: float, E: Floats, *, beta: float) -> Envelope:
+def geometric(
+    part: SensorDecomposition, gain: Floats, process: float, noise: float, E: Floats, *, beta: float
+) -> ErrorEnvelope:
     """The paper's own bound, with the smallest constants eta_F, eta_L, eta_Z for a given beta.
 
     Parameters
@@ -358,7 +369,7 @@ def geometric(part: Part, gain: Floats, process: float, noise: float, E: Floats,
     eta_f = float(sizes.max())
     eta_l = float(np.max(np.linalg.norm(powers @ gain, axis=1)))
     eta_z = float(np.max(np.linalg.norm(powers @ (part.basis.T @ E), 2, axis=(1, 2))))
-    return Envelope(frozen(np.array([eta_f, beta])), (eta_l * noise + eta_z * process) / (1.0 - beta))
+    return ErrorEnvelope(frozen(np.array([eta_f, beta])), (eta_l * noise + eta_z * process) / (1.0 - beta))
 
 
 def init(design: LuenbergerDesign, t: float, x: Floats, error: float = np.inf) -> LuenbergerState:

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 from scipy.linalg import expm
 
 from gridsec.arrays import Floats, Ints, exponential_integrals, frozen, perron_bound
-from gridsec.errors import FeederInvalid, InputInvalid, Problem, refuse
+from gridsec.errors import FeederInvalid, InputInvalid, Problem, raise_if_any
 from gridsec.grid.droop import Droop
 from gridsec.grid.network import LinDistFlow, Network, Power
 from gridsec.grid.three_phase import CustomerFlow, ThreePhaseFeeder, lindist3flow, per_customer
@@ -189,7 +189,7 @@ class Lure:
                     "an upper slope is below its lower one, which is 0 by default; `Lure.of` takes another",
                 )
             )
-        refuse(wrong)
+        raise_if_any(wrong)
 
     @classmethod
     def of(
@@ -366,7 +366,7 @@ def rest(h: float, policy: StepPolicy) -> float:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Transition:
+class LureTransition:
     """Quantities of a step of length h that do not depend on x and u.
 
     Attributes
@@ -390,7 +390,7 @@ class Transition:
     policy: StepPolicy
 
 
-def transition(lure: Lure, h: float, policy: StepPolicy = POLICY) -> Transition:
+def transition(lure: Lure, h: float, policy: StepPolicy = POLICY) -> LureTransition:
     """Prepare steps of a fixed length.
 
     The number of substeps follows the fastest rate. A state of a diagonal A that is faster than `rest` is
@@ -426,7 +426,7 @@ def transition(lure: Lure, h: float, policy: StepPolicy = POLICY) -> Transition:
     most = rest(h, policy)
     if -slowest >= most:
         empty = np.zeros(0)
-        return Transition(h, 0, empty, empty, empty, policy)
+        return LureTransition(h, 0, empty, empty, empty, policy)
     slowed = np.ones(own.size)
     if diagonal and fastest > most:
         fastest, slowed = most, np.divide(most, np.abs(own), out=slowed, where=own < -most)
@@ -437,7 +437,7 @@ def transition(lure: Lure, h: float, policy: StepPolicy = POLICY) -> Transition:
     s = h / count
     if diagonal:
         decay, one, two = exponential_integrals(own * s)
-        return Transition(h, count, decay, slowed * s * one, slowed * s * two, policy)
+        return LureTransition(h, count, decay, slowed * s * one, slowed * s * two, policy)
     n = own.size
     # One exponential of a block matrix contains both integrals in its first row.
     block = np.zeros((3 * n, 3 * n))
@@ -445,13 +445,13 @@ def transition(lure: Lure, h: float, policy: StepPolicy = POLICY) -> Transition:
     block[:n, n : 2 * n] = s * np.eye(n)
     block[n : 2 * n, 2 * n :] = np.eye(n)
     full = expm(block)
-    return Transition(h, count, full[:n, :n], full[:n, n : 2 * n], full[:n, 2 * n :], policy)
+    return LureTransition(h, count, full[:n, :n], full[:n, n : 2 * n], full[:n, 2 * n :], policy)
 
 
 _PERRON_ROUNDS = 8
 
 
-def step(prepared: Transition, lure: Lure, x: Floats, u: Floats) -> Floats:
+def step(prepared: LureTransition, lure: Lure, x: Floats, u: Floats) -> Floats:
     """State after one prepared step, with u constant.
 
     Parameters

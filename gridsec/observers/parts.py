@@ -22,7 +22,7 @@ from gridsec.errors import DesignInfeasible, InputInvalid, Problem
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Part:
+class SensorDecomposition:
     """Decomposition of an n-dimensional state for one sensor: an orthonormal basis in three pieces.
 
     Attributes
@@ -55,7 +55,7 @@ class Part:
         return np.hstack([self.observable, self.fading])
 
 
-def decompose(A: Floats, C: Floats, *, slowest: float, tol: float) -> tuple[Part, ...]:
+def decompose(A: Floats, C: Floats, *, slowest: float, tol: float) -> tuple[SensorDecomposition, ...]:
     """Kalman decomposition for every single sensor.
 
     The unobservable motion has eigenvalues of its own. Modes below `slowest` in modulus go into `fading`, the
@@ -103,7 +103,7 @@ def decompose(A: Floats, C: Floats, *, slowest: float, tol: float) -> tuple[Part
     return tuple(_part(A, c, row, slowest, tol) for c, row in zip(C, unit_rows(C, tol=tol), strict=True))
 
 
-def _part(A: Floats, c: Floats, row: Floats, slowest: float, tol: float) -> Part:
+def _part(A: Floats, c: Floats, row: Floats, slowest: float, tol: float) -> SensorDecomposition:
     """Decomposition for the sensor with row c, of length one in `row`."""
     seen, unseen = _krylov(A, row, tol)
     hidden_count, turn = 0, np.zeros((0, 0))
@@ -116,7 +116,9 @@ def _part(A: Floats, c: Floats, row: Floats, slowest: float, tol: float) -> Part
     rest = unseen @ turn
     hidden, fading = rest[:, :hidden_count], rest[:, hidden_count:]
     Z = np.hstack([seen, fading])
-    return Part(frozen(seen), frozen(fading), frozen(hidden), frozen(Z.T @ A @ Z), frozen(c @ Z))
+    return SensorDecomposition(
+        frozen(seen), frozen(fading), frozen(hidden), frozen(Z.T @ A @ Z), frozen(c @ Z)
+    )
 
 
 def _krylov(A: Floats, row: Floats, tol: float) -> tuple[Floats, Floats]:
@@ -135,7 +137,7 @@ def _krylov(A: Floats, row: Floats, tol: float) -> tuple[Floats, Floats]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Stack:
+class StackedDecompositions:
     """All parts, stacked. mu is the sum of the parts' sizes.
 
     Attributes
@@ -156,7 +158,7 @@ class Stack:
     lee2018 (4.2.9), (4.2.10), (4.2.5).
     """
 
-    parts: tuple[Part, ...]
+    parts: tuple[SensorDecomposition, ...]
     first: Ints
     phi: Floats
     S: Floats
@@ -173,7 +175,7 @@ class Stack:
         return tuple(self.phi[self.rows(i)] for i in range(len(self.parts)))
 
 
-def stack(parts: Sequence[Part], B: Floats) -> Stack:
+def stack(parts: Sequence[SensorDecomposition], B: Floats) -> StackedDecompositions:
     """Stack the parts.
 
     Parameters
@@ -189,7 +191,7 @@ def stack(parts: Sequence[Part], B: Floats) -> Stack:
     for i, part in enumerate(parts):
         T[i, first[i] : first[i + 1]] = part.t
     S = block_diag(*(part.S for part in parts))
-    return Stack(
+    return StackedDecompositions(
         tuple(parts), frozen_ints(first), frozen(phi), frozen(S), frozen(T), frozen(phi @ np.asarray(B))
     )
 

@@ -30,7 +30,7 @@ from typing import Literal
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, frozen
-from gridsec.errors import DesignInfeasible, InputInvalid, Problem, refuse
+from gridsec.errors import DesignInfeasible, InputInvalid, Problem, raise_if_any
 from gridsec.observers.lmi.sampled import DiscreteLure, sample
 from gridsec.observers.lmi.unknown_input import (
     ErrorSystem,
@@ -98,7 +98,7 @@ class UnknownInputPlant:
             problems.append(Problem("shape", f"drift has shape {self.drift.shape}; expected ({n}, d)"))
         if self.span.shape != (n,) or not np.all(self.span > 0.0):
             problems.append(Problem("not-positive", f"span must be positive, of shape ({n},)"))
-        refuse(problems)
+        raise_if_any(problems)
 
     @property
     def scale(self) -> Floats:
@@ -357,7 +357,7 @@ def pairs_text(pairs: Sequence[Pair]) -> str:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class UnknownInputDesign:
+class UnknownInputObserver:
     """Stacked observers. c observers, n states, r inputs, p sensors.
 
     Attributes
@@ -399,7 +399,7 @@ class UnknownInputDesign:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class UnknownInputState:
+class UnknownInputObserverState:
     """State of the observers. c observers, n states, p sensors, l inputs.
 
     Attributes
@@ -434,7 +434,7 @@ def design(
     multiplier: Multiplier = "diagonal",
     tolerance: float = 1e-9,
     rounding: float = 1e-9,
-) -> UnknownInputDesign:
+) -> UnknownInputObserver:
     """Design the observers of several pairs; impossible ones are reported in `missing`.
 
     Parameters
@@ -459,7 +459,9 @@ def design(
     ValueError
         If `rates` is empty, or `multiplier` is unknown.
     """
-    refuse([] if len(rates) else [Problem("missing", "rates are empty; at least one contraction is needed")])
+    raise_if_any(
+        [] if len(rates) else [Problem("missing", "rates are empty; at least one contraction is needed")]
+    )
     templates: dict[tuple[int, int], UnknownInputTemplate] = {}
     made: list[tuple[Pair, ErrorSystem, UnknownInputGains]] = []
     missing: list[Missing] = []
@@ -507,7 +509,7 @@ def _stack(
     made: Sequence[tuple[Pair, ErrorSystem, UnknownInputGains]],
     missing: tuple[Missing, ...],
     rounding: float,
-) -> UnknownInputDesign:
+) -> UnknownInputObserver:
     c, n, p = len(made), len(plant.system.A), len(plant.noise)
     sensors = np.zeros((c, p), dtype=np.bool_)
     inject, K, blind = np.zeros((c, n, p)), np.zeros((c, n, p)), np.zeros((c, n, n))
@@ -531,7 +533,7 @@ def _stack(
         slip[i] = rounding * np.sqrt(np.sum(np.abs(gains.P)))
     masks = np.array(sensors)
     masks.flags.writeable = False
-    return UnknownInputDesign(
+    return UnknownInputObserver(
         plant=plant,
         pairs=tuple(pair for pair, _, _ in made),
         missing=missing,
@@ -550,8 +552,8 @@ def _stack(
 
 
 def init(
-    design: UnknownInputDesign, t: float, x: Floats | None = None, radius: Floats | None = None
-) -> UnknownInputState:
+    design: UnknownInputObserver, t: float, x: Floats | None = None, radius: Floats | None = None
+) -> UnknownInputObserverState:
     """Initial state of all observers, at the same estimate.
 
     Parameters
@@ -567,7 +569,7 @@ def init(
     start = np.zeros(n) if x is None else np.asarray(x, dtype=np.float64)
     away = np.abs(start) + design.plant.span if radius is None else np.asarray(radius, dtype=np.float64)
     level = _levels(design, np.tile(away, (count, 1)))
-    return UnknownInputState(
+    return UnknownInputObserverState(
         t=float(t),
         x=np.tile(start, (count, 1)),
         level=level,
@@ -579,7 +581,7 @@ def init(
     )
 
 
-def _levels(design: UnknownInputDesign, box: Floats) -> Floats:
+def _levels(design: UnknownInputObserver, box: Floats) -> Floats:
     """Upper bound of `sqrt(e^T P e)` in each box; (c,)."""
     out = np.empty(len(box))
     for i, (gains, half) in enumerate(zip(design.gains, box, strict=True)):
@@ -588,8 +590,8 @@ def _levels(design: UnknownInputDesign, box: Floats) -> Floats:
 
 
 def step(
-    design: UnknownInputDesign, state: UnknownInputState, y: Floats, u: Floats, seen: Bools
-) -> UnknownInputState:
+    design: UnknownInputObserver, state: UnknownInputObserverState, y: Floats, u: Floats, seen: Bools
+) -> UnknownInputObserverState:
     """Process the readings of one tick. The first ones are only stored: an observer needs two.
 
     Parameters
@@ -632,10 +634,10 @@ def step(
         lost = np.abs(free[~able]) + plant.span
         box[~able] = lost
         level[~able] = _levels(design, box)[~able]
-    return UnknownInputState(state.t + system.h, x, level, box, now, drive, heard, able)
+    return UnknownInputObserverState(state.t + system.h, x, level, box, now, drive, heard, able)
 
 
-def _grown(design: UnknownInputDesign, box: Floats) -> Floats:
+def _grown(design: UnknownInputObserver, box: Floats) -> Floats:
     """`shrink box + floor`, with infinite entries kept out of products with zero."""
     endless = ~np.isfinite(box)
     image = np.einsum("cij,cj->ci", design.shrink, np.where(endless, 0.0, box))
@@ -643,7 +645,7 @@ def _grown(design: UnknownInputDesign, box: Floats) -> Floats:
     return np.where(reached, np.inf, image + design.floor)
 
 
-def outputs(design: UnknownInputDesign, state: UnknownInputState, u: Floats) -> Floats:
+def outputs(design: UnknownInputObserver, state: UnknownInputObserverState, u: Floats) -> Floats:
     """Expected reading of every sensor by every observer, `C x_hat + D u`; (c, p).
 
     Parameters

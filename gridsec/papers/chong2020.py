@@ -30,7 +30,7 @@ from gridsec.observers.gains import CircleGains, margin, options_for
 from gridsec.observers.gains import stacked as in_one
 from gridsec.observers.lmi import solve_many
 from gridsec.observers.lure import Lure, close_loop, equilibrium, known_input
-from gridsec.papers.claims import Claim, Figure, Line, Panel, Reproduction, at_most, number
+from gridsec.papers.claims import Claim, FigureCurve, Panel, PaperFigure, Reproduction, at_most, number
 
 CUSTOMERS = 5
 LIARS = 2
@@ -49,7 +49,7 @@ GAINS = {"(12)": "L, K of (12)", "direct": "L = 0, K = E_J"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Setting:
+class Chong2020Feeder:
     """Feeder of the paper's Figure 2, per unit on 100 kVA and 230 V.
 
     Attributes
@@ -71,7 +71,7 @@ class Setting:
 
 
 @cache
-def setting(customers: int = CUSTOMERS) -> Setting:
+def setting(customers: int = CUSTOMERS) -> Chong2020Feeder:
     """Line of N customers on an overhead line, busbar at 0.97 pu, 6 kW and 2 kvar drawn by each."""
     base_volt, base_kva = 230.0, 100.0
     ohm = 3.0 * base_volt**2 / (1e3 * base_kva)
@@ -92,7 +92,7 @@ def setting(customers: int = CUSTOMERS) -> Setting:
     droop = fleet(every, "ieee1547-b", np.full(customers, 20.0), base_kva)
     load = np.full(customers, 1.0 / base_kva)
     w = known_input(feeder.linear(), droop.vbar, -6.0 * load, -2.0 * load, 0.97**2)
-    return Setting(feeder, droop, close_loop(feeder, droop, every), w)
+    return Chong2020Feeder(feeder, droop, close_loop(feeder, droop, every), w)
 
 
 def reported(z: Floats, vbar: float, alpha: Floats) -> Floats:
@@ -125,7 +125,7 @@ def attack(t: float) -> Floats:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Run:
+class Chong2020Run:
     """Plant and all observers over time. T times, N customers, o observers.
 
     Attributes
@@ -238,14 +238,14 @@ def observers(of: Design, customers: int = CUSTOMERS, liars: int = LIARS) -> Obs
 
 
 def observe(
-    of: Setting,
+    of: Chong2020Feeder,
     made: Observers,
     alpha: Callable[[float], Floats],
     *,
     x: Floats,
     start: Floats,
     times: Floats = TIMES,
-) -> Run:
+) -> Chong2020Run:
     """Integrate plant and both banks (11) together, in continuous time, and select by (6) and (7).
 
     Parameters
@@ -291,7 +291,7 @@ def observe(
     z = truth @ lure.H.T + w
     picked = estimates[np.arange(len(times)), chosen]
     said = reported(z, vbar, np.stack([alpha(t) for t in times]))
-    return Run(
+    return Chong2020Run(
         t=times,
         x=truth,
         estimates=estimates,
@@ -330,7 +330,7 @@ def envelope(made: Observers, errors: Floats, t: Floats) -> Floats:
 
 
 @cache
-def under_attack(of: Design = "(12)") -> tuple[Run, Floats, Floats]:
+def under_attack(of: Design = "(12)") -> tuple[Chong2020Run, Floats, Floats]:
     """The paper's setting with two of five meters manipulated: run, and envelopes of (8) and (20).
 
     The plant starts near its equilibrium, every observer at random within the inverters' limits, equally for
@@ -345,7 +345,7 @@ def under_attack(of: Design = "(12)") -> tuple[Run, Floats, Floats]:
     return run, state, np.abs(at.lure.H).sum(axis=1).max() * state
 
 
-def exact_start(of: Design = "(12)") -> Run:
+def exact_start(of: Design = "(12)") -> Chong2020Run:
     """Counterexample to (8) as printed: the selected estimate starts exact, and has an error later.
 
     Three meters; meter 1 is manipulated from the start. The observers of {1, 2}, {1} and {2} start in the
@@ -413,18 +413,18 @@ def _design_claims(of: Design) -> list[Claim]:
     ]
 
 
-def _figure() -> Figure:
+def _figure() -> PaperFigure:
     run = under_attack()[0]
     v, said, back = np.sqrt(run.v2), np.sqrt(run.v2_reported), np.sqrt(run.v2_estimate)
     voltages = [
         line
         for i in (1, 4)
         for line in (
-            Line(f"customer {i + 1}, true", run.t, v[:, i]),
-            Line(
+            FigureCurve(f"customer {i + 1}, true", run.t, v[:, i]),
+            FigureCurve(
                 f"customer {i + 1}, reported", run.t, np.where(said[:, i] < 1.2, said[:, i], np.nan), "dotted"
             ),
-            Line(f"customer {i + 1}, reconstructed", run.t, back[:, i], "dashed"),
+            FigureCurve(f"customer {i + 1}, reconstructed", run.t, back[:, i], "dashed"),
         )
     ]
     panels = (
@@ -446,7 +446,7 @@ def _figure() -> Figure:
             "t in s",
             "number of the set",
             tuple(
-                Line(GAINS[of], run.t, under_attack(of)[0].chosen.astype(np.float64), "steps")
+                FigureCurve(GAINS[of], run.t, under_attack(of)[0].chosen.astype(np.float64), "steps")
                 for of in DESIGNS
             ),
         ),
@@ -454,10 +454,10 @@ def _figure() -> Figure:
     caption = (
         "Line feeder of section VII, five customers, two meters manipulated: the selected estimate converges."
     )
-    return Figure("chong2020-line", caption, panels)
+    return PaperFigure("chong2020-line", caption, panels)
 
 
-def _decay(of: Design, what: Literal["state", "voltage"]) -> tuple[Line, Line]:
+def _decay(of: Design, what: Literal["state", "voltage"]) -> tuple[FigureCurve, FigureCurve]:
     """Return logarithms of an error of the selected estimate and of its envelope."""
     run, state, voltage = under_attack(of)
     tiny = 1e-12  # pu, keeps an error of exactly zero on the logarithmic axis
@@ -466,6 +466,6 @@ def _decay(of: Design, what: Literal["state", "voltage"]) -> tuple[Line, Line]:
         error, limit = np.abs(run.v2 - run.v2_estimate).max(axis=1), voltage
     name = "(8)" if what == "state" else "(20)"
     return (
-        Line(f"selected, {GAINS[of]}", run.t, np.log10(error + tiny)),
-        Line(f"envelope {name}, {GAINS[of]}", run.t, np.log10(limit + tiny), "dashed"),
+        FigureCurve(f"selected, {GAINS[of]}", run.t, np.log10(error + tiny)),
+        FigureCurve(f"envelope {name}, {GAINS[of]}", run.t, np.log10(limit + tiny), "dashed"),
     )

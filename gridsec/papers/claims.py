@@ -49,7 +49,7 @@ class Claim:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Line:
+class FigureCurve:
     """One curve.
 
     Attributes
@@ -97,11 +97,11 @@ class Panel:
     title: str
     x_label: str
     y_label: str
-    lines: tuple[Line, ...]
+    lines: tuple[FigureCurve, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Figure:
+class PaperFigure:
     """Panels of one figure, drawn one below the other.
 
     Attributes
@@ -135,7 +135,7 @@ class Reproduction:
 
     paper: str
     claims: tuple[Claim, ...]
-    figures: tuple[Figure, ...] = field(default=())
+    figures: tuple[PaperFigure, ...] = field(default=())
 
     @property
     def unmet(self) -> tuple[Claim, ...]:

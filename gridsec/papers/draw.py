@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Canvas
 
-    from gridsec.papers.claims import Figure, Line, Panel
+    from gridsec.papers.claims import FigureCurve, Panel, PaperFigure
 
 DPI: Final = 150
 WIDTH: Final = 7.4  # inches, with room for legends beside the axes
@@ -108,7 +108,7 @@ def available() -> bool:
     return find_spec("matplotlib") is not None
 
 
-def draw(figure: Figure) -> Canvas:
+def draw(figure: PaperFigure) -> Canvas:
     """Draw a figure: its caption, then its panels one below the other, legends beside the axes.
 
     A label has the same colour in every panel. Neighbouring panels over the same abscissa share it.
@@ -150,7 +150,7 @@ def draw(figure: Figure) -> Canvas:
     return canvas
 
 
-def png(figure: Figure) -> bytes:
+def png(figure: PaperFigure) -> bytes:
     """Draw a figure as a PNG; the same data give the same bytes.
 
     Raises
@@ -360,6 +360,6 @@ def _same_abscissa(upper: Panel, lower: Panel) -> bool:
     return bool(np.allclose(a, b, rtol=0.0, atol=0.01 * max(a[1] - a[0], b[1] - b[0])))
 
 
-def _span(lines: tuple[Line, ...]) -> tuple[float, float]:
+def _span(lines: tuple[FigureCurve, ...]) -> tuple[float, float]:
     every = np.concatenate([line.x for line in lines]) if lines else np.empty(0)
     return (float(np.nanmin(every)), float(np.nanmax(every))) if every.size else (0.0, 0.0)

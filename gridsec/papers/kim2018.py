@@ -18,8 +18,8 @@ import numpy as np
 from gridsec.arrays import Floats
 from gridsec.observers.high_gain import (
     HighGainDesign,
+    HighGainEstimate,
     Inverse,
-    Outcome,
     Partial,
     System,
     affine,
@@ -44,9 +44,9 @@ from gridsec.observers.high_gain.intervals import Bracket
 from gridsec.observers.high_gain.redundancy import upper_proven
 from gridsec.papers.claims import (
     Claim,
-    Figure,
-    Line,
+    FigureCurve,
     Panel,
+    PaperFigure,
     Reproduction,
     at_most,
     number,
@@ -326,7 +326,7 @@ def attacks(t: Floats, size: float = ATTACK) -> Floats:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Run:
+class Kim2018Run:
     """A simulation. k instants, N entries of z.
 
     Attributes
@@ -347,7 +347,7 @@ class Run:
     x: Floats
     z: Floats
     attack: Floats
-    outcomes: tuple[Outcome, ...]
+    outcomes: tuple[HighGainEstimate, ...]
 
     @property
     def sigma(self) -> Floats:
@@ -367,7 +367,7 @@ def simulate(
     seconds: float = 25.0,
     seed: int = 1,
     deviation: float | None = None,
-) -> Run:
+) -> Kim2018Run:
     """The paper's simulation: 25 s in steps of 0.02 s, noise uniform within 1e-6.
 
     Parameters
@@ -394,10 +394,10 @@ def simulate(
         state, outcome = step(made, state, y[k], u(t[k]), seen, STEP)
         estimates.append(state.z[made.system.mask])
         outcomes.append(outcome)
-    return Run(t[1:], x[1:], np.array(estimates), added[1:], tuple(outcomes))
+    return Kim2018Run(t[1:], x[1:], np.array(estimates), added[1:], tuple(outcomes))
 
 
-def switching(run: Run, start: float, stop: float) -> str:
+def switching(run: Kim2018Run, start: float, stop: float) -> str:
     """Sets in use between two times, as in "1 -> 2 -> 3".
 
     Parameters
@@ -471,7 +471,7 @@ def _table_claims(model: System) -> list[Claim]:
     return out
 
 
-def _simulation_claims(made: HighGainDesign, run: Run) -> list[Claim]:
+def _simulation_claims(made: HighGainDesign, run: Kim2018Run) -> list[Claim]:
     place = "section IV, Figure 1"
     error = np.max(np.abs(run.estimates - run.x), axis=1)
     quiet = ((run.t > 3.0) & (run.t < 6.0)) | ((run.t > 6.5) & (run.t < 17.0)) | (run.t > 17.5)
@@ -494,29 +494,29 @@ def _simulation_claims(made: HighGainDesign, run: Run) -> list[Claim]:
     ]
 
 
-def _third(made: HighGainDesign, run: Run) -> Floats:
+def _third(made: HighGainDesign, run: Kim2018Run) -> Floats:
     """Error of the estimate by the third set alone, (k,)."""
     inverse = made.inverses[2]
     estimate = inverse(run.z[:, made.system.pick(inverse.sensors)])
     return np.asarray(np.max(np.abs(estimate - run.x), axis=1))
 
 
-def _figure(made: HighGainDesign, run: Run) -> Figure:
+def _figure(made: HighGainDesign, run: Kim2018Run) -> PaperFigure:
     inverse = made.inverses[2]
     third = inverse(run.z[:, made.system.pick(inverse.sensors)]) - run.x
     error = run.estimates - run.x
-    waves = tuple(Line(f"a{i + 1}", run.t, run.attack[:, i], "steps") for i in range(4))
-    return Figure(
+    waves = tuple(FigureCurve(f"a{i + 1}", run.t, run.attack[:, i], "steps") for i in range(4))
+    return PaperFigure(
         "kim2018-figure-1",
         "Sensor 3 is attacked on [6, 8] s and sensor 2 on [17, 20] s; the search leaves each out in turn",
         (
             Panel("(a) attacks", "t in s", "a(t)", waves),
-            Panel("(b) set in use", "t in s", "sigma(t)", (Line("", run.t, run.sigma, "steps"),)),
+            Panel("(b) set in use", "t in s", "sigma(t)", (FigureCurve("", run.t, run.sigma, "steps"),)),
             Panel("(c) error with switching", "t in s", "xhat - x", _components(run.t, error)),
             Panel("(d) error of the third set alone", "t in s", "xhat - x", _components(run.t, third)),
         ),
     )
 
 
-def _components(t: Floats, values: Floats) -> tuple[Line, ...]:
-    return tuple(Line(f"x{k + 1}", t, values[:, k]) for k in range(values.shape[1]))
+def _components(t: Floats, values: Floats) -> tuple[FigureCurve, ...]:
+    return tuple(FigureCurve(f"x{k + 1}", t, values[:, k]) for k in range(values.shape[1]))

@@ -18,7 +18,16 @@ from gridsec.arrays import Floats, spectral_radius
 from gridsec.observers import kalman, luenberger
 from gridsec.observers.luenberger import Bounds
 from gridsec.papers import lee2018_chapter5
-from gridsec.papers.claims import Claim, Figure, Line, Panel, Reproduction, at_most, number, statement
+from gridsec.papers.claims import (
+    Claim,
+    FigureCurve,
+    Panel,
+    PaperFigure,
+    Reproduction,
+    at_most,
+    number,
+    statement,
+)
 from gridsec.secure.decode import partial_bounded, partial_gaussian
 from gridsec.secure.decode.partial_bounded import BoundedDesign
 from gridsec.secure.decode.partial_gaussian import GaussianDesign
@@ -62,7 +71,7 @@ RATE, SLOWEST, TOL = 0.998, 1.0 - 1e-6, 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Plant:
+class SampledPlant:
     """A sampled plant and its continuous origin.
 
     Attributes
@@ -83,7 +92,7 @@ class Plant:
     E: Floats
 
 
-def plant(disturbance: Literal["continuous", "sampled"] = "continuous") -> Plant:
+def plant(disturbance: Literal["continuous", "sampled"] = "continuous") -> SampledPlant:
     """The three-inertia system; states theta_1, its speed, theta_2, its speed, theta_3, its speed.
 
     Parameters
@@ -109,10 +118,10 @@ def plant(disturbance: Literal["continuous", "sampled"] = "continuous") -> Plant
     sampled = expm(both * PERIOD)
     A, held = sampled[:6, :6], sampled[:6, 6:]
     C = np.delete(ROWS_PRINTED, 2, axis=0)
-    return Plant(A_c, B_c, A, held @ B_c, C, held if disturbance == "continuous" else np.eye(6))
+    return SampledPlant(A_c, B_c, A, held @ B_c, C, held if disturbance == "continuous" else np.eye(6))
 
 
-def estimator(model: Plant, *, slowest: float = SLOWEST) -> BoundedDesign:
+def estimator(model: SampledPlant, *, slowest: float = SLOWEST) -> BoundedDesign:
     """Partial Luenberger observers and Algorithm 4.1 for one attacked sensor.
 
     Parameters
@@ -127,7 +136,7 @@ def estimator(model: Plant, *, slowest: float = SLOWEST) -> BoundedDesign:
     return partial_bounded.design(observers, 1, tol=TOL)
 
 
-def gaussian_estimator(model: Plant, *, false_alarm: float = 1e-4) -> GaussianDesign:
+def gaussian_estimator(model: SampledPlant, *, false_alarm: float = 1e-4) -> GaussianDesign:
     """Partial Kalman filters and Algorithm 4.2, with the variances of the bounded signals.
 
     A vector uniform in the ball of radius r in R^6 has the covariance `r^2 / 8 I`; a number uniform in
@@ -139,7 +148,7 @@ def gaussian_estimator(model: Plant, *, false_alarm: float = 1e-4) -> GaussianDe
     return partial_gaussian.design(filters, 1, false_alarm=false_alarm, tol=1e-10, refresh=0.02)
 
 
-def conventional_gain(model: Plant) -> Floats:
+def conventional_gain(model: SampledPlant) -> Floats:
     """L of one observer (4.2.1) on all sensors, the stationary Kalman predictor.
 
     Returns
@@ -162,13 +171,13 @@ def reference(t: Floats) -> Floats:
     return np.where(t >= REFERENCE_START - 0.5 * PERIOD, REFERENCE, 0.0)
 
 
-def closed_loop(model: Plant) -> Floats:
+def closed_loop(model: SampledPlant) -> Floats:
     """Motion of (x, sum of reference - theta_3) under u = K x + K_I sum, for a known state; (7, 7)."""
     return np.block([[model.A + model.B @ FEEDBACK, model.B * INTEGRAL], [-model.C[[2]], np.eye(1)]])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Run:
+class Lee2018Run:
     """One simulation of T steps.
 
     Attributes
@@ -211,7 +220,7 @@ class _World:
     wanted: Floats
 
 
-def _world(model: Plant, t: Floats, seed: int, *, attacked: bool, normal: bool) -> _World:
+def _world(model: SampledPlant, t: Floats, seed: int, *, attacked: bool, normal: bool) -> _World:
     rng = np.random.default_rng(seed)
     steps, p = t.size, len(model.C)
     w = rng.standard_normal((steps, 6))
@@ -228,14 +237,14 @@ def _world(model: Plant, t: Floats, seed: int, *, attacked: bool, normal: bool) 
 
 
 def simulate(
-    model: Plant,
+    model: SampledPlant,
     design: BoundedDesign | GaussianDesign,
     *,
     seconds: float,
     seed: int = 1,
     attacked: bool = True,
     feedback: Literal["resilient", "conventional"] = "resilient",
-) -> Run:
+) -> Lee2018Run:
     """The closed loop of Figures 4.1 and 4.8, with an estimator in it and a conventional observer beside it.
 
     Parameters
@@ -281,7 +290,7 @@ def simulate(
             y = model.C @ x + world.n[k + 1] + world.lie[k + 1]
             if isinstance(design, GaussianDesign):
                 two, seen = partial_gaussian.step(design, two, y, u)
-    return Run(t, xs, hats, plains, bounds, disagree, searched, world.lie[:, 0], world.wanted, us)
+    return Lee2018Run(t, xs, hats, plains, bounds, disagree, searched, world.lie[:, 0], world.wanted, us)
 
 
 SECONDS = 6.0
@@ -310,7 +319,7 @@ def chapter4() -> Reproduction:
     return Reproduction("lee2018-4", claims, (_figure(run), _errors(run, gauss)))
 
 
-def _index_claims(model: Plant) -> list[Claim]:
+def _index_claims(model: SampledPlant) -> list[Claim]:
     place = "section 4.5"
     asymptotic = asymptotic_index(model.A, model.C, discrete=True, tol=TOL)
     enough = redundant_detectable(model.A, model.C, 2, discrete=True, tol=TOL)
@@ -360,7 +369,7 @@ def _memory_claims(made: BoundedDesign) -> list[Claim]:
     ]
 
 
-def _run_claims(model: Plant, made: BoundedDesign, run: Run) -> list[Claim]:
+def _run_claims(model: SampledPlant, made: BoundedDesign, run: Lee2018Run) -> list[Claim]:
     error = np.linalg.norm(run.x_hat - run.x, axis=1)
     late = run.t >= SETTLED
     on = run.t >= ATTACK_START + 0.1
@@ -399,7 +408,7 @@ def _run_claims(model: Plant, made: BoundedDesign, run: Run) -> list[Claim]:
     ]
 
 
-def _gauss_claims(run: Run) -> list[Claim]:
+def _gauss_claims(run: Lee2018Run) -> list[Claim]:
     error = np.linalg.norm(run.x_hat - run.x, axis=1)
     on = run.t >= ATTACK_START - 0.5 * PERIOD
     delay = float(run.t[on][np.argmax(run.searched[on])] - ATTACK_START)
@@ -421,27 +430,30 @@ def _gauss_claims(run: Run) -> list[Claim]:
     ]
 
 
-def _figure(run: Run) -> Figure:
+def _figure(run: Lee2018Run) -> PaperFigure:
     def states(k: int, number: int, name: str, unit: str) -> Panel:
         lines = (
-            Line("observer on all sensors", run.t, run.x_conventional[:, k], "dotted"),
-            Line("state", run.t, run.x[:, k]),
-            Line("estimate", run.t, run.x_hat[:, k], "dashed"),
+            FigureCurve("observer on all sensors", run.t, run.x_conventional[:, k], "dotted"),
+            FigureCurve("state", run.t, run.x[:, k]),
+            FigureCurve("estimate", run.t, run.x_hat[:, k], "dashed"),
         )
         return Panel(f"Figure 4.{number}: {name}", "t in s", f"{name} in {unit}", lines)
 
     panels = (
-        Panel("Figure 4.9: attack", "t in s", "a1 in rad", (Line("", run.t, run.attack),)),
+        Panel("Figure 4.9: attack", "t in s", "a1 in rad", (FigureCurve("", run.t, run.attack),)),
         states(0, 10, "theta 1", "rad"),
         states(3, 11, "speed of theta 2", "rad/s"),
         Panel(
             "Figure 4.12: tracking",
             "t in s",
             "rad",
-            (Line("reference", run.t, run.reference, "steps"), Line("theta 3", run.t, run.x[:, 4])),
+            (
+                FigureCurve("reference", run.t, run.reference, "steps"),
+                FigureCurve("theta 3", run.t, run.x[:, 4]),
+            ),
         ),
     )
-    return Figure(
+    return PaperFigure(
         "lee2018-figures-4-9-to-4-12",
         f"Three inertias: sensor 1 is manipulated from {ATTACK_START:g} s on, the reference steps at "
         f"{REFERENCE_START:g} s; the resilient estimate stays with the state, one on all sensors does not",
@@ -449,17 +461,17 @@ def _figure(run: Run) -> Figure:
     )
 
 
-def _errors(run: Run, gauss: Run) -> Figure:
+def _errors(run: Lee2018Run, gauss: Lee2018Run) -> PaperFigure:
     def size(hat: Floats, x: Floats) -> Floats:
         return np.asarray(np.log10(np.maximum(np.linalg.norm(hat - x, axis=1), 1e-12)), dtype=np.float64)
 
     lines = (
-        Line("bound of Theorem 4.3.2", run.t, np.log10(run.bound), "dotted"),
-        Line("observer on all sensors", run.t, size(run.x_conventional, run.x), "dashdot"),
-        Line("Algorithm 4.1", run.t, size(run.x_hat, run.x)),
-        Line("Algorithm 4.2", gauss.t, size(gauss.x_hat, gauss.x), "dashed"),
+        FigureCurve("bound of Theorem 4.3.2", run.t, np.log10(run.bound), "dotted"),
+        FigureCurve("observer on all sensors", run.t, size(run.x_conventional, run.x), "dashdot"),
+        FigureCurve("Algorithm 4.1", run.t, size(run.x_hat, run.x)),
+        FigureCurve("Algorithm 4.2", gauss.t, size(gauss.x_hat, gauss.x), "dashed"),
     )
-    return Figure(
+    return PaperFigure(
         "lee2018-errors-4",
         "Estimation errors of both decoders on the three-inertia system, with the guaranteed bound",
         (Panel("Estimation error", "t in s", "log10 of the error", lines),),

@@ -16,11 +16,20 @@ import numpy as np
 from gridsec.arrays import Floats
 from gridsec.observers.high_gain import HighGainDesign, design
 from gridsec.observers.high_gain.constants import decay_componentwise, decay_lee
-from gridsec.papers.claims import Claim, Figure, Line, Panel, Reproduction, number, rounded_up, statement
+from gridsec.papers.claims import (
+    Claim,
+    FigureCurve,
+    Panel,
+    PaperFigure,
+    Reproduction,
+    number,
+    rounded_up,
+    statement,
+)
 from gridsec.papers.kim2018 import (
     STEP,
     Z_BOUND,
-    Run,
+    Kim2018Run,
     lip_inverses,
     phi,
     printed_inverses,
@@ -131,16 +140,21 @@ def reproduce() -> Reproduction:
     return Reproduction("lee2018-5", claims, (_figure(run),))
 
 
-def _members(run: Run, before: float) -> str:
+def _members(run: Kim2018Run, before: float) -> str:
     last = [outcome for outcome in run.outcomes if outcome.t < before - 0.5 * STEP][-1]
     return "{" + ", ".join(str(i + 1) for i in np.flatnonzero(last.trusted)) + "}"
 
 
-def _figure(run: Run) -> Figure:
-    panels = [Panel("Figure 5.1: attack", "t in s", "a2(t)", (Line("a2", run.t, run.attack[:, 1], "steps"),))]
+def _figure(run: Kim2018Run) -> PaperFigure:
+    panels = [
+        Panel("Figure 5.1: attack", "t in s", "a2(t)", (FigureCurve("a2", run.t, run.attack[:, 1], "steps"),))
+    ]
     for k in range(3):
-        lines = (Line("state", run.t, run.x[:, k]), Line("estimate", run.t, run.estimates[:, k], "dashed"))
+        lines = (
+            FigureCurve("state", run.t, run.x[:, k]),
+            FigureCurve("estimate", run.t, run.estimates[:, k], "dashed"),
+        )
         panels.append(Panel(f"Figure 5.{k + 2}: x{k + 1}", "t in s", f"x{k + 1}(t)", lines))
-    return Figure(
+    return PaperFigure(
         "lee2018-figures-5-1-to-5-4", "Sensor 2 is attacked from 4 s on; set 2 replaces set 1", tuple(panels)
     )

@@ -34,7 +34,7 @@ from gridsec.observers.lmi.sampled import DiscreteLure, drift_error, sample
 from gridsec.observers.lure import Lure, equilibrium
 from gridsec.observers.lure import advance as advance_continuous
 from gridsec.papers import chong2020
-from gridsec.papers.claims import Claim, Figure, Line, Panel, Reproduction, number, statement
+from gridsec.papers.claims import Claim, FigureCurve, Panel, PaperFigure, Reproduction, number, statement
 from gridsec.secure import windows
 from gridsec.secure.windows import Rule, WindowDesign
 
@@ -148,7 +148,7 @@ def on_feeder(
     return FeederStudy(design, error, bound, tuple(verdicts))
 
 
-def feeder_figure() -> Figure:
+def feeder_figure() -> PaperFigure:
     """Algorithms 1 and 2 on a sampled feeder: the line of chong2020, section VII, read once a second.
 
     Meter 3 has a bias of 0.04 squared pu (2.1 % of the voltage) from 150 s on; windows have 20 steps.
@@ -177,16 +177,19 @@ def feeder_figure() -> Figure:
     window, meter = points(named)
     masks = study.design.observers.masks[1 : 1 + study.design.sets.count_large]
     labels = ["pi"] + ["pi_J, J without meter " + str(int(np.argmin(J)) + 1) for J in masks]
-    lines = [Line(label, t, column) for label, column in zip(labels, score.T, strict=True)]
-    lines.append(Line("threshold", t, np.full(t.size, study.design.detect_above), "dashed"))
+    lines = [FigureCurve(label, t, column) for label, column in zip(labels, score.T, strict=True)]
+    lines.append(FigureCurve("threshold", t, np.full(t.size, study.design.detect_above), "dashed"))
     panels = (
         Panel("Largest value in each window", "t in s", "pu of reactive power", tuple(lines)),
         Panel(
-            "Named", "t in s", "meter (0: none)", (Line("", t[window.astype(np.intp) - 1], meter, "points"),)
+            "Named",
+            "t in s",
+            "meter (0: none)",
+            (FigureCurve("", t[window.astype(np.intp) - 1], meter, "points"),),
         ),
     )
     caption = "Sampled line feeder, five meters with noise, one manipulated from 150 s on; proven thresholds."
-    return Figure("yang2019-feeder", caption, panels)
+    return PaperFigure("yang2019-feeder", caption, panels)
 
 
 DECAYS = (0.6, 0.8, 0.9, 0.95, 0.995)
@@ -357,7 +360,7 @@ def isolation_rates(design: WindowDesign, trace: windows.Trace, sensor: int, rul
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Setting:
+class FigureSetting:
     """Setting of one of the paper's four figures.
 
     Attributes
@@ -392,12 +395,12 @@ class Setting:
 DETECTED, ISOLATED = 1, 2
 """Attacked sensors for Algorithms 1 and 2, from 0."""
 SETTINGS = (
-    *(Setting(k, DETECTED, size) for k, size in enumerate(DETECTION, start=1)),
-    *(Setting(k, ISOLATED, size) for k, size in enumerate(ISOLATION, start=3)),
+    *(FigureSetting(k, DETECTED, size) for k, size in enumerate(DETECTION, start=1)),
+    *(FigureSetting(k, ISOLATED, size) for k, size in enumerate(ISOLATION, start=3)),
 )
 
 
-def figure(of: Setting) -> Figure:
+def figure(of: FigureSetting) -> PaperFigure:
     """Result of every window in one run in the setting of Figures 1 to 4, for N = 50, 100, 200.
 
     Detection is 0 or 1; isolation the numbers of the named sensors, 0 if there are none.
@@ -420,17 +423,17 @@ def figure(of: Setting) -> Figure:
             else:
                 y = windows.detection(trace.pi[0], design.detect_above, N).astype(np.float64)
                 x = np.arange(1.0, y.size + 1)
-            lines.append(Line(label, x, y, "points"))
+            lines.append(FigureCurve(label, x, y, "points"))
         what = "sensor named" if of.isolates else "detection(i)"
         panels.append(Panel(f"N = {N}", "window i", what, tuple(lines)))
     caption = (
         f"Setting of Figure {of.figure}, {of.text}, which is not reproduced: answers by {_threshold(of)} and "
         "by calibrated thresholds, which are not the paper's."
     )
-    return Figure(f"yang2019-figure-{of.figure}", caption, tuple(panels))
+    return PaperFigure(f"yang2019-figure-{of.figure}", caption, tuple(panels))
 
 
-def _threshold(of: Setting) -> str:
+def _threshold(of: FigureSetting) -> str:
     return "(19)" if of.isolates else "(10)"
 
 
@@ -505,7 +508,7 @@ def _no_false_alarm(at: Levels) -> Claim:
     return number(what, "(9)", 0, fired, unit=1)
 
 
-def _figure_claim(at: Levels, of: Setting, trace: windows.Trace) -> Claim:
+def _figure_claim(at: Levels, of: FigureSetting, trace: windows.Trace) -> Claim:
     """Return the rates of the paper's recipe, beside those of this project's thresholds and rule."""
     task = "windows naming sensor 3 alone" if of.isolates else "windows found attacked"
     recipe = f"Algorithm {1 + of.isolates}, {_threshold(of)} with simulated gains"
@@ -567,7 +570,7 @@ def _proposition_4() -> Claim:
     return replace(statement(what, "Proposition 4 (erratum)", "1, 2", named), why=why)
 
 
-def _figure_rates(at: Levels, traces: Sequence[windows.Trace]) -> Figure:
+def _figure_rates(at: Levels, traces: Sequence[windows.Trace]) -> PaperFigure:
     """Rates in the four settings over many runs."""
     N = np.array(LENGTHS, dtype=np.float64)
     kinds: tuple[tuple[str, WindowDesign, Rule], ...] = (
@@ -581,12 +584,12 @@ def _figure_rates(at: Levels, traces: Sequence[windows.Trace]) -> Figure:
         (True, "Isolation", "part of windows naming sensor 3 alone"),
     ):
         lines = [
-            Line(f"{of.text}, {label}", N, of.rates(design, trace, rule))
+            FigureCurve(f"{of.text}, {label}", N, of.rates(design, trace, rule))
             for of, trace in zip(SETTINGS, traces, strict=True)
             if of.isolates == isolates
             for label, design, rule in (kinds if isolates else kinds[:2])
         ]
         panels.append(Panel(title, "window length N", y_label, tuple(lines)))
-    return Figure(
+    return PaperFigure(
         "yang2019-rates", "Detection and isolation rates over 60 runs of 1000 steps.", tuple(panels)
     )

@@ -19,8 +19,8 @@ from gridsec.errors import InputInvalid, Problem
 from gridsec.observers.lmi.sampled import DiscreteLure, advance
 from gridsec.observers.unknown_input import Missing, UnknownInputPlant, exact, obstruction, pairs_text
 from gridsec.papers import yang2021_feeder
-from gridsec.papers.claims import Claim, Figure, Line, Panel, Reproduction, number, statement
-from gridsec.secure.isolation import Isolation, IsolationDesign, design, init, members, step, support
+from gridsec.papers.claims import Claim, FigureCurve, Panel, PaperFigure, Reproduction, number, statement
+from gridsec.secure.isolation import IsolationDesign, IsolationStep, design, init, members, step, support
 
 TOLERANCE = 1e-3
 """Tolerance of zero in (46), (47) after the steps of the figures."""
@@ -98,7 +98,7 @@ def missing_complete() -> tuple[Missing, ...]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Run:
+class Yang2021Run:
     """One simulation. T steps, n states, r inputs, p sensors.
 
     Attributes
@@ -122,7 +122,7 @@ class Run:
     a_y: Floats
     a_y_hat: Floats
     bound: Floats
-    answers: tuple[Isolation, ...]
+    answers: tuple[IsolationStep, ...]
 
     def named(self, last: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """Inputs and sensors (from 1) with a reconstructed attack above `TOLERANCE` in the `last` steps."""
@@ -142,7 +142,7 @@ def simulate(
     sensors: tuple[int, ...] = (1,),
     steps: int = STEPS,
     seed: int = 2021,
-) -> Run:
+) -> Yang2021Run:
     """Run an example: known inputs and attacks uniform and white, `x(0)` standard normal.
 
     Parameters
@@ -174,7 +174,7 @@ def simulate(
         answers.append(answer)
         x = advance(model.system, x, u[k]) + model.inputs @ a_u[k]
     late = np.array([answer.input_attack for answer in answers])
-    return Run(
+    return Yang2021Run(
         x=truth,
         x_hat=np.array([answer.x for answer in answers]),
         a_u=a_u,
@@ -187,7 +187,7 @@ def simulate(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Doubt:
+class IndistinguishableHistories:
     """Two histories with the same readings, each with no more attacks than assumed. T steps.
 
     Attributes
@@ -208,7 +208,7 @@ class Doubt:
     attacked: tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
 
 
-def doubt(example: int, size: float, steps: int = STEPS) -> Doubt:
+def doubt(example: int, size: float, steps: int = STEPS) -> IndistinguishableHistories:
     """Two indistinguishable histories of a printed example, with q = 1 or q_1 = q_2 = 1.
 
     Example 1: sensors 1 and 2 read the same, so that states that differ along (1, -1) differ in sensors 3 and
@@ -240,7 +240,7 @@ def doubt(example: int, size: float, steps: int = STEPS) -> Doubt:
     # Sensor 3 reports its reading of the second history, sensor 4 that of the first.
     y = honest[0].copy()
     y[:, 2] = honest[1][:, 2]
-    return Doubt(y, u, x, attacked)
+    return IndistinguishableHistories(y, u, x, attacked)
 
 
 def reproduce() -> Reproduction:
@@ -329,7 +329,7 @@ def doubt_error(example: int, size: float = 2.0) -> float:
     return float(np.max(np.linalg.norm(story.x[:, -1] - answer.x, axis=1)))
 
 
-def _figures(amplitude: float, numbers: tuple[int, ...]) -> list[Figure]:
+def _figures(amplitude: float, numbers: tuple[int, ...]) -> list[PaperFigure]:
     one, two = simulate(1, amplitude), simulate(2, amplitude)
     size = f"uniform in ±{amplitude:g}"
     return [
@@ -347,25 +347,28 @@ def _figures(amplitude: float, numbers: tuple[int, ...]) -> list[Figure]:
     ]
 
 
-def _states(run: Run, place: int, caption: str) -> Figure:
+def _states(run: Yang2021Run, place: int, caption: str) -> PaperFigure:
     return _figure(place, caption, run.x, run.x_hat, "x")
 
 
-def _attacks(run: Run, place: int, which: str, caption: str) -> Figure:
+def _attacks(run: Yang2021Run, place: int, which: str, caption: str) -> PaperFigure:
     if which == "y":
         return _figure(place, caption, run.a_y, run.a_y_hat, "a_y")
     return _figure(place, caption, run.a_u, run.a_u_hat, "a_u")
 
 
-def _figure(place: int, caption: str, truth: Floats, found: Floats, letter: str) -> Figure:
+def _figure(place: int, caption: str, truth: Floats, found: Floats, letter: str) -> PaperFigure:
     k = np.arange(len(truth), dtype=np.float64)
     panels = tuple(
         Panel(
             title=f"{letter}{i + 1}",
             x_label="k",
             y_label=f"{letter}{i + 1}",
-            lines=(Line("truth", k, truth[:, i], "solid"), Line("estimate", k, found[:, i], "dashed")),
+            lines=(
+                FigureCurve("truth", k, truth[:, i], "solid"),
+                FigureCurve("estimate", k, found[:, i], "dashed"),
+            ),
         )
         for i in range(truth.shape[1])
     )
-    return Figure(f"yang2021-figure-{place}", caption, panels)
+    return PaperFigure(f"yang2021-figure-{place}", caption, panels)

@@ -18,8 +18,8 @@ from gridsec.grid.radial import Feeder
 from gridsec.observers.lmi.sampled import advance, measure
 from gridsec.observers.lure import Lure, close_loop
 from gridsec.observers.unknown_input import UnknownInputPlant, inverters
-from gridsec.papers.claims import Figure, Line, Panel
-from gridsec.secure.isolation import Isolation, IsolationDesign, design, init, step
+from gridsec.papers.claims import FigureCurve, Panel, PaperFigure
+from gridsec.secure.isolation import IsolationDesign, IsolationStep, design, init, step
 
 CUSTOMERS = 13
 STEP_S = 1.0
@@ -98,7 +98,7 @@ def bank(reading_error: float = 1e-6) -> IsolationDesign:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Run:
+class Yang2021FeederRun:
     """One simulation. T ticks, m inverters, p meters.
 
     Attributes
@@ -114,10 +114,12 @@ class Run:
     x: Floats
     a_u: Floats
     a_y: Floats
-    answers: tuple[Isolation, ...]
+    answers: tuple[IsolationStep, ...]
 
 
-def simulate(made: IsolationDesign, *, inverter: int, meter: int, ticks: int = 80, seed: int = 1) -> Run:
+def simulate(
+    made: IsolationDesign, *, inverter: int, meter: int, ticks: int = 80, seed: int = 1
+) -> Yang2021FeederRun:
     """Simulate the loop under attack from `ONSET_S` on: the inverter absorbs, the meter is biased.
 
     Parameters
@@ -142,10 +144,10 @@ def simulate(made: IsolationDesign, *, inverter: int, meter: int, ticks: int = 8
         state, answer = step(made, state, y, u, np.ones(p, dtype=np.bool_))
         answers.append(answer)
         x = advance(model.system, x, u) + model.inputs @ au[k]
-    return Run(xs, au, ay, tuple(answers))
+    return Yang2021FeederRun(xs, au, ay, tuple(answers))
 
 
-def figure() -> Figure:
+def figure() -> PaperFigure:
     """Injections, reconstructed attacks on inverters and on meters."""
     run = simulate(bank(), inverter=1, meter=5)
     t = np.arange(0.0, len(run.x) * STEP_S, STEP_S)
@@ -161,7 +163,7 @@ def figure() -> Figure:
         _panel("Wrong part of the set point", "pu", t, (run.a_u, ahead), [f"c{i + 1:02d}" for i in AT]),
         _panel("Attack on the meter", "squared pu", t, (run.a_y, lies), [f"c{i + 1:02d}" for i in METERS]),
     )
-    return Figure(
+    return PaperFigure(
         "yang2021-feeder",
         "One inverter and one meter are attacked from 40 s on; both are named, and no others",
         panels,
@@ -171,5 +173,5 @@ def figure() -> Figure:
 def _panel(what: str, unit: str, t: Floats, pair: tuple[Floats, Floats], names: list[str]) -> Panel:
     lines = []
     for i, name in enumerate(names):
-        lines += [Line(name, t, pair[0][:, i], "solid"), Line("", t, pair[1][:, i], "dashed")]
+        lines += [FigureCurve(name, t, pair[0][:, i], "solid"), FigureCurve("", t, pair[1][:, i], "dashed")]
     return Panel(f"{what}: truth, and estimate (dashed)", "t in s", unit, tuple(lines))

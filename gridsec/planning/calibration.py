@@ -54,13 +54,13 @@ from scipy.special import logsumexp
 from gridsec.arrays import Bools, Floats, Ints, Phasors
 
 __all__ = [
-    "Doubts",
-    "Evidence",
     "Field",
-    "Fit",
+    "HypothesisEvidence",
     "Increments",
     "LoadErrors",
     "Places",
+    "PriorUncertainty",
+    "RegressionFit",
     "Regressors",
     "Series",
     "Weighed",
@@ -224,7 +224,7 @@ class Series:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Doubts:
+class PriorUncertainty:
     """Prior standard deviations of uncertain quantities; 0 for known ones.
 
     Attributes
@@ -264,7 +264,7 @@ class Regressors:
     spread : (K,)
         Prior standard deviations.
     where : kind -> (k,)
-        Indices of columns by the names of `Doubts`; k depends on the kind.
+        Indices of columns by the names of `PriorUncertainty`; k depends on the kind.
     """
 
     columns: Floats
@@ -272,7 +272,7 @@ class Regressors:
     where: dict[str, Ints]
 
 
-def regressors(places: Places, series: Series, doubts: Doubts) -> Regressors:
+def regressors(places: Places, series: Series, doubts: PriorUncertainty) -> Regressors:
     """All regressors of a feeder with correct files."""
     A, B = places.at_meters
     seen = series.seen[:, :, None]
@@ -647,7 +647,7 @@ class _Composite:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Fit:
+class RegressionFit:
     """Regression without any error of the files. n readings, K coefficients.
 
     Attributes
@@ -670,7 +670,7 @@ class Fit:
     scale: float
 
 
-def fit(y: Floats, columns: Floats, spread: Floats, count: int) -> Fit:
+def fit(y: Floats, columns: Floats, spread: Floats, count: int) -> RegressionFit:
     """Fit the regression without any error of the files.
 
     Parameters
@@ -691,7 +691,7 @@ def fit(y: Floats, columns: Floats, spread: Floats, count: int) -> Fit:
     explained = A @ half.T
     scaled = explained.T @ y
     residual = y - explained @ scaled
-    return Fit(
+    return RegressionFit(
         explained=explained,
         residual=residual,
         estimate=spread * (half.T @ scaled),
@@ -701,7 +701,7 @@ def fit(y: Floats, columns: Floats, spread: Floats, count: int) -> Fit:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Evidence:
+class HypothesisEvidence:
     """Evidence of the readings for H hypotheses.
 
     Attributes
@@ -717,7 +717,7 @@ class Evidence:
     log_factor: Floats
 
 
-def evidence(given: Fit, z: Floats, spread: Floats) -> Evidence:
+def evidence(given: RegressionFit, z: Floats, spread: Floats) -> HypothesisEvidence:
     """Compute the Bayes factor of each hypothesis.
 
     Parameters
@@ -733,7 +733,7 @@ def evidence(given: Fit, z: Floats, spread: Floats) -> Evidence:
     h = np.maximum(h, 0.0) / given.scale
     s2 = spread**2
     free = 0.5 * (g**2 * s2 / (1.0 + h * s2) - np.log1p(h * s2))
-    return Evidence(g, h, np.where(spread > 0.0, free, g - 0.5 * h))
+    return HypothesisEvidence(g, h, np.where(spread > 0.0, free, g - 0.5 * h))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -777,7 +777,7 @@ def weigh(log_factor: Floats, kind: Ints, risk: float) -> Weighed:
     return Weighed(np.exp(log_share - np.logaddexp(total, 0.0)), total, kept)
 
 
-def explain(given: Fit, z: Floats, own: Floats, like: float) -> tuple[Floats, Floats, Bools]:
+def explain(given: RegressionFit, z: Floats, own: Floats, like: float) -> tuple[Floats, Floats, Bools]:
     """Estimate each coefficient alone, and mark effects that cannot be distinguished.
 
     Parameters

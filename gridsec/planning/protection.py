@@ -20,7 +20,7 @@ from scipy.optimize import Bounds, LinearConstraint, linprog, milp
 from gridsec.arrays import Bools, Floats, Ints, frozen_ints
 from gridsec.errors import DesignInfeasible
 from gridsec.planning.redundancy import Patterns, fewest_meters
-from gridsec.planning.stealthy_attacks import Box, FalsePowers, largest_of
+from gridsec.planning.stealthy_attacks import ErrorBox, PowerErrorModel, largest_of
 
 __all__ = ["Attacker", "Protection", "Unprotectable", "fewest_protected", "hides", "lies_beyond"]
 
@@ -88,7 +88,7 @@ def hides(given: Patterns, liars: int) -> Attacker:
     return attack
 
 
-def lies_beyond(box: Box | FalsePowers, liars: int, size: Floats | float) -> Attacker:
+def lies_beyond(box: ErrorBox | PowerErrorModel, liars: int, size: Floats | float) -> Attacker:
     """Attacker with an attack above a bound that is consistent with an unmanipulated feeder.
 
     Parameters
@@ -99,7 +99,7 @@ def lies_beyond(box: Box | FalsePowers, liars: int, size: Floats | float) -> Att
     size : float or (p,)
         Bound of the attack on each meter, squared pu.
     """
-    p = (box.box if isinstance(box, FalsePowers) else box).meters.size
+    p = (box.box if isinstance(box, PowerErrorModel) else box).meters.size
     limit = np.broadcast_to(size, p)
     # Protection only reduces attacks: meters below the bound without any are skipped, and the one furthest
     # above it refutes first.

@@ -34,8 +34,8 @@ from gridsec.secure.index import Index, Sparsest, eigenspaces, fewest, kernel, l
 from gridsec.secure.index.blocks import MOST_NODES, Matrix, fewest_rows
 
 __all__ = [
+    "FeederSection",
     "Meter",
-    "Part",
     "Patterns",
     "fewest_meters",
     "from_busbar",
@@ -285,7 +285,7 @@ class Meter:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Part:
+class FeederSection:
     """Part of a feeder: everything fed through one bus alone.
 
     Attributes
@@ -317,7 +317,7 @@ def meter_redundancy(given: Patterns, meter: int, silent: Bools) -> Meter:
     return Meter(own, fewest_meters(given, silent=gone), own.count == 1.0)
 
 
-def part_redundancy(given: Patterns, part: Part, silent: Bools) -> Index:
+def part_redundancy(given: Patterns, part: FeederSection, silent: Bools) -> Index:
     """Smallest set of manipulated meters inside one part that imitates a pattern.
 
     All meters outside are unmanipulated. Up to `Index.correctable` manipulated meters, all of them in the
@@ -335,7 +335,7 @@ def part_redundancy(given: Patterns, part: Part, silent: Bools) -> Index:
     return fewest_meters(given, honest=honest, silent=silent)
 
 
-def parts(feeder: Feeder | ThreePhaseFeeder, buses: Ints, ties: Ints) -> Sequence[Part]:
+def parts(feeder: Feeder | ThreePhaseFeeder, buses: Ints, ties: Ints) -> Sequence[FeederSection]:
     """All parts of a feeder with different sets of meters, those nearest the busbar first.
 
     A part has all phases of its buses.
@@ -349,13 +349,13 @@ def parts(feeder: Feeder | ThreePhaseFeeder, buses: Ints, ties: Ints) -> Sequenc
     ties : (t, 2)
         Buses at both ends of the lines that close loops.
     """
-    found: dict[tuple[int, ...], Part] = {}
+    found: dict[tuple[int, ...], FeederSection] = {}
     lines = np.vstack([np.column_stack([feeder.parent, np.arange(1, len(feeder.buses))]), ties])
     beside = lines[(lines == 0).any(axis=1)].max(axis=1)
     for bus in range(1, len(feeder.buses)):
         inside = np.flatnonzero(_fed_through(feeder, lines, bus)[buses])
         if inside.size:
-            found.setdefault(tuple(inside.tolist()), Part(bus, bool((beside == bus).any()), inside))
+            found.setdefault(tuple(inside.tolist()), FeederSection(bus, bool((beside == bus).any()), inside))
     return tuple(found.values())
 
 

@@ -34,11 +34,19 @@ from scipy.optimize import Bounds, LinearConstraint, linprog, milp
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import DesignInfeasible, InputInvalid, Problem
 
-__all__ = ["Box", "FalsePowers", "Fit", "largest_lie", "largest_of", "largest_story", "worst_error"]
+__all__ = [
+    "ErrorBox",
+    "PowerErrorModel",
+    "StealthyAttack",
+    "largest_lie",
+    "largest_of",
+    "largest_story",
+    "worst_error",
+]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Box:
+class ErrorBox:
     """Errors of unmanipulated customers and meters. N customers, k unknowns, p meters.
 
     Attributes
@@ -78,7 +86,7 @@ class Box:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Fit:
+class StealthyAttack:
     """Largest attack, or error, consistent with an unmanipulated feeder.
 
     Attributes
@@ -99,7 +107,7 @@ class Fit:
     unknowns: Floats
 
 
-def largest_lie(box: Box, meter: int, liars: int, *, honest: Bools | None = None) -> Fit:
+def largest_lie(box: ErrorBox, meter: int, liars: int, *, honest: Bools | None = None) -> StealthyAttack:
     """Largest attack on a meter, in collusion with others, that is consistent with an unmanipulated feeder.
 
     Parameters
@@ -116,13 +124,13 @@ def largest_lie(box: Box, meter: int, liars: int, *, honest: Bools | None = None
     """
     honest = np.zeros(box.meters.size, dtype=np.bool_) if honest is None else honest
     if honest[meter] or liars < 1:
-        return Fit(0.0, 0.0, np.zeros(0, dtype=np.intp), np.zeros(box.effect.shape[1]))
+        return StealthyAttack(0.0, 0.0, np.zeros(0, dtype=np.intp), np.zeros(box.effect.shape[1]))
     found = _most(box, box.effect[box.meters[meter]], liars, honest, meter)
     own = 2.0 * float(box.reading[meter])
-    return Fit(found.size + own, found.bound + own, found.liars, found.unknowns)
+    return StealthyAttack(found.size + own, found.bound + own, found.liars, found.unknowns)
 
 
-def worst_error(box: Box, customer: int, liars: int, *, honest: Bools | None = None) -> Fit:
+def worst_error(box: ErrorBox, customer: int, liars: int, *, honest: Bools | None = None) -> StealthyAttack:
     """Largest difference of a customer's voltage between two states with the same readings.
 
     Parameters
@@ -138,7 +146,7 @@ def worst_error(box: Box, customer: int, liars: int, *, honest: Bools | None = N
 _HONEST = 1e-6
 
 
-def _most(box: Box, row: Floats, liars: int, honest: Bools, must: int | None) -> Fit:
+def _most(box: ErrorBox, row: Floats, liars: int, honest: Bools, must: int | None) -> StealthyAttack:
     """Maximise ``2 row c`` with integers, then again with fixed meters, so that the maximum is attained."""
     scaled = box.effect[box.meters] / box.reading[:, None]
     slack = np.maximum(np.abs(scaled).sum(axis=1) - 1.0, 0.0)
@@ -149,7 +157,7 @@ def _most(box: Box, row: Floats, liars: int, honest: Bools, must: int | None) ->
     # Meters that cannot exceed their own error need no binary; without binaries it is a linear program.
     if not size:
         liar = np.zeros(0, dtype=np.intp) if must is None else np.array([must], dtype=np.intp)
-        return Fit(0.0, 0.0, liar, np.zeros(row.size))
+        return StealthyAttack(0.0, 0.0, liar, np.zeros(row.size))
     chosen, bound = able, 0.0
     if int(np.count_nonzero(able)) > liars:
         chosen, bound = _choose(scaled, slack, row / size, liars, able, must=must)
@@ -158,7 +166,7 @@ def _most(box: Box, row: Floats, liars: int, honest: Bools, must: int | None) ->
     beyond = chosen & (np.abs(scaled @ c) > 1.0 + _HONEST)
     if must is not None:
         beyond[must] = True
-    return Fit(reached, max(reached, 2.0 * size * bound), np.flatnonzero(beyond), c)
+    return StealthyAttack(reached, max(reached, 2.0 * size * bound), np.flatnonzero(beyond), c)
 
 
 def _choose(
@@ -208,7 +216,7 @@ _HONEST_REPORTS = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FalsePowers:
+class PowerErrorModel:
     """Errors of meters and customers, manipulated or not. k unknowns, p meters.
 
     Attributes
@@ -221,17 +229,19 @@ class FalsePowers:
         Share of that range while its meter is unmanipulated, 0 to 1.
     """
 
-    box: Box
+    box: ErrorBox
     owner: Ints
     honest: Floats
 
-    def told(self, liars: Bools) -> Box:
+    def told(self, liars: Bools) -> ErrorBox:
         """The box while the meters in the mask (p,) may report any powers."""
         free = (self.owner >= 0) & liars[self.owner]
         return replace(self.box, effect=self.box.effect * np.where(free, 1.0, self.honest))
 
 
-def largest_story(given: FalsePowers, meter: int, liars: int, *, honest: Bools | None = None) -> Fit:
+def largest_story(
+    given: PowerErrorModel, meter: int, liars: int, *, honest: Bools | None = None
+) -> StealthyAttack:
     """Largest attack on a meter consistent with an unmanipulated feeder, with false powers of such meters.
 
     Parameters
@@ -260,14 +270,16 @@ def largest_story(given: FalsePowers, meter: int, liars: int, *, honest: Bools |
     return replace(found, bound=max(found.size, bound), liars=who)
 
 
-def largest_of(given: Box | FalsePowers, meter: int, liars: int, *, honest: Bools | None = None) -> Fit:
+def largest_of(
+    given: ErrorBox | PowerErrorModel, meter: int, liars: int, *, honest: Bools | None = None
+) -> StealthyAttack:
     """`largest_lie` of a box, and `largest_story` of false powers."""
-    if isinstance(given, FalsePowers):
+    if isinstance(given, PowerErrorModel):
         return largest_story(given, meter, liars, honest=honest)
     return largest_lie(given, meter, liars, honest=honest)
 
 
-def _choose_reports(given: FalsePowers, meter: int, liars: int, honest: Bools) -> tuple[Bools, float]:
+def _choose_reports(given: PowerErrorModel, meter: int, liars: int, honest: Bools) -> tuple[Bools, float]:
     """Choice of manipulated meters by HiGHS, and its bound of the meter's attack."""
     box = given.box
     p, k = box.meters.size, box.effect.shape[1]

@@ -26,15 +26,15 @@ from typing import Literal, get_args
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, frozen, frozen_ints
-from gridsec.errors import DesignInfeasible, NotObservable, Problem, no_choice, refuse
+from gridsec.errors import DesignInfeasible, NotObservable, Problem, no_choice, raise_if_any
 from gridsec.interface import Cause, Decision
 from gridsec.observers.lmi.unknown_input import Multiplier
 from gridsec.observers.unknown_input import (
     Missing,
     Pair,
-    UnknownInputDesign,
+    UnknownInputObserver,
+    UnknownInputObserverState,
     UnknownInputPlant,
-    UnknownInputState,
 )
 from gridsec.observers.unknown_input import design as design_family
 from gridsec.observers.unknown_input import init as init_family
@@ -72,7 +72,7 @@ class IsolationDesign:
         Gains from the bounds of the estimates to that of the reconstructed input attack.
     """
 
-    family: UnknownInputDesign
+    family: UnknownInputObserver
     large: Ints
     company: Ints
     alone: Bools
@@ -114,7 +114,7 @@ def members(inputs: int, sensors: int, max_inputs: int, max_sensors: int) -> tup
         If a count is negative.
     """
     counts = {"max_inputs": max_inputs, "max_sensors": max_sensors}
-    refuse(
+    raise_if_any(
         Problem("negative", f"{name} is {count}; it cannot be negative")
         for name, count in counts.items()
         if count < 0
@@ -174,7 +174,7 @@ def design(
     ValueError
         If a count is negative, `rates` is empty, or `measure` or `multiplier` is unknown.
     """
-    refuse(no_choice("measure", get_args(Measure), measure))
+    raise_if_any(no_choice("measure", get_args(Measure), measure))
     r, p = plant.inputs.shape[1], plant.noise.size
     wide, narrow = members(r, p, max_inputs, max_sensors)
     # With zero counts both banks are the same: one observer, compared with itself.
@@ -220,7 +220,7 @@ def _within(small: Pair, large: Pair) -> bool:
     return set(small[0]) >= set(large[0]) and set(small[1]) <= set(large[1])
 
 
-def disagreement(design: IsolationDesign, state: UnknownInputState) -> Floats:
+def disagreement(design: IsolationDesign, state: UnknownInputObserverState) -> Floats:
     """Disagreement pi of every large observer, (5) and (22); infinite without a member to confirm it.
 
     Returns
@@ -234,7 +234,7 @@ def disagreement(design: IsolationDesign, state: UnknownInputState) -> Floats:
     return np.where(_dead(design, state), np.inf, pi)
 
 
-def contradiction(design: IsolationDesign, state: UnknownInputState) -> Floats:
+def contradiction(design: IsolationDesign, state: UnknownInputObserverState) -> Floats:
     """Largest difference of an entry from that of the company, relative to the sum of both bounds.
 
     Returns
@@ -250,18 +250,18 @@ def contradiction(design: IsolationDesign, state: UnknownInputState) -> Floats:
     return np.where(_dead(design, state), np.inf, pi)
 
 
-def _gap(design: IsolationDesign, state: UnknownInputState) -> Floats:
+def _gap(design: IsolationDesign, state: UnknownInputObserverState) -> Floats:
     """Differences of every large observer's estimate from those of its company, (a, b, n)."""
     return np.asarray(np.abs(state.x[design.large][:, None, :] - state.x[design.company]))
 
 
-def _dead(design: IsolationDesign, state: UnknownInputState) -> Bools:
+def _dead(design: IsolationDesign, state: UnknownInputObserverState) -> Bools:
     """Mask (a,) of large observers that cannot be confirmed."""
     dead = design.alone | ~state.live[design.large] | ~state.live[design.company].all(axis=1)
     return np.asarray(dead)
 
 
-def bounds(design: IsolationDesign, state: UnknownInputState) -> Floats:
+def bounds(design: IsolationDesign, state: UnknownInputObserverState) -> Floats:
     """Bounds of the errors of all large observers, under any attack.
 
     Some small observer S within J is free of attacks, by Lemmas 1 to 3, so
@@ -278,7 +278,9 @@ def bounds(design: IsolationDesign, state: UnknownInputState) -> Floats:
     return np.asarray(np.minimum(gap.max(axis=1), np.abs(x) + design.family.plant.span))
 
 
-def estimate(design: IsolationDesign, state: UnknownInputState, index: int) -> tuple[Floats, Floats, bool]:
+def estimate(
+    design: IsolationDesign, state: UnknownInputObserverState, index: int
+) -> tuple[Floats, Floats, bool]:
     """Estimate (7), (24) of one large observer with a bound of its error.
 
     The true state is within the bounds of every large observer, so in the intersection of all these
@@ -302,7 +304,7 @@ def estimate(design: IsolationDesign, state: UnknownInputState, index: int) -> t
     return x[index], np.where(low <= high, bound, np.inf), bool(np.any(low > high))
 
 
-def select(design: IsolationDesign, state: UnknownInputState, pi: Floats) -> int:
+def select(design: IsolationDesign, state: UnknownInputObserverState, pi: Floats) -> int:
     """Index of the selected large observer: by (6), (23), or the one with the best certified estimate.
 
     Parameters
@@ -334,7 +336,7 @@ class IsolationState:
         Named so far: by Assumption 1 the attacked sets do not change.
     """
 
-    family: UnknownInputState
+    family: UnknownInputObserverState
     x: Floats | None
     bound: Floats | None
     u: Floats | None
@@ -343,7 +345,7 @@ class IsolationState:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Isolation:
+class IsolationStep:
     """Result of one tick. n states, r inputs, p sensors, a large observers.
 
     Attributes
@@ -441,7 +443,7 @@ def support(attack: Floats, threshold: Floats | float) -> Bools:
 
 def step(
     design: IsolationDesign, state: IsolationState, y: Floats, u: Floats, seen: Bools
-) -> tuple[IsolationState, Isolation]:
+) -> tuple[IsolationState, IsolationStep]:
     """Process one tick and name attacked inputs and sensors.
 
     Parameters
@@ -481,7 +483,7 @@ def step(
         silent=~heard,
     )
     decision, cause, reason = _decide(design, evidence, inputs, sensors)
-    answer = Isolation(
+    answer = IsolationStep(
         t=family.t,
         decision=decision,
         cause=cause,

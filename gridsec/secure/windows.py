@@ -25,10 +25,10 @@ from typing import Literal, get_args
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, frozen
-from gridsec.errors import InputInvalid, Problem, no_choice, refuse
+from gridsec.errors import InputInvalid, Problem, no_choice, raise_if_any
 from gridsec.interface import Decision
 from gridsec.observers import circle_discrete
-from gridsec.observers.circle_discrete import DiscreteDesign, Stack, advance, settling_steps, stack
+from gridsec.observers.circle_discrete import DiscreteDesign, StackedObservers, advance, settling_steps, stack
 from gridsec.observers.lmi.discrete import DirectProof, DiscreteOptions, discrete_circles
 from gridsec.observers.lmi.sampled import DiscreteLure, measure
 from gridsec.observers.lmi.sampled import advance as advance_plant
@@ -95,7 +95,7 @@ def believed(passing: Bools, masks: Bools) -> Bools:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Isolation:
+class WindowIsolation:
     """Result of windows. w windows, p meters.
 
     Attributes
@@ -114,7 +114,7 @@ class Isolation:
     share: Floats
 
 
-def isolation(pi_sets: Floats, thresholds: Floats, masks: Bools, length: int, rule: Rule) -> Isolation:
+def isolation(pi_sets: Floats, thresholds: Floats, masks: Bools, length: int, rule: Rule) -> WindowIsolation:
     """Algorithm 2, or its sound variant, over consecutive windows.
 
     "majority" takes the set that equals W-bar(k) most often in the window. Steps without a passing set do not
@@ -144,7 +144,7 @@ def isolation(pi_sets: Floats, thresholds: Floats, masks: Bools, length: int, ru
     ----------
     yang2019, Algorithm 2; docs/errata/yang2019.md on the two rules.
     """
-    refuse(no_choice("rule", get_args(Rule), rule))
+    raise_if_any(no_choice("rule", get_args(Rule), rule))
     count = pi_sets.shape[-2] // length
     shape = (*pi_sets.shape[:-2], count, length, pi_sets.shape[-1])
     windowed = np.asarray(pi_sets[..., : count * length, :].reshape(shape))
@@ -154,17 +154,17 @@ def isolation(pi_sets: Floats, thresholds: Floats, masks: Bools, length: int, ru
         alive = np.asarray(~failed & judged)
         decided = np.asarray(alive.any(axis=-1) & judged.all(axis=-1))
         suspects = ~believed(alive, masks) & decided[..., None]
-        return Isolation(suspects, decided, alive.mean(axis=-1))
+        return WindowIsolation(suspects, decided, alive.mean(axis=-1))
     trusted = believed(np.asarray(windowed <= thresholds), masks)
     return _majority(trusted, np.asarray(np.isfinite(windowed).all(axis=-1) & trusted.any(axis=-1)))
 
 
-def _majority(trusted: Bools, votes: Bools) -> Isolation:
+def _majority(trusted: Bools, votes: Bools) -> WindowIsolation:
     """The most frequent set (…, w, N, p) among the steps that vote (…, w, N); the earlier one at a tie."""
     lead, (length, p) = trusted.shape[:-2], trusted.shape[-2:]
     rows = trusted.reshape(-1, p)
     if not rows.size:
-        return Isolation(np.zeros((*lead, p), np.bool_), np.zeros(lead, np.bool_), np.zeros(lead))
+        return WindowIsolation(np.zeros((*lead, p), np.bool_), np.zeros(lead, np.bool_), np.zeros(lead))
     _, first, kind = np.unique(np.packbits(rows, axis=1), axis=0, return_index=True, return_inverse=True)
     count = len(rows) // length
     window, voting = np.repeat(np.arange(count), length), votes.reshape(-1)
@@ -176,7 +176,7 @@ def _majority(trusted: Bools, votes: Bools) -> Isolation:
     winner = np.argmax(tally * (length + 1) - seen.reshape(tally.shape), axis=1)
     share = tally[np.arange(count), winner] / length
     suspects = ~rows[first[winner]] & (share > 0.0)[:, None]
-    return Isolation(suspects.reshape(*lead, p), (share > 0.0).reshape(lead), share.reshape(lead))
+    return WindowIsolation(suspects.reshape(*lead, p), (share > 0.0).reshape(lead), share.reshape(lead))
 
 
 MOST_OBSERVERS = 20_000
@@ -210,7 +210,7 @@ class WindowDesign:
         Isolation rule of a window: "majority" is Algorithm 2; "survivors" keeps the J that never failed.
     """
 
-    observers: Stack
+    observers: StackedObservers
     sets: Subsets
     gains: Floats
     noise: float
@@ -365,7 +365,7 @@ def design(
     gamma = np.array([one.noise_gain for one in observers]) if gains is None else np.asarray(gains)
     sizes = {"noise": noise, "start": start, "epsilon": epsilon, "unknown": unknown}
     problems = _problems(sizes, gamma, len(observers), length)
-    refuse((*problems, *no_choice("rule", get_args(Rule), rule)))
+    raise_if_any((*problems, *no_choice("rule", get_args(Rule), rule)))
     level = epsilon + gamma * noise
     if unknown > 0.0:
         level = level + np.array([one.unknown_gain for one in observers]) * unknown
@@ -657,7 +657,7 @@ def calibrate(design: WindowDesign, honest: Trace) -> WindowDesign:
     """
     first = design.settling
     measures = {"pi": honest.pi[..., first:], "pi_sets": honest.pi_sets[..., first:, :]}
-    refuse(
+    raise_if_any(
         Problem("not-finite", f"{name} has no finite numbers alone from step {first} on")
         for name, found in measures.items()
         if not (found.size and np.isfinite(found).all())

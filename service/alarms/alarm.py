@@ -8,7 +8,7 @@ from enum import StrEnum
 from typing import Any
 
 from gridsec.errors import GridsecError
-from service.alarms.conditions import AlarmKind, Evidence, Severity
+from service.alarms.conditions import AlarmKind, ConditionEvidence, Severity
 from service.report.reasons import DataErrorReport
 from service.report.report import ExplanationReport, StalledMeter
 
@@ -98,7 +98,7 @@ class Alarm:
     t_raised: float
     t_cleared: float | None
     reason: str
-    evidence: Evidence
+    evidence: ConditionEvidence
     acknowledged_by: str | None = None
     t_acknowledged: float | None = None
     comment: str | None = None
@@ -116,7 +116,7 @@ class Alarm:
 
 
 @dataclass(frozen=True, slots=True)
-class Transition:
+class AlarmTransition:
     """One change of one alarm: the alarm after it, the change, its time and the operator."""
 
     alarm: Alarm
@@ -158,7 +158,7 @@ def from_json(data: Mapping[str, Any]) -> Alarm:
     )
     learning = tuple(StalledMeter(**meter) for meter in evidence.pop("learning", ()))
     error = evidence.pop("data_error", None)
-    fields["evidence"] = Evidence(
+    fields["evidence"] = ConditionEvidence(
         **evidence, explanations=explanations, learning=learning, data_error=_data_error(error)
     )
     return Alarm(**fields)

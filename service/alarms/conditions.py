@@ -34,7 +34,7 @@ class Severity(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Evidence:
+class ConditionEvidence:
     """Numbers of an alarm at the tick that raised it; None without one.
 
     Attributes
@@ -44,7 +44,7 @@ class Evidence:
     v_volt_reported, v_volt_estimated, attack_volt_estimated
         Reported and reconstructed voltage and their difference for suspects, V.
     kind
-        Attack kind of a meter, see `gridsec.interface.Kind`.
+        Attack kind of a meter, see `gridsec.interface.ManipulationKind`.
     attack_kvar_estimated
         Injection of an inverter beyond its droop curve, kvar.
     explanations
@@ -90,7 +90,7 @@ class Condition:
     feeder: str
     meter: str | None
     severity: Severity
-    evidence: Evidence = Evidence()
+    evidence: ConditionEvidence = ConditionEvidence()
     reason: str = ""
     known: bool = True
     customer: str | None = None
@@ -134,11 +134,11 @@ def conditions(report: FeederReport) -> list[Condition]:
     return found
 
 
-def _evidence(meter: MeterReport) -> Evidence:
+def _evidence(meter: MeterReport) -> ConditionEvidence:
     def number(value: float | None) -> float | None:
         return None if value is None else finite(value)
 
-    return Evidence(
+    return ConditionEvidence(
         number(meter.score),
         number(meter.threshold),
         number(meter.v_volt_reported),
@@ -196,7 +196,7 @@ def _busbar(report: FeederReport) -> Iterable[Condition]:
         report.feeder,
         BUSBAR,
         Severity.CRITICAL,
-        Evidence(
+        ConditionEvidence(
             v_volt_reported=busbar.v_volt_reported,
             v_volt_estimated=busbar.v_volt_estimated,
             attack_volt_estimated=busbar.attack_volt_estimated,
@@ -219,7 +219,7 @@ def _inverters(report: FeederReport) -> Iterable[Condition]:
             report.feeder,
             inverter.meter,
             Severity.CRITICAL,
-            Evidence(attack_kvar_estimated=kvar),
+            ConditionEvidence(attack_kvar_estimated=kvar),
             f"the inverter of {inverter.customer} injects {much} beyond its droop curve",
             known,
             inverter.customer,
@@ -297,7 +297,7 @@ def _undecided(report: FeederReport) -> Iterable[Condition]:
         report.feeder,
         None,
         Severity.MAJOR,
-        Evidence(explanations=report.explanations, data_error=report.data_error),
+        ConditionEvidence(explanations=report.explanations, data_error=report.data_error),
         reason=report.reason,
         known=not told and report.cause is not Cause.SETTLING,
         unheard=unheard,
@@ -328,7 +328,7 @@ def _learning(report: FeederReport) -> Iterable[Condition]:
         report.feeder,
         None,
         Severity.MINOR,
-        Evidence(learning=stalled),
+        ConditionEvidence(learning=stalled),
         f"{len(stalled)} of {len(report.meters)} meters are not learned after twice the expected time{time}: "
         f"{why}",
         known=learning is not None,

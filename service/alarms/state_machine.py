@@ -26,15 +26,15 @@ from gridsec.errors import InputInvalid, Problem
 from service.alarms.alarm import (
     Alarm,
     AlarmState,
+    AlarmTransition,
     AlarmUnknown,
     AlreadyAcknowledged,
     Change,
     RaisedAgain,
-    Transition,
     from_json,
     to_json,
 )
-from service.alarms.conditions import AlarmKind, Condition, Evidence, Severity, conditions
+from service.alarms.conditions import AlarmKind, Condition, ConditionEvidence, Severity, conditions
 
 __all__ = [
     "Alarm",
@@ -42,14 +42,14 @@ __all__ = [
     "AlarmKind",
     "AlarmRules",
     "AlarmState",
+    "AlarmTransition",
     "AlarmUnknown",
     "AlreadyAcknowledged",
     "Change",
     "Condition",
-    "Evidence",
+    "ConditionEvidence",
     "RaisedAgain",
     "Severity",
-    "Transition",
     "acknowledge",
     "acknowledged",
     "advance",
@@ -169,7 +169,7 @@ class AlarmBook:
 
 def advance(
     book: AlarmBook, rules: AlarmRules, conditions: Iterable[Condition], t: float
-) -> tuple[AlarmBook, tuple[Transition, ...]]:
+) -> tuple[AlarmBook, tuple[AlarmTransition, ...]]:
     """Update the book by one tick.
 
     Parameters
@@ -197,7 +197,7 @@ def advance(
         seen[condition.kind, condition.subject] = condition
     backwards = book.t is not None and t < book.t
     entries: dict[Key, Entry] = {}
-    transitions: list[Transition] = []
+    transitions: list[AlarmTransition] = []
     for key in sorted({*book.entries, *seen}, key=_order):
         old, condition_now = book.entries.get(key), seen.get(key)
         if condition_now is not None and not condition_now.known:
@@ -244,7 +244,7 @@ def _timed(old: Entry | None, present: bool, t: float, backwards: bool) -> Entry
 
 def _settle(
     entry: Entry, condition: Condition | None, rules: AlarmRules, key: Key, t: float
-) -> tuple[Entry | None, tuple[Transition, ...]]:
+) -> tuple[Entry | None, tuple[AlarmTransition, ...]]:
     """Raise, clear or drop the alarm of an entry if it is due."""
     kind, alarm = key[0], entry.alarm
     lasted = t - entry.since
@@ -256,13 +256,13 @@ def _settle(
         if lasted < rules.off(kind):
             return entry, ()
         alarm = replace(alarm, state=AlarmState.CLEARED, t_cleared=t)
-        return replace(entry, alarm=alarm), (Transition(alarm, Change.CLEARED, t),)
+        return replace(entry, alarm=alarm), (AlarmTransition(alarm, Change.CLEARED, t),)
     return (entry if _remembered(alarm, rules, t) else None), ()
 
 
 def _present(
     entry: Entry, condition: Condition, rules: AlarmRules, t: float
-) -> tuple[Entry, tuple[Transition, ...]]:
+) -> tuple[Entry, tuple[AlarmTransition, ...]]:
     """Raise the alarm of a present condition when it is due, and update its evidence."""
     alarm, lasted = entry.alarm, t - entry.since
     if alarm is None or not alarm.active:
@@ -274,10 +274,10 @@ def _present(
         alarm, change = replace(alarm, reason=condition.reason, evidence=condition.evidence), Change.UPDATED
     else:
         return entry, ()
-    return replace(entry, alarm=alarm), (Transition(alarm, change, t),)
+    return replace(entry, alarm=alarm), (AlarmTransition(alarm, change, t),)
 
 
-def _explains_more(now: Evidence, before: Evidence) -> bool:
+def _explains_more(now: ConditionEvidence, before: ConditionEvidence) -> bool:
     """True if an error of the feeder's files explains the condition and is new to the alarm."""
     error, told = now.data_error, before.data_error
     if error is None or told is None:
@@ -336,7 +336,9 @@ def alarm_id(condition: Condition, onset: float) -> str:
     return "".join(_CROCKFORD[number >> shift & 31] for shift in range(125, -1, -5))
 
 
-def acknowledged(alarm: Alarm, who: str, comment: str, t: float, *, count: int | None = None) -> Transition:
+def acknowledged(
+    alarm: Alarm, who: str, comment: str, t: float, *, count: int | None = None
+) -> AlarmTransition:
     """Return the transition by which an operator acknowledges an alarm.
 
     A cleared alarm without an acknowledgement can still be acknowledged; it stays cleared.
@@ -368,7 +370,7 @@ def acknowledged(alarm: Alarm, who: str, comment: str, t: float, *, count: int |
         t_acknowledged=t,
         comment=comment,
     )
-    return Transition(answered, Change.ACKNOWLEDGED, t, who, comment)
+    return AlarmTransition(answered, Change.ACKNOWLEDGED, t, who, comment)
 
 
 def carried(alarm: Alarm, answered: Alarm) -> Alarm:
@@ -394,7 +396,7 @@ def carried(alarm: Alarm, answered: Alarm) -> Alarm:
 
 def acknowledge(
     book: AlarmBook, alarm_id: str, who: str, comment: str, t: float, *, count: int | None = None
-) -> tuple[AlarmBook, tuple[Transition, ...]]:
+) -> tuple[AlarmBook, tuple[AlarmTransition, ...]]:
     """Acknowledge an alarm of the book.
 
     Parameters
@@ -424,7 +426,7 @@ def acknowledge(
     raise AlarmUnknown(alarm_id)
 
 
-def close(alarms: Iterable[Alarm], t: float, why: str) -> tuple[Transition, ...]:
+def close(alarms: Iterable[Alarm], t: float, why: str) -> tuple[AlarmTransition, ...]:
     """Return the transitions that clear alarms without a monitor.
 
     Parameters
@@ -433,7 +435,7 @@ def close(alarms: Iterable[Alarm], t: float, why: str) -> tuple[Transition, ...]
         The alarms, of which the active ones are cleared; time (Unix s), and reason for the event.
     """
     cleared = (replace(alarm, state=AlarmState.CLEARED, t_cleared=t) for alarm in alarms if alarm.active)
-    return tuple(Transition(alarm, Change.CLEARED, t, None, why) for alarm in cleared)
+    return tuple(AlarmTransition(alarm, Change.CLEARED, t, None, why) for alarm in cleared)
 
 
 def restore(feeder: str, alarms: Iterable[Alarm]) -> AlarmBook:

@@ -15,7 +15,7 @@ from gridsec.interface import Cause, Decision
 from service.alarms.state_machine import AlarmKind, AlarmState, Change, Severity
 from service.engine.commissioning import Stage
 from service.report.voltages import BUSBAR
-from service.store.schema import Step
+from service.store.schema import CommissioningChange
 
 
 def _finite(value: Any) -> Any:
@@ -280,7 +280,7 @@ class CommissioningEvent(BaseModel):
     """One change of a commissioning."""
 
     t: float
-    change: Step
+    change: CommissioningChange
     meters: list[str]
     who: str | None
     reason: str

@@ -33,7 +33,7 @@ from service.api.errors import Guard, handlers, problem
 from service.errors import FeederNotLoaded, FeederUnknown
 from service.report.report import FeederReport
 from service.report.report import to_json as report_json
-from service.store import Event, Store, StoreUnavailable
+from service.store import Store, StoredTransition, StoreUnavailable
 
 
 class Backend(Protocol):
@@ -536,7 +536,7 @@ async def acknowledge(backend: BackendHere, alarm_id: AlarmId, answer: models.Ac
     return await backend.acknowledge(alarm_id, answer.who, answer.comment, count=answer.count)
 
 
-def _event(event: Event) -> models.AlarmEvent:
+def _event(event: StoredTransition) -> models.AlarmEvent:
     return models.AlarmEvent(
         seq=event.seq,
         t=event.t,

@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from service.cli.paths import Given, Unusable, see
+from service.cli.paths import Given, Unusable, check_paths
 
 __all__ = [
     "ADDRESS",
@@ -23,11 +23,11 @@ __all__ = [
     "WRITER_LOST",
     "Feeder",
     "Studied",
-    "complain",
     "err",
     "finite",
     "options_of",
     "out",
+    "print_error",
     "read_all",
     "refuse_options",
 ]
@@ -67,7 +67,7 @@ def refuse_options(problems: Iterable[str], **places: Given) -> None:
     problems
         Problems found so far.
     places
-        Files and folders as in `service.cli.paths.see`.
+        Files and folders as in `service.cli.paths.check_paths`.
 
     Raises
     ------
@@ -78,7 +78,7 @@ def refuse_options(problems: Iterable[str], **places: Given) -> None:
     """
     found = list(problems)
     try:
-        see(**places)
+        check_paths(**places)
     except Unusable as error:
         if not found:
             raise
@@ -147,7 +147,7 @@ def finite(value: float | None) -> float | None:
     return value
 
 
-def complain(message: str) -> None:
+def print_error(message: str) -> None:
     """Print an error message.
 
     Parameters

@@ -28,11 +28,11 @@ from rich.markup import escape
 from rich.table import Table
 
 from feeders.model.site import Site, load
-from feeders.simulation.scenario import Sample, Scenario, random_attacks
+from feeders.simulation.scenario import Scenario, SimulatedTick, random_attacks
 from gridsec.errors import GridsecError
 from service.cli.simulate import Pace, play
 from service.ingest.queues import BusConfig
-from service.ingest.zenoh_bus import Meters
+from service.ingest.zenoh_bus import MeterClient
 
 START_WITHIN_S = 30.0
 CLEAR_WITHIN_S = 30.0
@@ -48,7 +48,7 @@ class DemoFailed(GridsecError):
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class DemoPlan:
     """Parameters of the demo.
 
     Attributes
@@ -62,7 +62,7 @@ class Plan:
     size
         Smallest size of the manipulation, pu.
     kind
-        Attack kind (see `feeders.simulation.attacks.Kind`).
+        Attack kind (see `feeders.simulation.attacks.RandomAttackKind`).
     seed
         Seed of meters, loads and errors.
     http
@@ -84,7 +84,7 @@ class Plan:
 
 
 @dataclass(slots=True)
-class Outcome:
+class DemoResult:
     """Results over HTTP: manipulated meters, meters named as manipulated, and problems."""
 
     lied: set[str] = field(default_factory=set)
@@ -219,7 +219,7 @@ def _end(process: subprocess.Popen[str]) -> None:
         process.stdout.close()
 
 
-def run(plan: Plan, console: Console, *, check: bool, keep: bool) -> Outcome:
+def run(plan: DemoPlan, console: Console, *, check: bool, keep: bool) -> DemoResult:
     """Run the demo.
 
     Parameters
@@ -259,7 +259,7 @@ def run(plan: Plan, console: Console, *, check: bool, keep: bool) -> Outcome:
         _introduce(site, service, plan, console)
         time.sleep(max(0.0, start - time.time()))
         with (
-            Meters(BusConfig("client", connect=(service.zenoh,)), "gridsec") as meters,
+            MeterClient(BusConfig("client", connect=(service.zenoh,)), "gridsec") as meters,
             _screen(console) as show,
         ):
             story = _Story(site, service, start, console=console, show=show)
@@ -280,7 +280,7 @@ def _screen(console: Console) -> Iterator[Callable[[Table], None] | None]:
         yield lambda table: live.update(table, refresh=True)
 
 
-def _over(elapsed: float, plan: Plan, story: _Story, *, check: bool, keep: bool) -> bool:
+def _over(elapsed: float, plan: DemoPlan, story: _Story, *, check: bool, keep: bool) -> bool:
     if elapsed < plan.duration_s or keep:
         return False
     if not check or not story.standing:
@@ -291,7 +291,7 @@ def _over(elapsed: float, plan: Plan, story: _Story, *, check: bool, keep: bool)
     return True
 
 
-def verdict(outcome: Outcome) -> tuple[str, ...]:
+def verdict(outcome: DemoResult) -> tuple[str, ...]:
     """Return the failures of a demo; empty for a success."""
     problems = list(outcome.problems)
     if missed := outcome.lied - outcome.named:
@@ -303,7 +303,7 @@ def verdict(outcome: Outcome) -> tuple[str, ...]:
     return tuple(problems)
 
 
-def _introduce(site: Site, service: Service, plan: Plan, console: Console) -> None:
+def _introduce(site: Site, service: Service, plan: DemoPlan, console: Console) -> None:
     on, off = plan.attack
     title = site.tables.meta.title or site.feeder.name
     console.print(
@@ -331,7 +331,7 @@ class _Story:
         console: Console,
         show: Callable[[Table], None] | None,
     ) -> None:
-        self.outcome = Outcome()
+        self.outcome = DemoResult()
         self.standing: set[str] = set()
         self._site = site
         self._service = service
@@ -341,7 +341,7 @@ class _Story:
         self._lying: set[str] = set()
         self._states: dict[str, str] = {}
 
-    def tell(self, sample: Sample) -> None:
+    def tell(self, sample: SimulatedTick) -> None:
         """Print the changes since the last tick."""
         lying = {self._site.meter_ids[k] for k in np.flatnonzero(sample.manipulated)}
         self.outcome.lied |= lying
@@ -374,7 +374,7 @@ class _Story:
             if alarm["t_cleared"] is None
         }
 
-    def _picture(self, sample: Sample) -> None:
+    def _picture(self, sample: SimulatedTick) -> None:
         if self._show is None:
             return
         state = self._service.get(f"/api/v1/feeders/{self._site.feeder.name}/state")

@@ -12,11 +12,11 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from gridsec.errors import FeederInvalid, refuse
-from service.cli.console import FEEDER, Feeder, complain, err, out
-from service.cli.paths import see
+from gridsec.errors import FeederInvalid, raise_if_any
+from service.cli.console import FEEDER, Feeder, err, out, print_error
+from service.cli.paths import check_paths
 from service.cli.sources import show_check, spared
-from service.cli.study_planning import said
+from service.cli.study_planning import as_usage_error
 from service.errors import prefixed
 
 if TYPE_CHECKING:
@@ -103,7 +103,7 @@ def feeders_validate(
             out.print(f"{escape(str(path))}: note: {escape(note)}")
         if problems:
             invalid = True
-            complain(str(FeederInvalid(prefixed(f"{path}: ", problem) for problem in problems)))
+            print_error(str(FeederInvalid(prefixed(f"{path}: ", problem) for problem in problems)))
         else:
             out.print(f"[green]{escape(str(path))}: valid[/]")
     if invalid:
@@ -134,8 +134,8 @@ def feeders_design(
     problems = no_choice("--estimator", ESTIMATORS, *([estimator] if estimator else []))
     if max_attacked is not None and max_attacked < 0:
         problems.append(f"--max-attacked is {max_attacked}; it must not be negative")
-    with said():
-        refuse(problems)
+    with as_usage_error():
+        raise_if_any(problems)
     site = choose(load(feeder), estimator=estimator, max_attacked=max_attacked)
     columns = (TextColumn("observers"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     started = time.monotonic()
@@ -190,7 +190,7 @@ def convert(
     """
     from feeders.convert.convert import convert as run
 
-    see(over={"FOLDER": folder})
+    check_paths(over={"FOLDER": folder})
     with spared(folder):
         done = run(
             source,

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from gridsec.errors import DesignInfeasible, FeederInvalid, GridsecError, NotObservable, refuse
+from gridsec.errors import DesignInfeasible, FeederInvalid, GridsecError, NotObservable, raise_if_any
 from service.cli import (
     console,
     feeders,
@@ -43,16 +43,16 @@ from service.cli.console import (
     USAGE,
     WRITER_LOST,
     Feeder,
-    complain,
+    print_error,
     read_all,
 )
-from service.cli.paths import Unusable, see
+from service.cli.paths import Unusable, check_paths
 from service.cli.serve import Endpoints
-from service.cli.study_planning import said
+from service.cli.study_planning import as_usage_error
 
 if TYPE_CHECKING:
     from feeders.model.site import Site
-    from feeders.simulation.attacks import Kind
+    from feeders.simulation.attacks import RandomAttackKind
     from feeders.simulation.scenario import Scenario
     from gridsec.attack import Attack, InverterAttack
 
@@ -63,7 +63,7 @@ study_app = typer.Typer(no_args_is_help=True)
 @study_app.callback()
 def study(context: typer.Context) -> None:
     """Study feeders and estimators."""
-    context.call_on_close(session.idle())
+    context.call_on_close(session.exit_on_signal())
 
 
 study_app.command("redundancy")(study_planning.redundancy)
@@ -100,10 +100,10 @@ def main() -> None:
     try:
         app()
     except GridsecError as error:
-        complain(str(error))
+        print_error(str(error))
         sys.exit(exit_code(error))
     except OSError as error:
-        complain(f"{error.filename or ''}: {error.strerror or error}".removeprefix(": "))
+        print_error(f"{error.filename or ''}: {error.strerror or error}".removeprefix(": "))
         sys.exit(FILE)
 
 
@@ -161,11 +161,11 @@ def demo(
     keep: Annotated[bool, typer.Option("--keep", help="Continue until interrupted.")] = False,
 ) -> None:
     """Run a demonstration: a service, virtual meters on zenoh, an attack on some of them, and a web page."""
-    from service.cli.demo import Plan, run, verdict
+    from service.cli.demo import DemoPlan, run, verdict
 
     _see_kind(kind, check=check)
     _see_size(size)
-    plan = Plan(feeder, duration, attacked, size, kind, seed, http)
+    plan = DemoPlan(feeder, duration, attacked, size, kind, seed, http)
     try:
         outcome = run(plan, console.out, check=check, keep=keep)
     except KeyboardInterrupt:
@@ -176,7 +176,7 @@ def demo(
     if check:
         problems = verdict(outcome)
         for problem in problems:
-            complain(problem)
+            print_error(problem)
         if problems:
             raise typer.Exit(FAILED)
         console.out.print("[green]Exactly the manipulated meters were named, and all alarms have cleared.[/]")
@@ -184,13 +184,13 @@ def demo(
 
 def _see_kind(kind: str, *, check: bool) -> None:
     """Refuse unknown kinds, and with `--check` those that may not become visible during the demo."""
-    from feeders.simulation.attacks import Kind
+    from feeders.simulation.attacks import RandomAttackKind
 
-    if kind not in set(Kind):
+    if kind not in set(RandomAttackKind):
         raise typer.BadParameter(
-            f"{kind!r} is not known; expected one of {', '.join(Kind)}", param_hint="--kind"
+            f"{kind!r} is not known; expected one of {', '.join(RandomAttackKind)}", param_hint="--kind"
         )
-    if check and kind in {Kind.STUCK, Kind.REPLAY}:
+    if check and kind in {RandomAttackKind.STUCK, RandomAttackKind.REPLAY}:
         raise typer.BadParameter(
             f"{kind} is visible only after the voltage has left the repeated values, which may take longer "
             "than the demo; until then such meters are correctly not named. Leave out --check",
@@ -298,10 +298,10 @@ def simulate(
     if problems:
         raise typer.BadParameter("; ".join(problems))
     if out is not None:
-        see(simulated={"--out": out, "--out, its truth": truth_path(out)})
+        check_paths(simulated={"--out": out, "--out, its truth": truth_path(out)})
     tick = site.tables.meta.monitor.tick_s if dt is None else dt
     first = math.ceil(time.time() / tick) * tick if start is None else start
-    with said():
+    with as_usage_error():
         scenario = Scenario(
             seed=seed,
             start=first,
@@ -346,7 +346,7 @@ def _span(begin: float, end: float) -> tuple[float, float]:
 class _Lie:
     """Parsed value of --attack; without a count, an attack on the busbar meter."""
 
-    kind: Kind
+    kind: RandomAttackKind
     count: int | None
     size: float
     begin: float
@@ -355,26 +355,28 @@ class _Lie:
 
 def _lie(text: str) -> _Lie:
     """Parse `kind:count:size:from:to`."""
-    from feeders.simulation.attacks import Kind, no_size
+    from feeders.simulation.attacks import RandomAttackKind, no_size
     from service.report.voltages import BUSBAR
 
     try:
         name, count, size, begin, end = text.split(":")
-        many, part, kind = None if count == BUSBAR else int(count), float(size), Kind(name)
+        many, part, kind = None if count == BUSBAR else int(count), float(size), RandomAttackKind(name)
         times = float(begin), float(end)
     except ValueError:
-        raise ValueError(f"expected kind:count:size:from:to with a kind of {', '.join(Kind)}") from None
+        raise ValueError(
+            f"expected kind:count:size:from:to with a kind of {', '.join(RandomAttackKind)}"
+        ) from None
     on, off = _span(*times)
     if many is not None and many < 1:
         raise ValueError(f"{many} is not a number of meters; expected 1 or more")
     # The size of a stuck or replayed reading follows from later changes, not from the option.
-    sized = many is not None and kind not in (Kind.STUCK, Kind.REPLAY)
+    sized = many is not None and kind not in (RandomAttackKind.STUCK, RandomAttackKind.REPLAY)
     if not math.isfinite(part) or (sized and part <= 0.0):
         what = "positive" if sized else "finite"
         raise ValueError(f"its size is {size}; expected a {what} part of nominal")
-    if kind not in (Kind.STUCK, Kind.REPLAY):
-        refuse(no_size(part))
-    if kind is Kind.DRIFT and math.isinf(off):
+    if kind not in (RandomAttackKind.STUCK, RandomAttackKind.REPLAY):
+        raise_if_any(no_size(part))
+    if kind is RandomAttackKind.DRIFT and math.isinf(off):
         raise ValueError("a drift needs an end, which determines its speed")
     return _Lie(kind, many, part, on, off)
 
@@ -424,17 +426,17 @@ def _publish(
 ) -> None:
     from service.cli.simulate import OutOfStep, Pace, play
     from service.ingest.queues import BusConfig
-    from service.ingest.zenoh_bus import Meters
+    from service.ingest.zenoh_bus import MeterClient
 
     ticks = 0
     if pace[0] == 1.0:
         time.sleep(max(0.0, scenario.start - time.time()))
     try:
-        with Meters(BusConfig("client", connect=connect), prefix) as meters:
+        with MeterClient(BusConfig("client", connect=connect), prefix) as meters:
             for _ in play(site, scenario, meters, Pace(*pace)):
                 ticks += 1
     except OutOfStep as error:
-        complain(f"the service is out of step: {error}")
+        print_error(f"the service is out of step: {error}")
         raise typer.Exit(FAILED) from None
     except KeyboardInterrupt:
         pass

@@ -17,7 +17,7 @@ from gridsec.errors import GridsecError, InputInvalid, Problem
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["A_FEEDER", "Unusable", "is_feeder", "see", "write_tables"]
+__all__ = ["A_FEEDER", "Unusable", "check_paths", "is_feeder", "write_tables"]
 
 
 A_FEEDER: Final = "a feeder's folder; tables go into another folder"
@@ -111,7 +111,7 @@ class Unusable(GridsecError):
         return tuple(problem.code for problem in self.problems)
 
 
-def see(
+def check_paths(
     *,
     folders: Given = NONE,
     over: Given = NONE,

@@ -11,8 +11,8 @@ from rich.markup import escape
 
 from gridsec.errors import FeederInvalid, Problem
 from service.cli import console
-from service.cli.console import FAILED, complain, refuse_options
-from service.cli.serve import Estimator, Grace, MaxSkew
+from service.cli.console import FAILED, print_error, refuse_options
+from service.cli.serve import EstimatorName, Grace, MaxSkew
 
 if TYPE_CHECKING:
     from feeders.model.site import Site
@@ -25,7 +25,7 @@ def replay(
     feeder: Annotated[
         str | None, typer.Option(help="Folder or name. [default: the feeder of the recording]")
     ] = None,
-    estimator: Estimator = None,
+    estimator: EstimatorName = None,
     clock: Annotated[
         str,
         typer.Option(help="events: time of the readings; wall: time of their arrival, as in live operation."),
@@ -46,7 +46,7 @@ def replay(
     from feeders.registry.registry import choose
     from feeders.simulation.recording import RecordingInvalid, read_recording
     from service.alarms.state_machine import to_json
-    from service.engine.replay import Tally
+    from service.engine.replay import ReplayCounts
     from service.engine.replay import replay as run
     from service.ingest.align import Clock
 
@@ -56,7 +56,7 @@ def replay(
     if clock == Clock.WALL and not recording.timed:
         raise RecordingInvalid(f"{file}: no column arrival, which --clock wall needs")
     site = choose(_site_of(recording, feeder), estimator=estimator)
-    tally = Tally()
+    tally = ReplayCounts()
     began: float | None = None
     results = run(
         site,
@@ -81,7 +81,7 @@ def replay(
     summary.print(f"ticks:    {_counts(tally.ticks)}, skipped {tally.skipped}")
     summary.print(f"readings: {_counts(tally.readings)}, never arrived {tally.lost}")
     if not tally.judged:
-        complain("no tick has a verdict: there is no answer on manipulation")
+        print_error("no tick has a verdict: there is no answer on manipulation")
         raise typer.Exit(FAILED)
 
 

@@ -13,8 +13,8 @@ from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from service.cli import console
-from service.cli.console import FAILED, complain
-from service.cli.paths import see
+from service.cli.console import FAILED, print_error
+from service.cli.paths import check_paths
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -40,7 +40,7 @@ def reproduce(
     papers = _chosen(paper)
     drawing = draw.available()
     if drawing:
-        see(over={"--out": out})
+        check_paths(over={"--out": out})
         out.mkdir(parents=True, exist_ok=True)
     failed: list[Claim] = []
     count = met = 0
@@ -54,9 +54,9 @@ def reproduce(
             path.write_bytes(draw.png(figure))
             console.out.print(f"{escape(str(path))}: {escape(figure.caption)}")
     if not drawing:
-        complain("figures are not drawn: they need matplotlib, in a checkout: pip install -e '.[plot]'")
+        print_error("figures are not drawn: they need matplotlib, in a checkout: pip install -e '.[plot]'")
     for claim in failed:
-        complain(f"not met: {claim.what} ({claim.where}): {_printed(claim)}, ours {_text(claim.ours)}")
+        print_error(f"not met: {claim.what} ({claim.where}): {_printed(claim)}, ours {_text(claim.ours)}")
     if failed:
         raise typer.Exit(FAILED)
     console.out.print(

@@ -20,7 +20,9 @@ if TYPE_CHECKING:
     from service.app import Running
 
 Feeders = Annotated[list[str] | None, typer.Option(help="Folder or name of a feeder; may be repeated.")]
-Estimator = Annotated[str | None, typer.Option(help="See `feeders estimators`. [default: as in feeder.toml]")]
+EstimatorName = Annotated[
+    str | None, typer.Option(help="See `feeders estimators`. [default: as in feeder.toml]")
+]
 Listen = Annotated[
     list[str] | None, typer.Option(help="zenoh endpoint to listen on. [default: tcp/127.0.0.1:7447]")
 ]
@@ -61,7 +63,7 @@ UntilEof = Annotated[bool, typer.Option(hidden=True, help="End when standard inp
 def serve(
     *,
     feeder: Feeders = None,
-    estimator: Estimator = None,
+    estimator: EstimatorName = None,
     zenoh_listen: Listen = None,
     zenoh_connect: Endpoints = None,
     zenoh_mode: Mode = None,

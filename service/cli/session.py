@@ -22,12 +22,12 @@ from rich.segment import ControlType
 
 from gridsec.errors import DesignInfeasible, NotObservable
 from service.cli import console
-from service.cli.console import complain
+from service.cli.console import print_error
 
 if TYPE_CHECKING:
     from feeders.studies.journal import InUse, Journal, OtherStudy
 
-__all__ = ["JournalAt", "Keeping", "NoJournal", "idle", "keeping"]
+__all__ = ["JournalAt", "Keeping", "NoJournal", "exit_on_signal", "keeping"]
 
 JournalAt = Annotated[
     Path | None,
@@ -118,7 +118,7 @@ class Keeping:
             return True
         if not self._warned:
             said = f"{why.filename or path}: {why.strerror}" if isinstance(why, OSError) else str(why)
-            complain(f"no journal is kept, an interruption loses finished work: {said}")
+            print_error(f"no journal is kept, an interruption loses finished work: {said}")
             self._warned = True
         return False
 
@@ -198,7 +198,7 @@ def keeping(
     except KeyboardInterrupt as stop:
         number = stop.number if isinstance(stop, Stopped) else signal.SIGINT
         kept.close(done=False)
-        complain(f"interrupted; {kept.left()}")
+        print_error(f"interrupted; {kept.left()}")
         raise typer.Exit(128 + number) from None
     except (OSError, WorkerLost, ClusterUnusable):
         kept.close(done=False)
@@ -215,11 +215,11 @@ def keeping(
         _prune(where)
 
 
-def idle() -> Callable[[], object]:
+def exit_on_signal() -> Callable[[], object]:
     """Let a signal end the program with one line while no study runs; returns the undo function."""
 
     def stop(number: int, _: FrameType | None) -> Never:
-        complain("interrupted; no work was in progress")
+        print_error("interrupted; no work was in progress")
         sys.exit(128 + number)
 
     return partial(_handle, _handle(dict.fromkeys(SIGNALS, stop)))
@@ -247,7 +247,7 @@ def _signals(left: Callable[[], str]) -> Iterator[None]:
             with suppress(IndexError):  # without a progress bar
                 console.err.clear_live()
             console.err.control(Control(ControlType.CARRIAGE_RETURN, (ControlType.ERASE_IN_LINE, 2)))
-            complain(f"interrupted; {left()}")
+            print_error(f"interrupted; {left()}")
         finally:
             _end(number[0], None)
 

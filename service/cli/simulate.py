@@ -13,8 +13,8 @@ import msgspec
 
 from feeders.model.site import Site
 from feeders.simulation.meters import BUSBAR
-from feeders.simulation.scenario import Reading, Sample, Scenario, simulate
-from service.ingest.zenoh_bus import Meters
+from feeders.simulation.scenario import Scenario, SimulatedReading, SimulatedTick, simulate
+from service.ingest.zenoh_bus import MeterClient
 
 # A service on a busy machine may pause for seconds.
 WAIT_S = 20.0
@@ -54,7 +54,7 @@ def key_of(feeder: str, meter: str) -> str:
     return f"{feeder}/{source}/reading"
 
 
-def payload_of(reading: Reading) -> bytes:
+def payload_of(reading: SimulatedReading) -> bytes:
     """Return a reading as transmitted JSON."""
     fields = {
         "t": reading.t,
@@ -71,12 +71,12 @@ def payload_of(reading: Reading) -> bytes:
 def play(
     site: Site,
     scenario: Scenario,
-    meters: Meters,
+    meters: MeterClient,
     pace: Pace,
     *,
     clock: Callable[[], float] = time.monotonic,
     sleep: Callable[[float], None] = time.sleep,
-) -> Iterator[Sample]:
+) -> Iterator[SimulatedTick]:
     """Publish a scenario's readings, tick by tick, each at its time.
 
     Parameters
@@ -101,7 +101,7 @@ def play(
     name = site.feeder.name
     steps = _Steps(meters, site, pace.ahead, scenario.dt_s) if pace.ahead is not None else None
     begin = clock()
-    waiting: list[tuple[float, int, Reading]] = []
+    waiting: list[tuple[float, int, SimulatedReading]] = []
     number = count()
 
     def send_until(t: float) -> None:
@@ -130,7 +130,7 @@ class _Steps:
     less than a max(d, s) therefore always ends, for any d, s, start, and a >= 1.
     """
 
-    def __init__(self, meters: Meters, site: Site, ahead: int, dt_s: float) -> None:
+    def __init__(self, meters: MeterClient, site: Site, ahead: int, dt_s: float) -> None:
         tick_s = site.tables.meta.monitor.tick_s
         self._meters = meters
         # Sums of many steps are not exact: a thousandth of a step is the tolerance.

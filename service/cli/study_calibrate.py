@@ -13,7 +13,7 @@ from service.cli.console import Studied, refuse_options
 from service.cli.paths import write_tables
 from service.cli.session import JournalAt, NoJournal, keeping
 from service.cli.sources import converted
-from service.cli.study_planning import Out, bar, said, show
+from service.cli.study_planning import Out, as_usage_error, bar, show
 
 if TYPE_CHECKING:
     from feeders.studies.calibrate.study import Calibrate
@@ -48,13 +48,13 @@ def calibrate(
     `--write` makes a copy with the significant corrections only; the feeder itself is never changed.
     """
     from feeders.studies.calibrate.feeder import site_of
-    from feeders.studies.calibrate.search import Kind
+    from feeders.studies.calibrate.search import FileErrorKind
     from feeders.studies.calibrate.study import calibrate as study
     from feeders.studies.calibrate.study import wrong_numbers
     from gridsec.errors import no_choice
 
     refuse_options(
-        [*no_choice("--look-for", Kind, *(look_for or ())), *wrong_numbers(risk, tolerance)],
+        [*no_choice("--look-for", FileErrorKind, *(look_for or ())), *wrong_numbers(risk, tolerance)],
         folders={"--out": out},
         new={"--write": write},
         files={"--journal": journal},
@@ -63,16 +63,16 @@ def calibrate(
     with keeping("calibrate", feeder, journal, without=no_journal) as kept:
         feeder = converted(feeder, out)
         site = site_of(feeder)
-        with bar("possible errors of the files") as tell, said():
+        with bar("possible errors of the files") as report_progress, as_usage_error():
             found = study(
                 site,
                 readings,
                 risk=risk,
                 tolerance=tolerance,
                 exclude=exclude or (),
-                kinds=[kind for kind in Kind if not look_for or kind in look_for],
+                kinds=[kind for kind in FileErrorKind if not look_for or kind in look_for],
                 journal=kept,
-                progress=tell,
+                progress=report_progress,
             )
         _tell(found)
         write_tables(out, "calibrate", found.tables)

@@ -12,19 +12,19 @@ import numpy as np
 import typer
 from rich.markup import escape
 
-from gridsec.errors import refuse
+from gridsec.errors import raise_if_any
 from service.cli import console
 from service.cli.console import Studied, finite, options_of, read_all
-from service.cli.paths import see, write_tables
+from service.cli.paths import check_paths, write_tables
 from service.cli.session import JournalAt, Keeping, NoJournal, keeping
 from service.cli.sources import converted
-from service.cli.study_planning import Out, bar, said, show
+from service.cli.study_planning import Out, as_usage_error, bar, show
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from feeders.model.site import Site
-    from feeders.studies.campaign.plan import Kind, Plan
+    from feeders.studies.campaign.plan import AttackClass, CampaignPlan
     from feeders.studies.campaign.study import Campaign
     from feeders.studies.workers import Runner
 
@@ -35,7 +35,7 @@ __all__ = [
     "DaskAt",
     "DesignOf",
     "Duration",
-    "Estimator",
+    "EstimatorName",
     "Kinds",
     "KnownKvar",
     "KnownKw",
@@ -73,7 +73,7 @@ def planned(
     load_error_kw: float | None,
     load_error_kvar: float | None,
     **chosen: Any,
-) -> Plan:
+) -> CampaignPlan:
     """Return the plan of a campaign; all problems of its options are raised at once.
 
     Parameters
@@ -87,10 +87,11 @@ def planned(
     Raises
     ------
     ValueError
-        If a scenario is too short for the interval of the readings, a setting is unknown, or as for `Plan`.
+        If a scenario is too short for the interval of the readings, a setting is unknown, or as for
+        `CampaignPlan`.
     """
     from feeders.simulation.trial import LoadError
-    from feeders.studies.campaign.plan import Plan, wrong_settings
+    from feeders.studies.campaign.plan import CampaignPlan, wrong_settings
 
     problems: list[str] = [*wrong_settings(site, chosen.get("settings") or ())]
     step_s = step or site.tables.meta.monitor.tick_s
@@ -105,15 +106,15 @@ def planned(
     if load_error_kw is not None or load_error_kvar is not None:
         chosen["load_error"] = LoadError(load_error_kw or 0.0, load_error_kvar or 0.0)
     try:
-        plan = Plan.of(site, **{name: value for name, value in chosen.items() if value is not None})
+        plan = CampaignPlan.of(site, **{name: value for name, value in chosen.items() if value is not None})
     except ValueError as error:
-        refuse([*problems, str(error)])
+        raise_if_any([*problems, str(error)])
         raise
-    refuse(problems)
+    raise_if_any(problems)
     return plan
 
 
-def sources(site: Site, plan: Plan, given: Mapping[str, object]) -> str:
+def sources(site: Site, plan: CampaignPlan, given: Mapping[str, object]) -> str:
     """Summary of a campaign, with the origin of its parameters: files or options.
 
     Parameters
@@ -194,7 +195,7 @@ Step = Annotated[
     ),
 ]
 DesignOf = Annotated[str, typer.Option(help="factorial or random combinations.")]
-Estimator = Annotated[
+EstimatorName = Annotated[
     str | None,
     typer.Option(help="Estimator, see `gridsec feeders estimators`. [default: as in the feeder's files]"),
 ]
@@ -261,7 +262,7 @@ def campaign(
     duration: Duration = None,
     step: Step = None,
     design: DesignOf = "factorial",
-    estimator: Estimator = None,
+    estimator: EstimatorName = None,
     setting: Settings = None,
     alarms_per_year: AlarmsPerYear = None,
     learned: Learned = 0.0,
@@ -277,11 +278,11 @@ def campaign(
     """Simulate attacks over days of profiles: meters named correctly, missed or named falsely, and delays."""
     from feeders.model.profiles import Season
     from feeders.model.site import load
-    from feeders.simulation.trial import Meters
+    from feeders.simulation.trial import TrialMeterErrors
     from feeders.studies.campaign.plan import Design, Place
     from feeders.studies.campaign.study import campaign as study
 
-    see(folders={"--out": out}, files={"--journal": journal})
+    check_paths(folders={"--out": out}, files={"--journal": journal})
     site, count = load(converted(feeder, out)), min(scenarios, together)
     problems = ["--workers: a Dask cluster has its own workers"] * (dask is not None and workers is not None)
     if count == 1:
@@ -293,8 +294,8 @@ def campaign(
     places = _each("--place", Place, place, problems)
     seasons = _each("--season", Season, season, problems)
     (drawn,) = _each("--design", Design, [design], problems) or (None,)
-    (quality,) = _each("--meters", Meters, [meters], problems) or (None,)
-    with keeping("campaign", feeder, journal, without=no_journal) as kept, said():
+    (quality,) = _each("--meters", TrialMeterErrors, [meters], problems) or (None,)
+    with keeping("campaign", feeder, journal, without=no_journal) as kept, as_usage_error():
         plan = options_of(
             lambda: planned(
                 site,
@@ -328,8 +329,8 @@ def campaign(
         console.out.print(escape(sources(site, plan, given)))
         if promised:
             plan = _with_promised(site, plan, plan.kinds if kind else (), kept)
-        with bar("scenarios") as tell:
-            found = study(site, plan, runner=_runner(workers, dask), journal=kept, progress=tell)
+        with bar("scenarios") as report_progress:
+            found = study(site, plan, runner=_runner(workers, dask), journal=kept, progress=report_progress)
         _print(found)
         write_tables(out, "campaign", found.tables)
 
@@ -354,13 +355,17 @@ def _print(found: Campaign) -> None:
     show("False accusations without an attack, and manipulated meters named", found.false_names)
 
 
-def _with_promised(site: Site, plan: Plan, others: tuple[Kind, ...], kept: Keeping) -> Plan:
+def _with_promised(
+    site: Site, plan: CampaignPlan, others: tuple[AttackClass, ...], kept: Keeping
+) -> CampaignPlan:
     from feeders.studies.campaign.guarantees import promised
     from feeders.studies.detectable import detectable, workers
 
     stated = plan.trial(site, plan.moment(0)).stated
-    with bar("attacks on meters, errors of customers") as tell:
-        found = detectable(stated, max_attacked=2, runner=workers(stated, None), journal=kept, progress=tell)
+    with bar("attacks on meters, errors of customers") as report_progress:
+        found = detectable(
+            stated, max_attacked=2, runner=workers(stated, None), journal=kept, progress=report_progress
+        )
     return replace(plan, kinds=(*others, *promised(stated, found)))
 
 
@@ -384,19 +389,19 @@ def _each(
     return None if wrong or not chosen else tuple(known(name) for name in dict.fromkeys(chosen))
 
 
-def _kind(text: str, step_s: float) -> Kind:
-    from feeders.simulation.attacks import Trick
-    from feeders.studies.campaign.plan import KINDS, Kind
+def _kind(text: str, step_s: float) -> AttackClass:
+    from feeders.simulation.attacks import AttackKind
+    from feeders.studies.campaign.plan import KINDS, AttackClass
 
     name, _, sizes = text.partition(":")
-    if name not in tuple(Trick):
-        raise ValueError(f"expected one of {', '.join(Trick)}")
-    trick = Trick(name)
+    if name not in tuple(AttackKind):
+        raise ValueError(f"expected one of {', '.join(AttackKind)}")
+    trick = AttackKind(name)
     if not sizes:
         usual = [kind.every(step_s) for kind in KINDS if kind.trick is trick]
         sizes = ",".join(str(size) for kind in usual for size in kind.sizes)
     try:
-        return Kind(name, trick, tuple(float(size) for size in sizes.split(",")))
+        return AttackClass(name, trick, tuple(float(size) for size in sizes.split(",")))
     except ValueError as error:
         raise ValueError("expected something like bias:1,3") from error
 

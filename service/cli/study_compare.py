@@ -20,7 +20,7 @@ from service.cli.study_campaign import LoadErrorKvar, LoadErrorKw, MetersAs
 
 if TYPE_CHECKING:
     from feeders.model.site import Site
-    from feeders.studies.comparison import Plan, Row
+    from feeders.studies.comparison import ComparisonPlan, ComparisonRow
 
 Families = Annotated[list[str] | None, typer.Option(help="An estimator; may be repeated. [default: all]")]
 Cases = Annotated[list[str] | None, typer.Option(help="A case; may be repeated. [default: all]")]
@@ -64,15 +64,15 @@ def compare(
     """
     from feeders.model.site import load
     from feeders.registry.registry import FAMILIES
-    from feeders.simulation.trial import LoadError, Meters
-    from feeders.studies.comparison import CASES, Plan, markdown, splice, write_csv
+    from feeders.simulation.trial import LoadError, TrialMeterErrors
+    from feeders.studies.comparison import CASES, ComparisonPlan, markdown, splice, write_csv
     from feeders.util import replace_file
     from gridsec.errors import no_choice
 
     families, cases = tuple(FAMILIES), tuple(each.name for each in CASES)
     refuse_options(
         [
-            *no_choice("--meters", Meters, meters),
+            *no_choice("--meters", TrialMeterErrors, meters),
             *no_choice("--family", families, *(family or ())),
             *no_choice("--case", cases, *(case or ())),
         ],
@@ -80,12 +80,12 @@ def compare(
         replaced={"--csv": csv, "--write": write},
         read={"--write": write},
     )
-    plan = Plan(
+    plan = ComparisonPlan(
         max_attacked=max_attacked,
         seeds=seeds,
         duration_s=duration,
         load_error=LoadError(load_error_kw, load_error_kvar),
-        meters=Meters(meters),
+        meters=TrialMeterErrors(meters),
         report_q=report_q,
         families=tuple(name for name in families if not family or name in family),
         cases=tuple(name for name in cases if not case or name in case),
@@ -109,7 +109,7 @@ def _read(page: Path) -> str:
     return page.read_text(encoding="utf-8")
 
 
-def _compared(site: Site, plan: Plan, kept: Keeping) -> list[Row]:
+def _compared(site: Site, plan: ComparisonPlan, kept: Keeping) -> list[ComparisonRow]:
     """Run the comparison with a progress display."""
     from feeders.studies.comparison import compare as study
 
@@ -127,7 +127,7 @@ def _compared(site: Site, plan: Plan, kept: Keeping) -> list[Row]:
         )
 
 
-def _told(feeder: str, site: Site, plan: Plan) -> str:
+def _told(feeder: str, site: Site, plan: ComparisonPlan) -> str:
     """Conditions of the tables, in one sentence."""
     error, runs = plan.load_error, "one run" if plan.seeds == 1 else f"{plan.seeds} runs"
     return (
@@ -140,11 +140,11 @@ def _told(feeder: str, site: Site, plan: Plan) -> str:
     )
 
 
-def _command(feeder: str, plan: Plan) -> str:
+def _command(feeder: str, plan: ComparisonPlan) -> str:
     """Command line of the same measurement."""
-    from feeders.studies.comparison import Plan
+    from feeders.studies.comparison import ComparisonPlan
 
-    usual = Plan()
+    usual = ComparisonPlan()
     options = {
         "--max-attacked": (plan.max_attacked, usual.max_attacked),
         "--seeds": (plan.seeds, usual.seeds),
@@ -165,7 +165,7 @@ def _command(feeder: str, plan: Plan) -> str:
     return command_line(words)
 
 
-def _show(rows: list[Row], plan: Plan) -> None:
+def _show(rows: list[ComparisonRow], plan: ComparisonPlan) -> None:
     """Print one table for each case, with reasons below it."""
     from feeders.studies.comparison import CASES, HEADERS, cells
 

@@ -15,7 +15,7 @@ from service.cli.console import Studied, options_of
 from service.cli.paths import write_tables
 from service.cli.session import JournalAt, Keeping, NoJournal, keeping
 from service.cli.sources import converted
-from service.cli.study_planning import Out, bar, said, show
+from service.cli.study_planning import Out, as_usage_error, bar, show
 
 if TYPE_CHECKING:
     from feeders.model.site import Site
@@ -153,10 +153,10 @@ def _studied(
     from feeders.studies.droop.study import droop as study
     from feeders.studies.droop.study import presets_of
 
-    with bar("fleets, steps and loads") as tell, said():
-        found = study(site, options, seed=seed, journal=kept, progress=tell)
+    with bar("fleets, steps and loads") as report_progress, as_usage_error():
+        found = study(site, options, seed=seed, journal=kept, progress=report_progress)
         if others:
-            theirs = presets_of(others, options, seed=seed, journal=kept, progress=tell)
+            theirs = presets_of(others, options, seed=seed, journal=kept, progress=report_progress)
             found.tables["presets"] = pd.concat([found.tables["presets"], theirs], ignore_index=True)
     return found
 

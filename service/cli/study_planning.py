@@ -15,7 +15,7 @@ from rich.table import Table
 
 from service.cli import console
 from service.cli.console import Studied, finite
-from service.cli.paths import see, write_tables
+from service.cli.paths import check_paths, write_tables
 from service.cli.session import JournalAt, NoJournal, keeping
 from service.cli.sources import converted
 
@@ -73,10 +73,10 @@ def redundancy(
     from feeders.model.site import load
     from feeders.studies.redundancy import redundancy as study
 
-    see(folders={"--out": out}, files={"--journal": journal})
+    check_paths(folders={"--out": out}, files={"--journal": journal})
     with keeping("redundancy", feeder, journal, without=no_journal) as kept:
         site = load(converted(feeder, out))
-        with bar("search for invisible attacks") as tell, said():
+        with bar("search for invisible attacks") as report_progress, as_usage_error():
             found = study(
                 site,
                 unknown=unknown,
@@ -84,7 +84,7 @@ def redundancy(
                 busbar_known=not busbar_unknown,
                 curves=curves,
                 journal=kept,
-                progress=tell,
+                progress=report_progress,
             )
         console.out.print(_unknowns(found.unknown, found.feeder))
         show("Manipulated meters of invisible attacks", found.summary)
@@ -123,7 +123,7 @@ def protect(
     from feeders.studies.unobservable import Attack
 
     bound = math.nan if lie_volt is None else lie_volt
-    with said():
+    with as_usage_error():
         check(
             max_attacked=max_attacked,
             goal=goal,
@@ -132,10 +132,10 @@ def protect(
             unknown=unknown,
             busbar_known=not busbar_unknown,
         )
-    see(folders={"--out": out}, files={"--journal": journal})
+    check_paths(folders={"--out": out}, files={"--journal": journal})
     with keeping("protect", feeder, journal, without=no_journal) as kept:
         site = load(converted(feeder, out))
-        with bar("meters protected, against attacks") as tell, said():
+        with bar("meters protected, against attacks") as report_progress, as_usage_error():
             found = study(
                 site,
                 max_attacked=max_attacked,
@@ -147,7 +147,7 @@ def protect(
                 never=never or (),
                 exact=not greedy,
                 journal=kept,
-                progress=lambda known, done: tell(done, known),
+                progress=lambda known, done: report_progress(done, known),
             )
         _tell_protection(found, len(site.meter_ids))
         write_tables(out, "protect", found.tables)
@@ -200,10 +200,10 @@ def detectable(
     from feeders.studies.detectable import detectable as study
     from feeders.studies.detectable import workers as where
 
-    see(folders={"--out": out}, files={"--journal": journal})
+    check_paths(folders={"--out": out}, files={"--journal": journal})
     with keeping("detectable", feeder, journal, without=no_journal) as kept:
         site = load(converted(feeder, out))
-        with bar("attacks on meters, errors of customers") as tell, said():
+        with bar("attacks on meters, errors of customers") as tell, as_usage_error():
             found = study(
                 site,
                 max_attacked=max_attacked,
@@ -221,9 +221,9 @@ def detectable(
         show(f"Errors of the voltage with {more + 1} hidden manipulated meters, V", found.customers.round(2))
         write_tables(out, "detectable", found.tables)
         if trials:
-            with bar("simulated attacks") as tell:
+            with bar("simulated attacks") as report_progress:
                 seen = rehearse(
-                    site, found, trials=trials, seed=seed, share=share, journal=kept, progress=tell
+                    site, found, trials=trials, seed=seed, share=share, journal=kept, progress=report_progress
                 )
             console.out.print(
                 f"{seen.trials} attacks up to the hidden size: {seen.hidden_named} with a meter named\n"
@@ -261,7 +261,7 @@ def bar(what: str) -> Iterator[Tell]:
 
 
 @contextmanager
-def said() -> Iterator[None]:
+def as_usage_error() -> Iterator[None]:
     """Convert a ValueError to a usage error."""
     try:
         yield

@@ -20,19 +20,19 @@ from rich.markup import escape
 from feeders.util import command_line, replace_file, word
 from gridsec.errors import GridsecError, InputInvalid, Problem
 from service.cli import console
-from service.cli.console import FAILED, Studied, complain, options_of, read_all
+from service.cli.console import FAILED, Studied, options_of, print_error, read_all
 from service.cli.paths import write_tables
 from service.cli.session import keeping
 from service.cli.sources import converted
-from service.cli.study_campaign import Estimator, KnownKvar, KnownKw, Seed, Step, planned, sources
+from service.cli.study_campaign import EstimatorName, KnownKvar, KnownKw, Seed, Step, planned, sources
 from service.cli.study_droop import Allowed, Preset
 from service.cli.study_planning import BusbarUnknown, GoalOf, LieVolt, Silent, Unknown, bar
 
 if TYPE_CHECKING:
     from feeders.model.site import Site
     from feeders.report.build import Report
-    from feeders.report.html import Outcome, Result
-    from feeders.studies.campaign.plan import Plan
+    from feeders.report.html import Result, StudyOutcome
+    from feeders.studies.campaign.plan import CampaignPlan
     from feeders.studies.journal import Progress, Where
     from service.cli.session import Keeping
 
@@ -133,14 +133,16 @@ class Study:
     seeded: bool = False
 
 
-def _detectable(site: Site, asked: Asked, journal: Where, tell: Progress | None) -> Result:
+def _detectable(site: Site, asked: Asked, journal: Where, report_progress: Progress | None) -> Result:
     from feeders.studies.detectable import detectable, workers
 
     runner = workers(site, None if asked.workers > 1 else 1)
-    return detectable(site, max_attacked=asked.max_attacked, runner=runner, journal=journal, progress=tell)
+    return detectable(
+        site, max_attacked=asked.max_attacked, runner=runner, journal=journal, progress=report_progress
+    )
 
 
-def _protect(site: Site, asked: Asked, journal: Where, tell: Progress | None) -> Result:
+def _protect(site: Site, asked: Asked, journal: Where, report_progress: Progress | None) -> Result:
     from feeders.studies.protect import Goal, protect
 
     return protect(
@@ -151,11 +153,11 @@ def _protect(site: Site, asked: Asked, journal: Where, tell: Progress | None) ->
         unknown=asked.unknown,
         busbar_known=not asked.busbar_unknown,
         journal=journal,
-        progress=None if tell is None else lambda known, done: tell(done, known),
+        progress=None if report_progress is None else lambda known, done: report_progress(done, known),
     )
 
 
-def _redundancy(site: Site, asked: Asked, journal: Where, tell: Progress | None) -> Result:
+def _redundancy(site: Site, asked: Asked, journal: Where, report_progress: Progress | None) -> Result:
     from feeders.studies.redundancy import redundancy
 
     return redundancy(
@@ -164,11 +166,11 @@ def _redundancy(site: Site, asked: Asked, journal: Where, tell: Progress | None)
         silent=asked.silent,
         busbar_known=not asked.busbar_unknown,
         journal=journal,
-        progress=tell,
+        progress=report_progress,
     )
 
 
-def _droop(site: Site, asked: Asked, journal: Where, tell: Progress | None) -> Result:
+def _droop(site: Site, asked: Asked, journal: Where, report_progress: Progress | None) -> Result:
     from feeders.studies.droop.study import DroopOptions, droop
 
     low, high = asked.busbar or (1.0, 1.0)
@@ -176,29 +178,31 @@ def _droop(site: Site, asked: Asked, journal: Where, tell: Progress | None) -> R
     options = DroopOptions(
         preset=asked.preset, v0_low=low, v0_high=high, v_min=least, v_max=most, hosting=asked.hosting
     )
-    return droop(site, options, seed=asked.seed, journal=journal, progress=tell)
+    return droop(site, options, seed=asked.seed, journal=journal, progress=report_progress)
 
 
-def _calibrate(site: Site, asked: Asked, journal: Where, tell: Progress | None) -> Result:
+def _calibrate(site: Site, asked: Asked, journal: Where, report_progress: Progress | None) -> Result:
     from feeders.studies.calibrate.study import calibrate
 
     if asked.readings is None:
         raise InputInvalid([Problem("missing", "recorded readings are missing")])
-    return calibrate(site, asked.readings, journal=journal, progress=tell)
+    return calibrate(site, asked.readings, journal=journal, progress=report_progress)
 
 
-def _campaign(site: Site, asked: Asked, journal: Where, tell: Progress | None) -> Result:
+def _campaign(site: Site, asked: Asked, journal: Where, report_progress: Progress | None) -> Result:
     from feeders.studies.campaign.study import campaign
     from feeders.studies.workers import cores
 
-    return campaign(site, plan(site, asked), runner=cores(asked.workers), journal=journal, progress=tell)
+    return campaign(
+        site, plan(site, asked), runner=cores(asked.workers), journal=journal, progress=report_progress
+    )
 
 
-def plan(site: Site, asked: Asked) -> Plan:
+def plan(site: Site, asked: Asked) -> CampaignPlan:
     """Return the simulated attacks of a report."""
-    from feeders.studies.campaign.plan import Plan
+    from feeders.studies.campaign.plan import CampaignPlan
 
-    together = min(asked.scenarios, Plan().together)
+    together = min(asked.scenarios, CampaignPlan().together)
     return planned(
         site,
         step=asked.step,
@@ -307,7 +311,7 @@ def outcome(
     *,
     kept: Keeping,
     bar: Callable[[str], AbstractContextManager[Progress]],
-) -> Outcome:
+) -> StudyOutcome:
     """Run a study; a failure becomes part of the report.
 
     Parameters
@@ -317,7 +321,7 @@ def outcome(
     bar
         Progress bar.
     """
-    from feeders.report.html import Outcome
+    from feeders.report.html import StudyOutcome
     from feeders.studies.droop.fleets import NOTHING, NoInverters
 
     study = STUDIES[name]
@@ -325,16 +329,16 @@ def outcome(
     start = time.perf_counter()
     found: Result | None = None
     problem, absent = "", False
-    with bar(study.what) as tell:
+    with bar(study.what) as report_progress:
         try:
-            found = study.run(site, asked, kept, tell)
+            found = study.run(site, asked, kept, report_progress)
         except NoInverters as error:
             absent = not asked.hosting
             problem = NOTHING if absent else str(error)
         except (GridsecError, ValueError) as error:
             problem = str(error)
     duration = time.perf_counter() - start
-    return Outcome(
+    return StudyOutcome(
         name, found, problem, command_line(words), duration, resumed=name in kept.resumed, absent=absent
     )
 
@@ -441,7 +445,7 @@ def report(
     seed: Seed = 0,
     workers: Workers = None,
     step: Step = None,
-    estimator: Estimator = None,
+    estimator: EstimatorName = None,
     load_error_kw: KnownKw = None,
     load_error_kvar: KnownKvar = None,
     preset: Preset = None,
@@ -541,7 +545,7 @@ def _make(asked: Asked, chosen: tuple[str, ...], out: Path, *, made: str, comman
             console.out.print(escape(f"{each.study}: {each.problem}"))
     failed = [each for each in outcomes if each.result is None and not each.absent]
     for each in failed:
-        complain(f"{each.study}: {each.problem}")
+        print_error(f"{each.study}: {each.problem}")
     if failed:
         raise typer.Exit(FAILED)
 

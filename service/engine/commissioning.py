@@ -1,7 +1,7 @@
 """Commissioning of one feeder: learning of its meters' fixed errors, with storage across restarts.
 
-`Commissioning` has no clock and no input or output, like the `Watch` that owns it: time comes from the ticks,
-stored texts are passed as values. Readers on other threads only take references.
+`FeederCommissioning` has no clock and no input or output, like the `FeederMonitor` that owns it: time comes
+from the ticks, stored texts are passed as values. Readers on other threads only take references.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from feeders.model.site import Site
-from feeders.registry.registry import Learner, Watcher
+from feeders.registry.registry import BiasLearning, DesignedEstimator
 from gridsec.arrays import Bools, Floats
 from gridsec.errors import GridsecError, Problem
 from gridsec.estimators.sequential import (
@@ -26,8 +26,8 @@ from gridsec.estimators.sequential import (
     to_arrays,
 )
 from service.report.report import LearningReport, StalledMeter
-from service.store.schema import Happened, Step
-from service.store.state_codec import Kept, KeptInvalid, decode, encode, fingerprint
+from service.store.schema import CommissioningChange, CommissioningEvent
+from service.store.state_codec import KeptInvalid, StateSnapshot, decode, encode, fingerprint
 
 SAVE_S = 60.0
 """Interval of storing the learning in progress, s; all other changes are stored at once."""
@@ -139,7 +139,7 @@ class Progress:
     meters: tuple[MeterStage, ...]
 
 
-class Commissioning:
+class FeederCommissioning:
     """Commissioning of one feeder.
 
     Parameters
@@ -155,22 +155,22 @@ class Commissioning:
         As in `Progress`.
     """
 
-    def __init__(self, site: Site, kept: Kept | None = None) -> None:
+    def __init__(self, site: Site, kept: StateSnapshot | None = None) -> None:
         self.known: Commission | None = None
         self.restored = False
         self.note = ""
         self._site, self._kept, self._fingerprint = site, kept, fingerprint(site)
-        self._watcher: Watcher | None = None
+        self._watcher: DesignedEstimator | None = None
         self._t: float | None = None
         self._saved_t: float | None = None
-        self._happened: tuple[Happened, ...] = ()
+        self._happened: tuple[CommissioningEvent, ...] = ()
 
     @property
-    def learner(self) -> Learner | None:
+    def learner(self) -> BiasLearning | None:
         """Learning functions of the present monitor; None if it does not learn, or before its design."""
-        return None if self._watcher is None else self._watcher.learner
+        return None if self._watcher is None else self._watcher.bias_learning
 
-    def install(self, watcher: Watcher) -> None:
+    def install(self, watcher: DesignedEstimator) -> None:
         """Install a finished design, and the stored state if it fits."""
         self._watcher = watcher
         if self.learner is None:
@@ -201,9 +201,9 @@ class Commissioning:
         before, self.known, self._t = self.known, self.learner.commission(state), t
         if before is None:
             every = np.ones(len(self._site.meter_ids), dtype=np.bool_)
-            self._note(Step.BEGUN, every, t, reason=self.note)
+            self._note(CommissioningChange.BEGUN, every, t, reason=self.note)
         elif self.known.learned is not before.learned:
-            self._note(Step.LEARNED, self.known.learned.at == t, t)
+            self._note(CommissioningChange.LEARNED, self.known.learned.at == t, t)
 
     def renew(self, state: Any, meters: Sequence[str], t: float, who: str, reason: str) -> Any:
         """Restart the learning of meters.
@@ -236,35 +236,37 @@ class Commissioning:
         after = learner.renew(watcher.design, begun, which)
         self.known = learner.commission(after)
         self._t = t if self._t is None else self._t
-        self._note(Step.RECOMMISSIONED, which, t, who=who, reason=reason)
+        self._note(CommissioningChange.RECOMMISSIONED, which, t, who=who, reason=reason)
         return None if state is None else after
 
     def _why_not(self) -> Problem:
         if self._watcher is None:
             return Problem("no-monitor", "the monitor has no design yet, or the design failed")
         family = self._watcher.family
-        if family.learner is None:
+        if family.bias_learning is None:
             text = f"its estimator, {family.name}, does not learn meters' errors"
             return Problem("never-learns", text)
         return Problem("learning-off", "commission_s is 0: learning is off")
 
     def _note(
-        self, change: Step, which: Bools, t: float, *, who: str | None = None, reason: str = ""
+        self, change: CommissioningChange, which: Bools, t: float, *, who: str | None = None, reason: str = ""
     ) -> None:
         meters = tuple(meter for meter, one in zip(self._site.meter_ids, which, strict=True) if one)
-        one_more = Happened(self._site.feeder.name, t, change, meters, who, reason)
+        one_more = CommissioningEvent(self._site.feeder.name, t, change, meters, who, reason)
         # Never changed in place: a copy of this object stays valid for an undo.
         self._happened = (*self._happened, one_more)
 
     # ---------------------------------------------------------------- storage
 
-    def now(self) -> Kept | None:
+    def now(self) -> StateSnapshot | None:
         """Return the present state for the store; None before the first tick."""
         if self.known is None or self._t is None:
             return None
         return encode(self._site, self._fingerprint, self._t, to_arrays(self.known))
 
-    def due(self, *, at_once: bool = False) -> tuple[tuple[Kept, ...], tuple[Happened, ...]]:
+    def due(
+        self, *, at_once: bool = False
+    ) -> tuple[tuple[StateSnapshot, ...], tuple[CommissioningEvent, ...]]:
         """Return the state that is due for the store; it counts as stored afterwards.
 
         Parameters
@@ -302,9 +304,9 @@ class Commissioning:
     def _found(self, known: Commission | None) -> LearningProgress | None:
         """Progress of the estimator; None if it does not learn, and before the first tick."""
         watcher = self._watcher
-        if known is None or watcher is None or watcher.learner is None:
+        if known is None or watcher is None or watcher.bias_learning is None:
             return None
-        return watcher.learner.progress(watcher.design, known)
+        return watcher.bias_learning.progress(watcher.design, known)
 
     def progress(self) -> Progress:
         """Return the progress."""

@@ -16,29 +16,29 @@ import structlog
 
 from feeders.format.tables import from_json
 from feeders.model.site import Site, from_tables
-from feeders.registry.registry import Watcher
+from feeders.registry.registry import DesignedEstimator
 from gridsec.errors import FeederInvalid, GridsecError, Problem
-from service.engine.feeder_monitor import Watch, design
+from service.engine.feeder_monitor import FeederMonitor, design
 
 _log = structlog.get_logger("gridsec.runtime")
 
 
-def begin(watch: Watch, hand_over: Callable[[Callable[[], None]], None]) -> None:
+def begin(monitor: FeederMonitor, on_designed: Callable[[Callable[[], None]], None]) -> None:
     """Design in a daemon thread, which does not delay the end of the process.
 
     Parameters
     ----------
-    hand_over
+    on_designed
         Called from that thread with the remaining step, `install`, to run between two rounds.
     """
 
     def run() -> None:
         started = time.monotonic()
-        finished: Watcher | None = None
+        finished: DesignedEstimator | None = None
         defect: Exception | None = None
         problem = ""
         try:
-            finished = design(watch.site, _progress(watch.name))
+            finished = design(monitor.site, _progress(monitor.name))
         except GridsecError as error:
             problem = str(error)
         except Exception as error:  # noqa: BLE001 - shown to the operator as the feeder's problem
@@ -47,16 +47,16 @@ def begin(watch: Watch, hand_over: Callable[[Callable[[], None]], None]) -> None
 
         def end() -> None:
             if defect is not None:
-                _log.error("design failed", feeder=watch.name, exc_info=defect)
-            _log.info("design finished", feeder=watch.name, seconds=seconds, problem=problem or None)
-            install(watch, finished, problem)
+                _log.error("design failed", feeder=monitor.name, exc_info=defect)
+            _log.info("design finished", feeder=monitor.name, seconds=seconds, problem=problem or None)
+            install(monitor, finished, problem)
 
-        hand_over(end)
+        on_designed(end)
 
-    _apart(watch.name, run)
+    _apart(monitor.name, run)
 
 
-def prepare(name: str, tables: dict[str, Any]) -> asyncio.Future[tuple[Site, Watcher]]:
+def prepare(name: str, tables: dict[str, Any]) -> asyncio.Future[tuple[Site, DesignedEstimator]]:
     """Load and design a feeder as `begin` does; called from the event loop.
 
     Parameters
@@ -71,9 +71,9 @@ def prepare(name: str, tables: dict[str, Any]) -> asyncio.Future[tuple[Site, Wat
         waiting completes it in another way; the result of the thread is then discarded.
     """
     loop = asyncio.get_running_loop()
-    answer: asyncio.Future[tuple[Site, Watcher]] = loop.create_future()
+    answer: asyncio.Future[tuple[Site, DesignedEstimator]] = loop.create_future()
 
-    def work() -> tuple[Site, Watcher]:
+    def work() -> tuple[Site, DesignedEstimator]:
         parsed = from_json(tables)
         if parsed.meta.name != name:
             text = f"feeder: name {parsed.meta.name!r} does not fit the address {name!r}"
@@ -104,24 +104,24 @@ def _apart(name: str, run: Callable[[], None]) -> None:
     threading.Thread(target=run, name=f"gridsec-design-{name}", daemon=True).start()
 
 
-def install(watch: Watch, finished: Watcher | None, problem: str) -> None:
+def install(monitor: FeederMonitor, finished: DesignedEstimator | None, problem: str) -> None:
     """Start monitoring with a finished design, or mark the feeder as failed.
 
     Parameters
     ----------
-    watch, finished, problem
+    monitor, finished, problem
         Monitor of the feeder, and its design, or None with the reason.
     """
     if finished is None:
-        watch.fail(problem)
+        monitor.fail(problem)
         return
-    watch.install(finished)
-    if watch.commissioning.restored:
-        _log.info("commissioning goes on from what was kept", feeder=watch.name)
-    elif watch.commissioning.note:
-        _log.warning("commissioning begins anew", feeder=watch.name, reason=watch.commissioning.note)
-    if watch.suspicions.note:
-        _log.warning("stored suspicions are not used", feeder=watch.name, reason=watch.suspicions.note)
+    monitor.install(finished)
+    if monitor.commissioning.restored:
+        _log.info("commissioning goes on from what was kept", feeder=monitor.name)
+    elif monitor.commissioning.note:
+        _log.warning("commissioning begins anew", feeder=monitor.name, reason=monitor.commissioning.note)
+    if monitor.suspicions.note:
+        _log.warning("stored suspicions are not used", feeder=monitor.name, reason=monitor.suspicions.note)
 
 
 def settle() -> None:

@@ -37,22 +37,22 @@ from service.alarms.state_machine import (
     restore,
 )
 from service.alarms.state_machine import to_json as alarm_json
-from service.engine.commissioning import Commissioning
+from service.engine.commissioning import FeederCommissioning
 from service.engine.commissioning import to_json as commissioning_json
-from service.engine.feeder_monitor import TickResult, Watch, align_rules, known_of
+from service.engine.feeder_monitor import FeederMonitor, TickResult, align_rules, known_of
 from service.engine.suspicions import Suspicions
 from service.errors import FeederUnknown
-from service.ingest.align import Clock, Outcome
-from service.ingest.decode import Decoded, Wire
+from service.ingest.align import Clock, ReadingOutcome
+from service.ingest.decode import DecodedPayload, Wire
 from service.ingest.queues import Sample
 from service.ingest.reading import HEAD_BYTES, BadReading, BadReason, Reading, beginning, head_of
 from service.metrics import Metrics
 from service.report.report import FeederReport
 from service.report.report import to_json as report_json
 from service.store import Rejected, Store
-from service.store.committer import Apart, Keeper, Wish, alarm_key, at_once
-from service.store.schema import Happened
-from service.store.state_codec import Kept
+from service.store.committer import Committer, Executor, Wish, alarm_key, inline
+from service.store.schema import CommissioningEvent
+from service.store.state_codec import StateSnapshot
 
 BAD_PER_SOURCE = 5
 """Bad readings of one round, key and reason that are stored separately; the others become one entry."""
@@ -135,7 +135,10 @@ class CatchUp:
         self._calm_at: float | None = None
 
     def judge(
-        self, watches: Iterable[Watch], judge: Callable[[Watch], None], go_on: Callable[[], bool]
+        self,
+        monitors: Iterable[FeederMonitor],
+        judge: Callable[[FeederMonitor], None],
+        go_on: Callable[[], bool],
     ) -> None:
         """Evaluate the pending ticks.
 
@@ -146,25 +149,25 @@ class CatchUp:
         go_on
             Checked before each tick; if False, the remaining ticks stay pending.
         """
-        due = [watch for watch in watches if watch.pending]
-        stale = [watch for watch in due if len(watch.pending) > 1]
+        due = [monitor for monitor in monitors if monitor.pending]
+        stale = [monitor for monitor in due if len(monitor.pending) > 1]
         if self._waits or not stale:
             self._left_s = BUDGET_S
         begun = self._clock()
         end = begun + self._left_s
         while stale and go_on() and self._clock() < end:
-            first = min(stale, key=lambda watch: watch.pending[0].t)
+            first = min(stale, key=lambda monitor: monitor.pending[0].t)
             judge(first)
             if len(first.pending) < 2:
                 stale.remove(first)
         self._left_s -= self._clock() - begun
         if stale and self._waits:
             return
-        for watch in stale if go_on() else ():
-            watch.skip(len(watch.pending) - 1)
-        for watch in due:
-            if watch.pending and go_on():
-                judge(watch)
+        for monitor in stale if go_on() else ():
+            monitor.skip(len(monitor.pending) - 1)
+        for monitor in due:
+            if monitor.pending and go_on():
+                judge(monitor)
 
     def skipped(self, feeder: str, count: int) -> None:
         """Log the first skipped ticks, and their number after `CALM_S` without one.
@@ -224,15 +227,15 @@ class RuntimeConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class Past:
+class PersistedState:
     """Stored state of a feeder for the warm start of a monitor: alarms, commissioning, suspicions."""
 
     alarms: tuple[Alarm, ...]
-    commission: Kept | None
-    distrust: Kept | None
+    commission: StateSnapshot | None
+    distrust: StateSnapshot | None
 
 
-class Rounds:
+class Engine:
     """All state of the service.
 
     Parameters
@@ -262,7 +265,7 @@ class Rounds:
         *,
         wall: Callable[[], float],
         stored: Callable[[], None],
-        apart: Apart = at_once,
+        apart: Executor = inline,
         unloaded: Mapping[str, str] | None = None,
         clock: Callable[[], float] = time.monotonic,
         go_on: Callable[[], bool] = lambda: True,
@@ -270,17 +273,17 @@ class Rounds:
         self.config = config
         self.store = store
         self.metrics = Metrics()
-        self.watches: dict[str, Watch] = {}
+        self.monitors: dict[str, FeederMonitor] = {}
         self.unloaded = dict(unloaded or {})
         self.reported: dict[str, float] = {}
         self._wall, self._stored, self._continues = wall, stored, go_on
         self._catch_up = CatchUp(clock, waits=config.clock is Clock.EVENTS)
-        self.keeper = Keeper(store, self.metrics, stored, self._count_stored, apart)
+        self.committer = Committer(store, self.metrics, stored, self._count_stored, apart)
         self._wire = Wire({}, config.prefix, config.max_payload)
         for site in sites:
             self.add(site)
 
-    def add(self, site: Site, past: Past | None = None) -> Watch:
+    def add(self, site: Site, past: PersistedState | None = None) -> FeederMonitor:
         """Start monitoring a feeder, or restart it with other tables; its alarms stay.
 
         Parameters
@@ -294,24 +297,26 @@ class Rounds:
             site, config.clock, max_skew_s=config.max_skew_s, grace_s=config.grace_s, live=True
         )
         book = restore(name, past.alarms)
-        watch = Watch(
-            site, rules, book, Commissioning(site, past.commission), Suspicions(site, past.distrust)
+        monitor = FeederMonitor(
+            site, rules, book, FeederCommissioning(site, past.commission), Suspicions(site, past.distrust)
         )
         held = {alarm.id for alarm in book.alarms}
         twice = [alarm for alarm in past.alarms if alarm.id not in held]
-        self.keeper.waiting.add(transitions=close(twice, self._wall(), TOLD_TWICE))
-        self.watches = {**self.watches, name: watch}
+        self.committer.waiting.add(transitions=close(twice, self._wall(), TOLD_TWICE))
+        self.monitors = {**self.monitors, name: monitor}
         self.unloaded.pop(name, None)
         self._learn()
-        return watch
+        return monitor
 
-    def _past(self, name: str, store: Store) -> Past:
+    def _past(self, name: str, store: Store) -> PersistedState:
         # With `Clock.EVENTS` the latest tick may be long ago; `advance` drops alarms that are too old.
         latest = min([self._wall(), *(tick["t"] for tick in store.history(name, limit=1))])
         alarms = store.active(name, cleared_since=latest - AlarmRules().memory_s)
-        return Past(tuple(alarms), store.commission(name), store.distrust(name))
+        return PersistedState(tuple(alarms), store.commission(name), store.distrust(name))
 
-    def put(self, site: Site, tables: Mapping[str, Any], installed: Callable[[Watch], None]) -> Future[None]:
+    def put(
+        self, site: Site, tables: Mapping[str, Any], installed: Callable[[FeederMonitor], None]
+    ) -> Future[None]:
         """Store a feeder's tables and start monitoring it, or restart it with other tables.
 
         Parameters
@@ -329,26 +334,26 @@ class Rounds:
         answer: Future[None] = Future()
         name = site.feeder.name
 
-        def store(past: Past) -> None:
-            self.keeper.store(
+        def store(past: PersistedState) -> None:
+            self.committer.store(
                 Wish(put=(name, tables)),
                 _landing(answer, lambda: installed(self.add(site, self._go_on(name, past)))),
                 partial(_refuse, answer),
             )
 
         self.keep_states(at_once=True)
-        self.keeper.look(partial(self._past, name), _then(answer, store), partial(_refuse, answer))
+        self.committer.look(partial(self._past, name), _then(answer, store), partial(_refuse, answer))
         return answer
 
-    def _go_on(self, name: str, stored: Past) -> Past:
+    def _go_on(self, name: str, stored: PersistedState) -> PersistedState:
         """Return the latest state of a feeder: a monitored one has had ticks since it was stored."""
-        watch = self.watches.get(name)
-        if watch is None:
+        monitor = self.monitors.get(name)
+        if monitor is None:
             return stored
-        return Past(
-            watch.book.alarms,
-            watch.commissioning.now() or stored.commission,
-            watch.suspicions.now() or stored.distrust,
+        return PersistedState(
+            monitor.book.alarms,
+            monitor.commissioning.now() or stored.commission,
+            monitor.suspicions.now() or stored.distrust,
         )
 
     def remove(self, name: str) -> Future[None]:
@@ -360,35 +365,35 @@ class Rounds:
             If it does not exist, or the change cannot be stored; monitoring then continues.
         """
         answer: Future[None] = Future()
-        watch = self.watches.get(name)
-        if watch is None and name not in self.unloaded:
+        monitor = self.monitors.get(name)
+        if monitor is None and name not in self.unloaded:
             raise FeederUnknown(name)
 
         def store(standing: Iterable[Alarm]) -> None:
-            t = self._wall() if watch is None or watch.book.t is None else watch.book.t
-            self.keeper.store(
+            t = self._wall() if monitor is None or monitor.book.t is None else monitor.book.t
+            self.committer.store(
                 Wish(close(standing, t, NOT_WATCHED), without=name),
                 _landing(answer, partial(self._removed, name)),
                 partial(_refuse, answer),
             )
 
-        if watch is None:
-            self.keeper.look(lambda db: db.active(name), _then(answer, store), partial(_refuse, answer))
+        if monitor is None:
+            self.committer.look(lambda db: db.active(name), _then(answer, store), partial(_refuse, answer))
         else:
-            store(watch.book.active)
+            store(monitor.book.active)
         return answer
 
     def _removed(self, name: str) -> None:
         self.unloaded.pop(name, None)
-        self.watches = {other: kept for other, kept in self.watches.items() if other != name}
-        self.keeper.waiting.forget(name)
+        self.monitors = {other: kept for other, kept in self.monitors.items() if other != name}
+        self.committer.waiting.forget(name)
         self._learn()
         self.metrics.forget(name)
-        if self.keeper.publisher is not None:
-            self.keeper.publisher.withdraw(f"{name}/estimate")
+        if self.committer.publisher is not None:
+            self.committer.publisher.withdraw(f"{name}/estimate")
 
     def _learn(self) -> None:
-        known = {name: known_of(watch.site) for name, watch in self.watches.items()}
+        known = {name: known_of(monitor.site) for name, monitor in self.monitors.items()}
         self._wire = Wire(known, self.config.prefix, self.config.max_payload)
 
     def begin(self) -> None:
@@ -396,21 +401,21 @@ class Rounds:
 
         Alarms of feeders that are neither monitored nor stored any more are cleared here: no monitor does it.
         """
-        ours, t = self.watches.keys() | self.unloaded.keys() | self.store.feeders().keys(), self._wall()
+        ours, t = self.monitors.keys() | self.unloaded.keys() | self.store.feeders().keys(), self._wall()
         standing = self.store.active()
         left_out = [alarm for alarm in standing if alarm.feeder not in ours]
-        self.keeper.waiting.add(transitions=close(left_out, t, NOT_WATCHED))
-        if self.keeper.publisher is not None:
+        self.committer.waiting.add(transitions=close(left_out, t, NOT_WATCHED))
+        if self.committer.publisher is not None:
             for alarm in standing:
                 if alarm.feeder in ours:
-                    self.keeper.publisher.answer(alarm_key(alarm), msgspec.json.encode(alarm_json(alarm)))
+                    self.committer.publisher.answer(alarm_key(alarm), msgspec.json.encode(alarm_json(alarm)))
         for name in self.unloaded:
             self.metrics.alarms.labels(name).set(sum(alarm.feeder == name for alarm in standing))
-        self.keeper.commit()
+        self.committer.commit()
 
     # ---------------------------------------------------------------- one round
 
-    def round(self, samples: list[Sample], oldest: Callable[[], float | None] = lambda: None) -> bool:
+    def cycle(self, samples: list[Sample], oldest: Callable[[], float | None] = lambda: None) -> bool:
         """Process samples and due ticks, store, publish.
 
         Parameters
@@ -430,19 +435,19 @@ class Rounds:
         now, waiting = self._wall(), oldest()
         # A tick must not end before samples that arrived in time have left the queue.
         until = now if waiting is None else min(now, waiting)
-        for watch in self.watches.values():
-            self._guarded(watch, partial(watch.reach, until))
+        for monitor in self.monitors.values():
+            self._guarded(monitor, partial(monitor.reach, until))
         results = self._judge()
         entries, left_out = some_of_each(bad)
-        self.keeper.waiting.add(rejected=entries)
+        self.committer.waiting.add(rejected=entries)
         self.metrics.forgotten.labels("bad-reading").inc(left_out)
         for result in results:
-            self.keeper.waiting.add(transitions=result.transitions, reports=(result.report,))
+            self.committer.waiting.add(transitions=result.transitions, reports=(result.report,))
             self._count_tick(result.report)
             self.reported[result.report.feeder] = time.monotonic()
         judged = {result.report.feeder for result in results}
-        self.keep_states(watch for name, watch in self.watches.items() if name in judged)
-        self.keeper.commit()
+        self.keep_states(monitor for name, monitor in self.monitors.items() if name in judged)
+        self.committer.commit()
         self._publish_estimates(results)
         if samples or results:
             self.metrics.cycle.observe(time.perf_counter() - started)
@@ -451,12 +456,12 @@ class Rounds:
     @property
     def behind(self) -> bool:
         """True while due ticks wait for the next round."""
-        return any(watch.pending for watch in self.watches.values())
+        return any(monitor.pending for monitor in self.monitors.values())
 
     def _place(self, samples: Iterable[Sample]) -> list[Rejected]:
         """Decode and align samples without evaluation; return the unusable readings."""
         bad: list[Rejected] = []
-        outcomes: Counter[tuple[str, Outcome]] = Counter()
+        outcomes: Counter[tuple[str, ReadingOutcome]] = Counter()
         lost: dict[str, int] = {}
         for sample in samples:
             if not self._continues():
@@ -464,61 +469,61 @@ class Rounds:
             decoded = self._decode(sample)
             bad.extend(self._note(problem, sample) for problem in decoded.bad)
             for reading in decoded.readings:
-                watch = self.watches[reading.feeder]
-                lost.setdefault(watch.name, watch.aligner.lost)
-                outcome = self._guarded(watch, partial(watch.place, reading, sample.arrival))
+                monitor = self.monitors[reading.feeder]
+                lost.setdefault(monitor.name, monitor.aligner.lost)
+                outcome = self._guarded(monitor, partial(monitor.place, reading, sample.arrival))
                 if outcome is not None:
-                    outcomes[watch.name, outcome] += 1
-                if outcome is Outcome.CLOCK_OFF:
+                    outcomes[monitor.name, outcome] += 1
+                if outcome is ReadingOutcome.CLOCK_OFF:
                     bad.append(self._clock_off(reading, sample.arrival))
-                bad.extend(self._clock_off(refused, sample.arrival) for refused in watch.aligner.refused())
+                bad.extend(self._clock_off(refused, sample.arrival) for refused in monitor.aligner.refused())
         for (name, outcome), count in outcomes.items():
             self.metrics.readings.labels(name, outcome).inc(count)
         for name, before in lost.items():
-            self.metrics.lost.labels(name).inc(self.watches[name].aligner.lost - before)
+            self.metrics.lost.labels(name).inc(self.monitors[name].aligner.lost - before)
         return bad
 
     def _judge(self) -> list[TickResult]:
         """Evaluate the pending ticks within the time budget; count skipped ones."""
         results: list[TickResult] = []
 
-        def judge(watch: Watch) -> None:
-            skipped = watch.skipped
-            result = self._guarded(watch, watch.judge)
-            if watch.skipped > skipped:
-                self.metrics.skipped.labels(watch.name).inc(watch.skipped - skipped)
-                self._catch_up.skipped(watch.name, watch.skipped - skipped)
+        def judge(monitor: FeederMonitor) -> None:
+            skipped = monitor.skipped
+            result = self._guarded(monitor, monitor.judge)
+            if monitor.skipped > skipped:
+                self.metrics.skipped.labels(monitor.name).inc(monitor.skipped - skipped)
+                self._catch_up.skipped(monitor.name, monitor.skipped - skipped)
             if result is not None:
                 results.append(result)
 
-        self._catch_up.judge(self.watches.values(), judge, self._continues)
+        self._catch_up.judge(self.monitors.values(), judge, self._continues)
         self._catch_up.calm()
         return results
 
-    def keep_states(self, watches: Iterable[Watch] | None = None, *, at_once: bool = False) -> None:
+    def keep_states(self, monitors: Iterable[FeederMonitor] | None = None, *, at_once: bool = False) -> None:
         """Queue the commissioning and the suspicions of feeders for the database, if they are due.
 
         Parameters
         ----------
-        watches
+        monitors
             The feeders; None: all. Both states change with evaluated ticks only.
         at_once
             Include a commissioning that is not due yet.
         """
-        for watch in self.watches.values() if watches is None else watches:
-            kept, happened = watch.commissioning.due(at_once=at_once)
-            self.keeper.waiting.add(kept=(*kept, *watch.suspicions.due()), happened=happened)
+        for monitor in self.monitors.values() if monitors is None else monitors:
+            kept, happened = monitor.commissioning.due(at_once=at_once)
+            self.committer.waiting.add(kept=(*kept, *monitor.suspicions.due()), happened=happened)
             for one in happened:
                 _say(one)
             if happened:
-                self._count_learned(watch)
+                self._count_learned(monitor)
 
-    def _count_learned(self, watch: Watch) -> None:
-        known = watch.commissioning.known
+    def _count_learned(self, monitor: FeederMonitor) -> None:
+        known = monitor.commissioning.known
         if known is not None:
-            self.metrics.learned.labels(watch.name).set(np.isfinite(known.learned.at).sum())
+            self.metrics.learned.labels(monitor.name).set(np.isfinite(known.learned.at).sum())
 
-    def _decode(self, sample: Sample) -> Decoded:
+    def _decode(self, sample: Sample) -> DecodedPayload:
         """Decode a payload; a defect of the decoder costs this payload only."""
         try:
             return self._wire.decode(sample.key, sample.payload, sample.encoding, size=sample.size)
@@ -526,18 +531,18 @@ class Rounds:
             problem = beginning(f"{type(error).__name__}: {error}")
             _log.error("a payload could not be decoded", key=sample.key[:HEAD_BYTES], problem=problem)
             head, key = head_of(sample.payload[:HEAD_BYTES]), beginning(sample.key)
-            return Decoded(bad=(BadReading(BadReason.INTERNAL, (problem,), key, head=head),))
+            return DecodedPayload(bad=(BadReading(BadReason.INTERNAL, (problem,), key, head=head),))
 
-    def _guarded(self, watch: Watch, run: Callable[[], T]) -> T | None:
+    def _guarded(self, monitor: FeederMonitor, run: Callable[[], T]) -> T | None:
         """Run a step of one feeder; a defect stops this feeder, visibly, and no other."""
         found: T | None = None
         try:
             found = run()
         except Exception as error:  # noqa: BLE001 - the other feeders stay monitored
-            watch.break_down(error)
-        if watch.defect is not None:
-            _log.error("a feeder's monitor failed", feeder=watch.name, exc_info=watch.defect)
-            watch.defect = None
+            monitor.break_down(error)
+        if monitor.defect is not None:
+            _log.error("a feeder's monitor failed", feeder=monitor.name, exc_info=monitor.defect)
+            monitor.defect = None
         return found
 
     def _note(self, problem: BadReading, sample: Sample) -> Rejected:
@@ -564,17 +569,17 @@ class Rounds:
         metrics.seen.labels(name).set(sum(meter.seen for meter in report.meters))
         metrics.suspects.labels(name).set(len(report.suspects))
         metrics.count_learning(report)
-        metrics.alarms.labels(name).set(len(self.watches[name].book.active))
+        metrics.alarms.labels(name).set(len(self.monitors[name].book.active))
 
     # ---------------------------------------------------------------- publishing
 
     def _publish_estimates(self, results: list[TickResult]) -> None:
-        if self.keeper.publisher is None:
+        if self.committer.publisher is None:
             return
         for result in results:
             key = f"{result.report.feeder}/estimate"
-            self.keeper.publisher.telemetry(key, msgspec.json.encode(report_json(result.report)))
-        self.metrics.count_bus(self.keeper.publisher.counts)
+            self.committer.publisher.telemetry(key, msgspec.json.encode(report_json(result.report)))
+        self.metrics.count_bus(self.committer.publisher.counts)
 
     # ---------------------------------------------------------------- operators
 
@@ -615,23 +620,23 @@ class Rounds:
                 self._acknowledged(transition.alarm)
                 return alarm_json(transition.alarm)
 
-            self.keeper.store(Wish((transition,)), _landing(answer, landed), partial(_refuse, answer))
+            self.committer.store(Wish((transition,)), _landing(answer, landed), partial(_refuse, answer))
 
-        books = (alarm for watch in self.watches.values() for alarm in watch.book.alarms)
+        books = (alarm for monitor in self.monitors.values() for alarm in monitor.book.alarms)
         held = next((alarm for alarm in books if alarm.id == alarm_id), None)
         if held is None:
-            self.keeper.look(lambda db: db.alarm(alarm_id), _then(answer, store), partial(_refuse, answer))
+            self.committer.look(lambda db: db.alarm(alarm_id), _then(answer, store), partial(_refuse, answer))
         else:
             store(held)
         return answer
 
     def _acknowledged(self, alarm: Alarm) -> None:
         """Copy a stored acknowledgement to the book, and to results since the start of the write."""
-        self.keeper.waiting.carry(alarm)
-        watch = self.watches.get(alarm.feeder)
-        if watch is not None and alarm.acknowledged_by is not None and alarm.t_acknowledged is not None:
+        self.committer.waiting.carry(alarm)
+        monitor = self.monitors.get(alarm.feeder)
+        if monitor is not None and alarm.acknowledged_by is not None and alarm.t_acknowledged is not None:
             try:
-                watch.acknowledge(
+                monitor.acknowledge(
                     alarm.id,
                     alarm.acknowledged_by,
                     alarm.comment or "",
@@ -657,29 +662,29 @@ class Rounds:
             As in `acknowledge`.
         """
         answer: Future[dict[str, Any]] = Future()
-        watch = self.watches.get(name)
-        if watch is None:
+        monitor = self.monitors.get(name)
+        if monitor is None:
             raise FeederUnknown(name)
-        t = self._wall() if watch.book.t is None else watch.book.t
-        take_back = watch.recommission(meters, t, who, reason)
-        kept, happened = watch.commissioning.due()
-        kept, wanted = (*kept, *watch.suspicions.due()), happened[-1:]
+        t = self._wall() if monitor.book.t is None else monitor.book.t
+        take_back = monitor.recommission(meters, t, who, reason)
+        kept, happened = monitor.commissioning.due()
+        kept, wanted = (*kept, *monitor.suspicions.due()), happened[-1:]
         take_back()
 
         def landed() -> dict[str, Any]:
             # Ticks since then have changed the state: the restart is repeated from the present state, stored
             # with the next batch.
-            watch.recommission(meters, t, who, reason)
-            kept, happened = watch.commissioning.due()
-            kept = (*kept, *watch.suspicions.due())
-            self.keeper.waiting.add(kept=kept, happened=happened[:-1])
+            monitor.recommission(meters, t, who, reason)
+            kept, happened = monitor.commissioning.due()
+            kept = (*kept, *monitor.suspicions.due())
+            self.committer.waiting.add(kept=kept, happened=happened[:-1])
             for one in wanted:
                 _say(one)
-            self._count_learned(watch)
-            return commissioning_json(watch.commissioning.progress())
+            self._count_learned(monitor)
+            return commissioning_json(monitor.commissioning.progress())
 
         wish = Wish(kept=kept, happened=wanted)
-        self.keeper.store(wish, _landing(answer, landed), partial(_refuse, answer))
+        self.committer.store(wish, _landing(answer, landed), partial(_refuse, answer))
         return answer
 
 
@@ -711,7 +716,7 @@ def _refuse(answer: Future[Any], error: GridsecError) -> None:
         answer.set_exception(error)
 
 
-def _say(happened: Happened) -> None:
+def _say(happened: CommissioningEvent) -> None:
     """Log a change of a commissioning."""
     _log.info(
         "commissioning",

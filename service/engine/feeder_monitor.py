@@ -1,7 +1,7 @@
 """Monitor of one feeder: readings in, reports and alarm transitions out.
 
 The live service, replay and tests all use it. It has no clock, no threads and no input or output. Calls on a
-`Watch` must not overlap.
+`FeederMonitor` must not overlap.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from feeders.model.site import Site, to_frame
 from feeders.registry import registry
 from gridsec.interface import Cause
 from service.alarms.conditions import conditions
-from service.alarms.state_machine import AlarmBook, AlarmRules, Transition, acknowledge, advance, hold
-from service.engine.commissioning import Commissioning
+from service.alarms.state_machine import AlarmBook, AlarmRules, AlarmTransition, acknowledge, advance, hold
+from service.engine.commissioning import FeederCommissioning
 from service.engine.suspicions import Suspicions
-from service.ingest.align import Aligner, AlignRules, Clock, Outcome, Tick, rules
+from service.ingest.align import Aligner, AlignRules, Clock, ReadingOutcome, Tick, rules
 from service.ingest.reading import Known, Reading
 from service.report import feeder_info
 from service.report.reasons import DataErrors
@@ -49,7 +49,7 @@ class TickResult:
     """Result of one tick."""
 
     report: FeederReport
-    transitions: tuple[Transition, ...]
+    transitions: tuple[AlarmTransition, ...]
 
 
 def known_of(site: Site) -> Known:
@@ -87,7 +87,7 @@ def alarm_rules(site: Site, times: AlignRules) -> AlarmRules:
     return AlarmRules(settings.on_delay_s, settings.off_delay_s, silence_s=times.silence_s)
 
 
-def design(site: Site, progress: Callable[[int, int], None] | None = None) -> registry.Watcher:
+def design(site: Site, progress: Callable[[int, int], None] | None = None) -> registry.DesignedEstimator:
     """Return the design of a feeder's estimator; slow on large feeders.
 
     Parameters
@@ -103,7 +103,7 @@ def design(site: Site, progress: Callable[[int, int], None] | None = None) -> re
     return registry.design(site, workers=os.cpu_count() or 1, progress=progress)
 
 
-class Watch:
+class FeederMonitor:
     """Monitor of one feeder.
 
     Parameters
@@ -136,7 +136,7 @@ class Watch:
         site: Site,
         rules: AlignRules,
         book: AlarmBook,
-        commissioning: Commissioning | None = None,
+        commissioning: FeederCommissioning | None = None,
         suspicions: Suspicions | None = None,
     ) -> None:
         self.site = site
@@ -144,7 +144,7 @@ class Watch:
         self.max_attacked = site.tables.meta.monitor.max_attacked
         self.aligner = Aligner(site.meter_ids, rules)
         self.book = book
-        self.commissioning = commissioning or Commissioning(site)
+        self.commissioning = commissioning or FeederCommissioning(site)
         self.suspicions = suspicions or Suspicions(site)
         self.phase = Phase.DESIGNING
         self.problem = ""
@@ -154,7 +154,7 @@ class Watch:
         self.defect: Exception | None = None
         self._alarm_rules = alarm_rules(site, rules)
         self._data_errors = DataErrors(site)
-        self._watcher: registry.Watcher | None = None
+        self._watcher: registry.DesignedEstimator | None = None
         self._state: Any = None
 
     @property
@@ -169,7 +169,7 @@ class Watch:
         revision: str = feeder_info.detail(self.site, self.patience_s)["revision"]
         return revision
 
-    def install(self, finished: registry.Watcher) -> None:
+    def install(self, finished: registry.DesignedEstimator) -> None:
         """Start monitoring with a finished design."""
         self._watcher, self._state = finished, None
         self._data_errors.renew()
@@ -200,7 +200,7 @@ class Watch:
         self.fail(f"{type(defect).__name__}: {defect}")
         self.defect = defect
 
-    def place(self, reading: Reading, now: float) -> Outcome:
+    def place(self, reading: Reading, now: float) -> ReadingOutcome:
         """Align one reading; ticks that become due are pending.
 
         Parameters
@@ -246,7 +246,7 @@ class Watch:
         self.skipped += tick.skipped
         return self._result(tick)
 
-    def take(self, reading: Reading, now: float) -> tuple[Outcome, list[TickResult]]:
+    def ingest(self, reading: Reading, now: float) -> tuple[ReadingOutcome, list[TickResult]]:
         """Align one reading and evaluate the ticks that become due.
 
         Parameters
@@ -256,7 +256,7 @@ class Watch:
         """
         return self.place(reading, now), self._judged()
 
-    def due(self, now: float) -> list[TickResult]:
+    def advance(self, now: float) -> list[TickResult]:
         """Evaluate the ticks that are due without a new reading.
 
         Parameters
@@ -273,7 +273,7 @@ class Watch:
 
     def acknowledge(
         self, alarm_id: str, who: str, comment: str, t: float, *, count: int | None = None
-    ) -> tuple[Transition, ...]:
+    ) -> tuple[AlarmTransition, ...]:
         """Acknowledge an alarm of this feeder.
 
         Parameters
@@ -290,7 +290,7 @@ class Watch:
         Parameters
         ----------
         meters, t, who, reason
-            As in `Commissioning.renew`.
+            As in `FeederCommissioning.renew`.
 
         Returns
         -------

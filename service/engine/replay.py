@@ -8,19 +8,19 @@ from dataclasses import dataclass, field
 
 from feeders.model.site import Site
 from feeders.simulation.meters import BUSBAR
-from feeders.simulation.scenario import Reading as Recorded
+from feeders.simulation.scenario import SimulatedReading as Recorded
 from gridsec.interface import Decision
 from service.alarms.state_machine import AlarmBook
-from service.engine.commissioning import Commissioning
-from service.engine.feeder_monitor import TickResult, Watch, align_rules, design, known_of
+from service.engine.commissioning import FeederCommissioning
+from service.engine.feeder_monitor import FeederMonitor, TickResult, align_rules, design, known_of
 from service.engine.suspicions import Suspicions
-from service.ingest.align import Clock, Outcome
+from service.ingest.align import Clock, ReadingOutcome
 from service.ingest.reading import T_MAX, T_MIN, BadReason, Findings, Known, Reading, judge, to_reading
-from service.store.state_codec import Kept
+from service.store.state_codec import StateSnapshot
 
 
 @dataclass(slots=True)
-class Tally:
+class ReplayCounts:
     """Counts of a replay: readings by outcome or reason, ticks by verdict, skipped ticks."""
 
     readings: Counter[str] = field(default_factory=Counter)
@@ -37,13 +37,13 @@ class Tally:
 def replay(
     site: Site,
     recorded: Iterable[Recorded],
-    tally: Tally,
+    tally: ReplayCounts,
     *,
     clock: Clock = Clock.EVENTS,
     max_skew_s: float | None = None,
     grace_s: float | None = None,
-    kept: Kept | None = None,
-    distrust: Kept | None = None,
+    kept: StateSnapshot | None = None,
+    distrust: StateSnapshot | None = None,
     skipped: Sequence[tuple[float, float]] = (),
 ) -> Iterator[TickResult]:
     """Yield the service's results for recorded readings.
@@ -59,7 +59,7 @@ def replay(
     max_skew_s, grace_s
         As in `align.rules`.
     kept
-        State of the meters' errors at the start of the recording, as in `Commissioning`; None for none.
+        State of the meters' errors at the start of the recording, as in `FeederCommissioning`; None for none.
     distrust
         Distrusted devices at the start, as in `Suspicions`; None for none.
     skipped
@@ -72,47 +72,49 @@ def replay(
     """
     rules = align_rules(site, clock, max_skew_s=max_skew_s, grace_s=grace_s)
     book = AlarmBook(site.feeder.name)
-    watch = Watch(site, rules, book, Commissioning(site, kept), Suspicions(site, distrust))
-    watch.install(design(site))
+    monitor = FeederMonitor(site, rules, book, FeederCommissioning(site, kept), Suspicions(site, distrust))
+    monitor.install(design(site))
     known = known_of(site)
     for one in recorded:
-        reading = _checked(watch.name, known, one, tally, clock)
+        reading = _checked(monitor.name, known, one, tally, clock)
         if reading is not None:
             # With `Clock.EVENTS` the arrival has no effect, and a file need not contain it.
             now = one.arrival if clock is Clock.WALL else 0.0
-            outcome = watch.place(reading, now)
+            outcome = monitor.place(reading, now)
             tally.readings[outcome] += 1
-            watch.reach(now)
-            yield from _counted(watch, _judged(watch, skipped), tally)
-            refused = len(watch.aligner.refused())
-            tally.readings[Outcome.ACCEPTED] -= refused
-            tally.readings[Outcome.CLOCK_OFF] += refused
-    watch.finish()
-    yield from _counted(watch, _judged(watch, skipped), tally)
-    tally.lost, tally.skipped = watch.aligner.lost, watch.skipped
+            monitor.reach(now)
+            yield from _counted(monitor, _judged(monitor, skipped), tally)
+            refused = len(monitor.aligner.refused())
+            tally.readings[ReadingOutcome.ACCEPTED] -= refused
+            tally.readings[ReadingOutcome.CLOCK_OFF] += refused
+    monitor.finish()
+    yield from _counted(monitor, _judged(monitor, skipped), tally)
+    tally.lost, tally.skipped = monitor.aligner.lost, monitor.skipped
 
 
-def _judged(watch: Watch, skipped: Sequence[tuple[float, float]]) -> Iterator[TickResult]:
+def _judged(monitor: FeederMonitor, skipped: Sequence[tuple[float, float]]) -> Iterator[TickResult]:
     """Evaluate the pending ticks; a skipped one stays until the next one counts it."""
-    while watch.pending:
-        t = watch.pending[0].t
+    while monitor.pending:
+        t = monitor.pending[0].t
         if not any(first <= t <= last for first, last in skipped):
-            yield watch.judge()
-        elif len(watch.pending) > 1:
-            watch.skip(1)
+            yield monitor.judge()
+        elif len(monitor.pending) > 1:
+            monitor.skip(1)
         else:
             return
 
 
-def _counted(watch: Watch, results: Iterator[TickResult], tally: Tally) -> list[TickResult]:
+def _counted(monitor: FeederMonitor, results: Iterator[TickResult], tally: ReplayCounts) -> list[TickResult]:
     found = list(results)
-    if watch.defect is not None:
-        raise watch.defect
+    if monitor.defect is not None:
+        raise monitor.defect
     tally.ticks.update(str(result.report.verdict) for result in found)
     return found
 
 
-def _checked(feeder: str, known: Known, recorded: Recorded, tally: Tally, clock: Clock) -> Reading | None:
+def _checked(
+    feeder: str, known: Known, recorded: Recorded, tally: ReplayCounts, clock: Clock
+) -> Reading | None:
     """Return a recorded reading as if received from zenoh, or None (counted) for a bad one."""
     if clock is Clock.WALL and not _is_time(recorded.arrival):
         tally.readings[BadReason.VALUE] += 1

@@ -20,19 +20,19 @@ from typing import Any, TypeVar
 import structlog
 
 from feeders.model.site import Site
-from feeders.registry.registry import Watcher
+from feeders.registry.registry import DesignedEstimator
 from gridsec.errors import GridsecError
 from service.engine import design_jobs
 from service.engine.commissioning import to_json as commissioning_json
-from service.engine.engine import Rounds, RuntimeConfig
-from service.engine.feeder_monitor import Phase, Watch
+from service.engine.engine import Engine, RuntimeConfig
+from service.engine.feeder_monitor import FeederMonitor, Phase
 from service.errors import FeederFixed, TooManyFeeders
 from service.ingest.align import Clock
 from service.ingest.queues import Inbox, Sample
 from service.report import feeder_info
 from service.report.report import FeederReport
 from service.store import OutcomeUnknown, Store, StoreUnavailable
-from service.store.committer import Done, Publisher
+from service.store.committer import Publisher, WriteResult
 
 SAMPLES_PER_ROUND = 512
 """Payloads of one round if senders wait. With the wall clock a round takes all waiting samples."""
@@ -81,7 +81,7 @@ class Runtime:
     ) -> None:
         self._wall, self._settled = wall, settled
         self._stopping = False
-        self._rounds = Rounds(
+        self._engine = Engine(
             config,
             store,
             sites,
@@ -93,14 +93,14 @@ class Runtime:
         )
         # With `Clock.EVENTS` samples wait for ticks and for the database.
         self._waits = config.clock is Clock.EVENTS
-        self._given = frozenset(self._rounds.watches) if given is None else frozenset(given)
+        self._given = frozenset(self._engine.monitors) if given is None else frozenset(given)
         self._inbox = Inbox(
             lambda: self._in_loop(self._wake.set),
             max_samples=config.max_samples,
             lossless=self._waits,
         )
         self._commands: deque[tuple[Callable[[], Future[Any]], asyncio.Future[Any]]] = deque()
-        self._prepared: set[asyncio.Future[tuple[Site, Watcher]]] = set()
+        self._prepared: set[asyncio.Future[tuple[Site, DesignedEstimator]]] = set()
         self._subscribers: set[asyncio.Queue[str]] = set()
         self._outcomes: deque[Callable[[], None]] = deque()
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="gridsec-round")
@@ -114,13 +114,13 @@ class Runtime:
 
     def attach(self, publisher: Publisher) -> None:
         """Set the publisher of estimates and alarms; called before `run`."""
-        self._rounds.keeper.publisher = publisher
+        self._engine.committer.publisher = publisher
 
     def deliver(self, batch: list[Sample]) -> int:
         """Take samples from a receiving thread; return the number of dropped ones."""
         dropped = self._inbox.put(batch)
-        self._rounds.metrics.samples.inc(len(batch))
-        self._rounds.metrics.dropped.inc(dropped)
+        self._engine.metrics.samples.inc(len(batch))
+        self._engine.metrics.dropped.inc(dropped)
         return dropped
 
     async def run(self) -> None:
@@ -133,16 +133,16 @@ class Runtime:
         """
         self._loop = asyncio.get_running_loop()
         try:
-            await self._loop.run_in_executor(self._writer, self._rounds.begin)
-            for watch in self._rounds.watches.values():
-                design_jobs.begin(watch, lambda install: self._in_loop(partial(self._hand_over, install)))
+            await self._loop.run_in_executor(self._writer, self._engine.begin)
+            for monitor in self._engine.monitors.values():
+                design_jobs.begin(monitor, lambda install: self._in_loop(partial(self._hand_over, install)))
             while not self._stopping:
                 self._check_writer()
                 await self._execute_commands()
                 samples = self._samples()
-                news = await self._in_worker(self._rounds.round, samples, self._inbox.oldest)
+                news = await self._in_worker(self._engine.cycle, samples, self._inbox.oldest)
                 self._last_round = time.monotonic()
-                self._rounds.metrics.queue.set(len(self._inbox))
+                self._engine.metrics.queue.set(len(self._inbox))
                 if news:
                     self._notify("state")
                 await self._pause()
@@ -176,20 +176,20 @@ class Runtime:
         """Return the samples of the next round; with `Clock.EVENTS` none before the last ones are stored."""
         if not self._waits:
             return self._inbox.drain(len(self._inbox))
-        busy = self._rounds.behind or self._rounds.keeper.storing
+        busy = self._engine.behind or self._engine.committer.storing
         return [] if busy else self._inbox.drain(SAMPLES_PER_ROUND)
 
     async def _pause(self) -> None:
         """Wait for samples, commands or the next tick."""
-        commands = self._commands and self._rounds.keeper.takes_commands
-        if self._stopping or self._outcomes or commands or self._rounds.behind:
+        commands = self._commands and self._engine.committer.takes_commands
+        if self._stopping or self._outcomes or commands or self._engine.behind:
             await asyncio.sleep(0)
             return
-        if len(self._inbox) and not (self._waits and self._rounds.keeper.storing):
+        if len(self._inbox) and not (self._waits and self._engine.committer.storing):
             await asyncio.sleep(0.0 if self._waits else GATHER_S)
             return
         now = self._wall()
-        wakes = [t for watch in self._rounds.watches.values() if (t := watch.aligner.wake()) is not None]
+        wakes = [t for monitor in self._engine.monitors.values() if (t := monitor.aligner.wake()) is not None]
         timeout = min([IDLE_S, *(t - now for t in wakes)])
         if timeout > 0.0:
             with contextlib.suppress(TimeoutError):
@@ -201,14 +201,14 @@ class Runtime:
     async def _in_worker(self, run: Callable[..., T], *arguments: Any) -> T:
         return await asyncio.get_running_loop().run_in_executor(self._worker, run, *arguments)
 
-    def _write_apart(self, write: Callable[[], Done], then: Callable[[Done], None]) -> None:
+    def _write_apart(self, write: Callable[[], WriteResult], then: Callable[[WriteResult], None]) -> None:
         """Write in a separate thread; its result is processed between two rounds."""
 
         def run() -> None:
             try:
                 done = write()
             except Exception as error:  # noqa: BLE001 - without a result nothing would be stored any more
-                done = Done(error=StoreUnavailable(f"{type(error).__name__}: {error}", code="defect"))
+                done = WriteResult(error=StoreUnavailable(f"{type(error).__name__}: {error}", code="defect"))
             self._in_loop(partial(self._take_in, partial(then, done)))
 
         self._writer.submit(run)
@@ -223,20 +223,20 @@ class Runtime:
             await asyncio.wait_for(self._last_commit(), LAST_COMMIT_S)
         except TimeoutError:
             # Requests are answered with success only after their commit.
-            waiting = len(self._rounds.keeper.waiting)
+            waiting = len(self._engine.committer.waiting)
             _log.error("the database did not answer before the end", transitions=waiting, s=LAST_COMMIT_S)
 
     async def _last_commit(self) -> None:
         """Store the remaining data, after the write in progress."""
-        await self._landed()
-        await self._in_worker(partial(self._rounds.keep_states, at_once=True))
-        await self._in_worker(partial(self._rounds.keeper.commit, at_once=True))
-        await self._landed()
+        await self._wait_for_write()
+        await self._in_worker(partial(self._engine.keep_states, at_once=True))
+        await self._in_worker(partial(self._engine.committer.commit, at_once=True))
+        await self._wait_for_write()
 
-    async def _landed(self) -> None:
+    async def _wait_for_write(self) -> None:
         """Wait for the write in progress, and process its result."""
         await self._take_outcomes()
-        while self._rounds.keeper.storing:
+        while self._engine.committer.storing:
             await self._wake.wait()
             self._wake.clear()
             await self._take_outcomes()
@@ -248,7 +248,7 @@ class Runtime:
     async def _execute_commands(self) -> None:
         await self._take_outcomes()
         # Only one write is in progress at a time; one before a command comes first.
-        while self._commands and self._rounds.keeper.takes_commands:
+        while self._commands and self._engine.committer.takes_commands:
             command, answer = self._commands.popleft()
             try:
                 found = await self._in_worker(command)
@@ -307,7 +307,7 @@ class Runtime:
         self._take_in(run)
 
     def _settle(self) -> None:
-        if all(watch.phase is not Phase.DESIGNING for watch in self._rounds.watches.values()):
+        if all(monitor.phase is not Phase.DESIGNING for monitor in self._engine.monitors.values()):
             self._settled()
 
     # ---------------------------------------------------------------- the backend of the API
@@ -315,44 +315,44 @@ class Runtime:
     @property
     def store(self) -> Store:
         """The database."""
-        return self._rounds.store
+        return self._engine.store
 
     def feeders(self) -> list[dict[str, Any]]:
         """Return the summary of every feeder, with the phase of its monitor and of the commissioning."""
         watched = [
             {
-                **feeder_info.summary(watch.site),
-                "phase": str(watch.phase),
-                "problem": watch.problem or None,
-                "patience_s": watch.patience_s,
-                "ticks_skipped": watch.skipped,
-                "commissioning": str(watch.commissioning.progress().state),
+                **feeder_info.summary(monitor.site),
+                "phase": str(monitor.phase),
+                "problem": monitor.problem or None,
+                "patience_s": monitor.patience_s,
+                "ticks_skipped": monitor.skipped,
+                "commissioning": str(monitor.commissioning.progress().state),
             }
-            for watch in self._rounds.watches.values()
+            for monitor in self._engine.monitors.values()
         ]
         failed = [
             {"name": name, "phase": str(Phase.FAILED), "problem": problem}
-            for name, problem in self._rounds.unloaded.copy().items()
+            for name, problem in self._engine.unloaded.copy().items()
         ]
         return watched + failed
 
     def feeder(self, name: str) -> dict[str, Any] | None:
         """Return all properties of a feeder, or None."""
-        watch = self._rounds.watches.get(name)
-        return None if watch is None else feeder_info.detail(watch.site, watch.patience_s)
+        monitor = self._engine.monitors.get(name)
+        return None if monitor is None else feeder_info.detail(monitor.site, monitor.patience_s)
 
     def known(self, name: str) -> bool:
         """True if a feeder is monitored."""
-        return name in self._rounds.watches
+        return name in self._engine.monitors
 
     def unloaded(self, name: str) -> str | None:
         """Return the reason why the stored tables of a feeder cannot be loaded, or None."""
-        return self._rounds.unloaded.get(name)
+        return self._engine.unloaded.get(name)
 
     def report(self, name: str) -> FeederReport | None:
         """Return a feeder's latest report, or None."""
-        watch = self._rounds.watches.get(name)
-        return None if watch is None else watch.report
+        monitor = self._engine.monitors.get(name)
+        return None if monitor is None else monitor.report
 
     def age(self, report: FeederReport) -> float:
         """Return the age of a feeder's latest report by the service's clock, s.
@@ -360,22 +360,22 @@ class Runtime:
         With `Clock.EVENTS` the age counts from the creation of the report.
         """
         now = time.monotonic()
-        since = now - self._rounds.reported.get(report.feeder, now)
-        return since if self._rounds.config.clock is Clock.EVENTS else max(since, self._wall() - report.t)
+        since = now - self._engine.reported.get(report.feeder, now)
+        return since if self._engine.config.clock is Clock.EVENTS else max(since, self._wall() - report.t)
 
     def commissioning(self, name: str) -> dict[str, Any] | None:
         """Return the progress of a feeder's commissioning, or None."""
-        watch = self._rounds.watches.get(name)
-        return None if watch is None else commissioning_json(watch.commissioning.progress())
+        monitor = self._engine.monitors.get(name)
+        return None if monitor is None else commissioning_json(monitor.commissioning.progress())
 
     def unstored(self) -> tuple[int, str | None]:
         """Return the number of alarm changes that wait for the database, and its problem or None."""
-        keeper = self._rounds.keeper
+        keeper = self._engine.committer
         return len(keeper.waiting), "; ".join(keeper.problems()) or None
 
     def metrics(self) -> bytes:
         """Return the metrics in Prometheus's text format."""
-        return self._rounds.metrics.exposition()
+        return self._engine.metrics.exposition()
 
     def healthy(self) -> tuple[bool, list[str]]:
         """Return True if the process can continue, and the problems otherwise."""
@@ -388,24 +388,24 @@ class Runtime:
 
     def ready(self) -> tuple[bool, list[str]]:
         """Return True if everything needed for monitoring works, and the problems otherwise."""
-        rounds = self._rounds
+        engine = self._engine
         problems = self.healthy()[1]
         if self._last_round is None:
             problems.append("the runtime is starting")
-        problems.extend(rounds.keeper.problems())
-        publisher = rounds.keeper.publisher
+        problems.extend(engine.committer.problems())
+        publisher = engine.committer.publisher
         if publisher is not None and publisher.failure is not None:
             problems.append(f"zenoh: {publisher.failure}")
-        for watch in rounds.watches.values():
-            if watch.phase is Phase.DESIGNING:
-                problems.append(f"feeder {watch.name}: the design of the monitor is not finished")
-            elif watch.phase is Phase.FAILED:
-                problems.append(f"feeder {watch.name}: {watch.problem}")
+        for monitor in engine.monitors.values():
+            if monitor.phase is Phase.DESIGNING:
+                problems.append(f"feeder {monitor.name}: the design of the monitor is not finished")
+            elif monitor.phase is Phase.FAILED:
+                problems.append(f"feeder {monitor.name}: {monitor.problem}")
             # With `Clock.EVENTS` the time may stand still.
-            told, waits = watch.report, rounds.config.clock is Clock.WALL
-            if waits and told is not None and (age := self.age(told)) > watch.patience_s:
-                problems.append(f"feeder {watch.name}: the latest report is {age:.0f} s old")
-        for name, problem in rounds.unloaded.copy().items():
+            told, waits = monitor.report, engine.config.clock is Clock.WALL
+            if waits and told is not None and (age := self.age(told)) > monitor.patience_s:
+                problems.append(f"feeder {monitor.name}: the latest report is {age:.0f} s old")
+        for name, problem in engine.unloaded.copy().items():
             problems.append(f"feeder {name}: {problem}")
         return not problems, problems
 
@@ -429,20 +429,20 @@ class Runtime:
         prepared.add_done_callback(self._prepared.discard)
         site, finished = await prepared
 
-        def installed(watch: Watch) -> None:
-            design_jobs.install(watch, finished, "")
+        def installed(monitor: FeederMonitor) -> None:
+            design_jobs.install(monitor, finished, "")
             self._settle()
 
         def put() -> Future[None]:
             self._make_room(name)
-            return self._rounds.put(site, tables, installed)
+            return self._engine.put(site, tables, installed)
 
         await self._command(put)
 
     def _make_room(self, name: str) -> None:
         """Check the limit of feeders before one more is added."""
-        put = (self._rounds.watches.keys() | self._rounds.unloaded.keys()) - self._given
-        most = self._rounds.config.max_feeders
+        put = (self._engine.monitors.keys() | self._engine.unloaded.keys()) - self._given
+        most = self._engine.config.max_feeders
         if name not in put | self._given and len(put) >= most:
             raise TooManyFeeders(most)
 
@@ -456,7 +456,7 @@ class Runtime:
         """
         if name in self._given:
             raise FeederFixed(name)
-        await self._command(partial(self._rounds.remove, name))
+        await self._command(partial(self._engine.remove, name))
         self._notify("state")
 
     async def acknowledge(
@@ -478,7 +478,7 @@ class Runtime:
         OutcomeUnknown
             If it is not known to be stored; repeating the acknowledgement gives the answer.
         """
-        return await self._command(partial(self._rounds.acknowledge, alarm_id, who, comment, count=count))
+        return await self._command(partial(self._engine.acknowledge, alarm_id, who, comment, count=count))
 
     async def recommission(self, name: str, meters: Sequence[str], who: str, reason: str) -> dict[str, Any]:
         """Restart the learning of meters' errors; it is stored when this returns.
@@ -493,7 +493,7 @@ class Runtime:
         FeederUnknown, NothingToLearn, StoreUnavailable
             If it is not possible; nothing is changed then.
         """
-        return await self._command(partial(self._rounds.recommission, name, meters, who, reason))
+        return await self._command(partial(self._engine.recommission, name, meters, who, reason))
 
     async def subscribe(self) -> AsyncGenerator[dict[str, Any], None]:
         """Yield a wake-up after each stored alarm and each new report, until the service stops."""

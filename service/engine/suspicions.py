@@ -1,7 +1,7 @@
 """Record of a feeder's distrusted devices, with storage across restarts.
 
-`Suspicions` has no clock and no input or output, like the `Watch` that owns it: time comes from the ticks,
-stored texts are passed as values.
+`Suspicions` has no clock and no input or output, like the `FeederMonitor` that owns it: time comes from the
+ticks, stored texts are passed as values.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from feeders.model.site import Site
-from feeders.registry.registry import Memory, Watcher
-from gridsec.estimators.sequential import Distrust, nobody
+from feeders.registry.registry import DesignedEstimator, WarmStart
+from gridsec.estimators.sequential import SuspicionRecord
 from service.report.voltages import busbar_phases
-from service.store.state_codec import Kept, KeptInvalid, decode_distrust, encode_distrust
+from service.store.state_codec import KeptInvalid, StateSnapshot, decode_distrust, encode_distrust
 
 
 class Suspicions:
@@ -34,24 +34,24 @@ class Suspicions:
         Reason why stored state is not used; empty otherwise.
     """
 
-    def __init__(self, site: Site, kept: Kept | None = None) -> None:
-        self.known = nobody(len(site.meter_ids), site.droop.tau.size, len(busbar_phases(site)))
+    def __init__(self, site: Site, kept: StateSnapshot | None = None) -> None:
+        self.known = SuspicionRecord.empty(len(site.meter_ids), site.droop.tau.size, len(busbar_phases(site)))
         self.note = ""
         self._site = site
-        self._watcher: Watcher | None = None
+        self._watcher: DesignedEstimator | None = None
         self._t: float | None = None
         if kept is not None:
             try:
                 self.known = decode_distrust(site, kept)
             except KeptInvalid as error:
                 self.note = f"suspicions of {kept.t:.0f} are not used: {error}"
-        self._stored: Distrust | None = None if self.note else self.known
+        self._stored: SuspicionRecord | None = None if self.note else self.known
 
     @property
-    def _memory(self) -> Memory | None:
-        return None if self._watcher is None else self._watcher.family.memory
+    def _memory(self) -> WarmStart | None:
+        return None if self._watcher is None else self._watcher.family.warm_start
 
-    def install(self, watcher: Watcher) -> None:
+    def install(self, watcher: DesignedEstimator) -> None:
         """Install a finished design."""
         self._watcher = watcher
 
@@ -65,7 +65,7 @@ class Suspicions:
         """
         if self._watcher is None or self._memory is None:
             return state
-        return self._memory.restore(self._watcher.design, state, self.known)
+        return self._memory.warm_start(self._watcher.design, state, self.known)
 
     def follow(self, state: Any, t: float) -> None:
         """Update from the result of a tick.
@@ -94,11 +94,11 @@ class Suspicions:
         which = [not chosen or meter in chosen for meter in self._site.meter_ids]
         self.known, self._t = self.known.without(np.array(which, dtype=np.bool_)), t
 
-    def now(self) -> Kept | None:
+    def now(self) -> StateSnapshot | None:
         """Return the present state for the store; None before the first tick."""
         return None if self._t is None else encode_distrust(self._site, self._t, self.known)
 
-    def due(self) -> tuple[Kept, ...]:
+    def due(self) -> tuple[StateSnapshot, ...]:
         """Return the state for the store if it has changed; it counts as stored afterwards."""
         if self._t is None or (self._stored is not None and self._stored.same(self.known)):
             return ()

@@ -158,7 +158,7 @@ class Clock(StrEnum):
     EVENTS = "events"
 
 
-class Outcome(StrEnum):
+class ReadingOutcome(StrEnum):
     """Result of the alignment of a well-formed reading."""
 
     ACCEPTED = "accepted"
@@ -326,7 +326,7 @@ class Aligner:
     def __init__(self, meters: Iterable[str], rules: AlignRules) -> None:
         self.meters = tuple(meters)
         self.rules = rules
-        self.counts: Counter[Outcome] = Counter()
+        self.counts: Counter[ReadingOutcome] = Counter()
         self.lost = 0
         self.restarts = 0
         self._skipped = 0
@@ -347,7 +347,7 @@ class Aligner:
 
     # ---------------------------------------------------------------- in
 
-    def take(self, reading: Reading, now: float) -> tuple[Outcome, list[Tick]]:
+    def take(self, reading: Reading, now: float) -> tuple[ReadingOutcome, list[Tick]]:
         """Align one reading, and emit the ticks that are due.
 
         Parameters
@@ -362,14 +362,14 @@ class Aligner:
         """
         # A reading that waited in the queue arrived before the present time; the clock was not set back.
         self._latest = max(self._latest, now)
-        ticks = list(self._let_go(self._latest))
+        ticks = list(self._emit_ticks(self._latest))
         source = self._sources[reading.meter]
         if self.rules.clock is Clock.EVENTS:
             self._hear(reading, source)
-            ticks.extend(self._let_go(self._latest))
+            ticks.extend(self._emit_ticks(self._latest))
         outcome = self._place(reading, source, self.now(now))
         self.counts[outcome] += 1
-        ticks.extend(self._let_go(self._latest))
+        ticks.extend(self._emit_ticks(self._latest))
         return outcome, ticks
 
     def refused(self) -> tuple[Reading, ...]:
@@ -377,23 +377,23 @@ class Aligner:
         refused, self._refused = tuple(self._refused), []
         return refused
 
-    def _place(self, reading: Reading, source: _Source, now: float | None) -> Outcome:
+    def _place(self, reading: Reading, source: _Source, now: float | None) -> ReadingOutcome:
         t = reading.t
         if now is not None and abs(t - now) > self.rules.max_skew_s:
-            return Outcome.CLOCK_OFF
+            return ReadingOutcome.CLOCK_OFF
         index = bisect_left(source.held, t, key=_time_of)
         if index < len(source.held) and source.held[index].t == t:
-            return Outcome.DUPLICATE
+            return ReadingOutcome.DUPLICATE
         if now is not None and self.rules.clock is Clock.WALL:
             self._clocks.note(reading.meter, t, now)
         self._count_gap(reading, source)
         late = self._next is not None and t <= self._time(self._next - 1) + self.rules.lead_s
         if late and t <= source.last_t:
-            return Outcome.LATE
+            return ReadingOutcome.LATE
         if len(source.held) >= HELD_PER_SOURCE:
             self._thin(source)
             if len(source.held) >= HELD_PER_SOURCE:
-                return Outcome.OVERFLOW
+                return ReadingOutcome.OVERFLOW
             index = bisect_left(source.held, t, key=_time_of)
         source.held.insert(index, reading)
         in_order = t > source.last_t
@@ -403,8 +403,8 @@ class Aligner:
         if self._next is not None:
             self._wait_for(reading.meter, source, self._next)
         if late:
-            return Outcome.LATE
-        return Outcome.ACCEPTED if in_order else Outcome.OUT_OF_ORDER
+            return ReadingOutcome.LATE
+        return ReadingOutcome.ACCEPTED if in_order else ReadingOutcome.OUT_OF_ORDER
 
     def _thin(self, source: _Source) -> None:
         """Keep only the last reading between two ticks: no tick uses the others."""
@@ -472,8 +472,8 @@ class Aligner:
             wild = [r for r in source.held if abs(r.t - now) > self.rules.max_skew_s]
             if wild:
                 self._refused.extend(wild)
-                self.counts[Outcome.ACCEPTED] -= len(wild)
-                self.counts[Outcome.CLOCK_OFF] += len(wild)
+                self.counts[ReadingOutcome.ACCEPTED] -= len(wild)
+                self.counts[ReadingOutcome.CLOCK_OFF] += len(wild)
                 source.held = [r for r in source.held if abs(r.t - now) <= self.rules.max_skew_s]
                 source.last_t = source.held[-1].t if source.held else -math.inf
 
@@ -502,9 +502,9 @@ class Aligner:
             self._latest = wall
             self._begin(wall)
         self._latest = max(self._latest, wall)
-        yield from self._let_go(wall)
+        yield from self._emit_ticks(wall)
 
-    def _let_go(self, wall: float) -> Iterator[Tick]:
+    def _emit_ticks(self, wall: float) -> Iterator[Tick]:
         now = self.now(wall)
         if now is None:
             return

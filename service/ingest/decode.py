@@ -33,8 +33,8 @@ from service.ingest.reading import (
     BadReading,
     BadReason,
     Known,
-    Raw,
     Reading,
+    WireReading,
     beginning,
     head_of,
     judge,
@@ -195,7 +195,7 @@ DETAILED_PER_REASON = 5
 
 
 @dataclass(frozen=True, slots=True)
-class Decoded:
+class DecodedPayload:
     """Readings and bad readings of one payload."""
 
     readings: tuple[Reading, ...] = ()
@@ -229,7 +229,9 @@ class Wire:
     prefix: str = "gridsec"
     max_bytes: int = 256 * 1024
 
-    def decode(self, key: str, payload: bytes, encoding: str = "", *, size: int | None = None) -> Decoded:
+    def decode(
+        self, key: str, payload: bytes, encoding: str = "", *, size: int | None = None
+    ) -> DecodedPayload:
         """Return the readings and the bad readings in one payload.
 
         Parameters
@@ -249,7 +251,7 @@ class Wire:
         source = source_of(key, self.prefix, self.known)
         head = head_of(payload[:HEAD_BYTES])
         if isinstance(source, BadReading):
-            return Decoded(bad=(replace(source, head=head),))
+            return DecodedPayload(bad=(replace(source, head=head),))
         base = BadReading(BadReason.SYNTAX, (), beginning(key), source.feeder, source.meter, head)
         length = len(payload) if size is None else size
         if length > self.max_bytes:
@@ -265,7 +267,9 @@ class Wire:
         return decoder(payload, source, self.known[source.feeder], base)
 
 
-def _decoder(kind: str, source: Source) -> Callable[[bytes, Source, Known, BadReading], Decoded] | None:
+def _decoder(
+    kind: str, source: Source
+) -> Callable[[bytes, Source, Known, BadReading], DecodedPayload] | None:
     if kind in JSON_ENCODINGS:
         return _single if source.concentrator is None else _json_batch
     if source.concentrator is not None:
@@ -312,16 +316,16 @@ def _nowhere(key: str, reason: BadReason, why: str) -> BadReading:
     return BadReading(reason, (f"`{shown}` {why}",), shown)
 
 
-def _refuse(base: BadReading, reason: BadReason, *problems: str) -> Decoded:
-    return Decoded(bad=(replace(base, reason=reason, problems=tuple(map(printable, problems))),))
+def _refuse(base: BadReading, reason: BadReason, *problems: str) -> DecodedPayload:
+    return DecodedPayload(bad=(replace(base, reason=reason, problems=tuple(map(printable, problems))),))
 
 
 # ---------------------------------------------------------------------------------------------------------
 # JSON
 
 
-_decode_one = msgspec.json.Decoder(Raw).decode
-_decode_many = msgspec.json.Decoder(list[Raw]).decode
+_decode_one = msgspec.json.Decoder(WireReading).decode
+_decode_many = msgspec.json.Decoder(list[WireReading]).decode
 
 
 def _parse(payload: bytes) -> Any:
@@ -337,14 +341,14 @@ def _parse(payload: bytes) -> Any:
             raise error from None
 
 
-def _single(payload: bytes, source: Source, known: Known, base: BadReading) -> Decoded:
+def _single(payload: bytes, source: Source, known: Known, base: BadReading) -> DecodedPayload:
     try:
         raw = _decode_one(payload)
     except (msgspec.MsgspecError, RecursionError):
         pass
     else:
         if plausible(raw, known, source.meter):
-            return Decoded((to_reading(source.feeder, source.meter, raw),))
+            return DecodedPayload((to_reading(source.feeder, source.meter, raw),))
     try:
         value = _parse(payload)
     except (ValueError, RecursionError, msgspec.MsgspecError) as error:
@@ -352,19 +356,19 @@ def _single(payload: bytes, source: Source, known: Known, base: BadReading) -> D
     if value in ([], {}):
         return _refuse(base, BadReason.EMPTY, "the reading is empty")
     found = judge(value, known, source.meter, in_batch=False)
-    if isinstance(found, Raw):
-        return Decoded((to_reading(source.feeder, source.meter, found),))
+    if isinstance(found, WireReading):
+        return DecodedPayload((to_reading(source.feeder, source.meter, found),))
     return _refuse(base, found.reason, *found.problems)
 
 
-def _json_batch(payload: bytes, source: Source, known: Known, base: BadReading) -> Decoded:
+def _json_batch(payload: bytes, source: Source, known: Known, base: BadReading) -> DecodedPayload:
     try:
         rows = _decode_many(payload)
     except (msgspec.MsgspecError, RecursionError):
         pass
     else:
         if rows and all(plausible(raw, known, raw.meter) and raw.meter in known.meters for raw in rows):
-            return Decoded(tuple(to_reading(source.feeder, raw.meter, raw) for raw in rows))
+            return DecodedPayload(tuple(to_reading(source.feeder, raw.meter, raw) for raw in rows))
     try:
         value = _parse(payload)
     except (ValueError, RecursionError, msgspec.MsgspecError) as error:
@@ -381,7 +385,7 @@ def _json_batch(payload: bytes, source: Source, known: Known, base: BadReading) 
 _FIELDS = ("meter", "t", "v_volt", "p_kw", "q_kvar", "seq", "t_power")
 
 
-def _cbor(payload: bytes, source: Source, known: Known, base: BadReading) -> Decoded:
+def _cbor(payload: bytes, source: Source, known: Known, base: BadReading) -> DecodedPayload:
     try:
         columns = cbor2.loads(payload)
     except (
@@ -398,7 +402,9 @@ def _cbor(payload: bytes, source: Source, known: Known, base: BadReading) -> Dec
     return _columns(columns, source, known, base)
 
 
-def _arrow(payload: bytes, source: Source, known: Known, base: BadReading, *, is_file: bool) -> Decoded:
+def _arrow(
+    payload: bytes, source: Source, known: Known, base: BadReading, *, is_file: bool
+) -> DecodedPayload:
     try:
         columns = columns_of(payload, is_file, _FIELDS)
     except ArrowProblem as error:
@@ -407,14 +413,14 @@ def _arrow(payload: bytes, source: Source, known: Known, base: BadReading, *, is
     return _columns(columns, source, known, base)
 
 
-_BATCH_DECODERS: Mapping[str, Callable[[bytes, Source, Known, BadReading], Decoded]] = {
+_BATCH_DECODERS: Mapping[str, Callable[[bytes, Source, Known, BadReading], DecodedPayload]] = {
     "application/cbor": _cbor,
     "application/vnd.apache.arrow.stream": partial(_arrow, is_file=False),
     "application/vnd.apache.arrow.file": partial(_arrow, is_file=True),
 }
 
 
-def _columns(columns: Mapping[Any, Any], source: Source, known: Known, base: BadReading) -> Decoded:
+def _columns(columns: Mapping[Any, Any], source: Source, known: Known, base: BadReading) -> DecodedPayload:
     present = {name: columns[name] for name in _FIELDS if name in columns}
     problems = [
         f"column `{name}` is {name_of(column)}, not an array"
@@ -432,7 +438,7 @@ def _columns(columns: Mapping[Any, Any], source: Source, known: Known, base: Bad
     return _batch(rows, source, known, base)
 
 
-def _batch(rows: list[Any], source: Source, known: Known, base: BadReading) -> Decoded:
+def _batch(rows: list[Any], source: Source, known: Known, base: BadReading) -> DecodedPayload:
     if not rows:
         return _refuse(base, BadReason.EMPTY, "the batch is empty")
     readings: list[Reading] = []
@@ -440,7 +446,7 @@ def _batch(rows: list[Any], source: Source, known: Known, base: BadReading) -> D
     more: Counter[BadReason] = Counter()
     for index, row in enumerate(rows):
         found = judge(row, known, in_batch=True)
-        if isinstance(found, Raw):
+        if isinstance(found, WireReading):
             readings.append(to_reading(source.feeder, found.meter, found))
             continue
         alike = bad.setdefault(found.reason, [])
@@ -455,4 +461,4 @@ def _batch(rows: list[Any], source: Source, known: Known, base: BadReading) -> D
         replace(base, reason=reason, problems=(f"{count} more elements of the batch: {reason}",), count=count)
         for reason, count in more.items()
     )
-    return Decoded(tuple(readings), (*chain.from_iterable(bad.values()), *rest))
+    return DecodedPayload(tuple(readings), (*chain.from_iterable(bad.values()), *rest))

@@ -171,7 +171,7 @@ RETRY_S = 1.0
 """Time until the next attempt to publish a refused event, s."""
 
 
-class Event(NamedTuple):
+class Publication(NamedTuple):
     """A put, or (without a payload) a deletion, that must not be lost; `done` is called after it."""
 
     key: str
@@ -191,7 +191,7 @@ class Outgoing:
     def __init__(self) -> None:
         self.retry_at: float | None = None
         self._telemetry: deque[tuple[str, bytes]] = deque(maxlen=TELEMETRY_WAITING)
-        self._events: deque[Event] = deque()
+        self._events: deque[Publication] = deque()
         self._closing = False
         self._wakeup = threading.Condition()
 
@@ -201,7 +201,7 @@ class Outgoing:
             self._telemetry.append((key, payload))
             self._wakeup.notify()
 
-    def add_events(self, *events: Event) -> bool:
+    def add_events(self, *events: Publication) -> bool:
         """Add all events and return True, or none if the queue is full."""
         with self._wakeup:
             if len(self._events) >= EVENTS_WAITING:
@@ -216,7 +216,7 @@ class Outgoing:
             self._closing = True
             self._wakeup.notify()
 
-    def next(self) -> Event | tuple[str, bytes] | None:
+    def next(self) -> Publication | tuple[str, bytes] | None:
         """Wait for the next item and remove it; events come first. None after the last one."""
         with self._wakeup:
             while True:
@@ -231,7 +231,7 @@ class Outgoing:
                     return None
                 self._wakeup.wait(pause if self._events else None)
 
-    def put_back(self, event: Event) -> None:
+    def put_back(self, event: Publication) -> None:
         """Queue a refused event again; after `close`, discard all events.
 
         Parameters

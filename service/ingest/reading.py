@@ -133,7 +133,7 @@ class Known:
         return self.own_volt.get(meter, self.nominal_volt) if isinstance(meter, str) else self.nominal_volt
 
 
-class Raw(msgspec.Struct, gc=False):
+class WireReading(msgspec.Struct, gc=False):
     """A reading as transmitted; `meter` is present in batches only, `v_phases` at the busbar."""
 
     t: float
@@ -146,7 +146,7 @@ class Raw(msgspec.Struct, gc=False):
     t_power: float | None = None
 
 
-def plausible(raw: Raw, known: Known, meter: str | None) -> bool:
+def plausible(raw: WireReading, known: Known, meter: str | None) -> bool:
     """True if every number of a well-typed reading of a meter (None: the busbar) is plausible."""
     limit = known.power_max_kw
     return (
@@ -166,7 +166,7 @@ def _phases_plausible(phases: list[float | None], known: Known) -> bool:
     return len(phases) == PHASES and all(v is None or 0.0 <= v <= highest for v in phases)
 
 
-def to_reading(feeder: str, meter: str | None, raw: Raw) -> Reading:
+def to_reading(feeder: str, meter: str | None, raw: WireReading) -> Reading:
     """Return the reading of a meter (None: the busbar)."""
     return Reading(
         feeder,
@@ -181,7 +181,7 @@ def to_reading(feeder: str, meter: str | None, raw: Raw) -> Reading:
     )
 
 
-def _phases_of(raw: Raw) -> tuple[float, ...] | None:
+def _phases_of(raw: WireReading) -> tuple[float, ...] | None:
     """Voltages of the phases; None if all are absent."""
     if raw.v_phases is None or all(v is None for v in raw.v_phases):
         return None
@@ -212,7 +212,7 @@ class Findings:
 _GRAVITY = (BadReason.TYPE, BadReason.VALUE, BadReason.UNKNOWN_METER)
 
 
-def judge(value: Any, known: Known, meter: str | None = None, *, in_batch: bool) -> Raw | Findings:
+def judge(value: Any, known: Known, meter: str | None = None, *, in_batch: bool) -> WireReading | Findings:
     """Return the reading in a parsed value, or all its problems.
 
     Parameters
@@ -257,7 +257,7 @@ def judge(value: Any, known: Known, meter: str | None = None, *, in_batch: bool)
         findings.add(BadReason.UNKNOWN_METER, f"the feeder has no meter `{str(named)[:64]}`")
     if findings.of or t is None or v_volt is None:
         return findings
-    return Raw(t, v_volt, p_kw, q_kvar, seq, named, v_phases, t_power)
+    return WireReading(t, v_volt, p_kw, q_kvar, seq, named, v_phases, t_power)
 
 
 def _phases(value: Any, known: Known, findings: Findings) -> list[float | None] | None:

@@ -17,7 +17,7 @@ from typing import Any
 
 import zenoh
 
-from service.ingest.queues import BusConfig, BusCounts, BusUnavailable, Event, Outgoing, Sample
+from service.ingest.queues import BusConfig, BusCounts, BusUnavailable, Outgoing, Publication, Sample
 
 RING = 8192
 """Capacity of the subscription's queue, samples."""
@@ -239,8 +239,8 @@ class Bus:
                 self._answers.pop(full, None)
             else:
                 self._answers[full] = payload
-        put = Event(full, payload, None if last else done)
-        return self._outgoing.add_events(put, *([Event(full, None, done)] if last else []))
+        put = Publication(full, payload, None if last else done)
+        return self._outgoing.add_events(put, *([Publication(full, None, done)] if last else []))
 
     def answer(self, key: str, payload: bytes) -> None:
         """Store the reply to queries for a key, without publishing it.
@@ -270,7 +270,7 @@ class Bus:
         publishers: dict[str, zenoh.Publisher] = {}
         while (item := self._outgoing.next()) is not None:
             try:
-                if isinstance(item, Event):
+                if isinstance(item, Publication):
                     _put_event(live, item.key, item.payload)
                 else:
                     key, value = item
@@ -284,11 +284,11 @@ class Bus:
             except zenoh.ZError as error:
                 self.counts.publish_failed += 1
                 self.failure = _first_line(error)
-                if isinstance(item, Event) and _well_formed(item.key):
+                if isinstance(item, Publication) and _well_formed(item.key):
                     self._outgoing.put_back(item)
                 continue
             self.counts.published += 1
-            if isinstance(item, Event):
+            if isinstance(item, Publication):
                 self._outgoing.retry_at = None
                 if item.done is not None:
                     item.done()
@@ -351,7 +351,7 @@ def _try_recv(handler: zenoh.handlers.Handler[zenoh.Sample]) -> zenoh.Sample | N
         return None
 
 
-class Meters:
+class MeterClient:
     """zenoh session of the virtual meters: puts readings and, on request, receives estimates.
 
     Parameters
@@ -369,7 +369,7 @@ class Meters:
         self._live: zenoh.Session | None = None
         self._estimates: zenoh.handlers.Handler[zenoh.Sample] | None = None
 
-    def __enter__(self) -> Meters:
+    def __enter__(self) -> MeterClient:
         """Open the session."""
         self._live = self._stack.enter_context(session(self._config))
         return self

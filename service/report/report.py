@@ -23,7 +23,7 @@ from service.report.voltages import (
     BUSBAR,
     UNKNOWN_BUSBAR,
     BusbarReport,
-    Grounds,
+    ReferenceVoltages,
     attack_volts,
     bus_volts,
     busbar_phases,
@@ -119,7 +119,7 @@ class MeterReport:
     attack_volt_estimated
         Reconstructed manipulation: reported minus reconstructed voltage, V, for suspects; 0 for others.
     kind
-        Attack kind, see `gridsec.interface.Kind`; None if unknown.
+        Attack kind, see `gridsec.interface.ManipulationKind`; None if unknown.
     phase
         Measured phase: a, b or c; None on a balanced feeder.
     v_min_volt, v_max_volt
@@ -128,7 +128,7 @@ class MeterReport:
     learning_state, learning_reason
         As in `LearningReport`; None if the estimator does not learn, or does not run.
     model_only
-        True if the estimates use no reading of this tick, see `voltages.Grounds`.
+        True if the estimates use no reading of this tick, see `voltages.ReferenceVoltages`.
     clock_offset_s
         Lead of its clock relative to the other meters, s; None if not measurable.
     """
@@ -275,7 +275,7 @@ class FeederReport:
     skipped
         Number of skipped ticks directly before this one.
     model_only
-        True if no value of the feeder uses a reading of this tick, see `voltages.Grounds`.
+        True if no value of the feeder uses a reading of this tick, see `voltages.ReferenceVoltages`.
     model_only_phases
         In three phases, the phases without such a reading.
     bus_model_only
@@ -515,7 +515,7 @@ def _whole(
     inverters: tuple[InverterReport, ...],
     explanations: tuple[ExplanationReport, ...],
     busbar: BusbarReport,
-    rests_on: Grounds,
+    rests_on: ReferenceVoltages,
     bus_phases: tuple[tuple[float | None, ...], ...] = (),
     buses_alone: tuple[bool, ...] = (),
 ) -> FeederReport:

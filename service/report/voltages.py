@@ -54,7 +54,7 @@ def busbar_phases(site: Site) -> tuple[Phase | None, ...]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Grounds:
+class ReferenceVoltages:
     """Voltage readings of one tick that the reconstruction uses, by phase of the busbar, (b,).
 
     A value without such a reading in its phase is *model only*: it follows from powers, the model and the
@@ -83,7 +83,7 @@ class Grounds:
 
 def grounds(
     site: Site, tick: Tick, estimate: Estimate | None = None, verdict: Verdict | None = None
-) -> Grounds:
+) -> ReferenceVoltages:
     """Return the readings that the values of a tick use.
 
     Parameters
@@ -99,7 +99,7 @@ def grounds(
         busbar = busbar & (verdict.cause is not Cause.NO_BUSBAR)
         busbar = busbar & ~verdict.busbar if verdict.busbar.size else busbar
     of_meters = site.feeder.busbar_incidence()[site.meters[used]].any(axis=0)
-    return Grounds(np.asarray(of_meters, dtype=np.bool_), busbar)
+    return ReferenceVoltages(np.asarray(of_meters, dtype=np.bool_), busbar)
 
 
 def bus_volts(site: Site, v2_bus: Floats, measured: Bools) -> tuple[Floats, Floats, Bools]:
@@ -110,7 +110,8 @@ def bus_volts(site: Site, v2_bus: Floats, measured: Bools) -> tuple[Floats, Floa
     v2_bus : (n,)
         Squared voltages as in `gridsec.interface.Estimate`, pu.
     measured : (b,)
-        Phases with a reading, see `Grounds`. The other phases of a bus count only where it has none of these.
+        Phases with a reading, see `ReferenceVoltages`. The other phases of a bus count only where it has none
+        of these.
 
     Returns
     -------
@@ -192,7 +193,7 @@ class BusbarReport:
     attack_volt_estimated
         Reconstructed manipulation, V: the mean over the time scale of its detection; 0 if not suspect.
     model_only
-        True if `v_volt_estimated` uses no reading of this tick, see `voltages.Grounds`.
+        True if `v_volt_estimated` uses no reading of this tick, see `voltages.ReferenceVoltages`.
     clock_offset_s
         Lead of its clock relative to the other meters, s; None if not measurable.
     """

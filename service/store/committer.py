@@ -1,8 +1,8 @@
 """Writes alarm transitions to the database, then publishes them on zenoh, without delaying the monitoring.
 
-The results of a round are collected in `Waiting` and passed to `apart`, which the runtime sets to a separate
-thread with the wall clock. One write is in progress at a time. After a failed write its contents are kept and
-written again. Alarms are published after they are stored, not before.
+The results of a round are collected in `WriteQueue` and passed to `apart`, which the runtime sets to a
+separate thread with the wall clock. One write is in progress at a time. After a failed write its contents are
+kept and written again. Alarms are published after they are stored, not before.
 
 A command stores a `Wish` in the same way and gets the result between two rounds. A commit without an answer
 is repeated with its key until the database confirms it.
@@ -21,15 +21,15 @@ from typing import Any, Protocol, TypeVar
 import msgspec
 import structlog
 
-from service.alarms.state_machine import Alarm, Transition
+from service.alarms.state_machine import Alarm, AlarmTransition
 from service.alarms.state_machine import to_json as alarm_json
 from service.ingest.queues import BusCounts
 from service.metrics import Metrics
 from service.report.report import FeederReport
-from service.store import Event, OutcomeUnknown, Store, StoreUnavailable
-from service.store.schema import Happened
-from service.store.state_codec import Kept
-from service.store.write_queue import Batch, Waiting
+from service.store import OutcomeUnknown, Store, StoredTransition, StoreUnavailable
+from service.store.schema import CommissioningEvent
+from service.store.state_codec import StateSnapshot
+from service.store.write_queue import Batch, WriteQueue
 
 RETRY_S = 1.0
 SLOW_S = 15.0
@@ -72,9 +72,9 @@ class Wish:
         As in `Store.commit`.
     """
 
-    transitions: tuple[Transition, ...] = ()
-    kept: tuple[Kept, ...] = ()
-    happened: tuple[Happened, ...] = ()
+    transitions: tuple[AlarmTransition, ...] = ()
+    kept: tuple[StateSnapshot, ...] = ()
+    happened: tuple[CommissioningEvent, ...] = ()
     without: str | None = None
     put: tuple[str, Mapping[str, Any]] | None = None
 
@@ -101,7 +101,7 @@ class Command:
 
 
 @dataclass(frozen=True, slots=True)
-class Job:
+class WriteJob:
     """One write: data, published events, and the next part of the outbox."""
 
     key: int
@@ -112,27 +112,27 @@ class Job:
     command: Command | None = None
 
     @property
-    def transitions(self) -> tuple[Transition, ...]:
+    def transitions(self) -> tuple[AlarmTransition, ...]:
         """All transitions, in the order of their event numbers."""
         own = () if self.command is None else self.command.wish.transitions
         return (*self.batch.transitions, *own)
 
 
 @dataclass(frozen=True, slots=True)
-class Done:
+class WriteResult:
     """Result of a job: event numbers of a stored one, values read, or the error."""
 
     numbers: tuple[int, ...] | None = None
     marked: bool = False
-    page: tuple[Event, ...] | None = None
+    page: tuple[StoredTransition, ...] | None = None
     found: Any = None
     error: StoreUnavailable | None = None
 
 
-Apart = Callable[[Callable[[], Done], Callable[[Done], None]], None]
+Executor = Callable[[Callable[[], WriteResult], Callable[[WriteResult], None]], None]
 
 
-def at_once(write: Callable[[], Done], then: Callable[[Done], None]) -> None:
+def inline(write: Callable[[], WriteResult], then: Callable[[WriteResult], None]) -> None:
     """Write, and process the result, before returning.
 
     Parameters
@@ -143,7 +143,7 @@ def at_once(write: Callable[[], Done], then: Callable[[Done], None]) -> None:
     then(write())
 
 
-class Keeper:
+class Committer:
     """Writes alarm transitions to the database, then publishes them on zenoh.
 
     Parameters
@@ -176,9 +176,9 @@ class Keeper:
         metrics: Metrics,
         stored: Callable[[], None],
         kept: Callable[[tuple[FeederReport, ...]], None],
-        apart: Apart = at_once,
+        apart: Executor = inline,
     ) -> None:
-        self.waiting = Waiting(lambda what, count: metrics.forgotten.labels(what).inc(count))
+        self.waiting = WriteQueue(lambda what, count: metrics.forgotten.labels(what).inc(count))
         self.publisher: Publisher | None = None
         self.problem: str | None = None
         self.storing = False
@@ -189,7 +189,7 @@ class Keeper:
         self._retry_at = self._began = 0.0
         self._keys = count(1)
         # A job with an unknown outcome; nothing else is stored before it.
-        self._unknown: Job | None = None
+        self._unknown: WriteJob | None = None
         self._published: deque[int] = deque()
         self._unpublished: deque[tuple[int, Alarm]] = deque()
         # The outbox has events after this number that are not in `_unpublished`; None: it has none.
@@ -257,9 +257,9 @@ class Keeper:
             raise StoreUnavailable(self.problem, code="writes-fail")
         self._send(replace(self._job(), command=command))
 
-    def _job(self) -> Job:
+    def _job(self) -> WriteJob:
         more = self._outbox_after is not None and len(self._unpublished) < OUTBOX_PAGE
-        return Job(
+        return WriteJob(
             next(self._keys),
             self.waiting.take(),
             tuple(self._published),
@@ -267,19 +267,19 @@ class Keeper:
             page_after=self._outbox_after if more else None,
         )
 
-    def _send(self, job: Job) -> None:
+    def _send(self, job: WriteJob) -> None:
         self.storing, self._began = True, time.monotonic()
         self._metrics.unstored.set(len(self.waiting))
         self._apart(partial(_write, self._store, job), partial(self._written, job))
 
-    def _written(self, job: Job, done: Done) -> None:
+    def _written(self, job: WriteJob, done: WriteResult) -> None:
         """Process the result of a job."""
         self.storing = False
         if done.numbers is not None:
             self._unknown = None
             self.waiting.stored()
             self._kept(job.batch.reports)
-            self._tell(job.transitions, done.numbers)
+            self._publish_stored(job.transitions, done.numbers)
         elif isinstance(done.error, OutcomeUnknown) or job is self._unknown:
             self._unknown = job
         else:
@@ -301,14 +301,14 @@ class Keeper:
         if job.command is not None:
             self._answer(job.command, done)
 
-    def _answer(self, command: Command, done: Done) -> None:
+    def _answer(self, command: Command, done: WriteResult) -> None:
         """Pass a command its result. Stored data stay stored, whatever failed afterwards."""
         if done.numbers is not None and (done.error is None or command.wish != Wish()):
             command.landed(done.found)
         elif done.error is not None:
             command.refused(done.error)
 
-    def _tell(self, transitions: tuple[Transition, ...], numbers: tuple[int, ...]) -> None:
+    def _publish_stored(self, transitions: tuple[AlarmTransition, ...], numbers: tuple[int, ...]) -> None:
         """Log stored transitions, and queue them for publication."""
         for number, transition in zip(numbers, transitions, strict=True):
             alarm = transition.alarm
@@ -377,9 +377,9 @@ class Keeper:
             self._unpublished.popleft()
 
 
-def _write(store: Store, job: Job) -> Done:
+def _write(store: Store, job: WriteJob) -> WriteResult:
     """Execute a job in any thread: it changes only the database, and raises nothing."""
-    done = Done()
+    done = WriteResult()
     try:
         if job.probe:
             store.check()
@@ -394,7 +394,7 @@ def _write(store: Store, job: Job) -> Done:
             put=wish.put,
             key=job.key,
         )
-        done = Done(numbers)
+        done = WriteResult(numbers)
         if job.command is not None:
             done = replace(done, found=job.command.read(store))
         store.outbox_done(job.published)

@@ -23,12 +23,12 @@ from service.store.schema import (
     HISTORY,
     LAYOUT,
     OUTBOX,
-    Event,
-    Happened,
+    CommissioningChange,
+    CommissioningEvent,
     Rejected,
-    Step,
+    StoredTransition,
 )
-from service.store.state_codec import Kept, Matter
+from service.store.state_codec import SnapshotKind, StateSnapshot
 
 
 class Reader:
@@ -127,7 +127,7 @@ class Reader:
         with self._read() as connection:
             return [from_json(json.loads(data)) for data in connection.scalars(query)]
 
-    def events(self, alarm_id: str, *, after: int = 0, limit: int = 1000) -> list[Event]:
+    def events(self, alarm_id: str, *, after: int = 0, limit: int = 1000) -> list[StoredTransition]:
         """Return the events of an alarm, oldest first.
 
         Parameters
@@ -142,7 +142,9 @@ class Reader:
         with self._read() as connection:
             return [_event(row) for row in connection.execute(query).mappings()]
 
-    def events_after(self, number: int, *, feeder: str | None = None, limit: int = 100) -> list[Event]:
+    def events_after(
+        self, number: int, *, feeder: str | None = None, limit: int = 100
+    ) -> list[StoredTransition]:
         """Return the events after a number, oldest first.
 
         Parameters
@@ -160,7 +162,7 @@ class Reader:
         with self._read() as connection:
             return [_event(row) for row in connection.execute(query).mappings()]
 
-    def outbox_pending(self, limit: int = 1000, *, after: int = 0) -> list[Event]:
+    def outbox_pending(self, limit: int = 1000, *, after: int = 0) -> list[StoredTransition]:
         """Return the unpublished events, oldest first.
 
         Parameters
@@ -238,21 +240,21 @@ class Reader:
             rows = connection.execute(sa.select(FEEDER.c.name, FEEDER.c.tables).order_by(FEEDER.c.name))
             return {name: json.loads(tables) for name, tables in rows}
 
-    def commission(self, feeder: str) -> Kept | None:
+    def commission(self, feeder: str) -> StateSnapshot | None:
         """Return the stored commissioning of a feeder, or None."""
-        return self._kept(COMMISSION, feeder, Matter.COMMISSION)
+        return self._kept(COMMISSION, feeder, SnapshotKind.COMMISSION)
 
-    def distrust(self, feeder: str) -> Kept | None:
+    def distrust(self, feeder: str) -> StateSnapshot | None:
         """Return the stored suspicions of a feeder, or None."""
-        return self._kept(DISTRUST, feeder, Matter.DISTRUST)
+        return self._kept(DISTRUST, feeder, SnapshotKind.DISTRUST)
 
-    def _kept(self, table: sa.Table, feeder: str, matter: Matter) -> Kept | None:
+    def _kept(self, table: sa.Table, feeder: str, matter: SnapshotKind) -> StateSnapshot | None:
         c = table.c
         with self._read() as connection:
             row = connection.execute(sa.select(c.feeder, c.t, c.data).where(c.feeder == feeder)).first()
-            return None if row is None else Kept(*row, matter)
+            return None if row is None else StateSnapshot(*row, matter)
 
-    def commission_events(self, feeder: str, limit: int = 100) -> list[Happened]:
+    def commission_events(self, feeder: str, limit: int = 100) -> list[CommissioningEvent]:
         """Return the newest entries of a feeder's record of commissioning, oldest first.
 
         Parameters
@@ -265,10 +267,10 @@ class Reader:
         with self._read() as connection:
             rows = connection.execute(query).mappings().all()
         return [
-            Happened(
+            CommissioningEvent(
                 feeder,
                 row["t"],
-                Step(row["change"]),
+                CommissioningChange(row["change"]),
                 tuple(json.loads(row["meters"])),
                 row["who"],
                 row["reason"],
@@ -277,8 +279,8 @@ class Reader:
         ]
 
 
-def _event(row: sa.RowMapping) -> Event:
-    return Event(
+def _event(row: sa.RowMapping) -> StoredTransition:
+    return StoredTransition(
         row["seq"],
         row["t"],
         Change(row["change"]),

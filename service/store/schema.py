@@ -13,7 +13,7 @@ from gridsec.errors import GridsecError
 from service.alarms.state_machine import Alarm, Change
 
 
-class Step(StrEnum):
+class CommissioningChange(StrEnum):
     """Change of a commissioning."""
 
     BEGUN = "begun"
@@ -22,7 +22,7 @@ class Step(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Happened:
+class CommissioningEvent:
     """One entry of a feeder's record of commissioning.
 
     Attributes
@@ -39,7 +39,7 @@ class Happened:
 
     feeder: str
     t: float
-    change: Step
+    change: CommissioningChange
     meters: tuple[str, ...]
     who: str | None = None
     reason: str = ""
@@ -64,7 +64,7 @@ class WriterLost(StoreUnavailable):
 
 
 @dataclass(frozen=True, slots=True)
-class Event:
+class StoredTransition:
     """One stored transition. `seq` increases in the order of commits and is never reused."""
 
     seq: int

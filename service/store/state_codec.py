@@ -21,7 +21,7 @@ from feeders.format.tables import to_json
 from feeders.model.site import Site
 from gridsec.arrays import Floats
 from gridsec.errors import GridsecError
-from gridsec.estimators.sequential import Distrust
+from gridsec.estimators.sequential import SuspicionRecord
 from service.report.voltages import Phase, busbar_phases
 
 FORMAT: Final = 1
@@ -32,7 +32,7 @@ _Time: TypeAlias = Annotated[float, msgspec.Meta(gt=0.0, lt=1e300)]
 _BESIDE = ("title", "accept", "busbar_xy", "limits", "monitor")
 
 
-class Matter(StrEnum):
+class SnapshotKind(StrEnum):
     """Subject of a text."""
 
     COMMISSION = "commission"
@@ -46,7 +46,7 @@ class KeptInvalid(GridsecError):
 
 
 @dataclass(frozen=True, slots=True)
-class Kept:
+class StateSnapshot:
     """An encoded text of the store.
 
     Attributes
@@ -62,10 +62,10 @@ class Kept:
     feeder: str
     t: float
     text: str
-    matter: Matter = Matter.COMMISSION
+    matter: SnapshotKind = SnapshotKind.COMMISSION
 
 
-class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class CommissionRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Contents of the text of a commissioning.
 
     Attributes
@@ -73,7 +73,7 @@ class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     format
         Version of the text.
     feeder, t
-        As in `Kept`.
+        As in `StateSnapshot`.
     fingerprint
         Result of `fingerprint` at that time.
     meters
@@ -108,7 +108,7 @@ def fingerprint(site: Site) -> dict[str, str]:
     return {name: _digest(part) for name, part in parts.items()}
 
 
-def encode(site: Site, now: Mapping[str, str], t: float, arrays: Mapping[str, Floats]) -> Kept:
+def encode(site: Site, now: Mapping[str, str], t: float, arrays: Mapping[str, Floats]) -> StateSnapshot:
     """Encode a commissioning.
 
     Parameters
@@ -122,11 +122,11 @@ def encode(site: Site, now: Mapping[str, str], t: float, arrays: Mapping[str, Fl
     """
     name = site.feeder.name
     numbers = {key: [None if math.isnan(x) else x for x in value.tolist()] for key, value in arrays.items()}
-    record = Record(FORMAT, name, t, dict(now), list(site.meter_ids), numbers)
-    return Kept(name, t, msgspec.json.encode(record).decode())
+    record = CommissionRecord(FORMAT, name, t, dict(now), list(site.meter_ids), numbers)
+    return StateSnapshot(name, t, msgspec.json.encode(record).decode())
 
 
-def decode(site: Site, now: Mapping[str, str], kept: Kept) -> dict[str, Floats]:
+def decode(site: Site, now: Mapping[str, str], kept: StateSnapshot) -> dict[str, Floats]:
     """Decode a commissioning for the present feeder.
 
     Parameters
@@ -144,7 +144,7 @@ def decode(site: Site, now: Mapping[str, str], kept: Kept) -> dict[str, Floats]:
     KeptInvalid
         If the text is damaged, newer than this program, or of a feeder that has changed since.
     """
-    record = _read(site, kept, Record)
+    record = _read(site, kept, CommissionRecord)
     changed = [name for name in now if record.fingerprint.get(name) != now[name]]
     if changed:
         raise KeptInvalid(f"the feeder has changed since ({', '.join(changed)})", code="feeder-changed")
@@ -176,7 +176,7 @@ class Suspect(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     repeats_s: _Time | None = None
 
 
-class Deviant(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class NamedInverter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """An inverter that was named as manipulated.
 
     Attributes
@@ -189,7 +189,7 @@ class Deviant(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     number: Annotated[int, msgspec.Meta(ge=0)]
 
 
-class OffPhase(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class SuspectBusbarPhase(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A phase with a distrusted busbar meter.
 
     Attributes
@@ -216,7 +216,7 @@ class DistrustRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     format
         Version of the text.
     feeder, t
-        As in `Kept`.
+        As in `StateSnapshot`.
     meters, inverters
         Distrusted devices.
     busbar
@@ -227,11 +227,11 @@ class DistrustRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     feeder: str
     t: _Finite
     meters: list[Suspect]
-    inverters: list[Deviant]
-    busbar: list[OffPhase] = []
+    inverters: list[NamedInverter]
+    busbar: list[SuspectBusbarPhase] = []
 
 
-def encode_distrust(site: Site, t: float, distrust: Distrust) -> Kept:
+def encode_distrust(site: Site, t: float, distrust: SuspicionRecord) -> StateSnapshot:
     """Encode suspicions.
 
     Parameters
@@ -247,20 +247,20 @@ def encode_distrust(site: Site, t: float, distrust: Distrust) -> Kept:
         for k, (scale, named, again) in enumerate(meters)
         if math.isfinite(scale)
     ]
-    deviants = [Deviant(*owners[k]) for k in np.flatnonzero(distrust.inverters).tolist()]
+    deviants = [NamedInverter(*owners[k]) for k in np.flatnonzero(distrust.inverters).tolist()]
     each = zip(
         busbar_phases(site), distrust.busbar_scale_s, distrust.busbar_named, distrust.busbar_off, strict=True
     )
     phases = [
-        OffPhase(phase, float(scale), bool(named), float(off))
+        SuspectBusbarPhase(phase, float(scale), bool(named), float(off))
         for phase, scale, named, off in each
         if math.isfinite(scale)
     ]
     record = DistrustRecord(FORMAT, name, t, suspects, deviants, phases)
-    return Kept(name, t, msgspec.json.encode(record).decode(), Matter.DISTRUST)
+    return StateSnapshot(name, t, msgspec.json.encode(record).decode(), SnapshotKind.DISTRUST)
 
 
-def decode_distrust(site: Site, kept: Kept) -> Distrust:
+def decode_distrust(site: Site, kept: StateSnapshot) -> SuspicionRecord:
     """Decode suspicions for the meters, inverters and phases of the present feeder.
 
     Parameters
@@ -283,7 +283,7 @@ def decode_distrust(site: Site, kept: Kept) -> Distrust:
     if len(off) < len(record.busbar):
         raise KeptInvalid("it is damaged: a phase occurs twice", code="duplicate")
     phases = [off.get(phase) for phase in busbar_phases(site)]
-    return Distrust(
+    return SuspicionRecord(
         np.array([math.nan if one is None else one.scale_s for one in found], dtype=np.float64),
         np.array([one.repeats_s if one and one.repeats_s else math.nan for one in found], dtype=np.float64),
         np.array([one is not None and one.named for one in found], dtype=np.bool_),
@@ -310,10 +310,10 @@ class _Version(msgspec.Struct, frozen=True):
     format: Annotated[int, msgspec.Meta(ge=1)]
 
 
-_Text = TypeVar("_Text", Record, DistrustRecord)
+_Text = TypeVar("_Text", CommissionRecord, DistrustRecord)
 
 
-def _read(site: Site, kept: Kept, kind: type[_Text]) -> _Text:
+def _read(site: Site, kept: StateSnapshot, kind: type[_Text]) -> _Text:
     """Return the contents of a text of this feeder."""
     try:
         version = msgspec.json.decode(kept.text, type=_Version).format

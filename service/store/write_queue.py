@@ -14,11 +14,11 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
-from service.alarms.state_machine import Alarm, Change, Transition, carried
+from service.alarms.state_machine import Alarm, AlarmTransition, Change, carried
 from service.report.report import FeederReport
 from service.store import Rejected
-from service.store.schema import Happened
-from service.store.state_codec import Kept, Matter
+from service.store.schema import CommissioningEvent
+from service.store.state_codec import SnapshotKind, StateSnapshot
 
 TRANSITIONS_KEPT = 10_000
 """Number of waiting transitions beyond which they are thinned out."""
@@ -32,18 +32,18 @@ T = TypeVar("T")
 class Batch:
     """Contents of one transaction."""
 
-    transitions: tuple[Transition, ...] = ()
+    transitions: tuple[AlarmTransition, ...] = ()
     reports: tuple[FeederReport, ...] = ()
     rejected: tuple[Rejected, ...] = ()
-    kept: tuple[Kept, ...] = ()
-    happened: tuple[Happened, ...] = ()
+    kept: tuple[StateSnapshot, ...] = ()
+    happened: tuple[CommissioningEvent, ...] = ()
 
     def __bool__(self) -> bool:
         """True if it has any contents."""
         return any((self.transitions, self.reports, self.rejected, self.kept, self.happened))
 
 
-class Waiting:
+class WriteQueue:
     """Queue of data that wait for the database. Used by one thread at a time.
 
     Parameters
@@ -60,11 +60,11 @@ class Waiting:
     def __init__(self, forgotten: Callable[[str, int], None]) -> None:
         self.given_up = 0
         self._forgotten = forgotten
-        self._transitions: list[Transition] = []
+        self._transitions: list[AlarmTransition] = []
         self._reports: deque[FeederReport] = deque()
         self._rejected: deque[Rejected] = deque()
-        self._kept: dict[tuple[str, Matter], Kept] = {}
-        self._happened: deque[Happened] = deque()
+        self._kept: dict[tuple[str, SnapshotKind], StateSnapshot] = {}
+        self._happened: deque[CommissioningEvent] = deque()
         # Alarms that are not in the database; those of the batch in progress may be stored at any moment.
         self._unheard: set[str] = set()
         self._on_the_way: set[str] = set()
@@ -78,11 +78,11 @@ class Waiting:
     def add(
         self,
         *,
-        transitions: Iterable[Transition] = (),
+        transitions: Iterable[AlarmTransition] = (),
         reports: Iterable[FeederReport] = (),
         rejected: Iterable[Rejected] = (),
-        kept: Iterable[Kept] = (),
-        happened: Iterable[Happened] = (),
+        kept: Iterable[StateSnapshot] = (),
+        happened: Iterable[CommissioningEvent] = (),
     ) -> None:
         """Add data.
 

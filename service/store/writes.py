@@ -11,7 +11,7 @@ from typing import Any
 import sqlalchemy as sa
 import structlog
 
-from service.alarms.state_machine import Transition, to_json
+from service.alarms.state_machine import AlarmTransition, to_json
 from service.report.report import FeederReport
 from service.store.connect import Connections
 from service.store.history import HistoryRules, Mark, mark, pack, rows, worth_keeping
@@ -28,14 +28,14 @@ from service.store.schema import (
     LAYOUT,
     OUTBOX,
     WRITER,
-    Happened,
+    CommissioningEvent,
     Rejected,
     StoreUnavailable,
     WriterLost,
     digest,
     migrate,
 )
-from service.store.state_codec import Kept, Matter
+from service.store.state_codec import SnapshotKind, StateSnapshot
 
 BAD_READINGS_KEPT = 1000
 _PAYLOAD_KEPT = 256
@@ -48,7 +48,7 @@ ALONE_S = 5.0
 _STEADY_S = 86_400.0
 """Time for which a feeder must have reported before anything is deleted, s."""
 _log = structlog.get_logger("gridsec.store")
-_KEPT = {Matter.COMMISSION: COMMISSION, Matter.DISTRUST: DISTRUST}
+_KEPT = {SnapshotKind.COMMISSION: COMMISSION, SnapshotKind.DISTRUST: DISTRUST}
 
 
 class Store(Reader):
@@ -149,12 +149,12 @@ class Store(Reader):
 
     def commit(
         self,
-        transitions: Iterable[Transition] = (),
+        transitions: Iterable[AlarmTransition] = (),
         *,
         reports: Iterable[FeederReport] = (),
         rejected: Iterable[Rejected] = (),
-        kept: Iterable[Kept] = (),
-        happened: Iterable[Happened] = (),
+        kept: Iterable[StateSnapshot] = (),
+        happened: Iterable[CommissioningEvent] = (),
         without: str | None = None,
         put: tuple[str, Mapping[str, Any]] | None = None,
         key: int | None = None,
@@ -247,7 +247,7 @@ class Store(Reader):
             return False
         return True
 
-    def _put_transition(self, connection: sa.Connection, transition: Transition) -> int:
+    def _put_transition(self, connection: sa.Connection, transition: AlarmTransition) -> int:
         alarm = transition.alarm
         data = json.dumps(to_json(alarm), allow_nan=False)
         row = {
@@ -282,7 +282,7 @@ class Store(Reader):
         statement = self._connections.insert(FEEDER).values(row)
         connection.execute(statement.on_conflict_do_update(index_elements=["name"], set_=row))
 
-    def _put_kept(self, connection: sa.Connection, kept: Kept) -> None:
+    def _put_kept(self, connection: sa.Connection, kept: StateSnapshot) -> None:
         row = {"feeder": kept.feeder, "t": kept.t, "data": kept.text}
         statement = self._connections.insert(_KEPT[kept.matter]).values(row)
         connection.execute(statement.on_conflict_do_update(index_elements=["feeder"], set_=row))
@@ -348,7 +348,7 @@ def _forget_feeder(connection: sa.Connection, name: str) -> None:
         connection.execute(table.delete().where(table.c.feeder == name))
 
 
-def _happened(item: Happened) -> dict[str, Any]:
+def _happened(item: CommissioningEvent) -> dict[str, Any]:
     return {
         "feeder": item.feeder,
         "t": item.t,

@@ -21,7 +21,7 @@ from typing import Any, Protocol, TypeVar
 import httpx
 import zenoh
 
-from feeders.simulation.scenario import Reading
+from feeders.simulation.scenario import SimulatedReading
 from tests.service.running import free_port
 
 START_S = 60.0
@@ -35,7 +35,7 @@ class Tick(Protocol):
     def t(self) -> float: ...
 
     @property
-    def readings(self) -> Iterable[Reading]: ...
+    def readings(self) -> Iterable[SimulatedReading]: ...
 
 
 T = TypeVar("T", bound=Tick)
@@ -153,7 +153,7 @@ class Fleet:
     def __exit__(self, *_: object) -> None:
         self.session.close()
 
-    def put(self, reading: Reading) -> None:
+    def put(self, reading: SimulatedReading) -> None:
         where = f"meter/{reading.meter}" if reading.meter else "substation"
         values = {
             "t": reading.t,

@@ -18,14 +18,14 @@ from benchmarks.clean_days import Run, main, plan, play
 from feeders.model.profiles import Season
 from feeders.model.site import Snapshot, from_tables, load, to_frame
 from feeders.registry.registry import design
-from feeders.simulation.attacks import Kind, random_attacks
+from feeders.simulation.attacks import RandomAttackKind, random_attacks
 from feeders.simulation.demand import Variation
 from feeders.simulation.meters import MeterErrors
-from feeders.simulation.scenario import START, Reading, Scenario, simulate
+from feeders.simulation.scenario import START, Scenario, SimulatedReading, simulate
 from gridsec.arrays import Floats
 from gridsec.interface import Decision
 from service.alarms.conditions import AlarmKind
-from service.engine.replay import Tally, replay
+from service.engine.replay import ReplayCounts, replay
 
 DAY_S = 86_400.0
 SETTLED_S = 120.0
@@ -70,13 +70,13 @@ def test_a_day_without_an_attack_raises_no_alarm(feeder: str, hour: int) -> None
     )
     truth: dict[float, Floats] = {}
 
-    def readings() -> Iterator[Reading]:
+    def readings() -> Iterator[SimulatedReading]:
         for sample in simulate(site, scenario):
             truth[sample.t] = sample.v_volt / site.feeder.base_volt
             yield from sample.readings
 
     ticks = 0
-    for result in replay(site, readings(), Tally()):
+    for result in replay(site, readings(), ReplayCounts()):
         report = result.report
         ticks += 1
         assert not any(meter.suspect for meter in report.meters)
@@ -103,7 +103,7 @@ def test_a_meter_at_the_edge_of_its_class_is_learned_and_not_named() -> None:
     nominal, p, random = tables.meta.voltage_volt, len(site.meter_ids), np.random.default_rng(0)
     off = np.where(np.array(site.meter_ids) == "m05", site.accuracy.class_fraction, 0.0)
     watcher = design(site)
-    assert watcher.learner is not None
+    assert watcher.bias_learning is not None
     state = watcher.init(0.0)
     for k in range(1, int(1.2 * settings.commission_s / settings.tick_s)):
         v = nominal * (1.0 + off + site.accuracy.jitter * random.standard_normal(p))
@@ -111,7 +111,7 @@ def test_a_meter_at_the_edge_of_its_class_is_learned_and_not_named() -> None:
         frame = to_frame(site, Snapshot(10.0 * k, v, np.zeros(p), np.full(p, np.nan), v0))
         state, _, verdict = watcher.step(state, frame)
         assert k < 12 or verdict.decision is Decision.CLEAN, f"{10 * k} s: {verdict}"
-    assert watcher.learner.commission(state).learning is None
+    assert watcher.bias_learning.commission(state).learning is None
 
 
 def test_the_benchmark_counts_nothing_where_nothing_is() -> None:
@@ -127,7 +127,9 @@ def test_the_benchmark_counts_nothing_where_nothing_is() -> None:
 def test_the_benchmark_counts_alarms_and_tells_which_are_right() -> None:
     """As many alarms as liars, and those about voltages that truly are too low are no false ones."""
     run = plan("simbench-lv-rural1", Season.WINTER, 3, 600.0, None)
-    lies = random_attacks(run.site, 1, Kind.BIAS, 2, 0.05, t_on=START + 300.0, t_off=START + 500.0)
+    lies = random_attacks(
+        run.site, 1, RandomAttackKind.BIAS, 2, 0.05, t_on=START + 300.0, t_off=START + 500.0
+    )
     seen = play(replace(run, scenario=replace(run.scenario, attacks=lies)))
     assert seen.false == {"meter-manipulated": 2}
     assert len(seen.suspects) == 2

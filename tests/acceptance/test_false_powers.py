@@ -9,7 +9,7 @@ import pytest
 
 from feeders.model.site import load, to_frame
 from feeders.registry.registry import SEQUENTIAL, choose, design
-from feeders.simulation.attacks import Lie, Trick, manipulations
+from feeders.simulation.attacks import AttackKind, AttackSpec, manipulations
 from feeders.simulation.scenario import START, Scenario, simulate, snapshots
 from gridsec.interface import Cause, Decision
 
@@ -25,7 +25,7 @@ def test_a_power_that_is_false_is_told_as_a_power(size: float) -> None:
     for seed in range(8):
         profile = float(np.random.default_rng(seed).uniform(0.0, 13.9 * 86_400.0))
         quiet = Scenario(seed=seed, duration_s=60.0, profile_s=profile)
-        attacks, _ = manipulations(site, Lie(Trick.POWER, 1, size, ONSET_S), quiet)
+        attacks, _ = manipulations(site, AttackSpec(AttackKind.POWER, 1, size, ONSET_S), quiet)
         (attack,) = attacks
         state, loud = watcher.init(START - 1.0), False
         for snapshot in snapshots(simulate(site, replace(quiet, attacks=attacks))):
@@ -49,7 +49,7 @@ def test_residuals_made_with_a_power_that_was_doubted_name_nobody_afterwards() -
     watcher, seed = design(site), 9
     profile = float(np.random.default_rng(seed).uniform(0.0, 13.9 * 86_400.0))
     quiet = Scenario(seed=seed, duration_s=90.0, profile_s=profile)
-    (attack,), _ = manipulations(site, Lie(Trick.COORDINATED_POWER, 2, 3.0, ONSET_S), quiet)
+    (attack,), _ = manipulations(site, AttackSpec(AttackKind.COORDINATED_POWER, 2, 3.0, ONSET_S), quiet)
     state, errors = watcher.init(START - 1.0), []
     for snapshot in snapshots(simulate(site, replace(quiet, attacks=(attack,)))):
         frame = to_frame(site, snapshot)

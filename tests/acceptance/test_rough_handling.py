@@ -27,7 +27,7 @@ from pyarrow import ipc
 
 from feeders.format.tables import write
 from feeders.model.site import Site, from_tables, load
-from feeders.simulation.scenario import START, Reading, Scenario, simulate
+from feeders.simulation.scenario import START, Scenario, SimulatedReading, simulate
 from gridsec.attack import Attack, Bias
 from tests.acceptance.live import Fleet, Live, serve
 from tests.service.running import free_port
@@ -42,7 +42,7 @@ class Sample:
     """What is reported at one tick; the busbar's meter is the empty string."""
 
     t: float
-    readings: tuple[Reading, ...]
+    readings: tuple[SimulatedReading, ...]
 
 
 def sampled(site: Site, seconds: float, dt_s: float = 1.0, attacks: tuple[Attack, ...] = ()) -> list[Sample]:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.uncertain_loads import CELLS, LARGEST_ERROR_PERCENT, Cell, run
-from feeders.simulation.trial import Meters
+from feeders.simulation.trial import TrialMeterErrors
 
 # Learning takes six simulated hours: one seed of that has to do here.
 RUNS = [(cell, seed) for cell in CELLS for seed in range(1 if cell.learned else 3)]
@@ -24,5 +24,5 @@ def test_everybody_who_lies_and_nobody_else(cell: Cell, seed: int) -> None:
     assert not outcome.accused.any()
     assert not outcome.accused_inverters.any()
     assert outcome.missed == 0
-    if cell.meters is Meters.WHITE:
+    if cell.meters is TrialMeterErrors.WHITE:
         assert np.percentile(outcome.error_liars, 95) <= LARGEST_ERROR_PERCENT

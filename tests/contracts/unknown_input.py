@@ -34,7 +34,7 @@ def plant(where: str) -> UnknownInputPlant:
 
 
 @functools.cache
-def design(where: str) -> observers.UnknownInputDesign:
+def design(where: str) -> observers.UnknownInputObserver:
     made = observers.design(plant(where), PAIRS[where])
     assert not made.missing
     return made

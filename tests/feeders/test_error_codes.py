@@ -22,14 +22,14 @@ import pytest
 import feeders
 from feeders.convert.convert import convert
 from feeders.convert.from_simbench import envelope
-from feeders.convert.network import Network, below, busbar_of
+from feeders.convert.network import SourceNetwork, below, busbar_of
 from feeders.format.tables import CustomerRow, FeederTables, LineRow, from_json, read, to_json, write
 from feeders.model.load_uncertainty import from_history
 from feeders.model.site import from_tables, load
 from feeders.model.three_phase import three_phase
 from feeders.registry import plugins
-from feeders.registry.registry import Family, choose
-from feeders.simulation.attacks import Kind, random_attacks
+from feeders.registry.registry import Estimator, choose
+from feeders.simulation.attacks import RandomAttackKind, random_attacks
 from feeders.simulation.demand import Variation
 from feeders.simulation.meters import Channel
 from feeders.simulation.plant import ClosedLoop, Loads
@@ -114,8 +114,8 @@ def opened() -> Any:
     return convert("street", "out", opened=["main"])
 
 
-def network(*lines: LineRow, sources: tuple[str, ...] = ("bb",), **more: Any) -> Network:
-    return Network("a tool", list(sources), {"bb": 230.0, "end": 230.0}, list(lines or (MAIN,)), **more)
+def network(*lines: LineRow, sources: tuple[str, ...] = ("bb",), **more: Any) -> SourceNetwork:
+    return SourceNetwork("a tool", list(sources), {"bb": 230.0, "end": 230.0}, list(lines or (MAIN,)), **more)
 
 
 def without(module: str, made: Callable[[], Any]) -> Any:
@@ -241,7 +241,7 @@ CALLS: dict[str, Callable[[], Any]] = {
     ),
     "three phases as a balanced feeder": lambda: load("ieee-european-lv").balanced,
     "no such estimator": lambda: choose(village(), estimator="oracle", max_attacked=-1),
-    "an estimator that no package offers": lambda: plugins.load("nobody", Family),
+    "an estimator that no package offers": lambda: plugins.load("nobody", Estimator),
     "two sources": lambda: busbar_of(network(sources=("bb", "end")), [MAIN], None),
     "a second source": lambda: below(network(sources=("bb", "end")), "bb", ()),
     "no such bus": lambda: busbar_of(network(), [MAIN], "nowhere"),
@@ -265,10 +265,10 @@ CALLS: dict[str, Callable[[], Any]] = {
     "a scenario without length": lambda: Scenario(duration_s=0.0),
     "an attack of a meter that is not there": elsewhere,
     "more attacked meters than there are": lambda: random_attacks(
-        village(), 0, Kind.BIAS, 8, 0.02, t_on=START, t_off=START + 1.0
+        village(), 0, RandomAttackKind.BIAS, 8, 0.02, t_on=START, t_off=START + 1.0
     ),
     "a fake load at all meters": lambda: random_attacks(
-        village(), 0, Kind.COORDINATED, 7, 0.02, t_on=START, t_off=START + 1.0
+        village(), 0, RandomAttackKind.COORDINATED, 7, 0.02, t_on=START, t_off=START + 1.0
     ),
     "a load beyond the feeder": lambda: PowerFlow(village()).solve(np.full(8, 1e5), np.zeros(8), 230.0),
     "inverters that do not settle": not_settled,

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from feeders.model.site import Site, from_tables, load, to_frame
-from feeders.simulation.scenario import Sample, Scenario, simulate, snapshots
+from feeders.simulation.scenario import Scenario, SimulatedTick, simulate, snapshots
 from gridsec.arrays import Bools
 from gridsec.interface import Frame
 
@@ -33,7 +33,7 @@ def unmetered(site: Site) -> Bools:
     return out
 
 
-def played(site: Site, seed: int, duration_s: float) -> Iterator[tuple[Sample, Frame]]:
+def played(site: Site, seed: int, duration_s: float) -> Iterator[tuple[SimulatedTick, Frame]]:
     """Some hour of the summer's profiles by AC power flow, and what the service makes of its readings."""
     when = float(HOURS[seed % HOURS.size] + 86400.0 * (seed % 14))
     samples = list(simulate(site, Scenario(seed=seed, duration_s=duration_s, profile_s=when)))

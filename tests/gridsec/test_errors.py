@@ -13,7 +13,7 @@ from gridsec.errors import (
     InputInvalid,
     NotObservable,
     Problem,
-    refuse,
+    raise_if_any,
 )
 from tests.codes import refused
 
@@ -65,9 +65,9 @@ def test_the_code_of_one_sentence_is_that_of_its_class_or_its_own() -> None:
 
 
 def test_refuse_raises_only_with_problems() -> None:
-    refuse([])
+    raise_if_any([])
     with refused(InputInvalid, "shape", "order") as caught:
-        refuse(Problem(code, f"{code} is wrong") for code in ("shape", "order"))
+        raise_if_any(Problem(code, f"{code} is wrong") for code in ("shape", "order"))
     assert str(caught.value) == "shape is wrong; order is wrong"
     assert isinstance(caught.value, ValueError)
 

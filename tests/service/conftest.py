@@ -35,7 +35,7 @@ from service.errors import FeederFixed, FeederUnknown, TooManyFeeders
 from service.report.feeder_info import revision
 from service.report.report import FeederReport, MeterReport
 from service.store import Store
-from service.store.schema import Happened, Step
+from service.store.schema import CommissioningChange, CommissioningEvent
 from tests.service.asking import T0, Setup
 from tests.service.databases import Cluster, find_postgresql
 from tests.service.looking import Site
@@ -235,7 +235,7 @@ class SmallService:
 
     async def recommission(self, name: str, meters: Sequence[str], who: str, reason: str) -> dict[str, Any]:
         chosen = tuple(meters) or tuple(self.villages[name].meters)
-        event = Happened(name, T0, Step.RECOMMISSIONED, chosen, who, reason)
+        event = CommissioningEvent(name, T0, CommissioningChange.RECOMMISSIONED, chosen, who, reason)
         await asyncio.to_thread(partial(self.store.commit, happened=[event]))
         self.learning.update(chosen)
         return self.commissioning(name) or {}

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from feeders.model.site import Site
 from feeders.simulation.scenario import Scenario, by_arrival, random_attacks, simulate
 from service.cli.simulate import key_of, payload_of
-from service.engine.engine import Rounds, RuntimeConfig
+from service.engine.engine import Engine, RuntimeConfig
 from service.engine.feeder_monitor import design
 from service.ingest.align import Clock
 from service.ingest.queues import Sample
@@ -30,10 +30,10 @@ def two_liars(site: Site) -> list[Sample]:
 
 def rounds(
     store: Store, site: Site, outlet: Outlet | None = None, stored: Callable[[], None] = lambda: None
-) -> Rounds:
-    made = Rounds(RuntimeConfig(clock=Clock.EVENTS), store, [site], wall=lambda: START, stored=stored)
-    made.keeper.publisher = outlet
-    made.watches[FEEDER].install(design(site))
+) -> Engine:
+    made = Engine(RuntimeConfig(clock=Clock.EVENTS), store, [site], wall=lambda: START, stored=stored)
+    made.committer.publisher = outlet
+    made.monitors[FEEDER].install(design(site))
     made.begin()
     return made
 

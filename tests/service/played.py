@@ -8,14 +8,16 @@ from typing import Any
 from feeders.format.tables import write
 from feeders.model.site import Site
 from feeders.simulation.recording import read_recording, record
-from feeders.simulation.scenario import Sample, Scenario
+from feeders.simulation.scenario import Scenario, SimulatedTick
 from service.cli.simulate import Pace, play
-from service.engine.replay import Tally, replay
+from service.engine.replay import ReplayCounts, replay
 from service.report.report import FeederReport
 from tests.service.running import service, until
 
 
-def served(site: Site, scenario: Scenario, folder: Path, name: str) -> tuple[list[Sample], dict[str, Any]]:
+def served(
+    site: Site, scenario: Scenario, folder: Path, name: str
+) -> tuple[list[SimulatedTick], dict[str, Any]]:
     """Play a scenario into a running service; what was played, and the feeder's state at its end.
 
     Parameters
@@ -35,4 +37,4 @@ def served(site: Site, scenario: Scenario, folder: Path, name: str) -> tuple[lis
 def replayed(site: Site, scenario: Scenario, folder: Path) -> list[FeederReport]:
     """Record a scenario into a folder and replay it; one report a tick."""
     recording = record(site, scenario, folder / "day.parquet")
-    return [one.report for one in replay(site, read_recording(recording.path).readings(), Tally())]
+    return [one.report for one in replay(site, read_recording(recording.path).readings(), ReplayCounts())]

@@ -17,7 +17,7 @@ import httpx
 
 from service.app import Running, serve
 from service.ingest.queues import BusConfig, BusCounts
-from service.ingest.zenoh_bus import Meters
+from service.ingest.zenoh_bus import MeterClient
 from service.settings import settings
 
 FEEDER = "simbench-lv-rural1"
@@ -82,7 +82,7 @@ class Outlet:
 class InProcess:
     """A service, an HTTP client of it, and a zenoh client of it."""
 
-    def __init__(self, http: httpx.Client, meters: Meters, zenoh: str) -> None:
+    def __init__(self, http: httpx.Client, meters: MeterClient, zenoh: str) -> None:
         self.http, self.meters, self.zenoh = http, meters, zenoh
 
     def get(self, path: str, **params: Any) -> Any:
@@ -152,7 +152,7 @@ def service(
         config = BusConfig("client", connect=(zenoh,))
         with (
             httpx.Client(base_url=found["running"].url, timeout=10.0) as http,
-            Meters(config, chosen.prefix) as meters,
+            MeterClient(config, chosen.prefix) as meters,
         ):
             yield InProcess(http, meters, zenoh)
     finally:

@@ -5,7 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 from gridsec.interface import Cause, Decision
-from service.alarms.state_machine import Alarm, AlarmKind, AlarmState, Change, Evidence, Severity, Transition
+from service.alarms.state_machine import (
+    Alarm,
+    AlarmKind,
+    AlarmState,
+    AlarmTransition,
+    Change,
+    ConditionEvidence,
+    Severity,
+)
 from service.report.report import FeederReport, MeterReport
 from tests.service.asking import T0
 
@@ -24,13 +32,13 @@ def an_alarm(number: int = 0, **changes: object) -> Alarm:
         t_raised=t,
         t_cleared=None,
         reason="reports 240.0 V – «quoted» ' \" \\ 雪",
-        evidence=Evidence(1e-3 / 3, None, 0.1 + 0.2, 230.0, -5e-324),
+        evidence=ConditionEvidence(1e-3 / 3, None, 0.1 + 0.2, 230.0, -5e-324),
     )
     return replace(made, **changes)  # type: ignore[arg-type]
 
 
-def raised(alarm: Alarm) -> Transition:
-    return Transition(alarm, Change.RAISED, alarm.t_raised)
+def raised(alarm: Alarm) -> AlarmTransition:
+    return AlarmTransition(alarm, Change.RAISED, alarm.t_raised)
 
 
 def a_report(

@@ -19,8 +19,8 @@ import pytest
 
 from feeders.format.tables import to_json, write
 from feeders.model.site import Site, from_tables, load
-from feeders.simulation.meters import Channel, Silence
-from feeders.simulation.scenario import Sample, Scenario, random_attacks, simulate
+from feeders.simulation.meters import Channel, MeterOutage
+from feeders.simulation.scenario import Scenario, SimulatedTick, random_attacks, simulate
 from service.cli.simulate import Pace, key_of, payload_of, play
 from service.store import Store
 from tests.service.databases import both
@@ -36,7 +36,7 @@ def site() -> Site:
     return load(FEEDER)
 
 
-def run(live: InProcess, site: Site, scenario: Scenario) -> list[Sample]:
+def run(live: InProcess, site: Site, scenario: Scenario) -> list[SimulatedTick]:
     """Play a scenario in step with the service and wait until it has seen the end."""
     samples = list(play(site, scenario, live.meters, STEP))
     until(lambda: live.state(site.feeder.name).get("t", 0.0) >= samples[-1].t - 2 * scenario.dt_s, "the end")
@@ -180,7 +180,7 @@ def test_concentrators(site: Site, tmp_path: Path) -> None:
     assert states[0]["verdict"] == "clean"
 
 
-def _send(live: InProcess, sample: Sample, *, together: bool) -> None:
+def _send(live: InProcess, sample: SimulatedTick, *, together: bool) -> None:
     rows = [r for r in sample.readings if r.meter]
     for r in sample.readings:
         if not (r.meter and together):
@@ -193,7 +193,7 @@ def _send(live: InProcess, sample: Sample, *, together: bool) -> None:
 
 def test_a_silent_meter_is_data_loss_and_never_clean(site: Site, tmp_path: Path) -> None:
     mute = site.meter_ids[4]
-    channel = Channel(silences=(Silence(mute, START + 10, START + 40),))
+    channel = Channel(silences=(MeterOutage(mute, START + 10, START + 40),))
     verdicts = []
     with service(tmp_path, clock="events") as live:
         for sample in play(

@@ -27,22 +27,22 @@ import service
 from feeders.format.tables import to_json
 from feeders.model.site import load
 from gridsec.errors import FeederInvalid, GridsecError, InputInvalid, Problem
-from gridsec.estimators.sequential import nobody
+from gridsec.estimators.sequential import SuspicionRecord
 from service import app
 from service.alarms.state_machine import AlarmBook, AlarmRules, acknowledge, acknowledged, restore
 from service.cli import demo
-from service.cli.paths import see, write_tables
+from service.cli.paths import check_paths, write_tables
 from service.cli.replay import _site_of
 from service.cli.sources import converted
 from service.cli.study_report import STUDIES, Asked
-from service.engine.commissioning import Commissioning
+from service.engine.commissioning import FeederCommissioning
 from service.engine.design_jobs import prepare
 from service.engine.runtime import Runtime
 from service.errors import FeederFixed, FeederNotLoaded, FeederUnknown, TooManyFeeders
 from service.ingest import zenoh_bus
 from service.ingest.align import AlignRules
 from service.ingest.queues import BusConfig
-from service.ingest.zenoh_bus import Meters
+from service.ingest.zenoh_bus import MeterClient
 from service.settings import settings
 from service.store import Store, committer, schema, writes
 from service.store.connect import NoAnswer, WriterSession
@@ -266,7 +266,7 @@ def defect(_: Path, __: Patch) -> None:
         raise ZeroDivisionError("a defect")
 
     error = committer._write(
-        cast(Any, SimpleNamespace(check=check)), committer.Job(1, Batch(), probe=True)
+        cast(Any, SimpleNamespace(check=check)), committer.WriteJob(1, Batch(), probe=True)
     ).error
     assert error is not None
     raise error
@@ -289,19 +289,21 @@ def damaged(changes: dict[str, Any]) -> Call:
 def suspect_twice(_: Path, __: Patch) -> None:
     site = load("cigre-lv")
     p, m = len(site.meter_ids), site.droop.tau.size
-    kept = encode_distrust(site, T0, replace(nobody(p, m), scale_s=np.where(np.arange(p) < 1, 60.0, np.nan)))
+    kept = encode_distrust(
+        site, T0, replace(SuspicionRecord.empty(p, m), scale_s=np.where(np.arange(p) < 1, 60.0, np.nan))
+    )
     record = json.loads(kept.text)
     decode_distrust(site, replace(kept, text=json.dumps(record | {"meters": 2 * record["meters"]})))
 
 
 def watcher(name: str, learner: object) -> Any:
     """A watcher that does not learn; its estimator can, or cannot."""
-    return SimpleNamespace(family=SimpleNamespace(name=name, learner=learner), learner=None)
+    return SimpleNamespace(family=SimpleNamespace(name=name, bias_learning=learner), bias_learning=None)
 
 
 def learning(installed: Any) -> Call:
     def made(_: Path, __: Patch) -> None:
-        commissioning = Commissioning(load("cigre-lv"))
+        commissioning = FeederCommissioning(load("cigre-lv"))
         commissioning._watcher = installed
         commissioning.renew(None, [], T0, "Ada", "new")
 
@@ -312,7 +314,7 @@ def put_fails(_: Path, __: Patch) -> None:
     def put(*_: object, **__: object) -> None:
         raise zenoh.ZError("the session is closed at /there")
 
-    meters = Meters(BusConfig(), "gridsec")
+    meters = MeterClient(BusConfig(), "gridsec")
     meters._live = cast(Any, SimpleNamespace(put=put))
     meters.put("key", b"")
 
@@ -377,7 +379,7 @@ def paths(place: Path, _: Patch) -> None:
     (place / "cigre").mkdir()
     (place / "cigre" / "feeder.toml").write_text("")
     (place / "measured.parquet").write_text("measured")
-    see(
+    check_paths(
         folders={"--out": Path("file"), "--more": Path("link"), "--tables": Path("cigre")},
         over={"--over": Path("file/in")},
         new={"--write": Path("cigre")},
@@ -392,7 +394,7 @@ def not_writable(_: Path, patch: Patch) -> None:
         raise PermissionError(13, "Permission denied")
 
     patch.setattr("service.cli.paths.tempfile.TemporaryFile", deny)
-    see(folders={"--out": Path("results")})
+    check_paths(folders={"--out": Path("results")})
 
 
 def wrong_settings(_: Path, __: Patch) -> None:
@@ -456,7 +458,7 @@ CALLS: dict[str, Call] = {
         zenoh_bus._config(BusConfig(file=Path("zenoh.json5"))),
     ),
     "zenoh endpoint": no_bus,
-    "zenoh session that is closed": lambda _, __: Meters(BusConfig(), "gridsec").put("key", b""),
+    "zenoh session that is closed": lambda _, __: MeterClient(BusConfig(), "gridsec").put("key", b""),
     "put that fails": put_fails,
     "stored state of another format": damaged({'"format":': '"format":9'}),
     "stored state of another feeder": damaged({'"feeder":"cigre-lv"': '"feeder":"town"'}),
@@ -495,7 +497,7 @@ CALLS: dict[str, Call] = {
     "removed lock": with_store(lock_removed),
     "second writer": with_store(another_writer),
     "session that the server ends": session_ended,
-    "command while writes fail": lambda _, __: committer.Keeper._command(
+    "command while writes fail": lambda _, __: committer.Committer._command(
         cast(Any, SimpleNamespace(problem="cannot write g.db: disk full")), cast(Any, None)
     ),
     "command while the service stops": lambda _, __: Runtime._go_on(

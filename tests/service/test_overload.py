@@ -23,10 +23,10 @@ import pytest
 from feeders.format.tables import write
 from feeders.model.site import Site, load
 from feeders.simulation.meters import BUSBAR
-from feeders.simulation.scenario import Reading, Scenario, simulate
+from feeders.simulation.scenario import Scenario, SimulatedReading, simulate
 from service.cli.simulate import key_of
 from service.ingest.queues import BusConfig
-from service.ingest.zenoh_bus import Meters
+from service.ingest.zenoh_bus import MeterClient
 from tests.service.databases import Cluster
 from tests.service.running import FEEDER, InProcess, free_port, service, until
 
@@ -46,7 +46,7 @@ class Fleet(threading.Thread):
         self.samples = [s.readings for s in simulate(site, Scenario(seed=1, duration_s=60.0, dt_s=1.0))]
 
     def run(self) -> None:
-        with Meters(BusConfig("client", connect=(self.zenoh,)), "gridsec") as meters:
+        with MeterClient(BusConfig("client", connect=(self.zenoh,)), "gridsec") as meters:
             due = time.monotonic()
             for number in count():
                 readings = self.samples[int(self.wall()) % len(self.samples)]
@@ -58,7 +58,7 @@ class Fleet(threading.Thread):
                 due = max(due + 1.0 / self.hertz, time.monotonic() - 0.1)
                 time.sleep(max(0.0, due - time.monotonic()))
 
-    def _put(self, meters: Meters, name: str, reading: Reading, number: int) -> None:
+    def _put(self, meters: MeterClient, name: str, reading: SimulatedReading, number: int) -> None:
         fields = {"t": self.wall(), "v_volt": reading.v_volt + 1e-4 * (number % 100)}
         if reading.meter != BUSBAR:
             fields["p_kw"] = reading.p_kw or 0.0

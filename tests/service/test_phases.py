@@ -16,9 +16,9 @@ from feeders.simulation.scenario import Scenario, random_attacks, simulate
 from service.api.models import FeederDetail, State
 from service.cli.simulate import Pace, payload_of, play
 from service.engine.feeder_monitor import known_of
-from service.engine.replay import Tally, replay
+from service.engine.replay import ReplayCounts, replay
 from service.ingest.align import Tick
-from service.ingest.decode import Decoded, Wire
+from service.ingest.decode import DecodedPayload, Wire
 from service.ingest.reading import BadReason, Reading
 from service.report.feeder_info import detail
 from service.report.voltages import snapshot
@@ -39,7 +39,7 @@ def scenario(site: Site) -> Scenario:
     return Scenario(seed=6, start=START, duration_s=40.0, attacks=attacks)
 
 
-def decode(site: Site, **changed: Any) -> Decoded:
+def decode(site: Site, **changed: Any) -> DecodedPayload:
     wire = Wire({EUROPEAN: known_of(site)})
     reading = {"t": START, "v_volt": 240.0, "v_phases": [239.0, 240.0, 241.0]} | changed
     return wire.decode(f"gridsec/{EUROPEAN}/substation/reading", msgspec.json.encode(reading))
@@ -104,7 +104,7 @@ def test_a_recording_keeps_the_phases_and_is_replayed(site: Site, scenario: Scen
     assert busbar.v_phases is not None
     assert busbar.v_volt == pytest.approx(np.mean(busbar.v_phases))
     assert recording.truth().v_bus_volt.shape == (25, 3 * 906)
-    tally = Tally()
+    tally = ReplayCounts()
     reports = [result.report for result in replay(site, read_recording(recording.path).readings(), tally)]
     lying = {site.meter_ids[k] for k in np.flatnonzero(samples[-1].manipulated)}
     assert {meter.meter for meter in reports[-1].meters if meter.suspect} == lying

@@ -24,14 +24,14 @@ from gridsec.grid.droop import voltage_curve
 from gridsec.grid.meshed import MeshedFeeder, impedances
 from gridsec.grid.radial import Feeder
 from gridsec.grid.three_phase import PHASES, ThreePhaseFeeder, lindist3flow
-from gridsec.planning.calibration import Doubts, Field, Places, Series
+from gridsec.planning.calibration import Field, Places, PriorUncertainty, Series
 from gridsec.planning.droop.ac_sensitivity import lines
 
 if TYPE_CHECKING:
     from feeders.format.tables import FeederTables
     from feeders.studies.calibrate.readings import Frames
 
-__all__ = ["Lateral", "Network", "alone", "laterals", "network", "site_of"]
+__all__ = ["Lateral", "MergedNetwork", "alone", "laterals", "network", "site_of"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -142,7 +142,7 @@ _CHUNK: Final = 64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Network:
+class MergedNetwork:
     """Feeder, in which lines in series are merged if it is large.
 
     Attributes
@@ -223,7 +223,7 @@ def _site(tables: FeederTables) -> Site | ThreePhaseSite:
     return site
 
 
-def network(tables: FeederTables) -> Network:
+def network(tables: FeederTables) -> MergedNetwork:
     """Prepare a feeder for calibration.
 
     Parameters
@@ -246,7 +246,7 @@ def network(tables: FeederTables) -> Network:
     else:
         place = np.column_stack([np.arange(len(feeder.buses)), np.zeros(len(feeder.buses))]).astype(np.intp)
         ends = lines(feeder)[0]
-    return Network(site, feeder, rows, ends, place, _places(site, feeder, place), single, parts)
+    return MergedNetwork(site, feeder, rows, ends, place, _places(site, feeder, place), single, parts)
 
 
 Model = Feeder | MeshedFeeder | ThreePhaseFeeder
@@ -342,7 +342,7 @@ def _shares(feeder: Model, bus: Ints) -> Floats | Phasors:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Powers:
+class CustomerPowers:
     """Customers' powers by the readings and the files. T frames, N customers, pu.
 
     Attributes
@@ -364,7 +364,7 @@ class Powers:
     missing: Bools
 
 
-def powers(site: Site | ThreePhaseSite, given: Frames) -> Powers:
+def powers(site: Site | ThreePhaseSite, given: Frames) -> CustomerPowers:
     """Compute the powers of all customers.
 
     Without a reading of q it is that of the load, by the middle of the limits of its power factor, less the
@@ -410,7 +410,7 @@ def powers(site: Site | ThreePhaseSite, given: Frames) -> Powers:
         q[:, own] -= voltage_curve(site.droop, at)
         slope = voltage_curve(site.droop, at + STEEP_PU) - voltage_curve(site.droop, at - STEEP_PU)
         steep[:, own] = slope / (2.0 * STEEP_PU) / (2.0 * at)
-    return Powers(
+    return CustomerPowers(
         p=-draws,
         q=-np.where(metered_q, q_read, q),
         load=np.where(metered_q, 0.0, load),
@@ -428,7 +428,7 @@ def _sun(draws: Floats, pv_peak: Floats) -> Floats:
     return np.asarray(np.clip(feeds.max(axis=1, initial=0.0), 0.0, 1.0))
 
 
-def series(net: Network, given: Frames, drawn: Powers, excluded: Collection[str]) -> Series:
+def series(net: MergedNetwork, given: Frames, drawn: CustomerPowers, excluded: Collection[str]) -> Series:
     """Readings and power flow of a feeder.
 
     Parameters
@@ -466,7 +466,7 @@ def series(net: Network, given: Frames, drawn: Powers, excluded: Collection[str]
     )
 
 
-def _voltages(net: Network, p: Floats, q: Floats, v0: Floats) -> tuple[Floats, Floats | Phasors]:
+def _voltages(net: MergedNetwork, p: Floats, q: Floats, v0: Floats) -> tuple[Floats, Floats | Phasors]:
     """Squared voltages of all buses with their losses, (T, F, b + 1), and `Series.drop`, (T, F, L).
 
     The input is the busbar voltage (T,) or (T, 3).
@@ -497,7 +497,9 @@ def _phasors(feeder: MeshedFeeder, s: Phasors, v0: Floats) -> Phasors:
     return np.asarray(idle + np.conj(s / V) @ feeder.transfer.T)
 
 
-def doubts(net: Network, drawn: Powers, tolerance: float, free: Collection[int], spread: float) -> Doubts:
+def doubts(
+    net: MergedNetwork, drawn: CustomerPowers, tolerance: float, free: Collection[int], spread: float
+) -> PriorUncertainty:
     """Prior standard deviations of the errors of the files, uniform within the stated limits.
 
     Parameters
@@ -521,7 +523,7 @@ def doubts(net: Network, drawn: Powers, tolerance: float, free: Collection[int],
     length[list(free)] = spread
     half = 0.5 * (model.tan_max - model.tan_min)
     root = np.sqrt(3.0)
-    return Doubts(
+    return PriorUncertainty(
         bias=np.hypot(site.accuracy.class_fraction, site.accuracy.busbar_class) / root,
         p_gain=np.where(without, 0.0, model.p_fraction / root),
         q_gain=np.where(unmetered, 0.0, model.q_fraction / root),
@@ -533,7 +535,7 @@ def doubts(net: Network, drawn: Powers, tolerance: float, free: Collection[int],
     )
 
 
-def field(net: Network, drawn: Powers) -> Field:
+def field(net: MergedNetwork, drawn: CustomerPowers) -> Field:
     """Effect of load errors at the meters."""
     site, model = net.site, net.site.loads
     A, B = net.places.at_meters
@@ -548,7 +550,7 @@ def field(net: Network, drawn: Powers) -> Field:
     )
 
 
-def meter_noise(net: Network, given: Frames) -> tuple[Floats, Floats]:
+def meter_noise(net: MergedNetwork, given: Frames) -> tuple[Floats, Floats]:
     """Variances of the readings' own noise (T, p), squared pu^2, and effect of the busbar's, (T, p, F).
 
     Each phase of the busbar has a register of its own, and a place has the error of its own phase.
@@ -562,7 +564,7 @@ def meter_noise(net: Network, given: Frames) -> tuple[Floats, Floats]:
     return own / count, std[:, None, None] * net.places.of_phases
 
 
-def gaps(net: Network, drawn: Powers) -> list[Floats]:
+def gaps(net: MergedNetwork, drawn: CustomerPowers) -> list[Floats]:
     """Effect of interpolated powers in each frame, T times (p, g): their changes from frame to frame."""
     A, B = net.places.at_meters
     change_p, change_q = (np.diff(power, axis=0).std(axis=0) for power in (drawn.p, drawn.q))

@@ -22,9 +22,9 @@ from feeders.studies.calibrate import feeder as model
 from gridsec.arrays import Floats, Ints
 from gridsec.grid.three_phase import PHASES, ThreePhaseFeeder
 from gridsec.planning.calibration import (
-    Evidence,
-    Fit,
+    HypothesisEvidence,
     LoadErrors,
+    RegressionFit,
     Regressors,
     Series,
     Whitening,
@@ -43,17 +43,17 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from feeders.format.tables import FeederTables
-    from feeders.studies.calibrate.feeder import Lateral, Network, Powers
+    from feeders.studies.calibrate.feeder import CustomerPowers, Lateral, MergedNetwork
     from feeders.studies.calibrate.readings import Frames
 
 __all__ = [
     "PLACES",
     "Correction",
+    "CorrectionState",
+    "FileErrorKind",
     "Guess",
-    "Kind",
+    "HypothesisComparison",
     "Round",
-    "State",
-    "Verdict",
     "apply",
     "as_filed",
     "compare",
@@ -65,7 +65,7 @@ __all__ = [
 ]
 
 
-class Kind(StrEnum):
+class FileErrorKind(StrEnum):
     """Kinds of errors of the files."""
 
     BUS = "bus"
@@ -75,7 +75,7 @@ class Kind(StrEnum):
     METER = "meter"
 
 
-PLACES: Final = (Kind.BUS, Kind.PHASE)
+PLACES: Final = (FileErrorKind.BUS, FileErrorKind.PHASE)
 """Errors of a customer's place; a customer has at most one of each."""
 
 
@@ -99,7 +99,7 @@ class Correction:
         first; none for a single customer.
     """
 
-    kind: Kind
+    kind: FileErrorKind
     names: tuple[str, ...]
     bus: str = ""
     phases: str = ""
@@ -109,7 +109,7 @@ class Correction:
     @property
     def exchange(self) -> bool:
         """True for an exchange of the phases of two customers or laterals: each has a letter of its own."""
-        return self.kind is Kind.PHASE and len(self.phases) > 1
+        return self.kind is FileErrorKind.PHASE and len(self.phases) > 1
 
     @property
     def on(self) -> tuple[dict[str, str], dict[str, str]]:
@@ -129,19 +129,19 @@ def apply(tables: FeederTables, wrong: Correction) -> FeederTables:
     wrong
         The error; that of a meter changes no file.
     """
-    if wrong.kind is Kind.METER:
+    if wrong.kind is FileErrorKind.METER:
         return tables
-    if wrong.kind is Kind.LENGTH:
+    if wrong.kind is FileErrorKind.LENGTH:
         rows = (longer(row, wrong.factor) if row.line in wrong.names else row for row in tables.lines)
         return replace(tables, lines=tuple(rows))
     customers = {row.customer: row for row in tables.customers}
-    if wrong.kind is Kind.PHASE:
+    if wrong.kind is FileErrorKind.PHASE:
         on, lines_on = wrong.on
         customers |= {name: replace(customers[name], phases=phases) for name, phases in on.items()}
         lines = (_on(row, lines_on[row.line]) if row.line in lines_on else row for row in tables.lines)
         return replace(tables, lines=tuple(lines), customers=tuple(customers.values()))
     one = customers[wrong.names[0]]
-    if wrong.kind is Kind.SWAP:
+    if wrong.kind is FileErrorKind.SWAP:
         other = customers[wrong.names[1]]
         changed = [replace(one, meter=other.meter), replace(other, meter=one.meter)]
     else:
@@ -187,7 +187,7 @@ def left(earlier: Correction, later: Correction) -> Correction | None:
     earlier, later
         Corrections of one feeder; for a customer's place the later one is valid.
     """
-    if later.kind is Kind.BUS and set(earlier.names) <= set(later.names) and earlier.lines:
+    if later.kind is FileErrorKind.BUS and set(earlier.names) <= set(later.names) and earlier.lines:
         # No customer remains on the lateral to confirm the phase of its lines.
         return _without_lines(earlier)
     if earlier.kind is not later.kind or later.kind not in PLACES:
@@ -224,9 +224,9 @@ def as_filed(tables: FeederTables, wrong: Correction, bus_of_file: Mapping[str, 
         Bus of the model of each bus of the files.
     """
     rows = {row.customer: row for row in tables.customers}
-    if wrong.kind is Kind.BUS:
+    if wrong.kind is FileErrorKind.BUS:
         return all(bus_of_file[rows[name].bus] == bus_of_file[wrong.bus] for name in wrong.names)
-    if wrong.kind is not Kind.PHASE:
+    if wrong.kind is not FileErrorKind.PHASE:
         return False
     lines = {row.line: row for row in tables.lines}
     on, lines_on = wrong.on
@@ -264,7 +264,7 @@ class Guess:
         Kind of the error.
     subject
         Customer, first customer of a swap, meter, or branch, by index in the present network. For an exchange
-        of phases the first part, by index into `Network.parts`.
+        of phases the first part, by index into `MergedNetwork.parts`.
     other
         Second customer, bus of the merged tree, or lateral; -1 for none. For an exchange the second part.
     phases
@@ -277,7 +277,7 @@ class Guess:
         Time interval of the meter's different error, Unix s.
     """
 
-    kind: Kind
+    kind: FileErrorKind
     subject: int
     other: int = -1
     phases: str = ""
@@ -288,7 +288,7 @@ class Guess:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class State:
+class CorrectionState:
     """Files with all corrections so far, and excluded meters.
 
     Attributes
@@ -308,17 +308,17 @@ class State:
     lengths: dict[str, float] = field(default_factory=dict)
     unread: str = ""
 
-    def same(self, other: State) -> bool:
+    def same(self, other: CorrectionState) -> bool:
         """True for equal files and excluded meters."""
         mine, others = ((each.tables.lines, each.tables.customers, each.excluded) for each in (self, other))
         return mine == others
 
-    def after(self, wrong: Correction) -> State:
+    def after(self, wrong: Correction) -> CorrectionState:
         """Correct one more error."""
-        if wrong.kind is Kind.METER:
+        if wrong.kind is FileErrorKind.METER:
             return replace(self, excluded=(*self.excluded, *wrong.names))
         lengths = dict(self.lengths)
-        if wrong.kind is Kind.LENGTH:
+        if wrong.kind is FileErrorKind.LENGTH:
             lengths |= {name: lengths.get(name, 1.0) * wrong.factor for name in wrong.names}
         return replace(self, tables=apply(self.tables, wrong), lengths=lengths)
 
@@ -327,19 +327,19 @@ class State:
 class Round:
     """Model, fit and readings for the files with all corrections so far."""
 
-    state: State
-    net: Network
-    drawn: Powers
+    state: CorrectionState
+    net: MergedNetwork
+    drawn: CustomerPowers
     series: Series
     noise: LoadErrors
     whiten: Whitening
     given: Regressors
-    fit: Fit
+    fit: RegressionFit
     readings: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Verdict:
+class HypothesisComparison:
     """Comparison of all hypotheses.
 
     Attributes
@@ -357,13 +357,13 @@ class Verdict:
     """
 
     guesses: list[Guess]
-    found: Evidence
+    found: HypothesisEvidence
     confidence: Floats
     any: float
     kept: Ints
 
 
-def prepare(state: State, frames: Frames, *, tolerance: float, errors: bool = False) -> Round:
+def prepare(state: CorrectionState, frames: Frames, *, tolerance: float, errors: bool = False) -> Round:
     """Fit meters, loads and lines under the assumption of correct files.
 
     Parameters
@@ -418,11 +418,11 @@ def prepare(state: State, frames: Frames, *, tolerance: float, errors: bool = Fa
     )
 
 
-def _typical(net: Network) -> float:
+def _typical(net: MergedNetwork) -> float:
     return 0.02 * float(np.median(net.site.loads.load_peak[net.site.meters]))
 
 
-def _spread_out(found: Fit, used: Ints, given: Regressors) -> Fit:
+def _spread_out(found: RegressionFit, used: Ints, given: Regressors) -> RegressionFit:
     """Fit with all coefficients, those with a prior of zero included."""
     estimate, std = np.zeros((2, given.spread.size))
     estimate[used], std[used] = found.estimate, found.std
@@ -433,9 +433,9 @@ def compare(
     now: Round,
     frames: Frames,
     risk: float,
-    tell: Callable[[int, int], None],
-    kinds: Collection[Kind] = tuple(Kind),
-) -> Verdict:
+    report_progress: Callable[[int, int], None],
+    kinds: Collection[FileErrorKind] = tuple(FileErrorKind),
+) -> HypothesisComparison:
     """Compare all hypotheses of an error of the files.
 
     Parameters
@@ -446,21 +446,21 @@ def compare(
         The readings.
     risk
         Probability of a proposal for files without errors.
-    tell
+    report_progress
         Called with (done, total).
     kinds
         Kinds of errors to consider.
     """
     guesses: list[Guess] = []
-    parts: list[Evidence] = []
+    parts: list[HypothesisEvidence] = []
     # Some kinds may have no hypothesis: phases on a balanced feeder, meters if all are excluded.
     chunks = [chunk for chunk in _chunks(now, kinds) if chunk[0]]
     for k, (some, make, spread) in enumerate(chunks):
-        tell(k, len(chunks))
+        report_progress(k, len(chunks))
         z = now.whiten(make())
         parts.append(evidence(now.fit, z.reshape(-1, len(some)), np.full(len(some), spread)))
         guesses.extend(some)
-    tell(len(chunks), len(chunks))
+    report_progress(len(chunks), len(chunks))
     names = ("g", "h", "log_factor")
     g, h, factor = (np.concatenate([np.empty(0), *(getattr(part, n) for part in parts)]) for n in names)
     kind = np.array([_family(guess) for guess in guesses], dtype=np.intp)
@@ -468,15 +468,17 @@ def compare(
     for k in _close(now, guesses, factor):
         exact[k] = _exactly(now, frames, guesses[k])
     weighed = weigh(exact, kind, risk)
-    return Verdict(guesses, Evidence(g, h, exact), weighed.confidence, weighed.any, weighed.kept)
+    return HypothesisComparison(
+        guesses, HypothesisEvidence(g, h, exact), weighed.confidence, weighed.any, weighed.kept
+    )
 
 
 def _family(guess: Guess) -> int:
     """Group of hypotheses with a common prior weight; exchanges of phases are a group of their own."""
-    return len(Kind) if guess.exchange else list(Kind).index(guess.kind)
+    return len(FileErrorKind) if guess.exchange else list(FileErrorKind).index(guess.kind)
 
 
-_MOVES: Final = (Kind.BUS, Kind.PHASE, Kind.SWAP)
+_MOVES: Final = (FileErrorKind.BUS, FileErrorKind.PHASE, FileErrorKind.SWAP)
 
 
 def _close(now: Round, guesses: list[Guess], factor: Floats) -> list[int]:
@@ -487,7 +489,7 @@ def _close(now: Round, guesses: list[Guess], factor: Floats) -> list[int]:
     moves = [k for k in order if guesses[k].kind in _MOVES]
     likely = [k for k in moves[:_REFIT] if factor[k] > 0.0]
     best = guesses[order[0]]
-    if best.kind is Kind.METER:
+    if best.kind is FileErrorKind.METER:
         customer = int(now.net.site.meters[best.subject])
         likely += [k for k in moves if customer in concerned(now, guesses[k])][:1]
     return list(dict.fromkeys(likely))
@@ -507,10 +509,10 @@ def concerned(now: Round, guess: Guess) -> list[int]:
         return list(map(int, now.net.laterals[guess.other].customers))
     if guess.exchange:
         return [int(customer) for part in _sides(now.net, guess) for customer in part.customers]
-    return [guess.subject, guess.other] if guess.kind is Kind.SWAP else [guess.subject]
+    return [guess.subject, guess.other] if guess.kind is FileErrorKind.SWAP else [guess.subject]
 
 
-def _sides(net: Network, guess: Guess) -> tuple[Lateral, Lateral]:
+def _sides(net: MergedNetwork, guess: Guess) -> tuple[Lateral, Lateral]:
     """Both parts of an exchange."""
     return net.parts[guess.subject], net.parts[guess.other]
 
@@ -518,49 +520,49 @@ def _sides(net: Network, guess: Guess) -> tuple[Lateral, Lateral]:
 Chunk = tuple[list[Guess], Callable[[], Floats], float]
 
 
-def _chunks(now: Round, kinds: Collection[Kind]) -> Iterator[Chunk]:
+def _chunks(now: Round, kinds: Collection[FileErrorKind]) -> Iterator[Chunk]:
     """Hypotheses of one kind, and a function that computes their effects, (T, p, H)."""
     net, series = now.net, now.series
     trusted = np.flatnonzero(series.seen.any(axis=0)).tolist()
     read = [phase for phase in PHASES if phase not in now.state.unread]
-    moves: dict[Kind, Callable[[Network, list[int]], list[Guess]]] = {
-        Kind.BUS: _buses,
-        Kind.PHASE: partial(_phases, read=read),
-        Kind.SWAP: _swaps,
+    moves: dict[FileErrorKind, Callable[[MergedNetwork, list[int]], list[Guess]]] = {
+        FileErrorKind.BUS: _buses,
+        FileErrorKind.PHASE: partial(_phases, read=read),
+        FileErrorKind.SWAP: _swaps,
     }
     guesses = [guess for kind, made in moves.items() if kind in kinds for guess in made(net, trusted)]
     for first in range(0, len(guesses), _CHUNK):
         some = guesses[first : first + _CHUNK]
         yield some, partial(_moves, now, some), 0.0
-    if Kind.LENGTH in kinds:
-        lengths = [Guess(Kind.LENGTH, k) for k in range(len(net.lines))]
+    if FileErrorKind.LENGTH in kinds:
+        lengths = [Guess(FileErrorKind.LENGTH, k) for k in range(len(net.lines))]
         yield lengths, partial(_seen, now, lengthened(net.places, series)), LENGTH_SPREAD
-    for j in trusted if Kind.METER in kinds else ():
+    for j in trusted if FileErrorKind.METER in kinds else ():
         columns, times = steps(series, j, PIECES)
-        changes = [Guess(Kind.METER, j, since=since, until=until) for since, until in times]
+        changes = [Guess(FileErrorKind.METER, j, since=since, until=until) for since, until in times]
         yield changes, partial(_seen, now, columns), CHANGE_SPREAD
-    if Kind.METER in kinds:
+    if FileErrorKind.METER in kinds:
         span = float(series.t[0]), float(series.t[-1])
-        always = [Guess(Kind.METER, j, since=span[0], until=span[1]) for j in trusted]
+        always = [Guess(FileErrorKind.METER, j, since=span[0], until=span[1]) for j in trusted]
         columns = now.given.columns[:, :, now.given.where["bias"][trusted]]
         yield always, partial(_seen, now, columns), LIE_SPREAD
 
 
-def _buses(net: Network, trusted: list[int]) -> list[Guess]:
+def _buses(net: MergedNetwork, trusted: list[int]) -> list[Guess]:
     out = []
     rows = net.site.tables.customers
     for j in trusted:
         customer = int(net.site.meters[j])
         phases = rows[customer].phases
         out += [
-            Guess(Kind.BUS, customer, bus, phases)
+            Guess(FileErrorKind.BUS, customer, bus, phases)
             for bus in range(len(net.feeder.buses))
             if bus != net.feeder.bus[customer] and net.reaches(bus, phases)
         ]
     return out
 
 
-def _phases(net: Network, trusted: list[int], read: Collection[str]) -> list[Guess]:
+def _phases(net: MergedNetwork, trusted: list[int], read: Collection[str]) -> list[Guess]:
     out = []
     if isinstance(net.feeder, ThreePhaseFeeder):
         for j in trusted:
@@ -568,31 +570,31 @@ def _phases(net: Network, trusted: list[int], read: Collection[str]) -> list[Gue
             bus, phases = int(net.feeder.bus[customer]), net.site.tables.customers[customer].phases
             if len(phases) == 1:
                 others = [phase for phase in read if phase != phases and net.reaches(bus, phase)]
-                out += [Guess(Kind.PHASE, customer, bus, phase) for phase in others]
+                out += [Guess(FileErrorKind.PHASE, customer, bus, phase) for phase in others]
         for k, lateral in enumerate(net.laterals):
             seen = np.intersect1d(net.site.meters[trusted], lateral.customers).tolist()
             others = [phase for phase in lateral.others if phase in read and seen]
-            out += [Guess(Kind.PHASE, seen[0], k, phase, lateral=True) for phase in others]
+            out += [Guess(FileErrorKind.PHASE, seen[0], k, phase, lateral=True) for phase in others]
         out += _exchanges(net, trusted)
     return out
 
 
-def _exchanges(net: Network, trusted: list[int]) -> list[Guess]:
+def _exchanges(net: MergedNetwork, trusted: list[int]) -> list[Guess]:
     """Pairs of single-phase customers, or of laterals, with each other's phase in the files."""
     read = net.site.meters[trusted]
     asked = [k for k, part in enumerate(net.parts) if np.isin(part.customers, read).any()]
     pairs = ((a, b, net.parts[a], net.parts[b]) for a, b in combinations(asked, 2))
     return [
-        Guess(Kind.PHASE, a, b, other.phase + one.phase, exchange=True)
+        Guess(FileErrorKind.PHASE, a, b, other.phase + one.phase, exchange=True)
         for a, b, one, other in pairs
         if other.phase in one.others and one.phase in other.others
     ]
 
 
-def _swaps(net: Network, trusted: list[int]) -> list[Guess]:
+def _swaps(net: MergedNetwork, trusted: list[int]) -> list[Guess]:
     W = net.places.weight
     customers = [int(net.site.meters[j]) for j in trusted]
-    return [Guess(Kind.SWAP, a, b) for a, b in combinations(customers, 2) if (W[a] != W[b]).any()]
+    return [Guess(FileErrorKind.SWAP, a, b) for a, b in combinations(customers, 2) if (W[a] != W[b]).any()]
 
 
 def _moves(now: Round, guesses: list[Guess]) -> Floats:
@@ -606,7 +608,7 @@ def _moves(now: Round, guesses: list[Guess]) -> Floats:
             both = zip(_sides(net, guess), guess.phases, strict=True)
             out[:, :, h] = net.places.rephased(series, [part.to(phase) for part, phase in both])
             continue
-        if guess.kind is Kind.SWAP:
+        if guess.kind is FileErrorKind.SWAP:
             W = net.places.weight
             change = {guess.subject: W[guess.other], guess.other: W[guess.subject]}
         else:
@@ -644,9 +646,9 @@ def correction(now: Round, guess: Guess, factor: float = 1.0) -> Correction:
         Factor on the length, for a length.
     """
     net, tables = now.net, now.state.tables
-    if guess.kind is Kind.METER:
+    if guess.kind is FileErrorKind.METER:
         return Correction(guess.kind, (net.site.meter_ids[guess.subject],))
-    if guess.kind is Kind.LENGTH:
+    if guess.kind is FileErrorKind.LENGTH:
         return Correction(
             guess.kind, tuple(tables.lines[k].line for k in net.lines[guess.subject]), factor=factor
         )
@@ -666,6 +668,6 @@ def correction(now: Round, guess: Guess, factor: float = 1.0) -> Correction:
             lines=tuple(name for some in lines for name in some),
         )
     name = tables.customers[guess.subject].customer
-    if guess.kind is Kind.SWAP:
+    if guess.kind is FileErrorKind.SWAP:
         return Correction(guess.kind, (name, tables.customers[guess.other].customer))
     return Correction(guess.kind, (name,), net.feeder.buses[guess.other], guess.phases)

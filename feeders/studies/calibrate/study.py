@@ -30,11 +30,11 @@ from feeders.studies.calibrate.search import (
     PLACES,
     SHORTEST,
     Correction,
+    CorrectionState,
+    FileErrorKind,
     Guess,
-    Kind,
+    HypothesisComparison,
     Round,
-    State,
-    Verdict,
     apply,
     as_filed,
     compare,
@@ -44,7 +44,7 @@ from feeders.studies.calibrate.search import (
     prepare,
 )
 from feeders.studies.journal import Journal, Progress, Where
-from gridsec.errors import FeederInvalid, InputInvalid, Problem, refuse
+from gridsec.errors import FeederInvalid, InputInvalid, Problem, raise_if_any
 from gridsec.planning.calibration import explain, lengthened
 
 if TYPE_CHECKING:
@@ -56,9 +56,9 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Calibrate",
-    "Found",
+    "FileErrorSearch",
     "OtherFeeder",
-    "Search",
+    "SearchResult",
     "calibrate",
     "customers",
     "described",
@@ -134,7 +134,7 @@ def meters(now: Round, risk: float) -> pd.DataFrame:
 
 
 def line_table(
-    now: Round, tolerance: float, kinds: Collection[Kind]
+    now: Round, tolerance: float, kinds: Collection[FileErrorKind]
 ) -> tuple[pd.DataFrame, list[tuple[str, ...]]]:
     """Table of lines: length of each line, or lines in series, alone; and the ids of each row's lines."""
     net, rows = now.net, now.state.tables.lines
@@ -147,7 +147,7 @@ def line_table(
     base = np.array([now.state.lengths.get(chain[0], 1.0) for chain in names])
     factor, std = base * (1.0 + shift), base * std
     unknown = ~(std < UNSURE_LENGTH)
-    right = AS_FILED if Kind.LENGTH in kinds else UNASKED
+    right = AS_FILED if FileErrorKind.LENGTH in kinds else UNASKED
     shown = [" ".join(chain[:1] if len(chain) == 1 else (chain[0], "to", chain[-1])) for chain in names]
     frame = pd.DataFrame(
         {
@@ -186,7 +186,7 @@ def final(
     out, sure, told_of = [], [], set[tuple[str, ...]]()
     for row, first in zip(found, wrongs, strict=True):
         wrong = first
-        if wrong.kind is Kind.LENGTH:
+        if wrong.kind is FileErrorKind.LENGTH:
             if wrong.names in told_of:
                 continue
             told_of.add(wrong.names)
@@ -206,13 +206,13 @@ def final(
         decided = not row["alternatives"] and wrong.factor >= SHORTEST
         # A customer's bus and phases belong together: neither is written without the other.
         decided &= wrong.kind not in PLACES or vague.isdisjoint(wrong.names)
-        verdict = EXCLUDED if wrong.kind is Kind.METER else PROPOSED if decided else UNTOLD
-        if decided and wrong.kind is not Kind.METER:
+        verdict = EXCLUDED if wrong.kind is FileErrorKind.METER else PROPOSED if decided else UNTOLD
+        if decided and wrong.kind is not FileErrorKind.METER:
             sure.append(wrong)
         out.append(
             {
                 "kind": str(wrong.kind),
-                "what": _who(wrong) if wrong.kind is not Kind.LENGTH else " ".join(wrong.names),
+                "what": _who(wrong) if wrong.kind is not FileErrorKind.LENGTH else " ".join(wrong.names),
                 "now": row["now"],
                 "proposed": _proposed(wrong, row),
                 **{name: numbers[name] for name in ("estimate", "std", "low", "high")},
@@ -226,14 +226,16 @@ def final(
 
 
 def _proposed(wrong: Correction, row: dict[str, Any]) -> str:
-    if wrong.kind is Kind.METER:
+    if wrong.kind is FileErrorKind.METER:
         when = pd.to_datetime([row["since"], row["until"]], unit="s", utc=True).strftime("%Y-%m-%d %H:%M")
         return f"another error from {when[0]} to {when[1]} UTC"
-    if wrong.kind is Kind.LENGTH:
+    if wrong.kind is FileErrorKind.LENGTH:
         return f"{wrong.factor:.3g} times as long"
     if wrong.exchange:
         return "phases exchanged"
-    return {Kind.BUS: wrong.bus, Kind.PHASE: wrong.phases}.get(wrong.kind, "meters exchanged")
+    return {FileErrorKind.BUS: wrong.bus, FileErrorKind.PHASE: wrong.phases}.get(
+        wrong.kind, "meters exchanged"
+    )
 
 
 def _who(wrong: Correction) -> str:
@@ -254,16 +256,16 @@ def _who(wrong: Correction) -> str:
 def present(tables: FeederTables, wrong: Correction) -> str:
     """Present content of the files for an error."""
     rows = {row.customer: row for row in tables.customers}
-    if wrong.kind is Kind.BUS:
+    if wrong.kind is FileErrorKind.BUS:
         return rows[wrong.names[0]].bus
     if wrong.exchange:
         first = {phases: name for name, phases in reversed(wrong.on[0].items())}
         return " and ".join(rows[first[phases]].phases for phases in dict.fromkeys(wrong.on[0].values()))
     if wrong.lines:
         return next(row.phases for row in tables.lines if row.line == wrong.lines[0])
-    if wrong.kind is Kind.PHASE:
+    if wrong.kind is FileErrorKind.PHASE:
         return rows[wrong.names[0]].phases
-    if wrong.kind is Kind.SWAP:
+    if wrong.kind is FileErrorKind.SWAP:
         return " and ".join(rows[name].meter for name in wrong.names)
     return ""
 
@@ -271,23 +273,27 @@ def present(tables: FeederTables, wrong: Correction) -> str:
 def described(wrong: Correction) -> str:
     """Short description of an alternative."""
     subject = _who(wrong)
-    if wrong.kind is Kind.BUS:
+    if wrong.kind is FileErrorKind.BUS:
         return f"{subject} at {wrong.bus}"
     if wrong.exchange:
         return f"{subject} with exchanged phases"
-    if wrong.kind is Kind.PHASE:
+    if wrong.kind is FileErrorKind.PHASE:
         return f"{subject} on {wrong.phases}"
-    return {Kind.SWAP: f"{subject} swapped", Kind.LENGTH: f"length of {subject}"}.get(
+    return {FileErrorKind.SWAP: f"{subject} swapped", FileErrorKind.LENGTH: f"length of {subject}"}.get(
         wrong.kind, f"error of {subject} changes"
     )
 
 
 def customers(
-    now: Round, said: Verdict, wrongs: Sequence[Correction], risk: float, kinds: Collection[Kind]
+    now: Round,
+    said: HypothesisComparison,
+    wrongs: Sequence[Correction],
+    risk: float,
+    kinds: Collection[FileErrorKind],
 ) -> pd.DataFrame:
     """Table of customers: place of every customer, and alternatives that the readings do not exclude."""
     net, right = now.net, _as_filed(now.state.tables, kinds)
-    moved = {name for wrong in wrongs if wrong.kind in (*PLACES, Kind.SWAP) for name in wrong.names}
+    moved = {name for wrong in wrongs if wrong.kind in (*PLACES, FileErrorKind.SWAP) for name in wrong.names}
     excluded = {*now.state.excluded}.difference(blind(net.site, now.state.unread))
     open_from = -float(np.log(1.0 / risk))
     others: dict[int, list[tuple[float, str]]] = {}
@@ -298,7 +304,7 @@ def customers(
             on = guess.phases
             if guess.exchange:
                 on = guess.phases[customer not in net.parts[guess.subject].customers]
-            place = f"{bus} {on}" if guess.kind is Kind.PHASE else bus
+            place = f"{bus} {on}" if guess.kind is FileErrorKind.PHASE else bus
             others.setdefault(customer, []).append((float(factor), place))
     out = []
     for k, row in enumerate(now.state.tables.customers):
@@ -321,9 +327,9 @@ def customers(
     return pd.DataFrame(out)
 
 
-def _as_filed(tables: FeederTables, kinds: Collection[Kind]) -> str:
+def _as_filed(tables: FeederTables, kinds: Collection[FileErrorKind]) -> str:
     """Verdict on a place without evidence against it; kinds that were not searched are named."""
-    possible = PLACES if tables.in_phases else (Kind.BUS,)
+    possible = PLACES if tables.in_phases else (FileErrorKind.BUS,)
     missing = [kind for kind in possible if kind not in kinds]
     if len(missing) == len(possible):
         return UNASKED
@@ -396,7 +402,7 @@ Row = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Found:
+class SearchResult:
     """Result of a search.
 
     Attributes
@@ -410,11 +416,11 @@ class Found:
     """
 
     now: Round
-    said: Verdict
+    said: HypothesisComparison
     rows: list[Row]
 
 
-class Search:
+class FileErrorSearch:
     """Search for the errors of a feeder's files.
 
     Parameters
@@ -433,9 +439,9 @@ class Search:
 
     def __init__(
         self,
-        files: State,
-        fitted: Callable[[State], Round],
-        weighed: Callable[[Round], Verdict],
+        files: CorrectionState,
+        fitted: Callable[[CorrectionState], Round],
+        weighed: Callable[[Round], HypothesisComparison],
         risk: float,
         kept: Journal,
     ) -> None:
@@ -446,7 +452,7 @@ class Search:
         self._kept = kept
         self._steps = 0
 
-    def run(self) -> Found:
+    def run(self) -> SearchResult:
         """Forward steps and re-examinations until neither changes anything."""
         found, settled = self._forward(self._files, [])
         for _ in range(MOST_REVISIONS if settled else 0):
@@ -459,19 +465,19 @@ class Search:
                 break
         return found
 
-    def _after(self, rows: Sequence[Row]) -> State:
+    def _after(self, rows: Sequence[Row]) -> CorrectionState:
         """Files with these errors corrected."""
         state = self._files
         for row in rows:
             state = state.after(read(row["correction"]))
         return state
 
-    def _step(self, state: State) -> tuple[Round, Callable[[], Verdict], Row | None]:
+    def _step(self, state: CorrectionState) -> tuple[Round, Callable[[], HypothesisComparison], Row | None]:
         """Fit, comparison, and the error that the readings support most; None without one."""
         now = self._fitted(state)
-        said: list[Verdict] = []
+        said: list[HypothesisComparison] = []
 
-        def verdict() -> Verdict:
+        def verdict() -> HypothesisComparison:
             if not said:
                 said.append(self._weighed(now))
             return said[0]
@@ -482,7 +488,7 @@ class Search:
         self._steps += 1
         return now, verdict, row
 
-    def _forward(self, state: State, rows: list[Row]) -> tuple[Found, bool]:
+    def _forward(self, state: CorrectionState, rows: list[Row]) -> tuple[SearchResult, bool]:
         """Forward steps; False if the search returns to earlier files."""
         been, settled = [self._files, state], True
         for step in range(MOST_ERRORS + 1):
@@ -490,9 +496,9 @@ class Search:
             if row is None or step == MOST_ERRORS:
                 break
             wrong = read(row["correction"])
-            if wrong.kind is Kind.METER:
+            if wrong.kind is FileErrorKind.METER:
                 # All errors so far may rest on this meter's readings: the search restarts without it.
-                meters = [each for each in rows if each["correction"]["kind"] == Kind.METER]
+                meters = [each for each in rows if each["correction"]["kind"] == FileErrorKind.METER]
                 rows = [*meters, row]
                 state = self._after(rows)
             elif any(state.after(wrong).same(before) for before in been):
@@ -503,7 +509,7 @@ class Search:
                 state = state.after(wrong)
                 rows = _together(rows, row, self._files.tables, now.net.site.bus_of_file)
             been.append(state)
-        return Found(now, verdict(), rows), settled
+        return SearchResult(now, verdict(), rows), settled
 
     def _revised(self, rows: list[Row]) -> list[Row]:
         """Errors after a new comparison of each, with all others corrected."""
@@ -511,7 +517,12 @@ class Search:
             wrong = read(row["correction"])
             alone = [each for each in rows if _same_subject(read(each["correction"]), wrong)]
             rest = [each for each in rows if each not in alone]
-            if row not in rows or wrong.kind is Kind.METER or not _files_of(rest) or _chained(wrong, rest):
+            if (
+                row not in rows
+                or wrong.kind is FileErrorKind.METER
+                or not _files_of(rest)
+                or _chained(wrong, rest)
+            ):
                 continue
             try:
                 now, _, again = self._step(self._after(rest))
@@ -519,26 +530,26 @@ class Search:
                 continue  # A bus and a phase that require each other cannot be withdrawn alone.
             if again is None:
                 rows = rest
-            elif again["correction"]["kind"] != Kind.METER:
+            elif again["correction"]["kind"] != FileErrorKind.METER:
                 rows = _together(rest, again, self._files.tables, now.net.site.bus_of_file)
         return rows
 
 
 def _files_of(rows: Sequence[Row]) -> bool:
     """True if any error is one of the files; otherwise nothing has changed since the first comparison."""
-    return any(row["correction"]["kind"] != Kind.METER for row in rows)
+    return any(row["correction"]["kind"] != FileErrorKind.METER for row in rows)
 
 
 def _same_subject(one: Correction, other: Correction) -> bool:
     """True for equal errors, and for lengths of the same lines, which are found in several steps."""
-    return one == other or (one.kind is other.kind is Kind.LENGTH and one.names == other.names)
+    return one == other or (one.kind is other.kind is FileErrorKind.LENGTH and one.names == other.names)
 
 
 def _chained(wrong: Correction, rest: Sequence[Row]) -> bool:
     """True for an exchange of meters relative to another one: it cannot be withdrawn alone."""
     others = [read(row["correction"]) for row in rest]
-    return wrong.kind is Kind.SWAP and any(
-        other.kind is Kind.SWAP and set(other.names) & set(wrong.names) for other in others
+    return wrong.kind is FileErrorKind.SWAP and any(
+        other.kind is FileErrorKind.SWAP and set(other.names) & set(wrong.names) for other in others
     )
 
 
@@ -567,16 +578,16 @@ def _doubted(row: Row, wrong: Correction) -> Row:
     return row | {"alternatives": [*row["alternatives"], described(wrong)]}
 
 
-def _best(now: Round, said: Verdict, risk: float, files: FeederTables) -> Row | None:
+def _best(now: Round, said: HypothesisComparison, risk: float, files: FeederTables) -> Row | None:
     """Error that the readings support most; None without sufficient evidence."""
     if said.any < math.log(1.0 / risk):
         return None
     best = int(said.kept[0])
     guess, g, h = said.guesses[best], float(said.found.g[best]), float(said.found.h[best])
-    shift = g / (h + LENGTH_SPREAD**-2) if guess.kind is Kind.LENGTH else 0.0
+    shift = g / (h + LENGTH_SPREAD**-2) if guess.kind is FileErrorKind.LENGTH else 0.0
     wrong = correction(now, guess, max(1.0 + shift, SHORTEST))
     others = [correction(now, said.guesses[k]) for k in said.kept[1:]]
-    if wrong.kind is Kind.PHASE:
+    if wrong.kind is FileErrorKind.PHASE:
         others += _unread(wrong, guess, now.state.unread)
     return {
         "correction": asdict(wrong),
@@ -585,7 +596,7 @@ def _best(now: Round, said: Verdict, risk: float, files: FeederTables) -> Row | 
         "log_factor": float(said.found.log_factor[best]),
         "confidence": float(said.confidence[best]),
         # Swaps build on each other; a place is compared with that in the files.
-        "now": present(now.state.tables if wrong.kind is Kind.SWAP else files, wrong),
+        "now": present(now.state.tables if wrong.kind is FileErrorKind.SWAP else files, wrong),
         "since": guess.since,
         "until": guess.until,
         "alternatives": [described(other) for other in others],
@@ -600,7 +611,7 @@ def _unread(wrong: Correction, guess: Guess, unread: str) -> list[Correction]:
 def read(row: Row) -> Correction:
     """Correction from the plain types of the journal."""
     return Correction(
-        Kind(row["kind"]),
+        FileErrorKind(row["kind"]),
         tuple(row["names"]),
         row["bus"],
         row["phases"],
@@ -712,7 +723,7 @@ def calibrate(
     risk: float = 0.05,
     tolerance: float = 0.02,
     exclude: Sequence[str] = (),
-    kinds: Sequence[Kind] = tuple(Kind),
+    kinds: Sequence[FileErrorKind] = tuple(FileErrorKind),
     journal: Where = None,
     progress: Progress | None = None,
 ) -> Calibrate:
@@ -755,20 +766,20 @@ def calibrate(
     problems = wrong_numbers(risk, tolerance)
     if unknown := sorted(set(exclude) - set(site.meter_ids)):
         problems.append(Problem("unknown-name", f"{site.feeder.name} has no meter {', '.join(unknown)}"))
-    refuse(problems)
+    raise_if_any(problems)
     given = frames(site, readings, exclude=exclude)
     subject = _subject(site, given, risk, tolerance) | {"exclude": sorted(exclude), "kinds": sorted(kinds)}
 
-    def weighed(now: Round) -> Verdict:
+    def weighed(now: Round) -> HypothesisComparison:
         return compare(now, given, risk, progress or _quiet, kinds)
 
-    def fitted(state: State) -> Round:
+    def fitted(state: CorrectionState) -> Round:
         return prepare(state, given, tolerance=tolerance, errors=True)
 
     unread = given.unread if site.tables.in_phases else ""
-    files = State(site.tables, (*exclude, *blind(site, unread)), unread=unread)
+    files = CorrectionState(site.tables, (*exclude, *blind(site, unread)), unread=unread)
     with Journal(journal, subject) as kept:
-        found = Search(files, fitted, weighed, risk, kept).run()
+        found = FileErrorSearch(files, fitted, weighed, risk, kept).run()
     now = found.now
     lines, ids = line_table(now, tolerance, kinds)
     wrongs = [read(row["correction"]) for row in found.rows]

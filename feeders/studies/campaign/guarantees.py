@@ -18,8 +18,8 @@ import pandas as pd
 
 from feeders.format.tables import FeederTables
 from feeders.model.site import from_tables
-from feeders.simulation.attacks import Trick
-from feeders.studies.campaign.plan import Kind, Promise
+from feeders.simulation.attacks import AttackKind
+from feeders.studies.campaign.plan import AttackClass, Promise
 from feeders.studies.detectable import Detectable, monitor_rule
 from feeders.studies.journal import Journal, Progress, Where, worked
 from feeders.studies.operating import SHARE, squared, volts_of_lie
@@ -224,7 +224,7 @@ NOTHING = 1e-6
 """Numerical error of a solver for zero, V."""
 
 
-def promised(site: Site, found: Detectable, *, share: float = SHARE) -> tuple[Kind, ...]:
+def promised(site: Site, found: Detectable, *, share: float = SHARE) -> tuple[AttackClass, ...]:
     """Attacks of the sizes of `detectable`, for a campaign.
 
     Parameters
@@ -249,14 +249,18 @@ def promised(site: Site, found: Detectable, *, share: float = SHARE) -> tuple[Ki
     """
     most, alone = found.max_attacked, (1,)
     kinds = [
-        Kind("hidden_alone", Trick.BIAS, HIDDEN, _volts(found, "hidden_alone"), (), alone, Promise.HIDDEN),
-        Kind("named_alone", Trick.BIAS, NAMED, _volts(found, "named_alone"), (), alone, Promise.NAMED),
+        AttackClass(
+            "hidden_alone", AttackKind.BIAS, HIDDEN, _volts(found, "hidden_alone"), (), alone, Promise.HIDDEN
+        ),
+        AttackClass(
+            "named_alone", AttackKind.BIAS, NAMED, _volts(found, "named_alone"), (), alone, Promise.NAMED
+        ),
     ]
     if most > 1:
         worst = _collusions(site, found, share)
         kinds += [
-            Kind("hidden", Trick.BIAS, HIDDEN, (), worst, (most,), Promise.HIDDEN),
-            Kind("named", Trick.BIAS, NAMED, _volts(found, "named"), (), (most,), Promise.NAMED),
+            AttackClass("hidden", AttackKind.BIAS, HIDDEN, (), worst, (most,), Promise.HIDDEN),
+            AttackClass("named", AttackKind.BIAS, NAMED, _volts(found, "named"), (), (most,), Promise.NAMED),
         ]
     return tuple(kind for kind in kinds if any(kind.volts) or kind.together)
 

@@ -21,17 +21,28 @@ import numpy as np
 from feeders.format.columns import ESTIMATORS
 from feeders.model.profiles import Season, library
 from feeders.model.site import from_tables
-from feeders.simulation.attacks import Trick
+from feeders.simulation.attacks import AttackKind
 from feeders.simulation.demand import Variation
-from feeders.simulation.trial import LoadError, Meters, Trial
+from feeders.simulation.trial import LoadError, Trial, TrialMeterErrors
 from feeders.util import own_numbers, plain
 from gridsec.arrays import Ints
-from gridsec.errors import InputInvalid, Problem, choice, each_choice, refuse
+from gridsec.errors import InputInvalid, Problem, choice, each_choice, raise_if_any
 
 if TYPE_CHECKING:
     from feeders.model.site import Site
 
-__all__ = ["CLEAN", "KINDS", "LEARN_STEP_S", "Case", "Design", "Kind", "Moment", "Place", "Plan", "Promise"]
+__all__ = [
+    "CLEAN",
+    "KINDS",
+    "LEARN_STEP_S",
+    "AttackClass",
+    "CampaignCase",
+    "CampaignPlan",
+    "Design",
+    "Place",
+    "Promise",
+    "SceneTime",
+]
 
 CLEAN: Final = "clean"
 """Kind of the scenario without an attack."""
@@ -73,7 +84,7 @@ class Promise(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Kind:
+class AttackClass:
     """Kind of attack.
 
     Attributes
@@ -83,7 +94,7 @@ class Kind:
     trick
         Manipulation of the devices.
     sizes
-        As `feeders.simulation.attacks.Lie.size`; with `volts`, factors on these.
+        As `feeders.simulation.attacks.AttackSpec.size`; with `volts`, factors on these.
     volts
         Bias of each meter, V; empty: the same size for all meters.
     together
@@ -101,7 +112,7 @@ class Kind:
     """
 
     name: str
-    trick: Trick
+    trick: AttackKind
     sizes: tuple[float, ...]
     volts: tuple[float, ...] = ()
     together: tuple[tuple[float, ...], ...] = ()
@@ -109,22 +120,22 @@ class Kind:
     promise: Promise | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "trick", choice("trick", Trick, self.trick))
+        object.__setattr__(self, "trick", choice("trick", AttackKind, self.trick))
         if not self.sizes or self.name == CLEAN:
             raise InputInvalid(
                 [Problem("missing", f"kind {self.name!r} needs a size, and a name other than {CLEAN!r}")]
             )
-        if (self.volts or self.together) and self.trick is not Trick.BIAS:
+        if (self.volts or self.together) and self.trick is not AttackKind.BIAS:
             raise InputInvalid(
                 [
                     Problem(
                         "inconsistent",
-                        f"kind {self.name!r}: sizes in volts of each meter are for {Trick.BIAS}",
+                        f"kind {self.name!r}: sizes in volts of each meter are for {AttackKind.BIAS}",
                     )
                 ]
             )
 
-    def every(self, step_s: float) -> Kind:
+    def every(self, step_s: float) -> AttackClass:
         """Kind for another interval of the readings: ages and rates are counted in readings.
 
         Parameters
@@ -132,23 +143,23 @@ class Kind:
         step_s
             Interval of the readings, s.
         """
-        factor = {Trick.REPLAY: step_s, Trick.CLOCK_SHIFT: step_s, Trick.DRIFT: 1.0 / step_s}
+        factor = {AttackKind.REPLAY: step_s, AttackKind.CLOCK_SHIFT: step_s, AttackKind.DRIFT: 1.0 / step_s}
         return replace(self, sizes=tuple(size * factor.get(self.trick, 1.0) for size in self.sizes))
 
 
 KINDS: Final = (
-    Kind("bias", Trick.BIAS, (1.0, 2.0, 3.0, 5.0)),
-    Kind("scaling", Trick.SCALING, (3.0,)),
-    Kind("drift", Trick.DRIFT, (1.0, 3.0)),
-    Kind("stuck", Trick.STUCK, (0.0,)),
-    Kind("replay", Trick.REPLAY, (60.0,)),
-    Kind("coordinated", Trick.COORDINATED, (1.0, 3.0)),
+    AttackClass("bias", AttackKind.BIAS, (1.0, 2.0, 3.0, 5.0)),
+    AttackClass("scaling", AttackKind.SCALING, (3.0,)),
+    AttackClass("drift", AttackKind.DRIFT, (1.0, 3.0)),
+    AttackClass("stuck", AttackKind.STUCK, (0.0,)),
+    AttackClass("replay", AttackKind.REPLAY, (60.0,)),
+    AttackClass("coordinated", AttackKind.COORDINATED, (1.0, 3.0)),
 )
 """Default kinds of a campaign."""
 
 
 @dataclass(frozen=True, slots=True)
-class Moment:
+class SceneTime:
     """Time and random numbers of a scene.
 
     Attributes
@@ -165,7 +176,7 @@ class Moment:
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class CampaignCase:
     """One scenario.
 
     Attributes
@@ -190,8 +201,8 @@ class Case:
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
-    """Campaign. The defaults are 160 scenarios of ten minutes; `Plan.of` uses the settings of the files.
+class CampaignPlan:
+    """Campaign. The defaults are 160 scenarios of ten minutes; `of` uses the settings of the files.
 
     Attributes
     ----------
@@ -232,7 +243,7 @@ class Plan:
     scenes: int = 10
     together: int = 16
     seed: int = 0
-    kinds: tuple[Kind, ...] = KINDS
+    kinds: tuple[AttackClass, ...] = KINDS
     liars: tuple[int, ...] = (1, 3)
     places: tuple[Place, ...] = tuple(Place)
     design: Design = Design.FACTORIAL
@@ -246,7 +257,7 @@ class Plan:
     alarms_per_year: tuple[float, ...] = (1.0,)
     learn_s: float = 0.0
     settings: tuple[tuple[str, float], ...] = ()
-    meters: Meters = Meters.SITE
+    meters: TrialMeterErrors = TrialMeterErrors.SITE
     load_error: LoadError | None = field(default_factory=lambda: LoadError(0.1, 0.05))
     variation: Variation = field(default_factory=Variation)
     report_q: bool = False
@@ -257,7 +268,7 @@ class Plan:
         set_("places", each_choice("place", Place, self.places))
         set_("seasons", each_choice("season", Season, self.seasons))
         set_("design", choice("design", Design, self.design))
-        set_("meters", choice("meters", Meters, self.meters))
+        set_("meters", choice("meters", TrialMeterErrors, self.meters))
         times = (self.duration_s, self.step_s, *self.onset_s, self.lying_s, self.settling_s, self.learn_s)
         checks = (
             (
@@ -304,15 +315,15 @@ class Plan:
             ),
         )
         problems = [problem for problem, wrong in checks if wrong]
-        refuse(problems)
+        raise_if_any(problems)
 
     @classmethod
-    def of(cls, site: Site, **chosen: Any) -> Plan:
+    def of(cls, site: Site, **chosen: Any) -> CampaignPlan:
         """Campaign with the settings of the feeder's files, except for the given attributes.
 
         Estimator, interval of readings and false alarms are those of `[monitor]`, and powers have the
         uncertainty of the service. Times are counted in readings: with one reading per second they are those
-        of `Plan()`.
+        of `CampaignPlan()`.
 
         Parameters
         ----------
@@ -349,7 +360,7 @@ class Plan:
         return max(LEARN_STEP_S, self.step_s)
 
     @property
-    def _combined(self) -> list[tuple[Kind, float, int, Place]]:
+    def _combined(self) -> list[tuple[AttackClass, float, int, Place]]:
         """Every combination of kind, size, number of devices and place; some kinds determine their places."""
         return [
             (kind, size, count, place)
@@ -359,7 +370,7 @@ class Plan:
             )
         ]
 
-    def moment(self, scene: int) -> Moment:
+    def moment(self, scene: int) -> SceneTime:
         """Time of a scene.
 
         Parameters
@@ -370,9 +381,9 @@ class Plan:
         random = np.random.default_rng([self.seed, _MOMENT, scene])
         season = self.seasons[int(random.integers(len(self.seasons)))]
         t = library(season).t_s
-        return Moment(season, float(random.uniform(0.0, t[-1])), int(random.integers(2**31)))
+        return SceneTime(season, float(random.uniform(0.0, t[-1])), int(random.integers(2**31)))
 
-    def cases(self, scene: int) -> list[Case]:
+    def cases(self, scene: int) -> list[CampaignCase]:
         """Scenarios of a scene, the first without an attack.
 
         Parameters
@@ -381,7 +392,7 @@ class Plan:
             Number of the scene.
         """
         first = scene * self.together
-        found = [Case(first, CLEAN, 0.0, 0, "", self.duration_s, (self.seed, first))]
+        found = [CampaignCase(first, CLEAN, 0.0, 0, "", self.duration_s, (self.seed, first))]
         combined = self._combined
         low, high = (round(t / self.step_s) for t in self.onset_s)
         for number in range(first + 1, first + self.together):
@@ -390,7 +401,7 @@ class Plan:
             kind, size, count, place = combined[self._chosen(attack, len(combined), random)]
             onset_s = self.step_s * int(random.integers(low, high, endpoint=True))
             seed = (self.seed, _LIARS, number)
-            found.append(Case(number, kind.name, size, count, place, onset_s, seed))
+            found.append(CampaignCase(number, kind.name, size, count, place, onset_s, seed))
         return found
 
     def _chosen(self, attack: int, count: int, random: np.random.Generator) -> int:
@@ -400,11 +411,11 @@ class Plan:
         order: Ints = np.random.default_rng([self.seed, _ORDER, turn]).permutation(count)
         return int(order[place])
 
-    def kind(self, name: str) -> Kind:
+    def kind(self, name: str) -> AttackClass:
         """Kind of this name."""
         return next(kind for kind in self.kinds if kind.name == name)
 
-    def trial(self, site: Site, moment: Moment) -> Trial:
+    def trial(self, site: Site, moment: SceneTime) -> Trial:
         """Scene without an attack, without its season.
 
         Parameters
@@ -444,7 +455,7 @@ class Plan:
             For a setting out of range.
         """
         meta = stated.tables.meta
-        refuse(wrong_settings(stated, self.settings))
+        raise_if_any(wrong_settings(stated, self.settings))
         known = asdict(meta.monitor)
         # An integer setting stays one, in any spelling.
         chosen = {name: type(known[name])(value) for name, value in self.settings}
@@ -476,10 +487,10 @@ def wrong_settings(site: Site, settings: Iterable[tuple[str, float]]) -> list[Pr
 _MOMENT, _CASE, _ORDER, _LIARS = range(4)
 
 # The trace of a false load determines its meters, and inverters have no such places.
-_PLACED = (Trick.COORDINATED, Trick.COORDINATED_POWER, Trick.INVERTER)
+_PLACED = (AttackKind.COORDINATED, AttackKind.COORDINATED_POWER, AttackKind.INVERTER)
 
 
-def _places(kind: Kind, places: Iterable[Place]) -> tuple[Place, ...]:
-    if kind.trick is Trick.INVERTER or kind.together:
+def _places(kind: AttackClass, places: Iterable[Place]) -> tuple[Place, ...]:
+    if kind.trick is AttackKind.INVERTER or kind.together:
         return (Place.RANDOM,)
     return (Place.COLLUDING,) if kind.trick in _PLACED else tuple(places)

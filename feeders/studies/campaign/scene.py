@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from feeders.registry.registry import Watcher, design
+from feeders.registry.registry import DesignedEstimator, design
 from feeders.simulation.attacks import (
-    Lie,
+    AttackKind,
+    AttackSpec,
     NoSuchAttack,
-    Trick,
     coordinated,
     each_alone,
     fake_load,
@@ -25,8 +25,8 @@ from feeders.simulation.attacks import (
 from feeders.simulation.plant import Loads, NoEquilibrium
 from feeders.simulation.powerflow import PowerFlowDiverged
 from feeders.simulation.scenario import Scenario
-from feeders.simulation.trial import Trial, Truth, frames
-from feeders.studies.campaign.plan import CLEAN, Case, Place, Plan
+from feeders.simulation.trial import FrameTruth, Trial, frames
+from feeders.studies.campaign.plan import CLEAN, CampaignCase, CampaignPlan, Place
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.attack import (
     Attack,
@@ -52,7 +52,7 @@ __all__ = ["Prepared", "attacks", "liars", "prepare", "risings", "watch"]
 
 
 def attacks(
-    site: Site, plan: Plan, case: Case, honest: Scenario
+    site: Site, plan: CampaignPlan, case: CampaignCase, honest: Scenario
 ) -> tuple[tuple[Attack, ...], tuple[InverterAttack, ...]]:
     """Build the attacks of a scenario.
 
@@ -69,7 +69,7 @@ def attacks(
         For too few meters or inverters, or without a place for a false load.
     """
     kind, random = plan.kind(case.kind), np.random.default_rng(case.seed)
-    there = site.droop.tau.size if kind.trick is Trick.INVERTER else site.meters.size
+    there = site.droop.tau.size if kind.trick is AttackKind.INVERTER else site.meters.size
     if case.liars > there:
         raise NoSuchAttack(
             f"{site.feeder.name} has {there} of these devices; cannot manipulate {case.liars}",
@@ -77,11 +77,11 @@ def attacks(
         )
     t_on = honest.start + case.onset_s
     t_off = honest.start + min(case.onset_s + plan.lying_s, plan.duration_s)
-    if kind.trick in (Trick.COORDINATED, Trick.COORDINATED_POWER):
-        power = kind.trick is Trick.COORDINATED_POWER
+    if kind.trick in (AttackKind.COORDINATED, AttackKind.COORDINATED_POWER):
+        power = kind.trick is AttackKind.COORDINATED_POWER
         loads = present_loads(site, honest, t_on)
         return (_story(site, case, loads, random, t_on=t_on, t_off=t_off, power=power),), ()
-    if kind.trick is Trick.INVERTER:
+    if kind.trick is AttackKind.INVERTER:
         some = np.sort(random.choice(there, case.liars, replace=False))
         rating = np.array([row.inverter_kva for row in site.tables.customers])[site.droop.customer[some]]
         q = case.size / 100.0 * random.choice([-1.0, 1.0], some.size) * rating / site.feeder.base_kva
@@ -100,11 +100,11 @@ def attacks(
     if told.size:
         nominal = site.customer_nominal[site.meters[some]]
         return (Bias(some, t_on, t_off, case.size * signs * told[some] / nominal),), ()
-    lie = Lie(kind.trick, case.liars, case.size)
+    lie = AttackSpec(kind.trick, case.liars, case.size)
     return (each_alone(lie, some, signs, t_on, t_off),), ()
 
 
-def liars(site: Site, case: Case, random: np.random.Generator) -> tuple[Ints, Floats]:
+def liars(site: Site, case: CampaignCase, random: np.random.Generator) -> tuple[Ints, Floats]:
     """Choose the manipulated meters by a scenario's rule.
 
     Parameters
@@ -157,7 +157,7 @@ def _nearest(R: Floats, meters: Ints, one: int, count: int) -> Ints:
 
 def _story(
     site: Site,
-    case: Case,
+    case: CampaignCase,
     loads: Loads,
     random: np.random.Generator,
     *,
@@ -202,13 +202,13 @@ class Prepared:
     """
 
     site: Site
-    plan: Plan
+    plan: CampaignPlan
     stated: Site
-    watchers: dict[float, Watcher]
-    learners: dict[float, Watcher]
+    watchers: dict[float, DesignedEstimator]
+    learners: dict[float, DesignedEstimator]
 
 
-def prepare(site: Site, plan: Plan) -> Prepared:
+def prepare(site: Site, plan: CampaignPlan) -> Prepared:
     """Design the estimators of a campaign.
 
     Parameters
@@ -224,14 +224,14 @@ def prepare(site: Site, plan: Plan) -> Prepared:
     scene = plan.trial(site, plan.moment(0))
     watchers = _designed(plan, scene.stated)
     learners = _designed(plan, replace(scene, step_s=plan.learn_step_s).stated) if plan.learn_s else {}
-    if any(watcher.learner is None for watcher in learners.values()):
+    if any(watcher.bias_learning is None for watcher in learners.values()):
         raise InputInvalid(
             [Problem("inconsistent", f"{plan.estimator} does not learn its meters' fixed errors")]
         )
     return Prepared(site, plan, scene.stated, watchers, learners)
 
 
-def _designed(plan: Plan, stated: Site) -> dict[float, Watcher]:
+def _designed(plan: CampaignPlan, stated: Site) -> dict[float, DesignedEstimator]:
     return {rate: design(plan.watched(stated, rate)) for rate in plan.alarms_per_year}
 
 
@@ -295,7 +295,7 @@ class _Played:
     inverters: Bools  # (T, m)
 
     @classmethod
-    def of(cls, played: list[tuple[Frame, Truth]]) -> _Played:
+    def of(cls, played: list[tuple[Frame, FrameTruth]]) -> _Played:
         return cls(
             [frame for frame, _ in played],
             np.array([truth.v2 for _, truth in played]),
@@ -334,12 +334,14 @@ def _learned(given: Prepared, trial: Trial, honest: Scenario) -> dict[float, Com
             states[rate], _, _ = watcher.step(states[rate], frame)
     found = {}
     for rate, watcher in given.learners.items():
-        if watcher.learner is not None:
-            found[rate] = watcher.learner.commission(states[rate])
+        if watcher.bias_learning is not None:
+            found[rate] = watcher.bias_learning.commission(states[rate])
     return found
 
 
-def _clean(watcher: Watcher, state: Any, played: _Played, onsets: set[int]) -> tuple[_Seen, dict[int, Any]]:
+def _clean(
+    watcher: DesignedEstimator, state: Any, played: _Played, onsets: set[int]
+) -> tuple[_Seen, dict[int, Any]]:
     """Monitor the scene without an attack, and keep the states before some frames."""
     states, parts, begin = {}, [], 0
     for end in sorted({*onsets, len(played.frames)}):
@@ -352,7 +354,7 @@ def _clean(watcher: Watcher, state: Any, played: _Played, onsets: set[int]) -> t
     return _Seen(*(np.concatenate(column) for column in columns)), states
 
 
-def _step(watcher: Watcher, state: Any, some: list[Frame]) -> tuple[_Seen, Any]:
+def _step(watcher: DesignedEstimator, state: Any, some: list[Frame]) -> tuple[_Seen, Any]:
     named, inverters, decisions, v2 = [], [], [], []
     for frame in some:
         state, estimate, verdict = watcher.step(state, frame)
@@ -368,7 +370,7 @@ def _step(watcher: Watcher, state: Any, some: list[Frame]) -> tuple[_Seen, Any]:
 # ------------------------------------------------------------------------------------------ reports
 
 
-def _lied(given: Prepared, played: _Played, honest: Scenario, case: Case) -> _Played:
+def _lied(given: Prepared, played: _Played, honest: Scenario, case: CampaignCase) -> _Played:
     """Scene with the attack of a scenario."""
     some, wrong = attacks(given.stated, given.plan, case, honest)
     if wrong or not all(_simple(attack, honest.start) for attack in some):
@@ -418,7 +420,7 @@ def _simple(attack: Attack, start: float) -> bool:
 # --------------------------------------------------------------------------------------- results
 
 
-def _row(head: dict[str, Any], case: Case, rate: float) -> dict[str, Any]:
+def _row(head: dict[str, Any], case: CampaignCase, rate: float) -> dict[str, Any]:
     return {
         "scenario": case.number,
         **head,
@@ -447,7 +449,7 @@ _ERRORS = ("error_liars", "error_liars_95", "error_others", "error_others_95")
 def _told(  # noqa: PLR0917  # one row needs all that is known of the case
     given: Prepared,
     head: dict[str, Any],
-    case: Case,
+    case: CampaignCase,
     rate: float,
     seen: _Seen,
     played: _Played,
@@ -540,7 +542,7 @@ def _each(  # noqa: PLR0917  # meters and inverters alike
 
 
 def _errors(  # noqa: PLR0917  # the same
-    plan: Plan, site: Site, seen: _Seen, played: _Played, begin: int, lies: Bools
+    plan: CampaignPlan, site: Site, seen: _Seen, played: _Played, begin: int, lies: Bools
 ) -> dict[str, float]:
     """Errors of the voltage, % of nominal, at manipulated meters during the attack and elsewhere."""
     with np.errstate(invalid="ignore"):

@@ -21,7 +21,7 @@ from scipy.stats import binomtest, chi2
 
 from feeders.format.tables import FeederTables
 from feeders.model.site import from_tables
-from feeders.studies.campaign.plan import CLEAN, Plan, Promise
+from feeders.studies.campaign.plan import CLEAN, CampaignPlan, Promise
 from feeders.studies.campaign.scene import Prepared, prepare, watch
 from feeders.studies.journal import Journal, Progress, Where
 from feeders.studies.workers import Here, Runner, versions
@@ -293,7 +293,7 @@ class Campaign:
 
     feeder: str
     digest: str
-    plan: Plan
+    plan: CampaignPlan
     versions: dict[str, str]
     scenarios: pd.DataFrame
     liars: pd.DataFrame
@@ -320,7 +320,7 @@ class Campaign:
 
 def campaign(
     site: Site,
-    plan: Plan | None = None,
+    plan: CampaignPlan | None = None,
     *,
     seed: int | None = None,
     runner: Runner | None = None,
@@ -357,7 +357,7 @@ def campaign(
     ClusterUnusable, WorkerLost
         From the runner; finished scenes are in the journal.
     """
-    plan = Plan() if plan is None else plan
+    plan = CampaignPlan() if plan is None else plan
     plan = plan if seed is None else replace(plan, seed=seed)
     prepare(site, plan)  # errors of the plan occur here, not in a worker
     used = versions()
@@ -373,7 +373,7 @@ def campaign(
 
 
 def _played(
-    site: Site, plan: Plan, runner: Runner, kept: Journal, progress: Progress | None
+    site: Site, plan: CampaignPlan, runner: Runner, kept: Journal, progress: Progress | None
 ) -> list[dict[str, Any]]:
     """Rows of all scenes; scenes that the journal lacks are simulated."""
     keys = [f"scene|{scene}" for scene in range(plan.scenes)]
@@ -394,7 +394,7 @@ def _played(
 _prepared: list[tuple[str, Prepared]] = []
 
 
-def _scene(tables: FeederTables, plan: Plan, scene: int) -> list[dict[str, Any]]:
+def _scene(tables: FeederTables, plan: CampaignPlan, scene: int) -> list[dict[str, Any]]:
     """Simulate a scene in any process; designs are made once in each process."""
     asked = repr((tables, plan))
     given = next((made for what, made in _prepared if what == asked), None)
@@ -404,7 +404,7 @@ def _scene(tables: FeederTables, plan: Plan, scene: int) -> list[dict[str, Any]]
     return watch(given, scene)
 
 
-def _campaign(site: Site, plan: Plan, used: dict[str, str], rows: list[dict[str, Any]]) -> Campaign:
+def _campaign(site: Site, plan: CampaignPlan, used: dict[str, str], rows: list[dict[str, Any]]) -> Campaign:
     if all(row["reason"] for row in rows):
         raise NothingPlayed(
             f"{site.feeder.name}: no scenario can be simulated; the first: {rows[0]['reason']}"

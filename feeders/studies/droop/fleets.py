@@ -13,9 +13,9 @@ import numpy as np
 from feeders.studies.operating import Bases
 from feeders.studies.unobservable import customer_indices
 from gridsec.arrays import Floats, Ints
-from gridsec.errors import FeederInvalid, Problem, refuse
+from gridsec.errors import FeederInvalid, Problem, raise_if_any
 from gridsec.grid.droop import Droop, fleet
-from gridsec.planning.droop.ac_sensitivity import Box
+from gridsec.planning.droop.ac_sensitivity import InjectionBox
 
 if TYPE_CHECKING:
     from feeders.model.site import Site
@@ -169,7 +169,7 @@ def chosen_fleet(site: Site, preset: str | None, who: Who = Who.PV) -> Droop:
     return site.droop
 
 
-def points(site: Site, v0: float = 1.0) -> dict[str, Box]:
+def points(site: Site, v0: float = 1.0) -> dict[str, InjectionBox]:
     """Operating points of the study, each a box without width.
 
     Evening: full load, no generation. Noon: a fifth of the load, full generation. Half: half of both.
@@ -184,7 +184,7 @@ def points(site: Site, v0: float = 1.0) -> dict[str, Box]:
     return {name: point(site, at.load, at.pv, v0) for name, at in _POINTS.items()}
 
 
-def point(site: Site, load: Floats | float, pv: Floats | float, v0: float = 1.0) -> Box:
+def point(site: Site, load: Floats | float, pv: Floats | float, v0: float = 1.0) -> InjectionBox:
     """Operating point without the inverters' reactive power, the loads at their expected power factor.
 
     Parameters
@@ -200,7 +200,7 @@ def point(site: Site, load: Floats | float, pv: Floats | float, v0: float = 1.0)
     usual = [meta.load.power_factor if row.power_factor is None else row.power_factor for row in rows]
     drawn = load * site.loads.load_peak
     p, q = pv * site.loads.pv_peak - drawn, -drawn * np.tan(np.arccos(np.array(usual)))
-    return Box(p, p, q, q, v0, v0)
+    return InjectionBox(p, p, q, q, v0, v0)
 
 
 def box(
@@ -212,7 +212,7 @@ def box(
     pv_high: float = 1.0,
     v0_low: float = 1.0,
     v0_high: float = 1.0,
-) -> Box:
+) -> InjectionBox:
     """Box of all powers within the feeder's files, independent for each customer.
 
     Loads from `load_low load_kw` to `load_high load_kw`, with q from `load tan_min - floor` to
@@ -237,9 +237,9 @@ def box(
         *range_problem("generation", pv_low, pv_high),
         *range_problem("busbar voltage", v0_low, v0_high),
     ]
-    refuse(problems)
+    raise_if_any(problems)
     known = site.loads
-    return Box(
+    return InjectionBox(
         p_low=pv_low * known.pv_peak - load_high * known.load_peak,
         p_high=pv_high * known.pv_peak - load_low * known.load_peak,
         q_low=-(load_high * known.load_peak * known.tan_max + known.q_floor),

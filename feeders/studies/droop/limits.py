@@ -28,7 +28,14 @@ from feeders.studies.unobservable import customer_indices
 from gridsec.arrays import Floats, Ints
 from gridsec.errors import DesignInfeasible
 from gridsec.grid.droop import Droop, voltage_curve
-from gridsec.planning.droop.ac_sensitivity import Box, Complex, Network, currents, sensitivity, solve
+from gridsec.planning.droop.ac_sensitivity import (
+    Complex,
+    InjectionBox,
+    PhasorNetwork,
+    currents,
+    sensitivity,
+    solve,
+)
 from gridsec.planning.droop.equilibrium import Band, always, at_rest, injected, rest
 from gridsec.planning.droop.stability import Update, growth, slopes
 
@@ -36,9 +43,9 @@ if TYPE_CHECKING:
     from feeders.model.site import Site
 
 __all__ = [
+    "BandGuarantee",
     "Conditions",
-    "Kept",
-    "Plan",
+    "DroopPlan",
     "Safety",
     "capacity",
     "checked",
@@ -55,7 +62,7 @@ EXACT: Final = 1e-6
 """Largest difference between the set-points of the second power flow and a witness's injections, pu."""
 
 
-class Kept(StrEnum):
+class BandGuarantee(StrEnum):
     """Proof status of the band."""
 
     KEPT = "kept"
@@ -81,8 +88,8 @@ class Safety:
         One row for each customer. witness One row for each customer: loads that violate the band, if found.
     """
 
-    rest: Kept
-    always: Kept
+    rest: BandGuarantee
+    always: BandGuarantee
     why: str
     low_volt: float
     high_volt: float
@@ -97,7 +104,7 @@ def without_inverters(droop: Droop) -> Droop:
     return droop.take(np.zeros(0, dtype=np.intp))
 
 
-def safety(subject: Subject, droop: Droop, loads: Box, limits: tuple[float, float]) -> Safety:
+def safety(subject: Subject, droop: Droop, loads: InjectionBox, limits: tuple[float, float]) -> Safety:
     """Prove or refute that no voltage leaves a band.
 
     Parameters
@@ -151,7 +158,11 @@ def safety(subject: Subject, droop: Droop, loads: Box, limits: tuple[float, floa
 
 
 def _or_none(
-    bound: Callable[[Network, Droop, Box], Band], net: Network, droop: Droop, loads: Box, reasons: list[str]
+    bound: Callable[[PhasorNetwork, Droop, InjectionBox], Band],
+    net: PhasorNetwork,
+    droop: Droop,
+    loads: InjectionBox,
+    reasons: list[str],
 ) -> Band | None:
     try:
         return bound(net, droop, loads)
@@ -168,14 +179,14 @@ def _inside(band: Band | None, limits: Limits) -> bool:
     return band is not None and bool(np.all(band.low >= limits[0]) and np.all(band.high <= limits[1]))
 
 
-def _verdict(band: Band | None, limits: Limits, witness: list[dict[str, Any]] | None) -> Kept:
+def _verdict(band: Band | None, limits: Limits, witness: list[dict[str, Any]] | None) -> BandGuarantee:
     if _inside(band, limits):
-        return Kept.KEPT
-    return Kept.VIOLATED if witness else Kept.UNDECIDED
+        return BandGuarantee.KEPT
+    return BandGuarantee.VIOLATED if witness else BandGuarantee.UNDECIDED
 
 
 def _witness(
-    subject: Subject, droop: Droop, loads: Box, limits: Limits, *, jump: bool
+    subject: Subject, droop: Droop, loads: InjectionBox, limits: Limits, *, jump: bool
 ) -> list[dict[str, Any]] | None:
     """Loads in the box with a voltage outside the band, in equilibrium or after a jump of all loads."""
     s, v0 = _candidates(subject.net, droop, loads)
@@ -194,7 +205,7 @@ def _witness(
     return None
 
 
-def _candidates(net: Network, droop: Droop, loads: Box) -> tuple[Complex, Floats]:
+def _candidates(net: PhasorNetwork, droop: Droop, loads: InjectionBox) -> tuple[Complex, Floats]:
     """Corners of the box in pairs (low, high): of all loads, and by the sensitivities of each voltage."""
     low, high = loads.p_low + 1j * loads.q_low, loads.p_high + 1j * loads.q_high
     middle: Complex = np.asarray(0.5 * (low + high))
@@ -282,7 +293,7 @@ class Conditions:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Plan:
+class DroopPlan:
     """Distribution of generation, and its inverters.
 
     Attributes
@@ -334,18 +345,18 @@ def ratings_pu(site: Site) -> Floats:
     return np.asarray(amps[:, None] * 3.0 * volt / (1000.0 * site.feeder.base_kva))
 
 
-def _fleet(site: Site, plan: Plan, kw: float) -> Droop:
+def _fleet(site: Site, plan: DroopPlan, kw: float) -> Droop:
     own = np.flatnonzero(plan.share > 0.0) if plan.preset and kw > 0.0 else np.zeros(0, dtype=np.intp)
     return made(site, own, plan.preset or "ieee1547-b", KVA_PER_KW * kw * plan.share[own])
 
 
-def _loads(site: Site, plan: Plan, kw: float, at: Conditions) -> Box:
+def _loads(site: Site, plan: DroopPlan, kw: float, at: Conditions) -> InjectionBox:
     drawn = point(site, at.load, 0.0, at.v0)
     p = drawn.p_low + kw / site.feeder.base_kva * plan.share
-    return Box(p, p, drawn.q_low, drawn.q_high, at.v0, at.v0)
+    return InjectionBox(p, p, drawn.q_low, drawn.q_high, at.v0, at.v0)
 
 
-def checked(subject: Subject, plan: Plan, kw: float, at: Conditions, ratings: Floats) -> dict[str, Any]:
+def checked(subject: Subject, plan: DroopPlan, kw: float, at: Conditions, ratings: Floats) -> dict[str, Any]:
     """Effect of an amount of generation: extreme voltages, fullest line, and first violated limit.
 
     Parameters
@@ -430,7 +441,7 @@ def _largest(holds: Callable[[float], bool], most: float) -> float:
     return low
 
 
-def capacity(subject: Subject, plan: Plan, at: Conditions, *, seed: int = 0) -> dict[str, Any]:
+def capacity(subject: Subject, plan: DroopPlan, at: Conditions, *, seed: int = 0) -> dict[str, Any]:
     """Largest generation without a violation, by bisection; confirmed by the other power flow.
 
     Parameters
@@ -465,7 +476,7 @@ def capacity(subject: Subject, plan: Plan, at: Conditions, *, seed: int = 0) -> 
     }
 
 
-def _confirmed_hosting(subject: Subject, droop: Droop, loads: Box) -> float:
+def _confirmed_hosting(subject: Subject, droop: Droop, loads: InjectionBox) -> float:
     """Largest difference between the two power flows, V; infinity if the second has no solution."""
     feeder, s = subject.site.feeder, loads.p_low + 1j * loads.q_low
     x, V = rest(subject.net, droop, s, loads.v0_low)
@@ -477,7 +488,9 @@ def _confirmed_hosting(subject: Subject, droop: Droop, loads: Box) -> float:
     return float(np.max(np.abs(volts - subject.site.customer_volt * np.abs(V))))
 
 
-def curve(subject: Subject, plan: Plan, amounts: Sequence[float], at: Conditions) -> list[dict[str, Any]]:
+def curve(
+    subject: Subject, plan: DroopPlan, amounts: Sequence[float], at: Conditions
+) -> list[dict[str, Any]]:
     """Effect of increasing generation, one row for each amount.
 
     Parameters
@@ -507,7 +520,7 @@ def draw(  # noqa: PLR0917  # which feeder, which fleet, which order of places
     subject, at
         As in `checked`.
     preset
-        As in `Plan`.
+        As in `DroopPlan`.
     unit_kw
         Size of a unit, kW.
     seed, number
@@ -517,10 +530,10 @@ def draw(  # noqa: PLR0917  # which feeder, which fleet, which order of places
     order: Ints = np.random.default_rng([seed, number]).permutation(count)
     ratings = ratings_pu(subject.site)
 
-    def plan(units: int) -> Plan:
+    def plan(units: int) -> DroopPlan:
         has = np.full(count, units // count, dtype=np.float64)
         has[order[: units % count]] += 1.0
-        return Plan(has / max(units, 1), preset)
+        return DroopPlan(has / max(units, 1), preset)
 
     def broken(units: int) -> str:
         return str(checked(subject, plan(units), unit_kw * units, at, ratings)["broken"])

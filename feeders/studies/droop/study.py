@@ -18,9 +18,9 @@ import pandas as pd
 
 from feeders.studies.droop.fleets import Who, box, chosen_fleet, equip, points, range_problem
 from feeders.studies.droop.limits import (
+    BandGuarantee,
     Conditions,
-    Kept,
-    Plan,
+    DroopPlan,
     Safety,
     capacity,
     curve,
@@ -30,9 +30,9 @@ from feeders.studies.droop.limits import (
     without_inverters,
 )
 from feeders.studies.droop.verdict import (
-    Run,
+    FleetVerdict,
+    StepResponse,
     Subject,
-    Verdict,
     edge,
     inverter_rows,
     judge,
@@ -47,9 +47,9 @@ from feeders.studies.droop.verdict import (
 from feeders.studies.journal import Progress, Where, worked
 from feeders.studies.operating import Bases
 from feeders.util import word
-from gridsec.errors import InputInvalid, Problem, refuse
+from gridsec.errors import InputInvalid, Problem, raise_if_any
 from gridsec.grid.droop import PRESETS, Droop
-from gridsec.planning.droop.ac_sensitivity import Box
+from gridsec.planning.droop.ac_sensitivity import InjectionBox
 from gridsec.planning.droop.equilibrium import rest
 from gridsec.planning.droop.stability import Update, enlarged
 
@@ -131,7 +131,7 @@ class DroopOptions:
 
     def __post_init__(self) -> None:
         problems = [*self._fleet_problems(), *self._limit_problems(), *self._hosting_problems()]
-        refuse(problems)
+        raise_if_any(problems)
 
     def _fleet_problems(self) -> Iterator[str]:
         presets = [name for name in (self.preset, *self.presets) if name is not None]
@@ -240,9 +240,9 @@ class DroopStudy:
     digest: str
     seed: int
     options: DroopOptions
-    verdict: Verdict
-    rest: Kept
-    always: Kept
+    verdict: FleetVerdict
+    rest: BandGuarantee
+    always: BandGuarantee
     tables: dict[str, pd.DataFrame]
 
 
@@ -270,7 +270,7 @@ class _Study:
         return low, own.v_max_pu if given.v_max is None else given.v_max
 
     @property
-    def box(self) -> Box:
+    def box(self) -> InjectionBox:
         given = self.options
         return box(
             self.subject.site,
@@ -317,7 +317,7 @@ def droop(
     """
     given = options or DroopOptions()
     study = _Study(Subject.of(site), chosen_fleet(site, given.preset, given.who), given, seed)
-    refuse(band_problem(*study.limits))  # one limit may be an option, and the other the file's
+    raise_if_any(band_problem(*study.limits))  # one limit may be an option, and the other the file's
     subject = {"study": "droop", "digest": site.digest, "seed": seed, "options": asdict(given)}
     done = worked(journal, subject, _tasks(study), progress)
     tables = _tables(site, done)
@@ -328,8 +328,8 @@ def droop(
         seed=seed,
         options=given,
         verdict=worst(tables["stability"]["verdict"]),
-        rest=Kept(band["rest"]),
-        always=Kept(band["always"]),
+        rest=BandGuarantee(band["rest"]),
+        always=BandGuarantee(band["always"]),
         tables=tables,
     )
 
@@ -354,7 +354,7 @@ def _tasks(study: _Study) -> Iterator[Task]:
         yield from _hosting_tasks(study)
 
 
-def _stability(study: _Study, name: str, at: Box) -> dict[str, Any]:
+def _stability(study: _Study, name: str, at: InjectionBox) -> dict[str, Any]:
     parts = study.subject, study.fleet, study.update, at
     found, longest = judge(*parts, seed=study.seed), longest_interval(*parts)
     tau = study.update.interval_s / longest if longest and study.update.interval_s else math.nan
@@ -378,7 +378,7 @@ def _any_loads(study: _Study) -> dict[str, Any]:
     return {"point": ANY, **asdict(judge(*parts)), "margin": margin(*parts)}
 
 
-def _runs(study: _Study, fleet: Droop) -> dict[str, Run]:
+def _runs(study: _Study, fleet: Droop) -> dict[str, StepResponse]:
     """Step responses, each from equilibrium."""
     site, net, out = study.subject.site, study.subject.net, {}
     for name, step in steps(site, study.v0).items():
@@ -453,7 +453,7 @@ def _hosting_tasks(study: _Study) -> Iterator[Task]:
     at = Conditions(given.hosting_load, given.v0_high, low, high, study.update)
     share = shares_of(site, given.hosting_customers)
     for preset in given.hosting_presets:
-        plan = Plan(share, preset)
+        plan = DroopPlan(share, preset)
         yield f"hosting|{preset}", partial(capacity, study.subject, plan, at, seed=study.seed)
         yield f"hosting_curve|{preset}", partial(_curve, study, plan, at)
     for number in range(given.draws):
@@ -462,7 +462,7 @@ def _hosting_tasks(study: _Study) -> Iterator[Task]:
             yield f"hosting_draws|{preset}|{number}", task
 
 
-def _curve(study: _Study, plan: Plan, at: Conditions) -> list[dict[str, Any]]:
+def _curve(study: _Study, plan: DroopPlan, at: Conditions) -> list[dict[str, Any]]:
     """Hosting curve of 13 amounts, up to a third beyond the capacity without reactive power."""
     most = capacity(study.subject, replace(plan, preset=""), at)["capacity_kw"]
     return curve(study.subject, plan, list(np.linspace(0.0, 4.0 / 3.0 * most or 1.0, 13)), at)

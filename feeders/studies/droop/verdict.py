@@ -27,7 +27,7 @@ from feeders.studies.operating import Bases
 from gridsec.arrays import Floats
 from gridsec.errors import DesignInfeasible, FeederInvalid
 from gridsec.grid.droop import Droop, voltage_curve
-from gridsec.planning.droop.ac_sensitivity import Box, Network, network, sensitivity
+from gridsec.planning.droop.ac_sensitivity import InjectionBox, PhasorNetwork, network, sensitivity
 from gridsec.planning.droop.equilibrium import Share, injected, rest, shares, shares_of_gain
 from gridsec.planning.droop.stability import Loop, Update, growth, loop, proof, reach, slopes, steepened
 
@@ -35,12 +35,12 @@ if TYPE_CHECKING:
     from feeders.model.site import Site
 
 __all__ = [
+    "FleetOutcome",
+    "FleetVerdict",
     "Judgement",
-    "Outcome",
-    "Run",
-    "Step",
+    "StepChange",
+    "StepResponse",
     "Subject",
-    "Verdict",
     "edge",
     "inverter_rows",
     "judge",
@@ -70,7 +70,7 @@ LEAST_PU: Final = 1e-5
 """Voltage change that counts as zero, pu."""
 
 
-class Outcome(StrEnum):
+class FleetOutcome(StrEnum):
     """Outcome of a simulation of a fleet."""
 
     SETTLES = "settles"
@@ -80,7 +80,7 @@ class Outcome(StrEnum):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Step:
+class StepChange:
     """Sudden change of loads, generation or busbar, from an equilibrium.
 
     Attributes
@@ -89,12 +89,12 @@ class Step:
         Operating points without the inverters' reactive power.
     """
 
-    before: Box
-    after: Box
+    before: InjectionBox
+    after: InjectionBox
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Run:
+class StepResponse:
     """One simulated step. T + 1 instants.
 
     Attributes
@@ -109,13 +109,13 @@ class Run:
         Reactive injections, pu.
     """
 
-    outcome: Outcome
+    outcome: FleetOutcome
     t: Floats
     v: Floats
     x: Floats
 
 
-def steps(site: Site, v0: float = 1.0, *, tap: float = 0.025) -> dict[str, Step]:
+def steps(site: Site, v0: float = 1.0, *, tap: float = 0.025) -> dict[str, StepChange]:
     """Steps of the study.
 
     Load: from 0.2 to 0.8 of the peak, no generation. Cloud: generation from its peak to 0.2 of it, at 0.2
@@ -132,9 +132,9 @@ def steps(site: Site, v0: float = 1.0, *, tap: float = 0.025) -> dict[str, Step]
     """
     noon = point(site, 0.2, 1.0, v0)
     return {
-        "load": Step(point(site, 0.2, 0.0, v0), point(site, 0.8, 0.0, v0)),
-        "cloud": Step(noon, point(site, 0.2, 0.2, v0)),
-        "tap": Step(noon, replace(noon, v0_low=v0 + tap, v0_high=v0 + tap)),
+        "load": StepChange(point(site, 0.2, 0.0, v0), point(site, 0.8, 0.0, v0)),
+        "cloud": StepChange(noon, point(site, 0.2, 0.2, v0)),
+        "tap": StepChange(noon, replace(noon, v0_low=v0 + tap, v0_high=v0 + tap)),
     }
 
 
@@ -142,12 +142,12 @@ def simulate(
     plant: tuple[Site, PowerFlow | PlacesFlow],
     droop: Droop,
     update: Update,
-    loads: Box,
+    loads: InjectionBox,
     x: Floats,
     *,
     gain: float = 0.0,
     updates: int = 400,
-) -> Run:
+) -> StepResponse:
     """Simulate the inverters on the AC power flow with constant loads, until equilibrium or `updates`.
 
     Parameters
@@ -175,7 +175,7 @@ def simulate(
     asked = [x] * update.dead
     xs: list[Floats] = [x]
     vs: list[Floats] = []
-    outcome = Outcome.OPEN
+    outcome = FleetOutcome.OPEN
     still = SETTLED * max(float(np.max(droop.limit, initial=0.0)), 1e-12)
     window = max(16, updates // 8)
     for k in range(updates + 1):
@@ -183,7 +183,7 @@ def simulate(
             q = loads.q_low + x @ owner
             v = flow.solve(-base_kva * loads.p_low, -base_kva * q, v0_volt)[0] / base_volt
         except PowerFlowDiverged:
-            outcome = Outcome.COLLAPSES
+            outcome = FleetOutcome.COLLAPSES
             break
         vs.append(v)
         if k == updates or (k >= window and _moved(xs[-window:]) <= still):
@@ -191,26 +191,26 @@ def simulate(
         asked.append(voltage_curve(droop, v[own]))
         x = (1.0 - alpha) * x + alpha * asked.pop(0)
         xs.append(x)
-    if outcome is Outcome.OPEN:
+    if outcome is FleetOutcome.OPEN:
         outcome = _told(xs, window, still)
     xs = xs[: len(vs)]
     t = update.interval_s * np.arange(len(vs), dtype=np.float64)
-    return Run(outcome, t, np.array(vs), np.array(xs))
+    return StepResponse(outcome, t, np.array(vs), np.array(xs))
 
 
 def _moved(xs: list[Floats]) -> float:
     return float(np.max(np.ptp(np.array(xs), axis=0), initial=0.0))
 
 
-def _told(xs: list[Floats], window: int, still: float) -> Outcome:
+def _told(xs: list[Floats], window: int, still: float) -> FleetOutcome:
     """Outcome by the last two windows."""
     late, before = _moved(xs[-window:]), _moved(xs[-2 * window : -window])
     if late <= still:
-        return Outcome.SETTLES
-    return Outcome.OSCILLATES if late >= DECAYS * before else Outcome.OPEN
+        return FleetOutcome.SETTLES
+    return FleetOutcome.OSCILLATES if late >= DECAYS * before else FleetOutcome.OPEN
 
 
-def step_rows(site: Site, runs: Mapping[str, Run]) -> list[dict[str, Any]]:
+def step_rows(site: Site, runs: Mapping[str, StepResponse]) -> list[dict[str, Any]]:
     """Settling time, overshoot and extreme voltages of steps, one row each.
 
     Parameters
@@ -228,7 +228,7 @@ def step_rows(site: Site, runs: Mapping[str, Run]) -> list[dict[str, Any]]:
             rows.append(row)
             continue
         v = bases.ratio * run.v  # relative to the nominal voltage
-        end = v[-1] if run.outcome is not Outcome.OSCILLATES else v[len(v) // 2 :].mean(axis=0)
+        end = v[-1] if run.outcome is not FleetOutcome.OSCILLATES else v[len(v) // 2 :].mean(axis=0)
         change = end - v[0]
         most = int(np.argmax(np.abs(change)))
         size = float(np.abs(change[most]))
@@ -236,7 +236,7 @@ def step_rows(site: Site, runs: Mapping[str, Run]) -> list[dict[str, Any]]:
         late = np.flatnonzero(away > max(BAND * size, LEAST_PU))
         past = np.max((v - end) * np.sign(change), initial=0.0)
         low, high = bases.extremes(end / bases.ratio)
-        settles = run.outcome is Outcome.SETTLES
+        settles = run.outcome is FleetOutcome.SETTLES
         row |= {
             "settling_s": (float(run.t[late[-1] + 1]) if late.size else 0.0) if settles else math.nan,
             "overshoot_percent": 100.0 * float(past) / size if size > LEAST_PU else 0.0,
@@ -249,7 +249,7 @@ def step_rows(site: Site, runs: Mapping[str, Run]) -> list[dict[str, Any]]:
     return rows
 
 
-def trajectories(site: Site, runs: Mapping[str, Run]) -> pd.DataFrame:
+def trajectories(site: Site, runs: Mapping[str, StepResponse]) -> pd.DataFrame:
     """Voltages and reactive power over time, for plots: one row for each step, instant and customer.
 
     Parameters
@@ -289,7 +289,7 @@ PLACES: Final = 4
 """Number of bisections of an interval of factor 2: factors have an accuracy of 4 %."""
 
 
-class Verdict(StrEnum):
+class FleetVerdict(StrEnum):
     """Stability of a fleet."""
 
     STABLE = "stable"
@@ -313,7 +313,7 @@ class Subject:
 
     site: Site
     flow: PowerFlow | PlacesFlow
-    net: Network
+    net: PhasorNetwork
 
     @classmethod
     def of(cls, site: Site) -> Subject:
@@ -343,7 +343,7 @@ class Judgement:
         Reason for a missing proof.
     """
 
-    verdict: Verdict
+    verdict: FleetVerdict
     proof: str
     gain: float
     growth: float
@@ -351,7 +351,7 @@ class Judgement:
     why: str = ""
 
 
-def judge(subject: Subject, droop: Droop, update: Update, loads: Box, *, seed: int = 0) -> Judgement:
+def judge(subject: Subject, droop: Droop, update: Update, loads: InjectionBox, *, seed: int = 0) -> Judgement:
     """Determine the stability of a fleet with constant loads, anywhere in a box or at a point.
 
     Parameters
@@ -373,27 +373,27 @@ def judge(subject: Subject, droop: Droop, update: Update, loads: Box, *, seed: i
     if given is not None:
         found = proof(given)
         if found.kind:
-            return Judgement(Verdict.STABLE, found.kind, gain, grows[1])
+            return Judgement(FleetVerdict.STABLE, found.kind, gain, grows[1])
         why = f"the loop gain may be {gain:.3g}; the certificates are valid up to {found.factor:.3g} of it"
     if not pointlike:
-        return Judgement(Verdict.UNDECIDED, "", gain, math.nan, why=why)
+        return Judgement(FleetVerdict.UNDECIDED, "", gain, math.nan, why=why)
     if steady is None:
-        return Judgement(Verdict.UNDECIDED, "", gain, math.nan, why=f"{why}; no equilibrium found")
+        return Judgement(FleetVerdict.UNDECIDED, "", gain, math.nan, why=f"{why}; no equilibrium found")
     if grows[0] > 1.0 + CLEARLY:
         x, plant = _kicked(droop, steady[0], seed), (subject.site, subject.flow)
         run = simulate(plant, droop, update, loads, x, gain=0.0 if math.isnan(gain) else gain, updates=_AWAY)
-        if run.outcome in {Outcome.OSCILLATES, Outcome.COLLAPSES}:
-            return Judgement(Verdict.UNSTABLE, "", gain, grows[0], str(run.outcome))
+        if run.outcome in {FleetOutcome.OSCILLATES, FleetOutcome.COLLAPSES}:
+            return Judgement(FleetVerdict.UNSTABLE, "", gain, grows[0], str(run.outcome))
         why += f"; the equilibrium is unstable, but the simulation: {run.outcome}"
-    return Judgement(Verdict.UNDECIDED, "", gain, grows[1], why=why)
+    return Judgement(FleetVerdict.UNDECIDED, "", gain, grows[1], why=why)
 
 
-def _pointlike(loads: Box) -> bool:
+def _pointlike(loads: InjectionBox) -> bool:
     ends = ((loads.p_low, loads.p_high), (loads.q_low, loads.q_high), (loads.v0_low, loads.v0_high))
     return all(np.array_equal(low, high) for low, high in ends)
 
 
-def _loop(net: Network, droop: Droop, update: Update, loads: Box) -> tuple[Loop | None, str]:
+def _loop(net: PhasorNetwork, droop: Droop, update: Update, loads: InjectionBox) -> tuple[Loop | None, str]:
     try:
         return loop(droop, reach(net, droop, loads), update), ""
     except DesignInfeasible as error:
@@ -401,7 +401,7 @@ def _loop(net: Network, droop: Droop, update: Update, loads: Box) -> tuple[Loop 
 
 
 def _linearised(
-    net: Network, droop: Droop, update: Update, loads: Box
+    net: PhasorNetwork, droop: Droop, update: Update, loads: InjectionBox
 ) -> tuple[Floats, tuple[float, float]] | None:
     """Injections in equilibrium, and least and largest growth around it, which differ only on breakpoints."""
     s, own = loads.p_low + 1j * loads.q_low, droop.customer
@@ -428,7 +428,7 @@ def edge(
     subject: Subject,
     droop: Droop,
     update: Update,
-    loads: Box,
+    loads: InjectionBox,
     change: Callable[[Droop, float], Droop] = steepened,
 ) -> tuple[float, float]:
     """Factors on all slopes at which a fleet ceases to be stable, by doubling and bisection.
@@ -485,7 +485,7 @@ def _last(holds: Callable[[float], bool], places: int) -> float:
     return times
 
 
-def longest_interval(subject: Subject, droop: Droop, update: Update, loads: Box) -> float:
+def longest_interval(subject: Subject, droop: Droop, update: Update, loads: InjectionBox) -> float:
     """Longest sampling interval found with a proof of stability, s.
 
     Infinity: the certificate covers every interval. The time constants may be shorter in the same ratio.
@@ -513,7 +513,7 @@ def longest_interval(subject: Subject, droop: Droop, update: Update, loads: Box)
 
 
 def inverter_rows(
-    subject: Subject, droop: Droop, update: Update, loads: Box, where: str
+    subject: Subject, droop: Droop, update: Update, loads: InjectionBox, where: str
 ) -> list[dict[str, Any]]:
     """Share of each inverter in the loop gain, and admissible factor on its slope alone.
 
@@ -552,7 +552,7 @@ def _shares(site: Site, given: Loop) -> Share:
     return replace(own, factor=np.fmax(own.factor, limit if limit >= 1.0 else math.nan))
 
 
-def margin(subject: Subject, droop: Droop, update: Update, loads: Box) -> float:
+def margin(subject: Subject, droop: Droop, update: Update, loads: InjectionBox) -> float:
     """Factor on the steepest slopes up to which all curves with the same limits are proven stable.
 
     Parameters
@@ -574,9 +574,9 @@ def margin(subject: Subject, droop: Droop, update: Update, loads: Box) -> float:
     return proof(loop(droop, replace(within, region=wide), update)).factor
 
 
-def worst(verdicts: Iterable[str]) -> Verdict:
+def worst(verdicts: Iterable[str]) -> FleetVerdict:
     """Combined verdict: unstable if one is, stable if all are."""
     known = set(verdicts)
-    if Verdict.UNSTABLE in known:
-        return Verdict.UNSTABLE
-    return Verdict.STABLE if known == {Verdict.STABLE} else Verdict.UNDECIDED
+    if FleetVerdict.UNSTABLE in known:
+        return FleetVerdict.UNSTABLE
+    return FleetVerdict.STABLE if known == {FleetVerdict.STABLE} else FleetVerdict.UNDECIDED

@@ -25,14 +25,14 @@ from typing import Literal
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints
-from gridsec.errors import DesignInfeasible, InputInvalid, Problem, no_choice, refuse
+from gridsec.errors import DesignInfeasible, InputInvalid, Problem, no_choice, raise_if_any
 from gridsec.estimators.exact_bank import direct as direct_bank
 from gridsec.estimators.exact_bank.direct import SlotState
 from gridsec.observers.certificates import feeds
 from gridsec.observers.gains import CircleOptions
 from gridsec.observers.gains import stacked as in_one
 from gridsec.observers.lmi.circle_criterion import solve_many
-from gridsec.observers.lure import Lure, StepPolicy, Transition, transition, unit
+from gridsec.observers.lure import Lure, LureTransition, StepPolicy, transition, unit
 from gridsec.secure.subsets import Subsets, subsets
 
 __all__ = [
@@ -107,7 +107,7 @@ class StackedState:
 
     x: Floats
     seen: Bools
-    prepared: Transition
+    prepared: LureTransition
 
 
 def start(lure: Lure, gains: Gains, policy: StepPolicy) -> StackedState:
@@ -295,8 +295,8 @@ class Bank:
     sizes: Ints
     direct: bool
     gains: Gains | None
-    layout: direct_bank.Layout | None
-    base: direct_bank.Plan | None
+    layout: direct_bank.SlotLayout | None
+    base: direct_bank.AvailabilityIndex | None
     policy: StepPolicy
 
 
@@ -348,7 +348,7 @@ def design(
     masks = sets.masks()
     sizes = masks.sum(axis=1)
     if isinstance(gains, str):
-        refuse(no_choice("gains", ("direct",), gains))
+        raise_if_any(no_choice("gains", ("direct",), gains))
         lay = direct_bank.layout(lure, reactive)
         base = direct_bank.make_plan(lay, sets, np.ones(p, dtype=np.bool_))
         return Bank(lure, sets, masks, sizes, True, None, lay, base, policy)
@@ -483,7 +483,7 @@ def step(  # noqa: PLR0917  # design and state, then the four inputs that every 
     return direct_bank.advance(lay, state, direct_bank.drive(lay, y, u, live, net), h, bank.policy)
 
 
-def _structure(bank: Bank) -> tuple[direct_bank.Layout, direct_bank.Plan]:
+def _structure(bank: Bank) -> tuple[direct_bank.SlotLayout, direct_bank.AvailabilityIndex]:
     if bank.layout is None or bank.base is None:
         raise InputInvalid([Problem("wrong-design", "this state belongs to a bank with direct injection")])
     return bank.layout, bank.base

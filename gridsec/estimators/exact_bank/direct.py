@@ -25,7 +25,7 @@ import numpy as np
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import InputInvalid, Problem
 from gridsec.grid.droop import Droop
-from gridsec.observers.lure import Lure, StepPolicy, Transition, transition, unit
+from gridsec.observers.lure import Lure, LureTransition, StepPolicy, transition, unit
 from gridsec.secure.subsets import Subsets
 
 # Size limit of stored feedback blocks, bytes; larger ones are replaced by a dense product.
@@ -34,7 +34,7 @@ _KEPT_PLANS = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Layout:
+class SlotLayout:
     """Units of the slots: inverters 0 … n-1, then meters without an inverter; e units in all.
 
     Index e is the padding: row, column and state are zero.
@@ -77,7 +77,7 @@ class Layout:
         return int(self.rows.size - 1)
 
 
-def layout(lure: Lure, reactive: Floats | None) -> Layout:
+def layout(lure: Lure, reactive: Floats | None) -> SlotLayout:
     """Assign meters to the inverters that they drive.
 
     A meter is at an inverter's customer exactly if its output is that inverter's:
@@ -127,7 +127,7 @@ def layout(lure: Lure, reactive: Floats | None) -> Layout:
     if reactive is not None and extra:
         H[:n, n:e] = lure.F @ reactive[:, extra]
     real = np.arange(e + 1) < n
-    return Layout(
+    return SlotLayout(
         lure=lure,
         droop=droop,
         of_meter=of_meter,
@@ -141,7 +141,7 @@ def layout(lure: Lure, reactive: Floats | None) -> Layout:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Block:
+class SlotBlock:
     """Slots of one bank. n observers, k slots each.
 
     Attributes
@@ -163,7 +163,7 @@ class Block:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Plan:
+class AvailabilityIndex:
     """Index arrays for one pattern of available meters.
 
     Attributes
@@ -184,12 +184,12 @@ class Plan:
     seen: Bools
     driven: Bools
     trailing: Ints
-    large: Block
-    small: Block
+    large: SlotBlock
+    small: SlotBlock
     compare: tuple[tuple[Ints, Ints, Ints], ...]
 
 
-def make_plan(lay: Layout, sets: Subsets, seen: Bools) -> Plan:
+def make_plan(lay: SlotLayout, sets: Subsets, seen: Bools) -> AvailabilityIndex:
     """Index arrays for one pattern of available meters, `seen` (p,)."""
     silent = lay.of_meter[~seen]
     quiet = silent[silent < lay.units]
@@ -202,7 +202,7 @@ def make_plan(lay: Layout, sets: Subsets, seen: Bools) -> Plan:
     meter = of_unit[trailing]
     large = _block(lay, _slots(lay, sets.out_large, trailing, meter))
     small = _block(lay, _slots(lay, sets.out_small, trailing, meter))
-    return Plan(
+    return AvailabilityIndex(
         seen=seen.copy(),
         driven=lay.metered & seen[lay.driver] if seen.size else lay.metered,
         trailing=trailing,
@@ -212,7 +212,7 @@ def make_plan(lay: Layout, sets: Subsets, seen: Bools) -> Plan:
     )
 
 
-def _slots(lay: Layout, out: Ints, trailing: Ints, meter: Ints) -> Ints:
+def _slots(lay: SlotLayout, out: Ints, trailing: Ints, meter: Ints) -> Ints:
     """Units (k, n) in the slots of observers that leave out the meters `out` (n, s)."""
     count = out.shape[0]
     own = lay.of_meter[out].reshape(count, -1).T
@@ -223,15 +223,15 @@ def _slots(lay: Layout, out: Ints, trailing: Ints, meter: Ints) -> Ints:
     return np.ascontiguousarray(np.concatenate([own, rest]))
 
 
-def _block(lay: Layout, units: Ints) -> Block:
+def _block(lay: SlotLayout, units: Ints) -> SlotBlock:
     k, n = units.shape
     real = lay.real[units]
     H = lay.H[units[:, None, :], units[None, :, :]] if 8 * k * k * n <= _BLOCK_BYTES else None
-    return Block(units, lay.rows[units], None if real.all() else real, H)
+    return SlotBlock(units, lay.rows[units], None if real.all() else real, H)
 
 
 def _comparisons(
-    lay: Layout, sets: Subsets, units: Ints, *, all_slots: bool
+    lay: SlotLayout, sets: Subsets, units: Ints, *, all_slots: bool
 ) -> tuple[tuple[Ints, Ints, Ints], ...]:
     """Lookups of equation (6) for each choice of the meters that S leaves out as well."""
     width = lay.of_meter.shape[1]
@@ -274,13 +274,13 @@ class SlotState:
     driven: Floats
     large: Floats
     small: Floats
-    plan: Plan | None
-    plans: tuple[Plan, ...]
+    plan: AvailabilityIndex | None
+    plans: tuple[AvailabilityIndex, ...]
     seen: Bools
-    prepared: Transition
+    prepared: LureTransition
 
 
-def start(lay: Layout, sets: Subsets, base: Plan, policy: StepPolicy) -> SlotState:
+def start(lay: SlotLayout, sets: Subsets, base: AvailabilityIndex, policy: StepPolicy) -> SlotState:
     """All observers at zero injection with all meters available, for the plan `base` of all meters."""
     return SlotState(
         driven=np.zeros(lay.units + 1),
@@ -293,7 +293,7 @@ def start(lay: Layout, sets: Subsets, base: Plan, policy: StepPolicy) -> SlotSta
     )
 
 
-def follow(lay: Layout, sets: Subsets, state: SlotState, seen: Bools, adopt: Floats | None) -> SlotState:
+def follow(lay: SlotLayout, sets: Subsets, state: SlotState, seen: Bools, adopt: Floats | None) -> SlotState:
     """The same observers under another pattern of available meters.
 
     A meter that becomes unavailable frees its inverter in every observer, from its last value. A meter that
@@ -331,7 +331,9 @@ def follow(lay: Layout, sets: Subsets, state: SlotState, seen: Bools, adopt: Flo
     )
 
 
-def _carry(before: Plan | None, after: Plan, block: Block, x: Floats, driven: Floats) -> Floats:
+def _carry(
+    before: AvailabilityIndex | None, after: AvailabilityIndex, block: SlotBlock, x: Floats, driven: Floats
+) -> Floats:
     """Slots of `x` under the plan `before`, in the order of `block` of the plan `after`."""
     fresh = np.asarray(driven[block.units])
     if before is None:
@@ -381,7 +383,7 @@ class Drive:
         return s
 
 
-def drive(lay: Layout, y: Floats, u: Floats, seen: Bools, net: Floats | None) -> Drive:
+def drive(lay: SlotLayout, y: Floats, u: Floats, seen: Bools, net: Floats | None) -> Drive:
     """Prepare the inputs of a step.
 
     Parameters
@@ -419,7 +421,7 @@ _HALVINGS = 30
 _RELAX = 2000
 
 
-def advance(lay: Layout, state: SlotState, inputs: Drive, h: float, policy: StepPolicy) -> SlotState:
+def advance(lay: SlotLayout, state: SlotState, inputs: Drive, h: float, policy: StepPolicy) -> SlotState:
     """All observers a time h later, under constant inputs.
 
     The same exponential Runge-Kutta substeps, and the same equilibrium after long steps, as those of
@@ -460,7 +462,7 @@ def _gather(values: Floats, n: int, units: Ints) -> Floats:
     return np.asarray(values[units])
 
 
-def _targets(lay: Layout, inputs: Drive, blocks: tuple[Block, ...], x: list[Floats]) -> list[Floats]:
+def _targets(lay: SlotLayout, inputs: Drive, blocks: tuple[SlotBlock, ...], x: list[Floats]) -> list[Floats]:
     """K(zeta) of the driven observer and of every slot of the banks."""
     n = lay.driver.size
     s = inputs.reference(x[0])
@@ -474,14 +476,14 @@ def _targets(lay: Layout, inputs: Drive, blocks: tuple[Block, ...], x: list[Floa
     return out
 
 
-def _curve(lay: Layout, block: Block, z: Floats) -> Floats:
+def _curve(lay: SlotLayout, block: SlotBlock, z: Floats) -> Floats:
     if not lay.driver.size:
         return np.zeros_like(z)
     k = lay.droop(z, block.rows)
     return k if block.real is None else np.where(block.real, k, 0.0)
 
 
-def _outputs(lay: Layout, block: Block, z: Floats, s: Floats, x: Floats) -> Floats:
+def _outputs(lay: SlotLayout, block: SlotBlock, z: Floats, s: Floats, x: Floats) -> Floats:
     """Outputs z (k, n) of every slot: the common z plus the effect of the slots' own deviations."""
     apart = x - s[block.units]
     out = np.asarray(z[block.units])
@@ -494,7 +496,7 @@ def _outputs(lay: Layout, block: Block, z: Floats, s: Floats, x: Floats) -> Floa
     return np.asarray(out + np.take_along_axis(wide @ lay.H.T, block.units.T, axis=1).T)
 
 
-def _scatter(lay: Layout, units: Ints, apart: Floats) -> Floats:
+def _scatter(lay: SlotLayout, units: Ints, apart: Floats) -> Floats:
     """Deviations of the slots (k, n) as full vectors (n, e + 1)."""
     wide = np.zeros((units.shape[1], lay.units + 1))
     np.put_along_axis(wide, units.T, apart.T, axis=1)
@@ -502,7 +504,7 @@ def _scatter(lay: Layout, units: Ints, apart: Floats) -> Floats:
     return wide
 
 
-def settle(lay: Layout, state: SlotState, inputs: Drive, policy: StepPolicy) -> SlotState:
+def settle(lay: SlotLayout, state: SlotState, inputs: Drive, policy: StepPolicy) -> SlotState:
     """All observers in their equilibria."""
     n = lay.driver.size
     driven = state.driven.copy()
@@ -510,7 +512,7 @@ def settle(lay: Layout, state: SlotState, inputs: Drive, policy: StepPolicy) -> 
         driven[:n] = np.where(inputs.driven, lay.droop(inputs.reading), driven[:n])
     loose = np.flatnonzero(~inputs.driven)
     if loose.size:
-        alone = Block(loose[:, None], lay.rows[loose][:, None], None, None)
+        alone = SlotBlock(loose[:, None], lay.rows[loose][:, None], None, None)
         driven[loose] = _equilibrium(
             lay, alone, inputs, driven[loose][:, None], driven=driven, policy=policy
         )[:, 0]
@@ -524,7 +526,7 @@ def settle(lay: Layout, state: SlotState, inputs: Drive, policy: StepPolicy) -> 
 
 
 def _equilibrium(
-    lay: Layout, block: Block, inputs: Drive, x: Floats, *, driven: Floats, policy: StepPolicy
+    lay: SlotLayout, block: SlotBlock, inputs: Drive, x: Floats, *, driven: Floats, policy: StepPolicy
 ) -> Floats:
     """Slots (k, n) with `x = K(z(x))`, computed in parts of a few thousand observers."""
     k, n = x.shape
@@ -546,7 +548,7 @@ def _equilibrium(
 class _Loops:
     """The equations `x = K(H x + fixed)` of n observers with k slots."""
 
-    lay: Layout
+    lay: SlotLayout
     rows: Ints
     real: Bools
     H: Floats
@@ -602,7 +604,7 @@ class _Loops:
         return np.asarray(x + length[:, None] * step)
 
 
-def consistency(lay: Layout, sets: Subsets, state: SlotState) -> Floats:
+def consistency(lay: SlotLayout, sets: Subsets, state: SlotState) -> Floats:
     """pi_S of every large set; chong2020 (6). Empty while too few meters are available."""
     plan = state.plan
     if plan is None:
@@ -621,7 +623,7 @@ def consistency(lay: Layout, sets: Subsets, state: SlotState) -> Floats:
     return np.asarray(worst.ravel()[sets.pairs].max(axis=1))
 
 
-def spread(lay: Layout, sets: Subsets, state: SlotState, index: int) -> Floats:
+def spread(lay: SlotLayout, sets: Subsets, state: SlotState, index: int) -> Floats:
     """Largest deviation of the compared estimates from that of one S, inverter by inverter; (n,)."""
     n = lay.driver.size
     plan = state.plan
@@ -637,7 +639,7 @@ def spread(lay: Layout, sets: Subsets, state: SlotState, index: int) -> Floats:
     return np.asarray(np.abs(wide - own)[:, :n].max(axis=0, initial=0.0))
 
 
-def estimate(lay: Layout, sets: Subsets, state: SlotState, index: int) -> Floats:
+def estimate(lay: SlotLayout, sets: Subsets, state: SlotState, index: int) -> Floats:
     """Estimate (n,) of one observer: large sets first, then small ones; -1 for the driven observer."""
     x = state.driven.copy()
     if index >= 0 and state.plan is not None:

@@ -24,11 +24,11 @@ import numpy as np
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import DesignInfeasible
 from gridsec.estimators import thresholds
-from gridsec.estimators.decision import Situation, Tally, count, decide, residual_excess
+from gridsec.estimators.decision import Counters, DecisionInputs, count, decide, residual_excess
 from gridsec.estimators.exact_bank import bank as banks
 from gridsec.estimators.exact_bank.bank import StackedState
-from gridsec.estimators.inputs import Inputs, Past, clean, injections, known, nothing_new, reconstruct
-from gridsec.estimators.plant import Options, Plant, Setting, check_plant
+from gridsec.estimators.inputs import Inputs, PreviousStep, clean, injections, known, nothing_new, reconstruct
+from gridsec.estimators.plant import EstimatorContext, Options, Plant, check_plant
 from gridsec.estimators.thresholds import ErrorBound, ErrorModel, Majorant, Motion
 from gridsec.grid.meter import reading_error
 from gridsec.grid.network import LinDistFlow
@@ -70,9 +70,9 @@ class MonitorDesign:
     options: Options
 
     @property
-    def setting(self) -> Setting:
+    def setting(self) -> EstimatorContext:
         """Setting for the preparation of frames."""
-        return Setting(
+        return EstimatorContext(
             self.plant,
             self.model,
             self.errors,
@@ -126,7 +126,7 @@ class MonitorState:
     bound: ErrorBound
     level: ErrorBound
     settled: bool
-    tally: Tally
+    tally: Counters
     v0_squared: Floats | float
     last: tuple[Estimate, Verdict] | None
 
@@ -266,7 +266,7 @@ def init(design: MonitorDesign, t: float) -> MonitorState:
         bound=widest,
         level=widest,
         settled=False,
-        tally=Tally(np.zeros(p, dtype=np.intp), np.zeros(p, dtype=np.intp), np.zeros(p, dtype=np.bool_)),
+        tally=Counters(np.zeros(p, dtype=np.intp), np.zeros(p, dtype=np.intp), np.zeros(p, dtype=np.bool_)),
         v0_squared=design.plant.droop.vbar**2,
         last=None,
     )
@@ -290,7 +290,7 @@ def step(design: MonitorDesign, state: MonitorState, frame: Frame) -> tuple[Moni
     if late or not np.isfinite(frame.t):
         return state, *nothing_new(design.plant, frame, state.t, state.last, state.v0_squared, state.x)
     frame = known(frame)
-    inputs = clean(design.setting, Past(state.x, state.v0_squared, state.tally.named), frame)
+    inputs = clean(design.setting, PreviousStep(state.x, state.v0_squared, state.tally.named), frame)
     h = 0.0 if state.bank is None else frame.t - state.t
     if state.bank is None:
         bank = banks.init(design.bank, inputs.z, inputs.w, inputs.live, net=inputs.net)
@@ -360,7 +360,7 @@ def _conclude(  # noqa: PLR0917  # design, state and frame, then the results of 
     if enough:
         tally = count(tally, over, live, confirm=options.confirm, release=options.release)
     decision, cause, reason = decide(
-        Situation(
+        DecisionInputs(
             names=tuple(plant.feeder.customers[c] for c in plant.meters),
             max_attacked=design.bank.sets.max_attacked,
             live=live,

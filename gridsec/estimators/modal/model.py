@@ -36,7 +36,7 @@ import numpy as np
 from scipy.linalg import cholesky, eigh, solve_triangular
 
 from gridsec.arrays import Floats, Ints, submatrix
-from gridsec.errors import Problem, refuse
+from gridsec.errors import Problem, raise_if_any
 from gridsec.estimators.sequential.design import YEAR_S, SequentialDesign
 from gridsec.estimators.sequential.loads import prior
 
@@ -115,7 +115,7 @@ class ResidualModel:
         problems += [
             Problem("out-of-range", f"{name} must be {wanted}") for name, good, wanted in ranges if not good
         ]
-        refuse(problems)
+        raise_if_any(problems)
 
     def loads(self, at: Ints) -> Floats:
         """Covariance S between some meters, (k, k).
@@ -273,7 +273,7 @@ def modes(model: ResidualModel, at: Ints | None = None) -> Modes:
     """
     at = np.arange(model.meters.size) if at is None else np.asarray(at, dtype=np.intp)
     if not at.size:
-        refuse([Problem("shape", "modes need at least one meter")])
+        raise_if_any([Problem("shape", "modes need at least one meter")])
     D = model.noise(at)
     half = cholesky(D, lower=True)
     S = solve_triangular(half, solve_triangular(half, model.loads(at), lower=True).T, lower=True)

@@ -17,7 +17,7 @@ from gridsec.estimators.sequential.commission import (
     to_arrays,
 )
 from gridsec.estimators.sequential.design import SequentialDesign, SequentialOptions, design
-from gridsec.estimators.sequential.distrust import Distrust, distrusted, nobody, restore
+from gridsec.estimators.sequential.distrust import SuspicionRecord, distrusted, warm_start
 from gridsec.estimators.sequential.learning import LearningProgress, LearningState, progress
 from gridsec.estimators.sequential.loads import LoadDoubt
 from gridsec.estimators.sequential.state import SequentialState, init, renew
@@ -25,7 +25,6 @@ from gridsec.estimators.sequential.step import step
 
 __all__ = [
     "Commission",
-    "Distrust",
     "Learning",
     "LearningProgress",
     "LearningReason",
@@ -34,14 +33,14 @@ __all__ = [
     "SequentialDesign",
     "SequentialOptions",
     "SequentialState",
+    "SuspicionRecord",
     "design",
     "distrusted",
     "from_arrays",
     "init",
-    "nobody",
     "progress",
     "renew",
-    "restore",
     "step",
     "to_arrays",
+    "warm_start",
 ]

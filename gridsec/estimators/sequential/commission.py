@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, submatrix
-from gridsec.errors import Problem, refuse
+from gridsec.errors import Problem, raise_if_any
 from gridsec.estimators.sequential.conditional import invert
 from gridsec.estimators.sequential.design import SequentialDesign
 from gridsec.estimators.sequential.search import Recent
@@ -418,7 +418,7 @@ def from_arrays(design: SequentialDesign, arrays: Mapping[str, Floats]) -> Commi
         If it does not fit; the message names every problem.
     """
     problems = _problems(design, arrays)
-    refuse(problems)
+    raise_if_any(problems)
     learned = Learned(*(arrays[name] for name in _KNOWN))
     if not any_of(np.isfinite(arrays["since"])):
         return Commission(learned, None)

@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, all_of, any_of, changed
-from gridsec.estimators.decision import Situation, decide
+from gridsec.estimators.decision import DecisionInputs, decide
 from gridsec.estimators.sequential import words
 from gridsec.estimators.sequential.apart import apart
 from gridsec.estimators.sequential.bounds import Bounded, Grounds, Powers
@@ -200,7 +200,7 @@ def _of_meters(  # what there is to say of meters
 ) -> _Said:
     """The answer by the meters alone: those that report, are beyond, and have too wide limits, (p,) each."""
     said = decide(
-        Situation(
+        DecisionInputs(
             names=design.names,
             max_attacked=max(1, min(design.most, int(np.count_nonzero(live)) // 3)),
             live=live,

@@ -14,7 +14,7 @@ from scipy.linalg import lapack
 from scipy.special import ndtri
 
 from gridsec.arrays import Bools, Floats, Ints
-from gridsec.errors import DesignInfeasible, NotObservable, Problem, refuse
+from gridsec.errors import DesignInfeasible, NotObservable, Problem, raise_if_any
 from gridsec.estimators.plant import Plant, check_plant, judging_problems
 from gridsec.estimators.sequential.conditional import Prior
 from gridsec.estimators.sequential.decoder import Decoder
@@ -122,7 +122,7 @@ class SequentialOptions:
                 for name in ("hidden_charge", "commission_s", "stability", "unread_std_percent")
             ),
         ]
-        refuse(
+        raise_if_any(
             [
                 *(
                     Problem(what.code, f"{name} is {getattr(self, name)}; it {what}")

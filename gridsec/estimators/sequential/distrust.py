@@ -25,7 +25,7 @@ from gridsec.estimators.sequential.state import SequentialState
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Distrust:
+class SuspicionRecord:
     """Who is not believed. p meters, m inverters, b phases of the busbar, one on a balanced feeder.
 
     Attributes
@@ -56,12 +56,12 @@ class Distrust:
     busbar_off: Floats = field(default_factory=lambda: np.zeros(1))
 
     @property
-    def empty(self) -> bool:
+    def is_empty(self) -> bool:
         """Whether everybody is believed."""
         scales_s = (self.scale_s, self.busbar_scale_s)
         return not (self.inverters.any() or any(np.isfinite(scale_s).any() for scale_s in scales_s))
 
-    def same(self, other: Distrust) -> bool:
+    def same(self, other: SuspicionRecord) -> bool:
         """Whether another says the same of everybody; by how much the busbar's meter is off does not count.
 
         Parameters
@@ -78,7 +78,7 @@ class Distrust:
             and np.array_equal(self.busbar_named, other.busbar_named)
         )
 
-    def without(self, which: Bools) -> Distrust:
+    def without(self, which: Bools) -> SuspicionRecord:
         """What is left when some meters were replaced.
 
         Parameters
@@ -89,21 +89,21 @@ class Distrust:
         scale_s, repeats_s = (np.where(which, np.nan, each) for each in (self.scale_s, self.repeats_s))
         return replace(self, scale_s=scale_s, repeats_s=repeats_s, named=self.named & ~which)
 
+    @staticmethod
+    def empty(meters: int, inverters: int, phases: int = 1) -> SuspicionRecord:
+        """Everybody is believed.
 
-def nobody(meters: int, inverters: int, phases: int = 1) -> Distrust:
-    """Everybody is believed.
-
-    Parameters
-    ----------
-    meters, inverters, phases
-        p, m and b.
-    """
-    no, none, here = (np.zeros(count, dtype=np.bool_) for count in (meters, inverters, phases))
-    never = np.full(meters, np.nan)
-    return Distrust(never, never, no, none, np.full(phases, np.nan), here, np.zeros(phases))
+        Parameters
+        ----------
+        meters, inverters, phases
+            p, m and b.
+        """
+        no, none, here = (np.zeros(count, dtype=np.bool_) for count in (meters, inverters, phases))
+        never = np.full(meters, np.nan)
+        return SuspicionRecord(never, never, no, none, np.full(phases, np.nan), here, np.zeros(phases))
 
 
-def distrusted(design: SequentialDesign, state: SequentialState) -> Distrust:
+def distrusted(design: SequentialDesign, state: SequentialState) -> SuspicionRecord:
     """Whom a state does not believe.
 
     Parameters
@@ -115,12 +115,12 @@ def distrusted(design: SequentialDesign, state: SequentialState) -> Distrust:
     inverters = trust.inverters if state.last is None else state.last[1].inverters
     busbar = state.busbar
     if trust.trusted.all() and busbar.believed.all() and not inverters.any():
-        return nobody(trust.trusted.size, inverters.size, busbar.believed.size)
+        return SuspicionRecord.empty(trust.trusted.size, inverters.size, busbar.believed.size)
     scales_s = np.array(design.lengths) * design.step_s
     # Repetition shows on no scale; the longest is what is left to judge such a meter by.
     repeats = ~trust.trusted & (trust.lag > 0)
     scale = np.where(repeats, len(design.lengths) - 1, trust.scale)
-    return Distrust(
+    return SuspicionRecord(
         np.where(trust.trusted, np.nan, scales_s[scale]),
         np.where(repeats, trust.lag * design.step_s, np.nan),
         trust.named,
@@ -131,7 +131,7 @@ def distrusted(design: SequentialDesign, state: SequentialState) -> Distrust:
     )
 
 
-def restore(design: SequentialDesign, state: SequentialState, before: Distrust) -> SequentialState:
+def warm_start(design: SequentialDesign, state: SequentialState, before: SuspicionRecord) -> SequentialState:
     """Go on distrusting who was, from a state that has not seen any frame.
 
     A meter is trusted again as always, but not before it has given as many readings as its scale needs to
@@ -146,7 +146,7 @@ def restore(design: SequentialDesign, state: SequentialState, before: Distrust) 
     before
         Who was distrusted.
     """
-    if before.empty:
+    if before.is_empty:
         return state
     trust, which = state.trust, np.isfinite(before.scale_s)
     scale = _closest(design, before.scale_s)
@@ -179,7 +179,7 @@ def restore(design: SequentialDesign, state: SequentialState, before: Distrust) 
     )
 
 
-def _busbar(design: SequentialDesign, before: Distrust, need: Ints, settling: int) -> Busbar:
+def _busbar(design: SequentialDesign, before: SuspicionRecord, need: Ints, settling: int) -> Busbar:
     """What is thought of the busbar's meter, as far as it was not believed."""
     out = np.isfinite(before.busbar_scale_s)
     scale = _closest(design, before.busbar_scale_s)

@@ -15,7 +15,7 @@ import numpy as np
 from gridsec.arrays import Bools, Floats, Ints, all_of, indices, submatrix
 from gridsec.errors import DesignInfeasible
 from gridsec.estimators.sequential.design import SequentialDesign
-from gridsec.observers.lure import POLICY, Lure, Transition, advance, step, transition
+from gridsec.observers.lure import POLICY, Lure, LureTransition, advance, step, transition
 
 _PATIENT = replace(POLICY, settled=0.0)
 
@@ -36,7 +36,7 @@ class Free:
 
     rows: Ints
     loop: Lure
-    transition: Transition
+    transition: LureTransition
 
 
 def drive(  # noqa: PLR0917  # state, what drives it, and for how long

@@ -30,7 +30,7 @@ from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, indices
 from gridsec.estimators.sequential import clocks, repeats
 from gridsec.estimators.sequential.effects import Effects
 from gridsec.estimators.sequential.repeats import Memory, Rules
-from gridsec.interface import Kind
+from gridsec.interface import ManipulationKind
 
 # A named meter's readings are looked at every so many ticks, and every so many seconds where ticks are long.
 _EVERY, _EVERY_S = 16, 240.0
@@ -118,16 +118,16 @@ class Kinds:
 
     memory: Memory
     since: Ints
-    alone: tuple[Kind | None, ...]
+    alone: tuple[ManipulationKind | None, ...]
     told: Bools
 
     @property
-    def kinds(self) -> tuple[Kind | None, ...]:
+    def kinds(self) -> tuple[ManipulationKind | None, ...]:
         """What each named meter's manipulation looks like, (p,)."""
         if not any_of(self.told):
             return self.alone
         return tuple(
-            Kind.COORDINATED if told and kind is Kind.OFFSET else kind
+            ManipulationKind.COORDINATED if told and kind is ManipulationKind.OFFSET else kind
             for kind, told in zip(self.alone, self.told.tolist(), strict=True)
         )
 
@@ -223,7 +223,7 @@ def describe(  # noqa: PLR0917  # what each meter says, and what the others say 
     told, new = heard.told & named, any_of(since == tick)
     stuck = named & (memory.stuck | (memory.run * shapes.rules.surprise >= _CALLED))
     replays = named & ~stuck & (memory.lag > 0)
-    for kind, which in ((Kind.STUCK, stuck), (Kind.REPLAY, replays)):
+    for kind, which in ((ManipulationKind.STUCK, stuck), (ManipulationKind.REPLAY, replays)):
         for j in indices(which).tolist():
             alone[j] = kind
     others, meters = named & ~stuck & ~replays, np.arange(named.size)
@@ -258,14 +258,14 @@ def _turns(since: Ints, tick: int, every: int) -> Bools:
 
 
 @cache
-def _nobody(meters: int) -> tuple[Ints, tuple[Kind | None, ...], Bools]:
+def _nobody(meters: int) -> tuple[Ints, tuple[ManipulationKind | None, ...], Bools]:
     none = empty(meters)
     return none.since, none.alone, none.told
 
 
 def _alone(
-    shapes: Shapes, memory: Memory, meters: Ints, age: int, before: tuple[Kind | None, ...]
-) -> Iterator[Kind | None]:
+    shapes: Shapes, memory: Memory, meters: Ints, age: int, before: tuple[ManipulationKind | None, ...]
+) -> Iterator[ManipulationKind | None]:
     """What the lies of meters named at the same time look like, each by itself."""
     start = max(memory.first, memory.tick - 2 * age - 4 * _BINS)
     code, model = repeats.past(memory, meters, start, memory.kept)
@@ -302,11 +302,11 @@ def _longest(code: Floats) -> Ints:
     return np.asarray(run.max(axis=0, initial=0))
 
 
-def _again(shapes: Shapes, meter: int, lie: Floats, age: int) -> Kind | None:
+def _again(shapes: Shapes, meter: int, lie: Floats, age: int) -> ManipulationKind | None:
     """What the lie of a meter that was stuck looks like since it moves, if that is for long enough."""
     heard = int(np.isfinite(lie).sum())
     if heard < max(shapes.every, _SHORTEST):
-        return Kind.STUCK
+        return ManipulationKind.STUCK
     return shape(lie, float(np.sqrt(shapes.noise[meter])), min(age, lie.size))
 
 
@@ -330,32 +330,32 @@ def _backward(shapes: Shapes, tick: int, since: Ints) -> tuple[Ints, Bools]:
     return number, (early == 0) & (age > 0) | (early == 1) & (age == 1)
 
 
-_LASTING = (Kind.REPLAY, Kind.CLOCK_SHIFT, Kind.DRIFT)
+_LASTING = (ManipulationKind.REPLAY, ManipulationKind.CLOCK_SHIFT, ManipulationKind.DRIFT)
 
 
 def _of_the_past(  # noqa: PLR0917  # one meter, and where to look
-    shapes: Shapes, memory: Memory, meter: int, spread: float, window: int, before: Kind | None
-) -> Kind | None:
+    shapes: Shapes, memory: Memory, meter: int, spread: float, window: int, before: ManipulationKind | None
+) -> ManipulationKind | None:
     """Replay or clock shift if a meter's readings are of another time; else what it was before.
 
     A clock that is off, or set wrong, never makes a meter say again what it has said: that comes first.
     """
-    if before is Kind.REPLAY:
+    if before is ManipulationKind.REPLAY:
         return before
     code, model = repeats.past(memory, meter, memory.first, memory.kept)
     same = repeats.recurring(code) * repeats.surprise(shapes.rules, memory)[meter]
     if same >= _CALLED + np.log(code.size):
-        return Kind.REPLAY
+        return ManipulationKind.REPLAY
     heard = min(window, code.size // 2)
-    if before is Kind.CLOCK_SHIFT or heard < clocks.WINDOWS[0]:
+    if before is ManipulationKind.CLOCK_SHIFT or heard < clocks.WINDOWS[0]:
         return before
     y = (code * shapes.rules.step[meter]) ** 2
     own = repeats.own_part(memory, meter)
     lag = clocks.shifted(y, model, own, heard, 3.0 * np.sqrt(spread), spread + float(shapes.noise[meter]))
-    return Kind.CLOCK_SHIFT if lag else before
+    return ManipulationKind.CLOCK_SHIFT if lag else before
 
 
-def shape(lie: Floats, noise: float, age: int) -> Kind | None:
+def shape(lie: Floats, noise: float, age: int) -> ManipulationKind | None:
     """Whether a lie is constant or grows.
 
     A ramp from nothing to its full size that begins and ends at any two of `_BINS` moments is fitted by
@@ -373,20 +373,23 @@ def shape(lie: Floats, noise: float, age: int) -> Kind | None:
     """
     heard = lie[np.isfinite(lie)]
     if heard.size and _drifts(heard[:, None], np.array([noise]))[0]:
-        return Kind.DRIFT
+        return ManipulationKind.DRIFT
     now = lie[-(age + 2) :]
     now = now[np.isfinite(now)]
-    return Kind.OFFSET if now.size and now.std() < _LEFT * abs(now.mean()) + noise else None
+    return ManipulationKind.OFFSET if now.size and now.std() < _LEFT * abs(now.mean()) + noise else None
 
 
-def _shapes(lies: Floats, noise: Floats, age: int) -> list[Kind | None]:
+def _shapes(lies: Floats, noise: Floats, age: int) -> list[ManipulationKind | None]:
     """`shape` of several meters' lies, (n, k)."""
     if not all_of(np.isfinite(lies)):
         return [shape(lie, std, age) for lie, std in zip(lies.T, noise.tolist(), strict=True)]
     now = lies[-(age + 2) :]
     constant = now.std(axis=0) < _LEFT * np.abs(now.mean(axis=0)) + noise
     both = zip(_drifts(lies, noise).tolist(), constant.tolist(), strict=True)
-    return [Kind.DRIFT if drifts else Kind.OFFSET if rests else None for drifts, rests in both]
+    return [
+        ManipulationKind.DRIFT if drifts else ManipulationKind.OFFSET if rests else None
+        for drifts, rests in both
+    ]
 
 
 def _drifts(lies: Floats, noise: Floats) -> Bools:

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gridsec.arrays import Floats, Ints
-from gridsec.errors import Problem, refuse
+from gridsec.errors import Problem, raise_if_any
 from gridsec.estimators.sequential.conditional import Prior
 from gridsec.grid.droop import Droop
 from gridsec.grid.meter import MeterAccuracy
@@ -84,7 +84,7 @@ class LoadDoubt:
             for name in ("common_p", "common_q", "lasting", "together")
             if not (np.greater_equal(getattr(self, name), 0) & np.less_equal(getattr(self, name), 1)).all()
         ]
-        refuse(problems)
+        raise_if_any(problems)
         for name, std in (("even_p", self.p), ("even_q", self.q)):
             object.__setattr__(self, name, np.sqrt(3.0) * np.maximum(std, EXACT))
 

@@ -114,7 +114,7 @@ class Seen:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Doubt:
+class AttackAssumption:
     """Assumed number and size of attacks.
 
     Attributes
@@ -138,7 +138,7 @@ def saturated(errors: ErrorModel) -> Tube:
     return Tube(errors.droop.q[:, 3].copy(), errors.droop.q[:, 0].copy())
 
 
-def spread(errors: ErrorModel, doubt: Doubt, known: Tube, free: Tube, gain: Floats) -> Floats:
+def spread(errors: ErrorModel, doubt: AttackAssumption, known: Tube, free: Tube, gain: Floats) -> Floats:
     """Largest distance of voltages from those with the middle injections, under any attack; (r,).
 
     Unmanipulated inverters are in `known`; those of the worst M meters in `free`; the worst of all inverters
@@ -169,7 +169,7 @@ def spread(errors: ErrorModel, doubt: Doubt, known: Tube, free: Tube, gain: Floa
 _ROUNDS = 4
 
 
-def advance(errors: ErrorModel, doubt: Doubt, before: Tubes | None, seen: Seen, h: float) -> Tubes:
+def advance(errors: ErrorModel, doubt: AttackAssumption, before: Tubes | None, seen: Seen, h: float) -> Tubes:
     """Intervals after a step.
 
     Voltages between two ticks are assumed within the extremes of their intervals at both.
@@ -198,7 +198,7 @@ def advance(errors: ErrorModel, doubt: Doubt, before: Tubes | None, seen: Seen, 
     return Tubes(driven, free, z_own.where(seen.metered, z_free), z_free, seen.metered)
 
 
-def _z_free(errors: ErrorModel, doubt: Doubt, seen: Seen, known: Tube, free: Tube) -> Tube:
+def _z_free(errors: ErrorModel, doubt: AttackAssumption, seen: Seen, known: Tube, free: Tube) -> Tube:
     """`z = rest - 2X x` at the inverters' customers, without their own meters."""
     z = seen.rest - doubt.coupling @ known.middle
     wide = seen.rest_error + spread(errors, doubt, known, free, errors.inverters_own)
@@ -341,7 +341,7 @@ class Relation:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Trial:
+class PairResult:
     """Result of one pair for a tick. p meters, m inverters.
 
     Attributes
@@ -420,7 +420,7 @@ def believe(relation: Relation, meters: Bools) -> Believed:
     )
 
 
-def try_pair(believed: Believed, inverters: Bools, room: Floats) -> Trial:
+def try_pair(believed: Believed, inverters: Bools, room: Floats) -> PairResult:
     """Test if a pair explains a tick.
 
     With `G = U^T P U` its tests are those of its meters alone minus `T U G^-1 U^T P`, a matrix of rank |J_u|.
@@ -461,7 +461,7 @@ def try_pair(believed: Believed, inverters: Bools, room: Floats) -> Trial:
     attack[chosen], attack_error[chosen] = left_r, np.where(seen, np.abs(left_E) @ h, np.inf)
     beyond = np.any((np.abs(attack) - attack_error > room)[chosen])
     misfit = float(believed.plain @ size[:k])
-    return Trial(fits and not beyond, misfit, score, threshold, attack, attack_error)
+    return PairResult(fits and not beyond, misfit, score, threshold, attack, attack_error)
 
 
 # Relative level of rounding.

@@ -31,25 +31,25 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, frozen
 from gridsec.errors import NotObservable, Problem
-from gridsec.estimators.decision import Situation, Tally, count, decide
+from gridsec.estimators.decision import Counters, DecisionInputs, count, decide
 from gridsec.estimators.inputs import (
     NO_VOLTAGE,
     Inputs,
-    Past,
+    PreviousStep,
     busbar_errors,
     clean,
     known,
     nothing_new,
     reconstruct,
 )
-from gridsec.estimators.plant import Options, Plant, Setting, check_plant, setting
+from gridsec.estimators.plant import EstimatorContext, Options, Plant, check_plant, estimator_context
 from gridsec.estimators.unknown_input.pairs import (
+    AttackAssumption,
     Believed,
-    Doubt,
+    PairResult,
     Pairs,
     Relation,
     Seen,
-    Trial,
     Tube,
     Tubes,
     Unseen,
@@ -63,8 +63,8 @@ from gridsec.interface import Cause, Decision, Estimate, Explanation, Frame, Ver
 
 __all__ = [
     "Answer",
-    "Found",
-    "Tick",
+    "PairResults",
+    "TickRelations",
     "UnknownInputDesign",
     "UnknownInputState",
     "answer",
@@ -97,12 +97,12 @@ class UnknownInputDesign:
         2X from inverters to all customers.
     """
 
-    setting: Setting
+    setting: EstimatorContext
     max_inverters: int
     pairs: Pairs
     within: Bools
     missing: tuple[Unseen, ...]
-    doubt: Doubt
+    doubt: AttackAssumption
     gain: Floats
 
     @property
@@ -136,7 +136,7 @@ class UnknownInputState:
     t: float
     began: float
     tubes: Tubes | None
-    contradicted: Tally
+    contradicted: Counters
     x: Floats
     v0_squared: Floats | float
     named: Bools
@@ -145,7 +145,7 @@ class UnknownInputState:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Tick:
+class TickRelations:
     """One tick as linear relations; the suspected meters determine the intervals of inverters.
 
     Attributes
@@ -237,7 +237,7 @@ class Tick:
         """Largest wrong injection of each inverter (m,), for unmanipulated ones within `tube`."""
         return self.design.doubt.reach + np.abs(tube.middle) + tube.half
 
-    def trial(self, meters: Bools, inverters: Bools) -> Trial:
+    def trial(self, meters: Bools, inverters: Bools) -> PairResult:
         """Result of the pair of suspected meters (p,) and inverters (m,) for the tick."""
         return try_pair(self.believe(meters), inverters, self.room(self.tube(meters)))
 
@@ -246,7 +246,7 @@ class Tick:
 _EXACT = 1e-9
 
 
-def observe(design: UnknownInputDesign, state: UnknownInputState, frame: Frame) -> Tick:
+def observe(design: UnknownInputDesign, state: UnknownInputState, frame: Frame) -> TickRelations:
     """Prepare a frame, and advance the intervals of unmanipulated inverters.
 
     Parameters
@@ -254,12 +254,12 @@ def observe(design: UnknownInputDesign, state: UnknownInputState, frame: Frame) 
     frame
         Later than the last one.
     """
-    inputs = clean(design.setting, Past(state.x, state.v0_squared, state.named), frame)
+    inputs = clean(design.setting, PreviousStep(state.x, state.v0_squared, state.named), frame)
     h = 0.0 if state.tubes is None else frame.t - state.t
     v2, error, rest = _without_inverters(design, state, frame, inputs)
     seen = _seen(design, inputs, inputs.live & ~state.named, v2, error)
     tubes = advance(design.setting.errors, design.doubt, state.tubes, seen, h)
-    return Tick(design, frame, inputs, tubes, v2, error, rest)
+    return TickRelations(design, frame, inputs, tubes, v2, error, rest)
 
 
 def _without_inverters(
@@ -325,7 +325,7 @@ Answer = tuple[Decision, Cause, str]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Found:
+class PairResults:
     """Result of the pairs of one tick. p meters, m inverters.
 
     Attributes
@@ -343,14 +343,14 @@ class Found:
     meters: Bools
     inverters: Bools
     threshold: Floats
-    trial: Trial
+    trial: PairResult
     explanations: tuple[Explanation, ...]
 
 
 _SHOWN = 8
 
 
-def explain(pairs: Pairs, trials: dict[int, Trial], order: list[int]) -> tuple[Explanation, ...]:
+def explain(pairs: Pairs, trials: dict[int, PairResult], order: list[int]) -> tuple[Explanation, ...]:
     """The smallest possible pairs, likeliest first, with probabilities for normal errors."""
     best = trials[order[0]].misfit
     weights = np.exp([-0.5 * (trials[k].misfit - best) for k in order])
@@ -361,7 +361,7 @@ def explain(pairs: Pairs, trials: dict[int, Trial], order: list[int]) -> tuple[E
     )
 
 
-def deaf_inverters(design: UnknownInputDesign, trial: Trial) -> Bools:
+def deaf_inverters(design: UnknownInputDesign, trial: PairResult) -> Bools:
     """Mask (m,) of inverters with possible undetected wrong injections above their curve's span."""
     return np.asarray(trial.attack_error > design.setting.plant.droop.span)
 
@@ -369,8 +369,8 @@ def deaf_inverters(design: UnknownInputDesign, trial: Trial) -> Bools:
 def answer(
     design: UnknownInputDesign,
     state: UnknownInputState,
-    tick: Tick,
-    found: Found,
+    tick: TickRelations,
+    found: PairResults,
 ) -> Answer:
     """Decision, cause and one sentence; `estimators.decision` decides on meters as for every estimator."""
     now, live = design.setting, tick.inputs.live
@@ -382,7 +382,7 @@ def answer(
     pending = (state.contradicted.above > 0) & ~state.contradicted.named
     memory = np.exp(-(state.t - state.began) / plant.droop.tau.max(initial=_SHORT))
     base = decide(
-        Situation(
+        DecisionInputs(
             names=tuple(names),
             max_attacked=now.max_attacked,
             live=live,
@@ -428,7 +428,7 @@ _SHORT = 1e-3
 _NAMED = 4
 
 
-def _agreement(design: UnknownInputDesign, trial: Trial, owners: list[str]) -> str:
+def _agreement(design: UnknownInputDesign, trial: PairResult, owners: list[str]) -> str:
     """Sentence of CLEAN with the undetectable remainder: injections above twice their error are detected."""
     said = "All meters and inverters agree with the feeder"
     if not owners:
@@ -486,12 +486,12 @@ def design(
         raise NotObservable(range(p), p, why + " (yang2021, Assumption 3)", code="too-few-meters")
     if options is None:
         options = Options() if step_s <= 30.0 else Options(release=4)
-    made = setting(plant, max_attacked=max_attacked, options=options)
+    made = estimator_context(plant, max_attacked=max_attacked, options=options)
     own = plant.droop.customer
     gain = 2.0 * made.model.X[:, own]
     most = min(max_inverters, m)
     found, missing = pairs(gain[plant.meters], max_attacked, most)
-    doubt = Doubt(max_attacked, most, plant.droop.rating, frozen(gain[own]))
+    doubt = AttackAssumption(max_attacked, most, plant.droop.rating, frozen(gain[own]))
     return UnknownInputDesign(made, most, found, found.within(), missing, doubt, frozen(gain))
 
 
@@ -503,7 +503,7 @@ def init(design: UnknownInputDesign, t: float) -> UnknownInputState:
         t=t,
         began=t,
         tubes=None,
-        contradicted=Tally(none, none, np.zeros(c, dtype=np.bool_)),
+        contradicted=Counters(none, none, np.zeros(c, dtype=np.bool_)),
         x=np.zeros(plant.droop.tau.size),
         v0_squared=plant.droop.vbar**2,
         named=np.zeros(plant.meters.size, dtype=np.bool_),
@@ -541,7 +541,7 @@ def step(
     return _conclude(design, after, tick)
 
 
-def _contradicted(design: UnknownInputDesign, state: UnknownInputState, tick: Tick) -> Tally:
+def _contradicted(design: UnknownInputDesign, state: UnknownInputState, tick: TickRelations) -> Counters:
     """Test the pairs, as far as necessary, and count contradictions."""
     options, both, tally = design.setting.options, design.pairs, state.contradicted
     over = np.zeros(design.observers, dtype=np.bool_)
@@ -568,7 +568,7 @@ def _contradicted(design: UnknownInputDesign, state: UnknownInputState, tick: Ti
 
 
 def _conclude(
-    design: UnknownInputDesign, state: UnknownInputState, tick: Tick
+    design: UnknownInputDesign, state: UnknownInputState, tick: TickRelations
 ) -> tuple[UnknownInputState, Estimate, Verdict]:
     both, inputs = design.pairs, tick.inputs
     possible = ~state.contradicted.named
@@ -586,7 +586,7 @@ def _conclude(
     explanations = explain(design.pairs, trials, order) if len(order) > 1 else ()
     v2 = estimate.v2[design.setting.plant.meters]
     verdict = Verdict(
-        *answer(design, state, tick, Found(meters, inverters, threshold, trial, explanations)),
+        *answer(design, state, tick, PairResults(meters, inverters, threshold, trial, explanations)),
         meters,
         score,
         threshold,
@@ -603,7 +603,7 @@ def _conclude(
 
 
 def _estimate(
-    design: UnknownInputDesign, tick: Tick, trial: Trial, chosen: int | None, *, certain: bool
+    design: UnknownInputDesign, tick: TickRelations, trial: PairResult, chosen: int | None, *, certain: bool
 ) -> tuple[Floats, Estimate]:
     """Estimate of the chosen pair, with a bound that holds for every possible pair."""
     now, inputs, both = design.setting, tick.inputs, design.pairs
@@ -620,7 +620,7 @@ def _estimate(
         bound = gain @ (doubt.reach + np.abs(x))
     else:
         # Further undetected attacks are possible; the reconstructed one may then be due to them.
-        more = Doubt(
+        more = AttackAssumption(
             doubt.meters - (int(meters.sum()) if certain else 0),
             doubt.inverters - (int(accused.sum()) if certain else 0),
             doubt.reach,
@@ -641,7 +641,7 @@ def _estimate(
     return x, estimate
 
 
-def _scores(tick: Tick, meters: Bools, inverters: Bools, trial: Trial) -> tuple[Floats, Floats]:
+def _scores(tick: TickRelations, meters: Bools, inverters: Bools, trial: PairResult) -> tuple[Floats, Floats]:
     """Scores of meters against all others of the chosen pair; of suspected ones against the trusted ones."""
     score, threshold = trial.score.copy(), trial.threshold.copy()
     for j in np.flatnonzero(meters & tick.inputs.live).tolist():

@@ -3,8 +3,8 @@
 from gridsec.observers.high_gain.form import Partial, Polynomial, System, affine, defects, linear
 from gridsec.observers.high_gain.observer import (
     HighGainDesign,
+    HighGainEstimate,
     HighGainState,
-    Outcome,
     design,
     error_bounds,
     init,
@@ -14,9 +14,9 @@ from gridsec.observers.high_gain.redundancy import Inverse, given, groups, neare
 
 __all__ = [
     "HighGainDesign",
+    "HighGainEstimate",
     "HighGainState",
     "Inverse",
-    "Outcome",
     "Partial",
     "Polynomial",
     "System",

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from gridsec.arrays import Bools, Floats, frozen, not_negative
-from gridsec.errors import DesignInfeasible, NotObservable, Problem, no_choice, refuse
+from gridsec.errors import DesignInfeasible, NotObservable, Problem, no_choice, raise_if_any
 from gridsec.interface import Cause, Decision
 from gridsec.observers.high_gain.constants import (
     Decay,
@@ -46,7 +46,7 @@ Search = Literal["all", "one"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Outcome:
+class HighGainEstimate:
     """Result at one instant.
 
     Attributes
@@ -140,7 +140,7 @@ Field = Callable[[Floats, Floats], Floats]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Transition:
+class HighGainTransition:
     """One step of the linear parts, exact for forcing that is linear in time.
 
     Attributes
@@ -173,7 +173,7 @@ def gains(system: System, theta: Floats) -> Floats:
     return out
 
 
-def transition(system: System, K: Floats, h: float) -> Transition:
+def transition(system: System, K: Floats, h: float) -> HighGainTransition:
     """Matrices of one step of length h, s, for the gains K (p, n_max)."""
     p, n = K.shape
     M = np.zeros((p, n, n))
@@ -184,7 +184,7 @@ def transition(system: System, K: Floats, h: float) -> Transition:
     block[:, :n, n : 2 * n] = np.eye(n) * h
     block[:, n : 2 * n, 2 * n :] = np.eye(n)
     out = np.asarray(expm(block), dtype=np.float64)
-    return Transition(h, out[:, :n, :n], out[:, :n, n : 2 * n], out[:, :n, 2 * n :])
+    return HighGainTransition(h, out[:, :n, :n], out[:, :n, n : 2 * n], out[:, :n, 2 * n :])
 
 
 def field(system: System) -> Field:
@@ -252,7 +252,7 @@ def _looped(system: System) -> Field:
 def advance(
     right: Field,
     K: Floats,
-    move: Transition,
+    move: HighGainTransition,
     z: Floats,
     *,
     y: tuple[Floats, Floats],
@@ -353,7 +353,7 @@ class HighGainDesign:
     search: Search
     K: Floats
     field: Field
-    move: Transition
+    move: HighGainTransition
     substeps: int
 
 
@@ -453,7 +453,7 @@ def design(
             f"{p} sensors, {max_attacked} attacked: more than twice are needed",
             code="too-few-meters",
         )
-    refuse(_problems(lowest, search, decay))
+    raise_if_any(_problems(lowest, search, decay))
     thetas = np.broadcast_to(np.asarray(theta, dtype=np.float64), (p,))
     noises = np.broadcast_to(not_negative("noise", noise), (p,))
     decays = _constants(system, thetas, noises, decay)
@@ -592,7 +592,7 @@ def init(
 
 def step(  # noqa: PLR0917  # the border that all observer families share
     design: HighGainDesign, state: HighGainState, y: Floats, u: Floats, seen: Bools, h: float
-) -> tuple[HighGainState, Outcome]:
+) -> tuple[HighGainState, HighGainEstimate]:
     """Advance all observers to the next readings, and decide.
 
     Parameters
@@ -686,7 +686,7 @@ def _test(design: HighGainDesign, inverse: Inverse, z: Floats, delta: Floats) ->
 
 def _judge(  # noqa: PLR0917  # the whole state
     design: HighGainDesign, state: HighGainState, z: Floats, age: Floats, live: Bools, large: Bools, t: float
-) -> tuple[int, Outcome]:
+) -> tuple[int, HighGainEstimate]:
     delta = error_bounds(design, age)
     sigma, visited, trial, alarm = _search(design, state.sigma, z, delta, live, large)
     trusted = np.zeros(len(live), dtype=np.bool_)
@@ -713,7 +713,7 @@ def _judge(  # noqa: PLR0917  # the whole state
         search=design.search,
     )
     guessed = live & ~trusted if alarm and passed and not named.any() else named
-    return sigma, Outcome(
+    return sigma, HighGainEstimate(
         t=t,
         x=nothing if trial is None else trial.x,
         bound=float(bound),

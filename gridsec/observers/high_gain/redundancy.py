@@ -446,7 +446,7 @@ def correctable(codes: Floats, errors: int, *, tolerance: float = 0.0) -> bool:
 
 
 @dataclass(frozen=True, slots=True)
-class Redundancy:
+class SensorRedundancy:
     """Redundancy without k sensors, at the sampled points.
 
     Attributes
@@ -467,7 +467,7 @@ class Redundancy:
     injective: float
 
 
-def redundancy(system: System, missing: int, *, samples: int = 2000, seed: int = 0) -> Redundancy:
+def redundancy(system: System, missing: int, *, samples: int = 2000, seed: int = 0) -> SensorRedundancy:
     """Search for counterexamples of k-redundant observability by sampling.
 
     A value of zero disproves it. Positive values are evidence, and a proof with a bound of
@@ -509,7 +509,7 @@ def redundancy(system: System, missing: int, *, samples: int = 2000, seed: int =
             seed=seed,
         )
         injective = min(injective, quotient.upper)
-    return Redundancy(missing, best[1], best[0], injective)
+    return SensorRedundancy(missing, best[1], best[0], injective)
 
 
 def groups(sensors: int, attacked: int) -> list[tuple[int, ...]]:

@@ -26,13 +26,13 @@ from typing import Any
 import numpy as np
 
 from gridsec.arrays import Floats, Ints, frozen, frozen_ints
-from gridsec.errors import DesignInfeasible, InputInvalid, Problem, refuse
+from gridsec.errors import DesignInfeasible, InputInvalid, Problem, raise_if_any
 from gridsec.observers.gains import negativity
 from gridsec.observers.lmi.sampled import DiscreteLure, shift
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Uncertainty:
+class UncertaintyInputs:
     """Input matrices of the unknown delta (r,) besides the meters.
 
     `x+ = … + state @ delta`, `z = H x + F u + argument @ delta`, `y = … + output @ delta`.
@@ -63,13 +63,13 @@ class Uncertainty:
             )
 
 
-def nothing_unknown(system: DiscreteLure) -> Uncertainty:
+def nothing_unknown(system: DiscreteLure) -> UncertaintyInputs:
     """No uncertainty but that of the meters; r = 0."""
     sizes = (len(system.A), len(system.lower), len(system.C))
-    return Uncertainty(*(np.zeros((size, 0)) for size in sizes))
+    return UncertaintyInputs(*(np.zeros((size, 0)) for size in sizes))
 
 
-def input_error(system: DiscreteLure, load: Floats, held: Floats | None = None) -> Uncertainty:
+def input_error(system: DiscreteLure, load: Floats, held: Floats | None = None) -> UncertaintyInputs:
     """Uncertainty of an input known up to `load @ delta`, with arguments that move by `held` within a step.
 
     Parameters
@@ -87,7 +87,7 @@ def input_error(system: DiscreteLure, load: Floats, held: Floats | None = None) 
     if held is not None:
         extra = (np.zeros((len(system.A), held.size)), np.diag(held), np.zeros((len(system.C), held.size)))
         parts = [np.hstack(pair) for pair in zip(parts, extra, strict=True)]
-    return Uncertainty(*parts)
+    return UncertaintyInputs(*parts)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -131,7 +131,7 @@ class DiscreteGains:
     mu: float
     mu_delta: float
     noise: Floats
-    unknown: Uncertainty
+    unknown: UncertaintyInputs
     margin: float
     backoff: float
     status: str
@@ -339,7 +339,7 @@ class DiscreteOptions:
 
     decays: tuple[float, ...]
     noise: Floats
-    unknown: Uncertainty
+    unknown: UncertaintyInputs
     weight: Floats
 
     def __post_init__(self) -> None:
@@ -352,7 +352,7 @@ class DiscreteOptions:
             Problem("not-positive", "noise must be finite and positive, of shape (p,)"): noise,
             Problem("not-definite", "the weight must be positive definite"): negativity(-self.weight) > 0.0,
         }
-        refuse(text for text, holds in held.items() if not holds)
+        raise_if_any(text for text, holds in held.items() if not holds)
 
 
 def discrete_options(
@@ -360,7 +360,7 @@ def discrete_options(
     *,
     decays: Sequence[float] | float,
     noise: Floats | float,
-    unknown: Uncertainty | None = None,
+    unknown: UncertaintyInputs | None = None,
     weight: Floats | None = None,
 ) -> DiscreteOptions:
     """Options with short forms filled in for a plant.

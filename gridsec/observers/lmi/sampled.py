@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from scipy.linalg import expm
 
 from gridsec.arrays import Floats, exponential_integrals, spectral_radius
-from gridsec.errors import Problem, refuse
+from gridsec.errors import Problem, raise_if_any
 from gridsec.observers.lure import Lure, as_floats, freeze, input_matrices, without_lower
 from gridsec.observers.newton import Nonlinearity
 
@@ -69,7 +69,7 @@ class DiscreteLure:
             wrong.append(Problem("order", "a lower slope exceeds its upper slope"))
         if not (np.isfinite(self.h) and self.h > 0.0):
             wrong.append(Problem("not-positive", f"h is {self.h}; the time between steps must be positive"))
-        refuse(wrong)
+        raise_if_any(wrong)
 
     @classmethod
     def of(

@@ -27,7 +27,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from gridsec.arrays import Floats, frozen
-from gridsec.errors import DesignInfeasible, InputInvalid, Problem, no_choice, refuse
+from gridsec.errors import DesignInfeasible, InputInvalid, Problem, no_choice, raise_if_any
 from gridsec.observers.lmi.solver import cvxpy_late, solver_warnings_as_status
 
 Multiplier = Literal["diagonal", "scalar"]
@@ -85,7 +85,7 @@ class ErrorSystem:
             for name, shape in wanted.items()
             if getattr(self, name).shape != shape
         ]
-        refuse(wrong)
+        raise_if_any(wrong)
         if not np.all(self.N > 0.0):
             raise InputInvalid([Problem("not-positive", "every sensor must have a positive error scale N")])
         if np.any(self.half < 0.0):
@@ -200,7 +200,7 @@ class UnknownInputTemplate:
     """
 
     def __init__(self, states: int, sensors: int, bounds: int, multiplier: Multiplier) -> None:
-        refuse(no_choice("multiplier", get_args(Multiplier), multiplier))
+        raise_if_any(no_choice("multiplier", get_args(Multiplier), multiplier))
         cp = cvxpy_late()
         n, k, m = states, sensors, bounds
         self.shape = (n, k, m)

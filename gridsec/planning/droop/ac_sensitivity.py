@@ -36,9 +36,9 @@ from gridsec.grid.three_phase import ROTATION
 from gridsec.grid.trees import below, from_root
 
 __all__ = [
-    "Box",
     "Complex",
-    "Network",
+    "InjectionBox",
+    "PhasorNetwork",
     "Region",
     "Sensitivity",
     "currents",
@@ -64,7 +64,7 @@ _SLACK = 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Network:
+class PhasorNetwork:
     """Coefficients of `V = E v0 + Z conj(s / V)` at the customers, and at all places. N customers, n places.
 
     A place is a bus, or in three phases a phase of one. The busbar has k voltages, 1 or 3.
@@ -86,7 +86,7 @@ class Network:
     E_bus: Complex
 
 
-def network(feeder: AnyNetwork) -> Network:
+def network(feeder: AnyNetwork) -> PhasorNetwork:
     """Impedances of a feeder, `(I + j Z0 B)^-1 Z0` with series impedances Z0 and charging B.
 
     Raises
@@ -105,20 +105,20 @@ def network(feeder: AnyNetwork) -> Network:
     both = np.asarray(np.linalg.solve(loaded, unloaded), dtype=np.complex128)
     Z_bus, E_bus = both[:, :-1], both[:, -1]
     E = E_bus[feeder.bus]
-    return Network(Z_bus[feeder.bus], E, E[:, None], Z_bus, E_bus)
+    return PhasorNetwork(Z_bus[feeder.bus], E, E[:, None], Z_bus, E_bus)
 
 
-def _meshed(feeder: MeshedFeeder | PhasedMesh) -> Network:
+def _meshed(feeder: MeshedFeeder | PhasedMesh) -> PhasorNetwork:
     """Inverses of a meshed feeder, in three phases turned back by the angles of the busbar."""
     idle, Z_bus = feeder.idle.reshape(len(feeder.buses), -1), feeder.transfer
     if isinstance(feeder, PhasedMesh):
         back = np.conj(ROTATION)[np.arange(len(idle)) % 3][:, None]
         idle, Z_bus = back * idle * ROTATION, back * Z_bus * ROTATION[feeder.tree.phase]
     E_bus, own = idle.sum(axis=1), feeder.bus
-    return Network(Z_bus[own], E_bus[own], idle[own], Z_bus, E_bus)
+    return PhasorNetwork(Z_bus[own], E_bus[own], idle[own], Z_bus, E_bus)
 
 
-def _phased(feeder: PhasedFeeder) -> Network:
+def _phased(feeder: PhasedFeeder) -> PhasorNetwork:
     """Impedances by sweeps for each customer's current and each busbar voltage, iterated for the charging."""
     tree, count = feeder.tree, feeder.bus.size
     idle: Complex = np.zeros((count + 3, 3, len(tree.buses)), dtype=np.complex128)
@@ -142,10 +142,10 @@ def _phased(feeder: PhasedFeeder) -> Network:
     every = turned.transpose(2, 1, 0).reshape(len(feeder.buses), count + 3)
     Z_bus, each = every[:, :count], every[:, count:]
     E_bus, own = np.asarray(each.sum(axis=1)), feeder.bus
-    return Network(Z_bus[own], E_bus[own], each[own], Z_bus, E_bus)
+    return PhasorNetwork(Z_bus[own], E_bus[own], each[own], Z_bus, E_bus)
 
 
-def solve(net: Network, s: Complex, v0: Floats | float) -> Complex:
+def solve(net: PhasorNetwork, s: Complex, v0: Floats | float) -> Complex:
     """Voltages of the customers by AC power flow; NaN where the iteration does not converge.
 
     Parameters
@@ -177,7 +177,7 @@ def solve(net: Network, s: Complex, v0: Floats | float) -> Complex:
     return V
 
 
-def currents(feeder: AnyNetwork, net: Network, s: Complex, V: Complex, v0: Floats | float) -> Floats:
+def currents(feeder: AnyNetwork, net: PhasorNetwork, s: Complex, V: Complex, v0: Floats | float) -> Floats:
     """Largest current at either end of every conductor of every line, pu. L lines: branches, then ties.
 
     Parameters
@@ -284,7 +284,7 @@ class Sensitivity:
         return np.asarray(self.v[:, None] * self.q.real)
 
 
-def sensitivity(net: Network, s: Complex, V: Complex) -> Sensitivity:
+def sensitivity(net: PhasorNetwork, s: Complex, V: Complex) -> Sensitivity:
     """Linearise the AC power flow at a solution.
 
     `xi + M conj(xi) = Zr c` with `Zr_ij = Z_ij / (V_i conj(V_j))` and `M = Zr diag(conj(s))`, hence
@@ -319,7 +319,7 @@ def sensitivity(net: Network, s: Complex, V: Complex) -> Sensitivity:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Box:
+class InjectionBox:
     """Box of injections and busbar voltages, pu.
 
     Attributes
@@ -367,7 +367,7 @@ class Region:
     high: Floats
 
 
-def region(net: Network, box: Box) -> Region:
+def region(net: PhasorNetwork, box: InjectionBox) -> Region:
     """Bound voltages and sensitivities of the AC power flow over a box of injections.
 
     Raises
@@ -409,7 +409,7 @@ def region(net: Network, box: Box) -> Region:
     )
 
 
-def _split(box: Box) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats]]:
+def _split(box: InjectionBox) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats]]:
     """Middles and half-widths of p and q."""
     return (
         (0.5 * (box.p_low + box.p_high), 0.5 * (box.q_low + box.q_high)),
@@ -451,7 +451,9 @@ def _neumann(feedback: Floats) -> Floats:
     return np.asarray(np.maximum(inverse, 0.0))
 
 
-def _limits(net: Network, box: Box, middle: Floats, J: Floats, off: Floats) -> tuple[Floats, Floats]:
+def _limits(
+    net: PhasorNetwork, box: InjectionBox, middle: Floats, J: Floats, off: Floats
+) -> tuple[Floats, Floats]:
     """Better of two bounds: from the middle, and from the corner that is extreme without negative J."""
     swing = np.full(net.of_busbar.shape[1], box.v0_high - box.v0_low)
     width = np.concatenate([box.p_high - box.p_low, box.q_high - box.q_low, swing])

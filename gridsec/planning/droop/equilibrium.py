@@ -15,7 +15,7 @@ import numpy as np
 from gridsec.arrays import Floats
 from gridsec.errors import DesignInfeasible
 from gridsec.grid.droop import Droop, voltage_curve
-from gridsec.planning.droop.ac_sensitivity import Box, Complex, Network, sensitivity, solve
+from gridsec.planning.droop.ac_sensitivity import Complex, InjectionBox, PhasorNetwork, sensitivity, solve
 from gridsec.planning.droop.stability import Loop, reach, slopes
 
 __all__ = ["Band", "Share", "always", "at_rest", "injected", "rest", "shares", "shares_of_gain"]
@@ -44,7 +44,7 @@ def injected(droop: Droop, s: Complex, x: Floats) -> Complex:
     return np.asarray(s + 1j * (x @ owner))
 
 
-def rest(net: Network, droop: Droop, s: Complex, v0: Floats | float) -> tuple[Floats, Complex]:
+def rest(net: PhasorNetwork, droop: Droop, s: Complex, v0: Floats | float) -> tuple[Floats, Complex]:
     """Injections and voltages with every inverter on its curve; NaN where no equilibrium is found.
 
     Plain iteration for all operating points together, with damping from the no-load loop gain, and Newton's
@@ -83,7 +83,7 @@ def rest(net: Network, droop: Droop, s: Complex, v0: Floats | float) -> tuple[Fl
     return x, V
 
 
-def _newton(net: Network, droop: Droop, s: Complex, v0: float, tol: float) -> tuple[Floats, Complex]:
+def _newton(net: PhasorNetwork, droop: Droop, s: Complex, v0: float, tol: float) -> tuple[Floats, Complex]:
     """Solve one point by damped Newton steps with the slopes at the present voltages."""
     own = droop.customer
 
@@ -124,7 +124,7 @@ class Band:
     high: Floats
 
 
-def always(net: Network, droop: Droop, loads: Box) -> Band:
+def always(net: PhasorNetwork, droop: Droop, loads: InjectionBox) -> Band:
     """Limits at all times, for any motion of the loads in their box, from any reachable state.
 
     Parameters
@@ -141,7 +141,7 @@ def always(net: Network, droop: Droop, loads: Box) -> Band:
     return Band(found.low, found.high)
 
 
-def at_rest(net: Network, droop: Droop, loads: Box) -> Band:
+def at_rest(net: PhasorNetwork, droop: Droop, loads: InjectionBox) -> Band:
     """Limits while the fleet is at rest: loads in the box that move slowly against the time constants.
 
     The AC equilibria of the two corners, widened by the largest effect of closed-loop sensitivities of the

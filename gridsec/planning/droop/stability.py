@@ -24,7 +24,7 @@ from scipy.linalg import LinAlgError, solve_continuous_are, solve_discrete_are
 from gridsec.arrays import Floats, Ints, spectral_radius
 from gridsec.errors import InputInvalid, Problem
 from gridsec.grid.droop import Droop, voltage_curve
-from gridsec.planning.droop.ac_sensitivity import Box, Complex, Network, Region, region
+from gridsec.planning.droop.ac_sensitivity import Complex, InjectionBox, PhasorNetwork, Region, region
 
 __all__ = [
     "Loop",
@@ -121,7 +121,7 @@ class Reach:
     region: Region
 
 
-def reach(net: Network, droop: Droop, loads: Box, *, rounds: int = _REACH_ROUNDS) -> Reach:
+def reach(net: PhasorNetwork, droop: Droop, loads: InjectionBox, *, rounds: int = _REACH_ROUNDS) -> Reach:
     """Shrink the box of the inverters' injections: voltages bound set-points, and set-points voltages.
 
     Parameters
@@ -152,7 +152,7 @@ def reach(net: Network, droop: Droop, loads: Box, *, rounds: int = _REACH_ROUNDS
     return Reach(low, high, found)
 
 
-def _with(loads: Box, droop: Droop, low: Floats, high: Floats) -> Box:
+def _with(loads: InjectionBox, droop: Droop, low: Floats, high: Floats) -> InjectionBox:
     """The box with the inverters' reactive power added to that of the loads."""
     q_low, q_high = loads.q_low.copy(), loads.q_high.copy()
     np.add.at(q_low, droop.customer, low)

@@ -6,7 +6,7 @@ hypotheses), `partial_bounded` and `partial_gaussian` (decoders on top of partia
 """
 
 from gridsec.secure.decode import gaussian, noise, partial_bounded, partial_gaussian, search
-from gridsec.secure.decode.search import Decoded, Decoder, design, exact
+from gridsec.secure.decode.search import Decoder, DecodeResult, design, exact
 from gridsec.secure.decode.stacks import (
     Stack,
     annihilator,
@@ -20,7 +20,7 @@ from gridsec.secure.decode.stacks import (
 )
 
 __all__ = [
-    "Decoded",
+    "DecodeResult",
     "Decoder",
     "Stack",
     "annihilator",

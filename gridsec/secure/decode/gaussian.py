@@ -22,7 +22,7 @@ from scipy.linalg import solve_triangular
 from scipy.special import chdtr, chdtrc, chdtri, gammaln, xlogy
 
 from gridsec.arrays import Bools, Floats, Ints, frozen, frozen_ints
-from gridsec.errors import DesignInfeasible, InputInvalid, NotObservable, Problem, no_choice, refuse
+from gridsec.errors import DesignInfeasible, InputInvalid, NotObservable, Problem, no_choice, raise_if_any
 from gridsec.secure.decode.stacks import MOST_SUBSETS, Stack, subsets
 
 # Terms of the continued fraction; for arguments beyond the largest double's logarithm two would suffice.
@@ -354,7 +354,7 @@ def choose(hypotheses: Hypotheses, z: Floats, *, rule: Rule, freedom: Ints | Non
     ----------
     lee2018, Algorithm 2.3 and (2.2.21), with the degrees of freedom corrected.
     """
-    refuse(no_choice("rule", get_args(Rule), rule))
+    raise_if_any(no_choice("rule", get_args(Rule), rule))
     S, width, N = hypotheses.standardise.shape
     flat = np.asarray(z, dtype=np.float64) @ hypotheses.standardise.reshape(S * width, N).T
     g = np.square(flat).reshape(*flat.shape[:-1], S, width).sum(axis=-1)

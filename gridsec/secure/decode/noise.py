@@ -24,7 +24,7 @@ from scipy.special import chdtr
 
 from gridsec.arrays import Bools, Floats, Ints, not_negative
 from gridsec.errors import DesignInfeasible, InputInvalid, Problem
-from gridsec.secure.decode.search import Decoded, Decoder, bounded, cheapest
+from gridsec.secure.decode.search import Decoder, DecodeResult, bounded, cheapest
 from gridsec.secure.decode.stacks import MOST_SUBSETS, Stack, masked, require, residual, subsets
 
 
@@ -211,7 +211,9 @@ def detect(stack: Stack, z: Floats, *, v_max: Floats | float) -> Detected:
     return Detected(np.asarray(x), sizes, np.any(~(sizes <= limit), axis=-1))
 
 
-def correct(decoder: Decoder, constants: CorrectionConstants, z: Floats, *, v_max: Floats | float) -> Decoded:
+def correct(
+    decoder: Decoder, constants: CorrectionConstants, z: Floats, *, v_max: Floats | float
+) -> DecodeResult:
     """Decode with the limit `theta v_max`; the result is within `kappa_c v_max`.
 
     Parameters

@@ -68,7 +68,7 @@ class Decoder:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Decoded:
+class DecodeResult:
     """Result for a batch of measurements.
 
     Attributes
@@ -142,7 +142,7 @@ def design(
     return Decoder(stack, q, r, kept, frozen(inverses))
 
 
-def exact(decoder: Decoder, z: Floats, *, tol: float) -> Decoded:
+def exact(decoder: Decoder, z: Floats, *, tol: float) -> DecodeResult:
     """Noiseless l0 decoding: recovers x exactly from any error in at most q blocks.
 
     Parameters
@@ -162,7 +162,7 @@ def exact(decoder: Decoder, z: Floats, *, tol: float) -> Decoded:
     return _vote(decoder, z, x, limit)
 
 
-def bounded(decoder: Decoder, z: Floats, *, limit: Floats | float) -> Decoded:
+def bounded(decoder: Decoder, z: Floats, *, limit: Floats | float) -> DecodeResult:
     """l0 decoding with bounded noise: fewest blocks with a residual above a limit.
 
     Parameters
@@ -197,7 +197,7 @@ def _candidates(decoder: Decoder, z: Floats) -> Floats:
     return flat.reshape(*flat.shape[:-1], S, n)
 
 
-def _vote(decoder: Decoder, z: Floats, x: Floats, limit: Floats) -> Decoded:
+def _vote(decoder: Decoder, z: Floats, x: Floats, limit: Floats) -> DecodeResult:
     stack = decoder.stack
     sizes = stack.norms(np.asarray(z)[..., None, :] - x @ stack.matrix.T)
     # Negated comparison: a residual of NaN counts as unexplained.
@@ -207,7 +207,7 @@ def _vote(decoder: Decoder, z: Floats, x: Floats, limit: Floats) -> Decoded:
     best = np.argmin(np.where(count == count.min(axis=-1, keepdims=True), misfit, np.inf), axis=-1)
     pick = best[..., None, None]
     chosen = np.take_along_axis(unexplained, pick, axis=-2)[..., 0, :]
-    return Decoded(
+    return DecodeResult(
         np.take_along_axis(x, pick, axis=-2)[..., 0, :],
         chosen,
         np.count_nonzero(chosen, axis=-1) <= decoder.max_attacked,

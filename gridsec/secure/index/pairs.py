@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from scipy.linalg import lapack, schur
 
 from gridsec.arrays import Bools, Floats, Ints, frozen_ints, unit_rows
-from gridsec.errors import no_choice, refuse
+from gridsec.errors import no_choice, raise_if_any
 from gridsec.observers.lure import Lure
 from gridsec.secure.index.blocks import Matrix, fewest, kernel, row_space, span
 
@@ -375,7 +375,7 @@ def dynamic_index(A: Floats, C: Floats, *, tol: float, by: By = "eigenvectors") 
     ----------
     lee2018 (3.2.3), Proposition 3.2.2.
     """
-    refuse(no_choice("by", get_args(By), by))
+    raise_if_any(no_choice("by", get_args(By), by))
     if by == "rank":
         found = fewest(observable_rows(A, C, tol=tol), np.eye(A.shape[0]), tol=tol)
         return Index(found.count, frozen_ints(found.blocks), found.direction)
@@ -413,7 +413,7 @@ def asymptotic_index(A: Floats, C: Floats, *, discrete: bool, tol: float, by: By
     ----------
     lee2018 (3.2.5), Proposition 3.2.4.
     """
-    refuse(no_choice("by", get_args(By), by))
+    raise_if_any(no_choice("by", get_args(By), by))
     if by == "rank":
         # An invariant kernel is the sum of its stable and its unstable part: searching X_u suffices.
         space = unstable_subspace(A, discrete=discrete, tol=tol)
@@ -462,7 +462,7 @@ def redundant_observable(A: Floats, C: Floats, q: int, *, tol: float, by: By = "
     ----------
     lee2018, Definition 3.1.1, Propositions 3.1.1 (iii) and 3.1.2 (ii).
     """
-    refuse(no_choice("by", get_args(By), by))
+    raise_if_any(no_choice("by", get_args(By), by))
     if by == "eigenvectors":
         return _over([e.vectors for e in eigenspaces(A, tol=tol)], C, tol, below=q + 1).count > q
     rows = observable_rows(A, C, tol=tol)
@@ -490,7 +490,7 @@ def redundant_detectable(
     ----------
     lee2018, Definition 3.1.3, Propositions 3.1.8 (ii) and 3.1.9 (ii).
     """
-    refuse(no_choice("by", get_args(By), by))
+    raise_if_any(no_choice("by", get_args(By), by))
     if by == "eigenvectors":
         spaces = [e.vectors for e in eigenspaces(A, tol=tol) if e.unstable(discrete=discrete, tol=tol)]
         return _over(spaces, C, tol, below=q + 1).count > q

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from feeders.convert.convert import Conversion, convert
-from feeders.convert.provenance import CHANGES_FILE, Change
+from feeders.convert.provenance import CHANGES_FILE, ConversionChange
 
 pytest.importorskip("opendssdirect", reason="the extra `convert` is not installed")
 
@@ -60,7 +60,7 @@ def converted(
     return convert(str(path), folder / "out", root=root)
 
 
-def angles(done: Conversion) -> list[Change]:
+def angles(done: Conversion) -> list[ConversionChange]:
     return [change for change in done.changes if change.prop == "angles between its phases"]
 
 
@@ -70,7 +70,9 @@ def test_phases_that_follow_each_other_the_other_way_round_are_told_and_checked_
 ) -> None:
     done = converted(tmp_path, TOWN, **ways)
     effect = "0, -120 and 120 degrees, in the source 0, 120 and -119.9; the check shows the effect"
-    assert angles(done) == [Change("bus board", "angles between its phases", "approximated", effect)]
+    assert angles(done) == [
+        ConversionChange("bus board", "angles between its phases", "approximated", effect)
+    ]
     assert effect in (tmp_path / "out" / CHANGES_FILE).read_text()
     assert done.check is not None
     # Mutual impedances act with the other sign of sin 120 degrees: percents of a drop of some percent.

@@ -13,7 +13,7 @@ from feeders.convert.convert import check_against_source, convert
 from feeders.convert.round_trip import BALANCED_PU, UNBALANCED_PU
 from feeders.format.tables import FeederTables, read
 from feeders.model.site import from_tables
-from feeders.studies.unobservable import Curves, knowledge
+from feeders.studies.unobservable import CurvePositions, knowledge
 from gridsec.errors import FeederInvalid
 from tests.codes import refused
 from tests.feeders.convert.test_from_power_grid_model import line, load, transformer, written
@@ -60,7 +60,9 @@ def test_a_station_with_everything(tap: int, tmp_path: Path) -> None:
     idle = [row for row in tables.customers if row.customer.endswith("no-load")]
     assert len(idle) == 2
     assert not any(row.meter for row in idle)
-    known = knowledge(from_tables(tables), unknown=None, silent=(), busbar_known=True, curves=Curves.DEADBAND)
+    known = knowledge(
+        from_tables(tables), unknown=None, silent=(), busbar_known=True, curves=CurvePositions.DEADBAND
+    )
     assert known.unknown == ()
     assert all(row.meter for row in tables.customers if row not in idle)
     iron = 1.3 * (net.res_bus.vm_pu[1] * 20.0 / 20.8) ** 2 if net.converged else 1.3

@@ -15,10 +15,10 @@ from feeders.convert.round_trip import BALANCED_PU
 from feeders.format.tables import read
 from feeders.model.site import load
 from feeders.registry.registry import design
-from feeders.simulation.attacks import Lie, Trick
+from feeders.simulation.attacks import AttackKind, AttackSpec
 from feeders.simulation.powerflow import PowerFlow
 from feeders.simulation.powerflow_three_phase import power_flow
-from feeders.simulation.trial import LoadError, Meters, Trial, judge
+from feeders.simulation.trial import LoadError, Trial, TrialMeterErrors, judge
 from gridsec.errors import FeederInvalid
 from gridsec.grid.meshed import MeshedFeeder, PhasedMesh
 from tests.codes import refused
@@ -99,8 +99,10 @@ new line.two bus1=645.3.2 bus2=671.3.2 linecode=603 length=1200 units=ft
 """
 
 
-@pytest.mark.parametrize("lie", [None, Lie(Trick.BIAS, 5, 3.0, onset_s=10.0)], ids=["nobody", "five"])
-def test_the_ieee_13_node_feeder_with_three_loops(lie: Lie | None, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "lie", [None, AttackSpec(AttackKind.BIAS, 5, 3.0, onset_s=10.0)], ids=["nobody", "five"]
+)
+def test_the_ieee_13_node_feeder_with_three_loops(lie: AttackSpec | None, tmp_path: Path) -> None:
     """Ties of three phases, of two and of one, behind a regulator that differs in its phases."""
     pytest.importorskip("opendssdirect", reason="the extra `convert` is not installed")
     before, loads = thirteen().split("new load", 1)
@@ -122,7 +124,7 @@ def test_the_ieee_13_node_feeder_with_three_loops(lie: Lie | None, tmp_path: Pat
     off = np.abs(site.feeder.bus_voltages(p, 0.4 * p, v0) - exact)[site.feeder.bus]
     assert (off <= site.feeder.model_error_bound(p, 0.4 * p, v0) + 1e-9).all()
     assert off.max() < 3e-3
-    trial = Trial(site, 2, 22.0, load_error=LoadError(20.0, 7.0), meters=Meters.WHITE, lie=lie)
+    trial = Trial(site, 2, 22.0, load_error=LoadError(20.0, 7.0), meters=TrialMeterErrors.WHITE, lie=lie)
     found = judge(design(trial.stated), trial, settling_s=3.0)
     assert found.liars.size == (5 if lie else 0)
     assert (found.delay_s <= 3.0).all()

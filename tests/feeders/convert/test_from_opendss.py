@@ -15,9 +15,9 @@ from feeders.convert.round_trip import BALANCED_PU, UNBALANCED_PU
 from feeders.format.tables import examine, read, write
 from feeders.model.site import from_tables, load
 from feeders.registry.registry import design
-from feeders.simulation.attacks import Lie, Trick
+from feeders.simulation.attacks import AttackKind, AttackSpec
 from feeders.simulation.trial import LoadError, Trial, judge
-from feeders.simulation.trial import Meters as Quality
+from feeders.simulation.trial import TrialMeterErrors as Quality
 from gridsec.errors import FeederInvalid, GridsecError
 from tests.codes import refused
 from tests.feeders.foreign import opendss
@@ -266,8 +266,10 @@ def test_the_ieee_13_node_feeder(root: str | None, tmp_path: Path) -> None:
     assert (tapped.min() > 1.02) == (root == "650")
 
 
-@pytest.mark.parametrize("lie", [None, Lie(Trick.BIAS, 5, 3.0, onset_s=10.0)], ids=["nobody", "five"])
-def test_the_ieee_13_node_feeder_is_watched(lie: Lie | None, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "lie", [None, AttackSpec(AttackKind.BIAS, 5, 3.0, onset_s=10.0)], ids=["nobody", "five"]
+)
+def test_the_ieee_13_node_feeder_is_watched(lie: AttackSpec | None, tmp_path: Path) -> None:
     """Five of sixteen meters lie, before and behind three different taps; nobody else is named."""
     (tmp_path / "thirteen.dss").write_text(thirteen())
     convert(str(tmp_path / "thirteen.dss"), tmp_path / "x", root="650")

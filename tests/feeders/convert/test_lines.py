@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from feeders.convert.lines import merged
-from feeders.convert.provenance import Change
+from feeders.convert.provenance import ConversionChange
 from feeders.format.tables import LineRow
 from feeders.model.three_phase import series_of
 
@@ -24,8 +24,8 @@ BC: dict[str, Any] = {name: value for name, value in POLE.items() if "a" not in 
 LINE = LineRow("one", "s", "t", 0.08, 0.07, rating_a=200.0, **POLE)
 
 
-def joined(*rows: LineRow) -> tuple[LineRow, list[Change]]:
-    changes: list[Change] = []
+def joined(*rows: LineRow) -> tuple[LineRow, list[ConversionChange]]:
+    changes: list[ConversionChange] = []
     (row,) = merged(rows, "s", changes, {"s": 230.0, "t": 230.0})
     return row, [each for each in changes if each.prop == "rating"]
 

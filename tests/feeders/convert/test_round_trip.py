@@ -15,7 +15,7 @@ from feeders.convert.convert import check_against_source, convert
 from feeders.convert.from_pandapower import from_pandapower
 from feeders.convert.from_power_grid_model import read_pgm
 from feeders.convert.network import feeder_of
-from feeders.convert.provenance import Change, changes_csv, sentences
+from feeders.convert.provenance import ConversionChange, changes_csv, sentences
 from feeders.convert.round_trip import BALANCED_PU, UNBALANCED_PU, SourceCheck, compare
 from feeders.convert.transformers import Extent
 from feeders.format.tables import read, write
@@ -313,7 +313,7 @@ def test_sentences_of_a_check_and_of_changes() -> None:
     worse = replace(check, largest_pu=2.5e-4, three_phase=True, as_found_pu=1e-3)
     assert not worse.exact
     assert "less than 1e-03 pu (bus b)" in worse.sentence
-    same = [Change(f"load {k}", "model 2", "approximated", "constant power") for k in range(11)]
+    same = [ConversionChange(f"load {k}", "model 2", "approximated", "constant power") for k in range(11)]
     assert sentences(same) == (
         "approximated: model 2 of "
         + ", ".join(f"load {k}" for k in range(8))

@@ -16,7 +16,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from feeders.format.columns import CUSTOMER_COLUMNS, LINE_COLUMNS, META_COLUMNS, REQUIRED, SUSPICIONS, Kind
+from feeders.format.columns import (
+    CUSTOMER_COLUMNS,
+    LINE_COLUMNS,
+    META_COLUMNS,
+    REQUIRED,
+    SUSPICIONS,
+    CellType,
+)
 from feeders.format.tables import (
     CustomerRow,
     FeederMeta,
@@ -277,8 +284,8 @@ def test_accepted_doubts_become_notes(tmp_path: Path) -> None:
     assert read(tmp_path) == accepted
 
 
-GARBAGE: dict[Kind, tuple[Any, ...]] = {
-    Kind.NUMBER: (
+GARBAGE: dict[CellType, tuple[Any, ...]] = {
+    CellType.NUMBER: (
         "nan",
         "inf",
         "-1e400",
@@ -293,13 +300,13 @@ GARBAGE: dict[Kind, tuple[Any, ...]] = {
         10**400,
         "٣,٥",
     ),
-    Kind.WHOLE: ("1.5", 2.5, "x", False, math.nan),
-    Kind.TRUTH: ("yes", 2, 1.0, "TRUEE", []),
-    Kind.TEXT: (1, 2.5, True, [], "\x00", "x" * 201),
-    Kind.ID: (7, "a\nb", "\ud800", "\u200b", "x" * 129, ["1"]),
-    Kind.NAME: ("a b", "ä", "x" * 65, 5, "a/b", "*", "a\n"),
-    Kind.PAIR: (1, [1], [1, "x"], "1,2", [1, math.nan]),
-    Kind.NAMES: ("voltage", [1], ["nonsense"]),
+    CellType.WHOLE: ("1.5", 2.5, "x", False, math.nan),
+    CellType.TRUTH: ("yes", 2, 1.0, "TRUEE", []),
+    CellType.TEXT: (1, 2.5, True, [], "\x00", "x" * 201),
+    CellType.ID: (7, "a\nb", "\ud800", "\u200b", "x" * 129, ["1"]),
+    CellType.NAME: ("a b", "ä", "x" * 65, 5, "a/b", "*", "a\n"),
+    CellType.PAIR: (1, [1], [1, "x"], "1,2", [1, math.nan]),
+    CellType.NAMES: ("voltage", [1], ["nonsense"]),
 }
 
 

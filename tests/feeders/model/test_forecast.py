@@ -16,7 +16,7 @@ from feeders.model.forecast import season_of
 from feeders.model.load_uncertainty import forecast_errors, from_history, load_doubt, tell, unread
 from feeders.model.profiles import Season, library
 from feeders.model.site import Site, Snapshot, from_tables, load, to_frame
-from feeders.registry.registry import SEQUENTIAL, Watcher, choose, design
+from feeders.registry.registry import SEQUENTIAL, DesignedEstimator, choose, design
 from feeders.simulation.scenario import START, Scenario, simulate, snapshots
 from feeders.simulation.trial import Trial, frames
 from feeders.studies.campaign.guarantees import Rehearsal, rehearse
@@ -195,7 +195,7 @@ def test_files_say_so_only_where_they_do(tmp_path: Path) -> None:
 # -------------------------------------------------------------------------------------- by AC power flow
 
 
-def watched(watcher: Watcher, site: Site, scenario: Scenario) -> tuple[Floats, Floats, bool]:
+def watched(watcher: DesignedEstimator, site: Site, scenario: Scenario) -> tuple[Floats, Floats, bool]:
     """Errors of the voltages where nobody meters, pu; over their standard deviations; and who is named."""
     state, some, named = watcher.init(scenario.start), unmetered(site), False
     samples, off, ratio = list(simulate(site, scenario)), list[Floats](), list[Floats]()

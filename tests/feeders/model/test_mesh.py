@@ -15,10 +15,10 @@ from benchmarks.mesh import baran_wu, closed, landnetz, rural3
 from feeders.format.tables import LineRow, examine, read, validate, write
 from feeders.model.site import Site, from_tables, load
 from feeders.registry.registry import choose, design
-from feeders.simulation.attacks import Lie, Trick
+from feeders.simulation.attacks import AttackKind, AttackSpec
 from feeders.simulation.powerflow import PowerFlow
 from feeders.simulation.powerflow_three_phase import power_flow
-from feeders.simulation.trial import LoadError, Meters, Outcome, Trial, judge
+from feeders.simulation.trial import LoadError, Trial, TrialMeterErrors, TrialResult, judge
 from feeders.studies.detectable import detectable
 from feeders.studies.redundancy import redundancy
 from gridsec.errors import FeederInvalid
@@ -144,7 +144,9 @@ def test_a_tie_that_the_model_does_not_know_makes_honest_meters_look_wrong() -> 
 # --- watching -----------------------------------------------------------------------------------
 
 
-def outcome(site: Site, lie: Lie | None, seconds: float, meters: Meters = Meters.WHITE) -> Outcome:
+def outcome(
+    site: Site, lie: AttackSpec | None, seconds: float, meters: TrialMeterErrors = TrialMeterErrors.WHITE
+) -> TrialResult:
     kw = 2.0 if site.feeder.name == "case33bw" else 0.3
     trial = Trial(site, 2, 10.0 + seconds, load_error=LoadError(kw, kw / 3.0), meters=meters, lie=lie)
     return judge(design(trial.stated), trial, settling_s=3.0)
@@ -153,18 +155,18 @@ def outcome(site: Site, lie: Lie | None, seconds: float, meters: Meters = Meters
 @pytest.mark.parametrize(
     ("make", "trick", "percent"),
     [
-        (landnetz, Trick.BIAS, 3.0),
-        (landnetz, Trick.TOGETHER, -2.0),
-        (rural3, Trick.TOGETHER, -2.0),
-        (baran_wu, Trick.BIAS, 3.0),
-        (baran_wu, Trick.TOGETHER, -2.0),
+        (landnetz, AttackKind.BIAS, 3.0),
+        (landnetz, AttackKind.TOGETHER, -2.0),
+        (rural3, AttackKind.TOGETHER, -2.0),
+        (baran_wu, AttackKind.BIAS, 3.0),
+        (baran_wu, AttackKind.TOGETHER, -2.0),
     ],
 )
 def test_a_third_of_the_meters_lies_and_nobody_else_is_named(
-    make: Callable[[], Site], trick: Trick, percent: float
+    make: Callable[[], Site], trick: AttackKind, percent: float
 ) -> None:
     site = make()
-    found = outcome(site, Lie(trick, site.meters.size // 3, percent, onset_s=10.0), 6.0)
+    found = outcome(site, AttackSpec(trick, site.meters.size // 3, percent, onset_s=10.0), 6.0)
     assert found.liars.size == site.meters.size // 3
     assert found.delay_s.max() <= 3.0
     assert not found.accused.any()
@@ -174,9 +176,14 @@ def test_a_third_of_the_meters_lies_and_nobody_else_is_named(
 
 @pytest.mark.parametrize(
     ("make", "meters"),
-    [(landnetz, Meters.WHITE), (landnetz, Meters.REAL), (rural3, Meters.REAL), (baran_wu, Meters.REAL)],
+    [
+        (landnetz, TrialMeterErrors.WHITE),
+        (landnetz, TrialMeterErrors.REAL),
+        (rural3, TrialMeterErrors.REAL),
+        (baran_wu, TrialMeterErrors.REAL),
+    ],
 )
-def test_clean_is_clean(make: Callable[[], Site], meters: Meters) -> None:
+def test_clean_is_clean(make: Callable[[], Site], meters: TrialMeterErrors) -> None:
     found = outcome(make(), None, 15.0, meters)
     assert not found.accused.any()
     assert not found.accused_inverters.any()
@@ -193,7 +200,7 @@ def test_two_lines_in_parallel_are_watched_and_studied_as_one_of_half_the_impeda
     meshed = replace(radial, lines=(*radial.lines, *again), meta=replace(radial.meta, meshed=True))
     twice, once = from_tables(meshed), from_tables(replace(radial, lines=half))
     assert len(twice.ties) == 5
-    lie = Lie(Trick.BIAS, 2, 1.5, onset_s=10.0)
+    lie = AttackSpec(AttackKind.BIAS, 2, 1.5, onset_s=10.0)
     runs = [outcome(site, lie, 20.0) for site in (twice, once)]
     np.testing.assert_array_equal(runs[0].delay_s, runs[1].delay_s)
     np.testing.assert_allclose(runs[0].error_all, runs[1].error_all, rtol=0, atol=1e-3)

@@ -16,9 +16,9 @@ from feeders.format.tables import FeederTables, LineRow, examine, read, validate
 from feeders.model.site import Site, from_tables, load
 from feeders.model.three_phase import three_phase
 from feeders.registry.registry import choose, design
-from feeders.simulation.attacks import Lie, Trick
+from feeders.simulation.attacks import AttackKind, AttackSpec
 from feeders.simulation.powerflow_three_phase import PlacesFlow, power_flow
-from feeders.simulation.trial import LoadError, Meters, Outcome, Trial, judge
+from feeders.simulation.trial import LoadError, Trial, TrialMeterErrors, TrialResult, judge
 from feeders.studies.calibrate.feeder import network
 from feeders.studies.detectable import detectable
 from feeders.studies.protect import protect
@@ -269,7 +269,9 @@ def test_a_tie_of_one_phase_asks_for_the_taps_of_that_phase_alone() -> None:
 # --- watching -----------------------------------------------------------------------------------
 
 
-def outcome(site: Site, lie: Lie | None, seconds: float, meters: Meters = Meters.WHITE) -> Outcome:
+def outcome(
+    site: Site, lie: AttackSpec | None, seconds: float, meters: TrialMeterErrors = TrialMeterErrors.WHITE
+) -> TrialResult:
     kw = 0.6 if site is european() else 0.1
     trial = Trial(site, 2, 10.0 + seconds, load_error=LoadError(kw, kw / 3.0), meters=meters, lie=lie)
     return judge(design(trial.stated), trial, settling_s=3.0)
@@ -279,15 +281,15 @@ def outcome(site: Site, lie: Lie | None, seconds: float, meters: Meters = Meters
 @pytest.mark.parametrize(
     ("make", "count", "trick", "percent"),
     [
-        (european, 6, Trick.BIAS, 3.0),
-        (european, 6, Trick.TOGETHER, -2.0),
-        (ring, 3, Trick.BIAS, 3.0),
+        (european, 6, AttackKind.BIAS, 3.0),
+        (european, 6, AttackKind.TOGETHER, -2.0),
+        (ring, 3, AttackKind.BIAS, 3.0),
     ],
 )
 def test_liars_are_named_and_nobody_else(
-    make: Callable[[], Site], count: int, trick: Trick, percent: float
+    make: Callable[[], Site], count: int, trick: AttackKind, percent: float
 ) -> None:
-    found = outcome(make(), Lie(trick, count, percent, onset_s=10.0), 6.0)
+    found = outcome(make(), AttackSpec(trick, count, percent, onset_s=10.0), 6.0)
     assert found.liars.size == count
     assert found.delay_s.max() <= 3.0
     assert not found.accused.any()
@@ -296,8 +298,8 @@ def test_liars_are_named_and_nobody_else(
 
 
 @pytest.mark.canary("real")
-@pytest.mark.parametrize("meters", [Meters.WHITE, Meters.REAL])
-def test_clean_is_clean(meters: Meters) -> None:
+@pytest.mark.parametrize("meters", [TrialMeterErrors.WHITE, TrialMeterErrors.REAL])
+def test_clean_is_clean(meters: TrialMeterErrors) -> None:
     found = outcome(european(), None, 10.0, meters)
     assert not found.accused.any()
     assert not found.accused_inverters.any()

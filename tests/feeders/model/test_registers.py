@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from feeders.model.site import Site, Snapshot, load, to_frame
-from feeders.registry.registry import Watcher, design
+from feeders.registry.registry import DesignedEstimator, design
 from feeders.simulation.scenario import START, Scenario, simulate, snapshots
 from gridsec.arrays import Floats
 from gridsec.interface import Frame, PowerOrigin
@@ -21,7 +21,7 @@ SIZES = (0.4, 0.6, 0.9, 0.99)
 
 
 @cache
-def watched(name: str) -> tuple[Site, Watcher, tuple[Snapshot, ...]]:
+def watched(name: str) -> tuple[Site, DesignedEstimator, tuple[Snapshot, ...]]:
     site = load(name)
     samples = simulate(site, Scenario(seed=1, duration_s=LIE_S + 15.0, dt_s=1.0))
     return site, design(site), tuple(snapshots(samples))

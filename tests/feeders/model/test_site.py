@@ -16,7 +16,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from feeders.format.columns import CUSTOMER_COLUMNS, LINE_COLUMNS, META_COLUMNS, SUSPICIONS, Kind
+from feeders.format.columns import CUSTOMER_COLUMNS, LINE_COLUMNS, META_COLUMNS, SUSPICIONS, CellType
 from feeders.format.tables import CustomerRow, FeederTables, from_json, read, to_json, write
 from feeders.model.site import Site, Snapshot, from_tables, load, names, plant, to_frame, volts
 from gridsec.errors import FeederInvalid
@@ -121,7 +121,7 @@ EXTREMES = [
     (table, column, value)
     for table, columns in [("lines", LINE_COLUMNS), ("customers", CUSTOMER_COLUMNS), *META_COLUMNS.items()]
     for column in columns
-    if column.kind is Kind.NUMBER
+    if column.kind is CellType.NUMBER
     for value in (column.low, column.high, column.above and column.above + 1e-300, 1e-300, 1e300)
     if value is not None
 ]

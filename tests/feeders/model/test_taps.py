@@ -13,7 +13,7 @@ from feeders.format.tables import FeederTables, LineRow, from_json, to_json, val
 from feeders.model.site import Site, Snapshot, from_tables, load, to_frame, volts
 from feeders.model.three_phase import three_phase
 from feeders.simulation.attacks import fake_load
-from feeders.simulation.meters import Channel, MeterErrors, Meters
+from feeders.simulation.meters import Channel, MeterErrors, SimulatedMeters
 from feeders.simulation.plant import ClosedLoop, Loads
 from feeders.simulation.powerflow import Grid, PowerFlow
 from feeders.simulation.powerflow_three_phase import PlacesFlow, UnbalancedPowerFlow, power_flow
@@ -145,7 +145,7 @@ def test_readings_are_per_unit_of_their_own_base(site: Site) -> None:
     np.testing.assert_allclose(accuracy.jitter * base, 0.0005 * 230.0, rtol=1e-14)
     np.testing.assert_array_equal(accuracy.class_fraction, 0.005)
     errors = MeterErrors(bias=0.0, power=0.0)
-    meters, rows = Meters(site, errors, Channel(), 1), len(site.tables.customers)
+    meters, rows = SimulatedMeters(site, errors, Channel(), 1), len(site.tables.customers)
     true = np.full((4000, rows), 231.04)
     registers = meters.read(
         np.arange(4000), true, 0.0 * true, 0.0 * true, np.full((4000, *np.shape(v0)), 231.0)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from feeders.model.site import load, to_frame
-from feeders.registry.registry import FAMILIES, Watcher, choose, design
+from feeders.registry.registry import FAMILIES, DesignedEstimator, choose, design
 from feeders.simulation.scenario import START, Scenario, simulate, snapshots
 from gridsec.interface import Decision, Frame
 
@@ -23,7 +23,7 @@ BEFORE, BAD, WHO = 20, 6, 2
 
 
 @cache
-def watcher(name: str) -> Watcher:
+def watcher(name: str) -> DesignedEstimator:
     return design(choose(load("simbench-lv-rural1"), max_attacked=1, estimator=name))
 
 

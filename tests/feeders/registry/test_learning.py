@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from feeders.model.site import from_tables, load
-from feeders.registry.registry import SEQUENTIAL, Watcher, choose, design
+from feeders.registry.registry import SEQUENTIAL, DesignedEstimator, choose, design
 from gridsec.estimators.sequential.commission import begin, conclude, nothing, ripe
 
 
@@ -21,8 +21,8 @@ def test_a_day_of_readings_leaves_what_the_operator_is_told(
 ) -> None:
     site = choose(load(name), estimator=SEQUENTIAL)
     made = design(site)
-    assert made.learner is not None
-    begun = made.learner.commission(made.init(0.0)).learning
+    assert made.bias_learning is not None
+    begun = made.bias_learning.commission(made.init(0.0)).learning
     assert begun is not None
     day, every = 86_400.0, np.ones(len(site.meter_ids), dtype=bool)
     gathered = replace(begun, count=86_400 * every.astype(np.intp), time_s=day * every)
@@ -54,6 +54,6 @@ def test_families_that_learn_nothing_say_so() -> None:
     assert meta.monitor.estimator == SEQUENTIAL
     for other in ("exact-bank", "weighted-least-squares", "set-search"):
         made = design(choose(site, estimator=other))
-        assert isinstance(made, Watcher)
-        assert made.learner is None
+        assert isinstance(made, DesignedEstimator)
+        assert made.bias_learning is None
         assert made.init(0.0) is not None

@@ -11,9 +11,9 @@ import pytest
 
 from benchmarks._stealthy import linear_tests, misfit_limit, within_misfit
 from feeders.model.site import Site, Snapshot, from_tables, load, to_frame
-from feeders.registry.registry import Watcher, design
+from feeders.registry.registry import DesignedEstimator, design
 from feeders.simulation.demand import Variation
-from feeders.simulation.scenario import START, Sample, Scenario, simulate, snapshots
+from feeders.simulation.scenario import START, Scenario, SimulatedTick, simulate, snapshots
 from gridsec.arrays import Bools, Floats
 from gridsec.estimators.sequential import SequentialDesign, SequentialState
 from gridsec.interface import Cause, Decision, Estimate, PowerOrigin, Verdict
@@ -33,12 +33,12 @@ def site() -> Site:
 
 
 @cache
-def watcher() -> Watcher:
+def watcher() -> DesignedEstimator:
     return design(site())
 
 
 @cache
-def played(seed: int, duration_s: float = 150.0) -> tuple[tuple[Sample, Snapshot], ...]:
+def played(seed: int, duration_s: float = 150.0) -> tuple[tuple[SimulatedTick, Snapshot], ...]:
     """Honest readings and the truth, at a moment of the summer drawn from the seed."""
     profile_s = float(np.random.default_rng([seed, 146]).uniform(0.0, 13.0 * 86_400.0))
     variation = Variation(tap_step_pu=0.0)
@@ -88,7 +88,7 @@ def watch(
     *,
     lying: bool,
     how: Callable[[Snapshot, Bools], Snapshot] = omitted,
-) -> Iterator[tuple[Sample, Estimate, Verdict]]:
+) -> Iterator[tuple[SimulatedTick, Estimate, Verdict]]:
     """Answers from the first withheld power on; the lie is the largest within the monitor's own limits."""
     model, at = design_of(), site().customer_volt[site().meters]
     state, lie = watcher().init(START), np.zeros(withhold.size)
@@ -106,7 +106,7 @@ def watch(
             yield sample, estimate, verdict
 
 
-def error(sample: Sample, estimate: Estimate) -> Floats:
+def error(sample: SimulatedTick, estimate: Estimate) -> Floats:
     """Error of every customer's squared voltage, pu."""
     return np.asarray(np.abs(estimate.v2 - (sample.v_volt / site().customer_volt) ** 2))
 

@@ -14,15 +14,17 @@ from feeders.format.columns import ESTIMATORS, OWN_ESTIMATORS
 from feeders.model.site import Site, load
 from feeders.registry import plugins, registry
 from feeders.registry.plugins import EstimatorUnusable
-from feeders.registry.registry import Families, Family, Job
+from feeders.registry.registry import DesignOptions, Estimator, Families
 from gridsec.errors import DesignInfeasible, FeederInvalid, NotObservable
 from tests.codes import refused
 
 GOOD = """
-from feeders.registry.registry import Family
+from feeders.registry.registry import Estimator
 
 print("loaded")
-FAMILY = Family("mine", "what", lambda s, j: s, lambda d, t: t, lambda d, s, f: s, lambda d: 1, lambda d: "")
+FAMILY = Estimator(
+    "mine", "what", lambda s, j: s, lambda d, t: t, lambda d, s, f: s, lambda d: 1, lambda d: ""
+)
 OTHER = "no family"
 """
 
@@ -77,15 +79,15 @@ def test_what_cannot_be_used_is_refused_by_name(place: Path) -> None:
         ("nobody", "0 packages offer it"),
     ):
         with refused(EstimatorUnusable, "estimator-unusable") as caught:
-            plugins.load(name, Family)
+            plugins.load(name, Estimator)
         assert why in str(caught.value)
 
 
 def test_what_a_design_says_on_purpose_is_passed_on_and_all_else_is_one_line() -> None:
-    site, job = load("cigre-lv"), Job()
+    site, job = load("cigre-lv"), DesignOptions()
 
-    def failing(error: Exception) -> Callable[[Site, Job], None]:
-        def design(_: Site, __: Job) -> None:
+    def failing(error: Exception) -> Callable[[Site, DesignOptions], None]:
+        def design(_: Site, __: DesignOptions) -> None:
             raise error
 
         return design
@@ -109,10 +111,10 @@ def test_a_broken_one_leaves_the_others_alone(place: Path) -> None:
     install(place, "pkg_g", GOOD.replace("lambda s, j: s", "lambda s, j: s.nothing"), "mine = pkg_g:FAMILY")
     code = (
         "from service.cli.main import main\n"
-        "from feeders.studies.comparison import Plan, compare\n"
+        "from feeders.studies.comparison import ComparisonPlan, compare\n"
         "from feeders.model.site import load\n"
         "who = ('broken', 'mine', 'l0-decoder')\n"
-        "plan = Plan(max_attacked=1, seeds=1, duration_s=70, cases=('bias',), families=who)\n"
+        "plan = ComparisonPlan(max_attacked=1, seeds=1, duration_s=70, cases=('bias',), families=who)\n"
         "print([(row.family, row.reason, row.liars) for row in compare(load('simbench-lv-rural1'), plan)])\n"
         "main()\n"
     )

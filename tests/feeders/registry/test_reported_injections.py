@@ -11,7 +11,7 @@ import pytest
 from feeders.model.site import load, names, to_frame
 from feeders.registry.registry import design
 from feeders.simulation.scenario import START
-from feeders.simulation.trial import Lie, LoadError, Meters, Trial, Trick, frames
+from feeders.simulation.trial import AttackKind, AttackSpec, LoadError, Trial, TrialMeterErrors, frames
 from gridsec.attack import Bias
 from gridsec.estimators import sequential
 from gridsec.interface import Cause, Decision, Frame, Verdict
@@ -57,7 +57,7 @@ def test_honest_errors_at_their_ends_never_accuse_an_inverter(name: str, step_s:
 def test_all_are_told_of_whoever_else_lies(count: int, liar: int | None) -> None:
     """Two inverters off their curves are both in an explanation; a named meter hides none of them."""
     site = load("cigre-lv")
-    lie = Lie(Trick.INVERTER, count, 100.0)
+    lie = AttackSpec(AttackKind.INVERTER, count, 100.0)
     trial = Trial(site, 0, duration_s=60.0, load_error=LoadError(0.1, 0.05), lie=lie, report_q=True)
     honest = trial.scenario
     owners = set(site.droop.customer[honest.inverter_attacks[0].inverters].tolist())
@@ -83,7 +83,11 @@ def test_all_are_told_of_whoever_else_lies(count: int, liar: int | None) -> None
 
 
 def watched(
-    name: str, *, seed: int = 0, meters: Meters = Meters.SITE, error: LoadError | None = None
+    name: str,
+    *,
+    seed: int = 0,
+    meters: TrialMeterErrors = TrialMeterErrors.SITE,
+    error: LoadError | None = None,
 ) -> Iterator[tuple[Frame, Verdict, int]]:
     """A minute in which one inverter leaves its curve by its rating after 30 s: frames, verdicts, whose."""
     trial = Trial(
@@ -92,7 +96,7 @@ def watched(
         duration_s=60.0,
         load_error=LoadError(0.1, 0.05) if error is None else error,
         meters=meters,
-        lie=Lie(Trick.INVERTER, 1, 100.0),
+        lie=AttackSpec(AttackKind.INVERTER, 1, 100.0),
         report_q=True,
     )
     watcher = design(trial.stated)
@@ -126,7 +130,7 @@ def test_an_inverter_off_its_curve_is_never_clean_and_nobody_else_is_accused(nam
 
 
 def test_the_voltages_say_that_it_is_the_inverter_where_they_can() -> None:
-    answers = list(watched("cigre-lv", meters=Meters.WHITE, error=LoadError(0.01, 0.01)))
+    answers = list(watched("cigre-lv", meters=TrialMeterErrors.WHITE, error=LoadError(0.01, 0.01)))
     _, verdict, which = answers[-1]
     assert verdict.decision is Decision.ATTACKED
     assert np.flatnonzero(verdict.inverters).tolist() == [which]
@@ -135,11 +139,11 @@ def test_the_voltages_say_that_it_is_the_inverter_where_they_can() -> None:
     assert abs(verdict.inverter_attack[which]) == pytest.approx(rating, rel=0.3)
 
 
-@pytest.mark.parametrize("meters", [Meters.SITE, Meters.WHITE])
-def test_a_false_report_is_never_clean_and_names_no_inverter(meters: Meters) -> None:
+@pytest.mark.parametrize("meters", [TrialMeterErrors.SITE, TrialMeterErrors.WHITE])
+def test_a_false_report_is_never_clean_and_names_no_inverter(meters: TrialMeterErrors) -> None:
     """The inverter does as it should; what the meter says of the reactive power is off by its rating."""
     site = load("cigre-lv")
-    error = LoadError(0.01, 0.01) if meters is Meters.WHITE else LoadError(0.1, 0.05)
+    error = LoadError(0.01, 0.01) if meters is TrialMeterErrors.WHITE else LoadError(0.1, 0.05)
     trial = Trial(site, 3, duration_s=60.0, load_error=error, meters=meters, report_q=True)
     c = int(site.droop.customer[0])
     false = site.tables.customers[c].inverter_kva / site.feeder.base_kva

@@ -8,9 +8,9 @@ import pytest
 
 from feeders.model.site import Site, from_tables, load
 from feeders.report.build import Report, report
-from feeders.report.html import Outcome
-from feeders.simulation.attacks import Trick
-from feeders.studies.campaign.plan import Kind, Place, Plan
+from feeders.report.html import StudyOutcome
+from feeders.simulation.attacks import AttackKind
+from feeders.studies.campaign.plan import AttackClass, CampaignPlan, Place
 from feeders.studies.campaign.study import Campaign, campaign
 from feeders.studies.detectable import detectable
 from feeders.studies.droop.study import DroopOptions, DroopStudy, droop
@@ -26,10 +26,13 @@ def site() -> Site:
 
 @pytest.fixture(scope="session")
 def played(site: Site) -> Campaign:
-    plan = Plan(
+    plan = CampaignPlan(
         scenes=1,
         together=8,
-        kinds=(Kind("bias", Trick.BIAS, (1.0, 5.0)), Kind("replay", Trick.REPLAY, (20.0,))),
+        kinds=(
+            AttackClass("bias", AttackKind.BIAS, (1.0, 5.0)),
+            AttackClass("replay", AttackKind.REPLAY, (20.0,)),
+        ),
         liars=(1, 2),
         places=(Place.RANDOM,),
         duration_s=60.0,
@@ -45,20 +48,22 @@ def studied(site: Site) -> DroopStudy:
 
 
 @pytest.fixture(scope="session")
-def outcomes(site: Site, played: Campaign, studied: DroopStudy) -> list[Outcome]:
+def outcomes(site: Site, played: Campaign, studied: DroopStudy) -> list[StudyOutcome]:
     """All that there is, and a study that failed."""
     return [
-        Outcome("detectable", detectable(site, max_attacked=2), command="gridsec study detectable cigre-lv"),
-        Outcome("protect", protect(site, max_attacked=2, goal=Goal.BOUND, lie_volt=4.6)),
-        Outcome("campaign", played, seconds=1.0, resumed=True),
-        Outcome("redundancy", redundancy(site, silent=["m02"])),
-        Outcome("droop", studied),
-        Outcome("calibrate", None, problem="calibrate of cigre-lv: too few readings <b>here</b>"),
+        StudyOutcome(
+            "detectable", detectable(site, max_attacked=2), command="gridsec study detectable cigre-lv"
+        ),
+        StudyOutcome("protect", protect(site, max_attacked=2, goal=Goal.BOUND, lie_volt=4.6)),
+        StudyOutcome("campaign", played, seconds=1.0, resumed=True),
+        StudyOutcome("redundancy", redundancy(site, silent=["m02"])),
+        StudyOutcome("droop", studied),
+        StudyOutcome("calibrate", None, problem="calibrate of cigre-lv: too few readings <b>here</b>"),
     ]
 
 
 @pytest.fixture(scope="session")
-def made(site: Site, outcomes: list[Outcome]) -> Report:
+def made(site: Site, outcomes: list[StudyOutcome]) -> Report:
     return report(site, outcomes, ABOUT)
 
 

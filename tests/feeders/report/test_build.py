@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from feeders.model.site import Site
 from feeders.report.build import Report, report
 from feeders.report.drawing import NARROW
-from feeders.report.html import Outcome, section
+from feeders.report.html import StudyOutcome, section
 from feeders.report.text import Question, Side, Standing, number, said
 from feeders.studies.redundancy import redundancy
 from tests.feeders.report.about import ABOUT, HOSTILE
@@ -159,7 +159,7 @@ def test_rounding_keeps_what_is_proved(value: float, digits: int) -> None:
     assert read(Side.ABOVE) - read(Side.BELOW) < 1.001 * 10.0**-digits
 
 
-def test_all_tables_and_figures_are_there_as_files(made: Report, outcomes: list[Outcome]) -> None:
+def test_all_tables_and_figures_are_there_as_files(made: Report, outcomes: list[StudyOutcome]) -> None:
     for outcome in outcomes:
         if outcome.result is not None:
             for name, table in outcome.result.tables.items():
@@ -176,7 +176,7 @@ def test_all_tables_and_figures_are_there_as_files(made: Report, outcomes: list[
             assert data.startswith(b"\x89PNG")
 
 
-def test_the_same_studies_give_the_same_bytes(site: Site, outcomes: list[Outcome], made: Report) -> None:
+def test_the_same_studies_give_the_same_bytes(site: Site, outcomes: list[StudyOutcome], made: Report) -> None:
     again = report(site, outcomes[:2], ABOUT)
     assert again.html == report(site, outcomes[:2], ABOUT).html
     for name, data in again.pictures.items():
@@ -189,8 +189,8 @@ def test_the_same_studies_give_the_same_bytes(site: Site, outcomes: list[Outcome
 def test_names_stay_text(hostile: Site) -> None:
     found = redundancy(hostile, unknown=[hostile.feeder.customers[0]])
     outcomes = [
-        Outcome("redundancy", found, command=HOSTILE),
-        Outcome(HOSTILE, None, problem=HOSTILE),
+        StudyOutcome("redundancy", found, command=HOSTILE),
+        StudyOutcome(HOSTILE, None, problem=HOSTILE),
     ]
     about = replace(ABOUT, command=HOSTILE, made=HOSTILE, folder=HOSTILE, versions={HOSTILE: HOSTILE})
     result = report(hostile, outcomes, about)
@@ -220,10 +220,10 @@ class Strange:
 
 
 def test_a_study_without_a_section_of_its_own_loses_nothing(site: Site) -> None:
-    result = report(site, [Outcome("strange", Strange())], ABOUT)
+    result = report(site, [StudyOutcome("strange", Strange())], ABOUT)
     assert "&lt;b&gt;a&lt;/b&gt;" in result.html
     assert result.tables["strange-findings"] is Strange.tables["findings"]
-    told = section(site, Outcome("strange", Strange()))
+    told = section(site, StudyOutcome("strange", Strange()))
     finding = told.answers[Question.OTHER]
     assert finding.standing is Standing.MEASURED
     assert "findings (2 rows)" in said(finding.sentences[0])
@@ -241,7 +241,7 @@ def test_numbers_of_a_column_stand_in_line_and_do_not_become_nothing(site: Site)
         feeder = "cigre-lv"
         tables: ClassVar = {"findings": pd.DataFrame(columns)}
 
-    page = Page(report(site, [Outcome("strange", Columns())], ABOUT).html)
+    page = Page(report(site, [StudyOutcome("strange", Columns())], ABOUT).html)
     cells = [text for tag, text in page.texts if tag == "td"]
     assert cells[0::4] == ["1", "20", "∞"]
     assert cells[1::4] == ["0.5000", "0.1235", "<0.0001"]

@@ -7,8 +7,8 @@ import math
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from feeders.report.charts import Bar, Curve, Row, curves, rows, ticks
-from feeders.report.drawing import Area, Disc, Line, Text
+from feeders.report.charts import Bar, ChartRow, Curve, curves, rows, ticks
+from feeders.report.drawing import Area, Disc, Polyline, Text
 
 
 @given(st.floats(-1e6, 1e6), st.floats(1e-6, 1e6), st.integers(3, 9))
@@ -26,8 +26,8 @@ def test_ticks_are_round_and_cover(low: float, span: float, most: int) -> None:
 
 def test_bars_are_as_long_as_they_say() -> None:
     data = [
-        Row("a", (Bar(0.0, 1.0, "fill-a", "x"), Bar(1.0, 4.0, "fill-b", "y"))),
-        Row("b", (Bar(0.0, 2.0, "fill-a", "x"),)),
+        ChartRow("a", (Bar(0.0, 1.0, "fill-a", "x"), Bar(1.0, 4.0, "fill-b", "y"))),
+        ChartRow("b", (Bar(0.0, 2.0, "fill-a", "x"),)),
     ]
     drawing = rows(data, 400.0, axis="V")
     bars = [m for m in drawing.marks if isinstance(m, Area) and m.tip]
@@ -39,9 +39,9 @@ def test_bars_are_as_long_as_they_say() -> None:
 
 
 def test_an_axis_that_does_not_begin_at_zero_has_no_ticks_before_its_beginning() -> None:
-    drawing = rows([Row("a", (Bar(-0.38, 0.21, "fill-a", "x"),))], 720.0, axis="%", start=-0.38)
+    drawing = rows([ChartRow("a", (Bar(-0.38, 0.21, "fill-a", "x"),))], 720.0, axis="%", start=-0.38)
     left = min(x for m in drawing.marks if isinstance(m, Area) for x, _ in m.points)
-    grid = [m.points[0][0] for m in drawing.marks if isinstance(m, Line)]
+    grid = [m.points[0][0] for m in drawing.marks if isinstance(m, Polyline)]
     assert len(grid) >= 4
     assert min(grid) >= left
 
@@ -50,7 +50,7 @@ def test_a_curve_has_a_gap_where_nothing_is_known() -> None:
     curve = Curve((0.0, 1.0, 2.0, 3.0, 4.0), (1.0, 2.0, math.nan, 3.0, 4.0), "line-a", "one")
     lone = Curve((0.0, 1.0), (math.inf, 2.0), "line-b", "two")
     drawing = curves([curve, lone], 400.0, x="s", y="V")
-    assert sum(isinstance(m, Line) and m.look == "line-a" for m in drawing.marks) == 3  # and the legend
+    assert sum(isinstance(m, Polyline) and m.look == "line-a" for m in drawing.marks) == 3  # and the legend
     assert sum(isinstance(m, Disc | Area) for m in drawing.marks) == 1
     assert {"one", "two", "s", "V"} <= {m.text for m in drawing.marks if isinstance(m, Text)}
 
@@ -61,7 +61,7 @@ def test_decades() -> None:
 
 
 def test_long_labels_are_cut_at_their_beginning() -> None:
-    drawing = rows([Row("street " * 30 + "end", (Bar(0.0, 1.0, "fill-a", "x"),))], 350.0, axis="V")
+    drawing = rows([ChartRow("street " * 30 + "end", (Bar(0.0, 1.0, "fill-a", "x"),))], 350.0, axis="V")
     label = next(m.text for m in drawing.marks if isinstance(m, Text) and m.anchor == "end")
     assert label.startswith("…")
     assert label.endswith("end")

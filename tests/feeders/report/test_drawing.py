@@ -8,14 +8,30 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from feeders.report.drawing import DARK, LIGHT, LOOKS, STEPS, Area, Disc, Drawing, Line, Text, svg, width_of
+from feeders.report.drawing import (
+    DARK,
+    LIGHT,
+    LOOKS,
+    STEPS,
+    Area,
+    Disc,
+    Drawing,
+    Polyline,
+    Text,
+    svg,
+    width_of,
+)
 
 SVG = "{http://www.w3.org/2000/svg}"
 
 
 @given(st.text(), st.text())
 def test_any_text_stays_text(name: str, tip: str) -> None:
-    marks = (Text(1.0, 2.0, name), Disc(1.0, 2.0, 3.0, "solid", tip), Line(((0.0, 0.0), (1.0, 1.0)), "wire"))
+    marks = (
+        Text(1.0, 2.0, name),
+        Disc(1.0, 2.0, 3.0, "solid", tip),
+        Polyline(((0.0, 0.0), (1.0, 1.0)), "wire"),
+    )
     root = ElementTree.fromstring(svg(Drawing(10.0, 10.0, marks), title=name, text=tip, key="k", alone=True))
     assert [each.tag for each in root] == [
         SVG + tag for tag in ("title", "desc", "style", "rect", "text", "circle", "path")
@@ -25,7 +41,7 @@ def test_any_text_stays_text(name: str, tip: str) -> None:
 
 
 def test_neighbours_of_one_look_share_a_path() -> None:
-    line = Line(((0.0, 0.0), (1.0, 0.5)), "wire")
+    line = Polyline(((0.0, 0.0), (1.0, 0.5)), "wire")
     area = Area(((0.0, 0.0), (1.0, 0.0), (1.0, 1.0)), "solid")
     root = ElementTree.fromstring(
         svg(Drawing(5.0, 5.0, (line, line, area, line)), title="", text="", key="k")

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from benchmarks.mesh import baran_wu, european, landnetz, rural3
 from feeders.model.site import Site, load, names
-from feeders.report.drawing import NARROW, STEPS, WIDE, Disc, Line, Text, width_of
+from feeders.report.drawing import NARROW, STEPS, WIDE, Disc, Polyline, Text, width_of
 from feeders.report.maps import Shape, Spot, _crossed, draw_map, has_places, place, steps_of
 
 
@@ -55,9 +55,9 @@ def test_ties_end_on_the_lines_they_join(make: Callable[[], Site], width: float)
             assert _touches(tie[-1], lit)
             assert tie[0] != tie[-1]
     drawn = draw_map(site, [Spot(Shape.METER)] * site.feeder.bus.size, width, legend={})
-    assert len([mark for mark in drawn.marks if isinstance(mark, Line) and mark.look == "line-wire"]) == len(
-        site.ties
-    )
+    assert len(
+        [mark for mark in drawn.marks if isinstance(mark, Polyline) and mark.look == "line-wire"]
+    ) == len(site.ties)
 
 
 def test_streets_of_a_tree_do_not_share_a_place(feeder: Site) -> None:

@@ -9,8 +9,8 @@ import pytest
 
 from feeders.model.site import Site, from_tables
 from feeders.report.build import Report, report
-from feeders.report.drawing import NARROW, WIDE, Line
-from feeders.report.html import Outcome
+from feeders.report.drawing import NARROW, WIDE, Polyline
+from feeders.report.html import StudyOutcome
 from feeders.report.maps import LEGS, Shape, Spot, draw_map
 from feeders.studies.droop.study import DroopOptions, droop
 from feeders.studies.redundancy import redundancy
@@ -27,8 +27,8 @@ def phased() -> Site:
 def whole(phased: Site) -> Report:
     options = DroopOptions(presets=("ieee1547-b",), tau_factors=(1.0,))
     outcomes = [
-        Outcome("redundancy", redundancy(phased, silent=["m02"])),
-        Outcome("droop", droop(phased, options)),
+        StudyOutcome("redundancy", redundancy(phased, silent=["m02"])),
+        StudyOutcome("droop", droop(phased, options)),
     ]
     return report(phased, outcomes, ABOUT)
 
@@ -50,7 +50,7 @@ def test_a_feeder_in_phases_says_how_many_are_on_which(phased: Site, whole: Repo
 def test_everybody_has_the_leg_of_its_phase(phased: Site, width: float) -> None:
     spots = [Spot(Shape.METER, tip=name) for name in phased.feeder.customers]
     drawn = draw_map(phased, spots, width, legend={"meter": Spot(Shape.METER)})
-    legs = [mark for mark in drawn.marks if isinstance(mark, Line) and mark.look == "line-ink"]
+    legs = [mark for mark in drawn.marks if isinstance(mark, Polyline) and mark.look == "line-ink"]
     assert len(legs) == len(spots) + len(LEGS)
     # Right of its place and above, below, left and above.
     ends = [(b[0] > a[0] + 1e-6) - (b[0] < a[0] - 1e-6) for a, b in (leg.points for leg in legs)]

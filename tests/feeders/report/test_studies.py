@@ -13,7 +13,7 @@ import pytest
 from feeders.model.site import Site, from_tables
 from feeders.report import section_calibrate
 from feeders.report.drawing import NARROW, WIDE
-from feeders.report.html import Outcome
+from feeders.report.html import StudyOutcome
 from feeders.report.section_campaign import campaign as attacks
 from feeders.report.section_droop import droop as fleet
 from feeders.report.section_meters import detectable as sizes
@@ -23,9 +23,9 @@ from feeders.report.text import Question, Section, Standing, said
 from feeders.studies.calibrate.study import AS_FILED, EXCLUDED, PROPOSED, UNTOLD, Calibrate
 from feeders.studies.campaign.study import Campaign
 from feeders.studies.detectable import Detectable
-from feeders.studies.droop.limits import Kept
+from feeders.studies.droop.limits import BandGuarantee
 from feeders.studies.droop.study import DroopStudy
-from feeders.studies.droop.verdict import Verdict
+from feeders.studies.droop.verdict import FleetVerdict
 from feeders.studies.protect import Goal, Protect, protect
 from feeders.studies.redundancy import Redundancy
 from tests.feeders import stations
@@ -35,14 +35,14 @@ def told(section: Section, question: Question) -> str:
     return " ".join(said(sentence) for sentence in section.answers[question].sentences)
 
 
-def result(outcomes: list[Outcome], name: str) -> object:
+def result(outcomes: list[StudyOutcome], name: str) -> object:
     return next(each.result for each in outcomes if each.study == name)
 
 
 def test_a_stable_fleet(site: Site, studied: DroopStudy) -> None:
     section = fleet(site, studied)
     finding = section.answers[Question.FLEET]
-    if studied.verdict is Verdict.STABLE and studied.always is Kept.KEPT:
+    if studied.verdict is FleetVerdict.STABLE and studied.always is BandGuarantee.KEPT:
         assert finding.standing is Standing.PROVED
     assert told(section, Question.FLEET).startswith({"stable": "Stable: proved"}[str(studied.verdict)])
     for figure in section.figures:
@@ -50,21 +50,21 @@ def test_a_stable_fleet(site: Site, studied: DroopStudy) -> None:
         assert figure.draw(NARROW).width == NARROW
 
 
-@pytest.mark.parametrize("verdict", list(Verdict))
-@pytest.mark.parametrize("always", list(Kept))
-@pytest.mark.parametrize("rest", list(Kept))
+@pytest.mark.parametrize("verdict", list(FleetVerdict))
+@pytest.mark.parametrize("always", list(BandGuarantee))
+@pytest.mark.parametrize("rest", list(BandGuarantee))
 def test_what_is_said_of_a_fleet_is_what_is_known(
-    site: Site, studied: DroopStudy, verdict: Verdict, rest: Kept, always: Kept
+    site: Site, studied: DroopStudy, verdict: FleetVerdict, rest: BandGuarantee, always: BandGuarantee
 ) -> None:
     stability = studied.tables["stability"].assign(verdict=str(verdict), margin=math.nan)
     band = studied.tables["band"].assign(rest=str(rest), always=str(always))
     tables = {**studied.tables, "stability": stability, "band": band}
     section = fleet(site, replace(studied, verdict=verdict, rest=rest, always=always, tables=tables))
     text, finding = told(section, Question.FLEET), section.answers[Question.FLEET]
-    assert ("Stable: proved" in text) == (verdict is Verdict.STABLE)
-    assert ("It may oscillate" in text) == (verdict is Verdict.UNDECIDED)
-    assert ("kept for arbitrary changes of loads" in text) == (always is Kept.KEPT)
-    if Verdict.UNDECIDED in (verdict, rest, always):
+    assert ("Stable: proved" in text) == (verdict is FleetVerdict.STABLE)
+    assert ("It may oscillate" in text) == (verdict is FleetVerdict.UNDECIDED)
+    assert ("kept for arbitrary changes of loads" in text) == (always is BandGuarantee.KEPT)
+    if FleetVerdict.UNDECIDED in (verdict, rest, always):
         assert finding.standing in {Standing.PART, Standing.OPEN}
 
 
@@ -116,7 +116,7 @@ def test_words_of_the_calibration_are_its_own() -> None:
     assert words == (UNTOLD, PROPOSED, EXCLUDED, AS_FILED)
 
 
-def test_sizes_that_are_not_proved_are_said_to_be_none(site: Site, outcomes: list[Outcome]) -> None:
+def test_sizes_that_are_not_proved_are_said_to_be_none(site: Site, outcomes: list[StudyOutcome]) -> None:
     found = result(outcomes, "detectable")
     assert isinstance(found, Detectable)
     meters, customers = found.meters.copy(), found.customers.copy()
@@ -178,7 +178,9 @@ def test_a_broken_band_is_told_with_a_voltage(site: Site, studied: DroopStudy) -
     )
     band = studied.tables["band"].assign(rest="violated", always="violated")
     tables = {**studied.tables, "band": band, "witness": witness}
-    finding = fleet(site, replace(studied, rest=Kept.VIOLATED, always=Kept.VIOLATED, tables=tables)).answers
+    finding = fleet(
+        site, replace(studied, rest=BandGuarantee.VIOLATED, always=BandGuarantee.VIOLATED, tables=tables)
+    ).answers
     sentence = finding[Question.FLEET].sentences[1]
     volt = next(part for part in sentence if not isinstance(part, str))
     assert volt.source == "droop-witness:v_volt:row 1"
@@ -186,7 +188,7 @@ def test_a_broken_band_is_told_with_a_voltage(site: Site, studied: DroopStudy) -
     assert f"at {site.feeder.customers[1]}, by AC power flow" in said(sentence)
 
 
-def test_a_search_that_gave_up_is_not_an_all_clear(site: Site, outcomes: list[Outcome]) -> None:
+def test_a_search_that_gave_up_is_not_an_all_clear(site: Site, outcomes: list[StudyOutcome]) -> None:
     found = result(outcomes, "redundancy")
     assert isinstance(found, Redundancy)
     summary, meters = found.summary.copy(), found.meters.copy()
@@ -199,7 +201,7 @@ def test_a_search_that_gave_up_is_not_an_all_clear(site: Site, outcomes: list[Ou
     assert any(getattr(mark, "text", "") == "not known" for mark in drawing.marks)
 
 
-def test_what_is_not_proved_of_sizes_is_not_called_proved(site: Site, outcomes: list[Outcome]) -> None:
+def test_what_is_not_proved_of_sizes_is_not_called_proved(site: Site, outcomes: list[StudyOutcome]) -> None:
     """That the search names who lies is simulated only, and what is proved has a probability, and a share."""
     found = result(outcomes, "detectable")
     assert isinstance(found, Detectable)
@@ -224,7 +226,7 @@ def test_protection_against_false_powers_is_told(site: Site) -> None:
     assert "by itself, with true powers" in text
 
 
-def test_nobody_among_none_left_invisible_is_told_as_such(site: Site, outcomes: list[Outcome]) -> None:
+def test_nobody_among_none_left_invisible_is_told_as_such(site: Site, outcomes: list[StudyOutcome]) -> None:
     found = result(outcomes, "protect")
     assert isinstance(found, Protect)
     goal = {"goal": Goal.IDENTIFY, "before": 1.0, "after": math.inf, "alone": math.nan}
@@ -235,7 +237,7 @@ def test_nobody_among_none_left_invisible_is_told_as_such(site: Site, outcomes: 
     )
 
 
-def test_who_lies_alone_has_nobody_with_it(site: Site, outcomes: list[Outcome]) -> None:
+def test_who_lies_alone_has_nobody_with_it(site: Site, outcomes: list[StudyOutcome]) -> None:
     found = result(outcomes, "detectable")
     assert isinstance(found, Detectable)
     for liars, words in (
@@ -245,7 +247,7 @@ def test_who_lies_alone_has_nobody_with_it(site: Site, outcomes: list[Outcome]) 
         assert sizes(site, replace(found, max_attacked=liars)).figures[0].text.startswith(words)
 
 
-def test_protection_with_a_gap_is_not_called_the_fewest(site: Site, outcomes: list[Outcome]) -> None:
+def test_protection_with_a_gap_is_not_called_the_fewest(site: Site, outcomes: list[StudyOutcome]) -> None:
     found = result(outcomes, "protect")
     assert isinstance(found, Protect)
     assert len(found.meters)

@@ -5,7 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from feeders.simulation.attacks import LARGEST, Kind, NoSuchAttack, coordinated, fake_load, random_attacks
+from feeders.simulation.attacks import (
+    LARGEST,
+    NoSuchAttack,
+    RandomAttackKind,
+    coordinated,
+    fake_load,
+    random_attacks,
+)
 from feeders.simulation.demand import Customers
 from feeders.simulation.plant import ClosedLoop, Loads
 from feeders.simulation.powerflow import PowerFlow
@@ -16,12 +23,18 @@ from tests.feeders.villages import village, village_without_inverters
 
 ON, OFF = START + 20.0, START + 80.0
 SIZE = 0.03
-CONSTANT = (Kind.BIAS, Kind.SCALING, Kind.RANDOM, Kind.COORDINATED, Kind.COORDINATED_POWER)
+CONSTANT = (
+    RandomAttackKind.BIAS,
+    RandomAttackKind.SCALING,
+    RandomAttackKind.RANDOM,
+    RandomAttackKind.COORDINATED,
+    RandomAttackKind.COORDINATED_POWER,
+)
 
 
 @pytest.mark.parametrize("kind", CONSTANT)
 @pytest.mark.parametrize("count", [1, 2, 3])
-def test_every_manipulated_meter_is_moved_by_at_least_the_size(kind: Kind, count: int) -> None:
+def test_every_manipulated_meter_is_moved_by_at_least_the_size(kind: RandomAttackKind, count: int) -> None:
     site = village()
     for seed in range(4):
         attacks = random_attacks(site, seed, kind, count, SIZE, t_on=ON, t_off=OFF)
@@ -48,7 +61,7 @@ def test_displacements_are_not_larger_than_stated() -> None:
 
 def test_a_drift_arrives_after_a_third_of_the_attack() -> None:
     site = village()
-    attacks = random_attacks(site, 1, Kind.DRIFT, 2, SIZE, t_on=ON, t_off=OFF)
+    attacks = random_attacks(site, 1, RandomAttackKind.DRIFT, 2, SIZE, t_on=ON, t_off=OFF)
     for sample in simulate(site, Scenario(duration_s=90.0, attacks=attacks)):
         shift = np.abs(sample.shift_volt[sample.manipulated]) / 230.0
         if sample.t >= ON + 20.0 and sample.manipulated.any():
@@ -59,7 +72,7 @@ def test_a_drift_arrives_after_a_third_of_the_attack() -> None:
 
 def test_every_kind_can_be_made_for_any_number_of_meters() -> None:
     site = village()
-    for kind in Kind:
+    for kind in RandomAttackKind:
         for count in (1, 4):
             (attack,) = random_attacks(site, 3, kind, count, 0.01, t_on=ON, t_off=OFF)
             assert attack.meters.size == count
@@ -70,8 +83,8 @@ def test_a_seed_fixes_the_attack_and_another_changes_it() -> None:
     site = village()
     chosen = set()
     for seed in range(10):
-        (first,) = random_attacks(site, seed, Kind.COORDINATED, 2, SIZE, t_on=ON, t_off=OFF)
-        (second,) = random_attacks(site, seed, Kind.COORDINATED, 2, SIZE, t_on=ON, t_off=OFF)
+        (first,) = random_attacks(site, seed, RandomAttackKind.COORDINATED, 2, SIZE, t_on=ON, t_off=OFF)
+        (second,) = random_attacks(site, seed, RandomAttackKind.COORDINATED, 2, SIZE, t_on=ON, t_off=OFF)
         np.testing.assert_array_equal(first.meters, second.meters)
         assert isinstance(first, Coordinated)
         assert isinstance(second, Coordinated)
@@ -85,7 +98,7 @@ def test_the_lie_is_what_a_real_load_would_do(with_inverters: bool) -> None:
     site = village() if with_inverters else village_without_inverters()
     scenario = Scenario(seed=5)
     (attack,) = random_attacks(
-        site, 5, Kind.COORDINATED_POWER, 3, SIZE, t_on=ON, t_off=OFF, scenario=scenario
+        site, 5, RandomAttackKind.COORDINATED_POWER, 3, SIZE, t_on=ON, t_off=OFF, scenario=scenario
     )
     assert isinstance(attack, Coordinated)
     (own,) = np.flatnonzero(attack.p_shift)  # just one meter lies about power: the load's own
@@ -120,12 +133,12 @@ def test_chosen_meters_far_away_need_a_larger_load() -> None:
 def test_what_cannot_be_made_is_refused_with_its_reason() -> None:
     site = village()
     with refused(NoSuchAttack, "too-few-meters"):
-        random_attacks(site, 0, Kind.BIAS, 8, SIZE, t_on=ON, t_off=OFF)
+        random_attacks(site, 0, RandomAttackKind.BIAS, 8, SIZE, t_on=ON, t_off=OFF)
     with refused(NoSuchAttack, "no-effect"):
         fake_load(site, 2, np.array([5]), SIZE)  # c7 sits on the busbar
     with refused(NoSuchAttack, "no-such-attack"):
         fake_load(site, 2, np.array([0, 2]), 0.18)
     with refused(NoSuchAttack, "no-such-attack"):
-        random_attacks(site, 0, Kind.COORDINATED, 7, SIZE, t_on=ON, t_off=OFF)
+        random_attacks(site, 0, RandomAttackKind.COORDINATED, 7, SIZE, t_on=ON, t_off=OFF)
     with pytest.raises(ValueError, match="'nonsense' is not a valid Kind"):
         random_attacks(site, 0, "nonsense", 1, SIZE, t_on=ON, t_off=OFF)

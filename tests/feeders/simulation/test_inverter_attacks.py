@@ -10,7 +10,7 @@ from feeders.model.site import load
 from feeders.simulation.meters import MeterErrors
 from feeders.simulation.powerflow import PowerFlow
 from feeders.simulation.recording import scenario_from_json, scenario_to_json
-from feeders.simulation.scenario import START, Sample, Scenario, simulate
+from feeders.simulation.scenario import START, Scenario, SimulatedTick, simulate
 from gridsec.attack import InverterAttack
 from gridsec.errors import InputInvalid
 from tests.codes import refused
@@ -21,7 +21,7 @@ ATTACK = InverterAttack(np.array([2]), np.array([KVAR / SITE.feeder.base_kva]), 
 EXACT = MeterErrors(bias=0.0, jitter=0.0, resolution=0.0, power=0.0, report_q=True)
 
 
-def play(*attacks: InverterAttack) -> list[Sample]:
+def play(*attacks: InverterAttack) -> list[SimulatedTick]:
     scenario = Scenario(seed=3, duration_s=12.0, errors=EXACT, inverter_attacks=attacks)
     return list(simulate(SITE, scenario))
 

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from feeders.model.site import Site, from_tables
-from feeders.simulation.meters import BUSBAR, Channel, MeterErrors, Meters, Silence
+from feeders.simulation.meters import BUSBAR, Channel, MeterErrors, MeterOutage, SimulatedMeters
 from gridsec.errors import InputInvalid
 from tests.codes import refused
 from tests.feeders.villages import tables, village
@@ -41,7 +41,7 @@ def truth(ticks: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray
 @given(seed=st.integers(0, 2**32))
 def test_honest_meters_keep_their_promise(seed: int) -> None:
     site = unlike()
-    meters = Meters(site, MeterErrors(report_q=True), Channel(), seed)
+    meters = SimulatedMeters(site, MeterErrors(report_q=True), Channel(), seed)
     accuracy, nominal = site.accuracy, site.tables.meta.voltage_volt
     v, p, q, v0 = truth(TICKS.size, seed)
     read = meters.read(TICKS, v, p, q, v0)
@@ -66,7 +66,7 @@ def test_bias_is_fixed_and_jitter_has_its_size() -> None:
     ticks = np.arange(20_000)
     v = np.full((ticks.size, len(site.tables.customers)), 231.234)
     zero = np.zeros_like(v)
-    meters = Meters(site, MeterErrors(), Channel(), 1)
+    meters = SimulatedMeters(site, MeterErrors(), Channel(), 1)
     error = meters.read(ticks, v, zero, zero, v[:, 0]).v_volt - 231.234
     bound = 5.0 / np.sqrt(ticks.size)
     sigma = site.accuracy.jitter * 230.0
@@ -80,7 +80,7 @@ def test_bias_is_fixed_and_jitter_has_its_size() -> None:
 
 def test_biases_fill_the_class_evenly() -> None:
     site = unlike()
-    drawn = [Meters(site, MeterErrors(), Channel(), seed) for seed in range(400)]
+    drawn = [SimulatedMeters(site, MeterErrors(), Channel(), seed) for seed in range(400)]
     p_fraction, q_fraction = (of[site.meters] for of in (site.loads.p_fraction, site.loads.q_fraction))
     assert not np.isclose(p_fraction, q_fraction, rtol=0.5).any()
     shares = [
@@ -103,7 +103,7 @@ def test_biases_fill_the_class_evenly() -> None:
 def test_registers_have_their_resolution() -> None:
     site = village()
     v, p, q, v0 = truth(50)
-    read = Meters(site, MeterErrors(report_q=True), Channel(), 2).read(np.arange(50), v, p, q, v0)
+    read = SimulatedMeters(site, MeterErrors(report_q=True), Channel(), 2).read(np.arange(50), v, p, q, v0)
     for values, step in ((read.v_volt, 0.1), (read.v0_volt, 0.1), (read.p_kw, 0.01), (read.q_kvar, 0.01)):
         np.testing.assert_allclose(values / step, np.round(values / step), atol=1e-6)
     assert all(len(repr(float(value))) <= 6 for value in read.v_volt.ravel())  # 231.4, not 231.40000000000003
@@ -113,18 +113,18 @@ def test_ideal_meters_read_the_truth() -> None:
     site = village()
     v, p, q, v0 = truth(50)
     ideal = MeterErrors(bias=0.0, jitter=0.0, resolution=0.0, power=0.0, report_q=True)
-    read = Meters(site, ideal, Channel(), 3).read(np.arange(50), v, p, q, v0)
+    read = SimulatedMeters(site, ideal, Channel(), 3).read(np.arange(50), v, p, q, v0)
     np.testing.assert_array_equal(read.v_volt, v[:, site.meters])
     np.testing.assert_array_equal(read.p_kw, p[:, site.meters])
     np.testing.assert_array_equal(read.q_kvar, q[:, site.meters])
     np.testing.assert_array_equal(read.v0_volt, v0)
-    silent = Meters(site, MeterErrors(), Channel(), 3).read(np.arange(50), v, p, q, v0)
+    silent = SimulatedMeters(site, MeterErrors(), Channel(), 3).read(np.arange(50), v, p, q, v0)
     assert np.isnan(silent.q_kvar).all()  # by default meters report no reactive power
 
 
 def test_what_a_tick_draws_depends_on_its_number_alone() -> None:
     site = village()
-    meters = Meters(site, MeterErrors(), Channel(loss=0.3, delay_mean_s=1.0, duplicate=0.3), 4)
+    meters = SimulatedMeters(site, MeterErrors(), Channel(loss=0.3, delay_mean_s=1.0, duplicate=0.3), 4)
     ticks = np.arange(-300, 700)
     v, p, q, v0 = truth(ticks.size)
     t = START + ticks
@@ -142,7 +142,7 @@ def test_losses_delays_and_duplicates_have_their_rates() -> None:
     channel = Channel(
         loss=0.05, delay_s=0.2, delay_mean_s=0.5, late=0.02, late_s=30.0, duplicate=0.1, clock_s=2.0
     )
-    delivery = Meters(site, MeterErrors(), channel, 5).deliver(ticks, START + ticks)
+    delivery = SimulatedMeters(site, MeterErrors(), channel, 5).deliver(ticks, START + ticks)
     arrived = np.isfinite(delivery.arrival)
     n = arrived.size
     assert abs(1 - arrived.mean() - 0.05) < 5 * np.sqrt(0.05 / n)
@@ -165,7 +165,7 @@ def test_losses_delays_and_duplicates_have_their_rates() -> None:
 
 def test_a_perfect_channel_delivers_at_once() -> None:
     ticks = np.arange(10)
-    delivery = Meters(village(), MeterErrors(), Channel(), 6).deliver(ticks, START + ticks)
+    delivery = SimulatedMeters(village(), MeterErrors(), Channel(), 6).deliver(ticks, START + ticks)
     expected = np.broadcast_to((START + ticks)[:, None], delivery.arrival.shape)
     np.testing.assert_array_equal(delivery.arrival, expected)
     np.testing.assert_array_equal(delivery.stamp, expected)
@@ -174,8 +174,12 @@ def test_a_perfect_channel_delivers_at_once() -> None:
 
 def test_silences_silence_their_meter_and_no_other() -> None:
     site, ticks = village(), np.arange(100)
-    channel = Channel(silences=(Silence("m-c3", START + 20, START + 40), Silence(BUSBAR, START + 90, np.inf)))
-    arrived = np.isfinite(Meters(site, MeterErrors(), channel, 7).deliver(ticks, START + ticks).arrival)
+    channel = Channel(
+        silences=(MeterOutage("m-c3", START + 20, START + 40), MeterOutage(BUSBAR, START + 90, np.inf))
+    )
+    arrived = np.isfinite(
+        SimulatedMeters(site, MeterErrors(), channel, 7).deliver(ticks, START + ticks).arrival
+    )
     expected = np.ones_like(arrived)
     expected[20:40, site.meter_ids.index("m-c3")] = False
     expected[90:, -1] = False
@@ -184,7 +188,7 @@ def test_silences_silence_their_meter_and_no_other() -> None:
 
 def test_nonsense_is_refused() -> None:
     with refused(InputInvalid, "unknown-name"):
-        Meters(village(), MeterErrors(), Channel(silences=(Silence("m-nobody", 0.0, 1.0),)), 0)
+        SimulatedMeters(village(), MeterErrors(), Channel(silences=(MeterOutage("m-nobody", 0.0, 1.0),)), 0)
     with refused(InputInvalid, "out-of-range"):
         Channel(loss=1.5)
     with refused(InputInvalid, "negative"):

@@ -14,9 +14,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from feeders.simulation.attacks import Kind, busbar_attack, random_attacks
+from feeders.simulation.attacks import RandomAttackKind, busbar_attack, random_attacks
 from feeders.simulation.demand import Variation
-from feeders.simulation.meters import BUSBAR, Channel, MeterErrors, Silence
+from feeders.simulation.meters import BUSBAR, Channel, MeterErrors, MeterOutage
 from feeders.simulation.powerflow import PowerFlowDiverged
 from feeders.simulation.recording import (
     FORMAT,
@@ -38,7 +38,7 @@ def busy() -> Scenario:
     site = village()
     attacks = tuple(
         attack
-        for seed, kind in enumerate(Kind)
+        for seed, kind in enumerate(RandomAttackKind)
         for attack in random_attacks(site, seed, kind, 2, 0.02, t_on=START + 20.0, t_off=START + 60.0)
     )
     return Scenario(
@@ -54,7 +54,7 @@ def busy() -> Scenario:
             late_s=20.0,
             duplicate=0.1,
             clock_s=0.5,
-            silences=(Silence("m-c1", START + 5.0, np.inf), Silence(BUSBAR, START, START + 3.0)),
+            silences=(MeterOutage("m-c1", START + 5.0, np.inf), MeterOutage(BUSBAR, START, START + 3.0)),
         ),
         attacks=attacks,
         busbar_attacks=(busbar_attack(site, "scaling", 0.02, t_on=START + 30.0, t_off=START + 70.0),),
@@ -125,7 +125,7 @@ def test_numbers_of_numpy_and_infinite_ones_are_written_and_read(tmp_path: Path)
         dt_s=np.float32(1.0),
         substep_s=np.inf,
         variation=Variation(busbar_pu=np.float32(1.0), tap_interval_s=np.inf),
-        channel=Channel(silences=(Silence("inf", np.float32(0.0), np.inf),)),
+        channel=Channel(silences=(MeterOutage("inf", np.float32(0.0), np.inf),)),
     )
     expected = replace(given, seed=3, duration_s=3.0, dt_s=1.0)
     assert scenario_from_json(json.loads(json.dumps(scenario_to_json(given)))) == expected

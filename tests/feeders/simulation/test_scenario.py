@@ -10,15 +10,15 @@ import pytest
 
 from feeders.model.site import Site, load, names, to_frame
 from feeders.simulation.demand import Customers, Variation
-from feeders.simulation.meters import BUSBAR, Channel, MeterErrors, Silence
+from feeders.simulation.meters import BUSBAR, Channel, MeterErrors, MeterOutage
 from feeders.simulation.plant import ClosedLoop, Loads, substeps
 from feeders.simulation.powerflow import PowerFlow
 from feeders.simulation.scenario import (
     START,
     SUNNY_NOON_S,
-    Sample,
     Scenario,
     Season,
+    SimulatedTick,
     by_arrival,
     simulate,
     snapshots,
@@ -33,11 +33,11 @@ HIGH = Variation(busbar_pu=1.04)
 """A busbar voltage at which the inverters are busy."""
 
 
-def play(site: Site, scenario: Scenario) -> list[Sample]:
+def play(site: Site, scenario: Scenario) -> list[SimulatedTick]:
     return list(simulate(site, scenario))
 
 
-def same(a: Sample, b: Sample) -> bool:
+def same(a: SimulatedTick, b: SimulatedTick) -> bool:
     truth = all(
         np.array_equal(getattr(a, name), getattr(b, name))
         for name in (
@@ -200,7 +200,7 @@ def test_ticks_readings_and_signs() -> None:
 
 def test_snapshots_hold_what_arrived() -> None:
     site = village()
-    silences = (Silence("m-c2", START + 2, START + 4), Silence(BUSBAR, START + 6, START + 7))
+    silences = (MeterOutage("m-c2", START + 2, START + 4), MeterOutage(BUSBAR, START + 6, START + 7))
     scenario = Scenario(duration_s=8.0, channel=Channel(silences=silences))
     samples = play(site, scenario)
     for sample, snapshot in zip(samples, snapshots(samples), strict=True):

@@ -10,7 +10,7 @@ import pytest
 from feeders.model.site import Site, load, to_frame
 from feeders.simulation.attacks import fake_load
 from feeders.simulation.demand import Customers, Variation
-from feeders.simulation.meters import Channel, MeterErrors, Meters, Silence
+from feeders.simulation.meters import Channel, MeterErrors, MeterOutage, SimulatedMeters
 from feeders.simulation.powerflow_three_phase import UnbalancedPowerFlow
 from feeders.simulation.scenario import START, Scenario, simulate, snapshots
 from gridsec.arrays import Floats
@@ -65,7 +65,7 @@ def test_a_balanced_feeder_has_one_busbar_whatever_the_unbalance() -> None:
 
 
 def test_each_phase_of_the_busbar_is_metered_with_an_error_of_its_own(site: Site) -> None:
-    meters = Meters(site, MeterErrors(jitter=0.0, resolution=0.0), Channel(), 5)
+    meters = SimulatedMeters(site, MeterErrors(jitter=0.0, resolution=0.0), Channel(), 5)
     assert meters.busbar_bias.shape == (3,)
     assert np.ptp(meters.busbar_bias) > 0.0
     scenario = Scenario(seed=5, duration_s=2.0, errors=MeterErrors(jitter=0.0, resolution=0.0))
@@ -77,7 +77,7 @@ def test_each_phase_of_the_busbar_is_metered_with_an_error_of_its_own(site: Site
 
 
 def test_frames_have_the_phases_of_the_busbar_or_know_that_they_are_missing(site: Site) -> None:
-    silent = Channel(silences=(Silence("", START + 1.0, START + 2.0),))
+    silent = Channel(silences=(MeterOutage("", START + 1.0, START + 2.0),))
     samples = list(simulate(site, Scenario(duration_s=2.0, channel=silent)))
     frames = [to_frame(site, snapshot) for snapshot in snapshots(samples)]
     expected = (samples[0].reported.v0_volt[0] / site.feeder.base_volt) ** 2

@@ -12,12 +12,12 @@ import pytest
 
 from feeders.model.load_uncertainty import load_doubt
 from feeders.model.site import Site, Snapshot, from_tables, load, to_frame
-from feeders.registry.registry import FAMILIES, Family, Watcher, choose, design
-from feeders.simulation.attacks import Lie, NoSuchAttack, Trick, manipulations
+from feeders.registry.registry import FAMILIES, DesignedEstimator, Estimator, choose, design
+from feeders.simulation.attacks import AttackKind, AttackSpec, NoSuchAttack, manipulations
 from feeders.simulation.demand import Customers
-from feeders.simulation.meters import Channel, Silence
+from feeders.simulation.meters import Channel, MeterOutage
 from feeders.simulation.scenario import START, simulate
-from feeders.simulation.trial import LoadError, Meters, Trial, Truth, frames, judge
+from feeders.simulation.trial import FrameTruth, LoadError, Trial, TrialMeterErrors, frames, judge
 from gridsec.arrays import Floats
 from gridsec.attack import Coordinated
 from gridsec.interface import Cause, Decision, Estimate, Frame, Verdict
@@ -31,18 +31,20 @@ def small() -> Site:
     return load(SMALL)
 
 
-def trial(trick: Trick | None = None, **changes: Any) -> Trial:
+def trial(trick: AttackKind | None = None, **changes: Any) -> Trial:
     lie = (
-        None if trick is None else Lie(trick, 2, 60.0 if trick in {Trick.REPLAY, Trick.CLOCK_SHIFT} else 3.0)
+        None
+        if trick is None
+        else AttackSpec(trick, 2, 60.0 if trick in {AttackKind.REPLAY, AttackKind.CLOCK_SHIFT} else 3.0)
     )
     return replace(Trial(small(), seed=3, duration_s=60.0, lie=lie), **changes)
 
 
-def played(trick: Trick | None = None, **changes: Any) -> list[tuple[Frame, Truth]]:
+def played(trick: AttackKind | None = None, **changes: Any) -> list[tuple[Frame, FrameTruth]]:
     return list(frames(trial(trick, **changes)))
 
 
-def reported(trick: Trick | None = None, **changes: Any) -> Floats:
+def reported(trick: AttackKind | None = None, **changes: Any) -> Floats:
     """Voltages as told, in pu, (T, p)."""
     y: Floats = np.array([frame.y for frame, _ in played(trick, **changes)])
     return np.sqrt(y)
@@ -127,7 +129,7 @@ def test_intervals_give_the_standard_deviation_back_and_the_files_state_it() -> 
 
 def test_without_load_errors_frames_are_those_of_service_and_hold_the_truth() -> None:
     """Registers and power factors err as the files say, by as much as the intervals have, all the time."""
-    made = trial(load_error=None, meters=Meters.SITE)
+    made = trial(load_error=None, meters=TrialMeterErrors.SITE)
     assert made.stated.tables.customers == small().tables.customers
     assert made.stated.tables.meta == small().tables.meta
     samples, base = list(simulate(small(), made.scenario)), small().feeder.base_kva
@@ -149,7 +151,9 @@ def test_what_the_files_say_to_come_and_go_does() -> None:
     tables = small().tables
     told = tuple(replace(row, p_std_kw=0.5, q_std_kvar=0.25) for row in tables.customers[:4])
     site = from_tables(replace(tables, customers=(*told, *tables.customers[4:])))
-    made = Trial(site, seed=3, duration_s=20_000.0, step_s=20.0, load_error=None, meters=Meters.SITE)
+    made = Trial(
+        site, seed=3, duration_s=20_000.0, step_s=20.0, load_error=None, meters=TrialMeterErrors.SITE
+    )
     p, q = Customers(site, made.scenario.variation, 3, START, made.profile_s).hidden(
         START + 20.0 * np.arange(1000.0)
     )
@@ -161,7 +165,7 @@ def test_what_the_files_say_to_come_and_go_does() -> None:
 
 @pytest.mark.parametrize(("meters", "fixed", "jitter"), [("white", 0.0, 0.2), ("real", 0.5, 0.05)])
 def test_meters_err_as_stated(meters: str, fixed: float, jitter: float) -> None:
-    pairs = played(meters=Meters(meters), duration_s=400.0)
+    pairs = played(meters=TrialMeterErrors(meters), duration_s=400.0)
     at = small().meters
     error = 100.0 * np.array([np.sqrt(frame.y) - np.sqrt(truth.v2[at]) for frame, truth in pairs])
     mean = error.mean(axis=0)
@@ -173,13 +177,13 @@ def test_meters_err_as_stated(meters: str, fixed: float, jitter: float) -> None:
     volts = np.sqrt(np.array([frame.y for frame, _ in pairs])) * small().feeder.base_volt
     tenths = np.abs(volts * 10 - np.round(volts * 10)).max() < 1e-6
     assert tenths == (meters == "real")
-    accuracy = trial(meters=Meters(meters)).stated.accuracy
+    accuracy = trial(meters=TrialMeterErrors(meters)).stated.accuracy
     np.testing.assert_allclose(accuracy.jitter, jitter / 100.0)
     np.testing.assert_allclose(accuracy.class_fraction, fixed / 100.0, atol=2e-6)
 
 
 def test_the_site_may_speak_for_its_meters() -> None:
-    stated = trial(meters=Meters.SITE).stated
+    stated = trial(meters=TrialMeterErrors.SITE).stated
     np.testing.assert_array_equal(stated.accuracy.class_fraction, small().accuracy.class_fraction)
     np.testing.assert_array_equal(stated.accuracy.jitter, small().accuracy.jitter)
 
@@ -194,7 +198,7 @@ def test_meters_may_report_what_inverters_do() -> None:
 
 
 def test_a_trial_is_the_same_every_time_and_another_one_is_not() -> None:
-    np.testing.assert_array_equal(reported(Trick.BIAS), reported(Trick.BIAS))
+    np.testing.assert_array_equal(reported(AttackKind.BIAS), reported(AttackKind.BIAS))
     assert np.abs(reported() - reported(seed=4)).min() > 0.0
     assert [frame.t for frame, _ in played(step_s=10.0)] == [START + 10.0 * k for k in range(6)]
 
@@ -202,7 +206,7 @@ def test_a_trial_is_the_same_every_time_and_another_one_is_not() -> None:
 # ------------------------------------------------------------------------------------------------- lies
 
 
-def shift(trick: Trick, **changes: Any) -> tuple[Floats, Floats]:
+def shift(trick: AttackKind, **changes: Any) -> tuple[Floats, Floats]:
     """What the lie does to the reports, pu, and who lies at each tick; both (T, p)."""
     pairs = played(trick, **changes)
     change = reported(trick, **changes) - reported(**(changes | {"lie": None}))
@@ -216,20 +220,20 @@ def shift(trick: Trick, **changes: Any) -> tuple[Floats, Floats]:
 
 
 def test_bias_together_and_scaling() -> None:
-    change, liars = shift(Trick.BIAS)
+    change, liars = shift(AttackKind.BIAS)
     np.testing.assert_allclose(np.abs(change[liars]), 0.03, atol=1e-12)
     assert liars[30:].sum() == 60
-    low = Lie(Trick.TOGETHER, 5, -2.0, 10.0, 20.0)
-    change = reported(Trick.BIAS, lie=low) - reported()
+    low = AttackSpec(AttackKind.TOGETHER, 5, -2.0, 10.0, 20.0)
+    change = reported(AttackKind.BIAS, lie=low) - reported()
     rows, columns = np.nonzero(change)
     assert (rows.min(), rows.max(), np.unique(columns).size) == (10, 19, 5)
     np.testing.assert_allclose(change[10:20][:, np.unique(columns)], -0.02, atol=1e-12)
-    change, liars = shift(Trick.SCALING)
+    change, liars = shift(AttackKind.SCALING)
     np.testing.assert_allclose(np.abs(change / reported())[liars], 0.03, atol=1e-12)
 
 
 def test_drift_leaves_at_its_rate() -> None:
-    change, liars = shift(Trick.DRIFT)
+    change, liars = shift(AttackKind.DRIFT)
     (who,) = np.nonzero(liars[-1])
     np.testing.assert_allclose(
         np.abs(change[30:, who]), np.outer(0.03 / 60.0 * np.arange(30), np.ones(2)), atol=1e-12
@@ -237,23 +241,23 @@ def test_drift_leaves_at_its_rate() -> None:
 
 
 def test_stuck_replayed_and_late_meters_repeat_themselves() -> None:
-    honest, told = reported(), reported(Trick.STUCK)
-    _, liars = shift(Trick.STUCK)
+    honest, told = reported(), reported(AttackKind.STUCK)
+    _, liars = shift(AttackKind.STUCK)
     (who,) = np.nonzero(liars[-1])
     np.testing.assert_array_equal(told[30:, who], np.broadcast_to(honest[30, who], (30, 2)))
     # An honest run that began 60 s earlier would be needed to look further back than the start.
-    early = Lie(Trick.CLOCK_SHIFT, 2, 20.0, 30.0)
+    early = AttackSpec(AttackKind.CLOCK_SHIFT, 2, 20.0, 30.0)
     np.testing.assert_array_equal(reported(lie=early)[30:, who], honest[10:40, who])
-    longer = Lie(Trick.REPLAY, 2, 100.0, 150.0)
+    longer = AttackSpec(AttackKind.REPLAY, 2, 100.0, 150.0)
     honest = reported(duration_s=200.0)
     np.testing.assert_array_equal(reported(duration_s=200.0, lie=longer)[150:, who], honest[50:100, who])
 
 
 def test_coordinated_meters_show_the_trace_of_a_load() -> None:
     """Oracle: the column of LinDistFlow of that load, restricted to the liars, up to curvature."""
-    change, liars = shift(Trick.COORDINATED)
+    change, liars = shift(AttackKind.COORDINATED)
     (who,) = np.nonzero(liars[-1])
-    (attack,) = trial(Trick.COORDINATED_POWER).scenario.attacks
+    (attack,) = trial(AttackKind.COORDINATED_POWER).scenario.attacks
     assert isinstance(attack, Coordinated)
     assert attack.meters.tolist() == who.tolist()
     (k,) = np.nonzero(attack.p_shift)[0]
@@ -265,8 +269,8 @@ def test_coordinated_meters_show_the_trace_of_a_load() -> None:
     np.testing.assert_allclose(found / found[k], trace / trace[k], rtol=0.1)
     assert np.abs(found).min() == pytest.approx(0.03, rel=1e-6)
     # Voltages alone, and the load itself.
-    plain = [frame.p for frame, _ in played(Trick.COORDINATED)]
-    loads = [(frame.p, frame.q) for frame, _ in played(Trick.COORDINATED_POWER)]
+    plain = [frame.p for frame, _ in played(AttackKind.COORDINATED)]
+    loads = [(frame.p, frame.q) for frame, _ in played(AttackKind.COORDINATED_POWER)]
     honest = [(frame.p, frame.q) for frame, _ in played()]
     np.testing.assert_array_equal(plain, [p for p, _ in honest])
     for which, size in ((0, attack.p_shift[k]), (1, attack.q_shift[k])):
@@ -278,13 +282,15 @@ def test_coordinated_meters_show_the_trace_of_a_load() -> None:
 
 def test_a_false_power_moves_no_voltage() -> None:
     """The same load as in the coordinated story, but nobody shows its trace."""
-    change, liars = shift(Trick.POWER)
+    change, liars = shift(AttackKind.POWER)
     assert not change.any()
     assert liars[-1].sum() == 1
-    (attack,) = trial(Trick.COORDINATED_POWER).scenario.attacks
+    (attack,) = trial(AttackKind.COORDINATED_POWER).scenario.attacks
     assert isinstance(attack, Coordinated)
     (k,) = np.nonzero(attack.p_shift)[0]
-    for (told, _), (other, _) in zip(played(Trick.POWER), played(Trick.COORDINATED_POWER), strict=True):
+    for (told, _), (other, _) in zip(
+        played(AttackKind.POWER), played(AttackKind.COORDINATED_POWER), strict=True
+    ):
         np.testing.assert_array_equal(told.p, other.p)
         np.testing.assert_array_equal(told.q, other.q)
     (who,) = np.nonzero(liars[-1])
@@ -293,8 +299,8 @@ def test_a_false_power_moves_no_voltage() -> None:
 
 def test_a_load_that_nobody_would_believe_is_no_measurement() -> None:
     """A load of 1.5 MW: the frame falls back on what the customer could draw, and says how wide that is."""
-    pairs = played(Trick.COORDINATED_POWER, lie=Lie(Trick.COORDINATED_POWER, 2, 12.0))
-    (attack,) = trial(lie=Lie(Trick.COORDINATED_POWER, 2, 12.0)).scenario.attacks
+    pairs = played(AttackKind.COORDINATED_POWER, lie=AttackSpec(AttackKind.COORDINATED_POWER, 2, 12.0))
+    (attack,) = trial(lie=AttackSpec(AttackKind.COORDINATED_POWER, 2, 12.0)).scenario.attacks
     assert isinstance(attack, Coordinated)
     site = small()
     customer = site.meters[attack.meters[np.argmax(attack.p_shift)]]
@@ -311,7 +317,7 @@ def test_a_silent_meter_tells_no_powers(ask: str) -> None:
     tables = small().tables
     meta = replace(tables.meta, load=replace(tables.meta.load, forecast=ask))
     made = trial(site=from_tables(replace(tables, meta=meta)), duration_s=4.0, profile_s=0.0)
-    mute = Silence(small().meter_ids[5], START + 2.0, START + 3.0)
+    mute = MeterOutage(small().meter_ids[5], START + 2.0, START + 3.0)
     scenario = replace(made.scenario, channel=Channel(silences=(mute,)))
     nobody = np.full(13, np.nan)
     lost = to_frame(made.stated, Snapshot(START + 2.0, nobody, nobody, nobody, np.nan))
@@ -327,7 +333,7 @@ def test_a_silent_meter_tells_no_powers(ask: str) -> None:
 
 
 def test_inverters_move_the_truth_and_no_report() -> None:
-    wrong = played(lie=Lie(Trick.INVERTER, 1, 100.0))
+    wrong = played(lie=AttackSpec(AttackKind.INVERTER, 1, 100.0))
     honest = played()
     assert not any(truth.liars.any() or truth.attack.any() for _, truth in wrong)
     assert [int(truth.inverters.sum()) for _, truth in wrong] == [0] * 30 + [1] * 30
@@ -336,8 +342,15 @@ def test_inverters_move_the_truth_and_no_report() -> None:
     assert np.abs(moved[30:]).max() > 5e-5
 
 
-@pytest.mark.parametrize("lie", [Lie(Trick.BIAS, 14), Lie(Trick.INVERTER, 10), Lie(Trick.COORDINATED, 99)])
-def test_more_liars_than_there_are_is_refused(lie: Lie) -> None:
+@pytest.mark.parametrize(
+    "lie",
+    [
+        AttackSpec(AttackKind.BIAS, 14),
+        AttackSpec(AttackKind.INVERTER, 10),
+        AttackSpec(AttackKind.COORDINATED, 99),
+    ],
+)
+def test_more_liars_than_there_are_is_refused(lie: AttackSpec) -> None:
     with refused(NoSuchAttack, "too-few-meters"):
         list(frames(trial(lie=lie)))
     assert manipulations(small(), None, trial().scenario) == ((), ())
@@ -350,7 +363,7 @@ def test_more_liars_than_there_are_is_refused(lie: Lie) -> None:
 class Script:
     """A watcher that reads its answers off a list."""
 
-    pairs: list[tuple[Frame, Truth]]
+    pairs: list[tuple[Frame, FrameTruth]]
     named: dict[int, list[int]]
     undecided: tuple[int, ...] = ()
     off: float = 0.0
@@ -367,14 +380,14 @@ class Script:
         estimate = Estimate(frame.t, v2, nothing, v2, ~suspects, np.zeros(9))
         return tick + 1, estimate, Verdict(decision, Cause.AGREEMENT, "", suspects, nothing, nothing, nothing)
 
-    def watcher(self) -> Watcher:
-        family = Family("script", "", lambda *_: self, lambda *_: 0, self.step, lambda _: 1, lambda _: "")
-        return Watcher(family, self, 2)
+    def watcher(self) -> DesignedEstimator:
+        family = Estimator("script", "", lambda *_: self, lambda *_: 0, self.step, lambda _: 1, lambda _: "")
+        return DesignedEstimator(family, self, 2)
 
 
 def test_a_watcher_that_names_nobody_misses_all() -> None:
-    pairs = played(Trick.BIAS)
-    out = judge(Script(pairs, {}, off=0.001).watcher(), trial(Trick.BIAS), played=pairs)
+    pairs = played(AttackKind.BIAS)
+    out = judge(Script(pairs, {}, off=0.001).watcher(), trial(AttackKind.BIAS), played=pairs)
     assert (out.missed, out.false_clean, out.accused.sum(), out.undecided.sum()) == (2, 1.0, 0, 0)
     assert np.isinf(out.delay_s).all()
     np.testing.assert_allclose(out.error_all, 0.1)
@@ -386,12 +399,12 @@ def test_a_watcher_that_names_nobody_misses_all() -> None:
 
 
 def test_names_are_timed_and_false_ones_counted() -> None:
-    pairs = played(Trick.BIAS)
+    pairs = played(AttackKind.BIAS)
     first, second = np.flatnonzero(pairs[-1][1].liars).tolist()
     honest = next(j for j in range(13) if j not in {first, second})
     named = {5: [honest], 20: [first]} | {k: [first] for k in range(34, 60)} | {50: [first, second, honest]}
     script = Script(pairs, named, undecided=(0, 31))
-    out = judge(script.watcher(), trial(Trick.BIAS), played=pairs)
+    out = judge(script.watcher(), trial(AttackKind.BIAS), played=pairs)
     assert out.liars.tolist() == [first, second]
     assert out.delay_s.tolist() == [4.0, 20.0]
     assert np.flatnonzero(out.accused).tolist() == sorted([first, honest])
@@ -402,7 +415,7 @@ def test_names_are_timed_and_false_ones_counted() -> None:
 
 
 def test_a_name_that_outlives_its_lie_is_not_false() -> None:
-    short = Lie(Trick.BIAS, 1, 3.0, 20.0, 40.0)
+    short = AttackSpec(AttackKind.BIAS, 1, 3.0, 20.0, 40.0)
     pairs = played(lie=short)
     (liar,) = np.flatnonzero(pairs[30][1].liars)
     out = judge(
@@ -420,7 +433,7 @@ def test_nothing_to_be_said_is_not_a_number() -> None:
 
 
 def test_a_real_family_names_exactly_the_liars() -> None:
-    made = trial(Trick.BIAS, meters=Meters.REAL, load_error=LoadError(0.1, 0.05))
+    made = trial(AttackKind.BIAS, meters=TrialMeterErrors.REAL, load_error=LoadError(0.1, 0.05))
     for name in ("exact-bank", "sequential"):
         watcher = design(choose(made.stated, estimator=name, max_attacked=2))
         assert watcher.family is FAMILIES[name]

@@ -15,7 +15,7 @@ import pytest
 
 from feeders.model.site import Site, from_tables, load
 from feeders.registry.registry import FAMILIES, choose, design
-from feeders.simulation.attacks import Trick
+from feeders.simulation.attacks import AttackKind
 from feeders.simulation.trial import judge
 from feeders.studies.comparison import (
     BEGIN,
@@ -23,9 +23,9 @@ from feeders.studies.comparison import (
     END,
     FEEDER,
     HEADERS,
-    Case,
-    Plan,
-    Row,
+    ComparisonCase,
+    ComparisonPlan,
+    ComparisonRow,
     cells,
     compare,
     markdown,
@@ -37,7 +37,7 @@ from tests.codes import refused
 
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "estimators.md"
 
-SHORT = Plan(
+SHORT = ComparisonPlan(
     max_attacked=1,
     seeds=2,
     duration_s=90.0,
@@ -115,26 +115,34 @@ def test_a_family_that_fails_while_it_watches_leaves_the_others_alone(
 
 def test_a_plan_that_compares_nothing_is_refused_with_all_that_is_wrong() -> None:
     with refused(InputInvalid, "unknown-name", "unknown-name", "not-positive"):
-        Plan(families=("sequential", "bank"), cases=("biass",), seeds=0)
+        ComparisonPlan(families=("sequential", "bank"), cases=("biass",), seeds=0)
 
 
 def test_cases_lie_as_they_say() -> None:
     assert len({case.name for case in CASES}) == len(CASES)
     assert CASES[0].lie(2) is None
     tricks = {case.trick for case in CASES}
-    assert tricks >= {None, Trick.BIAS, Trick.COORDINATED, Trick.COORDINATED_POWER, Trick.DRIFT}
-    assert tricks >= {Trick.STUCK, Trick.REPLAY, Trick.INVERTER}
+    assert tricks >= {
+        None,
+        AttackKind.BIAS,
+        AttackKind.COORDINATED,
+        AttackKind.COORDINATED_POWER,
+        AttackKind.DRIFT,
+    }
+    assert tricks >= {AttackKind.STUCK, AttackKind.REPLAY, AttackKind.INVERTER}
     assert [case.lie(2).count for case in CASES if (case.lie(2)) is not None] == [2] * 6 + [1]  # type: ignore[union-attr]
-    assert Case("x", "", Trick.BIAS, 1.0, one=True).lie(7) is not None
+    assert ComparisonCase("x", "", AttackKind.BIAS, 1.0, one=True).lie(7) is not None
 
 
 # ---------------------------------------------------------------------------------------------- on paper
 
 ROWS = [
-    Row("sequential", "clean", "", 0, 0, 0, 0, 0.0, math.nan, math.nan, 0.1, 0.4, 2.0, 1, math.nan, 0.01),
-    Row("exact-bank", "clean", "too few | meters,\n 2 of 5"),
-    Row("sequential", "bias", "", 6, 5, 1, 2, 0.1, 4.0, 0.25, math.inf, 0.4, 2.0, 1, 0.5, 0.01),
-    Row("exact-bank", "bias", "too few | meters,\n 2 of 5"),
+    ComparisonRow(
+        "sequential", "clean", "", 0, 0, 0, 0, 0.0, math.nan, math.nan, 0.1, 0.4, 2.0, 1, math.nan, 0.01
+    ),
+    ComparisonRow("exact-bank", "clean", "too few | meters,\n 2 of 5"),
+    ComparisonRow("sequential", "bias", "", 6, 5, 1, 2, 0.1, 4.0, 0.25, math.inf, 0.4, 2.0, 1, 0.5, 0.01),
+    ComparisonRow("exact-bank", "bias", "too few | meters,\n 2 of 5"),
 ]
 
 
@@ -187,7 +195,7 @@ def test_csv_holds_every_number(tmp_path: Path) -> None:
     assert read[1]["reason"] == ROWS[1].reason
     assert float(read[2]["error_liars"]) == 0.25
     assert math.isinf(float(read[2]["error_all"]))
-    assert set(read[0]) == set(Row.__dataclass_fields__)
+    assert set(read[0]) == set(ComparisonRow.__dataclass_fields__)
 
 
 def test_a_csv_that_cannot_be_completed_leaves_the_old_one(tmp_path: Path) -> None:
@@ -195,7 +203,7 @@ def test_a_csv_that_cannot_be_completed_leaves_the_old_one(tmp_path: Path) -> No
     write_csv(ROWS, path)
     before = path.read_bytes()
 
-    def breaking() -> Iterator[Row]:
+    def breaking() -> Iterator[ComparisonRow]:
         yield ROWS[0]
         raise OSError("the disk is full")
 

@@ -16,7 +16,7 @@ import pytest
 
 from feeders.model.site import load
 from feeders.studies.campaign.guarantees import rehearse
-from feeders.studies.comparison import Plan, Row, compare
+from feeders.studies.comparison import ComparisonPlan, ComparisonRow, compare
 from feeders.studies.detectable import detectable
 from feeders.studies.journal import InUse, Journal, OtherStudy, edition, remove, versions, worked
 from tests.codes import refused
@@ -180,7 +180,7 @@ def test_simulated_lies_go_on_and_more_of_them_too(tmp_path: Path) -> None:
 
 
 def test_a_comparison_goes_on(tmp_path: Path) -> None:
-    plan = Plan(
+    plan = ComparisonPlan(
         max_attacked=1, seeds=1, duration_s=80.0, families=("sequential",), cases=("clean", "bias", "stuck")
     )
     journal, said = tmp_path / "journal", list[str]()
@@ -189,7 +189,7 @@ def test_a_comparison_goes_on(tmp_path: Path) -> None:
         if what == "case stuck":
             raise Stop
 
-    def timeless(rows: list[Row]) -> list[str]:
+    def timeless(rows: list[ComparisonRow]) -> list[str]:
         return [repr({**asdict(row), "step_ms": 0.0, "step_ms_95": 0.0}) for row in rows]
 
     with pytest.raises(Stop):

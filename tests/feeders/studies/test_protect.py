@@ -13,7 +13,7 @@ from feeders.model.site import from_tables, load
 from feeders.simulation.powerflow import PowerFlow
 from feeders.studies.operating import box, false_powers, squared, volts_of_lie
 from feeders.studies.protect import Goal, protect
-from feeders.studies.unobservable import Attack, Curves
+from feeders.studies.unobservable import Attack, CurvePositions
 from gridsec.errors import DesignInfeasible, InputInvalid
 from gridsec.planning.stealthy_attacks import largest_lie, largest_story
 from tests.codes import refused
@@ -134,8 +134,8 @@ def test_the_text_of_a_goal_is_the_goal() -> None:
     given: dict[str, Any] = {"max_attacked": 1, "lie_volt": 8.0}
     text = protect(site, goal="bound", curves="steepest", attack="persistent", **given)
     assert text.goal is Goal.BOUND
-    assert text.before == protect(site, goal=Goal.BOUND, curves=Curves.STEEPEST, **given).before
-    assert text.before != protect(site, goal=Goal.BOUND, curves=Curves.DEADBAND, **given).before
+    assert text.before == protect(site, goal=Goal.BOUND, curves=CurvePositions.STEEPEST, **given).before
+    assert text.before != protect(site, goal=Goal.BOUND, curves=CurvePositions.DEADBAND, **given).before
 
 
 # ------------------------------------------------------------------------------------ false powers

@@ -12,7 +12,7 @@ import pytest
 from feeders.model.site import load
 from feeders.studies.journal import Journal, OtherStudy
 from feeders.studies.redundancy import ALL, SILENT, redundancy
-from feeders.studies.unobservable import Attack, Curves
+from feeders.studies.unobservable import Attack, CurvePositions
 from gridsec.errors import InputInvalid
 from tests.codes import refused
 
@@ -99,10 +99,10 @@ def test_unknown_names_are_refused() -> None:
 
 def test_the_text_of_a_choice_is_the_choice_and_another_text_is_refused(tmp_path: Path) -> None:
     site, journal = load("cigre-lv"), str(tmp_path / "journal")
-    both = ("steepest", Curves.STEEPEST)
+    both = ("steepest", CurvePositions.STEEPEST)
     said = [redundancy(site, curves=curves, journal=journal) for curves in both]
     assert said[0].summary.equals(said[1].summary)
     assert said[0].summary.equals(redundancy(site).summary)
-    assert not said[0].summary.equals(redundancy(site, curves=Curves.DEADBAND).summary)
+    assert not said[0].summary.equals(redundancy(site, curves=CurvePositions.DEADBAND).summary)
     with refused(InputInvalid, "unknown-name"):
         redundancy(site, curves="flat")

@@ -13,11 +13,11 @@ import pytest
 from feeders.model.load_uncertainty import unread
 from feeders.model.profiles import Season
 from feeders.model.site import Site, load
-from feeders.registry.registry import Watcher, design
+from feeders.registry.registry import DesignedEstimator, design
 from feeders.simulation.scenario import START
-from feeders.simulation.trial import Meters, Trial, Trick, frames
+from feeders.simulation.trial import AttackKind, Trial, TrialMeterErrors, frames
 from feeders.studies.campaign.guarantees import Rehearsal, rehearse
-from feeders.studies.campaign.plan import Kind, Place, Plan
+from feeders.studies.campaign.plan import AttackClass, CampaignPlan, Place
 from feeders.studies.campaign.study import campaign
 from feeders.studies.detectable import Detectable, detectable, monitor_rule
 from feeders.studies.operating import squared
@@ -33,7 +33,7 @@ def found() -> Detectable:
     return detectable(CIGRE, max_attacked=1)
 
 
-def watched(watcher: Watcher, site: Site, seed: int, lies: Floats) -> tuple[bool, Floats]:
+def watched(watcher: DesignedEstimator, site: Site, seed: int, lies: Floats) -> tuple[bool, Floats]:
     """Whether a lie, squared pu, is noticed; and the largest errors, V, while it is not."""
     state, noticed, worst = watcher.init(START), False, np.zeros(site.feeder.bus.size)
     for tick, (sample, frame) in enumerate(played(site, seed, float(HONEST + LYING))):
@@ -113,7 +113,7 @@ def test_errors_under_the_worst_collusions_are_covered_on_a_metered_feeder() -> 
 
 def powers(site: Site, hour: float) -> tuple[Floats, Floats, Floats]:
     """Active powers and their errors in the frames of a trial, and the true squared voltages, (T, N) each."""
-    trial = Trial(site, seed=5, duration_s=5.0, meters=Meters.REAL, profile_s=3600.0 * hour)
+    trial = Trial(site, seed=5, duration_s=5.0, meters=TrialMeterErrors.REAL, profile_s=3600.0 * hour)
     pairs = list(frames(trial))
     p = np.array([frame.p for frame, _ in pairs])
     error = np.array([frame.p_error for frame, _ in pairs])
@@ -137,7 +137,7 @@ def test_watchers_of_trials_are_not_told_what_nobody_meters() -> None:
 @pytest.mark.acceptance
 def test_campaigns_do_not_tell_either() -> None:
     """Voltages at customers without meters are off by volts, and no honest meter is named for it."""
-    plan = Plan(
+    plan = CampaignPlan(
         scenes=4,
         together=3,
         seed=2,
@@ -146,7 +146,7 @@ def test_campaigns_do_not_tell_either() -> None:
         lying_s=10.0,
         settling_s=2.0,
         seasons=(Season.SUMMER,),
-        kinds=(Kind("bias", Trick.BIAS, (1.0,)),),
+        kinds=(AttackClass("bias", AttackKind.BIAS, (1.0,)),),
         liars=(1,),
         places=(Place.RANDOM,),
     )

@@ -14,9 +14,9 @@ from gridsec.estimators.data_errors import (
     BLOCK_S,
     FEWEST_BLOCKS,
     MOST_BLOCKS,
+    AccusationWindow,
     DataErrorDesign,
     DataErrorKind,
-    Window,
     begin,
     design,
     follow,
@@ -145,8 +145,8 @@ def prepared(files: Network) -> DataErrorDesign:
 
 
 def watched(
-    files: Network, frames: Sequence[Frame], accused: list[int], window: Window | None = None
-) -> Window:
+    files: Network, frames: Sequence[Frame], accused: list[int], window: AccusationWindow | None = None
+) -> AccusationWindow:
     made, window = prepared(files), begin() if window is None else window
     for frame in frames:
         window = follow(made, window, frame, np.zeros(0), np.isin(np.arange(frame.y.size), accused))

@@ -8,10 +8,10 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gridsec.estimators.decision import Situation, Tally, count, decide, residual_excess
+from gridsec.estimators.decision import Counters, DecisionInputs, count, decide, residual_excess
 from gridsec.interface import Cause, Decision
 
-FRESH = Tally(np.zeros(1, dtype=np.intp), np.zeros(1, dtype=np.intp), np.zeros(1, dtype=bool))
+FRESH = Counters(np.zeros(1, dtype=np.intp), np.zeros(1, dtype=np.intp), np.zeros(1, dtype=bool))
 
 
 @given(
@@ -52,9 +52,9 @@ def test_flicker_is_named_with_its_second_flash(gap: int, start: int) -> None:
         assert (tally.above[0] > 0) == (flashes >= 1)
 
 
-def calm() -> Situation:
+def calm() -> DecisionInputs:
     no = np.zeros(5, dtype=bool)
-    return Situation(
+    return DecisionInputs(
         names=tuple("abcde"),
         max_attacked=1,
         live=~no,

@@ -18,7 +18,7 @@ from gridsec.arrays import Ints
 from gridsec.errors import DesignInfeasible, InputInvalid, NotObservable
 from gridsec.estimators import partial, thresholds
 from gridsec.estimators import partial as partial_observers
-from gridsec.estimators.inputs import Past, clean
+from gridsec.estimators.inputs import PreviousStep, clean
 from gridsec.estimators.partial import PartialDesign, PartialState
 from gridsec.interface import Cause, Decision, Estimate, Frame, Verdict
 from gridsec.observers import circle
@@ -323,7 +323,7 @@ class TestParts:
             street.advance(h)
             frame = street.frame()
             before, (state, _, _) = state, partial.step(made, state, frame)
-            past = Past(before.parts.x, before.v0_squared, before.tally.named)
+            past = PreviousStep(before.parts.x, before.v0_squared, before.tally.named)
             inputs = clean(made.setting, past, frame)
             if not others:
                 others = [circle.init(one, frame.t, state.parts.driven) for one in singles]
@@ -344,7 +344,7 @@ class TestParts:
         state, _ = watch(street, made, 10)
         street.advance(1.0)
         frame = street.frame()
-        past = Past(state.parts.x, state.v0_squared, state.tally.named)
+        past = PreviousStep(state.parts.x, state.v0_squared, state.tally.named)
         inputs = clean(made.setting, past, frame)
         alone, model, parts, _ = partial_observers.observe(
             made.setting, made.model, state.parts, frame, inputs, 1.0
@@ -366,7 +366,7 @@ class TestParts:
         state, _ = watch(street, made, 10)
         street.advance(1.0)
         frame = street.frame()
-        inputs = clean(made.setting, Past(state.parts.x, state.v0_squared, state.tally.named), frame)
+        inputs = clean(made.setting, PreviousStep(state.parts.x, state.v0_squared, state.tally.named), frame)
         alone, model, parts, _ = partial_observers.observe(
             made.setting, made.model, state.parts, frame, inputs, 1.0
         )

@@ -15,7 +15,7 @@ from feeders.registry.registry import choose, design
 from feeders.simulation.scenario import START, Scenario, random_attacks, simulate, snapshots
 from gridsec.errors import DesignInfeasible, InputInvalid, NotObservable
 from gridsec.estimators import set_search
-from gridsec.estimators.inputs import Past, clean
+from gridsec.estimators.inputs import PreviousStep, clean
 from gridsec.estimators.set_search import SetSearchDesign, SetSearchState, advance
 from gridsec.interface import Cause, Decision, Estimate, Verdict
 from tests.codes import refused
@@ -135,7 +135,7 @@ def test_the_search_finds_what_brute_force_finds() -> None:
     lies = {2: 0.05, 6: -0.04}
     street.advance(1.0)
     frame = street.frame(lies)
-    inputs = clean(made.setting, Past(state.x, state.v0_squared, state.tally.named), frame)
+    inputs = clean(made.setting, PreviousStep(state.x, state.v0_squared, state.tally.named), frame)
     view = advance(made, state, frame, inputs)
     found = set_search._search(made, inputs, view, state)
     X = made.setting.model.X

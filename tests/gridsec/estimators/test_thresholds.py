@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 
 from gridsec.errors import InputInvalid
 from gridsec.estimators import thresholds
-from gridsec.estimators.thresholds import ErrorBound, Motion, Uncertainty
+from gridsec.estimators.thresholds import ErrorBound, Motion, TickUncertainty
 from gridsec.grid.droop import PRESETS, fleet
 from gridsec.grid.meter import MeterAccuracy, busbar_error, reading_error
 from tests.codes import refused
@@ -113,11 +113,11 @@ class TestLargest:
 
 def problem(
     rng: np.random.Generator, *, customers: int = 7, M: int = 1
-) -> tuple[thresholds.ErrorModel, Uncertainty]:
+) -> tuple[thresholds.ErrorModel, TickUncertainty]:
     plant = make_plant(rng, customers=customers, drop=0.04)
     model = thresholds.error_model(plant.droop, plant.feeder.linear(), plant.meters, M)
     nobody = np.zeros(customers, dtype=bool)
-    now = Uncertainty(
+    now = TickUncertainty(
         base=rng.uniform(0.0, 0.01, customers),
         reading=rng.uniform(0.005, 0.02, customers),
         live=np.ones(customers, dtype=bool),
@@ -169,7 +169,7 @@ class TestGap:
         plant = make_plant(rng, customers=6, inverters=np.array([1, 4, 4]), meters=np.array([0, 1, 3, 4, 5]))
         model = thresholds.error_model(plant.droop, plant.feeder.linear(), plant.meters, 1)
         live, none = np.ones(5, dtype=bool), np.zeros(5, dtype=bool)
-        now = Uncertainty(rng.uniform(0.0, 0.01, 6), np.full(5, 0.01), live, none, np.zeros(5))
+        now = TickUncertainty(rng.uniform(0.0, 0.01, 6), np.full(5, 0.01), live, none, np.zeros(5))
         bound = ErrorBound(rng.uniform(0.0, 0.01, 3), rng.uniform(0.0, 0.02, 3))
         np.testing.assert_allclose(
             thresholds.gap(model, now, bound, own=True),
@@ -196,7 +196,7 @@ class TestErrorBound:
         out = rng.choice(n, 2, replace=False)
         left = np.isin(np.arange(n), out)
         base, reading = rng.uniform(0.0, 0.01, n), rng.uniform(0.005, 0.02, n)
-        now = Uncertainty(base, reading, np.ones(n, dtype=bool), np.zeros(n, dtype=bool), np.zeros(n))
+        now = TickUncertainty(base, reading, np.ones(n, dtype=bool), np.zeros(n, dtype=bool), np.zeros(n))
         w = rng.uniform(-0.06, 0.16, n)
         delta, noise = base * rng.choice([-1.0, 1.0], n), reading * rng.choice([-1.0, 1.0], n)
         x = np.concatenate([rng.uniform(-1, 1, n) * droop.limit, rng.uniform(-1, 1, n) * droop.limit])
@@ -234,7 +234,7 @@ class TestErrorBound:
         lin = plant.feeder.linear()
         model = replace(thresholds.error_model(droop, lin, plant.meters, 1), mismatch=np.zeros(5))
         S, zero, none = 2.0 * lin.X, np.zeros(5), np.zeros(5, dtype=bool)
-        exact = Uncertainty(zero, zero, ~none, none, zero)
+        exact = TickUncertainty(zero, zero, ~none, none, zero)
 
         def rest(w: np.ndarray, x: np.ndarray) -> np.ndarray:
             for _ in range(3000):
@@ -291,7 +291,7 @@ class TestErrorBound:
         tree = random_tree(5, rng, drop=0.01)
         droop = fleet(np.arange(5), "asnzs4777-a", np.full(5, 5.0), 100.0)
         model = thresholds.error_model(droop, tree.linear(), np.arange(5), 1)
-        now = Uncertainty(
+        now = TickUncertainty(
             np.full(5, 0.003), np.full(5, 0.015), np.ones(5, dtype=bool), np.zeros(5, dtype=bool), np.zeros(5)
         )
         motion = Motion(np.zeros(5), np.zeros(5), np.zeros(5), 1.0)

@@ -20,7 +20,7 @@ from scipy.optimize import linprog
 from feeders.model.site import Site, from_tables, load, plant, to_frame
 from feeders.registry.registry import choose
 from feeders.registry.registry import design as watcher
-from feeders.simulation.meters import Channel, MeterErrors, Silence
+from feeders.simulation.meters import Channel, MeterErrors, MeterOutage
 from feeders.simulation.scenario import START, Scenario, simulate, snapshots
 from gridsec.attack import Bias, InverterAttack
 from gridsec.errors import DesignInfeasible, InputInvalid, NotObservable
@@ -186,10 +186,10 @@ def test_more_liars_than_assumed_are_undecided() -> None:
 
 def test_a_silent_meter_is_undecided_and_a_silent_liar_stays_named() -> None:
     site = village()
-    silence = Channel(silences=(Silence(site.meter_ids[3], START + 20.0, START + 99.0),))
+    silence = Channel(silences=(MeterOutage(site.meter_ids[3], START + 20.0, START + 99.0),))
     answers = watch(site, channel=silence)
     assert (answers[-1][1].decision, answers[-1][1].cause) == (Decision.UNDECIDED, Cause.SILENT_METERS)
-    silence = Channel(silences=(Silence(site.meter_ids[4], START + 20.0, START + 99.0),))
+    silence = Channel(silences=(MeterOutage(site.meter_ids[4], START + 20.0, START + 99.0),))
     assert named(watch(site, meter=(4, 0.05), channel=silence)[-1][1]) == ([4], [])
 
 
@@ -214,10 +214,10 @@ def test_an_inverter_that_cannot_be_judged_any_more_stays_named() -> None:
 
 def test_too_few_meters_and_no_busbar_are_undecided() -> None:
     site = village()
-    rest = tuple(Silence(meter, START, START + 99.0) for meter in site.meter_ids[2:])
+    rest = tuple(MeterOutage(meter, START, START + 99.0) for meter in site.meter_ids[2:])
     last = watch(site, channel=Channel(silences=rest), seconds=5.0)[-1][1]
     assert (last.decision, last.cause) == (Decision.UNDECIDED, Cause.TOO_FEW_METERS)
-    lost = Channel(silences=(Silence("", START + 18.0, START + 99.0),))
+    lost = Channel(silences=(MeterOutage("", START + 18.0, START + 99.0),))
     last = watch(site, meter=(4, 0.05), channel=lost)[-1][1]
     assert (last.decision, last.cause, named(last)[0]) == (Decision.UNDECIDED, Cause.NO_BUSBAR, [4])
 

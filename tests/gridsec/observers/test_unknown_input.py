@@ -23,7 +23,7 @@ from gridsec.observers.lmi.unknown_input import (
 )
 from gridsec.observers.unknown_input import (
     Pair,
-    UnknownInputDesign,
+    UnknownInputObserver,
     UnknownInputPlant,
     design,
     error_system,
@@ -47,14 +47,14 @@ def pairs_of(plant: UnknownInputPlant, inputs: int, sensors: int) -> list[Pair]:
 
 
 @pytest.fixture(scope="module")
-def partial() -> UnknownInputDesign:
+def partial() -> UnknownInputObserver:
     """All thirty partial observers of the corrected Example 2."""
     plant = yang2021.plant(2, corrected=True)
     return design(plant, pairs_of(plant, 1, 3) + pairs_of(plant, 2, 2))
 
 
 @pytest.fixture(scope="module")
-def noisy() -> UnknownInputDesign:
+def noisy() -> UnknownInputObserver:
     """Observers of a feeder, with noise, drift and a span."""
     plant = yang2021_feeder.plant(yang2021_feeder.AT, yang2021_feeder.METERS, 1e-5)
     plant = replace(plant, drift=plant.inputs * 1e-4)
@@ -189,7 +189,7 @@ def independent(system: ErrorSystem, gains: UnknownInputGains) -> float:
 
 
 def test_every_proof_survives_another_factorisation(
-    partial: UnknownInputDesign, noisy: UnknownInputDesign
+    partial: UnknownInputObserver, noisy: UnknownInputObserver
 ) -> None:
     assert len(partial.pairs) == 30
     for family in (partial, noisy):
@@ -201,7 +201,7 @@ def test_every_proof_survives_another_factorisation(
             assert independent(system, gains) > 0.0
 
 
-def test_the_matrix_is_the_statement(partial: UnknownInputDesign) -> None:
+def test_the_matrix_is_the_statement(partial: UnknownInputObserver) -> None:
     """Its quadratic form equals increment of V minus bound plus multiplier, evaluated by hand."""
     rng = np.random.default_rng(0)
     system, g = error_system(partial.plant, partial.pairs[3]), partial.gains[3]
@@ -215,7 +215,7 @@ def test_the_matrix_is_the_statement(partial: UnknownInputDesign) -> None:
         assert v @ unknown_input_matrix(system, g) @ v == pytest.approx(value, rel=1e-9)
 
 
-def test_false_proofs_have_negative_margins(partial: UnknownInputDesign) -> None:
+def test_false_proofs_have_negative_margins(partial: UnknownInputObserver) -> None:
     system, g = error_system(partial.plant, partial.pairs[0]), partial.gains[0]
     assert unknown_input_margin(system, replace(g, rate=0.1 * g.rate)) < 0.0
     assert unknown_input_margin(system, replace(g, mu=0.1 * g.mu)) < 0.0
@@ -230,7 +230,7 @@ def test_false_proofs_have_negative_margins(partial: UnknownInputDesign) -> None
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**31), size=st.floats(0.1, 100.0))
 def test_the_error_decays_at_the_certified_rate_whatever_the_inputs_do(
-    partial: UnknownInputDesign, seed: int, size: float
+    partial: UnknownInputObserver, seed: int, size: float
 ) -> None:
     rng = np.random.default_rng(seed)
     system, plant = partial.plant.system, partial.plant
@@ -256,7 +256,7 @@ def test_the_error_decays_at_the_certified_rate_whatever_the_inputs_do(
 
 
 def test_the_error_system_is_plant_minus_observer(
-    partial: UnknownInputDesign, noisy: UnknownInputDesign
+    partial: UnknownInputObserver, noisy: UnknownInputObserver
 ) -> None:
     """e+ of `error_system`, term by term, against a step of every observer beside a step of the plant."""
     rng = np.random.default_rng(11)
@@ -287,7 +287,9 @@ def test_the_error_system_is_plant_minus_observer(
 
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 2**31), extreme=st.booleans())
-def test_noise_and_drift_stay_inside_the_bounds(noisy: UnknownInputDesign, seed: int, extreme: bool) -> None:
+def test_noise_and_drift_stay_inside_the_bounds(
+    noisy: UnknownInputObserver, seed: int, extreme: bool
+) -> None:
     rng = np.random.default_rng(seed)
     plant, system = noisy.plant, noisy.plant.system
 
@@ -310,7 +312,7 @@ def test_noise_and_drift_stay_inside_the_bounds(noisy: UnknownInputDesign, seed:
 # The contract of every family.
 
 
-def test_unknown_inputs_leave_no_trace(partial: UnknownInputDesign) -> None:
+def test_unknown_inputs_leave_no_trace(partial: UnknownInputObserver) -> None:
     """Started at the truth, an observer stays there whatever its J_u is told, and leaves it otherwise."""
     rng = np.random.default_rng(5)
     plant, system = partial.plant, partial.plant.system
@@ -327,7 +329,7 @@ def test_unknown_inputs_leave_no_trace(partial: UnknownInputDesign) -> None:
         assert np.all(error[~entitled] > 0.1)
 
 
-def test_attacks_are_visible(partial: UnknownInputDesign) -> None:
+def test_attacks_are_visible(partial: UnknownInputObserver) -> None:
     """Every trusted sensor moves every observer that trusts it, every believed input too."""
     plant, system = partial.plant, partial.plant.system
     seen, u = np.ones(4, dtype=np.bool_), np.zeros(3)
@@ -352,7 +354,7 @@ def test_attacks_are_visible(partial: UnknownInputDesign) -> None:
         assert np.all(moved[~trusts] == 0.0)
 
 
-def test_a_silent_sensor_has_exactly_no_influence(partial: UnknownInputDesign) -> None:
+def test_a_silent_sensor_has_exactly_no_influence(partial: UnknownInputObserver) -> None:
     rng = np.random.default_rng(1)
     state = init(partial, 0.0, radius=np.ones(3))
     states = [state, state, state]
@@ -371,7 +373,7 @@ def test_a_silent_sensor_has_exactly_no_influence(partial: UnknownInputDesign) -
     assert np.all(np.isfinite(states[0].box[~missed]))
 
 
-def test_a_silent_sensor_costs_what_the_span_says(noisy: UnknownInputDesign) -> None:
+def test_a_silent_sensor_costs_what_the_span_says(noisy: UnknownInputObserver) -> None:
     """After a gap the bounds start again from the span, and hold."""
     system, x, state = noisy.plant.system, np.array([0.03, -0.02, 0.01]), init(noisy, 0.0)
     u = np.full(13, 0.07)
@@ -386,7 +388,7 @@ def test_a_silent_sensor_costs_what_the_span_says(noisy: UnknownInputDesign) -> 
     assert np.all(state.box[0] < 0.5 * reset)
 
 
-def test_many_at_once_equal_one_at_a_time(partial: UnknownInputDesign) -> None:
+def test_many_at_once_equal_one_at_a_time(partial: UnknownInputObserver) -> None:
     rng = np.random.default_rng(3)
     y, u, seen = rng.standard_normal((8, 4)), rng.standard_normal((8, 3)), np.ones(4, dtype=np.bool_)
     together = init(partial, 0.0, radius=np.ones(3))
@@ -401,7 +403,7 @@ def test_many_at_once_equal_one_at_a_time(partial: UnknownInputDesign) -> None:
         np.testing.assert_allclose(state.x[0], together.x[i], rtol=1e-5, atol=1e-6)
 
 
-def test_time_starts_with_the_first_readings(partial: UnknownInputDesign) -> None:
+def test_time_starts_with_the_first_readings(partial: UnknownInputObserver) -> None:
     state = init(partial, 7.0, radius=np.ones(3))
     first = step(partial, state, np.zeros(4), np.zeros(3), np.ones(4, dtype=np.bool_))
     assert first.t == 7.0

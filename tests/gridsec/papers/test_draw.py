@@ -15,32 +15,35 @@ from matplotlib.figure import Figure as Canvas
 from matplotlib.transforms import Bbox
 
 from gridsec.arrays import Floats
-from gridsec.papers.claims import Figure, Line, Panel, Style
+from gridsec.papers.claims import FigureCurve, Panel, PaperFigure, Style
 from gridsec.papers.draw import DPI, FAINT, INK, PALETTE, WIDTH, draw, png
 
 T = np.linspace(0.0, 10.0, 101)
-DOTS = Line("", np.arange(11.0), np.ones(11), "points")
+DOTS = FigureCurve("", np.arange(11.0), np.ones(11), "points")
 STYLES: tuple[Style, ...] = ("solid", "dashed", "dotted", "dashdot", "points", "steps")
 
 
-def figure(*panels: Panel, caption: str = "What it shows") -> Figure:
-    return Figure("name-1", caption, panels)
+def figure(*panels: Panel, caption: str = "What it shows") -> PaperFigure:
+    return PaperFigure("name-1", caption, panels)
 
 
-def panel(*lines: Line, x_label: str = "t in s") -> Panel:
+def panel(*lines: FigureCurve, x_label: str = "t in s") -> Panel:
     return Panel("Voltage", x_label, "v in V", lines)
 
 
-def rich() -> Figure:
+def rich() -> PaperFigure:
     """Return a figure that asks for everything: all styles, gaps, many curves, long labels and caption."""
     gap = np.where((T > 3.0) & (T < 4.0), np.nan, np.sin(T))
     return figure(
         panel(
-            *(Line(f"curve number {k} of six, {style}", T, gap + k, style) for k, style in enumerate(STYLES))
+            *(
+                FigureCurve(f"curve number {k} of six, {style}", T, gap + k, style)
+                for k, style in enumerate(STYLES)
+            )
         ),
-        panel(Line("", T, np.round(T / 4.0), "steps"), x_label="k"),
-        panel(*(Line(f"m{k:02d}", T, 1e-6 * np.cos(T + k)) for k in range(13))),
-        panel(Line("", T, 1.5 * T), Line("", T, 2.5 * T), Line("mean", T, 2.0 * T)),
+        panel(FigureCurve("", T, np.round(T / 4.0), "steps"), x_label="k"),
+        panel(*(FigureCurve(f"m{k:02d}", T, 1e-6 * np.cos(T + k)) for k in range(13))),
+        panel(FigureCurve("", T, 1.5 * T), FigureCurve("", T, 2.5 * T), FigureCurve("mean", T, 2.0 * T)),
         Panel("Points", "t in s", "part of all windows in which a manipulated meter was named", (DOTS,)),
         caption="A caption of more than one line says in one sentence what there is to see in the picture. "
         * 2,
@@ -116,21 +119,21 @@ def test_no_text_is_cut_and_none_lies_on_data() -> None:
 
 
 def test_neighbours_over_one_abscissa_share_it() -> None:
-    one, other = panel(Line("", T, T)), panel(Line("", T + 5.0, T))
+    one, other = panel(FigureCurve("", T, T)), panel(FigureCurve("", T + 5.0, T))
     labels = [axes.get_xlabel() for axes in draw(figure(one, one, other)).axes]
     assert labels == ["", "t in s", "t in s"]
-    labels = [axes.get_xlabel() for axes in draw(figure(one, panel(Line("", T, T), x_label="k"))).axes]
+    labels = [axes.get_xlabel() for axes in draw(figure(one, panel(FigureCurve("", T, T), x_label="k"))).axes]
     assert labels == ["t in s", "k"]
-    upper, lower = draw(figure(one, panel(Line("", T, T, "points")))).axes
+    upper, lower = draw(figure(one, panel(FigureCurve("", T, T, "points")))).axes
     assert upper.get_xlim() == lower.get_xlim()
 
 
 def test_whole_numbers_have_ticks_at_whole_numbers() -> None:
-    axes = draw(figure(panel(Line("", T, np.where(T < 5.0, 1.0, 2.0), "steps")))).axes[0]
+    axes = draw(figure(panel(FigureCurve("", T, np.where(T < 5.0, 1.0, 2.0), "steps")))).axes[0]
     assert np.all(axes.get_yticks() == np.round(axes.get_yticks()))
-    axes = draw(figure(panel(Line("", T, np.zeros(T.size), "points")))).axes[0]
+    axes = draw(figure(panel(FigureCurve("", T, np.zeros(T.size), "points")))).axes[0]
     assert [y for y in axes.get_yticks() if axes.get_ylim()[0] <= y <= axes.get_ylim()[1]] == [0.0, 1.0]
-    axes = draw(figure(panel(Line("", T, np.where(T < 5.0, 1.0, 1.5), "steps")))).axes[0]
+    axes = draw(figure(panel(FigureCurve("", T, np.where(T < 5.0, 1.0, 1.5), "steps")))).axes[0]
     assert np.any(axes.get_yticks() != np.round(axes.get_yticks()))
 
 
@@ -144,9 +147,9 @@ def colours(canvas: Canvas) -> list[list[str]]:
 
 
 def test_a_label_keeps_its_colour() -> None:
-    a, b, c, d = (Line(label, T, T) for label in "abcd")
+    a, b, c, d = (FigureCurve(label, T, T) for label in "abcd")
     first, second, third, fourth = colours(
-        draw(figure(panel(a, b), panel(b, c), panel(d), panel(d, Line("", T, T))))
+        draw(figure(panel(a, b), panel(b, c), panel(d), panel(d, FigureCurve("", T, T))))
     )
     assert [*first, second[1]] == list(PALETTE[:3])
     assert second[0] == first[1]
@@ -155,7 +158,7 @@ def test_a_label_keeps_its_colour() -> None:
 
 
 def test_large_families_have_colours_of_their_own_in_each_panel() -> None:
-    first, second = ([Line(str(k), T, T) for k in range(*ends)] for ends in ((0, 5), (4, 10)))
+    first, second = ([FigureCurve(str(k), T, T) for k in range(*ends)] for ends in ((0, 5), (4, 10)))
     upper, lower = colours(draw(figure(panel(*first), panel(*second))))
     assert upper == list(PALETTE[:5])
     assert lower == list(PALETTE[:6])
@@ -163,13 +166,15 @@ def test_large_families_have_colours_of_their_own_in_each_panel() -> None:
 
 @pytest.mark.parametrize("count", [13, 30])
 def test_of_many_curves_each_looks_different(count: int) -> None:
-    (axes,) = draw(figure(panel(*(Line(str(k), T, T + k) for k in range(count))))).axes
+    (axes,) = draw(figure(panel(*(FigureCurve(str(k), T, T + k) for k in range(count))))).axes
     assert len({(to_hex(line.get_color()), line.get_linestyle()) for line in axes.lines}) == count
 
 
 def test_a_curve_under_another_still_shows() -> None:
-    same = [Line(label, T, T, style) for label, style in (("a", "solid"), ("b", "steps"), ("c", "dashed"))]
-    points = [Line(label, T, T, "points") for label in "abc"]
+    same = [
+        FigureCurve(label, T, T, style) for label, style in (("a", "solid"), ("b", "steps"), ("c", "dashed"))
+    ]
+    points = [FigureCurve(label, T, T, "points") for label in "abc"]
     solid, dots = draw(figure(panel(*same), panel(*points))).axes
     widths = [line.get_linewidth() for line in solid.lines]
     sizes = [line.get_markersize() for line in dots.lines]
@@ -178,15 +183,21 @@ def test_a_curve_under_another_still_shows() -> None:
 
 
 def test_partners_without_a_label_lie_in_front() -> None:
-    lines = (Line("true", T, T), Line("", T, T, "dashed"), Line("", T, -T))
+    lines = (FigureCurve("true", T, T), FigureCurve("", T, T, "dashed"), FigureCurve("", T, -T))
     truth, partner, crowd = draw(figure(panel(*lines))).axes[0].lines
     assert partner.get_zorder() > truth.get_zorder() > crowd.get_zorder()
     assert [partner.get_color(), crowd.get_color()] == [INK, FAINT]
 
 
 def test_letters_are_typeset() -> None:
-    lines = (Line("pi_J, J without 3", T, T), Line("a2", T, T), Line("m02 -> c_in", T, T))
-    axes = draw(Figure("n", "c", (Panel("sigma(t) of theta 1", "t in s", "xhat - x <= 1", lines),))).axes[0]
+    lines = (
+        FigureCurve("pi_J, J without 3", T, T),
+        FigureCurve("a2", T, T),
+        FigureCurve("m02 -> c_in", T, T),
+    )
+    axes = draw(
+        PaperFigure("n", "c", (Panel("sigma(t) of theta 1", "t in s", "xhat - x <= 1", lines),))
+    ).axes[0]
     assert axes.get_title(loc="left") == r"σ(t) of $\mathregular{θ_{1}}$"
     assert axes.get_ylabel() == r"$\mathregular{\hat{x}}$ − x ≤ 1"
     legend = axes.get_legend()
@@ -246,7 +257,7 @@ def chunks(data: bytes) -> dict[bytes, list[bytes]]:
 
 
 def test_a_png_is_sharp_named_and_always_the_same() -> None:
-    asked = figure(panel(Line("", T, T)))
+    asked = figure(panel(FigureCurve("", T, T)))
     data = png(asked)
     assert data == png(asked)
     parts = chunks(data)
@@ -257,7 +268,7 @@ def test_a_png_is_sharp_named_and_always_the_same() -> None:
 
 
 def test_settings_of_the_caller_are_neither_changed_nor_used() -> None:
-    asked = figure(panel(Line("a", T, T), Line("b", T, -T)))
+    asked = figure(panel(FigureCurve("a", T, T), FigureCurve("b", T, -T)))
     expected = png(asked)
     with mpl.rc_context({"font.size": 30.0, "axes.facecolor": "black", "lines.linewidth": 9.0}):
         before = dict(mpl.rcParams)
@@ -278,8 +289,8 @@ def test_nothing_is_imported_before_something_is_drawn() -> None:
     assert python(code) == "False True"
     code = (
         "import sys\nimport numpy as np\nfrom gridsec.papers.draw import png\n"
-        "from gridsec.papers.claims import Figure, Line, Panel\n"
-        "x = np.arange(3.0)\npng(Figure('n', 'c', (Panel('t', 'x', 'y', (Line('', x, x),)),)))\n"
+        "from gridsec.papers.claims import PaperFigure, FigureCurve, Panel\n"
+        "x = np.arange(3.0)\npng(PaperFigure('n', 'c', (Panel('t', 'x', 'y', (FigureCurve('', x, x),)),)))\n"
         "print('matplotlib.pyplot' in sys.modules)"
     )
     assert python(code) == "False"

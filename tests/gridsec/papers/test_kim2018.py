@@ -15,7 +15,7 @@ from gridsec.observers.high_gain.constants import Slopes, decay_componentwise, d
 from gridsec.observers.high_gain.form import at, jacobian_at
 from gridsec.papers import kim2018 as example
 from gridsec.papers import lee2018_chapter5
-from gridsec.papers.claims import Line, at_most, number, rounded_up, statement
+from gridsec.papers.claims import FigureCurve, at_most, number, rounded_up, statement
 from tests.codes import refused
 from tests.gridsec.papers.made import made
 
@@ -245,4 +245,4 @@ def test_claims_compare_as_they_say() -> None:
     assert statement("", "", "a", "a").met
     assert not statement("", "", "a", "b").met
     with refused(InputInvalid, "shape"):
-        Line("", np.zeros(2), np.zeros(3))
+        FigureCurve("", np.zeros(2), np.zeros(3))

@@ -15,7 +15,7 @@ from gridsec.grid.radial import Feeder
 from gridsec.grid.three_phase import ThreePhaseFeeder
 from gridsec.observers.lure import Lure, close_loop
 from gridsec.planning.redundancy import unknown_pair, unknown_voltages
-from gridsec.planning.stealthy_attacks import Box
+from gridsec.planning.stealthy_attacks import ErrorBox
 from gridsec.secure.index import observable_rows, unstable_subspace
 
 TOL = 1e-9
@@ -111,7 +111,7 @@ def brute(
     return np.inf
 
 
-def street(seed: int, meters: int = 6) -> Box:
+def street(seed: int, meters: int = 6) -> ErrorBox:
     """A random feeder's paths in common, soft enough for loads and meters to matter alike."""
     rng = np.random.default_rng(seed)
     n = meters + 1
@@ -124,4 +124,4 @@ def street(seed: int, meters: int = 6) -> Box:
     R = paths @ np.diag(rng.uniform(0.5, 2.0, n)) @ paths.T
     effect = np.hstack([2 * R * rng.uniform(0.0, 0.004, n), np.full((n, 1), 0.001)])
     at = np.sort(rng.choice(n, meters, replace=False))
-    return Box(effect, at, rng.uniform(0.001, 0.01, meters))
+    return ErrorBox(effect, at, rng.uniform(0.001, 0.01, meters))

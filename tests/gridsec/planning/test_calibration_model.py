@@ -9,7 +9,7 @@ import pytest
 
 from gridsec.arrays import Floats
 from gridsec.grid.radial import Feeder
-from gridsec.planning.calibration import Doubts, Places, Series, lengthened, regressors, steps
+from gridsec.planning.calibration import Places, PriorUncertainty, Series, lengthened, regressors, steps
 from tests.gridsec.planning.small import tree
 
 T = 6
@@ -112,7 +112,9 @@ def test_a_longer_line_is_its_drop() -> None:
 def test_columns_of_powers_are_differences_of_the_flow() -> None:
     feeder, places, series = scene(2)
     count, meters = feeder.bus.size, places.meters.size
-    doubts = Doubts(np.ones(meters), *(np.ones(count) for _ in range(6)), np.ones(feeder.parent.size))
+    doubts = PriorUncertainty(
+        np.ones(meters), *(np.ones(count) for _ in range(6)), np.ones(feeder.parent.size)
+    )
     made = regressors(places, series, doubts)
     base = voltages(feeder, series.p, series.q)
     grow = np.zeros((T, count))

@@ -14,7 +14,7 @@ from gridsec.arrays import Floats
 from gridsec.errors import DesignInfeasible, InputInvalid
 from gridsec.grid.droop import Droop, voltage_curve
 from gridsec.grid.radial import Feeder
-from gridsec.planning.droop.ac_sensitivity import Box, currents, network, region, sensitivity, solve
+from gridsec.planning.droop.ac_sensitivity import InjectionBox, currents, network, region, sensitivity, solve
 from gridsec.planning.droop.equilibrium import always, at_rest, injected, rest, shares, shares_of_gain
 from gridsec.planning.droop.stability import (
     Loop,
@@ -34,14 +34,14 @@ from tests.gridsec.radial import random_feeder, random_loop, sweep
 FEW = settings(max_examples=25)
 
 
-def random_box(feeder: Feeder, rng: np.random.Generator, size: float) -> Box:
+def random_box(feeder: Feeder, rng: np.random.Generator, size: float) -> InjectionBox:
     count = len(feeder.customers)
     p, q = rng.uniform(-0.08, 0.08, (2, count))
     dp, dq = size * rng.uniform(0.0, 0.05, (2, count))
-    return Box(p - dp, p + dp, q - dq, q + dq, 0.99, 1.03)
+    return InjectionBox(p - dp, p + dp, q - dq, q + dq, 0.99, 1.03)
 
 
-def corners(box: Box, rng: np.random.Generator) -> tuple[Floats, Floats, float]:
+def corners(box: InjectionBox, rng: np.random.Generator) -> tuple[Floats, Floats, float]:
     """A point of the box, often on its edges."""
     u = np.clip(rng.uniform(-0.5, 1.5, (2, box.p_low.size)), 0.0, 1.0)
     p = box.p_low + u[0] * (box.p_high - box.p_low)
@@ -137,7 +137,7 @@ def test_a_box_that_holds_collapse_is_refused() -> None:
     count = len(feeder.customers)
     none = np.zeros(count)
     with refused(DesignInfeasible, "no-solution"):
-        region(network(feeder), Box(np.full(count, -20.0), none, none, none, 1.0, 1.0))
+        region(network(feeder), InjectionBox(np.full(count, -20.0), none, none, none, 1.0, 1.0))
 
 
 # --- certificates -----------------------------------------------------------------------------------------
@@ -291,7 +291,7 @@ def test_loop_leaves_out_inverters_that_do_not_react() -> None:
     feeder, droop, _ = random_loop(11, gain=0.3)
     count = len(feeder.customers)
     still = np.zeros(count)
-    quiet = reach(network(feeder), droop, Box(still, still, still, still, 1.0, 1.0))
+    quiet = reach(network(feeder), droop, InjectionBox(still, still, still, still, 1.0, 1.0))
     made = loop(droop, quiet, Update())
     assert made.tau.size == 0
     assert proof(made).kind == "deadband"
@@ -366,7 +366,7 @@ def test_the_band_at_rest_is_reached_where_all_sensitivities_are_positive() -> N
     count = len(feeder.customers)
     full, none = np.full(count, 0.01), np.zeros(count)
     line = replace(feeder, parent=np.arange(feeder.parent.size), x=0.5 * feeder.r)
-    loads = Box(-full, full, none, none, 1.0, 1.0)
+    loads = InjectionBox(-full, full, none, none, 1.0, 1.0)
     net = network(line)
     band = at_rest(net, droop, loads)
     V = np.abs(rest(net, droop, np.stack([-full, full]) + 0j, 1.0)[1])

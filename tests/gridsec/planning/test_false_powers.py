@@ -10,22 +10,22 @@ from scipy.optimize import linprog
 
 from gridsec.arrays import Bools
 from gridsec.planning.protection import fewest_protected, lies_beyond
-from gridsec.planning.stealthy_attacks import FalsePowers, largest_lie, largest_story
+from gridsec.planning.stealthy_attacks import PowerErrorModel, largest_lie, largest_story
 from tests.gridsec.planning.small import street
 
 
-def stories(seed: int, meters: int) -> FalsePowers:
+def stories(seed: int, meters: int) -> PowerErrorModel:
     """A street whose powers are known to a share, by its meters: of unknowns that belong to nobody too."""
     box, rng = street(seed, meters=meters), np.random.default_rng(seed)
     k = box.effect.shape[1]
-    return FalsePowers(box, rng.integers(-1, box.meters.size, k), rng.choice([0.0, 0.1, 0.5, 1.0], k))
+    return PowerErrorModel(box, rng.integers(-1, box.meters.size, k), rng.choice([0.0, 0.1, 0.5, 1.0], k))
 
 
 def mask(p: int, some: tuple[int, ...]) -> Bools:
     return np.isin(np.arange(p), some)
 
 
-def tried(given: FalsePowers, meter: int, liars: int, honest: Bools) -> float:
+def tried(given: PowerErrorModel, meter: int, liars: int, honest: Bools) -> float:
     """Every set of liars by a linear program of its own; bounds of the unknowns are written out."""
     box, best = given.box, 0.0
     able = [j for j in range(box.meters.size) if not honest[j]]
@@ -71,7 +71,9 @@ def test_largest_stories_equal_enumeration(seed: int) -> None:
 
 def test_with_true_powers_it_is_the_lie_alone() -> None:
     given = stories(3, 4)
-    true = FalsePowers(given.told(mask(given.box.meters.size, ())), given.owner, np.ones(given.owner.size))
+    true = PowerErrorModel(
+        given.told(mask(given.box.meters.size, ())), given.owner, np.ones(given.owner.size)
+    )
     for j in range(true.box.meters.size):
         assert largest_story(true, j, 2).size == pytest.approx(largest_lie(true.box, j, 2).size)
 

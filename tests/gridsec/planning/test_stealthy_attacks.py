@@ -10,12 +10,12 @@ from scipy.optimize import linprog
 
 from gridsec.arrays import Floats
 from gridsec.errors import InputInvalid
-from gridsec.planning.stealthy_attacks import Box, largest_lie, worst_error
+from gridsec.planning.stealthy_attacks import ErrorBox, largest_lie, worst_error
 from tests.codes import refused
 from tests.gridsec.planning.small import street
 
 
-def tried(box: Box, row: Floats, liars: int, honest: Floats, must: int | None) -> float:
+def tried(box: ErrorBox, row: Floats, liars: int, honest: Floats, must: int | None) -> float:
     """Maximum of ``2 row c`` by trying every set of liars."""
     able = [j for j in range(box.meters.size) if not honest[j]]
     best = 0.0
@@ -87,6 +87,6 @@ def test_protection_and_collusion_are_monotone() -> None:
 
 def test_boxes_are_checked() -> None:
     with refused(InputInvalid, "not-positive"):
-        Box(np.eye(2), np.array([0, 1]), np.array([0.1, 0.0]))
+        ErrorBox(np.eye(2), np.array([0, 1]), np.array([0.1, 0.0]))
     with refused(InputInvalid, "shape"):
-        Box(np.eye(2), np.array([0, 1]), np.array([0.1]))
+        ErrorBox(np.eye(2), np.array([0, 1]), np.array([0.1]))

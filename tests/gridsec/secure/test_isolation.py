@@ -25,8 +25,8 @@ from gridsec.observers.unknown_input import UnknownInputPlant, exact, inverters,
 from gridsec.papers import yang2021, yang2021_feeder
 from gridsec.secure import isolation
 from gridsec.secure.isolation import (
-    Isolation,
     IsolationDesign,
+    IsolationStep,
     Measure,
     disagreement,
     init,
@@ -64,7 +64,9 @@ def partial() -> IsolationDesign:
     )
 
 
-def drive(made: IsolationDesign, a_u: Floats, a_y: Floats, seed: int = 0) -> tuple[list[Isolation], Floats]:
+def drive(
+    made: IsolationDesign, a_u: Floats, a_y: Floats, seed: int = 0
+) -> tuple[list[IsolationStep], Floats]:
     """Answers and true states for given attacks."""
     rng = np.random.default_rng(seed)
     plant = made.family.plant

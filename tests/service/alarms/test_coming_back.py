@@ -7,7 +7,7 @@ from pathlib import Path
 from feeders.model.site import load
 from feeders.simulation.scenario import Scenario, by_arrival, random_attacks, simulate
 from service.alarms.state_machine import AlarmKind, AlarmState, Change
-from service.engine.engine import Rounds, RuntimeConfig
+from service.engine.engine import Engine, RuntimeConfig
 from service.engine.feeder_monitor import design
 from service.ingest.align import Clock
 from service.store import Store
@@ -25,14 +25,14 @@ def test_who_lies_again_soon_after_a_restart_raises_the_same_alarm(tmp_path: Pat
     readings = list(by_arrival(simulate(site, scenario)))
     with Store(f"sqlite:///{tmp_path}/s.db") as store:
         for begin, end in ((0.0, 25.0), (25.0, 36.0)):
-            live = Rounds(
+            live = Engine(
                 RuntimeConfig(clock=Clock.EVENTS),
                 store,
                 [site],
                 wall=lambda: START + begin,  # noqa: B023
                 stored=lambda: None,
             )
-            live.watches[FEEDER].install(design(site))
+            live.monitors[FEEDER].install(design(site))
             live.begin()
             feed(live, samples(readings, begin, end))
             ((alarm,), _) = store.alarms()

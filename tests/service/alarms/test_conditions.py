@@ -15,7 +15,7 @@ from service.alarms.state_machine import (
     AlarmKind,
     AlarmRules,
     Condition,
-    Evidence,
+    ConditionEvidence,
     Severity,
     advance,
     conditions,
@@ -41,7 +41,7 @@ def test_a_suspect_is_a_condition_with_its_numbers() -> None:
     (found,) = conditions(report(meter("m1"), liar, cause=Cause.RESIDUALS))
     assert (found.kind, found.meter, found.known) == (AlarmKind.METER_MANIPULATED, "m2", True)
     assert found.severity is Severity.CRITICAL
-    assert found.evidence == Evidence(9e-3, 2e-3, 240.0, 230.0, 10.0)
+    assert found.evidence == ConditionEvidence(9e-3, 2e-3, 240.0, 230.0, 10.0)
     assert "240.0 V" in found.reason
     assert "230.0 V" in found.reason
 
@@ -58,7 +58,7 @@ def test_a_manipulated_inverter_is_a_condition_of_its_customer() -> None:
     (found,) = conditions(with_inverters(report(meter("m1"), cause=Cause.RESIDUALS), wrong, other))
     assert (found.kind, found.subject, found.meter) == (AlarmKind.INVERTER_MANIPULATED, "Miller", "m1")
     assert (found.severity, found.known) == (Severity.CRITICAL, True)
-    assert found.evidence == Evidence(attack_kvar_estimated=-6.25)
+    assert found.evidence == ConditionEvidence(attack_kvar_estimated=-6.25)
     assert "the inverter of Miller injects -6.2 kvar" in found.reason
 
 
@@ -211,7 +211,7 @@ def test_stalled_meters_are_one_condition_of_the_feeder() -> None:
     (found,) = conditions(with_learning(now, learning))
     assert (found.kind, found.subject, found.known) == (AlarmKind.LEARNING_STALLED, None, True)
     assert found.severity is Severity.MINOR
-    assert found.evidence == Evidence(learning=STALLED)
+    assert found.evidence == ConditionEvidence(learning=STALLED)
     assert found.reason == (
         "2 of 3 meters are not learned after twice the expected time of 86401 s: no-busbar (1), silent (1)"
     )

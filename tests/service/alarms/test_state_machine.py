@@ -20,13 +20,13 @@ from service.alarms.state_machine import (
     AlarmKind,
     AlarmRules,
     AlarmState,
+    AlarmTransition,
     AlarmUnknown,
     AlreadyAcknowledged,
     Change,
     Condition,
-    Evidence,
+    ConditionEvidence,
     Severity,
-    Transition,
     acknowledge,
     acknowledged,
     advance,
@@ -78,7 +78,9 @@ def tick(truth: str, name: str | None = "m1") -> list[Condition]:
     if truth == "A":
         return []
     kind = AlarmKind.METER_MANIPULATED
-    return [Condition(kind, FEEDER, name, Severity.CRITICAL, Evidence(1.0), "why", known=truth == "P")]
+    return [
+        Condition(kind, FEEDER, name, Severity.CRITICAL, ConditionEvidence(1.0), "why", known=truth == "P")
+    ]
 
 
 Tick = tuple[float, str]
@@ -86,16 +88,16 @@ Tick = tuple[float, str]
 
 def run(
     ticks: Sequence[Tick], rules: AlarmRules = RULES, book: AlarmBook | None = None
-) -> tuple[AlarmBook, list[Transition]]:
+) -> tuple[AlarmBook, list[AlarmTransition]]:
     book = book or AlarmBook(FEEDER)
-    happened: list[Transition] = []
+    happened: list[AlarmTransition] = []
     for t, truth in ticks:
         book, new = advance(book, rules, tick(truth), t)
         happened += new
     return book, happened
 
 
-def times(happened: Iterable[Transition]) -> list[tuple[float, Change]]:
+def times(happened: Iterable[AlarmTransition]) -> list[tuple[float, Change]]:
     return [(item.t - T0, item.change) for item in happened]
 
 
@@ -223,7 +225,7 @@ def test_conditions_of_another_feeder_are_refused() -> None:
 
 def test_meters_do_not_disturb_each_other_and_the_order_is_repeatable() -> None:
     book = AlarmBook(FEEDER)
-    happened: list[Transition] = []
+    happened: list[AlarmTransition] = []
     for k in range(4):
         names = ["m2", None, "m1"] if k else ["m1"]
         book, new = advance(book, RULES, [c for name in names for c in tick("P", name)], T0 + k)
@@ -348,7 +350,7 @@ def raised() -> tuple[AlarmBook, Alarm]:
 def test_acknowledging_keeps_the_alarm_and_says_who() -> None:
     book, alarm = raised()
     book, (item,) = acknowledge(book, alarm.id, "Ada", "on my way", T0 + 10)
-    assert item == Transition(book.active[0], Change.ACKNOWLEDGED, T0 + 10, "Ada", "on my way")
+    assert item == AlarmTransition(book.active[0], Change.ACKNOWLEDGED, T0 + 10, "Ada", "on my way")
     assert item.alarm == replace(
         alarm,
         state=AlarmState.ACKNOWLEDGED,
@@ -435,7 +437,7 @@ def test_json_and_back() -> None:
     assert type(data["state"]) is str
     assert from_json({**data, "unknown": 1}) == alarm
     shown = (ExplanationReport(("m1", "m2"), ("Miller",), 0.5, ("Smith",)),)
-    rich = replace(alarm, customer="Miller", evidence=Evidence(kind="stuck", explanations=shown))
+    rich = replace(alarm, customer="Miller", evidence=ConditionEvidence(kind="stuck", explanations=shown))
     assert from_json(json.loads(json.dumps(to_json(rich)))) == rich
 
 

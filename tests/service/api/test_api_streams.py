@@ -11,7 +11,7 @@ import fastapi.routing
 import pytest
 
 from gridsec.interface import Cause
-from service.alarms.state_machine import Change, Transition
+from service.alarms.state_machine import AlarmTransition, Change
 from service.report.report import to_json as report_json
 from tests.service.asking import T0, Setup, Stream, is_problem
 from tests.service.running import PATIENCE_S, until
@@ -88,7 +88,7 @@ def test_a_quiet_stream_has_a_heartbeat(setup: Setup, monkeypatch: pytest.Monkey
 def test_a_slow_client_costs_nothing_and_loses_nothing(setup: Setup) -> None:
     setup.attack()
     alarm = setup.service.books["village"].active[0]
-    transition = Transition(alarm, Change.RAISED, T0, None, "x" * 60_000)
+    transition = AlarmTransition(alarm, Change.RAISED, T0, None, "x" * 60_000)
     with socket.create_connection(("127.0.0.1", setup.server.port)) as client:
         client.sendall(b"GET /api/v1/alarms/stream?after=1 HTTP/1.1\r\nHost: x\r\n\r\n")
         until(lambda: setup.service.queues, "the stream")

@@ -13,9 +13,9 @@ import pytest
 from feeders.format.tables import write
 from feeders.model.profiles import Season
 from feeders.model.site import load
-from feeders.simulation.attacks import Trick
+from feeders.simulation.attacks import AttackKind
 from feeders.simulation.trial import LoadError
-from feeders.studies.campaign.plan import Kind, Place, Plan
+from feeders.studies.campaign.plan import AttackClass, CampaignPlan, Place
 from feeders.studies.campaign.study import campaign
 from feeders.studies.droop.study import DroopOptions, droop
 from tests.feeders.villages import village, village_without_inverters
@@ -106,10 +106,10 @@ def test_options_are_stronger_than_the_files(
         "within 0.1 kW and 0.05 kvar, medians of 1 sigma (--load-error-kw, --load-error-kvar)",
     ):
         assert said in plain(told)
-    plan = Plan(
+    plan = CampaignPlan(
         scenes=1,
         together=3,
-        kinds=(Kind("bias", Trick.BIAS, (3.0,)),),
+        kinds=(AttackClass("bias", AttackKind.BIAS, (3.0,)),),
         liars=(1,),
         places=(Place.RANDOM,),
         seasons=(Season.SUMMER,),

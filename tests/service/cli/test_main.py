@@ -26,10 +26,10 @@ from feeders.format.tables import write
 from feeders.model.site import load
 from feeders.simulation.recording import read_recording
 from feeders.simulation.scenario import Scenario, random_attacks
-from service.cli.demo import Outcome, verdict
+from service.cli.demo import DemoResult, verdict
 from service.cli.simulate import Pace, play
 from service.ingest.queues import BusConfig
-from service.ingest.zenoh_bus import Meters
+from service.ingest.zenoh_bus import MeterClient
 from tests.service.commands import command, plain
 from tests.service.running import FEEDER, free_port, until
 
@@ -400,7 +400,7 @@ def test_a_wrong_inverter_is_recorded_and_raises_its_alarm(gridsec: Run, tmp_pat
 def test_a_signal_ends_the_service_in_time_even_with_a_stream_open(number: int, tmp_path: Path) -> None:
     with serving(tmp_path) as (child, url, zenoh):
         with (
-            Meters(BusConfig("client", connect=(zenoh,)), "gridsec"),
+            MeterClient(BusConfig("client", connect=(zenoh,)), "gridsec"),
             httpx.stream("GET", f"{url}/api/v1/alarms/stream", timeout=10.0) as stream,
         ):
             assert stream.status_code == 200
@@ -426,7 +426,7 @@ def test_an_acknowledged_alarm_survives_kill_9(tmp_path: Path) -> None:
     attacks = random_attacks(site, 2, "bias", 1, 0.03, t_on=start + 10, t_off=start + 1e6)
     scenario = Scenario(seed=1, start=start, duration_s=30.0, attacks=attacks)
     with serving(tmp_path, "--clock", "events") as (child, url, zenoh):
-        with Meters(BusConfig("client", connect=(zenoh,)), "gridsec") as meters:
+        with MeterClient(BusConfig("client", connect=(zenoh,)), "gridsec") as meters:
             for _ in play(site, scenario, meters, Pace(float("inf"), ahead=3)):
                 pass
             (alarm,) = until(lambda: httpx.get(f"{url}/api/v1/alarms").json()["alarms"])
@@ -440,7 +440,7 @@ def test_an_acknowledged_alarm_survives_kill_9(tmp_path: Path) -> None:
         events = httpx.get(f"{url}/api/v1/alarms/{alarm['id']}/events").json()["events"]
         assert [e["change"] for e in events] == ["raised", "acknowledged"]
         # Still lying: the same alarm stands, no second one is raised.
-        with Meters(BusConfig("client", connect=(zenoh,)), "gridsec") as meters:
+        with MeterClient(BusConfig("client", connect=(zenoh,)), "gridsec") as meters:
             later = Scenario(seed=1, start=start + 30.0, duration_s=20.0, attacks=attacks)
             for _ in play(site, later, meters, Pace(float("inf"), ahead=3)):
                 pass
@@ -461,7 +461,7 @@ def test_a_log_that_cannot_be_written_stops_nothing(tmp_path: Path, disk: bool) 
     attacks = random_attacks(site, 2, "bias", 1, 0.03, t_on=start + 10, t_off=start + 20)
     scenario = Scenario(seed=1, start=start, duration_s=40.0, attacks=attacks)
     with serving(tmp_path, "--clock", "events", log=log) as (child, url, zenoh):
-        with Meters(BusConfig("client", connect=(zenoh,)), "gridsec") as meters:
+        with MeterClient(BusConfig("client", connect=(zenoh,)), "gridsec") as meters:
             for _ in play(site, scenario, meters, Pace(float("inf"), ahead=3)):
                 pass
             until(
@@ -504,13 +504,13 @@ def test_demo_shows_and_checks(gridsec: Run) -> None:
 
 
 def test_demo_fails_for_every_kind_of_mistake() -> None:
-    assert verdict(Outcome({"a", "b"}, {"a", "b"})) == ()
-    assert verdict(Outcome({"a", "b"}, {"a", "c"}, ["alarms still active: undecided x"])) == (
+    assert verdict(DemoResult({"a", "b"}, {"a", "b"})) == ()
+    assert verdict(DemoResult({"a", "b"}, {"a", "c"}, ["alarms still active: undecided x"])) == (
         "alarms still active: undecided x",
         "manipulated and not named: b",
         "named and not manipulated: c",
     )
-    assert verdict(Outcome()) == ("no meter was manipulated",)
+    assert verdict(DemoResult()) == ("no meter was manipulated",)
 
 
 def test_demo_does_not_check_what_need_not_show(gridsec: Run) -> None:

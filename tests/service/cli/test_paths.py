@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from feeders.format.tables import write
-from service.cli.paths import Unusable, see
+from service.cli.paths import Unusable, check_paths
 from tests.codes import refused
 from tests.feeders.villages import tables
 from tests.service.commands import command, plain
@@ -103,12 +103,12 @@ def test_readings_that_are_none_do_not_cost_the_other_studies(
 
 def test_what_nobody_can_write_into_is_told(place: Path) -> None:
     with refused(Unusable, "not-writable"):
-        see(folders={"--out": Path("/proc/no/such/folder")})
+        check_paths(folders={"--out": Path("/proc/no/such/folder")})
     (place / "link").symlink_to("nowhere")
     with refused(Unusable, "dead-link"):
-        see(folders={"--out": Path("link")})
+        check_paths(folders={"--out": Path("link")})
     with refused(Unusable, "no-access", "not-file") as caught:
-        see(folders={"--out": Path("x" * 300)}, files={"--csv": Path("FOLDER")})
+        check_paths(folders={"--out": Path("x" * 300)}, files={"--csv": Path("FOLDER")})
     assert [each.partition(": ")[0] for each in caught.value.problems] == [
         "--out " + "x" * 300,
         "--csv FOLDER",
@@ -117,7 +117,7 @@ def test_what_nobody_can_write_into_is_told(place: Path) -> None:
 
 def test_what_can_be_written_is_not_touched(place: Path) -> None:
     before = content(place.parent)
-    see(
+    check_paths(
         folders={"--out": Path("FOLDER"), "--more": Path("new/folder"), "--not-given": None},
         over={"folder": Path("VILLAGE")},
         new={"--write": Path("copy")},

@@ -16,7 +16,7 @@ from feeders.simulation.scenario import Scenario
 from service.cli.simulate import OutOfStep, Pace, play
 from service.ingest.align import Aligner, Clock, rules
 from service.ingest.reading import Reading
-from service.ingest.zenoh_bus import Meters
+from service.ingest.zenoh_bus import MeterClient
 
 FEEDER = "simbench-lv-rural1"
 START = 1_795_212_000.0
@@ -60,7 +60,7 @@ def lags(dt_s: float, tick_s: float, ahead: int, offset_s: float = 0.0, loss: fl
     )
     pace = Pace(speed=math.inf, ahead=ahead)
     played = play(
-        site, scenario, cast(Meters, service), pace, clock=lambda: float(next(now)), sleep=lambda _: None
+        site, scenario, cast(MeterClient, service), pace, clock=lambda: float(next(now)), sleep=lambda _: None
     )
     out: list[Any] = [sample.t - service.reached for sample in played]
     return [lag for lag in out if math.isfinite(lag)]

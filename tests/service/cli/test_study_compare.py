@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from feeders.registry.registry import FAMILIES
-from feeders.studies.comparison import BEGIN, END, Row
+from feeders.studies.comparison import BEGIN, END, ComparisonRow
 from service.cli import study_compare
 from tests.service.commands import command
 
@@ -57,7 +57,7 @@ def test_what_is_written_in_the_document_during_the_work_stays(
     page = tmp_path / "page.md"
     page.write_text(f"{BEGIN}\nold\n{END}\n", encoding="utf-8")
 
-    def working(*_: object) -> list[Row]:
+    def working(*_: object) -> list[ComparisonRow]:
         with page.open("a", encoding="utf-8") as file:
             file.write("written meanwhile\n")
         return []

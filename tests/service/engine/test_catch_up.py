@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 
 from feeders.model.site import Site
-from feeders.simulation.scenario import Reading, Scenario, by_arrival, random_attacks, simulate
+from feeders.simulation.scenario import Scenario, SimulatedReading, by_arrival, random_attacks, simulate
 from service.alarms.state_machine import AlarmState
 from service.cli.simulate import key_of, payload_of
-from service.engine.engine import BUDGET_S, Rounds, RuntimeConfig
-from service.engine.feeder_monitor import TickResult, Watch, design
-from service.engine.replay import Tally, replay
+from service.engine.engine import BUDGET_S, Engine, RuntimeConfig
+from service.engine.feeder_monitor import FeederMonitor, TickResult, design
+from service.engine.replay import ReplayCounts, replay
 from service.ingest.align import LEAP_TICKS, Clock
 from service.ingest.queues import Sample
 from service.report.report import FeederReport, to_json
@@ -33,16 +33,16 @@ class Scene:
     def __init__(self, store: Store, site: Site, monkeypatch: pytest.MonkeyPatch, clock: Clock) -> None:
         self.wall, self.monotonic, self.alive = START - 0.5, 0.0, True
         self.reports: list[FeederReport] = []
-        judge = Watch.judge
+        judge = FeederMonitor.judge
 
-        def judged(watch: Watch) -> TickResult:
+        def judged(monitor: FeederMonitor) -> TickResult:
             self.monotonic += TICK_COST_S
-            result = judge(watch)
+            result = judge(monitor)
             self.reports.append(result.report)
             return result
 
-        monkeypatch.setattr(Watch, "judge", judged)
-        self.rounds = Rounds(
+        monkeypatch.setattr(FeederMonitor, "judge", judged)
+        self.rounds = Engine(
             RuntimeConfig(clock=clock),
             store,
             [site],
@@ -51,21 +51,21 @@ class Scene:
             clock=lambda: self.monotonic,
             go_on=lambda: self.alive,
         )
-        self.rounds.keeper.publisher = Outlet()
-        self.watch = self.rounds.watches[FEEDER]
+        self.rounds.committer.publisher = Outlet()
+        self.watch = self.rounds.monitors[FEEDER]
         self.watch.install(design(site))
         self.rounds.begin()
-        self.rounds.round([])
+        self.rounds.cycle([])
 
-    def play(self, readings: list[Reading], shift: float = 0.0) -> None:
+    def play(self, readings: list[SimulatedReading], shift: float = 0.0) -> None:
         """One round per reading time."""
         for t in sorted({r.t for r in readings}):
             now = [replace(r, t=r.t + shift, arrival=r.t + shift + 0.1) for r in readings if r.t == t]
             self.wall = t + shift + 0.2
-            self.rounds.round([sample(r) for r in now])
+            self.rounds.cycle([sample(r) for r in now])
 
 
-def sample(r: Reading) -> Sample:
+def sample(r: SimulatedReading) -> Sample:
     return Sample(f"gridsec/{key_of(FEEDER, r.meter)}", payload_of(r), "", float(r.arrival or r.t), 1)
 
 
@@ -76,24 +76,24 @@ def scene(site: Site, path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[C
 
 
 @pytest.fixture(scope="module")
-def readings(site: Site) -> list[Reading]:
+def readings(site: Site) -> list[SimulatedReading]:
     attacks = random_attacks(site, 2, "bias", 1, 0.03, t_on=START + 13, t_off=START + 100)
     return list(by_arrival(simulate(site, Scenario(seed=1, start=START, duration_s=40.0, attacks=attacks))))
 
 
-def seconds(readings: list[Reading], first: float, last: float) -> list[Reading]:
+def seconds(readings: list[SimulatedReading], first: float, last: float) -> list[SimulatedReading]:
     return [r for r in readings if START + first <= r.t < START + last]
 
 
 def test_a_leap_costs_a_second_of_catching_up_and_skips_the_rest(
-    scene: Callable[[Clock], Scene], readings: list[Reading]
+    scene: Callable[[Clock], Scene], readings: list[SimulatedReading]
 ) -> None:
     live = scene(Clock.WALL)
     live.play(seconds(readings, 0, 9))
     assert [str(r.verdict) for r in live.reports[-5:]] == ["clean"] * 5
     before, begun = len(live.reports), live.monotonic
     live.wall += HOURS
-    live.rounds.round([])
+    live.rounds.cycle([])
     new = live.reports[before:]
     # What was begun within the budget is finished, and the newest tick is judged in any case.
     assert live.monotonic - begun <= BUDGET_S + 2 * TICK_COST_S
@@ -114,7 +114,7 @@ def test_a_leap_costs_a_second_of_catching_up_and_skips_the_rest(
 
 
 def test_skipped_ticks_neither_clear_nor_raise_an_alarm(
-    scene: Callable[[Clock], Scene], site: Site, readings: list[Reading]
+    scene: Callable[[Clock], Scene], site: Site, readings: list[SimulatedReading]
 ) -> None:
     """Both sides of a gap say absent: the off-delay does not count the gap."""
     live = scene(Clock.WALL)
@@ -139,12 +139,12 @@ def test_skipped_ticks_neither_clear_nor_raise_an_alarm(
 
 @pytest.mark.parametrize("back_s", [HOURS, 60.0])
 def test_a_clock_set_back_is_judged_from_there_on(
-    scene: Callable[[Clock], Scene], readings: list[Reading], back_s: float
+    scene: Callable[[Clock], Scene], readings: list[SimulatedReading], back_s: float
 ) -> None:
     live = scene(Clock.WALL)
     live.play(seconds(readings, 0, 5))
     live.wall = START + 5.2 - back_s
-    live.rounds.round([])
+    live.rounds.cycle([])
     before = len(live.reports)
     live.play(seconds(readings, 6, 9), -back_s)
     assert [r.t for r in live.reports[before:]] == [START + k - back_s for k in (6, 7, 8)]
@@ -153,7 +153,7 @@ def test_a_clock_set_back_is_judged_from_there_on(
 
 
 def test_a_budget_is_refilled_only_when_all_is_judged(
-    scene: Callable[[Clock], Scene], readings: list[Reading]
+    scene: Callable[[Clock], Scene], readings: list[SimulatedReading]
 ) -> None:
     live = scene(Clock.WALL)
     live.play(seconds(readings, 0, 3))
@@ -161,73 +161,73 @@ def test_a_budget_is_refilled_only_when_all_is_judged(
     for _ in range(4):
         before = len(live.reports)
         live.wall += 40.0
-        live.rounds.round([])
+        live.rounds.cycle([])
         judged.append(len(live.reports) - before)
     assert judged[0] > 10
     assert judged[1:] == [1, 1, 1]
     live.wall += 1.0
-    live.rounds.round([])
+    live.rounds.cycle([])
     live.wall += 40.0
     before = len(live.reports)
-    live.rounds.round([])
+    live.rounds.cycle([])
     assert len(live.reports) - before > 10
 
 
 def test_where_the_readings_tell_the_time_ticks_wait_and_none_is_skipped(
-    scene: Callable[[Clock], Scene], readings: list[Reading]
+    scene: Callable[[Clock], Scene], readings: list[SimulatedReading]
 ) -> None:
     live = scene(Clock.EVENTS)
-    live.rounds.round([sample(r) for r in seconds(readings, 0, 38)])
+    live.rounds.cycle([sample(r) for r in seconds(readings, 0, 38)])
     assert live.rounds.behind
     assert len(live.reports) <= BUDGET_S / TICK_COST_S + 1
     while live.rounds.behind:
-        live.rounds.round([])
+        live.rounds.cycle([])
     assert [r.t for r in live.reports] == [START + k for k in range(len(live.reports))]
     assert len(live.reports) >= 37
     assert live.watch.skipped == 0
 
 
 def test_a_round_ends_between_two_ticks_when_the_service_stops(
-    scene: Callable[[Clock], Scene], readings: list[Reading]
+    scene: Callable[[Clock], Scene], readings: list[SimulatedReading]
 ) -> None:
     live = scene(Clock.WALL)
     live.play(seconds(readings, 0, 3))
     live.alive, before = False, len(live.reports)
     live.wall += HOURS
-    live.rounds.round([sample(r) for r in seconds(readings, 3, 4)])
+    live.rounds.cycle([sample(r) for r in seconds(readings, 3, 4)])
     assert len(live.reports) == before
 
 
 def test_a_replay_without_the_skipped_ticks_says_what_was_live(
-    scene: Callable[[Clock], Scene], site: Site, readings: list[Reading]
+    scene: Callable[[Clock], Scene], site: Site, readings: list[SimulatedReading]
 ) -> None:
     """A recording does not hold the service's stalls; given them, a replay is live to the last bit."""
     live = scene(Clock.WALL)
     live.play(seconds(readings, 0, 12))
     later = 30.0
     live.wall = START + 12 + later
-    live.rounds.round([])
+    live.rounds.cycle([])
     live.play(seconds(readings, 12, 25), later)
     gaps = [(r.t - r.skipped, r.t - 1.0) for r in live.reports if r.skipped]
     assert gaps
     recorded = [replace(r, arrival=r.t + 0.1) for r in seconds(readings, 0, 12)]
     recorded[0] = replace(recorded[0], arrival=START - 0.5)
     recorded += [replace(r, t=r.t + later, arrival=r.t + later + 0.1) for r in seconds(readings, 12, 25)]
-    told, tally = [to_json(r) for r in live.reports], Tally()
+    told, tally = [to_json(r) for r in live.reports], ReplayCounts()
     again = [to_json(r.report) for r in replay(site, recorded, tally, clock=Clock.WALL, skipped=gaps)]
     assert again[: len(told)] == told
     assert tally.skipped == live.watch.skipped > 0
-    whole = Tally()
+    whole = ReplayCounts()
     assert len(list(replay(site, recorded, whole, clock=Clock.WALL))) == len(again) + tally.skipped
     assert whole.skipped == 0
 
 
 def test_states_are_kept_when_a_tick_was_judged(
-    scene: Callable[[Clock], Scene], readings: list[Reading], monkeypatch: pytest.MonkeyPatch
+    scene: Callable[[Clock], Scene], readings: list[SimulatedReading], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     live, asked = scene(Clock.WALL), []
     monkeypatch.setattr(type(live.watch.suspicions), "due", lambda _: asked.append(1) or ())
     live.wall = START + 0.1
     for r in seconds(readings, 0, 1):
-        live.rounds.round([sample(replace(r, arrival=START + 0.1))])
+        live.rounds.cycle([sample(replace(r, arrival=START + 0.1))])
     assert len(asked) == len(live.reports) == 1

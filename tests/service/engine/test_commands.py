@@ -11,13 +11,13 @@ import sqlalchemy as sa
 from feeders.format.tables import to_json
 from feeders.model.site import Site
 from service.alarms.state_machine import AlarmState, AlreadyAcknowledged
-from service.engine.engine import NOT_WATCHED, Rounds, RuntimeConfig
-from service.engine.feeder_monitor import Watch, design
+from service.engine.engine import NOT_WATCHED, Engine, RuntimeConfig
+from service.engine.feeder_monitor import FeederMonitor, design
 from service.ingest.align import Clock
 from service.ingest.queues import Sample
 from service.store import OutcomeUnknown, Store
-from service.store.committer import Done
-from service.store.schema import Step
+from service.store.committer import WriteResult
+from service.store.schema import CommissioningChange
 from tests.service.liars import FEEDER, START, until
 
 
@@ -25,9 +25,9 @@ class Slow:
     """Rounds with writes that are done when the test says so."""
 
     def __init__(self, site: Site, store: Store) -> None:
-        self.writes: list[tuple[Callable[[], Done], Callable[[Done], None]]] = []
+        self.writes: list[tuple[Callable[[], WriteResult], Callable[[WriteResult], None]]] = []
         self.store = store
-        self.live = Rounds(
+        self.live = Engine(
             RuntimeConfig(clock=Clock.EVENTS),
             store,
             [site],
@@ -35,24 +35,24 @@ class Slow:
             stored=lambda: None,
             apart=lambda write, then: self.writes.append((write, then)),
         )
-        self.live.watches[FEEDER].install(design(site))
+        self.live.monitors[FEEDER].install(design(site))
         self.live.begin()
         self.land()
 
     @property
-    def watch(self) -> Watch:
-        return self.live.watches[FEEDER]
+    def watch(self) -> FeederMonitor:
+        return self.live.monitors[FEEDER]
 
     def land(self) -> None:
         """Do all writes, and those that follow from them."""
         while self.writes:
             write, then = self.writes.pop(0)
             then(write())
-            self.live.keeper.commit(at_once=True)
+            self.live.committer.commit(at_once=True)
 
     def play(self, samples: list[Sample]) -> None:
         """Judge samples while nothing is written."""
-        self.live.round(samples)
+        self.live.cycle(samples)
         assert len(self.writes) <= 1
 
 
@@ -107,7 +107,7 @@ def test_a_write_of_unknown_outcome_is_repeated_before_anything_else(
             assert isinstance(answer.exception(), OutcomeUnknown)
             assert all(one.acknowledged_by is None for one in slow.watch.book.alarms if one.id == alarm.id)
             slow.play(after[: len(after) // 8])
-            slow.live.keeper.commit(at_once=True)
+            slow.live.committer.commit(at_once=True)
             slow.land()
             assert [str(event.change) for event in store.events(alarm.id)][:2] == ["raised", "acknowledged"]
             assert [one.acknowledged_by for one in slow.watch.book.alarms if one.id == alarm.id] == ["Ada"]
@@ -127,8 +127,8 @@ def test_alarms_that_rise_while_their_feeder_is_removed_do_not_stand(
         assert len(slow.watch.book.active) == 2
         slow.land()
         assert answer.result() is None
-        assert (slow.live.watches, store.active()) == ({}, [])
-        slow.live.round([])
+        assert (slow.live.monitors, store.active()) == ({}, [])
+        slow.live.cycle([])
         slow.land()
         assert store.active() == []
         assert all(
@@ -144,7 +144,7 @@ def test_alarms_that_rise_while_their_feeder_is_put_are_gone_on_with(
         slow.play(until(attacked, 5.0)[0])
         slow.land()
         known = slow.watch
-        answer = slow.live.put(site, to_json(site.tables), lambda watch: watch.install(design(site)))
+        answer = slow.live.put(site, to_json(site.tables), lambda monitor: monitor.install(design(site)))
         slow.play(until(until(attacked, 5.0)[1], 15.0)[0])
         assert slow.watch is known
         slow.land()
@@ -171,5 +171,5 @@ def test_learning_anew_begins_when_it_is_stored(site: Site, attacked: list[Sampl
         assert states["m01"]["state"] == "learning"
         assert gathered is not slow.watch.commissioning.known.learning
         changes = [event.change for event in store.commission_events(FEEDER)]
-        assert changes == [Step.BEGUN, Step.RECOMMISSIONED]
+        assert changes == [CommissioningChange.BEGUN, CommissioningChange.RECOMMISSIONED]
         assert store.commission(FEEDER) is not None

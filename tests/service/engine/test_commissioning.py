@@ -21,22 +21,22 @@ import pytest
 
 from feeders.format.tables import write
 from feeders.model.site import Site, from_tables, load
-from feeders.simulation.scenario import Reading, Scenario, by_arrival, simulate
+from feeders.simulation.scenario import Scenario, SimulatedReading, by_arrival, simulate
 from gridsec.attack import Scaling
 from gridsec.estimators.sequential import Commission, LearningReason, LearningState, to_arrays
 from service.alarms.state_machine import Alarm, AlarmKind, AlarmState, Severity
 from service.cli.simulate import Pace, key_of, payload_of, play
-from service.engine.commissioning import Commissioning, NothingToLearn, Stage
-from service.engine.engine import Rounds, RuntimeConfig
+from service.engine.commissioning import FeederCommissioning, NothingToLearn, Stage
+from service.engine.engine import Engine, RuntimeConfig
 from service.engine.feeder_monitor import design
-from service.engine.replay import Tally, replay
+from service.engine.replay import ReplayCounts, replay
 from service.engine.runtime import Runtime
 from service.ingest.align import Clock
 from service.ingest.queues import BusConfig, Sample
-from service.ingest.zenoh_bus import Meters
+from service.ingest.zenoh_bus import MeterClient
 from service.report.report import LearningReport, StalledMeter, to_json
 from service.store import Store, StoreUnavailable
-from service.store.schema import Step
+from service.store.schema import CommissioningChange
 from tests.codes import refused
 from tests.service.databases import both
 from tests.service.running import FEEDER, InProcess, Outlet, free_port, service, until
@@ -58,12 +58,12 @@ def site() -> Site:
 
 
 @pytest.fixture(scope="module")
-def honest(site: Site) -> list[Reading]:
+def honest(site: Site) -> list[SimulatedReading]:
     """A hundred and sixty seconds without a liar."""
     return list(by_arrival(simulate(site, Scenario(seed=1, start=START, duration_s=160.0))))
 
 
-def samples(readings: list[Reading], begin: float, end: float) -> list[Sample]:
+def samples(readings: list[SimulatedReading], begin: float, end: float) -> list[Sample]:
     return [
         Sample(f"gridsec/{key_of(FEEDER, r.meter)}", payload_of(r), "", r.arrival, 1)
         for r in readings
@@ -71,21 +71,21 @@ def samples(readings: list[Reading], begin: float, end: float) -> list[Sample]:
     ]
 
 
-def rounds(store: Store, site: Site, *, install: bool = True) -> Rounds:
-    made = Rounds(RuntimeConfig(clock=Clock.EVENTS), store, [site], wall=lambda: START, stored=lambda: None)
+def rounds(store: Store, site: Site, *, install: bool = True) -> Engine:
+    made = Engine(RuntimeConfig(clock=Clock.EVENTS), store, [site], wall=lambda: START, stored=lambda: None)
     if install:
-        made.watches[FEEDER].install(design(site))
+        made.monitors[FEEDER].install(design(site))
     made.begin()
     return made
 
 
-def feed(live: Rounds, some: list[Sample]) -> None:
+def feed(live: Engine, some: list[Sample]) -> None:
     for k in range(0, len(some), 50):
-        live.round(some[k : k + 50])
+        live.cycle(some[k : k + 50])
 
 
-def known(live: Rounds) -> Commission:
-    found = live.watches[FEEDER].commissioning.known
+def known(live: Engine) -> Commission:
+    found = live.monitors[FEEDER].commissioning.known
     assert found is not None
     return found
 
@@ -99,29 +99,29 @@ def same(one: Commission, other: Commission) -> bool:
 
 
 @both
-def test_what_was_learned_survives_a_restart(site: Site, honest: list[Reading], url: str) -> None:
+def test_what_was_learned_survives_a_restart(site: Site, honest: list[SimulatedReading], url: str) -> None:
     with Store(url) as store:
         live = rounds(store, site)
         feed(live, samples(honest, 0, 70))
         before = known(live)
         assert before.learning is None
         assert [(e.change, len(e.meters)) for e in store.commission_events(FEEDER)] == [
-            (Step.BEGUN, 13),
-            (Step.LEARNED, 13),
+            (CommissioningChange.BEGUN, 13),
+            (CommissioningChange.LEARNED, 13),
         ]
     with Store(url) as store:
         live = rounds(store, site)
         assert same(known(live), before)  # to the last bit, before the first tick
         feed(live, samples(honest, 100, 120))
         assert same(known(live), before)
-        progress = live.watches[FEEDER].commissioning.progress()
+        progress = live.monitors[FEEDER].commissioning.progress()
         assert (progress.state, progress.restored, progress.note) == (Stage.LEARNED, True, "")
         assert len(store.commission_events(FEEDER)) == 2
 
 
 @both
 def test_half_of_a_commissioning_survives_but_for_the_last_interval(
-    site: Site, honest: list[Reading], url: str, monkeypatch: pytest.MonkeyPatch
+    site: Site, honest: list[SimulatedReading], url: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("service.engine.commissioning.SAVE_S", 10.0)
     with Store(url) as store:
@@ -129,19 +129,19 @@ def test_half_of_a_commissioning_survives_but_for_the_last_interval(
         feed(live, samples(honest, 0, 38))
         kept = store.commission(FEEDER)
         assert kept is not None
-        latest = live.watches[FEEDER].report
+        latest = live.monitors[FEEDER].report
         assert latest is not None
         assert latest.t - 10.0 <= kept.t <= latest.t
         # Whoever stops the service properly loses nothing at all.
         live.keep_states(at_once=True)
-        live.keeper.commit(at_once=True)
+        live.committer.commit(at_once=True)
         assert (store.commission(FEEDER) or kept).t == latest.t
         gathered = known(live)
     with Store(url) as store:
         live = rounds(store, site)
         assert same(known(live), gathered)
         feed(live, samples(honest, 100, 130))
-        progress = live.watches[FEEDER].commissioning.progress()
+        progress = live.monitors[FEEDER].commissioning.progress()
         assert progress.state is Stage.LEARNED
         assert gathered.learning is not None
         assert progress.learned_at == pytest.approx(
@@ -150,7 +150,7 @@ def test_half_of_a_commissioning_survives_but_for_the_last_interval(
 
 
 def test_a_stopped_runtime_keeps_all_that_was_gathered(
-    site: Site, honest: list[Reading], tmp_path: Path
+    site: Site, honest: list[SimulatedReading], tmp_path: Path
 ) -> None:
     with Store(f"sqlite:///{tmp_path}/s.db") as store:
 
@@ -210,7 +210,7 @@ def test_kill_9_does_not_make_it_forget(site: Site, tmp_path: Path) -> None:
     write(site.tables, folder)
     path = f"/api/v1/feeders/{FEEDER}/commissioning"
     with serving(tmp_path, folder) as (child, url, zenoh):
-        with Meters(BusConfig("client", connect=(zenoh,)), "gridsec") as meters:
+        with MeterClient(BusConfig("client", connect=(zenoh,)), "gridsec") as meters:
             for _ in play(site, Scenario(seed=1, start=START, duration_s=75.0), meters, STEP):
                 pass
             before = until(lambda: _learned(httpx.get(url + path).json()))
@@ -253,25 +253,25 @@ CHANGES = {
 
 @pytest.mark.parametrize("what", list(CHANGES))
 def test_a_changed_feeder_begins_anew_and_says_why(
-    site: Site, honest: list[Reading], tmp_path: Path, what: str
+    site: Site, honest: list[SimulatedReading], tmp_path: Path, what: str
 ) -> None:
     with Store(f"sqlite:///{tmp_path}/s.db") as store:
         feed(rounds(store, site), samples(honest, 0, 5))
     with Store(f"sqlite:///{tmp_path}/s.db") as store:
         live = rounds(store, CHANGES[what](site))
-        assert live.watches[FEEDER].commissioning.progress().state is Stage.WAITING
+        assert live.monitors[FEEDER].commissioning.progress().state is Stage.WAITING
         feed(live, samples(honest, 100, 110))
-        progress = live.watches[FEEDER].commissioning.progress()
+        progress = live.monitors[FEEDER].commissioning.progress()
         assert (progress.state, progress.restored) == (Stage.LEARNING, False)
         assert progress.note.endswith(f"the feeder has changed since ({what})")
         assert progress.gathered_s is not None
         assert progress.gathered_s < 10.0
         last = store.commission_events(FEEDER)[-1]
-        assert (last.change, last.reason) == (Step.BEGUN, progress.note)
+        assert (last.change, last.reason) == (CommissioningChange.BEGUN, progress.note)
 
 
 def test_a_damaged_text_in_the_database_costs_the_commissioning_and_nothing_else(
-    site: Site, honest: list[Reading], tmp_path: Path
+    site: Site, honest: list[SimulatedReading], tmp_path: Path
 ) -> None:
     path = tmp_path / "s.db"
     with Store(f"sqlite:///{path}") as store:
@@ -286,7 +286,7 @@ def test_a_damaged_text_in_the_database_costs_the_commissioning_and_nothing_else
     with Store(f"sqlite:///{path}") as store:
         live = rounds(store, site)
         feed(live, samples(honest, 10, 20))
-        progress = live.watches[FEEDER].commissioning.progress()
+        progress = live.monitors[FEEDER].commissioning.progress()
         assert "bias is beyond the class (meters 3)" in progress.note
         assert progress.state is Stage.LEARNING
 
@@ -295,7 +295,7 @@ def test_a_damaged_text_in_the_database_costs_the_commissioning_and_nothing_else
 
 
 def test_a_replay_with_what_was_known_is_what_the_restarted_service_said(
-    site: Site, honest: list[Reading], tmp_path: Path
+    site: Site, honest: list[SimulatedReading], tmp_path: Path
 ) -> None:
     with Store(f"sqlite:///{tmp_path}/s.db") as store:
         feed(rounds(store, site), samples(honest, 0, 70))
@@ -303,26 +303,26 @@ def test_a_replay_with_what_was_known_is_what_the_restarted_service_said(
     outlet = Outlet()
     with Store(f"sqlite:///{tmp_path}/s.db") as store:
         live = rounds(store, site)
-        live.keeper.publisher = outlet
+        live.committer.publisher = outlet
         feed(live, samples(honest, 100, 130))
     later = [r for r in honest if START + 100 <= r.t < START + 130]
-    told = [json.loads(json.dumps(to_json(r.report))) for r in replay(site, later, Tally(), kept=kept)]
+    told = [json.loads(json.dumps(to_json(r.report))) for r in replay(site, later, ReplayCounts(), kept=kept)]
     assert len(outlet.estimates) >= 28
     assert told[: len(outlet.estimates)] == outlet.estimates
     # And it matters: without what was learned the numbers are others.
-    fresh = [json.loads(json.dumps(to_json(r.report))) for r in replay(site, later, Tally())]
+    fresh = [json.loads(json.dumps(to_json(r.report))) for r in replay(site, later, ReplayCounts())]
     assert fresh[5]["meters"] != told[5]["meters"]
 
 
 def test_a_clock_that_is_set_back_costs_nothing_that_was_learned(
-    site: Site, honest: list[Reading], tmp_path: Path
+    site: Site, honest: list[SimulatedReading], tmp_path: Path
 ) -> None:
     with Store(f"sqlite:///{tmp_path}/s.db") as store:
         live = rounds(store, site)
         feed(live, samples(honest, 0, 70))
-        before, watch = known(live), live.watches[FEEDER]
-        assert watch.report is not None
-        watch.report = replace(watch.report, t=START + 1e6)
+        before, monitor = known(live), live.monitors[FEEDER]
+        assert monitor.report is not None
+        monitor.report = replace(monitor.report, t=START + 1e6)
         feed(live, samples(honest, 70, 80))
         assert same(known(live), before)
 
@@ -344,7 +344,7 @@ def test_a_replaced_meter_is_learned_anew_and_the_others_stay(tmp_path: Path) ->
         old = known(live).learned
         assert known(live).learning is None
         feed(live, samples(readings, 6 * hours, 7 * hours))
-        report = live.watches[FEEDER].report
+        report = live.monitors[FEEDER].report
         assert report is not None
         named = [k for k, meter in enumerate(report.meters) if meter.suspect]
         assert named == [4], "replaced without a word, it counts as manipulated"
@@ -363,12 +363,14 @@ def test_a_replaced_meter_is_learned_anew_and_the_others_stay(tmp_path: Path) ->
         assert not [alarm for alarm in store.active(FEEDER) if alarm.active]
         changes = [(e.change, e.who, e.reason, e.meters) for e in store.commission_events(FEEDER)[2:]]
         assert changes == [
-            (Step.RECOMMISSIONED, "Ada", "new meter", (who,)),
-            (Step.LEARNED, None, "", (who,)),
+            (CommissioningChange.RECOMMISSIONED, "Ada", "new meter", (who,)),
+            (CommissioningChange.LEARNED, None, "", (who,)),
         ]
 
 
-def test_what_cannot_be_stored_is_not_begun(site: Site, honest: list[Reading], tmp_path: Path) -> None:
+def test_what_cannot_be_stored_is_not_begun(
+    site: Site, honest: list[SimulatedReading], tmp_path: Path
+) -> None:
     path = tmp_path / "s.db"
     with Store(f"sqlite:///{path}") as store:
         live = rounds(store, site)
@@ -380,10 +382,13 @@ def test_what_cannot_be_stored_is_not_begun(site: Site, honest: list[Reading], t
             live.recommission(FEEDER, [], "Ada", "all new").result()
         other.close()
         assert same(known(live), before)
-        live.keeper.problem = None
+        live.committer.problem = None
         feed(live, samples(honest, 70, 80))
         assert same(known(live), before)
-        assert [e.change for e in store.commission_events(FEEDER)] == [Step.BEGUN, Step.LEARNED]
+        assert [e.change for e in store.commission_events(FEEDER)] == [
+            CommissioningChange.BEGUN,
+            CommissioningChange.LEARNED,
+        ]
 
 
 def test_before_the_first_tick_and_where_nothing_is_learned(site: Site, tmp_path: Path) -> None:
@@ -391,12 +396,12 @@ def test_before_the_first_tick_and_where_nothing_is_learned(site: Site, tmp_path
         live = rounds(store, site, install=False)
         with refused(NothingToLearn, "no-monitor"):
             live.recommission(FEEDER, [], "Ada", "new").result()
-        live.watches[FEEDER].install(design(site))
+        live.monitors[FEEDER].install(design(site))
         live.recommission(FEEDER, ["m03"], "Ada", "new").result()
         begun = known(live)
         assert begun.learning is not None
         assert begun.learning.open.all()
-        never = Commissioning(variant(site, commission_s=0.0))
+        never = FeederCommissioning(variant(site, commission_s=0.0))
         never.install(design(variant(site, commission_s=0.0)))
         assert never.progress().state is Stage.OFF
         with refused(NothingToLearn, "learning-off"):
@@ -406,7 +411,7 @@ def test_before_the_first_tick_and_where_nothing_is_learned(site: Site, tmp_path
 # ------------------------------------------------------------------- stalled
 
 
-def learning_counts(live: Rounds) -> dict[str, float]:
+def learning_counts(live: Engine) -> dict[str, float]:
     """Metrics of learning that are not zero, by state and by reason."""
     pattern = re.compile(rf'gridsec_meters_learning(?:_delayed)?{{feeder="{FEEDER}",\w+="([\w-]+)"}} (\S+)')
     found = pattern.findall(live.metrics.exposition().decode())
@@ -439,27 +444,27 @@ def test_a_stalled_meter_raises_an_alarm_that_ends_when_the_meter_is_learned(
             "1 of 13 meters are not learned after twice the expected time of 61 s: silent (1)"
         )
         assert alarm.evidence.learning == (StalledMeter(late, "silent", 0.0),)
-        report = live.watches[FEEDER].report
+        report = live.monitors[FEEDER].report
         assert report is not None
         shown = to_json(report)["meters"]
         assert [m["learning_state"] for m in shown].count("learned") == 12
         assert (shown[4]["learning_state"], shown[4]["learning_reason"]) == ("stalled", "silent")
-        progress = live.watches[FEEDER].commissioning.progress()
+        progress = live.monitors[FEEDER].commissioning.progress()
         assert (progress.expected_s, progress.stalled) == (61.0, 1)
         one = progress.meters[4]
         assert one.watched_s == report.t - begun
         assert one.lost_s == {"silent": one.watched_s}
         assert learning_counts(live) == {"learned": 12.0, "stalled": 1.0, "silent": 1.0}
         live.keep_states(at_once=True)
-        live.keeper.commit(at_once=True)
+        live.committer.commit(at_once=True)
     with Store(url) as store:
         live = rounds(store, site, install=False)
         feed(live, samples(readings, 140, 155))
-        blind = live.watches[FEEDER].report
+        blind = live.monitors[FEEDER].report
         assert blind is not None
         assert blind.learning is None
         assert stalled(store) == [alarm]
-        live.watches[FEEDER].install(design(site))
+        live.monitors[FEEDER].install(design(site))
         feed(live, samples(readings, 155, begin + 50))
         assert stalled(store) == [alarm]
         feed(live, samples(readings, begin + 50, end))
@@ -478,14 +483,16 @@ def test_a_stalled_meter_raises_an_alarm_that_ends_when_the_meter_is_learned(
         assert "gridsec_meters_learning_delayed{" not in live.metrics.exposition().decode()
 
 
-def test_a_text_of_an_earlier_version_goes_on(site: Site, honest: list[Reading], tmp_path: Path) -> None:
+def test_a_text_of_an_earlier_version_goes_on(
+    site: Site, honest: list[SimulatedReading], tmp_path: Path
+) -> None:
     """Without the times that later versions keep: the time that counted stays."""
     path = tmp_path / "s.db"
     with Store(f"sqlite:///{path}") as store:
         live = rounds(store, site)
         feed(live, samples(honest, 0, 20))
         live.keep_states(at_once=True)
-        live.keeper.commit(at_once=True)
+        live.committer.commit(at_once=True)
         before, kept = known(live), store.commission(FEEDER)
     assert kept is not None
     content = json.loads(kept.text)
@@ -497,7 +504,7 @@ def test_a_text_of_an_earlier_version_goes_on(site: Site, honest: list[Reading],
         raw.execute("UPDATE commission SET data = ?", (json.dumps(content),))
     raw.close()
     with Store(f"sqlite:///{path}") as store:
-        progress = rounds(store, site).watches[FEEDER].commissioning.progress()
+        progress = rounds(store, site).monitors[FEEDER].commissioning.progress()
         assert (progress.restored, progress.note) == (True, "")
         assert before.learning is not None
         assert [m.gathered_s for m in progress.meters] == before.learning.time_s.tolist()

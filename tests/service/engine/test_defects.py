@@ -11,14 +11,14 @@ from typing import Any
 import pytest
 
 from feeders.model.site import Site, load
-from feeders.registry.registry import Watcher
+from feeders.registry.registry import DesignedEstimator
 from gridsec.interface import Cause, Frame
 from service.alarms.state_machine import AlarmKind, Condition, conditions
-from service.engine.engine import BAD_PER_ROUND, BAD_PER_SOURCE, Rounds, RuntimeConfig
+from service.engine.engine import BAD_PER_ROUND, BAD_PER_SOURCE, Engine, RuntimeConfig
 from service.engine.feeder_monitor import Phase, design
 from service.engine.runtime import Runtime
 from service.ingest.align import Clock
-from service.ingest.decode import Decoded, Wire
+from service.ingest.decode import DecodedPayload, Wire
 from service.ingest.queues import Sample
 from service.report.report import FeederReport
 from service.store import Store
@@ -38,11 +38,11 @@ def test_a_write_that_fails_in_an_unforeseen_way_is_shown_and_tried_again(
         live = rounds(store, site)
         with monkeypatch.context() as patch:
             patch.setattr(store, "commit", broken)
-            live.round(until(attacked, 15.0)[0])
-            assert "a defect" in live.keeper.problems()[0]
-            assert "2 changes of alarms wait" in live.keeper.problems()[1]
-        live.round([])
-        assert live.keeper.problems() == []
+            live.cycle(until(attacked, 15.0)[0])
+            assert "a defect" in live.committer.problems()[0]
+            assert "2 changes of alarms wait" in live.committer.problems()[1]
+        live.cycle([])
+        assert live.committer.problems() == []
         assert len(store.alarms()[0]) == 2
 
 
@@ -75,7 +75,7 @@ def test_a_defect_of_the_decoder_costs_one_payload(
 ) -> None:
     decode = Wire.decode
 
-    def broken(self: Wire, key: str, payload: bytes, *more: Any, **named: Any) -> Decoded:
+    def broken(self: Wire, key: str, payload: bytes, *more: Any, **named: Any) -> DecodedPayload:
         if b"boom" in payload:
             raise ZeroDivisionError("a def\x00ect")
         return decode(self, key, payload, *more, **named)
@@ -86,7 +86,7 @@ def test_a_defect_of_the_decoder_costs_one_payload(
     with Store(f"sqlite:///{path}") as store:
         live = rounds(store, site, outlet)
         before, after = until(attacked, 5.0)
-        live.round([*before, bad, *after])
+        live.cycle([*before, bad, *after])
         assert outlet.estimates[-1]["t"] >= START + 38
         (kept,) = store.rejected()
         assert (kept.key, kept.reason) == (bad.key, "internal: ZeroDivisionError: a def\\x00ect")
@@ -107,11 +107,11 @@ def test_a_flood_of_bad_readings_is_counted_in_full_and_leaves_room_for_others(
     others = [one for k in range(200) for one in bad(f"nowhere-{k}/substation/reading", b"{}")]
     with Store(f"sqlite:///{path}") as store:
         live = rounds(store, site)
-        live.round(flood + quiet)
+        live.cycle(flood + quiet)
         kept = Counter(one.key.split("/")[3] for one in store.rejected(1000))
         assert kept == {"m01": BAD_PER_SOURCE + 1, "m02": 1, "m03": 1}
         assert "syntax: 395 more on this key at the same time" in {r.reason for r in store.rejected(1000)}
-        live.round(others + flood + quiet)
+        live.cycle(others + flood + quiet)
         kept = Counter(one.key.split("/")[1] for one in store.rejected(1000)[:BAD_PER_ROUND])
         assert kept == {FEEDER: 8} | dict.fromkeys([f"nowhere-{k}" for k in range(BAD_PER_ROUND - 8)], 1)
         told = live.metrics.exposition().decode()
@@ -131,14 +131,14 @@ def test_a_defect_in_one_feeder_s_monitor_is_shown_and_blinds_no_other(
         other = live.add(load("kerber-landnetz"))
         other.install(design(other.site))
         before, after = until(attacked, 5.0)
-        live.round(before)
+        live.cycle(before)
         with monkeypatch.context() as patch:
-            patch.setattr(Watcher, "step", broken)
-            live.round(after[:100])
-        live.round(after[100:])
-        watch = live.watches[FEEDER]
-        assert watch.phase is Phase.FAILED
-        assert "a defect" in watch.problem
+            patch.setattr(DesignedEstimator, "step", broken)
+            live.cycle(after[:100])
+        live.cycle(after[100:])
+        monitor = live.monitors[FEEDER]
+        assert monitor.phase is Phase.FAILED
+        assert "a defect" in monitor.problem
         assert other.phase is Phase.WATCHING
         assert outlet.estimates[-1]["cause"] == "design-invalid"
         assert outlet.estimates[-1]["verdict"] == "undecided"
@@ -148,16 +148,16 @@ def test_what_was_found_before_a_defect_is_not_lost(
     site: Site, attacked: list[Sample], path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """All ticks go at once, and the monitor breaks at one of them, while two lie."""
-    step, wall = Watcher.step, START - 0.5
+    step, wall = DesignedEstimator.step, START - 0.5
 
-    def breaks(self: Watcher, state: Any, frame: Frame) -> Any:
+    def breaks(self: DesignedEstimator, state: Any, frame: Frame) -> Any:
         if frame.t >= START + 17:
             raise ZeroDivisionError("a defect")
         return step(self, state, frame)
 
-    monkeypatch.setattr(Watcher, "step", breaks)
+    monkeypatch.setattr(DesignedEstimator, "step", breaks)
     with Store(f"sqlite:///{path}") as store:
-        live = Rounds(
+        live = Engine(
             RuntimeConfig(clock=Clock.WALL),
             store,
             [site],
@@ -165,19 +165,19 @@ def test_what_was_found_before_a_defect_is_not_lost(
             stored=lambda: None,
             clock=lambda: 0.0,
         )
-        live.keeper.publisher = outlet = Outlet()
-        live.watches[FEEDER].install(design(site))
+        live.committer.publisher = outlet = Outlet()
+        live.monitors[FEEDER].install(design(site))
         live.begin()
-        live.round([replace(sample, arrival=wall) for sample in attacked])
+        live.cycle([replace(sample, arrival=wall) for sample in attacked])
         assert not outlet.estimates
         wall = START + 30.5
-        live.round([])
-        assert live.watches[FEEDER].phase is Phase.FAILED
+        live.cycle([])
+        assert live.monitors[FEEDER].phase is Phase.FAILED
         kinds = [alarm.kind for alarm in store.active(FEEDER)]
         assert kinds.count(AlarmKind.METER_MANIPULATED) == 2
         assert [e["t"] for e in outlet.estimates] == [START + k for k in range(31)]
         assert {e["cause"] for e in outlet.estimates[17:]} == {"design-invalid"}
-        assert "a defect" in live.watches[FEEDER].problem
+        assert "a defect" in live.monitors[FEEDER].problem
 
 
 @pytest.mark.canary("False")
@@ -195,7 +195,7 @@ def test_alarms_of_before_a_defect_in_the_alarms_reach_the_database(
     monkeypatch.setattr("service.engine.feeder_monitor.conditions", breaks)
     wall = START - 0.5
     with Store(f"sqlite:///{path}") as store:
-        live = Rounds(
+        live = Engine(
             RuntimeConfig(clock=Clock.WALL),
             store,
             [site],
@@ -203,16 +203,16 @@ def test_alarms_of_before_a_defect_in_the_alarms_reach_the_database(
             stored=lambda: None,
             clock=lambda: 0.0,
         )
-        live.keeper.publisher = outlet = Outlet()
-        live.watches[FEEDER].install(design(site))
+        live.committer.publisher = outlet = Outlet()
+        live.monitors[FEEDER].install(design(site))
         live.begin()
-        live.round([replace(sample, arrival=wall) for sample in attacked])
+        live.cycle([replace(sample, arrival=wall) for sample in attacked])
         wall = START + 30.5
-        live.round([])
-        watch = live.watches[FEEDER]
-        assert "a defect" in watch.problem
-        assert set(watch.book.active) == set(store.active(FEEDER))
-        kinds = [alarm.kind for alarm in watch.book.active]
+        live.cycle([])
+        monitor = live.monitors[FEEDER]
+        assert "a defect" in monitor.problem
+        assert set(monitor.book.active) == set(store.active(FEEDER))
+        kinds = [alarm.kind for alarm in monitor.book.active]
         assert kinds.count(AlarmKind.METER_MANIPULATED) == 2
         assert kinds.count(AlarmKind.UNDECIDED) == (not for_ever)
         assert [e["t"] for e in outlet.estimates] == [START + k for k in range(31)]
@@ -225,7 +225,7 @@ def test_a_dead_task_is_not_healthy(site: Site, path: Path, monkeypatch: pytest.
 
     async def scene(store: Store) -> None:
         runtime = Runtime(RuntimeConfig(), store, [site])
-        monkeypatch.setattr(Rounds, "round", broken)
+        monkeypatch.setattr(Engine, "cycle", broken)
         with pytest.raises(ZeroDivisionError):
             await asyncio.wait_for(runtime.run(), 20.0)
         alive, problems = runtime.healthy()

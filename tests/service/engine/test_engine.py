@@ -13,24 +13,24 @@ from typing import Any
 import pytest
 
 from feeders.model.site import Site
-from feeders.registry.registry import Watcher
+from feeders.registry.registry import DesignedEstimator
 from gridsec.interface import Frame
 from service.alarms.state_machine import (
     AlarmState,
+    AlarmTransition,
     AlarmUnknown,
     AlreadyAcknowledged,
     Change,
     RaisedAgain,
-    Transition,
 )
-from service.engine.engine import NOT_WATCHED, Rounds, RuntimeConfig
-from service.engine.feeder_monitor import Watch, design
+from service.engine.engine import NOT_WATCHED, Engine, RuntimeConfig
+from service.engine.feeder_monitor import FeederMonitor, design
 from service.engine.runtime import Runtime
 from service.errors import FeederUnknown
 from service.ingest.align import Clock
 from service.ingest.queues import Sample
 from service.store import Store, StoreUnavailable, connect
-from service.store.committer import Done
+from service.store.committer import WriteResult
 from tests.codes import refused
 from tests.service.liars import FEEDER, START, rounds, until
 from tests.service.running import Outlet
@@ -59,13 +59,13 @@ def test_alarms_are_stored_before_they_are_published(site: Site, attacked: list[
     with Store(f"sqlite:///{path}") as store:
         live = rounds(store, site, outlet, stored=lambda: woken.append(store.last_event))
         before, after = until(attacked, 15.0)
-        live.round(before)
+        live.cycle(before)
         assert [a["state"] for a, _ in outlet.events] == ["raised", "raised"]
         assert {a["id"] for a, _ in outlet.events} == {a.id for a in store.active(FEEDER)}
         assert woken
-        live.round(after)
+        live.cycle(after)
         assert [(a["state"], last) for a, last in outlet.events[2:]] == [("cleared", True)] * 2
-        live.round([])
+        live.cycle([])
         assert store.outbox_pending() == []
         assert [e["t"] for e in outlet.estimates] == [START + k for k in range(len(outlet.estimates))]
         assert len(outlet.estimates) >= 39
@@ -76,17 +76,17 @@ def test_a_backlog_makes_no_tick_blind(site: Site, attacked: list[Sample], path:
     """The service has fallen behind: of all that arrived each round takes a part, at a much later time."""
     wall = START - 0.5
     with Store(f"sqlite:///{path}") as store:
-        live = Rounds(RuntimeConfig(clock=Clock.WALL), store, [site], wall=lambda: wall, stored=lambda: None)
-        live.keeper.publisher = outlet = Outlet()
-        live.watches[FEEDER].install(design(site))
+        live = Engine(RuntimeConfig(clock=Clock.WALL), store, [site], wall=lambda: wall, stored=lambda: None)
+        live.committer.publisher = outlet = Outlet()
+        live.monitors[FEEDER].install(design(site))
         live.begin()
-        live.round([])
+        live.cycle([])
         for first in range(0, len(attacked), 100):
             rest = attacked[first + 100 :]
             wall = max(wall, attacked[first : first + 100][-1].arrival + late_s)
             oldest = rest[0].arrival if rest else None
-            live.round(attacked[first : first + 100], lambda oldest=oldest: oldest)
-        assert live.watches[FEEDER].aligner.restarts == 0
+            live.cycle(attacked[first : first + 100], lambda oldest=oldest: oldest)
+        assert live.monitors[FEEDER].aligner.restarts == 0
         heard = [e for e in outlet.estimates if e["t"] < START + 39]
         assert [e["t"] for e in heard] == [START + k for k in range(39)]
         assert all(meter["seen"] for e in heard for meter in e["meters"])
@@ -98,17 +98,17 @@ def test_what_was_not_published_is_published_after_a_restart(
     site: Site, attacked: list[Sample], path: Path
 ) -> None:
     with Store(f"sqlite:///{path}") as store:
-        rounds(store, site, Outlet(confirms=False)).round(until(attacked, 15.0)[0])
+        rounds(store, site, Outlet(confirms=False)).cycle(until(attacked, 15.0)[0])
         assert len(store.outbox_pending()) == 2
     outlet = Outlet()
     with Store(f"sqlite:///{path}") as store:
         live = rounds(store, site, outlet)
         assert [a["state"] for a, _ in outlet.events] == ["raised", "raised"]
         assert len(outlet.answers) == 2
-        live.round([])
+        live.cycle([])
         assert store.outbox_pending() == []
         # The alarms are known: the attack that goes on raises no new ones.
-        live.round(until(attacked, 15.0)[1])
+        live.cycle(until(attacked, 15.0)[1])
         assert len(store.alarms()[0]) == 2
 
 
@@ -124,23 +124,23 @@ def test_a_database_that_goes_away_and_comes_back_loses_nothing(
     with Store(f"sqlite:///{path}") as store:
         live = rounds(store, site, outlet)
         before, rest = until(attacked, 8.0)
-        live.round(before)
-        assert live.keeper.problem is None
+        live.cycle(before)
+        assert live.committer.problem is None
         other = locked()
         during, after = until(rest, 30.0)
         for k in range(0, len(during), 100):
-            live.round(during[k : k + 100])
-        assert live.keeper.problem is not None
-        assert "locked" in live.keeper.problem
+            live.cycle(during[k : k + 100])
+        assert live.committer.problem is not None
+        assert "locked" in live.committer.problem
         assert outlet.events == []
-        assert live.watches[FEEDER].book.alarms
+        assert live.monitors[FEEDER].book.alarms
         assert outlet.estimates[-1]["t"] >= START + 28
         with pytest.raises(StoreUnavailable):
-            live.acknowledge(live.watches[FEEDER].book.alarms[0].id, "Ada", "").result()
-        assert all(a.state is not AlarmState.ACKNOWLEDGED for a in live.watches[FEEDER].book.alarms)
+            live.acknowledge(live.monitors[FEEDER].book.alarms[0].id, "Ada", "").result()
+        assert all(a.state is not AlarmState.ACKNOWLEDGED for a in live.monitors[FEEDER].book.alarms)
         other.close()
-        live.round(after)
-        assert live.keeper.problem is None
+        live.cycle(after)
+        assert live.committer.problem is None
         assert [a["state"] for a, _ in outlet.events] == ["raised"] * 2 + ["cleared"] * 2
         assert len(store.alarms()[0]) == 2
         stored = [e.t for e in store.events_after(0)]
@@ -201,16 +201,16 @@ def test_nobody_who_watches_waits_for_a_locked_database(
 def test_the_delay_of_a_report_ends_when_it_is_stored(
     site: Site, path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    step, wall = Watcher.step, START - 0.5
-    writes: list[tuple[Callable[[], Done], Callable[[Done], None]]] = []
+    step, wall = DesignedEstimator.step, START - 0.5
+    writes: list[tuple[Callable[[], WriteResult], Callable[[WriteResult], None]]] = []
 
-    def slow(self: Watcher, state: Any, frame: Frame) -> Any:
+    def slow(self: DesignedEstimator, state: Any, frame: Frame) -> Any:
         nonlocal wall
         wall += 0.25
         return step(self, state, frame)
 
     with Store(f"sqlite:///{path}") as store:
-        live = Rounds(
+        live = Engine(
             RuntimeConfig(),
             store,
             [site],
@@ -218,18 +218,18 @@ def test_the_delay_of_a_report_ends_when_it_is_stored(
             stored=lambda: None,
             apart=lambda write, then: writes.append((write, then)),
         )
-        live.watches[FEEDER].install(design(site))
+        live.monitors[FEEDER].install(design(site))
         live.begin()
-        monkeypatch.setattr(Watcher, "step", slow)
+        monkeypatch.setattr(DesignedEstimator, "step", slow)
         for begin in (START - 0.5, START + 0.5):
             wall = begin
-            live.round([])
+            live.cycle([])
             assert "gridsec_report_delay_seconds_sum" not in live.metrics.exposition().decode()
             wall += 2.0
             while writes:
                 write, then = writes.pop(0)
                 then(write())
-                live.keeper.commit()
+                live.committer.commit()
         told = f'gridsec_report_delay_seconds_sum{{feeder="{FEEDER}"}} 2.75'
         assert told in live.metrics.exposition().decode()
 
@@ -240,10 +240,12 @@ def test_an_outbox_of_any_length_is_published_in_order_also_after_a_failed_read(
     monkeypatch.setattr("service.store.committer.OUTBOX_PAGE", 7)
     monkeypatch.setattr("service.store.committer.RETRY_S", 0.0)
     with Store(f"sqlite:///{path}") as store:
-        rounds(store, site, Outlet(confirms=False)).round(until(attacked, 15.0)[0])
+        rounds(store, site, Outlet(confirms=False)).cycle(until(attacked, 15.0)[0])
         first, second = store.active(FEEDER)
         for k in range(50):
-            store.commit([Transition(first, Change.RAISED, float(k)), Transition(second, Change.RAISED, 0.0)])
+            store.commit(
+                [AlarmTransition(first, Change.RAISED, float(k)), AlarmTransition(second, Change.RAISED, 0.0)]
+            )
         expected = [event.alarm.id for event in store.outbox_pending()]
         assert len(expected) == 102
     outlet = Outlet()
@@ -251,13 +253,13 @@ def test_an_outbox_of_any_length_is_published_in_order_also_after_a_failed_read(
         with monkeypatch.context() as patch:
             patch.setattr(store, "outbox_pending", _refuse)
             live = rounds(store, site, outlet)
-            live.round([])
+            live.cycle([])
             assert outlet.events == []
-            assert "reading" in live.keeper.problems()[0]
+            assert "reading" in live.committer.problems()[0]
         # What is stored meanwhile is published after what has been waiting.
-        live.round(until(attacked, 15.0)[1])
+        live.cycle(until(attacked, 15.0)[1])
         for _ in range(20):
-            live.round([])
+            live.cycle([])
         assert [alarm["id"] for alarm, _ in outlet.events][:102] == expected
         assert [alarm["state"] for alarm, _ in outlet.events][102:] == ["cleared", "cleared"]
         assert store.outbox_pending() == []
@@ -276,10 +278,10 @@ def test_events_that_zenoh_does_not_take_wait_in_the_outbox(
         live = rounds(store, site, outlet)
         with monkeypatch.context() as patch:
             patch.setattr(outlet, "event", lambda *_, **__: False)
-            live.round(until(attacked, 15.0)[0])
-            live.round(until(attacked, 15.0)[1])
+            live.cycle(until(attacked, 15.0)[0])
+            live.cycle(until(attacked, 15.0)[1])
         for _ in range(3):
-            live.round([])
+            live.cycle([])
         assert [alarm["state"] for alarm, _ in outlet.events] == ["raised"] * 2 + ["cleared"] * 2
         assert store.outbox_pending() == []
 
@@ -294,16 +296,16 @@ def test_a_deleted_feeder_leaves_cleared_alarms_and_its_history(
     with Store(f"sqlite:///{path}") as store:
         live = rounds(store, site, outlet)
         store.commit(put=(FEEDER, {}))
-        live.round(until(attacked, 15.0)[0])
+        live.cycle(until(attacked, 15.0)[0])
         other = locked()
         with pytest.raises(StoreUnavailable):
             live.remove(FEEDER).result()
-        assert FEEDER in live.watches
-        assert len(live.watches[FEEDER].book.active) == 2
+        assert FEEDER in live.monitors
+        assert len(live.monitors[FEEDER].book.active) == 2
         other.close()
-        live.keeper.commit(at_once=True)
+        live.committer.commit(at_once=True)
         live.remove(FEEDER).result()
-        assert (live.watches, store.feeders(), store.active(FEEDER)) == ({}, {}, [])
+        assert (live.monitors, store.feeders(), store.active(FEEDER)) == ({}, {}, [])
         alarms = store.alarms()[0]
         assert {alarm.state for alarm in alarms} == {AlarmState.CLEARED}
         assert store.events(alarms[0].id)[-1].comment == NOT_WATCHED
@@ -311,7 +313,7 @@ def test_a_deleted_feeder_leaves_cleared_alarms_and_its_history(
         assert outlet.withdrawn == [f"{FEEDER}/estimate"]
         assert store.history(FEEDER)
         assert "gridsec_alarms_active{" not in live.metrics.exposition().decode()
-        live.round(until(attacked, 15.0)[1][:1])
+        live.cycle(until(attacked, 15.0)[1][:1])
         assert store.rejected()[0].reason.startswith("unknown-feeder")
         with pytest.raises(FeederUnknown):
             live.remove(FEEDER).result()
@@ -321,22 +323,22 @@ def test_alarms_of_a_feeder_that_was_left_out_are_cleared_at_the_start(
     site: Site, attacked: list[Sample], path: Path
 ) -> None:
     with Store(f"sqlite:///{path}") as store:
-        rounds(store, site, Outlet(confirms=False)).round(until(attacked, 15.0)[0])
+        rounds(store, site, Outlet(confirms=False)).cycle(until(attacked, 15.0)[0])
         first, second = store.active(FEEDER)
         elsewhere = replace(first, id="0" * 26, feeder="elsewhere")
-        store.outbox_done(store.commit([Transition(elsewhere, Change.RAISED, START)]))
+        store.outbox_done(store.commit([AlarmTransition(elsewhere, Change.RAISED, START)]))
         store.commit(put=("elsewhere", {"tables": "of another version, which cannot be loaded"}))
     outlet = Outlet()
     with Store(f"sqlite:///{path}") as store:
-        live = Rounds(RuntimeConfig(), store, [], wall=lambda: START + 60, stored=lambda: None)
-        live.keeper.publisher = outlet
+        live = Engine(RuntimeConfig(), store, [], wall=lambda: START + 60, stored=lambda: None)
+        live.committer.publisher = outlet
         live.begin()
         alarms = {alarm.id: alarm for alarm in store.alarms()[0]}
         assert alarms.pop(elsewhere.id) == elsewhere
         assert alarms.keys() == {first.id, second.id}
         assert {(one.state, one.t_cleared) for one in alarms.values()} == {(AlarmState.CLEARED, START + 60)}
         assert store.events(first.id)[-1].comment == NOT_WATCHED
-        live.round([])
+        live.cycle([])
         assert [one["state"] for one, _ in outlet.events] == ["raised"] * 2 + ["cleared"] * 2
     with Store(f"sqlite:///{path}") as store:
         number = store.last_event
@@ -351,7 +353,7 @@ def test_of_two_alarms_that_tell_the_same_none_stands_for_ever(site: Site, path:
 
     def after(name: str, run: Callable[[Store], None]) -> list[str]:
         with Store(f"sqlite:///{path}-{name}") as store:
-            store.commit([Transition(each, Change.RAISED, START) for each in both])
+            store.commit([AlarmTransition(each, Change.RAISED, START) for each in both])
             run(store)
             return [each.id for each in store.active()]
 
@@ -360,11 +362,11 @@ def test_of_two_alarms_that_tell_the_same_none_stands_for_ever(site: Site, path:
 
     def unloaded(store: Store) -> None:
         why = {FEEDER: "of another version"}
-        live = Rounds(RuntimeConfig(), store, [], wall=lambda: START, stored=lambda: None, unloaded=why)
+        live = Engine(RuntimeConfig(), store, [], wall=lambda: START, stored=lambda: None, unloaded=why)
         live.remove(FEEDER).result()
 
     def left_out(store: Store) -> None:
-        Rounds(RuntimeConfig(), store, [], wall=lambda: START, stored=lambda: None).begin()
+        Engine(RuntimeConfig(), store, [], wall=lambda: START, stored=lambda: None).begin()
 
     assert after("watched", watched) == ["1" * 26]
     assert after("unloaded", unloaded) == after("left-out", left_out) == []
@@ -375,12 +377,12 @@ def test_what_cleared_lately_is_remembered_by_the_readings_clock(
 ) -> None:
     """However long ago that is for the wall clock."""
     with Store(f"sqlite:///{path}") as store:
-        rounds(store, site).round(attacked)
+        rounds(store, site).cycle(attacked)
         before = store.alarms()[0]
         config = RuntimeConfig(clock=Clock.EVENTS)
-        live = Rounds(config, store, [site], wall=lambda: START + 1e8, stored=lambda: None)
+        live = Engine(config, store, [site], wall=lambda: START + 1e8, stored=lambda: None)
         assert {alarm.state for alarm in before} == {AlarmState.CLEARED}
-        assert sorted(live.watches[FEEDER].book.alarms, key=lambda alarm: alarm.id) == before[::-1]
+        assert sorted(live.monitors[FEEDER].book.alarms, key=lambda alarm: alarm.id) == before[::-1]
 
 
 def test_an_idle_service_notices_that_the_database_is_back(
@@ -394,19 +396,19 @@ def test_an_idle_service_notices_that_the_database_is_back(
     with Store(f"sqlite:///{path}") as store:
         live = rounds(store, site)
         other = locked()
-        live.round(until(attacked, 5.0)[0])
-        live.round([])
-        assert live.keeper.problem is not None
+        live.cycle(until(attacked, 5.0)[0])
+        live.cycle([])
+        assert live.committer.problem is not None
         other.close()
-        live.round([])
-        assert live.keeper.problem is None
+        live.cycle([])
+        assert live.committer.problem is None
 
 
 def test_acknowledgements(site: Site, attacked: list[Sample], path: Path) -> None:
     outlet = Outlet()
     with Store(f"sqlite:///{path}") as store:
         live = rounds(store, site, outlet)
-        live.round(until(attacked, 15.0)[0])
+        live.cycle(until(attacked, 15.0)[0])
         first, second = (a.id for a in store.active(FEEDER))
         assert live.acknowledge(first, "Ada", "on my way").result()["acknowledged_by"] == "Ada"
         with pytest.raises(AlreadyAcknowledged):
@@ -415,11 +417,11 @@ def test_acknowledgements(site: Site, attacked: list[Sample], path: Path) -> Non
             live.acknowledge(second, "Bob", "", count=2).result()
         with pytest.raises(AlarmUnknown):
             live.acknowledge("0" * 26, "Ada", "").result()
-        live.round(until(attacked, 15.0)[1])
+        live.cycle(until(attacked, 15.0)[1])
     with Store(f"sqlite:///{path}") as store:
         # The feeder is not watched any more: the store alone knows its alarm.
-        live = Rounds(RuntimeConfig(), store, [], wall=lambda: START + 100, stored=lambda: None)
-        live.keeper.publisher = outlet
+        live = Engine(RuntimeConfig(), store, [], wall=lambda: START + 100, stored=lambda: None)
+        live.committer.publisher = outlet
         live.begin()
         known = store.alarm(second)
         assert known is not None
@@ -434,10 +436,10 @@ def test_an_old_report_is_told_to_be_old(
     site: Site, attacked: list[Sample], path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A round hangs for a minute of the service's clock: the last report stays, and says how old it is."""
-    wall, goes_on, due = START + 3.5, threading.Event(), Watch.due
+    wall, goes_on, due = START + 3.5, threading.Event(), FeederMonitor.advance
     some = [sample for sample in attacked if START + 4 <= sample.arrival < START + 6]
 
-    def hangs(self: Watch, now: float) -> Any:
+    def hangs(self: FeederMonitor, now: float) -> Any:
         goes_on.wait(20.0)
         return due(self, now)
 
@@ -449,7 +451,7 @@ def test_an_old_report_is_told_to_be_old(
         wall = START + 6.0
         while runtime.report(FEEDER) is None or not runtime.ready()[0]:  # noqa: ASYNC110
             await asyncio.sleep(0.01)
-        monkeypatch.setattr(Watch, "due", hangs)
+        monkeypatch.setattr(FeederMonitor, "advance", hangs)
         report = runtime.report(FEEDER)
         assert report is not None
         assert runtime.age(report) < 5.0

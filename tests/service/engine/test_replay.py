@@ -11,15 +11,15 @@ from typing import Any
 import pytest
 
 from feeders.model.site import Site, from_tables, load
-from feeders.registry.registry import Watcher
+from feeders.registry.registry import DesignedEstimator
 from feeders.simulation.meters import Channel
 from feeders.simulation.recording import read_recording, record
-from feeders.simulation.scenario import Reading, Scenario, by_arrival, random_attacks, simulate
+from feeders.simulation.scenario import Scenario, SimulatedReading, by_arrival, random_attacks, simulate
 from gridsec.interface import Frame
 from service.cli.simulate import key_of, payload_of
-from service.engine.engine import Rounds, RuntimeConfig
+from service.engine.engine import Engine, RuntimeConfig
 from service.engine.feeder_monitor import design
-from service.engine.replay import Tally, replay
+from service.engine.replay import ReplayCounts, replay
 from service.ingest.align import Clock
 from service.ingest.queues import Sample
 from service.report.report import to_json
@@ -53,15 +53,15 @@ def test_the_live_rounds_and_a_replay_agree_to_the_last_bit(
     ]
     outlet = Outlet()
     with Store(f"sqlite:///{tmp_path / 'gridsec.db'}") as store:
-        live = Rounds(
+        live = Engine(
             RuntimeConfig(clock=Clock.EVENTS), store, [site], wall=lambda: START, stored=lambda: None
         )
-        live.watches[FEEDER].install(design(site))
-        live.keeper.publisher = outlet
+        live.monitors[FEEDER].install(design(site))
+        live.committer.publisher = outlet
         for k in range(0, len(samples), 37):
-            live.round(samples[k : k + 37])
+            live.cycle(samples[k : k + 37])
         alarms = store.alarms()[0]
-    tally = Tally()
+    tally = ReplayCounts()
     replayed = list(replay(site, readings, tally))
     assert len(outlet.estimates) >= 85
     told = [json.loads(json.dumps(to_json(r.report))) for r in replayed]
@@ -83,19 +83,19 @@ def test_what_was_live_by_the_wall_clock_is_replayed_by_the_time_of_arrival(
     clock, outlet, chance = [readings[0].arrival], Outlet(), random.Random(3)
     with Store(f"sqlite:///{tmp_path / 'gridsec.db'}") as store:
         config = RuntimeConfig(**asked)
-        live = Rounds(config, store, [site], wall=lambda: clock[0], stored=lambda: None)
-        live.watches[FEEDER].install(design(site))
-        live.keeper.publisher = outlet
+        live = Engine(config, store, [site], wall=lambda: clock[0], stored=lambda: None)
+        live.monitors[FEEDER].install(design(site))
+        live.committer.publisher = outlet
         while readings:
             clock[0] += chance.expovariate(2.0)  # rounds come when they come: between readings, or after many
             ready = [r for r in readings if r.arrival <= clock[0]]
             readings = readings[len(ready) :]
-            live.round(
+            live.cycle(
                 [Sample(f"gridsec/{key_of(FEEDER, r.meter)}", payload_of(r), "", r.arrival, 1) for r in ready]
             )
         clock[0] += 1.0
-        live.round([])
-    told, tally = {}, Tally()
+        live.cycle([])
+    told, tally = {}, ReplayCounts()
     for by in Clock:
         run = replay(site, read_recording(path).readings(), tally, clock=by, **asked)
         told[by] = [json.loads(json.dumps(to_json(one.report))) for one in run]
@@ -113,7 +113,7 @@ def test_readings_that_do_not_say_when_they_arrived_were_not_live(
     good = list(by_arrival(simulate(site, replace(scenario, duration_s=3.0, channel=Channel(), attacks=()))))
     bad = [replace(one, arrival=arrival) for one in good[:5]]
     for clock, refused in ((Clock.WALL, 5), (Clock.EVENTS, 0)):
-        tally = Tally()
+        tally = ReplayCounts()
         assert len(list(replay(site, [*bad, *good[5:]], tally, clock=clock))) == 3
         assert (tally.readings["value"], tally.readings["accepted"]) == (refused, len(good) - refused)
 
@@ -129,20 +129,20 @@ def forecasting(site: Site) -> Site:
 def test_a_file_and_the_stream_it_was_made_of_agree(site: Site, scenario: Scenario, tmp_path: Path) -> None:
     short = replace(scenario, duration_s=30.0)
     record(site, short, tmp_path / "short.parquet")
-    from_file = list(replay(site, read_recording(tmp_path / "short.parquet").readings(), Tally()))
-    from_stream = list(replay(site, by_arrival(simulate(site, short)), Tally()))
+    from_file = list(replay(site, read_recording(tmp_path / "short.parquet").readings(), ReplayCounts()))
+    from_stream = list(replay(site, by_arrival(simulate(site, short)), ReplayCounts()))
     assert from_file == from_stream
 
 
 def test_bad_readings_of_a_recording_are_counted(site: Site, scenario: Scenario) -> None:
     good = list(by_arrival(simulate(site, replace(scenario, duration_s=10.0, channel=Channel(), attacks=()))))
     bad = [
-        Reading("m99", START, 1, START, 230.0, None, None),
-        Reading("m01", START, 1, START, float("nan"), None, None),
-        Reading("m01", START * 1000, 1, START, 230.0, None, None),
-        Reading("m01", START + 1e6, 1, START, 230.0, None, None),
+        SimulatedReading("m99", START, 1, START, 230.0, None, None),
+        SimulatedReading("m01", START, 1, START, float("nan"), None, None),
+        SimulatedReading("m01", START * 1000, 1, START, 230.0, None, None),
+        SimulatedReading("m01", START + 1e6, 1, START, 230.0, None, None),
     ]
-    tally = Tally()
+    tally = ReplayCounts()
     results = list(replay(site, [*good[:14], *bad, *good[14:]], tally))
     assert (tally.readings["unknown-meter"], tally.readings["value"], tally.readings["clock-off"]) == (
         1,
@@ -159,14 +159,14 @@ def test_a_defect_ends_a_replay_also_at_its_last_tick(
 ) -> None:
     # The last readings are missing but for a few: only the end lets their tick go.
     readings = list(by_arrival(simulate(site, scenario)))[:-10]
-    at = list(replay(site, readings, Tally()))[-back].report.t
-    step = Watcher.step
+    at = list(replay(site, readings, ReplayCounts()))[-back].report.t
+    step = DesignedEstimator.step
 
-    def breaks(self: Watcher, state: Any, frame: Frame) -> Any:
+    def breaks(self: DesignedEstimator, state: Any, frame: Frame) -> Any:
         if frame.t >= at:
             raise ZeroDivisionError("a defect")
         return step(self, state, frame)
 
-    monkeypatch.setattr(Watcher, "step", breaks)
+    monkeypatch.setattr(DesignedEstimator, "step", breaks)
     with pytest.raises(ZeroDivisionError, match="a defect"):
-        list(replay(site, readings, Tally()))
+        list(replay(site, readings, ReplayCounts()))

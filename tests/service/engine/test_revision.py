@@ -9,7 +9,7 @@ import pytest
 
 from feeders.model.site import Site, from_tables, load
 from service.alarms.state_machine import AlarmBook
-from service.engine.feeder_monitor import Watch, align_rules
+from service.engine.feeder_monitor import FeederMonitor, align_rules
 from service.ingest.align import Clock
 from service.ingest.reading import Reading
 from service.report.feeder_info import detail
@@ -34,13 +34,13 @@ def ticking(site: Site, seconds: float) -> Site:
 
 def told(site: Site, grace_s: float | None = None) -> dict[str, Any]:
     """The first state of a feeder whose meters all read."""
-    watch = Watch(site, align_rules(site, Clock.WALL, grace_s=grace_s), AlarmBook(site.feeder.name))
-    watch.due(T)
+    monitor = FeederMonitor(site, align_rules(site, Clock.WALL, grace_s=grace_s), AlarmBook(site.feeder.name))
+    monitor.advance(T)
     for meter in (*site.meter_ids, None):
-        watch.take(Reading(FEEDER, meter, T, 230.0), T)
-    assert watch.report is not None
-    assert watch.report.revision == detail(site, watch.patience_s)["revision"]
-    return to_json(watch.report)
+        monitor.ingest(Reading(FEEDER, meter, T, 230.0), T)
+    assert monitor.report is not None
+    assert monitor.report.revision == detail(site, monitor.patience_s)["revision"]
+    return to_json(monitor.report)
 
 
 def test_the_same_feeder_has_the_same_revision_and_every_other_another() -> None:

@@ -14,7 +14,7 @@ from feeders.simulation.meters import BUSBAR
 from gridsec.interface import Cause
 from service.alarms.state_machine import AlarmKind
 from service.cli.simulate import key_of
-from service.engine.engine import Rounds, RuntimeConfig
+from service.engine.engine import Engine, RuntimeConfig
 from service.engine.feeder_monitor import design
 from service.ingest.align import Clock
 from service.ingest.queues import Sample
@@ -39,22 +39,22 @@ class Street:
     def __init__(self, site: Site, store: Store) -> None:
         self.site, self.store, self.second = site, store, 0
         self.wall = START - 0.5
-        self.rounds = Rounds(
+        self.rounds = Engine(
             RuntimeConfig(clock=Clock.WALL), store, [site], wall=lambda: self.wall, stored=lambda: None
         )
-        self.watch = self.rounds.watches[FEEDER]
+        self.watch = self.rounds.monitors[FEEDER]
         self.watch.install(design(site))
         self.rounds.begin()
-        self.rounds.round([])
+        self.rounds.cycle([])
 
     def go_on(self, seconds: int, says: Says) -> None:
         """Let everybody say something each second."""
         for second in range(self.second, self.second + seconds):
             t = START + second
             self.wall = t + 0.05
-            self.rounds.round(list(self._samples(second, says)))
+            self.rounds.cycle(list(self._samples(second, says)))
             self.wall = t + 0.9
-            self.rounds.round([])
+            self.rounds.cycle([])
         self.second += seconds
 
     def _samples(self, second: int, says: Says) -> Iterable[Sample]:

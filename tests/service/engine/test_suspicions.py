@@ -13,17 +13,17 @@ import pytest
 
 from feeders.model.site import Site, from_tables, load
 from feeders.simulation.meters import MeterErrors
-from feeders.simulation.scenario import Reading, Scenario, by_arrival, simulate
+from feeders.simulation.scenario import Scenario, SimulatedReading, by_arrival, simulate
 from gridsec.attack import Scaling
 from gridsec.estimators.sequential import Commission, to_arrays
 from gridsec.estimators.sequential.commission import nothing
-from service.engine.engine import Rounds, RuntimeConfig
+from service.engine.engine import Engine, RuntimeConfig
 from service.engine.feeder_monitor import design
-from service.engine.replay import Tally, replay
+from service.engine.replay import ReplayCounts, replay
 from service.ingest.align import Clock
 from service.report.report import to_json
 from service.store import Store, StoreUnavailable
-from service.store.state_codec import Kept, encode, fingerprint
+from service.store.state_codec import StateSnapshot, encode, fingerprint
 from tests.service.engine.test_commissioning import START, feed, samples, variant
 from tests.service.running import FEEDER, Outlet
 
@@ -38,7 +38,7 @@ def site() -> Site:
 
 
 @pytest.fixture(scope="module")
-def learned(site: Site) -> Kept:
+def learned(site: Site) -> StateSnapshot:
     """What a long commissioning leaves of meters without fixed errors: a tenth of the class is allowed."""
     made = design(site).design
     known = nothing(made)
@@ -51,7 +51,7 @@ def learned(site: Site) -> Kept:
     return encode(site, fingerprint(site), START - 1.0, to_arrays(Commission(small, None)))
 
 
-def _readings(site: Site, until: float) -> list[Reading]:
+def _readings(site: Site, until: float) -> list[SimulatedReading]:
     """A third of the meters reads 0.2 % too much, well inside their class."""
     at = np.array([site.meter_ids.index(meter) for meter in LIARS])
     lie = Scaling(at, START + 3.0, START + until, np.full(at.size, 0.002))
@@ -62,12 +62,12 @@ def _readings(site: Site, until: float) -> list[Reading]:
 
 
 @pytest.fixture(scope="module")
-def lying(site: Site) -> list[Reading]:
+def lying(site: Site) -> list[SimulatedReading]:
     return _readings(site, 1e6)
 
 
 @pytest.fixture(scope="module")
-def honest(site: Site) -> list[Reading]:
+def honest(site: Site) -> list[SimulatedReading]:
     """They stop when the service ends."""
     return _readings(site, END)
 
@@ -83,15 +83,15 @@ class Told(Outlet):
         return tuple(m["meter"] for m in self.estimates[k]["meters"] if m["suspect"])
 
 
-def watching(store: Store, site: Site) -> tuple[Rounds, Told]:
-    made = Rounds(RuntimeConfig(clock=Clock.EVENTS), store, [site], wall=lambda: START, stored=lambda: None)
-    made.keeper.publisher = told = Told()
-    made.watches[site.feeder.name].install(design(site))
+def watching(store: Store, site: Site) -> tuple[Engine, Told]:
+    made = Engine(RuntimeConfig(clock=Clock.EVENTS), store, [site], wall=lambda: START, stored=lambda: None)
+    made.committer.publisher = told = Told()
+    made.monitors[site.feeder.name].install(design(site))
     made.begin()
     return made, told
 
 
-def until_the_end(url: str, site: Site, learned: Kept, readings: list[Reading]) -> None:
+def until_the_end(url: str, site: Site, learned: StateSnapshot, readings: list[SimulatedReading]) -> None:
     """A service that has named the liars, and ends."""
     with Store(url) as store:
         store.commit(kept=[learned])
@@ -105,7 +105,12 @@ def until_the_end(url: str, site: Site, learned: Kept, readings: list[Reading]) 
 
 
 @pytest.fixture(scope="module")
-def ended(tmp_path_factory: pytest.TempPathFactory, site: Site, learned: Kept, lying: list[Reading]) -> Path:
+def ended(
+    tmp_path_factory: pytest.TempPathFactory,
+    site: Site,
+    learned: StateSnapshot,
+    lying: list[SimulatedReading],
+) -> Path:
     """The folder of its database."""
     folder = tmp_path_factory.mktemp("ended")
     until_the_end(f"sqlite:///{folder}/s.db", site, learned, lying)
@@ -120,7 +125,9 @@ def left(ended: Path, tmp_path: Path) -> Path:
 
 @pytest.mark.postgresql
 @pytest.mark.parametrize("family", ["postgresql"])
-def test_in_postgresql_too(site: Site, learned: Kept, lying: list[Reading], url: str) -> None:
+def test_in_postgresql_too(
+    site: Site, learned: StateSnapshot, lying: list[SimulatedReading], url: str
+) -> None:
     until_the_end(url, site, learned, lying)
     with Store(url) as store:
         live, told = watching(store, site)
@@ -128,7 +135,7 @@ def test_in_postgresql_too(site: Site, learned: Kept, lying: list[Reading], url:
         assert told.suspects(0) == LIARS
 
 
-def test_a_restart_clears_no_true_alarm(site: Site, lying: list[Reading], left: Path) -> None:
+def test_a_restart_clears_no_true_alarm(site: Site, lying: list[SimulatedReading], left: Path) -> None:
     with Store(f"sqlite:///{left}") as store:
         standing = [alarm.id for alarm in store.active(FEEDER)]
         assert len(standing) == len(LIARS)
@@ -141,7 +148,9 @@ def test_a_restart_clears_no_true_alarm(site: Site, lying: list[Reading], left: 
         assert [alarm.id for alarm in store.active(FEEDER)] == standing
 
 
-def test_who_has_become_honest_meanwhile_is_cleared(site: Site, honest: list[Reading], left: Path) -> None:
+def test_who_has_become_honest_meanwhile_is_cleared(
+    site: Site, honest: list[SimulatedReading], left: Path
+) -> None:
     with Store(f"sqlite:///{left}") as store:
         live, told = watching(store, site)
         feed(live, samples(honest, END, END + 40))
@@ -157,7 +166,9 @@ def test_who_has_become_honest_meanwhile_is_cleared(site: Site, honest: list[Rea
 
 
 @pytest.mark.parametrize("ticks", [0, 3])
-def test_a_replaced_meter_is_believed(site: Site, lying: list[Reading], left: Path, ticks: int) -> None:
+def test_a_replaced_meter_is_believed(
+    site: Site, lying: list[SimulatedReading], left: Path, ticks: int
+) -> None:
     with Store(f"sqlite:///{left}") as store:
         live, _ = watching(store, site)
         feed(live, samples(lying, END, END + ticks))
@@ -176,10 +187,10 @@ def test_what_could_not_be_stored_is_not_forgotten(site: Site, left: Path) -> No
         with pytest.raises(StoreUnavailable):
             live.recommission(FEEDER, [], "Ada", "all new").result()
         other.close()
-        assert np.isfinite(live.watches[FEEDER].suspicions.known.scale_s).sum() == len(LIARS)
+        assert np.isfinite(live.monitors[FEEDER].suspicions.known.scale_s).sum() == len(LIARS)
 
 
-def test_a_meter_that_is_gone_is_not_missed(site: Site, lying: list[Reading], left: Path) -> None:
+def test_a_meter_that_is_gone_is_not_missed(site: Site, lying: list[SimulatedReading], left: Path) -> None:
     gone, *others = LIARS
     rows = tuple(replace(row, meter="" if row.meter == gone else row.meter) for row in site.tables.customers)
     smaller = from_tables(replace(site.tables, customers=rows))
@@ -190,7 +201,7 @@ def test_a_meter_that_is_gone_is_not_missed(site: Site, lying: list[Reading], le
 
 
 def test_a_damaged_text_costs_the_suspicions_and_nothing_else(
-    site: Site, lying: list[Reading], left: Path
+    site: Site, lying: list[SimulatedReading], left: Path
 ) -> None:
     with sqlite3.connect(left) as raw:
         raw.execute("UPDATE distrust SET data = replace(data, '15.0', '-15.0')")
@@ -198,42 +209,44 @@ def test_a_damaged_text_costs_the_suspicions_and_nothing_else(
     with Store(f"sqlite:///{left}") as store:
         live, told = watching(store, site)
         feed(live, samples(lying, END, END + 4))
-        watch = live.watches[FEEDER]
-        assert "damaged" in watch.suspicions.note
-        assert watch.commissioning.restored
+        monitor = live.monitors[FEEDER]
+        assert "damaged" in monitor.suspicions.note
+        assert monitor.commissioning.restored
         assert told.suspects(0) == ()
         kept = store.distrust(FEEDER)
         assert kept is not None
         assert json.loads(kept.text)["meters"] == []
 
 
-def test_a_clock_that_is_set_back_clears_nobody(site: Site, lying: list[Reading], left: Path) -> None:
+def test_a_clock_that_is_set_back_clears_nobody(
+    site: Site, lying: list[SimulatedReading], left: Path
+) -> None:
     with Store(f"sqlite:///{left}") as store:
         live, told = watching(store, site)
         feed(live, samples(lying, END, END + 6))
-        watch = live.watches[FEEDER]
-        assert watch.report is not None
-        watch.report = replace(watch.report, t=START + 1e6)
+        monitor = live.monitors[FEEDER]
+        assert monitor.report is not None
+        monitor.report = replace(monitor.report, t=START + 1e6)
         feed(live, samples(lying, END + 6, END + 40))
         assert {told.suspects(k) for k in range(len(told.estimates))} == {LIARS}
 
 
 def test_a_replay_with_what_was_kept_is_what_the_restarted_service_said(
-    site: Site, lying: list[Reading], left: Path
+    site: Site, lying: list[SimulatedReading], left: Path
 ) -> None:
     later = [r for r in lying if START + END <= r.t < START + END + 20]
     with Store(f"sqlite:///{left}") as store:
         kept, distrust = store.commission(FEEDER), store.distrust(FEEDER)
         live, told = watching(store, site)
         feed(live, samples(later, END, END + 20))
-    results = replay(site, later, Tally(), kept=kept, distrust=distrust)
+    results = replay(site, later, ReplayCounts(), kept=kept, distrust=distrust)
     said = [json.loads(json.dumps(to_json(result.report))) for result in results]
     assert len(told.estimates) >= 18
     assert said[: len(told.estimates)] == told.estimates
 
 
 def test_another_estimator_begins_as_it_always_did(
-    site: Site, lying: list[Reading], left: Path, tmp_path: Path
+    site: Site, lying: list[SimulatedReading], left: Path, tmp_path: Path
 ) -> None:
     bank = variant(site, estimator="windowed-bank", max_attacked=1)
     said = []

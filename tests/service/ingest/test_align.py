@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.ingest.align import BACKLOG_TICKS, HELD_PER_SOURCE, Aligner, Clock, Outcome, Tick, rules
+from service.ingest.align import BACKLOG_TICKS, HELD_PER_SOURCE, Aligner, Clock, ReadingOutcome, Tick, rules
 from service.ingest.reading import Reading
 
 T0 = 1_795_212_000.0
@@ -32,7 +32,7 @@ class Wall:
         self.a = a
         self.ticks: list[Tick] = list(a.due(start))
 
-    def at(self, now: float, *readings: Reading) -> list[Outcome]:
+    def at(self, now: float, *readings: Reading) -> list[ReadingOutcome]:
         outcomes = []
         self.ticks += self.a.due(now)
         for one in readings:
@@ -119,23 +119,23 @@ def test_late_duplicate_and_out_of_order() -> None:
     w = Wall(a, T0 - 0.5)
     w.at(T0 + 0.1, *(reading(m, T0) for m in ALL if m != "d"))
     w.at(T0 + 0.6)
-    assert w.at(T0 + 0.7, reading("d", T0, 1.0)) == [Outcome.LATE]
-    assert w.at(T0 + 0.8, reading("d", T0, 2.0)) == [Outcome.DUPLICATE]
+    assert w.at(T0 + 0.7, reading("d", T0, 1.0)) == [ReadingOutcome.LATE]
+    assert w.at(T0 + 0.8, reading("d", T0, 2.0)) == [ReadingOutcome.DUPLICATE]
     assert w.at(T0 + 0.8, reading("a", T0 + 0.9), reading("a", T0 + 0.5)) == [
-        Outcome.ACCEPTED,
-        Outcome.OUT_OF_ORDER,
+        ReadingOutcome.ACCEPTED,
+        ReadingOutcome.OUT_OF_ORDER,
     ]
     w.at(T0 + 1.1, *(reading(m, T0 + 1) for m in ALL if m != "d"))
     w.at(T0 + 1.6)
     late = w.ticks[1].readings[3]
     assert late is not None
     assert (late.t, late.v_volt) == (T0, 1.0)
-    assert w.at(T0 + 1.7, reading("a", T0 + 0.5)) == [Outcome.LATE]
+    assert w.at(T0 + 1.7, reading("a", T0 + 0.5)) == [ReadingOutcome.LATE]
     assert a.counts == {
-        Outcome.ACCEPTED: 9,
-        Outcome.LATE: 2,
-        Outcome.DUPLICATE: 1,
-        Outcome.OUT_OF_ORDER: 1,
+        ReadingOutcome.ACCEPTED: 9,
+        ReadingOutcome.LATE: 2,
+        ReadingOutcome.DUPLICATE: 1,
+        ReadingOutcome.OUT_OF_ORDER: 1,
     }
 
 
@@ -146,7 +146,7 @@ def test_a_clock_that_is_off_is_refused_and_its_meter_is_silent() -> None:
     for k in range(15):
         w.all_at(T0 + k, skip=("c",))
         outcomes |= set(w.at(T0 + k + 0.02, reading("c", T0 + k + (3600.0 if k % 2 else -3600.0))))
-    assert outcomes == {Outcome.CLOCK_OFF}
+    assert outcomes == {ReadingOutcome.CLOCK_OFF}
     w.at(T0 + 14.6)
     assert {seen(t) for t in w.ticks} == {"ab-d0"}
     assert w.ticks[-1].silent == (("c", math.inf),)
@@ -172,7 +172,7 @@ def test_whose_readings_are_all_too_old_is_silent(lag_s: float, who: str | None)
         w.all_at(T0 + k)
     for k in range(10, 40):
         w.all_at(T0 + k, skip=(who,))
-        assert w.at(T0 + k + 0.02, reading(who, T0 + k - lag_s))[0] is not Outcome.CLOCK_OFF
+        assert w.at(T0 + k + 0.02, reading(who, T0 + k - lag_s))[0] is not ReadingOutcome.CLOCK_OFF
     w.at(T0 + 39.6)
     # Its last usable one is that of second 9: those of before the change are newer for as long as the lag.
     assert next((t.t - T0, t.silent) for t in w.ticks if t.silent) == (20.0, ((who, 11.0),))
@@ -301,7 +301,7 @@ def test_readings_that_waited_are_no_clock_set_back(waited_s: float, told: bool)
     assert len({t.t for t in ticks}) == len(ticks)
     if told:
         assert {seen(t) for t in ticks[:60]} == {"abcd0"}
-        assert a.counts == {Outcome.ACCEPTED: len(arrivals)}
+        assert a.counts == {ReadingOutcome.ACCEPTED: len(arrivals)}
 
 
 def test_many_readings_between_two_ticks_are_no_overflow() -> None:
@@ -314,7 +314,7 @@ def test_many_readings_between_two_ticks_are_no_overflow() -> None:
     assert [t.t for t in ticks] == [start + 900.0 * k for k in range(5)]
     ages = [tick.t - one.t for tick in ticks[1:] for one in (*tick.readings, tick.busbar) if one]
     assert ages == [1.0] * (4 * len(ALL))
-    assert not a.counts[Outcome.OVERFLOW]
+    assert not a.counts[ReadingOutcome.OVERFLOW]
 
 
 def test_a_reading_that_was_overtaken_is_not_lost_twice() -> None:
@@ -360,7 +360,7 @@ def test_a_source_far_ahead_of_the_ticks_is_bounded() -> None:
     a = aligner(tick_s=0.1)
     w = Wall(a, T0 - 0.5)
     outcomes = w.at(T0 - 0.4, *(reading("a", T0 + 0.1 * k) for k in range(HELD_PER_SOURCE + 5)))
-    assert outcomes.count(Outcome.OVERFLOW) == 5
+    assert outcomes.count(ReadingOutcome.OVERFLOW) == 5
 
 
 # --- time told by the readings ------------------------------------------------------------------------
@@ -391,7 +391,7 @@ def test_events_one_wild_clock_moves_nothing(off: float, place: int) -> None:
     assert [t.t for t in ticks] == [T0 + k for k in range(30)]
     expected = "".join("-" if m == wild else (m or "0") for m in ALL)
     assert {seen(t) for t in ticks} == {expected}
-    assert a.counts[Outcome.CLOCK_OFF] == 30
+    assert a.counts[ReadingOutcome.CLOCK_OFF] == 30
     swept = a.refused()
     assert all(r.meter == wild for r in swept)
 
@@ -403,7 +403,7 @@ def test_events_one_wild_clock_that_never_stops_talking_moves_nothing() -> None:
         for meter in ALL:
             ticks += a.take(reading(meter, T0 + k), 0.0)[1]
         for j in range(200 if k == 10 else 0):
-            assert a.take(reading("c", T0 + 86_400.0 + j), 0.0)[0] is Outcome.CLOCK_OFF
+            assert a.take(reading("c", T0 + 86_400.0 + j), 0.0)[0] is ReadingOutcome.CLOCK_OFF
     assert not any(tick.skipped for tick in ticks)
     assert [t.t for t in ticks] == [T0 + k for k in range(30)][-len(ticks) :]
     assert len(ticks) >= 28
@@ -478,7 +478,7 @@ def test_whatever_arrives(stream: list[tuple[str | None, float, float]]) -> None
         now += pause
         one = reading(meter, T0 + t, t)
         outcome, more = a.take(one, now)
-        if outcome is not Outcome.CLOCK_OFF:
+        if outcome is not ReadingOutcome.CLOCK_OFF:
             offered.add((meter, one.t))
         ticks += more
     ticks += a.due(now + 2.0)
@@ -499,18 +499,18 @@ def test_events_a_first_reading_from_the_far_future_is_forgotten() -> None:
     a = aligner(Clock.EVENTS)
     others = tuple(meter for meter in ALL if meter != "d")
 
-    def said(*readings: Reading) -> list[tuple[Outcome, list[Tick]]]:
+    def said(*readings: Reading) -> list[tuple[ReadingOutcome, list[Tick]]]:
         return [a.take(one, math.nan) for one in readings]
 
-    accepted = (Outcome.ACCEPTED, [])
+    accepted = (ReadingOutcome.ACCEPTED, [])
     assert said(reading("d", T0 + 7200.0)) == [accepted]
     assert said(*(reading(meter, T0 - 0.5) for meter in others)) == [accepted] * 4
     assert [one.t for one in a.refused()] == [T0 + 7200.0]
-    assert a.counts == {Outcome.ACCEPTED: 4, Outcome.CLOCK_OFF: 1}
+    assert a.counts == {ReadingOutcome.ACCEPTED: 4, ReadingOutcome.CLOCK_OFF: 1}
     # The tick waits for this meter as for any other, and takes what it says now.
     assert said(*(reading(meter, T0) for meter in others)) == [accepted] * 4
     ((outcome, (tick,)),) = said(reading("d", T0, 231.0))
-    assert outcome is Outcome.ACCEPTED
+    assert outcome is ReadingOutcome.ACCEPTED
     assert (tick.t, seen(tick), tick.silent) == (T0, "abcd0", ())
 
 
@@ -532,4 +532,4 @@ def test_long_ticks_take_what_is_read_up_to_a_second_later() -> None:
 def test_clocks_of_long_ticks_may_be_off_by_two_of_them(off_s: float, sign: float, refused: bool) -> None:
     w = Wall(aligner(tick_s=900.0), T0 - 1.0)
     (outcome,) = w.at(T0, reading("a", T0 + sign * off_s))
-    assert (outcome is Outcome.CLOCK_OFF) == refused
+    assert (outcome is ReadingOutcome.CLOCK_OFF) == refused

@@ -12,7 +12,7 @@ from feeders.model.site import load, to_frame
 from gridsec.interface import Cause
 from service.alarms.conditions import AlarmKind, Severity, conditions
 from service.alarms.state_machine import AlarmBook
-from service.engine.feeder_monitor import Watch, align_rules, design
+from service.engine.feeder_monitor import FeederMonitor, align_rules, design
 from service.ingest.align import FEWEST, KEPT, OFFSETS_TICKS, Aligner, Clock, ClockOffsets, Tick, rules
 from service.ingest.reading import Reading
 from service.report.report import to_json
@@ -152,7 +152,7 @@ def test_an_offset_is_a_minor_condition_with_its_seconds(offset: float, words: s
 def test_the_clock_of_the_busbar_meter_is_measured_and_shown() -> None:
     """Ahead by 2 s: ticks, snapshot, alarm of the substation, REST; no meter has an offset."""
     site = load("cigre-lv")
-    watch = Watch(site, align_rules(site, Clock.WALL), AlarmBook(site.feeder.name))
+    watch = FeederMonitor(site, align_rules(site, Clock.WALL), AlarmBook(site.feeder.name))
     watch.install(design(site))
     rng, raised = random.Random(6), []
     for k in range(3 * OFFSETS_TICKS + 10):
@@ -160,7 +160,7 @@ def test_the_clock_of_the_busbar_meter_is_measured_and_shown() -> None:
         for one in (*site.meter_ids, None):
             stamp = T0 + k + (2.0 if one is None else 0.0)
             volt = site.tables.meta.voltage_volt
-            _, results = watch.take(Reading(site.feeder.name, one, stamp, volt, 0.0, 0.0), now)
+            _, results = watch.ingest(Reading(site.feeder.name, one, stamp, volt, 0.0, 0.0), now)
             raised += [t.alarm for result in results for t in result.transitions]
     assert ("substation", AlarmKind.CLOCK_OFFSET) in {(one.meter, one.kind) for one in raised}
     assert watch.report is not None
@@ -176,7 +176,7 @@ def test_the_clock_of_the_busbar_meter_is_measured_and_shown() -> None:
 def test_a_watched_feeder_raises_the_alarm_and_shows_the_offset(offset: float, cause: Cause) -> None:
     """An offset that no scale judges: undecided with this cause, and no alarm besides."""
     site = load("cigre-lv")
-    watch = Watch(site, align_rules(site, Clock.WALL), AlarmBook(site.feeder.name))
+    watch = FeederMonitor(site, align_rules(site, Clock.WALL), AlarmBook(site.feeder.name))
     watch.install(design(site))
     rng, off, kinds = random.Random(5), site.meter_ids[1], []
     for k in range(7 * OFFSETS_TICKS):
@@ -184,7 +184,7 @@ def test_a_watched_feeder_raises_the_alarm_and_shows_the_offset(offset: float, c
         for one in (*site.meter_ids, None):
             stamp = T0 + k + (offset if one == off else 0.0)
             volt = site.tables.meta.voltage_volt
-            _, results = watch.take(Reading(site.feeder.name, one, stamp, volt, 0.0, 0.0), now)
+            _, results = watch.ingest(Reading(site.feeder.name, one, stamp, volt, 0.0, 0.0), now)
             # Up to the first reading of the meter that serves a tick the meter is silent.
             kinds += [t.alarm.kind for result in results for t in result.transitions if k > 50]
             kinds += [

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pyarrow import ipc
 
-from service.ingest.decode import DETAILED_PER_REASON, Decoded, Wire
+from service.ingest.decode import DETAILED_PER_REASON, DecodedPayload, Wire
 from service.ingest.reading import BadReason, Known, Reading
 
 T = 1_795_212_000.25
@@ -27,11 +27,11 @@ BATCH = "gridsec/village/concentrator/k1/readings"
 STREAM, FILE = "application/vnd.apache.arrow.stream", "application/vnd.apache.arrow.file"
 
 
-def decode(payload: bytes | object, key: str = METER, encoding: str = "application/json") -> Decoded:
+def decode(payload: bytes | object, key: str = METER, encoding: str = "application/json") -> DecodedPayload:
     return WIRE.decode(key, payload if isinstance(payload, bytes) else json.dumps(payload).encode(), encoding)
 
 
-def only_bad(decoded: Decoded) -> tuple[BadReason, tuple[str, ...]]:
+def only_bad(decoded: DecodedPayload) -> tuple[BadReason, tuple[str, ...]]:
     assert not decoded.readings
     (bad,) = decoded.bad
     return bad.reason, bad.problems
@@ -43,7 +43,7 @@ def good(**changes: Any) -> dict[str, Any]:
 
 def test_the_reading_of_the_documentation() -> None:
     payload = b'{"t": 1795212000.25, "seq": 17, "v_volt": 231.4, "p_kw": 0.8, "q_kvar": 0.1}'
-    assert decode(payload) == Decoded((Reading("village", "a", 1795212000.25, 231.4, 0.8, 0.1, 17),))
+    assert decode(payload) == DecodedPayload((Reading("village", "a", 1795212000.25, 231.4, 0.8, 0.1, 17),))
 
 
 @pytest.mark.parametrize(
@@ -326,7 +326,7 @@ VALUES = st.recursive(
 FIELDS = st.sampled_from(["t", "v_volt", "p_kw", "q_kvar", "seq", "meter", "t_power", "x"])
 
 
-def sound(decoded: Decoded) -> None:
+def sound(decoded: DecodedPayload) -> None:
     assert decoded.readings or decoded.bad
     for reading in decoded.readings:
         assert reading.meter in {"a", "b", "c"}

@@ -13,7 +13,7 @@ import zenoh
 
 from service.ingest import queues, zenoh_bus
 from service.ingest.queues import BusConfig, BusUnavailable, Sample
-from service.ingest.zenoh_bus import BATCH, RING, Bus, Meters
+from service.ingest.zenoh_bus import BATCH, RING, Bus, MeterClient
 from tests.codes import refused
 from tests.service.running import free_port, until
 
@@ -35,11 +35,11 @@ class Sink:
 @contextmanager
 def pair(
     sink: Sink, *, lossless: bool = False, max_payload: int = 10_000
-) -> Iterator[tuple[Bus, Meters, str]]:
+) -> Iterator[tuple[Bus, MeterClient, str]]:
     end = f"tcp/127.0.0.1:{free_port()}"
     with (
         Bus(BusConfig(listen=(end,)), "gridsec", sink, max_payload=max_payload, lossless=lossless) as bus,
-        Meters(BusConfig("client", connect=(end,)), "gridsec") as meters,
+        MeterClient(BusConfig("client", connect=(end,)), "gridsec") as meters,
     ):
         yield bus, meters, end
 
@@ -116,7 +116,7 @@ def test_a_slow_service_keeps_the_newest_and_does_not_hold_up_the_sender() -> No
     end = f"tcp/127.0.0.1:{free_port()}"
     with (
         Bus(BusConfig(listen=(end,)), "gridsec", slow, max_payload=1000, lossless=False),
-        Meters(BusConfig("client", connect=(end,)), "gridsec") as meters,
+        MeterClient(BusConfig("client", connect=(end,)), "gridsec") as meters,
     ):
         for k in range(RING + 2_000):
             meters.put("f/meter/a/reading", str(k).encode())
@@ -190,7 +190,7 @@ def test_nobody_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(zenoh_bus, "_OPEN_TIMEOUT_MS", 500)
     end = f"tcp/127.0.0.1:{free_port()}"
     config = BusConfig("client", connect=(end,))
-    with refused(BusUnavailable, "bus-endpoint") as caught, Meters(config, "gridsec"):
+    with refused(BusUnavailable, "bus-endpoint") as caught, MeterClient(config, "gridsec"):
         pass
     assert end in str(caught.value)
 
@@ -205,12 +205,12 @@ def test_a_user_s_own_configuration(tmp_path: Path) -> None:
     sink = Sink()
     with (
         Bus(BusConfig(file=file), "gridsec", sink, max_payload=1000, lossless=False),
-        Meters(BusConfig("client", connect=(end,)), "gridsec") as meters,
+        MeterClient(BusConfig("client", connect=(end,)), "gridsec") as meters,
     ):
         meters.put("f/meter/a/reading", b"1")
         until(lambda: sink.samples)
     file.write_text("{ mode: ")
-    with refused(BusUnavailable, "bus-configuration"), Meters(BusConfig(file=file), "gridsec"):
+    with refused(BusUnavailable, "bus-configuration"), MeterClient(BusConfig(file=file), "gridsec"):
         pass
 
 

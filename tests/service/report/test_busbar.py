@@ -14,16 +14,16 @@ import pytest
 from feeders.model.site import Site, load
 from feeders.simulation.attacks import NoSuchAttack, busbar_attack
 from feeders.simulation.recording import read_recording
-from feeders.simulation.scenario import Reading as Said
 from feeders.simulation.scenario import Scenario, by_arrival, simulate
+from feeders.simulation.scenario import SimulatedReading as Said
 from gridsec.attack import Bias
-from gridsec.estimators.sequential import nobody
+from gridsec.estimators.sequential import SuspicionRecord
 from gridsec.interface import Cause, Decision, Estimate, Explanation, Verdict
 from service.alarms.conditions import AlarmKind, Condition, Severity, conditions
 from service.alarms.state_machine import AlarmBook, Change
 from service.api.models import State
 from service.cli.simulate import key_of, payload_of
-from service.engine.feeder_monitor import Watch, align_rules, design
+from service.engine.feeder_monitor import FeederMonitor, align_rules, design
 from service.ingest.align import Clock, Tick
 from service.ingest.reading import Reading
 from service.report.report import FeederReport, blind, build, to_json
@@ -215,7 +215,7 @@ def test_what_is_kept_of_it_comes_back(name: str) -> None:
     site = load(name)
     b = 3 if name == EUROPEAN else 1
     which = np.arange(b) == b - 1
-    nothing = nobody(len(site.meter_ids), site.droop.tau.size, b)
+    nothing = SuspicionRecord.empty(len(site.meter_ids), site.droop.tau.size, b)
     before = replace(
         nothing,
         busbar_scale_s=np.where(which, 60.0, np.nan),
@@ -289,11 +289,11 @@ def test_one_reading_in_between_does_not_end_its_data_loss(site: Site) -> None:
         for r in by_arrival(simulate(site, Scenario(start=START, duration_s=120.0)))
         if r.meter or r.t - START in (0.0, 80.0)
     ]
-    watch = Watch(site, align_rules(site, Clock.EVENTS), AlarmBook(FEEDER))
+    watch = FeederMonitor(site, align_rules(site, Clock.EVENTS), AlarmBook(FEEDER))
     watch.install(design(site))
     seen = []
     for r in readings:
-        for result in watch.take(Reading(FEEDER, r.meter or None, r.t, r.v_volt), r.arrival)[1]:
+        for result in watch.ingest(Reading(FEEDER, r.meter or None, r.t, r.v_volt), r.arrival)[1]:
             seen += [t.change for t in result.transitions if t.alarm.kind is AlarmKind.DATA_LOSS]
     assert seen == [Change.RAISED]
 

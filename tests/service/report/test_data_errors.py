@@ -29,7 +29,7 @@ from service.alarms.state_machine import to_json as alarm_to_json
 from service.api.models import AlarmModel, State
 from service.cli.simulate import Pace, play
 from service.engine.feeder_monitor import TickResult
-from service.engine.replay import Tally, replay
+from service.engine.replay import ReplayCounts, replay
 from service.report.reasons import DataErrorReport, DataErrors
 from service.report.report import to_json, with_data_error
 from tests.service.reports import FEEDER, T0, meter, report
@@ -67,7 +67,7 @@ def results(files: Site, tmp_path_factory: pytest.TempPathFactory) -> list[TickR
     """Results of the service for half an hour of the true feeder with these files."""
     path = tmp_path_factory.mktemp("day") / "day.parquet"
     recording = record(from_tables(tables(exchanged=False)), SCENE, path)
-    return list(replay(files, read_recording(recording.path).readings(), Tally()))
+    return list(replay(files, read_recording(recording.path).readings(), ReplayCounts()))
 
 
 def test_the_hint_is_in_the_report_its_reason_and_the_evidence(results: list[TickResult]) -> None:
@@ -204,7 +204,7 @@ def test_a_defect_of_the_comparison_costs_no_verdict(
 
     monkeypatch.setattr(data_errors, "follow", broken)
     recording = record(from_tables(tables(exchanged=False)), SCENE, tmp_path / "day.parquet")
-    without = list(replay(files, read_recording(recording.path).readings(), Tally()))
+    without = list(replay(files, read_recording(recording.path).readings(), ReplayCounts()))
     assert [one.report.verdict for one in without] == [one.report.verdict for one in results]
     assert any(one.report.data_error is not None for one in results)
     assert not any(one.report.data_error is not None for one in without)

@@ -16,7 +16,7 @@ from feeders.registry.registry import choose
 from feeders.simulation.meters import MeterErrors
 from feeders.simulation.scenario import Scenario, random_attacks, simulate
 from gridsec.attack import InverterAttack
-from gridsec.interface import Cause, Decision, Estimate, Explanation, Kind, Verdict
+from gridsec.interface import Cause, Decision, Estimate, Explanation, ManipulationKind, Verdict
 from service.alarms.conditions import AlarmKind, conditions
 from service.engine.feeder_monitor import design
 from service.ingest.align import Tick
@@ -215,7 +215,7 @@ def test_kinds_inverters_and_a_standard_deviation_of_its_own(site: Site) -> None
     estimate = replace(estimate, std=np.full(estimate.v2.size, 0.002), x=np.linspace(0.0, 0.08, m))
     verdict = replace(
         verdict,
-        kinds=tuple(Kind.DRIFT if k == 3 else None for k in range(13)),
+        kinds=tuple(ManipulationKind.DRIFT if k == 3 else None for k in range(13)),
         inverters=named,
         inverter_attack=np.where(named, -0.1, 0.0),
     )

@@ -19,7 +19,7 @@ from feeders.model.site import Site, load
 from feeders.simulation.meters import BUSBAR
 from service.alarms.state_machine import AlarmState, acknowledged
 from service.cli.simulate import key_of
-from service.engine.engine import Rounds
+from service.engine.engine import Engine
 from service.store import OutcomeUnknown, Rejected, Store, StoreUnavailable, connect
 from tests.codes import refused
 from tests.service.asking import is_problem
@@ -283,9 +283,9 @@ def test_the_database_is_written_apart_from_judging(
 ) -> None:
     """Threads of judging and of writing differ with every clock, and what is judged is stored."""
     judging, writing = set[str](), set[str]()
-    round_, commit = Rounds.round, Store.commit
+    round_, commit = Engine.cycle, Store.commit
 
-    def judged(self: Rounds, *given: Any) -> bool:
+    def judged(self: Engine, *given: Any) -> bool:
         judging.add(threading.current_thread().name)
         return round_(self, *given)
 
@@ -293,7 +293,7 @@ def test_the_database_is_written_apart_from_judging(
         writing.add(threading.current_thread().name)
         return commit(self, *given, **more)
 
-    monkeypatch.setattr(Rounds, "round", judged)
+    monkeypatch.setattr(Engine, "cycle", judged)
     monkeypatch.setattr(Store, "commit", stored)
     now = time.time()
     with service(tmp_path, clock=clock) as live:

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from feeders.model.site import Site, from_tables, load
-from gridsec.estimators.sequential import nobody
+from gridsec.estimators.sequential import SuspicionRecord
 from service.store.state_codec import (
     FORMAT,
-    Kept,
     KeptInvalid,
+    StateSnapshot,
     decode,
     decode_distrust,
     encode,
@@ -40,7 +40,7 @@ def test_what_does_not_matter_changes_nothing(site: Site) -> None:
     assert other.digest != site.digest
 
 
-def _damaged(kept: Kept, **changes: Any) -> Kept:
+def _damaged(kept: StateSnapshot, **changes: Any) -> StateSnapshot:
     return replace(kept, text=json.dumps(json.loads(kept.text) | changes))
 
 
@@ -72,7 +72,7 @@ def test_who_is_not_believed_comes_back_by_name(site: Site) -> None:
     p, m = len(site.meter_ids), site.droop.tau.size
     which, inverters = np.arange(p) % 5 == 1, np.arange(m) == m - 1
     before = replace(
-        nobody(p, m),
+        SuspicionRecord.empty(p, m),
         scale_s=np.where(which, 1.0 / 3.0, np.nan),
         repeats_s=np.where(which & (np.arange(p) > 7), 900.0, np.nan),
         named=which & (np.arange(p) > 5),

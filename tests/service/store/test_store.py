@@ -14,9 +14,9 @@ from service.alarms.state_machine import (
     Alarm,
     AlarmKind,
     AlarmState,
+    AlarmTransition,
     Change,
     Severity,
-    Transition,
     acknowledged,
 )
 from service.report.report import FeederReport
@@ -26,8 +26,8 @@ from tests.service.databases import both
 from tests.service.stored import T0, a_report, an_alarm, raised
 
 
-def cleared(alarm: Alarm, t: float) -> Transition:
-    return Transition(replace(alarm, state=AlarmState.CLEARED, t_cleared=t), Change.CLEARED, t)
+def cleared(alarm: Alarm, t: float) -> AlarmTransition:
+    return AlarmTransition(replace(alarm, state=AlarmState.CLEARED, t_cleared=t), Change.CLEARED, t)
 
 
 # --------------------------------------------------- alarms, events and outbox

@@ -19,8 +19,8 @@ import sqlalchemy as sa
 from service.report.report import FeederReport
 from service.store import Store, StoreUnavailable, WriterLost, connect, schema
 from service.store.history import pack, rows
-from service.store.schema import Happened, Step
-from service.store.state_codec import Kept, Matter
+from service.store.schema import CommissioningChange, CommissioningEvent
+from service.store.state_codec import SnapshotKind, StateSnapshot
 from tests.codes import refused
 from tests.service.databases import Cluster, both
 from tests.service.reports import meter, report
@@ -153,13 +153,15 @@ def test_sqlite_is_as_safe_as_it_says(tmp_path: Path) -> None:
 def test_what_was_learned_is_kept_as_it_is(store: Store) -> None:
     assert store.commission("village") is None
     assert store.commission_events("village") == []
-    other = Kept("town", T0, "{}")
-    begun = Happened("village", T0, Step.BEGUN, ("m1", "m2"), None, "")
-    store.commit(kept=[Kept("village", T0, '{"a": 1.0}'), other], happened=[begun])
-    wish = Happened("village", T0 + 5, Step.RECOMMISSIONED, ("m2",), "Ada", 'm2 replaced; it "hummed"')
-    store.commit(kept=[Kept("village", T0 + 5, '{"a": 2.0}')], happened=[wish])
-    assert store.commission("village") == Kept("village", T0 + 5, '{"a": 2.0}')
-    store.commit(kept=[Kept("village", T0, "{}", Matter.DISTRUST)])
+    other = StateSnapshot("town", T0, "{}")
+    begun = CommissioningEvent("village", T0, CommissioningChange.BEGUN, ("m1", "m2"), None, "")
+    store.commit(kept=[StateSnapshot("village", T0, '{"a": 1.0}'), other], happened=[begun])
+    wish = CommissioningEvent(
+        "village", T0 + 5, CommissioningChange.RECOMMISSIONED, ("m2",), "Ada", 'm2 replaced; it "hummed"'
+    )
+    store.commit(kept=[StateSnapshot("village", T0 + 5, '{"a": 2.0}')], happened=[wish])
+    assert store.commission("village") == StateSnapshot("village", T0 + 5, '{"a": 2.0}')
+    store.commit(kept=[StateSnapshot("village", T0, "{}", SnapshotKind.DISTRUST)])
     assert store.commission_events("village") == [begun, wish]
     assert store.commission_events("village", 1) == [wish]
     # A feeder that is deleted is forgotten, what happened to it is not, and others stay.
@@ -192,13 +194,16 @@ def test_a_database_from_before_commissioning_was_kept_is_brought_forward(url: s
     with Store(url) as old, old._write() as connection:
         put_back(connection, 1, schema.COMMISSION, schema.COMMISSION_EVENT, schema.DISTRUST, schema.WRITER)
     with Store(url) as new:
-        new.commit(kept=[Kept("village", T0, "{}")])
-        assert new.commission("village") == Kept("village", T0, "{}")
+        new.commit(kept=[StateSnapshot("village", T0, "{}")])
+        assert new.commission("village") == StateSnapshot("village", T0, "{}")
 
 
 @both
 def test_a_database_from_before_suspicions_were_kept_is_brought_forward(url: str) -> None:
-    learned, suspected = Kept("village", T0, "{}"), Kept("village", T0, "[]", Matter.DISTRUST)
+    learned, suspected = (
+        StateSnapshot("village", T0, "{}"),
+        StateSnapshot("village", T0, "[]", SnapshotKind.DISTRUST),
+    )
     with Store(url) as old, old._write() as connection:
         old._put_kept(connection, learned)
         put_back(connection, 2, schema.DISTRUST, schema.WRITER)
@@ -355,11 +360,11 @@ WRITER = """
     while True:
         number += 1
         alarm = Alarm(uuid.uuid4().hex[:26], AlarmKind.DATA_LOSS, "village", None, Severity.MINOR,
-                      AlarmState.RAISED, 1, 0.0, 1.0, None, "", Evidence())
+                      AlarmState.RAISED, 1, 0.0, 1.0, None, "", ConditionEvidence())
         over = replace(alarm, state=AlarmState.CLEARED, t_cleared=2.0)
-        a = store.commit([Transition(alarm, Change.RAISED, 1.0)])
+        a = store.commit([AlarmTransition(alarm, Change.RAISED, 1.0)])
         print(alarm.id, a[0], "raised", flush=True)
-        b = store.commit([Transition(over, Change.CLEARED, 2.0)])
+        b = store.commit([AlarmTransition(over, Change.CLEARED, 2.0)])
         print(alarm.id, b[0], "cleared", flush=True)
 """
 

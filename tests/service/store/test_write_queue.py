@@ -10,22 +10,30 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gridsec.interface import Cause, Decision
-from service.alarms.state_machine import Alarm, AlarmKind, AlarmState, Change, Evidence, Severity, Transition
+from service.alarms.state_machine import (
+    Alarm,
+    AlarmKind,
+    AlarmState,
+    AlarmTransition,
+    Change,
+    ConditionEvidence,
+    Severity,
+)
 from service.report.report import FeederReport
 from service.store import Rejected, write_queue
-from service.store.write_queue import Waiting
+from service.store.write_queue import WriteQueue
 
 KIND, LEVEL = AlarmKind.METER_MANIPULATED, Severity.CRITICAL
-RAISED = Alarm("", KIND, "f", "m", LEVEL, AlarmState.RAISED, 1, 0, 0, None, "", Evidence())
+RAISED = Alarm("", KIND, "f", "m", LEVEL, AlarmState.RAISED, 1, 0, 0, None, "", ConditionEvidence())
 
 
-def raised(name: str, count: int = 1, by: str | None = None) -> Transition:
-    return Transition(replace(RAISED, id=name, count=count, acknowledged_by=by), Change.RAISED, 0.0)
+def raised(name: str, count: int = 1, by: str | None = None) -> AlarmTransition:
+    return AlarmTransition(replace(RAISED, id=name, count=count, acknowledged_by=by), Change.RAISED, 0.0)
 
 
-def cleared(name: str, count: int = 1, by: str | None = None) -> Transition:
+def cleared(name: str, count: int = 1, by: str | None = None) -> AlarmTransition:
     alarm = replace(RAISED, id=name, count=count, state=AlarmState.CLEARED, t_cleared=1.0, acknowledged_by=by)
-    return Transition(alarm, Change.CLEARED, 1.0)
+    return AlarmTransition(alarm, Change.CLEARED, 1.0)
 
 
 def report(t: float) -> FeederReport:
@@ -41,7 +49,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("small")
 def test_a_flapping_alarm_keeps_its_newest_state() -> None:
     lost: Counter[str] = Counter()
-    book = Waiting(lambda what, count: lost.update({what: count}))
+    book = WriteQueue(lambda what, count: lost.update({what: count}))
     for count in range(1, 100):
         book.add(transitions=[raised("a", count), cleared("a", count)])
     book.add(transitions=[raised("a", 100)])
@@ -57,7 +65,7 @@ def test_a_flapping_alarm_keeps_its_newest_state() -> None:
 @pytest.mark.usefixtures("small")
 def test_alarms_that_came_and_went_unheard_go_first_and_are_counted() -> None:
     lost: Counter[str] = Counter()
-    book = Waiting(lambda what, count: lost.update({what: count}))
+    book = WriteQueue(lambda what, count: lost.update({what: count}))
     # The database knows these: one has been answered, one cleared unanswered while the database was away.
     book.add(transitions=[cleared("answered", 1, "Ada"), cleared("known", 3), raised("standing")])
     for k in range(200):
@@ -72,7 +80,7 @@ def test_alarms_that_came_and_went_unheard_go_first_and_are_counted() -> None:
 
 @pytest.mark.usefixtures("small")
 def test_what_stands_is_kept_beyond_the_limit() -> None:
-    book = Waiting(lambda *_: None)
+    book = WriteQueue(lambda *_: None)
     book.add(transitions=[raised(f"s{k}") for k in range(100)])
     book.add(transitions=[raised(f"s{k}", 2) for k in range(150)])
     assert {item.alarm.id for item in book.take().transitions} == {f"s{k}" for k in range(150)}
@@ -81,7 +89,7 @@ def test_what_stands_is_kept_beyond_the_limit() -> None:
 @pytest.mark.usefixtures("small")
 def test_records_that_were_not_stored_come_back_in_order_and_the_oldest_go() -> None:
     lost: Counter[str] = Counter()
-    book = Waiting(lambda what, count: lost.update({what: count}))
+    book = WriteQueue(lambda what, count: lost.update({what: count}))
     book.add(reports=[report(t) for t in (1.0, 2.0, 3.0)], rejected=[Rejected(1.0, "k", "r")])
     first = book.take()
     book.add(reports=[report(t) for t in (4.0, 5.0, 6.0)])
@@ -102,7 +110,7 @@ def test_the_database_ends_with_the_state_of_every_alarm_that_stands(steps: list
     """Alarms flip at random while the database comes and goes; a dictionary is the oracle."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(write_queue, "TRANSITIONS_KEPT", 8)
-        book = Waiting(lambda *_: None)
+        book = WriteQueue(lambda *_: None)
         truth: dict[str, Alarm] = {}
         database: dict[str, Alarm] = {}
         flying = None

@@ -9,7 +9,7 @@ import pytest
 from playwright.sync_api import APIResponse, Route, expect
 
 from gridsec.interface import Cause
-from service.alarms.state_machine import AlarmState, Change, Transition
+from service.alarms.state_machine import AlarmState, AlarmTransition, Change
 from service.report.report import (
     BusbarReport,
     CustomerReport,
@@ -339,7 +339,7 @@ def test_the_badge_counts_what_is_not_loaded_too(site: Site) -> None:
     """One alarm that nobody has answered is older than a page of others that have come and gone."""
     site.service.store.commit([raised(an_alarm())])
     gone = [an_alarm(k, state=AlarmState.CLEARED, t_cleared=T0 + k + 1) for k in range(1, 61)]
-    site.service.store.commit([Transition(alarm, Change.CLEARED, T0) for alarm in gone])
+    site.service.store.commit([AlarmTransition(alarm, Change.CLEARED, T0) for alarm in gone])
     page = site.open()
     badge = page.locator("#alarm-count")
     expect(badge).to_have_text("1 new")

@@ -12,7 +12,7 @@ from feeders.format.tables import FeederTables
 from feeders.model.site import Site, from_tables, load
 from feeders.model.three_phase import ThreePhaseSite
 from feeders.simulation.demand import Customers, Variation
-from feeders.simulation.meters import Channel, MeterErrors, Meters
+from feeders.simulation.meters import Channel, MeterErrors, SimulatedMeters
 from feeders.simulation.powerflow_three_phase import UnbalancedPowerFlow
 from feeders.simulation.recording import Recording, record
 from feeders.simulation.scenario import START, Scenario
@@ -51,7 +51,7 @@ def recorded(folder: Path, given: Scenario) -> Recording:
 
 def biases(given: Scenario) -> Floats:
     """True biases relative to the busbar's meter, percent."""
-    meters = Meters(CIGRE, given.errors, given.channel, given.seed)
+    meters = SimulatedMeters(CIGRE, given.errors, given.channel, given.seed)
     return np.asarray(100.0 * (meters.bias - meters.busbar_bias))
 
 
@@ -97,7 +97,7 @@ def three_phase_readings(
     feeder = given.feeder
     first = np.searchsorted(feeder.of, np.arange(len(feeder.customers)))
     v = np.sqrt(np.add.reduceat(connections**2 * feeder.share, first, axis=1))
-    meters = Meters(given, MeterErrors(report_q=True), Channel(), seed)  # type: ignore[arg-type]
+    meters = SimulatedMeters(given, MeterErrors(report_q=True), Channel(), seed)  # type: ignore[arg-type]
     read = meters.read(np.arange(ticks), v, demand.p_kw, demand.q_kvar, demand.v0_volt)
     none = np.full(ticks, np.nan)
     return pd.DataFrame(

@@ -16,7 +16,7 @@ from feeders.model.three_phase import three_phase
 from feeders.simulation.recording import RecordingInvalid
 from feeders.simulation.scenario import START
 from feeders.studies.calibrate.readings import frames
-from feeders.studies.calibrate.search import Kind
+from feeders.studies.calibrate.search import FileErrorKind
 from feeders.studies.calibrate.study import OtherFeeder, calibrate
 from feeders.studies.journal import OtherStudy
 from gridsec.attack import Attack, Bias, Drift, Replay, Stuck
@@ -112,7 +112,7 @@ def test_the_class_of_the_busbars_meter_counts(bias: float, verdict: str, tmp_pa
     exact = replace(given, errors=replace(given.errors, bias=0.0), attacks=(lie,))
     readings = recorded(tmp_path, exact).frame()
     readings.loc[readings["meter"] == "", "v_volt"] *= 1.0 - 0.0009
-    rows = calibrate(CIGRE, readings, kinds=[Kind.METER]).meters.set_index("meter")
+    rows = calibrate(CIGRE, readings, kinds=[FileErrorKind.METER]).meters.set_index("meter")
     assert rows.loc["m02", "bias_percent"] == pytest.approx(100.0 * bias + 0.09, abs=0.06)
     assert rows.loc["m02", "verdict"] == verdict
     assert "outside its class" not in set(rows.drop("m02")["verdict"])
@@ -212,7 +212,7 @@ def test_a_wrong_phase_is_found(tmp_path: Path) -> None:
     wrong = three_phase(replace(tables, customers=tuple(rows)))
     path = tmp_path / "readings.csv"
     readings.to_csv(path, index=False)
-    found = calibrate(wrong, path, kinds=[Kind.PHASE])
+    found = calibrate(wrong, path, kinds=[FileErrorKind.PHASE])
     assert found.proposals[["kind", "what", "proposed"]].to_numpy().tolist() == [["phase", "LOAD5", was]]
     assert found.corrections[0].phases == was
     assert "as in the files; bus not looked for" in set(found.customers["verdict"])
@@ -221,11 +221,11 @@ def test_a_wrong_phase_is_found(tmp_path: Path) -> None:
 
 def test_what_was_not_looked_for_is_not_as_in_the_files(tmp_path: Path) -> None:
     readings = recorded(tmp_path, scenario(1))
-    found = calibrate(CIGRE, readings, kinds=[Kind.METER])
+    found = calibrate(CIGRE, readings, kinds=[FileErrorKind.METER])
     assert set(found.lines["verdict"]) <= {"not looked for", "cannot be told"}
     assert "not looked for" in set(found.lines["verdict"])
     assert set(found.customers["verdict"]) == {"not looked for"}
-    found = calibrate(CIGRE, readings, kinds=[Kind.LENGTH, Kind.BUS])
+    found = calibrate(CIGRE, readings, kinds=[FileErrorKind.LENGTH, FileErrorKind.BUS])
     assert "as in the files" in set(found.lines["verdict"])
     assert set(found.customers["verdict"]) <= {"as in the files", "cannot be told"}
 
@@ -237,7 +237,9 @@ def test_phases_of_the_busbar_that_are_apart_are_no_errors_of_meters(tmp_path: P
     readings = three_phase_readings(given, seed=1, ticks=64, dt_s=900.0, hidden_kw=0.1, apart=0.006)
     path = tmp_path / "readings.csv"
     readings.to_csv(path, index=False)
-    assert "outside its class" not in set(calibrate(given, path, kinds=[Kind.METER]).meters["verdict"])
+    assert "outside its class" not in set(
+        calibrate(given, path, kinds=[FileErrorKind.METER]).meters["verdict"]
+    )
     for without in (readings.drop(columns="v_phases"), readings.assign(v_phases="[null, null, null]")):
         with refused(RecordingInvalid, "missing") as caught:
             calibrate(given, without)
@@ -249,8 +251,8 @@ def test_phases_of_the_busbar_that_are_apart_are_no_errors_of_meters(tmp_path: P
 
 def test_where_there_is_nothing_to_look_for_nothing_is_found(tmp_path: Path) -> None:
     readings = recorded(tmp_path, scenario(1, ticks=96))
-    assert calibrate(CIGRE, readings, kinds=[Kind.PHASE]).proposals.empty
-    for kinds in (tuple(Kind), [Kind.METER], [Kind.BUS]):
+    assert calibrate(CIGRE, readings, kinds=[FileErrorKind.PHASE]).proposals.empty
+    for kinds in (tuple(FileErrorKind), [FileErrorKind.METER], [FileErrorKind.BUS]):
         found = calibrate(CIGRE, readings, exclude=CIGRE.meter_ids, kinds=kinds)
         assert found.proposals.empty
         assert set(found.meters["verdict"]) == {"excluded"}

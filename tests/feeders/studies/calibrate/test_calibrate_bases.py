@@ -17,7 +17,7 @@ from feeders.simulation.recording import record
 from feeders.simulation.scenario import START
 from feeders.studies.calibrate.feeder import network, powers, series
 from feeders.studies.calibrate.readings import Frames
-from feeders.studies.calibrate.search import Kind, longer
+from feeders.studies.calibrate.search import FileErrorKind, longer
 from feeders.studies.calibrate.study import Calibrate, calibrate
 from gridsec.attack import Attack, Bias
 from gridsec.errors import FeederInvalid
@@ -165,7 +165,9 @@ def test_a_tap_of_each_phase_and_no_loops_in_three() -> None:
     lines = tuple(replace(line, **own) if line.line == "l2" else line for line in plainly)
     truth = replace(tables, lines=lines, customers=rows)
     read = three_phase_readings(three_phase(truth), 1, 192, 900.0, hidden_kw=0.2)
-    found = calibrate(three_phase(moved(truth, "c3", "n6")), read, kinds=(Kind.BUS, Kind.PHASE))
+    found = calibrate(
+        three_phase(moved(truth, "c3", "n6")), read, kinds=(FileErrorKind.BUS, FileErrorKind.PHASE)
+    )
     rows_found = found.proposals[["kind", "what", "proposed"]].to_numpy().tolist()
     assert rows_found == [["bus", "c3", "n3"]]
     assert found.meters["bias_percent"].abs().max() < 1.5

@@ -20,7 +20,7 @@ from feeders.simulation.recording import RecordingInvalid, record
 from feeders.simulation.scenario import Scenario
 from feeders.studies.calibrate.feeder import network, powers, series
 from feeders.studies.calibrate.readings import Frames, frames
-from feeders.studies.calibrate.search import Correction, Kind, apply, as_filed, left
+from feeders.studies.calibrate.search import Correction, FileErrorKind, apply, as_filed, left
 from feeders.studies.calibrate.study import Calibrate, calibrate
 from tests.codes import refused
 from tests.feeders.studies.calibrate.calibrate_cases import three_phase_readings
@@ -114,7 +114,9 @@ def test_the_noise_of_the_busbars_phases_is_learned_as_that_of_three_meters(tmp_
         seed=1, duration_s=2 * 86400.0, dt_s=900.0, profile_s=0.0, errors=MeterErrors(report_q=True)
     )
     found = calibrate(
-        three_phase(tables), record(from_tables(tables), day, tmp_path / "day.parquet"), kinds=[Kind.LENGTH]
+        three_phase(tables),
+        record(from_tables(tables), day, tmp_path / "day.parquet"),
+        kinds=[FileErrorKind.LENGTH],
     )
     white = found.errors.set_index("quantity").loc["noise of meters"]
     assert white["low"] < 1.0 < white["high"]
@@ -200,25 +202,27 @@ def test_of_a_customer_with_a_wrong_bus_and_phase_one_place_is_proposed() -> Non
 
 def test_places_of_which_each_speaks_for_the_other_are_not_written() -> None:
     """Phases are not looked for: the search comes back to the bus of the files, and ends there."""
-    found = calibrate(three_phase(on(street(), {"s1": "a"})), days(), kinds=(Kind.BUS, Kind.LENGTH))
+    found = calibrate(
+        three_phase(on(street(), {"s1": "a"})), days(), kinds=(FileErrorKind.BUS, FileErrorKind.LENGTH)
+    )
     assert found.proposals["kind"].tolist() == ["length", "bus"]
     assert found.proposals.loc[1, ["what", "verdict"]].tolist() == ["c-s1", "cannot be told"]
     assert found.proposals["alternatives"][1] == "c-s1 at s1"
-    assert [wrong.kind for wrong in found.corrections] in ([], [Kind.LENGTH])
+    assert [wrong.kind for wrong in found.corrections] in ([], [FileErrorKind.LENGTH])
 
 
 def test_what_a_later_place_leaves_of_an_earlier_one() -> None:
     tables = street()
-    away = Correction(Kind.BUS, ("c-s1",), "n4")
-    on_c = Correction(Kind.PHASE, ("c-u", "c-u1", "c-u2"), phases="c", lines=("l-u", "l-u1", "l-u2"))
+    away = Correction(FileErrorKind.BUS, ("c-s1",), "n4")
+    on_c = Correction(FileErrorKind.PHASE, ("c-u", "c-u1", "c-u2"), phases="c", lines=("l-u", "l-u1", "l-u2"))
     assert left(away, replace(away, bus="n3")) is None
     assert left(away, on_c) == away
     assert left(on_c, replace(on_c, phases="a")) is None
     two = replace(on_c, names=("c-u", "c-u1"))
-    assert left(on_c, two) == Correction(Kind.PHASE, ("c-u2",), phases="c")
-    gone = Correction(Kind.BUS, on_c.names, "n4")
+    assert left(on_c, two) == Correction(FileErrorKind.PHASE, ("c-u2",), phases="c")
+    gone = Correction(FileErrorKind.BUS, on_c.names, "n4")
     assert left(on_c, gone) == replace(on_c, lines=())
-    swap = Correction(Kind.SWAP, ("c-s1", "c-s2"))
+    swap = Correction(FileErrorKind.SWAP, ("c-s1", "c-s2"))
     assert left(swap, away) == swap
     group = network(tables).site.bus_of_file
     assert as_filed(tables, replace(away, bus="s1"), group)
@@ -233,7 +237,7 @@ def test_a_line_takes_its_own_columns_to_another_phase() -> None:
         "l", "n1", "s1", 0.2, 0.1, phases="b", r_bb_ohm=0.2, x_bb_ohm=0.1, b_us=3.0, b_bb_us=3.0, tap_b=0.98
     )
     tables = replace(street(), lines=(row,), customers=())
-    wrong = Correction(Kind.PHASE, (), phases="c", lines=("l",))
+    wrong = Correction(FileErrorKind.PHASE, (), phases="c", lines=("l",))
     (after,) = apply(tables, wrong).lines
     assert (after.r_cc_ohm, after.x_cc_ohm, after.b_cc_us, after.tap_c) == (0.2, 0.1, 3.0, 0.98)
     assert after.taps == (1.0, 1.0, 0.98)

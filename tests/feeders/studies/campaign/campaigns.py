@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from feeders.model.site import load
-from feeders.simulation.attacks import Trick
-from feeders.studies.campaign.plan import Kind, Place, Plan
+from feeders.simulation.attacks import AttackKind
+from feeders.studies.campaign.plan import AttackClass, CampaignPlan, Place
 
 SITE = load("cigre-lv")
 
-PLAN = Plan(
+PLAN = CampaignPlan(
     scenes=3,
     together=4,
     seed=3,
@@ -17,11 +17,11 @@ PLAN = Plan(
     lying_s=9.0,
     settling_s=3.0,
     kinds=(
-        Kind("bias", Trick.BIAS, (3.0,)),
-        Kind("replay", Trick.REPLAY, (6.0,)),
-        Kind("late", Trick.CLOCK_SHIFT, (20.0,)),
-        Kind("coordinated-power", Trick.COORDINATED_POWER, (2.0,)),
-        Kind("inverter", Trick.INVERTER, (100.0,)),
+        AttackClass("bias", AttackKind.BIAS, (3.0,)),
+        AttackClass("replay", AttackKind.REPLAY, (6.0,)),
+        AttackClass("late", AttackKind.CLOCK_SHIFT, (20.0,)),
+        AttackClass("coordinated-power", AttackKind.COORDINATED_POWER, (2.0,)),
+        AttackClass("inverter", AttackKind.INVERTER, (100.0,)),
     ),
     liars=(1,),
     places=(Place.RANDOM, Place.STREET),

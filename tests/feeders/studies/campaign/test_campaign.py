@@ -22,10 +22,10 @@ from scipy.stats import beta
 from feeders.model.profiles import Season
 from feeders.model.site import Site, from_tables, load
 from feeders.registry.registry import design
-from feeders.simulation.attacks import Trick
+from feeders.simulation.attacks import AttackKind
 from feeders.simulation.demand import Variation
-from feeders.simulation.trial import LoadError, Meters, Trial, frames, judge
-from feeders.studies.campaign.plan import CLEAN, Case, Design, Kind, Place, Plan
+from feeders.simulation.trial import LoadError, Trial, TrialMeterErrors, frames, judge
+from feeders.studies.campaign.plan import CLEAN, AttackClass, CampaignCase, CampaignPlan, Design, Place
 from feeders.studies.campaign.scene import attacks, liars, risings
 from feeders.studies.campaign.study import Campaign, NothingPlayed, campaign, false_names, grouped, scenarios
 from feeders.studies.journal import OtherStudy, edition
@@ -52,13 +52,13 @@ def same(one: Campaign, other: Campaign) -> None:
 
 
 def test_a_plan_of_the_files_counts_in_readings() -> None:
-    assert replace(Plan.of(SITE), load_error=Plan().load_error) == Plan()
+    assert replace(CampaignPlan.of(SITE), load_error=CampaignPlan().load_error) == CampaignPlan()
     meta = SITE.tables.meta
     monitor = replace(
         meta.monitor, tick_s=900.0, silence_s=9000.0, estimator="set-search", alarms_per_year=3.0
     )
     rare = from_tables(replace(SITE.tables, meta=replace(meta, monitor=monitor)))
-    plan = Plan.of(rare, seed=5, learn_s=3600.0)
+    plan = CampaignPlan.of(rare, seed=5, learn_s=3600.0)
     assert (plan.step_s, plan.duration_s, plan.estimator, plan.alarms_per_year, plan.seed) == (
         *(900.0, 540_000.0, "set-search", (3.0,), 5),
     )
@@ -69,7 +69,7 @@ def test_a_plan_of_the_files_counts_in_readings() -> None:
     # Ten readings later a drift is as large as it is after ten seconds.
     np.testing.assert_allclose(np.array(sizes["drift"]) * 900.0, [1.0, 3.0])
     assert sizes["bias"] == (1.0, 2.0, 3.0, 5.0)
-    assert Plan.of(rare, duration_s=9000.0).onset_s == (900.0, 2700.0)
+    assert CampaignPlan.of(rare, duration_s=9000.0).onset_s == (900.0, 2700.0)
 
 
 @pytest.mark.acceptance
@@ -130,9 +130,9 @@ def test_lies_behind_taps_are_those_of_the_full_play(site: Site) -> None:
     """In volts, whether a lie is put upon the scene or the scene is played anew with it."""
     p, nominal = site.meters.size, site.customer_nominal[site.meters]
     kinds = (
-        Kind("bias", Trick.BIAS, (4.0,)),
-        Kind("told", Trick.BIAS, (1.0,), (7.0,) * p),
-        Kind("story", Trick.COORDINATED, (3.0,)),
+        AttackClass("bias", AttackKind.BIAS, (4.0,)),
+        AttackClass("told", AttackKind.BIAS, (1.0,), (7.0,) * p),
+        AttackClass("story", AttackKind.COORDINATED, (3.0,)),
     )
     plan = replace(PLAN, scenes=1, together=12, kinds=kinds, places=(Place.RANDOM,), alarms_per_year=(1.0,))
     rows = campaign(site, plan).liars
@@ -176,7 +176,7 @@ def test_places() -> None:
     random = np.random.default_rng(1)
 
     def chosen(place: Place) -> tuple[np.ndarray, np.ndarray]:
-        return liars(site, Case(1, "bias", 1.0, 4, str(place), 0.0, (1,)), random)
+        return liars(site, CampaignCase(1, "bias", 1.0, 4, str(place), 0.0, (1,)), random)
 
     apart = (own[:, None] + own - 2.0 * model.R)[np.ix_(site.meters, site.meters)]
     for _ in range(20):
@@ -197,7 +197,7 @@ def test_places() -> None:
 
 
 def test_what_cannot_be_played_says_why() -> None:
-    plan = replace(PLAN, scenes=1, kinds=(Kind("bias", Trick.BIAS, (1.0,)),), liars=(99,))
+    plan = replace(PLAN, scenes=1, kinds=(AttackClass("bias", AttackKind.BIAS, (1.0,)),), liars=(99,))
     found = campaign(SITE, plan)
     reasons = found.scenarios.loc[found.scenarios["kind"] == "bias", "reason"]
     assert reasons.str.contains("6 of these devices; cannot manipulate 99").all()
@@ -237,7 +237,7 @@ def test_settings_reach_the_estimator() -> None:
 @pytest.mark.acceptance
 def test_lies_inside_the_class_are_named_once_meters_are_learned() -> None:
     """A meter of class 0.5 that changes by 0.7 % may only be told when its own fixed error is known."""
-    kinds = (Kind("bias", Trick.BIAS, (0.7,)),)
+    kinds = (AttackClass("bias", AttackKind.BIAS, (0.7,)),)
     plan = replace(
         PLAN, scenes=2, together=3, kinds=kinds, lying_s=12.0, duration_s=23.0, alarms_per_year=(1.0,)
     )
@@ -487,8 +487,10 @@ def test_texts_and_numbers_of_numpy_make_the_same_plan() -> None:
     assert asked == same
     assert asked.cases(1) == same.cases(1)
     assert asked.subject == same.subject
-    assert Kind("b", "bias", (1.0,), volts=(2.0,)) == Kind("b", Trick.BIAS, (1.0,), volts=(2.0,))
-    assert Trial(SITE, meters="site").stated.tables == Trial(SITE, meters=Meters.SITE).stated.tables
+    assert AttackClass("b", "bias", (1.0,), volts=(2.0,)) == AttackClass(
+        "b", AttackKind.BIAS, (1.0,), volts=(2.0,)
+    )
+    assert Trial(SITE, meters="site").stated.tables == Trial(SITE, meters=TrialMeterErrors.SITE).stated.tables
     wrong = {"alarms_per_year": (np.inf,), "lying_s": np.nan, "seed": -1}
     with refused(InputInvalid, "negative", "not-positive", "not-finite"):
         replace(PLAN, **wrong)

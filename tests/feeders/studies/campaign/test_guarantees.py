@@ -11,12 +11,12 @@ import pytest
 from scipy.stats import beta
 
 from feeders.model.site import Site
-from feeders.registry.registry import Watcher, design
-from feeders.simulation.attacks import Trick
+from feeders.registry.registry import DesignedEstimator, design
+from feeders.simulation.attacks import AttackKind
 from feeders.simulation.scenario import Scenario
 from feeders.simulation.trial import Trial, frames
 from feeders.studies.campaign.guarantees import promised, rehearse, rehearse_everywhere
-from feeders.studies.campaign.plan import Kind, Place, Promise
+from feeders.studies.campaign.plan import AttackClass, Place, Promise
 from feeders.studies.campaign.scene import attacks
 from feeders.studies.campaign.study import campaign
 from feeders.studies.detectable import detectable
@@ -77,7 +77,7 @@ def test_for_one_liar_or_where_nothing_hides_there_are_fewer_kinds() -> None:
     assert [kind.name for kind in promised(SITE, nothing)] == ["named_alone"]
 
 
-def crying_wolf(site: Site) -> Watcher:
+def crying_wolf(site: Site) -> DesignedEstimator:
     """What the site's file asks for, which also names the first meter every seven seconds."""
     watcher = design(site)
 
@@ -97,8 +97,8 @@ def test_broken_promises_are_counted_against_the_same_scene_without_the_lie(
     """Promises of which nothing is true, and an estimator that cries wolf; the oracle plays all in full."""
     monkeypatch.setattr("feeders.studies.campaign.scene.design", crying_wolf)
     kinds = (
-        Kind("loud", Trick.BIAS, (1.0, 3.0), promise=Promise.HIDDEN),
-        Kind("small", Trick.BIAS, (0.2, 3.0), promise=Promise.NAMED),
+        AttackClass("loud", AttackKind.BIAS, (1.0, 3.0), promise=Promise.HIDDEN),
+        AttackClass("small", AttackKind.BIAS, (0.2, 3.0), promise=Promise.NAMED),
     )
     plan = replace(PLAN, scenes=6, together=5, kinds=kinds, alarms_per_year=(1.0,), places=(Place.RANDOM,))
     told = campaign(SITE, plan)
@@ -134,7 +134,7 @@ def test_broken_promises_are_counted_against_the_same_scene_without_the_lie(
         assert count[promise]["by_chance"]
 
 
-def _named(watcher: Watcher, trial: Trial, scenario: Scenario) -> np.ndarray:
+def _named(watcher: DesignedEstimator, trial: Trial, scenario: Scenario) -> np.ndarray:
     """Who is named in each frame."""
     state, rows = watcher.init(scenario.start), []
     for frame, _ in frames(trial, scenario):

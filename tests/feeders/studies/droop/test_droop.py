@@ -16,12 +16,20 @@ from feeders.simulation.plant import ClosedLoop, Loads
 from feeders.simulation.powerflow import PowerFlow, PowerFlowDiverged
 from feeders.simulation.powerflow_three_phase import power_flow
 from feeders.studies.droop.fleets import Who, box, equip, point
-from feeders.studies.droop.limits import Conditions, Kept, Plan, capacity, draw, safety, shares_of
+from feeders.studies.droop.limits import (
+    BandGuarantee,
+    Conditions,
+    DroopPlan,
+    capacity,
+    draw,
+    safety,
+    shares_of,
+)
 from feeders.studies.droop.study import DroopOptions, droop, presets_of
 from feeders.studies.droop.verdict import (
-    Outcome,
+    FleetOutcome,
+    FleetVerdict,
     Subject,
-    Verdict,
     edge,
     inverter_rows,
     judge,
@@ -37,7 +45,7 @@ from gridsec.arrays import Floats
 from gridsec.errors import FeederInvalid, InputInvalid
 from gridsec.grid.droop import Droop
 from gridsec.grid.droop import fleet as fleet_of
-from gridsec.planning.droop.ac_sensitivity import Box, sensitivity, solve
+from gridsec.planning.droop.ac_sensitivity import InjectionBox, sensitivity, solve
 from gridsec.planning.droop.equilibrium import rest
 from gridsec.planning.droop.stability import Update, enlarged, growth, slopes
 from tests.codes import refused
@@ -71,7 +79,7 @@ def random_site(seed: int, *, phased: bool = False) -> Site:
     return from_tables(FeederTables(meta, tuple(lines), customers))
 
 
-def near_the_edge(site: Site, rng: np.random.Generator, loads: Box, update: Update) -> Droop:
+def near_the_edge(site: Site, rng: np.random.Generator, loads: InjectionBox, update: Update) -> Droop:
     """A random fleet whose slopes, all at their steepest, are 0.5 to 2 times what makes it unstable."""
     count = len(site.feeder.customers)
     own = np.sort(rng.choice(count, int(rng.integers(1, count + 1)), replace=False))
@@ -96,7 +104,7 @@ def run_together(
     site: Site,
     fleets: list[Droop],
     updates: list[Update],
-    loads: list[Box],
+    loads: list[InjectionBox],
     seed: int,
     *,
     volt: Floats | float = 230.0,
@@ -148,7 +156,7 @@ def run_together(
 def test_the_verdict_is_that_of_the_simulation_in_200_fleets_around_the_edge(
     feeders: int, phased: bool
 ) -> None:
-    told: dict[tuple[Verdict, bool], int] = {}
+    told: dict[tuple[FleetVerdict, bool], int] = {}
     for seed in range(feeders):
         site, rng = random_site(seed, phased=phased), np.random.default_rng(seed)
         subject = Subject.of(site)
@@ -167,10 +175,10 @@ def test_the_verdict_is_that_of_the_simulation_in_200_fleets_around_the_edge(
             key = (found.verdict, bool(moved > 1e-5))
             told[key] = told.get(key, 0) + 1
     assert sum(told.values()) == feeders * FLEETS
-    assert told.get((Verdict.STABLE, True), 0) == 0
-    assert told.get((Verdict.UNSTABLE, False), 0) == 0
-    assert told[Verdict.STABLE, False] >= 5 * feeders
-    assert told[Verdict.UNSTABLE, True] >= 5 * feeders
+    assert told.get((FleetVerdict.STABLE, True), 0) == 0
+    assert told.get((FleetVerdict.UNSTABLE, False), 0) == 0
+    assert told[FleetVerdict.STABLE, False] >= 5 * feeders
+    assert told[FleetVerdict.UNSTABLE, True] >= 5 * feeders
 
 
 # --- the parts --------------------------------------------------------------------------------------------
@@ -186,22 +194,22 @@ def test_an_unstable_fleet_is_told_and_seen_to_oscillate() -> None:
     site, fleet, update = unsettled()
     subject, at = Subject.of(site), point(site, 0.0, 0.4, 1.04)
     found = judge(subject, fleet, update, at)
-    assert found.verdict is Verdict.UNSTABLE
+    assert found.verdict is FleetVerdict.UNSTABLE
     assert found.growth > 1.0
     assert found.outcome == "oscillates"
     slow = judge(subject, fleet, Update(0.0), at)
     assert slow.growth < 1.0
-    assert slow.verdict is not Verdict.UNSTABLE
+    assert slow.verdict is not FleetVerdict.UNSTABLE
 
 
 def test_collapse_is_an_outcome_and_not_an_error() -> None:
     site, fleet, update = unsettled()
     drawn = point(site, 300.0, 0.0)
     run = simulate((site, PowerFlow(site)), fleet, update, drawn, np.zeros(fleet.tau.size))
-    assert run.outcome is Outcome.COLLAPSES
+    assert run.outcome is FleetOutcome.COLLAPSES
     assert step_rows(site, {"load": run})[0]["outcome"] == "collapses"
     found = judge(Subject.of(site), fleet, update, drawn)
-    assert found.verdict is Verdict.UNDECIDED
+    assert found.verdict is FleetVerdict.UNDECIDED
     assert "no equilibrium" in found.why
 
 
@@ -219,7 +227,7 @@ def test_edges_and_margins_of_one_customer_are_those_of_the_formula() -> None:
     assert 0.8 / gain < sure
     assert over < 1.3 / gain
     first = judge(subject, site.droop, update, at)
-    assert first.verdict is Verdict.STABLE
+    assert first.verdict is FleetVerdict.STABLE
     assert first.gain == pytest.approx(gain, rel=0.1)
     assert margin(subject, site.droop, update, at) == pytest.approx(1.0 / gain, rel=0.2)
     assert longest_interval(subject, site.droop, update, at) == np.inf
@@ -238,7 +246,7 @@ def test_steps_end_where_the_inverters_of_the_simulator_rest() -> None:
     still = ClosedLoop(subject.flow, fleet, base, 230.0).equilibrium(loads)
     for update in (Update(1.0), Update(1.0, 2), Update(0.0)):
         run = simulate((site, subject.flow), fleet, update, step.after, x, updates=2000)
-        assert run.outcome is Outcome.SETTLES
+        assert run.outcome is FleetOutcome.SETTLES
         np.testing.assert_allclose(230.0 * run.v[-1], still.v_volt, atol=2e-3)
         told = step_rows(site, {"tap": run})[0]
         # A first-order response is within 2 % after ln 50 time constants, sooner with feedback.
@@ -268,8 +276,8 @@ def test_the_band_is_kept_in_all_random_profiles_or_broken_by_the_witness(
     assert found.low_volt <= found.low_rest_volt <= lowest + 1e-4
     assert found.high_volt >= found.high_rest_volt >= highest - 1e-4
     broken = lowest < 230.0 * limits[0] or highest > 230.0 * limits[1]
-    assert found.rest is (Kept.VIOLATED if broken else Kept.KEPT)
-    if found.rest is Kept.VIOLATED:
+    assert found.rest is (BandGuarantee.VIOLATED if broken else BandGuarantee.KEPT)
+    if found.rest is BandGuarantee.VIOLATED:
         row = {r["customer"]: r for r in found.witness}
         names = list(base.customers)
         p, q = (np.array([row[n][key] for n in names]) for key in ("p_kw", "q_kvar"))
@@ -288,9 +296,9 @@ def test_a_jump_breaks_a_band_that_slow_loads_keep() -> None:
     assert volts[0] < volts[1] - 1.0
     limits = ((0.7 * volts[1] + 0.3 * volts[0]) / 230.0, 1.5)
     found = safety(subject, fleet, loads, limits)
-    assert found.rest is Kept.KEPT
-    assert found.always is not Kept.KEPT
-    if found.always is Kept.VIOLATED:
+    assert found.rest is BandGuarantee.KEPT
+    assert found.always is not BandGuarantee.KEPT
+    if found.always is BandGuarantee.VIOLATED:
         assert found.witness[0]["when"] == "after a jump of all loads"
 
 
@@ -298,7 +306,7 @@ def test_hosting_capacity_is_where_the_simulator_breaks_the_band() -> None:
     site = village()
     subject, at = Subject.of(site), Conditions(0.1, 1.0, 0.9, 1.05, Update())
     for preset in ("", "ieee1547-b"):
-        plan = Plan(shares_of(site, None), preset)
+        plan = DroopPlan(shares_of(site, None), preset)
         found = capacity(subject, plan, at)
         assert found["limit"] == "voltage high"
         assert found["confirmed_volt"] < 1e-5
@@ -324,7 +332,7 @@ def test_hosting_is_for_the_highest_busbar() -> None:
     )
     limits = site.tables.meta.limits
     at = Conditions(0.1, 1.02, limits.v_min_pu, limits.v_max_pu, Update(1.0))
-    expected = capacity(Subject.of(site), Plan(shares_of(site, None), ""), at)
+    expected = capacity(Subject.of(site), DroopPlan(shares_of(site, None), ""), at)
     assert droop(site, options).tables["hosting"]["capacity_kw"].tolist() == [expected["capacity_kw"]]
 
 
@@ -333,7 +341,7 @@ def test_line_ratings_limit_what_is_hosted() -> None:
     lines = tuple(replace(row, rating_a=20.0 if row.line == "l1" else None) for row in site.tables.lines)
     tight = from_tables(replace(site.tables, lines=lines))
     found = capacity(
-        Subject.of(tight), Plan(shares_of(tight, None), ""), Conditions(0.0, 1.0, 0.5, 2.0, Update())
+        Subject.of(tight), DroopPlan(shares_of(tight, None), ""), Conditions(0.0, 1.0, 0.5, 2.0, Update())
     )
     assert found["limit"] == "line to n1"
     # 20 A of 230 V on three phases, and all but losses and what sits elsewhere comes through l1.
@@ -348,8 +356,8 @@ def test_the_study_has_all_tables_and_goes_on_from_its_journal(tmp_path: Path) -
     told: list[tuple[int, int]] = []
     journal = tmp_path / "journal"
     found = droop(site, options, seed=3, journal=journal, progress=lambda done, of: told.append((done, of)))
-    assert found.verdict is Verdict.STABLE
-    assert found.always in {Kept.KEPT, Kept.VIOLATED}
+    assert found.verdict is FleetVerdict.STABLE
+    assert found.always in {BandGuarantee.KEPT, BandGuarantee.VIOLATED}
     assert {
         "stability",
         "steps",

@@ -15,9 +15,25 @@ from feeders.simulation.plant import ClosedLoop, Loads
 from feeders.simulation.powerflow import PowerFlow, PowerFlowDiverged
 from feeders.simulation.powerflow_three_phase import power_flow
 from feeders.studies.droop.fleets import Who, box, equip, point
-from feeders.studies.droop.limits import Conditions, Kept, Plan, capacity, ratings_pu, safety, shares_of
+from feeders.studies.droop.limits import (
+    BandGuarantee,
+    Conditions,
+    DroopPlan,
+    capacity,
+    ratings_pu,
+    safety,
+    shares_of,
+)
 from feeders.studies.droop.study import DroopOptions, droop, presets_of
-from feeders.studies.droop.verdict import Outcome, Subject, Verdict, judge, simulate, step_rows, trajectories
+from feeders.studies.droop.verdict import (
+    FleetOutcome,
+    FleetVerdict,
+    Subject,
+    judge,
+    simulate,
+    step_rows,
+    trajectories,
+)
 from feeders.studies.operating import Bases
 from gridsec.arrays import Floats
 from gridsec.grid.droop import Droop
@@ -73,7 +89,7 @@ def volts_by_hand(tables: FeederTables) -> Floats:
 @pytest.mark.canary("taps in phases")
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_verdict_is_that_of_the_simulation_in_volts(kind: str) -> None:
-    told: dict[tuple[Verdict, bool], int] = {}
+    told: dict[tuple[FleetVerdict, bool], int] = {}
     for seed in range(2):
         rng = np.random.default_rng([seed, 1])
         site = changed(random_site(seed, phased="phases" in kind), kind, rng)
@@ -90,14 +106,14 @@ def test_the_verdict_is_that_of_the_simulation_in_volts(kind: str) -> None:
         moves = run_together(site, fleets, updates, loads, seed, volt=volt)
         for fleet, update, at, moved in zip(fleets, updates, loads, moves, strict=True):
             verdict, moves_on = judge(subject, fleet, update, at, seed=seed).verdict, moved > 1e-5
-            if verdict is Verdict.STABLE and moves_on:  # it may be slow
+            if verdict is FleetVerdict.STABLE and moves_on:  # it may be slow
                 alone = run_together(site, [fleet], [update], [at], seed, volt=volt, steps=8000)
                 moves_on = alone[0] > 1e-5
             key = verdict, bool(moves_on)
             told[key] = told.get(key, 0) + 1
     assert sum(told.values()) == 30
-    assert told.get((Verdict.STABLE, True), 0) == told.get((Verdict.UNSTABLE, False), 0) == 0
-    assert min(told[Verdict.STABLE, False], told[Verdict.UNSTABLE, True]) >= 5
+    assert told.get((FleetVerdict.STABLE, True), 0) == told.get((FleetVerdict.UNSTABLE, False), 0) == 0
+    assert min(told[FleetVerdict.STABLE, False], told[FleetVerdict.UNSTABLE, True]) >= 5
 
 
 @pytest.mark.canary("taps in phases")
@@ -121,15 +137,15 @@ def test_curves_and_limits_are_those_of_the_nominal_voltage(kind: str) -> None:
             assert found.low_rest_volt <= low + 1e-4
             assert found.high_rest_volt >= high - 1e-4
             if low < 230.0 * limits[0] or high > 230.0 * limits[1]:
-                assert found.rest is not Kept.KEPT
-            if found.rest is Kept.VIOLATED:
+                assert found.rest is not BandGuarantee.KEPT
+            if found.rest is BandGuarantee.VIOLATED:
                 v = np.array([row["v_volt"] for row in found.witness])
                 assert v.min() < 230.0 * limits[0] or v.max() > 230.0 * limits[1]
                 assert [row["beyond"] for row in found.witness] == [
                     bool(each < 230.0 * limits[0] or each > 230.0 * limits[1]) for each in v
                 ]
         hosted(site, subject, rng)
-    assert {Kept.KEPT, Kept.VIOLATED} <= verdicts
+    assert {BandGuarantee.KEPT, BandGuarantee.VIOLATED} <= verdicts
 
 
 def rest_volts(loop: ClosedLoop, loads: object, u: Floats) -> Floats:
@@ -140,7 +156,7 @@ def rest_volts(loop: ClosedLoop, loads: object, u: Floats) -> Floats:
 
 def hosted(site: Site, subject: Subject, rng: np.random.Generator) -> None:
     """A little less than the capacity is within the band by simulation, a little more is not."""
-    plan = Plan(shares_of(site, None), "ieee1547-b")
+    plan = DroopPlan(shares_of(site, None), "ieee1547-b")
     at = Conditions(0.1, 1.0, 0.8, float(rng.uniform(1.08, 1.2)), Update())
     found = capacity(subject, plan, at)
     if found["limit"] != "voltage high":
@@ -224,7 +240,7 @@ def test_volts_of_a_simulation_are_those_of_the_power_flow() -> None:
     site = from_tables(replace(tables, lines=lines))
     fleet, loads = equip(site, "vde4105"), point(site, 0.4, 0.9, 1.01)
     run = simulate((site, power_flow(site)), fleet, Update(), loads, np.zeros(fleet.tau.size))
-    assert run.outcome is Outcome.SETTLES
+    assert run.outcome is FleetOutcome.SETTLES
     curves = fleet_of(fleet.customer, "vde4105", np.array([22.0, 30.0]), 100.0)
     loop = ClosedLoop(PowerFlow(site), curves, 100.0, 230.0)
     still = loop.equilibrium(Loads(-100.0 * loads.p_low, -100.0 * loads.q_low, 1.01 * 230.0)).v_volt
@@ -279,7 +295,7 @@ def test_currents_of_a_loop_are_those_of_the_power_flow() -> None:
     np.testing.assert_allclose(np.sort(found[:, 0]), np.sort(percent), rtol=1e-6)
     # The fullest one is told by its name.
     names = [row.line for row in site.tables.lines if row.line != "link"]
-    own = Plan(shares_of(site, ["c8"]), "")
+    own = DroopPlan(shares_of(site, ["c8"]), "")
     limit = capacity(Subject.of(site), own, Conditions(0.0, 1.0, 0.5, 2.0, Update()))["limit"]
     assert limit == "line from n6 to n3"
     assert names[-1] == "tie"

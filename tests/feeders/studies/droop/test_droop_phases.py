@@ -14,13 +14,13 @@ from hypothesis import strategies as st
 from feeders.model.site import Site, load
 from feeders.simulation.powerflow_three_phase import UnbalancedPowerFlow
 from feeders.studies.droop.fleets import Who, box, equip, point
-from feeders.studies.droop.limits import Conditions, Kept, Plan, checked, ratings_pu, safety
-from feeders.studies.droop.verdict import Subject, Verdict, inverter_rows, judge, longest_interval
+from feeders.studies.droop.limits import BandGuarantee, Conditions, DroopPlan, checked, ratings_pu, safety
+from feeders.studies.droop.verdict import FleetVerdict, Subject, inverter_rows, judge, longest_interval
 from gridsec.arrays import Floats
 from gridsec.errors import DesignInfeasible, FeederInvalid
 from gridsec.grid.droop import Droop, voltage_curve
 from gridsec.grid.phased import PhasedFeeder
-from gridsec.planning.droop.ac_sensitivity import Box, currents, network, region, sensitivity, solve
+from gridsec.planning.droop.ac_sensitivity import InjectionBox, currents, network, region, sensitivity, solve
 from gridsec.planning.droop.equilibrium import always, at_rest, injected, rest
 from gridsec.planning.droop.stability import Update, enlarged, loop, proof, reach
 from tests.codes import refused
@@ -47,14 +47,14 @@ def volts(site: Site, p: Floats, q: Floats, v0: Floats | float) -> Floats:
     return asymmetric(site).solve(kw(site, p), kw(site, q), given)[0] / base
 
 
-def random_box(site: Site, rng: np.random.Generator, size: float) -> Box:
+def random_box(site: Site, rng: np.random.Generator, size: float) -> InjectionBox:
     count = len(site.feeder.customers)
     p, q = rng.uniform(-0.03, 0.03, (2, count))
     dp, dq = size * rng.uniform(0.0, 0.02, (2, count))
-    return Box(p - dp, p + dp, q - dq, q + dq, 0.99, 1.02)
+    return InjectionBox(p - dp, p + dp, q - dq, q + dq, 0.99, 1.02)
 
 
-def corner(given: Box, rng: np.random.Generator) -> tuple[Floats, Floats, Floats]:
+def corner(given: InjectionBox, rng: np.random.Generator) -> tuple[Floats, Floats, Floats]:
     """A point of the box, often on its edges; the phases of the busbar each on their own."""
     u = np.clip(rng.uniform(-0.5, 1.5, (2, given.p_low.size)), 0.0, 1.0)
     p = given.p_low + u[0] * (given.p_high - given.p_low)
@@ -193,8 +193,8 @@ def test_phases_that_do_not_touch_are_three_fleets() -> None:
         for at in (lambda site: point(site, 0.3, 1.0, 1.05), box):
             found = judge(whole, fleet(WHOLE), update, at(WHOLE))
             each = [judge(s, fleet(s.site), update, at(s.site)) for s in alone]
-            assert found.verdict is Verdict.STABLE
-            assert {one.verdict for one in each} == {Verdict.STABLE}
+            assert found.verdict is FleetVerdict.STABLE
+            assert {one.verdict for one in each} == {FleetVerdict.STABLE}
             assert found.gain == pytest.approx(max(one.gain for one in each), rel=1e-3)
             if not np.isnan(found.growth):
                 assert found.growth == pytest.approx(max(one.growth for one in each), rel=1e-9)
@@ -204,15 +204,15 @@ def test_phases_that_do_not_touch_are_three_fleets() -> None:
         same = limits[row["customer"]]
         for name in ("low_volt", "high_volt", "low_rest_volt", "high_rest_volt"):
             assert row[name] == pytest.approx(same[name], abs=0.02)
-    assert bands[0].always is Kept.KEPT
+    assert bands[0].always is BandGuarantee.KEPT
     # The fullest conductor of a line is that of its fullest phase.
     at = Conditions(0.1, 1.0, 0.9, 1.1, Update())
     share = np.full(len(WHOLE.feeder.customers), 1.0 / len(WHOLE.feeder.customers))
-    found_lines = checked(whole, Plan(share, ""), 60.0, at, ratings_pu(WHOLE))["line_percent"]
+    found_lines = checked(whole, DroopPlan(share, ""), 60.0, at, ratings_pu(WHOLE))["line_percent"]
     parts = []
     for s in alone:
         count = len(s.site.feeder.customers)
-        plan = Plan(np.full(count, 1.0 / count), "")
+        plan = DroopPlan(np.full(count, 1.0 / count), "")
         amps = checked(s, plan, 60.0 * count / share.size, at, ratings_pu(s.site))["line_percent"]
         # One pu of current is a third of a phase's own power as three phases count it.
         parts.append(3.0 * amps)
@@ -241,7 +241,7 @@ def test_the_european_feeder_is_stable_and_its_witness_is_one() -> None:
     site = load("ieee-european-lv")
     subject = Subject.of(site)
     found = judge(subject, site.droop, Update(), box(site))
-    assert (found.verdict, found.proof) == (Verdict.STABLE, "small-gain")
+    assert (found.verdict, found.proof) == (FleetVerdict.STABLE, "small-gain")
     rows = safety(subject, site.droop, box(site), (0.9, 1.1)).witness
     p, q, x = (np.array([row[name] for row in rows]) for name in ("p_kw", "q_kvar", "inverter_kvar"))
     v = UnbalancedPowerFlow(site).solve(p, q - x, rows[0]["busbar_volt"])[0]

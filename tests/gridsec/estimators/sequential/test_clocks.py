@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 
 from benchmarks.slow_kinds import Days, Seen, lied, played, read_every, watch
 from feeders.model.site import Site, load
-from feeders.registry.registry import Watcher, design
+from feeders.registry.registry import DesignedEstimator, design
 from gridsec.arrays import Floats
 from gridsec.estimators.sequential import clocks
-from gridsec.interface import Kind
+from gridsec.interface import ManipulationKind
 
 SEEDS = st.integers(0, 2**32 - 1)
 NOISE = 1e-3
@@ -213,7 +213,7 @@ def test_a_level_beyond_the_room_is_left_as_far_as_an_honest_meter_leaves_it(
 
 
 @pytest.fixture(scope="module")
-def quarters() -> tuple[Site, Watcher, Days]:
+def quarters() -> tuple[Site, DesignedEstimator, Days]:
     """Three days of a street that is read every quarter of an hour."""
     site = read_every(load("cigre-lv"), 900.0)
     return site, design(site), played(site, 4, 3.0)
@@ -226,19 +226,22 @@ class TestQuartersOfAnHour:
     @pytest.mark.parametrize(
         ("lie", "kind"),
         [
-            ("clock 1 tick behind", Kind.CLOCK_SHIFT),
-            ("voltage 1 tick early", Kind.CLOCK_SHIFT),
-            ("the last 24 h again and again", Kind.REPLAY),
-            ("stuck", Kind.STUCK),
+            ("clock 1 tick behind", ManipulationKind.CLOCK_SHIFT),
+            ("voltage 1 tick early", ManipulationKind.CLOCK_SHIFT),
+            ("the last 24 h again and again", ManipulationKind.REPLAY),
+            ("stuck", ManipulationKind.STUCK),
         ],
     )
     def test_lies_over_days_are_called_what_they_are(
-        self, quarters: tuple[Site, Watcher, Days], lie: str, kind: Kind
+        self, quarters: tuple[Site, DesignedEstimator, Days], lie: str, kind: ManipulationKind
     ) -> None:
         site, watcher, days = quarters
         told, who, on = lied(site, days, lie, 4)
         seen: Seen = watch(site, watcher, told, who, on)
         assert seen.last == {int(j): str(kind) for j in who}
         assert not seen.honest
-        wrong = {str(other) for other in (Kind.CLOCK_SHIFT, Kind.REPLAY, Kind.STUCK)} - {str(kind)}
+        wrong = {
+            str(other)
+            for other in (ManipulationKind.CLOCK_SHIFT, ManipulationKind.REPLAY, ManipulationKind.STUCK)
+        } - {str(kind)}
         assert not wrong & set(seen.ticks)

@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 
 from gridsec.estimators import sequential
-from gridsec.estimators.sequential import Distrust, SequentialDesign, distrusted, init, nobody, renew, restore
+from gridsec.estimators.sequential import (
+    SequentialDesign,
+    SuspicionRecord,
+    distrusted,
+    init,
+    renew,
+    warm_start,
+)
 from gridsec.interface import Decision
 from tests.gridsec.estimators.sequential.test_monitor import Answers, prepare, watch
 from tests.gridsec.street import Street, make_plant
@@ -34,12 +41,12 @@ def test_liars_stay_named_and_are_forgotten_when_they_stop(begun: tuple[Sequenti
     before = distrusted(design, state)
     assert np.flatnonzero(before.named).tolist() == list(LIARS)
     assert np.flatnonzero(np.isfinite(before.scale_s)).tolist() == list(LIARS)
-    again = restore(design, init(design, street.t), before)
+    again = warm_start(design, init(design, street.t), before)
     assert distrusted(design, again).same(replace(before, inverters=np.zeros(M, dtype=np.bool_)))
     again, answers = watch(street, design, 30, state=again, lies=dict.fromkeys(LIARS, 0.04))
     assert set(_suspects(answers)) == {LIARS}
     assert {verdict.decision for _, verdict in answers} == {Decision.ATTACKED}
-    again = restore(design, init(design, street.t), distrusted(design, again))
+    again = warm_start(design, init(design, street.t), distrusted(design, again))
     _, answers = watch(street, design, 70, state=again)
     first = _suspects(answers).index(())
     assert first >= design.options.release
@@ -56,8 +63,10 @@ def test_a_scale_speaks_for_a_meter_once_it_has_readings_enough(
     """Readings, not ticks: a meter that was silent at first owes them still."""
     design, street = begun
     which = np.isin(np.arange(P), LIARS)
-    before = replace(nobody(P, M), scale_s=np.where(which, scale_s, np.nan), named=which & named)
-    state = restore(design, init(design, street.t), before)
+    before = replace(
+        SuspicionRecord.empty(P, M), scale_s=np.where(which, scale_s, np.nan), named=which & named
+    )
+    state = warm_start(design, init(design, street.t), before)
     readings = max(readings, int(state.trust.owed.max()))
     state, silent = watch(street, design, 10, state=state, silent=LIARS)
     state, early = watch(street, design, readings - 1, state=state)
@@ -71,21 +80,21 @@ def test_a_scale_speaks_for_a_meter_once_it_has_readings_enough(
 def test_inverters_stay_named_until_they_can_be_judged(begun: tuple[SequentialDesign, Street]) -> None:
     design, street = begun
     inverters = np.arange(M) == 1
-    before = replace(nobody(P, M), inverters=inverters)
-    state, answers = watch(street, design, 80, state=restore(design, init(design, street.t), before))
+    before = replace(SuspicionRecord.empty(P, M), inverters=inverters)
+    state, answers = watch(street, design, 80, state=warm_start(design, init(design, street.t), before))
     named = [tuple(np.flatnonzero(verdict.inverters).tolist()) for _, verdict in answers]
     last = named.index(())
     assert set(named[:last]) == {(1,)}
     assert 48 <= last <= 48 + 12
     assert not any(named[last:])
-    assert distrusted(design, state).empty
+    assert distrusted(design, state).is_empty
 
 
-def _busbar(scale_s: float, off: float, *, named: bool = True) -> Distrust:
+def _busbar(scale_s: float, off: float, *, named: bool = True) -> SuspicionRecord:
     """The busbar's meter is not believed, and nobody else."""
     known = off if named else 0.0
     return replace(
-        nobody(P, M),
+        SuspicionRecord.empty(P, M),
         busbar_scale_s=np.array([scale_s]),
         busbar_named=np.array([named]),
         busbar_off=np.array([known]),
@@ -105,7 +114,7 @@ def test_a_busbar_that_goes_on_lying_is_not_believed_again(
     """The small lies are found by means of a minute only, which are empty at first."""
     design, street = begun
     before = _busbar(scale_s, 0.02 * percent, named=named)
-    state = restore(design, init(design, street.t), before)
+    state = warm_start(design, init(design, street.t), before)
     assert distrusted(design, state).same(before)
     state, answers = watch(street, design, 130, state=state, change=_high(percent))
     assert not any(verdict.decision is Decision.CLEAN for _, verdict in answers)
@@ -123,7 +132,7 @@ def test_a_busbar_that_has_become_honest_is_believed_once_it_has_agreed_long_eno
     begun: tuple[SequentialDesign, Street], scale_s: float, need: int
 ) -> None:
     design, street = begun
-    state = restore(design, init(design, street.t), _busbar(scale_s, 0.06))
+    state = warm_start(design, init(design, street.t), _busbar(scale_s, 0.06))
     owed = int(-state.busbar.quiet[0])
     assert owed >= need
     # However long it says nothing, that pays nothing back.
@@ -132,14 +141,14 @@ def test_a_busbar_that_has_become_honest_is_believed_once_it_has_agreed_long_eno
     assert all(verdict.busbar[0] for _, verdict in answers[:owed])
     state, answers = watch(street, design, 250, state=state)
     assert answers[-1][1].decision is Decision.CLEAN
-    assert distrusted(design, state).empty
+    assert distrusted(design, state).is_empty
 
 
 def test_a_replaced_meter_owes_nothing(begun: tuple[SequentialDesign, Street]) -> None:
     design, street = begun
     which = np.isin(np.arange(P), LIARS)
-    before = replace(nobody(P, M), scale_s=np.where(which, 60.0, np.nan), named=which)
-    state = renew(design, restore(design, init(design, street.t), before), np.arange(P) == LIARS[0])
+    before = replace(SuspicionRecord.empty(P, M), scale_s=np.where(which, 60.0, np.nan), named=which)
+    state = renew(design, warm_start(design, init(design, street.t), before), np.arange(P) == LIARS[0])
     assert distrusted(design, state).same(before.without(np.arange(P) == LIARS[0]))
     assert state.trust.owed[LIARS[0]] == 0
     _, _, verdict = sequential.step(design, state, street.frame())
@@ -149,4 +158,4 @@ def test_a_replaced_meter_owes_nothing(begun: tuple[SequentialDesign, Street]) -
 def test_nobody_is_nothing_to_restore(begun: tuple[SequentialDesign, Street]) -> None:
     design, street = begun
     state = init(design, street.t)
-    assert restore(design, state, nobody(P, M)) is state
+    assert warm_start(design, state, SuspicionRecord.empty(P, M)) is state

@@ -14,7 +14,7 @@ from scipy.stats import norm
 
 from benchmarks.kinds import CLOCK_S, DELAY_S, Seen, attacks, watch
 from feeders.model.site import Site, load, to_frame
-from feeders.registry.registry import SEQUENTIAL, Watcher, choose, design
+from feeders.registry.registry import SEQUENTIAL, DesignedEstimator, choose, design
 from feeders.simulation.meters import MeterErrors
 from feeders.simulation.scenario import START, Scenario, simulate, snapshots
 from gridsec.arrays import Bools, Floats, Ints
@@ -22,7 +22,7 @@ from gridsec.attack import Bias, Replay
 from gridsec.estimators.sequential import kinds, repeats
 from gridsec.estimators.sequential.kinds import Shapes
 from gridsec.estimators.sequential.repeats import BLOCKS, BYTES, ROWS, SPAN, Block, Memory, Rules
-from gridsec.interface import Kind
+from gridsec.interface import ManipulationKind
 
 STEP = 0.1 / 230.0
 SEEDS = st.integers(0, 2**32 - 1)
@@ -254,13 +254,18 @@ class TestShapes:
     def test_a_step_is_an_offset(self, seed: int, size: float, age: int) -> None:
         ticks = 2 * age + 128
         step = np.where(np.arange(ticks) >= ticks - age - 2, size, 0.0)
-        assert kinds.shape(self.lie(np.random.default_rng(seed), step), self.NOISE, age) is Kind.OFFSET
+        assert (
+            kinds.shape(self.lie(np.random.default_rng(seed), step), self.NOISE, age)
+            is ManipulationKind.OFFSET
+        )
 
     @given(seed=SEEDS, size=st.floats(0.03, 0.2), part=st.floats(0.3, 0.9))
     @settings(max_examples=40, deadline=None)
     def test_a_ramp_is_a_drift(self, seed: int, size: float, part: float) -> None:
         ramp = -size * np.clip(np.linspace(1.0 - 1.0 / part, 1.0, 300), 0.0, 1.0)
-        assert kinds.shape(self.lie(np.random.default_rng(seed), ramp), self.NOISE, 80) is Kind.DRIFT
+        assert (
+            kinds.shape(self.lie(np.random.default_rng(seed), ramp), self.NOISE, 80) is ManipulationKind.DRIFT
+        )
 
     def test_wild_lies_have_no_shape(self) -> None:
         for seed in range(40):
@@ -290,7 +295,7 @@ class TestShapes:
 
 
 @pytest.fixture(scope="module")
-def street() -> tuple[Site, Watcher]:
+def street() -> tuple[Site, DesignedEstimator]:
     site = choose(load("cigre-lv"), estimator=SEQUENTIAL)
     return site, design(site)
 
@@ -299,7 +304,7 @@ def street() -> tuple[Site, Watcher]:
 class TestFeeders:
     """AC power flow as the truth; the measured rates are in docs/theory-sequential.md."""
 
-    def seen(self, street: tuple[Site, Watcher], kind: str, seeds: range) -> list[Seen]:
+    def seen(self, street: tuple[Site, DesignedEstimator], kind: str, seeds: range) -> list[Seen]:
         site, watcher = street
         out = []
         for seed in seeds:
@@ -313,15 +318,17 @@ class TestFeeders:
     @pytest.mark.parametrize(
         ("kind", "look"),
         [
-            ("bias", Kind.OFFSET),
-            ("scaling", Kind.OFFSET),
-            ("drift", Kind.DRIFT),
-            ("stuck", Kind.STUCK),
-            ("replay", Kind.REPLAY),
-            ("coordinated", Kind.COORDINATED),
+            ("bias", ManipulationKind.OFFSET),
+            ("scaling", ManipulationKind.OFFSET),
+            ("drift", ManipulationKind.DRIFT),
+            ("stuck", ManipulationKind.STUCK),
+            ("replay", ManipulationKind.REPLAY),
+            ("coordinated", ManipulationKind.COORDINATED),
         ],
     )
-    def test_most_are_called_what_they_are(self, street: tuple[Site, Watcher], kind: str, look: Kind) -> None:
+    def test_most_are_called_what_they_are(
+        self, street: tuple[Site, DesignedEstimator], kind: str, look: ManipulationKind
+    ) -> None:
         runs = self.seen(street, kind, range(20, 23))
         called = [name for seen in runs for name in seen.kind.values()]
         assert called.count(look) >= 0.75 * len(called)
@@ -333,11 +340,13 @@ class TestFeeders:
 
     @pytest.mark.canary("21")
     @pytest.mark.parametrize("seed", [20, 21])
-    def test_clocks_that_are_off_are_recognised(self, street: tuple[Site, Watcher], seed: int) -> None:
+    def test_clocks_that_are_off_are_recognised(
+        self, street: tuple[Site, DesignedEstimator], seed: int
+    ) -> None:
         site, watcher = street
         late, _ = attacks(site, "clock", seed)
         seen = watch(site, watcher, Scenario(seed=seed, duration_s=1200.0, attacks=late))
-        assert list(seen.kind.values()) == [Kind.CLOCK_SHIFT]
+        assert list(seen.kind.values()) == [ManipulationKind.CLOCK_SHIFT]
         assert not seen.honest
         assert CLOCK_S != DELAY_S
 
@@ -345,7 +354,7 @@ class TestFeeders:
     @pytest.mark.parametrize("jitter", [1.0, 0.2, 0.0])
     @pytest.mark.parametrize("hour", [12.0, 1.0])
     def test_honest_meters_are_not_called_anything(
-        self, street: tuple[Site, Watcher], jitter: float, hour: float
+        self, street: tuple[Site, DesignedEstimator], jitter: float, hour: float
     ) -> None:
         """Registers of 0.1 V, also with less jitter than promised, at a sunny noon and in the night."""
         site, watcher = street
@@ -362,7 +371,9 @@ class TestFeeders:
         assert not seen.honest
         assert not seen.alone
 
-    def test_who_was_stuck_and_then_lies_otherwise_is_told_so(self, street: tuple[Site, Watcher]) -> None:
+    def test_who_was_stuck_and_then_lies_otherwise_is_told_so(
+        self, street: tuple[Site, DesignedEstimator]
+    ) -> None:
         site, watcher = street
         (stuck, *_), _ = attacks(site, "stuck", 1)
         end = START + 500.0
@@ -374,14 +385,14 @@ class TestFeeders:
             state, _, verdict = watcher.step(state, to_frame(site, snapshot))
             if snapshot.t >= end:
                 looks.append({verdict.kinds[j] for j in stuck.meters})
-        assert all(look <= {Kind.STUCK, Kind.OFFSET} for look in looks)
-        assert looks[0] == {Kind.STUCK}
-        assert looks[-1] == {Kind.OFFSET}
+        assert all(look <= {ManipulationKind.STUCK, ManipulationKind.OFFSET} for look in looks)
+        assert looks[0] == {ManipulationKind.STUCK}
+        assert looks[-1] == {ManipulationKind.OFFSET}
 
     @pytest.mark.canary("1")
     @pytest.mark.parametrize("seed", [1, 5, 6])
     def test_kinds_belong_to_named_meters_and_are_forgotten_with_them(
-        self, street: tuple[Site, Watcher], seed: int
+        self, street: tuple[Site, DesignedEstimator], seed: int
     ) -> None:
         site, watcher = street
         stuck, _ = attacks(site, "stuck", seed)
@@ -393,11 +404,13 @@ class TestFeeders:
             for j, kind in enumerate(verdict.kinds):
                 assert kind is None or verdict.suspects[j]
                 kinds_seen.add(kind)
-        assert kinds_seen == {None, Kind.STUCK}
+        assert kinds_seen == {None, ManipulationKind.STUCK}
         assert verdict is not None
         assert not verdict.suspects.any()
 
-    def test_a_replay_of_what_was_never_reported_is_no_repetition(self, street: tuple[Site, Watcher]) -> None:
+    def test_a_replay_of_what_was_never_reported_is_no_repetition(
+        self, street: tuple[Site, DesignedEstimator]
+    ) -> None:
         """A clock that is behind since ever repeats nothing: only the voltage can tell."""
         site, watcher = street
         late = (Replay(np.array([2]), START, START + 1e6, delay_s=200.0),)
@@ -454,8 +467,8 @@ class TestTurns:
 def test_who_has_repeated_itself_is_a_replay_for_good() -> None:
     """Nothing of the past is asked: there is none."""
     shapes = cast("Shapes", SimpleNamespace())
-    found = kinds._of_the_past(shapes, repeats.empty(1), 0, 1.0, 32, Kind.REPLAY)
-    assert found is Kind.REPLAY
+    found = kinds._of_the_past(shapes, repeats.empty(1), 0, 1.0, 32, ManipulationKind.REPLAY)
+    assert found is ManipulationKind.REPLAY
 
 
 def test_many_who_are_named_at_once_are_looked_at_one_after_the_other() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from feeders.model.site import load
 from feeders.registry.registry import design
-from feeders.simulation.trial import Meters, Trial, frames
+from feeders.simulation.trial import Trial, TrialMeterErrors, frames
 from gridsec.estimators import sequential
 from gridsec.interface import Decision, Frame
 from tests.gridsec.estimators.sequential.test_monitor import prepare, watch
@@ -53,7 +53,7 @@ def test_nothing_is_remembered_of_frames_without_readings() -> None:
 @pytest.mark.parametrize("name", ["kerber-landnetz", "cigre-lv"])
 def test_the_standard_deviation_covers_the_jitter_of_the_busbar(name: str) -> None:
     """White meters, AC power flow: errors are as large as is said, also those all customers share."""
-    trial = Trial(load(name), seed=5, duration_s=150.0, meters=Meters.WHITE)
+    trial = Trial(load(name), seed=5, duration_s=150.0, meters=TrialMeterErrors.WHITE)
     watcher, ratios = design(trial.stated), []
     state = watcher.init(0.0)
     for k, (frame, truth) in enumerate(frames(trial)):

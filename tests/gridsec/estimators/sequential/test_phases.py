@@ -12,7 +12,7 @@ from feeders.model.load_uncertainty import load_doubt
 from feeders.model.site import Site, from_tables, load, one_phase_each
 from feeders.registry.registry import design as design_site
 from feeders.simulation.powerflow_three_phase import power_flow
-from feeders.simulation.trial import Lie, LoadError, Meters, Trial, Trick, frames
+from feeders.simulation.trial import AttackKind, AttackSpec, LoadError, Trial, TrialMeterErrors, frames
 from gridsec.estimators import sequential
 from gridsec.estimators.plant import Plant
 from gridsec.estimators.sequential import LoadDoubt, SequentialDesign, SequentialOptions
@@ -208,12 +208,12 @@ class TestTheEuropeanFeeder:
     """55 single-phase customers, 19 inverters; the truth is asymmetric AC power flow."""
 
     @staticmethod
-    def trial(lie: Lie | None, seconds: float = 40.0, kw: float = 0.6) -> Trial:
+    def trial(lie: AttackSpec | None, seconds: float = 40.0, kw: float = 0.6) -> Trial:
         return Trial(
             load("ieee-european-lv"),
             seed=4,
             duration_s=seconds,
-            meters=Meters.WHITE,
+            meters=TrialMeterErrors.WHITE,
             load_error=LoadError(kw, kw / 3.0),
             lie=lie,
             profile_s=300_000.0,
@@ -239,7 +239,7 @@ class TestTheEuropeanFeeder:
 
     @pytest.mark.acceptance
     def test_eighteen_liars_are_named_and_nobody_else(self) -> None:
-        this = self.trial(Lie(Trick.BIAS, 18, 3.0, onset_s=20.0))
+        this = self.trial(AttackSpec(AttackKind.BIAS, 18, 3.0, onset_s=20.0))
         watcher = design_site(this.stated)
         state, inside = watcher.init(0.0), []
         for frame, truth in frames(this):
@@ -337,7 +337,7 @@ def test_a_busbar_that_moved_while_it_was_silent_accuses_nobody(name: str) -> No
         load(name),
         seed=4,
         duration_s=70.0,
-        meters=Meters.WHITE,
+        meters=TrialMeterErrors.WHITE,
         load_error=LoadError(0.6, 0.2),
         profile_s=300_000.0,
     )

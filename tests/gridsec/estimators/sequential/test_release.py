@@ -10,9 +10,9 @@ from scipy.stats import norm
 
 from feeders.model.site import load
 from feeders.registry.registry import design
-from feeders.simulation.attacks import Lie, Trick
+from feeders.simulation.attacks import AttackKind, AttackSpec
 from feeders.simulation.scenario import START
-from feeders.simulation.trial import LoadError, Meters, Trial, frames
+from feeders.simulation.trial import LoadError, Trial, TrialMeterErrors, frames
 from gridsec.arrays import Floats
 from gridsec.estimators.sequential.bounds import FALSE_Q
 from gridsec.estimators.sequential.conditional import Fit, Prior, fit, judge, loosen
@@ -106,8 +106,10 @@ def test_a_third_lies_about_voltages_and_powers_alike() -> None:
     """Nobody honest is named for powers that liars tell, and errors are as large as is said."""
     site = load("kerber-dorfnetz")
     count, ratios = site.meters.size // 3, []
-    lie = Lie(Trick.BIAS, count, 3.0, onset_s=10.0)
-    trial = Trial(site, seed=5, duration_s=35.0, load_error=LoadError(0.3, 0.1), meters=Meters.REAL, lie=lie)
+    lie = AttackSpec(AttackKind.BIAS, count, 3.0, onset_s=10.0)
+    trial = Trial(
+        site, seed=5, duration_s=35.0, load_error=LoadError(0.3, 0.1), meters=TrialMeterErrors.REAL, lie=lie
+    )
     watcher = design(trial.stated)
     state, rng = watcher.init(START), np.random.default_rng(5)
     fake = rng.uniform(-15.0, 15.0, site.meters.size) / site.feeder.base_kva

@@ -11,7 +11,7 @@ from feeders.model.site import load, to_frame
 from feeders.registry.registry import design
 from feeders.simulation.scenario import Scenario, simulate, snapshots
 from gridsec.attack import Attack, Replay, Stuck
-from gridsec.estimators.sequential import distrusted, init, nobody, restore
+from gridsec.estimators.sequential import SuspicionRecord, distrusted, init, warm_start
 from gridsec.estimators.sequential.doubts import doubted, none
 from gridsec.interface import Decision, Frame
 from tests.gridsec.estimators.sequential.test_gaps import LIAR, calm
@@ -72,8 +72,8 @@ def test_silence_clears_no_inverter(silent: int) -> None:
     made, after = prepare(plant), []
     for quiet in (0, silent):
         street = Street(plant, np.random.default_rng(6))
-        before = replace(nobody(12, 5), inverters=np.arange(5) == 1)
-        state = restore(made, init(made, street.t), before)
+        before = replace(SuspicionRecord.empty(12, 5), inverters=np.arange(5) == 1)
+        state = warm_start(made, init(made, street.t), before)
         state, nothing = watch(street, made, quiet, state=state, silent=tuple(range(12)))
         assert all(verdict.inverters[1] for _, verdict in nothing)
         state, answers = watch(street, made, 80, state=state)
@@ -88,7 +88,9 @@ def test_only_those_who_feel_an_inverter_clear_it() -> None:
     felt = plant.feeder.linear().X[plant.meters, plant.droop.customer[1]]
     far = int(np.argmin(felt))
     assert felt[far] < 0.2 * felt.max()
-    state = restore(made, init(made, street.t), replace(nobody(12, 5), inverters=np.arange(5) == 1))
+    state = warm_start(
+        made, init(made, street.t), replace(SuspicionRecord.empty(12, 5), inverters=np.arange(5) == 1)
+    )
     others = tuple(j for j in range(12) if j != far)
     state, answers = watch(street, made, 100, state=state, silent=others)
     assert all(verdict.inverters[1] for _, verdict in answers)
@@ -110,7 +112,7 @@ def test_who_repeats_himself_is_not_believed_until_that_would_be_noticed_anew(
         if k == restart:
             before = distrusted(made.design, state)
             assert np.isfinite(before.repeats_s).nonzero()[0].tolist() == WHO.tolist()
-            state = restore(made.design, made.init(seen.t), before)
+            state = warm_start(made.design, made.init(seen.t), before)
             assert distrusted(made.design, state).same(before)
         state, _, verdict = made.step(state, to_frame(site, seen))
         if k >= restart:
@@ -121,11 +123,11 @@ def test_who_repeats_himself_is_not_believed_until_that_would_be_noticed_anew(
 def test_who_repeated_himself_and_is_mended_is_believed_again() -> None:
     site = load("simbench-lv-rural1")
     made, line = design(site), []
-    before = nobody(len(site.meter_ids), site.droop.tau.size)
+    before = SuspicionRecord.empty(len(site.meter_ids), site.droop.tau.size)
     which = np.isin(np.arange(len(site.meter_ids)), WHO)
     before = replace(before, scale_s=np.where(which, 60.0, np.nan), named=which)
     before = replace(before, repeats_s=np.where(which, 100.0, np.nan))
-    state = restore(made.design, made.init(1_000.0), before)
+    state = warm_start(made.design, made.init(1_000.0), before)
     for seen in snapshots(simulate(site, Scenario(seed=2, start=1_000.0, duration_s=700.0))):
         state, _, verdict = made.step(state, to_frame(site, seen))
         line.append(bool(verdict.suspects.any()))
