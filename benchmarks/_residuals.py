@@ -9,7 +9,7 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.estimators.modal.model import ResidualModel
-from gridsec.grid.network import Power, columns, covariance, variances
+from gridsec.grid.network import Power
 from gridsec.grid.radial import Feeder
 
 BASE_KVA = 100.0
@@ -81,8 +81,8 @@ def model_of(
     at, n = feeder.bus, len(feeder.buses)
     sizes = ((Power.ACTIVE, np.full(at.size, p_std**2)), (Power.REACTIVE, np.full(at.size, q_std**2)))
     return ResidualModel(
-        of_meters=np.sum([covariance(feeder, power, at, of) for power, of in sizes], axis=0),
-        variance=np.sum([variances(feeder, power, of) for power, of in sizes], axis=0),
+        of_meters=np.sum([feeder.covariance(power, at, of) for power, of in sizes], axis=0),
+        variance=np.sum([feeder.variances(power, of) for power, of in sizes], axis=0),
         meters=at,
         white=np.broadcast_to(4.0 * np.square(jitter), at.shape).astype(np.float64),
         fixed=np.broadcast_to(4.0 * np.square(classes) / 3.0, at.shape).astype(np.float64),
@@ -98,7 +98,7 @@ def model_of(
 def power_columns(feeder: Feeder) -> Floats:
     """Effect of every customer's active power, then of the reactive ones, on the meters, (p, 2 N)."""
     every = np.arange(feeder.bus.size)
-    return np.hstack([columns(feeder, power, every)[feeder.bus] for power in Power])
+    return np.hstack([feeder.columns(power, every)[feeder.bus] for power in Power])
 
 
 def root(matrix: Floats) -> Floats:

@@ -46,9 +46,8 @@ from gridsec.estimators.modal import core, estimate, signatures, static
 from gridsec.estimators.modal import filter as modal
 from gridsec.estimators.modal.core import Core
 from gridsec.estimators.modal.estimate import Estimated
-from gridsec.estimators.modal.search import Identification, Problem
+from gridsec.estimators.modal.search import Identification, SearchProblem
 from gridsec.estimators.sequential import SequentialDesign
-from gridsec.grid.network import bus_voltages
 from gridsec.interface import Decision, Frame
 
 QUIET, WATCHED = 180, 120
@@ -108,7 +107,7 @@ class World:
         self.fixed = np.sqrt(front.fixed) * self.random.standard_normal(front.fixed.size)
         self.busbar = front.busbar * float(self.random.standard_normal())
         self.p, self.zero = np.full(count, -0.01), np.zeros(count)
-        self.model = bus_voltages(front.plant.feeder, self.p, self.zero, 1.0, steps=1)
+        self.model = front.plant.feeder.bus_voltages(self.p, self.zero, 1.0, steps=1)
         self.seen = np.ones(front.fixed.size, dtype=np.bool_)
 
     def tick(self, lie: Floats | float = 0.0) -> tuple[Frame, Floats, Floats]:
@@ -333,7 +332,7 @@ class Support:
             return plain
         W = made.U.T[:, self.liars]
         y, F = signatures.scores(made, self.rows, self.more).matrix(0, W)
-        problem = Problem(y, F, np.full(k, 1.0), k, np.zeros(k), np.full(k, np.inf))
+        problem = SearchProblem(y, F, np.full(k, 1.0), k, np.zeros(k), np.full(k, np.inf))
         every = np.ones((1, k), dtype=np.bool_)
         one = Identification(every, ~every[:, 0], np.ones(1), every[0], (problem,))
         zero = np.zeros((plain.mean.size, k))
@@ -380,7 +379,7 @@ def honest(feeder: str, seed: int, ticks: int = 240) -> Honest:
             continue
         most = max(most, evidence.log_m)
         now = core.estimate(kernel, mine)
-        feeder_model = bus_voltages(front.plant.feeder, frame.p, frame.q, state.v0_squared, steps=1)
+        feeder_model = front.plant.feeder.bus_voltages(frame.p, frame.q, state.v0_squared, steps=1)
         new = (feeder_model + now.mean)[customers] - truth.v2
         old = answer.v2 - truth.v2
         errors.append(

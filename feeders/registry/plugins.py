@@ -68,7 +68,7 @@ def load(name: str, kind: type) -> Any:
         ) from failure
     if not isinstance(made, kind) or getattr(made, "name", None) != name:
         raise EstimatorUnusable(
-            f"estimator {name!r} ({_where(points[0])}) is not a {kind.__name__} of that name"
+            f"estimator {name!r} ({_where(points[0])}) is no {kind.__name__} of that name"
         )
     return made
 

@@ -19,6 +19,7 @@ from scipy.signal import lfilter
 
 from feeders.model.profiles import Season, library, profile
 from gridsec.arrays import Floats
+from gridsec.grid.network import InPhases
 
 if TYPE_CHECKING:
     from feeders.model.site import Site
@@ -246,7 +247,7 @@ class Customers:
         self._sky = Fluctuation(seed, Stream.COMMON_CLOUD, 1, variation.cloud_correlation_s)
         self._busbar = Fluctuation(seed, Stream.BUSBAR, 1, variation.busbar_correlation_s)
         self._unbalance = None
-        if site.feeder.busbar_phases == 3:
+        if isinstance(site.feeder, InPhases):
             self._unbalance = Fluctuation(seed, Stream.UNBALANCE, 3, variation.busbar_correlation_s)
         rows, metered = site.tables.customers, np.array([bool(row.meter) for row in site.tables.customers])
         self._hidden_kw = metered * _told(variation.hidden_kw, [row.p_std_kw for row in rows])

@@ -15,6 +15,7 @@ import numpy as np
 from feeders.simulation.demand import Stream, generator
 from gridsec.arrays import Floats, Ints
 from gridsec.errors import InputInvalid, Problem
+from gridsec.grid.network import InPhases
 
 if TYPE_CHECKING:
     from feeders.model.site import Site
@@ -194,7 +195,7 @@ class SimulatedMeters:
     def __init__(self, site: Site, errors: MeterErrors, channel: Channel, seed: int) -> None:
         accuracy, customer = site.accuracy, site.meters
         self.count = customer.size
-        self._busbars = site.feeder.busbar_phases
+        self._busbars = 3 if isinstance(site.feeder, InPhases) else 1
         self._channel = channel
         self._errors = errors
         self._seed = seed

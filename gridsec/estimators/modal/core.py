@@ -18,6 +18,7 @@ from math import inf, log
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints
+from gridsec.errors import InputInvalid, Problem
 from gridsec.estimators.modal import detector, signatures, static
 from gridsec.estimators.modal import estimate as estimates
 from gridsec.estimators.modal import filter as modal
@@ -25,7 +26,7 @@ from gridsec.estimators.modal.detector import SIZE, Detector, Evidence
 from gridsec.estimators.modal.estimate import Estimated, Estimator
 from gridsec.estimators.modal.filter import FilterState, Update
 from gridsec.estimators.modal.model import Modes, ResidualModel, modes, residual_model
-from gridsec.estimators.modal.search import Identification, Problem, cost, groups, search
+from gridsec.estimators.modal.search import Identification, SearchProblem, cost, groups, search
 from gridsec.estimators.modal.signatures import Columns
 from gridsec.estimators.modal.static import Static
 from gridsec.estimators.sequential.design import YEAR_S, SequentialDesign
@@ -118,7 +119,7 @@ def assemble(model: ResidualModel, powers: Floats, most: Floats, *, gamma: float
         If gamma is below 1.
     """
     if not 1.0 <= gamma < inf:
-        raise ValueError(f"gamma is {gamma}; it must be at least 1 and finite")
+        raise InputInvalid([Problem("out-of-range", f"gamma is {gamma}; it must be at least 1 and finite")])
     made, at = modes(model), model.meters
     std = np.full(powers.shape[1], FALSE_POWER)
     used = model.phases(made.at).any(axis=0)
@@ -272,7 +273,7 @@ def _searched(core: Core, state: CoreState, row: int) -> Identification:
     return search(plain, core.groups, (replace(plain, y=y, F=F), charge - 2.0 * ratio))
 
 
-def _problem(core: Core, state: CoreState, row: int) -> Problem:
+def _problem(core: Core, state: CoreState, row: int) -> SearchProblem:
     """Scores, information and charges of all faults at one onset."""
     faults, p = core.faults, core.modes.size
     now = signatures.scores(core.modes, state.detector.onsets, state.static, np.array([row]))
@@ -281,7 +282,7 @@ def _problem(core: Core, state: CoreState, row: int) -> Problem:
     charge = np.zeros(y.size)
     charge[p:] = accusation
     charge[p : p + faults.powers] = ACCUSATIONS * accusation
-    return Problem(y, F, faults.std, p, charge, core.bound)
+    return SearchProblem(y, F, faults.std, p, charge, core.bound)
 
 
 def estimate(core: Core, state: CoreState, suspicion: Suspicion | None = None) -> Estimated:
@@ -300,7 +301,7 @@ def estimate(core: Core, state: CoreState, suspicion: Suspicion | None = None) -
         Before the first tick.
     """
     if state.update is None:
-        raise ValueError("no reading has been taken in yet")
+        raise InputInvalid([Problem("missing", "no reading is available yet")])
     made, by = core.modes, core.estimator
     plain = estimates.honest(made, by, state.filter, state.static, state.update)
     if suspicion is None:

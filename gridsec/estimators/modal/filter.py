@@ -37,6 +37,7 @@ import numpy as np
 from scipy.linalg import lapack
 
 from gridsec.arrays import Bools, Floats, all_of, indices
+from gridsec.errors import InputInvalid, Problem
 from gridsec.estimators.modal.model import Modes
 
 
@@ -124,7 +125,7 @@ def step(
     """
     h = t - state.t
     if not h >= 0.0:
-        raise ValueError(f"t is {t}; it must not be before {state.t}")
+        raise InputInvalid([Problem("order", f"t is {t}; it must not be before {state.t}")])
     rho, rho_b = exp(-h / modes.model.time_s), exp(-h / modes.model.fixed_s)
     mean = state.mean * np.array([[rho], [rho_b]])
     cov = state.cov * np.array([[rho * rho], [rho * rho_b], [rho_b * rho_b]])
@@ -183,7 +184,7 @@ def restrict(before: Modes, state: FilterState, after: Modes) -> FilterState:
     place[before.at] = np.arange(before.size)
     rows = place[after.at]
     if (rows < 0).any():
-        raise ValueError("every new member must have been a member before")
+        raise InputInvalid([Problem("unknown-index", "every new member must be a member before")])
     move = after.U.T @ before.back[rows]
     mean = state.mean @ move.T
     cov = state.cov @ (move * move).T

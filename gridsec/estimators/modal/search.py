@@ -65,7 +65,7 @@ STANDS_OUT = 9.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Problem:
+class SearchProblem:
     """Scores and information of q faults at one onset; the meters come first.
 
     Attributes
@@ -130,7 +130,7 @@ class Identification:
     shock: Bools
     weight: Floats
     named: Bools
-    problems: tuple[Problem, ...]
+    problems: tuple[SearchProblem, ...]
 
 
 def penalties(meters: int) -> Floats:
@@ -147,7 +147,7 @@ def penalties(meters: int) -> Floats:
     return np.concatenate([[0.0], np.cumsum(more)])
 
 
-def cost(problem: Problem, chosen: Bools) -> float:
+def cost(problem: SearchProblem, chosen: Bools) -> float:
     """Cost of one set; O(k^3).
 
     Parameters
@@ -166,7 +166,7 @@ def cost(problem: Problem, chosen: Bools) -> float:
     return out
 
 
-def alike(problem: Problem, chosen: Bools) -> float:
+def alike(problem: SearchProblem, chosen: Bools) -> float:
     """Cost of one set if its meters are off by nearly the same amount, as likely as if they are not; O(k^3).
 
     The amounts have the prior covariance ``s^2 (ALIKE 1 1' + (1 - ALIKE) I)``. The set bears the largest
@@ -192,7 +192,7 @@ def alike(problem: Problem, chosen: Bools) -> float:
     return charge - float(y @ cho_solve((lower, True), y)) + 2.0 * float(np.log(np.diag(lower)).sum())
 
 
-def amounts(problem: Problem, chosen: Bools) -> tuple[Floats, Floats]:
+def amounts(problem: SearchProblem, chosen: Bools) -> tuple[Floats, Floats]:
     """Posterior mean (k,) and covariance (k, k) of the amounts of a set.
 
     Parameters
@@ -216,7 +216,7 @@ class Tableau:
         The problem.
     """
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: SearchProblem) -> None:
         q = problem.y.size
         self.problem, self.penalty = problem, penalties(problem.meters)
         self.A = np.empty((q + 1, q + 1), order="F")
@@ -385,7 +385,7 @@ def _grouped(tableau: Tableau, groups: tuple[Ints, ...]) -> bool:
     return True
 
 
-def relevant(problem: Problem) -> Bools:
+def relevant(problem: SearchProblem) -> Bools:
     """Meters that stand out when each has a prior variance of its own, (q,); O(p^3) per iteration.
 
     Parameters
@@ -406,7 +406,7 @@ def relevant(problem: Problem) -> Bools:
 
 
 def search(
-    problem: Problem, groups: tuple[Ints, ...] = (), shocked: tuple[Problem, float] | None = None
+    problem: SearchProblem, groups: tuple[Ints, ...] = (), shocked: tuple[SearchProblem, float] | None = None
 ) -> Identification:
     """Find the likeliest sets and the meters without which nothing explains the readings.
 
@@ -426,7 +426,7 @@ def search(
     return _identified((plain, other), (found, {key: each + shocked[1] for key, each in more.items()}))
 
 
-def _explored(problem: Problem, groups: tuple[Ints, ...]) -> tuple[Problem, dict[bytes, float]]:
+def _explored(problem: SearchProblem, groups: tuple[Ints, ...]) -> tuple[SearchProblem, dict[bytes, float]]:
     """The problem with the estimated prior size, and all sets that were met with their costs."""
     start = relevant(problem)
     best = _best((Tableau(problem), _at(problem, start)), groups)
@@ -470,7 +470,7 @@ def _best(starts: tuple[Tableau, ...], groups: tuple[Ints, ...]) -> Tableau:
     return min((descend(start, groups) for start in starts), key=lambda end: end.cost)
 
 
-def _at(problem: Problem, chosen: Bools) -> Tableau:
+def _at(problem: SearchProblem, chosen: Bools) -> Tableau:
     """A tableau pivoted on a set."""
     out = Tableau(problem)
     for j in np.flatnonzero(chosen):
@@ -478,7 +478,7 @@ def _at(problem: Problem, chosen: Bools) -> Tableau:
     return out
 
 
-def _sized(problem: Problem, chosen: Bools) -> Problem:
+def _sized(problem: SearchProblem, chosen: Bools) -> SearchProblem:
     """The problem with the prior size of the meters' faults estimated from a set of them."""
     p = problem.meters
     if not chosen[:p].any():
@@ -527,7 +527,7 @@ def _neighbours(best: Tableau, found: dict[bytes, float]) -> None:
         found.setdefault(chosen.tobytes(), best.cost + float(both[i, j]))
 
 
-def _identified(problems: tuple[Problem, ...], found: tuple[dict[bytes, float], ...]) -> Identification:
+def _identified(problems: tuple[SearchProblem, ...], found: tuple[dict[bytes, float], ...]) -> Identification:
     """Weights of the sets found, and the meters without which nothing is left."""
     every = sorted((each[key], k, key) for k, each in enumerate(found) for key in each)
     costs = np.array([one for one, _, _ in every])

@@ -73,8 +73,8 @@ def test_what_cannot_be_used_is_refused_by_name(place: Path) -> None:
     install(place, "pkg_e", GOOD, "twice = pkg_e:FAMILY")
     for name, why in (
         ("broken", "cannot be loaded: out of order"),
-        ("other", "is not a Family of that name"),
-        ("alias", "is not a Family of that name"),
+        ("other", "is no Estimator of that name"),
+        ("alias", "is no Estimator of that name"),
         ("twice", "2 packages offer it"),
         ("nobody", "0 packages offer it"),
     ):

@@ -140,5 +140,5 @@ def test_what_cannot_be_made_is_refused_with_its_reason() -> None:
         fake_load(site, 2, np.array([0, 2]), 0.18)
     with refused(NoSuchAttack, "no-such-attack"):
         random_attacks(site, 0, RandomAttackKind.COORDINATED, 7, SIZE, t_on=ON, t_off=OFF)
-    with pytest.raises(ValueError, match="'nonsense' is not a valid Kind"):
+    with pytest.raises(ValueError, match="'nonsense' is not a valid RandomAttackKind"):
         random_attacks(site, 0, "nonsense", 1, SIZE, t_on=ON, t_off=OFF)

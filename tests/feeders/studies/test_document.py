@@ -47,10 +47,10 @@ def test_numbers_of_protect() -> None:
         assert cells(row["meter"]) == [row["customer"], row["bus"], str(row["attacks"])]
     usual = protect(RURAL, max_attacked=2)
     assert usual.meters["meter"].tolist() == ["m13"]
-    assert f"largest hidden lie, V: {usual.before:.4g} before, {usual.after:.4g} after" in PAGE
+    assert f"largest hidden attack, V: {usual.before:.4g} before, {usual.after:.4g} after" in PAGE
     assert f"(contain): at most {usual.lie_volt:.4g}; one meter hides {usual.alone:.4g}" in PAGE
     found = protect(RURAL, max_attacked=2, goal=Goal.BOUND, lie_volt=4.5)
-    assert f"largest hidden lie, V: {found.before:.4g} before, {found.after:.4g} after" in PAGE
+    assert f"largest hidden attack, V: {found.before:.4g} before, {found.after:.4g} after" in PAGE
 
 
 def test_numbers_of_detectable() -> None:

@@ -12,8 +12,8 @@ from gridsec.arrays import Floats
 from gridsec.estimators.modal import estimate, signatures, static
 from gridsec.estimators.modal import filter as modal
 from gridsec.estimators.modal.model import ResidualModel, modes
-from gridsec.estimators.modal.search import Identification, Problem, amounts
-from gridsec.grid.network import Power, columns
+from gridsec.estimators.modal.search import Identification, SearchProblem, amounts
+from gridsec.grid.network import Power
 
 FEEDER = tree(9, np.random.default_rng(1))
 
@@ -68,7 +68,7 @@ def test_equals_the_joint_gaussian(lasting: float, fault: str) -> None:
     if fault == "meter":
         G[2] = 1.0
     elif fault == "power":
-        effect = columns(FEEDER, Power.ACTIVE, every[3:4])
+        effect = FEEDER.columns(Power.ACTIVE, every[3:4])
         G, std = effect[model.meters], 0.05
     elif fault == "busbar":
         effect = model.busbar_of
@@ -84,7 +84,7 @@ def test_equals_the_joint_gaussian(lasting: float, fault: str) -> None:
     if fault != "none":
         W = made.U.T @ G
         y, F = signatures.scores(made, rows, more).matrix(0, W)
-        problem = Problem(y, F, np.array([std]), 1, np.zeros(1), np.full(1, np.inf))
+        problem = SearchProblem(y, F, np.array([std]), 1, np.zeros(1), np.full(1, np.inf))
         T = estimate.moves(made, prepared, more, rows, 0, W, effect)
         one = Identification(
             np.ones((1, 1), bool), np.zeros(1, bool), np.ones(1), np.ones(1, bool), (problem,)
@@ -100,7 +100,7 @@ def test_equals_the_joint_gaussian(lasting: float, fault: str) -> None:
 def test_a_mixture_contains_the_disagreement() -> None:
     """Variance of two explanations: the mean of the variances and the spread of the means."""
     F = np.diag([100.0, 100.0])
-    problem = Problem(np.array([50.0, 50.0]), F, np.ones(2), 2, np.zeros(2), np.full(2, np.inf))
+    problem = SearchProblem(np.array([50.0, 50.0]), F, np.ones(2), 2, np.zeros(2), np.full(2, np.inf))
     chosen = np.array([[True, False], [False, True]])
     found = Identification(chosen, np.zeros(2, bool), np.array([0.5, 0.5]), np.zeros(2, bool), (problem,))
     before = estimate.Estimated(np.zeros(1), np.array([1e-4]))
@@ -145,7 +145,7 @@ def test_coverage_in_simulation() -> None:
 
 def covariance_of_all() -> Floats:
     """Covariance of the voltages at all buses."""
-    effect = np.hstack([columns(FEEDER, power, np.arange(9)) for power in Power])
+    effect = np.hstack([FEEDER.columns(power, np.arange(9)) for power in Power])
     return np.asarray((effect * np.repeat([0.006**2, 0.002**2], 9)) @ effect.T)
 
 

@@ -11,11 +11,11 @@ import pytest
 from gridsec.arrays import Bools
 from gridsec.estimators.modal import search as s
 from gridsec.estimators.modal.model import modes
-from gridsec.estimators.modal.search import Problem, Tableau
+from gridsec.estimators.modal.search import SearchProblem, Tableau
 from tests.gridsec.estimators.modal.test_detector import FEEDER, busbar
 
 
-def problem(seed: int, p: int = 8, others: int = 2, liars: int = 2, size: float = 1.0) -> Problem:
+def problem(seed: int, p: int = 8, others: int = 2, liars: int = 2, size: float = 1.0) -> SearchProblem:
     """Scores of random faults whose information is that of correlated readings."""
     random = np.random.default_rng(seed)
     q, common = p + others, random.standard_normal((p + others, 3))
@@ -24,10 +24,10 @@ def problem(seed: int, p: int = 8, others: int = 2, liars: int = 2, size: float 
     f[random.choice(p, liars, replace=False)] = size * random.choice([-1.0, 1.0], liars)
     y = F @ f + np.linalg.cholesky(F) @ random.standard_normal(q)
     charge = np.where(np.arange(q) < p, 0.0, 10.0)
-    return Problem(y, F, np.full(q, 1.0), p, charge, np.full(q, np.inf))
+    return SearchProblem(y, F, np.full(q, 1.0), p, charge, np.full(q, np.inf))
 
 
-def every(given: Problem) -> list[tuple[float, Bools]]:
+def every(given: SearchProblem) -> list[tuple[float, Bools]]:
     """All sets with their costs, by determinants and solves; independent amounts or amounts alike."""
     q, p, out = given.y.size, given.meters, []
     for k in range(q + 1):
@@ -51,7 +51,7 @@ def every(given: Problem) -> list[tuple[float, Bools]]:
     return sorted(out, key=lambda each: each[0])
 
 
-def total(given: Problem, chosen: Bools) -> float:
+def total(given: SearchProblem, chosen: Bools) -> float:
     """Cost of one set, with amounts alike as likely as not."""
     one = s.cost(given, chosen)
     if np.count_nonzero(chosen[: given.meters]) < 2:
@@ -126,16 +126,18 @@ def test_impossible_amounts_are_not_chosen() -> None:
     """A power that would have to be beyond its bound is left out, and a meter explains it."""
     F = np.array([[50.0, 49.0], [49.0, 50.0]])
     f = np.array([0.0, 3.0])
-    given = Problem(F @ f, F, np.ones(2), 1, np.array([0.0, 1.0]), np.array([np.inf, 0.5]))
+    given = SearchProblem(F @ f, F, np.ones(2), 1, np.array([0.0, 1.0]), np.array([np.inf, 0.5]))
     assert not s.search(given).chosen[0][1]
-    free = Problem(F @ f, F, np.ones(2), 1, np.array([0.0, 1.0]), np.array([np.inf, np.inf]))
+    free = SearchProblem(F @ f, F, np.ones(2), 1, np.array([0.0, 1.0]), np.array([np.inf, np.inf]))
     assert s.search(free).chosen[0][1]
 
 
 def test_amounts_that_become_impossible_are_removed() -> None:
     """A power that is possible beside a meter, but not without it: it is barred when the meter goes."""
     given = problem(3, p=6, others=2, liars=2, size=3.0)
-    tight = Problem(given.y, given.F, given.std, 6, np.zeros(8), np.where(np.arange(8) < 6, np.inf, 0.05))
+    tight = SearchProblem(
+        given.y, given.F, given.std, 6, np.zeros(8), np.where(np.arange(8) < 6, np.inf, 0.05)
+    )
     tableau = Tableau(tight)
     tableau.toggle(7)
     end = s.descend(tableau)
