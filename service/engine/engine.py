@@ -225,7 +225,7 @@ class RuntimeConfig:
 
 @dataclass(frozen=True, slots=True)
 class Past:
-    """Stored state of a feeder for the warm start of a monitor: alarms, commissioning, suspicions."""
+    """State of a feeder for the warm start of a monitor: alarms, commissioning, suspicions."""
 
     alarms: tuple[Alarm, ...]
     commission: Kept | None
