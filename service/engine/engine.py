@@ -228,7 +228,7 @@ class RuntimeConfig:
 
 @dataclass(frozen=True, slots=True)
 class PersistedState:
-    """Stored state of a feeder for the warm start of a monitor: alarms, commissioning, suspicions."""
+    """State of a feeder for the warm start of a monitor: alarms, commissioning, suspicions."""
 
     alarms: tuple[Alarm, ...]
     commission: StateSnapshot | None
