@@ -41,7 +41,7 @@ def timed(totals: dict[str, float], name: str, run: Callable[..., Any]) -> Calla
 
 def main() -> None:
     """Run the service."""
-    from service.cli import main as cli
+    from service.cli.main import main as gridsec
     from service.engine.engine import Engine
 
     path, totals = Path(sys.argv[1]), {"cycle": 0.0, "keep_states": 0.0}
@@ -55,7 +55,7 @@ def main() -> None:
 
     signal.signal(signal.SIGUSR1, write)
     sys.argv = ["gridsec", "serve", *sys.argv[2:]]
-    cli.main()
+    gridsec()
 
 
 if __name__ == "__main__":

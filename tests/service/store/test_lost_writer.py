@@ -115,9 +115,9 @@ SERVICE = """
     sys.path.insert(0, {tests!r})
     from service.store import connect
     connect.IDLE_S, connect.BEAT_S = {idle_s}, {idle_s} / 4
-    from service.cli.main import main as cli
+    from service.cli.main import main
     sys.argv = ["gridsec", "serve", *{arguments!r}]
-    cli.main()
+    main()
 """
 
 
