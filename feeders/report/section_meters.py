@@ -279,13 +279,13 @@ def _picture(site: Site, customers: pd.DataFrame, liars: int, sure: str) -> Find
     )
     if not all(math.isfinite(v) for v in customers["error"]):
         return Finding(Standing.OPEN, (("No bound of the error is proved for every customer.",),))
-    whoever: Sentence = (
+    arbitrary: Sentence = (
         "For any method, two voltages up to ",
         most(customers, name, "error_fits", "V", side=Side.ABOVE),
         " apart apart can fit the same readings.",
     )
     how: Sentence = ("Proved for the linear effect of load errors, and checked by AC power flow.",)
-    return Finding(Standing.PART, (lead, whoever, how))
+    return Finding(Standing.PART, (lead, arbitrary, how))
 
 
 def _percent(site: Site) -> str:

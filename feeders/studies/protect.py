@@ -363,7 +363,7 @@ def _in_volts(  # question and its options
     curves: CurvePositions,
 ) -> _Asked:
     """Question in volts: attacks beyond the bound, and the largest one, V, in volts of the busbar's level."""
-    count, nobody = site.meters.size, np.zeros(site.meters.size, dtype=np.bool_)
+    count, no_meters = site.meters.size, np.zeros(site.meters.size, dtype=np.bool_)
     # Base of a customer in volts at the busbar's level, behind taps and transformers.
     base = (site.customer_volt / site.customer_nominal)[site.meters] * site.tables.meta.voltage_volt
     told = false_powers(site, unknown=unknown, share=share, curves=curves)
@@ -375,8 +375,8 @@ def _in_volts(  # question and its options
         sizes = [largest_of(given, j, max_attacked, honest=protected).bound for j in range(count)]
         return float(volts_of_lie(base, np.array(sizes)).max())
 
-    sizes = np.array([largest_lie(told.told(nobody), j, 1).bound for j in range(count)])
-    alone, before = float(volts_of_lie(base, sizes).max()), largest(nobody)
+    sizes = np.array([largest_lie(told.told(no_meters), j, 1).bound for j in range(count)])
+    alone, before = float(volts_of_lie(base, sizes).max()), largest(no_meters)
     if math.isnan(lie_volt):
         lie_volt = math.ceil(50.0 * (alone + before)) / 100.0
     return _Asked(lies_beyond(given, max_attacked, squared(base, lie_volt)), largest, before, lie_volt, alone)

@@ -91,10 +91,10 @@ def nothing_new(  # noqa: PLR0917  # the last answer, and the values without one
         estimate, verdict = last
         return estimate, replace(verdict, decision=Decision.UNDECIDED, cause=Cause.SETTLING, reason=reason)
     at, p = plant.feeder.bus, plant.meters.size
-    v2_bus, nobody = plant.feeder.broadcast_busbar(v0_squared), np.zeros(p, dtype=np.bool_)
-    estimate = Estimate(t, v2_bus[at], np.full(at.size, NO_VOLTAGE), v2_bus, nobody, x)
+    v2_bus, no_meters = plant.feeder.broadcast_busbar(v0_squared), np.zeros(p, dtype=np.bool_)
+    estimate = Estimate(t, v2_bus[at], np.full(at.size, NO_VOLTAGE), v2_bus, no_meters, x)
     score, threshold = np.full(p, np.nan), np.full(p, NO_VOLTAGE)
-    verdict = Verdict(Decision.UNDECIDED, Cause.SETTLING, reason, nobody, score, threshold, np.zeros(p))
+    verdict = Verdict(Decision.UNDECIDED, Cause.SETTLING, reason, no_meters, score, threshold, np.zeros(p))
     return estimate, verdict
 
 

@@ -178,15 +178,15 @@ def observe(  # noqa: PLR0917  # the observers, their state, and the inputs
         and True once their initial transient is negligible.
     """
     plant, errors = setting.plant, setting.errors
-    own, nobody = plant.droop.customer, np.zeros_like(inputs.live)
+    own, no_meters = plant.droop.customer, np.zeros_like(inputs.live)
     # The first state is the equilibrium of the first frame.
     x = circle.step(
-        model, circle.CircleState(0.0, before.x), inputs.z, inputs.w, nobody, h if h > 0 else _LONG_S
+        model, circle.CircleState(0.0, before.x), inputs.z, inputs.w, no_meters, h if h > 0 else _LONG_S
     ).x
-    seen = reconstruct(setting, frame, inputs, injections(plant, frame, x, nobody))
+    seen = reconstruct(setting, frame, inputs, injections(plant, frame, x, no_meters))
     moved = np.abs(seen.correction - inputs.correction)[plant.feeder.bus]
     base = np.minimum(inputs.now.base + moved, NO_VOLTAGE)
-    alone = replace(inputs.now, base=base, live=nobody, told=nobody)
+    alone = replace(inputs.now, base=base, live=no_meters, told=no_meters)
     z = plant.droop.vbar**2 - seen.v2[own]
     fast = plant.droop.tau * rest(h, POLICY) < 1.0
     # If all are that fast, the step ends in the equilibrium.

@@ -216,7 +216,7 @@ def init(design: SetSearchDesign, t: float) -> SetSearchState:
     """Initial state at Unix time t, s; the observer starts with the first frame and trusts all meters."""
     plant, widest = design.setting.plant, thresholds.widest(design.errors)
     m, p = plant.droop.tau.size, plant.meters.size
-    nobody, zero = np.zeros(p, dtype=np.bool_), np.zeros(p, dtype=np.intp)
+    no_meters, zero = np.zeros(p, dtype=np.bool_), np.zeros(p, dtype=np.intp)
     return SetSearchState(
         t=t,
         bank=None,
@@ -227,10 +227,10 @@ def init(design: SetSearchDesign, t: float) -> SetSearchState:
         level=widest,
         sure=widest.free,
         settled=False,
-        dropped=nobody,
+        dropped=no_meters,
         innocent=np.full(p, np.inf),
         readings=zero,
-        tally=Counters(zero, zero, nobody),
+        tally=Counters(zero, zero, no_meters),
         v0_squared=plant.droop.vbar**2,
         last=None,
     )

@@ -194,21 +194,7 @@ class Meshed(OfMatrices):
         p_error: Floats,
         q_error: Floats,
     ) -> tuple[Floats, Floats]:
-        """Error bounds of the correction of `bus_voltages` for powers within intervals.
-
-        Parameters
-        ----------
-        self, p, q : (N,), v0_squared
-            As in `bus_voltages`, one operating point.
-        p_error, q_error : (N,)
-            Largest errors of the powers, pu.
-
-        Returns
-        -------
-        (N,), (N,)
-            Change of the correction, and distance of its first step from the AC power flow, pu:
-            `gridsec.grid.intervals.bounds`.
-        """
+        """See `gridsec.grid.network.WithMatrices`; by `gridsec.grid.intervals.bounds`."""
         with np.errstate(all="ignore"):  # NaN gets an infinite bound without a warning
             s, _, idle = _start(self, p, q, v0_squared)
             first = idle + np.conj(s / idle) @ self.transfer_between.T

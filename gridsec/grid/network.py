@@ -276,9 +276,24 @@ class WithMatrices(Network, Protocol):
     @property
     def X(self) -> Floats: ...  # noqa: D102, N802
 
-    def interval_bounds(  # noqa: D102
+    def interval_bounds(
         self, p: Floats, q: Floats, v0_squared: Floats | float, *, p_error: Floats, q_error: Floats
-    ) -> tuple[Floats, Floats]: ...
+    ) -> tuple[Floats, Floats]:
+        """Error bounds of the loss correction for powers within intervals.
+
+        Parameters
+        ----------
+        p, q : (N,), v0_squared
+            As in `bus_voltages`, one operating point.
+        p_error, q_error : (N,)
+            Largest errors of the powers, pu.
+
+        Returns
+        -------
+        (N,), (N,)
+            Change of the correction, and distance of its first step from the AC power flow, pu; infinite
+            without a bound.
+        """
 
 
 class OfMatrices:

@@ -108,20 +108,7 @@ class PhasedFeeder(InPhases, OfMatrices, OnTree):
         p_error: Floats,
         q_error: Floats,
     ) -> tuple[Floats, Floats]:
-        """`gridsec.grid.three_phase.interval_bounds`, for every customer.
-
-        Parameters
-        ----------
-        self, p, q : (N,), v0_squared
-            As in `bus_voltages`, one operating point.
-        p_error, q_error : (N,)
-            Largest errors of the powers, pu.
-
-        Returns
-        -------
-        (N,), (N,)
-            Change of the correction, and distance of its first step from the AC power flow, pu.
-        """
+        """See `gridsec.grid.network.WithMatrices`; by `gridsec.grid.three_phase.interval_bounds`."""
         v0 = np.broadcast_to(np.asarray(v0_squared, dtype=np.float64), len(PHASES))
         with np.errstate(all="ignore"):  # NaN gets an infinite bound without a warning
             moved, rest = three_phase.interval_bounds(

@@ -402,8 +402,8 @@ def init(
         Initial estimate of all observers, and the bound of its error, see `observers.unknown_input.init`.
     """
     r, p = len(design.left), len(design.family.plant.noise)
-    nobody = np.zeros(r, dtype=np.bool_), np.zeros(p, dtype=np.bool_)
-    return IsolationState(init_family(design.family, t, x, radius), None, None, None, *nobody)
+    none_attacked = np.zeros(r, dtype=np.bool_), np.zeros(p, dtype=np.bool_)
+    return IsolationState(init_family(design.family, t, x, radius), None, None, None, *none_attacked)
 
 
 def input_attack(design: IsolationDesign, x: Floats, before: Floats, u: Floats) -> Floats:

@@ -549,8 +549,8 @@ def _contradicted(design: UnknownInputDesign, state: UnknownInputState, tick: Ti
     if few or not tick.inputs.busbar:
         return tally
     # Readings that the empty pair explains are explained by all other pairs as well.
-    nobody = tick.trial(both.meters[0], both.inverters[0])
-    if not nobody.fits:
+    unattacked = tick.trial(both.meters[0], both.inverters[0])
+    if not unattacked.fits:
         over[0] = True
         # Pairs with the same meters share nearly all of the work.
         groups: dict[bytes, list[int]] = {}
@@ -561,7 +561,7 @@ def _contradicted(design: UnknownInputDesign, state: UnknownInputState, tick: Ti
             believed, room = tick.believe(meters), tick.room(tick.tube(meters))
             over[group] = [not try_pair(believed, both.inverters[k], room).fits for k in group]
     # Evidence against a pair stays while members outside the pair cannot be judged.
-    deaf = deaf_inverters(design, nobody)
+    deaf = deaf_inverters(design, unattacked)
     silent = state.named & ~tick.inputs.live
     hold = (silent & ~both.meters).any(axis=1) | (state.inverters & deaf & ~both.inverters).any(axis=1)
     return count(tally, over, np.asarray(~hold), confirm=options.confirm, release=options.release)

@@ -17,9 +17,7 @@ yang2019 (4), Assumption 1. Proofs: docs/theory-discrete.md.
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -29,6 +27,7 @@ from gridsec.arrays import Floats, Ints, frozen, frozen_ints
 from gridsec.errors import DesignInfeasible, InputInvalid, Problem, raise_if_any
 from gridsec.observers.gains import negativity
 from gridsec.observers.lmi.sampled import DiscreteLure, shift
+from gridsec.observers.lmi.solver import cvxpy_late, solver_warnings_as_status
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -527,21 +526,6 @@ def _refuse_blind(system: DiscreteLure, gains: DiscreteGains) -> None:
 _TINY = 1e-300
 
 
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Suppress the warning about inaccurate solutions; the margin of a design decides."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Solution may be inaccurate", category=UserWarning)
-        yield
-
-
-def _cvxpy() -> Any:
-    """Import cvxpy late: it takes a second, and only a design needs it. Its annotations are incomplete."""
-    import cvxpy
-
-    return cvxpy
-
-
 class _Template:
     """The scaled inequality for sets of one size, stated once and solved for several sets and decays.
 
@@ -578,7 +562,7 @@ class _Template:
         self.q_unit = float(np.trace(scaled)) / max(1, len(scaled))
 
     def _pose(self) -> None:
-        cp = _cvxpy()
+        cp = cvxpy_late()
         moved, options, live, k = self.moved, self.options, self.live, self.size
         x, z, y, unknown = self.x_unit, self.z_unit, self.y_unit, self.options.unknown
         n, m, r = len(x), int(np.count_nonzero(live)), unknown.state.shape[1]
@@ -644,7 +628,7 @@ class _Template:
 
     def solve(self, J: Ints, decay: float) -> DiscreteGains:
         """Design for one set at one decay, verified."""
-        cp = _cvxpy()
+        cp = cvxpy_late()
         what = f"discrete circle-criterion observer of the meters {J.tolist()} at decay {decay:g} per step"
         if len(J):
             self.C.value = self.system.C[J] * self.x_unit / self.y_unit
@@ -654,7 +638,7 @@ class _Template:
             self.C.value = np.zeros((0, len(self.x_unit)))
         self.decay2.value = decay**2
         try:
-            with _quiet():
+            with solver_warnings_as_status():
                 self.problem.solve(solver=cp.CLARABEL)
         except cp.error.SolverError as failure:
             raise DesignInfeasible(what, f"the solver failed: {failure}", code="solver-failed") from failure

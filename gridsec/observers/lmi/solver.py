@@ -55,10 +55,7 @@ def group_pursuit(F: Floats, y: Floats, heights: Ints) -> Floats:
     DesignInfeasible
         If the solver finds no solution, or its solution does not satisfy `F e = y` to 1e-6 of y.
     """
-    import cvxpy
-
-    cp: Any = cvxpy  # its annotations are incomplete
-
+    cp = cvxpy_late()
     size = float(np.max(np.abs(y), initial=0.0))
     if size == 0.0:
         return np.zeros(F.shape[1])
