@@ -1,6 +1,7 @@
 """Powers that are older than the voltages beside them, with kettles and charging cars, and no manipulation.
 
     python -m benchmarks.late_powers [runs] [minutes]
+    python -m benchmarks.late_powers [runs] [minutes] --unchanged
 
 Kerber Dorfnetz without inverters, one reading per second, AC power flow as the truth. Every household
 switches a kettle of 2 kW for 150 s, every ten minutes on average; every fifth customer, with a connection of
@@ -14,6 +15,10 @@ Columns: runs; runs with an honest meter named; honest meters named; ticks CLEAN
 largest error of a voltage over its standard deviation and over its bound; named of a third of the meters that
 reads 3 % wrong, with random signs, in the last two minutes. Exits 1 when an honest meter is named although
 the age is stated, or an error is beyond the bound.
+
+With `--unchanged`: `held` powers, rounded to 10 W, `p_interval_s` = 60 s, no manipulation. Registers of some
+customers are stuck from the third minute on or read 50 W (empty houses). Exits 1 if an honest meter is named,
+an error is beyond the bound, or all registers are stuck and the verdict stays CLEAN.
 """
 
 from __future__ import annotations
@@ -31,7 +36,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 
 from benchmarks._arguments import arguments
-from feeders.model.site import Site, Snapshot, from_tables, load, to_frame
+from feeders.model.site import PowerAges, Site, Snapshot, from_tables, load, to_frame
 from feeders.registry.registry import DesignedEstimator, design
 from feeders.simulation.demand import Customers, Variation
 from feeders.simulation.powerflow import PowerFlow
@@ -49,6 +54,10 @@ TAP_EVERY_S = 120.0
 LIES_S = 120.0
 """Length of the manipulation at the end, s."""
 LIE = 0.03
+STUCK_S, EMPTY_KW, RESOLUTION_KW = 120.0, 0.05, 0.01
+"""Last renewal of stuck registers, s; power of an empty house and resolution of a register, kW."""
+UNCHANGED = (("empty", 1), ("empty", 6), ("stuck", 6), ("stuck", 28), ("stuck", 57))
+"""Kinds of unchanged powers and their number of customers, of 57."""
 CASES = (
     ("fresh", ""),
     ("late", ""),
@@ -188,6 +197,60 @@ def run(seed: int, duration_s: int, how: str, stated: str) -> tuple[Counter[str]
     return seen, of_std, of_bound
 
 
+def unchanged(seed: int, duration_s: int, kind: str, count: int) -> tuple[Counter[str], float, float]:
+    """Counts of a run with unchanged powers; its largest error over the standard deviation and the bound.
+
+    Parameters
+    ----------
+    seed, duration_s
+        As in `world`.
+    kind, count
+        "empty" or "stuck", and the number of its customers.
+    """
+    where, made, truth = site(LATE_S), watcher(LATE_S), world(seed, duration_s)
+    customers = truth.v.shape[1]
+    which = np.random.default_rng([seed, 63]).permutation(customers)[:count]
+    age, ages_of, state = ages(seed, "held", truth.t.size, customers), PowerAges(where), made.init(START)
+    seen, of_std, of_bound = Counter[str](), 0.0, 0.0
+    for k, t in enumerate(truth.t):
+        old = np.round(k + LATE_S - age[k]).astype(np.intp)
+        p = truth.register * truth.p_kw[old, np.arange(customers)]
+        last = round(min(k, STUCK_S))
+        p[which] = EMPTY_KW if kind == "empty" else (truth.register * truth.p_kw[last])[which]
+        p = RESOLUTION_KW * np.round(p / RESOLUTION_KW)
+        said = Snapshot(t, truth.read[k], p, np.full(p.size, np.nan), truth.v0[k])
+        state, estimate, verdict = made.step(state, to_frame(where, ages_of.apply(said)))
+        seen[verdict.decision] += 1
+        seen["honest"] += int(np.count_nonzero(verdict.suspects))
+        error = np.abs(estimate.v2 - (truth.v[k] / where.customer_volt) ** 2)
+        of_std = max(of_std, float((error / estimate.std).max()))
+        of_bound = max(of_bound, float((error / estimate.bound).max()))
+    return seen, of_std, of_bound
+
+
+def without_change(runs: int, minutes: int) -> int:
+    """Print the table of unchanged powers; 1 if a limit is missed."""
+    print(
+        "| unchanged | customers | runs | honest named | CLEAN % | UNDECIDED % | in std | in bounds |\n|",
+        end="",
+    )
+    print("---|" * 8)
+    good = True
+    for kind, count in UNCHANGED:
+        all_, of_std, of_bound = Counter[str](), 0.0, 0.0
+        for seed in range(runs):
+            seen, std, bound = unchanged(seed, 60 * minutes, kind, count)
+            all_ += seen
+            of_std, of_bound = max(of_std, std), max(of_bound, bound)
+        ticks = runs * minutes * 60
+        share = [f"{100.0 * all_[each] / ticks:.1f}" for each in (Decision.CLEAN, Decision.UNDECIDED)]
+        cells = [kind, f"{count}", f"{runs}", f"{all_['honest']}", *share, f"{of_std:.1f}", f"{of_bound:.2f}"]
+        print(f"| {' | '.join(cells)} |", flush=True)
+        good &= not all_["honest"] and of_bound <= 1.0
+        good &= (kind, count) != UNCHANGED[-1] or all_[Decision.UNDECIDED] > 0
+    return 0 if good else 1
+
+
 def main(runs: int, minutes: int) -> int:
     """Print a table; 1 if a limit is missed."""
     print(
@@ -212,5 +275,5 @@ def main(runs: int, minutes: int) -> int:
 
 
 if __name__ == "__main__":
-    asked = arguments(__doc__, runs=20, minutes=10)
-    sys.exit(main(asked.runs, asked.minutes))
+    asked = arguments(__doc__, runs=20, minutes=10, unchanged=False)
+    sys.exit((without_change if asked.unchanged else main)(asked.runs, asked.minutes))

@@ -60,9 +60,11 @@ from gridsec.interface import Frame, PowerOrigin
 
 __all__ = [
     "ABSURD_PU",
+    "RENEWAL_TICKS",
     "SWITCHED",
     "Late",
     "LoadModel",
+    "PowerAges",
     "Registered",
     "Site",
     "Snapshot",
@@ -87,6 +89,9 @@ SWITCHED: Final = 5.0
 The limits of one meter begin at 5.2: no single device exceeds them. A larger value names honest meters, a
 smaller one hides attacks.
 """
+
+RENEWAL_TICKS: Final = 2.5
+"""Delay of a renewed power by lost readings, ticks: the age at which a reading is not usable at a tick."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -171,6 +176,41 @@ def late(site: Site, snapshot: Snapshot) -> Late | None:
     useless = (ages > 0.0) & (std >= spread(site))
     which = (ages > 0.0) & ~useless
     return Late(which, useless, ages <= interval, np.where(which, std, 0.0), np.where(which, reach, 0.0))
+
+
+class PowerAges:
+    """Ages of powers that stay bit-identical for longer than `[meters] p_interval_s`.
+
+    A power without a time of its own is renewed once in each interval. An unchanged one is then as old as its
+    first reading. Readings may be lost: the rule starts `RENEWAL_TICKS` ticks after the interval. Without a
+    stated interval, and for powers with a time of their own, it has no effect.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    """
+
+    def __init__(self, site: Site) -> None:
+        meta = site.tables.meta
+        self._interval = meta.meters.p_interval_s
+        self._unchanged = self._interval + RENEWAL_TICKS * meta.monitor.tick_s
+        self._powers = np.full((2, site.meters.size), np.nan)
+        self._since = np.full(site.meters.size, np.nan)
+
+    def apply(self, snapshot: Snapshot) -> Snapshot:
+        """Add the ages of unchanged powers to the readings of the next tick."""
+        if self._interval == 0.0:
+            return snapshot
+        powers = np.array([snapshot.p_kw, snapshot.q_kvar])
+        same = (powers == self._powers) | np.isnan(powers) & np.isnan(self._powers)
+        renewed = np.isfinite(snapshot.p_kw) & ~same.all(axis=0)
+        self._powers[:, renewed] = powers[:, renewed]
+        self._since[renewed] = snapshot.t
+        told = np.full(renewed.size, np.nan) if snapshot.p_age_s is None else snapshot.p_age_s
+        age = snapshot.t - self._since
+        old = np.isnan(told) & np.isfinite(snapshot.p_kw) & (age > self._unchanged)
+        return replace(snapshot, p_age_s=np.where(old, age, told)) if old.any() else snapshot
 
 
 def change(site: Site, age_s: Floats | float, reach: Floats) -> Floats:

@@ -15,7 +15,7 @@ from enum import StrEnum
 from functools import cached_property
 from typing import Any
 
-from feeders.model.site import Site, to_frame
+from feeders.model.site import PowerAges, Site, to_frame
 from feeders.registry import registry
 from gridsec.interface import Cause
 from service.alarms.conditions import conditions
@@ -154,6 +154,7 @@ class FeederMonitor:
         self.defect: Exception | None = None
         self._alarm_rules = alarm_rules(site, rules)
         self._data_errors = DataErrors(site)
+        self._power_ages = PowerAges(site)
         self._watcher: registry.DesignedEstimator | None = None
         self._state: Any = None
 
@@ -346,7 +347,8 @@ class FeederMonitor:
             begun = self._watcher.init(tick.t, self.commissioning.known)
             self._state = self.suspicions.restore(begun)
             self._data_errors.renew()
-        frame = to_frame(self.site, snapshot(self.site, tick))
+            self._power_ages = PowerAges(self.site)
+        frame = to_frame(self.site, self._power_ages.apply(snapshot(self.site, tick)))
         self._state, estimate, verdict = self._watcher.step(self._state, frame)
         self.commissioning.follow(self._state, tick.t)
         self.suspicions.follow(self._state, tick.t)

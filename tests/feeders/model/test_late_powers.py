@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.late_powers import run
+from benchmarks.late_powers import run, unchanged
 from feeders.model.load_uncertainty import load_doubt
-from feeders.model.site import SWITCHED, Site, Snapshot, from_tables, late, load, to_frame
+from feeders.model.site import SWITCHED, PowerAges, Site, Snapshot, from_tables, late, load, to_frame
 from gridsec.estimators.sequential.design import SequentialOptions
 from gridsec.interface import PowerOrigin
 from tests.feeders.model.test_forecast import forecasting
@@ -121,3 +121,35 @@ def test_kettles_and_cars_accuse_nobody_once_the_age_is_stated(stated: str) -> N
         if stated == "p_interval_s":
             assert seen["named"] == seen["liars"]
             assert seen["clean"] == seen["ticks"]
+
+
+def test_an_unchanged_power_has_the_age_of_its_first_reading(site: Site) -> None:
+    """Beyond the interval and 2.5 ticks; new digits end it, a stated time or no interval avoid it."""
+    ages = PowerAges(stating(site, 60.0))
+    for k in range(100):
+        seen = replace(said(site), t=T + k)
+        seen.p_kw[1] = 1.0 + 0.01 * (k // 60)
+        seen.p_kw[2] = np.nan if k % 2 else 1.0
+        seen.q_kvar[3] = 0.1 + 0.01 * (k // 60)
+        seen = replace(seen, p_age_s=np.where(np.arange(seen.p_kw.size) == 4, 5.0, np.nan))
+        age = ages.apply(seen).p_age_s
+        assert age is not None
+        assert age[4] == 5.0
+        assert np.isnan(age[[1, 3]]).all()
+        old = k > 62
+        assert age[0] == k if old else np.isnan(age[0])
+        assert age[2] == k if old and k % 2 == 0 else np.isnan(age[2])
+    untold = PowerAges(site)
+    assert all(untold.apply(replace(said(site), t=T + k)).p_age_s is None for k in range(100))
+
+
+@pytest.mark.canary("unchanged")
+def test_stuck_registers_are_never_clean_for_long_and_empty_houses_cost_nothing() -> None:
+    """All registers stuck from the third minute on: no voltage beside them is a check of its own."""
+    seen, _, of_bound = unchanged(0, 600, "stuck", 57)
+    assert seen["honest"] == 0
+    assert seen["undecided"] > 60
+    assert of_bound <= 1.0
+    seen, _, of_bound = unchanged(0, 600, "empty", 6)
+    assert seen["clean"] == 600
+    assert of_bound <= 1.0
