@@ -41,8 +41,8 @@ from feeders.convert.round_trip import SourceCheck, compare
 from feeders.convert.transformers import EVERYTHING, Extent
 from feeders.format.reader import CUSTOMERS_FILE, LINES_FILE, META_FILE
 from feeders.format.tables import FeederTables, read, write
-from feeders.model.profiles import ENVELOPES, Season
 from feeders.model.site import from_tables
+from feeders.profiles import ENVELOPES, Season
 from feeders.util import command_line, extra
 from gridsec.errors import FeederInvalid, GridsecError, Problem
 

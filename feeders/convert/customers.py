@@ -11,7 +11,7 @@ import numpy as np
 
 from feeders.convert.provenance import WHOLE, ConversionChange
 from feeders.format.tables import CustomerRow
-from feeders.model.profiles import envelopes
+from feeders.profiles import envelopes
 from gridsec.arrays import Phasors
 
 HOUSEHOLDS: Final = ("H0-A", "H0-B", "H0-C", "H0-G", "H0-L")
@@ -201,7 +201,7 @@ def customers_of(
             effect = "draws nothing in the source's power flow"
             changes.append(ConversionChange(draw.label, WHOLE, "left out", effect))
         for phases, kva in connections:
-            row = CustomerRow(_unique(draw, phases, {*taken, *power}), draw.bus, 0.0, phases=phases)
+            row = CustomerRow(_unique(draw, phases, {*taken, *power}), draw.bus, load_kw=0.0, phases=phases)
             power[row.customer] = kva
             takes = kva.real > EVEN * max(abs(kva), draw.peak_kw)
             if draw.rating_kva is None or takes:
@@ -254,7 +254,9 @@ def idle_customers(
     power: dict[str, complex] = {}
     for draw in draws:
         for phases, kva in _connections(draw) if draw.idle else ():
-            row = CustomerRow(_unique(draw, phases, {*taken, *power}), draw.bus, rounded(max(kva.real, 0.0)))
+            row = CustomerRow(
+                _unique(draw, phases, {*taken, *power}), draw.bus, load_kw=rounded(max(kva.real, 0.0))
+            )
             factor = max(kva.real / abs(kva), LEAST_POWER_FACTOR)
             # Reactive power beyond the power factor: all of it without active power.
             beside = abs(kva.imag) - row.load_kw * math.tan(math.acos(factor))

@@ -40,7 +40,7 @@ from feeders.convert.pandapower_net import between_phases, ids, network_of, phas
 from feeders.convert.provenance import WHOLE, BusbarUnclear, ConversionChange
 from feeders.convert.transformers import EVERYTHING, Extent
 from feeders.format.tables import CustomerRow, FeederMeta, FeederTables, LoadDefaults, MonitorDefaults
-from feeders.model.profiles import envelopes, pv_names
+from feeders.profiles import envelopes, pv_names
 from gridsec.arrays import Phasors
 from gridsec.errors import GridsecError
 

@@ -19,7 +19,7 @@ from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, QhullError
 
 from feeders.convert.provenance import SourceUnreadable
-from feeders.model.profiles import ReactiveEnvelope, Season
+from feeders.profiles import ReactiveEnvelope, Season
 from feeders.util import extra
 from gridsec.arrays import Floats
 from gridsec.errors import GridsecError

@@ -12,8 +12,8 @@ import numpy as np
 
 from feeders.convert.customers import Draw, rounded
 from feeders.convert.provenance import WHOLE, ConversionChange
-from feeders.format.matrices import SERIES_NAMES, SHUNT_NAMES, cells_of, columns_of, passive, shunt_us
-from feeders.format.tables import LineRow
+from feeders.format.columns import SERIES_NAMES, SHUNT_NAMES, LineRow
+from feeders.format.matrices import cells_of, columns_of, passive, shunt_us
 from feeders.model.three_phase import series_of, shunt_of
 from gridsec.arrays import Floats, Ints, Phasors
 
@@ -141,7 +141,7 @@ def line_row(
         *ends,
         rounded((own - mutual).real),
         rounded((own - mutual).imag),
-        _NAMES[tuple(phases.tolist())],
+        phases=_NAMES[tuple(phases.tolist())],
         **charging_cells(name, phases, shunt, changes),
     )
     if len(phases) == 1:

@@ -1,12 +1,14 @@
 """Graph of the feeder: fused buses, a tree below the busbar, loops, islands.
 
-Works on ids alone: the checks and the loader use the same graph.
+The checks and the loader use the same graph.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+
+from feeders.format.columns import LineRow
 
 LOOPS_SHOWN = 20
 
@@ -80,17 +82,17 @@ class _Sets:
         return True
 
 
-def tree(busbar: str, edges: Sequence[Edge], others: Iterable[str] = ()) -> Tree:
-    """Fuse the buses at both ends of lines without impedance and walk the others from the busbar.
+def closed_tree(busbar: str, lines: Iterable[LineRow]) -> tuple[list[LineRow], Tree]:
+    """Closed lines of a feeder, and their tree."""
+    closed = [row for row in lines if row.closed]
+    edges = [Edge(row.line, row.from_bus, row.to_bus, row.fuses, phases=len(row.phases)) for row in closed]
+    return closed, tree(busbar, edges)
 
-    Parameters
-    ----------
-    busbar
-        Root of the tree.
-    edges
-        The closed lines.
-    others
-        Further buses that need a connection (ends of open lines).
+
+def tree(busbar: str, edges: Sequence[Edge], others: Iterable[str] = ()) -> Tree:
+    """Fuse the buses at both ends of closed lines without impedance and walk the others from the busbar.
+
+    `others` are further buses that need a connection, such as ends of open lines.
     """
     order = [busbar, *(bus for edge in edges for bus in (edge.from_bus, edge.to_bus)), *others]
     fused, connected = _Sets(order), _Sets(order)

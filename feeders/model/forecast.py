@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from feeders.model.equipment import LoadModel, indices
-from feeders.model.profiles import PROFILE_STEP_S, Profiles, Season, library, profile
+from feeders.profiles import PROFILE_STEP_S, Profiles, Season, library, profile
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.interface import Frame
 

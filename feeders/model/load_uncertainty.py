@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from feeders.format.columns import META_COLUMNS
+from feeders.format.columns import META_COLUMNS, Number
 from feeders.format.tables import FeederTables
 from feeders.model.forecast import always
 from feeders.model.site import Site, Snapshot, expected, to_frame
@@ -26,7 +26,9 @@ Seasons, hours and habits move these together.
 """
 
 LONGEST_S: Final = next(
-    column.high for column in META_COLUMNS["load"] if column.name == "correlation_s" and column.high
+    column.high
+    for column in META_COLUMNS["load"]
+    if column.name == "correlation_s" and isinstance(column, Number) and column.high
 )
 """Longest correlation time of the format, s."""
 

@@ -19,39 +19,35 @@ docs/theory-sequential.md, section 7.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from feeders.format.columns import CUSTOMER_COLUMNS, parse
-from feeders.format.tables import CustomerRow, FeederTables, validate
-from feeders.format.topology import Edge, Tree, tree
+from feeders.format.columns import CUSTOMER_COLUMNS, CellInvalid, Column, CustomerRow, FeederTables
+from feeders.format.tables import validate
+from feeders.format.topology import Tree
 from feeders.model.equipment import (
+    Equipment,
     LoadModel,
     Referred,
-    accuracy,
-    digest,
+    equipment,
     find,
     indices,
-    inverters,
-    load_model,
-    metered_customers,
     names,
-    positions,
+    not_radial,
     refer,
+    without_impedance,
 )
 from feeders.model.forecast import Forecast, forecast
-from feeders.model.three_phase import spanned, unsupported
+from feeders.model.three_phase import spanned_valid, unsupported
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, frozen
 from gridsec.errors import FeederInvalid, Problem
 from gridsec.estimators.plant import Plant
 from gridsec.grid import AnyNetwork
-from gridsec.grid.droop import Droop
 from gridsec.grid.meshed import MeshedFeeder, PhasedMesh
-from gridsec.grid.meter import MeterAccuracy
 from gridsec.grid.network import Power
 from gridsec.grid.phased import PhasedFeeder
 from gridsec.grid.radial import Feeder
@@ -303,57 +299,29 @@ def _intervals(model: LoadModel, metered: Floats, known: Bools) -> Registered:
 ABSURD_PU = 100.0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Site:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Site(Equipment):
     """Feeder for monitoring and simulation. N customers, p meters, b + 1 buses.
 
     With single-phase lines or customers, or lines that are not transposed, it is in three phases, and each
-    customer has one phase. A customer of three phases becomes three, see `one_phase_each`.
+    customer of `tables` has one phase. A customer of three phases becomes three, see `one_phase_each`.
 
     Attributes
     ----------
-    tables
-        Content of the files in SI; in three phases with customers of one phase.
     feeder
         The radial tree, pu; or with closed ties, or in three phases.
-    droop
-        The inverters with a droop curve, in the order of the customers.
-    meters : (p,)
-        Index of each meter's customer, ascending.
-    meter_ids : (p,)
-        Ids of the meters.
-    accuracy
-        Accuracies of the meters, pu.
-    bus_of_file
-        Fused bus index of every bus id of the files.
-    xy : (b + 1, 2)
-        Positions of the buses, None unless the files have all of them.
-    loads
-        Limits of the customers' powers.
     base_volt : (n,)
         1 pu of every place, V: the nominal voltage, times the taps' ratio behind taps, see
         `feeders.model.equipment`.
     nominal_volt : (n,)
         Nominal voltage of every place, V; behind a transformer it differs from the busbar's.
-    digest
-        SHA-256 of the content: key of design caches. It changes with every value and with the order of
-        the rows (which is the order of all arrays), not with layout, comments or unknown columns.
     forecast
         Forecast of unread powers; None: they have their range only.
     """
 
-    tables: FeederTables
     feeder: AnyNetwork
-    droop: Droop
-    meters: Ints
-    meter_ids: tuple[str, ...]
-    accuracy: MeterAccuracy
-    bus_of_file: Mapping[str, int]
-    xy: Floats | None
-    loads: LoadModel
     base_volt: Floats
     nominal_volt: Floats
-    digest: str
     forecast: Forecast | None = None
 
     @property
@@ -390,9 +358,7 @@ class Site:
             If closed lines form loops.
         """
         if isinstance(self.feeder, MeshedFeeder | PhasedMesh):
-            raise FeederInvalid(
-                [Problem("not-radial", "lines: closed lines form loops; a radial feeder is required")]
-            )
+            raise not_radial()
         return self.spanning
 
     @property
@@ -446,12 +412,7 @@ class Snapshot:
 
 
 def load(path_or_name: Path | str) -> Site:
-    """Load a feeder.
-
-    Parameters
-    ----------
-    path_or_name
-        A folder, or the name of a bundled feeder (`names()`).
+    """Load a feeder: a folder, or the name of a bundled feeder (`names()`).
 
     Raises
     ------
@@ -473,40 +434,14 @@ def from_tables(tables: FeederTables) -> Site:
     FeederInvalid
         For invalid tables, or for content that the model does not support.
     """
-    if tables.in_phases:
-        try:
-            return _in_phases(one_phase_each(tables))
-        except FeederInvalid as error:
-            # Rows and ids are those of the files, not of the channels.
-            problems = validate(tables) or _channels(tables) or unsupported(tables) or error.problems
-            raise FeederInvalid(problems) from error
-    problems = validate(tables) or _unsupported(tables)
+    problems = validate(tables)
+    if not tables.in_phases:
+        problems = problems or tuple(without_impedance(tables))
+    else:  # rows and ids of the files, not of the channels
+        problems = problems or tuple(_channels(tables)) or unsupported(tables)
     if problems:
         raise FeederInvalid(problems)
-    meta = tables.meta
-    closed = [line for line in tables.lines if line.closed]
-    found = tree(
-        meta.busbar,
-        [Edge(row.line, row.from_bus, row.to_bus, row.r_ohm == row.x_ohm == 0.0) for row in closed],
-    )
-    base = refer(tables, closed, found)
-    feeder, loads = _feeder(tables, base, found), load_model(tables)
-    metered = metered_customers(tables)
-    return Site(
-        tables=tables,
-        feeder=_meshed(tables, feeder, base, found) if base.ties else feeder,
-        droop=inverters(tables, base.customer / base.customer_nominal),
-        meters=metered,
-        meter_ids=tuple(tables.customers[k].meter for k in metered),
-        accuracy=accuracy(tables, base.customer, base.customer_nominal),
-        bus_of_file=found.group,
-        xy=positions(tables, found),
-        loads=loads,
-        base_volt=frozen(base.bus[:, 0]),
-        nominal_volt=frozen(base.nominal),
-        digest=digest(tables),
-        forecast=forecast(tables, loads),
-    )
+    return _in_phases(one_phase_each(tables)) if tables.in_phases else _in_one_phase(tables)
 
 
 def one_phase_each(tables: FeederTables) -> FeederTables:
@@ -515,11 +450,6 @@ def one_phase_each(tables: FeederTables) -> FeederTables:
     A meter of three phases reads three voltages and three powers; they become the channels "X-a", "X-b" and
     "X-c". Standard deviations are split as those of independent phases. An inverter of three phases becomes
     three that follow the voltage of their own phase.
-
-    Parameters
-    ----------
-    tables
-        The feeder's tables.
     """
     rows = [part for row in tables.customers for part in (_parts(row) if row.phases == "abc" else [row])]
     return replace(tables, customers=tuple(rows))
@@ -554,7 +484,7 @@ def _channels(tables: FeederTables) -> list[Problem]:
         for number, row in enumerate(tables.customers, start=1):
             where = f"customers, row {number} ({row.customer})"
             ids = [getattr(part, column.name) for part in (_parts(row) if row.phases == "abc" else [row])]
-            wrong = [problem for problem in (parse(column, own)[1] for own in ids) if problem]
+            wrong = [problem for problem in map(partial(_wrong, column), ids) if problem]
             wrong += [
                 Problem(
                     "duplicate",
@@ -570,9 +500,17 @@ def _channels(tables: FeederTables) -> list[Problem]:
     return problems
 
 
+def _wrong(column: Column, cell: str) -> Problem | None:
+    try:
+        column.parse(cell)
+    except CellInvalid as wrong:
+        return wrong.problem
+    return None
+
+
 def _in_phases(tables: FeederTables) -> Site:
     """Site of a feeder with one phase per customer."""
-    found, ties = spanned(tables)
+    found, ties = spanned_valid(tables)
     parts = {f.name: getattr(found, f.name) for f in fields(found)}
     feeder = PhasedMesh(found.feeder, *ties) if ties.ends.size else PhasedFeeder(found.feeder)
     places = {
@@ -582,6 +520,19 @@ def _in_phases(tables: FeederTables) -> Site:
         "forecast": forecast(found.tables, found.loads),
     }
     return Site(**parts | places)
+
+
+def _in_one_phase(tables: FeederTables) -> Site:
+    """Site of a balanced feeder."""
+    base, found = refer(tables)
+    feeder, own = _feeder(tables, base, found), equipment(tables, base, found)
+    return Site(
+        feeder=_meshed(tables, feeder, base, found) if base.ties else feeder,
+        base_volt=frozen(base.bus[:, 0]),
+        nominal_volt=frozen(base.nominal),
+        forecast=forecast(tables, own["loads"]),
+        **own,
+    )
 
 
 def plant(site: Site) -> Plant:
@@ -667,20 +618,6 @@ def _busbar(v0_volt: Floats | float, base_volt: float) -> tuple[float, Floats | 
 
 
 # --- building -----------------------------------------------------------------------------------
-
-
-def _unsupported(tables: FeederTables) -> tuple[Problem, ...]:
-    """Problems of valid tables that the model does not support."""
-    problems = []
-    closed = [line for line in tables.lines if line.closed]
-    if all(line.r_ohm == line.x_ohm == 0.0 for line in closed):
-        problems.append(
-            Problem(
-                "nothing-to-design",
-                "lines: no closed line has an impedance; there is nothing to monitor below the busbar",
-            )
-        )
-    return tuple(problems)
 
 
 def _feeder(tables: FeederTables, base: Referred, found: Tree) -> Feeder:

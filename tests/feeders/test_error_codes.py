@@ -52,7 +52,7 @@ from tests.sentences import golden, sentences, used
 
 PACKAGE = Path(feeders.__file__).parent
 GOLDEN = Path(__file__).parent / "golden" / "errors.txt"
-HOUSE = CustomerRow("house", "end", 5.0, meter="m1")
+HOUSE = CustomerRow("house", "end", load_kw=5.0, meter="m1")
 MAIN = LineRow("main", "bb", "end", 0.1, 0.04)
 START = 1.75e9
 

@@ -23,8 +23,8 @@ from feeders.convert.from_pandapower import Fleet, from_pandapower
 from feeders.convert.from_simbench import envelope, envelopes_csv, library_csv
 from feeders.convert.provenance import SourceUnreadable, origin, sentences
 from feeders.format.tables import read, validate
-from feeders.model.profiles import Season, data_root, envelopes
 from feeders.model.site import from_tables, load, names
+from feeders.profiles import Season, data_root, envelopes
 from gridsec.errors import FeederInvalid, GridsecError
 from gridsec.grid.phased import PhasedFeeder
 from tests.codes import refused
