@@ -19,8 +19,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from feeders.convert import from_simbench
+from feeders.convert.customers import Fleet
 from feeders.convert.from_opendss import read_opendss
-from feeders.convert.from_pandapower import Fleet, from_pandapower
+from feeders.convert.from_pandapower import from_pandapower
 from feeders.convert.from_power_grid_model import read_pgm
 from feeders.convert.network import Converted, feeder_of, opened_rows
 from feeders.convert.provenance import (

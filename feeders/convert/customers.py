@@ -73,6 +73,33 @@ def with_meters(rows: list[CustomerRow]) -> list[CustomerRow]:
     return [replace(row, meter=f"m{k:0{digits}d}") for k, row in enumerate(rows, start=1)]
 
 
+@dataclass(frozen=True, slots=True)
+class Fleet:
+    """Synthetic PV inverters for a source without any."""
+
+    every: int
+    """Interval among the customers without generation, from the first one on."""
+    kva: float
+    """Rating, kVA; 0: half of the customer's load_kw."""
+    droop: str = "ieee1547-b"
+
+
+def with_fleet(
+    customers: list[CustomerRow], fleet: Fleet, changes: list[ConversionChange]
+) -> list[CustomerRow]:
+    """Add synthetic inverters to customers without one."""
+    rows = list(customers)
+    bare = [k for k, row in enumerate(rows) if row.inverter_kva == 0.0]
+    for k in bare[:: fleet.every]:
+        kva = fleet.kva or rounded(0.5 * rows[k].load_kw)
+        if kva > 0:
+            pv = {"pv_kw": rounded(0.9 * kva), "pv_profile": f"PV{k % 8 + 1}"}
+            rows[k] = replace(rows[k], **pv, inverter_kva=kva, droop=fleet.droop)
+            effect = f"synthetic, with droop curve {fleet.droop}; not in the source"
+            changes.append(ConversionChange(rows[k].customer, f"PV inverter of {kva:g} kVA", "added", effect))
+    return rows
+
+
 def base_kva(volt: float, load_kw: float) -> float:
     """Base power of the per-unit system for a feeder of this voltage and load."""
     return 100.0 if volt < 1000.0 else 10.0 ** max(2, math.ceil(math.log10(max(load_kw, 1.0))))
@@ -305,24 +332,26 @@ def _unique(draw: Draw, phases: str, taken: Collection[str]) -> str:
     return name
 
 
+def expected_load(
+    row: CustomerRow, kva: complex, label: str, prop: str, changes: list[ConversionChange]
+) -> CustomerRow:
+    """Set the power factors of a load of this power; reports parts of it that the format lacks."""
+    p, q = kva.real, kva.imag
+    if p < 0:
+        effect = "feeds in; its expected load is taken as 0"
+        changes.append(ConversionChange(label, prop, "changed", effect))
+    if q < -NO_POWER * abs(kva):
+        effect = "leading; expected to be 1"
+        changes.append(ConversionChange(label, "power factor", "approximated", effect))
+    if p <= 0.0 and q > NO_POWER:
+        changes.append(ConversionChange(label, *ONLY_REACTIVE))
+    return reactive(row, p / math.hypot(p, q) if p > 0 and q > 0 else None)
+
+
 def _load(
     row: CustomerRow, kva: complex, number: int, *, volt: float, changes: list[ConversionChange], noun: str
 ) -> CustomerRow:
-    p, q = kva.real, kva.imag
-    if p < 0:
-        changes.append(
-            ConversionChange(
-                f"{noun} {row.customer}", "p_kw", "changed", "feeds in; its expected load is taken as 0"
-            )
-        )
-    if q < -NO_POWER * abs(kva):
-        changes.append(
-            ConversionChange(
-                f"{noun} {row.customer}", "power factor", "approximated", "leading; expected to be 1"
-            )
-        )
-    if p <= 0.0 and q > NO_POWER:
-        changes.append(ConversionChange(f"{noun} {row.customer}", *ONLY_REACTIVE))
+    p = kva.real
     household = volt < 1000.0 and p <= HOUSEHOLD_KW
     row = replace(row, load_kw=rounded(max(p, 0.0)), load_profile=usual_profile(number, household=household))
-    return reactive(row, p / math.hypot(p, q) if p > 0 and q > 0 else None)
+    return expected_load(row, kva, f"{noun} {row.customer}", "p_kw", changes)

@@ -20,9 +20,9 @@ from typing import Any, Final
 import numpy as np
 
 from feeders.convert.customers import Draw, as_it_stands, is_even, rounded
-from feeders.convert.lines import Coupling, capacitor, line_row, open_end, with_taps
-from feeders.convert.network import SourceNetwork
-from feeders.convert.provenance import WHOLE, ConversionChange, SourceUnreadable
+from feeders.convert.lines import Coupling, line_row, with_taps
+from feeders.convert.provenance import ConversionChange, SourceUnreadable
+from feeders.convert.source import CONSTANT, IN_STAR, MEASURE, OFF, UNLIKE, SourceNetwork
 from feeders.format.tables import LineRow
 from feeders.util import extra
 from gridsec.arrays import Floats, Phasors
@@ -76,14 +76,7 @@ class Element:
 
 
 def voltage_dependence(dss: Any) -> list[tuple[str, ConversionChange]]:
-    """Loads that are not of constant power, each with its bus.
-
-    Parameters
-    ----------
-    dss
-        The engine, with the circuit of the file.
-    """
-    effect = "depends on the voltage in the source; taken as constant power"
+    """Loads that are not of constant power, each with its bus."""
     changes = []
     for name in dss.Loads.AllNames():
         if name.lower() == "none":
@@ -91,10 +84,8 @@ def voltage_dependence(dss: Any) -> list[tuple[str, ConversionChange]]:
         dss.Loads.Name(name)
         bus = str(dss.CktElement.BusNames()[0]).partition(".")[0].lower()
         if int(dss.Loads.Model()) != 1:
-            change = ConversionChange(
-                f"load {name}", f"model {int(dss.Loads.Model())}", "approximated", effect
-            )
-            changes.append((bus, change))
+            model = f"model {int(dss.Loads.Model())}"
+            changes.append((bus, ConversionChange(f"load {name}", model, "approximated", CONSTANT)))
     return changes
 
 
@@ -103,12 +94,8 @@ def beyond_limits(
 ) -> list[tuple[str, ConversionChange]]:
     """Loads and generators of constant power that become impedances at their voltages.
 
-    Parameters
-    ----------
-    found, constant
-        All elements as the source solves them, and with loads of constant power.
-    known
-        Labels of elements that are reported already.
+    `found` are the elements as the source solves them, `constant` those with loads of constant power, `known`
+    the labels of elements that are reported already.
     """
     out = []
     for one, other in zip(found, constant, strict=True):
@@ -122,24 +109,13 @@ def beyond_limits(
 
 
 def add_draw(dss: Any, each: Element, network: SourceNetwork) -> None:
-    """Add a load, a generator or a battery to a network, and report properties that a customer lacks.
-
-    Parameters
-    ----------
-    dss
-        The engine.
-    each
-        The element.
-    network
-        Receives the element.
-    """
+    """Add a load, a generator or a battery to a network, and report properties that a customer lacks."""
     power, bus = each.power_kva[0], each.buses[0]
     used = [node for node in each.nodes[0] if 1 <= node <= PHASES]
     even = len(used) == PHASES and (is_even(power) or not power.any())
     told = list(_curves(dss, each))
     if len(used) > 1 and not even:
-        effect = "in star, with its phases' powers of the source's power flow; exact at these loads only"
-        told.append(ConversionChange(each.label, "delta", "approximated", effect))
+        told.append(ConversionChange(each.label, "delta", "approximated", IN_STAR))
     rating: float | None = None
     peak = 0.0
     if each.kind == "pvsystem":
@@ -208,7 +184,6 @@ NO_LOAD: Final = 1e-5
 
 SERIES: Final = {"line", "reactor"}
 COUPLINGS: Final = {"transformer", "autotrans"}
-MEASURE: Final = "every customer has a meter of the feeder's own kind instead"
 DROOP: Final = "inverters of solar plants follow the droop curve of the customer"
 TOLD: Final = {
     "monitor": MEASURE,
@@ -229,7 +204,6 @@ TOLD: Final = {
 }
 """Classes without current, and their replacement in a feeder."""
 
-UNLIKE: Final = "has no place in a feeder; the check shows the effect"
 NO_PLACE: Final = {
     *("isource", "vccs", "fault", "upfc", "vsconverter"),
     *("gicsource", "gicline", "gictransformer"),
@@ -268,12 +242,7 @@ def _engine() -> Iterator[Any]:
 
 
 def read_opendss(path: Path) -> SourceNetwork:
-    """Read and solve a master file.
-
-    Parameters
-    ----------
-    path
-        The file that defines the circuit and its voltage bases.
+    """Read and solve a master file, which defines the circuit and its voltage bases.
 
     Raises
     ------
@@ -435,28 +404,22 @@ def _take(dss: Any, each: Element, network: SourceNetwork, problems: list[Proble
     """Add an element to the network, or report its omission."""
     label = f"{each.kind} {each.name}"
     if not each.enabled:
-        network.changes.append(ConversionChange(label, WHOLE, "left out", "disabled in the source"))
+        network.leave_out(label, "disabled in the source")
     elif each.kind in {"capacitor", "reactor"} and _is_shunt(each):
         _shunt(dss, each, network)
     elif each.kind in SERIES:
         _line(dss, each, network, problems)
     elif each.kind == "capacitor":
-        problems.append(
-            Problem(
-                "unsupported",
-                f"{label} is in series between {each.buses[0]} and {each.buses[1]}; expected a shunt",
-            )
-        )
+        text = f"{label} is in series between {each.buses[0]} and {each.buses[1]}; expected a shunt"
+        problems.append(Problem("unsupported", text))
     elif each.kind in COUPLINGS:
         line, idle = _regulator(dss, each, network)
         network.couplings.append(Coupling(label, each.buses, each.power_kva, line, idle))
     elif each.kind in LOADS | GENERATORS | STORAGE:
         add_draw(dss, each, network)
     elif each.kind != "vsource":
-        change = ConversionChange(label, WHOLE, "left out", TOLD.get(each.kind, UNLIKE))
-        at = [bus for bus in each.buses if bus in network.nominal]
-        network.of_bus.extend((bus, change) for bus in at)
-        network.changes += [] if at else [change]  # without a bus, as controllers of several elements
+        at = [bus for bus in each.buses if bus in network.nominal]  # none for controllers of several elements
+        network.leave_out(label, TOLD.get(each.kind, UNLIKE), *at)
 
 
 def _regulator(dss: Any, each: Element, network: SourceNetwork) -> tuple[LineRow | None, Draw | None]:
@@ -571,12 +534,7 @@ def _line(dss: Any, each: Element, network: SourceNetwork, problems: list[Proble
         changes=changes,
     )
     network.of_bus.extend((each.buses[0], change) for change in changes)
-    row = _rated(dss, each, row)
-    network.lines.append(row)
-    if len(each.on) == 1:
-        bus = each.buses[each.on[0]]
-        stub = open_end(row, bus, network.nominal[bus])
-        network.lines += [stub] if stub else []
+    network.add_line(_rated(dss, each, row), [each.buses[k] for k in each.on])
 
 
 def _rated(dss: Any, each: Element, row: LineRow) -> LineRow:
@@ -592,14 +550,12 @@ def _shunt(dss: Any, each: Element, network: SourceNetwork) -> None:
     label, bus = f"{each.kind} {each.name}", each.buses[0]
     kvar = -sum(power.sum() for power in each.power_kva).imag
     if not each.closed or each.kind == "reactor" or kvar <= 0:
-        effect = f"{-kvar:.4g} kvar" if each.closed else "switched off in the source"
-        network.of_bus.append((bus, ConversionChange(label, WHOLE, "left out", effect)))
+        effect = f"{-kvar:.4g} kvar" if each.closed else OFF
+        network.leave_out(label, effect, bus)
         return
     # Both terminals may be at phases of the bus: entries between phases are where their conductors meet.
     meet = np.equal.outer(np.arange(1, PHASES + 1), np.concatenate(each.nodes)).astype(np.float64)
     here = np.flatnonzero(meet.any(axis=1))
     block = (meet @ _yprim(dss, each).imag @ meet.T)[np.ix_(here, here)]
     phases = "".join("abc"[k] for k in here)
-    effect = f"{kvar:.4g} kvar as the charging of a line to nowhere"
-    network.of_bus.append((bus, ConversionChange(label, "connection", "changed", effect)))
-    network.lines.append(capacitor(f"capacitor.{each.name}", bus, block, phases))
+    network.add_capacitor(f"capacitor.{each.name}", bus, block, kvar, phases=phases, label=label)

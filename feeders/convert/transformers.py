@@ -23,21 +23,18 @@ import cmath
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
 from feeders.convert.customers import Draw, is_even, rounded
 from feeders.convert.lines import VOLT_DIGITS, Coupling, above_busbar, as_rows, fused_with, reached, turned
 from feeders.convert.provenance import WHOLE, ConversionChange
+from feeders.convert.source import SourceNetwork
 from feeders.format.tables import LineRow
 from feeders.format.validation import same_level
 from gridsec.arrays import Phasors
 from gridsec.errors import Problem
-
-if TYPE_CHECKING:
-    from feeders.convert.network import SourceNetwork
-
 
 TAP_DIGITS: Final = 9
 """Decimals of a ratio, the same for equal transformers."""

@@ -19,7 +19,8 @@ from pandapower import networks
 from pandapower.toolbox import drop_trafos, select_subnet
 
 from feeders.convert.convert import RECIPES, SEED, convert
-from feeders.convert.from_pandapower import Fleet, from_pandapower
+from feeders.convert.customers import Fleet
+from feeders.convert.from_pandapower import from_pandapower
 from feeders.convert.from_simbench import envelope, envelopes_csv, library_csv
 from feeders.convert.provenance import SourceUnreadable, origin, sentences
 from feeders.format.tables import read, validate
