@@ -93,8 +93,8 @@ def with_fleet(
     for k in bare[:: fleet.every]:
         kva = fleet.kva or rounded(0.5 * rows[k].load_kw)
         if kva > 0:
-            pv = {"pv_kw": rounded(0.9 * kva), "pv_profile": f"PV{k % 8 + 1}"}
-            rows[k] = replace(rows[k], **pv, inverter_kva=kva, droop=fleet.droop)
+            row = replace(rows[k], pv_kw=rounded(0.9 * kva), pv_profile=f"PV{k % 8 + 1}")
+            rows[k] = replace(row, inverter_kva=kva, droop=fleet.droop)
             effect = f"synthetic, with droop curve {fleet.droop}; not in the source"
             changes.append(ConversionChange(rows[k].customer, f"PV inverter of {kva:g} kVA", "added", effect))
     return rows

@@ -387,9 +387,8 @@ def _infeeds(
     fused = fused_with(busbar, rows)
     for source in network.sources:
         if source in inside and source != busbar:
-            text = (
-                f"bus {source!r} has another voltage source; expected the busbar {busbar!r} as the only one"
-            )
+            expected = f"expected the busbar {busbar!r} as the only one"
+            text = f"bus {source!r} has another voltage source; {expected}"
             problems.append(Problem("several-sources", text))
         elif source != busbar:
             above = reached(source, everything, without=fused)
