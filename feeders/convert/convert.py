@@ -79,18 +79,8 @@ def from_folder(
 ) -> Converted:
     """Copy a feeder in the project's own format, with the changes of its earlier conversion.
 
-    Parameters
-    ----------
-    folder
-        Folder of the feeder.
-    name
-        New name; empty: the old one.
-    opened
-        Lines to open.
-    root, droop, one_voltage
-        As in `feeders.convert.convert.convert`; only for networks of other tools.
-    meshed
-        True: loops stay closed, with any `meshed` of the file.
+    An empty `name` keeps the old one; `root`, `droop` and `one_voltage` are only for networks of other tools.
+    `meshed` keeps loops closed, with any `meshed` of the file.
 
     Raises
     ------
@@ -130,19 +120,7 @@ def from_folder(
 def source_again(
     before: Origin | None, tables: FeederTables, folder: Path, command: str, notes: tuple[str, ...]
 ) -> str:
-    """Content of the SOURCE.md of a folder that is written again.
-
-    Parameters
-    ----------
-    before
-        Origin of the folder before.
-    tables
-        The feeder.
-    folder, command
-        The folder, and the command line of the new conversion.
-    notes
-        Omissions, additions and changes, earlier and now.
-    """
+    """Content of the SOURCE.md of a folder that is written again; `before` is its origin until now."""
     if before is None or not before.source:
         about, source, package = "A feeder in the project's own form.", str(folder), versioned("gridsec")
         check = f"Not checked: {UNCHECKED}"
@@ -292,13 +270,10 @@ def convert(
     ----------
     source
         Source, see the module.
-    out
-        Output folder; created if it does not exist.
     root
         Bus that becomes the metered busbar, if the source has several candidates.
     name
-        Name of the feeder; default: that of the source if it is a feeder's folder, else that of the output
-        folder.
+        Default: that of the source if it is a feeder's folder, else that of the output folder.
     droop
         Preset of the source's generators.
     opened
@@ -382,16 +357,7 @@ def check_against_source(
     opened: Sequence[str] = (),
     one_voltage: bool = False,
 ) -> SourceCheck:
-    """Compare a folder's AC power flow with that of its source, at the source's loads.
-
-    Parameters
-    ----------
-    source
-        As in `convert`.
-    folder
-        The feeder.
-    root, opened, one_voltage
-        As in the conversion.
+    """Compare a folder's AC power flow with that of its source, at the source's loads; arguments as of `convert`.
 
     Raises
     ------

@@ -39,12 +39,7 @@ def usual_profile(number: int, *, household: bool) -> str:
 def reactive(customer: CustomerRow, power_factor: float | None) -> CustomerRow:
     """Set power factors and reactive floor from the history of the load's profile.
 
-    Parameters
-    ----------
-    customer
-        Customer with a load and its profile.
-    power_factor
-        At the peak, lagging; None: the usual one.
+    `power_factor` is that at the peak, lagging; None: the usual one.
     """
     factor = USUAL_POWER_FACTOR if power_factor is None else max(round(power_factor, 4), LEAST_POWER_FACTOR)
     tan = math.tan(math.acos(factor))
@@ -184,13 +179,7 @@ def is_even(power: Phasors) -> bool:
 
 
 def as_it_stands(power: Phasors) -> str:
-    """Effect on a load or generator with a control of its own, for a change.
-
-    Parameters
-    ----------
-    power : (3,)
-        Power from each phase at the source's operating point, kVA.
-    """
+    """Effect on a load or generator with a control of its own, for a change; `power` (3,) from each phase, kVA."""
     p, q = (round(float(part), 6) + 0.0 for part in (power.sum().real, power.sum().imag))
     if p < 0:
         return f"a customer that feeds in {-p:.4g} kW and draws {q:.4g} kvar in the check"
@@ -206,18 +195,8 @@ def customers_of(
 ) -> tuple[list[CustomerRow], dict[str, complex]]:
     """Rows of customers.csv, and the power of each at the source's operating point, kVA.
 
-    Parameters
-    ----------
-    draws
-        Loads and generators.
-    nominal
-        Nominal voltages of the buses, V.
-    droop
-        Preset of the generators' inverters; None: by their size.
-    changes
-        Receives inexact conversions.
-    taken
-        Names of other customers.
+    `nominal` are the buses' voltages, V; `droop` is the generators' preset, None: by their size; `taken` are
+    names of other customers.
     """
     rows: list[CustomerRow] = []
     power: dict[str, complex] = {}
@@ -268,15 +247,7 @@ def _generator(
 def idle_customers(
     draws: Iterable[Draw], taken: Collection[str]
 ) -> tuple[list[CustomerRow], dict[str, complex]]:
-    """No-load powers of transformers as customers without meters, and their powers, kVA.
-
-    Parameters
-    ----------
-    draws
-        Loads and generators; only those with `idle` count.
-    taken
-        Names of customers.
-    """
+    """No-load powers of transformers as customers without meters, and their powers, kVA."""
     rows: list[CustomerRow] = []
     power: dict[str, complex] = {}
     for draw in draws:
@@ -308,17 +279,11 @@ def _connections(draw: Draw) -> list[tuple[str, complex]]:
 
 
 def in_star(pairs: Phasors, volts: Phasors) -> Phasors:
-    """Powers of a load between phases, from each phase, kVA.
+    """Powers of a load between phases, from each phase, (3,), kVA.
 
     The current between the phases k and k + 1 is ``conj(S_k / (V_k - V_k+1))``; the current of a phase is the
-    difference of two of these.
-
-    Parameters
-    ----------
-    pairs : (3,)
-        Powers between a and b, b and c, c and a, kVA.
-    volts : (3,)
-        Voltages of the phases, V.
+    difference of two of these. `pairs` (3,) are the powers between a and b, b and c, c and a, kVA; `volts` (3,)
+    the voltages of the phases, V.
     """
     between = np.conj(pairs / (volts - np.roll(volts, -1)))
     return np.asarray(volts * np.conj(between - np.roll(between, 1)), dtype=np.complex128)

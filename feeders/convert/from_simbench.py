@@ -122,15 +122,7 @@ def _simbench() -> Any:
 
 
 def library_csv(columns: Mapping[str, Floats], season: Season) -> bytes:
-    """Season of the library as gzipped CSV: t_s, then `<load>_p`, `<load>_q`, `<pv>`.
-
-    Parameters
-    ----------
-    columns
-        Profiles of `year`.
-    season
-        Season of the slice.
-    """
+    """Season of the library as gzipped CSV: t_s, then `<load>_p`, `<load>_q`, `<pv>`; `columns` as of `year`."""
     rows = STRETCHES[season].rows
     names: list[tuple[str, str]] = []
     for load in load_profiles(columns):
@@ -151,16 +143,11 @@ def load_profiles(columns: Mapping[str, Floats]) -> list[str]:
 
 
 def envelope(p: Floats, q: Floats) -> ReactiveEnvelope:
-    """Smallest wedge with a floor that contains every point of a load profile.
+    """Smallest wedge with a floor that contains every point (T,) of a load profile, fractions of nominal values.
 
     Minimises the mean width ``(high - low) w + 2 floor`` subject to ``low p - floor <= q <= high p + floor``
     for all points, ``0 <= low <= 1 <= high``, at ``w = max(mean p, 0.3)``: at a weight as small as a
     household's mean, the upper slope would be several times the nominal one, and useless for an unknown load.
-
-    Parameters
-    ----------
-    p, q : (T,)
-        Active and reactive power, fractions of their nominal values.
 
     Raises
     ------

@@ -46,17 +46,7 @@ class Coupling:
 
 
 def reached(start: str, rows: Iterable[LineRow], without: Collection[str] = ()) -> dict[str, int]:
-    """Buses that closed lines connect, with their distances in lines; ways end at `without`.
-
-    Parameters
-    ----------
-    start
-        First bus.
-    rows
-        Lines.
-    without
-        Buses at which a way ends.
-    """
+    """Buses that closed lines connect to `start`, with their distances in lines; ways end at `without`."""
     near: dict[str, list[str]] = defaultdict(list)
     for row in rows:
         if row.closed:
@@ -87,15 +77,7 @@ def as_rows(couplings: Iterable[Coupling]) -> list[LineRow]:
 def above_busbar(
     busbar: str, sources: Iterable[str], rows: list[LineRow], couplings: Iterable[Coupling]
 ) -> set[str]:
-    """Buses that are connected to the sources without passing the busbar.
-
-    Parameters
-    ----------
-    busbar, sources
-        The busbar, and the buses with a voltage source.
-    rows, couplings
-        Everything that joins buses.
-    """
+    """Buses that are connected to the sources without passing the busbar."""
     fused = fused_with(busbar, rows)
     everything = [*rows, *as_rows(couplings)]
     return {bus for source in sources for bus in reached(source, everything, without=fused)}
@@ -117,23 +99,10 @@ def line_row(
     shunt: Floats,
     changes: list[ConversionChange],
 ) -> LineRow:
-    """Row of a line with matrices.
+    """Row of a line with matrices: series impedances (k, k), ohm, and total shunt susceptances (k, k), S.
 
-    Cyclically symmetric series impedances become sequence values. Charging that is equal in every phase and
-    goes to earth only becomes one number.
-
-    Parameters
-    ----------
-    name, ends
-        Name and buses of the line.
-    phases : (k,)
-        Phases of the line, ascending, 0 for a.
-    series : (k, k)
-        Series impedances, ohm.
-    shunt : (k, k)
-        Total shunt susceptances, S.
-    changes
-        Receives inexact conversions.
+    `phases` (k,) are ascending, 0 for a. Cyclically symmetric series impedances become sequence values. Charging
+    that is equal in every phase and goes to earth only becomes one number.
     """
     own, mutual = _means(series)
     row = LineRow(
@@ -186,13 +155,7 @@ def _cells(symbol: str, unit: str, matrix: Floats, phases: Ints) -> dict[str, An
 
 
 def charging_cells(name: str, phases: Ints, shunt: Floats, changes: list[ConversionChange]) -> dict[str, Any]:
-    """Cells of a line's charging: one number, or a matrix beside its positive sequence.
-
-    Parameters
-    ----------
-    name, phases, shunt, changes
-        As in `line_row`.
-    """
+    """Cells of a line's charging: one number, or a matrix beside its positive sequence; as of `line_row`."""
     own, mutual = (part.real for part in _means(shunt))
     one = {"b_us": rounded(max(own - mutual, 0.0) * 1e6)}
     if len(phases) == 1 or (cyclic(shunt) and abs(mutual) <= CYCLIC * abs(own)):
@@ -206,13 +169,7 @@ def charging_cells(name: str, phases: Ints, shunt: Floats, changes: list[Convers
 
 
 def by_sequence(one: float, zero: float) -> Floats:
-    """Susceptances of three equal phases; without a zero sequence the phases are not coupled.
-
-    Parameters
-    ----------
-    one, zero
-        Positive and zero sequence, S; NaN for an unknown zero sequence.
-    """
+    """Susceptances (3, 3) of equal phases from sequence values, S; not coupled if the zero sequence is NaN."""
     apart = zero if np.isfinite(zero) else one
     return np.asarray(one * np.eye(3) + (apart - one) / 3.0)
 
@@ -222,15 +179,7 @@ IN_EVERY_PHASE: Final = "the positive-sequence charging in every phase; exact wh
 
 
 def balanced_charging(lines: Sequence[LineRow], changes: list[ConversionChange]) -> list[LineRow]:
-    """Reduce charging to its positive sequence, if nothing else needs three phases.
-
-    Parameters
-    ----------
-    lines
-        Rows of a feeder on which all customers have three phases.
-    changes
-        Receives the omissions.
-    """
+    """Reduce charging to its positive sequence, if all customers have three phases and nothing else needs them."""
     matrices = [shunt_us(cells_of(row)) for row in lines]
     if any(
         row.phases != "abc" or row.r_aa_ohm is not None or row.tap_a is not None for row in lines
@@ -247,14 +196,7 @@ def balanced_charging(lines: Sequence[LineRow], changes: list[ConversionChange])
 def capacitor(name: str, bus: str, siemens: float | Floats, phases: str = "abc") -> LineRow:
     """Capacitor as the charging of a line to nowhere, so short that its voltage is that of its bus.
 
-    Parameters
-    ----------
-    name, bus
-        Name and bus of the capacitor.
-    siemens : scalar or (k, k)
-        Susceptance per phase, S, or matrix of its phases.
-    phases
-        Connected phases.
+    `siemens` is the susceptance per phase, S, or the matrix (k, k) of its phases.
     """
     here = np.array(["abc".index(phase) for phase in sorted(phases)])
     shunt = siemens * np.eye(here.size) if isinstance(siemens, float) else siemens
@@ -264,16 +206,9 @@ def capacitor(name: str, bus: str, siemens: float | Floats, phases: str = "abc")
 
 
 def open_end(row: LineRow, bus: str, volt: float) -> LineRow | None:
-    """Line that is open at one end only, as a line to nowhere with its charging; None if negligible.
+    """Line that is closed at `bus` only, as a line to nowhere with its charging; None if negligible.
 
-    Parameters
-    ----------
-    row
-        The line.
-    bus
-        Its closed end.
-    volt
-        Nominal voltage, V; below 1000 the charging is negligible.
+    Below a nominal voltage of 1000 V charging is negligible.
     """
     if row.b_us == 0 or volt < 1000.0 or not (row.r_ohm or row.x_ohm):
         return None
@@ -282,15 +217,7 @@ def open_end(row: LineRow, bus: str, volt: float) -> LineRow | None:
 
 
 def turned(row: LineRow, nominal: Mapping[str, float]) -> LineRow:
-    """Line in the reverse direction; a tap t becomes 1/t, with the impedance on its other side.
-
-    Parameters
-    ----------
-    row
-        The line.
-    nominal
-        Nominal voltages of the buses, V; used only if they differ at the two ends.
-    """
+    """Line in the reverse direction; a tap t becomes 1/t, with the impedance on its other side."""
     away = replace(row, from_bus=row.to_bus, to_bus=row.from_bus)
     level = 1.0
     if row.to_volt is not None:
@@ -324,15 +251,7 @@ def turned(row: LineRow, nominal: Mapping[str, float]) -> LineRow:
 
 
 def with_taps(row: LineRow, taps: Floats) -> LineRow:
-    """Line with a transformer at its first end: one ratio, or if they differ one for each phase.
-
-    Parameters
-    ----------
-    row
-        The line.
-    taps : (3,)
-        Ratios; only those of its phases count.
-    """
+    """Line with a transformer at its first end: one ratio, or if they differ one for each phase."""
     own = [rounded(float(tap)) for tap in taps]
     phases = phases_of(row)
     if len({own[phase] for phase in phases}) == 1:
@@ -349,19 +268,7 @@ def phases_of(row: LineRow) -> Ints:
 def merged(
     lines: Sequence[LineRow], busbar: str, changes: list[ConversionChange], nominal: Mapping[str, float]
 ) -> list[LineRow]:
-    """Merge parallel lines to one, and open lines that switches short-circuit.
-
-    Parameters
-    ----------
-    lines
-        Rows of a feeder.
-    busbar
-        Its busbar.
-    changes
-        Receives the merged lines.
-    nominal
-        Nominal voltages of the buses, V.
-    """
+    """Merge parallel lines to one, and open lines that switches short-circuit; `changes` receives both."""
     above: dict[str, str] = {busbar: busbar}
 
     def fused(bus: str) -> str:

@@ -91,13 +91,7 @@ class ConversionChange:
 
 
 def sentences(changes: Iterable[ConversionChange]) -> tuple[str, ...]:
-    """Changes as sentences, with equal changes of several elements together.
-
-    Parameters
-    ----------
-    changes
-        Changes in the order of the sentences.
-    """
+    """Changes as sentences, with equal changes of several elements together."""
     fates: dict[tuple[str, str, str], list[str]] = {}
     for change in changes:
         fates.setdefault((change.done, change.prop, change.effect), []).append(change.element)
@@ -211,22 +205,8 @@ def feeder_source(
 ) -> str:
     """Content of the SOURCE.md of a converted feeder.
 
-    Parameters
-    ----------
-    tables
-        The feeder.
-    about
-        One sentence on the network.
-    origin
-        The source, as in `convert`.
-    package
-        Package with the data, or that reads the file, and its version.
-    command
-        Command line of the conversion.
-    notes
-        Omissions, additions and changes.
-    check
-        Comparison of the AC power flow with the source's.
+    `package` has the data, or reads the file; `notes` are omissions, additions and changes; `check` compares
+    the AC power flow with the source's.
     """
     licence = LICENCES.get(origin.partition(":")[0], OWN_FILE)
     return f"""# {tables.meta.title}
@@ -254,15 +234,7 @@ def feeder_source(
 
 
 def profiles_source(stretches: Iterable[tuple[str, date, int]], loads: int, generators: int) -> str:
-    """Content of the SOURCE.md of the profile library.
-
-    Parameters
-    ----------
-    stretches
-        Name, first day and number of days of each file.
-    loads, generators
-        Numbers of profiles.
-    """
+    """Content of the SOURCE.md of the profile library; `stretches` are file, first day and days."""
     table = "\n".join(f"| `{file}` | {first:%Y-%m-%d} | {days} |" for file, first, days in stretches)
     return f"""# Load and generation profiles
 
@@ -313,12 +285,7 @@ class Origin:
 
 
 def origin(path_or_name: Path | str) -> Origin | None:
-    """Origin of a feeder; None if it was not converted.
-
-    Parameters
-    ----------
-    path_or_name
-        Its folder, or the name of a bundled feeder.
+    """Origin of a feeder, given by its folder or as a bundled feeder; None if it was not converted.
 
     Raises
     ------

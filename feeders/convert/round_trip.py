@@ -115,13 +115,6 @@ def _above(value: float) -> str:
 def compare(state: SourceState, tables: FeederTables) -> SourceCheck:
     """Solve a converted feeder at its source's loads and compare the voltages of all buses.
 
-    Parameters
-    ----------
-    state
-        State by the source's tool.
-    tables
-        The feeder.
-
     Raises
     ------
     PowerFlowDiverged

@@ -63,14 +63,9 @@ class TwoPort:
 
     @classmethod
     def measured(cls, idle: tuple[complex, complex], loaded: tuple[complex, complex, complex]) -> TwoPort:
-        """Identify a transformer from two power flows.
+        """Identify a transformer from the voltages at both ends, V, without load and loaded.
 
-        Parameters
-        ----------
-        idle
-            Voltages at both ends, V, without load.
-        loaded
-            Voltages at both ends, V, and current out of the second one, A.
+        `loaded` has the current out of the second end too, A.
         """
         ratio = idle[0] / idle[1]
         return cls(ratio, (loaded[0] / ratio - loaded[1]) / loaded[2])
@@ -81,15 +76,7 @@ class TwoPort:
         return round(math.degrees(cmath.phase(self.ratio)), TURN_DIGITS)
 
     def line(self, name: str, ends: tuple[str, str], nominal: tuple[float, float]) -> LineRow | None:
-        """Equivalent line, with its tap relative to the nominal voltages of its ends; None without one.
-
-        Parameters
-        ----------
-        name, ends
-            Name and buses of the transformer.
-        nominal
-            Nominal voltages at its ends, V.
-        """
+        """Equivalent line, with its tap relative to the nominal voltages of its ends, V; None without one."""
         r, x = rounded(self.series.real), rounded(self.series.imag)
         if not (math.isfinite(r) and math.isfinite(x)) or min(r, x) < 0 or r == x == 0:
             return None
@@ -97,16 +84,9 @@ class TwoPort:
         return LineRow(name, *ends, r, x, tap=tap)
 
     def idle(self, name: str, bus: str, flows: tuple[Phasors, Phasors], volts: Phasors) -> Draw | None:
-        """Power beyond the losses in z, as a draw at its first end; None if negligible.
+        """Power beyond the losses in z, as a draw at its first end `bus`; None if negligible.
 
-        Parameters
-        ----------
-        name, bus
-            Name of the transformer, and its first bus.
-        flows : (3,)
-            Power into it from each end, by phase, kVA.
-        volts : (3,)
-            Voltages behind it, V.
+        `flows` (3,) are the powers into it from each end, kVA; `volts` (3,) the voltages behind it, V.
         """
         into, back = flows
         power: Phasors = into + back - np.abs(back) ** 2 / np.abs(volts) ** 2 * self.series * 1e3
@@ -124,18 +104,9 @@ def coupling_of(
     rating_a: float,
     network: SourceNetwork,
 ) -> Coupling:
-    """Transformer with its equivalent line, if there is one.
+    """Transformer with its equivalent line, if there is one; `rating_a` is that at the second bus, A.
 
-    Parameters
-    ----------
-    name, buses, power_kva
-        As in `Coupling`.
-    port
-        Two-port between its first two buses; None if unknown.
-    rating_a
-        Rated current at the second bus, A.
-    network
-        Network with nominal voltages, and voltages if known.
+    `port` is the two-port between its first two buses; None if unknown.
     """
     if port is None:
         return Coupling(name, buses, power_kva)
@@ -177,19 +148,7 @@ THERE: Final = "a line to {:.6g} V, its ratio {} of the nominal one as in the so
 def transformed(
     network: SourceNetwork, rows: list[LineRow], busbar: str, extent: Extent, changes: list[ConversionChange]
 ) -> tuple[SourceNetwork, list[LineRow]]:
-    """Replace transformers below the busbar by their equivalent lines, where possible.
-
-    Parameters
-    ----------
-    network, rows
-        The network, and its lines after opening.
-    busbar
-        The busbar.
-    extent
-        Extent of the feeder.
-    changes
-        Receives the changes.
-    """
+    """Replace transformers below the busbar by their equivalent lines, where possible."""
     fused = fused_with(busbar, rows)
     above = above_busbar(busbar, network.sources, rows, network.couplings)
     left: list[Coupling] = []
@@ -237,15 +196,7 @@ def _leads_on(network: SourceNetwork, rows: Iterable[LineRow], each: Coupling, b
 
 
 class _Joined:
-    """Joined buses, and the complex ratios of their voltages.
-
-    Parameters
-    ----------
-    rows
-        Lines, with no ratio other than their taps.
-    loops
-        True: a transformer may close a loop.
-    """
+    """Joined buses, and the complex ratios of their voltages; rows have no ratio other than their taps."""
 
     def __init__(self, rows: Iterable[LineRow], *, loops: bool) -> None:
         self._loops = loops
@@ -295,15 +246,7 @@ class _Groups:
 
 
 def levels_of(rows: Iterable[LineRow], nominal: Mapping[str, float]) -> list[Problem]:
-    """Problems of the nominal voltages that lines join.
-
-    Parameters
-    ----------
-    rows
-        Lines of the feeder.
-    nominal
-        Nominal voltages of the buses, V.
-    """
+    """Problems of the nominal voltages, V, that lines join."""
     return [
         Problem(
             "inconsistent",

@@ -84,14 +84,9 @@ class Examination:
 
 
 def validate(source: FeederTables | Path | str | Mapping[str, Any]) -> tuple[Problem, ...]:
-    """Every problem of a feeder, each with file, row, column and value.
+    """Every problem of a feeder (folder, JSON form or tables), each with file, row, column and value.
 
     Tables without a problem are marked as valid; they are not parsed and checked again.
-
-    Parameters
-    ----------
-    source
-        A folder, the JSON form, or tables in memory.
     """
     if not isinstance(source, FeederTables):
         return examine(source).problems

@@ -70,13 +70,7 @@ class Forecast:
     season: Season | None = None
 
     def at(self, t: float) -> tuple[Floats, Floats]:
-        """Active power and the load's reactive power at a time, linear between quarters of an hour, (N,).
-
-        Parameters
-        ----------
-        t
-            Unix time, s; NaN counts as 0.
-        """
+        """Active power and the load's reactive power (N,) at a Unix time, s; linear between quarters of an hour."""
         local = float(np.clip(np.nan_to_num(t), -_LONGEST_S, _LONGEST_S)) - self.origin
         season = season_of(local + FIRST_MONDAY_S) if self.season is None else self.season
         week = self.weeks[season]
@@ -99,29 +93,14 @@ class Forecast:
         return np.clip(load - pv, *self.p_range), np.clip(q, *self.q_range)
 
     def played(self, origin: float, season: Season) -> Forecast:
-        """Forecast with the calendar of a simulation.
-
-        Parameters
-        ----------
-        origin
-            Unix time of the begin of the season's profiles, s.
-        season
-            Season of the profiles.
-        """
+        """Forecast with the calendar of a simulation; `origin` is the begin of the season's profiles, Unix time, s."""
         return replace(self, origin=origin, season=season)
 
     def fill(self, frame: Frame, unread: Bools) -> Frame:
-        """Frame with forecasts in place of unread powers.
+        """Frame with forecasts in place of unread powers (N,).
 
         Half-widths reach to the farther end of the range, so that intervals contain every possible power. The
         forecasts' standard deviations are separate fields.
-
-        Parameters
-        ----------
-        frame
-            Frame of the readings.
-        unread : (N,)
-            Mask of the unread powers.
         """
         p, q = self.at(frame.t)
         return replace(
@@ -136,20 +115,7 @@ class Forecast:
 
 
 def forecast(tables: FeederTables, loads: LoadModel) -> Forecast | None:
-    """Prepare the forecasts of a feeder.
-
-    Parameters
-    ----------
-    tables
-        The feeder's tables, with `[load] forecast` and `utc_offset_h`.
-    loads
-        Limits of the customers' powers.
-
-    Returns
-    -------
-    Forecast or None
-        None with "none": unread powers have their range only.
-    """
+    """Prepare the forecasts of a feeder; None with `forecast = "none"`: unread powers have their range only."""
     meta, rows = tables.meta, tables.customers
     if meta.load.forecast == "none":
         return None
@@ -176,17 +142,7 @@ def forecast(tables: FeederTables, loads: LoadModel) -> Forecast | None:
 
 
 def always(given: Forecast | None, frame: Frame, unread: Bools) -> Frame:
-    """Frame with intervals of unread powers that hold at any time, for designs and studies.
-
-    Parameters
-    ----------
-    given
-        Forecast of the feeder.
-    frame
-        A frame of any time.
-    unread : (N,)
-        Mask of the unread powers.
-    """
+    """Frame with intervals of unread powers (N,) that hold at any time, for designs and studies."""
     if given is None:
         return frame
     p, q = given.farthest()
@@ -198,31 +154,18 @@ def always(given: Forecast | None, frame: Frame, unread: Bools) -> Frame:
 
 
 def season_of(local_s: float) -> Season:
-    """Season of the northern hemisphere by the calendar; winter is December to February.
-
-    Parameters
-    ----------
-    local_s
-        Local time as seconds since 1970-01-01 00:00.
-    """
+    """Season of the northern hemisphere at a local time, s since 1970-01-01 00:00; winter is December to February."""
     month = int(np.datetime64(int(local_s), "s").astype("datetime64[M]").astype(np.int64)) % 12
     return tuple(Season)[(month + 1) % 12 // 3]
 
 
 @cache
 def spread(what: str, name: str) -> float:
-    """Standard deviation of a profile's forecast, relative to the peak.
+    """Standard deviation of the forecast by a profile of "load_p", "load_q" or "pv", relative to the peak.
 
     Root mean square error of all profiles of its class (first letter: households, trades, farms, roofs) on
     every day of a season, in the worst season; generation by day only. Without a name it is that of all
     classes.
-
-    Parameters
-    ----------
-    what
-        "load_p", "load_q" or "pv".
-    name
-        Profile of the forecast; empty: the mean of all.
     """
     worst = 0.0
     for season in Season:

@@ -110,16 +110,9 @@ class Late:
     reach: Floats
 
     def widen(self, site: Site, frame: Frame) -> Frame:
-        """Frame with the uncertainty of the late powers.
+        """Frame of the readings with the uncertainty of the late powers.
 
         Intervals reach to the ends of the range. Metered reactive powers of the same age are not used.
-
-        Parameters
-        ----------
-        site
-            The feeder.
-        frame
-            Frame of the readings, before widening.
         """
         loads, which, none = site.loads, self.which, np.full(self.std.size, np.nan)
         root, tan = np.sqrt(3.0), np.maximum(np.abs(loads.tan_min), np.abs(loads.tan_max))
@@ -144,12 +137,7 @@ class Late:
 def late(site: Site, snapshot: Snapshot) -> Late | None:
     """Late powers of a tick; None if all have the time of their voltage.
 
-    Parameters
-    ----------
-    site
-        The feeder; `[meters] p_interval_s` of its file is the age of powers without a time of their own.
-    snapshot
-        The readings.
+    `[meters] p_interval_s` of the feeder's file is the age of powers without a time of their own.
     """
     interval = site.tables.meta.meters.p_interval_s
     if snapshot.p_age_s is None and interval == 0.0:
@@ -170,16 +158,9 @@ def late(site: Site, snapshot: Snapshot) -> Late | None:
 
 
 def change(site: Site, age_s: Floats | float, reach: Floats) -> Floats:
-    """Standard deviation of the change of each customer's active power, (N,), pu; 0 at age 0.
+    """Standard deviation of the change of each customer's active power over an age, s, (N,), pu; 0 at age 0.
 
-    Parameters
-    ----------
-    site
-        The feeder.
-    age_s : (N,)
-        Age, s.
-    reach : (N,)
-        Distance to the farther end of the range, pu.
+    `reach` (N,) is the distance to the farther end of the range, pu.
     """
     slow = -2.0 * np.expm1(-np.asarray(age_s) / site.tables.meta.load.correlation_s)
     moved = np.hypot(np.sqrt(slow) * spread(site), reach / SWITCHED)
@@ -229,19 +210,12 @@ class Registered:
 
 
 def registered(site: Site, metered: Floats) -> Registered:
-    """Power intervals of the frame.
+    """Power intervals of the frame; `metered` (N,) is each register's net active power, pu, NaN without one.
 
     A reading is used up to ``LoadModel.credible``. Readings beyond the declared range are used only while the
     model error has a finite bound with all of them. Otherwise those with the largest voltage effect ``R_ii
     excess_i`` are replaced by the declared range, the fewest that restore the bound. The bound is at nominal
     busbar voltage, so that a busbar meter cannot affect it.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    metered : (N,)
-        Net active power by each register, pu; NaN: no usable reading.
     """
     known = np.abs(metered) <= site.loads.credible  # False for NaN
     found = _intervals(site.loads, metered, known)
@@ -541,15 +515,7 @@ def plant(site: Site) -> Plant:
 
 
 def volts(base_volt: Floats, v2_pu: Floats) -> Floats:
-    """Convert squared voltages to volts: ``v = base_volt sqrt(v2)``.
-
-    Parameters
-    ----------
-    base_volt : (n,)
-        1 pu of each, V: `Site.base_volt` or `Site.customer_volt`.
-    v2_pu : (…, n)
-        Squared voltages, pu; a negative one gives 0.
-    """
+    """Convert squared voltages (…, n), pu, to volts: ``v = base_volt sqrt(v2)``; a negative one gives 0."""
     return np.asarray(base_volt * np.sqrt(np.maximum(v2_pu, 0.0)), dtype=np.float64)
 
 

@@ -160,15 +160,7 @@ class DesignedEstimator:
         return learner if learner is not None and learner.needed_s(self.design) > 0 else None
 
     def init(self, t: float, commission: Commission | None = None) -> Any:
-        """Initial state.
-
-        Parameters
-        ----------
-        t
-            Unix time, s.
-        commission
-            Earlier knowledge of the meters' fixed errors, for estimators that learn them.
-        """
+        """Initial state at a Unix time, s, with earlier knowledge of the meters' fixed errors."""
         if self.bias_learning is None or commission is None:
             return self.family.init(self.design, t)
         return self.bias_learning.init(self.design, t, commission)

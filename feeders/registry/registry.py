@@ -69,14 +69,7 @@ def design(
     where: Path | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> DesignedEstimator:
-    """Design the estimator of the feeder's file.
-
-    Parameters
-    ----------
-    site
-        The feeder, with `[monitor] estimator`, `max_attacked` and `tick_s` of its file.
-    workers, where, progress
-        As in `DesignOptions`.
+    """Design the estimator of the feeder's file; options as of `DesignOptions`.
 
     Raises
     ------
@@ -141,16 +134,7 @@ def _bank(
 
 
 def choose(site: Site, *, estimator: str | None = None, max_attacked: int | None = None) -> Site:
-    """Copy a feeder with other settings of the monitor.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    estimator
-        Name of the estimator; None: as in the file.
-    max_attacked
-        M; None: as in the file.
+    """Copy a feeder with other settings of the monitor; None: as in the file.
 
     Raises
     ------
@@ -186,13 +170,6 @@ def lmi_options(site: Site, lure: Lure) -> CircleOptions:
     part of the thresholds instead. The load error has one column for every customer's p and one for its q.
     Each is the largest error of the file at the customer's peak, or that without a reading for a customer
     without a meter.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    lure
-        Its Lur'e system.
 
     References
     ----------
@@ -260,13 +237,7 @@ def _unknown_input(site: Site, _: DesignOptions) -> unknown_input.UnknownInputDe
 
 
 class Families(Mapping[str, Estimator]):
-    """Bundled estimators and those of other packages, which are loaded on first use.
-
-    Parameters
-    ----------
-    own
-        Bundled estimators.
-    """
+    """Bundled estimators and those of other packages, which are loaded on first use."""
 
     def __init__(self, own: Iterable[Estimator]) -> None:
         self._known = {family.name: family for family in own}
