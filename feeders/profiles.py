@@ -47,23 +47,14 @@ def data_root() -> Traversable:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Profiles:
-    """Profiles over time, for linear interpolation between samples.
+    """Profiles over time, for linear interpolation between samples."""
 
-    Attributes
-    ----------
-    t_s : (T,)
-        Time since the first sample, s; the first sample is at 00:00 of a Monday.
-    load_p, load_q : name -> (T,)
-        Active and reactive power of a load, as a fraction of its peak `load_kw` and of the reactive power of
-        `load_kw` at its expected power factor.
-    pv : name -> (T,)
-        Generation, fraction of its peak `pv_kw`.
-    """
-
-    t_s: Floats
+    t_s: Floats  # (T,), time since the first sample, s; the first sample is at 00:00 of a Monday
+    # name -> (T,), active and reactive power of a load, as a fraction of its peak `load_kw` and of the
+    # reactive power of `load_kw` at its expected power factor
     load_p: dict[str, Floats]
     load_q: dict[str, Floats]
-    pv: dict[str, Floats]
+    pv: dict[str, Floats]  # name -> (T,), generation, fraction of its peak `pv_kw`
 
 
 @dataclass(frozen=True, slots=True)

@@ -66,7 +66,7 @@ def plain(value: Any) -> Any:
 
 
 def own_numbers(given: DataclassInstance) -> None:
-    """Convert NumPy numbers of a frozen dataclass in its `__post_init__`; a 32-bit float cannot hold a Unix time."""
+    """Convert NumPy numbers of a frozen dataclass to Python's; a 32-bit float cannot hold a Unix time."""
     for each in fields(given):
         value = getattr(given, each.name)
         if isinstance(value, np.generic):

@@ -231,21 +231,12 @@ RECIPES: dict[str, Recipe] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Conversion:
-    """Result of a conversion.
+    """Result of a conversion."""
 
-    Attributes
-    ----------
-    changes
-        Omissions, approximations, additions and changes; also in conversion.csv beside the feeder.
-    check
-        Comparison of the AC power flows of feeder and source; None without one.
-    unchecked
-        Reason for a missing comparison.
-    """
-
+    # Omissions, approximations, additions and changes; also in conversion.csv beside the feeder
     changes: tuple[ConversionChange, ...]
-    check: SourceCheck | None
-    unchecked: str = ""
+    check: SourceCheck | None  # Comparison of the AC power flows of feeder and source; None without one
+    unchecked: str = ""  # Reason for a missing comparison
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -357,7 +348,7 @@ def check_against_source(
     opened: Sequence[str] = (),
     one_voltage: bool = False,
 ) -> SourceCheck:
-    """Compare a folder's AC power flow with that of its source, at the source's loads; arguments as of `convert`.
+    """Compare a folder's AC power flow with that of its source, at the source's loads; as of `convert`.
 
     Raises
     ------

@@ -134,37 +134,19 @@ EVEN: Final = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Draw:
-    """Load or generator at a bus.
+    """Load or generator at a bus."""
 
-    Attributes
-    ----------
-    name, bus
-        Name and bus.
-    power_kva : (3,)
-        Power from each phase at the source's operating point, P + jQ, kVA.
-    even
-        True for one connection of all three phases.
-    rating_kva
-        Rating of a generator's inverter, kVA; 0: without inverter; None: not a generator.
-    idle
-        True for a transformer's no-load power, which is unmetered.
-    peak_kw
-        Rated peak of a generator, kW; the present power may be less.
-    phases
-        Connected phases, with or without power.
-    noun
-        Noun for messages; empty: load or generator.
-    """
-
+    # Name and bus
     name: str
     bus: str
-    power_kva: Phasors
-    even: bool = True
+    power_kva: Phasors  # (3,), power from each phase at the source's operating point, P + jQ, kVA
+    even: bool = True  # True for one connection of all three phases
+    # Rating of a generator's inverter, kVA; 0: without inverter; None: not a generator
     rating_kva: float | None = None
-    idle: bool = False
-    peak_kw: float = 0.0
-    phases: str = "abc"
-    noun: str = ""
+    idle: bool = False  # True for a transformer's no-load power, which is unmetered
+    peak_kw: float = 0.0  # Rated peak of a generator, kW; the present power may be less
+    phases: str = "abc"  # Connected phases, with or without power
+    noun: str = ""  # Noun for messages; empty: load or generator
 
     @property
     def label(self) -> str:
@@ -179,7 +161,7 @@ def is_even(power: Phasors) -> bool:
 
 
 def as_it_stands(power: Phasors) -> str:
-    """Effect on a load or generator with a control of its own, for a change; `power` (3,) from each phase, kVA."""
+    """Effect on a load or generator with a control of its own, from its power (3,) in the source, kVA."""
     p, q = (round(float(part), 6) + 0.0 for part in (power.sum().real, power.sum().imag))
     if p < 0:
         return f"a customer that feeds in {-p:.4g} kW and draws {q:.4g} kvar in the check"
@@ -282,8 +264,7 @@ def in_star(pairs: Phasors, volts: Phasors) -> Phasors:
     """Powers of a load between phases, from each phase, (3,), kVA.
 
     The current between the phases k and k + 1 is ``conj(S_k / (V_k - V_k+1))``; the current of a phase is the
-    difference of two of these. `pairs` (3,) are the powers between a and b, b and c, c and a, kVA; `volts` (3,)
-    the voltages of the phases, V.
+    difference of two of these. `pairs` (3,) are the powers between a and b, b and c, c and a, kVA.
     """
     between = np.conj(pairs / (volts - np.roll(volts, -1)))
     return np.asarray(volts * np.conj(between - np.roll(between, 1)), dtype=np.complex128)

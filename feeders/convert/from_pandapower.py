@@ -69,24 +69,12 @@ class PandapowerNetwork(SourceNetwork):
 
 @dataclass(slots=True)
 class _Source:
-    """Part of a network below the busbar.
+    """Part of a network below the busbar."""
 
-    Attributes
-    ----------
-    network
-        The network.
-    names
-        Ids of its buses in the feeder.
-    changes
-        Receives inexact conversions.
-    power
-        Power of each customer, kVA.
-    """
-
-    network: PandapowerNetwork
-    names: dict[int, str]
-    changes: list[ConversionChange]
-    power: dict[str, complex] = field(default_factory=dict)
+    network: PandapowerNetwork  # The network
+    names: dict[int, str]  # Ids of its buses in the feeder
+    changes: list[ConversionChange]  # Receives inexact conversions
+    power: dict[str, complex] = field(default_factory=dict)  # Power of each customer, kVA
 
     @property
     def net(self) -> Any:

@@ -38,18 +38,10 @@ SUMMER_TIME = (date(2016, 3, 27), date(2016, 10, 30))
 
 @dataclass(frozen=True, slots=True)
 class Stretch:
-    """Consecutive days of the year.
+    """Consecutive days of the year."""
 
-    Attributes
-    ----------
-    monday
-        First day, from 00:00 local time.
-    days
-        Number of days.
-    """
-
-    monday: date
-    days: int
+    monday: date  # First day, from 00:00 local time
+    days: int  # Number of days
 
     @property
     def rows(self) -> slice:
@@ -122,7 +114,7 @@ def _simbench() -> Any:
 
 
 def library_csv(columns: Mapping[str, Floats], season: Season) -> bytes:
-    """Season of the library as gzipped CSV: t_s, then `<load>_p`, `<load>_q`, `<pv>`; `columns` as of `year`."""
+    """Season of the library as gzipped CSV: t_s, then `<load>_p`, `<load>_q`, `<pv>`."""
     rows = STRETCHES[season].rows
     names: list[tuple[str, str]] = []
     for load in load_profiles(columns):
@@ -143,11 +135,12 @@ def load_profiles(columns: Mapping[str, Floats]) -> list[str]:
 
 
 def envelope(p: Floats, q: Floats) -> ReactiveEnvelope:
-    """Smallest wedge with a floor that contains every point (T,) of a load profile, fractions of nominal values.
+    """Smallest wedge with a floor that contains every point (T,) of a load profile.
 
     Minimises the mean width ``(high - low) w + 2 floor`` subject to ``low p - floor <= q <= high p + floor``
     for all points, ``0 <= low <= 1 <= high``, at ``w = max(mean p, 0.3)``: at a weight as small as a
     household's mean, the upper slope would be several times the nominal one, and useless for an unknown load.
+    Powers are fractions of their nominal values.
 
     Raises
     ------

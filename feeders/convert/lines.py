@@ -20,29 +20,17 @@ from gridsec.arrays import Floats, Ints, Phasors
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Coupling:
-    """Transformer, or another element that joins buses and is not a line.
+    """Transformer, or another element that joins buses and is not a line."""
 
-    Attributes
-    ----------
-    name, buses
-        Kind and name, and the buses that it joins.
-    power_kva
-        Power into it from each bus, by phase, kVA.
-    line
-        Equivalent line from the first of its two buses to the second, with its tap relative to their nominal
-        voltages, without `to_volt`; None without an equivalent.
-    idle
-        No-load power beside that line.
-    turn
-        Phase shift from the first bus to the second, degrees.
-    """
-
+    # Kind and name, and the buses that it joins
     name: str
     buses: tuple[str, ...]
-    power_kva: tuple[Phasors, ...]
+    power_kva: tuple[Phasors, ...]  # Power into it from each bus, by phase, kVA
+    # Equivalent line from the first of its two buses to the second, with its tap relative to their nominal
+    # voltages, without `to_volt`; None without an equivalent
     line: LineRow | None = None
-    idle: Draw | None = None
-    turn: float = 0.0
+    idle: Draw | None = None  # No-load power beside that line
+    turn: float = 0.0  # Phase shift from the first bus to the second, degrees
 
 
 def reached(start: str, rows: Iterable[LineRow], without: Collection[str] = ()) -> dict[str, int]:
@@ -101,8 +89,8 @@ def line_row(
 ) -> LineRow:
     """Row of a line with matrices: series impedances (k, k), ohm, and total shunt susceptances (k, k), S.
 
-    `phases` (k,) are ascending, 0 for a. Cyclically symmetric series impedances become sequence values. Charging
-    that is equal in every phase and goes to earth only becomes one number.
+    Cyclically symmetric series impedances become sequence values. Charging that is equal in every phase and
+    goes to earth only becomes one number. `phases` (k,) are ascending, 0 for a.
     """
     own, mutual = _means(series)
     row = LineRow(
@@ -169,7 +157,7 @@ def charging_cells(name: str, phases: Ints, shunt: Floats, changes: list[Convers
 
 
 def by_sequence(one: float, zero: float) -> Floats:
-    """Susceptances (3, 3) of equal phases from sequence values, S; not coupled if the zero sequence is NaN."""
+    """Susceptances (3, 3) of equal phases from sequence values, S; not coupled if the zero one is NaN."""
     apart = zero if np.isfinite(zero) else one
     return np.asarray(one * np.eye(3) + (apart - one) / 3.0)
 
@@ -179,7 +167,7 @@ IN_EVERY_PHASE: Final = "the positive-sequence charging in every phase; exact wh
 
 
 def balanced_charging(lines: Sequence[LineRow], changes: list[ConversionChange]) -> list[LineRow]:
-    """Reduce charging to its positive sequence, if all customers have three phases and nothing else needs them."""
+    """Reduce charging to its positive sequence, if nothing needs three phases; all customers have them."""
     matrices = [shunt_us(cells_of(row)) for row in lines]
     if any(
         row.phases != "abc" or row.r_aa_ohm is not None or row.tap_a is not None for row in lines

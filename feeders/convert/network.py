@@ -178,49 +178,23 @@ BEYOND: Final = "supplied in the source, but not through the feeder: see the ele
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Converted:
-    """Feeder from another tool's network.
+    """Feeder from another tool's network."""
 
-    Attributes
-    ----------
-    tables
-        The feeder.
-    changes
-        Inexact conversions.
-    state
-        State by the source's tool at its own loads.
-    unchecked
-        Reason for a missing state.
-    """
-
-    tables: FeederTables
-    changes: tuple[ConversionChange, ...]
-    state: SourceState | None
-    unchecked: str = ""
+    tables: FeederTables  # The feeder
+    changes: tuple[ConversionChange, ...]  # Inexact conversions
+    state: SourceState | None  # State by the source's tool at its own loads
+    unchecked: str = ""  # Reason for a missing state
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SuppliedArea:
-    """Part of a network below a busbar.
+    """Part of a network below a busbar."""
 
-    Attributes
-    ----------
-    busbar
-        Bus of the busbar.
-    inside
-        The buses, nearest first, with their distances in lines.
-    lines
-        Rows of lines.csv, pointing away from the busbar.
-    draws
-        Loads and generators, and powers into transformers.
-    changes
-        Inexact conversions.
-    """
-
-    busbar: str
-    inside: dict[str, int]
-    lines: list[LineRow]
-    draws: list[Draw]
-    changes: list[ConversionChange]
+    busbar: str  # Bus of the busbar
+    inside: dict[str, int]  # The buses, nearest first, with their distances in lines
+    lines: list[LineRow]  # Rows of lines.csv, pointing away from the busbar
+    draws: list[Draw]  # Loads and generators, and powers into transformers
+    changes: list[ConversionChange]  # Inexact conversions
 
 
 def feeder_of(

@@ -70,24 +70,12 @@ class SourceUnreadable(GridsecError):
 
 @dataclass(frozen=True, slots=True)
 class ConversionChange:
-    """Element of the source that is not, or not exactly, in the feeder.
+    """Element of the source that is not, or not exactly, in the feeder."""
 
-    Attributes
-    ----------
-    element
-        Kind and name.
-    prop
-        Property of the element; WHOLE for all of it.
-    done
-        Kind of the change.
-    effect
-        Replacement in the feeder, and its effect on the voltages.
-    """
-
-    element: str
-    prop: str
-    done: Done
-    effect: str
+    element: str  # Kind and name
+    prop: str  # Property of the element; WHOLE for all of it
+    done: Done  # Kind of the change
+    effect: str  # Replacement in the feeder, and its effect on the voltages
 
 
 def sentences(changes: Iterable[ConversionChange]) -> tuple[str, ...]:
@@ -262,24 +250,15 @@ seconds from the first sample, which is at 00:00 local time.
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Origin:
-    """Origin of a converted feeder.
+    """Origin of a converted feeder."""
 
-    Attributes
-    ----------
-    source
-        The source, with the package that has or reads it; empty if unknown.
-    check
-        Comparison of the feeder's AC power flow with the source's, or the reason for a missing one; empty if
-        unknown.
-    changes
-        Omissions, approximations, additions and changes; one row each, as in conversion.csv.
-    about, command
-        Description of the network, and the command line of the conversion; empty if unknown.
-    """
-
-    source: str
+    source: str  # The source, with the package that has or reads it; empty if unknown
+    # Comparison of the feeder's AC power flow with the source's, or the reason for a missing one; empty if
+    # unknown
     check: str
+    # Omissions, approximations, additions and changes; one row each, as in conversion.csv
     changes: pd.DataFrame
+    # Description of the network, and the command line of the conversion; empty if unknown
     about: str = ""
     command: str = ""
 

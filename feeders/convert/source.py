@@ -23,49 +23,26 @@ IN_STAR: Final = "in star, with its phases' powers of the source's power flow; e
 
 @dataclass(slots=True)
 class SourceNetwork:
-    """Network in SI, with the state by its own tool.
+    """Network in SI, with the state by its own tool."""
 
-    Attributes
-    ----------
-    tool
-        The source's tool and its version.
-    sources
-        Buses with a voltage source.
-    nominal
-        Nominal voltage of each bus, phase to neutral, V.
-    lines
-        Rows of lines.csv, in any direction.
-    draws, couplings
-        Loads, generators and transformers.
-    xy
-        Positions.
-    volts : (3,)
-        Complex voltages of the buses, V; NaN where a phase is absent. Loads of constant power.
-    as_found : (3,)
-        The same with the loads' dependence on the voltage; empty without one.
-    changes
-        Inexact conversions so far.
-    of_bus
-        Changes that count if their bus is in the feeder.
-    connected
-        Buses and labels of loads and generators that the reader itself converts to customers.
-    unsolved
-        Reason for missing voltages of the source's own power flow.
-    """
-
-    tool: str
-    sources: list[str]
-    nominal: dict[str, float]
-    lines: list[LineRow] = field(default_factory=list)
+    tool: str  # The source's tool and its version
+    sources: list[str]  # Buses with a voltage source
+    nominal: dict[str, float]  # Nominal voltage of each bus, phase to neutral, V
+    lines: list[LineRow] = field(default_factory=list)  # Rows of lines.csv, in any direction
+    # Loads, generators and transformers
     draws: list[Draw] = field(default_factory=list)
     couplings: list[Coupling] = field(default_factory=list)
-    xy: dict[str, tuple[float, float]] = field(default_factory=dict)
+    xy: dict[str, tuple[float, float]] = field(default_factory=dict)  # Positions
+    # (3,), complex voltages of the buses, V; NaN where a phase is absent. Loads of constant power
     volts: dict[str, Phasors] = field(default_factory=dict)
+    # (3,), the same with the loads' dependence on the voltage; empty without one
     as_found: dict[str, Phasors] = field(default_factory=dict)
-    changes: list[ConversionChange] = field(default_factory=list)
+    changes: list[ConversionChange] = field(default_factory=list)  # Inexact conversions so far
+    # Changes that count if their bus is in the feeder
     of_bus: list[tuple[str, ConversionChange]] = field(default_factory=list)
+    # Buses and labels of loads and generators that the reader itself converts to customers
     connected: list[tuple[str, str]] = field(default_factory=list)
-    unsolved: str = ""
+    unsolved: str = ""  # Reason for missing voltages of the source's own power flow
 
     def note(self, element: str, prop: str, done: Done, effect: str) -> None:
         """Add a change."""

@@ -48,18 +48,10 @@ NO_LOAD_KVA: Final = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class TwoPort:
-    """Balanced transformer.
+    """Balanced transformer."""
 
-    Attributes
-    ----------
-    ratio
-        Complex ratio t of the voltage at its first end to that behind it, without load.
-    series
-        Impedance z behind it, ohm.
-    """
-
-    ratio: complex
-    series: complex
+    ratio: complex  # Complex ratio t of the voltage at its first end to that behind it, without load
+    series: complex  # Impedance z behind it, ohm
 
     @classmethod
     def measured(cls, idle: tuple[complex, complex], loaded: tuple[complex, complex, complex]) -> TwoPort:
@@ -122,18 +114,11 @@ def coupling_of(
 
 @dataclass(frozen=True, slots=True)
 class Extent:
-    """Extent of a feeder.
+    """Extent of a feeder."""
 
-    Attributes
-    ----------
-    one_voltage
-        True: only the busbar's nominal voltage; a transformer to another one is a customer.
-    meshed
-        True: transformers may close loops.
-    """
-
+    # True: only the busbar's nominal voltage; a transformer to another one is a customer
     one_voltage: bool = False
-    meshed: bool = False
+    meshed: bool = False  # True: transformers may close loops
 
 
 EVERYTHING: Final = Extent()

@@ -27,34 +27,18 @@ class Edge:
 
 @dataclass(frozen=True, slots=True)
 class Tree:
-    """Part of the feeder that is connected to the busbar, in topological order.
+    """Part of the feeder that is connected to the busbar, in topological order."""
 
-    Attributes
-    ----------
-    group
-        Fused bus index of every connected bus; 0 is the busbar.
-    buses
-        One id per fused bus: the first of its members in the order of the input.
-    parent
-        Fused bus that feeds bus k + 1; always at most k.
-    branch
-        Index (into the edges given) of the line that feeds bus k + 1.
-    ties
-        Indices of the edges that close loops: each joins two buses that are connected without it.
-    loops
-        Indices of the edges of each loop: of every tie that joins a bus to itself, and of at most LOOPS_SHOWN
-        others. A radial feeder has none.
-    islands
-        Unconnected buses, one tuple for each connected piece.
-    """
-
-    group: dict[str, int]
-    buses: tuple[str, ...]
-    parent: tuple[int, ...]
-    branch: tuple[int, ...]
+    group: dict[str, int]  # Fused bus index of every connected bus; 0 is the busbar
+    buses: tuple[str, ...]  # One id per fused bus: the first of its members in the order of the input
+    parent: tuple[int, ...]  # Fused bus that feeds bus k + 1; always at most k
+    branch: tuple[int, ...]  # Index (into the edges given) of the line that feeds bus k + 1
+    # Indices of the edges that close loops: each joins two buses that are connected without it
     ties: tuple[int, ...]
+    # Indices of the edges of each loop: of every tie that joins a bus to itself, and of at most LOOPS_SHOWN
+    # others. A radial feeder has none
     loops: tuple[tuple[int, ...], ...]
-    islands: tuple[tuple[str, ...], ...]
+    islands: tuple[tuple[str, ...], ...]  # Unconnected buses, one tuple for each connected piece
 
 
 class _Sets:

@@ -40,39 +40,23 @@ CREDIBLE_KW = 50.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadModel:
-    """Limits of the customers' powers without and with a reading, pu. N customers.
+    """Limits of the customers' powers without and with a reading, pu. N customers."""
 
-    Attributes
-    ----------
-    load_peak, pv_peak : (N,)
-        Largest load and largest generation.
-    tan_min, tan_max : (N,)
-        Limits of the load's q / p (lagging).
-    q_floor : (N,)
-        Reactive power of the load that does not follow p.
-    p_fraction, p_floor : (N,)
-        Error limit of a metered p: ``p_fraction |reading| + p_floor``.
-    q_error : (N,)
-        Error limit of a metered q: a fraction of the customer's range.
-    q_fraction : (N,)
-        The same fraction, for readings beyond that range.
-    credible : (N,)
-        Largest plausible |p| of a reading.
-    p_unread, q_unread : (N,)
-        Half-width of p without a reading, and upper limit of that of q: the range, or the standard deviation
-        of the files for a customer without a meter.
-    """
-
+    # (N,), largest load and largest generation
     load_peak: Floats
     pv_peak: Floats
+    # (N,), limits of the load's q / p (lagging)
     tan_min: Floats
     tan_max: Floats
-    q_floor: Floats
+    q_floor: Floats  # (N,), reactive power of the load that does not follow p
+    # (N,), error limit of a metered p: ``p_fraction |reading| + p_floor``
     p_fraction: Floats
     p_floor: Floats
-    q_error: Floats
-    q_fraction: Floats
-    credible: Floats
+    q_error: Floats  # (N,), error limit of a metered q: a fraction of the customer's range
+    q_fraction: Floats  # (N,), the same fraction, for readings beyond that range
+    credible: Floats  # (N,), largest plausible |p| of a reading
+    # (N,), Half-width of p without a reading, and upper limit of that of q: the range, or the standard
+    # deviation of the files for a customer without a meter
     p_unread: Floats
     q_unread: Floats
 
@@ -230,32 +214,17 @@ def positions(tables: FeederTables, found: Tree) -> Floats | None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Referred:
-    """Tree of a feeder with its voltage bases. N customers, b + 1 buses.
+    """Tree of a feeder with its voltage bases. N customers, b + 1 buses."""
 
-    Attributes
-    ----------
-    lines
-        Lines; line k feeds bus k + 1.
-    ties
-        The t lines that close loops.
-    nominal : (b + 1,)
-        Nominal voltage of every bus, V.
-    bus : (b + 1, 3)
-        Voltage base of every phase of every bus, V.
-    branch : (b, 3)
-        Voltage base of each line's impedance and charging, which are behind its tap as seen from `from_bus`.
-    tie : (t, 3)
-        The same of each tie.
-    customer, customer_nominal : (N,)
-        Voltage base of every customer, the mean of its phases, and its nominal voltage, V.
-    """
-
-    lines: list[LineRow]
-    ties: list[LineRow]
-    nominal: Floats
-    bus: Floats
+    lines: list[LineRow]  # Lines; line k feeds bus k + 1
+    ties: list[LineRow]  # The t lines that close loops
+    nominal: Floats  # (b + 1,), nominal voltage of every bus, V
+    bus: Floats  # (b + 1, 3), voltage base of every phase of every bus, V
+    # (b, 3), voltage base of each line's impedance and charging, which are behind its tap as seen from
+    # `from_bus`
     branch: Floats
-    tie: Floats
+    tie: Floats  # (t, 3), the same of each tie
+    # (N,), voltage base of every customer, the mean of its phases, and its nominal voltage, V
     customer: Floats
     customer_nominal: Floats
 
@@ -293,39 +262,18 @@ def refer(tables: FeederTables) -> tuple[Referred, Tree]:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Equipment:
-    """Fields of a site that do not depend on the kind of its model. N customers, p meters, b + 1 buses.
+    """Fields of a site that do not depend on the kind of its model. N customers, p meters, b + 1 buses."""
 
-    Attributes
-    ----------
-    tables
-        Content of the files in SI.
-    droop
-        The inverters with a droop curve, in the order of the customers.
-    meters : (p,)
-        Index of each meter's customer, ascending.
-    meter_ids : (p,)
-        Ids of the meters.
-    accuracy
-        Accuracies of the meters, pu.
-    bus_of_file
-        Fused bus index of every bus id of the files.
-    xy : (b + 1, 2)
-        Positions of the buses, None unless the files have all of them.
-    loads
-        Limits of the customers' powers, in units of `base_kva`.
-    digest
-        SHA-256 of the content: key of design caches. It changes with every value and with the order of
-        the rows (which is the order of all arrays), not with layout, comments or unknown columns.
-    """
-
-    tables: FeederTables
-    droop: Droop
-    meters: Ints
-    meter_ids: tuple[str, ...]
-    accuracy: MeterAccuracy
-    bus_of_file: Mapping[str, int]
-    xy: Floats | None
-    loads: LoadModel
+    tables: FeederTables  # Content of the files in SI
+    droop: Droop  # The inverters with a droop curve, in the order of the customers
+    meters: Ints  # (p,), index of each meter's customer, ascending
+    meter_ids: tuple[str, ...]  # (p,), ids of the meters
+    accuracy: MeterAccuracy  # Accuracies of the meters, pu
+    bus_of_file: Mapping[str, int]  # Fused bus index of every bus id of the files
+    xy: Floats | None  # (b + 1, 2), positions of the buses, None unless the files have all of them
+    loads: LoadModel  # Limits of the customers' powers, in units of `base_kva`
+    # SHA-256 of the content: key of design caches. It changes with every value and with the order of the rows
+    # (which is the order of all arrays), not with layout, comments or unknown columns
     digest: str
 
 

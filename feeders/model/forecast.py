@@ -38,39 +38,23 @@ _LOAD_P, _LOAD_Q, _PV = "load_p", "load_q", "pv"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Forecast:
-    """Forecasts of the customers' powers. N customers, pu, net import positive.
+    """Forecasts of the customers' powers. N customers, pu, net import positive."""
 
-    Attributes
-    ----------
-    p_std, q_std : (N,)
-        Standard deviations of the forecast's errors: `p_std_kw` and `q_std_kvar` of a customer without a
-        meter where its row has them, else `spread` of its profiles times its peaks.
-    p_range, q_range : (2, N)
-        Least and largest power of the customers, of q the load alone.
-    peaks : (3, N)
-        Peak of the load, its reactive power, and peak of the generation.
-    which : (3, N)
-        Index of the curve of each of these.
-    weeks
-        By season: the K curves over a week, relative to the peak, (672, K).
-    origin
-        Unix time of the begin of a week, s: Monday 00:00 of local time.
-    season
-        Fixed season; None: that of the calendar.
-    """
-
+    # (N,), standard deviations of the forecast's errors: `p_std_kw` and `q_std_kvar` of a customer without a
+    # meter where its row has them, else `spread` of its profiles times its peaks
     p_std: Floats
     q_std: Floats
+    # (2, N), least and largest power of the customers, of q the load alone
     p_range: Floats
     q_range: Floats
-    peaks: Floats
-    which: Ints
-    weeks: Mapping[Season, Floats]
-    origin: float
-    season: Season | None = None
+    peaks: Floats  # (3, N), peak of the load, its reactive power, and peak of the generation
+    which: Ints  # (3, N), index of the curve of each of these
+    weeks: Mapping[Season, Floats]  # By season: the K curves over a week, relative to the peak, (672, K)
+    origin: float  # Unix time of the begin of a week, s: Monday 00:00 of local time
+    season: Season | None = None  # Fixed season; None: that of the calendar
 
     def at(self, t: float) -> tuple[Floats, Floats]:
-        """Active power and the load's reactive power (N,) at a Unix time, s; linear between quarters of an hour."""
+        """Active power and the load's reactive power (N,) at a Unix time, s; linear between samples."""
         local = float(np.clip(np.nan_to_num(t), -_LONGEST_S, _LONGEST_S)) - self.origin
         season = season_of(local + FIRST_MONDAY_S) if self.season is None else self.season
         week = self.weeks[season]
@@ -93,7 +77,7 @@ class Forecast:
         return np.clip(load - pv, *self.p_range), np.clip(q, *self.q_range)
 
     def played(self, origin: float, season: Season) -> Forecast:
-        """Forecast with the calendar of a simulation; `origin` is the begin of the season's profiles, Unix time, s."""
+        """Forecast with the calendar of a simulation: the season's profiles begin at the Unix time `origin`."""
         return replace(self, origin=origin, season=season)
 
     def fill(self, frame: Frame, unread: Bools) -> Frame:
@@ -115,7 +99,7 @@ class Forecast:
 
 
 def forecast(tables: FeederTables, loads: LoadModel) -> Forecast | None:
-    """Prepare the forecasts of a feeder; None with `forecast = "none"`: unread powers have their range only."""
+    """Prepare the forecasts of a feeder; None with "none": unread powers have their range only."""
     meta, rows = tables.meta, tables.customers
     if meta.load.forecast == "none":
         return None
@@ -154,7 +138,7 @@ def always(given: Forecast | None, frame: Frame, unread: Bools) -> Frame:
 
 
 def season_of(local_s: float) -> Season:
-    """Season of the northern hemisphere at a local time, s since 1970-01-01 00:00; winter is December to February."""
+    """Season of the northern hemisphere at a local time, s since 1970-01-01; December to February is winter."""
     month = int(np.datetime64(int(local_s), "s").astype("datetime64[M]").astype(np.int64)) % 12
     return tuple(Season)[(month + 1) % 12 // 3]
 

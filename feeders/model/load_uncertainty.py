@@ -86,8 +86,8 @@ def _usual(half_width: Floats, std: Floats | None) -> Floats:
 def forecast_errors(site: Site, t: Floats, p_kw: Floats, q_kvar: Floats) -> tuple[Floats, Floats]:
     """Deviations of true powers from frames without readings, pu, (T, N): a history for `from_history`.
 
-    `t` (T,) are Unix times, s; `p_kw` and `q_kvar` (T, N) the true net active import and the reactive import of
-    the loads.
+    `t` (T,) are Unix times, s; `p_kw` and `q_kvar` (T, N) the true net active import and the loads' reactive
+    import.
     """
     none, base = np.full(site.meters.size, np.nan), site.feeder.base_kva
     frames = [to_frame(site, Snapshot(float(now), none, none, none, np.nan)) for now in t]

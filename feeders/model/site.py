@@ -87,27 +87,13 @@ smaller one hides attacks.
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Late:
-    """Late powers of one tick. N customers.
+    """Late powers of one tick. N customers."""
 
-    Attributes
-    ----------
-    which : (N,)
-        Customers with a late power that is better than none.
-    useless : (N,)
-        Customers with a power that is too late to be better than none.
-    stated : (N,)
-        Customers with a power no older than `[meters] p_interval_s`.
-    std : (N,)
-        Standard deviation of the change of the active power, pu; 0 elsewhere.
-    reach : (N,)
-        Largest change, pu.
-    """
-
-    which: Bools
-    useless: Bools
-    stated: Bools
-    std: Floats
-    reach: Floats
+    which: Bools  # (N,), customers with a late power that is better than none
+    useless: Bools  # (N,), customers with a power that is too late to be better than none
+    stated: Bools  # (N,), customers with a power no older than `[meters] p_interval_s`
+    std: Floats  # (N,), standard deviation of the change of the active power, pu; 0 elsewhere
+    reach: Floats  # (N,), largest change, pu
 
     def widen(self, site: Site, frame: Frame) -> Frame:
         """Frame of the readings with the uncertainty of the late powers.
@@ -184,29 +170,17 @@ def expected(site: Site) -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Registered:
-    """Load powers of one tick, consumption positive, pu. N customers.
+    """Load powers of one tick, consumption positive, pu. N customers."""
 
-    Attributes
-    ----------
-    p, p_error : (N,)
-        Centre and half-width of the interval of the net active power.
-    q, q_error : (N,)
-        The same of the load's reactive power.
-    known : (N,)
-        The interval rests on a reading.
-    origin : (N,)
-        `PowerOrigin` of `p`.
-    excess : (N,)
-        Part of the reading beyond the declared load or generation.
-    """
-
+    # (N,), centre and half-width of the interval of the net active power
     p: Floats
     p_error: Floats
+    # (N,), the same of the load's reactive power
     q: Floats
     q_error: Floats
-    known: Bools
-    origin: Ints
-    excess: Floats
+    known: Bools  # (N,), the interval rests on a reading
+    origin: Ints  # (N,), `PowerOrigin` of `p`
+    excess: Floats  # (N,), part of the reading beyond the declared load or generation
 
 
 def registered(site: Site, metered: Floats) -> Registered:

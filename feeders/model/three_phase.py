@@ -44,21 +44,11 @@ class Ties(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class ThreePhaseSite(Equipment):
-    """Feeder in three phases, powers in units of `base_kva`: as `gridsec.grid.three_phase.per_customer`.
+    """Feeder in three phases, powers in units of `base_kva`: as `gridsec.grid.three_phase.per_customer`."""
 
-    Attributes
-    ----------
-    feeder
-        The radial tree, pu; powers of single phases in thirds of `base_kva`.
-    base_volt : (b + 1, 3)
-        1 pu of every phase of every bus, V, see `feeders.model.equipment`.
-    nominal_volt : (b + 1,)
-        Nominal voltage of every bus, V.
-    """
-
-    feeder: ThreePhaseFeeder
-    base_volt: Floats
-    nominal_volt: Floats
+    feeder: ThreePhaseFeeder  # The radial tree, pu; powers of single phases in thirds of `base_kva`
+    base_volt: Floats  # (b + 1, 3), 1 pu of every phase of every bus, V, see `feeders.model.equipment`
+    nominal_volt: Floats  # (b + 1,), nominal voltage of every bus, V
 
     @property
     def customer_volt(self) -> Floats:

@@ -31,25 +31,14 @@ _KEEP = 64
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BankGains:
-    """Gains of a whole bank and their origin.
+    """Gains of a whole bank and their origin."""
 
-    Attributes
-    ----------
-    gains
-        Stacked, in the order of `gridsec.secure.subsets.Subsets.masks`, for
-        `gridsec.estimators.exact_bank.bank.design`.
-    designs
-        The single designs with their proofs, in the same order.
-    origin
-        "stored", "new", or "redesigned: …" with the problem of the stored ones.
-    problem
-        Problem of reading or storing the designs; empty without one.
-    """
-
+    # Stacked, in the order of `gridsec.secure.subsets.Subsets.masks`, for
+    # `gridsec.estimators.exact_bank.bank.design`
     gains: Gains
-    designs: tuple[CircleGains, ...]
-    origin: str
-    problem: str
+    designs: tuple[CircleGains, ...]  # The single designs with their proofs, in the same order
+    origin: str  # "stored", "new", or "redesigned: …" with the problem of the stored ones
+    problem: str  # Problem of reading or storing the designs; empty without one
 
 
 def folder(environment: Mapping[str, str] = os.environ, platform: str = sys.platform) -> Path:

@@ -122,21 +122,11 @@ class Estimator:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DesignedEstimator:
-    """Finished design of one feeder, with its estimator.
+    """Finished design of one feeder, with its estimator."""
 
-    Attributes
-    ----------
-    family
-        The estimator.
-    design
-        Design by the estimator.
-    asked
-        M of the feeder's file.
-    """
-
-    family: Estimator
-    design: Any
-    asked: int = 0
+    family: Estimator  # The estimator
+    design: Any  # Design by the estimator
+    asked: int = 0  # M of the feeder's file
 
     @property
     def max_attacked(self) -> int:
