@@ -21,7 +21,7 @@ from feeders.convert.customers import (
     usual_profile,
 )
 from feeders.convert.lines import as_rows, reached
-from feeders.convert.network import Converted, below_source, feeder_of, one_busbar
+from feeders.convert.network import below_source, one_busbar
 from feeders.convert.pandapower_net import between_phases, ids, phase_powers, read_net, with_truths
 from feeders.convert.provenance import WHOLE, BusbarUnclear, ConversionChange
 from feeders.convert.source import CONSTANT, OFF, SourceNetwork
@@ -33,11 +33,11 @@ SOLAR: Final = {"pv", "wye", "delta"}
 """Types of static generators that are compatible with a solar profile."""
 
 
-def from_pandapower(net: Any, name: str, **options: Any) -> Converted:
-    """Convert a pandapower net to a feeder; options and errors as of `feeders.convert.network.feeder_of`."""
+def read_pandapower(net: Any) -> PandapowerNetwork:
+    """Read and solve a pandapower net; `FeederInvalid` has all problems of its tables."""
     network = PandapowerNetwork("", [], {}, net=with_truths(net))
     read_net(network.net, network)
-    return feeder_of(network, name, **options)
+    return network
 
 
 @dataclass(slots=True)

@@ -19,32 +19,6 @@ from feeders.format.tables import FeederTables
 from feeders.model.equipment import folder_of
 from gridsec.errors import GridsecError
 
-__all__ = [
-    "ASSUMED",
-    "CHANGES_FILE",
-    "COLUMNS",
-    "LICENCES",
-    "NAMED",
-    "ODBL",
-    "OWN_FILE",
-    "PANDAPOWER",
-    "RANDOM",
-    "SOURCE_FILE",
-    "WHOLE",
-    "BusbarUnclear",
-    "ConversionChange",
-    "Done",
-    "Origin",
-    "SourceUnreadable",
-    "changes_csv",
-    "feeder_source",
-    "origin",
-    "profiles_source",
-    "sentences",
-    "versioned",
-]
-
-
 CHANGES_FILE: Final = "conversion.csv"
 COLUMNS: Final = ("element", "property", "done", "effect")
 WHOLE: Final = "all of it"

@@ -77,7 +77,7 @@ class Forecast:
         return np.clip(load - pv, *self.p_range), np.clip(q, *self.q_range)
 
     def played(self, origin: float, season: Season) -> Forecast:
-        """Forecast with the calendar of a simulation: the season's profiles begin at the Unix time `origin`."""
+        """Forecast with the calendar of a simulation: the season's profiles begin at a Unix time, s."""
         return replace(self, origin=origin, season=season)
 
     def fill(self, frame: Frame, unread: Bools) -> Frame:
@@ -138,7 +138,7 @@ def always(given: Forecast | None, frame: Frame, unread: Bools) -> Frame:
 
 
 def season_of(local_s: float) -> Season:
-    """Season of the northern hemisphere at a local time, s since 1970-01-01; December to February is winter."""
+    """Season of the northern hemisphere at a local time, s since 1970-01-01; winter is from December."""
     month = int(np.datetime64(int(local_s), "s").astype("datetime64[M]").astype(np.int64)) % 12
     return tuple(Season)[(month + 1) % 12 // 3]
 
