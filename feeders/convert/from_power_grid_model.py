@@ -316,12 +316,8 @@ def _two_ports(tables: Tables, symmetric: bool) -> dict[int, TwoPort]:
         nodes = solved[ComponentType.node]
         v = (nodes["u_pu"] * np.exp(1j * nodes["u_angle"]) * node["u_rated"] / 3.0**0.5).reshape(-1, 2)
         power = solved[ComponentType.sym_load]
-        current = np.conj((power["p"] + 1j * power["q"]) / 3.0 / v[:, 1])
-        found.append([(complex(a), complex(b), complex(i)) for (a, b), i in zip(v, current, strict=True)])
-    return {
-        int(row["id"]): TwoPort.measured(idle[:2], loaded)
-        for row, idle, loaded in zip(rows, *found, strict=True)
-    }
+        found.append((v, np.conj((power["p"] + 1j * power["q"]) / 3.0 / v[:, 1])))
+    return TwoPort.measured([row["id"] for row in rows], *found)
 
 
 def _passing(row: Any) -> bool:

@@ -78,13 +78,6 @@ def grid(code: str) -> Any:
     return simbench.get_simbench_net(code)
 
 
-def version() -> str:
-    """Installed version of simbench."""
-    from importlib.metadata import version as installed
-
-    return installed("simbench")
-
-
 def year() -> dict[str, Floats]:
     """Every low-voltage profile of the year: load profiles as `_pload`, `_qload`, and PV.
 

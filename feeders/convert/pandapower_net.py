@@ -546,13 +546,11 @@ def _two_ports(net: Any) -> dict[int, TwoPort]:
         found = [_alone(bench, loaded=loaded) for loaded in (False, True)]
     except Exception:  # noqa: BLE001  # external solvers may raise anything
         return {}
-    return {
-        int(i): TwoPort.measured(idle[:2], loaded) for i, idle, loaded in zip(own.index, *found, strict=True)
-    }
+    return TwoPort.measured(own.index, *found)
 
 
-def _alone(bench: Any, *, loaded: bool) -> list[tuple[complex, complex, complex]]:
-    """Voltages at both ends of each transformer, V, and the current out of it, A."""
+def _alone(bench: Any, *, loaded: bool) -> tuple[Phasors, Phasors]:
+    """Voltages at both ends of each transformer, (n, 2), V, and the current out of it, (n,), A."""
     import pandapower
 
     bench.shunt["in_service"] = loaded
@@ -563,8 +561,7 @@ def _alone(bench: Any, *, loaded: bool) -> list[tuple[complex, complex, complex]
     angle = np.deg2rad(bench.res_bus.va_degree.to_numpy())
     v = (rated * bench.res_bus.vm_pu.to_numpy() * np.exp(1j * angle)).reshape(-1, 2)
     power = 1e6 * (bench.res_trafo.p_lv_mw + 1j * bench.res_trafo.q_lv_mvar).to_numpy()
-    current = -np.conj(power / 3.0 / v[:, 1])
-    return [(complex(a), complex(b), complex(i)) for (a, b), i in zip(v, current, strict=True)]
+    return v, -np.conj(power / 3.0 / v[:, 1])
 
 
 def _fixed(net: Any, solved: Any, buses: dict[int, str], network: SourceNetwork) -> None:
@@ -656,4 +653,5 @@ def _rest(net: Any, buses: dict[int, str], network: SourceNetwork) -> None:
             continue
         for i, row in content.iterrows():
             known = [buses[int(row[end])] for end in ends if row[end] in buses]
-            network.leave_out(f"{table} {i}", "has no place in a feeder", *known)
+            for bus in known:
+                network.leave_out(f"{table} {i}", "has no place in a feeder", bus)

@@ -54,13 +54,18 @@ class TwoPort:
     series: complex  # Impedance z behind it, ohm
 
     @classmethod
-    def measured(cls, idle: tuple[complex, complex], loaded: tuple[complex, complex, complex]) -> TwoPort:
-        """Identify a transformer from the voltages at both ends, V, without load and loaded.
+    def measured(
+        cls, names: Iterable[int], idle: tuple[Phasors, Phasors], loaded: tuple[Phasors, Phasors]
+    ) -> dict[int, TwoPort]:
+        """Identify transformers from two power flows, without load and loaded.
 
-        `loaded` has the current out of the second end too, A.
+        Each has the voltages at both ends, (n, 2), V, and the currents out of the second end, (n,), A.
         """
-        ratio = idle[0] / idle[1]
-        return cls(ratio, (loaded[0] / ratio - loaded[1]) / loaded[2])
+        ports = {}
+        for name, (a, b), (u, v), current in zip(names, idle[0], *loaded, strict=True):
+            ratio = complex(a) / complex(b)
+            ports[int(name)] = cls(ratio, (complex(u) / ratio - complex(v)) / complex(current))
+        return ports
 
     @property
     def turn(self) -> float:
