@@ -23,6 +23,7 @@ from feeders.convert.customers import Draw, as_it_stands, is_even, rounded
 from feeders.convert.lines import Coupling, line_row, with_taps
 from feeders.convert.provenance import ConversionChange, SourceUnreadable
 from feeders.convert.source import CONSTANT, IN_STAR, MEASURE, OFF, UNLIKE, SourceNetwork
+from feeders.format.reader import CheckReport
 from feeders.format.tables import LineRow
 from feeders.util import extra
 from gridsec.arrays import Floats, Phasors
@@ -266,20 +267,27 @@ def _read(dss: Any, path: Path) -> SourceNetwork:
     dss.Text.Command(f'redirect "{path.resolve()}"')
     if not dss.Basic.NumCircuits():
         raise SourceUnreadable(f"{path}: OpenDSS finds no circuit in it; expected 'new circuit...'")
-    problems: list[Problem] = []
+    report = CheckReport()
     _run(dss, (*_voltage_bases(dss), *SOLVER))
     found = _solved(dss)
     if not found:
         raise GridsecError(f"{path}: OpenDSS's own power flow does not converge", code="not-converged")
-    elements = [_element(dss, name, problems) for name in dss.Circuit.AllElementNames()]
+    elements = [_element(dss, name, report) for name in dss.Circuit.AllElementNames()]
     changes = voltage_dependence(dss)
     _run(dss, CONSTANT_POWER)
     volts = _solved(dss)
     if volts:
         before = elements
-        elements = [_element(dss, name, problems) for name in dss.Circuit.AllElementNames()]
+        elements = [_element(dss, name, report) for name in dss.Circuit.AllElementNames()]
         changes += beyond_limits(before, elements, {change.element for _, change in changes})
-    nominal = _nominal(dss, problems)
+    nominal = _nominal(dss)
+    bare = [bus for bus, volt in nominal.items() if volt <= 0]
+    if bare:
+        report.problem(
+            "missing",
+            f"{len(bare)} bus(es) have no nominal voltage, among them {', '.join(bare[:5])}; "
+            "expected 'set voltagebases=[...]' and 'calcvoltagebases' in the file",
+        )
     network = SourceNetwork(
         tool=f"OpenDSS {version('dss_python_backend')}",
         sources=[each.buses[0] for each in elements if each.kind == "vsource" and each.enabled],
@@ -292,11 +300,10 @@ def _read(dss: Any, path: Path) -> SourceNetwork:
     network.of_bus.extend(changes)
     _build_everything(dss, elements)
     for each in elements:
-        _take(dss, each, network, problems)
-    if problems:
-        raise FeederInvalid(
-            Problem(problem.code, f"{path.name}: {problem}") for problem in dict.fromkeys(problems)
-        )
+        _take(dss, each, network, report)
+    if report.problems:
+        once = dict.fromkeys(report.problems)
+        raise FeederInvalid(Problem(problem.code, f"{path.name}: {problem}") for problem in once)
     return network
 
 
@@ -311,8 +318,7 @@ def _solved(dss: Any) -> dict[str, Phasors]:
     if not dss.Solution.Converged():
         return {}
     volts: dict[str, Phasors] = {}
-    for bus in dss.Circuit.AllBusNames():
-        dss.Circuit.SetActiveBus(bus)
+    for bus in _buses(dss):
         parts = np.array(dss.Bus.Voltages()).reshape(-1, 2)
         v = np.full(PHASES, np.nan, dtype=np.complex128)
         for node, (real, imaginary) in zip(dss.Bus.Nodes(), parts, strict=True):
@@ -326,37 +332,30 @@ def _solved(dss: Any) -> dict[str, Phasors]:
 def _voltage_bases(dss: Any) -> tuple[str, ...]:
     """Missing commands for a file with voltage bases that it does not apply, such as a saved one."""
     named = set(dss.Settings.VoltageBases()) != set(UNNAMED_KV)
-    bare = any(not volt > 0 for volt in _nominal(dss, []).values())
+    bare = any(not volt > 0 for volt in _nominal(dss).values())
     return ("calcvoltagebases",) if named and bare else ()
 
 
-def _nominal(dss: Any, problems: list[Problem]) -> dict[str, float]:
-    nominal = {}
-    for bus in dss.Circuit.AllBusNames():
-        dss.Circuit.SetActiveBus(bus)
-        nominal[bus] = 1000.0 * float(dss.Bus.kVBase())
-    bare = [bus for bus, volt in nominal.items() if volt <= 0]
-    if bare:
-        problems.append(
-            Problem(
-                "missing",
-                f"{len(bare)} bus(es) have no nominal voltage, among them {', '.join(bare[:5])}; "
-                "expected 'set voltagebases=[...]' and 'calcvoltagebases' in the file",
-            )
-        )
-    return nominal
+def _nominal(dss: Any) -> dict[str, float]:
+    return {bus: 1000.0 * float(dss.Bus.kVBase()) for bus in _buses(dss)}
 
 
 def _positions(dss: Any) -> dict[str, tuple[float, float]]:
-    places = {}
+    return {
+        bus: (round(float(dss.Bus.X()), 6), round(float(dss.Bus.Y()), 6))
+        for bus in _buses(dss)
+        if dss.Bus.Coorddefined()
+    }
+
+
+def _buses(dss: Any) -> Iterator[str]:
+    """Yield every bus while it is the active one."""
     for bus in dss.Circuit.AllBusNames():
         dss.Circuit.SetActiveBus(bus)
-        if dss.Bus.Coorddefined():
-            places[bus] = (round(float(dss.Bus.X()), 6), round(float(dss.Bus.Y()), 6))
-    return places
+        yield bus
 
 
-def _element(dss: Any, full: str, problems: list[Problem]) -> Element:
+def _element(dss: Any, full: str, report: CheckReport) -> Element:
     dss.Circuit.SetActiveElement(full)
     kind, _, name = full.partition(".")
     kind = kind.lower()
@@ -379,12 +378,10 @@ def _element(dss: Any, full: str, problems: list[Problem]) -> Element:
                 power[node - 1] += kva
         powers.append(power)
     if enabled and kind not in COUPLINGS and any(node > PHASES for here in nodes for node in here):
-        problems.append(
-            Problem(
-                "unsupported",
-                f"{kind} {name} has a conductor besides the phases 1, 2, 3 and the grounded neutral 0; "
-                "expected none",
-            )
+        report.problem(
+            "unsupported",
+            f"{kind} {name} has a conductor besides the phases 1, 2, 3 and the grounded neutral 0; "
+            "expected none",
         )
     on = tuple(k for k in range(len(buses)) if enabled and not element.IsOpen(k + 1, 0))
     return Element(name, kind, buses, nodes, tuple(powers), enabled, on)
@@ -400,7 +397,7 @@ def _build_everything(dss: Any, elements: list[Element]) -> None:
     dss.Solution.BuildYMatrix(1, 0)
 
 
-def _take(dss: Any, each: Element, network: SourceNetwork, problems: list[Problem]) -> None:
+def _take(dss: Any, each: Element, network: SourceNetwork, report: CheckReport) -> None:
     """Add an element to the network, or report its omission."""
     label = f"{each.kind} {each.name}"
     if not each.enabled:
@@ -408,10 +405,10 @@ def _take(dss: Any, each: Element, network: SourceNetwork, problems: list[Proble
     elif each.kind in {"capacitor", "reactor"} and _is_shunt(each):
         _shunt(dss, each, network)
     elif each.kind in SERIES:
-        _line(dss, each, network, problems)
+        _line(dss, each, network, report)
     elif each.kind == "capacitor":
         text = f"{label} is in series between {each.buses[0]} and {each.buses[1]}; expected a shunt"
-        problems.append(Problem("unsupported", text))
+        report.problem("unsupported", text)
     elif each.kind in COUPLINGS:
         line, idle = _regulator(dss, each, network)
         network.couplings.append(Coupling(label, each.buses, each.power_kva, line, idle))
@@ -492,23 +489,19 @@ def _yprim(dss: Any, each: Element) -> Phasors:
     return matrix
 
 
-def _line(dss: Any, each: Element, network: SourceNetwork, problems: list[Problem]) -> None:
+def _line(dss: Any, each: Element, network: SourceNetwork, report: CheckReport) -> None:
     """Line or series reactor: series impedance and charging from its primitive admittances."""
     label = each.name if each.kind == "line" else f"{each.kind}.{each.name}"
     here, there = each.nodes
     if here != there or len(set(here)) != len(here) or not all(1 <= node <= PHASES for node in here):
         if all(1 <= node <= PHASES for node in (*here, *there)):
-            problems.append(
-                Problem(
-                    "unsupported",
-                    f"line {label} joins the phases {'.'.join(map(str, here))} of {each.buses[0]} to "
-                    f"{'.'.join(map(str, there))} of {each.buses[1]}; expected the same phases at both ends",
-                )
+            report.problem(
+                "unsupported",
+                f"line {label} joins the phases {'.'.join(map(str, here))} of {each.buses[0]} to "
+                f"{'.'.join(map(str, there))} of {each.buses[1]}; expected the same phases at both ends",
             )
         elif 0 in (*here, *there):
-            problems.append(
-                Problem("unsupported", f"line {label} has a conductor to ground; expected phases 1, 2, 3")
-            )
+            report.problem("unsupported", f"line {label} has a conductor to ground; expected phases 1, 2, 3")
         return
     matrix, count = _yprim(dss, each), len(here)
     series = np.asarray(
@@ -520,9 +513,7 @@ def _line(dss: Any, each: Element, network: SourceNetwork, problems: list[Proble
     order = np.argsort(here)
     phases = np.array(here)[order] - 1
     if min(series.real.diagonal().min(), series.imag.diagonal().min()) < 0:
-        problems.append(
-            Problem("negative", f"line {label} has a negative resistance or reactance; expected none")
-        )
+        report.problem("negative", f"line {label} has a negative resistance or reactance; expected none")
         return
     changes: list[ConversionChange] = []
     row = line_row(

@@ -486,10 +486,8 @@ def _taps(parsed: Parsed, report: CheckReport) -> None:
         given = [name for name in names.values() if cells[name] is not None]
         wanted = [name for phase, name in names.items() if phase in cells["phases"]]
         if given and (given != wanted or cells["tap"] != 1.0):
-            report.problems.append(
-                Problem(
-                    "inconsistent",
-                    f"{where}, columns {', '.join(given)}: expected {', '.join(wanted)}, those of phases "
-                    f"{cells['phases']!r}, and no tap beside them; or tap alone, of all of them",
-                )
+            report.problem(
+                "inconsistent",
+                f"{where}, columns {', '.join(given)}: expected {', '.join(wanted)}, those of phases "
+                f"{cells['phases']!r}, and no tap beside them; or tap alone, of all of them",
             )
