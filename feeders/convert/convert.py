@@ -27,6 +27,7 @@ from feeders.convert.network import Converted, feeder_of, opened_rows
 from feeders.convert.provenance import (
     CHANGES_FILE,
     SOURCE_FILE,
+    Changes,
     ConversionChange,
     Origin,
     SourceUnreadable,
@@ -81,7 +82,7 @@ def from_folder(
         for option, value in given.items()
         if value
     ]
-    changes: list[ConversionChange] = []
+    changes = Changes()
     try:
         lines = opened_rows(tables.lines, opened, changes)
     except FeederInvalid as error:

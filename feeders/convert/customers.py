@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from feeders.convert.provenance import WHOLE, ConversionChange
+from feeders.convert.provenance import WHOLE, Changes
 from feeders.format.tables import CustomerRow
 from feeders.profiles import envelopes
 from gridsec.arrays import Phasors
@@ -79,9 +79,7 @@ class Fleet:
     droop: str = "ieee1547-b"
 
 
-def with_fleet(
-    customers: list[CustomerRow], fleet: Fleet, changes: list[ConversionChange]
-) -> list[CustomerRow]:
+def with_fleet(customers: list[CustomerRow], fleet: Fleet, changes: Changes) -> list[CustomerRow]:
     """Add synthetic inverters to customers without one."""
     rows = list(customers)
     bare = [k for k, row in enumerate(rows) if row.inverter_kva == 0.0]
@@ -91,7 +89,7 @@ def with_fleet(
             row = replace(rows[k], pv_kw=rounded(0.9 * kva), pv_profile=f"PV{k % 8 + 1}")
             rows[k] = replace(row, inverter_kva=kva, droop=fleet.droop)
             effect = f"synthetic, with droop curve {fleet.droop}; not in the source"
-            changes.append(ConversionChange(rows[k].customer, f"PV inverter of {kva:g} kVA", "added", effect))
+            changes.note(rows[k].customer, f"PV inverter of {kva:g} kVA", "added", effect)
     return rows
 
 
@@ -172,7 +170,7 @@ def customers_of(
     draws: Iterable[Draw],
     nominal: Mapping[str, float],
     droop: str | None,
-    changes: list[ConversionChange],
+    changes: Changes,
     taken: Collection[str] = (),
 ) -> tuple[list[CustomerRow], dict[str, complex]]:
     """Rows of customers.csv, and the power of each at the source's operating point, kVA.
@@ -187,7 +185,7 @@ def customers_of(
         connections = _connections(draw)
         if not connections:
             effect = "draws nothing in the source's power flow"
-            changes.append(ConversionChange(draw.label, WHOLE, "left out", effect))
+            changes.note(draw.label, WHOLE, "left out", effect)
         for phases, kva in connections:
             row = CustomerRow(_unique(draw, phases, {*taken, *power}), draw.bus, load_kw=0.0, phases=phases)
             power[row.customer] = kva
@@ -208,7 +206,7 @@ def _generator(
     number: int,
     *,
     droop: str | None,
-    changes: list[ConversionChange],
+    changes: Changes,
 ) -> CustomerRow:
     """Give a customer a generator's peak, and its inverter."""
     parts = len(_connections(draw))
@@ -217,12 +215,12 @@ def _generator(
     row = replace(row, pv_kw=peak, pv_profile=f"PV{number % 8 + 1}")
     if not rating > 0:
         effect = f"{row.pv_profile}, not in the source: a feeder's generation follows the sun"
-        changes.append(ConversionChange(draw.label, "profile", "added", effect))
+        changes.note(draw.label, "profile", "added", effect)
         return row
     row = replace(row, inverter_kva=rounded(rating), droop=droop or droop_preset(rating))
-    changes.append(ConversionChange(draw.label, "droop curve", "added", f"{row.droop}, not in the source"))
+    changes.note(draw.label, "droop curve", "added", f"{row.droop}, not in the source")
     if abs(kva.imag) > EVEN * rating:
-        changes.append(ConversionChange(draw.label, *BY_DROOP))
+        changes.note(draw.label, *BY_DROOP)
     return row
 
 
@@ -278,24 +276,22 @@ def _unique(draw: Draw, phases: str, taken: Collection[str]) -> str:
     return name
 
 
-def expected_load(
-    row: CustomerRow, kva: complex, label: str, prop: str, changes: list[ConversionChange]
-) -> CustomerRow:
+def expected_load(row: CustomerRow, kva: complex, label: str, prop: str, changes: Changes) -> CustomerRow:
     """Set the power factors of a load of this power; reports parts of it that the format lacks."""
     p, q = kva.real, kva.imag
     if p < 0:
         effect = "feeds in; its expected load is taken as 0"
-        changes.append(ConversionChange(label, prop, "changed", effect))
+        changes.note(label, prop, "changed", effect)
     if q < -NO_POWER * abs(kva):
         effect = "leading; expected to be 1"
-        changes.append(ConversionChange(label, "power factor", "approximated", effect))
+        changes.note(label, "power factor", "approximated", effect)
     if p <= 0.0 and q > NO_POWER:
-        changes.append(ConversionChange(label, *ONLY_REACTIVE))
+        changes.note(label, *ONLY_REACTIVE)
     return reactive(row, p / math.hypot(p, q) if p > 0 and q > 0 else None)
 
 
 def _load(
-    row: CustomerRow, kva: complex, number: int, *, volt: float, changes: list[ConversionChange], noun: str
+    row: CustomerRow, kva: complex, number: int, *, volt: float, changes: Changes, noun: str
 ) -> CustomerRow:
     p = kva.real
     household = volt < 1000.0 and p <= HOUSEHOLD_KW

@@ -21,7 +21,7 @@ import numpy as np
 
 from feeders.convert.customers import Draw, as_it_stands, is_even, rounded
 from feeders.convert.lines import Coupling, line_row, with_taps
-from feeders.convert.provenance import ConversionChange, SourceUnreadable
+from feeders.convert.provenance import Changes, ConversionChange, SourceUnreadable
 from feeders.convert.source import CONSTANT, IN_STAR, MEASURE, OFF, UNLIKE, SourceNetwork
 from feeders.format.reader import CheckReport
 from feeders.format.tables import LineRow
@@ -455,7 +455,7 @@ def _regulator(dss: Any, each: Element, network: SourceNetwork) -> tuple[LineRow
         phases,
         series=np.diag(series),
         shunt=np.zeros((count, count)),
-        changes=[],
+        changes=Changes(),
     )
     taps = np.ones(PHASES)
     here, there = (network.nominal[bus] for bus in each.buses)
@@ -515,7 +515,7 @@ def _line(dss: Any, each: Element, network: SourceNetwork, report: CheckReport) 
     if min(series.real.diagonal().min(), series.imag.diagonal().min()) < 0:
         report.problem("negative", f"line {label} has a negative resistance or reactance; expected none")
         return
-    changes: list[ConversionChange] = []
+    changes = Changes()
     row = line_row(
         label,
         (each.buses[0], each.buses[1]),

@@ -23,7 +23,7 @@ from feeders.convert.customers import (
 from feeders.convert.lines import as_rows, reached
 from feeders.convert.network import below_source, one_busbar
 from feeders.convert.pandapower_net import between_phases, ids, phase_powers, read_net, with_truths
-from feeders.convert.provenance import WHOLE, BusbarUnclear, ConversionChange
+from feeders.convert.provenance import WHOLE, BusbarUnclear, Changes
 from feeders.convert.source import CONSTANT, OFF, SourceNetwork
 from feeders.format.tables import CustomerRow
 from feeders.profiles import envelopes, pv_names
@@ -59,7 +59,7 @@ class PandapowerNetwork(SourceNetwork):
         return _root(self.net, self, ids(self.net.bus, "bus"), root)
 
     def customers(
-        self, inside: Collection[str], droop: str | None, changes: list[ConversionChange]
+        self, inside: Collection[str], droop: str | None, changes: Changes
     ) -> tuple[list[CustomerRow], dict[str, complex]]:
         """Customers of the loads and static generators inside, and their powers, kVA."""
         names = {i: bus for i, bus in ids(self.net.bus, "bus").items() if bus in inside}
@@ -73,17 +73,13 @@ class _Source:
 
     network: PandapowerNetwork  # The network
     names: dict[int, str]  # Ids of its buses in the feeder
-    changes: list[ConversionChange]  # Receives inexact conversions
+    changes: Changes  # Receives inexact conversions
     power: dict[str, complex] = field(default_factory=dict)  # Power of each customer, kVA
 
     @property
     def net(self) -> Any:
         """The net."""
         return self.network.net
-
-    def note(self, label: str, prop: str, done: Any, effect: str) -> None:
-        """Add a change."""
-        self.changes.append(ConversionChange(label, prop, done, effect))
 
 
 def _root(net: Any, network: SourceNetwork, names: dict[int, str], wanted: str | None) -> str:
@@ -154,9 +150,9 @@ def _phase_rows(source: _Source, number: int) -> Iterator[CustomerRow]:
         power, told = phase_powers(net, row, f"load {name}", source.network.volts.get(bus))
         used = [phase for phase, s in zip("abc", whole, strict=True) if s != 0]
         if not used:
-            source.note(f"load {name}", WHOLE, "left out", "draws nothing on any phase in the source")
+            source.changes.note(f"load {name}", WHOLE, "left out", "draws nothing on any phase in the source")
         elif not row.in_service:
-            source.note(f"load {name}", *SWITCHED_OFF)
+            source.changes.note(f"load {name}", *SWITCHED_OFF)
         source.changes.extend(told)
         for phase, s in zip("abc", power, strict=True):
             if phase in used:
@@ -182,9 +178,9 @@ def _load_row(source: _Source, index: int, name: str, number: int) -> CustomerRo
     s = complex(row.p_mw, row.q_mvar) * scale
     for column in row.index:
         if str(column).startswith("const_") and float(row[column]) > 0:
-            source.note(f"load {name}", column, "approximated", CONSTANT)
+            source.changes.note(f"load {name}", column, "approximated", CONSTANT)
     if not row.in_service:
-        source.note(f"load {name}", *SWITCHED_OFF)
+        source.changes.note(f"load {name}", *SWITCHED_OFF)
     low_voltage = float(source.net.bus.at[int(row.bus), "vn_kv"]) < 1.0
     profile = str(row["profile"]) if "profile" in row and isinstance(row["profile"], str) else ""
     if profile not in envelopes():
@@ -192,7 +188,7 @@ def _load_row(source: _Source, index: int, name: str, number: int) -> CustomerRo
         profile = usual_profile(number, household=low_voltage and s.real <= HOUSEHOLD_KW)
         if wanted:
             effect = f"is not in the library; {profile} instead"
-            source.note(f"load {name}", f"profile {wanted}", "changed", effect)
+            source.changes.note(f"load {name}", f"profile {wanted}", "changed", effect)
     return _known(source, name, source.names[int(row.bus)], s, profile=profile)
 
 
@@ -208,12 +204,12 @@ def _generators(
             continue
         bus, label = source.names[int(generator.bus)], f"generator {names[i]}"
         if not generator.in_service:
-            source.note(label, WHOLE, "left out", OFF)
+            source.changes.note(label, WHOLE, "left out", OFF)
             continue
         s = complex(generator.p_mw, generator.q_mvar) * float(generator.scaling)
         kw = rounded(max(s.real * 1000.0, 0.0))
         if s.real < 0.0:
-            source.note(label, "p_mw", "changed", "draws; its expected generation is taken as 0")
+            source.changes.note(label, "p_mw", "changed", "draws; its expected generation is taken as 0")
         kva = float(generator.sn_mva) * 1000.0
         kva = rounded(kva) if math.isfinite(kva) and kva > 0 else kw
         alone = [k for k in at_bus[bus] if rows[k].phases == "abc"]
@@ -222,11 +218,11 @@ def _generators(
             at_bus[bus].append(len(rows))
             rows.append(CustomerRow(customer=names[i], bus=bus, load_kw=0.0))
             effect = "has no load at its bus and became a customer of its own"
-            source.note(label, "customer", "changed", effect)
+            source.changes.note(label, "customer", "changed", effect)
         k = alone[0]
         source.power[rows[k].customer] = source.power.get(rows[k].customer, 0j) - 1000.0 * s
         if s.imag != 0.0:
-            source.note(label, "q_mvar", "left out", "its droop curve decides")
+            source.changes.note(label, "q_mvar", "left out", "its droop curve decides")
         rows[k] = replace(
             rows[k],
             pv_kw=rounded(rows[k].pv_kw + kw),
@@ -235,7 +231,7 @@ def _generators(
             droop=droop or droop_preset(rows[k].inverter_kva + kva),
         )
         effect = f"{rows[k].droop}, not in the source; at the first customer of its bus"
-        source.note(label, "droop curve", "added", effect)
+        source.changes.note(label, "droop curve", "added", effect)
 
 
 def _sun(source: _Source, generator: Any, label: str, usual: str) -> str:
@@ -248,5 +244,5 @@ def _sun(source: _Source, generator: Any, label: str, usual: str) -> str:
     for column, text in named.items():
         if column == "profile" or text.lower() not in SOLAR:
             effect = f"in simulations generation by the sun, {usual}"
-            source.note(label, f"{column} {text}", "changed", effect)
+            source.changes.note(label, f"{column} {text}", "changed", effect)
     return usual

@@ -22,7 +22,7 @@ from power_grid_model.validation import validate_input_data
 
 from feeders.convert.customers import SWITCHED_OFF, Draw, rounded
 from feeders.convert.lines import ALL, Coupling, by_sequence, charging_cells, line_row
-from feeders.convert.provenance import ConversionChange, SourceUnreadable
+from feeders.convert.provenance import Changes, SourceUnreadable
 from feeders.convert.source import CONSTANT, MEASURE, OFF, UNLIKE, SourceNetwork
 from feeders.convert.transformers import TwoPort, coupling_of
 from feeders.format.reader import some
@@ -228,7 +228,7 @@ def _asymmetric_lines(tables: Tables, network: SourceNetwork) -> None:
                 z[i, j] = z[j, i] = complex(row[f"r_{one}{other}"], row[f"x_{one}{other}"])
         if len(letters) > 3:
             z = z[:3, :3] - np.outer(z[:3, 3], z[3, :3]) / z[3, 3]
-        changes: list[ConversionChange] = []
+        changes = Changes()
         made = line_row(name, ends, np.arange(3), series=z, shunt=_capacitances(row), changes=changes)
         network.of_bus.extend((ends[0], change) for change in changes)
         limit = _finite(row["i_n"])

@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from feeders.convert.customers import Draw, rounded
-from feeders.convert.provenance import WHOLE, ConversionChange
+from feeders.convert.provenance import WHOLE, Changes, ConversionChange
 from feeders.format.columns import SERIES_NAMES, SHUNT_NAMES, LineRow
 from feeders.format.matrices import cells_of, columns_of, passive, shunt_us
 from feeders.model.three_phase import series_of, shunt_of
@@ -52,7 +52,7 @@ def reached(start: str, rows: Iterable[LineRow], without: Collection[str] = ()) 
 
 def fused_with(bus: str, rows: Iterable[LineRow]) -> dict[str, int]:
     """Buses that closed switches fuse with a bus."""
-    return reached(bus, (row for row in rows if row.r_ohm == row.x_ohm == 0.0))
+    return reached(bus, (row for row in rows if row.fuses))
 
 
 def as_rows(couplings: Iterable[Coupling]) -> list[LineRow]:
@@ -85,7 +85,7 @@ def line_row(
     *,
     series: Phasors,
     shunt: Floats,
-    changes: list[ConversionChange],
+    changes: Changes,
 ) -> LineRow:
     """Row of a line with matrices: series impedances (k, k), ohm, and total shunt susceptances (k, k), S.
 
@@ -106,7 +106,7 @@ def line_row(
     like_each_other = cyclic(series)
     if not like_each_other and not passive(series.real):
         effect = "its resistances generate power; taken as transposed"
-        changes.append(ConversionChange(f"line {name}", "impedance matrix", "approximated", effect))
+        changes.note(f"line {name}", "impedance matrix", "approximated", effect)
         like_each_other = True
     if like_each_other:
         zero = own + 2.0 * mutual
@@ -142,16 +142,14 @@ def _cells(symbol: str, unit: str, matrix: Floats, phases: Ints) -> dict[str, An
     return {name: rounded(value) for name, value in found.items()}
 
 
-def charging_cells(name: str, phases: Ints, shunt: Floats, changes: list[ConversionChange]) -> dict[str, Any]:
+def charging_cells(name: str, phases: Ints, shunt: Floats, changes: Changes) -> dict[str, Any]:
     """Cells of a line's charging: one number, or a matrix beside its positive sequence; as of `line_row`."""
     own, mutual = (part.real for part in _means(shunt))
     one = {"b_us": rounded(max(own - mutual, 0.0) * 1e6)}
     if len(phases) == 1 or (cyclic(shunt) and abs(mutual) <= CYCLIC * abs(own)):
         return one
     if not passive(shunt):
-        changes.append(
-            ConversionChange(f"line {name}", CHARGING, "approximated", "no capacitances; " + IN_EVERY_PHASE)
-        )
+        changes.note(f"line {name}", CHARGING, "approximated", "no capacitances; " + IN_EVERY_PHASE)
         return one
     return one | _cells("b", "us", 1e6 * shunt, phases)
 
@@ -166,7 +164,7 @@ CHARGING: Final = "charging between phases"
 IN_EVERY_PHASE: Final = "the positive-sequence charging in every phase; exact where the voltages are balanced"
 
 
-def balanced_charging(lines: Sequence[LineRow], changes: list[ConversionChange]) -> list[LineRow]:
+def balanced_charging(lines: Sequence[LineRow], changes: Changes) -> list[LineRow]:
     """Reduce charging to its positive sequence, if nothing needs three phases; all customers have them."""
     matrices = [shunt_us(cells_of(row)) for row in lines]
     if any(
@@ -190,7 +188,7 @@ def capacitor(name: str, bus: str, siemens: float | Floats, phases: str = "abc")
     shunt = siemens * np.eye(here.size) if isinstance(siemens, float) else siemens
     ohm = (1.0 + 1j) * 1e-7 / float(shunt.diagonal().max())
     series = np.diag(np.full(here.size, ohm, dtype=np.complex128))
-    return line_row(name, (bus, f"{bus} {name}"), here, series=series, shunt=shunt, changes=[])
+    return line_row(name, (bus, f"{bus} {name}"), here, series=series, shunt=shunt, changes=Changes())
 
 
 def open_end(row: LineRow, bus: str, volt: float) -> LineRow | None:
@@ -198,7 +196,7 @@ def open_end(row: LineRow, bus: str, volt: float) -> LineRow | None:
 
     Below a nominal voltage of 1000 V charging is negligible.
     """
-    if row.b_us == 0 or volt < 1000.0 or not (row.r_ohm or row.x_ohm):
+    if row.b_us == 0 or volt < 1000.0 or row.fuses:
         return None
     name = f"{row.line} open end"
     return replace(row, line=name, from_bus=bus, to_bus=f"{bus} {name}", closed=True)
@@ -232,7 +230,7 @@ def turned(row: LineRow, nominal: Mapping[str, float]) -> LineRow:
         phases,
         series=series_of(row)[here] * side,
         shunt=1e-6 * shunt_of(row)[here] / side,
-        changes=[],
+        changes=Changes(),
     )
     scaled = replace(scaled, closed=row.closed, rating_a=away.rating_a, to_volt=away.to_volt)
     return with_taps(scaled, 1.0 / np.array(row.taps))
@@ -254,7 +252,7 @@ def phases_of(row: LineRow) -> Ints:
 
 
 def merged(
-    lines: Sequence[LineRow], busbar: str, changes: list[ConversionChange], nominal: Mapping[str, float]
+    lines: Sequence[LineRow], busbar: str, changes: Changes, nominal: Mapping[str, float]
 ) -> list[LineRow]:
     """Merge parallel lines to one, and open lines that switches short-circuit; `changes` receives both."""
     above: dict[str, str] = {busbar: busbar}
@@ -266,32 +264,24 @@ def merged(
 
     rows: list[LineRow] = []
     for row in lines:
-        solid = row.closed and row.r_ohm == row.x_ohm == 0.0
+        solid = row.closed and row.fuses
         one, other = fused(row.from_bus), fused(row.to_bus)
         if solid and one == other:
-            changes.append(
-                ConversionChange(
-                    f"switch {row.line}", "closed", "changed", "open; others join the same buses"
-                )
-            )
+            changes.note(f"switch {row.line}", "closed", "changed", "open; others join the same buses")
             row = replace(row, closed=False)  # noqa: PLW2901
         elif solid:
             above[other] = one
         rows.append(row)
     beside: dict[frozenset[str], list[int]] = defaultdict(list)
     for k, row in enumerate(rows):
-        if row.closed and (row.r_ohm or row.x_ohm):
+        if row.closed and not row.fuses:
             beside[frozenset((fused(row.from_bus), fused(row.to_bus)))].append(k)
     gone: set[int] = set()
     for ends, members in beside.items():
         if len(ends) == 1:
             for k in members:
                 rows[k] = replace(rows[k], closed=False)
-                changes.append(
-                    ConversionChange(
-                        f"line {rows[k].line}", "closed", "changed", "open; switches join its two ends"
-                    )
-                )
+                changes.note(f"line {rows[k].line}", "closed", "changed", "open; switches join its two ends")
         elif len(members) > 1:
             start = fused(rows[members[0]].from_bus)
             alike = [
@@ -302,7 +292,7 @@ def merged(
     return [row for k, row in enumerate(rows) if k not in gone]
 
 
-def _parallel(rows: list[LineRow], changes: list[ConversionChange]) -> LineRow:
+def _parallel(rows: list[LineRow], changes: Changes) -> LineRow:
     """Merge lines between the same buses."""
     names = " + ".join(row.line for row in rows)
     first = rows[0]
@@ -310,9 +300,7 @@ def _parallel(rows: list[LineRow], changes: list[ConversionChange]) -> LineRow:
     tapped = len({row.taps for row in rows}) > 1
     if not alike or any((row.in_phases and len(row.phases) > 1) or tapped for row in rows):
         return _side_by_side(rows, names, changes)
-    changes.append(
-        ConversionChange(f"lines {names}", WHOLE, "changed", f"in parallel; one line {first.line}")
-    )
+    changes.note(f"lines {names}", WHOLE, "changed", f"in parallel; one line {first.line}")
     positive = [complex(row.r_ohm, row.x_ohm) for row in rows]
     total = 1.0 / sum(1.0 / z for z in positive)
     limit = _shared(rows, [abs(total) / abs(z) for z in positive])
@@ -332,7 +320,7 @@ def _parallel(rows: list[LineRow], changes: list[ConversionChange]) -> LineRow:
     return replace(joined, r0_ohm=rounded(zero.real), x0_ohm=rounded(zero.imag))
 
 
-def _side_by_side(rows: list[LineRow], names: str, changes: list[ConversionChange]) -> LineRow:
+def _side_by_side(rows: list[LineRow], names: str, changes: Changes) -> LineRow:
     """Merge lines of any phases and matrices between the same buses: their admittances add up."""
     first = rows[0]
     each: list[Phasors] = []
@@ -347,14 +335,12 @@ def _side_by_side(rows: list[LineRow], names: str, changes: list[ConversionChang
         taps[own] = np.where(np.isnan(taps[own]), np.array(row.taps)[own], taps[own])
         if np.abs(taps[own] - np.array(row.taps)[own]).max() > CYCLIC:
             effect = f"that of {first.line} beside it; the current that their difference drives is left out"
-            changes.append(ConversionChange(f"line {row.line}", "tap", "approximated", effect))
+            changes.note(f"line {row.line}", "tap", "approximated", effect)
     admittance = np.sum(each, axis=0)
     phases = np.flatnonzero(admittance.diagonal())
     there = np.ix_(phases, phases)
     series = np.asarray(np.linalg.inv(admittance[there]))
-    changes.append(
-        ConversionChange(f"lines {names}", WHOLE, "changed", f"side by side; one line {first.line}")
-    )
+    changes.note(f"lines {names}", WHOLE, "changed", f"side by side; one line {first.line}")
     joined = line_row(
         first.line,
         (first.from_bus, first.to_bus),
@@ -371,7 +357,7 @@ def _side_by_side(rows: list[LineRow], names: str, changes: list[ConversionChang
     even = all(np.abs(part - np.diag(part.diagonal())).max() <= CYCLIC for part in parts)
     if limit is not None and not (even and np.ptp(limits) <= CYCLIC * limit):
         effect = f"{limit:g} A, the least of its conductors' in balanced currents"
-        changes.append(ConversionChange(f"lines {names}", "rating", "approximated", effect))
+        changes.note(f"lines {names}", "rating", "approximated", effect)
     joined = replace(joined, rating_a=limit, to_x=first.to_x, to_y=first.to_y, to_volt=first.to_volt)
     return with_taps(joined, taps)
 

@@ -33,7 +33,7 @@ from feeders.convert.lines import (
     reached,
     turned,
 )
-from feeders.convert.provenance import WHOLE, BusbarUnclear, ConversionChange
+from feeders.convert.provenance import WHOLE, BusbarUnclear, Changes, ConversionChange
 from feeders.convert.round_trip import SourceState
 from feeders.convert.source import SourceNetwork, named_bus
 from feeders.convert.transformers import EVERYTHING, Extent, levels_of, transformed
@@ -76,9 +76,7 @@ def chosen(network: SourceNetwork, root: str | None, opened: Sequence[str], droo
     return busbar
 
 
-def opened_rows(
-    lines: Iterable[LineRow], opened: Sequence[str], changes: list[ConversionChange]
-) -> list[LineRow]:
+def opened_rows(lines: Iterable[LineRow], opened: Sequence[str], changes: Changes) -> list[LineRow]:
     """Open the requested lines; `FeederInvalid` names every unknown one."""
     rows = list(lines)
     if unknown := _unknown(rows, opened):
@@ -123,7 +121,7 @@ def below_source(network: SourceNetwork) -> str | None:
     return way[-1] if len(way) > 1 and _has_lines(way[-1], network.lines) else None
 
 
-def angles_of(volts: Phasors, busbar: str, changes: list[ConversionChange]) -> Phasors:
+def angles_of(volts: Phasors, busbar: str, changes: Changes) -> Phasors:
     """Busbar voltages with the angles of a feeder.
 
     The busbar meter reads magnitudes; simulations and monitors assume angles of 0, -120 and 120 degrees.
@@ -138,7 +136,7 @@ def angles_of(volts: Phasors, busbar: str, changes: list[ConversionChange]) -> P
         return volts
     theirs, ours = (_degrees(each[there]) for each in (volts / first, of_feeder))
     effect = f"{ours} degrees, in the source {theirs}; the check shows the effect"
-    changes.append(ConversionChange(f"bus {busbar}", "angles between its phases", "approximated", effect))
+    changes.note(f"bus {busbar}", "angles between its phases", "approximated", effect)
     return np.asarray(np.abs(volts) * of_feeder)
 
 
@@ -194,7 +192,7 @@ class SuppliedArea:
     inside: dict[str, int]  # The buses, nearest first, with their distances in lines
     lines: list[LineRow]  # Rows of lines.csv, pointing away from the busbar
     draws: list[Draw]  # Loads and generators, and powers into transformers
-    changes: list[ConversionChange]  # Inexact conversions
+    changes: Changes  # Inexact conversions
 
 
 def feeder_of(
@@ -272,7 +270,7 @@ def below(
     GridsecError
         For an unknown or ambiguous bus.
     """
-    changes = list(network.changes)
+    changes = Changes(network.changes)
     rows = opened_rows(network.lines, opened, changes)
     busbar = busbar_of(network, rows, root)
     network, rows = transformed(network, rows, busbar, extent, changes)
@@ -281,7 +279,7 @@ def below(
     kept = _kept(network, rows, inside, changes)
     problems += levels_of(kept, network.nominal)
     if problems:
-        lines = merged(kept, busbar, [], network.nominal)
+        lines = merged(kept, busbar, Changes(), network.nominal)
         raise FeederInvalid([*problems, *(() if extent.meshed else loops(busbar, lines))])
     draws = [draw for draw in network.draws if draw.bus in inside]
     sums, summed = _behind(network, rows, inside, changes)
@@ -325,7 +323,7 @@ def finished(
     return Converted(accepted, changes, state)
 
 
-def accepting(tables: FeederTables, changes: list[ConversionChange], unchecked: str) -> FeederTables:
+def accepting(tables: FeederTables, changes: Changes, unchecked: str) -> FeederTables:
     """Accept values that are doubtful only for their unit: the source's tool knows its units.
 
     `changes` receives every doubtful value. `unchecked` is the reason for a missing power flow of the source,
@@ -343,7 +341,7 @@ def accepting(tables: FeederTables, changes: list[ConversionChange], unchecked: 
         problems.append(Problem(problem.code, sentence))
         if found:
             doubts.add(doubt.partition('"')[0])
-            changes.append(ConversionChange("feeder", sentence, "accepted", "as in the source"))
+            changes.note("feeder", sentence, "accepted", "as in the source")
     if doubts and unchecked:
         raise FeederInvalid(
             [*problems, Problem("doubtful", f"{unchecked}; doubtful values cannot be confirmed")]
@@ -378,7 +376,7 @@ def _infeeds(
 
 
 def _kept(
-    network: SourceNetwork, rows: list[LineRow], inside: Mapping[str, int], changes: list[ConversionChange]
+    network: SourceNetwork, rows: list[LineRow], inside: Mapping[str, int], changes: Changes
 ) -> list[LineRow]:
     """Lines of the feeder, each pointing away from the busbar, with positions."""
     kept = []
@@ -391,11 +389,11 @@ def _kept(
             kept.append(replace(away, to_x=place[0], to_y=place[1]) if place else away)
         elif a or b:
             effect = "open, towards buses that the busbar does not feed"
-            changes.append(ConversionChange(f"line {row.line}", WHOLE, "left out", effect))
+            changes.note(f"line {row.line}", WHOLE, "left out", effect)
     outside = len(network.nominal.keys() - inside.keys())
     if outside:
         effect = "above the busbar, behind a transformer or without supply"
-        changes.append(ConversionChange(_buses(outside), WHOLE, "left out", effect))
+        changes.note(_buses(outside), WHOLE, "left out", effect)
     return kept
 
 
@@ -413,7 +411,7 @@ def _buses(count: int) -> str:
 
 
 def _behind(
-    network: SourceNetwork, rows: list[LineRow], inside: Mapping[str, int], changes: list[ConversionChange]
+    network: SourceNetwork, rows: list[LineRow], inside: Mapping[str, int], changes: Changes
 ) -> tuple[list[Draw], set[str]]:
     """Couplings below the busbar as powers into them, and the buses behind them."""
     everything = [*rows, *as_rows(network.couplings)]
@@ -434,7 +432,7 @@ def _behind(
         }
         if not np.isfinite(np.array([each.power_kva[k] for k in ends])).all():
             effect = f"{_buses(len(far))}; the power into it is not known"
-            changes.append(ConversionChange(each.name, "load side", "left out", effect))
+            changes.note(each.name, "load side", "left out", effect)
             continue
         summed |= far
         for k in ends:
@@ -445,5 +443,5 @@ def _behind(
         what = f"{_buses(len(far))} became a customer with" if far else "in a loop; customers with"
         effect = f"{total.real:.4g} kW and {total.imag:.4g} kvar; exact at these loads only"
         effect = f"{what} the power into it, {effect}"
-        changes.append(ConversionChange(each.name, "load side", "changed", effect))
+        changes.note(each.name, "load side", "changed", effect)
     return draws, summed

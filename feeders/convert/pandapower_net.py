@@ -252,7 +252,7 @@ def _named_connections(solved: Any, network: SourceNetwork) -> None:
         if others.any():
             solved[table].loc[others, "type"] = "wye"
             effect = "in star; pandapower's own three-phase power flow ignores other types"
-            network.note(f"{others.sum()} {table}(s)", "type", "changed", effect)
+            network.changes.note(f"{others.sum()} {table}(s)", "type", "changed", effect)
 
 
 def _volts(net: Any, buses: dict[int, str]) -> dict[str, Phasors]:

@@ -52,6 +52,14 @@ class ConversionChange:
     effect: str  # Replacement in the feeder, and its effect on the voltages
 
 
+class Changes(list[ConversionChange]):
+    """Changes of a conversion in the order of their detection."""
+
+    def note(self, element: str, prop: str, done: Done, effect: str) -> None:
+        """Add a change; arguments as of `ConversionChange`."""
+        self.append(ConversionChange(element, prop, done, effect))
+
+
 def sentences(changes: Iterable[ConversionChange]) -> tuple[str, ...]:
     """Changes as sentences, with equal changes of several elements together."""
     fates: dict[tuple[str, str, str], list[str]] = {}

@@ -8,7 +8,7 @@ from typing import Final
 
 from feeders.convert.customers import Draw
 from feeders.convert.lines import Coupling, capacitor, open_end
-from feeders.convert.provenance import WHOLE, ConversionChange, Done
+from feeders.convert.provenance import WHOLE, Changes, ConversionChange, Done
 from feeders.format.tables import CustomerRow, LineRow
 from gridsec.arrays import Floats, Phasors
 from gridsec.errors import GridsecError
@@ -37,16 +37,12 @@ class SourceNetwork:
     volts: dict[str, Phasors] = field(default_factory=dict)
     # (3,), the same with the loads' dependence on the voltage; empty without one
     as_found: dict[str, Phasors] = field(default_factory=dict)
-    changes: list[ConversionChange] = field(default_factory=list)  # Inexact conversions so far
+    changes: Changes = field(default_factory=Changes)  # Inexact conversions so far
     # Changes that count if their bus is in the feeder
     of_bus: list[tuple[str, ConversionChange]] = field(default_factory=list)
     # Buses and labels of loads and generators that the reader itself converts to customers
     connected: list[tuple[str, str]] = field(default_factory=list)
     unsolved: str = ""  # Reason for missing voltages of the source's own power flow
-
-    def note(self, element: str, prop: str, done: Done, effect: str) -> None:
-        """Add a change."""
-        self.changes.append(ConversionChange(element, prop, done, effect))
 
     def note_at(self, bus: str, element: str, prop: str, done: Done, effect: str) -> None:
         """Add a change that counts if the bus is in the feeder."""
@@ -57,7 +53,7 @@ class SourceNetwork:
         for bus in buses:
             self.note_at(bus, element, WHOLE, "left out", effect)
         if not buses:
-            self.note(element, WHOLE, "left out", effect)
+            self.changes.note(element, WHOLE, "left out", effect)
 
     def add_line(self, row: LineRow, connected: Collection[str]) -> None:
         """Add a line; with one of its ends connected, its charging there too."""
@@ -87,7 +83,7 @@ class SourceNetwork:
         return None if root is None else named_bus(self.nominal, root)
 
     def customers(
-        self, inside: Collection[str], droop: str | None, changes: list[ConversionChange]
+        self, inside: Collection[str], droop: str | None, changes: Changes
     ) -> tuple[list[CustomerRow], dict[str, complex]]:
         """Customers of the buses inside that are not draws, and their powers, kVA."""
         del inside, droop, changes

@@ -29,7 +29,7 @@ import numpy as np
 
 from feeders.convert.customers import Draw, is_even, rounded
 from feeders.convert.lines import VOLT_DIGITS, Coupling, above_busbar, as_rows, fused_with, reached, turned
-from feeders.convert.provenance import WHOLE, ConversionChange
+from feeders.convert.provenance import WHOLE, Changes, ConversionChange
 from feeders.convert.source import SourceNetwork
 from feeders.format.tables import LineRow
 from feeders.format.validation import same_level
@@ -136,7 +136,7 @@ THERE: Final = "a line to {:.6g} V, its ratio {} of the nominal one as in the so
 
 
 def transformed(
-    network: SourceNetwork, rows: list[LineRow], busbar: str, extent: Extent, changes: list[ConversionChange]
+    network: SourceNetwork, rows: list[LineRow], busbar: str, extent: Extent, changes: Changes
 ) -> tuple[SourceNetwork, list[LineRow]]:
     """Replace transformers below the busbar by their equivalent lines, where possible."""
     fused = fused_with(busbar, rows)
@@ -164,7 +164,7 @@ def transformed(
         changes.append(_told(each, turned(line, network.nominal) if backwards else line))
         if each.idle is None and not network.volts:
             effect = "not known without the source's power flow"
-            changes.append(ConversionChange(each.name, "no-load current", "left out", effect))
+            changes.note(each.name, "no-load current", "left out", effect)
     return replace(network, couplings=left, draws=[*network.draws, *draws]), [*rows, *lines]
 
 
@@ -182,7 +182,7 @@ def _leads_on(network: SourceNetwork, rows: Iterable[LineRow], each: Coupling, b
     behind = next((way for way in ways if busbar not in way), None)
     if behind is None:  # the transformer closes a loop
         return True
-    return any(row.closed and (row.r_ohm or row.x_ohm) and row.from_bus in behind for row in rows)
+    return any(row.closed and not row.fuses and row.from_bus in behind for row in rows)
 
 
 class _Joined:
@@ -195,7 +195,7 @@ class _Joined:
         for row in rows:
             if row.closed:
                 self._all.join(row.from_bus, row.to_bus, 1.0 / row.tap + 0j)
-            if row.closed and row.r_ohm == row.x_ohm == 0.0:
+            if row.closed and row.fuses:
                 self._solid.join(row.from_bus, row.to_bus, 1.0 + 0j)
 
     def takes(self, line: LineRow, ratio: complex) -> bool:
