@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from feeders.model.profiles import Season
 from feeders.model.site import load
+from feeders.profiles import Season
 from feeders.simulation.attacks import Trick
 from feeders.studies.campaign.plan import Kind, Place, Plan
 from feeders.studies.campaign.study import campaign

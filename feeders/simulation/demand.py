@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from scipy.signal import lfilter
 
-from feeders.model.profiles import Season, library, profile
+from feeders.profiles import Season, library, profile
 from gridsec.arrays import Floats
 from gridsec.grid.network import InPhases
 

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from feeders.model.profiles import Season
 from feeders.model.site import Snapshot
+from feeders.profiles import Season
 from feeders.simulation.attacks import random_attacks
 from feeders.simulation.demand import Variation
 from feeders.simulation.meters import BUSBAR, Channel, Delivery, MeterErrors, Registers, SimulatedMeters

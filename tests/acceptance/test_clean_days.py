@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from benchmarks.clean_days import Run, main, plan, play
-from feeders.model.profiles import Season
 from feeders.model.site import Snapshot, from_tables, load, to_frame
+from feeders.profiles import Season
 from feeders.registry.registry import design
 from feeders.simulation.attacks import RandomAttackKind, random_attacks
 from feeders.simulation.demand import Variation

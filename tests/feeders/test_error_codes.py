@@ -22,7 +22,8 @@ import pytest
 import feeders
 from feeders.convert.convert import convert
 from feeders.convert.from_simbench import envelope
-from feeders.convert.network import SourceNetwork, below, busbar_of
+from feeders.convert.network import below, busbar_of
+from feeders.convert.source import SourceNetwork
 from feeders.format.tables import CustomerRow, FeederTables, LineRow, from_json, read, to_json, write
 from feeders.model.load_uncertainty import from_history
 from feeders.model.site import from_tables, load
@@ -52,7 +53,7 @@ from tests.sentences import golden, sentences, used
 
 PACKAGE = Path(feeders.__file__).parent
 GOLDEN = Path(__file__).parent / "golden" / "errors.txt"
-HOUSE = CustomerRow("house", "end", 5.0, meter="m1")
+HOUSE = CustomerRow("house", "end", load_kw=5.0, meter="m1")
 MAIN = LineRow("main", "bb", "end", 0.1, 0.04)
 START = 1.75e9
 

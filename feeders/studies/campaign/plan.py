@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from feeders.format.columns import ESTIMATORS
-from feeders.model.profiles import Season, library
 from feeders.model.site import from_tables
+from feeders.profiles import Season, library
 from feeders.simulation.attacks import AttackKind
 from feeders.simulation.demand import Variation
 from feeders.simulation.trial import LoadError, Trial, TrialMeterErrors

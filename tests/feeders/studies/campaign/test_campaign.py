@@ -19,8 +19,8 @@ import pytest
 import threadpoolctl
 from scipy.stats import beta
 
-from feeders.model.profiles import Season
 from feeders.model.site import Site, from_tables, load
+from feeders.profiles import Season
 from feeders.registry.registry import design
 from feeders.simulation.attacks import AttackKind
 from feeders.simulation.demand import Variation
