@@ -239,6 +239,9 @@ def _without_busbar(
     if vouching < design.most:
         # All meters that speak against it may be manipulated themselves.
         return replace(found, others=(*found.others, lying)), None
+    if worse < -like and suspects[0] > design.most:
+        # Beside more suspects than can be told apart the busbar's meter is a rival only.
+        return replace(found, others=(*found.others, lying)), None
     if worse < -like:
         # A false power may look the same: it need not be as unlikely as to accuse somebody of it.
         power = search.beside_powers(now)
