@@ -49,7 +49,6 @@ def calibrate(site: Site, found: Calibrate) -> Section:
             )
         )
     return Section(
-        title="Readings against the files",
         answers={Question.RECORDS: _said(found)},
         figures=tuple(figures),
         tables=found.tables,

@@ -59,7 +59,6 @@ def campaign(_: Site, found: Campaign) -> Section:
     plan = found.plan
     rate = min(plan.alarms_per_year)
     return Section(
-        title="Simulated attacks",
         answers={Question.MONITOR: _behaved(found, rate)},
         figures=_figures(found, rate) if len(found.liars) else (),
         tables=found.tables,

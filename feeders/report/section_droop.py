@@ -54,7 +54,6 @@ def droop(site: Site, found: DroopStudy) -> Section:
     delay = f", with a dead time of {given.dead} intervals" if given.dead else ""
     hosts = "hosting" in found.tables
     return Section(
-        title="The inverters",
         answers={Question.FLEET: _fleet(site, found, band, busbar)},
         figures=_figures(site, found, (low, high), band),
         tables=found.tables,

@@ -42,7 +42,6 @@ def redundancy(site: Site, found: Redundancy) -> Section:
     """Section of the study redundancy."""
     first = found.meters[found.meters["case"] == "all live"]
     return Section(
-        title="Attacks that stay invisible",
         answers={Question.INVISIBLE: _invisible(found)},
         figures=(
             Figure(
@@ -142,7 +141,6 @@ def detectable(site: Site, found: Detectable) -> Section:
     """Section of the study detectable."""
     once, twice = _sure(found.risk), _sure(2.0 * found.risk)
     return Section(
-        title="Sizes of attacks",
         answers={
             Question.LIES: _sizes(site, found.meters, found.max_attacked, (once, twice)),
             Question.PICTURE: _picture(site, found.customers, found.max_attacked, twice),
@@ -345,7 +343,6 @@ def protect(site: Site, found: Protect) -> Section:
     """Section of the study protect."""
     chosen = set(found.meters["meter"]) if len(found.meters) else set()
     return Section(
-        title="Meters to protect",
         answers={Question.PROTECT: _protection(site, found)},
         figures=(
             Figure(

@@ -173,8 +173,6 @@ class Section:
 
     Attributes
     ----------
-    title
-        Heading.
     answers
         Answers by question.
     figures
@@ -189,7 +187,6 @@ class Section:
         Assumptions, as sentences.
     """
 
-    title: str
     answers: Mapping[Question, Finding]
     figures: tuple[Figure, ...] = ()
     tables: Mapping[str, pd.DataFrame] = field(default_factory=dict)
