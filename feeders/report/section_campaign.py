@@ -31,7 +31,10 @@ _SIZES = (
     "coordinated: displacement of the least affected meter by a false load, % of nominal; stuck: none"
 )
 _UNITS = {
-    **dict.fromkeys((AttackKind.BIAS, AttackKind.TOGETHER, AttackKind.SCALING, AttackKind.COORDINATED), " %"),
+    **dict.fromkeys(
+        (AttackKind.BIAS, AttackKind.TOGETHER, AttackKind.SCALING, AttackKind.RANDOM, AttackKind.COORDINATED),
+        " %",
+    ),
     **{
         AttackKind.DRIFT: " %/min",
         AttackKind.REPLAY: " s",

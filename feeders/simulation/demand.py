@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Self
 
 import numpy as np
 from scipy.signal import lfilter
@@ -23,6 +23,7 @@ from gridsec.grid.network import InPhases
 
 if TYPE_CHECKING:
     from feeders.model.site import Site
+    from feeders.simulation.scenario import Scenario
 
 GRID_S: Final = 1.0
 """Spacing of the random processes, s; linear in between."""
@@ -254,6 +255,12 @@ class Customers:
         self._hidden_kvar = metered * _told(variation.hidden_kvar, [row.q_std_kvar for row in rows])
         self._hidden_p = Fluctuation(seed, Stream.HIDDEN_P, count, variation.hidden_correlation_s)
         self._hidden_q = Fluctuation(seed, Stream.HIDDEN_Q, count, variation.hidden_correlation_s)
+
+    @classmethod
+    def of(cls, site: Site, scenario: Scenario) -> Self:
+        """Customers of a scenario."""
+        start, season = scenario.start, scenario.season
+        return cls(site, scenario.variation, scenario.seed, start, scenario.profile_s, season=season)
 
     def at(self, t: Floats) -> Demand:
         """Powers and busbar voltage at times t (T,), Unix s."""

@@ -328,9 +328,7 @@ class PlantTrajectory:
 
 def truth(site: Site, scenario: Scenario, first: int, end: float) -> Iterator[PlantTrajectory]:
     """True state from tick `first` up to tick `end`, which may be infinite; begins in equilibrium."""
-    customers = Customers(
-        site, scenario.variation, scenario.seed, scenario.start, scenario.profile_s, season=scenario.season
-    )
+    customers = Customers.of(site, scenario)
     loop = ClosedLoop(power_flow(site), site.droop, site.feeder.base_kva, site.customer_volt)
     steps = substeps(site, scenario)
     course = _Course(loop, scenario.dt_s / steps)

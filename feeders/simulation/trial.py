@@ -233,9 +233,7 @@ def frames(
     """
     site = trial.stated if stated is None else stated
     scenario = trial.scenario if scenario is None else scenario
-    known = Customers(
-        site, scenario.variation, scenario.seed, scenario.start, scenario.profile_s, season=scenario.season
-    )
+    known = Customers.of(site, scenario)
     if site.forecast is not None:
         origin = scenario.start - scenario.profile_s
         site = replace(site, forecast=site.forecast.played(origin, scenario.season))
