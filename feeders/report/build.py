@@ -27,39 +27,17 @@ __all__ = ["Report", "report"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Report:
-    """Report of a feeder.
+    """Report of a feeder."""
 
-    Attributes
-    ----------
-    html
-        The page.
-    pictures
-        Figure files by name: SVG, and PNG with matplotlib.
-    tables
-        Tables by file name.
-    """
-
-    html: str
-    pictures: dict[str, bytes]
-    tables: dict[str, pd.DataFrame]
+    html: str  # the page
+    pictures: dict[str, bytes]  # figure files by name: SVG, and PNG with matplotlib
+    tables: dict[str, pd.DataFrame]  # tables by file name
 
 
 def report(
     site: Site, outcomes: Sequence[StudyOutcome], about: About, origin: Origin | None = None
 ) -> Report:
-    """Build the report; equal arguments give equal bytes.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    outcomes
-        Outcomes of its studies, in the order of the sections.
-    about
-        Data on the report itself.
-    origin
-        Origin of the feeder, if it was converted.
-    """
+    """Build the report, with sections in the order of `outcomes`; equal arguments give equal bytes."""
     chapters = [Chapter(outcome, section(site, outcome)) for outcome in outcomes]
     chart = _chart(site)
     title = site.tables.meta.title or site.feeder.name

@@ -201,12 +201,8 @@ def width_of(text: str, size: float = 12.0) -> float:
 
 
 def style(scope: str = "") -> str:
-    """Style sheet of all looks, light and dark.
-
-    Parameters
-    ----------
-    scope
-        Selector of the drawings' container; empty: the whole document is one drawing.
+    """Style sheet of all looks, light and dark, below a selector; without one the whole document is one
+    drawing.
     """
     root = scope or ":root"
     before = f"{scope} " if scope else ""
@@ -238,18 +234,10 @@ def _rule(look: Look) -> str:
 
 
 def svg(drawing: Drawing, *, title: str, text: str, key: str, alone: bool = False) -> str:
-    """Write a drawing as SVG.
+    """Write a drawing as SVG with a title, and a text for screen readers.
 
-    Parameters
-    ----------
-    drawing
-        The drawing.
-    title, text
-        Title, and description for screen readers.
-    key
-        Prefix of ids, unique in the document: letters, digits and hyphens.
-    alone
-        True: a file of its own, with style sheet and background.
+    `key` is a prefix of ids, unique in the document: letters, digits and hyphens. With `alone` the drawing is
+    a file of its own, with style sheet and background.
     """
     width, height = _number(drawing.width), _number(drawing.height)
     head = [
@@ -327,24 +315,12 @@ NARROW: Final = 350.0
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """Figure of the report.
+    """Figure of the report."""
 
-    Attributes
-    ----------
-    name
-        Name of its files: letters, digits and hyphens.
-    title
-        Title in a few words.
-    text
-        Description, for screen readers; also printed below it.
-    draw
-        Draws it for a width, px.
-    """
-
-    name: str
-    title: str
-    text: str
-    draw: Callable[[float], Drawing]
+    name: str  # name of its files: letters, digits and hyphens
+    title: str  # title in a few words
+    text: str  # description, for screen readers; also printed below it
+    draw: Callable[[float], Drawing]  # draws it for a width, px
 
 
 SCALE: Final = 2.0
@@ -358,20 +334,7 @@ def available() -> bool:
 
 
 def png(drawing: Drawing, *, title: str, text: str) -> bytes:
-    """Draw a PNG; equal drawings give equal bytes.
-
-    Parameters
-    ----------
-    drawing
-        The drawing.
-    title, text
-        Metadata of the file.
-
-    Raises
-    ------
-    ModuleNotFoundError
-        Without matplotlib; see `available`.
-    """
+    """Draw a PNG with a title and a text as metadata; equal drawings give equal bytes. Needs matplotlib."""
 
     def marks(axes: Any) -> None:
         for k, mark in enumerate(drawing.marks):

@@ -45,33 +45,15 @@ class Result(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StudyOutcome:
-    """Outcome of a study.
+    """Outcome of a study."""
 
-    Attributes
-    ----------
-    study
-        Its name, as on the command line.
-    result
-        Result; None after a failure.
-    problem
-        Reason of the failure; empty without one.
-    command
-        Command line of this study alone.
-    seconds
-        Duration, s.
-    resumed
-        True if earlier work was reused, which is not in `seconds`.
-    absent
-        True if the study does not apply to this feeder; `problem` is the reason.
-    """
-
-    study: str
-    result: Result | None
-    problem: str = ""
-    command: str = ""
-    seconds: float = 0.0
-    resumed: bool = False
-    absent: bool = False
+    study: str  # its name, as on the command line
+    result: Result | None  # result; None after a failure
+    problem: str = ""  # reason of the failure; empty without one
+    command: str = ""  # command line of this study alone
+    seconds: float = 0.0  # duration, s
+    resumed: bool = False  # true if earlier work was reused, which is not in `seconds`
+    absent: bool = False  # true if the study does not apply to this feeder; `problem` is the reason
 
 
 class _Study(NamedTuple):
@@ -147,27 +129,13 @@ UNKNOWN: Final = "not known, not asked for, or without a case"
 
 @dataclass(frozen=True, slots=True)
 class About:
-    """Data on the report itself.
+    """Data on the report itself."""
 
-    Attributes
-    ----------
-    made
-        Date of the report, as text.
-    command
-        Command line of the report.
-    versions
-        Versions of gridsec and of its numerical libraries.
-    seeds
-        Seeds of all random numbers.
-    folder
-        Name of the folder beside the page with figures and tables; empty without one.
-    """
-
-    made: str
-    command: str
-    versions: Mapping[str, str]
-    seeds: Mapping[str, int]
-    folder: str = ""
+    made: str  # date of the report, as text
+    command: str  # command line of the report
+    versions: Mapping[str, str]  # versions of gridsec and of its numerical libraries
+    seeds: Mapping[str, int]  # seeds of all random numbers
+    folder: str = ""  # name of the folder beside the page with figures and tables; empty without one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -205,21 +173,7 @@ def page(
     *,
     origin: Origin | None,
 ) -> str:
-    """Write the page.
-
-    Parameters
-    ----------
-    title
-        Title of the feeder.
-    facts, chart
-        General data on the feeder: customers, meters, inverters and others by name, and its map.
-    chapters
-        Sections of its studies.
-    about
-        Data on the report itself.
-    origin
-        Origin of the feeder, if it was converted.
-    """
+    """Write the page; `facts` on the feeder are by name: customers, meters, inverters and others."""
     script = _file("sort.js")
     changes, changed = "", None
     if origin is not None:

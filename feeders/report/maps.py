@@ -56,35 +56,19 @@ HALF_PAGE: Final = 400.0
 
 @dataclass(frozen=True, slots=True)
 class Placed:
-    """Layout of a feeder on a sheet, px.
+    """Layout of a feeder on a sheet, px."""
 
-    Attributes
-    ----------
-    width, height
-        Size of the sheet.
-    wires, drops
-        Polylines of lines, and of the connections of customers.
-    ties
-        Polylines of the lines that close loops.
-    busbar
-        Both ends of the busbar.
-    customers
-        Position of each customer.
-    room
-        Available room of a customer.
-    real
-        True: positions of the files.
-    """
-
+    # Size of the sheet.
     width: float
     height: float
+    # Polylines of lines, and of the connections of customers.
     wires: tuple[tuple[Point, ...], ...]
     drops: tuple[tuple[Point, ...], ...]
-    ties: tuple[tuple[Point, ...], ...]
-    busbar: tuple[Point, Point]
-    customers: tuple[Point, ...]
-    room: float
-    real: bool
+    ties: tuple[tuple[Point, ...], ...]  # polylines of the lines that close loops
+    busbar: tuple[Point, Point]  # both ends of the busbar
+    customers: tuple[Point, ...]  # position of each customer
+    room: float  # available room of a customer
+    real: bool  # True: positions of the files
 
 
 def has_places(site: Site) -> bool:
@@ -93,15 +77,7 @@ def has_places(site: Site) -> bool:
 
 
 def place(site: Site, width: float) -> Placed:
-    """Lay out a feeder on a sheet of a given width.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    width
-        Width of the sheet, px; on narrow sheets trees grow downwards.
-    """
+    """Lay out a feeder on a sheet `width` px wide; on narrow sheets trees grow downwards."""
     return _real(site, width) if has_places(site) else _tree(site, width)
 
 
@@ -331,30 +307,14 @@ class Shape(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Spot:
-    """Mark of a customer on a map.
+    """Mark of a customer on a map."""
 
-    Attributes
-    ----------
-    shape
-        Kind of mark.
-    label
-        Text beside it, or empty.
-    tip
-        Text of the tooltip.
-    step
-        Step of a size on a scale.
-    weight
-        Priority of the label's position.
-    phase
-        Phase a, b or c on a feeder of several phases; empty: none shown.
-    """
-
-    shape: Shape
-    label: str = ""
-    tip: str = ""
-    step: int = 0
-    weight: float = 0.0
-    phase: str = ""
+    shape: Shape  # kind of mark
+    label: str = ""  # text beside it, or empty
+    tip: str = ""  # text of the tooltip
+    step: int = 0  # step of a size on a scale
+    weight: float = 0.0  # priority of the label's position
+    phase: str = ""  # phase a, b or c on a feeder of several phases; empty: none shown
 
 
 LEGS: Final = {"a": 60.0, "b": 180.0, "c": 300.0}
@@ -382,13 +342,7 @@ class ColorScale:
 
 
 def steps_of(values: Sequence[float], unit: str) -> ColorScale:
-    """Scale of equal steps of a round size over finite values.
-
-    Parameters
-    ----------
-    values, unit
-        Values, at least one of them finite, and their unit.
-    """
+    """Scale of equal steps of a round size over values, at least one of them finite."""
     finite = [value for value in values if math.isfinite(value)]
     least, most = min(finite), max(finite)
     same = most - least < 0.05 * max(abs(most), abs(least))
@@ -412,15 +366,7 @@ def _digits(step: float) -> int:
 
 
 def legend_of(meanings: Mapping[str, Shape], spots: Sequence[Spot]) -> dict[str, Spot]:
-    """Legend of the shapes on a map.
-
-    Parameters
-    ----------
-    meanings
-        Shapes by meaning.
-    spots
-        Marks of the map.
-    """
+    """Those of the shapes, by meaning, that are on a map."""
     there = {spot.shape for spot in spots}
     return {name: Spot(shape) for name, shape in meanings.items() if shape in there}
 
@@ -428,19 +374,7 @@ def legend_of(meanings: Mapping[str, Shape], spots: Sequence[Spot]) -> dict[str,
 def draw_map(
     site: Site, spots: Sequence[Spot], width: float, *, legend: Mapping[str, Spot], note: str = ""
 ) -> Drawing:
-    """Draw a feeder.
-
-    Parameters
-    ----------
-    site, spots
-        The feeder, and the mark of each customer.
-    width
-        Width of the sheet, px.
-    legend
-        Marks of the legend by meaning.
-    note
-        Text above the drawing.
-    """
+    """Draw a feeder on a sheet `width` px wide, with the mark of each customer, and a legend by meaning."""
     at = place(site, width)
     top = 22.0 if note else 0.0
     at = replace(
@@ -604,17 +538,7 @@ FEW_LABELS: Final = 40
 def size_map(
     site: Site, table: pd.DataFrame, width: float, *, who: str, column: str, unit: str = "V"
 ) -> Drawing:
-    """Map of the feeder with a number for each customer or meter.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    width
-        Width of the sheet, px.
-    table, column, unit
-        As in `spots_by_size`, with `who`.
-    """
+    """Map of the feeder with a number for each customer or meter, as in `spots_by_size`."""
     spots, legend = spots_by_size(site, table, who, column, unit)
     return draw_map(site, spots, width, legend=legend)
 
@@ -624,12 +548,7 @@ def spots_by_size(
 ) -> tuple[list[Spot], dict[str, Spot]]:
     """Marks of a map with sizes from a column of a table, and their legend.
 
-    Parameters
-    ----------
-    site
-        The feeder.
-    table, column, unit
-        Table, its column of numbers, and their unit. `who` is its column of ids, "meter" or "customer".
+    The column `who` of the table, "meter" or "customer", has the ids.
     """
     names = names_of(site, who)
     sizes = dict(zip(table[who].astype(str), table[column].astype(float), strict=True))
@@ -657,14 +576,9 @@ def spots_by_size(
 
 
 def comparable(site: Site, table: pd.DataFrame) -> tuple[pd.DataFrame, str]:
-    """Table of volts and its unit; with several nominal voltages relative to these.
+    """Table of volts and its unit; with several nominal voltages relative to that of the column `customer`.
 
-    Parameters
-    ----------
-    site
-        The feeder.
-    table
-        Table with a column `customer`; columns of numbers with a name in `_s` are not changed.
+    Columns of numbers with a name in `_s` are not changed.
     """
     if bool((site.nominal_volt == site.nominal_volt[0]).all()):
         return table, "V"

@@ -52,21 +52,11 @@ class Standing(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Value:
-    """Number in a sentence.
+    """Number in a sentence."""
 
-    Attributes
-    ----------
-    value
-        The number.
-    shown
-        Text of the number, with its unit.
-    source
-        Table, column, and operation: `detectable-meters:noticed:max`.
-    """
-
-    value: float
-    shown: str
-    source: str
+    value: float  # the number
+    shown: str  # text of the number, with its unit
+    source: str  # table, column, and operation: `detectable-meters:noticed:max`
 
 
 Sentence = tuple[str | Value, ...]
@@ -74,18 +64,10 @@ Sentence = tuple[str | Value, ...]
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Answer of a study.
+    """Answer of a study."""
 
-    Attributes
-    ----------
-    standing
-        Certainty of the answer.
-    sentences
-        The answer, the most important first.
-    """
-
-    standing: Standing
-    sentences: tuple[Sentence, ...]
+    standing: Standing  # certainty of the answer
+    sentences: tuple[Sentence, ...]  # the answer, the most important first
 
 
 def said(sentence: Sentence) -> str:
@@ -169,27 +151,13 @@ class Question(Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Section:
-    """Section of the report.
+    """Section of the report."""
 
-    Attributes
-    ----------
-    answers
-        Answers by question.
-    figures
-        Figures; their names begin with the study's.
-    tables
-        Tables by name.
-    shown
-        Columns of a table on the page, if not the first ones; files have all.
-    columns
-        Meanings of the tables' columns, in the order of the page.
-    assumptions
-        Assumptions, as sentences.
-    """
-
-    answers: Mapping[Question, Finding]
-    figures: tuple[Figure, ...] = ()
-    tables: Mapping[str, pd.DataFrame] = field(default_factory=dict)
+    answers: Mapping[Question, Finding]  # answers by question
+    figures: tuple[Figure, ...] = ()  # figures; their names begin with the study's
+    tables: Mapping[str, pd.DataFrame] = field(default_factory=dict)  # tables by name
+    # Columns of a table on the page, if not the first ones; files have all.
     shown: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    # Meanings of the tables' columns, in the order of the page.
     columns: Mapping[str, str] = field(default_factory=dict)
-    assumptions: tuple[str, ...] = ()
+    assumptions: tuple[str, ...] = ()  # assumptions, as sentences

@@ -87,28 +87,18 @@ Attacks: TypeAlias = tuple[tuple[Attack, ...], tuple[InverterAttack, ...]]
 
 @dataclass(frozen=True, slots=True)
 class AttackSpec:
-    """Attack stated in one line: manipulation, count, size and time; the scenario's seed chooses the devices.
+    """Attack stated in one line: manipulation, count, size and time; the seed chooses the devices."""
 
-    Attributes
-    ----------
-    trick
-        The manipulation.
-    count
-        Number of meters, or inverters.
-    size
-        Size. Bias (random signs), together (the sign of `size` for all) and scaling: % of nominal. Drift: %
-        of nominal per minute, random signs. Random: smallest displacement, % of nominal, redrawn each second.
-        Coordinated: displacement of the least affected manipulated meter by the trace of a false load, % of
-        nominal. The load is at a customer with a plausible reading of it, if there is one. Power: the same
-        load, with only the power of that meter falsified. Replay and clock shift: age of the reports, s.
-        Inverter: % of its rating, random signs. Stuck: unused.
-    onset_s, end_s
-        Seconds after the start of the scenario.
-    """
-
-    trick: AttackKind
-    count: int = 1
+    trick: AttackKind  # the manipulation
+    count: int = 1  # number of meters, or inverters
+    # Size. Bias (random signs), together (the sign of `size` for all) and scaling: % of nominal. Drift: % of
+    # nominal per minute, random signs. Random: smallest displacement, % of nominal, redrawn each second.
+    # Coordinated: displacement of the least affected manipulated meter by the trace of a false load, % of
+    # nominal. The load is at a customer with a plausible reading of it, if there is one. Power: the same
+    # load, with only the power of that meter falsified. Replay and clock shift: age of the reports, s.
+    # Inverter: % of its rating, random signs. Stuck: unused.
     size: float = 3.0
+    # Seconds after the start of the scenario.
     onset_s: float = 30.0
     end_s: float = np.inf
 
@@ -152,20 +142,15 @@ def random_attacks(
     t_off: float,
     scenario: Scenario | None = None,
 ) -> tuple[Attack, ...]:
-    """Choose random meters of a feeder and their attack.
+    """Choose random meters of a feeder and their attack; the seed determines both.
 
     Parameters
     ----------
-    seed
-        Chooses the meters, their displacements and the place of a fake load.
     kind
         One of RANDOM_KINDS. Bias, scaling and random displacements have random signs and sizes between `size`
         and 1.5 `size`. A drift reaches such a size after a third of the attack. A replay repeats the hour
         before. A fake load moves the least affected of its meters by `size`. Scaling moves a meter by at
-        least `size` while its voltage is within the feeder's limits. The displacement of stuck and replayed
-        meters is the change of the voltage since, independent of `size`.
-    count
-        Number of manipulated meters.
+        least `size` while its voltage is within the feeder's limits. Stuck meters have no size.
     size
         Smallest displacement of a manipulated meter, pu of nominal, > 0.
     t_on, t_off
@@ -195,22 +180,10 @@ def random_attacks(
 
 
 def busbar_attack(site: Site, kind: AttackKind | str, size: float, *, t_on: float, t_off: float) -> Attack:
-    """Attack the busbar meter, in all of its phases.
+    """Attack the busbar meter, in all of its phases, by bias, scaling or drift; times are Unix s.
 
-    Parameters
-    ----------
-    kind
-        Bias, scaling or drift: the reading is too high by `size`, or by this part of itself, or by `size`
-        from a third of the attack on.
-    size
-        Displacement, pu of nominal; negative for a low reading.
-    t_on, t_off
-        Begin and end, Unix s.
-
-    Raises
-    ------
-    NoSuchAttack
-        For another kind.
+    By bias the reading is too high by `size`, pu; by scaling by this part of itself; by drift by `size` from
+    a third of the attack on. A negative size gives low readings. Raises NoSuchAttack for another kind.
     """
     kind = choice("kind", AttackKind, kind)
     if kind not in (AttackKind.BIAS, AttackKind.SCALING, AttackKind.DRIFT):
@@ -224,15 +197,8 @@ def busbar_attack(site: Site, kind: AttackKind | str, size: float, *, t_on: floa
 def manipulations(site: Site, lie: AttackSpec | None, scenario: Scenario) -> Attacks:
     """Build the attacks of one statement; none for None.
 
-    Parameters
-    ----------
-    scenario
-        The scenario without attacks: its seed chooses the devices, and a false load adds to its loads.
-
-    Raises
-    ------
-    NoSuchAttack
-        For too few meters or inverters, or without a place for such a load.
+    The seed of `scenario` (without attacks) chooses the devices; a false load adds to its loads. Raises
+    NoSuchAttack for too few devices, or without a place for such a load.
     """
     if lie is None:
         return (), ()
@@ -266,18 +232,8 @@ def check_count(site: Site, kind: AttackKind, count: int) -> int:
 def on_devices(
     site: Site, lie: AttackSpec, devices: Ints, signs: Floats, *, t_on: float, t_off: float, seed: int = 0
 ) -> Attacks:
-    """Build the attack with independent manipulations of given devices; not with the trace of a load.
-
-    Parameters
-    ----------
-    lie
-        Manipulation and size.
-    devices, signs : (k,)
-        The meters or inverters, and the sign of the size for each.
-    t_on, t_off
-        Begin and end, Unix s.
-    seed
-        Seed of random displacements.
+    """Attack given meters or inverters (k,) independently, each by its sign (k,) of the size; times are
+    Unix s.
     """
     amount = lie.size / 100.0 * (np.abs(signs) if lie.trick is AttackKind.TOGETHER else signs)
     if lie.trick is AttackKind.INVERTER:
@@ -330,13 +286,8 @@ def fake_load(
 ) -> tuple[Ints, FakeLoad]:
     """Size a load at one customer with a trace of at least `size` pu at every manipulated meter.
 
-    Parameters
-    ----------
-    meters : (k,) or k
-        The meters to manipulate, or their number. A number selects those that the load affects most, with the
-        customer's own meter if there is one.
-    loads
-        True loads at the time; typical loads by default.
+    `meters` are the manipulated ones, (k,), or their number. A number selects those that the load affects
+    most, with the customer's own meter if there is one. Without `loads` the true loads are typical ones.
 
     Returns
     -------
@@ -424,23 +375,10 @@ def load_trace(
     t_off: float,
     plausible: bool = False,
 ) -> Coordinated:
-    """Build the attack with the trace of a load at the first possible customer, in random order.
+    """Attack with the trace of a load at the first possible customer, in random order.
 
-    Parameters
-    ----------
-    kind
-        One of LOAD_TRACES.
-    count, size
-        Number of manipulated meters, and smallest displacement of them, pu.
-    loads
-        True loads at the time; typical loads by default.
-    plausible
-        True: prefer a customer with a plausible reading of its power with the load.
-
-    Raises
-    ------
-    NoSuchAttack
-        Without such a customer.
+    The trace displaces `count` meters by at least `size` pu. `plausible` prefers a customer with a plausible
+    reading of its power with the load. Raises NoSuchAttack without such a customer.
     """
     loads = _typical(site) if loads is None else loads
     first: Coordinated | None = None

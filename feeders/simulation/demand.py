@@ -65,46 +65,27 @@ def generator(seed: int, stream: Stream, index: int = 0) -> np.random.Generator:
 
 @dataclass(frozen=True, slots=True)
 class Variation:
-    """Variation of loads, generation and the busbar.
+    """Variation of loads, generation and the busbar."""
 
-    Attributes
-    ----------
-    load_scale, pv_scale
-        Factors on the profiles, 1.
-    load_spread
-        Standard deviation of the logarithm of each customer's fast variation, 1.
-    load_correlation_s
-        Its correlation time, s.
-    cloud_spread, cloud_correlation_s
-        The same for generation. Half of its variance is common to the feeder, half is each roof's own.
-    busbar_pu
-        Mean voltage of the busbar, pu of nominal.
-    busbar_spread_pu, busbar_correlation_s
-        Standard deviation and correlation time of its slow variation, pu and s.
-    busbar_unbalance_pu
-        In three phases: standard deviation of an equally slow variation of each phase, pu.
-    tap_step_pu
-        Height of one step of the transformer's tap changer upstream, pu; 0: none.
-    tap_interval_s
-        Length of the intervals with one tap event each, at a random time, s.
-    hidden_kw, hidden_kvar, hidden_correlation_s
-        Standard deviations and correlation time, s, of the power of every metered customer beyond its
-        readings, for readings that are forecasts. None: those of the feeder's files (`p_std_kw`,
-        `q_std_kvar`), 0 for empty cells.
-    """
-
+    # Factors on the profiles, 1.
     load_scale: float = 1.0
     pv_scale: float = 1.0
-    load_spread: float = 0.3
-    load_correlation_s: float = 600.0
+    load_spread: float = 0.3  # standard deviation of the logarithm of each customer's fast variation, 1
+    load_correlation_s: float = 600.0  # its correlation time, s
+    # The same for generation. Half of its variance is common to the feeder, half is each roof's own.
     cloud_spread: float = 0.2
     cloud_correlation_s: float = 300.0
-    busbar_pu: float = 1.0
+    busbar_pu: float = 1.0  # mean voltage of the busbar, pu of nominal
+    # Standard deviation and correlation time of its slow variation, pu and s.
     busbar_spread_pu: float = 0.003
     busbar_correlation_s: float = 1800.0
+    # In three phases: standard deviation of an equally slow variation of each phase, pu.
     busbar_unbalance_pu: float = 0.002
-    tap_step_pu: float = 0.0125
-    tap_interval_s: float = 7200.0
+    tap_step_pu: float = 0.0125  # height of one step of the transformer's tap changer upstream, pu; 0: none
+    tap_interval_s: float = 7200.0  # length of the intervals with one tap event each, at a random time, s
+    # Standard deviations and correlation time, s, of the power of every metered customer beyond its readings,
+    # for readings that are forecasts. None: those of the feeder's files (`p_std_kw`, `q_std_kvar`), 0 for
+    # empty cells.
     hidden_kw: float | None = 0.0
     hidden_kvar: float | None = 0.0
     hidden_correlation_s: float = 600.0
@@ -116,15 +97,6 @@ class Fluctuation:
     Sampled exactly every GRID_S, autocorrelation exp(-abs(dt) / correlation_s). It consists of chunks that
     are joined as bridges: the values at the chunks' ends are independent, and the path between them is
     conditioned on both.
-
-    Parameters
-    ----------
-    seed, stream
-        Seed and stream of the path.
-    count
-        Number of copies.
-    correlation_s
-        Correlation time, s.
     """
 
     def __init__(self, seed: int, stream: Stream, count: int, correlation_s: float) -> None:
@@ -178,21 +150,11 @@ class Fluctuation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Demand:
-    """Powers of all customers at T times, without the droop inverters' reactive power.
+    """Powers of all customers at T times, without the droop inverters' reactive power."""
 
-    Attributes
-    ----------
-    p_kw : (T, N)
-        Net active import: load minus generation, kW.
-    q_kvar : (T, N)
-        Reactive import of the loads, kvar.
-    v0_volt : (T,) or (T, 3)
-        Busbar voltage, V; in three phases that of each.
-    """
-
-    p_kw: Floats
-    q_kvar: Floats
-    v0_volt: Floats
+    p_kw: Floats  # (T, N): net active import: load minus generation, kW
+    q_kvar: Floats  # (T, N): reactive import of the loads, kvar
+    v0_volt: Floats  # (T,) or (T, 3): busbar voltage, V; in three phases that of each
 
 
 class Customers:
@@ -200,22 +162,8 @@ class Customers:
 
     Loads are between 0 and `load_kw`, generation between 0 and `pv_kw`. Each customer has a constant ratio q
     / p inside the interval of power factors of the feeder's files. It also has a constant reactive power
-    within plus or minus the floor of the files. The monitor knows neither.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    variation
-        Variation of loads, generation and the busbar.
-    seed
-        Seed of all random numbers.
-    start
-        Unix time of the profiles' position `profile_s`, s.
-    profile_s
-        Position within the season's profiles, s; they repeat.
-    season
-        Season of the profiles.
+    within plus or minus the floor of the files. The monitor knows neither. At Unix time `start` the season's
+    profiles, which repeat, are at `profile_s`, s.
     """
 
     def __init__(

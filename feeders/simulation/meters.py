@@ -32,80 +32,38 @@ EARLIEST_TICK: Final = 2**40
 
 @dataclass(frozen=True, slots=True)
 class MeterErrors:
-    """Errors of the simulated meters relative to those of the feeder's files; 0: none.
+    """Errors of the simulated meters relative to those of the feeder's files; 0: none."""
 
-    Attributes
-    ----------
-    bias
-        Limit of the fixed biases relative to the class, 1; uniform.
-    jitter
-        Factor on the jitter, 1.
-    resolution
-        Factor on the registers' steps, 1.
-    power
-        Limit of the fixed gain errors of p and q relative to the stated error, 1; uniform.
-    report_q
-        True: meters report reactive power.
-    """
-
-    bias: float = 1.0
-    jitter: float = 1.0
-    resolution: float = 1.0
-    power: float = 1.0
-    report_q: bool = False
+    bias: float = 1.0  # limit of the fixed biases relative to the class, 1; uniform
+    jitter: float = 1.0  # factor on the jitter, 1
+    resolution: float = 1.0  # factor on the registers' steps, 1
+    power: float = 1.0  # limit of the fixed gain errors of p and q relative to the stated error, 1; uniform
+    report_q: bool = False  # True: meters report reactive power
 
 
 @dataclass(frozen=True, slots=True)
 class MeterOutage:
-    """Silence of a meter for t_on <= t < t_off.
+    """Silence of a meter for t_on <= t < t_off."""
 
-    Attributes
-    ----------
-    meter
-        Id of the meter; BUSBAR for the busbar's.
-    t_on, t_off
-        Unix time, s.
-    """
-
-    meter: str
+    meter: str  # id of the meter; BUSBAR for the busbar's
+    # Unix time, s.
     t_on: float
     t_off: float
 
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """Loss, delay and duplication of readings, clock offsets and silences.
+    """Loss, delay and duplication of readings, clock offsets and silences; ValueError for invalid numbers."""
 
-    Attributes
-    ----------
-    loss
-        Probability of the loss of a reading, 1.
-    delay_s
-        Shortest delay, s.
-    delay_mean_s
-        Mean of the exponentially distributed delay on top of it, s.
-    late, late_s
-        Probability (1) of an additional delay `late_s`; more than a tick reorders readings.
-    duplicate
-        Probability of a second arrival of a reading, 1; the copy has a delay of its own.
-    clock_s
-        Limit of the constant clock offset of each meter, s; uniform.
-    silences
-        Intervals without readings of a meter; its sequence numbers count on.
-
-    Raises
-    ------
-    ValueError
-        For a probability outside [0, 1], or a time that is negative or not finite.
-    """
-
-    loss: float = 0.0
-    delay_s: float = 0.0
-    delay_mean_s: float = 0.0
+    loss: float = 0.0  # probability of the loss of a reading, 1
+    delay_s: float = 0.0  # shortest delay, s
+    delay_mean_s: float = 0.0  # mean of the exponentially distributed delay on top of it, s
+    # Probability (1) of an additional delay `late_s`; more than a tick reorders readings.
     late: float = 0.0
     late_s: float = 0.0
-    duplicate: float = 0.0
-    clock_s: float = 0.0
+    duplicate: float = 0.0  # probability of a second arrival of a reading, 1; the copy has a delay of its own
+    clock_s: float = 0.0  # limit of the constant clock offset of each meter, s; uniform
+    # Intervals without readings of a meter; its sequence numbers count on.
     silences: tuple[MeterOutage, ...] = ()
 
     def __post_init__(self) -> None:
@@ -127,54 +85,28 @@ class Channel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Registers:
-    """Readings of the meters at T ticks, before any manipulation. p meters.
+    """Readings of the meters at T ticks, before any manipulation. p meters."""
 
-    Attributes
-    ----------
-    v_volt : (T, p)
-        Voltage, V.
-    p_kw, q_kvar : (T, p)
-        Net import, kW and kvar; q is NaN unless reported.
-    v0_volt : (T,) or (T, 3)
-        Busbar voltage, V; in three phases that of each.
-    """
-
-    v_volt: Floats
+    v_volt: Floats  # (T, p): voltage, V
+    # (T, p): net import, kW and kvar; q is NaN unless reported.
     p_kw: Floats
     q_kvar: Floats
-    v0_volt: Floats
+    v0_volt: Floats  # (T,) or (T, 3): busbar voltage, V; in three phases that of each
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Delivery:
-    """Arrival times of readings. p meters and, as the last column, the busbar meter.
+    """Arrival times of readings. p meters and, as the last column, the busbar meter."""
 
-    Attributes
-    ----------
-    stamp : (T, p + 1)
-        Time by the meter's clock, Unix s.
-    arrival : (T, p + 1)
-        Unix time, s; infinite for a lost reading.
-    copy : (T, p + 1)
-        Arrival of a duplicate; infinite without one.
-    """
-
-    stamp: Floats
-    arrival: Floats
-    copy: Floats
+    stamp: Floats  # (T, p + 1): time by the meter's clock, Unix s
+    arrival: Floats  # (T, p + 1): Unix time, s; infinite for a lost reading
+    copy: Floats  # (T, p + 1): arrival of a duplicate; infinite without one
 
 
 class SimulatedMeters:
-    """All meters of a feeder and their channel.
+    """All meters of a feeder and their channel; ValueError for the silence of an unknown meter.
 
-    Parameters
-    ----------
-    site
-        The feeder, with the meters' accuracies.
-    errors, channel
-        Share of these errors, and effects of the channel.
-    seed
-        Seed of all random numbers. Those of one tick depend on its number alone.
+    Random numbers of a tick depend on the seed and its number alone.
 
     Attributes
     ----------
@@ -185,11 +117,6 @@ class SimulatedMeters:
     p_gain, q_gain : (p,)
         Fixed relative errors of the power registers, 1: the true power is the reading times 1 + gain. Data
         sheets state the error as a fraction of the reading.
-
-    Raises
-    ------
-    ValueError
-        For the silence of an unknown meter.
     """
 
     def __init__(self, site: Site, errors: MeterErrors, channel: Channel, seed: int) -> None:
@@ -227,16 +154,9 @@ class SimulatedMeters:
         self._p_step = errors.resolution * site.tables.meta.meters.p_resolution_kw
 
     def read(self, ticks: Ints, v_volt: Floats, p_kw: Floats, q_kvar: Floats, v0_volt: Floats) -> Registers:
-        """Read all registers.
+        """Read all registers at consecutive ticks (T,), from true values in V, kW and kvar (net imports).
 
-        Parameters
-        ----------
-        ticks : (T,)
-            Numbers of the ticks, consecutive.
-        v_volt, p_kw, q_kvar : (T, N)
-            True values at every customer, V, kW, kvar (net imports).
-        v0_volt : (T,) or (T, 3)
-            True voltage of the busbar, V.
+        True values are (T, N) of the customers, and (T,) or (T, 3) of the busbar.
         """
         true = np.column_stack(
             [
@@ -253,15 +173,7 @@ class SimulatedMeters:
         return Registers(shown[:, : self.count], p, q, shown[:, self.count :].reshape(v0_volt.shape))
 
     def deliver(self, ticks: Ints, t: Floats) -> Delivery:
-        """Arrival times of the readings of some ticks.
-
-        Parameters
-        ----------
-        ticks : (T,)
-            Numbers of the ticks, consecutive.
-        t : (T,)
-            Times of the ticks, Unix s.
-        """
+        """Arrival times of the readings of consecutive ticks (T,) at times t (T,), Unix s."""
         channel, width = self._channel, self.count + 1
         uniform = self._draws(Stream.CHANNEL, ticks, 5 * width).reshape(ticks.size, 5, width)
         lost = uniform[:, 0] < channel.loss

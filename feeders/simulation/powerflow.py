@@ -44,52 +44,27 @@ class PowerFlowDiverged(GridsecError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Grid:
-    """Feeder for AC power flow, in SI. L lines, B buses, N customers.
+    """Feeder for AC power flow, in SI. L lines, B buses, N customers."""
 
-    Attributes
-    ----------
-    ends : (L, 2)
-        The buses at both ends of each line, 0 .. B-1.
-    r_ohm, x_ohm : (L,)
-        Series resistance and reactance per phase, ohm; not both zero.
-    b_siemens : (L,)
-        Total shunt susceptance per phase, S.
-    busbar
-        Bus of the given voltage.
-    customer_bus : (N,)
-        Bus of each customer.
-    bus_count
-        Number of buses B.
-    nominal_volt : scalar or (B,)
-        Nominal phase-to-neutral voltage, V; or that of each bus.
-    tap : (L,), optional
-        Ratio of an ideal transformer at the first end of each line: the voltage there by that behind it, each
-        relative to its nominal voltage.
-    """
-
-    ends: Ints
+    ends: Ints  # (L, 2): the buses at both ends of each line, 0 .. B-1.
+    # (L,): series resistance and reactance per phase, ohm; not both zero.
     r_ohm: Floats
     x_ohm: Floats
-    b_siemens: Floats
-    busbar: int
-    customer_bus: Ints
-    bus_count: int
-    nominal_volt: Floats | float
+    b_siemens: Floats  # (L,): total shunt susceptance per phase, S
+    busbar: int  # bus of the given voltage
+    customer_bus: Ints  # (N,): bus of each customer
+    bus_count: int  # number of buses B
+    nominal_volt: Floats | float  # scalar or (B,): nominal phase-to-neutral voltage, V; or that of each bus
+    # (L,): ratio of an ideal transformer at the first end of each line: the voltage there by that behind it,
+    # each relative to its nominal voltage.
     tap: Floats | None = None
 
 
 class PowerFlow:
     """AC power flow of one feeder, for repeated solutions.
 
-    Parameters
-    ----------
-    site
-        The feeder. Voltages are in the order of its customers and of `site.feeder.buses`.
-
-    Notes
-    -----
-    A solve starts flat every time, so that its result depends on its arguments alone. An object is not
-    thread-safe: its input arrays are reused.
+    Voltages are in the order of the feeder's customers and buses. A solve starts flat every time, so that its
+    result depends on its arguments alone. An object is not thread-safe: its input arrays are reused.
     """
 
     def __init__(self, site: Site) -> None:
@@ -112,26 +87,10 @@ class PowerFlow:
         self._source = _source_update(grid, (1,))
 
     def solve(self, p_kw: Floats, q_kvar: Floats, v0_volt: Floats | float) -> tuple[Floats, Floats]:
-        """Voltages for one set of loads.
+        """Voltages of customers (N,) and buses (b + 1,), phase to neutral, V, for one set of loads.
 
-        Parameters
-        ----------
-        p_kw, q_kvar : (N,)
-            Net import of each customer, three-phase total, kW and kvar.
-        v0_volt
-            Voltage of the busbar, phase to neutral, V.
-
-        Returns
-        -------
-        customers : (N,)
-            Voltage at each customer, phase to neutral, V.
-        buses : (b + 1,)
-            Voltage at each bus, V.
-
-        Raises
-        ------
-        PowerFlowDiverged
-            Without a solution, or if Newton's method does not find it.
+        Loads are three-phase net imports (N,), kW and kvar, `v0_volt` is the busbar's voltage, phase to
+        neutral, V. PowerFlowDiverged is raised without a solution, or if Newton's method does not find it.
         """
         by_node = self._solve(p_kw, q_kvar, v0_volt, "u_pu") * self._scale
         return by_node[self.grid.customer_bus], by_node[self._order]
@@ -146,28 +105,10 @@ class PowerFlow:
     def solve_batch(
         self, p_kw: Floats, q_kvar: Floats, v0_volt: Floats, *, threads: int = 1
     ) -> tuple[Floats, Floats]:
-        """Voltages for T sets of loads: the numbers of T calls of `solve`, many times faster.
+        """Voltages (T, N) and (T, b + 1), V, for T sets of loads (T, N) and busbar voltages (T,).
 
-        Parameters
-        ----------
-        p_kw, q_kvar : (T, N)
-            Net imports, kW and kvar.
-        v0_volt : (T,)
-            Voltages of the busbar, V.
-        threads
-            Number of threads.
-
-        Returns
-        -------
-        customers : (T, N)
-            Voltage at each customer, V.
-        buses : (T, b + 1)
-            Voltage at each bus, V.
-
-        Raises
-        ------
-        PowerFlowDiverged
-            If any set has no solution; names the first of them.
+        The numbers are those of T calls of `solve`, many times faster. PowerFlowDiverged names the first set
+        without a solution.
         """
         count = p_kw.shape[0]
         if count == 0:
@@ -247,16 +188,8 @@ def _grid(site: Site) -> tuple[Grid, Ints]:
 def levels(ends: Ints, to_volt: Floats, busbar: int, volt: float, count: int) -> Floats:
     """Nominal voltage of every bus, V: from the busbar on, until a transformer changes it.
 
-    Parameters
-    ----------
-    ends : (L, 2)
-        The buses at both ends of each line.
-    to_volt : (L,)
-        Nominal voltage of the second bus, V; NaN where it is that of the first.
-    busbar, volt
-        The busbar, and its nominal voltage, V.
-    count
-        Number of buses.
+    `ends` (L, 2) are the buses of each line, `to_volt` (L,) the nominal voltage of the second one, V, NaN
+    where it is that of the first.
     """
     if np.isnan(to_volt).all():
         return np.full(count, volt)

@@ -82,13 +82,7 @@ def scenario_to_json(scenario: Scenario) -> dict[str, Any]:
 
 
 def scenario_from_json(obj: dict[str, Any]) -> Scenario:
-    """Convert the result of `scenario_to_json` back to a scenario.
-
-    Raises
-    ------
-    KeyError, TypeError, ValueError
-        For any other content.
-    """
+    """Inverse of `scenario_to_json`; KeyError, TypeError or ValueError for any other content."""
     given = {"busbar_attacks": ()} | _heard(obj)
     channel = dict(given["channel"])
     channel["silences"] = tuple(
@@ -185,15 +179,7 @@ REGISTERS: Final = ("seq", "p_kw", "q_kvar", "t_power")
 
 
 class RecordingInvalid(Problems, GridsecError):
-    """A file is not a recording, or has no truth.
-
-    Parameters
-    ----------
-    problems
-        One clause each, with the expected content.
-    where
-        Place of all problems, at the begin of the sentence.
-    """
+    """A file is not a recording, or has no truth; `where` begins the sentence of all problems."""
 
     def __init__(self, *problems: str, where: str = "") -> None:
         self.problems = problems
@@ -203,61 +189,31 @@ class RecordingInvalid(Problems, GridsecError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedTruth:
-    """Truth of a recording at its T ticks; columns as in `feeders.simulation.scenario.SimulatedTick`.
+    """Truth of a recording at its T ticks; columns as in `feeders.simulation.scenario.SimulatedTick`."""
 
-    Attributes
-    ----------
-    t : (T,)
-        Unix time, s.
-    v_volt, p_kw, q_kvar : (T, N)
-        Voltage and net import of each customer, V, kW, kvar.
-    v_bus_volt : (T, b + 1)
-        Voltage of each bus, V.
-    x_kvar : (T, m)
-        Injection of each inverter, kvar.
-    manipulated : (T, p)
-        Mask of the meters under attack.
-    shift_volt : (T, p)
-        Reported minus honest reading, V.
-    """
-
-    t: Floats
+    t: Floats  # (T,): Unix time, s
+    # (T, N): voltage and net import of each customer, V, kW, kvar.
     v_volt: Floats
     p_kw: Floats
     q_kvar: Floats
-    v_bus_volt: Floats
-    x_kvar: Floats
-    manipulated: Bools
-    shift_volt: Floats
+    v_bus_volt: Floats  # (T, b + 1): voltage of each bus, V
+    x_kvar: Floats  # (T, m): injection of each inverter, kvar
+    manipulated: Bools  # (T, p): mask of the meters under attack
+    shift_volt: Floats  # (T, p): reported minus honest reading, V
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recording:
-    """Recorded file, read lazily: only the metadata is in memory.
+    """Recorded file, read lazily: only the metadata is in memory."""
 
-    Attributes
-    ----------
-    path
-        The file with the readings.
-    count
-        Number of readings.
-    feeder, digest
-        Name and content digest of its feeder; None for an external file.
-    scenario
-        The simulated scenario; None for an external file.
-    versions
-        Versions of the packages at its writing.
-    timed
-        True with arrival times of the readings.
-    """
-
-    path: Path
-    count: int
+    path: Path  # the file with the readings
+    count: int  # number of readings
+    # Name and content digest of its feeder; None for an external file.
     feeder: str | None
     digest: str | None
-    scenario: Scenario | None
-    versions: dict[str, str]
-    timed: bool = False
+    scenario: Scenario | None  # the simulated scenario; None for an external file
+    versions: dict[str, str]  # versions of the packages at its writing
+    timed: bool = False  # true with arrival times of the readings
 
     def readings(self) -> Iterator[SimulatedReading]:
         """All readings in the order of the file, that of arrival."""
@@ -271,13 +227,7 @@ class Recording:
         return table
 
     def truth(self) -> RecordedTruth:
-        """Truth of a simulated recording.
-
-        Raises
-        ------
-        RecordingInvalid
-            Without a truth, or with that of another recording.
-        """
+        """Truth of a simulated recording; RecordingInvalid without one, or with that of another recording."""
         path = truth_path(self.path)
         try:
             table, own = pq.read_table(path), pq.read_schema(self.path)
@@ -299,26 +249,10 @@ def truth_path(path: Path) -> Path:
 
 
 def record(site: Site, scenario: Scenario, path: Path | str) -> Recording:
-    """Write the readings of a scenario to a file, and its truth to a second one beside it.
+    """Write the readings of a finite scenario to a file .parquet, and its truth to a second one beside it.
 
     Both have temporary names first, so that a file with the final name is complete. An old truth is removed
     first: it never accompanies new readings.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    scenario
-        The scenario, of finite length.
-    path
-        File of the readings, with the ending .parquet.
-
-    Raises
-    ------
-    ValueError
-        For a scenario of infinite length.
-    OSError
-        If the files cannot be written.
     """
     if not math.isfinite(scenario.duration_s):
         raise InputInvalid([Problem("not-finite", "a scenario without an end cannot be recorded")])
@@ -354,12 +288,7 @@ def read_recording(path: Path | str) -> Recording:
 
     An external file needs the columns `meter`, `t` and `v_volt`. Without `arrival` readings arrive at their
     own time. `seq`, `p_kw`, `q_kvar` and `t_power` may be absent, and null or NaN if not reported.
-
-    Raises
-    ------
-    RecordingInvalid
-        If the file is not Parquet, lacks a column or has one of another type, has fractional numbers of
-        readings, or has another format.
+    RecordingInvalid states wrong columns, fractional numbers of readings, and other formats.
     """
     path = Path(path)
     try:
@@ -388,18 +317,7 @@ def read_recording(path: Path | str) -> Recording:
 
 
 def is_simulated(path: Path) -> bool:
-    """True for a file of `record`, readings or truth.
-
-    Parameters
-    ----------
-    path
-        The file.
-
-    Raises
-    ------
-    OSError
-        If it cannot be read.
-    """
+    """True for a file of `record`, readings or truth; OSError if it cannot be read."""
     try:
         return KEY in (pq.read_schema(path).metadata or {})
     except pa.ArrowException:

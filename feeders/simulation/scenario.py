@@ -58,54 +58,29 @@ LONGEST_LOOK_BACK_S: Final = 7 * 86_400.0
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """Simulated run: length, profiles, variation, meter errors, channel and attacks.
+    """Simulated run: length, profiles, variation, meter errors, channel and attacks."""
 
-    Attributes
-    ----------
-    seed
-        Seed of all random numbers, >= 0.
-    start
-        Unix time of the first tick, s.
-    duration_s
-        Ticks are at start + k dt_s < start + duration_s; may be infinite.
-    dt_s
-        Interval between readings, s.
-    profile_s
-        Position within the season's profiles at `start`, s. They begin on a Monday at 00:00, have two weeks
-        in summer and one in the other seasons, and repeat. By default the noon of a Wednesday.
-    substep_s
-        Longest step of the integrator, s. None: half the smallest time constant of the inverters, or one
-        quasi-static step for a tick of more than QUASI_STATIC_TAUS of the largest.
-    variation, errors, channel
-        Variation of loads and busbar, errors of the meters, effects of the channel.
-    attacks
-        Attacks on meters, applied in this order. Meters are indices into `Site.meters`.
-    inverter_attacks
-        Wrong injections of inverters; they add up. Inverters are indices into `Site.droop`.
-    season
-        Season of loads and generation, independent of the date of `start`.
-    busbar_attacks
-        Attacks on the busbar meter, applied in this order; none may use earlier readings. Their meters are
-        its phases, 0 to 2, or 0 on a balanced feeder.
-
-    Raises
-    ------
-    ValueError
-        For an unknown season, or an invalid number.
-    """
-
-    seed: int = 0
-    start: float = START
-    duration_s: float = 600.0
-    dt_s: float = 1.0
+    seed: int = 0  # seed of all random numbers, >= 0
+    start: float = START  # Unix time of the first tick, s
+    duration_s: float = 600.0  # ticks are at start + k dt_s < start + duration_s; may be infinite
+    dt_s: float = 1.0  # interval between readings, s
+    # Position within the season's profiles at `start`, s. They begin on a Monday at 00:00, have two weeks in
+    # summer and one in the other seasons, and repeat. By default the noon of a Wednesday.
     profile_s: float = SUNNY_NOON_S
+    # Longest step of the integrator, s. None: half the smallest time constant of the inverters, or one quasi-
+    # static step for a tick of more than QUASI_STATIC_TAUS of the largest.
     substep_s: float | None = None
+    # Variation of loads and busbar, errors of the meters, effects of the channel.
     variation: Variation = field(default_factory=Variation)
     errors: MeterErrors = field(default_factory=MeterErrors)
     channel: Channel = field(default_factory=Channel)
+    # Attacks on meters, applied in this order. Meters are indices into `Site.meters`.
     attacks: tuple[Attack, ...] = ()
+    # Wrong injections of inverters; they add up. Inverters are indices into `Site.droop`.
     inverter_attacks: tuple[InverterAttack, ...] = ()
-    season: Season = Season.SUMMER
+    season: Season = Season.SUMMER  # season of loads and generation, independent of the date of `start`
+    # Attacks on the busbar meter, applied in this order; none may use earlier readings. Their meters are its
+    # phases, 0 to 2, or 0 on a balanced feeder.
     busbar_attacks: tuple[Attack, ...] = ()
 
     def __post_init__(self) -> None:
@@ -133,83 +108,41 @@ class Scenario:
 
 @dataclass(frozen=True, slots=True)
 class SimulatedReading:
-    """One reading on its way to a service; net import positive.
+    """One reading on its way to a service; net import positive."""
 
-    Attributes
-    ----------
-    meter
-        Id of the meter; BUSBAR (the empty string) for the busbar meter.
-    t
-        Time by the meter's clock, Unix s.
-    seq
-        Number of the reading; rises by one with every tick, also without an arrival. None in external
-        recordings without numbers.
-    arrival
-        Arrival time, Unix s.
-    v_volt
-        Voltage, phase to neutral, V; for several phases their mean.
-    p_kw, q_kvar
-        Net import, kW and kvar; None where not reported.
-    v_phases
-        Busbar voltage of each phase, V; None on a balanced feeder.
-    t_power
-        Time of the powers by the meter's clock, Unix s; None for `t`.
-    """
-
-    meter: str
-    t: float
+    meter: str  # id of the meter; BUSBAR (the empty string) for the busbar meter
+    t: float  # time by the meter's clock, Unix s
+    # Number of the reading; rises by one with every tick, also without an arrival. None in external
+    # recordings without numbers.
     seq: int | None
-    arrival: float
-    v_volt: float
+    arrival: float  # arrival time, Unix s
+    v_volt: float  # voltage, phase to neutral, V; for several phases their mean
+    # Net import, kW and kvar; None where not reported.
     p_kw: float | None
     q_kvar: float | None
-    v_phases: tuple[float, ...] | None = None
-    t_power: float | None = None
+    v_phases: tuple[float, ...] | None = None  # busbar voltage of each phase, V; None on a balanced feeder
+    t_power: float | None = None  # time of the powers by the meter's clock, Unix s; None for `t`
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SimulatedTick:
-    """One tick: the truth, and the reports. N customers, m inverters, p meters, b + 1 buses.
+    """One tick: the truth, and the reports. N customers, m inverters, p meters, b + 1 buses."""
 
-    Attributes
-    ----------
-    t
-        Unix time, s.
-    seq
-        Number of the tick, from 0.
-    meter_ids : (p,)
-        Ids of the meters.
-    v_volt : (N,)
-        True voltage at each customer, V.
-    v_bus_volt : (b + 1,)
-        True voltage of each bus, the busbar first, V; in three phases (3 (b + 1),), the phases of a bus side
-        by side, NaN for an absent one.
-    x_kvar : (m,)
-        Reactive injection of each inverter by its droop curve, kvar, without attacks.
-    p_kw, q_kvar : (N,)
-        True net import of each customer, inverter included, kW and kvar.
-    manipulated : (p,)
-        Mask of the meters under attack.
-    shift_volt : (p,)
-        Reported minus honest reading, V; 0 for honest meters.
-    reported
-        Reports of the meters, manipulations included, as one row, with or without arrival.
-    delivery
-        Arrival times, as one row.
-    """
-
-    t: float
-    seq: int
-    meter_ids: tuple[str, ...]
-    v_volt: Floats
+    t: float  # Unix time, s
+    seq: int  # number of the tick, from 0
+    meter_ids: tuple[str, ...]  # (p,): ids of the meters
+    v_volt: Floats  # (N,): true voltage at each customer, V
+    # (b + 1,): true voltage of each bus, the busbar first, V; in three phases (3 (b + 1),), the phases of a
+    # bus side by side, NaN for an absent one.
     v_bus_volt: Floats
-    x_kvar: Floats
+    x_kvar: Floats  # (m,): reactive injection of each inverter by its droop curve, kvar, without attacks
+    # (N,): true net import of each customer, inverter included, kW and kvar.
     p_kw: Floats
     q_kvar: Floats
-    manipulated: Bools
-    shift_volt: Floats
-    reported: Registers
-    delivery: Delivery
+    manipulated: Bools  # (p,): mask of the meters under attack
+    shift_volt: Floats  # (p,): reported minus honest reading, V; 0 for honest meters
+    reported: Registers  # reports of the meters, manipulations included, as one row, with or without arrival
+    delivery: Delivery  # arrival times, as one row
 
     @property
     def readings(self) -> list[SimulatedReading]:
@@ -241,26 +174,12 @@ class SimulatedTick:
 
 
 def simulate(site: Site, scenario: Scenario) -> Iterator[SimulatedTick]:
-    """Simulate a scenario.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    scenario
-        The scenario.
-
-    Yields
-    ------
-    Sample
-        One per tick, in the order of time.
+    """Simulate a scenario, tick by tick.
 
     Raises
     ------
-    PowerFlowDiverged
-        If the power flow has no solution for the loads.
-    NoEquilibrium
-        Without a common solution of inverters and feeder.
+    PowerFlowDiverged, NoEquilibrium
+        Without a power flow solution, or without a common solution of inverters and feeder.
     ValueError
         For an attack on, or the silence of, an unknown meter, or an attack that uses too old readings.
     """
@@ -348,10 +267,8 @@ def by_arrival(samples: Iterable[SimulatedTick]) -> Iterator[SimulatedReading]:
 class _Past:
     """Honest voltage reports that attacks may still use, pu, in blocks of consecutive ticks.
 
-    Attributes
-    ----------
-    first
-        First tick that any attack uses; 0 or negative. Ticks before 0 are simulated before the scenario.
+    `first` is the first tick that any attack uses, 0 or negative. Ticks before 0 are simulated before the
+    scenario.
     """
 
     def __init__(self, meters: int, scenario: Scenario) -> None:
@@ -430,13 +347,7 @@ def _busbar_attacked(site: Site, scenario: Scenario, t: Floats, reported: Regist
 
 
 def check(site: Site, scenario: Scenario) -> None:
-    """Check the attacks of a scenario against the feeder.
-
-    Raises
-    ------
-    ValueError
-        With all problems.
-    """
+    """Check the attacks of a scenario against the feeder; ValueError with all problems."""
     name, phases = site.feeder.name, site.feeder.busbar_places().stop
     problems = [
         Problem(

@@ -200,7 +200,7 @@ def test_what_cannot_be_played_says_why() -> None:
     plan = replace(PLAN, scenes=1, kinds=(AttackClass("bias", AttackKind.BIAS, (1.0,)),), liars=(99,))
     found = campaign(SITE, plan)
     reasons = found.scenarios.loc[found.scenarios["kind"] == "bias", "reason"]
-    assert reasons.str.contains("6 of these devices; cannot manipulate 99").all()
+    assert reasons.str.contains("6 meters; cannot attack 99").all()
     assert found.by_kind["kind"].tolist() == [CLEAN, CLEAN]
     assert found.scenarios["exact"].dtype == np.bool_
     with refused(NothingPlayed, "nothing-played"):
