@@ -3,7 +3,7 @@
 An attack is a frozen value. It names its meters and its active interval ``[t_on, t_off)``, and `apply` turns
 unmanipulated reports into manipulated ones. Time is an argument and no state is kept: an attack that needs
 the past (a stuck or a replaying meter) requests it from the caller. So one tick, a whole day at once and a
-second run give the same numbers. Attacks are for simulation; no estimator reads this module.
+repetition give the same numbers. Attacks are for simulation; no estimator reads this module.
 
 Voltages are magnitudes per unit of the nominal voltage, as a meter displays them (not squared). Powers are
 in the unit of the reports; imports are positive, as on the wire.
@@ -12,14 +12,14 @@ in the unit of the reports; imports are positive, as on the wire.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gridsec.arrays import Bools, Floats, Ints
-from gridsec.errors import InputInvalid, Problem
+from gridsec.errors import Problem, require
 
 Past: TypeAlias = Callable[[Floats], Floats]
 """Unmanipulated reports of all p meters at earlier times: (T,) s -> (T, p) pu."""
@@ -47,6 +47,9 @@ class _Attack:
 
     def __post_init__(self) -> None:
         _check_meters(self.meters, self.t_on, self.t_off)
+        for each in fields(self):
+            if each.type == "Floats":
+                _check_per_meter(self.meters, each.name, getattr(self, each.name))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,20 +58,12 @@ class Bias(_Attack):
 
     size: Floats  # (k,): signed displacement, pu
 
-    def __post_init__(self) -> None:
-        _check_meters(self.meters, self.t_on, self.t_off)
-        _check_per_meter(self.meters, size=self.size)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scaling(_Attack):
     """Scaled reading: v~ = (1 + factor) v."""
 
     factor: Floats  # (k,): signed relative change, 1
-
-    def __post_init__(self) -> None:
-        _check_meters(self.meters, self.t_on, self.t_off)
-        _check_per_meter(self.meters, factor=self.factor)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,12 +74,11 @@ class Drift(_Attack):
     limit: Floats  # (k,): largest displacement, pu, >= 0
 
     def __post_init__(self) -> None:
-        _check_meters(self.meters, self.t_on, self.t_off)
-        _check_per_meter(self.meters, rate=self.rate, limit=self.limit)
-        if np.any(self.limit < 0.0):
-            raise InputInvalid(
-                [Problem("negative", "limit of a drift is a magnitude and cannot be negative")]
-            )
+        _Attack.__post_init__(self)
+        require(
+            not np.any(self.limit < 0.0),
+            Problem("negative", "limit of a drift is a magnitude and cannot be negative"),
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,11 +93,11 @@ class Replay(_Attack):
     delay_s: float  # delay of the replayed interval, s, > 0
 
     def __post_init__(self) -> None:
-        _check_meters(self.meters, self.t_on, self.t_off)
-        if not self.delay_s > 0.0:
-            raise InputInvalid(
-                [Problem("not-positive", f"a replay needs a positive delay, got {self.delay_s}")]
-            )
+        _Attack.__post_init__(self)
+        require(
+            self.delay_s > 0.0,
+            Problem("not-positive", f"a replay needs a positive delay, got {self.delay_s}"),
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,14 +111,13 @@ class Random(_Attack):
     seed: int  # seed of the draws
 
     def __post_init__(self) -> None:
-        _check_meters(self.meters, self.t_on, self.t_off)
-        _check_per_meter(self.meters, low=self.low, high=self.high)
-        if np.any(self.low < 0.0) or np.any(self.high < self.low):
-            raise InputInvalid([Problem("order", "a random attack needs 0 <= low <= high for every meter")])
-        if not self.hold_s > 0.0:
-            raise InputInvalid(
-                [Problem("not-positive", f"a random attack needs a positive hold time, got {self.hold_s}")]
-            )
+        _Attack.__post_init__(self)
+        ordered = not (np.any(self.low < 0.0) or np.any(self.high < self.low))
+        require(ordered, Problem("order", "a random attack needs 0 <= low <= high for every meter"))
+        held = self.hold_s > 0.0
+        require(
+            held, Problem("not-positive", f"a random attack needs a positive hold time, got {self.hold_s}")
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,10 +131,6 @@ class Coordinated(_Attack):
     # (k,): displacement of the reported import, unit of the reports; zero if only voltages are manipulated.
     p_shift: Floats
     q_shift: Floats
-
-    def __post_init__(self) -> None:
-        _check_meters(self.meters, self.t_on, self.t_off)
-        _check_per_meter(self.meters, shift=self.shift, p_shift=self.p_shift, q_shift=self.q_shift)
 
 
 Attack: TypeAlias = Bias | Scaling | Drift | Stuck | Replay | Random | Coordinated
@@ -159,15 +148,12 @@ class InverterAttack:
 
     def __post_init__(self) -> None:
         _check_meters(self.inverters, self.t_on, self.t_off, what="inverters")
-        if self.q.shape != self.inverters.shape or not np.all(np.isfinite(self.q)):
-            raise InputInvalid(
-                [
-                    Problem(
-                        "shape",
-                        f"q has shape {self.q.shape} or is not finite; one number per inverter is needed",
-                    )
-                ]
-            )
+        require(
+            self.q.shape == self.inverters.shape and np.all(np.isfinite(self.q)),
+            Problem(
+                "shape", f"q has shape {self.q.shape} or is not finite; one number per inverter is needed"
+            ),
+        )
 
 
 def apply(attack: Attack, t: Floats, honest: Reports, past: Past) -> Reports:
@@ -234,8 +220,9 @@ def load_pattern(R: Floats, X: Floats, target: int, ratio: float, v: Floats) -> 
 
 def most_affected(pattern: Floats, count: int) -> Ints:
     """The `count` entries of largest magnitude, ascending by index; ties go to the lower index."""
-    if not 0 < count <= pattern.size:
-        raise InputInvalid([Problem("out-of-range", f"cannot choose {count} of {pattern.size} meters")])
+    require(
+        0 < count <= pattern.size, Problem("out-of-range", f"cannot choose {count} of {pattern.size} meters")
+    )
     order = np.argsort(-np.abs(pattern), kind="stable")
     return np.sort(order[:count])
 
@@ -247,8 +234,7 @@ def coordinate(pattern: Floats, meters: Ints, size: float) -> float:
     without any effect is a ValueError.
     """
     weakest = float(np.min(np.abs(pattern[meters])))
-    if not weakest > 0.0:
-        raise InputInvalid([Problem("no-effect", "a chosen meter is not affected by the fake load at all")])
+    require(weakest > 0.0, Problem("no-effect", "a chosen meter is not affected by the fake load at all"))
     return size / weakest
 
 
@@ -302,30 +288,23 @@ def _scramble(bits: _Bits) -> _Bits:
 
 
 def _check_meters(meters: Ints, t_on: float, t_off: float, *, what: str = "meters") -> None:
-    if meters.ndim != 1 or meters.size == 0:
-        raise InputInvalid(
-            [Problem("shape", f"an attack needs a one-dimensional, non-empty array of {what}")]
-        )
-    if np.unique(meters).size != meters.size or np.any(meters < 0):
-        raise InputInvalid(
-            [
-                Problem(
-                    "duplicate" if np.all(meters >= 0) else "unknown-index",
-                    f"{what} of an attack must be different indices from 0, got {meters.tolist()}",
-                )
-            ]
-        )
-    if not t_on < t_off:
-        raise InputInvalid(
-            [Problem("order", f"an attack must begin before it ends, got t_on={t_on} and t_off={t_off}")]
-        )
+    one_each = meters.ndim == 1 and meters.size > 0
+    require(one_each, Problem("shape", f"an attack needs a one-dimensional, non-empty array of {what}"))
+    known = np.all(meters >= 0)
+    require(
+        known and np.unique(meters).size == meters.size,
+        Problem(
+            "duplicate" if known else "unknown-index",
+            f"{what} of an attack must be different indices from 0, got {meters.tolist()}",
+        ),
+    )
+    require(
+        t_on < t_off,
+        Problem("order", f"an attack must begin before it ends, got t_on={t_on} and t_off={t_off}"),
+    )
 
 
-def _check_per_meter(meters: Ints, **values: Floats) -> None:
-    for name, value in values.items():
-        if value.shape != meters.shape:
-            raise InputInvalid(
-                [Problem("shape", f"{name} has shape {value.shape}, but there are {meters.size} meters")]
-            )
-        if not np.all(np.isfinite(value)):
-            raise InputInvalid([Problem("not-finite", f"{name} must be finite")])
+def _check_per_meter(meters: Ints, name: str, value: Floats) -> None:
+    same = value.shape == meters.shape
+    require(same, Problem("shape", f"{name} has shape {value.shape}, but there are {meters.size} meters"))
+    require(np.all(np.isfinite(value)), Problem("not-finite", f"{name} must be finite"))

@@ -11,18 +11,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from feeders.format.validation import told
-from feeders.report import drawing as drawings
-from feeders.report.drawing import WIDE, Drawing, Figure, svg
+from feeders.report.drawing import WIDE, Drawing, Figure, png, svg
 from feeders.report.html import CONVERSION, FEEDER, About, Chapter, StudyOutcome, page, section
 from feeders.report.maps import Shape, Spot, draw_map, legend_of
+from gridsec.papers import draw
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from feeders.convert.provenance import Origin
     from feeders.model.site import Site
-
-__all__ = ["Report", "report"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,8 +55,8 @@ def _files(figure: Figure) -> list[tuple[str, bytes]]:
     drawing = figure.draw(WIDE)
     text = svg(drawing, title=figure.title, text=figure.text, key=figure.name, alone=True)
     out = [(f"{figure.name}.svg", text.encode())]
-    if drawings.available():
-        out.append((f"{figure.name}.png", drawings.png(drawing, title=figure.title, text=figure.text)))
+    if draw.available():
+        out.append((f"{figure.name}.png", png(drawing, title=figure.title, text=figure.text)))
     return out
 
 

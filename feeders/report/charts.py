@@ -9,8 +9,6 @@ from typing import Final
 
 from feeders.report.drawing import Area, Disc, Drawing, Mark, Polyline, Text, regular, width_of
 
-__all__ = ["LINES", "Bar", "ChartRow", "Curve", "curves", "rows", "ticks"]
-
 LINES: Final = ("line-a", "line-b", "line-c", "line-d", "line-ink", "line-bad", "line-wire", "line-s")
 """Looks of curves, different in colour and dashes."""
 

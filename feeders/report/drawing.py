@@ -10,33 +10,10 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
+from itertools import groupby
 from typing import Any, Final
 
 from gridsec.papers import draw
-
-__all__ = [
-    "DARK",
-    "LIGHT",
-    "LOOKS",
-    "NARROW",
-    "STEPS",
-    "WIDE",
-    "Area",
-    "Disc",
-    "Drawing",
-    "Figure",
-    "Look",
-    "Mark",
-    "Polyline",
-    "Text",
-    "available",
-    "png",
-    "regular",
-    "style",
-    "svg",
-    "width_of",
-]
-
 
 Point = tuple[float, float]
 
@@ -91,7 +68,6 @@ class Look:
     stroke: str = ""
     width: float = 1.0
     dash: str = ""
-    bold: bool = False
     halo: bool = False
 
 
@@ -201,9 +177,7 @@ def width_of(text: str, size: float = 12.0) -> float:
 
 
 def style(scope: str = "") -> str:
-    """Style sheet of all looks, light and dark, below a selector; without one the whole document is one
-    drawing.
-    """
+    """Style sheet of all looks, light and dark, below a selector, or for a whole document."""
     root = scope or ":root"
     before = f"{scope} " if scope else ""
     lines = [f"{root} {{ {_variables(LIGHT)} }}"]
@@ -226,8 +200,6 @@ def _rule(look: Look) -> str:
         parts.append("stroke-linecap: round;")
     if look.dash:
         parts.append(f"stroke-dasharray: {look.dash};")
-    if look.bold:
-        parts.append("font-weight: 650;")
     if look.halo:
         parts.append("paint-order: stroke; stroke: var(--g-card); stroke-width: 3px; stroke-linejoin: round;")
     return " ".join(parts)
@@ -254,26 +226,16 @@ def svg(drawing: Drawing, *, title: str, text: str, key: str, alone: bool = Fals
 
 def _merged(marks: Sequence[Mark]) -> Iterable[str]:
     """Write marks; successive ones of equal look without a tip share one path."""
-    held: tuple[str, list[str]] | None = None
-    for mark in marks:
-        if isinstance(mark, Polyline | Area) and not mark.tip:
-            if held is not None and held[0] == mark.look:
-                held[1].append(_path(mark))
-                continue
-            if held is not None:
-                yield _one_path(*held)
-            held = (mark.look, [_path(mark)])
-            continue
-        if held is not None:
-            yield _one_path(*held)
-            held = None
-        yield _element(mark)
-    if held is not None:
-        yield _one_path(*held)
+    for look, some in groupby(marks, _shared_look):
+        if look:
+            parts = [_path(mark) for mark in some if isinstance(mark, Polyline | Area)]
+            yield f'<path class="g-{look}" d="{"".join(parts)}"/>'
+        else:
+            yield from map(_element, some)
 
 
-def _one_path(look: str, parts: list[str]) -> str:
-    return f'<path class="g-{look}" d="{"".join(parts)}"/>'
+def _shared_look(mark: Mark) -> str:
+    return mark.look if isinstance(mark, Polyline | Area) and not mark.tip else ""
 
 
 def _element(mark: Mark) -> str:
@@ -328,11 +290,6 @@ _POINTS: Final = 0.72  # points per px on a sheet of 100 px per inch
 _SIDES: Final = 48
 
 
-def available() -> bool:
-    """True if PNG is available: matplotlib is installed."""
-    return draw.available()
-
-
 def png(drawing: Drawing, *, title: str, text: str) -> bytes:
     """Draw a PNG with a title and a text as metadata; equal drawings give equal bytes. Needs matplotlib."""
 
@@ -370,7 +327,6 @@ def _draw(axes: Any, mark: Mark, order: float) -> None:
             fontsize=_POINTS * mark.size * 0.94,  # DejaVu is wider than the fonts of screens
             ha=side,
             va="baseline",
-            weight="bold" if look.bold else "normal",
             zorder=order,
             parse_math=False,
             bbox=halo if look.halo else None,

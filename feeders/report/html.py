@@ -20,15 +20,13 @@ from jinja2 import Environment, FunctionLoader, StrictUndefined
 
 from feeders.report import section_calibrate, section_campaign, section_droop, section_meters
 from feeders.report.drawing import NARROW, WIDE, Figure, style, svg
-from feeders.report.text import Finding, Question, Section, Standing, Value, number, plural
+from feeders.report.text import Finding, Question, Section, Standing, Value, counted, number, plural
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from feeders.convert.provenance import Origin
     from feeders.model.site import Site
-
-__all__ = ["CONVERSION", "FEEDER", "About", "Chapter", "Result", "StudyOutcome", "page", "section"]
 
 
 class Result(Protocol):
@@ -98,7 +96,7 @@ def section(site: Site, outcome: StudyOutcome) -> Section:
 def _generic(study: str, _: Site, found: Result) -> Section:
     sizes: list[str | Value] = []
     for name, table in found.tables.items():
-        rows = Value(len(table), str(len(table)), f"{study}-{name}:rows")
+        rows = counted(len(table), f"{study}-{name}:rows")
         sizes += [", " if sizes else "", f"{name} (", rows, f" {plural(len(table), 'row')})"]
     lead = f"The study {study} has {len(found.tables)} {plural(len(found.tables), 'table')}: "
     told = Finding(Standing.MEASURED, ((lead, *sizes, ". They are shown below without conclusions."),))

@@ -29,23 +29,6 @@ if TYPE_CHECKING:
     from feeders.model.site import Site
     from gridsec.arrays import Floats
 
-__all__ = [
-    "ColorScale",
-    "Placed",
-    "Shape",
-    "Spot",
-    "comparable",
-    "draw_map",
-    "has_places",
-    "legend_of",
-    "names_of",
-    "place",
-    "single_phase",
-    "size_map",
-    "spots_by_size",
-    "steps_of",
-]
-
 
 Point = tuple[float, float]
 
@@ -371,23 +354,10 @@ def legend_of(meanings: Mapping[str, Shape], spots: Sequence[Spot]) -> dict[str,
     return {name: Spot(shape) for name, shape in meanings.items() if shape in there}
 
 
-def draw_map(
-    site: Site, spots: Sequence[Spot], width: float, *, legend: Mapping[str, Spot], note: str = ""
-) -> Drawing:
+def draw_map(site: Site, spots: Sequence[Spot], width: float, *, legend: Mapping[str, Spot]) -> Drawing:
     """Draw a feeder on a sheet `width` px wide, with the mark of each customer, and a legend by meaning."""
     at = place(site, width)
-    top = 22.0 if note else 0.0
-    at = replace(
-        at,
-        height=at.height + top,
-        wires=tuple(_down(points, top) for points in at.wires),
-        drops=tuple(_down(points, top) for points in at.drops),
-        ties=tuple(_down(points, top) for points in at.ties),
-        busbar=(_moved(at.busbar[0], top), _moved(at.busbar[1], top)),
-        customers=tuple(_moved(point, top) for point in at.customers),
-    )
-    marks: list[Mark] = [Text(8.0, 15.0, note, "quiet", size=12.0)] if note else []
-    marks += [Polyline(points, "drop") for points in at.drops]
+    marks: list[Mark] = [Polyline(points, "drop") for points in at.drops]
     marks += [Polyline(points, "wire") for points in at.wires]
     marks += [Polyline(points, "line-wire") for points in at.ties]
     marks.append(Polyline(at.busbar, "busbar", tip=f"busbar: {site.feeder.buses[0]}"))
@@ -396,7 +366,7 @@ def draw_map(
     order = sorted(range(len(spots)), key=lambda k: (spots[k].step, spots[k].weight))
     for k in order:
         marks += _glyph(spots[k], *at.customers[k], size)
-    marks += _labels(spots, at, size, top)
+    marks += _labels(spots, at, size)
     lines, height = _legend(legend, at.height, width)
     return Drawing(width, height, (*marks, *lines))
 
@@ -416,14 +386,6 @@ def _with_phases(
         **legend,
         **{f"phase {phase}": Spot(Shape.NONE, phase=phase) for phase in sorted(set(phases))},
     }
-
-
-def _moved(point: tuple[float, float], down: float) -> tuple[float, float]:
-    return (point[0], point[1] + down)
-
-
-def _down(points: Sequence[tuple[float, float]], down: float) -> tuple[tuple[float, float], ...]:
-    return tuple(_moved(point, down) for point in points)
 
 
 def _glyph(spot: Spot, x: float, y: float, size: float) -> list[Mark]:
@@ -461,7 +423,7 @@ def _leg(spot: Spot, x: float, y: float, size: float) -> list[Mark]:
 Box = tuple[float, float, float, float]
 
 
-def _labels(spots: Sequence[Spot], at: Placed, size: float, top: float) -> list[Mark]:
+def _labels(spots: Sequence[Spot], at: Placed, size: float) -> list[Mark]:
     """Labels with enough room, off the lines if possible: right, left, below, above, in this order.
 
     Labels of trees are below first.
@@ -487,7 +449,7 @@ def _labels(spots: Sequence[Spot], at: Placed, size: float, top: float) -> list[
             tx, ty, anchor, left = places[name]
             box = (left, ty - 9.0, left + long, ty + 2.0)
             inside = (
-                box[0] >= 1.0 and box[2] <= at.width - 1.0 and box[1] >= top and box[3] <= at.height + 6.0
+                box[0] >= 1.0 and box[2] <= at.width - 1.0 and box[1] >= 0.0 and box[3] <= at.height + 6.0
             )
             if inside and not any(_overlap(box, other) for other in taken):
                 free.append((Text(tx, ty, spots[k].label, "label", anchor, letters), box))

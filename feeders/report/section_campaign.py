@@ -10,7 +10,18 @@ import numpy as np
 
 from feeders.report.charts import LINES, Bar, ChartRow, Curve, curves, rows
 from feeders.report.drawing import Drawing, Figure
-from feeders.report.text import Finding, Question, Section, Sentence, Standing, Value, listed, number, plural
+from feeders.report.text import (
+    Finding,
+    Question,
+    Section,
+    Sentence,
+    Standing,
+    Value,
+    counted,
+    listed,
+    number,
+    plural,
+)
 from feeders.simulation.attacks import AttackKind
 from feeders.simulation.trial import TrialMeterErrors
 
@@ -22,7 +33,6 @@ if TYPE_CHECKING:
     from feeders.studies.campaign.plan import CampaignPlan
     from feeders.studies.campaign.study import Campaign
 
-__all__ = ["campaign"]
 
 # Columns on the page; the files have all.
 _BY = {"by_kind": "kind", "by_size": "size", "by_place": "place", "by_liars": "liars"}
@@ -30,18 +40,7 @@ _SIZES = (
     "bias, scaling: % of nominal; drift: % of nominal per minute; replay: age of the reports, s; "
     "coordinated: displacement of the least affected meter by a false load, % of nominal; stuck: none"
 )
-_UNITS = {
-    **dict.fromkeys(
-        (AttackKind.BIAS, AttackKind.TOGETHER, AttackKind.SCALING, AttackKind.RANDOM, AttackKind.COORDINATED),
-        " %",
-    ),
-    **{
-        AttackKind.DRIFT: " %/min",
-        AttackKind.REPLAY: " s",
-        AttackKind.CLOCK_SHIFT: " s",
-        AttackKind.INVERTER: " %",
-    },
-}
+_UNITS = {AttackKind.DRIFT: " %/min", AttackKind.REPLAY: " s", AttackKind.CLOCK_SHIFT: " s"}
 _ERRORS = {
     TrialMeterErrors.SITE: "those of the feeder's files",
     TrialMeterErrors.WHITE: "white noise of 0.2 %, no fixed error",
@@ -138,9 +137,9 @@ def _behaved(found: Campaign, rate: float) -> Finding:
         sentences.append(
             (
                 "Of ",
-                Value(len(liars), str(len(liars)), "campaign-liars:rows"),
+                counted(len(liars), "campaign-liars:rows"),
                 " manipulated devices in ",
-                Value(len(played), str(len(played)), "campaign-scenarios:reason:empty"),
+                counted(len(played), "campaign-scenarios:reason:empty"),
                 " simulated scenarios, the monitor named ",
                 Value(share, _percent(share), "campaign-false_names:named:row 0"),
                 f" (true share with 95 % confidence: {_percent(low)} to {_percent(high)}).",
@@ -153,7 +152,7 @@ def _behaved(found: Campaign, rate: float) -> Finding:
     sentences.append(
         (
             "False accusations: ",
-            Value(wronged, str(wronged), "campaign-scenarios:falsely_named:filled"),
+            counted(wronged, "campaign-scenarios:falsely_named:filled"),
             f" of {len(played)} {plural(len(played), 'scenario')}.",
             *_worst(played),
         )
@@ -172,7 +171,7 @@ def _missed(found: Campaign, rate: float) -> list[Sentence]:
         return [(f"None was missed.{soon.replace('Median delay of the others', 'Median delay')}",)]
     total = liars.groupby("kind").size()
     kinds = [f"{kind} ({count} of {total[kind]})" for kind, count in never.groupby("kind").size().items()]
-    missed = Value(len(never), str(len(never)), "campaign-liars:delay_s:infinite")
+    missed = counted(len(never), "campaign-liars:delay_s:infinite")
     return [(missed, f" {plural(len(never), 'was', 'were')} missed: {listed(kinds)}.{soon}")]
 
 
@@ -208,7 +207,7 @@ def _open(played: pd.DataFrame, impossible: int) -> list[Sentence]:
         )
     )
     if impossible:
-        count = Value(impossible, str(impossible), "campaign-scenarios:reason:filled")
+        count = counted(impossible, "campaign-scenarios:reason:filled")
         noun = plural(impossible, "scenario", "scenarios")
         out.append(
             (
@@ -240,7 +239,7 @@ def _named_chart(plan: CampaignPlan, table: pd.DataFrame, width: float) -> Drawi
         told = int(row["liars_told"])
         kind = tricks.get(row["kind"])
         # Sizes of kinds in volts are factors.
-        unit = "" if kind is None or kind.volts or kind.together else _UNITS.get(kind.trick, "")
+        unit = "" if kind is None or kind.volts or kind.together else _UNITS.get(kind.trick, " %")
         size = "" if kind is not None and kind.trick is AttackKind.STUCK else f" {row['size']:g}{unit}"
         data.append(ChartRow(f"{row['kind']}{size}", bars, f"{round(share * told / 100.0)} of {told}"))
     return rows(data, width, axis="manipulated devices named, %")

@@ -18,6 +18,7 @@ from feeders.report.text import (
     Side,
     Standing,
     Value,
+    counted,
     least,
     listed,
     number,
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
     from feeders.model.site import Site
     from feeders.studies.droop.study import DroopOptions, DroopStudy
 
-__all__ = ["droop"]
 
 ROWS = 30
 """Largest number of customers in a chart: those with the widest voltage limits."""
@@ -125,7 +125,7 @@ def _stability(stability: pd.DataFrame, verdict: str, busbar: str) -> Sentence:
         lead = f"Stable: proved for constant loads anywhere within their limits, the busbar {busbar}."
         return (lead, *margin)
     which = [str(p) for p, v in zip(stability["point"], stability["verdict"], strict=True) if v == verdict]
-    count = Value(len(which), str(len(which)), f"{name}:verdict:count {verdict}")
+    count = counted(len(which), f"{name}:verdict:count {verdict}")
     where: Sentence = (" (", count, f" of {len(stability)} cases: {listed(which)})")
     if verdict == UNSTABLE:
         return ("Unstable: the fleet leaves its equilibrium, in the proof and in AC simulation", *where, ".")

@@ -18,6 +18,7 @@ from feeders.report.text import (
     Side,
     Standing,
     Value,
+    counted,
     least,
     listed,
     most,
@@ -34,8 +35,6 @@ if TYPE_CHECKING:
     from feeders.studies.detectable import Detectable
     from feeders.studies.protect import Protect
     from feeders.studies.redundancy import Redundancy
-
-__all__ = ["detectable", "protect", "redundancy"]
 
 
 def redundancy(site: Site, found: Redundancy) -> Section:
@@ -432,7 +431,7 @@ def _protection(site: Site, found: Protect) -> Finding:
     if not count and not math.isnan(found.before):
         return Finding(sure, (lead, effect))
     if found.gap:
-        needed = Value(found.least, str(found.least), "protect-summary:least:row 0")
+        needed = counted(found.least, "protect-summary:least:row 0")
         proof = (
             "These suffice; their number is not proved to be the smallest; at least ",
             needed,

@@ -16,24 +16,6 @@ from feeders.report.drawing import Figure
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = [
-    "MANY",
-    "Finding",
-    "Question",
-    "Section",
-    "Sentence",
-    "Side",
-    "Standing",
-    "Value",
-    "least",
-    "listed",
-    "most",
-    "number",
-    "plural",
-    "rows",
-    "said",
-]
-
 
 MANY: Final = 12
 """Largest number of names in a sentence."""
@@ -115,9 +97,14 @@ def listed(names: Sequence[str]) -> str:
     return " and ".join([", ".join(some[:-1]), some[-1]] if len(some) > 1 else some)
 
 
+def counted(count: int, source: str) -> Value:
+    """Number of things."""
+    return Value(count, str(count), source)
+
+
 def rows(table: pd.DataFrame, name: str) -> Value:
     """Number of rows of a table."""
-    return Value(len(table), str(len(table)), f"{name}:rows")
+    return counted(len(table), f"{name}:rows")
 
 
 def most(

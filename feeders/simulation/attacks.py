@@ -232,9 +232,7 @@ def check_count(site: Site, kind: AttackKind, count: int) -> int:
 def on_devices(
     site: Site, lie: AttackSpec, devices: Ints, signs: Floats, *, t_on: float, t_off: float, seed: int = 0
 ) -> Attacks:
-    """Attack given meters or inverters (k,) independently, each by its sign (k,) of the size; times are
-    Unix s.
-    """
+    """Attack given meters or inverters (k,) independently, each by its sign (k,) of the size."""
     amount = lie.size / 100.0 * (np.abs(signs) if lie.trick is AttackKind.TOGETHER else signs)
     if lie.trick is AttackKind.INVERTER:
         rating = np.array([row.inverter_kva for row in site.tables.customers])[site.droop.customer]

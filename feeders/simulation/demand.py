@@ -1,8 +1,8 @@
 """Loads, generation and busbar voltage as functions of time.
 
 Every quantity is a pure function of the seed and of Unix time: any stretch, in any order and any chunks, has
-the same numbers. The integrator may therefore take substeps of any length, and a run with an attack has
-exactly the loads of the run without it.
+the same numbers. The integrator may therefore take substeps of any length, and a scenario
+with an attack has exactly the loads of that without it.
 
 Profiles of 15 min are interpolated. A faster variation is added, an Ornstein-Uhlenbeck process for every
 customer, so that readings at intervals of 1 s change from one to the next.

@@ -14,7 +14,7 @@ import numpy as np
 
 from feeders.simulation.demand import Stream, generator
 from gridsec.arrays import Floats, Ints
-from gridsec.errors import InputInvalid, Problem
+from gridsec.errors import InputInvalid, Problem, raise_if_any
 from gridsec.grid.network import InPhases
 
 if TYPE_CHECKING:
@@ -67,20 +67,20 @@ class Channel:
     silences: tuple[MeterOutage, ...] = ()
 
     def __post_init__(self) -> None:
-        for name in ("loss", "late", "duplicate"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise InputInvalid(
-                    [Problem("out-of-range", f"{name} is a probability, got {getattr(self, name)}")]
-                )
-        for name in ("delay_s", "delay_mean_s", "late_s", "clock_s"):
-            if not 0.0 <= getattr(self, name) < np.inf:
-                raise InputInvalid(
-                    [
-                        Problem(
-                            "negative", f"{name} must be finite and not negative, got {getattr(self, name)}"
-                        )
-                    ]
-                )
+        chances = {name: getattr(self, name) for name in ("loss", "late", "duplicate")}
+        times = {name: getattr(self, name) for name in ("delay_s", "delay_mean_s", "late_s", "clock_s")}
+        raise_if_any(
+            [
+                Problem("out-of-range", f"{name} is a probability, got {value}")
+                for name, value in chances.items()
+                if not 0.0 <= value <= 1.0
+            ]
+            + [
+                Problem("negative", f"{name} must be finite and not negative, got {value}")
+                for name, value in times.items()
+                if not 0.0 <= value < np.inf
+            ]
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -142,15 +142,13 @@ class SimulatedMeters:
         self.busbar_bias = errors.bias * accuracy.busbar_class * random.uniform(-1.0, 1.0, self._busbars)
         self._clock = channel.clock_s * random.uniform(-1.0, 1.0, self.count + 1)
 
-        base = np.append(site.customer_volt[customer], [site.tables.meta.voltage_volt] * self._busbars)
-        self._jitter = (
-            errors.jitter * base * np.append(accuracy.jitter, [accuracy.busbar_jitter] * self._busbars)
-        )
-        self._step = (
-            errors.resolution
-            * base
-            * np.append(accuracy.resolution, [accuracy.busbar_resolution] * self._busbars)
-        )
+        def registers(customers: Floats, busbar: float) -> Floats:
+            """Values of all voltage registers, those of the busbar meter last."""
+            return np.append(customers, [busbar] * self._busbars)
+
+        base = registers(site.customer_volt[customer], site.tables.meta.voltage_volt)
+        self._jitter = errors.jitter * base * registers(accuracy.jitter, accuracy.busbar_jitter)
+        self._step = errors.resolution * base * registers(accuracy.resolution, accuracy.busbar_resolution)
         self._p_step = errors.resolution * site.tables.meta.meters.p_resolution_kw
 
     def read(self, ticks: Ints, v_volt: Floats, p_kw: Floats, q_kvar: Floats, v0_volt: Floats) -> Registers:

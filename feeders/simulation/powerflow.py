@@ -102,9 +102,7 @@ class PowerFlow:
         phasors: Phasors = magnitude * np.exp(1j * (angle - angle[self.grid.busbar]))
         return phasors
 
-    def solve_batch(
-        self, p_kw: Floats, q_kvar: Floats, v0_volt: Floats, *, threads: int = 1
-    ) -> tuple[Floats, Floats]:
+    def solve_batch(self, p_kw: Floats, q_kvar: Floats, v0_volt: Floats) -> tuple[Floats, Floats]:
         """Voltages (T, N) and (T, b + 1), V, for T sets of loads (T, N) and busbar voltages (T,).
 
         The numbers are those of T calls of `solve`, many times faster. PowerFlowDiverged names the first set
@@ -121,7 +119,7 @@ class PowerFlow:
         by_node = self._calculate(
             "u_pu",
             update_data={ComponentType.sym_load: loads, ComponentType.source: source},
-            threading=threads if threads > 1 else -1,
+            threading=-1,
         )
         by_node = by_node * self._scale
         return by_node[:, self.grid.customer_bus], by_node[:, self._order]

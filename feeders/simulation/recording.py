@@ -36,27 +36,6 @@ if TYPE_CHECKING:
 
     from feeders.model.site import Site
 
-__all__ = [
-    "CHUNK_TICKS",
-    "FORMAT",
-    "KEY",
-    "PACKAGES",
-    "PHASES",
-    "READINGS",
-    "REGISTERS",
-    "REQUIRED",
-    "T_POWER",
-    "RecordedTruth",
-    "Recording",
-    "RecordingInvalid",
-    "is_simulated",
-    "read_recording",
-    "record",
-    "scenario_from_json",
-    "scenario_to_json",
-    "truth_path",
-]
-
 
 _LISTS = ("attacks", "busbar_attacks")
 

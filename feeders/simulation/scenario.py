@@ -24,7 +24,7 @@ from feeders.simulation.plant import PlantTrajectory, net_reactive, truth
 from feeders.util import own_numbers
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.attack import Attack, InverterAttack, Reports, apply_all, manipulated, reach
-from gridsec.errors import InputInvalid, Problem, choice, raise_if_any
+from gridsec.errors import Problem, choice, raise_if_any, require
 
 if TYPE_CHECKING:
     from feeders.model.site import Site
@@ -86,24 +86,17 @@ class Scenario:
     def __post_init__(self) -> None:
         own_numbers(self)
         object.__setattr__(self, "season", choice("season", Season, self.season))
-        if self.seed < 0:
-            raise InputInvalid([Problem("negative", f"seed must not be negative, got {self.seed}")])
-        if not np.isfinite(self.profile_s):
-            raise InputInvalid([Problem("not-finite", f"profile_s must be finite, got {self.profile_s}")])
-        if not 0.0 <= self.start < LATEST_S:
-            raise InputInvalid(
-                [Problem("out-of-range", f"start must be a Unix time in seconds, got {self.start}")]
-            )
-        if not self.duration_s > 0.0:
-            raise InputInvalid(
-                [Problem("not-positive", f"duration_s must be positive, got {self.duration_s}")]
-            )
-        if not 0.0 < self.dt_s < np.inf:
-            raise InputInvalid(
-                [Problem("not-positive", f"dt_s must be positive and finite, got {self.dt_s}")]
-            )
-        if self.substep_s is not None and not self.substep_s > 0.0:
-            raise InputInvalid([Problem("not-positive", f"substep_s must be positive, got {self.substep_s}")])
+        begin, length, step = self.start, self.duration_s, self.substep_s
+        require(self.seed >= 0, Problem("negative", f"seed must not be negative, got {self.seed}"))
+        finite = Problem("not-finite", f"profile_s must be finite, got {self.profile_s}")
+        require(np.isfinite(self.profile_s), finite)
+        unix = Problem("out-of-range", f"start must be a Unix time in seconds, got {begin}")
+        require(0.0 <= begin < LATEST_S, unix)
+        require(length > 0.0, Problem("not-positive", f"duration_s must be positive, got {length}"))
+        ticking = Problem("not-positive", f"dt_s must be positive and finite, got {self.dt_s}")
+        require(0.0 < self.dt_s < np.inf, ticking)
+        substep = Problem("not-positive", f"substep_s must be positive, got {step}")
+        require(step is None or step > 0.0, substep)
 
 
 @dataclass(frozen=True, slots=True)
@@ -350,12 +343,12 @@ def check(site: Site, scenario: Scenario) -> None:
     """Check the attacks of a scenario against the feeder; ValueError with all problems."""
     name, phases = site.feeder.name, site.feeder.busbar_places().stop
     problems = [
-        Problem(
-            "unknown-index",
-            f"an attack names inverter {wrong.inverters.max()}, but {name} has {site.droop.tau.size}",
+        Problem("unknown-index", f"an attack names {what} {index}, but {name} has {count}")
+        for what, index, count in (
+            *(("inverter", each.inverters.max(), site.droop.tau.size) for each in scenario.inverter_attacks),
+            *(("meter", each.meters.max(), site.meters.size) for each in scenario.attacks),
         )
-        for wrong in scenario.inverter_attacks
-        if wrong.inverters.max() >= site.droop.tau.size
+        if index >= count
     ]
     if any(
         attack.meters.max() >= phases or reach(attack, attack.t_off) > 0.0
@@ -368,30 +361,22 @@ def check(site: Site, scenario: Scenario) -> None:
             )
         )
     for attack in scenario.attacks:
-        if attack.meters.max() >= site.meters.size:
-            problems.append(
-                Problem(
-                    "unknown-index",
-                    f"an attack names meter {attack.meters.max()}, but {name} has {site.meters.size}",
-                )
-            )
         then = max(attack.t_on, scenario.start)
-        if attack.t_off > then and reach(attack, then) > LONGEST_LOOK_BACK_S:
-            back = reach(attack, then)
+        back = reach(attack, then)
+        if attack.t_off > then and back > LONGEST_LOOK_BACK_S:
             problems.append(
                 Problem(
                     "out-of-range",
                     f"an attack uses readings {back:.0f} s old, more than the simulation supports",
                 )
             )
-    every = (*scenario.attacks, *scenario.busbar_attacks, *scenario.inverter_attacks)
     problems += [
         Problem(
             "out-of-range",
-            f"an attack begins {attack.t_on - scenario.start:g} s after the start, when the scenario of "
+            f"an attack begins {each.t_on - scenario.start:g} s after the start, when the scenario of "
             f"{scenario.duration_s:g} s is over",
         )
-        for attack in every
-        if attack.t_on >= scenario.start + scenario.duration_s
+        for each in (*scenario.attacks, *scenario.busbar_attacks, *scenario.inverter_attacks)
+        if each.t_on >= scenario.start + scenario.duration_s
     ]
     raise_if_any(problems)

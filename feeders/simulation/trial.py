@@ -1,4 +1,4 @@
-"""Trials: short simulated runs with known attacks, for the comparison of estimators.
+"""Trials: short scenarios with a known attack, for the comparison of estimators.
 
 A trial is a `feeders.simulation.scenario.Scenario` with one load situation that varies slowly. Its frames
 have the profiles' powers of all customers with an available meter. The true loads differ from these by an
@@ -79,7 +79,7 @@ class LoadError:
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """Short simulated run."""
+    """Short scenario on a feeder, with stated errors of loads and meters."""
 
     site: Site  # The feeder. Designs are for `stated`, with the errors of meters and loads.
     seed: int = 0  # seed of all random numbers
