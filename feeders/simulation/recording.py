@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass, fields
 from importlib import metadata
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, get_args
 
 import numpy as np
 import pyarrow as pa
@@ -37,77 +37,43 @@ if TYPE_CHECKING:
     from feeders.model.site import Site
 
 
-_LISTS = ("attacks", "busbar_attacks")
+_LISTS: Final = ("attacks", "busbar_attacks")
+_KINDS: Final = {kind.__name__: kind for kind in get_args(attacks.Attack)}
 
 
 def scenario_to_json(scenario: Scenario) -> dict[str, Any]:
     """Convert a scenario to JSON types; infinite times become the text "inf"."""
-    told = {field.name: getattr(scenario, field.name) for field in fields(scenario)}
-    told["variation"] = asdict(scenario.variation)
-    told["errors"] = asdict(scenario.errors)
-    told["channel"] = asdict(scenario.channel)
+    told = asdict(scenario)
     for name in _LISTS:
-        told[name] = [
-            {"kind": type(attack).__name__}
-            | {field.name: getattr(attack, field.name) for field in fields(attack)}
-            for attack in getattr(scenario, name)
-        ]
-    told["inverter_attacks"] = [
-        {field.name: getattr(attack, field.name) for field in fields(attack)}
-        for attack in scenario.inverter_attacks
-    ]
+        for entry, attack in zip(told[name], getattr(scenario, name), strict=True):
+            entry["kind"] = type(attack).__name__
     out: dict[str, Any] = _told(plain(told))
     return out
 
 
 def scenario_from_json(obj: dict[str, Any]) -> Scenario:
     """Inverse of `scenario_to_json`; KeyError, TypeError or ValueError for any other content."""
-    given = {"busbar_attacks": ()} | _heard(obj)
-    channel = dict(given["channel"])
-    channel["silences"] = tuple(
-        MeterOutage(s["meter"], float(s["t_on"]), float(s["t_off"])) for s in channel["silences"]
-    )
-    given["channel"] = Channel(**channel)
+    given = {"busbar_attacks": (), "inverter_attacks": (), "season": Season.SUMMER} | _heard(obj)
+    silences = tuple(MeterOutage(**silence) for silence in given["channel"]["silences"])
+    given["channel"] = Channel(**given["channel"] | {"silences": silences})
     given["variation"] = Variation(**given["variation"])
     given["errors"] = MeterErrors(**given["errors"])
     for name in _LISTS:
-        given[name] = tuple(_attack(entry) for entry in given[name])
-    given["inverter_attacks"] = tuple(
-        attacks.InverterAttack(
-            np.array(entry["inverters"], dtype=np.intp),
-            np.array(entry["q"], dtype=np.float64),
-            float(entry["t_on"]),
-            float(entry["t_off"]),
-        )
-        for entry in given.get("inverter_attacks", ())
-    )
-    given["duration_s"] = float(given["duration_s"])
-    given["season"] = Season(given.get("season", Season.SUMMER))
+        given[name] = tuple(_attack(_KINDS[entry.pop("kind")], entry) for entry in given[name])
+    wrong = (_attack(attacks.InverterAttack, entry) for entry in given["inverter_attacks"])
+    given["inverter_attacks"] = tuple(wrong)
     return Scenario(**given)
 
 
-_ATTACKS: Final = {
-    kind.__name__: kind
-    for kind in (
-        attacks.Bias,
-        attacks.Scaling,
-        attacks.Drift,
-        attacks.Stuck,
-        attacks.Replay,
-        attacks.Random,
-        attacks.Coordinated,
+def _attack(kind: Any, entry: dict[str, Any]) -> Any:
+    """Attack of a kind, with lists as arrays; lists of indices are integers."""
+    types = {"meters": np.intp, "inverters": np.intp}
+    return kind(
+        **{
+            name: np.array(value, dtype=types.get(name, np.float64)) if isinstance(value, list) else value
+            for name, value in entry.items()
+        }
     )
-}
-
-
-def _attack(entry: dict[str, Any]) -> attacks.Attack:
-    values = dict(entry)
-    kind: Any = _ATTACKS[values.pop("kind")]
-    for name, value in values.items():
-        if isinstance(value, list):
-            values[name] = np.array(value, dtype=np.intp if name == "meters" else np.float64)
-    made: attacks.Attack = kind(**values)
-    return made
 
 
 _INFINITE: Final = ("inf", "-inf")
