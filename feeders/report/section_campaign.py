@@ -21,6 +21,8 @@ from feeders.report.text import (
     listed,
     number,
     plural,
+    quantity,
+    sentence,
 )
 from feeders.simulation.attacks import AttackKind
 from feeders.simulation.trial import TrialMeterErrors
@@ -135,14 +137,14 @@ def _behaved(found: Campaign, rate: float) -> Finding:
     if len(liars):
         share, low, high = (float(row[name].iloc[0]) for name in ("named", "named_low", "named_high"))
         sentences.append(
-            (
-                "Of ",
-                counted(len(liars), "campaign-liars:rows"),
-                " manipulated devices in ",
-                counted(len(played), "campaign-scenarios:reason:empty"),
-                " simulated scenarios, the monitor named ",
-                Value(share, _percent(share), "campaign-false_names:named:row 0"),
-                f" (true share with 95 % confidence: {_percent(low)} to {_percent(high)}).",
+            sentence(
+                "Of {liars} manipulated devices in {played} simulated scenarios, the monitor named {share} "
+                "(true share with 95 % confidence: {low} to {high}).",
+                liars=counted(len(liars), "campaign-liars:rows"),
+                played=counted(len(played), "campaign-scenarios:reason:empty"),
+                share=Value(share, _percent(share), "campaign-false_names:named:row 0"),
+                low=_percent(low),
+                high=_percent(high),
             )
         )
         sentences += _missed(found, rate)
@@ -192,30 +194,22 @@ def _worst(played: pd.DataFrame) -> Sentence:
 
 def _open(played: pd.DataFrame, impossible: int) -> list[Sentence]:
     """Undecided time, undetected time, and scenarios without a simulation."""
-    out: list[Sentence] = []
-    total, clean = float(played["undecided_s"].sum()), float(played["clean_lying_s"].sum())
-    watched = float(played["watched_s"].sum())
-    out.append(
-        (
-            "Of ",
-            Value(watched, f"{number(watched, 0)} s", "campaign-scenarios:watched_s:sum"),
-            " monitored, the verdict was UNDECIDED for ",
-            Value(total, f"{number(total, 0)} s", "campaign-scenarios:undecided_s:sum"),
-            ", and CLEAN for ",
-            Value(clean, f"{number(clean, 0)} s", "campaign-scenarios:clean_lying_s:sum"),
-            " with an attack that was not noticed yet, or never.",
-        )
+    watched, undecided, clean = (
+        quantity(float(played[name].sum()), "s", f"campaign-scenarios:{name}:sum", digits=0)
+        for name in ("watched_s", "undecided_s", "clean_lying_s")
     )
-    if impossible:
-        count = counted(impossible, "campaign-scenarios:reason:filled")
-        noun = plural(impossible, "scenario", "scenarios")
-        out.append(
-            (
-                count,
-                f" {noun} could not be simulated: no result for these.",
-            )
-        )
-    return out
+    times = sentence(
+        "Of {watched} monitored, the verdict was UNDECIDED for {undecided}, and CLEAN for {clean} with an "
+        "attack that was not noticed yet, or never.",
+        watched=watched,
+        undecided=undecided,
+        clean=clean,
+    )
+    if not impossible:
+        return [times]
+    count = counted(impossible, "campaign-scenarios:reason:filled")
+    noun = plural(impossible, "scenario")
+    return [times, (count, f" {noun} could not be simulated: no result for these.")]
 
 
 def _percent(share: float) -> str:

@@ -22,6 +22,7 @@ from feeders.report.text import (
     least,
     listed,
     number,
+    quantity,
 )
 
 if TYPE_CHECKING:
@@ -161,8 +162,7 @@ def _witness(site: Site, table: pd.DataFrame | None) -> Sentence:
     away = (table["v_volt"] / table["customer"].map(nominal) - 1.0).abs()
     k = int(away.where(table["beyond"]).fillna(-1.0).to_numpy().argmax())
     row = table.iloc[k]
-    size = float(row["v_volt"])
-    volt = Value(size, f"{number(size, 1)} V", f"droop-witness:v_volt:row {k}")
+    volt = quantity(float(row["v_volt"]), "V", f"droop-witness:v_volt:row {k}", digits=1)
     return ("; the loads of table witness give ", volt, f" at {row['customer']}, by AC power flow")
 
 
@@ -176,9 +176,9 @@ def _limits(site: Site, fleet: dict[str, object], always: str) -> Sentence:
     there = f" at the places nearest to the band's ends (nominal: {told(site.nominal_volt)}):"
     return (
         f"; proved limits{there if several else ''} ",
-        Value(low, f"{number(low, 1, Side.BELOW)} V", f"droop-band:low{which}_volt:row 0"),
+        quantity(low, "V", f"droop-band:low{which}_volt:row 0", digits=1, side=Side.BELOW),
         " and ",
-        Value(high, f"{number(high, 1, Side.ABOVE)} V", f"droop-band:high{which}_volt:row 0"),
+        quantity(high, "V", f"droop-band:high{which}_volt:row 0", digits=1, side=Side.ABOVE),
     )
 
 
@@ -190,9 +190,9 @@ def _hosting(found: DroopStudy) -> list[Sentence]:
         "Hosting capacity, with generation distributed as in the files, up to the first violated limit: "
     ]
     for k, row in enumerate(table.to_dict("records")):
-        kw = float(row["capacity_kw"])
         name = "without reactive power" if row["preset"] == "none" else f"with {row['preset']}"
-        size = Value(kw, f"{number(kw, 0, Side.BELOW)} kW", f"droop-hosting:capacity_kw:row {k}")
+        source = f"droop-hosting:capacity_kw:row {k}"
+        size = quantity(float(row["capacity_kw"]), "kW", source, digits=0, side=Side.BELOW)
         words += ["; " if k else "", size]
         unsure = {UNDECIDED: "; stability of the fleet there not proved", UNSTABLE: "; unstable there"}
         limit = row["limit"] or "no limit found"

@@ -9,6 +9,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
+from string import Formatter
 from typing import TYPE_CHECKING, Any, Final
 
 from feeders.report.drawing import Figure
@@ -50,6 +51,15 @@ class Finding:
 
     standing: Standing  # certainty of the answer
     sentences: tuple[Sentence, ...]  # the answer, the most important first
+
+
+def sentence(text: str, **parts: str | Value | Sentence) -> Sentence:
+    """Sentence with texts and numbers in place of `{name}`."""
+    out: list[str | Value] = []
+    for words, name, _, _ in Formatter().parse(text):
+        part = parts[name] if name else ()
+        out += [words, *(part if isinstance(part, tuple) else [part])]
+    return tuple(each for each in out if each)
 
 
 def said(sentence: Sentence) -> str:
@@ -107,20 +117,23 @@ def rows(table: pd.DataFrame, name: str) -> Value:
     return counted(len(table), f"{name}:rows")
 
 
+def quantity(value: float, unit: str, source: str, *, digits: int = 2, side: Side = Side.NEAR) -> Value:
+    """Rounded number with its unit."""
+    return Value(value, f"{number(value, digits, side)} {unit}".strip(), source)
+
+
 def most(
     table: pd.DataFrame, name: str, column: str, unit: str = "", *, digits: int = 2, side: Side = Side.NEAR
 ) -> Value:
     """Largest value of a column."""
-    value = float(table[column].max())
-    return Value(value, f"{number(value, digits, side)} {unit}".strip(), f"{name}:{column}:max")
+    return quantity(float(table[column].max()), unit, f"{name}:{column}:max", digits=digits, side=side)
 
 
 def least(
     table: pd.DataFrame, name: str, column: str, unit: str = "", *, digits: int = 2, side: Side = Side.NEAR
 ) -> Value:
     """Smallest value of a column."""
-    value = float(table[column].min())
-    return Value(value, f"{number(value, digits, side)} {unit}".strip(), f"{name}:{column}:min")
+    return quantity(float(table[column].min()), unit, f"{name}:{column}:min", digits=digits, side=side)
 
 
 class Question(Enum):
