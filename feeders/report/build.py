@@ -13,7 +13,7 @@ import numpy as np
 from feeders.format.validation import told
 from feeders.report.drawing import WIDE, Drawing, Figure, png, svg
 from feeders.report.html import CONVERSION, FEEDER, About, Chapter, StudyOutcome, page, section
-from feeders.report.maps import Shape, Spot, draw_map, legend_of
+from feeders.report.maps import Shape, Spot, draw_map, has_places, legend_of
 from gridsec.papers import draw
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ def _facts(site: Site) -> dict[str, str]:
 
 
 def _chart(site: Site) -> Figure:
-    real = "at their positions" if site.xy is not None else "as a tree"
+    real = "at their positions" if has_places(site) else "as a tree"
     return Figure(
         "feeder-map",
         "Map",

@@ -7,6 +7,7 @@ independent of feeders.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -266,7 +267,7 @@ def _number(value: float) -> str:
 
 def _plain(text: str) -> str:
     """Text for XML: escaped, and without characters that are invalid in XML."""
-    return escape("".join(c if c >= " " and c not in "\ufffe\uffff" else "\ufffd" for c in text))
+    return escape(re.sub("[\x00-\x1f\ufffe\uffff]", "\ufffd", text))
 
 
 WIDE: Final = 720.0

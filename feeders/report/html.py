@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
@@ -218,16 +219,14 @@ def _environment() -> Environment:
     )
 
 
+_HIDDEN: Final = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
+"""Control characters except the line feed, and those that change the direction of text."""
+
+
 def _visible(value: object) -> object:
-    """Text with visible control characters and unchangeable direction; markup stays as it is."""
-    if hasattr(value, "__html__") or not isinstance(value, str):
-        return value
-    return "".join(c if _harmless(c) else "\ufffd" for c in value)
-
-
-def _harmless(letter: str) -> bool:
-    return (letter >= " " or letter == "\n") and not (
-        "\x7f" <= letter <= "\x9f" or letter in "\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069"
+    """Text with a visible mark in place of each hidden character; markup stays as it is."""
+    return (
+        _HIDDEN.sub("\ufffd", value) if isinstance(value, str) and not hasattr(value, "__html__") else value
     )
 
 

@@ -429,7 +429,7 @@ def _labels(spots: Sequence[Spot], at: Placed, size: float) -> list[Mark]:
     Labels of trees are below first.
     """
     lit = np.array([(*a, *b) for wire in (*at.wires, *at.ties, *at.drops) for a, b in pairwise(wire)])
-    taken: list[Box] = [_around(x, y, size) for x, y in at.customers]
+    taken: list[Box] = [(x - size, y - size, x + size, y + size) for x, y in at.customers]
     marks: list[Mark] = []
     letters = 11.0
     order = sorted((k for k, spot in enumerate(spots) if spot.label), key=lambda k: -spots[k].weight)
@@ -458,10 +458,6 @@ def _labels(spots: Sequence[Spot], at: Placed, size: float) -> list[Mark]:
             taken.append(box)
             marks.append(mark)
     return marks
-
-
-def _around(x: float, y: float, r: float) -> Box:
-    return (x - r, y - r, x + r, y + r)
 
 
 def _crossed(box: Box, lines: Floats) -> bool:

@@ -275,8 +275,10 @@ def _on_meters(  # noqa: PLR0917  # the fields of an attack
         case AttackKind.RANDOM:
             low = np.abs(amount)
             return Random(meters, t_on, t_off, low=low, high=LARGEST * low, hold_s=1.0, seed=seed)
-        case _:
+        case AttackKind.BIAS | AttackKind.TOGETHER:
             return Bias(meters, t_on, t_off, amount)
+        case _:
+            raise NoSuchAttack(f"{kind} is not a manipulation of single meters", code="unknown-name")
 
 
 def fake_load(

@@ -162,7 +162,8 @@ class SimulatedMeters:
                 v0_volt.reshape(-1, self._busbars) * (1.0 + self.busbar_bias),
             ]
         )
-        shown = _round(true + self._jitter * self._normal(ticks), self._step)
+        normal = self._draws(Stream.JITTER, ticks, self.count + self._busbars)
+        shown = _round(true + self._jitter * normal, self._step)
         p = _round(p_kw[:, self._customer] / (1.0 + self.p_gain), np.full(self.count, self._p_step))
         if self._errors.report_q:
             q = _round(q_kvar[:, self._customer] / (1.0 + self.q_gain), np.full(self.count, self._p_step))
@@ -186,10 +187,6 @@ class SimulatedMeters:
             arrival=np.where(lost, np.inf, arrival),
             copy=np.where(lost | (uniform[:, 4] >= channel.duplicate), np.inf, copy),
         )
-
-    def _normal(self, ticks: Ints) -> Floats:
-        """Standard normal numbers of each tick, one for each voltage register."""
-        return self._draws(Stream.JITTER, ticks, self.count + self._busbars)
 
     def _draws(self, stream: Stream, ticks: Ints, width: int) -> Floats:
         """Random numbers of each tick: normal for JITTER, uniform on [0, 1) otherwise."""

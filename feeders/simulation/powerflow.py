@@ -83,8 +83,7 @@ class PowerFlow:
         self._order = order
         self._scale = np.broadcast_to(grid.nominal_volt, (grid.bus_count,))
         self._model = PowerGridModel(_components(grid))
-        self._loads = _load_update(grid, (grid.customer_bus.size,))
-        self._source = _source_update(grid, (1,))
+        self._loads, self._source = _updates(grid)
 
     def solve(self, p_kw: Floats, q_kvar: Floats, v0_volt: Floats | float) -> tuple[Floats, Floats]:
         """Voltages of customers (N,) and buses (b + 1,), phase to neutral, V, for one set of loads.
@@ -111,10 +110,9 @@ class PowerFlow:
         count = p_kw.shape[0]
         if count == 0:
             return np.empty((0, p_kw.shape[1])), np.empty((0, self._order.size))
-        loads = _load_update(self.grid, (count, p_kw.shape[1]))
+        loads, source = _updates(self.grid, count)
         loads["p_specified"] = p_kw * 1e3
         loads["q_specified"] = q_kvar * 1e3
-        source = _source_update(self.grid, (count, 1))
         source["u_ref"][:, 0] = v0_volt / self._scale[self.grid.busbar]
         by_node = self._calculate(
             "u_pu",
@@ -262,13 +260,11 @@ def _first_load(grid: Grid) -> int:
     return grid.bus_count + len(grid.ends)
 
 
-def _load_update(grid: Grid, shape: tuple[int] | tuple[int, int]) -> Any:
-    update = initialize_array(DatasetType.update, ComponentType.sym_load, shape)
-    update["id"] = _first_load(grid) + np.arange(grid.customer_bus.size)
-    return update
-
-
-def _source_update(grid: Grid, shape: tuple[int] | tuple[int, int]) -> Any:
-    update = initialize_array(DatasetType.update, ComponentType.source, shape)
-    update["id"] = _first_load(grid) + grid.customer_bus.size
-    return update
+def _updates(grid: Grid, *shape: int) -> tuple[Any, Any]:
+    """Updates of all loads and of the source, one for each set of a batch of the given shape."""
+    customers = grid.customer_bus.size
+    load = initialize_array(DatasetType.update, ComponentType.sym_load, (*shape, customers))
+    source = initialize_array(DatasetType.update, ComponentType.source, (*shape, 1))
+    load["id"] = _first_load(grid) + np.arange(customers)
+    source["id"] = _first_load(grid) + customers
+    return load, source

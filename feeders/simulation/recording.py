@@ -119,6 +119,7 @@ PHASES: Final = pa.field("v_phases", pa.list_(pa.float64()))
 REQUIRED: Final = ("meter", "t", "v_volt")
 T_POWER: Final = pa.field("t_power", pa.float64())
 """Time of the powers, a column of external recordings with powers older than their voltages."""
+COLUMNS: Final = tuple(field.name for field in fields(SimulatedReading))
 REGISTERS: Final = ("seq", "p_kw", "q_kvar", "t_power")
 """Columns in which NaN means null, not reported: tables of floats have no null."""
 
@@ -273,7 +274,7 @@ def _wrong_columns(schema: Any) -> list[Problem]:
     """All problems of a file's columns."""
     missing = [name for name in REQUIRED if name not in schema.names]
     problems = [Problem("missing", f"columns {', '.join(missing)} are missing")] if missing else []
-    for name in (*READINGS.names, PHASES.name, T_POWER.name):
+    for name in COLUMNS:
         if name not in schema.names:
             continue
         given = schema.field(name).type
@@ -430,28 +431,12 @@ def _matrix(column: Any) -> Any:
 
 
 def _readings(batch: Any) -> Iterator[SimulatedReading]:
-    size = batch.num_rows
-    there = {
-        name: _column(batch, name).to_pylist()
-        for name in batch.schema.names
-        if name in (*READINGS.names, PHASES.name, T_POWER.name)
-    }
-    nothing = [None] * size
-    for meter, t, seq, arrival, v_volt, p_kw, q_kvar, phases, t_power in zip(
-        there["meter"],
-        there["t"],
-        there.get("seq", nothing),
-        there.get("arrival", there["t"]),
-        there["v_volt"],
-        there.get("p_kw", nothing),
-        there.get("q_kvar", nothing),
-        there.get(PHASES.name, nothing),
-        there.get(T_POWER.name, nothing),
-        strict=True,
-    ):
-        yield SimulatedReading(
-            meter, t, seq, arrival, v_volt, p_kw, q_kvar, phases and tuple(phases), t_power
-        )
+    there = {name: _column(batch, name).to_pylist() for name in batch.schema.names if name in COLUMNS}
+    there.setdefault("arrival", there["t"])
+    phases = there.get(PHASES.name, ())
+    there[PHASES.name] = [volts and tuple(volts) for volts in phases] or [None] * batch.num_rows
+    nothing = [None] * batch.num_rows
+    yield from map(SimulatedReading, *(there.get(name, nothing) for name in COLUMNS))
 
 
 def _column(batch: Any, name: str) -> Any:

@@ -183,7 +183,8 @@ def simulate(site: Site, scenario: Scenario) -> Iterator[SimulatedTick]:
     if past.first < 0:
         for block in truth(site, scenario, past.first, 0):
             past.add(block.ticks, _honest(site, meters, block).v_volt / nominal)
-    for block in truth(site, scenario, 0, _tick_count(scenario)):
+    ticks = float(np.ceil(scenario.duration_s / scenario.dt_s - 1e-9))
+    for block in truth(site, scenario, 0, ticks):
         honest = _honest(site, meters, block)
         past.add(block.ticks, honest.v_volt / nominal)
         lies = manipulated(scenario.attacks, block.t, site.meters.size)
@@ -301,10 +302,6 @@ class _Past:
     def _tick(self, t: float) -> int:
         # Half a microsecond of slack: t - delay is rarely a representable multiple of dt.
         return int(np.floor((t - self._scenario.start + 5e-7) / self._scenario.dt_s))
-
-
-def _tick_count(scenario: Scenario) -> float:
-    return float(np.ceil(scenario.duration_s / scenario.dt_s - 1e-9))
 
 
 def _honest(site: Site, meters: SimulatedMeters, block: PlantTrajectory) -> Registers:
