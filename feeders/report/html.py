@@ -225,9 +225,8 @@ _HIDDEN: Final = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2
 
 def _visible(value: object) -> object:
     """Text with a visible mark in place of each hidden character; markup stays as it is."""
-    return (
-        _HIDDEN.sub("\ufffd", value) if isinstance(value, str) and not hasattr(value, "__html__") else value
-    )
+    is_text = isinstance(value, str) and not hasattr(value, "__html__")
+    return _HIDDEN.sub("\ufffd", str(value)) if is_text else value
 
 
 def _answers(chapters: Sequence[Chapter]) -> list[tuple[Question, Chapter | None, Finding]]:

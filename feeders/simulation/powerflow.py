@@ -263,8 +263,9 @@ def _first_load(grid: Grid) -> int:
 def _updates(grid: Grid, *shape: int) -> tuple[Any, Any]:
     """Updates of all loads and of the source, one for each set of a batch of the given shape."""
     customers = grid.customer_bus.size
-    load = initialize_array(DatasetType.update, ComponentType.sym_load, (*shape, customers))
-    source = initialize_array(DatasetType.update, ComponentType.source, (*shape, 1))
+    sizes: Any = (*shape, customers), (*shape, 1)
+    load = initialize_array(DatasetType.update, ComponentType.sym_load, sizes[0])
+    source = initialize_array(DatasetType.update, ComponentType.source, sizes[1])
     load["id"] = _first_load(grid) + np.arange(customers)
     source["id"] = _first_load(grid) + customers
     return load, source
