@@ -194,6 +194,11 @@ def raise_if_any(problems: Iterable[str]) -> None:
         raise InputInvalid(found)
 
 
+def require(holds: object, problem: Problem) -> None:
+    """Raise one error with a problem of an input, unless the condition holds."""
+    raise_if_any([] if holds else [problem])
+
+
 Choice = TypeVar("Choice", bound=StrEnum)
 
 

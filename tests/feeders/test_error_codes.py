@@ -30,7 +30,7 @@ from feeders.model.site import from_tables, load
 from feeders.model.three_phase import three_phase
 from feeders.registry import plugins
 from feeders.registry.registry import Estimator, choose
-from feeders.simulation.attacks import RandomAttackKind, random_attacks
+from feeders.simulation.attacks import AttackKind, random_attacks
 from feeders.simulation.demand import Variation
 from feeders.simulation.meters import Channel
 from feeders.simulation.plant import ClosedLoop, Loads
@@ -266,10 +266,10 @@ CALLS: dict[str, Callable[[], Any]] = {
     "a scenario without length": lambda: Scenario(duration_s=0.0),
     "an attack of a meter that is not there": elsewhere,
     "more attacked meters than there are": lambda: random_attacks(
-        village(), 0, RandomAttackKind.BIAS, 8, 0.02, t_on=START, t_off=START + 1.0
+        village(), 0, AttackKind.BIAS, 8, 0.02, t_on=START, t_off=START + 1.0
     ),
     "a fake load at all meters": lambda: random_attacks(
-        village(), 0, RandomAttackKind.COORDINATED, 7, 0.02, t_on=START, t_off=START + 1.0
+        village(), 0, AttackKind.COORDINATED, 7, 0.02, t_on=START, t_off=START + 1.0
     ),
     "a load beyond the feeder": lambda: PowerFlow(village()).solve(np.full(8, 1e5), np.zeros(8), 230.0),
     "inverters that do not settle": not_settled,
