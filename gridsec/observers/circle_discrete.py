@@ -8,9 +8,7 @@ with zero columns of L and K for meters outside the trusted set J. Every design 
 
 `monte_carlo` simulates them as the paper does, with a statement on the validity of such numbers.
 
-References
-----------
-yang2019, section II; docs/theory-discrete.md.
+Source: yang2019, section II; docs/theory-discrete.md.
 """
 
 from __future__ import annotations
@@ -42,53 +40,25 @@ from gridsec.observers.lmi.sampled import advance as advance_plant
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DiscreteDesign:
-    """One observer. n states, m nonlinearities, p meters.
+    """One observer. n states, m nonlinearities, p meters."""
 
-    Attributes
-    ----------
-    system
-        Plant.
-    trusted : (p,)
-        J as a mask.
-    L, K : (n, p), (m, p)
-        Gains; the columns of meters outside J are zero.
-    decay
-        lambda, per step.
-    growth
-        c.
-    noise_gain
-        gamma, with respect to the Euclidean norm of the trusted meters' errors.
-    unknown_gain
-        gamma_delta; for direct injection with respect to the error of the arguments z.
-    certificate
-        The proof.
-    """
-
-    system: DiscreteLure
-    trusted: Bools
-    L: Floats
-    K: Floats
-    decay: float
-    growth: float
-    noise_gain: float
-    unknown_gain: float
-    certificate: DiscreteGains | DirectProof
+    system: DiscreteLure  # plant
+    trusted: Bools  # (p,) J as a mask
+    L: Floats  # (n, p) gains; the columns of meters outside J are zero
+    K: Floats  # (m, p)
+    decay: float  # lambda, per step
+    growth: float  # c
+    noise_gain: float  # gamma, with respect to the Euclidean norm of the trusted meters' errors
+    unknown_gain: float  # gamma_delta; for direct injection with respect to the error of the arguments z
+    certificate: DiscreteGains | DirectProof  # the proof
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DiscreteState:
-    """State of an observer.
+    """State of an observer."""
 
-    Attributes
-    ----------
-    t
-        Time, s.
-    x : (n,)
-        Estimated state.
-    """
-
-    t: float
-    x: Floats
+    t: float  # time, s
+    x: Floats  # (n,) estimated state
 
 
 def design(
@@ -100,22 +70,12 @@ def design(
 ) -> DiscreteDesign:
     """Design one observer, with a verified proof.
 
-    Parameters
-    ----------
-    trusted : (p,)
-        J as a mask.
-    gains
-        "lmi": by `discrete_circle`. `DiscreteGains`: an existing design, verified again. `DirectProof` from
-        `discrete_contraction`: direct injection, with one proof for every set.
-    options
-        Specification of an LMI design; required by "lmi".
-
-    Raises
-    ------
-    DesignInfeasible
-        If there is no proof, or the given one does not hold here.
-    ValueError
-        If `trusted` has the wrong length, or contradicts the given design, or `gains` is another text.
+    trusted (p,).
+    gains: "lmi": by `discrete_circle`. `DiscreteGains`: an existing design, verified again. `DirectProof`
+        from `discrete_contraction`: direct injection, with one proof for every set.
+    options: specification of an LMI design; required by "lmi".
+    Raises DesignInfeasible if there is no proof, or the given one does not hold here. ValueError if `trusted`
+        has the wrong length, or contradicts the given design, or `gains` is another text.
     """
     trusted = np.array(trusted, dtype=np.bool_)
     trusted.flags.writeable = False
@@ -207,14 +167,9 @@ def init(design: DiscreteDesign, t: float, x: Floats | None = None) -> DiscreteS
 def step(design: DiscreteDesign, state: DiscreteState, y: Floats, u: Floats, seen: Bools) -> DiscreteState:
     """One step of one observer.
 
-    Parameters
-    ----------
-    y : (p,)
-        Readings at the beginning of the step; ignored where unseen or not finite.
-    u : (l,)
-        Known input during the step.
-    seen : (p,)
-        True for existing readings. The others have no influence.
+    y (p,): readings at the beginning of the step; ignored where unseen or not finite.
+    u (l,): known input during the step.
+    seen (p,): True for existing readings. The others have no influence.
     """
     x = _ahead(design.system, design.L, design.K, state.x, y=y, u=u, seen=seen)
     return DiscreteState(state.t + design.system.h, x)
@@ -228,14 +183,9 @@ def outputs(design: DiscreteDesign, state: DiscreteState, u: Floats) -> Floats:
 def error_bound(design: DiscreteDesign, k: int, *, start: float, noise: float, unknown: float = 0.0) -> float:
     """Right side of yang2019 (5) after k steps.
 
-    Parameters
-    ----------
-    start
-        |e(0)|.
-    noise
-        Supremum of the Euclidean norm of the trusted meters' errors (attacks included).
-    unknown
-        Supremum of the Euclidean norm of delta, or of the arguments' errors for direct injection.
+    start: |e(0)|.
+    noise: supremum of the Euclidean norm of the trusted meters' errors (attacks included).
+    unknown: supremum of the Euclidean norm of delta, or of the arguments' errors for direct injection.
     """
     first = design.growth * design.decay**k * start
     return first + design.noise_gain * noise + design.unknown_gain * unknown
@@ -244,17 +194,9 @@ def error_bound(design: DiscreteDesign, k: int, *, start: float, noise: float, u
 def settling_steps(design: DiscreteDesign, *, start: float, epsilon: float) -> int:
     """Smallest k with `c lambda^k |e(0)| <= epsilon`: k* of yang2019.
 
-    Parameters
-    ----------
-    start
-        Bound on |e(0)|; 0 for a start in the true state.
-    epsilon
-        Its largest remainder.
-
-    Raises
-    ------
-    ValueError
-        If `epsilon` is not positive and the start is not the true state.
+    start: bound on |e(0)|; 0 for a start in the true state.
+    epsilon: its largest remainder.
+    Raises ValueError if `epsilon` is not positive and the start is not the true state.
     """
     if design.growth * start <= epsilon:
         return 0
@@ -267,36 +209,19 @@ def settling_steps(design: DiscreteDesign, *, start: float, epsilon: float) -> i
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StackedObservers:
-    """Several observers of one plant, on a leading axis. o observers.
+    """Several observers of one plant, on a leading axis. o observers."""
 
-    Attributes
-    ----------
-    system
-        Plant.
-    masks : (o, p)
-        Trusted sets.
-    L, K : (o, n, p), (o, m, p)
-        Gains.
-    """
-
-    system: DiscreteLure
-    masks: Bools
-    L: Floats
-    K: Floats
+    system: DiscreteLure  # plant
+    masks: Bools  # (o, p) trusted sets
+    L: Floats  # (o, n, p) gains
+    K: Floats  # (o, m, p)
 
 
 def stack(designs: Sequence[DiscreteDesign]) -> StackedObservers:
     """Observers of one plant as stacked arrays.
 
-    Parameters
-    ----------
-    designs
-        At least one; all of the same plant.
-
-    Raises
-    ------
-    ValueError
-        If the observers belong to different plants.
+    designs: at least one; all of the same plant.
+    Raises ValueError if the observers belong to different plants.
     """
     if any(one.system is not designs[0].system for one in designs):
         raise InputInvalid([Problem("wrong-design", "the observers belong to different plants")])
@@ -311,21 +236,10 @@ def stack(designs: Sequence[DiscreteDesign]) -> StackedObservers:
 def advance(stack: StackedObservers, x: Floats, y: Floats, u: Floats, seen: Bools) -> Floats:
     """One step of all observers.
 
-    Parameters
-    ----------
-    x : (…, o, n)
-        Their estimates.
-    y : (…, p)
-        Readings; ignored where unseen or not finite.
-    u : (…, l)
-        Known input.
-    seen : (p,)
-        True for existing readings.
-
-    Returns
-    -------
-    (…, o, n)
-        Estimates one step later.
+    x (…, o, n): their estimates.
+    y (…, p): readings; ignored where unseen or not finite.
+    u (…, l), seen (p,).
+    Returns (…, o, n): estimates one step later.
     """
     y, u = np.asarray(y)[..., None, :], np.asarray(u)[..., None, :]
     return _ahead(stack.system, stack.L, stack.K, x, y=y, u=u, seen=seen)
@@ -343,26 +257,16 @@ def _ahead(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MonteCarlo:
-    """Gains by simulation: the largest observed ones, lower bounds of the true gains.
+    """Gains by simulation: the largest observed ones, lower bounds of the true gains."""
 
-    Attributes
-    ----------
-    gains : (o,)
-        `max |e_J(k)| / sup_{j < k} |n_J(j)|` over all runs and steps, starting from e(0) = 0.
-    runs
-        Number of independent runs.
-    exceedance
-        With the stated confidence, one more run of the same kind exceeds a given entry of `gains` with at
-        most this probability: `1 - (1 - confidence)^(1 / runs)`. It does not cover noise of another kind; see
-        docs/theory-discrete.md, section 4.
-    confidence
-        Requested confidence.
-    """
-
+    # (o,) `max |e_J(k)| / sup_{j < k} |n_J(j)|` over all runs and steps, starting from e(0) = 0
     gains: Floats
-    runs: int
+    runs: int  # number of independent runs
+    # with the stated confidence, one more run of the same kind exceeds a given entry of `gains` with at most
+    # this probability: `1 - (1 - confidence)^(1 / runs)`. It does not cover noise of another kind; see
+    # docs/theory-discrete.md, section 4
     exceedance: float
-    confidence: float
+    confidence: float  # requested confidence
 
 
 def monte_carlo(
@@ -379,21 +283,11 @@ def monte_carlo(
     Noise is independent and uniform between plus and minus `half_width`; every observer starts in the
     plant's state.
 
-    Parameters
-    ----------
-    half_width : (p,) or scalar
-        Half-width of each meter's noise.
-    start : (R, n)
-        Initial states, one for each run.
-    u : (T, l)
-        Known input of the T steps.
-    confidence
-        Confidence of `exceedance`.
-
-    Raises
-    ------
-    ValueError
-        With every number out of range; an observer without noisy meters has no gain.
+    half_width (p,) or scalar: half-width of each meter's noise.
+    start (R, n): initial states, one for each run.
+    u (T, l): known input of the T steps.
+    confidence: confidence of `exceedance`.
+    Raises ValueError with every number out of range; an observer without noisy meters has no gain.
     """
     system, rng = stack.system, np.random.default_rng(seed)
     runs, p = len(start), len(system.C)

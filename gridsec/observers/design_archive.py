@@ -69,10 +69,7 @@ def to_bytes(gains: Sequence[CircleGains], options: CircleOptions) -> bytes:
 def from_bytes(blob: bytes) -> tuple[CircleGains, ...]:
     """Read the bytes of `to_bytes`. The margins are the stored ones: recompute before trusting them.
 
-    Raises
-    ------
-    DesignInfeasible
-        If the bytes are damaged or not such an archive.
+    Raises DesignInfeasible if the bytes are damaged or not such an archive.
     """
     digest, content = blob[:_DIGEST], blob[_DIGEST:]
     if hashlib.sha256(content).digest() != digest:
@@ -135,24 +132,12 @@ def cached(
     Stored designs are verified again: readable, the right sets, every margin recomputed and positive, no
     blind design. Otherwise the bank is redesigned and put into the store.
 
-    Parameters
-    ----------
-    lure, subsets, options, workers, progress
-        As in `solve_many`.
-    get
-        Returns the bytes stored under a key, or None.
-    put
-        Stores bytes under a key.
-
-    Returns
-    -------
-    designs, origin
-        `origin` is "stored", "new", or "redesigned: " with the fault of the stored designs.
-
-    Raises
-    ------
-    DesignInfeasible
-        As `solve_many`.
+    lure, subsets, options, workers, progress: as in `solve_many`.
+    get: returns the bytes stored under a key, or None.
+    put: stores bytes under a key.
+    Returns designs, origin: `origin` is "stored", "new", or "redesigned: " with the fault of the stored
+        designs.
+    Raises DesignInfeasible as `solve_many`.
     """
     key = design_key(lure, subsets, options)
     blob = get(key)

@@ -31,28 +31,14 @@ def settle(
     elements of the generalised Jacobian except within rounding of a kink. The step is halved until the
     residual falls. Plain iteration would need a loop gain below 1; this method does not.
 
-    Parameters
-    ----------
-    phi
-        Nonlinearity, entry by entry, non-decreasing.
-    gain : (n, m)
-        Gain behind phi.
-    H : (m, n) or (…, m, n)
-        Feedback, possibly one for every leading index (one observer each).
-    drive : (…, m)
-    bias : (…, n)
-        Constant parts.
-    x0 : (…, n)
-        Initial value.
-    tol
-        Largest entry of the residual, in the unit of x.
-    max_iter
-        Largest number of Newton steps.
-
-    Raises
-    ------
-    DesignInfeasible
-        If the residual is still above `tol` after `max_iter` steps.
+    phi: nonlinearity, entry by entry, non-decreasing.
+    gain (n, m): gain behind phi.
+    H (m, n) or (…, m, n): feedback, possibly one for every leading index (one observer each).
+    drive (…, m).
+    bias (…, n): constant parts.
+    x0 (…, n): initial value.
+    tol: largest entry of the residual, in the unit of x.
+    Raises DesignInfeasible if the residual is still above `tol` after `max_iter` steps.
     """
     lead = np.broadcast_shapes(x0.shape[:-1], drive.shape[:-1], bias.shape[:-1], H.shape[:-2])
     (n, m), count = gain.shape, prod(lead)

@@ -72,38 +72,22 @@ RATE, SLOWEST, TOL = 0.998, 1.0 - 1e-6, 1e-9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SampledPlant:
-    """A sampled plant and its continuous origin.
+    """A sampled plant and its continuous origin."""
 
-    Attributes
-    ----------
-    A_c, B_c : (6, 6), (6, 1)
-        Continuous time.
-    A, B, C : (6, 6), (6, 1), (5, 6)
-        Sampled with zero-order hold.
-    E : (6, 6)
-        Input matrix of a disturbance w that is constant over a step: d = E w.
-    """
-
-    A_c: Floats
-    B_c: Floats
-    A: Floats
-    B: Floats
-    C: Floats
-    E: Floats
+    A_c: Floats  # (6, 6) continuous time
+    B_c: Floats  # (6, 1)
+    A: Floats  # (6, 6) sampled with zero-order hold
+    B: Floats  # (6, 1)
+    C: Floats  # (5, 6)
+    E: Floats  # (6, 6) input matrix of a disturbance w that is constant over a step: d = E w
 
 
 def plant(disturbance: Literal["continuous", "sampled"] = "continuous") -> SampledPlant:
     """The three-inertia system; states theta_1, its speed, theta_2, its speed, theta_3, its speed.
 
-    Parameters
-    ----------
-    disturbance
-        Quantity bounded by d_max. "continuous": d(t) of (4.5.1), constant over each step. "sampled": d(k) of
-        (4.1.1), a thousand times as large.
-
-    References
-    ----------
-    lee2018 (4.5.1), (4.5.2).
+    disturbance: quantity bounded by d_max. "continuous": d(t) of (4.5.1), constant over each step. "sampled":
+        d(k) of (4.1.1), a thousand times as large.
+    Source: lee2018 (4.5.1), (4.5.2).
     """
     k, b = STIFFNESS / INERTIA, FRICTION / INERTIA
     A_c = np.zeros((6, 6))
@@ -124,10 +108,7 @@ def plant(disturbance: Literal["continuous", "sampled"] = "continuous") -> Sampl
 def estimator(model: SampledPlant, *, slowest: float = SLOWEST) -> BoundedDesign:
     """Partial Luenberger observers and Algorithm 4.1 for one attacked sensor.
 
-    Parameters
-    ----------
-    slowest
-        0 for the observability decomposition; the detectability decomposition by default.
+    slowest: 0 for the observability decomposition; the detectability decomposition by default.
     """
     bounds = Bounds(D_MAX, np.full(len(model.C), N_MAX), model.E)
     observers = luenberger.design(
@@ -149,12 +130,7 @@ def gaussian_estimator(model: SampledPlant, *, false_alarm: float = 1e-4) -> Gau
 
 
 def conventional_gain(model: SampledPlant) -> Floats:
-    """L of one observer (4.2.1) on all sensors, the stationary Kalman predictor.
-
-    Returns
-    -------
-    (6, 5)
-    """
+    """L (6, 5) of one observer (4.2.1) on all sensors, the stationary Kalman predictor."""
     Q, R = model.E @ model.E.T * D_MAX**2, np.eye(len(model.C)) * N_MAX**2
     P = solve_discrete_are(model.A.T, model.C.T, Q, R)
     return np.asarray(model.A @ P @ model.C.T @ np.linalg.inv(model.C @ P @ model.C.T + R))
@@ -178,36 +154,18 @@ def closed_loop(model: SampledPlant) -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lee2018Run:
-    """One simulation of T steps.
+    """One simulation of T steps."""
 
-    Attributes
-    ----------
-    t : (T,)
-        Time, s.
-    x, x_hat, x_conventional : (T, 6)
-        State; estimate in the loop; estimate of the conventional observer beside it.
-    bound : (T,)
-        Bound of |x_hat - x|; infinite for Gaussian noise.
-    disagree : (T, 5)
-        Sensors that the estimate does not use (Gaussian) or explain (bounded).
-    searched : (T,)
-        Steps with a search (bounded) or an alarm (Gaussian).
-    attack, reference : (T,)
-        a_1 and theta_3,ref, rad.
-    u : (T,)
-        Torque, N m.
-    """
-
-    t: Floats
-    x: Floats
-    x_hat: Floats
-    x_conventional: Floats
-    bound: Floats
-    disagree: Floats
-    searched: Floats
-    attack: Floats
-    reference: Floats
-    u: Floats
+    t: Floats  # (T,) time, s
+    x: Floats  # (T, 6) state; estimate in the loop; estimate of the conventional observer beside it
+    x_hat: Floats  # (T, 6)
+    x_conventional: Floats  # (T, 6)
+    bound: Floats  # (T,) bound of |x_hat - x|; infinite for Gaussian noise
+    disagree: Floats  # (T, 5) sensors that the estimate does not use (Gaussian) or explain (bounded)
+    searched: Floats  # (T,) steps with a search (bounded) or an alarm (Gaussian)
+    attack: Floats  # (T,) a_1 and theta_3,ref, rad
+    reference: Floats  # (T,)
+    u: Floats  # (T,) torque, N m
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -247,16 +205,10 @@ def simulate(
 ) -> Lee2018Run:
     """The closed loop of Figures 4.1 and 4.8, with an estimator in it and a conventional observer beside it.
 
-    Parameters
-    ----------
-    design
-        From `estimator` or `gaussian_estimator`.
-    seed
-        Seed of disturbance and noise: uniform within their bounds, or Gaussian of the same variance.
-    attacked
-        Attack sensor 1 from 2 s on.
-    feedback
-        Estimate used by the controller.
+    design: from `estimator` or `gaussian_estimator`.
+    seed: seed of disturbance and noise: uniform within their bounds, or Gaussian of the same variance.
+    attacked: attack sensor 1 from 2 s on.
+    feedback: estimate used by the controller.
     """
     t: Floats = np.arange(round(seconds / PERIOD), dtype=np.float64) * PERIOD
     world = _world(model, t, seed, attacked=attacked, normal=isinstance(design, GaussianDesign))

@@ -82,12 +82,8 @@ def estimator(search: Literal["all", "one"] = "one") -> HighGainDesign:
 def smallest_noticed(*, low: float = 1.0, high: float = 100.0, tolerance: float = 0.1) -> float:
     """Smallest step on sensor 2 that the printed threshold detects, by bisection over simulations.
 
-    Parameters
-    ----------
-    low, high
-        An undetected and a detected size.
-    tolerance
-        Tolerance of the result.
+    low, high: an undetected and a detected size.
+    tolerance: tolerance of the result.
     """
     made = estimator()
     while high - low > tolerance:

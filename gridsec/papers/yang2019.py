@@ -5,10 +5,7 @@ smallest proven noise gain. With them the paper's own recipe, (10) and (19) with
 isolates no attack in the settings of Figures 1 to 4. `reproduce` prints its rates beside those of calibrated
 thresholds and of another voting rule, which are this project's.
 
-References
-----------
-yang2019, Algorithms 1 and 2; docs/theory-discrete.md, section 5.
-yang2019, Example 1, equations (25), (26), Figures 1 to 4.
+Source: yang2019, Algorithms 1 and 2, Example 1 with (25), (26), Figures 1 to 4; docs/theory-discrete.md.
 """
 
 from __future__ import annotations
@@ -46,10 +43,7 @@ JUMP = 3e-4
 def points(suspects: Bools) -> tuple[Floats, Floats]:
     """Points (window, meter), both from 1; meter 0 for a window without named meters.
 
-    Parameters
-    ----------
-    suspects : (w, p)
-        Named meters of each window.
+    suspects (w, p): named meters of each window.
     """
     with_nobody = np.hstack([~suspects.any(axis=1, keepdims=True), suspects])
     window, meter = np.nonzero(with_nobody)
@@ -58,22 +52,12 @@ def points(suspects: Bools) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FeederStudy:
-    """Results of the two algorithms on a sampled feeder.
+    """Results of the two algorithms on a sampled feeder."""
 
-    Attributes
-    ----------
-    design
-        Bank and proven thresholds.
-    error, bound : (T, o), (o,)
-        Error of every observer, and its proven bound, pu of reactive power.
-    verdicts
-        One for each window.
-    """
-
-    design: WindowDesign
-    error: Floats
-    bound: Floats
-    verdicts: tuple[windows.WindowVerdict, ...]
+    design: WindowDesign  # bank and proven thresholds
+    error: Floats  # (T, o) error of every observer, and its proven bound, pu of reactive power
+    bound: Floats  # (o,)
+    verdicts: tuple[windows.WindowVerdict, ...]  # one for each window
 
 
 def on_feeder(
@@ -95,25 +79,15 @@ def on_feeder(
     The observers run on the exponential Euler step. The deviation of the continuous plant within a step is an
     error of the arguments of at most `held` and part of the thresholds, which thus cover the discretisation.
 
-    Parameters
-    ----------
-    lure
-        Closed loop from `close_loop`.
-    h
-        Time between readings, s.
-    u : (T, l)
-        Known input, constant between readings.
-    noise
-        Half-width of the meters' uniform noise, squared pu.
-    held : (m,)
-        Bound on the motion of each inverter's argument within a step, squared pu: `sampled.held_error`
+    lure: closed loop from `close_loop`.
+    h: time between readings, s.
+    u (T, l): known input, constant between readings.
+    noise: half-width of the meters' uniform noise, squared pu.
+    held (m,): bound on the motion of each inverter's argument within a step, squared pu: `sampled.held_error`
         or `sampled.drift_error`.
-    limit : (m,)
-        Largest injection of each inverter, pu.
-    lie : (T, p)
-        Attack, squared pu (in z).
-    max_attacked, length, rule
-        q, N, and the isolation rule of windows.
+    limit (m,): largest injection of each inverter, pu.
+    lie (T, p): attack, squared pu (in z).
+    max_attacked, length, rule: q, N, and the isolation rule of windows.
     """
     plant = sample(lure, h)
     slowest = spectral_radius(plant.A)
@@ -240,10 +214,7 @@ def every_observer() -> tuple[DiscreteGains, ...]:
 def bank(decays: tuple[float, ...] = DECAYS) -> tuple[DiscreteDesign, ...]:
     """The eleven observers for one attacked sensor: of all four, of three and of two sensors.
 
-    Parameters
-    ----------
-    decays
-        Candidates for the decay.
+    decays: candidates for the decay.
     """
     plant = system()
     return windows.bank(plant, 1, options=discrete_options(plant, decays=decays, noise=1.0))
@@ -254,10 +225,7 @@ def simulated_gains(
 ) -> circle_discrete.MonteCarlo:
     """Gains by simulation, as in the paper: normal initial states, uniform noise, u = 0.
 
-    Parameters
-    ----------
-    runs, seed
-        Number of runs of 1000 steps, and seed of the random numbers.
+    runs, seed: number of runs of 1000 steps, and seed of the random numbers.
     """
     start = np.random.default_rng(seed).standard_normal((runs, 2))
     return circle_discrete.monte_carlo(
@@ -273,14 +241,9 @@ def _still() -> Floats:
 def trial(design: WindowDesign, *, sensor: int | None, size: float, runs: int, seed: int) -> windows.Trace:
     """Runs of 1000 steps: uniform noise, one sensor attacked by uniform values in plus and minus `size`.
 
-    Parameters
-    ----------
-    sensor
-        Attacked sensor, from 0; None for no attack.
-    size
-        Size of the attack.
-    runs, seed
-        Number of runs, and seed of the random numbers.
+    sensor: attacked sensor, from 0; None for no attack.
+    size: size of the attack.
+    runs, seed: number of runs, and seed of the random numbers.
     """
     rng = np.random.default_rng(seed)
     start = rng.standard_normal((runs, 2))
@@ -292,24 +255,13 @@ def trial(design: WindowDesign, *, sensor: int | None, size: float, runs: int, s
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Levels:
-    """Three kinds of thresholds for one bank.
+    """Three kinds of thresholds for one bank."""
 
-    Attributes
-    ----------
-    proven
-        (10) and (19) with the gains from the inequality: bounds.
-    simulated
-        (10) and (19) with simulated gains, as in the paper.
-    calibrated
-        The largest pi and pi_J of simulated runs without attack.
-    exceedance
-        Probability, at 99 % confidence, that one more run without attack of this kind exceeds a given
-        simulated gain or calibrated threshold.
-    """
-
-    proven: WindowDesign
-    simulated: WindowDesign
-    calibrated: WindowDesign
+    proven: WindowDesign  # (10) and (19) with the gains from the inequality: bounds
+    simulated: WindowDesign  # (10) and (19) with simulated gains, as in the paper
+    calibrated: WindowDesign  # the largest pi and pi_J of simulated runs without attack
+    # probability, at 99 % confidence, that one more run without attack of this kind exceeds a given simulated
+    # gain or calibrated threshold
     exceedance: float
 
 
@@ -317,12 +269,8 @@ class Levels:
 def levels(decays: tuple[float, ...] = DECAYS, runs: int = RUNS) -> Levels:
     """Thresholds for Example 1.
 
-    Parameters
-    ----------
-    decays
-        Candidates for the observers' decay.
-    runs
-        Number of simulated runs.
+    decays: candidates for the observers' decay.
+    runs: number of simulated runs.
     """
     observers = bank(decays)
     proven = windows.design(observers, 1, noise=NOISE, length=LENGTHS[0])
@@ -345,12 +293,8 @@ def detection_rates(design: WindowDesign, trace: windows.Trace) -> Floats:
 def isolation_rates(design: WindowDesign, trace: windows.Trace, sensor: int, rule: Rule) -> Floats:
     """Fraction of the windows that name exactly the attacked sensor, for N = 50, 100, 200.
 
-    Parameters
-    ----------
-    sensor
-        The attacked sensor, from 0.
-    rule
-        "majority" (Algorithm 2) or "survivors".
+    sensor: the attacked sensor, from 0.
+    rule: "majority" (Algorithm 2) or "survivors".
     """
     exact, rates = np.arange(4) == sensor, []
     for N in LENGTHS:
@@ -361,18 +305,10 @@ def isolation_rates(design: WindowDesign, trace: windows.Trace, sensor: int, rul
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FigureSetting:
-    """Setting of one of the paper's four figures.
+    """Setting of one of the paper's four figures."""
 
-    Attributes
-    ----------
-    figure
-        Its number.
-    sensor, size
-        The attacked sensor, from 0, and the half width of its uniform attack.
-    """
-
-    figure: int
-    sensor: int
+    figure: int  # its number
+    sensor: int  # the attacked sensor, from 0, and the half width of its uniform attack
     size: float
 
     @property

@@ -35,17 +35,9 @@ CORRECTION_2 = (1, 2, 0.4)
 def plant(example: int, *, corrected: bool = False) -> UnknownInputPlant:
     """The plants (37) and (38).
 
-    Parameters
-    ----------
-    example
-        1 (also of Example 3) or 2 (also of Example 4).
-    corrected
-        Change the one entry of C that makes all members of the bank exist.
-
-    Raises
-    ------
-    ValueError
-        If `example` is not 1 or 2.
+    example: 1 (also of Example 3) or 2 (also of Example 4).
+    corrected: change the one entry of C that makes all members of the bank exist.
+    Raises ValueError if `example` is not 1 or 2.
     """
     if example == 1:
         A, B = np.array([[0.2, 0.5], [0.2, 0.7]]), np.eye(2)
@@ -80,10 +72,7 @@ def plant(example: int, *, corrected: bool = False) -> UnknownInputPlant:
 def bank(example: int, *, corrected: bool = False) -> IsolationDesign:
     """The bank of an example: complete with q = 1, or partial with q_1 = q_2 = 1.
 
-    Parameters
-    ----------
-    example, corrected
-        As in `plant`.
+    example, corrected: as in `plant`.
     """
     max_inputs = 2 if example == 1 else 1
     made = plant(example, corrected=corrected)
@@ -99,30 +88,16 @@ def missing_complete() -> tuple[Missing, ...]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Yang2021Run:
-    """One simulation. T steps, n states, r inputs, p sensors.
+    """One simulation. T steps, n states, r inputs, p sensors."""
 
-    Attributes
-    ----------
-    x, x_hat : (T, n)
-        Truth and estimate.
-    a_u, a_u_hat : (T, r)
-        Attack on the inputs; `a_u_hat[k]` is (42) of step k + 1, NaN at the last step.
-    a_y, a_y_hat : (T, p)
-        Attack on the sensors and (43).
-    bound : (T, n)
-        Bound of the estimate's error; proven only where no member is missing.
-    answers
-        Results of the bank.
-    """
-
-    x: Floats
-    x_hat: Floats
-    a_u: Floats
-    a_u_hat: Floats
-    a_y: Floats
-    a_y_hat: Floats
-    bound: Floats
-    answers: tuple[IsolationStep, ...]
+    x: Floats  # (T, n) truth and estimate
+    x_hat: Floats  # (T, n)
+    a_u: Floats  # (T, r) attack on the inputs; `a_u_hat[k]` is (42) of step k + 1, NaN at the last step
+    a_u_hat: Floats  # (T, r)
+    a_y: Floats  # (T, p) attack on the sensors and (43)
+    a_y_hat: Floats  # (T, p)
+    bound: Floats  # (T, n) bound of the estimate's error; proven only where no member is missing
+    answers: tuple[IsolationStep, ...]  # results of the bank
 
     def named(self, last: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """Inputs and sensors (from 1) with a reconstructed attack above `TOLERANCE` in the `last` steps."""
@@ -145,17 +120,11 @@ def simulate(
 ) -> Yang2021Run:
     """Run an example: known inputs and attacks uniform and white, `x(0)` standard normal.
 
-    Parameters
-    ----------
-    example, corrected
-        As in `plant`.
-    amplitude
-        Attacks are uniform in (-amplitude, amplitude).
-    inputs, sensors
-        Attacked inputs and sensors, from 0. By default both inputs (Example 1) or the third (Example 4's
-        text).
-    seed
-        Seed of the random numbers; the paper does not state its own.
+    example, corrected: as in `plant`.
+    amplitude: attacks are uniform in (-amplitude, amplitude).
+    inputs, sensors: attacked inputs and sensors, from 0. By default both inputs (Example 1) or the third
+        (Example 4's text).
+    seed: seed of the random numbers; the paper does not state its own.
     """
     made = bank(example, corrected=corrected)
     model = made.family.plant
@@ -188,23 +157,12 @@ def simulate(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class IndistinguishableHistories:
-    """Two histories with the same readings, each with no more attacks than assumed. T steps.
+    """Two histories with the same readings, each with no more attacks than assumed. T steps."""
 
-    Attributes
-    ----------
-    y : (T, p)
-        Reports of the sensors in both.
-    u : (T, r)
-        Known input of both.
-    x : (2, T, n)
-        The two states.
-    attacked
-        Inputs and sensors attacked in each, from 0.
-    """
-
-    y: Floats
-    u: Floats
-    x: Floats
+    y: Floats  # (T, p) reports of the sensors in both
+    u: Floats  # (T, r) known input of both
+    x: Floats  # (2, T, n) the two states
+    # inputs and sensors attacked in each, from 0
     attacked: tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
 
 
@@ -216,14 +174,9 @@ def doubt(example: int, size: float, steps: int = STEPS) -> IndistinguishableHis
     Example 2: `b_1 - b_2` moves neither sensor 1 nor sensor 2. Input 1 and sensor 3 are attacked in one
     history, input 2 and sensor 4 in the other, and the states differ by `size (b_1 - b_2)` at the end.
 
-    Parameters
-    ----------
-    example
-        1 or 2, as printed.
-    size
-        Distance of the states, in multiples of (1, -1) or b_1 - b_2.
-    steps
-        Length of the histories.
+    example: 1 or 2, as printed.
+    size: distance of the states, in multiples of (1, -1) or b_1 - b_2.
+    steps: length of the histories.
     """
     model = plant(example)
     n, r = len(model.system.A), model.inputs.shape[1]

@@ -20,32 +20,17 @@ from gridsec.errors import DesignInfeasible, InputInvalid, NotObservable, Proble
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Subsets:
-    """Sensor subsets of chong2020's two banks. p meters, at most M attacked.
+    """Sensor subsets of chong2020's two banks. p meters, at most M attacked."""
 
-    Attributes
-    ----------
-    meters
-        p.
-    max_attacked
-        M.
-    out_large : (C(p, M), M)
-        Meters that each large set S leaves out, ascending.
-    out_small : (C(p, 2M), 2M)
-        Meters that each small set P leaves out, ascending.
-    choices : (C(2M, M), M)
-        The choices of M of the 2M places of `out_small`.
-    parent : (C(2M, M), C(p, 2M))
-        `parent[c, P]`: the S that leaves out those of P's meters that choice c picks.
-    pairs : (C(p, M), C(p - M, M))
-        For each S, positions of its comparisons in an array of shape `parent.shape`, flattened.
-    """
-
-    meters: int
-    max_attacked: int
-    out_large: Ints
-    out_small: Ints
-    choices: Ints
+    meters: int  # p
+    max_attacked: int  # M
+    out_large: Ints  # (C(p, M), M) meters that each large set S leaves out, ascending
+    out_small: Ints  # (C(p, 2M), 2M) meters that each small set P leaves out, ascending
+    choices: Ints  # (C(2M, M), M) the choices of M of the 2M places of `out_small`
+    # (C(2M, M), C(p, 2M)) `parent[c, P]`: the S that leaves out those of P's meters that choice c picks
     parent: Ints
+    # (C(p, M), C(p - M, M)) for each S, positions of its comparisons in an array of shape `parent.shape`,
+    # flattened
     pairs: Ints
 
     @property
@@ -71,27 +56,11 @@ class Subsets:
 def subsets(meters: int, max_attacked: int, *, most: int) -> Subsets:
     """Tables for p meters with at most M manipulated.
 
-    Parameters
-    ----------
-    meters
-        p, number of meters.
-    max_attacked
-        M, largest number of simultaneously manipulated meters.
-    most
-        Largest acceptable number of observers.
-
-    Raises
-    ------
-    NotObservable
-        Unless p > 2M.
-    DesignInfeasible
-        If the banks need more than `most` observers.
-    ValueError
-        If M is negative.
-
-    References
-    ----------
-    chong2020, Theorem 1 (ii), equations (5) and (6).
+    meters: p, number of meters.
+    max_attacked: M, largest number of simultaneously manipulated meters.
+    Raises NotObservable unless p > 2M. DesignInfeasible if the banks need more than `most` observers.
+        ValueError if M is negative.
+    Source: chong2020, Theorem 1 (ii), equations (5) and (6).
     """
     if max_attacked < 0:
         raise InputInvalid([Problem("negative", f"max_attacked is {max_attacked}; it cannot be negative")])
@@ -125,21 +94,10 @@ def most_attacked(meters: int, works: Callable[[Ints], bool]) -> int:
     All sets are tried, the largest first, until one fails. If the criterion is observability of the pair (A,
     C_J), `index.dynamic_index(A, C).correctable` gives the same result without trials.
 
-    Parameters
-    ----------
-    meters
-        p, number of meters.
-    works
-        Criterion for the meters J, ascending: True if an observer exists or can be designed for them.
-
-    Returns
-    -------
-    int
-        M; -1 if not even all meters suffice.
-
-    References
-    ----------
-    yang2019, before (3); yang2021, before (4); chong2020, Theorem 1 (ii) and Corollary 1.
+    meters: p, number of meters.
+    works: criterion for the meters J, ascending: True if an observer exists or can be designed for them.
+    Returns -1 if not even all meters suffice.
+    Source: yang2019, before (3); yang2021, before (4); chong2020, Theorem 1 (ii) and Corollary 1.
     """
     everybody = np.arange(meters)
     lost = 0

@@ -37,20 +37,7 @@ Matrix = Callable[[Sequence[Any]], Sequence[Sequence[Any]]]
 
 
 def at(function: Vector, points: Floats) -> Floats:
-    """Values of a function over components at points.
-
-    Parameters
-    ----------
-    function
-        From n components to k.
-    points : (…, n)
-        Points.
-
-    Returns
-    -------
-    Floats
-        (…, k).
-    """
+    """Values (…, k) of a function from n components to k at points (…, n)."""
     points = np.asarray(points, dtype=np.float64)
     values = function([points[..., i] for i in range(points.shape[-1])])
     # Assigned to one array: a stack of arrays after broadcasting takes several times as long.
@@ -61,15 +48,7 @@ def at(function: Vector, points: Floats) -> Floats:
 
 
 def jacobian_at(function: Matrix, points: Floats) -> Floats:
-    """Values of a matrix over components at points, (…, k, m).
-
-    Parameters
-    ----------
-    function
-        From n components to k rows of m entries.
-    points : (…, n)
-        Points.
-    """
+    """Values (…, k, m) of a function from n components to k rows of m entries, at points (…, n)."""
     points = np.asarray(points, dtype=np.float64)
     rows = function([points[..., i] for i in range(points.shape[-1])])
     columns = range(len(rows[0]))
@@ -83,34 +62,19 @@ def jacobian_at(function: Matrix, points: Floats) -> Floats:
 def sat(z: Floats, bound: Floats | float) -> Floats:
     """Componentwise saturation `min(max(z, -bound), bound)`; NaN becomes zero.
 
-    Parameters
-    ----------
-    z : (…)
-        Arbitrary values, also infinite.
-    bound
-        Saturation level, scalar or broadcastable.
-
-    References
-    ----------
-    kim2018, after (4); lee2018, after (5.2.5).
+    z (…): arbitrary values, also infinite.
+    bound: saturation level, scalar or broadcastable.
+    Source: kim2018, after (4); lee2018, after (5.2.5).
     """
     return np.clip(np.where(np.isnan(z), 0.0, z), -np.asarray(bound), np.asarray(bound))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Polynomial:
-    """Polynomial `sum_k c_k prod_j z_j^{e_kj}`; differentiable, and stackable over sensors.
+    """Polynomial `sum_k c_k prod_j z_j^{e_kj}`; differentiable, and stackable over sensors."""
 
-    Attributes
-    ----------
-    exponents : (k, n)
-        Non-negative integers.
-    coefficients : (k,)
-        Real.
-    """
-
-    exponents: Ints
-    coefficients: Floats
+    exponents: Ints  # (k, n) non-negative integers
+    coefficients: Floats  # (k,) real
 
     def __call__(self, z: Sequence[Any]) -> Any:
         """Value at n components."""
@@ -143,27 +107,15 @@ def affine(constant: float, slopes: Sequence[float]) -> Polynomial:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Partial:
-    """Uniformly observable part of one sensor.
+    """Uniformly observable part of one sensor."""
 
-    Attributes
-    ----------
-    phi
-        Phi_i, from the n components of x to the n_i of z_i.
-    jacobian
-        Its derivative, n_i rows of n entries.
-    alpha
-        alpha_i over the n_i components of z_i.
-    beta
-        beta_i: n_i rows with one function for each of the m inputs; row j must use z_1 … z_j only.
-    bound
-        M_z,i: `|Phi_i(x)| <= bound` on the whole box of states. alpha and beta are only evaluated
-        at saturated arguments, which makes them globally Lipschitz (kim2018 (4)).
-    """
-
-    phi: Vector
-    jacobian: Matrix
-    alpha: Scalar
+    phi: Vector  # Phi_i, from the n components of x to the n_i of z_i
+    jacobian: Matrix  # its derivative, n_i rows of n entries
+    alpha: Scalar  # alpha_i over the n_i components of z_i
+    # beta_i: n_i rows with one function for each of the m inputs; row j must use z_1 … z_j only
     beta: tuple[tuple[Scalar, ...], ...]
+    # M_z,i: `|Phi_i(x)| <= bound` on the whole box of states. alpha and beta are only evaluated at saturated
+    # arguments, which makes them globally Lipschitz (kim2018 (4))
     bound: float
 
     @property
@@ -181,23 +133,11 @@ class Partial:
 class System:
     """System with its sensors. n states, p sensors, N = n_1 + … + n_p.
 
-    Attributes
-    ----------
-    x_bound : (n,)
-        The states stay in the box `|x_k| <= x_bound_k`.
-    partials
-        The sensors' observable parts.
-
-    Raises
-    ------
-    NotObservable
-        If there is no sensor.
-    ValueError
-        If sensors differ in their numbers of inputs.
+    Raises NotObservable if there is no sensor. ValueError if sensors differ in their numbers of inputs.
     """
 
-    x_bound: Floats
-    partials: tuple[Partial, ...]
+    x_bound: Floats  # (n,) the states stay in the box `|x_k| <= x_bound_k`
+    partials: tuple[Partial, ...]  # the sensors' observable parts
     mask: Bools = field(init=False)
 
     def __post_init__(self) -> None:
@@ -227,16 +167,8 @@ class System:
     def phi(self, x: Floats, sensors: Sequence[int] | None = None) -> Floats:
         """Phi_I(x), (…, N_I); by default of all sensors.
 
-        Parameters
-        ----------
-        x : (…, n)
-            States.
-        sensors
-            I, ascending.
-
-        References
-        ----------
-        kim2018 (9); lee2018 (5.3.2), without the zeros for padding.
+        x (…, n).
+        Source: kim2018 (9); lee2018 (5.3.2), without the zeros for padding.
         """
         return np.concatenate([at(self.partials[i].phi, x) for i in self._chosen(sensors)], axis=-1)
 
@@ -262,14 +194,9 @@ class System:
 def largest(phi: Vector, x_bound: Floats, *, gap: float = 1e-3) -> float:
     """A proven M_z: bound on `|Phi_i|` over the box of states, by interval bisection.
 
-    Parameters
-    ----------
-    phi
-        Phi_i over components.
-    x_bound : (n,)
-        Half-widths of the box.
-    gap
-        Acceptable relative overestimation.
+    phi: Phi_i over components.
+    x_bound (n,): half-widths of the box.
+    gap: acceptable relative overestimation.
     """
     count = len(phi(list(np.zeros(len(x_bound)))))
     return max(supremum(_size(phi, j), -x_bound, x_bound, gap=gap).upper for j in range(count))
@@ -286,12 +213,8 @@ def slopes(partial: Partial, u_low: Floats, u_high: Floats, *, samples: int = 40
     at random points, widened by a tenth, and marked as not proven. Zero is always inside, because the
     functions are constant beyond the saturation.
 
-    Parameters
-    ----------
-    u_low, u_high : (m,)
-        Range of the inputs.
-    samples, seed
-        Number and seed of the random points.
+    u_low, u_high (m,): range of the inputs.
+    samples, seed: number and seed of the random points.
     """
     n = partial.size
     low, high, proven = np.zeros((n, n)), np.zeros((n, n)), True
@@ -330,23 +253,11 @@ def defects(system: System, f: Vector, g: Matrix, h: Vector, points: Floats, *, 
     Central differences of Phi_i along f and the columns of g against `(z_2, …, alpha)` and `beta`, and
     Phi_i1 against h_i. The check uses no derivative of the decomposition itself.
 
-    Parameters
-    ----------
-    f, g, h
-        The system over components; g has n rows of m entries.
-    points : (k, n)
-        Points inside the box of states.
-    step
-        Length of the differences, relative to the length of the direction.
-
-    Returns
-    -------
-    Floats
-        (p,) largest absolute defect of every sensor; near `step^2` for a correct decomposition.
-
-    References
-    ----------
-    kim2018, Assumption 2 and (3).
+    f, g, h: the system over components; g has n rows of m entries.
+    points (k, n): points inside the box of states.
+    step: length of the differences, relative to the length of the direction.
+    Returns (p,): largest absolute defect of every sensor; near `step^2` for a correct decomposition.
+    Source: kim2018, Assumption 2 and (3).
     """
     drift, drive, read = at(f, points), jacobian_at(g, points), at(h, points)
     out = np.zeros(len(system.partials))
@@ -381,19 +292,10 @@ def linear(A: Floats, B: Floats, C: Floats, x_bound: Floats, *, tolerance: float
     Phi_i is the observability matrix of (A, c_i) up to its rank n_i, and alpha_i are the coefficients of
     `c_i A^{n_i}` in its rows.
 
-    Parameters
-    ----------
-    A, B, C : (n, n), (n, m), (p, n)
-        The system.
-    x_bound : (n,)
-        Half-widths of the box of states.
-    tolerance
-        Largest relative part of a row outside the span of the rows before that counts as zero.
-
-    Raises
-    ------
-    NotObservable
-        If a sensor's row is zero.
+    A (n, n), B (n, m), C (p, n).
+    x_bound (n,): half-widths of the box of states.
+    tolerance: largest relative part of a row outside the span of the rows before that counts as zero.
+    Raises NotObservable if a sensor's row is zero.
     """
     A, B, C = (np.asarray(matrix, dtype=np.float64) for matrix in (A, B, C))
     x_bound = np.broadcast_to(np.asarray(x_bound, dtype=np.float64), A.shape[:1])
@@ -444,47 +346,26 @@ def _sympy() -> Any:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorForm:
-    """Symbolic decomposition for one sensor.
+    """Symbolic decomposition for one sensor."""
 
-    Attributes
-    ----------
-    phi
-        `h, L_f h, …`; n_i expressions in x.
-    alpha, beta
-        `L_f^{n_i} h`, and for each row j the m expressions `L_g L_f^{j-1} h`, in x.
-    polynomials
-        For alpha and each entry of beta (in this order, row by row) the equal polynomial in z_i, or None if
-        there is none of the given degree.
-    """
-
-    phi: tuple[Expression, ...]
-    alpha: Expression
+    phi: tuple[Expression, ...]  # `h, L_f h, …`; n_i expressions in x
+    alpha: Expression  # `L_f^{n_i} h`, and for each row j the m expressions `L_g L_f^{j-1} h`, in x
     beta: tuple[tuple[Expression, ...], ...]
+    # for alpha and each entry of beta (in this order, row by row) the equal polynomial in z_i, or None if
+    # there is none of the given degree
     polynomials: tuple[Polynomial | None, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Symbolic:
-    """A decomposed system.
+    """A decomposed system."""
 
-    Attributes
-    ----------
-    x
-        The symbols of the state.
-    forms
-        One for each sensor.
-    f, g, h
-        The system over components, for `form.defects` and simulation.
-    system
-        The decomposition, ready for the observers.
-    """
-
-    x: tuple[Expression, ...]
-    forms: tuple[SensorForm, ...]
-    f: Vector
+    x: tuple[Expression, ...]  # the symbols of the state
+    forms: tuple[SensorForm, ...]  # one for each sensor
+    f: Vector  # the system over components, for `form.defects` and simulation
     g: Matrix
     h: Vector
-    system: System
+    system: System  # the decomposition, ready for the observers
 
 
 def lie(expression: Expression, field: Sequence[Expression], x: Sequence[Expression]) -> Expression:
@@ -492,9 +373,7 @@ def lie(expression: Expression, field: Sequence[Expression], x: Sequence[Express
 
     The field has n expressions for the n symbols x.
 
-    References
-    ----------
-    lee2018, Remark 5.2.1.
+    Source: lee2018, Remark 5.2.1.
     """
     sympy = _sympy()
     terms = (sympy.diff(expression, symbol) * part for symbol, part in zip(x, field, strict=True))
@@ -515,36 +394,18 @@ def decompose(
 ) -> Symbolic:
     """Decomposition of `x' = f + g u, y = h` for every sensor.
 
-    Parameters
-    ----------
-    f
-        n expressions.
-    g
-        n rows of m expressions; n expressions for one input.
-    h
-        p expressions.
-    x
-        n symbols.
-    x_bound
-        Half-widths of the box of states; scalar or (n,).
-    degree
-        Largest degree of the polynomials for alpha and beta.
-    samples, seed
-        Random points for ranks and for matching.
-    tolerance
-        Relative singular value that counts as zero.
-
-    Raises
-    ------
-    NotObservable
-        If a sensor has no uniformly observable part: the rank changes over the box, or beta_ij depends
-        on more than z_1 … z_j, so that observability depends on the input.
-    ImportError
-        If sympy is missing.
-
-    References
-    ----------
-    kim2018, Assumption 2 and (3); lee2018, Assumption 5.2.1.
+    f: n expressions.
+    g: n rows of m expressions; n expressions for one input.
+    h: p expressions.
+    x: n symbols.
+    x_bound: half-widths of the box of states; scalar or (n,).
+    degree: largest degree of the polynomials for alpha and beta.
+    samples, seed: random points for ranks and for matching.
+    tolerance: relative singular value that counts as zero.
+    Raises NotObservable if a sensor has no uniformly observable part: the rank changes over the box, or
+        beta_ij depends on more than z_1 … z_j, so that observability depends on the input. ImportError if
+        sympy is missing.
+    Source: kim2018, Assumption 2 and (3); lee2018, Assumption 5.2.1.
     """
     sympy = _sympy()
     symbols = tuple(x)

@@ -5,10 +5,7 @@ Sensor i occupies the first n_i of n_max places of its row; the rest stays zero.
 Each sensor has an observer of its own, so that an attack affects only one. A set of p - q sensors is
 trusted while its left inverse explains all its estimates; the search continues only if it does not.
 
-References
-----------
-kim2018, section III; docs/theory-high-gain.md.
-kim2018, section III; lee2018, sections 5.2 and 5.4; docs/theory-high-gain.md.
+Source: kim2018, section III; lee2018, sections 5.2 and 5.4; docs/theory-high-gain.md.
 """
 
 from __future__ import annotations
@@ -47,47 +44,25 @@ Search = Literal["all", "one"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HighGainEstimate:
-    """Result at one instant.
+    """Result at one instant."""
 
-    Attributes
-    ----------
-    t
-        Time, s.
-    x : (n,)
-        Estimate of the state; NaN if no set is complete.
-    bound
-        Bound on its largest error while at most q sensors are attacked; NaN if the design has no `lowest`,
-        infinite if no set passed.
-    sigma
-        Index of the set in use, from 0.
-    visited
-        The tested sets, in order; the last is `sigma`.
-    trusted : (p,)
-        The sensors of that set.
-    residual, threshold
-        Of that set; NaN if not tested.
-    decision, cause, reason
-        As in `gridsec.interface`; UNDECIDED is an answer of its own.
-    suspects : (p,)
-        Sensors named as manipulated. With a known `bound`: those that cannot be unmanipulated; otherwise,
-        after an alarm, those outside the trusted set.
-    reset : (p,)
-        Observers that were reset in this step.
-    """
-
-    t: float
-    x: Floats
+    t: float  # time, s
+    x: Floats  # (n,) estimate of the state; NaN if no set is complete
+    # bound on its largest error while at most q sensors are attacked; NaN if the design has no `lowest`,
+    # infinite if no set passed
     bound: float
-    sigma: int
-    visited: tuple[int, ...]
-    trusted: Bools
-    residual: float
+    sigma: int  # index of the set in use, from 0
+    visited: tuple[int, ...]  # the tested sets, in order; the last is `sigma`
+    trusted: Bools  # (p,) the sensors of that set
+    residual: float  # of that set; NaN if not tested
     threshold: float
-    decision: Decision
+    decision: Decision  # as in `gridsec.interface`; UNDECIDED is an answer of its own
     cause: Cause
     reason: str
+    # (p,) sensors named as manipulated. With a known `bound`: those that cannot be unmanipulated; otherwise,
+    # after an alarm, those outside the trusted set
     suspects: Bools
-    reset: Bools
+    reset: Bools  # (p,) observers that were reset in this step
 
 
 def verdict(
@@ -102,22 +77,13 @@ def verdict(
 ) -> tuple[Decision, Cause, str]:
     """Decision, cause, and one sentence.
 
-    Parameters
-    ----------
-    heard
-        Number of sensors with a reading.
-    needed
-        Number of sensors of a set.
-    passed
-        True if the last set passed its test; None if it was not complete, and not tested.
-    alarm
-        True if a test failed or a sensor is named.
-    settled
-        True if the bounds of all observers with readings have settled.
-    untested
-        Number of sensors with a reading but without a test.
-    search
-        As in the design: with "one", other sets may still pass later.
+    heard: number of sensors with a reading.
+    needed: number of sensors of a set.
+    passed: True if the last set passed its test; None if it was not complete, and not tested.
+    alarm: True if a test failed or a sensor is named.
+    settled: True if the bounds of all observers with readings have settled.
+    untested: number of sensors with a reading but without a test.
+    search: as in the design: with "one", other sets may still pass later.
     """
     if passed is None:
         reason = f"{heard} sensors are heard and no set of {needed} is complete"
@@ -141,31 +107,18 @@ Field = Callable[[Floats, Floats], Floats]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HighGainTransition:
-    """One step of the linear parts, exact for forcing that is linear in time.
+    """One step of the linear parts, exact for forcing that is linear in time."""
 
-    Attributes
-    ----------
-    h
-        Length of the step, s.
-    whole : (p, n_max, n_max)
-        `e^{M h}` with `M = A - K C`.
-    held, slope : (p, n_max, n_max)
-        `z(h) = whole z(0) + held g(0) + slope (g(h) - g(0))`.
-    """
-
-    h: float
-    whole: Floats
-    held: Floats
-    slope: Floats
+    h: float  # length of the step, s
+    whole: Floats  # (p, n_max, n_max) `e^{M h}` with `M = A - K C`
+    held: Floats  # (p, n_max, n_max) `z(h) = whole z(0) + held g(0) + slope (g(h) - g(0))`
+    slope: Floats  # (p, n_max, n_max)
 
 
 def gains(system: System, theta: Floats) -> Floats:
     """K of every sensor, padded with zeros; (p, n_max).
 
-    Parameters
-    ----------
-    theta : (p,)
-        High-gain parameters, 1/s.
+    theta (p,): high-gain parameters, 1/s.
     """
     out = np.zeros(system.mask.shape)
     for i, partial in enumerate(system.partials):
@@ -263,29 +216,12 @@ def advance(
     Readings and inputs are interpolated linearly between the two instants. The stiff linear part is exact for
     every `theta h`.
 
-    Parameters
-    ----------
-    right
-        From `field`.
-    K : (p, n_max)
-        Gains.
-    move
-        From `transition`.
-    z : (p, n_max)
-        Estimates at the start.
-    y : pair of (p,)
-        Readings at the start and the end.
-    u : pair of (m,)
-        Inputs at the start and the end.
-
-    Returns
-    -------
-    Floats
-        (p, n_max), estimates at the end; not finite on overflow by extreme readings.
-
-    References
-    ----------
-    kim2018 (5); lee2018 (5.2.6).
+    K (p, n_max).
+    z (p, n_max): estimates at the start.
+    y (pair of (p,)): readings at the start and the end.
+    u (pair of (m,)): inputs at the start and the end.
+    Returns (p, n_max): estimates at the end; not finite on overflow by extreme readings.
+    Source: kim2018 (5); lee2018 (5.2.6).
     """
     before = right(z, u[0])
     forced = before + K * y[0][:, None]
@@ -304,85 +240,41 @@ _DECAYS = {"componentwise": decay_componentwise, "kim2018": decay_kim, "lee2018"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HighGainDesign:
-    """Design of the observers. p sensors, s sets of p - q sensors.
+    """Design of the observers. p sensors, s sets of p - q sensors."""
 
-    Attributes
-    ----------
-    system
-        The system and its decomposition.
-    inverses
-        Psi of the sets Lambda(1), …, Lambda(s), in the order of the search.
-    whole
-        Psi of all sensors, for the test of Corollary 1; without it there is no such test, and no CLEAN unless
-        `lowest` is known.
-    theta : (p,)
-        High-gain parameters, 1/s.
-    decays
-        Constants of every sensor's observer.
-    margins : (p,)
-        Margin of every sensor's Lyapunov inequality; Lemma 1 holds at this theta if positive.
-    proven
-        True if the margins use proven ranges of derivatives only.
-    limit : (p,)
-        Size of an estimate at which it is reset (7).
-    lowest
-        Lower bound on Lip_(Phi_J) over all sets of p - 2q sensors; NaN if unknown, and so is the error bound.
-    steep : (p,)
-        Upper bounds on Lip^(Phi_i).
-    search
-        "all": sets are tried at once until one passes. "one": one change of set per step, for limited
-        computing time (the papers' simulations).
-    K : (p, n_max)
-        Gains.
-    field, move
-        Right-hand side, and matrices for the nominal step.
-    substeps
-        Number of substeps of a step.
-    """
-
-    system: System
-    inverses: tuple[Inverse, ...]
+    system: System  # the system and its decomposition
+    inverses: tuple[Inverse, ...]  # Psi of the sets Lambda(1), …, Lambda(s), in the order of the search
+    # Psi of all sensors, for the test of Corollary 1; without it there is no such test, and no CLEAN unless
+    # `lowest` is known
     whole: Inverse | None
-    theta: Floats
-    decays: tuple[Decay, ...]
+    theta: Floats  # (p,) high-gain parameters, 1/s
+    decays: tuple[Decay, ...]  # constants of every sensor's observer
+    # (p,) margin of every sensor's Lyapunov inequality; Lemma 1 holds at this theta if positive
     margins: Floats
-    proven: bool
-    limit: Floats
+    proven: bool  # True if the margins use proven ranges of derivatives only
+    limit: Floats  # (p,) size of an estimate at which it is reset (7)
+    # lower bound on Lip_(Phi_J) over all sets of p - 2q sensors; NaN if unknown, and so is the error bound
     lowest: float
-    steep: Floats
+    steep: Floats  # (p,) upper bounds on Lip^(Phi_i)
+    # "all": sets are tried at once until one passes. "one": one change of set per step, for limited computing
+    # time (the papers' simulations)
     search: Search
-    K: Floats
-    field: Field
+    K: Floats  # (p, n_max) gains
+    field: Field  # right-hand side, and matrices for the nominal step
     move: HighGainTransition
-    substeps: int
+    substeps: int  # number of substeps of a step
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HighGainState:
-    """State of the observers.
+    """State of the observers."""
 
-    Attributes
-    ----------
-    t
-        Time, s.
-    z : (p, n_max)
-        Estimates; zero where a sensor has no such entry or is unavailable.
-    y : (p,)
-        Readings at t; NaN where unavailable.
-    u : (m,)
-        Input at t.
-    age : (p,)
-        Time of each observer with readings without a gap, s.
-    sigma
-        Place of the set in use, from 0.
-    """
-
-    t: float
-    z: Floats
-    y: Floats
-    u: Floats
-    age: Floats
-    sigma: int
+    t: float  # time, s
+    z: Floats  # (p, n_max) estimates; zero where a sensor has no such entry or is unavailable
+    y: Floats  # (p,) readings at t; NaN where unavailable
+    u: Floats  # (m,) input at t
+    age: Floats  # (p,) time of each observer with readings without a gap, s
+    sigma: int  # place of the set in use, from 0
 
 
 def design(
@@ -405,45 +297,23 @@ def design(
 ) -> HighGainDesign:
     """Design observers, thresholds and search, and verify their conditions.
 
-    Parameters
-    ----------
-    inverses
-        A left inverse for each set of p - q sensors, in the order of the search. By default the nearest
+    inverses: a left inverse for each set of p - q sensors, in the order of the search. By default the nearest
         points, for these sets and for `whole`.
-    theta
-        High-gain parameters, 1/s, at least 1; scalar or (p,).
-    noise
-        M_v: largest measurement error of unmanipulated sensors, interpolation included; scalar or (p,).
-    max_attacked
-        q.
-    u_low, u_high
-        Range of the inputs; scalar or (m,).
-    step_s
-        Nominal time between readings, s.
-    whole
-        Left inverse of all sensors for the test of Corollary 1.
-    decay
-        Derivation of eta, epsilon and rate; or these constants, one for each sensor.
-    lowest
-        Lower bound on Lip_(Phi_J) for every set J of p - 2q sensors, at least 0; NaN if unknown. At 0 or NaN
-        the estimate has no error bound.
-    search
-        See `HighGainDesign`.
-    reset
-        Apply the reset rule (7); lee2018 has none. Estimates that are not finite are reset anyway.
-    substeps
-        Number of substeps of a step, for accuracy.
-    tolerance
-        Largest error of a left inverse at its check points.
-
-    Raises
-    ------
-    NotObservable
-        If p <= 2q, or the sets are not all sets of p - q sensors.
-    DesignInfeasible
-        If theta is too small for Lemma 1, or a left inverse fails its check.
-    ValueError
-        If `noise` or `lowest` is negative, or `decay` or `search` is unknown.
+    theta: high-gain parameters, 1/s, at least 1; scalar or (p,).
+    noise: M_v: largest measurement error of unmanipulated sensors, interpolation included; scalar or (p,).
+    u_low, u_high: range of the inputs; scalar or (m,).
+    step_s: nominal time between readings, s.
+    whole: left inverse of all sensors for the test of Corollary 1.
+    decay: derivation of eta, epsilon and rate; or these constants, one for each sensor.
+    lowest: lower bound on Lip_(Phi_J) for every set J of p - 2q sensors, at least 0; NaN if unknown. At 0 or
+        NaN the estimate has no error bound.
+    search: see `HighGainDesign`.
+    reset: apply the reset rule (7); lee2018 has none. Estimates that are not finite are reset anyway.
+    substeps: number of substeps of a step, for accuracy.
+    tolerance: largest error of a left inverse at its check points.
+    Raises NotObservable if p <= 2q, or the sets are not all sets of p - q sensors. DesignInfeasible if theta
+        is too small for Lemma 1, or a left inverse fails its check. ValueError if `noise` or `lowest` is
+        negative, or `decay` or `search` is unknown.
     """
     p, m = len(system.partials), system.partials[0].inputs
     if not p > 2 * max_attacked >= 0:
@@ -566,16 +436,10 @@ def init(
 ) -> HighGainState:
     """Initial state of all observers.
 
-    Parameters
-    ----------
-    t
-        Time, s.
-    y : (p,)
-        Readings at t, NaN where missing; without them every observer starts with its first reading.
-    u : (m,)
-        Input at t; zero by default.
-    z : (p, n_max)
-        Initial estimates of the sensors with a reading, at most M_z in size; zero by default.
+    t: time, s.
+    y (p,): readings at t, NaN where missing; without them every observer starts with its first reading.
+    u (m,): input at t; zero by default.
+    z (p, n_max): initial estimates of the sensors with a reading, at most M_z in size; zero by default.
     """
     system = design.system
     p, m = len(system.partials), system.partials[0].inputs
@@ -595,25 +459,12 @@ def step(  # noqa: PLR0917  # the border that all observer families share
 ) -> tuple[HighGainState, HighGainEstimate]:
     """Advance all observers to the next readings, and decide.
 
-    Parameters
-    ----------
-    y : (p,)
-        Readings at `t + h`; ignored where unseen or not finite.
-    u : (m,)
-        Input at `t + h`; finite.
-    seen : (p,)
-        True for existing readings. An unseen sensor drops out, and returns with a new observer.
-    h
-        Length of the step, s.
-
-    Returns
-    -------
-    HighGainState, Outcome
-        At `t + h`. Never raises on data.
-
-    References
-    ----------
-    kim2018 (5), (7), Theorem 2.
+    y (p,): readings at `t + h`; ignored where unseen or not finite.
+    u (m,): input at `t + h`; finite.
+    seen (p,): True for existing readings. An unseen sensor drops out, and returns with a new observer.
+    h: length of the step, s.
+    Returns state and estimate at `t + h`; never raises on data.
+    Source: kim2018 (5), (7), Theorem 2.
     """
     live = np.asarray(seen, dtype=np.bool_) & np.isfinite(y)
     going = live & np.isfinite(state.y)
@@ -649,14 +500,8 @@ def _advance(
 def error_bounds(design: HighGainDesign, age: Floats) -> Floats:
     """Bound on the error of every observer without attack: `max(2 M_z eta e^{-rate age}, epsilon)`, (p,).
 
-    Parameters
-    ----------
-    age : (p,)
-        Time of each observer with readings, s.
-
-    References
-    ----------
-    kim2018 (12), (14); lee2018 (5.4.2).
+    age (p,): time of each observer with readings, s.
+    Source: kim2018 (12), (14); lee2018 (5.4.2).
     """
     pairs = zip(design.decays, design.system.z_bound, age, strict=True)
     return np.array([float(d.bound(2.0 * bound, a)) for d, bound, a in pairs])

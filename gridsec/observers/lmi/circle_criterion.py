@@ -8,9 +8,7 @@ and `circle` finds the L and K, with their proof, that keep the error small unde
 the known input and `noise * n` of the meters. The solver's result is not trusted: the inequality is
 rebuilt from the gains in NumPy, in the plant's own units, before a design leaves this module.
 
-References
-----------
-chong2020 (11), (12), corrected; arcak2001. Proofs: docs/theory-observers.md.
+Source: chong2020 (11), (12), corrected; arcak2001. Proofs: docs/theory-observers.md.
 """
 
 from __future__ import annotations
@@ -56,22 +54,11 @@ def circle(
     Minimises `k mu + r mu_delta`, a bound on the mean of e^T Q e for signals of their stated sizes, over (P,
     P L, Lambda, Lambda K, mu, mu_delta) subject to the corrected (12) with nu = 1.
 
-    Parameters
-    ----------
-    J : (k,)
-        Trusted meters.
-    rate, noise, load, weight, floor
-        See `options_for`.
-
-    Raises
-    ------
-    DesignInfeasible
-        If there is no such observer, if the rebuilt inequality is violated, or if the optimum is the blind L
-        = K = 0.
-
-    References
-    ----------
-    chong2020 (12), corrected: docs/theory-observers.md, section 2.
+    J (k,).
+    rate, noise, load, weight, floor: see `options_for`.
+    Raises DesignInfeasible if there is no such observer, if the rebuilt inequality is violated, or if the
+        optimum is the blind L = K = 0.
+    Source: chong2020 (12), corrected: docs/theory-observers.md, section 2.
     """
     options = options_for(lure, rate=rate, noise=noise, load=load, weight=weight, floor=floor)
     return _Template(lure, options, len(J)).solve(np.asarray(J, dtype=np.intp))
@@ -80,26 +67,12 @@ def circle(
 def prove(lure: Lure, J: Sequence[int] | Ints, L: Floats, K: Floats, options: CircleOptions) -> CircleGains:
     """Certificate for an observer with given gains: the corrected (12) in P and Lambda only.
 
-    Parameters
-    ----------
-    lure
-        Plant; n states, m nonlinearities.
-    J : (k,)
-        Trusted meters.
-    L, K : (n, k), (m, k)
-        Gains. Those of nonlinearities of slope bound 0 have no effect.
-    options
-        From `options_for`. Its `floor` is ignored.
-
-    Returns
-    -------
-    CircleGains
-        With exactly these gains and a positive margin. Blind gains are accepted.
-
-    Raises
-    ------
-    DesignInfeasible
-        If the inequality has no solution, or is violated when rebuilt.
+    lure: plant; n states, m nonlinearities.
+    J (k,).
+    L (n, k), K (m, k): gains. Those of nonlinearities of slope bound 0 have no effect.
+    options: from `options_for`. Its `floor` is ignored.
+    Blind gains are accepted.
+    Raises DesignInfeasible if the inequality has no solution, or is violated when rebuilt.
     """
     given = (np.asarray(L, dtype=np.float64), np.asarray(K, dtype=np.float64))
     template = _Template(lure, replace(options, floor=0.0), len(J), given=given)
@@ -118,17 +91,9 @@ def contraction(lure: Lure, *, rate: float) -> Certificate:
     load. Trusted meters only remove columns of H in it, and by Theorem 1 of docs/theory-certificates.md this
     proves every set.
 
-    Parameters
-    ----------
-    lure
-        Closed loop of a feeder with droop, from `close_loop`.
-    rate
-        alpha, 1/s.
-
-    Raises
-    ------
-    DesignInfeasible
-        If there is no such P at this rate, or its verification in NumPy fails.
+    lure: closed loop of a feeder with droop, from `close_loop`.
+    rate: alpha, 1/s.
+    Raises DesignInfeasible if there is no such P at this rate, or its verification in NumPy fails.
     """
     cp = cvxpy_late()
     what = f"certificate of direct injection for all sets of meters at rate {rate:g}/s"
@@ -173,24 +138,11 @@ def solve_many(
     Processes are spawned, so a calling script needs the `if __name__ == "__main__"` guard; each runs its
     linear algebra on one thread. One worker means this process.
 
-    Parameters
-    ----------
-    lure
-        Plant. Its matrices are sent to the workers; its nonlinearity, which no inequality needs, is not.
-    options
-        From `options_for`.
-    progress
-        Called in this process with (done, total) after finished designs.
-
-    Returns
-    -------
-    tuple of CircleGains
-        In the order of `subsets`.
-
-    Raises
-    ------
-    DesignInfeasible
-        For the first set with a failed design; pending work is dropped.
+    lure: plant. Its matrices are sent to the workers; its nonlinearity, which no inequality needs, is not.
+    options: from `options_for`.
+    progress: called in this process with (done, total) after finished designs.
+    Returns the designs in the order of `subsets`.
+    Raises DesignInfeasible for the first set with a failed design; pending work is dropped.
     """
     chunks = _chunks(subsets)
     results: dict[int, CircleGains] = {}
@@ -350,10 +302,7 @@ class _Template:
     def solve(self, J: Ints) -> CircleGains:
         """Design for one set, verified.
 
-        Raises
-        ------
-        DesignInfeasible
-            As in `circle`.
+        Raises DesignInfeasible as in `circle`.
         """
         cp = cvxpy_late()
         lure, options, live = self.lure, self.options, self.live
@@ -414,17 +363,8 @@ def settle(lure: Lure, found: CircleGains, what: str, *, blind: bool = False) ->
     and mu, mu_delta grown together by the stated steps (at most 5 %), which makes every diagonal
     block but that of psi more negative; the gains stay. `backoff` stores the step.
 
-    Parameters
-    ----------
-    what
-        Name of the design in errors.
-    blind
-        Accept gains that use no meter.
-
-    Raises
-    ------
-    DesignInfeasible
-        If every step fails, or if the design uses no meter.
+    blind: accept gains that use no meter.
+    Raises DesignInfeasible if every step fails, or if the design uses no meter.
     """
     best = -np.inf
     for step in BACKOFF:

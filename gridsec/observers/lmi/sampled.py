@@ -4,9 +4,7 @@
 
 The module is in this package because the inequalities use these systems; no solver is used here.
 
-References
-----------
-yang2019 (1), (2), with the known vector rho written as B u; docs/theory-discrete.md.
+Source: yang2019 (1), (2), with the known vector rho written as B u; docs/theory-discrete.md.
 """
 
 from __future__ import annotations
@@ -27,41 +25,22 @@ from gridsec.observers.newton import Nonlinearity
 class DiscreteLure:
     """`x+ = A x + G phi(H x + F u) + B u`, `y = C x + D u`. n states, m nonlinearities, l inputs, p meters.
 
-    Attributes
-    ----------
-    A : (n, n)
-    G : (n, m)
-    H : (m, n)
-    F : (m, l)
-    B : (n, l)
-    C : (p, n)
-    D : (p, l)
-        The matrices. A known vector rho(u, y) as in yang2019 (1) is passed as further entries of u.
-    lower, upper : (m,)
-        Bounds of the slopes of each entry of phi, `lower <= upper`.
-    phi
-        The nonlinearity, (…, m) -> (…, m), entry by entry.
-    h
-        Time from one step to the next, s.
-
-    Raises
-    ------
-    ValueError
-        If shapes are inconsistent, an entry is not finite, a lower slope exceeds its upper one, or h is not
-        positive; lists every problem.
+    Raises ValueError if shapes are inconsistent, an entry is not finite, a lower slope exceeds its upper one,
+        or h is not positive; lists every problem.
     """
 
-    A: Floats
-    G: Floats
-    H: Floats
-    F: Floats
-    B: Floats
-    C: Floats
+    A: Floats  # (n, n)
+    G: Floats  # (n, m)
+    H: Floats  # (m, n)
+    F: Floats  # (m, l)
+    B: Floats  # (n, l)
+    C: Floats  # (p, n)
+    # (p, l) the matrices. A known vector rho(u, y) as in yang2019 (1) is passed as further entries of u
     D: Floats
-    lower: Floats
-    upper: Floats
-    phi: Nonlinearity
-    h: float = 1.0
+    lower: Floats  # (m,) bounds of the slopes of each entry of phi, `lower <= upper`
+    upper: Floats  # (m,)
+    phi: Nonlinearity  # the nonlinearity, (…, m) -> (…, m), entry by entry
+    h: float = 1.0  # time from one step to the next, s
 
     def __post_init__(self) -> None:
         wrong = freeze(self, "lower", "upper")
@@ -89,17 +68,9 @@ class DiscreteLure:
     ) -> DiscreteLure:
         """System from nested lists or arrays; a missing input matrix is zero.
 
-        Parameters
-        ----------
-        A, C, G, H, phi, F, B, D, h
-            As in the class. Without any of F, B and D there are no inputs, l = 0.
-        lower, upper
-            Likewise; one number for all entries of phi.
-
-        Raises
-        ------
-        ValueError
-            As in the class.
+        A, C, G, H, phi, F, B, D, h: as in the class. Without any of F, B and D there are no inputs, l = 0.
+        lower, upper: likewise; one number for all entries of phi.
+        Raises ValueError as in the class.
         """
         a, c, g, hh, low, high = as_floats(A, C, G, H, lower, upper)
         f, b, d = input_matrices((len(hh), len(a), len(c)), F, B, D)
@@ -121,12 +92,7 @@ def shift(system: DiscreteLure) -> DiscreteLure:
 def advance(system: DiscreteLure, x: Floats, u: Floats) -> Floats:
     """State one step later.
 
-    Parameters
-    ----------
-    x : (…, n)
-        State.
-    u : (…, l)
-        Input.
+    x (…, n), u (…, l).
     """
     z = x @ system.H.T + u @ system.F.T
     return np.asarray(x @ system.A.T + system.phi(z) @ system.G.T + u @ system.B.T)
@@ -145,14 +111,8 @@ def sample(lure: Lure, h: float) -> DiscreteLure:
     some value of z_i *during* the step; `held_error` bounds the distance of that value from the one at its
     beginning.
 
-    Parameters
-    ----------
-    h
-        Length of a step, s, positive.
-
-    References
-    ----------
-    docs/theory-discrete.md, section 5.
+    h: length of a step, s, positive.
+    Source: docs/theory-discrete.md, section 5.
     """
     n = len(lure.A)
     own = np.diagonal(lure.A)
@@ -186,23 +146,11 @@ def held_error(lure: Lure, h: float, away: Floats) -> Floats:
     with `q_j = 1 - exp(-h / tau_j)`. With `away_j >= |K_j(z_j(0)) - x_j(0)|`, the motion m solves
     `m = q (away + d |H| m)`, if the spectral radius of `diag(q d) |H|` is below 1.
 
-    Parameters
-    ----------
-    lure
-        Closed loop of a feeder, A and G diagonal with G = -A.
-    h
-        Length of the step, s.
-    away : (m,)
-        Distance of each inverter from its set point at the beginning of the step, pu.
-
-    Returns
-    -------
-    (m,)
-        Bound on `|z_i(s) - z_i(0)|`, 0 <= s <= h, squared pu; infinite without a bound.
-
-    References
-    ----------
-    docs/theory-discrete.md, section 5.
+    lure: closed loop of a feeder, A and G diagonal with G = -A.
+    h: length of the step, s.
+    away (m,): distance of each inverter from its set point at the beginning of the step, pu.
+    Returns (m,): bound on `|z_i(s) - z_i(0)|`, 0 <= s <= h, squared pu; infinite without a bound.
+    Source: docs/theory-discrete.md, section 5.
     """
     q = -np.expm1(np.diagonal(lure.A) * h)
     reach = np.abs(lure.H)
@@ -219,21 +167,10 @@ def drift_error(lure: Lure, h: float, jump: Floats) -> Floats:
     With `|F (u(k+1) - u(k))| <= jump` the motion m of the inverters within any step obeys
     `m <= d ((1 + 2 q) |H| m + jump)`, if the spectral radius of `(1 + 2 q) diag(d) |H|` is below 1.
 
-    Parameters
-    ----------
-    lure, h
-        As in `held_error`.
-    jump : (m,)
-        Largest change of each argument's own input from one step to the next, squared pu.
-
-    Returns
-    -------
-    (m,)
-        Bound on `|z_i(s) - z_i(0)|`, 0 <= s <= h, squared pu; infinite without a bound.
-
-    References
-    ----------
-    docs/theory-discrete.md, section 5.
+    lure, h: as in `held_error`.
+    jump (m,): largest change of each argument's own input from one step to the next, squared pu.
+    Returns (m,): bound on `|z_i(s) - z_i(0)|`, 0 <= s <= h, squared pu; infinite without a bound.
+    Source: docs/theory-discrete.md, section 5.
     """
     q = -np.expm1(np.diagonal(lure.A) * h)
     reach = np.abs(lure.H)

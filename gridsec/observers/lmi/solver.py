@@ -1,8 +1,6 @@
 """Solver settings, and basis pursuit as a second-order cone program.
 
-References
-----------
-lee2018 (2.1.4), with the Euclidean norm of every block in place of the absolute value of every entry.
+Source: lee2018 (2.1.4), with the Euclidean norm of every block in place of the absolute value of every entry.
 """
 
 from __future__ import annotations
@@ -34,26 +32,12 @@ def cvxpy_late() -> Any:
 
 
 def group_pursuit(F: Floats, y: Floats, heights: Ints) -> Floats:
-    """Minimise `sum_i |e_i|_2` subject to `F e = y`.
+    """Minimise `sum_i |e_i|_2` over e (N,) subject to `F e = y`.
 
-    Parameters
-    ----------
-    F : (m, N)
-        Sensing matrix.
-    y : (m,)
-        Observation.
-    heights : (p,)
-        Entries of each block of e; they sum to N.
-
-    Returns
-    -------
-    (N,)
-        e.
-
-    Raises
-    ------
-    DesignInfeasible
-        If the solver finds no solution, or its solution does not satisfy `F e = y` to 1e-6 of y.
+    F (m, N), y (m,).
+    heights (p,): entries of each block of e; they sum to N.
+    Raises DesignInfeasible if the solver finds no solution, or its solution does not satisfy `F e = y` to
+        1e-6 of y.
     """
     cp = cvxpy_late()
     size = float(np.max(np.abs(y), initial=0.0))

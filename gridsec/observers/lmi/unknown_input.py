@@ -12,11 +12,8 @@ quadratic `V = e^T P e` with
 
 The inequality is rebuilt in NumPy before a design leaves this module.
 
-References
-----------
-yang2021 (33) to (36), which leaves the design to Witczak, Korbicz, Puig, "An LMI approach to designing
-observers and unknown input observers for nonlinear systems", 2006. The inequality used here is derived
-in docs/theory-unknown-input.md.
+Source: yang2021 (33) to (36), which leaves the design to Witczak, Korbicz, Puig, "An LMI approach to designing
+observers and unknown input observers for nonlinear systems", 2006. Derivation: docs/theory-unknown-input.md.
 """
 
 from __future__ import annotations
@@ -42,37 +39,20 @@ _BACKOFF = (0.0, 1e-3, 1e-2, 1e-1)
 class ErrorSystem:
     """Error of an unknown-input observer without its gain. n states, m bounds, k sensors.
 
-    Attributes
-    ----------
-    M : (n, n)
-        Error map without gain, at the middle of the slopes.
-    S : (n, m)
-        Input matrix of psi, the rest of the nonlinearity.
-    H : (m, n)
-        Argument matrix of psi.
-    half : (m,)
-        Half-width of the slopes: `|psi_i| <= half_i |(H e)_i|`. With the "scalar" multiplier:
-        `|psi| <= |half * H e|`, which is yang2021 (34) for H = I and half = gamma.
-    C : (k, n)
-        The sensors' rows.
-    W : (n, d)
-        Input matrix of errors of size one that the gain does not weigh: next readings, drift of the plant.
-    N : (k,)
-        Size of the error of each sensor's reading, positive.
-
-    Raises
-    ------
-    ValueError
-        If shapes are inconsistent, an error scale is not positive, or a half-width negative.
+    Raises ValueError if shapes are inconsistent, an error scale is not positive, or a half-width negative.
     """
 
-    M: Floats
-    S: Floats
-    H: Floats
+    M: Floats  # (n, n) error map without gain, at the middle of the slopes
+    S: Floats  # (n, m) input matrix of psi, the rest of the nonlinearity
+    H: Floats  # (m, n) argument matrix of psi
+    # (m,) half-width of the slopes: `|psi_i| <= half_i |(H e)_i|`. With the "scalar" multiplier: `|psi| <=
+    # |half * H e|`, which is yang2021 (34) for H = I and half = gamma
     half: Floats
-    C: Floats
+    C: Floats  # (k, n) the sensors' rows
+    # (n, d) input matrix of errors of size one that the gain does not weigh: next readings, drift of the
+    # plant
     W: Floats
-    N: Floats
+    N: Floats  # (k,) size of the error of each sensor's reading, positive
 
     def __post_init__(self) -> None:
         """Freeze the arrays and check that their shapes are consistent."""
@@ -94,33 +74,16 @@ class ErrorSystem:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UnknownInputGains:
-    """A gain with its proof. n states, m bounds, k sensors.
+    """A gain with its proof. n states, m bounds, k sensors."""
 
-    Attributes
-    ----------
-    K : (n, k)
-        Gain from the sensors' residuals.
-    P : (n, n)
-        `V = e^T P e`.
-    Lambda : (m,)
-        Multiplier of the bounds on the nonlinearity; all entries equal for the "scalar" one.
-    mu
-        `V+ <= rate^2 V + mu (|w|^2 + |n|^2)`.
-    rate
-        Certified contraction of sqrt(V) per step.
-    margin
-        Margin of the rebuilt inequality, see `unknown_input_margin`; it holds if positive.
-    status
-        Status of the solver; not a proof.
-    """
-
-    K: Floats
-    P: Floats
+    K: Floats  # (n, k) gain from the sensors' residuals
+    P: Floats  # (n, n) `V = e^T P e`
+    # (m,) multiplier of the bounds on the nonlinearity; all entries equal for the "scalar" one
     Lambda: Floats
-    mu: float
-    rate: float
-    margin: float
-    status: str
+    mu: float  # `V+ <= rate^2 V + mu (|w|^2 + |n|^2)`
+    rate: float  # certified contraction of sqrt(V) per step
+    margin: float  # margin of the rebuilt inequality, see `unknown_input_margin`; it holds if positive
+    status: str  # status of the solver; not a proof
 
 
 def unknown_input_matrix(system: ErrorSystem, gains: UnknownInputGains) -> Floats:
@@ -133,10 +96,7 @@ def unknown_input_matrix(system: ErrorSystem, gains: UnknownInputGains) -> Float
     the increment of V minus its bound, plus the multiplier times `|half H e|^2 - |psi|^2 >= 0`. Without a
     Schur complement, this is the statement itself, not the form given to the solver.
 
-    Returns
-    -------
-    Floats
-        (n + m + d + k, n + m + d + k), symmetric.
+    Returns (n + m + d + k, n + m + d + k): symmetric.
     """
     s, g = system, gains
     n, m, d, k = len(s.M), s.half.size, s.W.shape[1], s.N.size
@@ -156,10 +116,7 @@ def unknown_input_margin(system: ErrorSystem, gains: UnknownInputGains) -> float
     (rate^2 P, Lambda, mu), so that units have no effect. Negative infinity if P is not positive definite or a
     multiplier is negative. Bounds of half-width zero do not count: their psi is zero.
 
-    Parameters
-    ----------
-    system, gains
-        As in `unknown_input_matrix`.
+    system, gains: as in `unknown_input_matrix`.
     """
     live = system.half > 0.0
     lowest = float(np.min(np.linalg.eigvalsh(gains.P)))
@@ -185,18 +142,10 @@ class UnknownInputTemplate:
     Units: readings in their error scales N, states in the change that moves the readings by one such unit,
     psi_i in its largest value for an error of one unit. All entries are then of order one.
 
-    Parameters
-    ----------
-    states, sensors, bounds
-        n, k, and the number of bounds with a half-width above zero.
-    multiplier
-        "diagonal": every nonlinearity has a bound of its own. "scalar": one bound of their norm, the
+    states, sensors, bounds: n, k, and the number of bounds with a half-width above zero.
+    multiplier: "diagonal": every nonlinearity has a bound of its own. "scalar": one bound of their norm, the
         Lipschitz condition (34) of yang2021; it proves less.
-
-    Raises
-    ------
-    ValueError
-        If `multiplier` is unknown.
+    Raises ValueError if `multiplier` is unknown.
     """
 
     def __init__(self, states: int, sensors: int, bounds: int, multiplier: Multiplier) -> None:
@@ -238,21 +187,10 @@ class UnknownInputTemplate:
     def solve(self, system: ErrorSystem, rate: float, what: str) -> UnknownInputGains:
         """Design for one error system, verified.
 
-        Parameters
-        ----------
-        system
-            The error system, of the shape of this template.
-        rate
-            Required contraction, in (0, 1).
-        what
-            Name of the design in errors.
-
-        Raises
-        ------
-        DesignInfeasible
-            If the inequality has no solution, or is violated when rebuilt.
-        ValueError
-            If the rate is not inside (0, 1).
+        system: the error system, of the shape of this template.
+        rate: required contraction, in (0, 1).
+        Raises DesignInfeasible if the inequality has no solution, or is violated when rebuilt. ValueError if
+            the rate is not inside (0, 1).
         """
         if not 0.0 < rate < 1.0:
             raise InputInvalid(
@@ -327,19 +265,9 @@ def unknown_input(
     Minimises mu over (P, P K, Lambda) with `P >= I` in scaled coordinates, subject to the inequality in
     the module's head.
 
-    Parameters
-    ----------
-    rate
-        Required contraction of sqrt(V) per step, in (0, 1).
-    multiplier
-        See `UnknownInputTemplate`.
-    what
-        Name of the design in errors.
-
-    Raises
-    ------
-    DesignInfeasible
-        If there is no such gain, or the rebuilt inequality is violated.
+    rate: required contraction of sqrt(V) per step, in (0, 1).
+    multiplier: see `UnknownInputTemplate`.
+    Raises DesignInfeasible if there is no such gain, or the rebuilt inequality is violated.
     """
     shape = (len(system.M), system.N.size, int(np.count_nonzero(system.half > 0.0)))
     return UnknownInputTemplate(*shape, multiplier).solve(system, rate, what)

@@ -47,37 +47,18 @@ MOST_NODES = 1_000_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sparsest:
-    """A direction and the blocks that see it.
+    """A direction and the blocks that see it."""
 
-    Attributes
-    ----------
-    count
-        Number of those blocks; infinite without any direction.
-    blocks : (count,)
-        Indices of these blocks, ascending; empty without any direction.
-    direction : (n,)
-        Unit vector; empty if there is none. Complex only if the blocks or the space are.
-    """
-
-    count: float
-    blocks: Ints
-    direction: Matrix
+    count: float  # number of those blocks; infinite without any direction
+    blocks: Ints  # (count,) indices of these blocks, ascending; empty without any direction
+    direction: Matrix  # (n,) unit vector; empty if there is none. Complex only if the blocks or the space are
 
 
 def row_space(block: NDArray[Scalar], tol: float) -> NDArray[Scalar]:
-    """Orthonormal rows that span the rows of a matrix.
+    """Orthonormal rows (rank, n) that span the rows of a matrix; they have the same kernel.
 
-    Parameters
-    ----------
-    block : (k, n)
-        Any matrix.
-    tol
-        Singular values up to `tol` times the largest count as zero.
-
-    Returns
-    -------
-    (rank, n)
-        The same kernel as `block`.
+    block (k, n).
+    tol: singular values up to `tol` times the largest count as zero.
     """
     if not np.any(block):
         return block[:0]
@@ -86,19 +67,10 @@ def row_space(block: NDArray[Scalar], tol: float) -> NDArray[Scalar]:
 
 
 def kernel(matrix: NDArray[Scalar], tol: float) -> NDArray[Scalar]:
-    """Orthonormal basis of `{x : M x = 0}`.
+    """Orthonormal basis of `{x : M x = 0}` in columns, (n, n - rank).
 
-    Parameters
-    ----------
-    matrix : (k, n)
-        Any matrix.
-    tol
-        Singular values up to this size, absolutely, count as zero.
-
-    Returns
-    -------
-    (n, n - rank)
-        The basis in its columns.
+    matrix (k, n).
+    tol: singular values up to this size, absolutely, count as zero.
     """
     columns = matrix.shape[1]
     if matrix.shape[0] == 0:
@@ -110,12 +82,8 @@ def kernel(matrix: NDArray[Scalar], tol: float) -> NDArray[Scalar]:
 def span(columns: NDArray[Scalar], tol: float) -> NDArray[Scalar]:
     """Orthonormal basis of the range of a matrix with column norms near one or zero.
 
-    Parameters
-    ----------
-    columns : (n, k)
-        Any matrix.
-    tol
-        Singular values up to this size, absolutely, count as zero.
+    columns (n, k).
+    tol: singular values up to this size, absolutely, count as zero.
     """
     if columns.shape[1] == 0:
         return columns
@@ -139,29 +107,14 @@ def fewest(
     of the others is then either made to vanish (N shrinks) or counted. A path has at most n of the former,
     and fewer of the latter than the best count so far.
 
-    Parameters
-    ----------
-    rows : p times (k_i, n)
-        Orthonormal rows of each block, from `row_space`.
-    space : (n, d)
-        Orthonormal basis of the space in its columns.
-    tol
-        A block does not see a unit vector if the norm of their product is at most this.
-    below
-        Decide only if fewer blocks than this see some direction: if so, the count is below it, otherwise any
-        upper bound. Takes at most C(n + below, n) nodes. 0 for the minimum.
-    must
-        Restrict to directions that this block sees; if there are none, the count is infinite.
-
-    Returns
-    -------
-    Sparsest
-        An optimal direction. If several are optimal, the first found.
-
-    Raises
-    ------
-    DesignInfeasible
-        If more than `most` nodes are needed. The general problem is NP-hard.
+    rows (p times (k_i, n)): orthonormal rows of each block, from `row_space`.
+    space (n, d): orthonormal basis of the space in its columns.
+    tol: a block does not see a unit vector if the norm of their product is at most this.
+    below: decide only if fewer blocks than this see some direction: if so, the count is below it, otherwise
+        any upper bound. Takes at most C(n + below, n) nodes. 0 for the minimum.
+    must: restrict to directions that this block sees; if there are none, the count is infinite.
+    Of several optimal directions, returns the first found.
+    Raises DesignInfeasible if more than `most` nodes are needed. The general problem is NP-hard.
     """
     blocks = _padded(rows, space.shape[0])
     if space.shape[1] == 0 or not _sees(blocks, must, space, tol):
@@ -241,18 +194,10 @@ def fewest_rows(seen: Matrix, *, tol: float, must: int | None = None) -> Sparses
     Of several minimisers the first one of `gridsec.secure.index.fewest`: where two differ first, it does not
     see the earlier row.
 
-    Parameters
-    ----------
-    seen : (p, n)
-        Image of a basis in each row; together the rows see everything, n >= 2.
-    tol
-        Products of unit vectors up to this count as zero.
-    must
-        A row, not zero, that must see the direction; None for any.
-
-    References
-    ----------
-    lee2018, Proposition 3.2.2: the sensors that see an eigenvector.
+    seen (p, n): image of a basis in each row; together the rows see everything, n >= 2.
+    tol: products of unit vectors up to this count as zero.
+    must: a row, not zero, that must see the direction; None for any.
+    Source: lee2018, Proposition 3.2.2: the sensors that see an eigenvector.
     """
     count, n = seen.shape
     if comb(count, n - 1) > MOST_CHOICES:

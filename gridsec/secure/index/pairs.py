@@ -11,10 +11,7 @@ latter minimise over each whole eigenspace, which covers repeated eigenvalues, d
 For `x(k+1) = A x + B a`, `y = C x + D a` with an unknown a. With B = 0 and D the identity on the
 manipulated sensors this is a system under attack, which ties chapter 3 of lee2018 to the geometric theory.
 
-References
-----------
-lee2018, chapter 3. Corrections: docs/errata/lee2018-chapter-3.md.
-lee2018, chapter 3; chong2020 (9).
+Source: lee2018, chapter 3; chong2020 (9). Corrections: docs/errata/lee2018-chapter-3.md.
 """
 
 from __future__ import annotations
@@ -38,31 +35,18 @@ Complexes = NDArray[np.complex128]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Eigenspace:
-    """One eigenvalue with all its eigenvectors.
+    """One eigenvalue with all its eigenvectors."""
 
-    Attributes
-    ----------
-    value
-        The eigenvalue: the mean of its cluster, which is more accurate than its members.
-    vectors : (n, g)
-        Orthonormal basis of the eigenspace; g is the geometric multiplicity.
-    invariant : (n, m)
-        Orthonormal basis of the generalised eigenspace; m is the algebraic multiplicity.
-    """
-
-    value: complex
-    vectors: Complexes
+    value: complex  # the eigenvalue: the mean of its cluster, which is more accurate than its members
+    vectors: Complexes  # (n, g) orthonormal basis of the eigenspace; g is the geometric multiplicity
+    # (n, m) orthonormal basis of the generalised eigenspace; m is the algebraic multiplicity
     invariant: Complexes
 
     def unstable(self, *, discrete: bool, tol: float) -> bool:
         """True for an unstable eigenvalue: `|value| >= 1`, or `Re value >= 0` in continuous time.
 
-        Parameters
-        ----------
-        discrete
-            Sampled time.
-        tol
-            Distance from the border within which it counts as unstable.
+        discrete: sampled time.
+        tol: distance from the border within which it counts as unstable.
         """
         return bool(abs(self.value) >= 1.0 - tol if discrete else self.value.real >= -tol)
 
@@ -78,17 +62,9 @@ def eigenspaces(A: Floats, *, tol: float) -> tuple[Eigenspace, ...]:
     or N itself is that small. That holds, up to the constant, for any matrix within tol of one with an m-fold
     eigenvalue, and fails for several distinct eigenvalues further apart.
 
-    Parameters
-    ----------
-    A : (n, n)
-        Real matrix.
-    tol
-        Relative backward error at which eigenvalues count as equal and vectors as eigenvectors.
-
-    Returns
-    -------
-    tuple of Eigenspace
-        In no particular order; the algebraic multiplicities sum to n.
+    A (n, n).
+    tol: relative backward error at which eigenvalues count as equal and vectors as eigenvectors.
+    Their order is arbitrary; the algebraic multiplicities sum to n.
     """
     return tuple(_eigenspace(cluster, tol) for cluster in _clusters(_Schur.of(A), tol))
 
@@ -96,23 +72,11 @@ def eigenspaces(A: Floats, *, tol: float) -> tuple[Eigenspace, ...]:
 def unstable_subspace(A: Floats, *, discrete: bool, tol: float) -> Floats:
     """X_u(A): the span of the generalised eigenvectors of all unstable eigenvalues.
 
-    Parameters
-    ----------
-    A : (n, n)
-        Real matrix.
-    discrete
-        Sampled time.
-    tol
-        As in `eigenspaces` and `Eigenspace.unstable`.
-
-    Returns
-    -------
-    (n, d)
-        Real orthonormal basis.
-
-    References
-    ----------
-    lee2018, Notation and Symbols.
+    A (n, n).
+    discrete: sampled time.
+    tol: as in `eigenspaces` and `Eigenspace.unstable`.
+    Returns (n, d): real orthonormal basis.
+    Source: lee2018, Notation and Symbols.
     """
     return _part(A, discrete=discrete, tol=tol, unstable=True)
 
@@ -230,21 +194,12 @@ By = Literal["eigenvectors", "rank"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Index:
-    """Smallest set of sensors of an invisible attack, and its direction.
+    """Smallest set of sensors of an invisible attack, and its direction."""
 
-    Attributes
-    ----------
-    count
-        The index; infinite if no number of sensors suffices.
-    sensors : (count,)
-        A smallest set of sensors; empty if there is none.
-    direction : (n,)
-        Apparent displacement of the state; empty if there is none. Complex directions stand for their real
-        part, which is seen by the same sensors and has a norm of at least sqrt(1/2).
-    """
-
-    count: float
-    sensors: Ints
+    count: float  # the index; infinite if no number of sensors suffices
+    sensors: Ints  # (count,) a smallest set of sensors; empty if there is none
+    # (n,) apparent displacement of the state; empty if there is none. Complex directions stand for their real
+    # part, which is seen by the same sensors and has a norm of at least sqrt(1/2)
     direction: Matrix
 
     @property
@@ -264,22 +219,10 @@ class Index:
 def observability(A: Floats, C: Floats, steps: int | None = None) -> Floats:
     """Observability matrices of the single sensors, `G_i = [c_i; c_i A; …; c_i A^(k-1)]`.
 
-    Parameters
-    ----------
-    A : (n, n)
-    C : (p, n)
-        The pair.
-    steps
-        k; n by default.
-
-    Returns
-    -------
-    (p, k, n)
-        G_i in `[i]`; reshaped to (p k, n) it is the stacked G of the paper.
-
-    References
-    ----------
-    lee2018 (3.1.3), (3.1.4).
+    A (n, n), C (p, n).
+    steps: k; n by default.
+    Returns (p, k, n): G_i in `[i]`; reshaped to (p k, n) it is the stacked G of the paper.
+    Source: lee2018 (3.1.3), (3.1.4).
     """
     k = A.shape[0] if steps is None else steps
     out = np.empty((C.shape[0], k, A.shape[0]))
@@ -296,18 +239,10 @@ def observable_rows(A: Floats, C: Floats, *, tol: float) -> tuple[Floats, ...]:
     By Arnoldi's method on A^T, which does not form powers of A, so that ranks stay decidable if G_i itself is
     badly scaled. The kernel is the unobservable subspace of the pair (A, c_i).
 
-    Parameters
-    ----------
-    A, C : (n, n), (p, n)
-        The pair.
-    tol
-        A new row shorter than this times |A| counts as dependent. A sensor with a row up to this fraction of
+    A (n, n), C (p, n).
+    tol: a new row shorter than this times |A| counts as dependent. A sensor with a row up to this fraction of
         the longest measures nothing.
-
-    Returns
-    -------
-    p times (rank G_i, n)
-        Empty for a sensor that measures nothing.
+    Returns p times (rank G_i, n): empty for a sensor that measures nothing.
     """
     size = float(np.linalg.norm(A, 2)) or 1.0
     rows = unit_rows(np.asarray(C, dtype=np.float64), tol=tol)
@@ -334,17 +269,10 @@ def _sensors(C: Floats, tol: float) -> list[Matrix]:
 def static_index(C: Floats, *, tol: float) -> Index:
     """alpha_s(C) = cospark(C), the index of one snapshot of readings.
 
-    Parameters
-    ----------
-    C : (p, n)
-        Output matrix.
-    tol
-        A product of a sensor's unit row with a unit state up to this counts as zero. A sensor with a row up
+    C (p, n).
+    tol: a product of a sensor's unit row with a unit state up to this counts as zero. A sensor with a row up
         to this fraction of the longest measures nothing.
-
-    References
-    ----------
-    lee2018 (3.2.2).
+    Source: lee2018 (3.2.2).
     """
     found = fewest(_sensors(C, tol), np.eye(C.shape[1]), tol=tol)
     return Index(found.count, frozen_ints(found.blocks), found.direction)
@@ -357,23 +285,11 @@ def dynamic_index(A: Floats, C: Floats, *, tol: float, by: By = "eigenvectors") 
 
     The same number for sampled and for continuous time.
 
-    Parameters
-    ----------
-    A, C : (n, n), (p, n)
-        The pair.
-    tol
-        Tolerance of zero, relative to unit vectors, |A| and the longest row of C.
-    by
-        "eigenvectors": over every eigenspace, (3.2.4). "rank": over all states, (3.2.3).
-
-    Raises
-    ------
-    ValueError
-        If `by` is another text.
-
-    References
-    ----------
-    lee2018 (3.2.3), Proposition 3.2.2.
+    A (n, n), C (p, n).
+    tol: tolerance of zero, relative to unit vectors, |A| and the longest row of C.
+    by: "eigenvectors": over every eigenspace, (3.2.4). "rank": over all states, (3.2.3).
+    Raises ValueError if `by` is another text.
+    Source: lee2018 (3.2.3), Proposition 3.2.2.
     """
     raise_if_any(no_choice("by", get_args(By), by))
     if by == "rank":
@@ -387,31 +303,14 @@ def asymptotic_index(A: Floats, C: Floats, *, discrete: bool, tol: float, by: By
 
         min over x outside X_s(A) of |G x|_{0^n}   =   min over unstable eigenvectors v of |C v|_0
 
-    Parameters
-    ----------
-    A, C : (n, n), (p, n)
-        The pair.
-    discrete
-        True if A is the matrix of a sampled system (unstable: |lambda| >= 1), False for that of a
+    A (n, n), C (p, n).
+    discrete: True if A is the matrix of a sampled system (unstable: |lambda| >= 1), False for that of a
         differential equation (Re lambda >= 0).
-    tol
-        Tolerance of zero. An eigenvalue within this of the border counts as unstable.
-    by
-        As in `dynamic_index`.
-
-    Returns
-    -------
-    Index
-        Infinite for a stable A.
-
-    Raises
-    ------
-    ValueError
-        If `by` is another text.
-
-    References
-    ----------
-    lee2018 (3.2.5), Proposition 3.2.4.
+    tol: tolerance of zero. An eigenvalue within this of the border counts as unstable.
+    by: as in `dynamic_index`.
+    The index of a stable A is infinite.
+    Raises ValueError if `by` is another text.
+    Source: lee2018 (3.2.5), Proposition 3.2.4.
     """
     raise_if_any(no_choice("by", get_args(By), by))
     if by == "rank":
@@ -442,25 +341,12 @@ def _turned(direction: Matrix) -> Matrix:
 def redundant_observable(A: Floats, C: Floats, q: int, *, tol: float, by: By = "eigenvectors") -> bool:
     """True if (A, C) stays observable after the loss of any q sensors.
 
-    Parameters
-    ----------
-    A, C : (n, n), (p, n)
-        The pair.
-    q
-        Number of sensors lost.
-    tol
-        As in `dynamic_index`.
-    by
-        "eigenvectors": `|C v|_0 > q` for every eigenvector. "rank": all C(p, q) stacked matrices.
-
-    Raises
-    ------
-    ValueError
-        If `by` is another text.
-
-    References
-    ----------
-    lee2018, Definition 3.1.1, Propositions 3.1.1 (iii) and 3.1.2 (ii).
+    A (n, n), C (p, n).
+    q: number of sensors lost.
+    tol: as in `dynamic_index`.
+    by: "eigenvectors": `|C v|_0 > q` for every eigenvector. "rank": all C(p, q) stacked matrices.
+    Raises ValueError if `by` is another text.
+    Source: lee2018, Definition 3.1.1, Propositions 3.1.1 (iii) and 3.1.2 (ii).
     """
     raise_if_any(no_choice("by", get_args(By), by))
     if by == "eigenvectors":
@@ -474,21 +360,10 @@ def redundant_detectable(
 ) -> bool:
     """True if (A, C) stays detectable after the loss of any q sensors.
 
-    Parameters
-    ----------
-    A, C, q, tol, by
-        As in `redundant_observable`.
-    discrete
-        As in `asymptotic_index`.
-
-    Raises
-    ------
-    ValueError
-        If `by` is another text.
-
-    References
-    ----------
-    lee2018, Definition 3.1.3, Propositions 3.1.8 (ii) and 3.1.9 (ii).
+    A, C, q, tol, by: as in `redundant_observable`.
+    discrete: as in `asymptotic_index`.
+    Raises ValueError if `by` is another text.
+    Source: lee2018, Definition 3.1.3, Propositions 3.1.8 (ii) and 3.1.9 (ii).
     """
     raise_if_any(no_choice("by", get_args(By), by))
     if by == "eigenvectors":
@@ -504,19 +379,9 @@ def unobservable_subspace(A: Floats, C: Floats, q: int = 0, *, tol: float) -> Fl
 
         sum over |Lambda| = p - q of N(G_Lambda)
 
-    Parameters
-    ----------
-    A, C, q, tol
-        As in `redundant_observable`. The whole space for q >= p. Costs C(p, q) kernels.
-
-    Returns
-    -------
-    (n, d)
-        Orthonormal basis. Its orthogonal complement is the redundant observable subspace.
-
-    References
-    ----------
-    lee2018, Definition 3.1.2, Propositions 3.1.4 and 3.1.6.
+    A, C, q, tol: as in `redundant_observable`. The whole space for q >= p. Costs C(p, q) kernels.
+    Returns (n, d): orthonormal basis. Its orthogonal complement is the redundant observable subspace.
+    Source: lee2018, Definition 3.1.2, Propositions 3.1.4 and 3.1.6.
     """
     return _summed(A, C, q, np.eye(A.shape[0]), tol)
 
@@ -526,19 +391,9 @@ def undetectable_subspace(A: Floats, C: Floats, q: int = 0, *, discrete: bool, t
 
         sum over |Lambda| = p - q of N(G_Lambda) ∩ X_u(A)
 
-    Parameters
-    ----------
-    A, C, q, discrete, tol
-        As in `redundant_detectable`.
-
-    Returns
-    -------
-    (n, d)
-        Orthonormal basis. Its orthogonal complement is the redundant detectable subspace.
-
-    References
-    ----------
-    lee2018, Definition 3.1.4, Propositions 3.1.11 and 3.1.13.
+    A, C, q, discrete, tol: as in `redundant_detectable`.
+    Returns (n, d): orthonormal basis. Its orthogonal complement is the redundant detectable subspace.
+    Source: lee2018, Definition 3.1.4, Propositions 3.1.11 and 3.1.13.
     """
     return _summed(A, C, q, unstable_subspace(A, discrete=discrete, tol=tol), tol)
 
@@ -571,21 +426,14 @@ def _lost(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hidden:
-    """Motions of a system with an unknown input that cannot be distinguished from rest.
+    """Motions of a system with an unknown input that cannot be distinguished from rest."""
 
-    Attributes
-    ----------
-    weakly_unobservable : (n, d)
-        Basis of the initial states with an input that keeps the output zero for ever.
-    controllable : (n, c)
-        Basis of those among them that are reached from rest with zero output: the input stays hidden there
-        without any effect on the initial state.
-    zeros : (d - c,)
-        Invariant zeros: the eigenvalues of the remaining motion, which no input can change.
-    """
-
+    # (n, d) basis of the initial states with an input that keeps the output zero for ever
     weakly_unobservable: Floats
+    # (n, c) basis of those among them that are reached from rest with zero output: the input stays hidden
+    # there without any effect on the initial state
     controllable: Floats
+    # (d - c,) invariant zeros: the eigenvalues of the remaining motion, which no input can change
     zeros: NDArray[np.complex128]
 
     @property
@@ -596,16 +444,9 @@ class Hidden:
     def strongly_detectable(self, *, discrete: bool, tol: float) -> bool:
         """True if zero output implies a state that decays, for any input.
 
-        Parameters
-        ----------
-        discrete
-            Sampled time: zeros must have modulus below 1; otherwise a negative real part.
-        tol
-            Distance from that border within which a zero counts as unstable.
-
-        References
-        ----------
-        lee2018, Proposition 3.1.10 (iii), corrected: docs/errata/lee2018-chapter-3.md.
+        discrete: sampled time: zeros must have modulus below 1; otherwise a negative real part.
+        tol: distance from that border within which a zero counts as unstable.
+        Source: lee2018, Proposition 3.1.10 (iii), corrected: docs/errata/lee2018-chapter-3.md.
         """
         size = np.abs(self.zeros) - 1.0 if discrete else self.zeros.real
         return bool(self.controllable.shape[1] == 0 and np.all(size < -tol))
@@ -617,17 +458,10 @@ def hidden(A: Floats, B: Floats, C: Floats, D: Floats, *, tol: float) -> Hidden:
         V_0 = R^n,  V_(k+1) = {x : exists a with A x + B a in V_k, C x + D a = 0}
         T_0 = 0,    T_(k+1) = {A x + B a : x in T_k, C x + D a = 0},   controllable part = V ∩ T
 
-    Parameters
-    ----------
-    A, B, C, D : (n, n), (n, m), (p, n), (p, m)
-        The system, preferably in units with entries of order one.
-    tol
-        Singular values up to this, times the largest of the system's, count as zero.
-
-    References
-    ----------
-    H. Trentelman, A. Stoorvogel, M. Hautus, "Control theory for linear systems", Springer, 2001,
-    chapter 7; lee2018, section 3.1.2.
+    A (n, n), B (n, m), C (p, n), D (p, m): the system, preferably in units with entries of order one.
+    tol: singular values up to this, times the largest of the system's, count as zero.
+    Source: H. Trentelman, A. Stoorvogel, M. Hautus, "Control theory for linear systems", Springer, 2001,
+        chapter 7; lee2018, section 3.1.2.
     """
     whole = np.block([[A, B], [C, D]])
     size = float(np.linalg.norm(whole, 2)) or 1.0
@@ -653,18 +487,10 @@ def under_attack(A: Floats, C: Floats, manipulated: Sequence[int], *, tol: float
 
     The system `x+ = A x`, `y = C x + I_manipulated a` of the paper's (3.1.6).
 
-    Parameters
-    ----------
-    A, C : (n, n), (p, n)
-        The pair.
-    manipulated
-        Sensors under the attacker's control.
-    tol
-        As in `hidden`. A sensor with a row up to this fraction of the longest measures nothing.
-
-    References
-    ----------
-    lee2018 (3.1.6), Propositions 3.1.3 and 3.1.10.
+    A (n, n), C (p, n).
+    manipulated: sensors under the attacker's control.
+    tol: as in `hidden`. A sensor with a row up to this fraction of the longest measures nothing.
+    Source: lee2018 (3.1.6), Propositions 3.1.3 and 3.1.10.
     """
     # All blocks scaled to the size of A, so that one tolerance suffices: units change no subspace.
     size = float(np.linalg.norm(A, 2)) or 1.0
@@ -703,36 +529,20 @@ def _reachable(A: Floats, B: Floats, C: Floats, D: Floats, tol: float) -> Floats
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FeederIndex:
-    """Smallest numbers of meters in an invisible coordinated attack, for exactly known loads.
+    """Smallest numbers of meters in an invisible coordinated attack, for exactly known loads."""
 
-    Attributes
-    ----------
-    static
-        From one snapshot of readings alone.
-    dynamic
-        From the readings of all time.
-    asymptotic
-        As `dynamic`, for attacks that do not decay; infinite for a stable closed loop.
-    A, C : (n, n), (p, n)
-        The linearisation.
-    """
-
-    static: Index
-    dynamic: Index
-    asymptotic: Index
-    A: Floats
-    C: Floats
+    static: Index  # from one snapshot of readings alone
+    dynamic: Index  # from the readings of all time
+    asymptotic: Index  # as `dynamic`, for attacks that do not decay; infinite for a stable closed loop
+    A: Floats  # (n, n) the linearisation
+    C: Floats  # (p, n)
 
 
 def slopes(lure: Lure, z: Floats, *, step: float) -> Floats:
     """Slopes of the nonlinearities at a point, by symmetric differences; (m,).
 
-    Parameters
-    ----------
-    z : (m,)
-        Arguments of the nonlinearities.
-    step
-        Half the width of the difference, in the unit of z. Near a kink closer than this, the result is a
+    z (m,): arguments of the nonlinearities.
+    step: half the width of the difference, in the unit of z. Near a kink closer than this, the result is a
         mixture of the slopes on both sides.
     """
     return np.asarray((lure.phi(z + step) - lure.phi(z - step)) / (2.0 * step))
@@ -741,10 +551,7 @@ def slopes(lure: Lure, z: Floats, *, step: float) -> Floats:
 def linearise(lure: Lure, slope: Floats) -> tuple[Floats, Floats]:
     """The pair `(A + G diag(slope) H, C)` of a Lur'e system about a trajectory with these slopes.
 
-    Parameters
-    ----------
-    slope : (m,)
-        Slope of each nonlinearity, from `slopes`; `lure.slope` for the steepest; 0 in deadband.
+    slope (m,): slope of each nonlinearity, from `slopes`; `lure.slope` for the steepest; 0 in deadband.
     """
     return lure.A + (lure.G * slope) @ lure.H, np.asarray(lure.C)
 
@@ -756,14 +563,9 @@ def feeder_index(lure: Lure, slope: Floats, *, tol: float) -> FeederIndex:
     independently; those with equal time constants share one eigenspace, on which the dynamic index falls to
     the static one of their columns.
 
-    Parameters
-    ----------
-    lure
-        Closed loop, from `close_loop`.
-    slope : (m,)
-        As in `linearise`.
-    tol
-        As in `dynamic_index`.
+    lure: closed loop, from `close_loop`.
+    slope (m,): as in `linearise`.
+    tol: as in `dynamic_index`.
     """
     A, C = linearise(lure, slope)
     return FeederIndex(
