@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, frozen
-from gridsec.errors import DesignInfeasible, InputInvalid, Problem, no_choice, raise_if_any
+from gridsec.errors import DesignInfeasible, InputInvalid, no_choice, raise_if_any
 from gridsec.observers.certificates import Certificate, certify, error_bound, feeds
 from gridsec.observers.gains import CircleGains, CircleOptions, margin, sensitivity, state_bound
 from gridsec.observers.lmi import circle, contraction
@@ -80,8 +80,8 @@ def design(
     """
     trusted = np.asarray(trusted, dtype=np.bool_)
     if trusted.shape != (len(lure.C),):
-        raise InputInvalid(
-            [Problem("shape", f"trusted has shape {trusted.shape}; the plant has {len(lure.C)} meters")]
+        raise InputInvalid.of(
+            "shape", f"trusted has shape {trusted.shape}; the plant has {len(lure.C)} meters"
         )
     if isinstance(gains, str):
         raise_if_any(no_choice("gains", ("direct", "lmi"), gains))
@@ -91,13 +91,8 @@ def design(
     if isinstance(gains, CircleGains):
         made = gains
         if sorted(made.J.tolist()) != meters.tolist():
-            raise InputInvalid(
-                [
-                    Problem(
-                        "wrong-design",
-                        f"the design is for the meters {made.J.tolist()}, not {meters.tolist()}",
-                    )
-                ]
+            raise InputInvalid.of(
+                "wrong-design", f"the design is for the meters {made.J.tolist()}, not {meters.tolist()}"
             )
         held = margin(lure, made.J, made)
         if not held > 0.0:
@@ -106,9 +101,7 @@ def design(
             )
         made = replace(made, margin=held)
     elif options is None:
-        raise InputInvalid(
-            [Problem("missing", 'gains="lmi" needs options: gridsec.observers.lmi.options_for')]
-        )
+        raise InputInvalid.of("missing", 'gains="lmi" needs options: gridsec.observers.lmi.options_for')
     else:
         made = circle(
             lure,

@@ -80,8 +80,8 @@ def design(
     trusted = np.array(trusted, dtype=np.bool_)
     trusted.flags.writeable = False
     if trusted.shape != (len(system.C),):
-        raise InputInvalid(
-            [Problem("shape", f"trusted has shape {trusted.shape}; the plant has {len(system.C)} meters")]
+        raise InputInvalid.of(
+            "shape", f"trusted has shape {trusted.shape}; the plant has {len(system.C)} meters"
         )
     if isinstance(gains, str):
         raise_if_any(no_choice("gains", ("lmi",), gains))
@@ -91,21 +91,16 @@ def design(
     if isinstance(gains, DiscreteGains):
         made = gains
         if sorted(made.J.tolist()) != meters.tolist():
-            raise InputInvalid(
-                [
-                    Problem(
-                        "wrong-design",
-                        f"the design is for the meters {made.J.tolist()}, not {meters.tolist()}",
-                    )
-                ]
+            raise InputInvalid.of(
+                "wrong-design", f"the design is for the meters {made.J.tolist()}, not {meters.tolist()}"
             )
         held = discrete_margin(system, made.J, made)
         if not held > 0.0:
             what = f"discrete observer of the meters {meters.tolist()}"
             raise DesignInfeasible(what, "does not hold here", held, code="not-verified")
     elif options is None:
-        raise InputInvalid(
-            [Problem("missing", 'gains="lmi" needs options: gridsec.observers.lmi.discrete.discrete_options')]
+        raise InputInvalid.of(
+            "missing", 'gains="lmi" needs options: gridsec.observers.lmi.discrete.discrete_options'
         )
     else:
         made = discrete_circle(system, meters, options)
@@ -201,8 +196,8 @@ def settling_steps(design: DiscreteDesign, *, start: float, epsilon: float) -> i
     if design.growth * start <= epsilon:
         return 0
     if epsilon <= 0.0:
-        raise InputInvalid(
-            [Problem("not-positive", "epsilon must be positive unless the observers start in the true state")]
+        raise InputInvalid.of(
+            "not-positive", "epsilon must be positive unless the observers start in the true state"
         )
     return int(np.ceil(np.log(epsilon / (design.growth * start)) / np.log(design.decay)))
 
@@ -224,7 +219,7 @@ def stack(designs: Sequence[DiscreteDesign]) -> StackedObservers:
     Raises ValueError if the observers belong to different plants.
     """
     if any(one.system is not designs[0].system for one in designs):
-        raise InputInvalid([Problem("wrong-design", "the observers belong to different plants")])
+        raise InputInvalid.of("wrong-design", "the observers belong to different plants")
     return StackedObservers(
         designs[0].system,
         np.stack([one.trusted for one in designs]),

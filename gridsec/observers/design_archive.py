@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridsec.arrays import frozen, frozen_ints
-from gridsec.errors import DesignInfeasible, InputInvalid, Problem
+from gridsec.errors import DesignInfeasible, InputInvalid
 from gridsec.observers.gains import CircleGains, CircleOptions, margin, refuse_blind, sensitivity
 from gridsec.observers.lmi import BACKOFF, solve_many
 from gridsec.observers.lure import Lure
@@ -86,7 +86,7 @@ def from_bytes(blob: bytes) -> tuple[CircleGains, ...]:
 
 def _unpack(arrays: _Arrays) -> tuple[CircleGains, ...]:
     if str(arrays["format"]) != _FORMAT:
-        raise InputInvalid([Problem("unreadable", f"unknown format {arrays['format']!s}")])
+        raise InputInvalid.of("unreadable", f"unknown format {arrays['format']!s}")
     load, weight = frozen(arrays["load"]), frozen(arrays["weight"])
     taken = dict.fromkeys(np.unique(arrays["sizes"]).tolist(), 0)
     out = []

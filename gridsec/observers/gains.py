@@ -116,13 +116,8 @@ def options_for(
         floor=float(floor),
     )
     if len(options.load) != lure.F.shape[1] or len(options.weight) != len(lure.A):
-        raise InputInvalid(
-            [
-                Problem(
-                    "shape",
-                    f"load {options.load.shape} or weight {options.weight.shape} do not fit the plant",
-                )
-            ]
+        raise InputInvalid.of(
+            "shape", f"load {options.load.shape} or weight {options.weight.shape} do not fit the plant"
         )
     return options
 
@@ -150,8 +145,8 @@ def circle_matrix(lure: Lure, J: Ints | Sequence[int], gains: CircleGains) -> Fl
     """
     keep = np.isin(gains.J, np.asarray(J, dtype=np.intp))
     if np.count_nonzero(keep) != len(J):
-        raise InputInvalid(
-            [Problem("wrong-design", f"{list(J)} is not a subset of the design's meters {gains.J.tolist()}")]
+        raise InputInvalid.of(
+            "wrong-design", f"{list(J)} is not a subset of the design's meters {gains.J.tolist()}"
         )
     rows, L, K, N = gains.J[keep], gains.L[:, keep], gains.K[:, keep], gains.noise[keep]
     live = lure.slope > 0.0

@@ -20,7 +20,7 @@ from typing import Literal
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, frozen, spectral_radius
-from gridsec.errors import DesignInfeasible, InputInvalid, Problem, no_choice, raise_if_any
+from gridsec.errors import DesignInfeasible, InputInvalid, no_choice, raise_if_any
 from gridsec.observers.parts import (
     SensorDecomposition,
     StackedDecompositions,
@@ -105,7 +105,7 @@ def riccati_gain(part: SensorDecomposition, process: Floats, noise: float, *, ra
         decay).
     """
     if not 0.0 < rate <= 1.0:
-        raise InputInvalid([Problem("out-of-range", f"rate is {rate}; it must lie in (0, 1]")])
+        raise InputInvalid.of("out-of-range", f"rate is {rate}; it must lie in (0, 1]")
     size = part.t.size if rate == 1.0 else part.observable.shape[1]
     gain = np.zeros(part.t.size)
     if not size:
@@ -154,29 +154,19 @@ def design(
     parts = decompose(A, C, slowest=slowest, tol=tol)
     E, noise = np.asarray(bounds.E, dtype=np.float64), np.asarray(bounds.noise, dtype=np.float64)
     if E.ndim != 2 or E.shape[0] != len(A) or noise.shape != (len(parts),):
-        raise InputInvalid(
-            [
-                Problem(
-                    "shape",
-                    f"E has shape {E.shape} and noise {noise.shape} for n = {len(A)}, p = {len(parts)}",
-                )
-            ]
+        raise InputInvalid.of(
+            "shape", f"E has shape {E.shape} and noise {noise.shape} for n = {len(A)}, p = {len(parts)}"
         )
     if not (bounds.process >= 0.0 and np.all(noise >= 0.0)):
-        raise InputInvalid(
-            [Problem("negative", "bounds of disturbance and noise must be numbers and cannot be negative")]
+        raise InputInvalid.of(
+            "negative", "bounds of disturbance and noise must be numbers and cannot be negative"
         )
     if isinstance(gains, str):
         raise_if_any(no_choice("gains", ("riccati",), gains))
         weight = bounds.process**2 * E @ E.T
         if np.any(noise == 0.0):
-            raise InputInvalid(
-                [
-                    Problem(
-                        "not-positive",
-                        'gains="riccati" needs positive bounds of the noise; give the gains otherwise',
-                    )
-                ]
+            raise InputInvalid.of(
+                "not-positive", 'gains="riccati" needs positive bounds of the noise; give the gains otherwise'
             )
         chosen = [
             riccati_gain(part, weight, float(size) ** 2, rate=rate)
@@ -185,9 +175,7 @@ def design(
     else:
         chosen = [np.asarray(gain, dtype=np.float64) for gain in gains]
     if [gain.shape for gain in chosen] != [part.t.shape for part in parts]:
-        raise InputInvalid(
-            [Problem("shape", f"gains must have the lengths {[part.t.size for part in parts]}")]
-        )
+        raise InputInvalid.of("shape", f"gains must have the lengths {[part.t.size for part in parts]}")
     whole = stack(parts, B)
     L = np.zeros((whole.phi.shape[0], len(parts)))
     for i, gain in enumerate(chosen):
@@ -256,8 +244,8 @@ def geometric(
     """
     F = part.S - np.outer(gain, part.t)
     if not spectral_radius(F) < beta < 1.0:
-        raise InputInvalid(
-            [Problem("out-of-range", f"beta is {beta}; it must lie between {spectral_radius(F):.6g} and 1")]
+        raise InputInvalid.of(
+            "out-of-range", f"beta is {beta}; it must lie between {spectral_radius(F):.6g} and 1"
         )
     # |F^j M| beta^-j is largest within the first K powers: later ones are shorter than those K before.
     powers, sizes = _powers(F / beta)

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.linalg import LinAlgError, block_diag, schur, solve_discrete_are
 
 from gridsec.arrays import Bools, Floats, Ints, frozen, frozen_ints, unit_rows
-from gridsec.errors import DesignInfeasible, InputInvalid, Problem
+from gridsec.errors import DesignInfeasible, InputInvalid
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,16 +57,10 @@ def decompose(A: Floats, C: Floats, *, slowest: float, tol: float) -> tuple[Sens
     """
     A, C = np.asarray(A, dtype=np.float64), np.asarray(C, dtype=np.float64)
     if A.ndim != 2 or A.shape[0] != A.shape[1] or C.ndim != 2 or C.shape[1] != A.shape[0]:
-        raise InputInvalid(
-            [Problem("shape", f"A has shape {A.shape} and C {C.shape}; (n, n) and (p, n) are needed")]
-        )
+        raise InputInvalid.of("shape", f"A has shape {A.shape} and C {C.shape}; (n, n) and (p, n) are needed")
     if not 0.0 <= slowest <= 1.0:
-        raise InputInvalid(
-            [
-                Problem(
-                    "out-of-range", f"slowest is {slowest}; it is the modulus of a decaying mode, in [0, 1]"
-                )
-            ]
+        raise InputInvalid.of(
+            "out-of-range", f"slowest is {slowest}; it is the modulus of a decaying mode, in [0, 1]"
         )
     return tuple(_part(A, c, row, slowest, tol) for c, row in zip(C, unit_rows(C, tol=tol), strict=True))
 

@@ -137,8 +137,8 @@ def inverters(
     told = np.zeros(0, dtype=np.intp) if reports is None else np.asarray(reports, dtype=np.intp)
     error = np.zeros(0) if report_error is None else np.asarray(report_error, dtype=np.float64)
     if told.size != error.size:
-        raise InputInvalid(
-            [Problem("shape", f"{told.size} inverters report, but {error.size} errors of reports are given")]
+        raise InputInvalid.of(
+            "shape", f"{told.size} inverters report, but {error.size} errors of reports are given"
         )
     whole = DiscreteLure(
         A=system.A,

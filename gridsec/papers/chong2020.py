@@ -19,7 +19,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from gridsec.arrays import Floats, Ints
-from gridsec.errors import InputInvalid, Problem
+from gridsec.errors import InputInvalid
 from gridsec.estimators.exact_bank import bank as banks
 from gridsec.grid.droop import Droop, fleet
 from gridsec.grid.radial import Feeder
@@ -192,7 +192,7 @@ def observe(
     count, bank = len(w), made.bank
     gains = bank.gains
     if gains is None:
-        raise InputInvalid([Problem("missing", "the bank needs explicit gains")])
+        raise InputInvalid.of("missing", "the bank needs explicit gains")
     L, K = gains.L, gains.K
 
     def field(t: float, flat: Floats) -> Floats:

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 
 from gridsec.arrays import Floats
-from gridsec.errors import InputInvalid, Problem
+from gridsec.errors import InputInvalid
 
 Style = Literal["solid", "dashed", "dotted", "dashdot", "points", "steps"]
 
@@ -47,8 +47,8 @@ class FigureCurve:
     def __post_init__(self) -> None:
         x, y = np.asarray(self.x, dtype=np.float64), np.asarray(self.y, dtype=np.float64)
         if x.ndim != 1 or x.shape != y.shape:
-            raise InputInvalid(
-                [Problem("shape", f"line {self.label!r}: x has shape {x.shape}, y has shape {y.shape}")]
+            raise InputInvalid.of(
+                "shape", f"line {self.label!r}: x has shape {x.shape}, y has shape {y.shape}"
             )
         object.__setattr__(self, "x", x)
         object.__setattr__(self, "y", y)

@@ -15,7 +15,7 @@ from math import comb
 import numpy as np
 
 from gridsec.arrays import Floats
-from gridsec.errors import InputInvalid, Problem
+from gridsec.errors import InputInvalid
 from gridsec.observers.lmi.sampled import DiscreteLure, advance
 from gridsec.observers.unknown_input import Missing, UnknownInputPlant, exact, obstruction, pairs_text
 from gridsec.papers import yang2021_feeder
@@ -47,7 +47,7 @@ def plant(example: int, *, corrected: bool = False) -> UnknownInputPlant:
         B = np.array([[1.0, 0.0, 1.0], [1.0, 1.0, 0.0], [0.0, 1.0, 1.0]])
         C = np.array([[1.0, 1.0, 3.0, 4.0], [3.0, 1.0, 2.0, 1.0], [1.0, 1.0, 1.0, 1.0]]).T
     else:
-        raise InputInvalid([Problem("out-of-range", f"example {example}: only 1 and 2 have plants")])
+        raise InputInvalid.of("out-of-range", f"example {example}: only 1 and 2 have plants")
     if corrected:
         row, column, value = CORRECTION_1 if example == 1 else CORRECTION_2
         C = C.copy()

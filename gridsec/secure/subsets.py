@@ -15,7 +15,7 @@ from math import comb
 import numpy as np
 
 from gridsec.arrays import Bools, Ints
-from gridsec.errors import DesignInfeasible, InputInvalid, NotObservable, Problem
+from gridsec.errors import DesignInfeasible, InputInvalid, NotObservable
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,7 +63,7 @@ def subsets(meters: int, max_attacked: int, *, most: int) -> Subsets:
     Source: chong2020, Theorem 1 (ii), equations (5) and (6).
     """
     if max_attacked < 0:
-        raise InputInvalid([Problem("negative", f"max_attacked is {max_attacked}; it cannot be negative")])
+        raise InputInvalid.of("negative", f"max_attacked is {max_attacked}; it cannot be negative")
     if meters <= 2 * max_attacked:
         raise NotObservable(
             range(meters),

@@ -169,22 +169,12 @@ def bank(
         and `proof` is given.
     """
     if max_attacked < 1:
-        raise InputInvalid(
-            [
-                Problem(
-                    "out-of-range",
-                    "max_attacked must be at least 1: otherwise there is nothing to isolate",
-                )
-            ]
+        raise InputInvalid.of(
+            "out-of-range", "max_attacked must be at least 1: otherwise there is nothing to isolate"
         )
     if (options is None) == (proof is None):
-        raise InputInvalid(
-            [
-                Problem(
-                    "inconsistent",
-                    "give options for gains by matrix inequality, or a proof for direct injection",
-                )
-            ]
+        raise InputInvalid.of(
+            "inconsistent", "give options for gains by matrix inequality, or a proof for direct injection"
         )
     masks = bank_masks(len(system.C), max_attacked, most=most)
     if proof is not None:
@@ -227,13 +217,9 @@ def design(
     sets = subsets(p, max_attacked, most=MOST_OBSERVERS)
     wanted = bank_masks(p, max_attacked)
     if not np.array_equal(np.stack([one.trusted for one in observers]), wanted):
-        raise InputInvalid(
-            [
-                Problem(
-                    "wrong-design",
-                    f"no bank for {p} meters and max_attacked {max_attacked}, in the order of `bank_masks`",
-                )
-            ]
+        raise InputInvalid.of(
+            "wrong-design",
+            f"no bank for {p} meters and max_attacked {max_attacked}, in the order of `bank_masks`",
         )
     gamma = np.array([one.noise_gain for one in observers]) if gains is None else np.asarray(gains)
     sizes = {"noise": noise, "start": start, "epsilon": epsilon, "unknown": unknown}
@@ -243,13 +229,8 @@ def design(
     if unknown > 0.0:
         level = level + np.array([one.unknown_gain for one in observers]) * unknown
     if not np.all(np.isfinite(level)):
-        raise InputInvalid(
-            [
-                Problem(
-                    "not-finite",
-                    "an observer has no finite bound of its error: no value would ever exceed it",
-                )
-            ]
+        raise InputInvalid.of(
+            "not-finite", "an observer has no finite bound of its error: no value would ever exceed it"
         )
     large, small = level[1 : 1 + sets.count_large], level[1 + sets.count_large :]
     spread = np.broadcast_to(small, sets.parent.shape).ravel()[sets.pairs].max(axis=1)

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints
-from gridsec.errors import InputInvalid, NotObservable, Problem
+from gridsec.errors import InputInvalid, NotObservable
 from gridsec.observers.high_gain.constants import Slopes
 from gridsec.observers.high_gain.intervals import Interval, interval, supremum
 
@@ -147,9 +147,7 @@ class System:
             )
         widths = {partial.inputs for partial in self.partials}
         if len(widths) != 1:
-            raise InputInvalid(
-                [Problem("shape", f"all sensors share the inputs, but have {sorted(widths)} of them")]
-            )
+            raise InputInvalid.of("shape", f"all sensors share the inputs, but have {sorted(widths)} of them")
         object.__setattr__(self, "x_bound", np.atleast_1d(np.asarray(self.x_bound, dtype=np.float64)))
         sizes = np.array([partial.size for partial in self.partials])
         object.__setattr__(self, "mask", np.arange(sizes.max())[None, :] < sizes[:, None])

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
 from gridsec.arrays import Floats
-from gridsec.errors import InputInvalid, Problem
+from gridsec.errors import InputInvalid
 
 _ULPS = 2
 
@@ -103,9 +103,7 @@ def _absolute(a: object) -> Interval:
 def _power(a: object, b: object) -> Interval:
     p, exponent = interval(a), float(np.asarray(b, dtype=np.float64))
     if exponent != int(exponent):
-        raise InputInvalid(
-            [Problem("not-integer", f"only integer powers of intervals are defined, not {exponent}")]
-        )
+        raise InputInvalid.of("not-integer", f"only integer powers of intervals are defined, not {exponent}")
     k = int(exponent)
     if k < 0:
         return _divide(1.0, _power(a, -k))

@@ -24,7 +24,7 @@ from gridsec.arrays import Floats, Ints, frozen, frozen_ints
 from gridsec.errors import DesignInfeasible
 from gridsec.observers.certificates import Certificate, feeds, quadratic
 from gridsec.observers.gains import CircleGains, CircleOptions, margin, options_for, refuse_blind, sensitivity
-from gridsec.observers.lmi.solver import cvxpy_late, solver_warnings_as_status
+from gridsec.observers.lmi.solver import BACKOFF, cvxpy_late, first_proven, solve
 from gridsec.observers.lure import Lure
 from gridsec.processes import deaf, listen, stop
 
@@ -33,8 +33,6 @@ __all__ = ["BACKOFF", "circle", "contraction", "prove", "settle", "solve_many"]
 # Slack of the scaled inequality, with entries of order one: a hundred times the solver's tolerance, so that
 # its last digits cannot decide the sign of the margin.
 _SLACK = 1e-6
-# Relaxations tried, in order, if the rebuilt inequality is violated.
-BACKOFF = (0.0, 1e-4, 1e-3, 1e-2, 5e-2)
 # Subsets per task of `solve_many`: enough to share one canonicalisation, few enough for steady progress.
 _CHUNK = 5
 
@@ -109,12 +107,8 @@ def contraction(lure: Lure, *, rate: float) -> Certificate:
     slack = cp.Variable()
     constraints = [whole << -slack * np.eye(2 * n), P >> slack * np.eye(n), cp.trace(P) == n]
     problem = cp.Problem(cp.Maximize(slack), constraints)
-    try:
-        with solver_warnings_as_status():
-            problem.solve(solver=cp.CLARABEL)
-    except cp.error.SolverError as failure:
-        raise DesignInfeasible(what, f"the solver failed: {failure}", code="solver-failed") from failure
-    if problem.status not in {cp.OPTIMAL, cp.OPTIMAL_INACCURATE} or not slack.value > 0.0:
+    solve(problem, what)
+    if not slack.value > 0.0:
         raise DesignInfeasible(
             what, f"the inequality has no solution ({problem.status})", slack.value, code="no-solution"
         )
@@ -304,22 +298,13 @@ class _Template:
 
         Raises DesignInfeasible as in `circle`.
         """
-        cp = cvxpy_late()
         lure, options, live = self.lure, self.options, self.live
         what = f"circle-criterion observer of the meters {J.tolist()} at rate {options.rate:g}/s"
         self.C.value = lure.C[J] * self.x_unit / self.z_unit
         self.D.value = lure.D[J] @ options.load / self.z_unit
         self.N.value = (options.noise[J] / self.noise_unit)[None, :]
         self.at.value = feeds(lure)[np.ix_(live, J)].astype(np.float64)
-        try:
-            with solver_warnings_as_status():
-                self.problem.solve(solver=cp.CLARABEL)
-        except cp.error.SolverError as failure:
-            raise DesignInfeasible(what, f"the solver failed: {failure}", code="solver-failed") from failure
-        if self.problem.status not in {cp.OPTIMAL, cp.OPTIMAL_INACCURATE}:
-            raise DesignInfeasible(
-                what, f"the inequality has no solution ({self.problem.status})", code="no-solution"
-            )
+        solve(self.problem, what)
         return settle(lure, self._in_plant_units(J), what, blind=self.given is not None)
 
     def _in_plant_units(self, J: Ints) -> CircleGains:
@@ -366,9 +351,8 @@ def settle(lure: Lure, found: CircleGains, what: str, *, blind: bool = False) ->
     blind: accept gains that use no meter.
     Raises DesignInfeasible if every step fails, or if the design uses no meter.
     """
-    best = -np.inf
-    for step in BACKOFF:
-        tried = replace(
+    tries = (
+        replace(
             found,
             alpha=found.alpha * (1.0 - step),
             nu=found.nu * (1.0 - step),
@@ -376,12 +360,9 @@ def settle(lure: Lure, found: CircleGains, what: str, *, blind: bool = False) ->
             mu_delta=found.mu_delta * (1.0 + step),
             backoff=step,
         )
-        reached = margin(lure, found.J, tried)
-        if reached > 0.0:
-            if not blind:
-                refuse_blind(found.J, found.sensitivity)
-            return replace(tried, margin=reached)
-        best = max(best, reached)
-    raise DesignInfeasible(
-        what, f"solver: {found.status}, but the rebuilt inequality is violated", best, code="not-verified"
+        for step in BACKOFF
     )
+    made, reached = first_proven(tries, lambda tried: margin(lure, found.J, tried), what, found.status)
+    if not blind:
+        refuse_blind(found.J, found.sensitivity)
+    return replace(made, margin=reached)

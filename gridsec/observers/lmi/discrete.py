@@ -22,7 +22,7 @@ from gridsec.arrays import Floats, Ints, frozen, frozen_ints
 from gridsec.errors import DesignInfeasible, InputInvalid, Problem, raise_if_any
 from gridsec.observers.gains import negativity
 from gridsec.observers.lmi.sampled import DiscreteLure, shift
-from gridsec.observers.lmi.solver import cvxpy_late, solver_warnings_as_status
+from gridsec.observers.lmi.solver import BACKOFF, cvxpy_late, first_proven, solve
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,8 +42,8 @@ class UncertaintyInputs:
         for name in ("state", "argument", "output"):
             object.__setattr__(self, name, frozen(getattr(self, name)))
         if not self.state.shape[1] == self.argument.shape[1] == self.output.shape[1]:
-            raise InputInvalid(
-                [Problem("shape", "state, argument and output must have one column for each entry of delta")]
+            raise InputInvalid.of(
+                "shape", "state, argument and output must have one column for each entry of delta"
             )
 
 
@@ -112,8 +112,8 @@ def discrete_matrix(system: DiscreteLure, J: Ints | Sequence[int], gains: Discre
     """
     keep = np.isin(gains.J, np.asarray(J, dtype=np.intp))
     if np.count_nonzero(keep) != len(J):
-        raise InputInvalid(
-            [Problem("wrong-design", f"{list(J)} is not a subset of the design's meters {gains.J.tolist()}")]
+        raise InputInvalid.of(
+            "wrong-design", f"{list(J)} is not a subset of the design's meters {gains.J.tolist()}"
         )
     rows, L, K, N = gains.J[keep], gains.L[:, keep], gains.K[:, keep], gains.noise[keep]
     moved, lower = shift(system), system.G * system.lower
@@ -222,8 +222,6 @@ def direct_gain_bound(system: DiscreteLure, proof: DirectProof, rows: Floats) ->
 
 # Slack of the scaled inequality, as in circle_criterion: far above the solver's tolerance.
 _SLACK = 1e-7
-# Enlargements of mu and mu_delta tried, in order, if the rebuilt inequality is violated.
-_BACKOFF = (0.0, 1e-4, 1e-3, 1e-2, 5e-2)
 # Relative influence on the observer below which a meter counts as ignored.
 _BLIND = 1e-3
 
@@ -486,7 +484,6 @@ class _Template:
 
     def solve(self, J: Ints, decay: float) -> DiscreteGains:
         """Design for one set at one decay, verified."""
-        cp = cvxpy_late()
         what = f"discrete circle-criterion observer of the meters {J.tolist()} at decay {decay:g} per step"
         if len(J):
             self.C.value = self.system.C[J] * self.x_unit / self.y_unit
@@ -495,16 +492,16 @@ class _Template:
         else:
             self.C.value = np.zeros((0, len(self.x_unit)))
         self.decay2.value = decay**2
-        try:
-            with solver_warnings_as_status():
-                self.problem.solve(solver=cp.CLARABEL)
-        except cp.error.SolverError as failure:
-            raise DesignInfeasible(what, f"the solver failed: {failure}", code="solver-failed") from failure
-        if self.problem.status not in {cp.OPTIMAL, cp.OPTIMAL_INACCURATE}:
-            raise DesignInfeasible(
-                what, f"the inequality has no solution ({self.problem.status})", code="no-solution"
-            )
-        return _settle(self.system, self._in_plant_units(J, decay), what)
+        solve(self.problem, what)
+        found = self._in_plant_units(J, decay)
+        tries = (
+            replace(found, mu=found.mu * (1.0 + part), mu_delta=found.mu_delta * (1.0 + part), backoff=part)
+            for part in BACKOFF
+        )
+        made, held = first_proven(
+            tries, lambda tried: discrete_margin(self.system, J, tried), what, found.status
+        )
+        return replace(made, margin=held)
 
     def _in_plant_units(self, J: Ints, decay: float) -> DiscreteGains:
         P, lam = (np.asarray(self.variables[i].value, dtype=np.float64) for i in (0, 2))
@@ -554,21 +551,3 @@ def _blocks(
     rows.append([*ahead, last])
     keep = [i for i in range(count + 1) if i == count or sizes[i] > 0]
     return [[rows[i][j] for j in keep] for i in keep]
-
-
-def _settle(system: DiscreteLure, found: DiscreteGains, what: str) -> DiscreteGains:
-    """Turn a solver's result into a proven design, or refuse it.
-
-    If the margin in plant units is not positive, mu and mu_delta are enlarged by the stated steps.
-    """
-    best = -np.inf
-    for step in _BACKOFF:
-        grown = 1.0 + step
-        tried = replace(found, mu=found.mu * grown, mu_delta=found.mu_delta * grown, backoff=step)
-        held = discrete_margin(system, tried.J, tried)
-        if held > 0.0:
-            return replace(tried, margin=held)
-        best = max(best, held)
-    raise DesignInfeasible(
-        what, f"the rebuilt inequality is violated ({found.status})", best, code="not-verified"
-    )

@@ -17,8 +17,7 @@ from scipy.linalg import expm
 
 from gridsec.arrays import Floats, exponential_integrals, spectral_radius
 from gridsec.errors import Problem, raise_if_any
-from gridsec.observers.lure import Lure, as_floats, freeze, input_matrices, without_lower
-from gridsec.observers.newton import Nonlinearity
+from gridsec.observers.lure import Lure, Nonlinearity, as_floats, freeze, input_matrices, without_lower
 
 
 @dataclass(frozen=True, slots=True, eq=False)

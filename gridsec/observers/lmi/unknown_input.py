@@ -12,8 +12,8 @@ quadratic `V = e^T P e` with
 
 The inequality is rebuilt in NumPy before a design leaves this module.
 
-Source: yang2021 (33) to (36), which leaves the design to Witczak, Korbicz, Puig, "An LMI approach to designing
-observers and unknown input observers for nonlinear systems", 2006. Derivation: docs/theory-unknown-input.md.
+Source: yang2021 (33) to (36); Witczak, Korbicz, Puig, "An LMI approach to designing observers and unknown
+input observers for nonlinear systems", 2006. Derivation: docs/theory-unknown-input.md.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from gridsec.arrays import Floats, frozen
-from gridsec.errors import DesignInfeasible, InputInvalid, Problem, no_choice, raise_if_any
-from gridsec.observers.lmi.solver import cvxpy_late, solver_warnings_as_status
+from gridsec.errors import InputInvalid, Problem, no_choice, raise_if_any
+from gridsec.observers.lmi.solver import cvxpy_late, first_proven, solve
 
 Multiplier = Literal["diagonal", "scalar"]
 
@@ -67,9 +67,9 @@ class ErrorSystem:
         ]
         raise_if_any(wrong)
         if not np.all(self.N > 0.0):
-            raise InputInvalid([Problem("not-positive", "every sensor must have a positive error scale N")])
+            raise InputInvalid.of("not-positive", "every sensor must have a positive error scale N")
         if np.any(self.half < 0.0):
-            raise InputInvalid([Problem("negative", "half-widths of slopes cannot be negative")])
+            raise InputInvalid.of("negative", "half-widths of slopes cannot be negative")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -193,14 +193,9 @@ class UnknownInputTemplate:
             the rate is not inside (0, 1).
         """
         if not 0.0 < rate < 1.0:
-            raise InputInvalid(
-                [
-                    Problem(
-                        "out-of-range", f"the rate is {rate:g}; it is a contraction per step, between 0 and 1"
-                    )
-                ]
+            raise InputInvalid.of(
+                "out-of-range", f"the rate is {rate:g}; it is a contraction per step, between 0 and 1"
             )
-        cp = cvxpy_late()
         live = system.half > 0.0
         x = state_units(system)
         psi = system.half[live] * np.linalg.norm(system.H[live] * x, axis=1)
@@ -216,15 +211,7 @@ class UnknownInputTemplate:
             self.S.value = system.S[:, live] * psi / x[:, None]
             bound = system.half[live, None] * system.H[live] * x / psi[:, None]
             self.sector.value = np.einsum("ma,mb->abm", bound, bound).reshape(x.size**2, -1)
-        try:
-            with solver_warnings_as_status():
-                self.problem.solve(solver=cp.CLARABEL)
-        except cp.error.SolverError as failure:
-            raise DesignInfeasible(what, f"the solver failed: {failure}", code="solver-failed") from failure
-        if self.problem.status not in {cp.OPTIMAL, cp.OPTIMAL_INACCURATE}:
-            raise DesignInfeasible(
-                what, f"the inequality has no solution ({self.problem.status})", code="no-solution"
-            )
+        solve(self.problem, what)
         P, Y, mu = (np.asarray(v.value, dtype=np.float64) for v in self.variables[:3])
         Lambda = np.zeros(system.half.size)
         if self.variables[3] is not None:
@@ -238,7 +225,11 @@ class UnknownInputTemplate:
             margin=np.nan,
             status=str(self.problem.status),
         )
-        return _settle(system, found, what)
+        tries = (replace(found, mu=found.mu * (1.0 + part)) for part in _BACKOFF)
+        made, held = first_proven(
+            tries, lambda tried: unknown_input_margin(system, tried), what, found.status
+        )
+        return replace(made, margin=held)
 
 
 def state_units(system: ErrorSystem) -> Floats:
@@ -271,16 +262,3 @@ def unknown_input(
     """
     shape = (len(system.M), system.N.size, int(np.count_nonzero(system.half > 0.0)))
     return UnknownInputTemplate(*shape, multiplier).solve(system, rate, what)
-
-
-def _settle(system: ErrorSystem, found: UnknownInputGains, what: str) -> UnknownInputGains:
-    best = -np.inf
-    for part in _BACKOFF:
-        tried = replace(found, mu=found.mu * (1.0 + part))
-        reached = unknown_input_margin(system, tried)
-        if reached > 0.0:
-            return replace(tried, margin=reached)
-        best = max(best, reached)
-    raise DesignInfeasible(
-        what, f"solver: {found.status}, but the rebuilt inequality is violated", best, code="not-verified"
-    )

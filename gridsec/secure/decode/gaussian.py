@@ -20,7 +20,7 @@ from scipy.linalg import solve_triangular
 from scipy.special import chdtr, chdtrc, chdtri, gammaln, xlogy
 
 from gridsec.arrays import Bools, Floats, Ints, frozen, frozen_ints
-from gridsec.errors import DesignInfeasible, InputInvalid, NotObservable, Problem, no_choice, raise_if_any
+from gridsec.errors import DesignInfeasible, InputInvalid, NotObservable, no_choice, raise_if_any
 from gridsec.secure.decode.stacks import MOST_SUBSETS, Stack, subsets
 
 # Terms of the continued fraction; for arguments beyond the largest double's logarithm two would suffice.
@@ -87,9 +87,7 @@ class Test:
         Raises ValueError if `false_alarm` is outside (0, 1).
         """
         if not 0.0 < false_alarm < 1.0:
-            raise InputInvalid(
-                [Problem("out-of-range", f"false_alarm is {false_alarm}; it must lie in (0, 1)")]
-            )
+            raise InputInvalid.of("out-of-range", f"false_alarm is {false_alarm}; it must lie in (0, 1)")
         return float(chdtri(self.freedom, false_alarm))
 
 

@@ -20,7 +20,7 @@ from scipy.optimize import brentq
 from scipy.special import chdtr
 
 from gridsec.arrays import Bools, Floats, Ints, not_negative
-from gridsec.errors import DesignInfeasible, InputInvalid, Problem
+from gridsec.errors import DesignInfeasible, InputInvalid
 from gridsec.secure.decode.search import Decoder, DecodeResult, bounded, cheapest
 from gridsec.secure.decode.stacks import MOST_SUBSETS, Stack, masked, require, residual, subsets
 
@@ -100,7 +100,7 @@ def correction_constants(
     p = stack.count
     r = cheapest(p, q) if left_out is None else left_out
     if not q <= r <= 2 * q:
-        raise InputInvalid([Problem("out-of-range", f"r = {r} with q = {q}; expected q <= r <= 2 q")])
+        raise InputInvalid.of("out-of-range", f"r = {r} with q = {q}; expected q <= r <= 2 q")
     rho, _ = _subset_norms(stack, subsets(p, p - 2 * q, most))
     smallest = float(rho.min())
     eta = _best_prediction(stack, q, r, most)
@@ -223,7 +223,7 @@ def bound_for(stack: Stack, P: Floats, probability: float, *, tol: float) -> flo
         is too coarse.
     """
     if not 0.0 < probability < 1.0:
-        raise InputInvalid([Problem("out-of-range", f"probability is {probability}; it must lie in (0, 1)")])
+        raise InputInvalid.of("out-of-range", f"probability is {probability}; it must lie in (0, 1)")
     size = float(np.sqrt(max(float(np.max(np.linalg.eigvalsh(P))), 0.0)))
     if size == 0.0:
         return 0.0
@@ -255,7 +255,7 @@ def quadratic_probability(values: Floats, limit: float, *, tol: float) -> float:
     """
     top = float(np.max(values, initial=0.0))
     if not np.all(np.isfinite(values) & (values >= -_ROUNDING * top)):
-        raise InputInvalid([Problem("negative", "weights must be finite and not negative")])
+        raise InputInvalid.of("negative", "weights must be finite and not negative")
     not_negative("limit", limit)
     used = values[values > 0.0]
     if limit == 0.0 or used.size == 0:

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, frozen
-from gridsec.errors import InputInvalid, Problem
+from gridsec.errors import InputInvalid
 from gridsec.observers import luenberger
 from gridsec.observers.luenberger import LuenbergerDesign, LuenbergerState
 from gridsec.secure.decode import search
@@ -88,7 +88,7 @@ def design(
     blocks = observers.stack.blocks
     size = np.ones(len(blocks)) if scale is None else np.asarray(scale, dtype=np.float64)
     if size.shape != (len(blocks),) or not np.all(np.isfinite(size) & (size > 0.0)):
-        raise InputInvalid([Problem("not-positive", "scale must have one positive number for each sensor")])
+        raise InputInvalid.of("not-positive", "scale must have one positive number for each sensor")
     stacked = Stack.of([block / s for block, s in zip(blocks, size, strict=True)])
     decoder = search.design(stacked, max_attacked, tol=tol, left_out=left_out)
     constants = correction_constants(stacked, max_attacked, tol=tol, left_out=decoder.left_out)

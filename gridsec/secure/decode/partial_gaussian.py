@@ -30,7 +30,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from gridsec.arrays import Bools, Floats, Ints, frozen, frozen_ints
-from gridsec.errors import InputInvalid, NotObservable, Problem
+from gridsec.errors import InputInvalid, NotObservable
 from gridsec.observers import kalman
 from gridsec.observers.kalman import KalmanDesign, KalmanState, Steady
 from gridsec.observers.parts import heard
@@ -195,13 +195,8 @@ def design(
         ValueError if `max_attacked` is below 1, or `false_alarm` not inside (0, 1).
     """
     if max_attacked < 1 or not 0.0 < false_alarm < 1.0:
-        raise InputInvalid(
-            [
-                Problem(
-                    "out-of-range",
-                    f"max_attacked is {max_attacked} (>= 1), false_alarm {false_alarm} (in (0, 1))",
-                )
-            ]
+        raise InputInvalid.of(
+            "out-of-range", f"max_attacked is {max_attacked} (>= 1), false_alarm {false_alarm} (in (0, 1))"
         )
     stacked = Stack.of(filters.stack.blocks)
     zero = float(np.sqrt(tol))
@@ -300,8 +295,8 @@ def decode(design: GaussianDesign, state: GaussianState) -> tuple[GaussianState,
 
 def _require_all(y: Floats, seen: Bools | None) -> None:
     if not np.all(heard(y, seen)):
-        raise InputInvalid(
-            [Problem("missing", "filters with stationary gains need every reading; design without `steady`")]
+        raise InputInvalid.of(
+            "missing", "filters with stationary gains need every reading; design without `steady`"
         )
 
 

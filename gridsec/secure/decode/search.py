@@ -20,8 +20,8 @@ the sum of absolute values of its coefficients, attained by some xi and v; no no
 Both recover the error from `F z = F e`, F an annihilator of Phi, fast, but under stronger conditions than
 correctability; otherwise they may fail. `gridsec.secure.decode.search` has no such conditions.
 
-Source: lee2018, section 2.1, (2.2.4) to (2.2.6), (2.2.8) to (2.2.8''), Theorems 2.2.7 and 2.2.11; for boxes in
-place of balls: docs/theory-partial-observers.md, section 8.
+Source: lee2018, section 2.1, (2.2.4) to (2.2.6), (2.2.8) to (2.2.8''), Theorems 2.2.7 and 2.2.11; for boxes:
+docs/theory-partial-observers.md, section 8.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ import numpy as np
 from scipy.optimize import linprog
 
 from gridsec.arrays import Bools, Floats, Ints, frozen, not_negative
-from gridsec.errors import DesignInfeasible, InputInvalid, Problem
+from gridsec.errors import DesignInfeasible, InputInvalid
 from gridsec.observers.lmi.solver import group_pursuit
 from gridsec.secure.decode.stacks import MOST_SUBSETS, Stack, annihilator, masked, require, subsets
 
@@ -84,13 +84,8 @@ def design(
     q = max_attacked
     r = cheapest(stack.count, q) if left_out is None else left_out
     if q < 0 or not q <= r <= 2 * q:
-        raise InputInvalid(
-            [
-                Problem(
-                    "out-of-range",
-                    f"r = {r} with q = {q}; expected 0 <= q <= r <= 2 q (lee2018, Theorem 2.2.7)",
-                )
-            ]
+        raise InputInvalid.of(
+            "out-of-range", f"r = {r} with q = {q}; expected 0 <= q <= r <= 2 q (lee2018, Theorem 2.2.7)"
         )
     require(stack, 2 * q, tol, f"undoing {q} errors")
     kept = subsets(stack.count, stack.count - r, most)

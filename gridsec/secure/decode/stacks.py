@@ -18,7 +18,7 @@ from math import comb
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, frozen, frozen_ints, unit_rows
-from gridsec.errors import DesignInfeasible, InputInvalid, NotObservable, Problem
+from gridsec.errors import DesignInfeasible, InputInvalid, NotObservable
 from gridsec.secure.index import Sparsest, fewest, kernel, row_space
 
 MOST_SUBSETS = 200_000
@@ -40,17 +40,12 @@ class Stack:
         object.__setattr__(self, "matrix", frozen(self.matrix))
         object.__setattr__(self, "heights", frozen_ints(self.heights))
         if self.matrix.ndim != 2 or self.heights.ndim != 1 or np.any(self.heights < 0):
-            raise InputInvalid(
-                [Problem("shape", "a stack needs a matrix and one height, not negative, for every block")]
+            raise InputInvalid.of(
+                "shape", "a stack needs a matrix and one height, not negative, for every block"
             )
         if int(self.heights.sum()) != self.matrix.shape[0]:
-            raise InputInvalid(
-                [
-                    Problem(
-                        "shape",
-                        f"heights sum to {self.heights.sum()}; the matrix has {self.matrix.shape[0]} rows",
-                    )
-                ]
+            raise InputInvalid.of(
+                "shape", f"heights sum to {self.heights.sum()}; the matrix has {self.matrix.shape[0]} rows"
             )
         block = np.repeat(np.arange(self.heights.size), self.heights)
         object.__setattr__(self, "membership", frozen(np.eye(self.heights.size)[block]))
