@@ -157,10 +157,7 @@ def quadratic(
 
 
 def certify(lure: Lure) -> Certificate:
-    """Closed-form certificate with the highest rate.
-
-    Raises DesignInfeasible if none holds; the message lists the reasons.
-    """
+    """Closed-form certificate with the highest rate; DesignInfeasible with the reasons if there is none."""
     found: list[Certificate] = []
     failed: list[DesignInfeasible] = []
     for attempt in (reactance, small_gain):
@@ -203,10 +200,7 @@ def verify(certificate: Certificate, lure: Lure, trusted: Bools | None = None) -
 
 
 def feeds(lure: Readout) -> Bools:
-    """Incidence of meters that can drive inverters of the observer, by equal voltages.
-
-    Returns (m, p): True where the rows of `(H, F)` and `(C, D)` agree.
-    """
+    """Meters that can drive inverters of the observer, (m, p): the rows of `(H, F)` and `(C, D)` agree."""
     inverters, meters = np.hstack([lure.H, lure.F]), np.hstack([lure.C, lure.D])
     same: Bools = np.all(inverters[:, None, :] == meters[None, :, :], axis=2)
     return same
@@ -341,10 +335,7 @@ def _span(lure: Lure) -> Floats:
 
 
 def _quadratic_form(P: Floats, multiplier: Floats, form: _Form) -> Floats:
-    """`P T^-1 + T^-1 P - b D Lambda^-1 b^T` with `b = P T^-1 - S^T Lambda`.
-
-    Twice the term of the circle criterion, so that half of it is left for the load error.
-    """
+    """`P T^-1 + T^-1 P - b D Lambda^-1 b^T` with `b = P T^-1 - S^T Lambda`; half is left for load errors."""
     scaled = P / form.tau
     b = scaled - form.S.T * multiplier
     return np.asarray(scaled + scaled.T - (b * (form.slope / multiplier)) @ b.T)

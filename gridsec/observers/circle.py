@@ -20,7 +20,7 @@ from gridsec.arrays import Bools, Floats, Ints, frozen
 from gridsec.errors import DesignInfeasible, InputInvalid, no_choice, raise_if_any
 from gridsec.observers.certificates import Certificate, certify, error_bound, feeds
 from gridsec.observers.gains import CircleGains, CircleOptions, margin, sensitivity, state_bound
-from gridsec.observers.lmi import circle, contraction
+from gridsec.observers.lmi import contraction, solve_many
 from gridsec.observers.lure import POLICY, Lure, Readout, StepPolicy, advance
 
 
@@ -78,11 +78,7 @@ def design(
     Raises DesignInfeasible if there is no certificate, or if the design uses no meter. ValueError if
         `trusted` has the wrong length, or contradicts the given design, or `gains` is another text.
     """
-    trusted = np.asarray(trusted, dtype=np.bool_)
-    if trusted.shape != (len(lure.C),):
-        raise InputInvalid.of(
-            "shape", f"trusted has shape {trusted.shape}; the plant has {len(lure.C)} meters"
-        )
+    trusted = meter_mask(trusted, len(lure.C))
     if isinstance(gains, str):
         raise_if_any(no_choice("gains", ("direct", "lmi"), gains))
     if gains == "direct":
@@ -90,10 +86,7 @@ def design(
     meters = np.flatnonzero(trusted)
     if isinstance(gains, CircleGains):
         made = gains
-        if sorted(made.J.tolist()) != meters.tolist():
-            raise InputInvalid.of(
-                "wrong-design", f"the design is for the meters {made.J.tolist()}, not {meters.tolist()}"
-            )
+        require_meters(made.J, meters)
         held = margin(lure, made.J, made)
         if not held > 0.0:
             raise DesignInfeasible(
@@ -103,16 +96,28 @@ def design(
     elif options is None:
         raise InputInvalid.of("missing", 'gains="lmi" needs options: gridsec.observers.lmi.options_for')
     else:
-        made = circle(
-            lure,
-            meters,
-            rate=options.rate,
-            noise=options.noise,
-            load=options.load,
-            weight=options.weight,
-            floor=options.floor,
+        made = solve_many(lure, [meters.tolist()], options, workers=1)[0]
+    L, K = np.zeros((len(lure.A), len(trusted))), np.zeros((len(lure.slope), len(trusted)))
+    L[:, made.J], K[:, made.J] = made.L, made.K
+    heard = frozen(sensitivity(lure, L, K))
+    return CircleDesign(lure, trusted, frozen(L), frozen(K), made.alpha, heard, made)
+
+
+def meter_mask(trusted: Bools, meters: int) -> Bools:
+    """Copy of `trusted` that is read-only; refused unless it is (p,) for p `meters`."""
+    mask = np.array(trusted, dtype=np.bool_)
+    if mask.shape != (meters,):
+        raise InputInvalid.of("shape", f"trusted has shape {mask.shape}; the plant has {meters} meters")
+    mask.flags.writeable = False
+    return mask
+
+
+def require_meters(J: Ints, meters: Ints) -> None:
+    """Refuse a design for the meters J unless these are `meters`."""
+    if sorted(J.tolist()) != meters.tolist():
+        raise InputInvalid.of(
+            "wrong-design", f"the design is for the meters {J.tolist()}, not {meters.tolist()}"
         )
-    return _from_gains(lure, trusted, made)
 
 
 def _direct(lure: Lure, trusted: Bools, options: CircleOptions | None) -> CircleDesign:
@@ -125,7 +130,7 @@ def _direct(lure: Lure, trusted: Bools, options: CircleOptions | None) -> Circle
             raise
         proof = contraction(lure, rate=rate)
     heard = sensitivity(lure, L, K)
-    return CircleDesign(lure, _mask(trusted), frozen(L), frozen(K), proof.rate, frozen(heard), proof)
+    return CircleDesign(lure, trusted, frozen(L), frozen(K), proof.rate, frozen(heard), proof)
 
 
 def _fallback_rate(lure: Lure, options: CircleOptions | None) -> float:
@@ -139,24 +144,8 @@ def _fallback_rate(lure: Lure, options: CircleOptions | None) -> float:
 _MODEST = 0.1
 
 
-def _from_gains(lure: Lure, trusted: Bools, made: CircleGains) -> CircleDesign:
-    L, K = np.zeros((len(lure.A), len(trusted))), np.zeros((len(lure.slope), len(trusted)))
-    L[:, made.J], K[:, made.J] = made.L, made.K
-    heard = frozen(sensitivity(lure, L, K))
-    return CircleDesign(lure, _mask(trusted), frozen(L), frozen(K), made.alpha, heard, made)
-
-
-def _mask(trusted: Bools) -> Bools:
-    out = np.array(trusted, dtype=np.bool_)
-    out.flags.writeable = False
-    return out
-
-
 def error_norm(design: CircleDesign, e: Floats) -> Floats:
-    """Norm of errors e (…, n) that decays at least like `exp(-rate t)`, by the proof; (…).
-
-    `sqrt(e^T P e)`, or `max |e_i| / P_i` for a small-gain certificate.
-    """
+    """Norm of errors e (…, n) of the certified decay: `sqrt(e^T P e)`, or `max |e_i| / P_i` (small gain)."""
     P = design.certificate.P
     if P.ndim == 1:
         return np.asarray(np.max(np.abs(e) / P, axis=-1, initial=0.0))

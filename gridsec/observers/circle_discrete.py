@@ -21,7 +21,7 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, frozen
 from gridsec.errors import DesignInfeasible, InputInvalid, Problem, no_choice, raise_if_any
-from gridsec.observers.circle import direct_gain
+from gridsec.observers.circle import direct_gain, meter_mask, require_meters
 from gridsec.observers.lmi.discrete import (
     DirectProof,
     DiscreteGains,
@@ -77,12 +77,7 @@ def design(
     Raises DesignInfeasible if there is no proof, or the given one does not hold here. ValueError if `trusted`
         has the wrong length, or contradicts the given design, or `gains` is another text.
     """
-    trusted = np.array(trusted, dtype=np.bool_)
-    trusted.flags.writeable = False
-    if trusted.shape != (len(system.C),):
-        raise InputInvalid.of(
-            "shape", f"trusted has shape {trusted.shape}; the plant has {len(system.C)} meters"
-        )
+    trusted = meter_mask(trusted, len(system.C))
     if isinstance(gains, str):
         raise_if_any(no_choice("gains", ("lmi",), gains))
     if isinstance(gains, DirectProof):
@@ -90,10 +85,7 @@ def design(
     meters = np.flatnonzero(trusted)
     if isinstance(gains, DiscreteGains):
         made = gains
-        if sorted(made.J.tolist()) != meters.tolist():
-            raise InputInvalid.of(
-                "wrong-design", f"the design is for the meters {made.J.tolist()}, not {meters.tolist()}"
-            )
+        require_meters(made.J, meters)
         held = discrete_margin(system, made.J, made)
         if not held > 0.0:
             what = f"discrete observer of the meters {meters.tolist()}"
@@ -106,17 +98,8 @@ def design(
         made = discrete_circle(system, meters, options)
     L, K = np.zeros((len(system.A), trusted.size)), np.zeros((len(system.lower), trusted.size))
     L[:, made.J], K[:, made.J] = made.L, made.K
-    return DiscreteDesign(
-        system,
-        trusted,
-        frozen(L),
-        frozen(K),
-        made.decay,
-        growth(made),
-        noise_gain(made),
-        unknown_gain(made),
-        made,
-    )
+    bounds = (made.decay, growth(made), noise_gain(made), unknown_gain(made))
+    return DiscreteDesign(system, trusted, frozen(L), frozen(K), *bounds, made)
 
 
 def _direct(system: DiscreteLure, trusted: Bools, proof: DirectProof) -> DiscreteDesign:
@@ -139,18 +122,10 @@ def _direct(system: DiscreteLure, trusted: Bools, proof: DirectProof) -> Discret
     held = discrete_margin(system, [], silent)
     if not held > 0.0:
         raise DesignInfeasible("direct injection", "the proof does not hold here", held, code="not-verified")
-    K = direct_gain(system, trusted)
-    return DiscreteDesign(
-        system,
-        trusted,
-        frozen(np.zeros((n, trusted.size))),
-        frozen(K),
-        proof.decay,
-        growth(silent),
-        direct_gain_bound(system, proof, K),
-        direct_gain_bound(system, proof, np.eye(m)),
-        proof,
-    )
+    L, K = np.zeros((n, trusted.size)), direct_gain(system, trusted)
+    noise, unknown = (direct_gain_bound(system, proof, rows) for rows in (K, np.eye(m)))
+    bounds = (proof.decay, growth(silent), noise, unknown)
+    return DiscreteDesign(system, trusted, frozen(L), frozen(K), *bounds, proof)
 
 
 def init(design: DiscreteDesign, t: float, x: Floats | None = None) -> DiscreteState:
@@ -213,11 +188,7 @@ class StackedObservers:
 
 
 def stack(designs: Sequence[DiscreteDesign]) -> StackedObservers:
-    """Observers of one plant as stacked arrays.
-
-    designs: at least one; all of the same plant.
-    Raises ValueError if the observers belong to different plants.
-    """
+    """Observers of one plant as stacked arrays; ValueError if they belong to different plants."""
     if any(one.system is not designs[0].system for one in designs):
         raise InputInvalid.of("wrong-design", "the observers belong to different plants")
     return StackedObservers(

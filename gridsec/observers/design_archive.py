@@ -93,28 +93,16 @@ def _unpack(arrays: _Arrays) -> tuple[CircleGains, ...]:
     for size in arrays["sizes"].tolist():
         index = taken[size]
         taken[size] += 1
-        values = {name: arrays[f"{size}/{name}"][index] for name in _STORED}
-        out.append(
-            CircleGains(
-                J=frozen_ints(values["J"]),
-                L=frozen(values["L"]),
-                K=frozen(values["K"]),
-                P=frozen(values["P"]),
-                Lambda=frozen(values["Lambda"]),
-                nu=float(values["nu"]),
-                mu=float(values["mu"]),
-                mu_delta=float(values["mu_delta"]),
-                alpha=float(values["alpha"]),
-                noise=frozen(values["noise"]),
-                load=load,
-                weight=weight,
-                margin=float(values["margin"]),
-                sensitivity=frozen(values["sensitivity"]),
-                backoff=float(values["backoff"]),
-                status=str(values["status"]),
-            )
-        )
+        values = {name: _restored(arrays[f"{size}/{name}"][index]) for name in _STORED}
+        out.append(CircleGains(load=load, weight=weight, **values))
     return tuple(out)
+
+
+def _restored(value: Any) -> Any:
+    """Stored value as a read-only array, a number or a text."""
+    if value.ndim:
+        return frozen_ints(value) if value.dtype.kind == "i" else frozen(value)
+    return value.item()
 
 
 def cached(

@@ -41,26 +41,19 @@ class CircleOptions:
         """Freeze the arrays and refuse invalid values."""
         for name in ("noise", "load", "weight"):
             object.__setattr__(self, name, frozen(getattr(self, name)))
-        problems = [
-            text
-            for bad, text in (
-                (
-                    not (np.isfinite(self.rate) and self.rate > 0.0),
-                    Problem("not-positive", "the rate must be positive"),
-                ),
-                (
-                    self.noise.ndim != 1 or not _within(self.noise),
-                    Problem("negative", "noise must be finite, >= 0, of shape (p,)"),
-                ),
-                (
-                    self.load.ndim != 2 or not np.isfinite(self.load).all(),
-                    Problem("not-finite", "load must be finite, of shape (l, r)"),
-                ),
-                (not _is_square(self.weight), Problem("shape", "the weight must be a finite square matrix")),
-                (not 0.0 <= self.floor < 1.0, Problem("out-of-range", "the floor must lie in [0, 1)")),
-            )
-            if bad
-        ]
+        noise, load, weight = self.noise, self.load, self.weight
+        held = {
+            Problem("not-positive", "the rate must be positive"): np.isfinite(self.rate) and self.rate > 0.0,
+            Problem("negative", "noise must be finite, >= 0, of shape (p,)"): noise.ndim == 1
+            and bool(np.all(np.isfinite(noise) & (noise >= 0.0))),
+            Problem("not-finite", "load must be finite, of shape (l, r)"): load.ndim == 2
+            and bool(np.isfinite(load).all()),
+            Problem("shape", "the weight must be a finite square matrix"): weight.ndim == 2
+            and weight.shape[0] == weight.shape[1]
+            and bool(np.isfinite(weight).all()),
+            Problem("out-of-range", "the floor must lie in [0, 1)"): 0.0 <= self.floor < 1.0,
+        }
+        problems = [text for text, holds in held.items() if not holds]
         if not np.any(self.noise > 0.0):
             problems.append(Problem("not-positive", "at least one meter must have a noise scale above zero"))
         raise_if_any(problems)
@@ -279,11 +272,3 @@ def stacked(gains: Sequence[CircleGains], meters: int) -> tuple[Floats, Floats]:
         L[index][:, one.J] = one.L
         K[index][:, one.J] = one.K
     return L, K
-
-
-def _within(values: Floats) -> bool:
-    return bool(np.isfinite(values).all() and np.all(values >= 0.0))
-
-
-def _is_square(matrix: Floats) -> bool:
-    return matrix.ndim == 2 and matrix.shape[0] == matrix.shape[1] and bool(np.isfinite(matrix).all())

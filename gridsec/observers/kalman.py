@@ -116,11 +116,7 @@ def init(design: KalmanDesign, t: float, mean: Floats, covariance: Floats) -> Ka
 
 
 def predict(design: KalmanDesign, state: KalmanState, u: Floats) -> KalmanState:
-    """Prediction from (k|k) to (k+1|k).
-
-    u (…, m).
-    Source: lee2018 (4.3.9b), (4.3.9d), (4.3.15).
-    """
+    """Prediction from (k|k) to (k+1|k), with the input u (…, m); lee2018 (4.3.9b), (4.3.9d), (4.3.15)."""
     S, G = design.stack.S, design.stack.G
     P = S @ state.P @ S.T + design.process
     return KalmanState(state.t + design.period, state.z @ S.T + u @ G.T, P, state.K)
@@ -161,10 +157,7 @@ def step(
 def step_steady(
     design: KalmanDesign, steady: Steady, state: KalmanState, y: Floats, u: Floats
 ) -> KalmanState:
-    """`step` with the stationary gain and covariance of `steady`.
-
-    design, state, y, u: as in `step`, with every reading available.
-    """
+    """`step` with the gain and covariance of `steady`; every reading must be available."""
     z = state.z @ design.stack.S.T + u @ design.stack.G.T
     z = z + (y - z @ design.stack.T.T) @ steady.K.T
     return KalmanState(state.t + design.period, z, steady.P, steady.K)

@@ -48,10 +48,7 @@ class Bounds:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ErrorEnvelope:
-    """Bound of one observer's error without attack: |v(k)| <= |F^k| |v(0)| + limit.
-
-    Source: lee2018 (4.3.7).
-    """
+    """Bound of one observer's error without attack: |v(k)| <= |F^k| |v(0)| + limit; lee2018 (4.3.7)."""
 
     # (K + 1,) |F^j|_2 for j = 0 … K, the last at most half of one over the largest. Beyond: |F^(mK + r)| <=
     # powers[K]^m powers[r]

@@ -65,10 +65,7 @@ def as_floats(*given: ArrayLike) -> tuple[Floats, ...]:
 def input_matrices(
     heights: tuple[int, int, int], F: ArrayLike | None, B: ArrayLike | None, D: ArrayLike | None
 ) -> tuple[Floats, ...]:
-    """F, B and D as arrays, zero where not given; the given ones determine l.
-
-    heights: their numbers of rows: nonlinearities, states and meters.
-    """
+    """F, B and D as arrays with the rows `heights`, zero where not given; the given ones determine l."""
     found = [None if one is None else np.asarray(one, dtype=np.float64) for one in (F, B, D)]
     inputs = max((one.shape[-1] for one in found if one is not None and one.ndim), default=0)
     rows = zip(found, heights, strict=True)
@@ -340,10 +337,7 @@ _PERRON_ROUNDS = 8
 
 
 def step(prepared: LureTransition, lure: Lure, x: Floats, u: Floats) -> Floats:
-    """State after one prepared step, with u constant.
-
-    prepared: from `transition`, for the same system. x (…, n), u (…, l).
-    """
+    """State after one step prepared for the same system, with u (…, l) constant and x (…, n)."""
     if prepared.substeps == 0:
         policy = prepared.policy
         return equilibrium(lure, u, x, tol=policy.tol * unit(lure.phi), max_iter=policy.max_iter)

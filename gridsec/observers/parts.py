@@ -21,10 +21,7 @@ from gridsec.errors import DesignInfeasible, InputInvalid
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorDecomposition:
-    """Decomposition of an n-dimensional state for one sensor: an orthonormal basis in three pieces.
-
-    Source: lee2018 (4.2.3)-(4.2.5).
-    """
+    """Orthonormal basis of the state for one sensor, in three pieces; lee2018 (4.2.3) to (4.2.5)."""
 
     observable: Floats  # (n, nu) Z^o, basis of the orthogonal complement of the unobservable subspace N(G_i)
     # (n, mu - nu) Z^d, basis of the unobservable part that a model predicts with decaying error
@@ -100,10 +97,7 @@ def _krylov(A: Floats, row: Floats, tol: float) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StackedDecompositions:
-    """All parts, stacked. mu is the sum of the parts' sizes.
-
-    Source: lee2018 (4.2.9), (4.2.10), (4.2.5).
-    """
+    """All parts, stacked; lee2018 (4.2.5), (4.2.9), (4.2.10). mu is the sum of the parts' sizes."""
 
     parts: tuple[SensorDecomposition, ...]  # one for each sensor
     first: Ints  # (p + 1,) sensor i has the rows `first[i]:first[i + 1]` of the stacked arrays
@@ -123,10 +117,7 @@ class StackedDecompositions:
 
 
 def stack(parts: Sequence[SensorDecomposition], B: Floats) -> StackedDecompositions:
-    """Stack the parts.
-
-    B (n, m).
-    """
+    """Stack the parts, for the input matrix B (n, m)."""
     phi = np.vstack([part.basis.T for part in parts])
     first = np.concatenate([[0], np.cumsum([part.t.size for part in parts])])
     T = np.zeros((len(parts), phi.shape[0]))
@@ -170,11 +161,7 @@ def riccati(S: Floats, t: Floats, Q: Floats, r: float, *, tol: float) -> Floats:
 
 
 def heard(y: Floats, seen: Bools | None) -> Bools:
-    """Sensors with usable readings, (p,): seen, and finite in all runs.
-
-    y (…, p): readings; leading axes are independent runs.
-    seen (p,): True for existing readings; all if None.
-    """
+    """Sensors with usable readings y (…, p): `seen` (p,), if given, and finite in all runs; (p,)."""
     finite = np.isfinite(y)
     live = finite.all(axis=tuple(range(finite.ndim - 1)))
     return np.asarray(live if seen is None else live & np.asarray(seen, dtype=np.bool_))

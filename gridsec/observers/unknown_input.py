@@ -140,22 +140,11 @@ def inverters(
         raise InputInvalid.of(
             "shape", f"{told.size} inverters report, but {error.size} errors of reports are given"
         )
-    whole = DiscreteLure(
-        A=system.A,
-        G=system.G,
-        H=system.H,
-        F=system.F,
-        B=system.B,
-        C=np.vstack([system.C, np.eye(n)[told]]),
-        D=np.vstack([system.D, np.zeros((told.size, inputs))]),
-        lower=system.lower,
-        upper=system.upper,
-        phi=system.phi,
-        h=h,
-    )
+    C, D = np.vstack([system.C, np.eye(n)[told]]), np.vstack([system.D, np.zeros((told.size, inputs))])
     off = curve_error + lure.slope * (np.abs(lure.F) @ u_error)
     drift = system.G * off
     noise = np.concatenate([reading_error + np.abs(lure.D) @ u_error, error])
+    whole = replace(system, C=C, D=D)
     return UnknownInputPlant(whole, system.G[:, attackable], noise, drift[:, off > 0.0], span)
 
 
@@ -510,9 +499,6 @@ def _grown(design: UnknownInputObserver, box: Floats) -> Floats:
 
 
 def outputs(design: UnknownInputObserver, state: UnknownInputObserverState, u: Floats) -> Floats:
-    """Expected reading of every sensor by every observer, `C x_hat + D u`; (c, p).
-
-    u (l,): known input of the tick.
-    """
+    """Expected reading of every sensor by every observer, `C x_hat + D u`, for the tick's u (l,); (c, p)."""
     system = design.plant.system
     return np.asarray(state.x @ system.C.T + system.D @ u)

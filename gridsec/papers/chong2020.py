@@ -256,10 +256,9 @@ def envelope(made: Observers, errors: Floats, t: Floats) -> Floats:
 
 @cache
 def under_attack(of: Design = "(12)") -> tuple[Chong2020Run, Floats, Floats]:
-    """The paper's setting with two of five meters manipulated: run, and envelopes of (8) and (20).
+    """Setting of the paper with two of five meters manipulated: run, and envelopes of (8) and (20).
 
-    The plant starts near its equilibrium, every observer at random within the inverters' limits, equally for
-    both designs.
+    The plant starts near its equilibrium, every observer at random within the inverters' limits.
     """
     at, made = setting(), observers(of)
     rng = np.random.default_rng(2020)

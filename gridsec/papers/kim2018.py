@@ -282,11 +282,7 @@ def sharp_design(noise: float = NOISE) -> HighGainDesign:
 
 
 def trajectory(t: Floats, start: Sequence[float] = START) -> Floats:
-    """The true state, in closed form; (…, 3).
-
-    t (…): times, s.
-    start: x(0).
-    """
+    """The true state at times t (…), s, in closed form; (…, 3)."""
     w = 0.2 * np.pi
     a0, b0, c0 = start[0] - start[1] ** 3, start[1], start[2] - np.sin(start[1])
 
@@ -366,10 +362,7 @@ def simulate(
 
 
 def switching(run: Kim2018Run, start: float, stop: float) -> str:
-    """Sets in use between two times, as in "1 -> 2 -> 3".
-
-    start, stop: times, s.
-    """
+    """Sets in use from `start` to `stop`, s, as in "1 -> 2 -> 3"."""
     inside = run.sigma[(run.t >= start) & (run.t < stop)].astype(int)
     kept = [inside[0], *(b for a, b in pairwise(inside.tolist()) if a != b)]
     return " -> ".join(str(value) for value in kept)

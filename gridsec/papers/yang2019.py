@@ -41,10 +41,7 @@ JUMP = 3e-4
 
 
 def points(suspects: Bools) -> tuple[Floats, Floats]:
-    """Points (window, meter), both from 1; meter 0 for a window without named meters.
-
-    suspects (w, p): named meters of each window.
-    """
+    """Points (window, meter) of `suspects` (w, p), from 1; meter 0 for a window without named meters."""
     with_nobody = np.hstack([~suspects.any(axis=1, keepdims=True), suspects])
     window, meter = np.nonzero(with_nobody)
     return (window + 1).astype(np.float64), meter.astype(np.float64)
@@ -212,10 +209,7 @@ def every_observer() -> tuple[DiscreteGains, ...]:
 
 @cache
 def bank(decays: tuple[float, ...] = DECAYS) -> tuple[DiscreteDesign, ...]:
-    """The eleven observers for one attacked sensor: of all four, of three and of two sensors.
-
-    decays: candidates for the decay.
-    """
+    """The eleven observers for one attacked sensor: of all four, of three and of two sensors."""
     plant = system()
     return windows.bank(plant, 1, options=discrete_options(plant, decays=decays, noise=1.0))
 
@@ -223,10 +217,7 @@ def bank(decays: tuple[float, ...] = DECAYS) -> tuple[DiscreteDesign, ...]:
 def simulated_gains(
     observers: Sequence[DiscreteDesign], *, runs: int, seed: int
 ) -> circle_discrete.MonteCarlo:
-    """Gains by simulation, as in the paper: normal initial states, uniform noise, u = 0.
-
-    runs, seed: number of runs of 1000 steps, and seed of the random numbers.
-    """
+    """Gains by simulation, as in the paper: normal initial states, uniform noise, u = 0; 1000 steps."""
     start = np.random.default_rng(seed).standard_normal((runs, 2))
     return circle_discrete.monte_carlo(
         circle_discrete.stack(observers), half_width=HALF_WIDTH, start=start, u=_still(), seed=seed + 1
@@ -267,11 +258,7 @@ class Levels:
 
 @cache
 def levels(decays: tuple[float, ...] = DECAYS, runs: int = RUNS) -> Levels:
-    """Thresholds for Example 1.
-
-    decays: candidates for the observers' decay.
-    runs: number of simulated runs.
-    """
+    """Thresholds for Example 1, from simulated `runs`."""
     observers = bank(decays)
     proven = windows.design(observers, 1, noise=NOISE, length=LENGTHS[0])
     found = simulated_gains(observers, runs=runs, seed=2019)
@@ -291,11 +278,7 @@ def detection_rates(design: WindowDesign, trace: windows.Trace) -> Floats:
 
 
 def isolation_rates(design: WindowDesign, trace: windows.Trace, sensor: int, rule: Rule) -> Floats:
-    """Fraction of the windows that name exactly the attacked sensor, for N = 50, 100, 200.
-
-    sensor: the attacked sensor, from 0.
-    rule: "majority" (Algorithm 2) or "survivors".
-    """
+    """Fraction of the windows that name exactly the attacked `sensor`, from 0, for N = 50, 100, 200."""
     exact, rates = np.arange(4) == sensor, []
     for N in LENGTHS:
         found = windows.isolation(trace.pi_sets, design.isolate_above, large_sets(design), N, rule)

@@ -70,10 +70,7 @@ def plant(example: int, *, corrected: bool = False) -> UnknownInputPlant:
 
 @lru_cache(maxsize=4)
 def bank(example: int, *, corrected: bool = False) -> IsolationDesign:
-    """The bank of an example: complete with q = 1, or partial with q_1 = q_2 = 1.
-
-    example, corrected: as in `plant`.
-    """
+    """The bank of an example: complete with q = 1, or partial with q_1 = q_2 = 1."""
     max_inputs = 2 if example == 1 else 1
     made = plant(example, corrected=corrected)
     return design(made, max_inputs=max_inputs, max_sensors=1, measure="distance")

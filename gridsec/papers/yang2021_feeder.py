@@ -51,20 +51,12 @@ def _droop(at: tuple[int, ...]) -> Droop:
 
 
 def loop(at: tuple[int, ...], meters: tuple[int, ...]) -> Lure:
-    """The closed loop with inverters of 10 kVA and the curve of IEEE 1547, category B.
-
-    at: customers with an inverter, from 0.
-    meters: customers with a meter, from 0.
-    """
+    """Closed loop with inverters of 10 kVA and the curve of IEEE 1547, category B; customers count from 0."""
     return close_loop(feeder(), _droop(at), np.array(meters))
 
 
 def plant(at: tuple[int, ...], meters: tuple[int, ...], reading_error: float) -> UnknownInputPlant:
-    """The sampled loop with attacks possible on every inverter.
-
-    at, meters: as in `loop`.
-    reading_error: largest error of every meter, squared pu.
-    """
+    """The sampled loop with attacks possible on every inverter; `reading_error` in squared pu."""
     return inverters(
         loop(at, meters),
         STEP_S,

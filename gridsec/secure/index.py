@@ -2,7 +2,7 @@
 
 A block is a matrix with n columns; it *sees* a direction x unless it maps x to zero. `fewest` finds the
 direction that the fewest blocks see: with single rows as blocks, the cospark of a matrix; with observability
-matrices of single sensors, the dynamic security index; within an eigenspace, the minimum of Proposition 3.2.2.
+matrices of single sensors, the dynamic security index; in an eigenspace, the minimum of Proposition 3.2.2.
 
 In n dimensions a direction seen by the fewest rows is alone in the kernel of the rows that do not see it:
 otherwise one more of them could be made not to. So it is among the kernels of all choices of n - 1 rows. If
@@ -56,11 +56,7 @@ class Sparsest:
 
 
 def row_space(block: NDArray[Scalar], tol: float) -> NDArray[Scalar]:
-    """Orthonormal rows (rank, n) that span the rows of a matrix; they have the same kernel.
-
-    block (k, n).
-    tol: singular values up to `tol` times the largest count as zero.
-    """
+    """Orthonormal rows (rank, n) with the row space of a matrix; `tol` is relative to its norm."""
     if not np.any(block):
         return block[:0]
     _, s, vh = np.linalg.svd(block, full_matrices=False)
@@ -68,11 +64,7 @@ def row_space(block: NDArray[Scalar], tol: float) -> NDArray[Scalar]:
 
 
 def kernel(matrix: NDArray[Scalar], tol: float) -> NDArray[Scalar]:
-    """Orthonormal basis of `{x : M x = 0}` in columns, (n, n - rank).
-
-    matrix (k, n).
-    tol: singular values up to this size, absolutely, count as zero.
-    """
+    """Orthonormal basis of `{x : M x = 0}` in columns; singular values up to `tol` count as zero."""
     columns = matrix.shape[1]
     if matrix.shape[0] == 0:
         return np.eye(columns, dtype=matrix.dtype)
@@ -81,11 +73,7 @@ def kernel(matrix: NDArray[Scalar], tol: float) -> NDArray[Scalar]:
 
 
 def span(columns: NDArray[Scalar], tol: float) -> NDArray[Scalar]:
-    """Orthonormal basis of the range of a matrix with column norms near one or zero.
-
-    columns (n, k).
-    tol: singular values up to this size, absolutely, count as zero.
-    """
+    """Orthonormal basis of the range of columns of norm near one or zero; `tol` as in `kernel`."""
     if columns.shape[1] == 0:
         return columns
     u, s, _ = np.linalg.svd(columns, full_matrices=False)
@@ -241,11 +229,7 @@ class Eigenspace:
     invariant: Complexes
 
     def unstable(self, *, discrete: bool, tol: float) -> bool:
-        """True for an unstable eigenvalue: `|value| >= 1`, or `Re value >= 0` in continuous time.
-
-        discrete: sampled time.
-        tol: distance from the border within which it counts as unstable.
-        """
+        """True unless `|value| < 1 - tol` in sampled time, `Re value < -tol` in continuous time."""
         return bool(abs(self.value) >= 1.0 - tol if discrete else self.value.real >= -tol)
 
 
@@ -280,10 +264,7 @@ def unstable_subspace(A: Floats, *, discrete: bool, tol: float) -> Floats:
 
 
 def stable_subspace(A: Floats, *, discrete: bool, tol: float) -> Floats:
-    """X_s(A): the span of the generalised eigenvectors of all other eigenvalues.
-
-    Parameters and result as in `unstable_subspace`.
-    """
+    """X_s(A): the span of the generalised eigenvectors of all stable eigenvalues; see `unstable_subspace`."""
     return _part(A, discrete=discrete, tol=tol, unstable=False)
 
 
@@ -402,10 +383,7 @@ class Index:
 
     @property
     def correctable(self) -> float:
-        """Largest number of correctable manipulated sensors: `ceil(count / 2) - 1`.
-
-        It is -1 for a system that is not observable, and infinite for an infinite index.
-        """
+        """Largest number of correctable manipulated sensors, `ceil(count / 2) - 1`; -1 if not observable."""
         return float(np.ceil(self.count / 2.0) - 1.0)
 
     @property
@@ -489,11 +467,7 @@ def dynamic_index(A: Floats, C: Floats, *, tol: float, by: By = "eigenvectors") 
     Raises ValueError if `by` is another text.
     Source: lee2018 (3.2.3), Proposition 3.2.2.
     """
-    raise_if_any(no_choice("by", get_args(By), by))
-    if by == "rank":
-        found = fewest(observable_rows(A, C, tol=tol), np.eye(A.shape[0]), tol=tol)
-        return Index(found.count, frozen_ints(found.blocks), found.direction)
-    return _over(tuple(e.vectors for e in eigenspaces(A, tol=tol)), C, tol)
+    return _index(A, C, None, tol, by)
 
 
 def asymptotic_index(A: Floats, C: Floats, *, discrete: bool, tol: float, by: By = "eigenvectors") -> Index:
@@ -510,14 +484,28 @@ def asymptotic_index(A: Floats, C: Floats, *, discrete: bool, tol: float, by: By
     Raises ValueError if `by` is another text.
     Source: lee2018 (3.2.5), Proposition 3.2.4.
     """
+    return _index(A, C, discrete, tol, by)
+
+
+def _index(A: Floats, C: Floats, discrete: bool | None, tol: float, by: By) -> Index:
+    """`asymptotic_index`, or `dynamic_index` for `discrete` None."""
     raise_if_any(no_choice("by", get_args(By), by))
-    if by == "rank":
-        # An invariant kernel is the sum of its stable and its unstable part: searching X_u suffices.
-        space = unstable_subspace(A, discrete=discrete, tol=tol)
-        found = fewest(observable_rows(A, C, tol=tol), space, tol=tol)
-        return Index(found.count, frozen_ints(found.blocks), found.direction)
+    if by == "eigenvectors":
+        return _over(_eigenvectors(A, discrete, tol), C, tol)
+    # An invariant kernel is the sum of its stable and its unstable part: searching X_u suffices.
+    found = fewest(observable_rows(A, C, tol=tol), _searched(A, discrete, tol), tol=tol)
+    return Index(found.count, frozen_ints(found.blocks), found.direction)
+
+
+def _eigenvectors(A: Floats, discrete: bool | None, tol: float) -> list[Complexes]:
+    """Bases of all eigenspaces, or of the unstable ones in sampled or continuous time."""
     spaces = eigenspaces(A, tol=tol)
-    return _over(tuple(e.vectors for e in spaces if e.unstable(discrete=discrete, tol=tol)), C, tol)
+    return [e.vectors for e in spaces if discrete is None or e.unstable(discrete=discrete, tol=tol)]
+
+
+def _searched(A: Floats, discrete: bool | None, tol: float) -> Floats:
+    """Basis of all states, or of the unstable subspace in sampled or continuous time."""
+    return np.eye(A.shape[0]) if discrete is None else unstable_subspace(A, discrete=discrete, tol=tol)
 
 
 def _over(spaces: Sequence[Matrix], C: Floats, tol: float, *, below: float = 0.0) -> Index:
@@ -546,11 +534,7 @@ def redundant_observable(A: Floats, C: Floats, q: int, *, tol: float, by: By = "
     Raises ValueError if `by` is another text.
     Source: lee2018, Definition 3.1.1, Propositions 3.1.1 (iii) and 3.1.2 (ii).
     """
-    raise_if_any(no_choice("by", get_args(By), by))
-    if by == "eigenvectors":
-        return _over([e.vectors for e in eigenspaces(A, tol=tol)], C, tol, below=q + 1).count > q
-    rows = observable_rows(A, C, tol=tol)
-    return all(_lost(rows, kept, A.shape[0], tol).shape[1] == 0 for kept in _survivors(len(rows), q))
+    return _redundant(A, C, q, None, tol, by)
 
 
 def redundant_detectable(
@@ -563,13 +547,18 @@ def redundant_detectable(
     Raises ValueError if `by` is another text.
     Source: lee2018, Definition 3.1.3, Propositions 3.1.8 (ii) and 3.1.9 (ii).
     """
+    return _redundant(A, C, q, discrete, tol, by)
+
+
+def _redundant(  # noqa: PLR0917  # the arguments of both public forms
+    A: Floats, C: Floats, q: int, discrete: bool | None, tol: float, by: By
+) -> bool:
+    """`redundant_detectable`, or `redundant_observable` for `discrete` None."""
     raise_if_any(no_choice("by", get_args(By), by))
     if by == "eigenvectors":
-        spaces = [e.vectors for e in eigenspaces(A, tol=tol) if e.unstable(discrete=discrete, tol=tol)]
-        return _over(spaces, C, tol, below=q + 1).count > q
-    rows = observable_rows(A, C, tol=tol)
-    space = unstable_subspace(A, discrete=discrete, tol=tol)
-    return all(_lost(rows, kept, 0, tol, space).shape[1] == 0 for kept in _survivors(len(rows), q))
+        return _over(_eigenvectors(A, discrete, tol), C, tol, below=q + 1).count > q
+    rows, space = observable_rows(A, C, tol=tol), _searched(A, discrete, tol)
+    return all(_lost(rows, kept, space, tol).shape[1] == 0 for kept in _survivors(len(rows), q))
 
 
 def unobservable_subspace(A: Floats, C: Floats, q: int = 0, *, tol: float) -> Floats:
@@ -581,7 +570,7 @@ def unobservable_subspace(A: Floats, C: Floats, q: int = 0, *, tol: float) -> Fl
     Returns (n, d): orthonormal basis. Its orthogonal complement is the redundant observable subspace.
     Source: lee2018, Definition 3.1.2, Propositions 3.1.4 and 3.1.6.
     """
-    return _summed(A, C, q, np.eye(A.shape[0]), tol)
+    return _summed(A, C, q, _searched(A, None, tol), tol)
 
 
 def undetectable_subspace(A: Floats, C: Floats, q: int = 0, *, discrete: bool, tol: float) -> Floats:
@@ -600,7 +589,7 @@ def _summed(A: Floats, C: Floats, q: int, space: Floats, tol: float) -> Floats:
     rows = observable_rows(A, C, tol=tol)
     total = np.zeros((A.shape[0], 0))
     for kept in _survivors(len(rows), q):
-        lost = _lost(rows, kept, A.shape[0], tol, space)
+        lost = _lost(rows, kept, space, tol)
         # Only new directions are added, so that the basis never exceeds n columns.
         total = np.asarray(span(np.hstack([total, lost]), np.sqrt(tol)))
         if total.shape[1] == space.shape[1]:
@@ -612,14 +601,11 @@ def _survivors(p: int, q: int) -> list[tuple[int, ...]]:
     return list(combinations(range(p), max(p - q, 0)))
 
 
-def _lost(
-    rows: Sequence[Floats], kept: Sequence[int], n: int, tol: float, space: Floats | None = None
-) -> Floats:
+def _lost(rows: Sequence[Floats], kept: Sequence[int], space: Floats, tol: float) -> Floats:
     """Basis of the directions of a space that are invisible to all kept sensors."""
-    start = np.eye(n) if space is None else space
     if not kept:
-        return start
-    return np.asarray(start @ kernel(np.vstack([rows[i] for i in kept]) @ start, tol))
+        return space
+    return np.asarray(space @ kernel(np.vstack([rows[i] for i in kept]) @ space, tol))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -747,10 +733,7 @@ def slopes(lure: Lure, z: Floats, *, step: float) -> Floats:
 
 
 def linearise(lure: Lure, slope: Floats) -> tuple[Floats, Floats]:
-    """The pair `(A + G diag(slope) H, C)` of a Lur'e system about a trajectory with these slopes.
-
-    slope (m,): slope of each nonlinearity, from `slopes`; `lure.slope` for the steepest; 0 in deadband.
-    """
+    """Pair `(A + G diag(slope) H, C)` of a Lur'e system for slopes (m,), from `slopes` or `lure.slope`."""
     return lure.A + (lure.G * slope) @ lure.H, np.asarray(lure.C)
 
 

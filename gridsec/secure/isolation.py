@@ -235,10 +235,7 @@ def estimate(
 
 
 def select(design: IsolationDesign, state: UnknownInputObserverState, pi: Floats) -> int:
-    """Index of the selected large observer: by (6), (23), or the one with the best certified estimate.
-
-    pi (a,): disagreement of the large observers.
-    """
+    """Index of the selected large observer: by (6), (23), or the one with the best certified estimate."""
     if design.measure == "distance":
         return int(np.argmin(pi))
     wide = bounds(design, state)

@@ -43,10 +43,7 @@ def exceeds(measure: Floats, threshold: Floats | float) -> Bools:
 
 
 def detection(pi: Floats, threshold: float, length: int) -> Bools:
-    """Algorithm 1: True for windows (…, T // N) in which pi exceeds its threshold (10) anywhere.
-
-    pi (…, T): from step k* on; an incomplete last window is left out.
-    """
+    """Algorithm 1: True for windows (…, T // N) in which pi (…, T), from step k* on, exceeds (10)."""
     count = pi.shape[-1] // length
     above = exceeds(pi[..., : count * length], threshold)
     return np.asarray(above.reshape(*pi.shape[:-1], count, length).any(axis=-1))

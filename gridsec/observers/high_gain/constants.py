@@ -52,11 +52,7 @@ class Decay:
     origin: str  # derivation: "kim2018", "lee2018" or "componentwise"
 
     def bound(self, initial: Floats, age: Floats) -> Floats:
-        """Bound on the error, (…).
-
-        initial (…): bound on the error at the start.
-        age (…): time since the start, s.
-        """
+        """Bound on the error (…) for its bound `initial` (…) at the start, after `age` (…), s."""
         return np.asarray(np.maximum(self.eta * initial * np.exp(-self.rate * age), self.epsilon))
 
 

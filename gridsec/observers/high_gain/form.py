@@ -163,9 +163,8 @@ class System:
         return np.array([partial.bound for partial in self.partials], dtype=np.float64)
 
     def phi(self, x: Floats, sensors: Sequence[int] | None = None) -> Floats:
-        """Phi_I(x), (…, N_I); by default of all sensors.
+        """Phi_I(x), (…, N_I), for x (…, n); by default of all sensors.
 
-        x (…, n).
         Source: kim2018 (9); lee2018 (5.3.2), without the zeros for padding.
         """
         return np.concatenate([at(self.partials[i].phi, x) for i in self._chosen(sensors)], axis=-1)
@@ -430,9 +429,9 @@ def decompose(
     return Symbolic(
         x=symbols,
         forms=tuple(forms),
-        f=_vector(drift, symbols),
-        g=_matrix(drive, symbols),
-        h=_vector([sympy.sympify(output) for output in h], symbols),
+        f=_numeric(drift, symbols),
+        g=_numeric(drive, symbols),
+        h=_numeric([sympy.sympify(output) for output in h], symbols),
         system=System(bound, parts),
     )
 
@@ -449,7 +448,7 @@ class _Probe:
         """Rank of the differentials of some functions, at each point."""
         sympy = _sympy()
         rows = [[sympy.diff(entry, symbol) for symbol in self.x] for entry in chain]
-        values = _evaluate_matrix(_matrix(rows, self.x), self.points)
+        values = jacobian_at(_numeric(rows, self.x), self.points)
         size = np.linalg.norm(values, axis=-1, keepdims=True)
         singular = np.linalg.svd(values / np.where(size > 0.0, size, 1.0), compute_uv=False)
         return np.sum(singular > self.tolerance, axis=-1)
@@ -469,15 +468,6 @@ def _chain(i: int, output: Expression, drift: list[Expression], probe: _Probe) -
         if high < len(chain):
             return chain
         chain.append(lie(chain[-1], drift, probe.x))
-
-
-def _evaluate_matrix(rows: Matrix, points: Floats) -> Floats:
-    count = len(rows(list(points[0])))
-    return np.stack([at(_row(rows, r), points) for r in range(count)], axis=-2)
-
-
-def _row(rows: Matrix, r: int) -> Vector:
-    return lambda x: rows(x)[r]
 
 
 def _check_triangular(
@@ -504,7 +494,7 @@ def _match(
         for d in range(degree + 1)
         for pick in combinations_with_replacement(range(n), d)
     ]
-    z, goal = at(_vector(phi, probe.x), probe.points), at(_vector([target], probe.x), probe.points)[:, 0]
+    z, goal = at(_numeric(phi, probe.x), probe.points), at(_numeric([target], probe.x), probe.points)[:, 0]
     table = np.stack([np.prod(z**power, axis=-1) for power in powers], axis=-1)
     scale = np.max(np.abs(table), axis=0)
     weights = np.linalg.lstsq(table / scale, goal, rcond=1e-12)[0] / scale
@@ -525,8 +515,8 @@ def _match(
 
 def _partial(form: SensorForm, x: tuple[Expression, ...], bound: Floats) -> Partial:
     sympy = _sympy()
-    phi = _vector(form.phi, x)
-    jacobian = _matrix([[sympy.diff(entry, symbol) for symbol in x] for entry in form.phi], x)
+    phi = _numeric(form.phi, x)
+    jacobian = _numeric([[sympy.diff(entry, symbol) for symbol in x] for entry in form.phi], x)
     section = _section(phi, jacobian, bound)
     size = largest(phi, bound)
     found = iter(form.polynomials)
@@ -541,7 +531,7 @@ def _section(phi: Vector, jacobian: Matrix, bound: Floats) -> Callable[[Floats],
     def state(z: Floats) -> Floats:
         x = np.zeros((len(z), len(bound)))
         for _ in range(_ROUNDS):
-            move = np.linalg.pinv(_evaluate_matrix(jacobian, x))
+            move = np.linalg.pinv(jacobian_at(jacobian, x))
             x = sat(x + np.einsum("kij,kj->ki", move, z - at(phi, x)), bound)
         return x
 
@@ -550,7 +540,7 @@ def _section(phi: Vector, jacobian: Matrix, bound: Floats) -> Callable[[Floats],
 
 def _through(target: Expression, x: tuple[Expression, ...], section: Callable[[Floats], Floats]) -> Scalar:
     """`target` at a state with this z: a function of z exactly if `target` is one."""
-    value = _vector([target], x)
+    value = _numeric([target], x)
 
     def function(z: Sequence[Any]) -> Any:
         parts = np.broadcast_arrays(*[np.asarray(part, dtype=np.float64) for part in z])
@@ -565,14 +555,8 @@ def _through(target: Expression, x: tuple[Expression, ...], section: Callable[[F
 _ROUNDS = 12
 
 
-def _vector(entries: Sequence[Expression], x: tuple[Expression, ...]) -> Vector:
-    return _callable(list(entries), x)
-
-
-def _matrix(rows: Sequence[Sequence[Expression]], x: tuple[Expression, ...]) -> Matrix:
-    return _callable([list(row) for row in rows], x)
-
-
-def _callable(entries: Any, x: tuple[Expression, ...]) -> Callable[[Sequence[Any]], Any]:
-    function = _sympy().lambdify(x, entries, modules="numpy", cse=True)
+def _numeric(entries: Sequence[Any], x: tuple[Expression, ...]) -> Callable[[Sequence[Any]], Any]:
+    """Expressions, or rows of them, as a function over components."""
+    listed = [list(entry) if isinstance(entry, Sequence) else entry for entry in entries]
+    function = _sympy().lambdify(x, listed, modules="numpy", cse=True)
     return lambda point: function(*point)

@@ -21,10 +21,7 @@ _ULPS = 2
 
 
 class Interval(NDArrayOperatorsMixin):
-    """Arrays of closed intervals `[lo, hi]`, elementwise.
-
-    lo, hi (…): ends, `lo <= hi`, of the same shape.
-    """
+    """Arrays of closed intervals `[lo, hi]`, elementwise; ends of one shape, `lo <= hi`."""
 
     __slots__ = ("hi", "lo")
 

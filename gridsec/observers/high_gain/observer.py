@@ -116,10 +116,7 @@ class HighGainTransition:
 
 
 def gains(system: System, theta: Floats) -> Floats:
-    """K of every sensor, padded with zeros; (p, n_max).
-
-    theta (p,): high-gain parameters, 1/s.
-    """
+    """K of every sensor for `theta` (p,), 1/s, padded with zeros; (p, n_max)."""
     out = np.zeros(system.mask.shape)
     for i, partial in enumerate(system.partials):
         out[i, : partial.size] = gain(partial.size, float(theta[i]))
@@ -323,10 +320,18 @@ def design(
             f"{p} sensors, {max_attacked} attacked: more than twice are needed",
             code="too-few-meters",
         )
-    raise_if_any(_problems(lowest, search, decay))
+    problems = no_choice("search", get_args(Search), search)
+    problems += no_choice("decay", _DECAYS, decay) if isinstance(decay, str) else []
+    if lowest < 0.0:
+        problems.append(Problem("negative", f"lowest is {lowest}; a lower bound of gains is not negative"))
+    raise_if_any(problems)
     thetas = np.broadcast_to(np.asarray(theta, dtype=np.float64), (p,))
     noises = np.broadcast_to(not_negative("noise", noise), (p,))
-    decays = _constants(system, thetas, noises, decay)
+    if isinstance(decay, str):
+        parts = zip(system.partials, thetas, noises, strict=True)
+        decays = tuple(_DECAYS[decay](part.size, float(th), float(v)) for part, th, v in parts)
+    else:
+        decays = tuple(decay)
     inverses, whole = _inverses(system, inverses, whole, decays, max_attacked)
     low, high = (np.broadcast_to(np.asarray(end, dtype=np.float64), (m,)) for end in (u_low, u_high))
     margins, proven = _margins(system, thetas, low, high)
@@ -335,6 +340,8 @@ def design(
         check(system, inverse, points, tolerance=tolerance)
     eta, rest = (np.array([getattr(d, name) for d in decays]) for name in ("eta", "epsilon"))
     limit = np.maximum(2.0 * eta * system.z_bound, rest) + system.z_bound if reset else np.full(p, np.inf)
+    ends = (-system.x_bound, system.x_bound)
+    steep = np.array([upper_proven(part.jacobian, *ends, gap=1e-2).upper for part in system.partials])
     K = gains(system, thetas)
     return HighGainDesign(
         system=system,
@@ -346,26 +353,13 @@ def design(
         proven=proven,
         limit=frozen(limit),
         lowest=lowest,
-        steep=frozen(_steep(system)),
+        steep=frozen(steep),
         search=search,
         K=frozen(K),
         field=field(system),
         move=transition(system, K, step_s / substeps),
         substeps=substeps,
     )
-
-
-def _problems(lowest: float, search: str, decay: str | Sequence[Decay]) -> list[str]:
-    wrong = no_choice("search", get_args(Search), search)
-    wrong += no_choice("decay", _DECAYS, decay) if isinstance(decay, str) else []
-    return [
-        *wrong,
-        *(
-            [Problem("negative", f"lowest is {lowest}; a lower bound of gains is not negative")]
-            if lowest < 0.0
-            else []
-        ),
-    ]
 
 
 def _inverses(
@@ -391,21 +385,6 @@ def _inverses(
             code="missing",
         )
     return tuple(given), whole
-
-
-def _steep(system: System) -> Floats:
-    """Upper bounds on Lip^(Phi_i)."""
-    ends = (-system.x_bound, system.x_bound)
-    return np.array([upper_proven(part.jacobian, *ends, gap=1e-2).upper for part in system.partials])
-
-
-def _constants(
-    system: System, theta: Floats, noise: Floats, decay: str | Sequence[Decay]
-) -> tuple[Decay, ...]:
-    if not isinstance(decay, str):
-        return tuple(decay)
-    rule, parts = _DECAYS[decay], zip(system.partials, theta, noise, strict=True)
-    return tuple(rule(part.size, float(th), float(v)) for part, th, v in parts)
 
 
 def _margins(system: System, theta: Floats, low: Floats, high: Floats) -> tuple[Floats, bool]:
@@ -498,9 +477,8 @@ def _advance(
 
 
 def error_bounds(design: HighGainDesign, age: Floats) -> Floats:
-    """Bound on the error of every observer without attack: `max(2 M_z eta e^{-rate age}, epsilon)`, (p,).
+    """Bounds `max(2 M_z eta e^{-rate age}, epsilon)` (p,) of the errors without attack, after `age` (p,), s.
 
-    age (p,): time of each observer with readings, s.
     Source: kim2018 (12), (14); lee2018 (5.4.2).
     """
     pairs = zip(design.decays, design.system.z_bound, age, strict=True)
@@ -547,7 +525,8 @@ def _judge(  # noqa: PLR0917  # the whole state
         tested = live if whole or np.isfinite(bound) else trusted
         if design.whole is not None and whole:
             alarm |= not _test(design, design.whole, z, delta).passed
-    settled = bool(np.all(delta[live] <= _rest(design)[live]))
+    rest = np.array([decay.epsilon for decay in design.decays])
+    settled = bool(np.all(delta[live] <= rest[live]))
     decision, cause, reason = verdict(
         heard=int(live.sum()),
         needed=len(design.inverses[0].sensors),
@@ -575,36 +554,26 @@ def _judge(  # noqa: PLR0917  # the whole state
     )
 
 
-def _rest(design: HighGainDesign) -> Floats:
-    return np.array([decay.epsilon for decay in design.decays])
-
-
 def _search(  # noqa: PLR0917  # the inputs of a test, and the first set
     design: HighGainDesign, sigma: int, z: Floats, delta: Floats, live: Bools, large: Bools
 ) -> tuple[int, tuple[int, ...], _Trial | None, bool]:
     """Update rule (20): next set whenever the present one fails or is incomplete."""
-    visited, alarm, count = [sigma], False, len(design.inverses)
-    changes = count - 1 if design.search == "all" else 1
-    trial = _try(design, sigma, z, delta, live, large)
-    while (trial is None or not trial.passed) and len(visited) <= changes:
+    count = len(design.inverses)
+    visited: list[int] = []
+    trial: _Trial | None = None
+    alarm = False
+    for change in range(count if design.search == "all" else 2):
+        place = (sigma + change) % count
+        visited.append(place)
+        members = list(design.inverses[place].sensors)
+        trial = _test(design, design.inverses[place], z, delta) if live[members].all() else None
+        if trial is not None and large[members].any():
+            # A sensor that has just been reset is attacked, for any new estimate.
+            trial = replace(trial, residual=np.inf)
+        if trial is not None and trial.passed:
+            break
         alarm |= trial is not None
-        sigma = (sigma + 1) % count
-        visited.append(sigma)
-        trial = _try(design, sigma, z, delta, live, large)
-    alarm |= trial is not None and not trial.passed
-    return sigma, tuple(visited), trial, alarm
-
-
-def _try(  # noqa: PLR0917  # the inputs of a test
-    design: HighGainDesign, sigma: int, z: Floats, delta: Floats, live: Bools, large: Bools
-) -> _Trial | None:
-    inverse = design.inverses[sigma]
-    members = list(inverse.sensors)
-    if not live[members].all():
-        return None
-    trial = _test(design, inverse, z, delta)
-    # A sensor that has just been reset is attacked, for any new estimate.
-    return replace(trial, residual=np.inf) if large[members].any() else trial
+    return visited[-1], tuple(visited), trial, alarm
 
 
 def _unhealthy(design: HighGainDesign, z: Floats, x: Floats, delta: Floats, bound: float) -> Bools:

@@ -337,10 +337,7 @@ def detectable(codes: Floats, errors: int, *, tolerance: float = 0.0) -> bool:
 
 
 def correctable(codes: Floats, errors: int, *, tolerance: float = 0.0) -> bool:
-    """True if `errors` wrong blocks are always correctable: detectable for twice as many.
-
-    Source: lee2018, Definition 5.1.2 and Proposition 5.1.5.
-    """
+    """True if `errors` wrong blocks are always correctable: detectable for twice as many (5.1.2, 5.1.5)."""
     return detectable(codes, 2 * errors, tolerance=tolerance)
 
 
@@ -391,9 +388,6 @@ def redundancy(system: System, missing: int, *, samples: int = 2000, seed: int =
 
 
 def groups(sensors: int, attacked: int) -> list[tuple[int, ...]]:
-    """All sets of p - q sensors in the order of the papers' tables: the first leaves out sensor 0.
-
-    Source: kim2018, Theorem 2: the bijection Lambda.
-    """
+    """All sets of p - q sensors in the order Lambda of the papers' tables: the first leaves out sensor 0."""
     everyone = range(sensors)
     return [tuple(i for i in everyone if i not in out) for out in combinations(everyone, attacked)]

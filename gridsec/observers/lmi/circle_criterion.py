@@ -28,8 +28,6 @@ from gridsec.observers.lmi.solver import BACKOFF, cvxpy_late, first_proven, solv
 from gridsec.observers.lure import Lure
 from gridsec.processes import deaf, listen, stop
 
-__all__ = ["BACKOFF", "circle", "contraction", "prove", "settle", "solve_many"]
-
 # Slack of the scaled inequality, with entries of order one: a hundred times the solver's tolerance, so that
 # its last digits cannot decide the sign of the margin.
 _SLACK = 1e-6
@@ -294,10 +292,7 @@ class _Template:
         self.variables = (P, Y, lam, Gamma, mu, mu_delta)
 
     def solve(self, J: Ints) -> CircleGains:
-        """Design for one set, verified.
-
-        Raises DesignInfeasible as in `circle`.
-        """
+        """Design for one set, verified. Raises DesignInfeasible as in `circle`."""
         lure, options, live = self.lure, self.options, self.live
         what = f"circle-criterion observer of the meters {J.tolist()} at rate {options.rate:g}/s"
         self.C.value = lure.C[J] * self.x_unit / self.z_unit

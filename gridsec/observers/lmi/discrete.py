@@ -155,10 +155,7 @@ def discrete_margin(system: DiscreteLure, J: Ints | Sequence[int], gains: Discre
 
 
 def growth(gains: DiscreteGains) -> float:
-    """C of yang2019 (5), `sqrt(lambda_max(P) / lambda_min(P))`: `|e(k)| <= c decay^k |e(0)| + …`.
-
-    gains: a design with a positive margin.
-    """
+    """C of yang2019 (5), `sqrt(lambda_max(P) / lambda_min(P))`: `|e(k)| <= c decay^k |e(0)| + …`."""
     values = np.linalg.eigvalsh(gains.P)
     return float(np.sqrt(values[-1] / values[0]))
 
@@ -178,10 +175,7 @@ def noise_gain(gains: DiscreteGains) -> float:
 
 
 def unknown_gain(gains: DiscreteGains) -> float:
-    """Gain of delta: `|e| <= … + gain sup |delta|`; 0 without delta.
-
-    gains: a design with a positive margin.
-    """
+    """Gain of delta: `|e| <= … + gain sup |delta|`; 0 without delta."""
     if not gains.unknown.state.shape[1]:
         return 0.0
     lowest = float(np.linalg.eigvalsh(gains.P)[0])

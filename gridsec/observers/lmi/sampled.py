@@ -89,10 +89,7 @@ def shift(system: DiscreteLure) -> DiscreteLure:
 
 
 def advance(system: DiscreteLure, x: Floats, u: Floats) -> Floats:
-    """State one step later.
-
-    x (…, n), u (…, l).
-    """
+    """State one step later, for x (…, n) and u (…, l)."""
     z = x @ system.H.T + u @ system.F.T
     return np.asarray(x @ system.A.T + system.phi(z) @ system.G.T + u @ system.B.T)
 
@@ -123,19 +120,9 @@ def sample(lure: Lure, h: float) -> DiscreteLure:
         block[:n, :n], block[:n, n:] = h * lure.A, h * np.eye(n)
         full = expm(block)
         A, hold = full[:n, :n], full[:n, n:]
-    return DiscreteLure(
-        A=A,
-        G=hold @ lure.G,
-        H=lure.H,
-        F=lure.F,
-        B=hold @ lure.B,
-        C=lure.C,
-        D=lure.D,
-        lower=np.zeros(lure.slope.shape),
-        upper=lure.slope,
-        phi=lure.phi,
-        h=h,
-    )
+    lower = np.zeros(lure.slope.shape)
+    G, B = hold @ lure.G, hold @ lure.B
+    return DiscreteLure(A, G, lure.H, lure.F, B, lure.C, lure.D, lower, lure.slope, lure.phi, h)
 
 
 def held_error(lure: Lure, h: float, away: Floats) -> Floats:

@@ -109,10 +109,7 @@ def init(design: BoundedDesign, t: float, x: Floats, error: float) -> tuple[Boun
 def step(
     design: BoundedDesign, state: BoundedState, y: Floats, u: Floats, seen: Bools | None = None
 ) -> tuple[BoundedState, BoundedOutcome]:
-    """Step from the readings y(k) and the input u(k) to the estimate of x(k+1).
-
-    y (p,), u (m,), seen (p,): as in `luenberger.step`.
-    """
+    """Step from the readings y(k) and the input u(k) to the estimate of x(k+1), as `luenberger.step`."""
     return decode(
         design, replace(state, observers=luenberger.step(design.observers, state.observers, y, u, seen))
     )

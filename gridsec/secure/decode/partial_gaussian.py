@@ -255,10 +255,7 @@ def step(
 
 
 def decode(design: GaussianDesign, state: GaussianState) -> tuple[GaussianState, GaussianOutcome]:
-    """Test the trusted set, choose another if it fails, and estimate.
-
-    Source: lee2018, Algorithm 4.2.
-    """
+    """Test the trusted set, choose another if it fails, and estimate; lee2018, Algorithm 4.2."""
     z, now = state.filters.z, state.current
     tables, tested = _fused(design, state.tables, now)
     g, threshold = _score(tested, z), float(design.thresholds[tested.freedom])

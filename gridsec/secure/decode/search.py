@@ -332,11 +332,7 @@ def decode_by_pursuit(stack: Stack, z: Floats, *, tol: float) -> Floats:
 
 
 def decode_by_matching(stack: Stack, z: Floats, q: int, *, tol: float) -> tuple[Floats, Ints]:
-    """Decode by orthogonal matching pursuit; x and the blocks assumed in error.
-
-    stack, z, tol: as in `decode_by_pursuit`.
-    q: number of blocks in error.
-    """
+    """Decode by orthogonal matching pursuit; x, and the q blocks assumed in error."""
     F = annihilator(stack.matrix, tol=tol)
     e, chosen = matching_pursuit(F, F @ z, q, heights=stack.heights)
     return np.asarray(np.linalg.lstsq(stack.matrix, z - e, rcond=None)[0]), chosen

@@ -133,18 +133,12 @@ def error_detectable(stack: Stack, q: int, *, tol: float) -> bool:
 
 
 def error_correctable(stack: Stack, q: int, *, tol: float) -> bool:
-    """True if x is determined under any errors in q blocks: `cospark > 2 q`.
-
-    Source: lee2018, Definition 2.2.3 and Proposition 2.2.3.
-    """
+    """True if x is determined under any errors in q blocks: `cospark > 2 q`; lee2018, Definition 2.2.3."""
     return error_detectable(stack, 2 * q, tol=tol)
 
 
 def require(stack: Stack, lost: int, tol: float, purpose: str) -> None:
-    """Raise NotObservable unless x stays determined after the loss of any `lost` blocks.
-
-    Raises NotObservable if it is not; the message lists sensors with a loss that proves it.
-    """
+    """Raise NotObservable, with a proof, unless x stays determined after the loss of any `lost` blocks."""
     found = cospark(stack, tol=tol, below=lost + 1)
     if found.count > lost:
         return
@@ -176,11 +170,7 @@ def subsets(p: int, size: int, most: int) -> Ints:
 
 
 def masked(stack: Stack, kept: Ints) -> Floats:
-    """Phi with all rows outside some blocks set to zero, for several sets at once.
-
-    kept (S, k): blocks that stay.
-    Returns (S, N, n): the paper's `Phi_Lambda`; its pseudo-inverse has zero columns for all other rows.
-    """
+    """Phi with zero rows outside the blocks `kept` (S, k), the paper's `Phi_Lambda`; (S, N, n)."""
     keep = np.zeros((len(kept), stack.count))
     np.put_along_axis(keep, kept, 1.0, axis=1)
     return (keep @ stack.membership.T)[:, :, None] * stack.matrix
