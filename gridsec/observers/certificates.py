@@ -22,7 +22,7 @@ import numpy as np
 from gridsec.arrays import Bools, Floats, frozen
 from gridsec.errors import DesignInfeasible
 from gridsec.grid.droop import Droop
-from gridsec.observers.lure import Lure, Readout
+from gridsec.observers.lure import Lure, Matrices
 
 # Shares of 1 / slope on the diagonal of P that `reactance` tries, see Theorem 1.
 SHARES = (0.01, 0.03, 0.1, 0.3, 0.6, 1.0)
@@ -199,7 +199,7 @@ def verify(certificate: Certificate, lure: Lure, trusted: Bools | None = None) -
     )
 
 
-def feeds(lure: Readout) -> Bools:
+def feeds(lure: Matrices) -> Bools:
     """Meters that can drive inverters of the observer, (m, p): the rows of `(H, F)` and `(C, D)` agree."""
     inverters, meters = np.hstack([lure.H, lure.F]), np.hstack([lure.C, lure.D])
     same: Bools = np.all(inverters[:, None, :] == meters[None, :, :], axis=2)

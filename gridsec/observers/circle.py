@@ -21,7 +21,7 @@ from gridsec.errors import DesignInfeasible, InputInvalid, no_choice, raise_if_a
 from gridsec.observers.certificates import Certificate, certify, error_bound, feeds
 from gridsec.observers.gains import CircleGains, CircleOptions, margin, sensitivity, state_bound
 from gridsec.observers.lmi import contraction, solve_many
-from gridsec.observers.lure import POLICY, Lure, Readout, StepPolicy, advance
+from gridsec.observers.lure import POLICY, Lure, Matrices, StepPolicy, advance
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,7 +49,7 @@ class CircleState:
     x: Floats  # (n,) estimated state
 
 
-def direct_gain(lure: Readout, trusted: Bools) -> Floats:
+def direct_gain(lure: Matrices, trusted: Bools) -> Floats:
     """K of direct injection, (m, p): the inverter of a trusted meter is driven by that meter.
 
     `K = E_J`: `K_ij = 1` where the argument of nonlinearity i is the output of the trusted meter j;

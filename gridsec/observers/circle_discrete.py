@@ -21,7 +21,7 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, frozen
 from gridsec.errors import DesignInfeasible, InputInvalid, Problem, no_choice, raise_if_any
-from gridsec.observers.circle import direct_gain, meter_mask, require_meters
+from gridsec.observers.circle import CircleState, direct_gain, meter_mask, require_meters
 from gridsec.observers.lmi.discrete import (
     DirectProof,
     DiscreteGains,
@@ -51,14 +51,6 @@ class DiscreteDesign:
     noise_gain: float  # gamma, with respect to the Euclidean norm of the trusted meters' errors
     unknown_gain: float  # gamma_delta; for direct injection with respect to the error of the arguments z
     certificate: DiscreteGains | DirectProof  # the proof
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class DiscreteState:
-    """State of an observer."""
-
-    t: float  # time, s
-    x: Floats  # (n,) estimated state
 
 
 def design(
@@ -128,13 +120,13 @@ def _direct(system: DiscreteLure, trusted: Bools, proof: DirectProof) -> Discret
     return DiscreteDesign(system, trusted, frozen(L), frozen(K), *bounds, proof)
 
 
-def init(design: DiscreteDesign, t: float, x: Floats | None = None) -> DiscreteState:
+def init(design: DiscreteDesign, t: float, x: Floats | None = None) -> CircleState:
     """Initial state at t, s; the estimate starts at x (n,), by default at zero."""
     start = np.zeros(len(design.system.A)) if x is None else np.array(x, dtype=np.float64)
-    return DiscreteState(float(t), start)
+    return CircleState(float(t), start)
 
 
-def step(design: DiscreteDesign, state: DiscreteState, y: Floats, u: Floats, seen: Bools) -> DiscreteState:
+def step(design: DiscreteDesign, state: CircleState, y: Floats, u: Floats, seen: Bools) -> CircleState:
     """One step of one observer.
 
     y (p,): readings at the beginning of the step; ignored where unseen or not finite.
@@ -142,10 +134,10 @@ def step(design: DiscreteDesign, state: DiscreteState, y: Floats, u: Floats, see
     seen (p,): True for existing readings. The others have no influence.
     """
     x = _ahead(design.system, design.L, design.K, state.x, y=y, u=u, seen=seen)
-    return DiscreteState(state.t + design.system.h, x)
+    return CircleState(state.t + design.system.h, x)
 
 
-def outputs(design: DiscreteDesign, state: DiscreteState, u: Floats) -> Floats:
+def outputs(design: DiscreteDesign, state: CircleState, u: Floats) -> Floats:
     """Expected reading of every meter of the plant, trusted or not: `C x_hat + D u`, (p,)."""
     return measure(design.system, state.x, u)
 

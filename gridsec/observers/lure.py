@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import prod
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,53 +27,44 @@ from gridsec.grid.three_phase import CustomerFlow, ThreePhaseFeeder, lindist3flo
 
 Nonlinearity = Callable[[Floats], Floats]
 
-_MATRICES = ("A", "G", "H", "F", "B", "C", "D")
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Matrices:
+    """The matrices of a Lur'e system. n states, m nonlinearities, l inputs, p meters."""
+
+    A: Floats  # (n, n)
+    G: Floats  # (n, m)
+    H: Floats  # (m, n)
+    F: Floats  # (m, l)
+    B: Floats  # (n, l)
+    C: Floats  # (p, n)
+    D: Floats  # (p, l)
 
 
-class Readout(Protocol):
-    """Matrices of `z = H x + F u` and `y = C x + D u`, in continuous or discrete time."""
-
-    @property
-    def H(self) -> Floats: ...  # noqa: D102, N802
-    @property
-    def F(self) -> Floats: ...  # noqa: D102, N802
-    @property
-    def C(self) -> Floats: ...  # noqa: D102, N802
-    @property
-    def D(self) -> Floats: ...  # noqa: D102, N802
+_Seven = tuple[Floats, Floats, Floats, Floats, Floats, Floats, Floats]
 
 
-class Form(Readout, Protocol):
-    """Complete system in Lur'e form, in continuous or discrete time."""
-
-    @property
-    def A(self) -> Floats: ...  # noqa: D102, N802
-    @property
-    def G(self) -> Floats: ...  # noqa: D102, N802
-    @property
-    def B(self) -> Floats: ...  # noqa: D102, N802
-    @property
-    def phi(self) -> Nonlinearity: ...  # noqa: D102
-
-
-def as_floats(*given: ArrayLike) -> tuple[Floats, ...]:
-    """Nested lists as arrays of floats."""
-    return tuple(np.asarray(one, dtype=np.float64) for one in given)
-
-
-def input_matrices(
-    heights: tuple[int, int, int], F: ArrayLike | None, B: ArrayLike | None, D: ArrayLike | None
-) -> tuple[Floats, ...]:
-    """F, B and D as arrays with the rows `heights`, zero where not given; the given ones determine l."""
+def matrices_of(  # noqa: PLR0917  # all matrices
+    A: ArrayLike,
+    C: ArrayLike,
+    G: ArrayLike,
+    H: ArrayLike,
+    F: ArrayLike | None,
+    B: ArrayLike | None,
+    D: ArrayLike | None,
+) -> _Seven:
+    """Arrays A, G, H, F, B, C, D from nested lists; missing input matrices are zero, given ones state l."""
+    a, c, g, h = (np.asarray(one, dtype=np.float64) for one in (A, C, G, H))
     found = [None if one is None else np.asarray(one, dtype=np.float64) for one in (F, B, D)]
     inputs = max((one.shape[-1] for one in found if one is not None and one.ndim), default=0)
-    rows = zip(found, heights, strict=True)
-    return tuple(np.zeros((count, inputs)) if one is None else one for one, count in rows)
+    rows = zip(found, (h, a, c), strict=True)
+    f, b, d = (np.zeros((len(like), inputs)) if one is None else one for one, like in rows)
+    return a, g, h, f, b, c, d
 
 
-def freeze(system: object, *slopes: str) -> list[Problem]:
+def freeze(system: Matrices, *slopes: str) -> list[Problem]:
     """Freeze the seven matrices and the bounds `slopes` (m,) of a new system; return their problems."""
-    given: dict[str, Floats] = {name: frozen(getattr(system, name)) for name in (*_MATRICES, *slopes)}
+    given: dict[str, Floats] = {name: frozen(getattr(system, name)) for name in (*"AGHFBCD", *slopes)}
     for name, array in given.items():
         object.__setattr__(system, name, array)
     if wrong := [
@@ -96,7 +86,7 @@ def freeze(system: object, *slopes: str) -> list[Problem]:
     return wrong
 
 
-def without_lower(system: Form, lower: Floats) -> tuple[Floats, Floats, Nonlinearity]:
+def without_lower(system: Matrices, phi: Nonlinearity, lower: Floats) -> tuple[Floats, Floats, Nonlinearity]:
     """Loop transform: the lower slopes of phi move into the linear part.
 
     `phi(z) = lower z + phi~(z)`, with slopes of phi~ in [0, upper - lower], and `A~ = A + G diag(lower) H`,
@@ -105,8 +95,8 @@ def without_lower(system: Form, lower: Floats) -> tuple[Floats, Floats, Nonlinea
     lower (m,): the lower slopes. Returns A~, B~, phi~; phi itself if `lower` is zero.
     """
     if not np.any(lower):
-        return system.A, system.B, system.phi
-    phi, pushed = system.phi, system.G * lower
+        return system.A, system.B, phi
+    pushed = system.G * lower
     return (
         system.A + pushed @ system.H,
         system.B + pushed @ system.F,
@@ -115,20 +105,13 @@ def without_lower(system: Form, lower: Floats) -> tuple[Floats, Floats, Nonlinea
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Lure:
+class Lure(Matrices):
     """`x' = A x + G phi(H x + F u) + B u`, `y = C x + D u`.
 
     Raises ValueError if shapes are inconsistent, an entry is not finite, or a slope is negative; lists every
         problem.
     """
 
-    A: Floats  # (n, n)
-    G: Floats  # (n, m)
-    H: Floats  # (m, n)
-    F: Floats  # (m, l)
-    B: Floats  # (n, l)
-    C: Floats  # (p, n)
-    D: Floats  # (p, l) the matrices of the system
     slope: Floats  # (m,) upper bound of the slope of each entry of phi; the lower bound is 0
     phi: Nonlinearity  # the nonlinearity, (…, m) -> (…, m), entry by entry. For a feeder: its `Droop`
 
@@ -167,11 +150,10 @@ class Lure:
             upper one; lists every problem.
         Source: chong2020 (9), (10).
         """
-        a, c, g, h, high, low = as_floats(A, C, G, H, slope, lower)
-        f, b, d = input_matrices((len(h), len(a), len(c)), F, B, D)
-        high, low = (np.broadcast_to(bound, len(h)) for bound in (high, low))
-        given = cls(a, g, h, f, b, c, d, high - low, phi)
-        moved_a, moved_b, bent = without_lower(given, low)
+        found = matrices_of(A, C, G, H, F, B, D)
+        high, low = (np.broadcast_to(np.asarray(end, np.float64), len(found[2])) for end in (slope, lower))
+        given = cls(*found, high - low, phi)
+        moved_a, moved_b, bent = without_lower(given, phi, low)
         return replace(given, A=moved_a, B=moved_b, phi=bent)
 
 

@@ -64,7 +64,9 @@ def decompose(A: Floats, C: Floats, *, slowest: float, tol: float) -> tuple[Sens
 
 def _part(A: Floats, c: Floats, row: Floats, slowest: float, tol: float) -> SensorDecomposition:
     """Decomposition for the sensor with row c, of length one in `row`."""
-    seen, unseen = _krylov(A, row, tol)
+    seen = krylov(A, row, tol)
+    full = np.linalg.qr(seen, mode="complete")[0] if seen.shape[1] else np.eye(len(A))
+    unseen = full[:, seen.shape[1] :]
     hidden_count, turn = 0, np.zeros((0, 0))
     if unseen.shape[1]:
         # N(G) is invariant: the leading Schur vectors of its slow modes are invariant too, and the others
@@ -80,8 +82,8 @@ def _part(A: Floats, c: Floats, row: Floats, slowest: float, tol: float) -> Sens
     )
 
 
-def _krylov(A: Floats, row: Floats, tol: float) -> tuple[Floats, Floats]:
-    """Orthonormal bases of span{c, A^T c, …} and of its complement, without powers of A; c of length one."""
+def krylov(A: Floats, row: Floats, tol: float) -> Floats:
+    """Orthonormal basis of span{c, A^T c, …} in columns, without powers of A; c of length one."""
     n = A.shape[0]
     size = float(np.linalg.norm(A, 2)) or 1.0
     basis = np.zeros((n, 0))
@@ -91,8 +93,7 @@ def _krylov(A: Floats, row: Floats, tol: float) -> tuple[Floats, Floats]:
         # Twice, because later rows would inherit the rounding errors of a single pass.
         for _ in range(2):
             row = row - basis @ (basis.T @ row)
-    full, _ = np.linalg.qr(basis, mode="complete") if basis.shape[1] else (np.eye(n), None)
-    return basis, full[:, basis.shape[1] :]
+    return basis
 
 
 @dataclass(frozen=True, slots=True, eq=False)

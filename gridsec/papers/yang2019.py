@@ -146,8 +146,7 @@ def feeder_figure() -> PaperFigure:
     score = np.stack([verdict.score for verdict in study.verdicts])
     named = np.stack([verdict.suspects for verdict in study.verdicts])
     window, meter = points(named)
-    masks = study.design.observers.masks[1 : 1 + study.design.sets.count_large]
-    labels = ["pi"] + ["pi_J, J without meter " + str(int(np.argmin(J)) + 1) for J in masks]
+    labels = ["pi"] + ["pi_J, J without meter " + str(int(np.argmin(J)) + 1) for J in study.design.large]
     lines = [FigureCurve(label, t, column) for label, column in zip(labels, score.T, strict=True)]
     lines.append(FigureCurve("threshold", t, np.full(t.size, study.design.detect_above), "dashed"))
     panels = (
@@ -267,11 +266,6 @@ def levels(decays: tuple[float, ...] = DECAYS, runs: int = RUNS) -> Levels:
     return Levels(proven, simulated, windows.calibrate(proven, honest), found.exceedance)
 
 
-def large_sets(design: WindowDesign) -> Bools:
-    """Masks (s, p) of the sets of p - q sensors, in the order of pi_J."""
-    return design.observers.masks[1 : 1 + design.sets.count_large]
-
-
 def detection_rates(design: WindowDesign, trace: windows.Trace) -> Floats:
     """Fraction of the windows found attacked by Algorithm 1, for N = 50, 100, 200."""
     return np.array([windows.detection(trace.pi, design.detect_above, N).mean() for N in LENGTHS])
@@ -281,7 +275,7 @@ def isolation_rates(design: WindowDesign, trace: windows.Trace, sensor: int, rul
     """Fraction of the windows that name exactly the attacked `sensor`, from 0, for N = 50, 100, 200."""
     exact, rates = np.arange(4) == sensor, []
     for N in LENGTHS:
-        found = windows.isolation(trace.pi_sets, design.isolate_above, large_sets(design), N, rule)
+        found = windows.isolation(trace.pi_sets, design.isolate_above, design.large, N, rule)
         rates.append((found.suspects == exact).all(axis=-1).mean())
     return np.array(rates)
 
@@ -337,7 +331,7 @@ def figure(of: FigureSetting) -> PaperFigure:
         lines = []
         for label, design, rule in kinds:
             if of.isolates:
-                found = windows.isolation(trace.pi_sets[0], design.isolate_above, large_sets(design), N, rule)
+                found = windows.isolation(trace.pi_sets[0], design.isolate_above, design.large, N, rule)
                 x, y = points(found.suspects)
             else:
                 y = windows.detection(trace.pi[0], design.detect_above, N).astype(np.float64)
@@ -461,14 +455,9 @@ def _shown(rates: Floats) -> str:
     return ", ".join(f"{rate:.2f}" for rate in rates)
 
 
-def fast_levels() -> Levels:
-    """Thresholds for observers with decay 0.6 throughout: faster and noisier than necessary."""
-    return levels((0.6,), OTHER_RUNS)
-
-
 def _remark_2() -> Claim:
-    """Longer windows degrade Algorithm 2 if most steps trust all sensors."""
-    at = fast_levels()
+    """Longer windows degrade Algorithm 2 if most steps trust all sensors; decay 0.6: fast and noisy."""
+    at = levels((0.6,), OTHER_RUNS)
     rates = isolation_rates(
         at.calibrated, trial(at.proven, sensor=ISOLATED, size=5.0, runs=60, seed=60), ISOLATED, "majority"
     )
@@ -481,7 +470,7 @@ def _remark_2() -> Claim:
 def _proposition_4() -> Claim:
     design, trace = alternating_attack()
     found = windows.isolation(
-        trace.pi_sets[1:], design.isolate_above, large_sets(design), design.length, "majority"
+        trace.pi_sets[1:], design.isolate_above, design.large, design.length, "majority"
     )
     named = ", ".join(str(i + 1) for i in np.flatnonzero(found.suspects[0]))
     what = "sensors isolated when every attacked set fails in half of the window, attackers 1 and 2 in turns"

@@ -37,6 +37,7 @@ from scipy.linalg import lapack, schur
 from gridsec.arrays import Bools, Floats, Ints, frozen_ints, unit_rows
 from gridsec.errors import DesignInfeasible, no_choice, raise_if_any
 from gridsec.observers.lure import Lure
+from gridsec.observers.parts import krylov
 
 Complexes = NDArray[np.complex128]
 Matrix = NDArray[np.inexact[Any]]
@@ -105,7 +106,7 @@ def fewest(
     Of several optimal directions, returns the first found.
     Raises DesignInfeasible if more than `most` nodes are needed. The general problem is NP-hard.
     """
-    blocks = _padded(rows, space.shape[0])
+    blocks = padded(rows, space.shape[0])
     if space.shape[1] == 0 or not _sees(blocks, must, space, tol):
         return Sparsest(np.inf, np.zeros(0, dtype=np.intp), np.zeros(0))
     best, best_space, nodes = np.inf, space, 0
@@ -162,7 +163,7 @@ def _generic(blocks: Matrix, space: Matrix, tol: float) -> Sparsest:
     return Sparsest(float(where.size), where, x)
 
 
-def _padded(rows: Sequence[Matrix], n: int) -> Matrix:
+def padded(rows: Sequence[Matrix], n: int) -> Matrix:
     """The blocks as one array, short ones padded with zero rows; (p, largest k_i, n)."""
     tall = max((len(r) for r in rows), default=0)
     out = np.zeros((len(rows), max(tall, 1), n), dtype=np.result_type(np.float64, *(r.dtype for r in rows)))
@@ -420,20 +421,8 @@ def observable_rows(A: Floats, C: Floats, *, tol: float) -> tuple[Floats, ...]:
         the longest measures nothing.
     Returns p times (rank G_i, n): empty for a sensor that measures nothing.
     """
-    size = float(np.linalg.norm(A, 2)) or 1.0
     rows = unit_rows(np.asarray(C, dtype=np.float64), tol=tol)
-    return tuple(_arnoldi(A.T / size, row, tol) for row in rows)
-
-
-def _arnoldi(step: Floats, row: Floats, tol: float) -> Floats:
-    basis = np.zeros((0, row.size))
-    while np.linalg.norm(row) > tol and len(basis) < row.size:
-        basis = np.vstack([basis, row / np.linalg.norm(row)])
-        row = step @ basis[-1]
-        # Twice: a single pass leaves rounding errors that a third of the rows would inherit.
-        for _ in range(2):
-            row = row - basis.T @ (basis @ row)
-    return basis
+    return tuple(np.asarray(krylov(A, row, tol).T) for row in rows)
 
 
 def _sensors(C: Floats, tol: float) -> list[Matrix]:

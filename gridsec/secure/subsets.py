@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import chain, combinations
 from math import comb
 
 import numpy as np
@@ -80,9 +80,9 @@ def subsets(meters: int, max_attacked: int, *, most: int) -> Subsets:
             f"it needs {count} observers, and at most {most} are allowed; allow fewer manipulated meters",
             code="too-many",
         )
-    out_large = _combinations(meters, max_attacked)
-    out_small = _combinations(meters, 2 * max_attacked)
-    choices = _combinations(2 * max_attacked, max_attacked)
+    out_large = combinations_of(meters, max_attacked)
+    out_small = combinations_of(meters, 2 * max_attacked)
+    choices = combinations_of(2 * max_attacked, max_attacked)
     parent = np.stack([_rank(out_small[:, pick], meters) for pick in choices])
     pairs = np.argsort(parent, axis=None, kind="stable").reshape(out_large.shape[0], -1)
     return Subsets(meters, max_attacked, out_large, out_small, choices, parent, pairs)
@@ -101,19 +101,20 @@ def most_attacked(meters: int, works: Callable[[Ints], bool]) -> int:
     """
     everybody = np.arange(meters)
     lost = 0
-    while lost < meters and all(works(np.delete(everybody, out)) for out in _combinations(meters, lost)):
+    while lost < meters and all(works(np.delete(everybody, out)) for out in combinations_of(meters, lost)):
         lost += 1
     return (lost - 1) // 2
 
 
-def _combinations(n: int, k: int) -> Ints:
+def combinations_of(n: int, k: int) -> Ints:
     """All k-element subsets of range(n), each ascending, in lexicographic order; (C(n, k), k)."""
-    flat = [i for chosen in combinations(range(n), k) for i in chosen]
-    return np.array(flat, dtype=np.intp).reshape(comb(n, k), k)
+    count = comb(n, k)
+    flat = np.fromiter(chain.from_iterable(combinations(range(n), k)), dtype=np.intp, count=count * k)
+    return flat.reshape(count, k)
 
 
 def _rank(rows: Ints, n: int) -> Ints:
-    """Position of each ascending row among `_combinations(n, k)`; (r,).
+    """Position of each ascending row among `combinations_of(n, k)`; (r,).
 
     `C(n, k) - 1 - sum_i C(n - 1 - row_i, k - i)`: the rows after a row exceed it in the first place in which
     they differ.

@@ -140,6 +140,11 @@ class WindowDesign:
     # isolation rule of a window: "majority" is Algorithm 2; "survivors" keeps the J that never failed
     rule: Rule
 
+    @property
+    def large(self) -> Bools:
+        """Masks (s, p) of the large sets, in the order of pi_J."""
+        return self.observers.masks[1 : 1 + self.sets.count_large]
+
 
 def bank_masks(meters: int, max_attacked: int, *, most: int = MOST_OBSERVERS) -> Bools:
     """Sets of meters of all observers of a bank as masks (o, p): all meters, then J, then S."""
@@ -365,8 +370,7 @@ def _judged(design: WindowDesign, state: WindowState) -> tuple[float, Floats]:
 
 
 def _verdict(design: WindowDesign, t: float, pi: Floats, pi_sets: Floats) -> WindowVerdict:
-    masks = design.observers.masks[1 : 1 + design.sets.count_large]
-    found = isolation(pi_sets, design.isolate_above, masks, design.length, design.rule)
+    found = isolation(pi_sets, design.isolate_above, design.large, design.length, design.rule)
     seen = bool(np.isfinite(pi).all())
     exceeded = bool(exceeds(pi, design.detect_above).any())
     quiet = Decision.CLEAN if seen else Decision.UNDECIDED

@@ -17,25 +17,18 @@ from scipy.linalg import expm
 
 from gridsec.arrays import Floats, exponential_integrals, spectral_radius
 from gridsec.errors import Problem, raise_if_any
-from gridsec.observers.lure import Lure, Nonlinearity, as_floats, freeze, input_matrices, without_lower
+from gridsec.observers.lure import Lure, Matrices, Nonlinearity, freeze, matrices_of, without_lower
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class DiscreteLure:
-    """`x+ = A x + G phi(H x + F u) + B u`, `y = C x + D u`. n states, m nonlinearities, l inputs, p meters.
+class DiscreteLure(Matrices):
+    """`x+ = A x + G phi(H x + F u) + B u`, `y = C x + D u`.
 
+    A known vector rho(u, y) as in yang2019 (1) is passed as further entries of u.
     Raises ValueError if shapes are inconsistent, an entry is not finite, a lower slope exceeds its upper one,
         or h is not positive; lists every problem.
     """
 
-    A: Floats  # (n, n)
-    G: Floats  # (n, m)
-    H: Floats  # (m, n)
-    F: Floats  # (m, l)
-    B: Floats  # (n, l)
-    C: Floats  # (p, n)
-    # (p, l) the matrices. A known vector rho(u, y) as in yang2019 (1) is passed as further entries of u
-    D: Floats
     lower: Floats  # (m,) bounds of the slopes of each entry of phi, `lower <= upper`
     upper: Floats  # (m,)
     phi: Nonlinearity  # the nonlinearity, (…, m) -> (…, m), entry by entry
@@ -71,10 +64,9 @@ class DiscreteLure:
         lower, upper: likewise; one number for all entries of phi.
         Raises ValueError as in the class.
         """
-        a, c, g, hh, low, high = as_floats(A, C, G, H, lower, upper)
-        f, b, d = input_matrices((len(hh), len(a), len(c)), F, B, D)
-        low, high = (np.broadcast_to(bound, len(hh)) for bound in (low, high))
-        return cls(a, g, hh, f, b, c, d, low, high, phi, h)
+        found = matrices_of(A, C, G, H, F, B, D)
+        low, high = (np.broadcast_to(np.asarray(end, np.float64), len(found[2])) for end in (lower, upper))
+        return cls(*found, low, high, phi, h)
 
     @property
     def slope(self) -> Floats:
@@ -84,7 +76,7 @@ class DiscreteLure:
 
 def shift(system: DiscreteLure) -> DiscreteLure:
     """The same system with slopes in [0, upper - lower]: `gridsec.observers.lure.without_lower`."""
-    A, B, phi = without_lower(system, system.lower)
+    A, B, phi = without_lower(system, system.phi, system.lower)
     return replace(system, A=A, B=B, lower=np.zeros(system.lower.shape), upper=system.slope, phi=phi)
 
 

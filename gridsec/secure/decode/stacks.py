@@ -12,14 +12,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import chain, combinations
 from math import comb
 
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, frozen, frozen_ints, unit_rows
 from gridsec.errors import DesignInfeasible, InputInvalid, NotObservable
-from gridsec.secure.index import Sparsest, fewest, kernel, row_space
+from gridsec.secure.index import Sparsest, fewest, kernel, padded, row_space
+from gridsec.secure.subsets import combinations_of
 
 MOST_SUBSETS = 200_000
 """Default limit of enumerated subsets of sensors in a design."""
@@ -76,11 +76,8 @@ class Stack:
 
     def blocks(self) -> Floats:
         """The blocks as one array, short ones padded with zero rows; (p, largest height, n)."""
-        tall = int(np.max(self.heights, initial=0))
-        out = np.zeros((self.count, tall, self.unknowns))
-        for i, at in enumerate(np.split(self.matrix, np.cumsum(self.heights)[:-1])):
-            out[i, : len(at)] = at
-        return out
+        blocks = np.split(self.matrix, np.cumsum(self.heights)[:-1])
+        return np.asarray(padded(blocks, self.unknowns), dtype=np.float64)
 
     def norms(self, z: Floats) -> Floats:
         """Euclidean norm of every block of a stacked vector, (…, N) -> (…, p)."""
@@ -165,8 +162,7 @@ def subsets(p: int, size: int, most: int) -> Ints:
             f"{count} subsets; at most {most} allowed",
             code="too-many",
         )
-    flat = np.fromiter(chain.from_iterable(combinations(range(p), size)), dtype=np.intp, count=count * size)
-    return flat.reshape(count, size)
+    return combinations_of(p, size)
 
 
 def masked(stack: Stack, kept: Ints) -> Floats:
