@@ -185,17 +185,15 @@ RECIPE_FAILS = (
 def system() -> DiscreteLure:
     """The plant (25), (26) with delta = 0.1, alpha = 1; the sine's slopes lie in [-1, 1]."""
     delta, alpha = 0.1, 1.0
-    return DiscreteLure(
-        A=np.array([[1.0, delta], [0.0, 1.0]]),
+    return DiscreteLure.of(
+        [[1.0, delta], [0.0, 1.0]],
+        [[3.0, 0.3], [3.0, 0.6], [6.0, 0.9], [1.2, 12.0]],
         G=delta * alpha * np.array([[0.5], [1.0]]),
         H=np.ones((1, 2)),
-        F=np.zeros((1, 1)),
         B=np.full((2, 1), delta),
-        C=np.array([[3.0, 0.3], [3.0, 0.6], [6.0, 0.9], [1.2, 12.0]]),
-        D=np.zeros((4, 1)),
-        lower=-np.ones(1),
-        upper=np.ones(1),
         phi=np.sin,
+        lower=-1.0,
+        upper=1.0,
         h=delta,
     )
 
@@ -355,17 +353,9 @@ def deadbeat_bank() -> tuple[DiscreteDesign, ...]:
 
     `L_J` has the entries `1 / (2 |J|)`, so that `e_J(k+1) = -sum over J of (n_i + a_i) / (2 |J|)`.
     """
-    plant = DiscreteLure(
-        A=np.array([[0.5]]),
-        G=np.zeros((1, 1)),
-        H=np.zeros((1, 1)),
-        F=np.zeros((1, 1)),
-        B=np.zeros((1, 1)),
-        C=np.ones((5, 1)),
-        D=np.zeros((5, 1)),
-        lower=np.zeros(1),
-        upper=np.zeros(1),
-        phi=np.zeros_like,
+    none = np.zeros((1, 1))
+    plant = DiscreteLure.of(
+        [[0.5]], np.ones((5, 1)), G=none, H=none, B=none, phi=np.zeros_like, lower=0.0, upper=0.0
     )
     options = discrete_options(plant, decays=0.01, noise=1.0)
     made = []

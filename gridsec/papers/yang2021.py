@@ -52,18 +52,9 @@ def plant(example: int, *, corrected: bool = False) -> UnknownInputPlant:
         row, column, value = CORRECTION_1 if example == 1 else CORRECTION_2
         C = C.copy()
         C[row, column] = value
-    n, r = B.shape
-    system = DiscreteLure(
-        A=A,
-        G=np.eye(n),
-        H=np.eye(n),
-        F=np.zeros((n, r)),
-        B=B,
-        C=C,
-        D=np.zeros((len(C), r)),
-        lower=np.full(n, -0.5),
-        upper=np.full(n, 0.5),
-        phi=lambda z: np.asarray(0.5 * np.sin(z)),
+    one = np.eye(len(A))
+    system = DiscreteLure.of(
+        A, C, G=one, H=one, B=B, phi=lambda z: np.asarray(0.5 * np.sin(z)), lower=-0.5, upper=0.5
     )
     return exact(system, B)
 
