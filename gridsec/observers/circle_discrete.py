@@ -23,7 +23,6 @@ from gridsec.arrays import Bools, Floats, frozen
 from gridsec.errors import DesignInfeasible, InputInvalid, Problem, no_choice, raise_if_any
 from gridsec.observers.circle import CircleState, direct_gain, meter_mask, require_meters
 from gridsec.observers.lmi.discrete import (
-    DirectProof,
     DiscreteGains,
     DiscreteOptions,
     direct_gain_bound,
@@ -31,7 +30,6 @@ from gridsec.observers.lmi.discrete import (
     discrete_margin,
     growth,
     noise_gain,
-    nothing_unknown,
     unknown_gain,
 )
 from gridsec.observers.lmi.sampled import DiscreteLure, measure
@@ -50,21 +48,21 @@ class DiscreteDesign:
     growth: float  # c
     noise_gain: float  # gamma, with respect to the Euclidean norm of the trusted meters' errors
     unknown_gain: float  # gamma_delta; for direct injection with respect to the error of the arguments z
-    certificate: DiscreteGains | DirectProof  # the proof
+    certificate: DiscreteGains  # the proof
 
 
 def design(
     system: DiscreteLure,
     trusted: Bools,
     *,
-    gains: Literal["lmi"] | DiscreteGains | DirectProof = "lmi",
+    gains: Literal["lmi"] | DiscreteGains = "lmi",
     options: DiscreteOptions | None = None,
 ) -> DiscreteDesign:
     """Design one observer, with a verified proof.
 
     trusted (p,).
-    gains: "lmi": by `discrete_circle`. `DiscreteGains`: an existing design, verified again. `DirectProof`
-        from `discrete_contraction`: direct injection, with one proof for every set.
+    gains: "lmi": by `discrete_circle`. Or an existing design, verified again; that of `discrete_contraction`,
+        without meters, is the proof of direct injection for every set.
     options: specification of an LMI design; required by "lmi".
     Raises DesignInfeasible if there is no proof, or the given one does not hold here. ValueError if `trusted`
         has the wrong length, or contradicts the given design, or `gains` is another text.
@@ -72,12 +70,11 @@ def design(
     trusted = meter_mask(trusted, len(system.C))
     if isinstance(gains, str):
         raise_if_any(no_choice("gains", ("lmi",), gains))
-    if isinstance(gains, DirectProof):
-        return _direct(system, trusted, gains)
     meters = np.flatnonzero(trusted)
     if isinstance(gains, DiscreteGains):
         made = gains
-        require_meters(made.J, meters)
+        if made.J.size:
+            require_meters(made.J, meters)
         held = discrete_margin(system, made.J, made)
         if not held > 0.0:
             what = f"discrete observer of the meters {meters.tolist()}"
@@ -88,35 +85,19 @@ def design(
         )
     else:
         made = discrete_circle(system, meters, options)
+    if not made.J.size:
+        return _direct(system, trusted, made)
     L, K = np.zeros((len(system.A), trusted.size)), np.zeros((len(system.lower), trusted.size))
     L[:, made.J], K[:, made.J] = made.L, made.K
     bounds = (made.decay, growth(made), noise_gain(made), unknown_gain(made))
     return DiscreteDesign(system, trusted, frozen(L), frozen(K), *bounds, made)
 
 
-def _direct(system: DiscreteLure, trusted: Bools, proof: DirectProof) -> DiscreteDesign:
+def _direct(system: DiscreteLure, trusted: Bools, proof: DiscreteGains) -> DiscreteDesign:
     n, m = len(system.A), len(system.lower)
-    silent = DiscreteGains(
-        J=np.zeros(0, dtype=np.intp),
-        L=np.zeros((n, 0)),
-        K=np.zeros((m, 0)),
-        P=proof.P,
-        Lambda=proof.Lambda,
-        decay=proof.decay,
-        mu=0.0,
-        mu_delta=0.0,
-        noise=np.zeros(0),
-        unknown=nothing_unknown(system),
-        margin=proof.margin,
-        backoff=0.0,
-        status=proof.status,
-    )
-    held = discrete_margin(system, [], silent)
-    if not held > 0.0:
-        raise DesignInfeasible("direct injection", "the proof does not hold here", held, code="not-verified")
     L, K = np.zeros((n, trusted.size)), direct_gain(system, trusted)
     noise, unknown = (direct_gain_bound(system, proof, rows) for rows in (K, np.eye(m)))
-    bounds = (proof.decay, growth(silent), noise, unknown)
+    bounds = (proof.decay, growth(proof), noise, unknown)
     return DiscreteDesign(system, trusted, frozen(L), frozen(K), *bounds, proof)
 
 

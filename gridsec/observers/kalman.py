@@ -22,9 +22,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import block_diag, solve_discrete_lyapunov
 
-from gridsec.arrays import Bools, Floats, frozen, spectral_radius, symmetry_defect
-from gridsec.errors import DesignInfeasible, Problem, raise_if_any
-from gridsec.observers.parts import StackedDecompositions, decompose, heard, riccati, stack
+from gridsec.arrays import Bools, Floats, frozen, symmetry_defect
+from gridsec.errors import Problem, raise_if_any
+from gridsec.observers.parts import StackedDecompositions, decompose, heard, require_stable, riccati, stack
 
 RESIDUAL = 1e-8
 """Largest accepted relative residual of a Riccati equation."""
@@ -182,11 +182,7 @@ def steady(design: KalmanDesign) -> Steady:
         gains[at, i] = M @ part.t / (part.t @ M @ part.t + design.noise[i, i])
     J = np.eye(len(gains)) - gains @ whole.T
     F = J @ whole.S
-    radius = spectral_radius(F)
-    if not radius < 1.0:
-        raise DesignInfeasible(
-            "stationary filters", f"spectral radius {radius:.6g}", 1.0 - radius, code="unstable"
-        )
+    require_stable(F, "stationary filters")
     P = np.asarray(
         solve_discrete_lyapunov(F, J @ design.process @ J.T + gains @ design.noise @ gains.T),
         dtype=np.float64,

@@ -26,6 +26,7 @@ from gridsec.observers.parts import (
     StackedDecompositions,
     decompose,
     heard,
+    require_stable,
     riccati,
     stack,
 )
@@ -111,14 +112,8 @@ def riccati_gain(part: SensorDecomposition, process: Floats, noise: float, *, ra
     S, t = part.S[:size, :size] / rate, part.t[:size] / np.sqrt(noise)
     P = riccati(S, t, basis.T @ process @ basis, 1.0, tol=RESIDUAL)
     gain[:size] = rate * S @ P @ t / (t @ P @ t + 1.0) / np.sqrt(noise)
-    radius = spectral_radius(part.S[:size, :size] - np.outer(gain[:size], part.t[:size]))
-    if not radius < rate:
-        raise DesignInfeasible(
-            f"observer gain for decay like {rate:g}^k",
-            f"spectral radius {radius:.6g}",
-            rate - radius,
-            code="unstable",
-        )
+    closed = part.S[:size, :size] - np.outer(gain[:size], part.t[:size])
+    require_stable(closed, f"observer gain for decay like {rate:g}^k", rate=rate)
     return gain
 
 
@@ -198,11 +193,7 @@ def envelope(
     Raises DesignInfeasible as `design`.
     """
     F = part.S - np.outer(gain, part.t)
-    radius = spectral_radius(F)
-    if not radius < 1.0:
-        raise DesignInfeasible(
-            "partial observer", f"spectral radius {radius:.6g} of S - L t", 1.0 - radius, code="unstable"
-        )
+    require_stable(F, "partial observer, S - L t")
     if not part.t.size:
         return ErrorEnvelope(frozen(np.array([1.0, 0.0])), 0.0)
     powers, sizes = _powers(F)

@@ -413,19 +413,14 @@ def settle(
     c = np.broadcast_to(drive, (*lead, m)).reshape(count, m)
     e = np.broadcast_to(bias, (*lead, n)).reshape(count, n)
     every = np.broadcast_to(H, (*lead, m, n)).reshape(count, m, n) if H.ndim > 2 else H[None]
-    open_rows = np.arange(count)
+    rows, loop = np.arange(count), _Loop(phi, gain, every, c, e)
     for _ in range(max_iter):
-        loop = _Loop(
-            phi, gain, every if every.shape[0] == 1 else every[open_rows], c[open_rows], e[open_rows]
-        )
-        now = x[open_rows]
-        residual = loop.residual(now)
+        residual = loop.residual(x[rows])
         rough = np.max(np.abs(residual), axis=-1, initial=0.0) > tol
         if not rough.any():
             return x.reshape(*lead, n)
-        loop = loop.rows(rough)
-        open_rows, now, residual = open_rows[rough], now[rough], residual[rough]
-        x[open_rows] = loop.newton(now, residual)
+        rows, loop = rows[rough], loop.rows(rough)
+        x[rows] = loop.newton(x[rows], residual[rough])
     raise DesignInfeasible(
         "equilibrium of the droop loop",
         f"residual above {tol:g} after {max_iter} Newton steps",

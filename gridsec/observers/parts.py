@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import LinAlgError, block_diag, schur, solve_discrete_are
 
-from gridsec.arrays import Bools, Floats, Ints, frozen, frozen_ints, unit_rows
+from gridsec.arrays import Bools, Floats, Ints, frozen, frozen_ints, spectral_radius, unit_rows
 from gridsec.errors import DesignInfeasible, InputInvalid
 
 
@@ -159,6 +159,13 @@ def riccati(S: Floats, t: Floats, Q: Floats, r: float, *, tol: float) -> Floats:
     if not worst <= tol:
         raise DesignInfeasible("Riccati equation of one sensor", said, -worst, code="no-solution")
     return np.asarray(0.5 * (best + best.T))
+
+
+def require_stable(F: Floats, what: str, *, rate: float = 1.0) -> None:
+    """Raise DesignInfeasible unless the spectral radius of F is below `rate`."""
+    radius = spectral_radius(F)
+    if not radius < rate:
+        raise DesignInfeasible(what, f"spectral radius {radius:.6g}", rate - radius, code="unstable")
 
 
 def heard(y: Floats, seen: Bools | None) -> Bools:

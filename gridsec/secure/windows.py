@@ -25,7 +25,7 @@ from gridsec.errors import InputInvalid, Problem, no_choice, raise_if_any
 from gridsec.interface import Decision
 from gridsec.observers import circle_discrete
 from gridsec.observers.circle_discrete import DiscreteDesign, StackedObservers, advance, settling_steps, stack
-from gridsec.observers.lmi.discrete import DirectProof, DiscreteOptions, discrete_circles
+from gridsec.observers.lmi.discrete import DiscreteGains, DiscreteOptions, discrete_circles
 from gridsec.observers.lmi.sampled import DiscreteLure, measure
 from gridsec.observers.lmi.sampled import advance as advance_plant
 from gridsec.secure.subsets import Subsets, subsets
@@ -157,7 +157,7 @@ def bank(
     max_attacked: int,
     *,
     options: DiscreteOptions | None = None,
-    proof: DirectProof | None = None,
+    proof: DiscreteGains | None = None,
     most: int = MOST_OBSERVERS,
 ) -> tuple[DiscreteDesign, ...]:
     """Design all observers: of all meters, of every p - q and of every p - 2q of them.

@@ -131,37 +131,30 @@ def margin(slopes: Slopes, theta: float) -> float:
     n = slopes.low.shape[0]
     base = riccati(n, 1.0)
     root = np.linalg.cholesky(base)
+    power = theta ** (np.arange(n)[None, :] - np.arange(n)[:, None]).astype(np.float64)
+
+    def growth(D: Floats) -> float:
+        form = np.linalg.solve(root, np.linalg.solve(root, base @ D + D.T @ base).T)
+        return float(np.linalg.eigvalsh(0.5 * (form + form.T))[-1])
+
     free = np.argwhere(slopes.low < slopes.high)
     if len(free) > _CORNERS:
-        return _margin_by_norm(slopes, theta)
-    power = theta ** (np.arange(n)[None, :] - np.arange(n)[:, None]).astype(np.float64)
+        # Conservative: `2 |Pt^{1/2} D Pt^{-1/2}|` by centre and radius.
+        centre, radius = 0.5 * (slopes.low + slopes.high) * power, 0.5 * (slopes.high - slopes.low) * power
+        spread = np.abs(root.T) @ radius @ np.abs(np.linalg.inv(root.T))
+        return 0.5 * theta - growth(centre) - 2.0 * float(np.linalg.norm(spread, 2))
     worst = -np.inf
     for pick in product((False, True), repeat=len(free)):
         chosen = slopes.low.copy()
         for (j, k), upper in zip(free, pick, strict=True):
             if upper:
                 chosen[j, k] = slopes.high[j, k]
-        D = chosen * power
-        form = np.linalg.solve(root, np.linalg.solve(root, base @ D + D.T @ base).T)
-        worst = max(worst, float(np.linalg.eigvalsh(0.5 * (form + form.T))[-1]))
+        worst = max(worst, growth(chosen * power))
     return 0.5 * theta - worst
 
 
 # Number of uncertain entries above which a norm bound replaces the corners.
 _CORNERS = 12
-
-
-def _margin_by_norm(slopes: Slopes, theta: float) -> float:
-    """`margin` with `2 |Pt^{1/2} D Pt^{-1/2}|` bounded by centre and radius; conservative."""
-    n = slopes.low.shape[0]
-    base = riccati(n, 1.0)
-    root = np.linalg.cholesky(base)
-    power = theta ** (np.arange(n)[None, :] - np.arange(n)[:, None]).astype(np.float64)
-    centre, radius = 0.5 * (slopes.low + slopes.high) * power, 0.5 * (slopes.high - slopes.low) * power
-    form = np.linalg.solve(root, np.linalg.solve(root, base @ centre + centre.T @ base).T)
-    spread = np.abs(root.T) @ radius @ np.abs(np.linalg.inv(root.T))
-    extra = 2.0 * float(np.linalg.norm(spread, 2))
-    return 0.5 * theta - float(np.linalg.eigvalsh(0.5 * (form + form.T))[-1]) - extra
 
 
 def smallest_theta(slopes: Slopes, *, most: float = 1e6, tolerance: float = 1e-6) -> float:

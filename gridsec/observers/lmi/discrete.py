@@ -12,7 +12,7 @@ Source: yang2019 (4), (5), Assumption 1. Proofs: docs/theory-discrete.md.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -182,18 +182,7 @@ def unknown_gain(gains: DiscreteGains) -> float:
     return float(np.sqrt(gains.mu_delta / ((1.0 - gains.decay**2) * lowest)))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class DirectProof:
-    """Proof that the errors of direct injection decay, for every set of trusted meters, with switching."""
-
-    P: Floats  # (n, n) `|e+|_P <= decay |e|_P` without disturbances, `|e|_P = sqrt(e^T P e)`
-    Lambda: Floats  # (m,) multiplier
-    decay: float  # per step
-    margin: float  # margin of the inequality without meters; it holds if positive
-    status: str  # origin of the proof
-
-
-def direct_gain_bound(system: DiscreteLure, proof: DirectProof, rows: Floats) -> float:
+def direct_gain_bound(system: DiscreteLure, proof: DiscreteGains, rows: Floats) -> float:
     """Ultimate bound of direct injection: `|e| <= … + bound sup |s|` in Euclidean norms.
 
     `|P^(1/2) G diag(slope)|_2 |rows|_2 / ((1 - decay) sqrt(lambda_min(P)))`, over the nonlinearities
@@ -324,11 +313,11 @@ def discrete_prove(
     return _Template(system, options, len(J), given).best(np.asarray(J, dtype=np.intp))
 
 
-def discrete_contraction(system: DiscreteLure, *, decays: Sequence[float] | float) -> DirectProof:
-    """One proof of direct injection for all sets of meters: the inequality without meters.
+def discrete_contraction(system: DiscreteLure, *, decays: Sequence[float] | float) -> DiscreteGains:
+    """One proof of direct injection for all sets of meters: the inequality without meters, J empty.
 
-    A trusted meter replaces a slope of the loop by zero, which the proof covers. It needs
-    `lower <= 0 <= upper`.
+    `|e+|_P <= decay |e|_P` without disturbances, for every set and switching: a trusted meter replaces a
+    slope of the loop by zero, which the proof covers. It needs `lower <= 0 <= upper`.
 
     decays: candidates for lambda. The one with the smallest `sqrt(cond P) / (1 - lambda)` is used.
     Raises DesignInfeasible if there is no proof.
@@ -340,20 +329,14 @@ def discrete_contraction(system: DiscreteLure, *, decays: Sequence[float] | floa
     options = discrete_options(system, decays=decays, noise=1.0)
     n, m = len(system.A), len(system.lower)
     silent = _Template(system, options, 0, (np.zeros((n, 0)), np.zeros((m, 0))))
-    found, best = None, np.inf
-    for decay in options.decays:
-        try:
-            tried = silent.solve(np.zeros(0, dtype=np.intp), decay)
-        except DesignInfeasible:
-            continue
-        cost = np.sqrt(np.linalg.cond(tried.P)) / (1.0 - decay)
-        if cost < best:
-            found, best = tried, cost
-    if found is None:
+    try:
+        return silent.best(
+            np.zeros(0, dtype=np.intp), lambda one: float(np.sqrt(np.linalg.cond(one.P))) / (1.0 - one.decay)
+        )
+    except DesignInfeasible as failure:
         raise DesignInfeasible(
             what, f"the inequality has no solution for lambda in {options.decays}", code="no-solution"
-        )
-    return DirectProof(found.P, found.Lambda, found.decay, found.margin, found.status)
+        ) from failure
 
 
 def _refuse_blind(system: DiscreteLure, gains: DiscreteGains) -> None:
@@ -455,26 +438,22 @@ class _Template:
         self.problem = cp.Problem(cp.Minimize(cost), constraints)
         self.variables = (P, Y, lam, Gamma, mu, mu_delta)
 
-    def best(self, J: Ints) -> DiscreteGains:
-        """The candidate lambda with the smallest bound."""
-        failure, found, best = None, None, np.inf
+    def best(self, J: Ints, cost: Callable[[DiscreteGains], float] | None = None) -> DiscreteGains:
+        """The candidate lambda with the smallest cost, by default the bound of `e^T Q e`."""
+        found: list[DiscreteGains] = []
+        failed: DesignInfeasible | None = None
         for decay in self.options.decays:
             try:
-                tried = self.solve(J, decay)
+                found.append(self.solve(J, decay))
             except DesignInfeasible as reason:
-                failure = reason
-                continue
-            r = self.options.unknown.state.shape[1]
-            cost = (len(J) * tried.mu + r * tried.mu_delta) / (1.0 - decay**2)
-            if cost < best:
-                found, best = tried, cost
-        if found is None:
-            raise (
-                failure
-                if failure is not None
-                else DesignInfeasible("observer", "no candidate decay", code="no-solution")
-            )
-        return found
+                failed = reason
+        if failed is not None and not found:
+            raise failed
+        return min(found, key=self._bound if cost is None else cost)
+
+    def _bound(self, made: DiscreteGains) -> float:
+        r = self.options.unknown.state.shape[1]
+        return float((len(made.J) * made.mu + r * made.mu_delta) / (1.0 - made.decay**2))
 
     def solve(self, J: Ints, decay: float) -> DiscreteGains:
         """Design for one set at one decay, verified."""
