@@ -39,11 +39,9 @@ class Certificate:
     kind: str  # `reactance` and `lmi`: the norm is `sqrt(e^T P e)`. `small-gain`: it is `max_i |e_i| / P_i`
     P: Floats  # (n, n) or (n,) matrix or weights of the norm
     rate: float  # without disturbances the error decays in that norm at least like `exp(-rate t)`, 1/s
-    # steady error in that norm per pu of the largest entry of the meter noise, of the error of the known
-    # input w, and of the attack
-    noise: float
-    load: float
-    attack: float
+    noise: float  # steady error in that norm per pu of the largest entry of the meter noise
+    load: float  # the same for the error of the known input w
+    attack: float  # the same for the attack
     # slack of the condition at the claimed rate, as recomputed by `verify`, relative to the rate of the
     # slowest inverter; a positive margin proves the claim
     margin: float

@@ -30,8 +30,8 @@ class CircleDesign:
 
     lure: Lure  # plant
     trusted: Bools  # (p,) J as a mask
-    L: Floats  # (n, p) gains; the columns of meters outside J are zero
-    K: Floats  # (m, p)
+    L: Floats  # (n, p) gain into the state; zero columns for meters outside J
+    K: Floats  # (m, p) gain into the arguments of the nonlinearities; zero columns likewise
     rate: float  # certified decay rate of the error without disturbances, 1/s, in `error_norm`
     # (p,) influence of each meter on the estimate, see `gains.sensitivity`. A trusted meter without an
     # inverter has 0 under direct injection: attacks on it appear in its output residual only

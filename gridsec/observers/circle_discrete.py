@@ -42,8 +42,8 @@ class DiscreteDesign:
 
     system: DiscreteLure  # plant
     trusted: Bools  # (p,) J as a mask
-    L: Floats  # (n, p) gains; the columns of meters outside J are zero
-    K: Floats  # (m, p)
+    L: Floats  # (n, p) gain into the state; zero columns for meters outside J
+    K: Floats  # (m, p) gain into the arguments of the nonlinearities; zero columns likewise
     decay: float  # lambda, per step
     growth: float  # c
     noise_gain: float  # gamma, with respect to the Euclidean norm of the trusted meters' errors

@@ -64,8 +64,8 @@ class CircleGains:
     """One designed observer with its proof. k trusted meters, n states, m nonlinearities."""
 
     J: Ints  # (k,) the trusted meters
-    L: Floats  # (n, k) injection into the state, and into the argument of the nonlinearities
-    K: Floats  # (m, k)
+    L: Floats  # (n, k) injection into the state
+    K: Floats  # (m, k) injection into the arguments of the nonlinearities
     P: Floats  # (n, n) V = e^T P e is the certificate
     Lambda: Floats  # (m,) diagonal multiplier of the slope restriction
     nu: float  # V' <= -2 alpha V - nu e^T Q e + mu |n / noise|^2 + mu_delta |delta|^2
@@ -74,7 +74,7 @@ class CircleGains:
     alpha: float  # certified decay rate, 1/s
     noise: Floats  # (k,) scale of each trusted meter's error, squared pu
     load: Floats  # (l, r) as in `CircleOptions`
-    weight: Floats  # (n, n)
+    weight: Floats  # (n, n) as in `CircleOptions`
     margin: float  # margin of the rebuilt inequality, see `margin`; positive if it holds
     sensitivity: Floats  # (k,) influence of each trusted meter on the observer, see `sensitivity`
     backoff: float  # fraction by which alpha, nu, mu and mu_delta were relaxed after the solver

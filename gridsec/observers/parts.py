@@ -103,8 +103,8 @@ class StackedDecompositions:
     parts: tuple[SensorDecomposition, ...]  # one for each sensor
     first: Ints  # (p + 1,) sensor i has the rows `first[i]:first[i + 1]` of the stacked arrays
     phi: Floats  # (mu, n) Phi = [Z_1 … Z_p]^T, without the zero rows of the paper
-    S: Floats  # (mu, mu) motion and outputs of the stacked z; block diagonal
-    T: Floats  # (p, mu)
+    S: Floats  # (mu, mu) motion of the stacked z; block diagonal
+    T: Floats  # (p, mu) outputs of the stacked z; block diagonal
     G: Floats  # (mu, m) Phi B
 
     def rows(self, sensor: int) -> slice:

@@ -280,8 +280,8 @@ class UnknownInputObserver:
     missing: tuple[Missing, ...]  # requested observers that do not exist or were not found
     sensors: Bools  # (c, p) J_s as masks
     blind: Floats  # (c, n, n) Gbar
-    inject: Floats  # (c, n, p) `b H` and the gain, zero in the columns of sensors outside J_s
-    K: Floats  # (c, n, p)
+    inject: Floats  # (c, n, p) `b H`; zero columns for sensors outside J_s
+    K: Floats  # (c, n, p) gain; zero columns likewise
     gains: tuple[UnknownInputGains, ...]  # gain and proof of each observer, as designed
     rate: Floats  # (c,) `level+ <= sqrt((rate level)^2 + push^2) + slip`
     push: Floats  # (c,)
@@ -297,11 +297,11 @@ class UnknownInputObserverState:
 
     t: float  # time, s
     x: Floats  # (c, n) estimates
-    level: Floats  # (c,) bounds of their errors
-    box: Floats  # (c, n)
+    level: Floats  # (c,) bound of each error in the norm `sqrt(e^T P e)`
+    box: Floats  # (c, n) bound of each entry of the errors
     y: Floats | None  # (p,) the last readings; None before the first ones
-    u: Floats | None  # (l,)
-    seen: Bools | None  # (p,)
+    u: Floats | None  # (l,) input of the same tick
+    seen: Bools | None  # (p,) mask of these readings
     live: Bools  # (c,) True if the observer had all its readings in the last step
 
 

@@ -111,9 +111,9 @@ class Chong2020Run:
     estimates: Floats  # (T, o, N) those of every observer
     chosen: Ints  # (T,) sigma(t) of (7), as the number of the set
     pi: Floats  # (T, s) (6)
-    v2: Floats  # (T, N) squared voltages: true, by (19) corrected, and reported
-    v2_estimate: Floats  # (T, N)
-    v2_reported: Floats  # (T, N)
+    v2: Floats  # (T, N) squared voltages
+    v2_estimate: Floats  # (T, N) by (19) corrected
+    v2_reported: Floats  # (T, N) as reported
 
     @property
     def error(self) -> Floats:

@@ -40,8 +40,8 @@ class FigureCurve:
     """
 
     label: str  # for the legend; empty for none
-    x: Floats  # (k,) its points; NaN in `y` interrupts it
-    y: Floats  # (k,)
+    x: Floats  # (k,) abscissas
+    y: Floats  # (k,) ordinates; NaN interrupts the curve
     style: Style = "solid"  # "points" has markers only, "steps" holds each value until the next point
 
     def __post_init__(self) -> None:
@@ -58,9 +58,9 @@ class FigureCurve:
 class Panel:
     """One pair of axes with its curves."""
 
-    title: str  # texts, units included
-    x_label: str
-    y_label: str
+    title: str  # text above the axes
+    x_label: str  # with the unit
+    y_label: str  # with the unit
     lines: tuple[FigureCurve, ...]  # the curves
 
 

@@ -75,10 +75,10 @@ class SampledPlant:
     """A sampled plant and its continuous origin."""
 
     A_c: Floats  # (6, 6) continuous time
-    B_c: Floats  # (6, 1)
+    B_c: Floats  # (6, 1) continuous time
     A: Floats  # (6, 6) sampled with zero-order hold
-    B: Floats  # (6, 1)
-    C: Floats  # (5, 6)
+    B: Floats  # (6, 1) sampled
+    C: Floats  # (5, 6) outputs
     E: Floats  # (6, 6) input matrix of a disturbance w that is constant over a step: d = E w
 
 
@@ -157,14 +157,14 @@ class Lee2018Run:
     """One simulation of T steps."""
 
     t: Floats  # (T,) time, s
-    x: Floats  # (T, 6) state; estimate in the loop; estimate of the conventional observer beside it
-    x_hat: Floats  # (T, 6)
-    x_conventional: Floats  # (T, 6)
+    x: Floats  # (T, 6) state
+    x_hat: Floats  # (T, 6) estimate of the secure estimator
+    x_conventional: Floats  # (T, 6) estimate of the conventional observer
     bound: Floats  # (T,) bound of |x_hat - x|; infinite for Gaussian noise
     disagree: Floats  # (T, 5) sensors that the estimate does not use (Gaussian) or explain (bounded)
     searched: Floats  # (T,) steps with a search (bounded) or an alarm (Gaussian)
-    attack: Floats  # (T,) a_1 and theta_3,ref, rad
-    reference: Floats  # (T,)
+    attack: Floats  # (T,) a_1, rad
+    reference: Floats  # (T,) theta_3,ref, rad
     u: Floats  # (T,) torque, N m
 
 

@@ -52,8 +52,8 @@ class FeederStudy:
     """Results of the two algorithms on a sampled feeder."""
 
     design: WindowDesign  # bank and proven thresholds
-    error: Floats  # (T, o) error of every observer, and its proven bound, pu of reactive power
-    bound: Floats  # (o,)
+    error: Floats  # (T, o) error of every observer, pu of reactive power
+    bound: Floats  # (o,) its proven bound
     verdicts: tuple[windows.WindowVerdict, ...]  # one for each window
 
 
@@ -283,8 +283,8 @@ class FigureSetting:
     """Setting of one of the paper's four figures."""
 
     figure: int  # its number
-    sensor: int  # the attacked sensor, from 0, and the half width of its uniform attack
-    size: float
+    sensor: int  # the attacked sensor, from 0
+    size: float  # half-width of its uniform attack
 
     @property
     def isolates(self) -> bool:

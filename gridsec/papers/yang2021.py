@@ -78,12 +78,12 @@ def missing_complete() -> tuple[Missing, ...]:
 class Yang2021Run:
     """One simulation. T steps, n states, r inputs, p sensors."""
 
-    x: Floats  # (T, n) truth and estimate
-    x_hat: Floats  # (T, n)
-    a_u: Floats  # (T, r) attack on the inputs; `a_u_hat[k]` is (42) of step k + 1, NaN at the last step
-    a_u_hat: Floats  # (T, r)
-    a_y: Floats  # (T, p) attack on the sensors and (43)
-    a_y_hat: Floats  # (T, p)
+    x: Floats  # (T, n) state
+    x_hat: Floats  # (T, n) estimate
+    a_u: Floats  # (T, r) attack on the inputs
+    a_u_hat: Floats  # (T, r) (42) of the next step; NaN at the last step
+    a_y: Floats  # (T, p) attack on the sensors
+    a_y_hat: Floats  # (T, p) (43)
     bound: Floats  # (T, n) bound of the estimate's error; proven only where no member is missing
     answers: tuple[IsolationStep, ...]  # results of the bank
 

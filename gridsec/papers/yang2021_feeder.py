@@ -83,8 +83,8 @@ def bank(reading_error: float = 1e-6) -> IsolationDesign:
 class Yang2021FeederRun:
     """One simulation. T ticks, m inverters, p meters."""
 
-    x: Floats  # (T, m) reactive injections and wrong parts of their set points, pu
-    a_u: Floats  # (T, m)
+    x: Floats  # (T, m) reactive injections, pu
+    a_u: Floats  # (T, m) wrong parts of their set points, pu
     a_y: Floats  # (T, p) attacks on the meters, squared pu
     answers: tuple[IsolationStep, ...]  # results of the bank
 

@@ -707,8 +707,8 @@ class FeederIndex:
     static: Index  # from one snapshot of readings alone
     dynamic: Index  # from the readings of all time
     asymptotic: Index  # as `dynamic`, for attacks that do not decay; infinite for a stable closed loop
-    A: Floats  # (n, n) the linearisation
-    C: Floats  # (p, n)
+    A: Floats  # (n, n) motion of the linearised loop
+    C: Floats  # (p, n) outputs of the linearised loop
 
 
 def slopes(lure: Lure, z: Floats, *, step: float) -> Floats:

@@ -46,8 +46,8 @@ class IsolationDesign:
     large: Ints  # (a,) indices of the large ones, J of (5) or (22)
     company: Ints  # (a, b) for each large observer the small ones within it, padded by repetition
     alone: Bools  # (a,) large observers without any existing company: they cannot be confirmed
-    max_inputs: int  # q_1 and q_2. A complete bank distrusts all inputs: max_inputs = r
-    max_sensors: int
+    max_inputs: int  # q_1; a complete bank distrusts all inputs: max_inputs = r
+    max_sensors: int  # q_2
     missing: tuple[Missing, ...]  # members missing from the bank. Unless empty, the theorems do not apply
     # measure of disagreement. "distance": the Euclidean norm of (5) and (22), with the selection (6), (23).
     # "bounds": the largest difference of an entry relative to the sum of both observers' error bounds, in
@@ -55,10 +55,9 @@ class IsolationDesign:
     # selected
     measure: Measure
     left: Floats  # (r, n) left inverse of the inputs' matrix
-    # (r, n) gains from the bounds of the estimates to that of the reconstructed input attack
-    from_now: Floats
-    from_before: Floats  # (r, n)
-    from_drift: Floats  # (r,)
+    from_now: Floats  # (r, n) gain from the bound of an estimate to that of the reconstructed input attack
+    from_before: Floats  # (r, n) gain from the bound of the estimate before
+    from_drift: Floats  # (r,) contribution of the drift
 
     @property
     def guaranteed(self) -> bool:
@@ -249,11 +248,11 @@ class IsolationState:
     """State between ticks. n states, r inputs, p sensors, l known inputs."""
 
     family: UnknownInputObserverState  # the observers
-    x: Floats | None  # (n,) selected estimate and bound of its error at the last tick
-    bound: Floats | None  # (n,)
+    x: Floats | None  # (n,) selected estimate of the last tick
+    bound: Floats | None  # (n,) bound of its error
     u: Floats | None  # (l,) known input of the last tick
-    inputs: Bools  # (r,) named so far: by Assumption 1 the attacked sets do not change
-    sensors: Bools  # (p,)
+    inputs: Bools  # (r,) inputs named so far: by Assumption 1 the attacked sets do not change
+    sensors: Bools  # (p,) sensors named so far
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -264,21 +263,20 @@ class IsolationStep:
     decision: Decision  # as in `gridsec.interface.Verdict`. UNDECIDED if members of the bank are missing
     cause: Cause
     reason: str
-    x: Floats  # (n,) estimate (7), (24) and a bound of its error, valid under the theorems' assumptions
-    bound: Floats  # (n,)
+    x: Floats  # (n,) estimate (7), (24)
+    bound: Floats  # (n,) bound of its error under the theorems' assumptions
     selected: Pair  # (J_u, J_s) of the selected observer
     # (a,) pi of (5) or (22) for each large observer, infinite if it cannot be confirmed. With "bounds", a
     # value above 1 proves that an attack affects the observer or one of its company
     disagreement: Floats
-    # (r,) (42), of the *last* tick, and its largest value without attack. NaN and infinite at the first tick
-    input_attack: Floats
-    input_threshold: Floats  # (r,)
-    sensor_attack: Floats  # (p,) (43), NaN where unseen, and its largest value without attack
-    sensor_threshold: Floats  # (p,)
-    inputs_now: Bools  # (r,) (46), (47) with these thresholds, for this tick alone
-    sensors_now: Bools  # (p,)
-    inputs: Bools  # (r,) named at this tick or before
-    sensors: Bools  # (p,)
+    input_attack: Floats  # (r,) (42), of the *last* tick; NaN at the first tick
+    input_threshold: Floats  # (r,) its largest value without attack; infinite at the first tick
+    sensor_attack: Floats  # (p,) (43); NaN where unseen
+    sensor_threshold: Floats  # (p,) its largest value without attack
+    inputs_now: Bools  # (r,) (46) with these thresholds, for this tick alone
+    sensors_now: Bools  # (p,) (47) likewise
+    inputs: Bools  # (r,) inputs named at this tick or before
+    sensors: Bools  # (p,) sensors named at this tick or before
 
 
 def init(

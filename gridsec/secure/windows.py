@@ -310,8 +310,8 @@ class WindowVerdict:
     # Algorithm 2: ATTACKED, CLEAN if no meter is suspect and every set was judged at every step, or UNDECIDED
     isolation: Decision
     suspects: Bools  # (p,) meters named by Algorithm 2
-    score: Floats  # (1 + s,) largest pi and pi_J of the window beside their thresholds
-    threshold: Floats  # (1 + s,)
+    score: Floats  # (1 + s,) largest pi and pi_J of the window
+    threshold: Floats  # (1 + s,) their thresholds
 
 
 def init(design: WindowDesign, t: float, x: Floats) -> WindowState:
@@ -399,8 +399,8 @@ def _top(values: Floats) -> float:
 class Trace:
     """One simulated run or several. T steps, R runs on a leading axis if there are several."""
 
-    pi: Floats  # (…, T)
-    pi_sets: Floats  # (…, T, s) the consistency measures
+    pi: Floats  # (…, T) consistency measure of all large sets
+    pi_sets: Floats  # (…, T, s) consistency measure of each
     error: Floats  # (…, T, o) `|x_hat - x|` of every observer
 
 

@@ -114,7 +114,7 @@ class Slopes:
     # (n, n) entry (j, k): range of the derivative of row j with respect to z_k. Rows before the last are
     # those of `beta_j u`, the last one that of `alpha + beta_n u`; zero above the diagonal
     low: Floats
-    high: Floats  # (n, n)
+    high: Floats  # (n, n) upper ends
     proven: bool  # True for rigorous ranges; False for samples
 
 

@@ -346,8 +346,8 @@ class SensorForm:
     """Symbolic decomposition for one sensor."""
 
     phi: tuple[Expression, ...]  # `h, L_f h, …`; n_i expressions in x
-    alpha: Expression  # `L_f^{n_i} h`, and for each row j the m expressions `L_g L_f^{j-1} h`, in x
-    beta: tuple[tuple[Expression, ...], ...]
+    alpha: Expression  # `L_f^{n_i} h`, in x
+    beta: tuple[tuple[Expression, ...], ...]  # for each row j the m expressions `L_g L_f^{j-1} h`, in x
     # for alpha and each entry of beta (in this order, row by row) the equal polynomial in z_i, or None if
     # there is none of the given degree
     polynomials: tuple[Polynomial | None, ...]

@@ -177,8 +177,8 @@ Boxed = Callable[[Sequence[Any]], Any]
 class Bracket:
     """Bracket of a constant."""
 
-    lower: float  # ends of the bracket; an unknown end is infinite
-    upper: float
+    lower: float  # lower end; minus infinity or 0 if unknown
+    upper: float  # upper end; infinite if unknown
     # "interval bisection" is a proof (up to the correctness of the outward rounding); "sampling" shows only
     # that no tried point exceeds one side
     method: str

@@ -55,7 +55,7 @@ class HighGainEstimate:
     visited: tuple[int, ...]  # the tested sets, in order; the last is `sigma`
     trusted: Bools  # (p,) the sensors of that set
     residual: float  # of that set; NaN if not tested
-    threshold: float
+    threshold: float  # of that set; NaN if not tested
     decision: Decision  # as in `gridsec.interface`; UNDECIDED is an answer of its own
     cause: Cause
     reason: str
@@ -257,8 +257,8 @@ class HighGainDesign:
     # time (the papers' simulations)
     search: Search
     K: Floats  # (p, n_max) gains
-    field: Field  # right-hand side, and matrices for the nominal step
-    move: HighGainTransition
+    field: Field  # right-hand side of the observers
+    move: HighGainTransition  # matrices of the nominal substep
     substeps: int  # number of substeps of a step
 
 

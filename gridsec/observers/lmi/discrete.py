@@ -77,12 +77,11 @@ class DiscreteGains:
     """
 
     J: Ints  # (k,) the trusted meters
-    # (n, k) injection of `r = y - y_hat` into the state and into the arguments of the nonlinearities;
-    # yang2019 (4) writes the same with the opposite sign of both
+    # (n, k) injection of `r = y - y_hat` into the state; yang2019 (4) writes it with the opposite sign
     L: Floats
-    K: Floats  # (m, k)
-    P: Floats  # (n, n)
-    Lambda: Floats  # (m,) certificate and multiplier, for the loop-transformed system
+    K: Floats  # (m, k) injection into the arguments of the nonlinearities, likewise
+    P: Floats  # (n, n) certificate, for the loop-transformed system
+    Lambda: Floats  # (m,) multiplier, for the same system
     decay: float  # lambda of yang2019 (5), per step
     mu: float  # as above
     mu_delta: float

@@ -29,8 +29,8 @@ class DiscreteLure(Matrices):
         or h is not positive; lists every problem.
     """
 
-    lower: Floats  # (m,) bounds of the slopes of each entry of phi, `lower <= upper`
-    upper: Floats  # (m,)
+    lower: Floats  # (m,) lower bound of the slope of each entry of phi
+    upper: Floats  # (m,) upper bound, `lower <= upper`
     phi: Nonlinearity  # the nonlinearity, (…, m) -> (…, m), entry by entry
     h: float = 1.0  # time from one step to the next, s
 

@@ -163,9 +163,9 @@ class GaussianOutcome:
     covariance: Floats  # (n, n) covariance of its error, if the trusted sensors are unmanipulated
     trusted: Bools  # (p,) the sensors in use
     alarm: bool  # f: True if the set trusted before failed its test in this step
-    g: float  # statistic of the set trusted *before* this step, its threshold, its degrees of freedom
-    threshold: float
-    freedom: int
+    g: float  # statistic of the set trusted *before* this step
+    threshold: float  # its threshold
+    freedom: int  # its degrees of freedom
     # True if the set trusted now passes its own test. Otherwise more than q sensors are attacked, or this
     # step is one of the expected false alarms of all sets
     credible: bool

@@ -150,10 +150,10 @@ class Fits:
     """Fits that leave q blocks out, for all sets. S sets, p blocks, A rows, n unknowns, F functionals."""
 
     left_out: Bools  # (S, p) the blocks left out by each fit
-    # (S, A) ``s - B xi_hat`` and its largest value if all blocks outside the set are unmanipulated and, for
-    # rows of the set, these as well
-    residual: Floats
-    limit: Floats  # (S, A)
+    residual: Floats  # (S, A) `s - B xi_hat`
+    # (S, A) largest residual if all blocks outside the set, and for rows of the set these too, are
+    # unmanipulated
+    limit: Floats
     # (A,) largest value of ``|s|`` of an unmanipulated row: the limit of the fit without blocks
     reach: Floats
     disagree: Bools  # (S, p) blocks with a residual above its limit, or a value above `reach`
