@@ -38,7 +38,6 @@ class CircleOptions:
     floor: float  # smallest gain, 0 … 1, from a trusted meter to the curve of an inverter at the same place
 
     def __post_init__(self) -> None:
-        """Freeze the arrays and refuse invalid values."""
         for name in ("noise", "load", "weight"):
             object.__setattr__(self, name, frozen(getattr(self, name)))
         noise, load, weight = self.noise, self.load, self.weight
@@ -224,8 +223,7 @@ def sensitivity(lure: Lure, L: Floats, K: Floats) -> Floats:
 def refuse_blind(J: Ints, heard: Floats) -> None:
     """Refuse a design that ignores every one of its meters.
 
-    J (k,).
-    heard (k,): their `sensitivity`.
+    J (k,). heard (k,): their `sensitivity`.
     Raises DesignInfeasible if every sensitivity is below `_BLIND`; the message states reason and remedies.
     """
     if np.max(heard, initial=0.0) < _BLIND:

@@ -147,8 +147,7 @@ def step(
     """Step from (k|k) to (k+1|k+1), with the input u(k) and the readings y(k+1).
 
     y (…, p): readings at the end of the step; ignored where not seen or not finite.
-    u (…, m).
-    seen (p,): as in `correct`.
+    u (…, m). seen (p,): as in `correct`.
     Source: lee2018 (4.3.8).
     """
     return correct(design, predict(design, state, u), y, seen)

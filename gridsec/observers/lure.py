@@ -401,8 +401,7 @@ def settle(
     phi: nonlinearity, entry by entry, non-decreasing.
     gain (n, m): gain behind phi.
     H (m, n) or (…, m, n): feedback, possibly one for every leading index (one observer each).
-    drive (…, m).
-    bias (…, n): constant parts.
+    drive (…, m). bias (…, n): constant parts.
     x0 (…, n): initial value.
     tol: largest entry of the residual, in the unit of x.
     Raises DesignInfeasible if the residual is still above `tol` after `max_iter` steps.

@@ -54,7 +54,6 @@ class UnknownInputPlant:
     span: Floats  # (n,) largest possible |x_i|, or infinity. The only knowledge at the start
 
     def __post_init__(self) -> None:
-        """Freeze the arrays and refuse invalid values."""
         for name in ("inputs", "noise", "drift", "span"):
             object.__setattr__(self, name, frozen(getattr(self, name)))
         n, p = len(self.system.A), len(self.system.C)

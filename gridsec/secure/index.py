@@ -245,8 +245,7 @@ def eigenspaces(A: Floats, *, tol: float) -> tuple[Eigenspace, ...]:
     or N itself is that small. That holds, up to the constant, for any matrix within tol of one with an m-fold
     eigenvalue, and fails for several distinct eigenvalues further apart.
 
-    A (n, n).
-    tol: relative backward error at which eigenvalues count as equal and vectors as eigenvectors.
+    A (n, n). tol: relative backward error at which eigenvalues count as equal and vectors as eigenvectors.
     Their order is arbitrary; the algebraic multiplicities sum to n.
     """
     return tuple(_eigenspace(cluster, tol) for cluster in _clusters(_Schur.of(A), tol))
@@ -255,8 +254,7 @@ def eigenspaces(A: Floats, *, tol: float) -> tuple[Eigenspace, ...]:
 def unstable_subspace(A: Floats, *, discrete: bool, tol: float) -> Floats:
     """X_u(A): the span of the generalised eigenvectors of all unstable eigenvalues.
 
-    A (n, n).
-    discrete: sampled time.
+    A (n, n). discrete: sampled time.
     tol: as in `eigenspaces` and `Eigenspace.unstable`.
     Returns (n, d): real orthonormal basis.
     Source: lee2018, Notation and Symbols.

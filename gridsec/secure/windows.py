@@ -202,7 +202,6 @@ def design(
 ) -> WindowDesign:
     """Thresholds of a bank, `2 (epsilon + gamma m)`.
 
-    max_attacked: q, as there.
     noise: m, supremum of the Euclidean norm of all meters' noise.
     start: bound on every observer's initial error; 0 for starts in the true state.
     epsilon: its largest remainder when windows begin.
@@ -410,8 +409,7 @@ def simulate(
     """Simulate plant and bank together under given noise and attacks.
 
     x (…, n): initial states of the plant.
-    u (T, l).
-    disturbance (…, T, p): noise plus attack of every meter.
+    u (T, l). disturbance (…, T, p): noise plus attack of every meter.
     apart (…, n) or scalar: initial error of every observer.
     """
     system, observers = design.observers.system, design.observers

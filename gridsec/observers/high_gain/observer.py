@@ -77,13 +77,12 @@ def verdict(
 ) -> tuple[Decision, Cause, str]:
     """Decision, cause, and one sentence.
 
-    heard: number of sensors with a reading.
-    needed: number of sensors of a set.
+    heard: number of sensors with a reading. needed: number of sensors of a set.
     passed: True if the last set passed its test; None if it was not complete, and not tested.
     alarm: True if a test failed or a sensor is named.
     settled: True if the bounds of all observers with readings have settled.
     untested: number of sensors with a reading but without a test.
-    search: as in the design: with "one", other sets may still pass later.
+    search: with "one", other sets may still pass later.
     """
     if passed is None:
         reason = f"{heard} sensors are heard and no set of {needed} is complete"
@@ -213,8 +212,7 @@ def advance(
     Readings and inputs are interpolated linearly between the two instants. The stiff linear part is exact for
     every `theta h`.
 
-    K (p, n_max).
-    z (p, n_max): estimates at the start.
+    K (p, n_max). z (p, n_max): estimates at the start.
     y (pair of (p,)): readings at the start and the end.
     u (pair of (m,)): inputs at the start and the end.
     Returns (p, n_max): estimates at the end; not finite on overflow by extreme readings.

@@ -276,8 +276,7 @@ def extend(points: Floats, values: Floats, constants: Floats) -> Map:
     Every component keeps its constant on the whole space, in the largest-entry norm, and the given values
     that satisfy it (McShane's formula; in the papers Kirszbraun's).
 
-    points (k, N): points with known values.
-    values (k, n): its values.
+    points (k, N) with known values (k, n).
     constants (n,): Lipschitz constant of each component.
     Source: kim2018, footnote 2; lee2018, Remark 5.2.3.
     """

@@ -50,8 +50,7 @@ def circle(
     Minimises `k mu + r mu_delta`, a bound on the mean of e^T Q e for signals of their stated sizes, over (P,
     P L, Lambda, Lambda K, mu, mu_delta) subject to the corrected (12) with nu = 1.
 
-    J (k,).
-    rate, noise, load, weight, floor: see `options_for`.
+    J (k,). rate, noise, load, weight, floor: see `options_for`.
     Raises DesignInfeasible if there is no such observer, if the rebuilt inequality is violated, or if the
         optimum is the blind L = K = 0.
     Source: chong2020 (12), corrected: docs/theory-observers.md, section 2.
@@ -64,8 +63,7 @@ def prove(lure: Lure, J: Sequence[int] | Ints, L: Floats, K: Floats, options: Ci
     """Certificate for an observer with given gains: the corrected (12) in P and Lambda only.
 
     lure: plant; n states, m nonlinearities.
-    J (k,).
-    L (n, k), K (m, k): gains. Those of nonlinearities of slope bound 0 have no effect.
+    J (k,). L (n, k), K (m, k): gains. Those of nonlinearities of slope bound 0 have no effect.
     options: from `options_for`. Its `floor` is ignored.
     Blind gains are accepted.
     Raises DesignInfeasible if the inequality has no solution, or is violated when rebuilt.

@@ -278,7 +278,6 @@ def discrete_circles(
 ) -> tuple[DiscreteGains, ...]:
     """`discrete_circle` for several sets; sets of one size share one stated problem.
 
-    system, options: as there.
     Raises DesignInfeasible if there is no such observer for one of the sets, or it ignores its meters.
     """
     templates: dict[int, _Template] = {}

@@ -55,7 +55,6 @@ class ErrorSystem:
     N: Floats  # (k,) size of the error of each sensor's reading, positive
 
     def __post_init__(self) -> None:
-        """Freeze the arrays and check that their shapes are consistent."""
         for name in ("M", "S", "H", "half", "C", "W", "N"):
             object.__setattr__(self, name, frozen(getattr(self, name)))
         n, m, k, d = len(self.M), self.half.size, self.N.size, self.W.shape[-1]

@@ -185,8 +185,7 @@ def residual_covariance(stack: Stack, P: Floats) -> Floats:
 def detect(test: Test, z: Floats, *, false_alarm: float) -> Verdicts:
     """Chi-square test for the presence of an error.
 
-    z (…, N).
-    false_alarm: delta, probability of an alarm without an error, strictly between 0 and 1.
+    z (…, N). false_alarm: delta, probability of an alarm without an error, strictly between 0 and 1.
     Measurements that are not finite alarm.
     Source: lee2018, Algorithm 2.2, with the degrees of freedom corrected.
     """

@@ -320,8 +320,7 @@ def decode_by_pursuit(stack: Stack, z: Floats, *, tol: float) -> Floats:
     second-order cone program, because an attack has no pattern within the block of its sensor.
 
     stack: Phi of full column rank.
-    z (N,).
-    tol: as in `annihilator`.
+    z (N,). tol: as in `annihilator`.
     Returns (n,): `Phi^+ (z - e)`.
     Source: lee2018 (2.1.4); Remark 2.2.2.
     """
