@@ -168,17 +168,10 @@ class Lee2018Run:
     u: Floats  # (T,) torque, N m
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _World:
-    """Random and prescribed signals, drawn before the loop."""
-
-    d: Floats
-    n: Floats
-    lie: Floats
-    wanted: Floats
-
-
-def _world(model: SampledPlant, t: Floats, seed: int, *, attacked: bool, normal: bool) -> _World:
+def _signals(
+    model: SampledPlant, t: Floats, seed: int, *, attacked: bool, normal: bool
+) -> tuple[Floats, Floats, Floats]:
+    """Disturbance, noise and attack, drawn before the loop."""
     rng = np.random.default_rng(seed)
     steps, p = t.size, len(model.C)
     w = rng.standard_normal((steps, 6))
@@ -191,7 +184,7 @@ def _world(model: SampledPlant, t: Floats, seed: int, *, attacked: bool, normal:
     lie = np.zeros((steps, p))
     if attacked:
         lie[:, 0] = attack(t)
-    return _World(w @ model.E.T, n, lie, reference(t))
+    return w @ model.E.T, n, lie
 
 
 def simulate(
@@ -211,14 +204,15 @@ def simulate(
     feedback: estimate used by the controller.
     """
     t: Floats = np.arange(round(seconds / PERIOD), dtype=np.float64) * PERIOD
-    world = _world(model, t, seed, attacked=attacked, normal=isinstance(design, GaussianDesign))
+    normal, wanted = isinstance(design, GaussianDesign), reference(t)
+    d, n, lie = _signals(model, t, seed, attacked=attacked, normal=normal)
     gain = conventional_gain(model)
     steps = t.size
     x, total, plain = X_START.copy(), 0.0, np.zeros(6)
     xs, hats, plains = np.empty((steps, 6)), np.empty((steps, 6)), np.empty((steps, 6))
     bounds, us = np.full(steps, np.inf), np.empty(steps)
     disagree, searched = np.zeros((steps, len(model.C))), np.zeros(steps)
-    y = model.C @ x + world.n[0] + world.lie[0]
+    y = model.C @ x + n[0] + lie[0]
     if isinstance(design, BoundedDesign):
         one, out = partial_bounded.init(design, 0.0, np.zeros(6), START_ERROR)
     else:
@@ -233,16 +227,16 @@ def simulate(
         u = FEEDBACK @ used + INTEGRAL * total
         us[k] = u[0]
         # The controller has estimates only and integrates the estimated theta_3.
-        total += world.wanted[k] - used[4]
+        total += wanted[k] - used[4]
         plain = model.A @ plain + model.B @ u + gain @ (y - model.C @ plain)
-        x = model.A @ x + model.B @ u + world.d[k]
+        x = model.A @ x + model.B @ u + d[k]
         if isinstance(design, BoundedDesign):
             one, out = partial_bounded.step(design, one, y, u)
         if k + 1 < steps:
-            y = model.C @ x + world.n[k + 1] + world.lie[k + 1]
+            y = model.C @ x + n[k + 1] + lie[k + 1]
             if isinstance(design, GaussianDesign):
                 two, seen = partial_gaussian.step(design, two, y, u)
-    return Lee2018Run(t, xs, hats, plains, bounds, disagree, searched, world.lie[:, 0], world.wanted, us)
+    return Lee2018Run(t, xs, hats, plains, bounds, disagree, searched, lie[:, 0], wanted, us)
 
 
 SECONDS = 6.0
@@ -262,25 +256,19 @@ def chapter4() -> Reproduction:
     made = estimator(model)
     run = simulate(model, made, seconds=SECONDS)
     gauss = simulate(model, gaussian_estimator(model), seconds=SECONDS)
-    claims = (
-        *_index_claims(model),
-        *_memory_claims(made),
-        *_run_claims(model, made, run),
-        *_gauss_claims(gauss),
-    )
-    return Reproduction("lee2018-4", claims, (_figure(run), _errors(run, gauss)))
+    claims = [*_index_claims(model), *_memory_claims(made), *_run_claims(model, made, run)]
+    claims += _gauss_claims(gauss)
+    return Reproduction("lee2018-4", tuple(claims), (_figure(run), _errors(run, gauss)))
 
 
 def _index_claims(model: SampledPlant) -> list[Claim]:
     place = "section 4.5"
     asymptotic = asymptotic_index(model.A, model.C, discrete=True, tol=TOL)
-    enough = redundant_detectable(model.A, model.C, 2, discrete=True, tol=TOL)
-    more = redundant_detectable(model.A, model.C, 3, discrete=True, tol=TOL)
+    lost = [q for q in (2, 3) if redundant_detectable(model.A, model.C, q, discrete=True, tol=TOL)]
+    redundancy = f"{max(lost)}-redundant detectable" if lost else "not 2-redundant detectable"
     printed = asymptotic_index(model.A, ROWS_PRINTED, discrete=True, tol=TOL)
     return [
-        statement(
-            "redundancy of (A, C)", place, "2-redundant detectable", _redundancy(enough=enough, more=more)
-        ),
+        statement("redundancy of (A, C)", place, "2-redundant detectable", redundancy),
         number("attacked sensors that can be corrected", place, 1.0, asymptotic.correctable, unit=1.0),
         number(
             "dynamic security index", place, 3.0, dynamic_index(model.A, model.C, tol=TOL).count, unit=1.0
@@ -295,12 +283,6 @@ def _index_claims(model: SampledPlant) -> list[Claim]:
             "the printed C_c has six rows for five outputs: the one of theta_2 is there twice",
         ),
     ]
-
-
-def _redundancy(*, enough: bool, more: bool) -> str:
-    if more:
-        return "3-redundant detectable"
-    return "2-redundant detectable" if enough else "not 2-redundant detectable"
 
 
 def _memory_claims(made: BoundedDesign) -> list[Claim]:

@@ -271,31 +271,21 @@ def doubt_error(example: int, size: float = 2.0) -> float:
 
 
 def _figures(amplitude: float, numbers: tuple[int, ...]) -> list[PaperFigure]:
-    one, two = simulate(1, amplitude), simulate(2, amplitude)
+    # The captions of Figures 3 and 4 attack input 1, those of Figures 9 to 12 input 3.
+    one, two, other = (simulate(1, amplitude), simulate(2, amplitude), simulate(2, amplitude, inputs=(0,)))
     size = f"uniform in ±{amplitude:g}"
-    return [
-        _states(one, numbers[0], f"Example 1: estimate (dashed) and state, attacks {size}"),
-        # The captions of Figures 3 and 4 attack input 1, those of Figures 9 to 12 input 3.
-        _states(
-            simulate(2, amplitude, inputs=(0,)),
-            numbers[1],
-            f"Example 2: estimate (dashed) and state, attacks {size}",
-        ),
-        _attacks(one, numbers[2], "y", f"Example 3: attacks on the sensors, {size}, reconstructed by (43)"),
-        _attacks(one, numbers[3], "u", f"Example 3: attacks on the inputs, {size}, reconstructed by (42)"),
-        _attacks(two, numbers[4], "y", f"Example 4: attacks on the sensors, {size}, reconstructed by (43)"),
-        _attacks(two, numbers[5], "u", f"Example 4: attacks on the inputs, {size}, reconstructed by (42)"),
-    ]
-
-
-def _states(run: Yang2021Run, place: int, caption: str) -> PaperFigure:
-    return _figure(place, caption, run.x, run.x_hat, "x")
-
-
-def _attacks(run: Yang2021Run, place: int, which: str, caption: str) -> PaperFigure:
-    if which == "y":
-        return _figure(place, caption, run.a_y, run.a_y_hat, "a_y")
-    return _figure(place, caption, run.a_u, run.a_u_hat, "a_u")
+    states = f"estimate (dashed) and state, attacks {size}"
+    sensors = f"attacks on the sensors, {size}, reconstructed by (43)"
+    inputs = f"attacks on the inputs, {size}, reconstructed by (42)"
+    parts = (
+        (f"Example 1: {states}", one.x, one.x_hat, "x"),
+        (f"Example 2: {states}", other.x, other.x_hat, "x"),
+        (f"Example 3: {sensors}", one.a_y, one.a_y_hat, "a_y"),
+        (f"Example 3: {inputs}", one.a_u, one.a_u_hat, "a_u"),
+        (f"Example 4: {sensors}", two.a_y, two.a_y_hat, "a_y"),
+        (f"Example 4: {inputs}", two.a_u, two.a_u_hat, "a_u"),
+    )
+    return [_figure(place, *part) for place, part in zip(numbers, parts, strict=True)]
 
 
 def _figure(place: int, caption: str, truth: Floats, found: Floats, letter: str) -> PaperFigure:
