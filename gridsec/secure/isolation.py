@@ -4,10 +4,6 @@ A bank compares every large observer, which distrusts q_1 inputs and q_2 sensors
 distrust twice as many of each. The observer in best agreement with its company is selected. The attacks
 follow from its estimate; inputs and sensors with an attack above the estimate's error are named.
 
-    design(plant, ...) -> IsolationDesign
-    init(design, t) -> IsolationState
-    step(design, state, y, u, seen) -> (IsolationState, Isolation)
-
 Source: yang2021 (4) to (7), (19), (20), (22) to (24), (42) to (47); docs/theory-unknown-input.md.
 """
 

@@ -4,11 +4,9 @@
     z_i' = A z_i + e alpha_i(z_i) + beta_i(z_i) u,    beta_ij depends on z_i1, …, z_ij only
     y_i = z_i1 + a_i + v_i
 
-All functions are written over *components*: they take a sequence of n entries and use NumPy's operations on
-them, so that the same function serves numbers, arrays and intervals. `linear` computes the decomposition of a
-linear system, `form.decompose` that of a system in sympy.
-
-The only module that imports sympy, and only when called: sympy is optional.
+Functions are written over *components*: they take a sequence of n entries and use NumPy's operations on
+them, so that one function serves numbers, arrays and intervals. `linear` decomposes a linear system,
+`decompose` one in sympy, which is optional and imported only there.
 
 Lie derivatives are exact. The order n_i is the number of Lie derivatives with independent differentials;
 alpha_i and beta_ij are found by matching a polynomial in z_i against the exact expression, and accepted only

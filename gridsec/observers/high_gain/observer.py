@@ -1,9 +1,8 @@
 """Partial high-gain observers, detection with a time-varying threshold, and the switching search.
 
-Sensor i occupies the first n_i of n_max places of its row; the rest stays zero.
-
-Each sensor has an observer of its own, so that an attack affects only one. A set of p - q sensors is
-trusted while its left inverse explains all its estimates; the search continues only if it does not.
+Each sensor has an observer of its own, so that an attack affects only one; sensor i occupies the first n_i of
+n_max places of its row, the rest is zero. A set of p - q sensors is trusted while its left inverse explains
+all its estimates; the search continues only if it does not.
 
 Source: kim2018, section III; lee2018, sections 5.2 and 5.4; docs/theory-high-gain.md.
 """

@@ -1,12 +1,9 @@
 """Detection and correction under bounded noise, and the probability of these bounds for Gaussian noise.
 
-Every block of the noise has norm at most v_max. Then, for errors in at most q blocks:
-
-- `detect` never alarms without an error; without an alarm, errors and estimate are within
-  `kappa_e v_max` and `kappa_d v_max`;
-- `correct` is within `kappa_c v_max` for any errors.
-
-The guarantees for bounded noise hold with at least that probability.
+Every block of the noise has norm at most v_max. Then, for errors in at most q blocks, `detect` never alarms
+without an error, and without an alarm errors and estimate are within `kappa_e v_max` and `kappa_d v_max`;
+`correct` is within `kappa_c v_max` for any errors. Under Gaussian noise all this holds with at least the
+probability `bound_probability`.
 
 Source: lee2018, section 2.2.3.1, (2.2.15). Proofs and corrections: docs/theory-decoding.md.
 """

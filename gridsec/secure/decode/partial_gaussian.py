@@ -2,19 +2,17 @@
 
     z = Phi x + v + e,    v ~ N(0, P),  P >= 0
 
-The joint covariance of partial filters is usually singular: at the start all of them have the same initial
-error, and modes that several sensors cannot observe are predicted by all of them with exactly the same error.
-P^-1 then does not exist. Parity space avoids it: with N the annihilator of Phi, `N z` has covariance
-`V = N P N^T`, and
+The joint covariance of partial filters is usually singular: their initial errors are equal, and so are those
+of modes that several sensors cannot observe. In place of P^-1, with N the annihilator of Phi and
+`V = N P N^T`,
 
     g = (N z)^T V^+ (N z),     x_hat = Phi^+ (I - P N^T V^+ N) z
 
 are the test and the minimum-variance estimate of `gridsec.secure.decode.gaussian` wherever P > 0. A parity
 with variance zero is not random: it vanishes exactly unless there is an attack.
 
-The trusted sensors are fused and tested at every step. While the test passes, no other set is
-computed. After an alarm every set of p - q sensors is tested, and the most likely one is trusted from
-then on.
+The trusted sensors are fused and tested at every step. After an alarm every set of p - q sensors is tested,
+and the most likely one is trusted from then on.
 
 Corrected: degrees of freedom are the rank of the residual's covariance, that covariance may be singular,
 and the estimate of an alarming step is that of the newly chosen set: docs/errata/lee2018-chapter-4.md.

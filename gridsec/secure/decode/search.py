@@ -1,24 +1,21 @@
-"""l0 decoding: exact search, rows with bounds of their own, and recovery without enumeration.
+"""l0 decoding by exact search, for balls and for boxes, and recovery without enumeration.
 
-    F_(p,r)(z) = {Phi_Lambda^+ z_Lambda : |Lambda| = p - r},   q <= r <= 2q
+`exact` and `bounded` choose among the candidates
 
-always contains a good answer, so C(p, r) candidates take the place of R^n. One pass serves the
-noiseless decoder and the one for bounded noise; they differ in the criterion for an explained block.
+    F_(p,r)(z) = {Phi_Lambda^+ z_Lambda : |Lambda| = p - r},   q <= r <= 2q,
 
-    s = B xi + v + e,     |xi_i| <= 1,     |v_k| <= 1,     e zero in all but q blocks
+which always contain a good answer; C(p, r) of them take the place of R^n.
 
-xi is the state in units of its prior intervals: rows of an identity that cannot be attacked, such as a
-model's own prediction and loads within their intervals. For every set of q blocks the least-squares fit to
-all others is made. With W = (I + B B^T)^-1, Lambda the rows that are kept, D the others and
-``g = W_DD^-1 W_D s``,
+`fits` decodes rows with bounds of their own, `s = B xi + v + e` with |xi_i| <= 1, |v_k| <= 1 and e zero in
+all but q blocks. xi is the state in units of its prior intervals, which cannot be attacked. With
+``W = (I + B B^T)^-1``, Lambda the rows kept by a fit, D the others and ``g = W_DD^-1 W_D s``,
 
     residual_Lambda = W_Lambda s - W_LambdaD g,     residual_D = g,
 
-and both are known matrices times (xi, v). The largest value of a row of blocks without attack is therefore
-the sum of absolute values of its coefficients, attained by some xi and v; no norm is estimated.
+known matrices times (xi, v): the largest values without attack are sums of absolute coefficients.
 
-Both recover the error from `F z = F e`, F an annihilator of Phi, fast, but under stronger conditions than
-correctability; otherwise they may fail. `gridsec.secure.decode.search` has no such conditions.
+`decode_by_pursuit` and `decode_by_matching` recover e from `F z = F e`, F an annihilator of Phi, fast, but
+under stronger conditions than correctability.
 
 Source: lee2018, section 2.1, (2.2.4) to (2.2.6), (2.2.8) to (2.2.8''), Theorems 2.2.7 and 2.2.11; for boxes:
 docs/theory-partial-observers.md, section 8.
@@ -193,7 +190,7 @@ def fits(  # noqa: PLR0917  # the terms of s = B xi + v, then the requested boun
     block (A,): block of each row. A block without rows can be left out too, and never disagrees.
     q: number of blocks that each fit leaves out; all of them if fewer have rows.
     functionals (F, n): functionals to bound.
-    Raises DesignInfeasible if there are more sets.
+    Raises DesignInfeasible if there are more than `most` sets.
     """
     present = np.unique(block)
     chosen = present[subsets(present.size, min(q, present.size), most)]
