@@ -129,6 +129,11 @@ class InputInvalid(Problems, ValueError):
         self.problems = tuple(problems)
         super().__init__("; ".join(self.problems))
 
+    @classmethod
+    def of(cls, code: str, text: str) -> Self:
+        """Return the error of a single problem."""
+        return cls((Problem(code, text),))
+
 
 class NotObservable(GridsecError):
     """A set of meters is too small for the purpose.
