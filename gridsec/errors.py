@@ -27,12 +27,8 @@ __all__ = [
 class Problem(str):
     """Problem of an input: a sentence with a stable code.
 
-    Parameters
-    ----------
-    code
-        Violated rule, lower case words joined by hyphens, such as `shape` or `not-finite`.
-    text
-        Place, fault, and expected value.
+    code: violated rule, lower case words joined by hyphens, such as `shape` or `not-finite`.
+    text: place, fault, and expected value.
     """
 
     __slots__ = ("code",)
@@ -68,12 +64,8 @@ class _Pickled(BaseException):
 class GridsecError(_Pickled, Exception):
     """Base of every error that this project raises on purpose.
 
-    Parameters
-    ----------
-    args
-        The sentence.
-    code
-        Code of the reason: lower case words joined by hyphens; None: that of the class.
+    args: the sentence.
+    code: code of the reason: lower case words joined by hyphens; None: that of the class.
     """
 
     code: str = ""
@@ -103,10 +95,7 @@ class Problems(_Pickled):
 class FeederInvalid(Problems, GridsecError):
     """Invalid description of a feeder; `problems` lists every fault at once.
 
-    Parameters
-    ----------
-    problems
-        One complete sentence each: place, fault, and expected value.
+    problems: one complete sentence each: place, fault, and expected value.
     """
 
     def __init__(self, problems: Iterable[str]) -> None:
@@ -119,10 +108,7 @@ class FeederInvalid(Problems, GridsecError):
 class InputInvalid(Problems, ValueError):
     """Invalid arguments; `problems` lists every fault at once.
 
-    Parameters
-    ----------
-    problems
-        One clause each: fault and expected value.
+    problems: one clause each: fault and expected value.
     """
 
     def __init__(self, problems: Iterable[str]) -> None:
@@ -133,16 +119,10 @@ class InputInvalid(Problems, ValueError):
 class NotObservable(GridsecError):
     """A set of meters is too small for the purpose.
 
-    Parameters
-    ----------
-    subset
-        Indices of the meters.
-    rank
-        Rank that they determine, or the number of meters if the number is too small.
-    why
-        The violated condition, in words.
-    code
-        Code of the condition: lower case words joined by hyphens.
+    subset: indices of the meters.
+    rank: rank that they determine, or the number of meters if the number is too small.
+    why: the violated condition, in words.
+    code: code of the condition: lower case words joined by hyphens.
     """
 
     def __init__(self, subset: Iterable[int], rank: int, why: str, *, code: str = "not-observable") -> None:
@@ -154,16 +134,10 @@ class NotObservable(GridsecError):
 class DesignInfeasible(GridsecError):
     """A design was not found, or its verification failed.
 
-    Parameters
-    ----------
-    what
-        The design and its condition.
-    status
-        Status of the solver, or the failed check. A solver's status is never a proof.
-    margin
-        The recomputed margin of the failed condition, if any; negative if violated.
-    code
-        Code of the reason: lower case words joined by hyphens.
+    what: the design and its condition.
+    status: status of the solver, or the failed check. A solver's status is never a proof.
+    margin: the recomputed margin of the failed condition, if any; negative if violated.
+    code: code of the reason: lower case words joined by hyphens.
     """
 
     def __init__(
@@ -179,15 +153,8 @@ class DesignInfeasible(GridsecError):
 def raise_if_any(problems: Iterable[str]) -> None:
     """Raise one error with all problems of an input; return if there are none.
 
-    Parameters
-    ----------
-    problems
-        One clause each: fault and expected value.
-
-    Raises
-    ------
-    InputInvalid
-        If `problems` is not empty.
+    problems: one clause each: fault and expected value.
+    Raises InputInvalid if `problems` is not empty.
     """
     found = tuple(problems)
     if found:
@@ -200,12 +167,8 @@ Choice = TypeVar("Choice", bound=StrEnum)
 def no_choice(name: str, kind: Iterable[str], *values: str) -> list[str]:
     """Return one problem for each value that is not among the allowed ones.
 
-    Parameters
-    ----------
-    name
-        Name of the quantity in the message.
-    kind
-        Allowed values: an enumeration, or `typing.get_args` of a `Literal`.
+    name: name of the quantity in the message.
+    kind: allowed values: an enumeration, or `typing.get_args` of a `Literal`.
     """
     known = tuple(kind)
     return [
@@ -218,10 +181,7 @@ def no_choice(name: str, kind: Iterable[str], *values: str) -> list[str]:
 def each_choice(name: str, kind: type[Choice], values: Iterable[str]) -> tuple[Choice, ...]:
     """Return the members for members or their texts.
 
-    Raises
-    ------
-    ValueError
-        If a value is not a member; the message contains `name`.
+    Raises ValueError if a value is not a member; the message contains `name`.
     """
     given = tuple(values)
     problems = no_choice(name, kind, *given)
@@ -232,9 +192,6 @@ def each_choice(name: str, kind: type[Choice], values: Iterable[str]) -> tuple[C
 def choice(name: str, kind: type[Choice], value: str) -> Choice:
     """Return the member for a member or its text.
 
-    Raises
-    ------
-    ValueError
-        If `value` is not a member; the message contains `name`.
+    Raises ValueError if `value` is not a member; the message contains `name`.
     """
     return each_choice(name, kind, (value,))[0]

@@ -104,95 +104,46 @@ class DataErrorKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class DataError:
-    """An error of the files that explains accused meters. p meters, N customers, n places.
+    """An error of the files that explains accused meters. p meters, N customers, n places."""
 
-    Attributes
-    ----------
-    kind
-        Kind.
-    customers
-        Indices of the one or two customers at other places than in the files.
-    places
-        Place of each of them that explains the readings, as in `gridsec.grid.network`.
-    meters
-        Indices of the accused meters that it explains.
-    """
-
-    kind: DataErrorKind
-    customers: tuple[int, ...]
-    places: tuple[int, ...]
-    meters: tuple[int, ...]
+    kind: DataErrorKind  # kind
+    customers: tuple[int, ...]  # indices of the one or two customers at other places than in the files
+    places: tuple[int, ...]  # place of each of them that explains the readings, as in `gridsec.grid.network`
+    meters: tuple[int, ...]  # indices of the accused meters that it explains
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DataErrorDesign:
-    """Sensitivities between all places that customers may have. N customers, C places.
+    """Sensitivities between all places that customers may have. N customers, C places."""
 
-    Attributes
-    ----------
-    plant
-        Feeder, inverters and meters.
-    anywhere
-        The same feeder with one customer at each of the places.
-    places : (C,)
-        Places, ascending.
-    at : (N,)
-        Index of each customer's place in `places`.
-    unit : (C,)
-        1 pu of each place, V; customers are exchanged only between equal ones.
-    active, reactive : (C, C)
-        From a power at one place to the squared voltage at another, pu.
-    block_s
-        Duration of a block, s.
-    """
-
-    plant: Plant
-    anywhere: Network
-    places: Ints
-    at: Ints
-    unit: Floats
+    plant: Plant  # feeder, inverters and meters
+    anywhere: Network  # the same feeder with one customer at each of the places
+    places: Ints  # (C,) places, ascending
+    at: Ints  # (N,) index of each customer's place in `places`
+    unit: Floats  # (C,) 1 pu of each place, V; customers are exchanged only between equal ones
+    # active, reactive (C, C): from a power at one place to the squared voltage at another, pu
     active: Floats
     reactive: Floats
-    block_s: float
+    block_s: float  # duration of a block, s
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rows:
-    """Means of blocks. T blocks, p meters, N customers, C places.
+    """Means of blocks. T blocks, p meters, N customers, C places."""
 
-    Attributes
-    ----------
-    t : (T,)
-        Time of each block, s.
-    y : (T, p)
-        Squared voltages read, pu; NaN without a reading.
-    p, q : (T, N)
-        Injections, pu.
-    p_var, q_var : (T, N)
-        Variances of their errors, squared pu.
-    read : (T, N)
-        Active power is a reading.
-    v0 : (T, b)
-        Squared busbar voltage, pu; one, or those of three phases.
-    model : (T, C)
-        Squared voltages of the files' model, pu.
-    count : (T,)
-        Number of frames.
-    accused : (T, p)
-        Meters accused within the block.
-    """
-
-    t: Floats
-    y: Floats
+    t: Floats  # (T,) time of each block, s
+    y: Floats  # (T, p) squared voltages read, pu; NaN without a reading
+    # p, q (T, N): injections, pu
     p: Floats
     q: Floats
+    # p_var, q_var (T, N): variances of their errors, squared pu
     p_var: Floats
     q_var: Floats
-    read: Bools
-    v0: Floats
-    model: Floats
-    count: Floats
-    accused: Bools
+    read: Bools  # (T, N) active power is a reading
+    v0: Floats  # (T, b) squared busbar voltage, pu; one, or those of three phases
+    model: Floats  # (T, C) squared voltages of the files' model, pu
+    count: Floats  # (T,) number of frames
+    accused: Bools  # (T, p) meters accused within the block
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -233,21 +184,11 @@ class _Sums:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AccusationWindow:
-    """Readings since the first accusation, and their result. Empty while no meter is accused.
+    """Readings since the first accusation, and their result. Empty while no meter is accused."""
 
-    Attributes
-    ----------
-    rows
-        Complete blocks, at most `MOST_BLOCKS`; None before the first one.
-    error
-        Error of the files that explains accused meters; None if there is none.
-    t
-        Time of the last frame, s; None without one.
-    """
-
-    rows: Rows | None = None
-    error: DataError | None = None
-    t: float | None = None
+    rows: Rows | None = None  # complete blocks, at most `MOST_BLOCKS`; None before the first one
+    error: DataError | None = None  # error of the files that explains accused meters; None if there is none
+    t: float | None = None  # time of the last frame, s; None without one
     sums: _Sums | None = field(default=None, repr=False)
     since_accused: int = 0
 
@@ -260,12 +201,8 @@ def begin() -> AccusationWindow:
 def design(plant: Plant, base_volt: Floats, step_s: float) -> DataErrorDesign | None:
     """Prepare the comparison; None if the customers' buses have more than `MOST_PLACES` places.
 
-    Parameters
-    ----------
-    base_volt : (n,)
-        1 pu of every place, V.
-    step_s
-        Interval between frames, s.
+    base_volt (n,): 1 pu of every place, V.
+    step_s: interval between frames, s.
     """
     feeder = plant.feeder
     places = feeder.places(np.arange(len(feeder.buses) // feeder.busbar_phases))
@@ -300,17 +237,11 @@ def follow(
 ) -> AccusationWindow:
     """Add one frame to the window; compare at the end of each block.
 
-    Parameters
-    ----------
-    design, window
-        The preparation, and the window so far.
-    frame
-        Data of one tick. A frame that is not later than the last, or later by more than a window, restarts
+    design, window: the preparation, and the window so far.
+    frame: data of one tick. A frame that is not later than the last, or later by more than a window, restarts
         the window.
-    x : (m,)
-        Estimated injections of the inverters, pu.
-    accused : (p,)
-        From `accused`.
+    x (m,): estimated injections of the inverters, pu.
+    accused (p,): from `accused`.
     """
     if window.t is not None and not window.t < frame.t <= window.t + MOST_BLOCKS * design.block_s:
         window = AccusationWindow()
@@ -488,12 +419,8 @@ class _Scene:
 def compare(design: DataErrorDesign, rows: Rows, held: DataError | None = None) -> DataError | None:
     """Return the error of the files that explains accused meters at least as well as a manipulation does.
 
-    Parameters
-    ----------
-    design, rows
-        The preparation, and the blocks of a window.
-    held
-        Error found before; it stays unless another one is likelier by more than `_STAYS`.
+    design, rows: the preparation, and the blocks of a window.
+    held: error found before; it stays unless another one is likelier by more than `_STAYS`.
     """
     scene = _scene(design, rows)
     if scene is None or not scene.accused.any():

@@ -100,55 +100,30 @@ _LARGEST, _FARTHEST = 1e4, 1e8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Parts:
-    """State of the observers. m inverters.
+    """State of the observers. m inverters."""
 
-    Attributes
-    ----------
-    x, z : (m,)
-        Injections of the observer without meters, and z at its inverters, pu.
-    driven : (m,)
-        Injections of the scalar observers; those of `x` without a driving meter.
-    bound
-        `free` bounds the error of x, `driven` that of the scalar observers of unmanipulated meters.
-    level
-        Upper level of the bounds during the last step.
-    """
-
+    # x, z (m,): injections of the observer without meters, and z at its inverters, pu
     x: Floats
     z: Floats
-    driven: Floats
+    driven: Floats  # (m,) injections of the scalar observers; those of `x` without a driving meter
+    # `free` bounds the error of x, `driven` that of the scalar observers of unmanipulated meters
     bound: ErrorBound
-    level: ErrorBound
+    level: ErrorBound  # upper level of the bounds during the last step
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CodeWord:
-    """One frame as a code word in units of its bounds. A rows, n unknowns.
+    """One frame as a code word in units of its bounds. A rows, n unknowns."""
 
-    Attributes
-    ----------
-    B, s, block : (A, n), (A,), (A,)
-        Rows, their values, and the meter of each.
-    unit : (A,)
-        Unit of each row, squared pu or pu.
-    scale : (n,)
-        Unit of each unknown, pu: x, p, q, squared busbar voltage.
-    reading : (A,)
-        True for rows that are readings.
-    voltage : (N, n)
-        Sensitivity of the customers' squared voltages to one unit of each unknown, pu.
-    rest : (N,)
-        Their remaining error, pu.
-    """
-
+    # B, s, block (A, n), (A,), (A,): rows, their values, and the meter of each
     B: Floats
     s: Floats
     block: Ints
-    unit: Floats
-    scale: Floats
-    reading: Bools
-    voltage: Floats
-    rest: Floats
+    unit: Floats  # (A,) unit of each row, squared pu or pu
+    scale: Floats  # (n,) unit of each unknown, pu: x, p, q, squared busbar voltage
+    reading: Bools  # (A,) True for rows that are readings
+    voltage: Floats  # (N, n) sensitivity of the customers' squared voltages to one unit of each unknown, pu
+    rest: Floats  # (N,) their remaining error, pu
 
 
 def start(setting: EstimatorContext) -> Parts:
@@ -162,20 +137,11 @@ def observe(  # noqa: PLR0917  # the observers, their state, and the inputs
 ) -> tuple[TickUncertainty, Reconstruction, Parts, bool]:
     """Advance all observers and their bounds to a frame.
 
-    Parameters
-    ----------
-    model
-        The observer without meters.
-    frame, inputs
-        The frame, received and prepared.
-    h
-        Time since the last frame, s; 0 for the first one.
-
-    Returns
-    -------
-    Uncertainty, Reconstruction, Parts, bool
-        Uncertainty without any meter, voltages by the observer without meters, new state of the observers,
-        and True once their initial transient is negligible.
+    model: the observer without meters.
+    frame, inputs: the frame, received and prepared.
+    h: time since the last frame, s; 0 for the first one.
+    Returns Uncertainty, Reconstruction, Parts, bool: uncertainty without any meter, voltages by the observer
+        without meters, new state of the observers, and True once their initial transient is negligible.
     """
     plant, errors = setting.plant, setting.errors
     own, no_meters = plant.droop.customer, np.zeros_like(inputs.live)
@@ -226,14 +192,10 @@ def code_word(  # noqa: PLR0917  # as _conclude
 ) -> CodeWord:
     """Rows of all meters, each in units of its own bound.
 
-    Parameters
-    ----------
-    setting, parts, frame, inputs
-        The feeder, its observers after this frame, and the frame, received and prepared.
-    alone
-        Uncertainty without any meter.
-    model
-        Voltages by the observer without meters.
+    setting, parts, frame, inputs: the feeder, its observers after this frame, and the frame, received and
+        prepared.
+    alone: uncertainty without any meter.
+    model: voltages by the observer without meters.
     """
     plant, errors, lines = setting.plant, setting.errors, setting.model
     own, n, m = plant.droop.customer, frame.p.size, parts.x.size
@@ -308,19 +270,10 @@ def _split(
 def constants(word: CodeWord, meters: int, max_attacked: int, *, tol: float) -> CorrectionConstants:
     """Theta and kappa_c of lee2018 for a frame: block j is the rows of meter j with the model.
 
-    Parameters
-    ----------
-    tol
-        As in `gridsec.secure.decode.noise.correction_constants`.
-
-    Returns
-    -------
-    CorrectionConstants
-        In units of the code word: v_max is the root of the number of unknowns and of rows of a meter.
-
-    References
-    ----------
-    lee2018, Theorem 2.2.11, with the fading part of section 4.2.1 in every block.
+    tol: as in `gridsec.secure.decode.noise.correction_constants`.
+    Returns CorrectionConstants: in units of the code word: v_max is the root of the number of unknowns and of
+        rows of a meter.
+    Source: lee2018, Theorem 2.2.11, with the fading part of section 4.2.1 in every block.
     """
     alone = np.eye(word.scale.size)
     blocks = [np.vstack([alone, word.B[word.block == j]]) for j in range(meters)]
@@ -336,19 +289,11 @@ _SHOWN = 8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PartialDesign:
-    """Design of the partial-observer estimator.
-
-    Attributes
-    ----------
-    model
-        The observer without meters.
-    step_s
-        Expected interval between frames, s.
-    """
+    """Design of the partial-observer estimator."""
 
     setting: EstimatorContext
-    model: CircleDesign
-    step_s: float
+    model: CircleDesign  # the observer without meters
+    step_s: float  # expected interval between frames, s
 
     @property
     def observers(self) -> int:
@@ -358,36 +303,16 @@ class PartialDesign:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PartialState:
-    """State between frames.
+    """State between frames."""
 
-    Attributes
-    ----------
-    t
-        Time of the last used frame, s; that of `init` before the first one.
-    valid
-        True if the certificate was verified.
-    started
-        True after the first frame.
-    parts
-        The observers.
-    settled
-        True once the initial transient has decayed.
-    tally
-        Counters of accusations, and the named meters.
-    v0_squared
-        Last squared busbar voltage, pu.
-    last
-        Last estimate and verdict; None before the first one.
-    """
-
-    t: float
-    valid: bool
-    started: bool
-    parts: Parts
-    settled: bool
-    tally: Counters
-    v0_squared: Floats | float
-    last: tuple[Estimate, Verdict] | None
+    t: float  # time of the last used frame, s; that of `init` before the first one
+    valid: bool  # True if the certificate was verified
+    started: bool  # True after the first frame
+    parts: Parts  # the observers
+    settled: bool  # True once the initial transient has decayed
+    tally: Counters  # counters of accusations, and the named meters
+    v0_squared: Floats | float  # last squared busbar voltage, pu
+    last: tuple[Estimate, Verdict] | None  # last estimate and verdict; None before the first one
 
 
 def design(
@@ -395,21 +320,10 @@ def design(
 ) -> PartialDesign:
     """Design the observers and fits for one feeder.
 
-    Parameters
-    ----------
-    max_attacked
-        M, largest number of simultaneously manipulated meters.
-    step_s
-        Expected interval between frames, s; others work, too.
-
-    Raises
-    ------
-    NotObservable
-        Unless there are more than 2M meters.
-    DesignInfeasible
-        If the initial transient does not decay, or there are too many sets of M meters.
-    ValueError
-        As `plant.check_plant`.
+    max_attacked: M, largest number of simultaneously manipulated meters.
+    step_s: expected interval between frames, s; others work, too.
+    Raises NotObservable unless there are more than 2M meters; DesignInfeasible if the initial transient does
+        not decay, or there are too many sets of M meters; ValueError as `plant.check_plant`.
     """
     meters, p = plant.meters, plant.meters.size
     check_plant(plant, max_attacked=max_attacked, step_s=step_s)
@@ -453,18 +367,11 @@ def init(design: PartialDesign, t: float) -> PartialState:
 def step(design: PartialDesign, state: PartialState, frame: Frame) -> tuple[PartialState, Estimate, Verdict]:
     """Process one frame.
 
-    Parameters
-    ----------
-    frame
-        Data of one tick. A frame that is not later than the last one changes nothing: it returns the last
+    frame: data of one tick. A frame that is not later than the last one changes nothing: it returns the last
         estimate and UNDECIDED.
-
-    Returns
-    -------
-    PartialState, Estimate, Verdict
-        As every estimator's step; see `gridsec.interface`. Score and threshold are those of the readings in
-        the fit of the estimate, or of the observer without meters where that is stricter. All fits and all
-        rows decide on named meters: a small attack may be named below this threshold.
+    Score and threshold are those of the readings in the fit of the estimate, or of the observer without
+        meters where that is stricter. All fits and all rows decide on named meters: a small attack may be
+        named below this threshold.
     """
     if (state.started and not frame.t > state.t) or not np.isfinite(frame.t):
         plant = design.setting.plant

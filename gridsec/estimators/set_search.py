@@ -69,28 +69,14 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SetSearchDesign:
-    """Design of the switched observer. p meters, c candidate sets.
-
-    Attributes
-    ----------
-    bank
-        The observer: a bank for M = 0, with the trusted meters as its available meters.
-    errors
-        Propagation of errors in an observer without manipulated meters.
-    certificate
-        Proof that the observer converges for every set and every switching.
-    dropped : (c, p)
-        Sets of dropped meters, the smallest first.
-    dwell_s
-        Delta, s.
-    """
+    """Design of the switched observer. p meters, c candidate sets."""
 
     setting: EstimatorContext
-    bank: banks.Bank
-    errors: ErrorModel
-    certificate: Certificate
-    dropped: Bools
-    dwell_s: float
+    bank: banks.Bank  # the observer: a bank for M = 0, with the trusted meters as its available meters
+    errors: ErrorModel  # propagation of errors in an observer without manipulated meters
+    certificate: Certificate  # proof that the observer converges for every set and every switching
+    dropped: Bools  # (c, p) sets of dropped meters, the smallest first
+    dwell_s: float  # Delta, s
 
     @property
     def observers(self) -> int:
@@ -100,55 +86,25 @@ class SetSearchDesign:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SetSearchState:
-    """State between frames. m inverters, p meters.
+    """State between frames. m inverters, p meters."""
 
-    Attributes
-    ----------
-    t
-        Time of the last used frame, s; that of `init` before the first one.
-    bank
-        The observer; None before the first frame.
-    x : (m,)
-        Its estimate, pu.
-    z : (m,)
-        Its z at the inverters, squared pu.
-    y : (p,)
-        Last readings as z, squared pu; NaN where missing.
-    bound, level
-        Bounds on its error if no trusted meter is manipulated, see `thresholds.advance`.
-    sure : (m,)
-        Bound on the error of inverters with an unmanipulated own meter, under any other attack, pu.
-    settled
-        True once the transient of the start, or of the last switch, has decayed.
-    dropped : (p,)
-        Meters that are not trusted.
-    innocent : (p,)
-        Time since which a dropped meter is within its limit, s; infinite where it is not.
-    readings : (p,)
-        Number of these readings.
-    tally
-        Counters of accusations, and the named meters.
-    v0_squared
-        Last squared busbar voltage, pu.
-    last
-        Last estimate and verdict; None before the first frame.
-    """
-
-    t: float
-    bank: banks.BankState | None
-    x: Floats
-    z: Floats
-    y: Floats
+    t: float  # time of the last used frame, s; that of `init` before the first one
+    bank: banks.BankState | None  # the observer; None before the first frame
+    x: Floats  # (m,) its estimate, pu
+    z: Floats  # (m,) its z at the inverters, squared pu
+    y: Floats  # (p,) last readings as z, squared pu; NaN where missing
+    # bound, level: bounds on its error if no trusted meter is manipulated, see `thresholds.advance`
     bound: ErrorBound
     level: ErrorBound
+    # (m,) bound on the error of inverters with an unmanipulated own meter, under any other attack, pu
     sure: Floats
-    settled: bool
-    dropped: Bools
-    innocent: Floats
-    readings: Ints
-    tally: Counters
-    v0_squared: Floats | float
-    last: tuple[Estimate, Verdict] | None
+    settled: bool  # True once the transient of the start, or of the last switch, has decayed
+    dropped: Bools  # (p,) meters that are not trusted
+    innocent: Floats  # (p,) time since which a dropped meter is within its limit, s; infinite where it is not
+    readings: Ints  # (p,) number of these readings
+    tally: Counters  # counters of accusations, and the named meters
+    v0_squared: Floats | float  # last squared busbar voltage, pu
+    last: tuple[Estimate, Verdict] | None  # last estimate and verdict; None before the first frame
 
 
 def design(
@@ -161,24 +117,13 @@ def design(
 ) -> SetSearchDesign:
     """Design the observer and the candidate sets for one feeder.
 
-    Parameters
-    ----------
-    max_attacked
-        M, largest number of simultaneously manipulated meters.
-    step_s
-        Expected interval between frames, s. Other intervals work, too.
-    dwell_s
-        Delta, s; by default the time in which the observer's transient decays to the fraction
+    max_attacked: M, largest number of simultaneously manipulated meters.
+    step_s: expected interval between frames, s. Other intervals work, too.
+    dwell_s: Delta, s; by default the time in which the observer's transient decays to the fraction
         `options.settled`.
-
-    Raises
-    ------
-    NotObservable
-        Unless there are more than 2M meters.
-    DesignInfeasible
-        If no closed-form certificate holds, or there are too many sets to search.
-    ValueError
-        As `plant.check_plant`, or if `dwell_s` is negative or not finite.
+    Raises NotObservable unless there are more than 2M meters; DesignInfeasible if no closed-form certificate
+        holds, or there are too many sets to search; ValueError as `plant.check_plant`, or if `dwell_s` is
+        negative or not finite.
     """
     p = plant.meters.size
     wrong = dwell_s is not None and not 0.0 <= dwell_s < np.inf
@@ -238,22 +183,9 @@ def init(design: SetSearchDesign, t: float) -> SetSearchState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrustedEstimate:
-    """Estimate of the feeder from the trusted set. N customers, p meters, m inverters.
+    """Estimate of the feeder from the trusted set. N customers, p meters, m inverters."""
 
-    Attributes
-    ----------
-    bank, x, z, bound, level, sure, settled
-        As in `SetSearchState`, at this frame.
-    v2, v2_bus : (N,), (b + 1,)
-        Reconstructed squared voltages, pu.
-    base : (N,)
-        Error of `v2` for known injections, squared pu.
-    score, threshold : (p,)
-        Residuals, NaN without a reading, and their limits if no trusted meter is manipulated.
-    over : (p,)
-        Meters with a residual above its limit.
-    """
-
+    # bank, x, z, bound, level, sure, settled: as in `SetSearchState`, at this frame
     bank: banks.BankState
     x: Floats
     z: Floats
@@ -261,12 +193,15 @@ class TrustedEstimate:
     level: ErrorBound
     sure: Floats
     settled: bool
+    # v2, v2_bus (N,), (b + 1,): reconstructed squared voltages, pu
     v2: Floats
     v2_bus: Floats
-    base: Floats
+    base: Floats  # (N,) error of `v2` for known injections, squared pu
+    # score, threshold (p,): residuals, NaN without a reading, and their limits if no trusted meter is
+    # manipulated
     score: Floats
     threshold: Floats
-    over: Bools
+    over: Bools  # (p,) meters with a residual above its limit
 
 
 def advance(design: SetSearchDesign, state: SetSearchState, frame: Frame, inputs: Inputs) -> TrustedEstimate:
@@ -349,12 +284,8 @@ def _sure(design: SetSearchDesign, state: SetSearchState, inputs: Inputs, J: Boo
 def threshold_of(design: SetSearchDesign, v2: Floats, error: Floats) -> Floats:
     """Largest residual of an unmanipulated meter for an estimate with an error of at most `error`.
 
-    Parameters
-    ----------
-    v2 : (p,)
-        Reconstructed squared voltages at the meters, pu.
-    error : (…, p)
-        Their error bounds, squared pu.
+    v2 (p,): reconstructed squared voltages at the meters, pu.
+    error (…, p): their error bounds, squared pu.
     """
     plant, sigmas = design.setting.plant, design.setting.options.sigmas
     return np.asarray(reading_error(plant.accuracy, v2 + error, sigmas) + error)
@@ -373,10 +304,7 @@ def _settled(
 def lost(errors: ErrorModel, sure: Floats) -> Floats:
     """Additional error at every customer without one meter, (N, p): its inverter may inject anything.
 
-    Parameters
-    ----------
-    sure : (m,)
-        Error of each inverter that follows from its own meter, pu.
+    sure (m,): error of each inverter that follows from its own meter, pu.
     """
     metered, p = errors.meter_of >= 0, errors.meters.size
     more = np.bincount(errors.meter_of[metered], weights=(errors.span - sure)[metered], minlength=p)
@@ -388,16 +316,8 @@ def step(
 ) -> tuple[SetSearchState, Estimate, Verdict]:
     """Process one frame.
 
-    Parameters
-    ----------
-    frame
-        Data of one tick. A frame that is not later than the last one changes nothing: it returns the last
+    frame: data of one tick. A frame that is not later than the last one changes nothing: it returns the last
         estimate and UNDECIDED.
-
-    Returns
-    -------
-    SetSearchState, Estimate, Verdict
-        As every estimator's step; see `gridsec.interface`.
     """
     if not np.isfinite(frame.t) or (state.bank is not None and not frame.t > state.t):
         plant = design.setting.plant

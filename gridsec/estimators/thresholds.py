@@ -23,65 +23,35 @@ from gridsec.grid.network import LinDistFlow
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Majorant:
-    """Entrywise bounds for the observers of all sets, with any of their meters unavailable.
+    """Entrywise bounds for the observers of all sets, with any of their meters unavailable."""
 
-    Attributes
-    ----------
-    H : (m, m)
-        `|H - K_J C|`.
-    F : (m, N)
-        `|F - K_J D|`.
-    K, L : (m, p)
-        `|K_J|`, and `T |L_J|`: change of each state's target per pu of output error.
-    """
-
-    H: Floats
-    F: Floats
+    H: Floats  # (m, m) `|H - K_J C|`
+    F: Floats  # (m, N) `|F - K_J D|`
+    # K, L (m, p): `|K_J|`, and `T |L_J|`: change of each state's target per pu of output error
     K: Floats
     L: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ErrorModel:
-    """Propagation of errors through feeder and observers. N customers, m inverters, p meters.
+    """Propagation of errors through feeder and observers. N customers, m inverters, p meters."""
 
-    Attributes
-    ----------
-    droop
-        The inverters.
-    quota
-        2M: largest number of meters left out by an observer without manipulated meters.
-    R2, X2 : (N, N)
-        `2 |R|`, `2 |X|`.
-    inverters, reach : (N, m), (N, p)
-        Columns of X2 at the customers of inverters and of meters.
-    inverters_own, reach_own : (m, m), (m, p)
-        Rows of these at the inverters' customers.
-    meters : (p,)
-        Customer of each meter.
-    meter_of : (m,)
-        Meter that drives each inverter; -1 for none.
-    span : (m,)
-        Distance between the saturated values of each curve, pu.
-    mismatch : (m,)
-        Largest distance of a real inverter's curve, linear in v, from K, linear in z, pu.
-    majorant
-        For gains other than direct injection.
-    """
-
-    droop: Droop
-    quota: int
+    droop: Droop  # the inverters
+    quota: int  # 2M: largest number of meters left out by an observer without manipulated meters
+    # R2, X2 (N, N): `2 |R|`, `2 |X|`
     R2: Floats
     X2: Floats
+    # inverters, reach (N, m), (N, p): columns of X2 at the customers of inverters and of meters
     inverters: Floats
     reach: Floats
+    # inverters_own, reach_own (m, m), (m, p): rows of these at the inverters' customers
     inverters_own: Floats
     reach_own: Floats
-    meters: Ints
-    meter_of: Ints
-    span: Floats
-    mismatch: Floats
-    majorant: Majorant | None = None
+    meters: Ints  # (p,) customer of each meter
+    meter_of: Ints  # (m,) meter that drives each inverter; -1 for none
+    span: Floats  # (m,) distance between the saturated values of each curve, pu
+    mismatch: Floats  # (m,) largest distance of a real inverter's curve, linear in v, from K, linear in z, pu
+    majorant: Majorant | None = None  # for gains other than direct injection
 
 
 def error_model(droop: Droop, model: LinDistFlow, meters: Ints, max_attacked: int) -> ErrorModel:
@@ -122,55 +92,33 @@ def curve_mismatch(droop: Droop) -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TickUncertainty:
-    """Uncertainty at one tick.
+    """Uncertainty at one tick."""
 
-    Attributes
-    ----------
-    base : (N,)
-        Error of each customer's squared voltage for known injections of inverters: busbar, loads, model;
-        squared pu.
-    reading : (p,)
-        Error of each unmanipulated reading, squared pu.
-    live : (p,)
-        Meters with a usable reading.
-    told : (p,)
-        Available meters at customers with metered net reactive power in use.
-    extra : (p,)
-        Excess of the assumed load's uncertainty over that of the metered net at such a customer, pu.
-    """
-
+    # (N,) error of each customer's squared voltage for known injections of inverters: busbar, loads, model;
+    # squared pu
     base: Floats
-    reading: Floats
-    live: Bools
-    told: Bools
+    reading: Floats  # (p,) error of each unmanipulated reading, squared pu
+    live: Bools  # (p,) meters with a usable reading
+    told: Bools  # (p,) available meters at customers with metered net reactive power in use
+    # (p,) excess of the assumed load's uncertainty over that of the metered net at such a customer, pu
     extra: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ErrorBound:
-    """Bounds of the observers' error, inverter by inverter; valid at every time. m inverters.
+    """Bounds of the observers' error, inverter by inverter; valid at every time. m inverters."""
 
-    Attributes
-    ----------
-    driven : (m,)
-        For inverters driven by their own unmanipulated meter, pu.
-    free : (m,)
-        For inverters that run on the model, in every observer without manipulated meters that leaves out at
-        most 2M meters, pu.
-    """
-
-    driven: Floats
+    driven: Floats  # (m,) for inverters driven by their own unmanipulated meter, pu
+    # (m,) for inverters that run on the model, in every observer without manipulated meters that leaves out
+    # at most 2M meters, pu
     free: Floats
 
 
 def widest(model: ErrorModel, x: Floats | None = None) -> ErrorBound:
     """Bound without any knowledge: the true injections lie between the saturated values.
 
-    Parameters
-    ----------
-    x : (…, m), optional
-        The observers' states, needed where they can leave the range of the curves (gains L); by default they
-        lie in it.
+    x (…, m): the observers' states, needed where they can leave the range of the curves (gains L); by default
+        they lie in it.
     """
     if x is None:
         return ErrorBound(model.span.copy(), model.span.copy())
@@ -184,15 +132,8 @@ def gap(model: ErrorModel, now: TickUncertainty, bound: ErrorBound, *, own: bool
     `base_i + sum over undriven inverters 2 X_ik free_k + sum over meters 2 X_ij driven_j
     + the 2M largest of 2 X_ij (free_j - driven_j)`: the worst choice of 2M omitted meters.
 
-    Parameters
-    ----------
-    own
-        Restrict to the customers of the inverters.
-
-    Returns
-    -------
-    (N,) or (m,)
-        Bounds, squared pu.
+    own: restrict to the customers of the inverters.
+    Returns (N,) or (m,): bounds, squared pu.
     """
     inverters, column = (model.inverters_own, model.reach_own) if own else (model.inverters, model.reach)
     base = now.base[model.droop.customer] if own else now.base
@@ -219,25 +160,17 @@ def largest(values: Floats, count: int) -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """Estimate before and after one step.
+    """Estimate before and after one step."""
 
-    Attributes
-    ----------
-    before, after : (m,)
-        Estimated z at the inverters at the beginning and the end, pu.
-    offset : (m,)
-        Largest distance of the selected estimate's z from that of an observer without manipulated meters, pu.
-    h
-        Length of the step, s.
-    lag : (m,)
-        Motion of the inverters that the observers' step treats as slower than they are (`lure.transition`),
-        pu; 0 for the others.
-    """
-
+    # before, after (m,): estimated z at the inverters at the beginning and the end, pu
     before: Floats
     after: Floats
+    # (m,) largest distance of the selected estimate's z from that of an observer without manipulated meters,
+    # pu
     offset: Floats
-    h: float
+    h: float  # length of the step, s
+    # (m,) motion of the inverters that the observers' step treats as slower than they are
+    # (`lure.transition`), pu; 0 for the others
     lag: Floats | float = 0.0
 
 
@@ -247,10 +180,7 @@ def settled(model: ErrorModel, now: TickUncertainty, motion: Motion, start: Erro
     Iterates the monotone map of `docs/theory-detection.md` downwards from `start`. Every iterate is a bound;
     the iteration may stop at any time.
 
-    Parameters
-    ----------
-    start
-        An upper bound that the map does not exceed.
+    start: an upper bound that the map does not exceed.
     """
     level = start
     for _ in range(_ROUNDS):
@@ -306,17 +236,9 @@ def advance(
     monotone: with any G that is at least the present bound and at least its own image, the error stays
     below G during the step, and `bound+ = exp(-h/tau) bound + (1 - exp(-h/tau)) reach(G)`.
 
-    Parameters
-    ----------
-    bound
-        Bound at the beginning.
-    last
-        The G of the previous step, as first guess.
-
-    Returns
-    -------
-    ErrorBound, ErrorBound
-        Bound at the end, and this step's G.
+    bound: bound at the beginning.
+    last: the G of the previous step, as first guess.
+    Returns ErrorBound, ErrorBound: bound at the end, and this step's G.
     """
     keep = np.exp(-motion.h / model.droop.tau)
     top = ErrorBound(np.maximum(bound.driven, _ROOM * last.driven), np.maximum(bound.free, _ROOM * last.free))
@@ -349,12 +271,8 @@ def ceiling(model: ErrorModel, now: TickUncertainty, motion: Motion, floor: Erro
     matrix A of spectral radius below 1 (the certificate), and `(I - A)^-1 r` plus any multiple of
     `(I - A)^-1 1` is such a level.
 
-    Parameters
-    ----------
-    model, now, motion
-        As in `advance`.
-    floor
-        Lower limit of the level.
+    model, now, motion: as in `advance`.
+    floor: lower limit of the level.
     """
     big = model.majorant
     if big is None or not big.L.any():

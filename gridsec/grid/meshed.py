@@ -80,19 +80,10 @@ class Meshed(OfMatrices):
         voltages of the linear power flow and the square of its drops, and every step after it gains one order
         in the load, as a step of `Feeder.loss_correction` does.
 
-        Parameters
-        ----------
-        p, q : (…, N)
-            Net active and reactive injection of each customer (generation positive), pu.
-        v0_squared : (…) or scalar
-            Squared busbar voltage, pu; in three phases (3,), one for each, or scalar.
-        steps
-            Steps after the first iterate; 0 gives the linear power flow.
-
-        Returns
-        -------
-        (…, n)
-            Squared voltages, pu; on a balanced feeder n = b + 1.
+        p, q (…, N): net active and reactive injection of each customer (generation positive), pu.
+        v0_squared (…) or scalar: squared busbar voltage, pu; in three phases (3,), one for each, or scalar.
+        steps: steps after the first iterate; 0 gives the linear power flow.
+        Returns (…, n): squared voltages, pu; on a balanced feeder n = b + 1.
         """
         if not steps:
             base = self.without_drop(v0_squared)
@@ -118,19 +109,10 @@ class Meshed(OfMatrices):
         once; Re(conj(V) dV) is half the derivative of ``|V|^2``. Without load and charging it is R and X.
         O(N^3).
 
-        Parameters
-        ----------
-        p, q : (N,)
-            Net active and reactive injection of each customer at the operating point, pu.
-        v0_squared
-            As in `bus_voltages`.
-        steps
-            Steps to the voltages of the operating point, as in `bus_voltages`.
-
-        Returns
-        -------
-        LinDistFlow
-            The matrices; ``v^2`` then changes by ``2 R dp + 2 X dq``.
+        p, q (N,): net active and reactive injection of each customer at the operating point, pu.
+        v0_squared: as in `bus_voltages`.
+        steps: steps to the voltages of the operating point, as in `bus_voltages`.
+        Returns LinDistFlow: the matrices; ``v^2`` then changes by ``2 R dp + 2 X dq``.
         """
         s, idle, here = _start(self, p, q, v0_squared)
         V = here
@@ -157,19 +139,10 @@ class Meshed(OfMatrices):
         contain a solution of the AC power flow (Brouwer), and only one, because theta also bounds the
         contraction there. If theta is 1 or more, or rho above 0.1 |V2|, the bound is infinite.
 
-        Parameters
-        ----------
-        p, q, v0_squared
-            As in `bus_voltages`.
-
-        Returns
-        -------
-        (…, N)
-            Bound on the error of `v^2`, pu.
-
-        References
-        ----------
-        Wang et al. 2018, for the existence of the solution; the componentwise bound: docs/theory-mesh.md.
+        p, q, v0_squared: as in `bus_voltages`.
+        Returns (…, N): bound on the error of `v^2`, pu.
+        Source: Wang et al. 2018, for the existence of the solution; the componentwise bound:
+            docs/theory-mesh.md.
         """
         with np.errstate(all="ignore"):
             s, _, idle = _start(self, p, q, v0_squared)
@@ -215,47 +188,26 @@ class Meshed(OfMatrices):
 class MeshedFeeder(Balanced, Meshed, OnTree):
     """Feeder with closed loops. N customers, b + 1 buses, t ties.
 
-    Attributes
-    ----------
-    tree
-        The feeder without the ties: a radial feeder that reaches every bus.
-    ends : (t, 2)
-        Buses at both ends of each tie.
-    r, x : (t,)
-        Series resistance and reactance of each tie, pu.
-    charging : (t,)
-        Total shunt susceptance of each tie, pu; half of it at each end.
-    half : (b + 1,)
-        Derived. Shunt susceptance at the buses, pu.
-    R, X : (b + 1, N)
-        Derived. The linear power flow ``v^2 = v0^2 + 2 R p + 2 X q``, from a customer's power to every bus.
-    idle : (b + 1,)
-        Derived. Voltage of every bus without load, per voltage of the busbar; 1 without charging.
-    transfer : (b + 1, N)
-        Derived. From an injected current of a customer to the voltage of every bus, charging included, pu.
-    transfer_between : (N, N)
-        Derived. The same to the customers' voltages.
-    size : (N, N)
-        Derived. Its absolute values.
-
-    Raises
-    ------
-    FeederInvalid
-        With every problem found.
+    Raises FeederInvalid with every problem found.
     """
 
-    tree: Feeder
-    ends: Ints
+    tree: Feeder  # the feeder without the ties: a radial feeder that reaches every bus
+    ends: Ints  # (t, 2) buses at both ends of each tie
+    # r, x (t,): series resistance and reactance of each tie, pu
     r: Floats
     x: Floats
-    charging: Floats
-    half: Floats = field(init=False, repr=False)
+    charging: Floats  # (t,) total shunt susceptance of each tie, pu; half of it at each end
+    half: Floats = field(init=False, repr=False)  # (b + 1,) shunt susceptance at the buses, pu
+    # R, X (b + 1, N): the linear power flow ``v^2 = v0^2 + 2 R p + 2 X q``, from a customer's power to every
+    # bus
     R: Floats = field(init=False, repr=False)
     X: Floats = field(init=False, repr=False)
+    # (b + 1,) voltage of every bus without load, per voltage of the busbar; 1 without charging
     idle: Phasors = field(init=False, repr=False)
+    # (b + 1, N) from an injected current of a customer to the voltage of every bus, charging included, pu
     transfer: Phasors = field(init=False, repr=False)
-    transfer_between: Phasors = field(init=False, repr=False)
-    size: Floats = field(init=False, repr=False)
+    transfer_between: Phasors = field(init=False, repr=False)  # (N, N) the same to the customers' voltages
+    size: Floats = field(init=False, repr=False)  # (N, N) its absolute values
 
     def __post_init__(self) -> None:
         def put(name: str, value: object) -> None:
@@ -351,15 +303,8 @@ def impedances(feeder: MeshedFeeder, buses: Ints) -> Phasors:
 
     with the impedances of the t loops in the middle: no linear system of the feeder's size is solved.
 
-    Parameters
-    ----------
-    buses : (k,)
-        Buses of injected currents.
-
-    Returns
-    -------
-    (b + 1, k)
-        Rise of the voltage of every bus for each of them, pu; 0 at the busbar.
+    buses (k,): buses of injected currents.
+    Returns (b + 1, k): rise of the voltage of every bus for each of them, pu; 0 at the busbar.
     """
     tree = feeder.tree
 
@@ -402,59 +347,33 @@ def _charged(feeder: MeshedFeeder) -> tuple[Phasors, Phasors]:
 class PhasedMesh(InPhases, Meshed, OnTree):
     """Feeder of single-phase customers with closed ties. N customers, t ties, n = 3 (b + 1) places.
 
-    Attributes
-    ----------
-    tree
-        The feeder without the ties, with customers of one phase; it contains every phase of every bus.
-    ends : (t, 2)
-        Buses at both ends of each tie.
-    phases : (t, 3)
-        Phases a, b, c of each tie.
-    z : (t, 3, 3)
-        Series impedance of each tie, pu; symmetric, rows and columns of absent phases are 0.
-    charging : (t, 3, 3)
-        Total shunt susceptance of each tie, pu; half of it at each end.
-    bus : (N,)
-        Derived. Place of each customer.
-    buses : (n,)
-        Derived. Identifiers of the places, the busbar's three first.
-    half : (b + 1, 3, 3)
-        Derived. Shunt susceptance at the buses, pu.
-    R, X : (n, N)
-        Derived. The linear power flow ``v^2 = v0^2 + 2 R p + 2 X q``: from a customer's power, in units of
-        the three-phase base S, to the squared voltage of every place, pu. For an absent phase, that of its
-        end in the tree.
-    idle : (n, 3)
-        Derived. Voltage of every place without load, per voltage of the busbar; without charging that of its
-        phase.
-    transfer : (n, N)
-        Derived. From an injected current of a customer, in units of S, to the voltage of every place,
-        charging included, pu.
-    transfer_between : (N, N)
-        Derived. The same to the customers' voltages.
-    size : (N, N)
-        Derived. Its absolute values.
-
-    Raises
-    ------
-    FeederInvalid
-        With every problem found.
+    Raises FeederInvalid with every problem found.
     """
 
+    # the feeder without the ties, with customers of one phase; it contains every phase of every bus
     tree: ThreePhaseFeeder
-    ends: Ints
-    phases: Bools
+    ends: Ints  # (t, 2) buses at both ends of each tie
+    phases: Bools  # (t, 3) phases a, b, c of each tie
+    # (t, 3, 3) series impedance of each tie, pu; symmetric, rows and columns of absent phases are 0
     z: Phasors
-    charging: Floats
-    bus: Ints = field(init=False, repr=False)
+    charging: Floats  # (t, 3, 3) total shunt susceptance of each tie, pu; half of it at each end
+    bus: Ints = field(init=False, repr=False)  # (N,) place of each customer
+    # (n,) identifiers of the places, the busbar's three first
     buses: tuple[str, ...] = field(init=False, repr=False)
-    half: Floats = field(init=False, repr=False)
+    half: Floats = field(init=False, repr=False)  # (b + 1, 3, 3) shunt susceptance at the buses, pu
+    # R, X (n, N): The linear power flow ``v^2 = v0^2 + 2 R p + 2 X q``: from a customer's power, in units of
+    # the three-phase base S, to the squared voltage of every place, pu. For an absent phase, that of its end
+    # in the tree.
     R: Floats = field(init=False, repr=False)
     X: Floats = field(init=False, repr=False)
+    # (n, 3) voltage of every place without load, per voltage of the busbar; without charging that of its
+    # phase
     idle: Phasors = field(init=False, repr=False)
+    # (n, N) from an injected current of a customer, in units of S, to the voltage of every place, charging
+    # included, pu
     transfer: Phasors = field(init=False, repr=False)
-    transfer_between: Phasors = field(init=False, repr=False)
-    size: Floats = field(init=False, repr=False)
+    transfer_between: Phasors = field(init=False, repr=False)  # (N, N) the same to the customers' voltages
+    size: Floats = field(init=False, repr=False)  # (N, N) its absolute values
 
     def __post_init__(self) -> None:
         def put(name: str, value: object) -> None:
@@ -574,10 +493,7 @@ _SINGULAR = 1e13
 def phased_admittance(feeder: PhasedMesh) -> csc_array:
     """Admittance matrix of all places, charging included, (n, n), pu; rows of absent phases are empty.
 
-    Raises
-    ------
-    FeederInvalid
-        If the impedances of a line have no inverse.
+    Raises FeederInvalid if the impedances of a line have no inverse.
     """
     tree = feeder.tree
     lines = np.vstack([np.column_stack([tree.parent, np.arange(1, len(tree.buses))]), feeder.ends])

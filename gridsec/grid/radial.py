@@ -28,73 +28,36 @@ from gridsec.grid.trees import below, from_root, shrinking, walk
 class Feeder(Balanced):
     """Radial feeder: a tree of b branches and b + 1 buses, rooted at the metered busbar (bus 0).
 
-    Attributes
-    ----------
-    name
-        Name of the feeder.
-    parent : (b,)
-        Bus that feeds bus k + 1; `parent[k] <= k`, so buses are in topological order.
-    r, x : (b,)
-        Series resistance and reactance of the branch into bus k + 1, pu.
-    bus : (N,)
-        Bus of each customer. Several customers may share one; bus 0 is allowed.
-    customers : (N,)
-        Identifiers of the customers.
-    buses : (b + 1,)
-        Identifiers of the buses, the busbar first.
-    base_volt
-        Nominal phase-to-neutral voltage (1 pu), V.
-    base_kva
-        Three-phase base power (1 pu), kVA.
-    charging : (b,)
-        Total shunt susceptance of the branch into bus k + 1, pu; half of it at each end.
-    start, stop : (b + 1,)
-        Derived. Depth-first numbering: bus k and the buses fed through it are those with `start` in
-        `[start[k], stop[k])`.
-    order : (b + 1,)
-        Derived. The buses by these numbers.
-    depth : (b + 1,)
-        Derived. Number of branches between bus k and the busbar.
-    enter, leave : (b + 1,)
-        Derived. Steps of a walk around the tree at which it reaches a bus first, and has left it.
-    inside : (b + 1, b + 1) or None
-        Derived. 1 where the bus of the row is fed through that of the column; None for large trees.
-    half : (b + 1,)
-        Derived. Shunt susceptance at the buses, pu.
-    charges
-        Derived. True if any bus has charging.
-    squared : (b,)
-        Derived. ``r^2 + x^2``, pu.
-    alone
-        Derived. True if no two customers share a bus.
-
-    Raises
-    ------
-    FeederInvalid
-        With every problem found.
+    Raises FeederInvalid with every problem found.
     """
 
-    name: str
-    parent: Ints
+    name: str  # name of the feeder
+    parent: Ints  # (b,) bus that feeds bus k + 1; `parent[k] <= k`, so buses are in topological order
+    # r, x (b,): series resistance and reactance of the branch into bus k + 1, pu
     r: Floats
     x: Floats
-    bus: Ints
-    customers: tuple[str, ...]
-    buses: tuple[str, ...]
-    base_volt: float
-    base_kva: float
-    charging: Floats
+    bus: Ints  # (N,) Bus of each customer. Several customers may share one; bus 0 is allowed.
+    customers: tuple[str, ...]  # (N,) identifiers of the customers
+    buses: tuple[str, ...]  # (b + 1,) identifiers of the buses, the busbar first
+    base_volt: float  # nominal phase-to-neutral voltage (1 pu), V
+    base_kva: float  # three-phase base power (1 pu), kVA
+    charging: Floats  # (b,) total shunt susceptance of the branch into bus k + 1, pu; half of it at each end
+    # start, stop (b + 1,): depth-first numbering: bus k and the buses fed through it are those with `start`
+    # in `[start[k], stop[k])`
     start: Ints = field(init=False, repr=False)
     stop: Ints = field(init=False, repr=False)
-    order: Ints = field(init=False, repr=False)
-    depth: Ints = field(init=False, repr=False)
+    order: Ints = field(init=False, repr=False)  # (b + 1,) the buses by these numbers
+    depth: Ints = field(init=False, repr=False)  # (b + 1,) number of branches between bus k and the busbar
+    # enter, leave (b + 1,): steps of a walk around the tree at which it reaches a bus first, and has left it
     enter: Ints = field(init=False, repr=False)
     leave: Ints = field(init=False, repr=False)
+    # (b + 1, b + 1) or None: 1 where the bus of the row is fed through that of the column; None for large
+    # trees
     inside: Floats | None = field(init=False, repr=False)
-    half: Floats = field(init=False, repr=False)
-    charges: bool = field(init=False, repr=False)
-    squared: Floats = field(init=False, repr=False)
-    alone: bool = field(init=False, repr=False)
+    half: Floats = field(init=False, repr=False)  # (b + 1,) shunt susceptance at the buses, pu
+    charges: bool = field(init=False, repr=False)  # True if any bus has charging
+    squared: Floats = field(init=False, repr=False)  # (b,) ``r^2 + x^2``, pu
+    alone: bool = field(init=False, repr=False)  # True if no two customers share a bus
 
     def __post_init__(self) -> None:
         for name in ("r", "x", "charging"):
@@ -121,9 +84,7 @@ class Feeder(Balanced):
         `R_bus[k, j] = sum of r over the branches on both paths to the busbar`, from bus k and from the bus of
         customer j.
 
-        References
-        ----------
-        chong2020, equation (15), for any tree.
+        Source: chong2020, equation (15), for any tree.
         """
         R_bus = common_paths(self, self.r, self.bus)
         X_bus = common_paths(self, self.x, self.bus)
@@ -134,15 +95,8 @@ class Feeder(Balanced):
     def bus_voltages(self, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 1) -> Floats:
         """Squared voltage of every bus, corrected for losses and charging; O(b), without the N x N matrices.
 
-        Parameters
-        ----------
-        p, q, v0_squared, steps
-            As in `loss_correction`; `steps` = 0 gives LinDistFlow.
-
-        Returns
-        -------
-        (…, b + 1)
-            Squared voltages, pu.
+        p, q, v0_squared, steps: as in `loss_correction`; `steps` = 0 gives LinDistFlow.
+        Returns (…, b + 1): squared voltages, pu.
         """
         flows = _linear_flows(self, p, q, v0_squared)
         return _lossy(self, flows, flows, steps).v2
@@ -159,29 +113,13 @@ class Feeder(Balanced):
         iteration with the AC power flow of a balanced radial feeder as its limit; `steps` repeats it. O(b)
         for each operating point.
 
-        Parameters
-        ----------
-        p, q : (…, N)
-            Net active and reactive injection of each customer (generation positive, droop inverters
+        p, q (…, N): net active and reactive injection of each customer (generation positive, droop inverters
             included), pu.
-        v0_squared : (…) or scalar
-            Squared busbar voltage, pu.
-        steps
-            Number of fixed-point steps, at least 1.
-
-        Returns
-        -------
-        (…, b + 1)
-            Additive correction of `v^2`, pu; 0 at the busbar.
-
-        Raises
-        ------
-        ValueError
-            If `steps` is below 1.
-
-        References
-        ----------
-        Baran and Wu 1989, the DistFlow equations. Derivation: docs/theory-model.md.
+        v0_squared (…) or scalar: squared busbar voltage, pu.
+        steps: number of fixed-point steps, at least 1.
+        Returns (…, b + 1): additive correction of `v^2`, pu; 0 at the busbar.
+        Raises ValueError if `steps` is below 1.
+        Source: Baran and Wu 1989, the DistFlow equations. Derivation: docs/theory-model.md.
         """
         if steps < 1:
             raise InputInvalid([Problem("out-of-range", f"steps is {steps}; it must be at least 1")])
@@ -193,20 +131,10 @@ class Feeder(Balanced):
     ) -> tuple[Floats, Floats]:
         """`loss_correction` and `model_error_bound` of the same operating points, faster than separately.
 
-        Parameters
-        ----------
-        p, q, v0_squared, steps
-            As in `loss_correction`.
-
-        Returns
-        -------
-        (…, b + 1), (…, N)
-            Additive correction of `v^2`, and a bound on the error that remains after its first step, pu.
-
-        Raises
-        ------
-        ValueError
-            If `steps` is below 1.
+        p, q, v0_squared, steps: as in `loss_correction`.
+        Returns (…, b + 1), (…, N): additive correction of `v^2`, and a bound on the error that remains after
+            its first step, pu.
+        Raises ValueError if `steps` is below 1.
         """
         if steps < 1:
             raise InputInvalid([Problem("out-of-range", f"steps is {steps}; it must be at least 1")])
@@ -222,15 +150,8 @@ class Feeder(Balanced):
         (in practice a few hundredths). Under heavy loads the quotients grow from step to step, so the second
         step must be below a fifth of the first. Otherwise, towards voltage collapse, the bound is infinite.
 
-        Parameters
-        ----------
-        p, q, v0_squared
-            As in `loss_correction`.
-
-        Returns
-        -------
-        (…, N)
-            Bound on the remaining error of `v^2`, pu.
+        p, q, v0_squared: as in `loss_correction`.
+        Returns (…, N): bound on the remaining error of `v^2`, pu.
         """
         flows = _linear_flows(self, p, q, v0_squared)
         with np.errstate(all="ignore"):
@@ -239,15 +160,8 @@ class Feeder(Balanced):
     def reach(self, p: Floats, q: Floats) -> Floats:
         """Largest change of the squared voltages by powers of given sizes: ``2 |R| p + 2 |X| q``; O(b).
 
-        Parameters
-        ----------
-        p, q : (…, N)
-            Sizes of the customers' active and reactive powers, not negative, pu.
-
-        Returns
-        -------
-        (…, b + 1)
-            Change at every bus, pu.
+        p, q (…, N): sizes of the customers' active and reactive powers, not negative, pu.
+        Returns (…, b + 1): change at every bus, pu.
         """
         both = np.empty((2, *np.broadcast(p, q).shape))
         both[0], both[1] = p, q
@@ -406,17 +320,9 @@ def common_paths(feeder: Feeder, branch: Floats, buses: Ints) -> Floats:
     In depth-first order it is the minimum over consecutive buses between the two of their common sum: the sum
     up to the parent of the later bus.
 
-    Parameters
-    ----------
-    branch : (b,)
-        Quantity of each branch, not negative; for example `feeder.r`.
-    buses : (k,)
-        The second bus of each pair.
-
-    Returns
-    -------
-    (b + 1, k)
-        For every bus and each of `buses`.
+    branch (b,): quantity of each branch, not negative; for example `feeder.r`.
+    buses (k,): the second bus of each pair.
+    Returns (b + 1, k): for every bus and each of `buses`.
     """
     start, whole = feeder.start, path_sums(feeder, branch)
     between = np.zeros(start.size)
@@ -443,15 +349,8 @@ _TOGETHER = 16384
 def path_sums(feeder: Feeder, branch: Floats) -> Floats:
     """Sum of a branch quantity over the path from the busbar to each bus, with one rounding per branch.
 
-    Parameters
-    ----------
-    branch : (b,)
-        Quantity of each branch.
-
-    Returns
-    -------
-    (b + 1,)
-        0 at the busbar.
+    branch (b,): quantity of each branch.
+    Returns (b + 1,): 0 at the busbar.
     """
     out = [0.0]
     for above, more in zip(feeder.parent.tolist(), branch.tolist(), strict=True):
@@ -462,19 +361,10 @@ def path_sums(feeder: Feeder, branch: Floats) -> Floats:
 def squared_voltages(model: LinDistFlow, p: Floats, q: Floats, v0_squared: Floats | float) -> Floats:
     """Squared voltage of every customer by the linear power flow.
 
-    Parameters
-    ----------
-    model
-        From `lindistflow`.
-    p, q : (…, N)
-        Net active and reactive injection of each customer (generation positive), pu.
-    v0_squared : (…) or scalar
-        Squared busbar voltage, pu.
-
-    Returns
-    -------
-    (…, N)
-        Squared voltages, pu.
+    model: from `lindistflow`.
+    p, q (…, N): net active and reactive injection of each customer (generation positive), pu.
+    v0_squared (…) or scalar: squared busbar voltage, pu.
+    Returns (…, N): squared voltages, pu.
     """
     base = np.asarray(v0_squared, dtype=np.float64)[..., None]
     return base + 2.0 * (p @ model.R.T + q @ model.X.T)

@@ -57,61 +57,32 @@ _ROUNDING = 1e-6
 class ThreePhaseFeeder:
     """Radial feeder of up to three phases: b branches, b + 1 buses, rooted at the metered busbar (bus 0).
 
-    Attributes
-    ----------
-    name
-        Name of the feeder.
-    parent : (b,)
-        Bus that feeds bus k + 1; `parent[k] <= k`, so buses are in topological order.
-    z : (b, 3, 3)
-        Series impedance Z of the branch into bus k + 1, pu: the voltages along the three conductors drop by
-        ``Z i``. Symmetric; rows and columns of absent phases are 0.
-    phases : (b + 1, 3)
-        Phases a, b, c present at each bus.
-    bus : (N,)
-        Bus of each customer. Several customers may share one; bus 0 is allowed.
-    connected : (N, 3)
-        Connected phases of each customer, between phase and neutral.
-    customers : (N,)
-        Identifiers of the customers.
-    buses : (b + 1,)
-        Identifiers of the buses, the busbar first.
-    base_volt
-        Nominal phase-to-neutral voltage (1 pu), V.
-    base_kva
-        Three-phase base power S, kVA; 1 pu of the power of a phase is a third of it.
-    charging : (b, 3, 3)
-        Total shunt susceptance of the branch into bus k + 1, pu; half of it at each end.
-    of, at, phase : (C,)
-        Derived. The connections, customer by customer, phase by phase: customer, bus, and phase 0, 1, 2.
-    share : (C,)
-        Derived. Share of the customer's power in each connection: 1 on a single phase, 1/3 on all three.
-    start, stop, order, depth, enter, leave : (b + 1,); inside : (b + 1, b + 1) or None
-        Derived. The walk around the tree, see `gridsec.grid.trees.Walk`.
-    half : (b + 1, 3, 3)
-        Derived. Shunt susceptance at the buses, pu.
-
-    Raises
-    ------
-    FeederInvalid
-        With every problem found.
+    Raises FeederInvalid with every problem found.
     """
 
-    name: str
-    parent: Ints
+    name: str  # name of the feeder
+    parent: Ints  # (b,) bus that feeds bus k + 1; `parent[k] <= k`, so buses are in topological order
+    # (b, 3, 3) Series impedance Z of the branch into bus k + 1, pu: the voltages along the three conductors
+    # drop by ``Z i``. Symmetric; rows and columns of absent phases are 0.
     z: Phasors
-    phases: Bools
-    bus: Ints
-    connected: Bools
-    customers: tuple[str, ...]
-    buses: tuple[str, ...]
-    base_volt: float
-    base_kva: float
+    phases: Bools  # (b + 1, 3) phases a, b, c present at each bus
+    bus: Ints  # (N,) Bus of each customer. Several customers may share one; bus 0 is allowed.
+    connected: Bools  # (N, 3) connected phases of each customer, between phase and neutral
+    customers: tuple[str, ...]  # (N,) identifiers of the customers
+    buses: tuple[str, ...]  # (b + 1,) identifiers of the buses, the busbar first
+    base_volt: float  # nominal phase-to-neutral voltage (1 pu), V
+    base_kva: float  # three-phase base power S, kVA; 1 pu of the power of a phase is a third of it
+    # (b, 3, 3) total shunt susceptance of the branch into bus k + 1, pu; half of it at each end
     charging: Floats
+    # of, at, phase (C,): the connections, customer by customer, phase by phase: customer, bus, and phase 0,
+    # 1, 2
     of: Ints = field(init=False, repr=False)
     at: Ints = field(init=False, repr=False)
     phase: Ints = field(init=False, repr=False)
+    # (C,) share of the customer's power in each connection: 1 on a single phase, 1/3 on all three
     share: Floats = field(init=False, repr=False)
+    # start, stop, order, depth, enter, leave (b + 1,); inside : (b + 1, b + 1) or None: the walk around the
+    # tree, see `gridsec.grid.trees.Walk`
     start: Ints = field(init=False, repr=False)
     stop: Ints = field(init=False, repr=False)
     order: Ints = field(init=False, repr=False)
@@ -119,7 +90,7 @@ class ThreePhaseFeeder:
     enter: Ints = field(init=False, repr=False)
     leave: Ints = field(init=False, repr=False)
     inside: Floats | None = field(init=False, repr=False)
-    half: Floats = field(init=False, repr=False)
+    half: Floats = field(init=False, repr=False)  # (b + 1, 3, 3) shunt susceptance at the buses, pu
 
     def __post_init__(self) -> None:
         def put(name: str, value: object) -> None:
@@ -158,19 +129,10 @@ def sequence_matrix(positive: Phasors | Floats, zero: Phasors | Floats) -> Phaso
 
     ``Z_self = (Z_0 + 2 Z_1) / 3`` on the diagonal and ``Z_mutual = (Z_0 - Z_1) / 3`` off the diagonal.
 
-    Parameters
-    ----------
-    positive, zero : (…)
-        Positive- and zero-sequence impedance (or admittance), any unit.
-
-    Returns
-    -------
-    (…, 3, 3)
-        The matrix in phases, same unit.
-
-    References
-    ----------
-    Kersting 2012, chapter 4: the sequence impedances of a transposed line, solved for those of the phases.
+    positive, zero (…): positive- and zero-sequence impedance (or admittance), any unit.
+    Returns (…, 3, 3): the matrix in phases, same unit.
+    Source: Kersting 2012, chapter 4: the sequence impedances of a transposed line, solved for those of the
+        phases.
     """
     one, none = (np.asarray(value, dtype=np.complex128)[..., None, None] for value in (positive, zero))
     return np.asarray(one * np.eye(3) + (none - one) / 3.0)
@@ -227,12 +189,8 @@ def _branch_problems(feeder: ThreePhaseFeeder) -> list[Problem]:
 def line_problems(z: Phasors, charging: Floats, present: Bools) -> list[Problem]:
     """Problems of the impedances and susceptances of a line.
 
-    Parameters
-    ----------
-    z, charging : (3, 3)
-        Series impedance and total shunt susceptance, pu.
-    present : (3,)
-        Phases of the line.
+    z, charging (3, 3): series impedance and total shunt susceptance, pu.
+    present (3,): phases of the line.
     """
     blocks = (("z", z), ("charging", charging))
     out = [
@@ -316,17 +274,12 @@ class LinDist3Flow:
     """Linear power flow `v^2 = v0^2 + 2 R p + 2 X q` of squared phase voltages.
 
     R and X are neither symmetric nor nonnegative: phases on a common path couple with signs.
-
-    Attributes
-    ----------
-    R, X : (C, C)
-        From the powers of a connection to the voltage at a connection, pu.
-    R_bus, X_bus : (3, b + 1, C)
-        The same to every phase of every bus.
     """
 
+    # R, X (C, C): from the powers of a connection to the voltage at a connection, pu
     R: Floats
     X: Floats
+    # R_bus, X_bus (3, b + 1, C): the same to every phase of every bus
     R_bus: Floats
     X_bus: Floats
 
@@ -337,9 +290,7 @@ def lindist3flow(feeder: ThreePhaseFeeder) -> LinDist3Flow:
     Entry (phi at bus k, connection to psi at bus l): ``W_phi,psi`` summed over the common branches of the
     paths of k and l to the busbar, its real part in R and its imaginary part in X. O(b C).
 
-    References
-    ----------
-    Gan and Low 2014; Arnold et al. 2016. Derivation: docs/theory-three-phase.md.
+    Source: Gan and Low 2014; Arnold et al. 2016. Derivation: docs/theory-three-phase.md.
     """
     W_bus = common_paths(feeder, _rotated(feeder), feeder.at, feeder.phase)
     W = W_bus[feeder.phase, feeder.at]
@@ -349,17 +300,9 @@ def lindist3flow(feeder: ThreePhaseFeeder) -> LinDist3Flow:
 def common_paths(feeder: ThreePhaseFeeder, blocks: Phasors, at: Ints, phase: Ints) -> Phasors:
     """Entries of the branches' blocks, summed over the common path of every bus with each of some others.
 
-    Parameters
-    ----------
-    blocks : (b, 3, 3)
-        Summed blocks; for the series impedances ``z``, the sums are voltages per current.
-    at, phase : (k,)
-        Buses, and the columns of the blocks.
-
-    Returns
-    -------
-    (3, b + 1, k)
-        The sums, a row for each phase of every bus.
+    blocks (b, 3, 3): summed blocks; for the series impedances ``z``, the sums are voltages per current.
+    at, phase (k,): buses, and the columns of the blocks.
+    Returns (3, b + 1, k): the sums, a row for each phase of every bus.
     """
     whole = np.zeros((len(feeder.buses), 3, 3), dtype=np.complex128)
     for k, above in enumerate(feeder.parent.tolist()):
@@ -381,19 +324,10 @@ def sensitivities(
     gains one order in the load. Re(conj(v) dv) is then half the derivative of v^2. Without load and charging
     only the first term remains, which is `lindist3flow`. O(b C) for each step.
 
-    Parameters
-    ----------
-    p, q : (C,)
-        Net active and reactive injection of each connection at the operating point, pu.
-    v0_squared : (3,)
-        Squared busbar voltage of each phase, pu.
-    steps
-        Number of sweeps, at least 1: for the operating point as for the derivatives.
-
-    Returns
-    -------
-    LinDist3Flow
-        The matrices; ``v^2`` then changes by ``2 R dp + 2 X dq``.
+    p, q (C,): net active and reactive injection of each connection at the operating point, pu.
+    v0_squared (3,): squared busbar voltage of each phase, pu.
+    steps: number of sweeps, at least 1: for the operating point as for the derivatives.
+    Returns LinDist3Flow: the matrices; ``v^2`` then changes by ``2 R dp + 2 X dq``.
     """
     _check(steps)
     start = _Start.of(feeder, p, q, v0_squared)
@@ -428,14 +362,10 @@ _NOTHING: Phasors = np.zeros((3, 1), dtype=np.complex128)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CustomerFlow:
-    """Linear power flow customer by customer, in the per unit of balanced feeders.
+    """Linear power flow customer by customer, in the per unit of balanced feeders."""
 
-    Attributes
-    ----------
-    R, X : (N, N)
-        From a customer's power in units of the three-phase base S to a customer's squared voltage, pu.
-    """
-
+    # R, X (N, N): from a customer's power in units of the three-phase base S to a customer's squared voltage,
+    # pu
     R: Floats
     X: Floats
 
@@ -447,10 +377,7 @@ def per_customer(feeder: ThreePhaseFeeder, model: LinDist3Flow) -> CustomerFlow:
     are in kW / S as on a balanced feeder, so that droop curves and meters of `base_kva` apply. On a cable
     without mutual impedance, a single-phase customer has three times the impedance of one on all phases.
 
-    Parameters
-    ----------
-    model
-        From `lindist3flow` or `sensitivities`.
+    model: from `lindist3flow` or `sensitivities`.
     """
     first = np.searchsorted(feeder.of, np.arange(len(feeder.customers)))
 
@@ -465,19 +392,11 @@ def per_customer(feeder: ThreePhaseFeeder, model: LinDist3Flow) -> CustomerFlow:
 def squared_voltages(model: LinDist3Flow, p: Floats, q: Floats, v0_squared: Floats) -> Floats:
     """Squared voltage at every connection by the linear power flow.
 
-    Parameters
-    ----------
-    model
-        From `lindist3flow`.
-    p, q : (…, C)
-        Net active and reactive injection of each connection (generation positive), pu.
-    v0_squared : (…, C) or scalar
-        Squared busbar voltage of each connection's phase (``v0_squared[..., feeder.phase]``), pu.
-
-    Returns
-    -------
-    (…, C)
-        Squared voltages, pu.
+    model: from `lindist3flow`.
+    p, q (…, C): net active and reactive injection of each connection (generation positive), pu.
+    v0_squared (…, C) or scalar: squared busbar voltage of each connection's phase (``v0_squared[...,
+        feeder.phase]``), pu.
+    Returns (…, C): squared voltages, pu.
     """
     return np.asarray(v0_squared + 2.0 * (p @ model.R.T + q @ model.X.T))
 
@@ -487,15 +406,8 @@ def bus_voltages(
 ) -> Floats:
     """Squared voltage of every phase of every bus, corrected; O(b), without the matrices.
 
-    Parameters
-    ----------
-    feeder, p, q, v0_squared, steps
-        As in `loss_correction`; `steps` = 0 gives LinDist3Flow.
-
-    Returns
-    -------
-    (…, 3, b + 1)
-        Squared voltages, pu.
+    feeder, p, q, v0_squared, steps: as in `loss_correction`; `steps` = 0 gives LinDist3Flow.
+    Returns (…, 3, b + 1): squared voltages, pu.
     """
     start = _Start.of(feeder, p, q, v0_squared)
     return _sweeps(feeder, start, steps) if steps else start.linear
@@ -513,23 +425,11 @@ def loss_correction(
     turn the voltages induced by currents of other phases: hence phasors in place of squares. O(b) for each
     operating point.
 
-    Parameters
-    ----------
-    p, q : (…, C)
-        Net active and reactive injection of each connection (generation positive), pu.
-    v0_squared : (…, 3)
-        Squared busbar voltage of each phase, pu, with balanced angles.
-    steps
-        Number of sweeps, at least 1.
-
-    Returns
-    -------
-    (…, 3, b + 1)
-        Additive correction of `v^2`, pu; 0 at the busbar.
-
-    References
-    ----------
-    Derivation and measured errors: docs/theory-three-phase.md.
+    p, q (…, C): net active and reactive injection of each connection (generation positive), pu.
+    v0_squared (…, 3): squared busbar voltage of each phase, pu, with balanced angles.
+    steps: number of sweeps, at least 1.
+    Returns (…, 3, b + 1): additive correction of `v^2`, pu; 0 at the busbar.
+    Source: Derivation and measured errors: docs/theory-three-phase.md.
     """
     _check(steps)
     start = _Start.of(feeder, p, q, v0_squared)
@@ -545,15 +445,8 @@ def model_error_bound(feeder: ThreePhaseFeeder, p: Floats, q: Floats, v0_squared
     e (2 |v| + 2 e)``. Heavy loads make the quotients grow, so if this sweep is *not* below a fifth of the one
     before, towards voltage collapse, the bound is infinite. It does not cover unbalanced busbar angles.
 
-    Parameters
-    ----------
-    feeder, p, q, v0_squared
-        As in `loss_correction`.
-
-    Returns
-    -------
-    (…, C)
-        Bound on the remaining error of `v^2`, pu.
+    feeder, p, q, v0_squared: as in `loss_correction`.
+    Returns (…, C): bound on the remaining error of `v^2`, pu.
     """
     start = _Start.of(feeder, p, q, v0_squared)
     return _remainder(feeder, start, _sweep(feeder, start, start.phasors))
@@ -564,15 +457,9 @@ def corrected(
 ) -> tuple[Floats, Floats]:
     """`loss_correction` and `model_error_bound` of the same operating points, faster than separately.
 
-    Parameters
-    ----------
-    feeder, p, q, v0_squared, steps
-        As in `loss_correction`.
-
-    Returns
-    -------
-    (…, 3, b + 1), (…, C)
-        Additive correction of `v^2`, and a bound on the error that remains after its first step, pu.
+    feeder, p, q, v0_squared, steps: as in `loss_correction`.
+    Returns (…, 3, b + 1), (…, C): additive correction of `v^2`, and a bound on the error that remains after
+        its first step, pu.
     """
     _check(steps)
     start = _Start.of(feeder, p, q, v0_squared)
@@ -588,18 +475,10 @@ def interval_bounds(
 ) -> tuple[Floats, Floats]:
     """Change of the correction, and error of its first step, for all powers within intervals.
 
-    Parameters
-    ----------
-    feeder, p, q : (C,), v0_squared : (3,)
-        As in `loss_correction`, one operating point.
-    p_error, q_error : (C,)
-        Largest errors of the powers, pu.
-
-    Returns
-    -------
-    (C,), (C,)
-        As `gridsec.grid.intervals.bounds`; with unequal phases of the busbar, wider by the error of
-        LinDist3Flow for them.
+    feeder, p, q: as in `loss_correction`, one operating point.
+    p_error, q_error (C,): largest errors of the powers, pu.
+    Returns (C,), (C,): as `gridsec.grid.intervals.bounds`; with unequal phases of the busbar, wider by the
+        error of LinDist3Flow for them.
     """
     start = _Start.of(feeder, p, q, v0_squared)
     error = np.asarray(_at_buses(feeder, np.hypot(p_error, q_error) + 0j).real)

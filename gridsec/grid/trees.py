@@ -74,29 +74,19 @@ class OnTree:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Walk:
-    """A walk around a tree of b + 1 buses, children in order.
+    """A walk around a tree of b + 1 buses, children in order."""
 
-    Attributes
-    ----------
-    start, stop : (b + 1,)
-        Depth-first numbering: the subtree of bus k is the buses with `start` in `[start[k], stop[k])`.
-    order : (b + 1,)
-        The buses by these numbers.
-    depth : (b + 1,)
-        Number of branches between bus k and the root.
-    enter, leave : (b + 1,)
-        Steps at which the walk reaches a bus first, and has left it.
-    inside : (b + 1, b + 1) or None
-        1 where the bus of the row lies in the subtree of that of the column, else 0; None for trees so large
-        that sums along the walk cost less than a product with this matrix.
-    """
-
+    # start, stop (b + 1,): depth-first numbering: the subtree of bus k is the buses with `start` in
+    # `[start[k], stop[k])`
     start: Ints
     stop: Ints
-    order: Ints
-    depth: Ints
+    order: Ints  # (b + 1,) the buses by these numbers
+    depth: Ints  # (b + 1,) number of branches between bus k and the root
+    # enter, leave (b + 1,): steps at which the walk reaches a bus first, and has left it
     enter: Ints
     leave: Ints
+    # (b + 1, b + 1) or None: 1 where the bus of the row lies in the subtree of that of the column, else 0;
+    # None for trees so large that sums along the walk cost less than a product with this matrix
     inside: Floats | None
 
 
@@ -108,10 +98,7 @@ _DENSE, _FEW = 200, 8
 def walk(parent: Ints) -> Walk:
     """Walk around a tree.
 
-    Parameters
-    ----------
-    parent : (b,)
-        Bus that feeds bus k + 1, at most k.
+    parent (b,): bus that feeds bus k + 1, at most k.
     """
     count = parent.size + 1
     size = np.ones(count, dtype=np.intp)
@@ -174,17 +161,9 @@ def _dense(tree: Walked, values: Values) -> Floats | None:
 def meetings(parent: Ints, tree: Walked, buses: Ints) -> Ints:
     """Bus at which the paths to the root of every bus and of each of `buses` meet; O(b k).
 
-    Parameters
-    ----------
-    parent : (b,)
-        See `walk`.
-    buses : (k,)
-        The second bus of each pair.
-
-    Returns
-    -------
-    (b + 1, k)
-        The lowest bus on both paths, themselves included.
+    parent (b,): see `walk`.
+    buses (k,): the second bus of each pair.
+    Returns (b + 1, k): the lowest bus on both paths, themselves included.
     """
     out = np.zeros((parent.size + 1, buses.size), dtype=np.intp)
     at = tree.start[buses]
@@ -200,12 +179,8 @@ _SHRINK = 0.2
 def shrinking(first: Floats, second: Floats, axis: tuple[int, ...]) -> Bools:
     """Mask of sweeps with steps that shrink fast enough for all later ones to be at most the second.
 
-    Parameters
-    ----------
-    first, second : (…)
-        Changes in the first two steps.
-    axis
-        Axes of the buses; kept, with one entry.
+    first, second (…): changes in the first two steps.
+    axis: axes of the buses; kept, with one entry.
     """
     largest = np.max(first, axis=axis, keepdims=True)
     return np.asarray(np.max(second, axis=axis, keepdims=True) <= _SHRINK * largest)

@@ -49,24 +49,14 @@ __all__ = [
 class ErrorBox:
     """Errors of unmanipulated customers and meters. N customers, k unknowns, p meters.
 
-    Attributes
-    ----------
-    effect : (N, k)
-        B: effect of each unknown, at the end of its interval, on the squared voltages, pu.
-    meters : (p,)
-        Customer of each meter.
-    reading : (p,)
-        e: largest error of an unmanipulated squared reading, pu; positive.
-
-    Raises
-    ------
-    ValueError
-        If numbers of meters differ, an effect is not finite, or an error of a reading not positive.
+    Raises ValueError if numbers of meters differ, an effect is not finite, or an error of a reading not
+        positive.
     """
 
+    # (N, k) B: effect of each unknown, at the end of its interval, on the squared voltages, pu
     effect: Floats
-    meters: Ints
-    reading: Floats
+    meters: Ints  # (p,) customer of each meter
+    reading: Floats  # (p,) e: largest error of an unmanipulated squared reading, pu; positive
 
     def __post_init__(self) -> None:
         if self.reading.shape != self.meters.shape or self.effect.ndim != 2:
@@ -87,40 +77,20 @@ class ErrorBox:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StealthyAttack:
-    """Largest attack, or error, consistent with an unmanipulated feeder.
+    """Largest attack, or error, consistent with an unmanipulated feeder."""
 
-    Attributes
-    ----------
-    size
-        Squared pu; reached by `liars` with the unknowns at `unknowns`. 0 without possible attacks.
-    bound
-        Upper bound of the solver; at least `size`.
-    liars
-        Meters that must be manipulated for it.
-    unknowns : (k,)
-        c.
-    """
-
-    size: float
-    bound: float
-    liars: Ints
-    unknowns: Floats
+    size: float  # Squared pu; reached by `liars` with the unknowns at `unknowns`. 0 without possible attacks.
+    bound: float  # upper bound of the solver; at least `size`
+    liars: Ints  # meters that must be manipulated for it
+    unknowns: Floats  # (k,) c
 
 
 def largest_lie(box: ErrorBox, meter: int, liars: int, *, honest: Bools | None = None) -> StealthyAttack:
     """Largest attack on a meter, in collusion with others, that is consistent with an unmanipulated feeder.
 
-    Parameters
-    ----------
-    liars
-        Largest number of manipulated meters, this one among them.
-    honest : (p,), optional
-        Protected meters: they cannot be manipulated.
-
-    Raises
-    ------
-    DesignInfeasible
-        If the solver fails.
+    liars: largest number of manipulated meters, this one among them.
+    honest (p,): protected meters: they cannot be manipulated.
+    Raises DesignInfeasible if the solver fails.
     """
     honest = np.zeros(box.meters.size, dtype=np.bool_) if honest is None else honest
     if honest[meter] or liars < 1:
@@ -133,10 +103,7 @@ def largest_lie(box: ErrorBox, meter: int, liars: int, *, honest: Bools | None =
 def worst_error(box: ErrorBox, customer: int, liars: int, *, honest: Bools | None = None) -> StealthyAttack:
     """Largest difference of a customer's voltage between two states with the same readings.
 
-    Parameters
-    ----------
-    box, liars, honest
-        As in `largest_lie`; with `liars` = 0, the uncertainty under unmanipulated meters.
+    box, liars, honest: as in `largest_lie`; with `liars` = 0, the uncertainty under unmanipulated meters.
     """
     honest = np.zeros(box.meters.size, dtype=np.bool_) if honest is None else honest
     return _most(box, box.effect[customer], liars, honest, None)
@@ -217,21 +184,11 @@ _HONEST_REPORTS = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PowerErrorModel:
-    """Errors of meters and customers, manipulated or not. k unknowns, p meters.
+    """Errors of meters and customers, manipulated or not. k unknowns, p meters."""
 
-    Attributes
-    ----------
-    box
-        Unknowns at the ends of their ranges under manipulated meters.
-    owner : (k,)
-        Meter that determines each unknown; -1 for none.
-    honest : (k,)
-        Share of that range while its meter is unmanipulated, 0 to 1.
-    """
-
-    box: ErrorBox
-    owner: Ints
-    honest: Floats
+    box: ErrorBox  # unknowns at the ends of their ranges under manipulated meters
+    owner: Ints  # (k,) meter that determines each unknown; -1 for none
+    honest: Floats  # (k,) share of that range while its meter is unmanipulated, 0 to 1
 
     def told(self, liars: Bools) -> ErrorBox:
         """The box while the meters in the mask (p,) may report any powers."""
@@ -244,15 +201,9 @@ def largest_story(
 ) -> StealthyAttack:
     """Largest attack on a meter consistent with an unmanipulated feeder, with false powers of such meters.
 
-    Parameters
-    ----------
-    meter, liars, honest
-        As in `gridsec.planning.stealthy_attacks.largest_lie`. Protected meters report true powers, too.
-
-    Raises
-    ------
-    DesignInfeasible
-        If the solver fails.
+    meter, liars, honest: as in `gridsec.planning.stealthy_attacks.largest_lie`. Protected meters report true
+        powers, too.
+    Raises DesignInfeasible if the solver fails.
     """
     p = given.box.meters.size
     honest = np.zeros(p, dtype=np.bool_) if honest is None else honest

@@ -42,31 +42,15 @@ __all__ = ["MonitorDesign", "MonitorState", "design", "init", "step"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MonitorDesign:
-    """Design of the exact bank monitor.
-
-    Attributes
-    ----------
-    model
-        Linear power flow of the plant.
-    bank
-        The observers.
-    errors
-        Propagation of errors.
-    certificate
-        Proof that the observers converge, for all sensor sets at once.
-    proven
-        System of the certificate: the closed loop, or a majorant of all observers.
-    step_s
-        Expected interval between frames, s.
-    """
+    """Design of the exact bank monitor."""
 
     plant: Plant
-    model: LinDistFlow
-    bank: banks.Bank
-    errors: ErrorModel
-    certificate: Certificate
-    proven: Lure
-    step_s: float
+    model: LinDistFlow  # linear power flow of the plant
+    bank: banks.Bank  # the observers
+    errors: ErrorModel  # propagation of errors
+    certificate: Certificate  # proof that the observers converge, for all sensor sets at once
+    proven: Lure  # system of the certificate: the closed loop, or a majorant of all observers
+    step_s: float  # expected interval between frames, s
     options: Options
 
     @property
@@ -89,45 +73,21 @@ class MonitorDesign:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MonitorState:
-    """State between frames.
+    """State between frames."""
 
-    Attributes
-    ----------
-    t
-        Time of the last used frame, s; that of `init` before the first one.
-    valid
-        True if the certificate was verified.
-    bank
-        The observers; None before the first frame.
-    x : (m,)
-        Last selected estimate of the injections, pu.
-    z : (m,)
-        Its z at the inverters, pu.
-    spread : (m,)
-        Largest distance of it from that of an observer without manipulated meters, pu.
-    bound, level
-        Bounds on the observers' error, and their upper level during the last step.
-    settled
-        True once the initial transient has decayed.
-    tally
-        Counters of readings above and below the thresholds, and the named meters.
-    v0_squared
-        Last squared busbar voltage, pu; in three phases (3,).
-    last
-        Last estimate and verdict, returned for unusable frames; None before the first one.
-    """
-
-    t: float
-    valid: bool
-    bank: banks.BankState | None
-    x: Floats
-    z: Floats
-    spread: Floats
+    t: float  # time of the last used frame, s; that of `init` before the first one
+    valid: bool  # True if the certificate was verified
+    bank: banks.BankState | None  # the observers; None before the first frame
+    x: Floats  # (m,) last selected estimate of the injections, pu
+    z: Floats  # (m,) its z at the inverters, pu
+    spread: Floats  # (m,) largest distance of it from that of an observer without manipulated meters, pu
+    # bound, level: bounds on the observers' error, and their upper level during the last step
     bound: ErrorBound
     level: ErrorBound
-    settled: bool
-    tally: Counters
-    v0_squared: Floats | float
+    settled: bool  # True once the initial transient has decayed
+    tally: Counters  # counters of readings above and below the thresholds, and the named meters
+    v0_squared: Floats | float  # last squared busbar voltage, pu; in three phases (3,)
+    # last estimate and verdict, returned for unusable frames; None before the first one
     last: tuple[Estimate, Verdict] | None
 
 
@@ -142,33 +102,18 @@ def design(
 ) -> MonitorDesign:
     """Design the bank, its certificate and its error bounds for one feeder.
 
-    Parameters
-    ----------
-    max_attacked
-        M, largest number of simultaneously manipulated meters.
-    step_s
-        Expected interval between frames, s. Other intervals work too. Above 30 s, four consecutive readings
-        below the threshold clear a meter in place of six, unless `options` are given.
-    gains
-        `direct`: the inverter of a trusted meter is driven by that meter's reading. Or stacked gains
-        of circle-criterion observers in the order of `bank.subsets(p, M).masks()`; an entrywise
-        majorant of all of them must then satisfy the small-gain condition.
-    certificate
-        An external proof; by default the best closed form, or the solver's where none applies. It is verified
-        here.
-
-    Raises
-    ------
-    NotObservable
-        Unless there are more than 2M meters.
-    DesignInfeasible
-        If no certificate holds, the bank would be too large, or the gains detect nothing.
-    ValueError
-        As `plant.check_plant`; or if `gains` is another text.
-
-    References
-    ----------
-    chong2020, Corollary 1, for any feeder and with the corrections of its errata.
+    max_attacked: M, largest number of simultaneously manipulated meters.
+    step_s: expected interval between frames, s. Other intervals work too. Above 30 s, four consecutive
+        readings below the threshold clear a meter in place of six, unless `options` are given.
+    gains: `direct`: the inverter of a trusted meter is driven by that meter's reading. Or stacked gains of
+        circle-criterion observers in the order of `bank.subsets(p, M).masks()`; an entrywise majorant of all
+        of them must then satisfy the small-gain condition.
+    certificate: an external proof; by default the best closed form, or the solver's where none applies. It is
+        verified here.
+    Raises NotObservable unless there are more than 2M meters; DesignInfeasible if no certificate holds, the
+        bank would be too large, or the gains detect nothing; ValueError as `plant.check_plant`; or if `gains`
+        is another text.
+    Source: chong2020, Corollary 1, for any feeder and with the corrections of its errata.
     """
     meters = plant.meters
     check_plant(plant, max_attacked=max_attacked, step_s=step_s)
@@ -243,12 +188,9 @@ def _extreme(M: Floats, K: Floats, N: Floats) -> Floats:
 def init(design: MonitorDesign, t: float) -> MonitorState:
     """Initial state; the observers start with the first frame.
 
-    Parameters
-    ----------
-    design
-        From `design`. Its certificate is verified again, because a stored or hand-made design may be wrong.
-    t
-        Unix time, s.
+    design: from `design`. Its certificate is verified again, because a stored or hand-made design may be
+        wrong.
+    t: Unix time, s.
     """
     m, p = design.plant.droop.tau.size, design.plant.meters.size
     try:
@@ -275,16 +217,8 @@ def init(design: MonitorDesign, t: float) -> MonitorState:
 def step(design: MonitorDesign, state: MonitorState, frame: Frame) -> tuple[MonitorState, Estimate, Verdict]:
     """Process one frame.
 
-    Parameters
-    ----------
-    frame
-        Data of one tick. A frame that is not later than the last one changes nothing: it returns the last
+    frame: data of one tick. A frame that is not later than the last one changes nothing: it returns the last
         estimate and UNDECIDED.
-
-    Returns
-    -------
-    MonitorState, Estimate, Verdict
-        As every estimator's step; see `gridsec.interface`.
     """
     late = state.bank is not None and not frame.t > state.t
     if late or not np.isfinite(frame.t):

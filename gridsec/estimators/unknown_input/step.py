@@ -79,31 +79,16 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UnknownInputDesign:
-    """Design of the unknown-input estimator. N customers, m inverters, p meters.
-
-    Attributes
-    ----------
-    max_inverters
-        Largest number of simultaneously attacked inverters, q_1 of yang2021.
-    pairs
-        The candidates.
-    within : (c, c)
-        True if the suspects of the first candidate are a subset of those of the second.
-    missing
-        Pairs with inverters that voltages alone do not distinguish; they are tried as well.
-    doubt
-        Assumed number and size of attacks.
-    gain : (N, m)
-        2X from inverters to all customers.
-    """
+    """Design of the unknown-input estimator. N customers, m inverters, p meters."""
 
     setting: EstimatorContext
-    max_inverters: int
-    pairs: Pairs
-    within: Bools
+    max_inverters: int  # largest number of simultaneously attacked inverters, q_1 of yang2021
+    pairs: Pairs  # the candidates
+    within: Bools  # (c, c) True if the suspects of the first candidate are a subset of those of the second
+    # pairs with inverters that voltages alone do not distinguish; they are tried as well
     missing: tuple[Unseen, ...]
-    doubt: AttackAssumption
-    gain: Floats
+    doubt: AttackAssumption  # assumed number and size of attacks
+    gain: Floats  # (N, m) 2X from inverters to all customers
 
     @property
     def observers(self) -> int:
@@ -113,60 +98,34 @@ class UnknownInputDesign:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UnknownInputState:
-    """State between frames. m inverters, p meters.
+    """State between frames. m inverters, p meters."""
 
-    Attributes
-    ----------
-    t, began
-        Time of the last used frame, and of the first one, s; that of `init` before.
-    tubes
-        Intervals of unmanipulated inverters; None before the first frame.
-    contradicted
-        Counters of contradictions of each pair; pairs named there are refuted.
-    x : (m,)
-        Estimated injections including attacks, pu.
-    v0_squared
-        Last squared busbar voltage, pu; in three phases (3,).
-    named, inverters : (p,), (m,)
-        Meters and inverters named as manipulated.
-    last
-        Last estimate and verdict, returned for unusable frames.
-    """
-
+    # t, began: time of the last used frame, and of the first one, s; that of `init` before
     t: float
     began: float
-    tubes: Tubes | None
-    contradicted: Counters
-    x: Floats
-    v0_squared: Floats | float
+    tubes: Tubes | None  # intervals of unmanipulated inverters; None before the first frame
+    contradicted: Counters  # counters of contradictions of each pair; pairs named there are refuted
+    x: Floats  # (m,) estimated injections including attacks, pu
+    v0_squared: Floats | float  # last squared busbar voltage, pu; in three phases (3,)
+    # named, inverters (p,), (m,): meters and inverters named as manipulated
     named: Bools
     inverters: Bools
-    last: tuple[Estimate, Verdict] | None
+    last: tuple[Estimate, Verdict] | None  # last estimate and verdict, returned for unusable frames
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TickRelations:
-    """One tick as linear relations; the suspected meters determine the intervals of inverters.
+    """One tick as linear relations; the suspected meters determine the intervals of inverters."""
 
-    Attributes
-    ----------
-    design, frame, inputs
-        Design, received frame, and prepared frame.
-    tubes
-        Intervals of unmanipulated inverters.
-    v2, error : (N,)
-        Squared voltages without injections of inverters, and their error, squared pu.
-    rest : (N,)
-        The part of that error from neither loads nor busbar.
-    """
-
+    # design, frame, inputs: design, received frame, and prepared frame
     design: UnknownInputDesign
     frame: Frame
     inputs: Inputs
-    tubes: Tubes
+    tubes: Tubes  # intervals of unmanipulated inverters
+    # v2, error (N,): squared voltages without injections of inverters, and their error, squared pu
     v2: Floats
     error: Floats
-    rest: Floats
+    rest: Floats  # (N,) the part of that error from neither loads nor busbar
 
     def tube(self, meters: Bools) -> Tube:
         """Intervals of unmanipulated inverters if the meters in the mask (p,) are manipulated."""
@@ -249,10 +208,7 @@ _EXACT = 1e-9
 def observe(design: UnknownInputDesign, state: UnknownInputState, frame: Frame) -> TickRelations:
     """Prepare a frame, and advance the intervals of unmanipulated inverters.
 
-    Parameters
-    ----------
-    frame
-        Later than the last one.
+    frame: later than the last one.
     """
     inputs = clean(design.setting, PreviousStep(state.x, state.v0_squared, state.named), frame)
     h = 0.0 if state.tubes is None else frame.t - state.t
@@ -326,25 +282,14 @@ Answer = tuple[Decision, Cause, str]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PairResults:
-    """Result of the pairs of one tick. p meters, m inverters.
+    """Result of the pairs of one tick. p meters, m inverters."""
 
-    Attributes
-    ----------
-    meters, inverters : (p,), (m,)
-        Members of every possible pair.
-    threshold : (p,)
-        Largest score of each meter without manipulation, squared pu.
-    trial
-        Result of the likeliest pair.
-    explanations
-        The smallest possible pairs where there are several.
-    """
-
+    # meters, inverters (p,), (m,): members of every possible pair
     meters: Bools
     inverters: Bools
-    threshold: Floats
-    trial: PairResult
-    explanations: tuple[Explanation, ...]
+    threshold: Floats  # (p,) largest score of each meter without manipulation, squared pu
+    trial: PairResult  # result of the likeliest pair
+    explanations: tuple[Explanation, ...]  # the smallest possible pairs where there are several
 
 
 _SHOWN = 8
@@ -455,22 +400,11 @@ def design(
 ) -> UnknownInputDesign:
     """Design the pairs for one feeder.
 
-    Parameters
-    ----------
-    max_attacked, max_inverters
-        Largest numbers of simultaneously attacked meters and inverters, q_2 and q_1.
-    step_s
-        Expected interval between frames, s; it only selects the default options, others work as well.
-
-    Raises
-    ------
-    NotObservable
-        Unless there are more than 2 max_attacked meters, yang2021 (4) and (20).
-    DesignInfeasible
-        If there are too many pairs.
-    ValueError
-        As `plant.check_plant`, if `max_inverters` is negative, or if inverters have no rating, the largest
-        injection of an attacked one.
+    max_attacked, max_inverters: largest numbers of simultaneously attacked meters and inverters, q_2 and q_1.
+    step_s: expected interval between frames, s; it only selects the default options, others work as well.
+    Raises NotObservable unless there are more than 2 max_attacked meters, yang2021 (4) and (20);
+        DesignInfeasible if there are too many pairs; ValueError as `plant.check_plant`, if `max_inverters` is
+        negative, or if inverters have no rating, the largest injection of an attacked one.
     """
     p, m = plant.meters.size, plant.droop.tau.size
     more = (
@@ -517,10 +451,7 @@ def step(
 ) -> tuple[UnknownInputState, Estimate, Verdict]:
     """Process one frame.
 
-    Parameters
-    ----------
-    frame
-        Data of one tick. A frame that is not later than the last one changes nothing: it returns the last
+    frame: data of one tick. A frame that is not later than the last one changes nothing: it returns the last
         estimate and UNDECIDED.
     """
     if not np.isfinite(frame.t) or (state.tubes is not None and not frame.t > state.t):

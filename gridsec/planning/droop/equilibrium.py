@@ -33,12 +33,8 @@ _BESIDE: Final = 1e-7
 def injected(droop: Droop, s: Complex, x: Floats) -> Complex:
     """Injections of the customers with those of their inverters, (…, N).
 
-    Parameters
-    ----------
-    s : (…, N)
-        Complex injections without the inverters, pu.
-    x : (…, m)
-        Reactive injections of the inverters, pu.
+    s (…, N): complex injections without the inverters, pu.
+    x (…, m): reactive injections of the inverters, pu.
     """
     owner = np.equal.outer(droop.customer, np.arange(s.shape[-1])).astype(np.float64)
     return np.asarray(s + 1j * (x @ owner))
@@ -50,19 +46,10 @@ def rest(net: PhasorNetwork, droop: Droop, s: Complex, v0: Floats | float) -> tu
     Plain iteration for all operating points together, with damping from the no-load loop gain, and Newton's
     method for points without convergence.
 
-    Parameters
-    ----------
-    net
-        From `gridsec.planning.droop.ac_sensitivity.network`.
-    s : (…, N)
-        Complex injections without the inverters, pu.
-    v0 : (…) or scalar
-        Voltage of the busbar, pu.
-
-    Returns
-    -------
-    (…, m), (…, N)
-        Reactive injections, and complex voltages, pu.
+    net: from `gridsec.planning.droop.ac_sensitivity.network`.
+    s (…, N): complex injections without the inverters, pu.
+    v0 (…) or scalar: voltage of the busbar, pu.
+    Returns (…, m), (…, N): reactive injections, and complex voltages, pu.
     """
     own, everywhere = droop.customer, np.full(droop.tau.size, np.inf)
     root = np.sqrt(slopes(droop, -everywhere, everywhere))
@@ -112,14 +99,9 @@ def _newton(net: PhasorNetwork, droop: Droop, s: Complex, v0: float, tol: float)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Band:
-    """Proven limits of every customer's voltage for loads in a box, pu.
+    """Proven limits of every customer's voltage for loads in a box, pu."""
 
-    Attributes
-    ----------
-    low, high : (N,)
-        Lower and upper limit.
-    """
-
+    # low, high (N,): lower and upper limit
     low: Floats
     high: Floats
 
@@ -127,15 +109,8 @@ class Band:
 def always(net: PhasorNetwork, droop: Droop, loads: InjectionBox) -> Band:
     """Limits at all times, for any motion of the loads in their box, from any reachable state.
 
-    Parameters
-    ----------
-    loads
-        Injections without the droop inverters.
-
-    Raises
-    ------
-    DesignInfeasible
-        If the box is too large for a bound.
+    loads: injections without the droop inverters.
+    Raises DesignInfeasible if the box is too large for a bound.
     """
     found = reach(net, droop, loads).region
     return Band(found.low, found.high)
@@ -148,15 +123,8 @@ def at_rest(net: PhasorNetwork, droop: Droop, loads: InjectionBox) -> Band:
     wrong sign. Two equilibria differ by `dv = Jw dw - Jq Delta dv`; with `|dv| <= U |dw|`,
     `U = (I - |Jq| D)^-1 |Jw|`, the lower end of every sensitivity is `L = Jw - |Jq| D U`.
 
-    Parameters
-    ----------
-    net, droop, loads
-        As in `always`.
-
-    Raises
-    ------
-    DesignInfeasible
-        If the box is too large for a bound, or the loop gain is 1 or more.
+    net, droop, loads: as in `always`.
+    Raises DesignInfeasible if the box is too large for a bound, or the loop gain is 1 or more.
     """
     found, own = reach(net, droop, loads), droop.customer
     given = found.region
@@ -190,18 +158,10 @@ def at_rest(net: PhasorNetwork, droop: Droop, loads: InjectionBox) -> Band:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Share:
-    """Shares of the inverters in the loop gain. One entry for each inverter of a `Loop`.
+    """Shares of the inverters in the loop gain. One entry for each inverter of a `Loop`."""
 
-    Attributes
-    ----------
-    part : (m,)
-        Share of each inverter: its squared entry in the leading mode; the sum is 1.
-    factor : (m,)
-        Largest factor on its slope alone within the allowed gain; infinity if any.
-    """
-
-    part: Floats
-    factor: Floats
+    part: Floats  # (m,) share of each inverter: its squared entry in the leading mode; the sum is 1
+    factor: Floats  # (m,) largest factor on its slope alone within the allowed gain; infinity if any
 
 
 def shares(given: Loop, allowed: float) -> Share:
@@ -210,12 +170,8 @@ def shares(given: Loop, allowed: float) -> Share:
     `lambda_max(D^1/2 S D^1/2) <= a` is `a D^-1 - S >= 0`. A larger d_i subtracts a multiple of `e_i e_i'`, so
     with `w_i = [(a I - D^1/2 S D^1/2)^-1]_ii` the largest factor is `1 / (1 - 1 / (a w_i))`.
 
-    Parameters
-    ----------
-    given
-        The loop; S enters by its symmetric part.
-    allowed
-        a, the allowed gain.
+    given: the loop; S enters by its symmetric part.
+    allowed: a, the allowed gain.
     """
     S = 0.5 * (given.S + given.S.T)
     if not S.size:
@@ -237,10 +193,7 @@ def shares_of_gain(given: Loop) -> Share:
     multiplied by f leaves it below 1 up to `f = 1 / (1 - 1 / w_i)`. The part is the product of an inverter's
     entries in the leading left and right vectors: the growth of the gain with its slope alone.
 
-    Returns
-    -------
-    Share
-        Factors are NaN where the gain may be 1 or more, so that there is no certificate.
+    Returns Share: factors are NaN where the gain may be 1 or more, so that there is no certificate.
     """
     M = np.abs(given.S) + given.error
     if not M.size:
