@@ -6,7 +6,8 @@ Every estimator family is three functions with these types at their borders::
     init(design, t)             -> State
     step(design, state, frame)  -> (State, Estimate, Verdict)  online; never raises on data
 
-Outcomes are values. UNDECIDED is a separate answer: a missing answer must never look like CLEAN.
+Outcomes are values. A frame that is not later than the last one returns the last estimate and UNDECIDED, and
+the state as it was. UNDECIDED is a separate answer: a missing answer must never look like CLEAN.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 from typing import Final
 
@@ -145,6 +145,15 @@ class Rows:
     count: Floats  # (T,) number of frames
     accused: Bools  # (T, p) meters accused within the block
 
+    def joined(self, later: Rows) -> Rows:
+        """These and later blocks, at most `MOST_BLOCKS` of them."""
+        both = ((getattr(self, each.name), getattr(later, each.name)) for each in fields(self))
+        return Rows(*(np.concatenate(pair)[-MOST_BLOCKS:] for pair in both))
+
+    def where(self, which: Bools) -> Rows:
+        """The blocks of a mask (T,)."""
+        return Rows(*(getattr(self, each.name)[which] for each in fields(self)))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Mean:
@@ -159,7 +168,7 @@ class _Mean:
         both = np.array([power, variance])
         return _Mean(np.where(told, both, 0.0), told.astype(np.float64), both)
 
-    def plus(self, other: _Mean) -> _Mean:
+    def __add__(self, other: _Mean) -> _Mean:
         return _Mean(self.told + other.told, self.told_count + other.told_count, self.every + other.every)
 
     def value(self, count: int) -> Floats:
@@ -287,16 +296,12 @@ def _added(
     )
     if sums is None:
         return now
-    return _Sums(
-        block,
-        sums.count + 1,
-        sums.y + now.y,
-        sums.heard + now.heard,
-        sums.p.plus(now.p),
-        sums.q.plus(now.q),
-        sums.v0 + v0,
-        sums.accused | accused,
-    )
+    total = {name: getattr(sums, name) + getattr(now, name) for name in _SUMMED}
+    return replace(now, **total, accused=sums.accused | accused)
+
+
+# Fields of `_Sums` that are added up.
+_SUMMED: Final = ("count", "y", "heard", "p", "q", "v0")
 
 
 def _variance(half_width: Floats, std: Floats | None) -> Floats:
@@ -311,21 +316,11 @@ def _closed(design: DataErrorDesign, window: AccusationWindow, sums: _Sums) -> A
     model = _solved(design, design.at, p[None], q[None], v0=v0[None])[0]
     with np.errstate(all="ignore"):
         y = sums.y / sums.heard  # NaN without a reading
-    t = np.array([(sums.block + 0.5) * design.block_s])
-    now = Rows(
-        t=t,
-        y=y[None],
-        p=p[None],
-        q=q[None],
-        p_var=p_var[None],
-        q_var=q_var[None],
-        read=(sums.p.told_count > 0.0)[None],
-        v0=v0[None],
-        model=model[None],
-        count=np.array([float(sums.count)]),
-        accused=sums.accused[None],
-    )
-    rows = now if window.rows is None else _joined(window.rows, now)
+    t = (sums.block + 0.5) * design.block_s
+    read, count = sums.p.told_count > 0.0, float(sums.count)
+    row = (t, y, p, q, p_var, q_var, read, v0, model, count, sums.accused)
+    now = Rows(*(np.asarray(each)[None] for each in row))
+    rows = now if window.rows is None else window.rows.joined(now)
     since = 0 if sums.accused.any() else window.since_accused + 1
     return AccusationWindow(rows, compare(design, rows, window.error), window.t, None, since)
 
@@ -348,44 +343,6 @@ def _solved(design: DataErrorDesign, at: Ints, p: Floats, q: Floats, *, v0: Floa
 
 _LOSS_STEPS: Final = 3
 """Corrections of the linear power flow: the third changes less than the resolution of a meter."""
-
-
-def _joined(rows: Rows, more: Rows) -> Rows:
-    """Rows and later ones, at most `MOST_BLOCKS` of them."""
-
-    def both(one: Floats, other: Floats) -> Floats:
-        return np.concatenate((one, other))[-MOST_BLOCKS:]
-
-    return Rows(
-        t=both(rows.t, more.t),
-        y=both(rows.y, more.y),
-        p=both(rows.p, more.p),
-        q=both(rows.q, more.q),
-        p_var=both(rows.p_var, more.p_var),
-        q_var=both(rows.q_var, more.q_var),
-        read=np.concatenate((rows.read, more.read))[-MOST_BLOCKS:],
-        v0=both(rows.v0, more.v0),
-        model=both(rows.model, more.model),
-        count=both(rows.count, more.count),
-        accused=np.concatenate((rows.accused, more.accused))[-MOST_BLOCKS:],
-    )
-
-
-def _some(rows: Rows, which: Bools) -> Rows:
-    """The chosen rows."""
-    return Rows(
-        rows.t[which],
-        rows.y[which],
-        rows.p[which],
-        rows.q[which],
-        rows.p_var[which],
-        rows.q_var[which],
-        rows.read[which],
-        rows.v0[which],
-        rows.model[which],
-        rows.count[which],
-        rows.accused[which],
-    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -451,7 +408,7 @@ def _scene(design: DataErrorDesign, rows: Rows) -> _Scene | None:
     whole = heard[:, k].all(axis=1) & rows.read[:, read].all(axis=1) & possible
     if np.count_nonzero(whole) < FEWEST_BLOCKS:
         return None
-    rows = _some(rows, np.asarray(whole))
+    rows = rows.where(np.asarray(whole))
     at = design.at[plant.meters[k]]
     e = rows.y[:, k] - rows.model[:, at]
     loads = _load_covariance(design, rows, at)

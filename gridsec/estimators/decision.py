@@ -19,6 +19,12 @@ class Counters:
     named: Bools  # (p,) meters named as manipulated
 
 
+def no_counts(size: int) -> Counters:
+    """Counters before the first reading."""
+    zero = np.zeros(size, dtype=np.intp)
+    return Counters(zero, zero, np.zeros(size, dtype=np.bool_))
+
+
 def count(tally: Counters, over: Bools, live: Bools, *, confirm: int, release: int) -> Counters:
     """Update the counters with the residuals of one frame.
 

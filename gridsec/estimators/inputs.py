@@ -47,7 +47,7 @@ class Reconstruction:
     # v2_bus, v2 (n,), (N,): squared voltages of all places and of the customers, pu
     v2_bus: Floats
     v2: Floats
-    correction: Floats  # (n,) part of the loss correction in them, squared pu
+    moved: Floats  # (N,) change of the loss correction since the last estimate, squared pu
 
 
 def nothing_new(  # noqa: PLR0917  # the last answer, and the values without one
@@ -126,7 +126,8 @@ def reconstruct(setting: EstimatorContext, frame: Frame, inputs: Inputs, q: Floa
         correction = np.where(np.isfinite(correction), correction, inputs.correction)
     base = plant.feeder.broadcast_busbar(inputs.v0_squared)
     v2_bus = base + 2.0 * (model.R_bus @ frame.p + model.X_bus @ q) + correction
-    return Reconstruction(v2_bus, v2_bus[plant.feeder.bus], correction)
+    at = plant.feeder.bus
+    return Reconstruction(v2_bus, v2_bus[at], np.abs(correction - inputs.correction)[at])
 
 
 def clean(setting: EstimatorContext, past: PreviousStep, frame: Frame) -> Inputs:

@@ -49,7 +49,7 @@ import numpy as np
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import DesignInfeasible, NotObservable
 from gridsec.estimators import thresholds
-from gridsec.estimators.decision import Counters, DecisionInputs, count, decide
+from gridsec.estimators.decision import Counters, DecisionInputs, count, decide, no_counts
 from gridsec.estimators.inputs import (
     NO_VOLTAGE,
     Inputs,
@@ -62,14 +62,21 @@ from gridsec.estimators.inputs import (
     nothing_new,
     reconstruct,
 )
-from gridsec.estimators.plant import EstimatorContext, Options, Plant, check_plant, estimator_context
+from gridsec.estimators.plant import (
+    EstimatorContext,
+    Options,
+    Plant,
+    check_plant,
+    estimator_context,
+    usual_options,
+)
 from gridsec.estimators.thresholds import ErrorBound, Motion, TickUncertainty
 from gridsec.grid.meter import reading_error
 from gridsec.interface import Cause, Decision, Estimate, Explanation, Frame, Verdict
 from gridsec.observers import circle
 from gridsec.observers.certificates import Certificate, verify
 from gridsec.observers.circle import CircleDesign
-from gridsec.observers.lure import POLICY, close_loop, rest
+from gridsec.observers.lure import POLICY, close_loop
 from gridsec.secure.decode.noise import CorrectionConstants, correction_constants
 from gridsec.secure.decode.search import Fits, fits
 from gridsec.secure.decode.stacks import MOST_SUBSETS, Stack
@@ -150,13 +157,10 @@ def observe(  # noqa: PLR0917  # the observers, their state, and the inputs
         model, circle.CircleState(0.0, before.x), inputs.z, inputs.w, no_meters, h if h > 0 else _LONG_S
     ).x
     seen = reconstruct(setting, frame, inputs, injections(plant, frame, x, no_meters))
-    moved = np.abs(seen.correction - inputs.correction)[plant.feeder.bus]
-    base = np.minimum(inputs.now.base + moved, NO_VOLTAGE)
+    base = np.minimum(inputs.now.base + seen.moved, NO_VOLTAGE)
     alone = replace(inputs.now, base=base, live=no_meters, told=no_meters)
     z = plant.droop.vbar**2 - seen.v2[own]
-    fast = plant.droop.tau * rest(h, POLICY) < 1.0
-    # If all are that fast, the step ends in the equilibrium.
-    lag = np.where(fast & ~fast.all(), np.abs(x - before.x), 0.0)
+    lag = np.where(thresholds.slowed(errors, h, POLICY), np.abs(x - before.x), 0.0)
     motion = Motion(before.z if h > 0 else z, z, np.zeros(x.shape), h, lag)
     bound, level = thresholds.advance(errors, alone, motion, before.bound, before.level)
     heard = np.zeros(x.shape, dtype=np.bool_)
@@ -174,10 +178,8 @@ def observe(  # noqa: PLR0917  # the observers, their state, and the inputs
 
 def _settled(setting: EstimatorContext, alone: TickUncertainty, motion: Motion, bound: ErrorBound) -> bool:
     errors = setting.errors
-    none = np.zeros(bound.free.shape)
-    top = thresholds.ceiling(errors, alone, motion, ErrorBound(none, none))
-    at_rest = thresholds.settled(errors, alone, motion, top)
-    excess = errors.inverters[errors.meters] @ np.maximum(bound.free - at_rest.free, 0.0)
+    transient = np.maximum(bound.free - thresholds.at_rest(errors, alone, motion).free, 0.0)
+    excess = errors.inverters[errors.meters] @ transient
     allowed = alone.reading + alone.base[errors.meters]
     return bool(np.all(excess <= setting.options.settled * allowed))
 
@@ -335,8 +337,7 @@ def design(
     if sets > MOST_SUBSETS or sets * rows * (rows + unknowns) > MOST_WORK * step_s:
         said = f"{sets} sets of up to {rows} rows every {step_s:g} s are too many"
         raise DesignInfeasible(f"fits without every {max_attacked} of {p} meters", said, code="too-many")
-    if options is None:
-        options = Options() if step_s <= 30.0 else Options(release=4)
+    options = usual_options(step_s) if options is None else options
     model = circle.design(close_loop(plant.feeder, plant.droop, meters), np.zeros(p, dtype=np.bool_))
     return PartialDesign(estimator_context(plant, max_attacked=max_attacked, options=options), model, step_s)
 
@@ -347,7 +348,6 @@ def init(design: PartialDesign, t: float) -> PartialState:
     The certificate of the design is verified again.
     """
     plant, proof = design.setting.plant, design.model.certificate
-    p = plant.meters.size
     try:
         valid = isinstance(proof, Certificate) and verify(proof, design.model.lure) > 0
     except DesignInfeasible:
@@ -358,17 +358,15 @@ def init(design: PartialDesign, t: float) -> PartialState:
         started=False,
         parts=start(design.setting),
         settled=False,
-        tally=Counters(np.zeros(p, dtype=np.intp), np.zeros(p, dtype=np.intp), np.zeros(p, dtype=np.bool_)),
+        tally=no_counts(plant.meters.size),
         v0_squared=plant.droop.vbar**2,
         last=None,
     )
 
 
 def step(design: PartialDesign, state: PartialState, frame: Frame) -> tuple[PartialState, Estimate, Verdict]:
-    """Process one frame.
+    """Process one frame; see `gridsec.interface`.
 
-    frame: data of one tick. A frame that is not later than the last one changes nothing: it returns the last
-        estimate and UNDECIDED.
     Score and threshold are those of the readings in the fit of the estimate, or of the observer without
         meters where that is stricter. All fits and all rows decide on named meters: a small attack may be
         named below this threshold.
@@ -420,7 +418,7 @@ def _conclude(  # noqa: PLR0917  # the chain's values, in the order in which the
     doubtful = contradicted if not found.certain.any() else np.zeros_like(live)
     decision, cause, reason = decide(
         DecisionInputs(
-            names=tuple(plant.feeder.customers[c] for c in plant.meters),
+            names=plant.meter_names,
             max_attacked=most,
             live=live,
             suspected=(tally.above > 0) | doubtful,

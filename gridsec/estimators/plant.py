@@ -30,6 +30,11 @@ class Plant:
     # DistFlow fixed-point steps that correct LinDistFlow for branch losses; 0 leaves it linear
     loss_correction: int = 1
 
+    @property
+    def meter_names(self) -> tuple[str, ...]:
+        """Customer of each meter by name, (p,)."""
+        return tuple(self.feeder.customers[c] for c in self.meters)
+
     def __post_init__(self) -> None:
         meters, problems = np.asarray(self.meters), []
         if meters.ndim != 1 or (meters.size and meters.dtype.kind not in "iu"):
@@ -89,6 +94,11 @@ class Options:
                 *judging_problems(self.settled, self.widest, self.v2_limits),
             ]
         )
+
+
+def usual_options(step_s: float) -> Options:
+    """Default options for an interval between frames, s: above 30 s, four readings clear a meter, not six."""
+    return Options() if step_s <= 30.0 else Options(release=4)
 
 
 def judging_problems(settled: float, widest: float, v2_limits: tuple[float, float]) -> list[Problem]:

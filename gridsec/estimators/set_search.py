@@ -42,16 +42,23 @@ import numpy as np
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import DesignInfeasible, NotObservable, Problem
 from gridsec.estimators import thresholds
-from gridsec.estimators.decision import Counters, DecisionInputs, count, decide
+from gridsec.estimators.decision import Counters, DecisionInputs, count, decide, no_counts
 from gridsec.estimators.exact_bank import bank as banks
 from gridsec.estimators.inputs import Inputs, PreviousStep, clean, injections, known, nothing_new, reconstruct
-from gridsec.estimators.plant import EstimatorContext, Options, Plant, check_plant, estimator_context
+from gridsec.estimators.plant import (
+    EstimatorContext,
+    Options,
+    Plant,
+    check_plant,
+    estimator_context,
+    usual_options,
+)
 from gridsec.estimators.single_tick import MOST_SETS
 from gridsec.estimators.thresholds import ErrorBound, ErrorModel, Motion, TickUncertainty
 from gridsec.grid.meter import reading_error
 from gridsec.interface import Cause, Decision, Estimate, Explanation, Frame, Verdict
 from gridsec.observers.certificates import Certificate, certify
-from gridsec.observers.lure import close_loop, rest
+from gridsec.observers.lure import close_loop
 
 __all__ = [
     "SetSearchDesign",
@@ -145,8 +152,7 @@ def design(
     chosen = (D for k in range(1, max_attacked + 1) for D in combinations(range(p), k))
     for row, D in zip(dropped, chosen, strict=True):
         row[list(D)] = True
-    if options is None:
-        options = Options() if step_s <= 30.0 else Options(release=4)
+    options = usual_options(step_s) if options is None else options
     lure = close_loop(plant.feeder, plant.droop, plant.meters)
     proof = certify(lure)
     watched = estimator_context(plant, max_attacked=max_attacked, options=options)
@@ -161,7 +167,6 @@ def init(design: SetSearchDesign, t: float) -> SetSearchState:
     """Initial state at Unix time t, s; the observer starts with the first frame and trusts all meters."""
     plant, widest = design.setting.plant, thresholds.widest(design.errors)
     m, p = plant.droop.tau.size, plant.meters.size
-    no_meters, zero = np.zeros(p, dtype=np.bool_), np.zeros(p, dtype=np.intp)
     return SetSearchState(
         t=t,
         bank=None,
@@ -172,10 +177,10 @@ def init(design: SetSearchDesign, t: float) -> SetSearchState:
         level=widest,
         sure=widest.free,
         settled=False,
-        dropped=no_meters,
+        dropped=np.zeros(p, dtype=np.bool_),
         innocent=np.full(p, np.inf),
-        readings=zero,
-        tally=Counters(zero, zero, no_meters),
+        readings=np.zeros(p, dtype=np.intp),
+        tally=no_counts(p),
         v0_squared=plant.droop.vbar**2,
         last=None,
     )
@@ -218,12 +223,13 @@ def advance(design: SetSearchDesign, state: SetSearchState, frame: Frame, inputs
     none = np.zeros(J.size, dtype=np.bool_)
     seen = reconstruct(watched, frame, inputs, injections(plant, frame, x, none))
     z = droop.vbar**2 - seen.v2[droop.customer]
-    moved = np.abs(seen.correction - inputs.correction)[plant.feeder.bus]
-    now = replace(inputs.now, base=inputs.now.base + moved, live=J)
-    lag = np.where(_slowed(design, h), np.abs(x - state.x), 0.0)
+    now = replace(inputs.now, base=inputs.now.base + seen.moved, live=J)
+    lag = np.where(thresholds.slowed(errors, h, design.bank.policy), np.abs(x - state.x), 0.0)
     before = z if state.bank is None else state.z
     motion = Motion(before=before, after=z, offset=np.zeros(x.shape), h=h, lag=lag)
-    handed = _handed_over(design, state, J)
+    handed = state.bound
+    if state.bank is not None:
+        handed = thresholds.handed_over(errors, handed, state.bank.seen, J)
     bound, level = thresholds.advance(errors, now, motion, handed, state.level)
     error = thresholds.gap(errors, now, bound)
     threshold = threshold_of(design, seen.v2[at], error[at])
@@ -245,25 +251,10 @@ def advance(design: SetSearchDesign, state: SetSearchState, frame: Frame, inputs
     )
 
 
-def _slowed(design: SetSearchDesign, h: float) -> Bools:
-    """Mask (m,) of inverters that the step treats as slower than they are: `lure.transition`, `rest`."""
-    fast = design.setting.plant.droop.tau * rest(h, design.bank.policy) < 1.0
-    return fast & ~fast.all()
-
-
 def driven_by(design: SetSearchDesign, J: Bools) -> Bools:
     """Mask (m,) of inverters driven by a trusted meter, for the trusted meters J (p,)."""
     meter = design.errors.meter_of
     return (meter >= 0) & J[meter]
-
-
-def _handed_over(design: SetSearchDesign, state: SetSearchState, J: Bools) -> ErrorBound:
-    """The bounds when meters become unavailable or return: each inverter takes the other mode's error."""
-    if state.bank is None:
-        return state.bound
-    was, now = driven_by(design, state.bank.seen), driven_by(design, J)
-    free = np.where(was & ~now, np.maximum(state.bound.free, state.bound.driven), state.bound.free)
-    return ErrorBound(np.where(now & ~was, state.bound.free, state.bound.driven), free)
 
 
 def _sure(design: SetSearchDesign, state: SetSearchState, inputs: Inputs, J: Bools, motion: Motion) -> Floats:
@@ -295,10 +286,9 @@ def _settled(
     design: SetSearchDesign, now: TickUncertainty, motion: Motion, error: Floats, threshold: Floats
 ) -> bool:
     """True once the remaining transient is negligible against every threshold."""
-    none, at = np.zeros(motion.after.shape), design.setting.plant.meters
-    top = thresholds.ceiling(design.errors, now, motion, ErrorBound(none, none))
-    rest_ = thresholds.gap(design.errors, now, thresholds.settled(design.errors, now, motion, top))
-    return bool(np.all((error - rest_)[at] <= design.setting.options.settled * threshold))
+    rest = thresholds.gap(design.errors, now, thresholds.at_rest(design.errors, now, motion))
+    transient = (error - rest)[design.setting.plant.meters]
+    return bool(np.all(transient <= design.setting.options.settled * threshold))
 
 
 def lost(errors: ErrorModel, sure: Floats) -> Floats:
@@ -314,11 +304,7 @@ def lost(errors: ErrorModel, sure: Floats) -> Floats:
 def step(
     design: SetSearchDesign, state: SetSearchState, frame: Frame
 ) -> tuple[SetSearchState, Estimate, Verdict]:
-    """Process one frame.
-
-    frame: data of one tick. A frame that is not later than the last one changes nothing: it returns the last
-        estimate and UNDECIDED.
-    """
+    """Process one frame; see `gridsec.interface`."""
     if not np.isfinite(frame.t) or (state.bank is not None and not frame.t > state.t):
         plant = design.setting.plant
         return state, *nothing_new(plant, frame, state.t, state.last, state.v0_squared, state.x)
@@ -431,7 +417,7 @@ def _verdict(  # noqa: PLR0917  # all results of one tick
     plant, live = design.setting.plant, inputs.live
     decision, cause, reason = decide(
         DecisionInputs(
-            names=tuple(plant.feeder.customers[c] for c in plant.meters),
+            names=plant.meter_names,
             max_attacked=design.setting.max_attacked,
             live=live,
             suspected=(tally.above > 0) | dropped,

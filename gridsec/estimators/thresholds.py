@@ -19,6 +19,7 @@ import numpy as np
 from gridsec.arrays import Bools, Floats, Ints, frozen
 from gridsec.grid.droop import Droop, voltage_curve
 from gridsec.grid.network import LinDistFlow
+from gridsec.observers.lure import StepPolicy, rest
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -158,6 +159,29 @@ def largest(values: Floats, count: int) -> Floats:
     return np.asarray(np.partition(values, p - count, axis=1)[:, p - count :].sum(axis=1))
 
 
+def handed_over(
+    model: ErrorModel, bound: ErrorBound, before: Bools, live: Bools, *, spread: Floats | float = 0.0
+) -> ErrorBound:
+    """The bounds when meters become unavailable or return: each inverter takes the other mode's error.
+
+    before, live (p,): meters that drive inverters before and after the change.
+    spread (m,): distance of the state that a returning inverter starts from to that of the observer, pu.
+    """
+    if not live.size:
+        return bound
+    metered = model.meter_of >= 0
+    was, now = metered & before[model.meter_of], metered & live[model.meter_of]
+    free = np.where(was & ~now, np.maximum(bound.free, bound.driven), bound.free)
+    return ErrorBound(np.where(now & ~was, bound.free + spread, bound.driven), free)
+
+
+def slowed(model: ErrorModel, h: float, policy: StepPolicy) -> Bools:
+    """Mask (m,) of inverters that a step treats as slower than they are: `lure.transition`, `lure.rest`."""
+    fast = model.droop.tau * rest(h, policy) < 1.0
+    # If all are that fast, the step ends in the equilibrium.
+    return np.asarray(fast & ~fast.all())
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
     """Estimate before and after one step."""
@@ -191,6 +215,12 @@ def settled(model: ErrorModel, now: TickUncertainty, motion: Motion, start: Erro
         if done:
             break
     return level
+
+
+def at_rest(model: ErrorModel, now: TickUncertainty, motion: Motion) -> ErrorBound:
+    """Level to which the bounds converge from any initial state."""
+    none = np.zeros(model.span.size)
+    return settled(model, now, motion, ceiling(model, now, motion, ErrorBound(none, none)))
 
 
 def _image(model: ErrorModel, now: TickUncertainty, motion: Motion, bound: ErrorBound) -> ErrorBound:

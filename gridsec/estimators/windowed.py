@@ -134,10 +134,8 @@ def _empty(design: WindowedDesign) -> tuple[Floats, Floats]:
 def step(
     design: WindowedDesign, state: WindowedState, frame: Frame
 ) -> tuple[WindowedState, Estimate, Verdict]:
-    """Process one frame.
+    """Process one frame; see `gridsec.interface`.
 
-    frame: data of one tick. A frame that is not later than the last one changes nothing: it returns the last
-        estimate and UNDECIDED.
     Returns WindowedState, Estimate, Verdict: as every estimator's step. The result of a window holds until
         the next one is full.
     """
@@ -257,9 +255,7 @@ def _answer(
 
 def _combine(design: WindowedDesign, verdict: Verdict, said: WindowResult | None, off: Floats) -> Verdict:
     """Verdict of the windows; `off` is the signed distance of each reading from the reconstruction."""
-    plant = design.chain.plant
-    names = tuple(plant.feeder.customers[c] for c in plant.meters)
-    decision, cause, reason = _answer(verdict, said, names)
+    decision, cause, reason = _answer(verdict, said, design.chain.plant.meter_names)
     suspects = np.zeros_like(verdict.suspects) if said is None else said.suspects
     attack = np.where(suspects, np.nan_to_num(off), 0.0)
     return replace(verdict, decision=decision, cause=cause, reason=reason, suspects=suspects, attack=attack)

@@ -21,21 +21,21 @@ from typing import Literal
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, Ints
+from gridsec.arrays import Floats, Ints
 from gridsec.errors import DesignInfeasible
 from gridsec.estimators import thresholds
-from gridsec.estimators.decision import Counters, DecisionInputs, count, decide, residual_excess
+from gridsec.estimators.decision import Counters, DecisionInputs, count, decide, no_counts, residual_excess
 from gridsec.estimators.exact_bank import bank as banks
 from gridsec.estimators.exact_bank.bank import StackedState
 from gridsec.estimators.inputs import Inputs, PreviousStep, clean, injections, known, nothing_new, reconstruct
-from gridsec.estimators.plant import EstimatorContext, Options, Plant, check_plant
+from gridsec.estimators.plant import EstimatorContext, Options, Plant, check_plant, usual_options
 from gridsec.estimators.thresholds import ErrorBound, ErrorModel, Majorant, Motion
 from gridsec.grid.meter import reading_error
 from gridsec.grid.network import LinDistFlow
 from gridsec.interface import Estimate, Frame, Verdict
 from gridsec.observers.certificates import Certificate, certify, small_gain, verify
 from gridsec.observers.lmi import contraction
-from gridsec.observers.lure import Lure, close_loop, rest
+from gridsec.observers.lure import Lure, close_loop
 
 __all__ = ["MonitorDesign", "MonitorState", "design", "init", "step"]
 
@@ -117,8 +117,7 @@ def design(
     """
     meters = plant.meters
     check_plant(plant, max_attacked=max_attacked, step_s=step_s)
-    if options is None:
-        options = Options() if step_s <= 30.0 else Options(release=4)
+    options = usual_options(step_s) if options is None else options
     lure = close_loop(plant.feeder, plant.droop, meters)
     model = plant.feeder.linear()
     bank = banks.design(lure, max_attacked, gains=gains, reactive=_reactive(model, meters, gains))
@@ -192,7 +191,7 @@ def init(design: MonitorDesign, t: float) -> MonitorState:
         wrong.
     t: Unix time, s.
     """
-    m, p = design.plant.droop.tau.size, design.plant.meters.size
+    m = design.plant.droop.tau.size
     try:
         valid = verify(design.certificate, design.proven) > 0
     except DesignInfeasible:
@@ -208,56 +207,44 @@ def init(design: MonitorDesign, t: float) -> MonitorState:
         bound=widest,
         level=widest,
         settled=False,
-        tally=Counters(np.zeros(p, dtype=np.intp), np.zeros(p, dtype=np.intp), np.zeros(p, dtype=np.bool_)),
+        tally=no_counts(design.plant.meters.size),
         v0_squared=design.plant.droop.vbar**2,
         last=None,
     )
 
 
 def step(design: MonitorDesign, state: MonitorState, frame: Frame) -> tuple[MonitorState, Estimate, Verdict]:
-    """Process one frame.
-
-    frame: data of one tick. A frame that is not later than the last one changes nothing: it returns the last
-        estimate and UNDECIDED.
-    """
+    """Process one frame; see `gridsec.interface`."""
     late = state.bank is not None and not frame.t > state.t
     if late or not np.isfinite(frame.t):
         return state, *nothing_new(design.plant, frame, state.t, state.last, state.v0_squared, state.x)
     frame = known(frame)
     inputs = clean(design.setting, PreviousStep(state.x, state.v0_squared, state.tally.named), frame)
-    h = 0.0 if state.bank is None else frame.t - state.t
-    if state.bank is None:
+    before = state.bank
+    h = 0.0 if before is None else frame.t - state.t
+    if before is None:
         bank = banks.init(design.bank, inputs.z, inputs.w, inputs.live, net=inputs.net)
         unknown = _unknown(design, bank)
         state = replace(state, bound=unknown, level=unknown)
     else:
         bank = banks.step(
-            design.bank, state.bank, inputs.z, inputs.w, inputs.live, h, net=inputs.net, adopt=state.x
+            design.bank, before, inputs.z, inputs.w, inputs.live, h, net=inputs.net, adopt=state.x
         )
-        if banks.decided(design.bank, bank) and not banks.decided(design.bank, state.bank):
+        if banks.decided(design.bank, bank) and not banks.decided(design.bank, before):
             # The observers restart from one without trusted meters.
             unknown = _unknown(design, bank)
             state = replace(state, bound=unknown, level=unknown, settled=False)
         else:
-            state = replace(state, bound=_handed_over(design, state, inputs.live))
+            bound = thresholds.handed_over(
+                design.errors, state.bound, before.seen, inputs.live, spread=state.spread
+            )
+            state = replace(state, bound=bound)
     return _conclude(design, state, frame, inputs, bank, h)
 
 
 def _unknown(design: MonitorDesign, bank: banks.BankState) -> ErrorBound:
     """Bound on the error of observers that just started."""
     return thresholds.widest(design.errors, bank.x if isinstance(bank, StackedState) else None)
-
-
-def _handed_over(design: MonitorDesign, state: MonitorState, live: Bools) -> ErrorBound:
-    """The bounds when meters become unavailable or return: each inverter takes the other mode's error."""
-    meter_of, bound = design.errors.meter_of, state.bound
-    if state.bank is None or not live.size:
-        return bound
-    was, now = state.bank.seen[meter_of], live[meter_of]
-    silenced, returned = (meter_of >= 0) & was & ~now, (meter_of >= 0) & ~was & now
-    free = np.where(silenced, np.maximum(bound.free, bound.driven), bound.free)
-    # The inverter of a returning meter starts from the selected estimate.
-    return ErrorBound(np.where(returned, bound.free + state.spread, bound.driven), free)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -295,7 +282,7 @@ def _conclude(  # noqa: PLR0917  # design, state and frame, then the results of 
         tally = count(tally, over, live, confirm=options.confirm, release=options.release)
     decision, cause, reason = decide(
         DecisionInputs(
-            names=tuple(plant.feeder.customers[c] for c in plant.meters),
+            names=plant.meter_names,
             max_attacked=design.bank.sets.max_attacked,
             live=live,
             suspected=tally.above > 0,
@@ -394,10 +381,9 @@ def _view(  # noqa: PLR0917  # as _conclude
         held = np.bincount(own, weights=x, minlength=v2.size)[at] + inputs.q[at]
         doubt = np.where(told, np.abs(frame.q_net[at] - held), 0.0)
         offset = offset + thresholds.largest(errors.reach * np.nan_to_num(doubt), errors.quota // 2)
-    moved = np.abs(seen.correction - inputs.correction)[plant.feeder.bus]
-    now = replace(inputs.now, base=inputs.now.base + moved)
+    now = replace(inputs.now, base=inputs.now.base + seen.moved)
     before = z if state.bank is None else state.z
-    lag = _slowed(design, h) * (np.abs(x - state.x) + spread)
+    lag = thresholds.slowed(errors, h, design.bank.policy) * (np.abs(x - state.x) + spread)
     motion = Motion(before=before, after=z, offset=offset[own], h=h, lag=lag)
     if index >= 0:
         bound, level = thresholds.advance(errors, now, motion, state.bound, state.level)
@@ -409,19 +395,10 @@ def _view(  # noqa: PLR0917  # as _conclude
     score = np.where(inputs.live, np.abs(inputs.y - v2[at]), np.nan)
     settled = state.settled
     if index >= 0 and not settled:
-        none = np.zeros(x.shape)
-        top = thresholds.ceiling(errors, now, motion, ErrorBound(none, none))
-        level_at_rest = thresholds.settled(errors, now, motion, top)
-        transient = thresholds.gap(errors, now, bound)[at] - thresholds.gap(errors, now, level_at_rest)[at]
+        rest = thresholds.gap(errors, now, thresholds.at_rest(errors, now, motion))
+        transient = thresholds.gap(errors, now, bound)[at] - rest[at]
         settled = bool(np.all(transient <= design.options.settled * threshold))
     return _View(index, x, z, spread, bound, level, settled, v2, seen.v2_bus, error, score, threshold)
-
-
-def _slowed(design: MonitorDesign, h: float) -> Bools:
-    """Mask (m,) of inverters that the step treats as slower than they are: `lure.transition`, `rest`."""
-    fast = design.plant.droop.tau * rest(h, design.bank.policy) < 1.0
-    # If all are that fast, the step ends in the equilibrium.
-    return fast & ~fast.all()
 
 
 def _saturated(design: MonitorDesign, inputs: Inputs, frame: Frame, x: Floats) -> Floats:

@@ -25,13 +25,14 @@ yang2021 (2), (5) to (7), (17), (22) to (24), (42) to (47); docs/theory-unknown-
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, frozen
 from gridsec.errors import NotObservable, Problem
-from gridsec.estimators.decision import Counters, DecisionInputs, count, decide
+from gridsec.estimators.decision import Counters, DecisionInputs, count, decide, no_counts
 from gridsec.estimators.inputs import (
     NO_VOLTAGE,
     Inputs,
@@ -42,7 +43,14 @@ from gridsec.estimators.inputs import (
     nothing_new,
     reconstruct,
 )
-from gridsec.estimators.plant import EstimatorContext, Options, Plant, check_plant, estimator_context
+from gridsec.estimators.plant import (
+    EstimatorContext,
+    Options,
+    Plant,
+    check_plant,
+    estimator_context,
+    usual_options,
+)
 from gridsec.estimators.unknown_input.pairs import (
     AttackAssumption,
     Believed,
@@ -322,13 +330,13 @@ def answer(
     plant = now.plant
     meters, inverters, explanations = found.meters, found.inverters, found.explanations
     customers = plant.feeder.customers
-    names = [customers[c] for c in plant.meters]
+    names = plant.meter_names
     owners = [customers[c] for c in plant.droop.customer]
     pending = (state.contradicted.above > 0) & ~state.contradicted.named
     memory = np.exp(-(state.t - state.began) / plant.droop.tau.max(initial=_SHORT))
     base = decide(
         DecisionInputs(
-            names=tuple(names),
+            names=names,
             max_attacked=now.max_attacked,
             live=live,
             suspected=np.zeros(live.size, dtype=np.bool_),
@@ -383,8 +391,8 @@ def _agreement(design: UnknownInputDesign, trial: PairResult, owners: list[str])
     return f"{said}; up to {unseen[most]:.0f} kvar of the inverter of {owners[most]} could go unseen."
 
 
-def _list(meters: Bools, inverters: Bools, names: list[str], owners: list[str]) -> str:
-    parts = [names[j] for j in np.flatnonzero(meters)]
+def _list(meters: Bools, inverters: Bools, names: Sequence[str], owners: list[str]) -> str:
+    parts = [names[j] for j in np.flatnonzero(meters).tolist()]
     parts += [f"the inverter of {owners[i]}" for i in np.flatnonzero(inverters)]
     rest = f" and {len(parts) - _NAMED} more" if len(parts) > _NAMED else ""
     return " and ".join(parts[:_NAMED]) + rest
@@ -418,8 +426,7 @@ def design(
     if p <= 2 * max_attacked:
         why = f"{p} meters, {max_attacked} of them manipulated: more than {2 * max_attacked} are needed"
         raise NotObservable(range(p), p, why + " (yang2021, Assumption 3)", code="too-few-meters")
-    if options is None:
-        options = Options() if step_s <= 30.0 else Options(release=4)
+    options = usual_options(step_s) if options is None else options
     made = estimator_context(plant, max_attacked=max_attacked, options=options)
     own = plant.droop.customer
     gain = 2.0 * made.model.X[:, own]
@@ -431,13 +438,12 @@ def design(
 
 def init(design: UnknownInputDesign, t: float) -> UnknownInputState:
     """Initial state at Unix time t, s."""
-    plant, c = design.setting.plant, design.observers
-    none = np.zeros(c, dtype=np.intp)
+    plant = design.setting.plant
     return UnknownInputState(
         t=t,
         began=t,
         tubes=None,
-        contradicted=Counters(none, none, np.zeros(c, dtype=np.bool_)),
+        contradicted=no_counts(design.observers),
         x=np.zeros(plant.droop.tau.size),
         v0_squared=plant.droop.vbar**2,
         named=np.zeros(plant.meters.size, dtype=np.bool_),
@@ -449,11 +455,7 @@ def init(design: UnknownInputDesign, t: float) -> UnknownInputState:
 def step(
     design: UnknownInputDesign, state: UnknownInputState, frame: Frame
 ) -> tuple[UnknownInputState, Estimate, Verdict]:
-    """Process one frame.
-
-    frame: data of one tick. A frame that is not later than the last one changes nothing: it returns the last
-        estimate and UNDECIDED.
-    """
+    """Process one frame; see `gridsec.interface`."""
     if not np.isfinite(frame.t) or (state.tubes is not None and not frame.t > state.t):
         plant = design.setting.plant
         estimate, verdict = nothing_new(plant, frame, state.t, state.last, state.v0_squared, state.x)
@@ -560,11 +562,10 @@ def _estimate(
         sure = certain and more.meters == 0 and more.inverters == 0
         known = np.minimum(trial.attack_error if sure else np.inf, doubt.reach + np.abs(x))
         bound = spread(now.errors, more, tube, tick.tubes.free, gain) + gain @ np.where(accused, known, 0.0)
-    moved = np.abs(seen.correction - inputs.correction)[plant.feeder.bus]
     estimate = Estimate(
         t=tick.frame.t,
         v2=seen.v2,
-        bound=np.minimum(tick.error + moved + bound, NO_VOLTAGE),
+        bound=np.minimum(tick.error + seen.moved + bound, NO_VOLTAGE),
         v2_bus=seen.v2_bus,
         trusted=inputs.live & ~meters,
         x=x,
