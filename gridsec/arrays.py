@@ -26,6 +26,7 @@ __all__ = [
     "indices",
     "not_negative",
     "perron_bound",
+    "put",
     "spectral_radius",
     "submatrix",
     "symmetry_defect",
@@ -59,6 +60,14 @@ def frozen_ints(values: Ints) -> Ints:
     out = np.array(given, dtype=np.intp, order="C")
     out.flags.writeable = False
     return out
+
+
+def put(target: object, **values: object) -> None:
+    """Set fields of a frozen dataclass in its `__post_init__`; arrays become read-only."""
+    for name, value in values.items():
+        if isinstance(value, np.ndarray):
+            value.flags.writeable = False
+        object.__setattr__(target, name, value)
 
 
 def not_negative(name: str, values: Floats | float) -> Floats:

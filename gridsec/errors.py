@@ -21,6 +21,7 @@ __all__ = [
     "each_choice",
     "no_choice",
     "raise_if_any",
+    "wrong_shapes",
 ]
 
 
@@ -159,6 +160,15 @@ def raise_if_any(problems: Iterable[str]) -> None:
     found = tuple(problems)
     if found:
         raise InputInvalid(found)
+
+
+def wrong_shapes(*expected: tuple[str, tuple[int, ...], tuple[int, ...]]) -> list[Problem]:
+    """Return one problem for each name with a shape (second) other than the expected one (third)."""
+    return [
+        Problem("shape", f"{what} has shape {has}; expected {wants}")
+        for what, has, wants in expected
+        if has != wants
+    ]
 
 
 Choice = TypeVar("Choice", bound=StrEnum)

@@ -19,8 +19,8 @@ from math import log
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, Ints, frozen, frozen_ints
-from gridsec.errors import FeederInvalid, Problem
+from gridsec.arrays import Bools, Floats, Ints, frozen, frozen_ints, put
+from gridsec.errors import FeederInvalid, Problem, wrong_shapes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,11 +50,10 @@ class Droop:
     _shifted: bool = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "customer", frozen_ints(self.customer))
-        for name in ("v", "q", "tau"):
-            object.__setattr__(self, name, frozen(getattr(self, name)))
+        put(self, customer=frozen_ints(self.customer))
+        put(self, v=frozen(self.v), q=frozen(self.q), tau=frozen(self.tau))
         rating = np.asarray(self.rating, dtype=np.float64)
-        object.__setattr__(self, "rating", frozen(rating if rating.ndim else np.full(self.tau.shape, rating)))
+        put(self, rating=frozen(rating if rating.ndim else np.full(self.tau.shape, rating)))
         problems = _problems(self)
         if problems:
             raise FeederInvalid(problems)
@@ -62,11 +61,9 @@ class Droop:
         steepest = np.zeros(self.tau.shape)
         for ramp in ramps:
             np.maximum(steepest, ramp.slope, out=steepest)
-        object.__setattr__(self, "_ramps", tuple(ramp.compact() for ramp in ramps))
-        object.__setattr__(self, "_offset", _compact(offset))
-        object.__setattr__(self, "_shifted", bool(np.any(offset)))
-        object.__setattr__(self, "slope", frozen(steepest))
-        object.__setattr__(self, "limit", frozen(np.max(np.abs(self.q), axis=1, initial=0.0)))
+        put(self, _ramps=tuple(ramp.compact() for ramp in ramps), _offset=_compact(offset))
+        put(self, _shifted=bool(np.any(offset)), slope=frozen(steepest))
+        put(self, limit=frozen(np.max(np.abs(self.q), axis=1, initial=0.0)))
 
     def __call__(self, z: Floats, rows: Ints | None = None) -> Floats:
         """K(z), chong2020 (17): reactive set-points of the inverters.
@@ -107,13 +104,10 @@ class Droop:
         out: Droop = object.__new__(Droop)
         own = {name: getattr(self, name)[rows] for name in ("v", "q", "tau", "rating", "slope", "limit")}
         ramps = tuple(ramp.take(rows) for ramp in self._ramps)
-        object.__setattr__(out, "customer", frozen_ints(self.customer[rows]))
-        for name, values in own.items():
-            object.__setattr__(out, name, frozen(values))
-        object.__setattr__(out, "vbar", self.vbar)
-        object.__setattr__(out, "_ramps", ramps)
-        object.__setattr__(out, "_offset", _compact(_pick(self._offset, rows)))
-        object.__setattr__(out, "_shifted", bool(np.any(out._offset)))
+        put(out, customer=frozen_ints(self.customer[rows]), vbar=self.vbar, _ramps=ramps)
+        put(out, **{name: frozen(values) for name, values in own.items()})
+        put(out, _offset=_compact(_pick(self._offset, rows)))
+        put(out, _shifted=bool(np.any(out._offset)))
         return out
 
 
@@ -165,17 +159,12 @@ def _ramps(z: Floats, q: Floats) -> tuple[list[_Ramp], Floats]:
 def _problems(droop: Droop) -> list[Problem]:
     """Problems of the fields of `droop`."""
     count = droop.customer.size
-    shapes = (
-        ("v", droop.v.shape, (count, 4)),
-        ("q", droop.q.shape, (count, 4)),
-        ("tau", droop.tau.shape, (count,)),
-        ("rating", droop.rating.shape, (count,)),
+    out = wrong_shapes(
+        ("droop: v", droop.v.shape, (count, 4)),
+        ("droop: q", droop.q.shape, (count, 4)),
+        ("droop: tau", droop.tau.shape, (count,)),
+        ("droop: rating", droop.rating.shape, (count,)),
     )
-    out = [
-        Problem("shape", f"droop: {what} has shape {has}; expected {wants}")
-        for what, has, wants in shapes
-        if has != wants
-    ]
     if out:
         return out
     if not (np.isfinite(droop.vbar) and droop.vbar > 0):
@@ -385,17 +374,3 @@ def voltage_curve(droop: Droop, v: Floats) -> Floats:
     for ramp in ramps:
         total += ramp.slope * (np.clip(-v, ramp.low, ramp.high) - ramp.zero)
     return total
-
-
-def curve_gap(droop: Droop) -> Floats:
-    """Largest distance of K(z) from `voltage_curve`, for every inverter.
-
-    Between breakpoints `v_a < v_b` with values `q_a >= q_b`, both interpolate linearly, one in `v^2` and one
-    in v; they differ by `(q_a - q_b) t (1 - t) (v_b - v_a) / (v_b + v_a)` with t the fraction of the interval
-    in v, hence by at most a quarter of the factor of `t (1 - t)`.
-
-    Returns (m,): bound of `|K(vbar^2 - v^2) - voltage_curve(v)|` over all v, pu of the feeder's base.
-    """
-    v, q = droop.v, droop.q
-    widths = (v[:, 1:] - v[:, :-1]) / (v[:, 1:] + v[:, :-1])
-    return np.asarray(np.max((q[:, :-1] - q[:, 1:]) * widths / 4.0, axis=1, initial=0.0))

@@ -42,8 +42,8 @@ import numpy as np
 from scipy.sparse import coo_array, csc_array, diags_array
 from scipy.sparse.linalg import splu
 
-from gridsec.arrays import Bools, Floats, Ints, Phasors, frozen, frozen_ints
-from gridsec.errors import FeederInvalid, Problem
+from gridsec.arrays import Bools, Floats, Ints, Phasors, frozen, frozen_ints, put
+from gridsec.errors import FeederInvalid, Problem, wrong_shapes
 from gridsec.grid.intervals import Sweeps, bounds
 from gridsec.grid.network import Balanced, InPhases, LinDistFlow, OfMatrices, WithMatrices, unbounded
 from gridsec.grid.phased import PhasedFeeder
@@ -210,30 +210,20 @@ class MeshedFeeder(Balanced, Meshed, OnTree):
     size: Floats = field(init=False, repr=False)  # (N, N) its absolute values
 
     def __post_init__(self) -> None:
-        def put(name: str, value: object) -> None:
-            object.__setattr__(self, name, value)
-
-        for name in ("r", "x", "charging"):
-            put(name, frozen(getattr(self, name)))
-        put("ends", frozen_ints(self.ends))
+        put(self, r=frozen(self.r), x=frozen(self.x), charging=frozen(self.charging))
+        put(self, ends=frozen_ints(self.ends))
         problems = _problems(self)
         if problems:
             raise FeederInvalid(problems)
-        half = self.tree.half.copy()
-        np.add.at(half, self.ends, 0.5 * self.charging[:, None])
-        put("half", frozen(half))
+        put(self, half=_shunts(self.tree.half, self.ends, self.charging))
         Z = impedances(self, self.bus)
-        put("R", frozen(Z.real))
-        put("X", frozen(Z.imag))
-        idle, transfer = _charged(self) if half.any() else (np.ones(half.size, np.complex128), Z)
-        for name, values in (
-            ("idle", idle),
-            ("transfer", transfer),
-            ("transfer_between", transfer[self.bus]),
-        ):
-            values.flags.writeable = False
-            put(name, values)
-        put("size", frozen(np.abs(self.transfer_between)))
+        idle, transfer = np.ones((len(Z), 1), dtype=np.complex128), Z
+        if self.half.any():
+            injected = np.zeros(Z.shape, dtype=np.complex128)
+            injected[self.bus, np.arange(self.bus.size)] = 1.0
+            idle, transfer = _charged(admittance(self), np.arange(1, len(Z)), 1, injected)
+        put(self, R=frozen(Z.real), X=frozen(Z.imag), idle=idle[:, 0], transfer=transfer)
+        put(self, transfer_between=transfer[self.bus], size=np.abs(transfer[self.bus]))
 
     @property
     def bus(self) -> Ints:
@@ -261,17 +251,12 @@ class MeshedFeeder(Balanced, Meshed, OnTree):
 def _problems(feeder: MeshedFeeder) -> list[Problem]:
     """Problems of the ties against the tree."""
     count, buses = feeder.r.size, len(feeder.tree.buses)
-    expected = (
+    out = wrong_shapes(
         ("ends", feeder.ends.shape, (count, 2)),
         ("r", feeder.r.shape, (count,)),
         ("x", feeder.x.shape, (count,)),
         ("charging", feeder.charging.shape, (count,)),
     )
-    out = [
-        Problem("shape", f"{what} has shape {has}; expected {wants}")
-        for what, has, wants in expected
-        if has != wants
-    ]
     if out:
         return out
     for k, (one, other) in enumerate(feeder.ends.tolist()):
@@ -331,15 +316,24 @@ def admittance(feeder: MeshedFeeder) -> csc_array:
     return csc_array(incidence.T @ diags_array(1.0 / z) @ incidence + diags_array(1j * feeder.half))
 
 
-def _charged(feeder: MeshedFeeder) -> tuple[Phasors, Phasors]:
-    """Voltages without load, and effects of the customers' currents, charging included."""
-    Y = admittance(feeder)
-    below = splu(csc_array(Y[1:, 1:]))
-    idle = np.ones(len(feeder.buses), dtype=np.complex128)
-    idle[1:] = below.solve(-Y[1:, [0]].toarray().ravel())
-    transfer, injected = np.zeros((2, idle.size, feeder.bus.size), dtype=np.complex128)
-    injected[feeder.bus, np.arange(feeder.bus.size)] = 1.0
-    transfer[1:] = below.solve(injected[1:])
+def _shunts(of_tree: Floats, ends: Ints, charging: Floats) -> Floats:
+    """Shunt susceptance at the buses, with half the charging of each tie at each end."""
+    half = of_tree.copy()
+    np.add.at(half, ends, 0.5 * charging[:, None])
+    return half
+
+
+def _charged(Y: csc_array, free: Ints, busbar: int, injected: Phasors) -> tuple[Phasors, Phasors]:
+    """Voltages without load (n, b), and effects of the customers' currents `injected` (n, N), with charging.
+
+    Y: admittances (n, n). free: places with a voltage to solve for; the first b = `busbar` are given.
+    """
+    rows = Y.tocsr()[free]
+    solver = splu(csc_array(rows[:, free]))
+    idle: Phasors = np.eye(injected.shape[0], busbar, dtype=np.complex128)
+    idle[free] = solver.solve(-rows[:, :busbar].toarray())
+    transfer = np.zeros(injected.shape, dtype=np.complex128)
+    transfer[free] = solver.solve(injected[free])
     return idle, transfer
 
 
@@ -376,34 +370,21 @@ class PhasedMesh(InPhases, Meshed, OnTree):
     size: Floats = field(init=False, repr=False)  # (N, N) its absolute values
 
     def __post_init__(self) -> None:
-        def put(name: str, value: object) -> None:
-            if isinstance(value, np.ndarray):
-                value.flags.writeable = False
-            object.__setattr__(self, name, value)
-
-        put("ends", frozen_ints(self.ends))
-        put("phases", np.array(self.phases, dtype=np.bool_))
-        put("z", np.array(self.z, dtype=np.complex128))
-        put("charging", frozen(self.charging))
+        put(self, ends=frozen_ints(self.ends), phases=np.array(self.phases, dtype=np.bool_))
+        put(self, z=np.array(self.z, dtype=np.complex128), charging=frozen(self.charging))
         problems = _phased_problems(self)
         if problems:
             raise FeederInvalid(problems)
         radial = PhasedFeeder(self.tree)
-        put("bus", radial.bus)
-        put("buses", radial.buses)
-        half = self.tree.half.copy()
-        np.add.at(half, self.ends, 0.5 * self.charging[:, None])
-        put("half", half)
+        put(self, bus=radial.bus, buses=radial.buses)
+        put(self, half=_shunts(self.tree.half, self.ends, self.charging))
         Z = _impedances(self)
         turned = Z * (ROTATION[self.tree.phase] / np.tile(ROTATION, len(self.tree.buses))[:, None])
-        put("R", frozen(turned.real))
-        put("X", frozen(turned.imag))
-        quiet = np.tile(np.eye(3, dtype=np.complex128), (len(self.tree.buses), 1))
-        idle, transfer = _phased_charged(self) if half.any() else (quiet, Z)
-        put("idle", idle)
-        put("transfer", transfer)
-        put("transfer_between", transfer[self.bus])
-        put("size", np.abs(self.transfer_between))
+        idle, transfer = np.tile(np.eye(3, dtype=np.complex128), (len(self.tree.buses), 1)), Z
+        if self.half.any():
+            idle, transfer = _phased_charged(self)
+        put(self, R=frozen(turned.real), X=frozen(turned.imag), idle=idle, transfer=transfer)
+        put(self, transfer_between=transfer[self.bus], size=np.abs(transfer[self.bus]))
 
     def without_load(self, v0_squared: Floats | float) -> Phasors:
         """Voltage of every place without load, (n,), pu."""
@@ -421,17 +402,12 @@ class PhasedMesh(InPhases, Meshed, OnTree):
 def _phased_problems(feeder: PhasedMesh) -> list[Problem]:
     """Problems of the ties against the tree."""
     count, tree = len(feeder.ends), feeder.tree
-    expected = (
+    out = wrong_shapes(
         ("ends", feeder.ends.shape, (count, 2)),
         ("phases", feeder.phases.shape, (count, 3)),
         ("z", feeder.z.shape, (count, 3, 3)),
         ("charging", feeder.charging.shape, (count, 3, 3)),
     )
-    out = [
-        Problem("shape", f"{what} has shape {has}; expected {wants}")
-        for what, has, wants in expected
-        if has != wants
-    ]
     if out:
         return out
     last = len(tree.buses) - 1
@@ -521,16 +497,10 @@ def phased_admittance(feeder: PhasedMesh) -> csc_array:
 
 def _phased_charged(feeder: PhasedMesh) -> tuple[Phasors, Phasors]:
     """Voltages without load, and effects of the customers' currents, charging included."""
-    Y, tree = phased_admittance(feeder).tocsr(), feeder.tree
-    free = np.flatnonzero(tree.phases.ravel())
-    free = free[free >= len(PHASES)]
-    solver = splu(csc_array(Y[free][:, free]))
-    idle = np.zeros((len(feeder.buses), 3), dtype=np.complex128)
-    idle[:3] = np.eye(3)
-    idle[free] = solver.solve(-Y[free][:, :3].toarray())
-    transfer, injected = np.zeros((2, len(idle), feeder.bus.size), dtype=np.complex128)
+    tree, free = feeder.tree, np.flatnonzero(feeder.tree.phases.ravel())
+    injected = np.zeros((len(feeder.buses), feeder.bus.size), dtype=np.complex128)
     injected[feeder.bus, np.arange(feeder.bus.size)] = 3.0
-    transfer[free] = solver.solve(injected[free])
+    idle, transfer = _charged(phased_admittance(feeder), free[free >= len(PHASES)], len(PHASES), injected)
     # Beyond the end of a phase, its voltage is that at the end.
     stands = np.arange(len(idle)).reshape(-1, 3)
     for k, above in enumerate(tree.parent.tolist(), 1):

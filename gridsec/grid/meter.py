@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gridsec.arrays import Floats, Ints, frozen
+from gridsec.arrays import Floats, Ints, frozen, put
 from gridsec.errors import Problem, raise_if_any
 
 
@@ -37,7 +37,7 @@ class MeterAccuracy:
         p, problems = np.shape(self.class_fraction), []
         for name in ("class_fraction", "resolution", "jitter"):
             value = frozen(getattr(self, name))
-            object.__setattr__(self, name, value)
+            put(self, **{name: value})
             if value.ndim != 1 or value.shape != p:
                 problems.append(
                     Problem("shape", f"{name} must have one entry per meter, got shape {value.shape}")

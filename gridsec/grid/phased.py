@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gridsec.arrays import Floats, Ints, frozen, frozen_ints
+from gridsec.arrays import Floats, Ints, frozen, frozen_ints, put
 from gridsec.errors import FeederInvalid, Problem
 from gridsec.grid import three_phase
 from gridsec.grid.network import InPhases, OfMatrices, unbounded
@@ -49,19 +49,18 @@ class PhasedFeeder(InPhases, OfMatrices, OnTree):
             )
         model = lindist3flow(tree)
         names = tuple(f"{bus}.{phase}" for bus in tree.buses for phase in PHASES)
-        object.__setattr__(self, "bus", frozen_ints(len(PHASES) * tree.at + tree.phase))
-        object.__setattr__(self, "buses", names)
+        put(self, bus=frozen_ints(len(PHASES) * tree.at + tree.phase), buses=names)
         for name, found in (("R", model.R_bus), ("X", model.X_bus)):
             # 1 pu of the power of a phase is a third of S.
             by_place = 3.0 * np.moveaxis(found, 0, 1).reshape(len(names), tree.at.size)
-            object.__setattr__(self, name, frozen(by_place))
+            put(self, **{name: frozen(by_place)})
 
     def bus_voltages(self, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 1) -> Floats:
         """Squared voltage of every place, corrected for losses, charging and unequal phases.
 
         p, q (…, N): net active and reactive injection of each customer (generation positive), pu.
         v0_squared (…, 3) or scalar: squared busbar voltage of each phase, pu.
-        steps: as in `gridsec.grid.three_phase.loss_correction`; 0 gives LinDist3Flow.
+        steps: as in `gridsec.grid.three_phase.bus_voltages`; 0 gives LinDist3Flow.
         Returns (…, n): squared voltages, pu.
         """
         given = np.asarray(v0_squared, dtype=np.float64)

@@ -12,16 +12,15 @@ References
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass, field, replace
 from math import prod
 
 import numpy as np
 
-from gridsec.arrays import Floats, Ints, all_of, any_of, frozen, frozen_ints
-from gridsec.errors import FeederInvalid, InputInvalid, Problem
+from gridsec.arrays import Floats, Ints, all_of, any_of, frozen, frozen_ints, put
+from gridsec.errors import FeederInvalid, InputInvalid, Problem, wrong_shapes
 from gridsec.grid.network import Balanced, LinDistFlow, Power
-from gridsec.grid.trees import below, from_root, shrinking, walk
+from gridsec.grid.trees import Walk, at_ends, base_problems, below, duplicates, from_root, shrinking, walk
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,41 +41,21 @@ class Feeder(Balanced):
     base_volt: float  # nominal phase-to-neutral voltage (1 pu), V
     base_kva: float  # three-phase base power (1 pu), kVA
     charging: Floats  # (b,) total shunt susceptance of the branch into bus k + 1, pu; half of it at each end
-    # start, stop (b + 1,): depth-first numbering: bus k and the buses fed through it are those with `start`
-    # in `[start[k], stop[k])`
-    start: Ints = field(init=False, repr=False)
-    stop: Ints = field(init=False, repr=False)
-    order: Ints = field(init=False, repr=False)  # (b + 1,) the buses by these numbers
-    depth: Ints = field(init=False, repr=False)  # (b + 1,) number of branches between bus k and the busbar
-    # enter, leave (b + 1,): steps of a walk around the tree at which it reaches a bus first, and has left it
-    enter: Ints = field(init=False, repr=False)
-    leave: Ints = field(init=False, repr=False)
-    # (b + 1, b + 1) or None: 1 where the bus of the row is fed through that of the column; None for large
-    # trees
-    inside: Floats | None = field(init=False, repr=False)
+    walk: Walk = field(init=False, repr=False)  # around the tree
     half: Floats = field(init=False, repr=False)  # (b + 1,) shunt susceptance at the buses, pu
     charges: bool = field(init=False, repr=False)  # True if any bus has charging
     squared: Floats = field(init=False, repr=False)  # (b,) ``r^2 + x^2``, pu
     alone: bool = field(init=False, repr=False)  # True if no two customers share a bus
 
     def __post_init__(self) -> None:
-        for name in ("r", "x", "charging"):
-            object.__setattr__(self, name, frozen(getattr(self, name)))
-        for name in ("parent", "bus"):
-            object.__setattr__(self, name, frozen_ints(getattr(self, name)))
+        put(self, r=frozen(self.r), x=frozen(self.x), charging=frozen(self.charging))
+        put(self, parent=frozen_ints(self.parent), bus=frozen_ints(self.bus))
         problems = _problems(self)
         if problems:
             raise FeederInvalid(problems)
-        found = walk(self.parent)
-        for name in ("start", "stop", "order", "depth", "enter", "leave", "inside"):
-            object.__setattr__(self, name, getattr(found, name))
-        half: Floats = np.zeros(found.start.size)
-        np.add.at(half, self.parent, 0.5 * self.charging)
-        half[1:] += 0.5 * self.charging
-        object.__setattr__(self, "half", frozen(half))
-        object.__setattr__(self, "charges", any_of(half))
-        object.__setattr__(self, "alone", np.unique(self.bus).size == self.bus.size)
-        object.__setattr__(self, "squared", frozen(self.r**2 + self.x**2))
+        half = at_ends(self.parent, self.charging)
+        put(self, walk=walk(self.parent), half=half, charges=any_of(half), squared=self.r**2 + self.x**2)
+        put(self, alone=np.unique(self.bus).size == self.bus.size)
 
     def linear(self) -> LinDistFlow:
         """Matrices of the linear power flow of a feeder.
@@ -165,8 +144,8 @@ class Feeder(Balanced):
         """
         both = np.empty((2, *np.broadcast(p, q).shape))
         both[0], both[1] = p, q
-        P, Q = below(self, _at_buses(self, both))[..., 1:]
-        return from_root(self, 2.0 * (np.abs(self.r) * P + np.abs(self.x) * Q))
+        P, Q = below(self.walk, _at_buses(self, both))[..., 1:]
+        return from_root(self.walk, 2.0 * (np.abs(self.r) * P + np.abs(self.x) * Q))
 
     def with_customers_at(self, places: Ints) -> Feeder:
         """See `Network`."""
@@ -254,14 +233,18 @@ class Feeder(Balanced):
 
 def _problems(feeder: Feeder) -> list[Problem]:
     """Problems of the fields of `feeder`."""
-    out = _shape_problems(feeder)
+    branches = feeder.parent.size
+    out = wrong_shapes(
+        ("parent", feeder.parent.shape, (branches,)),
+        ("r", feeder.r.shape, (branches,)),
+        ("x", feeder.x.shape, (branches,)),
+        ("charging", feeder.charging.shape, (branches,)),
+        ("buses", (len(feeder.buses),), (branches + 1,)),
+        ("bus", feeder.bus.shape, (len(feeder.customers),)),
+    )
     if out:
         return out
-    branches = feeder.parent.size
-    for what in ("base_volt", "base_kva"):
-        value = getattr(feeder, what)
-        if not (np.isfinite(value) and value > 0):
-            out.append(Problem("not-positive", f"{what} is {value}; it must be a positive number"))
+    out = base_problems(feeder)
     for k in range(branches):
         where = f"branch {k} into bus {feeder.buses[k + 1]!r}"
         if not 0 <= feeder.parent[k] <= k:
@@ -286,32 +269,7 @@ def _problems(feeder: Feeder) -> list[Problem]:
                     f"customer {feeder.customers[j]!r}: bus {bus} does not exist; expected 0 to {branches}",
                 )
             )
-    for what, names in (("customer", feeder.customers), ("bus", feeder.buses)):
-        counted = Counter(names)
-        out.extend(
-            Problem("duplicate", f"{what} {name!r} is named {times} times")
-            for name, times in counted.items()
-            if times > 1
-        )
-    return out
-
-
-def _shape_problems(feeder: Feeder) -> list[Problem]:
-    """Problems of array lengths; all other checks require that there are none."""
-    branches = feeder.parent.size
-    expected = (
-        ("parent", feeder.parent.shape, (branches,)),
-        ("r", feeder.r.shape, (branches,)),
-        ("x", feeder.x.shape, (branches,)),
-        ("charging", feeder.charging.shape, (branches,)),
-        ("buses", (len(feeder.buses),), (branches + 1,)),
-        ("bus", feeder.bus.shape, (len(feeder.customers),)),
-    )
-    return [
-        Problem("shape", f"{what} has shape {has}; expected {wants}")
-        for what, has, wants in expected
-        if has != wants
-    ]
+    return out + duplicates(feeder)
 
 
 def common_paths(feeder: Feeder, branch: Floats, buses: Ints) -> Floats:
@@ -324,7 +282,7 @@ def common_paths(feeder: Feeder, branch: Floats, buses: Ints) -> Floats:
     buses (k,): the second bus of each pair.
     Returns (b + 1, k): for every bus and each of `buses`.
     """
-    start, whole = feeder.start, path_sums(feeder, branch)
+    start, whole = feeder.walk.start, path_sums(feeder, branch)
     between = np.zeros(start.size)
     between[start[1:]] = whole[feeder.parent]
     out, count = np.empty((buses.size, start.size)), np.arange(start.size)
@@ -358,18 +316,6 @@ def path_sums(feeder: Feeder, branch: Floats) -> Floats:
     return np.array(out)
 
 
-def squared_voltages(model: LinDistFlow, p: Floats, q: Floats, v0_squared: Floats | float) -> Floats:
-    """Squared voltage of every customer by the linear power flow.
-
-    model: from `lindistflow`.
-    p, q (…, N): net active and reactive injection of each customer (generation positive), pu.
-    v0_squared (…) or scalar: squared busbar voltage, pu.
-    Returns (…, N): squared voltages, pu.
-    """
-    base = np.asarray(v0_squared, dtype=np.float64)[..., None]
-    return base + 2.0 * (p @ model.R.T + q @ model.X.T)
-
-
 def _lossy(feeder: Feeder, flows: _Flows, now: _Flows, steps: int) -> _Flows:
     """The linear power flow with the losses of the flows `now`, repeated `steps` times."""
     for _ in range(steps):
@@ -378,7 +324,7 @@ def _lossy(feeder: Feeder, flows: _Flows, now: _Flows, steps: int) -> _Flows:
         loss_p, loss_q, drop = _losses(feeder, current, charge, sign=-1.0)
         # The losses include charging.
         Q = flows.Q + loss_q
-        now = _Flows(flows.P + loss_p, Q, Q, flows.v2 - from_root(feeder, drop))
+        now = _Flows(flows.P + loss_p, Q, Q, flows.v2 - from_root(feeder.walk, drop))
     return now
 
 
@@ -390,7 +336,7 @@ def _remainder(feeder: Feeder, flows: _Flows, once: _Flows) -> Floats:
         np.subtract((once.P**2 + once.Q**2) / once.v2[..., 1:], current[0], out=current[1])
         charge[0], charge[1] = flows.v2, once.v2 - flows.v2
         drop = _losses(feeder, np.abs(current), np.abs(feeder.half * charge), sign=1.0)[2]
-        first, second = from_root(feeder, drop)
+        first, second = from_root(feeder.walk, drop)
         shrinks = shrinking(first, second, (-1,))
         shrinks &= np.all((flows.v2 > 0) & (once.v2 > 0), axis=-1, keepdims=True)
         bound = np.where(shrinks, 2.0 * second, np.inf)
@@ -415,10 +361,10 @@ def _linear_flows(feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats | flo
     """Linear power flow from the injections of the customers."""
     both = np.empty((2, *np.broadcast(p, q).shape))
     both[0], both[1] = p, q
-    P, Q = -below(feeder, _at_buses(feeder, both))[..., 1:]
+    P, Q = -below(feeder.walk, _at_buses(feeder, both))[..., 1:]
     base = np.asarray(v0_squared, dtype=np.float64)[..., None]
-    v2 = base + from_root(feeder, -2.0 * (feeder.r * P + feeder.x * Q))
-    charged = Q - below(feeder, feeder.half * v2)[..., 1:] if feeder.charges else Q
+    v2 = base + from_root(feeder.walk, -2.0 * (feeder.r * P + feeder.x * Q))
+    charged = Q - below(feeder.walk, feeder.half * v2)[..., 1:] if feeder.charges else Q
     return _Flows(P, Q, charged, v2)
 
 
@@ -427,9 +373,9 @@ def _losses(feeder: Feeder, current: Floats, charge: Floats, *, sign: float) -> 
     own = np.zeros((2, *current.shape[:-1], current.shape[-1] + 1))
     np.multiply(feeder.r, current, out=own[0, ..., 1:])
     np.multiply(feeder.x, current, out=own[1, ..., 1:])
-    loss_p, loss_q = (below(feeder, own) - own)[..., 1:]
+    loss_p, loss_q = (below(feeder.walk, own) - own)[..., 1:]
     if feeder.charges:
-        loss_q = loss_q + sign * below(feeder, charge)[..., 1:]
+        loss_q = loss_q + sign * below(feeder.walk, charge)[..., 1:]
     drop = 2.0 * (feeder.r * loss_p + feeder.x * loss_q) + feeder.squared * current
     return loss_p, loss_q, drop
 

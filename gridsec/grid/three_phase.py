@@ -1,7 +1,7 @@
 """Radial feeders in three phases: impedances in per unit, LinDist3Flow and its correction.
 
 `ThreePhaseFeeder` is the radial tree of 3x3 blocks in per unit, `lindist3flow` its linear power flow of
-squared phase voltages, `loss_correction` the correction of that, and `PhasedFeeder` the form for estimators.
+squared phase voltages, `bus_voltages` the corrected one, and `PhasedFeeder` the form for estimators.
 
 1 pu of voltage is the nominal phase-to-neutral voltage V; 1 pu of power is a *third* of the three-phase
 base power S, because powers are those of single phases here; 1 pu of impedance is ``3 V^2 / S`` as on a
@@ -33,15 +33,24 @@ References
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, Ints, Phasors, frozen, frozen_ints
-from gridsec.errors import FeederInvalid, InputInvalid, Problem
+from gridsec.arrays import Bools, Floats, Ints, Phasors, frozen, frozen_ints, put
+from gridsec.errors import FeederInvalid, InputInvalid, Problem, wrong_shapes
 from gridsec.grid.intervals import Sweeps, bounds
-from gridsec.grid.trees import below, from_root, meetings, shrinking, walk
+from gridsec.grid.trees import (
+    Walk,
+    at_ends,
+    base_problems,
+    below,
+    duplicates,
+    from_root,
+    meetings,
+    shrinking,
+    walk,
+)
 
 PHASES = "abc"
 
@@ -81,43 +90,21 @@ class ThreePhaseFeeder:
     phase: Ints = field(init=False, repr=False)
     # (C,) share of the customer's power in each connection: 1 on a single phase, 1/3 on all three
     share: Floats = field(init=False, repr=False)
-    # start, stop, order, depth, enter, leave (b + 1,); inside : (b + 1, b + 1) or None: the walk around the
-    # tree, see `gridsec.grid.trees.Walk`
-    start: Ints = field(init=False, repr=False)
-    stop: Ints = field(init=False, repr=False)
-    order: Ints = field(init=False, repr=False)
-    depth: Ints = field(init=False, repr=False)
-    enter: Ints = field(init=False, repr=False)
-    leave: Ints = field(init=False, repr=False)
-    inside: Floats | None = field(init=False, repr=False)
+    walk: Walk = field(init=False, repr=False)  # around the tree
     half: Floats = field(init=False, repr=False)  # (b + 1, 3, 3) shunt susceptance at the buses, pu
 
     def __post_init__(self) -> None:
-        def put(name: str, value: object) -> None:
-            object.__setattr__(self, name, value)
-
         for name, kind in (("z", np.complex128), ("phases", np.bool_), ("connected", np.bool_)):
-            own = np.array(getattr(self, name), dtype=kind, order="C")
-            own.flags.writeable = False
-            put(name, own)
-        put("charging", frozen(self.charging))
-        for name in ("parent", "bus"):
-            put(name, frozen_ints(getattr(self, name)))
+            put(self, **{name: np.array(getattr(self, name), dtype=kind, order="C")})
+        put(self, charging=frozen(self.charging))
+        put(self, parent=frozen_ints(self.parent), bus=frozen_ints(self.bus))
         problems = _shape_problems(self) or [*_branch_problems(self), *_customer_problems(self)]
         if problems:
             raise FeederInvalid(problems)
-        found = walk(self.parent)
-        for name in ("start", "stop", "order", "depth", "enter", "leave", "inside"):
-            put(name, getattr(found, name))
         of, phase = np.nonzero(self.connected)
-        put("of", frozen_ints(of))
-        put("at", frozen_ints(self.bus[of]))
-        put("phase", frozen_ints(phase))
-        put("share", frozen(1.0 / self.connected.sum(axis=1)[of]))
-        half = np.zeros((found.start.size, 3, 3))
-        np.add.at(half, self.parent, 0.5 * self.charging)
-        half[1:] += 0.5 * self.charging
-        put("half", frozen(half))
+        put(self, of=frozen_ints(of), at=frozen_ints(self.bus[of]), phase=frozen_ints(phase))
+        put(self, share=frozen(1.0 / self.connected.sum(axis=1)[of]))
+        put(self, walk=walk(self.parent), half=at_ends(self.parent, self.charging))
 
     def connections(self, powers: Floats) -> Floats:
         """Split the customers' powers (…, N) over their connections (…, C), evenly over the phases."""
@@ -141,7 +128,7 @@ def sequence_matrix(positive: Phasors | Floats, zero: Phasors | Floats) -> Phaso
 def _shape_problems(feeder: ThreePhaseFeeder) -> list[Problem]:
     """Problems of array lengths; all other checks require that there are none."""
     branches, customers = feeder.parent.size, len(feeder.customers)
-    expected = (
+    return wrong_shapes(
         ("parent", feeder.parent.shape, (branches,)),
         ("z", feeder.z.shape, (branches, 3, 3)),
         ("charging", feeder.charging.shape, (branches, 3, 3)),
@@ -150,19 +137,10 @@ def _shape_problems(feeder: ThreePhaseFeeder) -> list[Problem]:
         ("bus", feeder.bus.shape, (customers,)),
         ("connected", feeder.connected.shape, (customers, 3)),
     )
-    return [
-        Problem("shape", f"{what} has shape {has}; expected {wants}")
-        for what, has, wants in expected
-        if has != wants
-    ]
 
 
 def _branch_problems(feeder: ThreePhaseFeeder) -> list[Problem]:
-    out = []
-    for what in ("base_volt", "base_kva"):
-        value = getattr(feeder, what)
-        if not (np.isfinite(value) and value > 0):
-            out.append(Problem("not-positive", f"{what} is {value}; it must be a positive number"))
+    out = base_problems(feeder)
     for k, above in enumerate(feeder.parent.tolist()):
         where = f"branch {k} into bus {feeder.buses[k + 1]!r}"
         if not 0 <= above <= k:
@@ -247,14 +225,7 @@ def _customer_problems(feeder: ThreePhaseFeeder) -> list[Problem]:
                     f"{named(feeder.phases[bus])!r}",
                 )
             )
-    for what, names in (("customer", feeder.customers), ("bus", feeder.buses)):
-        counted = Counter(names)
-        out.extend(
-            Problem("duplicate", f"{what} {name!r} is named {times} times")
-            for name, times in counted.items()
-            if times > 1
-        )
-    return out
+    return out + duplicates(feeder)
 
 
 def named(present: Bools) -> str:
@@ -307,7 +278,7 @@ def common_paths(feeder: ThreePhaseFeeder, blocks: Phasors, at: Ints, phase: Int
     whole = np.zeros((len(feeder.buses), 3, 3), dtype=np.complex128)
     for k, above in enumerate(feeder.parent.tolist()):
         whole[k + 1] = whole[above] + blocks[k]
-    shared = meetings(feeder.parent, feeder, at)
+    shared = meetings(feeder.parent, feeder.walk, at)
     return np.stack([whole[shared, phi, phase] for phi in range(3)])
 
 
@@ -329,7 +300,8 @@ def sensitivities(
     steps: number of sweeps, at least 1: for the operating point as for the derivatives.
     Returns LinDist3Flow: the matrices; ``v^2`` then changes by ``2 R dp + 2 X dq``.
     """
-    _check(steps)
+    if steps < 1:
+        raise InputInvalid([Problem("out-of-range", f"steps is {steps}; it must be at least 1")])
     start = _Start.of(feeder, p, q, v0_squared)
     v = start.phasors
     for _ in range(steps):
@@ -389,51 +361,30 @@ def per_customer(feeder: ThreePhaseFeeder, model: LinDist3Flow) -> CustomerFlow:
     return CustomerFlow(joined(model.R), joined(model.X))
 
 
-def squared_voltages(model: LinDist3Flow, p: Floats, q: Floats, v0_squared: Floats) -> Floats:
-    """Squared voltage at every connection by the linear power flow.
-
-    model: from `lindist3flow`.
-    p, q (…, C): net active and reactive injection of each connection (generation positive), pu.
-    v0_squared (…, C) or scalar: squared busbar voltage of each connection's phase (``v0_squared[...,
-        feeder.phase]``), pu.
-    Returns (…, C): squared voltages, pu.
-    """
-    return np.asarray(v0_squared + 2.0 * (p @ model.R.T + q @ model.X.T))
-
-
 def bus_voltages(
     feeder: ThreePhaseFeeder, p: Floats, q: Floats, v0_squared: Floats, *, steps: int = 1
 ) -> Floats:
-    """Squared voltage of every phase of every bus, corrected; O(b), without the matrices.
-
-    feeder, p, q, v0_squared, steps: as in `loss_correction`; `steps` = 0 gives LinDist3Flow.
-    Returns (…, 3, b + 1): squared voltages, pu.
-    """
-    start = _Start.of(feeder, p, q, v0_squared)
-    return _sweeps(feeder, start, steps) if steps else start.linear
-
-
-def loss_correction(
-    feeder: ThreePhaseFeeder, p: Floats, q: Floats, v0_squared: Floats, *, steps: int = 1
-) -> Floats:
-    """Correction of the linear squared voltage of every bus for losses, charging and unequal phases.
+    """Squared voltage of every phase of every bus, corrected for losses, charging and unequal phases.
 
     LinDist3Flow is the squared voltage after one backward and forward sweep from the flat start, linearised:
     ``v_k = v_parent - Z i_k`` with i_k the sum of ``conj(-s / v)`` over the buses fed by bus k. One step is
     one more sweep, with the currents at these voltages; its error is of third order in the powers. `steps`
     repeats it, and its limit is the AC power flow. Unlike on a balanced feeder the angles matter, since they
     turn the voltages induced by currents of other phases: hence phasors in place of squares. O(b) for each
-    operating point.
+    operating point, without the matrices.
 
     p, q (…, C): net active and reactive injection of each connection (generation positive), pu.
     v0_squared (…, 3): squared busbar voltage of each phase, pu, with balanced angles.
-    steps: number of sweeps, at least 1.
-    Returns (…, 3, b + 1): additive correction of `v^2`, pu; 0 at the busbar.
-    Source: Derivation and measured errors: docs/theory-three-phase.md.
+    steps: number of sweeps; 0 gives LinDist3Flow.
+    Returns (…, 3, b + 1): squared voltages, pu. Source: docs/theory-three-phase.md, with measured errors.
     """
-    _check(steps)
     start = _Start.of(feeder, p, q, v0_squared)
-    return np.asarray(_sweeps(feeder, start, steps) - start.linear)
+    if not steps:
+        return start.linear
+    phasors = start.phasors
+    for _ in range(steps):
+        phasors = _sweep(feeder, start, phasors)
+    return np.asarray(phasors.real**2 + phasors.imag**2)
 
 
 def model_error_bound(feeder: ThreePhaseFeeder, p: Floats, q: Floats, v0_squared: Floats) -> Floats:
@@ -445,29 +396,18 @@ def model_error_bound(feeder: ThreePhaseFeeder, p: Floats, q: Floats, v0_squared
     e (2 |v| + 2 e)``. Heavy loads make the quotients grow, so if this sweep is *not* below a fifth of the one
     before, towards voltage collapse, the bound is infinite. It does not cover unbalanced busbar angles.
 
-    feeder, p, q, v0_squared: as in `loss_correction`.
+    feeder, p, q, v0_squared: as in `bus_voltages`.
     Returns (…, C): bound on the remaining error of `v^2`, pu.
     """
     start = _Start.of(feeder, p, q, v0_squared)
-    return _remainder(feeder, start, _sweep(feeder, start, start.phasors))
-
-
-def corrected(
-    feeder: ThreePhaseFeeder, p: Floats, q: Floats, v0_squared: Floats, *, steps: int = 1
-) -> tuple[Floats, Floats]:
-    """`loss_correction` and `model_error_bound` of the same operating points, faster than separately.
-
-    feeder, p, q, v0_squared, steps: as in `loss_correction`.
-    Returns (…, 3, b + 1), (…, C): additive correction of `v^2`, and a bound on the error that remains after
-        its first step, pu.
-    """
-    _check(steps)
-    start = _Start.of(feeder, p, q, v0_squared)
     once = _sweep(feeder, start, start.phasors)
-    again = once
-    for _ in range(steps - 1):
-        again = _sweep(feeder, start, again)
-    return np.asarray(_square(again) - start.linear), _remainder(feeder, start, once)
+    with np.errstate(all="ignore"):
+        before = _drawn(feeder, start.s, start.phasors)
+        first = _reach(feeder, before - start.flat)
+        second = _reach(feeder, _drawn(feeder, start.s, once) - before)
+        shrinks = shrinking(first, second, (-2, -1))
+        bound = np.where(shrinks, 2.0 * second * (2.0 * np.abs(once) + 2.0 * second), np.inf)
+    return np.asarray(bound[..., feeder.phase, feeder.at])
 
 
 def interval_bounds(
@@ -475,7 +415,7 @@ def interval_bounds(
 ) -> tuple[Floats, Floats]:
     """Change of the correction, and error of its first step, for all powers within intervals.
 
-    feeder, p, q: as in `loss_correction`, one operating point.
+    feeder, p, q: as in `bus_voltages`, one operating point.
     p_error, q_error (C,): largest errors of the powers, pu.
     Returns (C,), (C,): as `gridsec.grid.intervals.bounds`; with unequal phases of the busbar, wider by the
         error of LinDist3Flow for them.
@@ -500,14 +440,11 @@ def interval_bounds(
     v0 = np.sqrt(np.asarray(v0_squared, dtype=np.float64))
     # `linear` assumes equal phases of the busbar.
     apart = np.abs(feeder.z) * np.abs(v0[:, None] / v0 - 1.0)
-    moved = moved + 2.0 * from_root(feeder, np.einsum("bij,jb->ib", apart, below(feeder, error)[..., 1:]))
+    moved = moved + 2.0 * from_root(
+        feeder.walk, np.einsum("bij,jb->ib", apart, below(feeder.walk, error)[..., 1:])
+    )
     here = (feeder.phase, feeder.at)
     return np.asarray(moved[here]), np.asarray(rest[here])
-
-
-def _check(steps: int) -> None:
-    if steps < 1:
-        raise InputInvalid([Problem("out-of-range", f"steps is {steps}; it must be at least 1")])
 
 
 def _rotated(feeder: ThreePhaseFeeder) -> Phasors:
@@ -535,18 +472,11 @@ class _Start:
             s = _at_buses(feeder, p + 1j * np.asarray(q))
             squared = np.asarray(v0_squared, dtype=np.float64)[..., None]
             v0 = np.sqrt(squared) * ROTATION[:, None]
-            flow = below(feeder, s)[..., 1:]
+            flow = below(feeder.walk, s)[..., 1:]
             gain = np.einsum("bij,...jb->...ib", _rotated(feeder), np.conj(flow)).real
-            linear = squared + 2.0 * from_root(feeder, gain)
+            linear = squared + 2.0 * from_root(feeder.walk, gain)
             flat = _drawn(feeder, s, np.broadcast_to(v0, s.shape))
             return cls(s, v0, flat, _forward(feeder, v0, flat), linear)
-
-
-def _sweeps(feeder: ThreePhaseFeeder, start: _Start, steps: int) -> Floats:
-    phasors = start.phasors
-    for _ in range(steps):
-        phasors = _sweep(feeder, start, phasors)
-    return _square(phasors)
 
 
 def _sweep(feeder: ThreePhaseFeeder, start: _Start, phasors: Phasors) -> Phasors:
@@ -566,28 +496,14 @@ def _charged(feeder: ThreePhaseFeeder, phasors: Phasors) -> Phasors | float:
 
 def _forward(feeder: ThreePhaseFeeder, v0: Phasors, drawn: Phasors) -> Phasors:
     """Voltages of the buses from the currents drawn there."""
-    current = below(feeder, drawn)[..., 1:]
-    return np.asarray(v0 - from_root(feeder, np.einsum("bij,...jb->...ib", feeder.z, current)))
-
-
-def _remainder(feeder: ThreePhaseFeeder, start: _Start, once: Phasors) -> Floats:
-    with np.errstate(all="ignore"):
-        before = _drawn(feeder, start.s, start.phasors)
-        first = _reach(feeder, before - start.flat)
-        second = _reach(feeder, _drawn(feeder, start.s, once) - before)
-        shrinks = shrinking(first, second, (-2, -1))
-        bound = np.where(shrinks, 2.0 * second * (2.0 * np.abs(once) + 2.0 * second), np.inf)
-    return np.asarray(bound[..., feeder.phase, feeder.at])
+    current = below(feeder.walk, drawn)[..., 1:]
+    return np.asarray(v0 - from_root(feeder.walk, np.einsum("bij,...jb->...ib", feeder.z, current)))
 
 
 def _reach(feeder: ThreePhaseFeeder, change: Phasors | Floats) -> Floats:
     """Largest change of the voltages by changed currents at the buses."""
-    current = below(feeder, np.abs(change))[..., 1:]
-    return np.asarray(from_root(feeder, np.einsum("bij,...jb->...ib", np.abs(feeder.z), current)))
-
-
-def _square(phasors: Phasors) -> Floats:
-    return np.asarray(phasors.real**2 + phasors.imag**2)
+    current = below(feeder.walk, np.abs(change))[..., 1:]
+    return np.asarray(from_root(feeder.walk, np.einsum("bij,...jb->...ib", np.abs(feeder.z), current)))
 
 
 def _at_buses(feeder: ThreePhaseFeeder, powers: Phasors) -> Phasors:

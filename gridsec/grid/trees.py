@@ -5,31 +5,17 @@ Bus 0 is the root, and bus `parent[k] <= k` feeds bus k + 1.
 
 from __future__ import annotations
 
+import math
+from collections import Counter
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, Phasors, frozen, frozen_ints
+from gridsec.errors import Problem
 
 Values = TypeVar("Values", Floats, Phasors)
-
-
-class Walked(Protocol):
-    """A tree with the numbers of a `Walk`."""
-
-    @property
-    def start(self) -> Ints: ...  # noqa: D102
-    @property
-    def stop(self) -> Ints: ...  # noqa: D102
-    @property
-    def order(self) -> Ints: ...  # noqa: D102
-    @property
-    def enter(self) -> Ints: ...  # noqa: D102
-    @property
-    def leave(self) -> Ints: ...  # noqa: D102
-    @property
-    def inside(self) -> Floats | None: ...  # noqa: D102
 
 
 class Named(Protocol):
@@ -43,6 +29,36 @@ class Named(Protocol):
     def base_volt(self) -> float: ...  # noqa: D102
     @property
     def base_kva(self) -> float: ...  # noqa: D102
+    @property
+    def buses(self) -> tuple[str, ...]: ...  # noqa: D102
+
+
+def base_problems(feeder: Named) -> list[Problem]:
+    """Problems of the per-unit bases."""
+    bases = (("base_volt", feeder.base_volt), ("base_kva", feeder.base_kva))
+    return [
+        Problem("not-positive", f"{what} is {value}; it must be a positive number")
+        for what, value in bases
+        if not (math.isfinite(value) and value > 0)
+    ]
+
+
+def duplicates(feeder: Named) -> list[Problem]:
+    """Problems of identifiers that occur several times."""
+    return [
+        Problem("duplicate", f"{what} {name!r} is named {times} times")
+        for what, names in (("customer", feeder.customers), ("bus", feeder.buses))
+        for name, times in Counter(names).items()
+        if times > 1
+    ]
+
+
+def at_ends(parent: Ints, charging: Floats) -> Floats:
+    """Charging (b, …) of the branches, half of it at each end, by bus (b + 1, …)."""
+    out: Floats = np.zeros((parent.size + 1, *charging.shape[1:]))
+    np.add.at(out, parent, 0.5 * charging)
+    out[1:] += 0.5 * charging
+    return frozen(out)
 
 
 class OnTree:
@@ -125,7 +141,7 @@ def walk(parent: Ints) -> Walk:
     return Walk(start, stop, order, depth, enter, leave, inside)
 
 
-def below(tree: Walked, values: Values) -> Values:
+def below(tree: Walk, values: Values) -> Values:
     """Sum of bus values (…, b + 1) over the subtree of each bus, itself included; O(b)."""
     inside = _dense(tree, values)
     if inside is not None:
@@ -138,7 +154,7 @@ def below(tree: Walked, values: Values) -> Values:
     return np.asarray(out)
 
 
-def from_root(tree: Walked, values: Values) -> Values:
+def from_root(tree: Walk, values: Values) -> Values:
     """Sum of branch values (…, b) over the path from the root to each bus, (…, b + 1); O(b)."""
     inside = _dense(tree, values)
     if inside is not None:
@@ -150,7 +166,7 @@ def from_root(tree: Walked, values: Values) -> Values:
     return np.asarray(np.cumsum(tour, axis=-1, out=tour).take(tree.enter, axis=-1))
 
 
-def _dense(tree: Walked, values: Values) -> Floats | None:
+def _dense(tree: Walk, values: Values) -> Floats | None:
     """Summation matrix for few real values of a small tree; None where the walk is faster."""
     inside = tree.inside
     if inside is None or values.dtype != np.float64 or values.size > _FEW * len(inside):
@@ -158,7 +174,7 @@ def _dense(tree: Walked, values: Values) -> Floats | None:
     return inside
 
 
-def meetings(parent: Ints, tree: Walked, buses: Ints) -> Ints:
+def meetings(parent: Ints, tree: Walk, buses: Ints) -> Ints:
     """Bus at which the paths to the root of every bus and of each of `buses` meet; O(b k).
 
     parent (b,): see `walk`.

@@ -285,7 +285,8 @@ def parts(feeder: Feeder | ThreePhaseFeeder, buses: Ints, ties: Ints) -> Sequenc
 def _fed_through(feeder: Feeder | ThreePhaseFeeder, lines: Ints, bus: int) -> Bools:
     """Buses that lose the busbar if one is removed, that bus included; on a tree all behind it."""
     if len(lines) < len(feeder.buses):
-        return np.asarray((feeder.start >= feeder.start[bus]) & (feeder.start < feeder.stop[bus]))
+        start, stop = feeder.walk.start, feeder.walk.stop
+        return np.asarray((start >= start[bus]) & (start < stop[bus]))
     left = lines[(lines != bus).all(axis=1)]
     graph = coo_array((np.ones(len(left)), left.T), shape=(len(feeder.buses),) * 2)
     _, piece = connected_components(graph, directed=False)

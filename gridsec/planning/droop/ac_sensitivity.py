@@ -120,8 +120,8 @@ def _phased(feeder: PhasedFeeder) -> PhasorNetwork:
     with np.errstate(all="ignore"):
         for _ in range(_ROUNDS if tree.half.any() else 1):
             charged = 1j * np.einsum("kij,cjk->cik", tree.half, V)
-            flow = np.einsum("bij,cjb->cib", tree.z, below(tree, drawn + charged)[..., 1:])
-            new: Complex = idle - from_root(tree, flow)
+            flow = np.einsum("bij,cjb->cib", tree.z, below(tree.walk, drawn + charged)[..., 1:])
+            new: Complex = idle - from_root(tree.walk, flow)
             V, change = new, float(np.abs(new - V).max())
             if not change > _TOL:
                 break
@@ -197,7 +197,7 @@ def _phase_currents(feeder: PhasedFeeder, injected: Complex, at: Complex) -> Flo
     flat = drawn.reshape(-1, 3, len(tree.buses))
     for row, each in zip(flat, injected.reshape(-1, tree.at.size), strict=True):
         np.add.at(row, (tree.phase, tree.at), -3.0 * ROTATION[tree.phase] * each)
-    series = below(tree, flat.reshape(V.shape))[..., 1:]
+    series = below(tree.walk, flat.reshape(V.shape))[..., 1:]
     shunt = 0.5j * tree.charging
     above, here = (
         np.einsum("bij,...jb->...ib", shunt, V[..., ends]) for ends in (tree.parent, slice(1, None))
