@@ -44,6 +44,7 @@ __all__ = [
     "currents",
     "lines",
     "network",
+    "neumann",
     "region",
     "sensitivity",
     "solve",
@@ -325,7 +326,11 @@ def region(net: PhasorNetwork, box: InjectionBox) -> Region:
     gain, away = np.abs(at.a) + np.abs(at.b), np.hypot(*half)
     r = _radius(gain, np.abs(s), away, np.abs(at.busbar).sum(axis=1) * swing)
     feedback = gain * ((away + np.abs(s) * (2.0 + r) * r) / (1.0 - r) ** 2)
-    amplify = _neumann(feedback)
+    amplify = neumann(feedback)
+    if amplify is None:
+        raise DesignInfeasible(
+            "sensitivities over all powers in the box", "it reaches too near to collapse", code="no-solution"
+        )
     tilt = gain * (r / (1.0 - r))
 
     def error(xi: Complex, own: Floats) -> Floats:
@@ -381,17 +386,13 @@ def _radius(gain: Floats, s: Floats, away: Floats, source: Floats) -> Floats:
     return r
 
 
-def _neumann(feedback: Floats) -> Floats:
+def neumann(feedback: Floats) -> Floats | None:
     """`(I - feedback)^-1`, which exists and is not negative exactly if the spectral radius is below 1."""
     size = feedback.shape[0]
     inverse = np.linalg.inv(np.eye(size) - feedback)
     # x = (I - F)^-1 1 with x >= 1 and F x < x proves it, by Perron and Frobenius.
     x = inverse @ np.ones(size)
-    if not (np.all(x >= 0.5) and np.all(feedback @ x < x)):
-        raise DesignInfeasible(
-            "sensitivities over all powers in the box", "it reaches too near to collapse", code="no-solution"
-        )
-    return np.asarray(np.maximum(inverse, 0.0))
+    return np.maximum(inverse, 0.0) if np.all(x >= 0.5) and np.all(feedback @ x < x) else None
 
 
 def _limits(

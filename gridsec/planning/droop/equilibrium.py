@@ -15,7 +15,14 @@ import numpy as np
 from gridsec.arrays import Floats
 from gridsec.errors import DesignInfeasible
 from gridsec.grid.droop import Droop, voltage_curve
-from gridsec.planning.droop.ac_sensitivity import Complex, InjectionBox, PhasorNetwork, sensitivity, solve
+from gridsec.planning.droop.ac_sensitivity import (
+    Complex,
+    InjectionBox,
+    PhasorNetwork,
+    neumann,
+    sensitivity,
+    solve,
+)
 from gridsec.planning.droop.stability import Loop, reach, slopes
 
 __all__ = ["Band", "Share", "always", "at_rest", "injected", "rest", "shares", "shares_of_gain"]
@@ -134,15 +141,14 @@ def at_rest(net: PhasorNetwork, droop: Droop, loads: InjectionBox) -> Band:
     columns = D * (np.abs(given.dv_dq) + given.q_error)[:, own]
     for k, customer in enumerate(own):
         back[:, customer] += columns[:, k]
-    inverse = np.linalg.inv(np.eye(len(back)) - back)
-    ones = inverse @ np.ones(len(back))
-    if not (np.all(ones >= 0.5) and np.all(back @ ones < ones)):
+    inverse = neumann(back)
+    if inverse is None:
         raise DesignInfeasible(
             "voltages of the fleet at rest", "the loop gain may be 1 or more", code="unstable"
         )
     # A rise of the busbar lifts all voltages; the fleet's reaction to it counts like that to a load.
     busbar_high = np.abs(given.dv_dv0) + given.v0_error
-    U = np.maximum(inverse, 0.0) @ np.column_stack([np.abs(J) + off, busbar_high])
+    U = inverse @ np.column_stack([np.abs(J) + off, busbar_high])
     L = np.column_stack([J - off, given.dv_dv0 - given.v0_error]) - back @ U
     swing = np.full(net.of_busbar.shape[1], loads.v0_high - loads.v0_low)
     width = np.concatenate([loads.p_high - loads.p_low, loads.q_high - loads.q_low, swing])
@@ -180,10 +186,13 @@ def shares(given: Loop, allowed: float) -> Share:
     part = modes[:, -1] ** 2
     if values[-1] >= allowed:
         return Share(part, np.ones(part.size))
+    return Share(part, _factor(allowed * np.sum(modes**2 / (allowed - values), axis=1)))
+
+
+def _factor(own: Floats) -> Floats:
+    """`1 / (1 - 1 / own)`, the largest factor on the slopes; infinite where own is 1."""
     with np.errstate(divide="ignore"):
-        own = allowed * np.sum(modes**2 / (allowed - values), axis=1)
-        factor = np.where(own > 1.0, 1.0 / (1.0 - 1.0 / np.maximum(own, 1.0 + 1e-15)), np.inf)
-    return Share(part, factor)
+        return np.where(own > 1.0, 1.0 / (1.0 - 1.0 / np.maximum(own, 1.0 + 1e-15)), np.inf)
 
 
 def shares_of_gain(given: Loop) -> Share:
@@ -200,13 +209,8 @@ def shares_of_gain(given: Loop) -> Share:
         return Share(np.zeros(0), np.zeros(0))
     left, right = (_leading(each) for each in (M.T, M))
     part = left * right / float(left @ right)
-    inverse = np.linalg.inv(np.eye(len(M)) - M)
-    ones = inverse @ np.ones(len(M))
-    if not (np.all(ones >= 0.5) and np.all(M @ ones < ones)):
-        return Share(part, np.full(len(M), np.nan))
-    own = np.diagonal(inverse)
-    with np.errstate(divide="ignore"):
-        return Share(part, np.where(own > 1.0, 1.0 / (1.0 - 1.0 / np.maximum(own, 1.0 + 1e-15)), np.inf))
+    inverse = neumann(M)
+    return Share(part, np.full(len(M), np.nan) if inverse is None else _factor(np.diagonal(inverse)))
 
 
 def _leading(M: Floats) -> Floats:
