@@ -1,7 +1,5 @@
 """Partial observers on a feeder, stacked and decoded: lee2018, Algorithm 4.1.
 
-Part of `gridsec.estimators.partial`, which explains both.
-
 A single meter determines little. The part of the state x (the injections of the inverters) that belongs
 to meter j is
 
@@ -33,10 +31,8 @@ more fits can explain a small attack differently. Then the answer is UNDECIDED, 
 The paper's own constants (theta, kappa) are available from `constants`; on feeders they guarantee less than
 is known without any meter. docs/theory-partial-observers.md, section 8, has the proof and the numbers.
 
-References
-----------
-lee2018, sections 4.2.1 and 4.3.1, for droop inverters: docs/theory-partial-observers.md, section 8.
-lee2018, sections 4.2.1 and 4.3.1, Algorithm 4.1, Theorems 2.2.11 and 4.3.2.
+Source: lee2018, sections 4.2.1 and 4.3.1, Algorithm 4.1, Theorems 2.2.11 and 4.3.2; for droop inverters
+docs/theory-partial-observers.md, section 8.
 """
 
 from __future__ import annotations

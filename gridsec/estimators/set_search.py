@@ -1,7 +1,5 @@
 """Switched observer that searches for another set of trusted meters when its own test fails.
 
-Part of `gridsec.estimators.set_search`, which selects the trusted meters.
-
 kim2018 and lee2018, chapter 5, do not run an observer for every set. They trust one set of meters while
 all of its readings agree with its estimate, and search for another one only if they do not:
 
@@ -25,10 +23,8 @@ The papers' sets have partial observers of their own, with estimates that can be
 candidate is judged by the injections that its members' readings alone imply, which needs no observer.
 Metered net reactive power is not used: that of a dropped meter would have to be removed, too.
 
-References
-----------
-docs/theory-high-gain.md, section 8; docs/theory-detection.md.
-kim2018, section III.D, Theorem 2; lee2018, section 5.4, Theorem 5.4.3; docs/theory-high-gain.md.
+Source: kim2018, section III.D, Theorem 2; lee2018, section 5.4, Theorem 5.4.3; docs/theory-high-gain.md,
+section 8.
 """
 
 from __future__ import annotations

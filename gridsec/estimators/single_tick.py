@@ -11,10 +11,7 @@ They share the model ``m = w + e + a`` of `gridsec.estimators.sequential`: w is 
 errors on all voltages, known by its covariance S (pseudo-measurements of the loads, which cannot be
 attacked); e are the errors of unmanipulated meters; a is the attack, in as few entries as possible.
 
-References
-----------
-lee2018 (2.2.8'), Remark 2.2.1: least squares over all meters but those of a set.
-lee2018, chapter 2; docs/theory-snapshot.md.
+Source: lee2018, chapter 2, (2.2.8'), Remark 2.2.1; docs/theory-snapshot.md.
 """
 
 from __future__ import annotations

@@ -5,9 +5,7 @@ loads within stated intervals, the observers' own error and the model's error ca
 term comes from a stated accuracy. The sum is a worst case, because the errors of loads and meters may be
 systematic. docs/theory-detection.md has the derivation and the proof.
 
-References
-----------
-chong2020, section V and Theorem 2 (the estimate's error), equation (19) (the reconstructed voltage).
+Source: chong2020, section V and Theorem 2 (the estimate's error), equation (19) (the reconstructed voltage).
 """
 
 from __future__ import annotations

@@ -21,9 +21,7 @@ An attack inside the dead band of a curve, beyond its saturation, or on a meter 
 injection: windows cannot detect it, at any size. Output residuals can. If they contradict the windows, the
 answer is UNDECIDED. CLEAN needs both.
 
-References
-----------
-yang2019, Algorithms 1 and 2, (8), (10), (17), (19); docs/theory-discrete.md, sections 3 and 6.
+Source: yang2019, Algorithms 1 and 2, (8), (10), (17), (19); docs/theory-discrete.md, sections 3 and 6.
 """
 
 from __future__ import annotations

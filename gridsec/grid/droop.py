@@ -5,10 +5,8 @@ ends. Inverters measure v, so their curve is linear in v between the breakpoints
 runs on `z = vbar^2 - v^2`, where the curve K of chong2020 (17) is linear between the *mapped* breakpoints
 (`Droop.__call__`). The two agree at the breakpoints; docs/theory-model.md bounds the difference between them.
 
-References
-----------
-.. [1] chong2020, equations (16) to (18). In (18) the slope restriction needs the larger of the two
-   slopes, not the smaller one.
+Source: chong2020, equations (16) to (18). In (18) the slope restriction needs the larger of the two slopes,
+not the smaller one.
 """
 
 from __future__ import annotations

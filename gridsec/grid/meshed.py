@@ -1,36 +1,23 @@
 """Feeders with closed ties, balanced or in three phases, and their power flow.
 
-`MeshedFeeder` and `PhasedMesh` are a tree and the lines that close loops in it. Both are represented by the
-inverse of their admittances, so that `bus_voltages`, `model_error_bound` and `interval_bounds` are the same.
-
-With W the voltage without load by the busbar, and ``Z = R + j X`` the inverse of the admittance
-matrix without the busbar, powers s and voltages V of the other buses obey
+`MeshedFeeder` and `PhasedMesh` are a tree and the lines that close loops in it. With W the voltage without
+load by the busbar, and ``Z = R + j X`` the inverse of the admittance matrix without the busbar, powers s and
+voltages V of the other places obey
 
     V = W + Z conj(s / V).
 
 To first order in s, and without charging, ``|V|^2 = v0^2 + 2 Re(Z conj(s)) = v0^2 + 2 R p + 2 X q``. On a
 tree Z has the sums of common paths, so that this is LinDistFlow. With ties its entries may be negative, but
-it stays symmetric, and both parts positive semidefinite. Derivations: docs/theory-mesh.md.
+it stays symmetric, and both parts positive semidefinite.
 
-The voltages of its places are ``V = W + Z conj(s / V)`` as on a balanced mesh, with Z the inverse of the
-admittances between phases of buses. With the busbar's phases a third of a turn apart, a = 1, e^{-j 2 pi / 3},
-e^{j 2 pi / 3}, the derivative of ``|V|^2`` at no load is ``2 Re(Z_kl a_l / a_k conj(s_l))``: on a tree
-LinDist3Flow. Z is symmetric; the rotated matrix is not. Derivations: docs/theory-mesh.md.
+In three phases Z is the inverse of the admittances between phases of buses. With the busbar's phases a third
+of a turn apart, a = 1, e^{-j 2 pi / 3}, e^{j 2 pi / 3}, the derivative of ``|V|^2`` at no load is ``2 Re(Z_kl
+a_l / a_k conj(s_l))``: on a tree LinDist3Flow. Z is symmetric; the rotated matrix is not. The methods of
+`Meshed` depend neither on the number of phases nor on symmetry or signs of Z.
 
-``V = W + Z conj(s / V)`` holds for the places of three phases as for the buses of a balanced feeder, with W
-the voltages without load by the busbar's phases. Nothing below depends on the number of phases, or needs Z
-to be symmetric or of any sign. Derivations: docs/theory-mesh.md.
-
-References
-----------
-.. [1] S. Bolognani, S. Zampieri, "On the existence and linear approximation of the power flow solution in
-   power distribution networks", IEEE Trans. Power Systems 31(1), 2016: the model, for networks of any form.
-.. [2] C. Wang, A. Bernstein, J.-Y. Le Boudec, M. Paolone, "Explicit conditions on existence and uniqueness
-   of load-flow solutions in distribution networks", IEEE Trans. Smart Grid 9(2), 2018: the fixed point.
-.. [3] C. Wang, A. Bernstein, J.-Y. Le Boudec, M. Paolone, "Explicit conditions on existence and uniqueness
-   of load-flow solutions in distribution networks", IEEE Trans. Smart Grid 9(2), 2018: the fixed point.
-.. [4] A. Bernstein, C. Wang, E. Dall'Anese, J.-Y. Le Boudec, C. Zhao, "Load flow in multiphase distribution
-   networks: existence, uniqueness, non-singularity and linear models", IEEE Trans. Power Systems 33(6), 2018.
+Source: docs/theory-mesh.md; bolognani2016 for the model of networks of any form; wang2018 for the fixed
+point; in three phases A. Bernstein, C. Wang, E. Dall'Anese, J.-Y. Le Boudec, C. Zhao, "Load flow in
+multiphase distribution networks", IEEE Trans. Power Systems 33(6), 2018.
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
 """Accuracy of meters and the largest error of a consistent reading.
 
-References
-----------
-IEC 62053 for accuracy classes; docs/theory-detection.md.
+Source: IEC 62053 for accuracy classes; docs/theory-detection.md.
 """
 
 from __future__ import annotations

@@ -3,11 +3,8 @@
 Everything is balanced three-phase, per phase, in per unit of the base voltage (phase to neutral) and
 of the three-phase base power, so that powers in kW of all phases together divide by `base_kva`.
 
-References
-----------
-.. [1] M. E. Baran, F. F. Wu, "Network reconfiguration in distribution systems for loss reduction and
-   load balancing", IEEE Trans. Power Delivery 4(2), 1989: the DistFlow branch equations.
-.. [2] chong2020, equation (15): the linear form, with service drops as leaf edges of the tree.
+Source: baranwu1989 (branch equations); chong2020 (15), the linear form, with service drops as leaf edges of
+the tree.
 """
 
 from __future__ import annotations

@@ -21,14 +21,7 @@ reactance, active power injected in phase b raises phase a, and in phase a lower
 Powers, voltages and their axes: connections (…, C) of the feeder; buses (…, 3, b + 1), phase before bus.
 The voltage of a phase absent at a bus is that at the end of the phase.
 
-References
-----------
-.. [1] W. H. Kersting, "Distribution System Modeling and Analysis", 3rd ed., CRC Press 2012, chapter 4.
-.. [2] L. Gan, S. H. Low, "Convex relaxations and linear approximation for optimal power flow in multiphase
-   radial networks", Power Systems Computation Conference 2014.
-.. [3] D. B. Arnold, M. Sankur, R. Dobbe, K. Brady, D. S. Callaway, A. von Meier, "Optimal dispatch of
-   reactive power for voltage regulation and balancing in unbalanced distribution systems", IEEE PES General
-   Meeting 2016.
+Source: kersting2012, chapter 4; ganlow2014; arnold2016; docs/theory-three-phase.md.
 """
 
 from __future__ import annotations

@@ -35,10 +35,8 @@ its logarithmic Bayes factor against files without that error is ``g - h / 2``, 
 + 1 / s^2) - log(1 + h s^2)) / 2``. Without any error the expectation of a Bayes factor is 1. So a mean of M
 factors exceeds ``1 / risk`` with at most the probability `risk`, for any dependence between them.
 
-References
-----------
-docs/theory-studies.md, Calibration.
-.. [1] V. Vovk, R. Wang, "E-values: calibration, combination and applications", Annals of Statistics 2021.
+Source: docs/theory-studies.md, Calibration; V. Vovk, R. Wang, "E-values: calibration, combination and
+applications", Annals of Statistics 2021.
 """
 
 from __future__ import annotations

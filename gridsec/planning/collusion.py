@@ -12,9 +12,7 @@ thousands of sets at once. Further meters are bounded by the remainder of g unde
 ``reach_k`` being the largest attack on meter k in any collusion. Branch and bound over J with this bound is
 exact, and prunes most pairs.
 
-References
-----------
-docs/theory-studies.md, section 5.
+Source: docs/theory-studies.md, section 5.
 """
 
 from __future__ import annotations

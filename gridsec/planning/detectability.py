@@ -13,10 +13,8 @@ moment, on s scales and at p meters together, all are within ``H_j`` with probab
 The first two are linear in a but for the number of manipulated meters: `gridsec.planning.collusion` searches
 them.
 
-References
-----------
-D. Hsu, S. Kakade, T. Zhang, "A tail inequality for quadratic forms of subgaussian random vectors", 2012;
-docs/theory-studies.md, section 5; docs/theory-sequential.md, sections 3 to 5.
+Source: D. Hsu, S. Kakade, T. Zhang, "A tail inequality for quadratic forms of subgaussian random vectors",
+2012; docs/theory-studies.md, section 5; docs/theory-sequential.md, sections 3 to 5.
 """
 
 from __future__ import annotations

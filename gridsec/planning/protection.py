@@ -4,9 +4,7 @@ Every successful attack is a set S of manipulated meters; a protection withstand
 protects a meter of S. So the solution is a smallest hitting set with rows generated on demand: protect a set
 that hits all attacks known so far, search for an attack against it, and repeat until there is none.
 
-References
-----------
-docs/theory-studies.md, section 4.
+Source: docs/theory-studies.md, section 4.
 """
 
 from __future__ import annotations

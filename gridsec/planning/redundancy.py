@@ -8,10 +8,8 @@ react. About a trajectory with slopes d of the droop curves,
 is a pair. Its eigenvalue 0 belongs to *persistent patterns*, its other eigenvalues to decaying transients of
 the inverters. Attacks are hidden while they equal such a pattern.
 
-References
-----------
-lee2018, chapter 3; docs/theory-studies.md, section 1.
-lee2018, Definitions 3.1.1 and 3.1.3, Propositions 3.1.2, 3.1.9 and 3.2.2; docs/theory-studies.md, section 2.
+Source: lee2018, chapter 3, Definitions 3.1.1 and 3.1.3, Propositions 3.1.2, 3.1.9 and 3.2.2;
+docs/theory-studies.md, sections 1 and 2.
 """
 
 from __future__ import annotations

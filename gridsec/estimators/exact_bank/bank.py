@@ -11,10 +11,7 @@ contains a small set without manipulated meters. The estimate of the S that agre
 subsets is therefore close to the true state under any attack (Theorem 2). `step` advances all observers at
 once; there is no loop over observers.
 
-References
-----------
-chong2020, equation (11).
-chong2020, equations (5) to (8), Theorem 2.
+Source: chong2020, equations (5) to (8), (11), Theorem 2.
 """
 
 from __future__ import annotations

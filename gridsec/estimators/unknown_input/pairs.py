@@ -23,11 +23,9 @@ and takes the injections of its inverters as unknown inputs. Their columns U of 
 since Q U = 0. Every row f of Q, and of C^T Q, is a test that the rest passes if unmanipulated:
 |f r| <= |f E| h.
 
-References
-----------
-yang2021 (2) and (17), with zero innovation under direct injection; docs/theory-unknown-input.md, 6.
-yang2021 (5), (22): consistency of an observer that distrusts (J_u, J_s) with those within it; (35), (36) for
-the decoupling; (42), (43) for the reconstruction. docs/theory-unknown-input.md, section 6.
+Source: yang2021 (2), (17) with zero innovation under direct injection; (5), (22): consistency of an observer
+that distrusts (J_u, J_s) with those within it; (35), (36): decoupling; (42), (43): reconstruction.
+Derivation: docs/theory-unknown-input.md, section 6.
 """
 
 from __future__ import annotations

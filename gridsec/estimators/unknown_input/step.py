@@ -3,9 +3,8 @@
 A candidate is a pair (suspected meters, suspected inverters) of bounded size. Its unknown-input observer uses
 neither. Unmanipulated inverters follow their curves (`gridsec.estimators.unknown_input.pairs`). The
 injections of the suspected inverters are unknown inputs, up to their rating, determined by the trusted
-readings through 2X. The remainder must be possible for unmanipulated readings
-(`gridsec.estimators.unknown_input.pairs`). Thresholds are worst cases of all uncertainties, so that
-unmanipulated readings never contradict the true pair. Hence:
+readings through 2X. The remainder must be possible for unmanipulated readings. Thresholds are worst cases of
+all uncertainties, so that unmanipulated readings never contradict the true pair. Hence:
 
 1. The true pair is never refuted while no more meters and inverters are attacked than assumed.
 2. Members of every pair that is not refuted are attacked: *named*.
@@ -18,9 +17,7 @@ Active powers are trusted, as in all banks. An inverter with an effect on the re
 cannot be judged, and then the answer is not CLEAN. Meters of class 0.5 alone judge only the largest
 inverters; with reported net reactive power of customers, most are judged.
 
-References
-----------
-yang2021 (2), (5) to (7), (17), (22) to (24), (42) to (47); docs/theory-unknown-input.md, section 6.
+Source: yang2021 (2), (5) to (7), (17), (22) to (24), (42) to (47); docs/theory-unknown-input.md, section 6.
 """
 
 from __future__ import annotations

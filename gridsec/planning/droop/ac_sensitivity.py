@@ -11,12 +11,8 @@ are those of the phases, and without charging Z is `R + j X` of `gridsec.grid.th
 Z is the inverse of the admittance matrix without the busbar (`gridsec.grid.meshed`). Z need not be symmetric,
 its parts may be negative, and the feeder need not be a tree.
 
-References
-----------
-docs/theory-studies.md, section on the droop fleet. The equation in this form: S. Bolognani and S. Zampieri,
-"On the existence and linear approximation of the power flow solution in power distribution networks", IEEE
-Trans. Power Systems 31(1), 2016; C. Wang, A. Bernstein, J.-Y. Le Boudec, M. Paolone, "Explicit conditions on
-existence and uniqueness of load-flow solutions in distribution networks", IEEE Trans. Smart Grid 9(2), 2018.
+Source: docs/theory-studies.md, section on the droop fleet; bolognani2016 and wang2018 for this form of the
+equation.
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
 """Equilibrium of a fleet of droop inverters on the AC feeder, and voltage bounds at rest and at all times.
 
-References
-----------
-docs/theory-studies.md, section on the droop fleet; chong2020, (13).
+Source: docs/theory-studies.md, section on the droop fleet; chong2020, (13).
 """
 
 from __future__ import annotations

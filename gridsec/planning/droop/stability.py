@@ -8,9 +8,7 @@ h = 0 is the first-order filter in continuous time. Two trajectories with the sa
 `e+ = (I - A) e + A psi`, `psi = -Delta Jt e`, where the slopes Delta lie between 0 and D and Jt, a chord of
 the AC power flow, within an error of J (`gridsec.planning.droop.ac_sensitivity.region`).
 
-References
-----------
-docs/theory-studies.md, section on the droop fleet, with proofs.
+Source: docs/theory-studies.md, section on the droop fleet, with proofs.
 """
 
 from __future__ import annotations
