@@ -73,8 +73,6 @@ def put(target: object, **values: object) -> None:
 def not_negative(name: str, values: Floats | float) -> Floats:
     """`values` as doubles; negative values and NaN are refused, infinity passes.
 
-    name: name of the quantity in the error message.
-    values (…): the numbers.
     Raises ValueError if one is negative or NaN.
     """
     out = np.asarray(values, dtype=np.float64)
@@ -117,7 +115,6 @@ def unit_rows(matrix: Floats, *, tol: float) -> Floats:
 
     tol: rows up to this fraction of the longest are zero. An exact zero row comes out of a decomposition at
         about 1e-17; scaled to length one it would have an arbitrary direction.
-    Returns (k, n): rows of length one or zero.
     """
     length = np.linalg.norm(matrix, axis=1, keepdims=True)
     nothing = length <= tol * np.max(length, initial=0.0)
@@ -144,7 +141,6 @@ def exponential_integrals(y: Floats) -> tuple[Floats, Floats, Floats]:
 
     The latter two use their power series near 0, where the formulas cancel.
 
-    y (…): any finite numbers.
     Source: M. Hochbruck, A. Ostermann, "Exponential integrators", Acta Numerica 19, 2010, equation (2.10).
     """
     near = np.abs(y) < 1e-2
@@ -166,8 +162,6 @@ def perron_bound(matrix: Floats, rounds: int) -> float:
 
     The quotient of Collatz and Wielandt, `max_i (|M| v)_i / v_i`, is a bound for every positive v; power
     iteration only tightens it.
-
-    matrix (n, n): any square matrix; signs are ignored.
     """
     if matrix.size == 0:
         return 0.0

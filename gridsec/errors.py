@@ -65,7 +65,6 @@ class _Pickled(BaseException):
 class GridsecError(_Pickled, Exception):
     """Base of every error that this project raises on purpose.
 
-    args: the sentence.
     code: code of the reason: lower case words joined by hyphens; None: that of the class.
     """
 
@@ -107,10 +106,7 @@ class FeederInvalid(Problems, GridsecError):
 
 
 class InputInvalid(Problems, ValueError):
-    """Invalid arguments; `problems` lists every fault at once.
-
-    problems: one clause each: fault and expected value.
-    """
+    """Invalid arguments; `problems` lists every fault at once."""
 
     def __init__(self, problems: Iterable[str]) -> None:
         self.problems = tuple(problems)
@@ -120,10 +116,8 @@ class InputInvalid(Problems, ValueError):
 class NotObservable(GridsecError):
     """A set of meters is too small for the purpose.
 
-    subset: indices of the meters.
     rank: rank that they determine, or the number of meters if the number is too small.
     why: the violated condition, in words.
-    code: code of the condition: lower case words joined by hyphens.
     """
 
     def __init__(self, subset: Iterable[int], rank: int, why: str, *, code: str = "not-observable") -> None:
@@ -154,7 +148,6 @@ class DesignInfeasible(GridsecError):
 def raise_if_any(problems: Iterable[str]) -> None:
     """Raise one error with all problems of an input; return if there are none.
 
-    problems: one clause each: fault and expected value.
     Raises InputInvalid if `problems` is not empty.
     """
     found = tuple(problems)
@@ -177,7 +170,6 @@ Choice = TypeVar("Choice", bound=StrEnum)
 def no_choice(name: str, kind: Iterable[str], *values: str) -> list[str]:
     """Return one problem for each value that is not among the allowed ones.
 
-    name: name of the quantity in the message.
     kind: allowed values: an enumeration, or `typing.get_args` of a `Literal`.
     """
     known = tuple(kind)

@@ -244,11 +244,9 @@ def follow(
 ) -> AccusationWindow:
     """Add one frame to the window; compare at the end of each block.
 
-    design, window: the preparation, and the window so far.
     frame: data of one tick. A frame that is not later than the last, or later by more than a window, restarts
         the window.
     x (m,): estimated injections of the inverters, pu.
-    accused (p,): from `accused`.
     """
     if window.t is not None and not window.t < frame.t <= window.t + MOST_BLOCKS * design.block_s:
         window = AccusationWindow()
@@ -374,7 +372,6 @@ class _Scene:
 def compare(design: DataErrorDesign, rows: Rows, held: DataError | None = None) -> DataError | None:
     """Return the error of the files that explains accused meters at least as well as a manipulation does.
 
-    design, rows: the preparation, and the blocks of a window.
     held: error found before; it stays unless another one is likelier by more than `_STAYS`.
     """
     scene = _scene(design, rows)

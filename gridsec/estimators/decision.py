@@ -33,8 +33,6 @@ def count(tally: Counters, over: Bools, live: Bools, *, confirm: int, release: i
     every second reading does not avoid detection. An unavailable meter keeps its state: a named meter is not
     cleared by silence.
 
-    over (p,): meters with a residual above the threshold.
-    live (p,): meters with a residual.
     confirm, release: readings above the threshold until a meter is named, and consecutive readings below it
         until it is neither named nor suspect.
     """
@@ -145,7 +143,6 @@ def residual_excess(score: Floats, threshold: Floats, live: Bools) -> Floats:
     """Relative excess of residuals over their thresholds; 0 below them.
 
     score, threshold (p,): residuals and thresholds, squared pu.
-    live (p,): meters with a residual.
     """
     ratio = np.divide(score, threshold, out=np.zeros_like(threshold), where=live & (threshold > 0))
     return np.asarray(np.maximum(ratio - 1.0, 0.0))

@@ -61,7 +61,6 @@ def nothing_new(  # noqa: PLR0917  # the last answer, and the values without one
     """Answer to a frame that is not later than the last one: the last answer, never CLEAN.
 
     t: time of the last frame that was used, Unix s.
-    last: last answer; None before the first.
     v0_squared, x: squared busbar voltage (or one for each phase) and injections, pu, for the answer without a
         last one.
     """
@@ -113,10 +112,7 @@ def _power(power: Floats, error: Floats) -> tuple[Floats, Floats]:
 
 
 def reconstruct(setting: EstimatorContext, frame: Frame, inputs: Inputs, q: Floats) -> Reconstruction:
-    """Voltages for given injections, with the loss correction at these; chong2020 (19).
-
-    q (N,): net reactive injections, pu; see `injections`.
-    """
+    """Voltages for given injections, with the loss correction at these; chong2020 (19)."""
     plant, model, correction = setting.plant, setting.model, inputs.correction
     if plant.loss_correction:
         with np.errstate(all="ignore"):
@@ -177,10 +173,7 @@ def _busbar(
 
 
 def busbar_errors(plant: Plant, v0_squared: Floats | float, sigmas: float) -> Floats | float:
-    """Largest error of the squared busbar voltage without manipulation; in three phases (3,) each.
-
-    v0_squared, sigmas: as in `gridsec.grid.meter.busbar_error`.
-    """
+    """Largest error of the squared busbar voltage without manipulation; in three phases (3,) each."""
     if plant.feeder.busbar_phases == 1:
         return busbar_error(plant.accuracy, float(v0_squared), sigmas)
     each = np.broadcast_to(v0_squared, 3).tolist()

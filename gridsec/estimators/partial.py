@@ -140,9 +140,6 @@ def observe(  # noqa: PLR0917  # the observers, their state, and the inputs
 ) -> tuple[TickUncertainty, Reconstruction, Parts, bool]:
     """Advance all observers and their bounds to a frame.
 
-    model: the observer without meters.
-    frame, inputs: the frame, received and prepared.
-    h: time since the last frame, s; 0 for the first one.
     Returns Uncertainty, Reconstruction, Parts, bool: uncertainty without any meter, voltages by the observer
         without meters, new state of the observers, and True once their initial transient is negligible.
     """
@@ -268,7 +265,6 @@ def _split(
 def constants(word: CodeWord, meters: int, max_attacked: int, *, tol: float) -> CorrectionConstants:
     """Theta and kappa_c of lee2018 for a frame: block j is the rows of meter j with the model.
 
-    tol: as in `gridsec.secure.decode.noise.correction_constants`.
     Returns CorrectionConstants: in units of the code word: v_max is the root of the number of unknowns and of
         rows of a meter.
     Source: lee2018, Theorem 2.2.11, with the fading part of section 4.2.1 in every block.

@@ -131,7 +131,6 @@ def check_plant(plant: Plant, *, max_attacked: int, step_s: float, more: Iterabl
 
     max_attacked: M, largest number of simultaneously manipulated meters.
     step_s: expected interval between frames, s.
-    more: further problems, found by the caller.
     Raises ValueError with every problem: meters at no customer, two at one, accuracy of other meters, numbers
         out of range.
     """

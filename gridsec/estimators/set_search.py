@@ -288,10 +288,7 @@ def _settled(
 
 
 def lost(errors: ErrorModel, sure: Floats) -> Floats:
-    """Additional error at every customer without one meter, (N, p): its inverter may inject anything.
-
-    sure (m,): error of each inverter that follows from its own meter, pu.
-    """
+    """Additional error at every customer without one meter, (N, p): its inverter may inject anything."""
     metered, p = errors.meter_of >= 0, errors.meters.size
     more = np.bincount(errors.meter_of[metered], weights=(errors.span - sure)[metered], minlength=p)
     return np.asarray(errors.reach * more)

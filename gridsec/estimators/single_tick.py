@@ -47,7 +47,6 @@ class SetMisfits:
 def check(candidates: int, most: int) -> None:
     """Refuse a search that would take too long.
 
-    candidates, most: number of meters, and largest size of a set.
     Raises DesignInfeasible if there would be more than `MOST_SETS` sets.
     """
     count = sum(comb(candidates, k) for k in range(most + 1))
@@ -185,8 +184,6 @@ def design(
 ) -> SequentialDesign:
     """Design with a decoder; `gridsec.estimators.sequential.init` and `step` run it.
 
-    decoder: from `gridsec.estimators.single_tick`, or a custom one.
-    doubt: uncertainty of the powers of the frames.
     step_s: expected interval between frames, s.
     max_attacked: M, the largest number of accusations.
     alarms_per_year: expected false alarms per year.

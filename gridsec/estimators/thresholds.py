@@ -131,7 +131,6 @@ def gap(model: ErrorModel, now: TickUncertainty, bound: ErrorBound, *, own: bool
     `base_i + sum over undriven inverters 2 X_ik free_k + sum over meters 2 X_ij driven_j
     + the 2M largest of 2 X_ij (free_j - driven_j)`: the worst choice of 2M omitted meters.
 
-    own: restrict to the customers of the inverters.
     Returns (N,) or (m,): bounds, squared pu.
     """
     inverters, column = (model.inverters_own, model.reach_own) if own else (model.inverters, model.reach)
@@ -264,7 +263,6 @@ def advance(
     monotone: with any G that is at least the present bound and at least its own image, the error stays
     below G during the step, and `bound+ = exp(-h/tau) bound + (1 - exp(-h/tau)) reach(G)`.
 
-    bound: bound at the beginning.
     last: the G of the previous step, as first guess.
     Returns ErrorBound, ErrorBound: bound at the end, and this step's G.
     """
@@ -298,9 +296,6 @@ def ceiling(model: ErrorModel, now: TickUncertainty, motion: Motion, floor: Erro
     Without output injection, the saturation of the curves. With it, the map is at most `r + A bound` with a
     matrix A of spectral radius below 1 (the certificate), and `(I - A)^-1 r` plus any multiple of
     `(I - A)^-1 1` is such a level.
-
-    model, now, motion: as in `advance`.
-    floor: lower limit of the level.
     """
     big = model.majorant
     if big is None or not big.L.any():

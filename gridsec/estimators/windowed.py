@@ -164,7 +164,6 @@ def consistency(
 ) -> tuple[float, Floats]:
     """Measures of disagreement, pi and pi_J, over their thresholds.
 
-    bound: error bounds of observers without manipulated meters.
     Returns pi, pi_J scalar, (s,): values above 1 are evidence. NaN while 2M or fewer meters are available.
     Source: yang2019 (8), (17), each entry over the sum of both observers' levels.
     """

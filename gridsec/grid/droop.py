@@ -68,7 +68,6 @@ class Droop:
 
         z (…, m), or the shape of `rows`: `vbar^2 - v^2` at each inverter, pu.
         rows (…): inverter of each entry of `z`; by default the last axis of `z` runs over all inverters.
-        Returns Floats: same shape as `z`, pu of the feeder's base.
         """
         total: Floats | None = None
         for ramp in self._ramps:
@@ -137,11 +136,7 @@ def _pick(values: Floats, rows: Ints | None) -> Floats:
 
 
 def _ramps(z: Floats, q: Floats) -> tuple[list[_Ramp], Floats]:
-    """Ramps with sum K, and the value of K between its two middle breakpoints.
-
-    z (m, 4): breakpoints, descending (they are ascending in v).
-    q (m, 4): values at the breakpoints, non-increasing.
-    """
+    """Ramps with sum K, and the value of K between its two middle breakpoints."""
     # (upper breakpoint, lower breakpoint, zero of the ramp): injecting, middle, absorbing.
     ramps = []
     for left, right, zero in ((0, 1, 1), (1, 2, 2), (2, 3, 2)):
@@ -262,7 +257,6 @@ def preset(name: str) -> DroopCurve:
     %) become `tau = T / ln 10`; a PT1 of 10 s in VDE-AR-N 4105 means `3 tau = 10 s`; AS/NZS 4777.2 requires
     the complete response within 10 s, read here as 95 %, the same `3 tau = 10 s`.
 
-    name: one of `PRESETS`.
     Raises FeederInvalid if `name` is not a preset.
     """
     for curve in _CURVES:
@@ -286,15 +280,11 @@ def fleet(
 ) -> Droop:
     """Fleet of inverters with standard curves.
 
-    customer (m,): customer of each inverter.
-    names (m,) or one: preset of each inverter.
     rated_kva (m,): rated apparent power s, kVA.
-    base_kva: three-phase base power of the feeder, kVA.
     tau (m,): time constants, s; those of the presets for NaN or without the array.
     capability: `fixed`: limits of the preset. `circular`: the output is capped at `sqrt(s^2 - p_gen^2)`,
         chong2020 after (17); the slopes stay.
     p_gen (m,): active power that each inverter generates, pu of the feeder's base; required for `circular`.
-    vbar: reference voltage, pu.
     Raises FeederInvalid if a preset does not exist, a rating is not positive, or an inverter generates above
         its rating.
     """

@@ -275,7 +275,6 @@ def impedances(feeder: MeshedFeeder, buses: Ints) -> Phasors:
 
     with the impedances of the t loops in the middle: no linear system of the feeder's size is solved.
 
-    buses (k,): buses of injected currents.
     Returns (b + 1, k): rise of the voltage of every bus for each of them, pu; 0 at the busbar.
     """
     tree = feeder.tree

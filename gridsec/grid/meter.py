@@ -89,7 +89,6 @@ def busbar_error(accuracy: MeterAccuracy, v0_squared: float, sigmas: float) -> f
     and `|r^2 - v^2| <= e (2 r + e)`.
 
     v0_squared: squared reading, pu.
-    sigmas: as in `reading_error`.
     """
     if accuracy.busbar_class >= 1.0:
         return float("inf")  # no bound from a class of 100 % or more
@@ -103,7 +102,6 @@ def told_error(accuracy: MeterAccuracy, y: Floats, sigmas: float) -> Floats:
     """Largest distance of the true voltage from a squared reading, per meter; compare `busbar_error`.
 
     y (p,): squared readings, pu.
-    sigmas: as in `reading_error`.
     Returns (p,): bounds, squared pu; larger than any voltage for a class of 100 % or more.
     """
     return ToldError.over(accuracy, np.arange(y.size), sigmas).of(y)
@@ -125,7 +123,6 @@ class ToldError:
     def over(cls, accuracy: MeterAccuracy, which: Ints, sigmas: float) -> ToldError:
         """Prepare the bound for a selection of meters.
 
-        accuracy, sigmas: as in `told_error`.
         which (k,): indices of meters; repetitions allowed.
         """
         part = accuracy.class_fraction[which]

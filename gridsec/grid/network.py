@@ -129,7 +129,6 @@ class Network(Protocol):
 
         p, q, v0_squared: as in `bus_voltages`.
         p_error, q_error (N,): largest errors of the powers, pu.
-        steps: corrections, at least 1.
         Returns (n,), (N,), (N,): correction at every place, its change within the intervals, and the distance
             of its first step from the AC power flow, pu; not finite without a bound, as for an invalid busbar
             voltage.

@@ -61,7 +61,6 @@ class PhasedFeeder(InPhases, OfMatrices, OnTree):
         p, q (…, N): net active and reactive injection of each customer (generation positive), pu.
         v0_squared (…, 3) or scalar: squared busbar voltage of each phase, pu.
         steps: as in `gridsec.grid.three_phase.bus_voltages`; 0 gives LinDist3Flow.
-        Returns (…, n): squared voltages, pu.
         """
         given = np.asarray(v0_squared, dtype=np.float64)
         v0 = np.broadcast_to(given, (*given.shape[:-1], len(PHASES)))

@@ -72,7 +72,6 @@ class Feeder(Balanced):
         """Squared voltage of every bus, corrected for losses and charging; O(b), without the N x N matrices.
 
         p, q, v0_squared, steps: as in `loss_correction`; `steps` = 0 gives LinDistFlow.
-        Returns (…, b + 1): squared voltages, pu.
         """
         flows = _linear_flows(self, p, q, v0_squared)
         return _lossy(self, flows, flows, steps).v2
@@ -107,7 +106,6 @@ class Feeder(Balanced):
     ) -> tuple[Floats, Floats]:
         """`loss_correction` and `model_error_bound` of the same operating points, faster than separately.
 
-        p, q, v0_squared, steps: as in `loss_correction`.
         Returns (…, b + 1), (…, N): additive correction of `v^2`, and a bound on the error that remains after
             its first step, pu.
         Raises ValueError if `steps` is below 1.
@@ -126,7 +124,6 @@ class Feeder(Balanced):
         (in practice a few hundredths). Under heavy loads the quotients grow from step to step, so the second
         step must be below a fifth of the first. Otherwise, towards voltage collapse, the bound is infinite.
 
-        p, q, v0_squared: as in `loss_correction`.
         Returns (…, N): bound on the remaining error of `v^2`, pu.
         """
         flows = _linear_flows(self, p, q, v0_squared)
@@ -276,7 +273,6 @@ def common_paths(feeder: Feeder, branch: Floats, buses: Ints) -> Floats:
     up to the parent of the later bus.
 
     branch (b,): quantity of each branch, not negative; for example `feeder.r`.
-    buses (k,): the second bus of each pair.
     Returns (b + 1, k): for every bus and each of `buses`.
     """
     start, whole = feeder.walk.start, path_sums(feeder, branch)
@@ -304,7 +300,6 @@ _TOGETHER = 16384
 def path_sums(feeder: Feeder, branch: Floats) -> Floats:
     """Sum of a branch quantity over the path from the busbar to each bus, with one rounding per branch.
 
-    branch (b,): quantity of each branch.
     Returns (b + 1,): 0 at the busbar.
     """
     out = [0.0]

@@ -110,7 +110,6 @@ def sequence_matrix(positive: Phasors | Floats, zero: Phasors | Floats) -> Phaso
     ``Z_self = (Z_0 + 2 Z_1) / 3`` on the diagonal and ``Z_mutual = (Z_0 - Z_1) / 3`` off the diagonal.
 
     positive, zero (…): positive- and zero-sequence impedance (or admittance), any unit.
-    Returns (…, 3, 3): the matrix in phases, same unit.
     Source: Kersting 2012, chapter 4: the sequence impedances of a transposed line, solved for those of the
         phases.
     """
@@ -161,7 +160,6 @@ def line_problems(z: Phasors, charging: Floats, present: Bools) -> list[Problem]
     """Problems of the impedances and susceptances of a line.
 
     z, charging (3, 3): series impedance and total shunt susceptance, pu.
-    present (3,): phases of the line.
     """
     blocks = (("z", z), ("charging", charging))
     out = [
@@ -341,8 +339,6 @@ def per_customer(feeder: ThreePhaseFeeder, model: LinDist3Flow) -> CustomerFlow:
     A customer's power is split evenly over the phases, and the voltage is the mean of their squares. Powers
     are in kW / S as on a balanced feeder, so that droop curves and meters of `base_kva` apply. On a cable
     without mutual impedance, a single-phase customer has three times the impedance of one on all phases.
-
-    model: from `lindist3flow` or `sensitivities`.
     """
     first = np.searchsorted(feeder.of, np.arange(len(feeder.customers)))
 

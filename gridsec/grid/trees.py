@@ -177,7 +177,6 @@ def _dense(tree: Walk, values: Values) -> Floats | None:
 def meetings(parent: Ints, tree: Walk, buses: Ints) -> Ints:
     """Bus at which the paths to the root of every bus and of each of `buses` meet; O(b k).
 
-    parent (b,): see `walk`.
     buses (k,): the second bus of each pair.
     Returns (b + 1, k): the lowest bus on both paths, themselves included.
     """

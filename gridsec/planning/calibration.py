@@ -260,7 +260,6 @@ def lengthened(places: Places, series: Series) -> Floats:
 def steps(series: Series, meter: int, pieces: int) -> tuple[Floats, list[tuple[float, float]]]:
     """Intervals in which one meter's error may differ from its usual: parts of the recording, and rests.
 
-    pieces: number of intervals with equally many frames.
     Returns (T, p, H), [H pairs]: effect of a relative error in each interval, and its begin and end, s.
     """
     T, p = series.y.shape
@@ -350,9 +349,7 @@ def whitening(
     """Compute the whitening filter.
 
     t (T,): times of the frames, s, ascending.
-    seen (T, p): True where there is a reading.
     S (p, p): covariance of the field, squared pu^2.
-    time_s: its correlation time, s.
     white (T, p): variance of each reading's own noise.
     common (T, p, f): common errors of a frame's readings, one column each, in standard deviations: the noise
         of the busbar's f voltages.
@@ -403,7 +400,6 @@ def increments(t: Floats, seen: Bools, residual: Floats) -> Increments:
     """Products of increments of residuals, free of constants in time.
 
     t (T,): times, s.
-    seen (T, p): True where there is a reading.
     residual (T, p): readings minus model, squared pu.
     """
     step, p = float(np.median(np.diff(t))), residual.shape[1]
@@ -439,8 +435,6 @@ def learn(
 
     white (p,): stated variance of the meters' noise, squared pu^2.
     common (p, p): covariance of the busbar noise's effect at the meters, squared pu^2.
-    guess: centre of the prior.
-    errors: compute standard errors.
     start: initial value of the search; by default `guess`.
     """
     base, begin = (np.log([n.p, n.q, n.time_s, n.white]) for n in (guess, start or guess))
@@ -565,7 +559,6 @@ class HypothesisEvidence:
 def evidence(given: RegressionFit, z: Floats, spread: Floats) -> HypothesisEvidence:
     """Compute the Bayes factor of each hypothesis.
 
-    z (n, H): whitened effect of each hypothesis.
     spread (H,): prior standard deviation of its coefficient; 0 for the coefficient 1.
     """
     projected = given.explained.T @ z
@@ -591,7 +584,6 @@ class Weighed:
 def weigh(log_factor: Floats, kind: Ints, risk: float) -> Weighed:
     """Compare hypotheses; all kinds have equal weight, and within a kind all hypotheses.
 
-    log_factor (H,): from `evidence`.
     kind (H,): kind of each, as a number.
     risk: probability of a proposal for files without errors.
     """
@@ -607,7 +599,6 @@ def weigh(log_factor: Floats, kind: Ints, risk: float) -> Weighed:
 def explain(given: RegressionFit, z: Floats, own: Floats, like: float) -> tuple[Floats, Floats, Bools]:
     """Estimate each coefficient alone, and mark effects that cannot be distinguished.
 
-    z (n, H): whitened effects.
     own (H,): standard deviation of the coefficient among the regressors; it is removed.
     like: smallest correlation of two effects, 1, that count as equal.
     Returns estimate, std (H,): least squares without prior for this coefficient; infinite errors where not

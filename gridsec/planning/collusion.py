@@ -61,7 +61,6 @@ class Shift:
 def corridor(rows: Floats, liars: int, *, reach: Floats) -> Corridor:
     """Tighten the largest attack on each meter, and leave out tests without effect.
 
-    rows (r, p): R.
     liars: M, at least 1.
     reach (p,): a bound of the attack on each meter in any collusion; 0 for protected meters.
     """
@@ -94,7 +93,6 @@ def furthest(given: Corridor, along: Floats, *, must: int | None = None, work: f
 
     along (p,) or (d, p): g; of several rows, the one with the largest displacement.
     must: a meter that is manipulated in any case.
-    work: limit of examined entries of tests.
     """
     search = _Search(given, np.zeros(given.reach.size), work)
     for row in np.atleast_2d(along):

@@ -62,7 +62,6 @@ class Rule:
 def rule(design: SequentialDesign, *, risk: float, model: Floats) -> Rule:
     """Compute the rule of a monitor.
 
-    design: the monitor, with its default search.
     risk: as in `Rule`.
     model: as in `Rule`.
     """
@@ -117,7 +116,6 @@ def largest_shift(
 ) -> Shift:
     """Largest displacement by attacks on at most M meters with all residuals within their bounds.
 
-    given, liars, seen, honest: as in `within`.
     along (p,) or (d, p): displacement per attack on each meter; a unit vector for the attack on one meter
         itself. Of several rows, the one with the largest displacement.
     must: a meter that is manipulated in any case.

@@ -105,8 +105,6 @@ def fewest_protected(
     """Protect the fewest meters such that no attack succeeds.
 
     attacker: returns an attack on every insufficient protection.
-    count: p.
-    never (p,): meters that cannot be protected.
     exact: solve each hitting set to optimality; otherwise repeatedly take the meter in most of the remaining
         attacks, and remove unnecessary meters at the end.
     progress: called with the number of known attacks and the number of meters protected against them.

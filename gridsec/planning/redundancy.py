@@ -77,7 +77,6 @@ def unknown_voltages(feeder: Network, unknown: Ints, *, busbar: bool, tol: float
     voltage are not counted.
 
     unknown (k,): customers with unknown active and reactive powers.
-    busbar: True if the busbar's voltage is unknown as well.
     tol: columns up to this fraction of the longest have no effect. Singular values up to this fraction of the
         largest, of columns of unit length, are zero.
     """
@@ -104,7 +103,6 @@ def from_busbar(feeder: Network) -> Floats:
 def unknown_pair(lure: Lure, slope: Floats, W: Floats) -> tuple[Floats, Floats]:
     """The pair (A, C) of the module's head, with states scaled to similar size.
 
-    lure: closed loop, from `close_loop`.
     slope (m,): slope of each droop curve.
     W (N, d): from `unknown_voltages`.
     """
@@ -153,7 +151,6 @@ def fewest_meters(
 
     honest (p,): meters that cannot be manipulated: only patterns invisible to them remain.
     silent (p,): unavailable meters.
-    must: a meter that is among the manipulated ones.
     below, most: as in `gridsec.secure.index.fewest`.
     Returns Index: infinite without a pattern to imitate.
     Raises DesignInfeasible after `most` nodes; ValueError if `must` is protected or unavailable.
@@ -198,7 +195,6 @@ def _components(seen: Matrix, tol: float) -> list[Matrix]:
     of the bipartite graph of its entries: those of the matroid of the rows.
 
     seen (p, g): image of a basis at each meter.
-    tol: largest entry that counts as zero.
     Returns (g, k) each: orthonormal bases; directions invisible to all meters are left out.
     """
     # Counts do not depend on invisible directions, so their complement suffices.
@@ -236,11 +232,7 @@ class FeederSection:
 
 
 def meter_redundancy(given: Patterns, meter: int, silent: Bools) -> Meter:
-    """Security index of one meter, and the index of the others without it.
-
-    meter: an available meter.
-    silent (p,): unavailable meters.
-    """
+    """Security index of one meter, and the index of the others without it."""
     own = fewest_meters(given, silent=silent, must=meter)
     gone = silent.copy()
     gone[meter] = True
@@ -253,7 +245,6 @@ def part_redundancy(given: Patterns, part: FeederSection, silent: Bools) -> Inde
     All meters outside are unmanipulated. Up to `Index.correctable` manipulated meters, all of them in the
     part, are identified, and no more in general.
 
-    part: from `parts`.
     silent (p,): unavailable meters.
     """
     honest = np.ones(silent.size, dtype=np.bool_)
@@ -266,7 +257,6 @@ def parts(feeder: Feeder | ThreePhaseFeeder, buses: Ints, ties: Ints) -> Sequenc
 
     A part has all phases of its buses.
 
-    feeder: the feeder's tree.
     buses (p,): bus of each meter.
     ties (t, 2): buses at both ends of the lines that close loops.
     """

@@ -124,9 +124,6 @@ def advance(
 
     y (p,): readings; arbitrary where not seen.
     u (l,): known input.
-    seen (p,): available meters.
-    h: length of the step, s.
-    policy: accuracy of the time step.
     """
     inputs = _inputs(lure, gains, y, u, seen)
     prepared = state.prepared if state.prepared.h == h else transition(lure, h, policy)
@@ -264,12 +261,10 @@ def design(
 ) -> Bank:
     """Build both banks.
 
-    lure: the plant with p meters.
     max_attacked: M, largest number of simultaneously manipulated meters.
     gains: `direct`, or gains of all observers in the order of `subsets(p, M).masks()`.
     reactive (l, p): change of u per pu of reactive injection at each meter's customer; direct injection only.
         Needed where net reactive power is metered at customers without an inverter.
-    policy: accuracy of the time steps.
     most: largest acceptable number of observers.
     Raises NotObservable unless p > 2M; DesignInfeasible if there are more than `most` observers, or an
         observer uses none of its meters: the degenerate gains L = K = 0 satisfy every convergence condition
@@ -297,7 +292,6 @@ def lmi_gains(
     """Gains of all observers of a bank by the corrected matrix inequality (12), for `design`.
 
     lure, max_attacked, most: as in `design`.
-    options: from `gridsec.observers.lmi.options_for`.
     workers: processes, as in `gridsec.observers.lmi.solve_many`.
     Raises NotObservable, DesignInfeasible as in `design`, or if an observer cannot be designed.
     Source: chong2020 (12); docs/theory-observers.md.
@@ -343,8 +337,6 @@ def init(bank: Bank, y: Floats, u: Floats, seen: Bools, *, net: Floats | None = 
     y (p,): readings as `z = vbar^2 - v^2`, pu; arbitrary where not seen. A reading that is not finite is not
         seen.
     u (l,): known input w, pu.
-    seen (p,): available meters.
-    net: as in `step`.
     """
     seen = np.asarray(seen & np.isfinite(y))
     if bank.gains is not None:
@@ -432,7 +424,6 @@ def select(
 ) -> int:
     """The large set to trust: smallest pi, ties by smallest penalty, then by number.
 
-    pi (s,): from `consistency`.
     allowed (s,): sets that may be chosen; all by default.
     penalty (s,): criterion for ties. Inside deadbands all observers coincide and every pi is zero.
     tie: sets with a pi up to the smallest pi plus this are ties, pu.
@@ -465,7 +456,6 @@ def believe(bank: Bank, state: BankState) -> tuple[Floats, Bools]:
 def spread(bank: Bank, state: BankState, index: int) -> Floats:
     """`max over P within S of |x_S,i - x_P,i|` for one large set S, inverter by inverter.
 
-    index: number of S.
     Returns (n,): deviations, pu; their maximum is `pi_S`.
     """
     if isinstance(state, SlotState):

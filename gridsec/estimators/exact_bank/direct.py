@@ -233,7 +233,6 @@ def follow(lay: SlotLayout, sets: Subsets, state: SlotState, seen: Bools, adopt:
     returns drives its inverter again, from `adopt` in all observers at once. With 2M or fewer available
     meters only the driven observer continues, on the model alone.
 
-    seen (p,): the new pattern.
     adopt (n,): initial injections of inverters with a returning meter; by default those of the driven
         observer.
     """
@@ -302,7 +301,6 @@ def drive(lay: SlotLayout, y: Floats, u: Floats, seen: Bools, net: Floats | None
 
     y (p,): readings as z; arbitrary where not seen.
     u (l,): known input.
-    seen (p,): available meters.
     net (p,): metered net reactive injection minus the assumed load; NaN where not reported.
     """
     n = lay.driver.size

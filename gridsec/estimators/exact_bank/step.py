@@ -189,7 +189,6 @@ def init(design: MonitorDesign, t: float) -> MonitorState:
 
     design: from `design`. Its certificate is verified again, because a stored or hand-made design may be
         wrong.
-    t: Unix time, s.
     """
     m = design.plant.droop.tau.size
     try:

@@ -141,7 +141,6 @@ def advance(errors: ErrorModel, doubt: AttackAssumption, before: Tubes | None, s
     Voltages between two ticks are assumed within the extremes of their intervals at both.
 
     before: intervals of the last tick; None at the first one, with inverters anywhere on their curves.
-    h: length of the step, s.
     """
     z_own = Tube(seen.z - seen.z_error, seen.z + seen.z_error)
     driven = free = saturated(errors)
@@ -210,7 +209,6 @@ def pairs(gain: Floats, most_meters: int, most_inverters: int) -> tuple[Pairs, t
     have a larger range than either.
 
     gain (p, m): 2X from inverters to meters, in units of the meters' errors.
-    most_meters, most_inverters: largest sets.
     Raises DesignInfeasible if the pairs cannot be tried within a tick.
     """
     p, m = gain.shape
@@ -325,7 +323,6 @@ def try_pair(believed: Believed, inverters: Bools, room: Floats) -> PairResult:
 
     With `G = U^T P U` its tests are those of its meters alone minus `T U G^-1 U^T P`, a matrix of rank |J_u|.
 
-    believed: the tick, without the rows of the pair's meters.
     room (m,): largest possible wrong injection, pu.
     """
     k, h = believed.plain.size, believed.h

@@ -211,10 +211,7 @@ _EXACT = 1e-9
 
 
 def observe(design: UnknownInputDesign, state: UnknownInputState, frame: Frame) -> TickRelations:
-    """Prepare a frame, and advance the intervals of unmanipulated inverters.
-
-    frame: later than the last one.
-    """
+    """Prepare a frame, and advance the intervals of unmanipulated inverters."""
     inputs = clean(design.setting, PreviousStep(state.x, state.v0_squared, state.named), frame)
     h = 0.0 if state.tubes is None else frame.t - state.t
     v2, error, rest = _without_inverters(design, state, frame, inputs)

@@ -135,7 +135,6 @@ def _phased(feeder: PhasedFeeder) -> PhasorNetwork:
 def solve(net: PhasorNetwork, s: Complex, v0: Floats | float) -> Complex:
     """Voltages of the customers by AC power flow; NaN where the iteration does not converge.
 
-    net: from `network`.
     s (…, N): net complex injections (generation positive), pu.
     v0 (…) or scalar: voltage of the busbar, pu.
     Returns (…, N): complex voltages, pu; the busbar has angle 0.

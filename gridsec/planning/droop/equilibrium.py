@@ -51,8 +51,6 @@ def rest(net: PhasorNetwork, droop: Droop, s: Complex, v0: Floats | float) -> tu
     Plain iteration for all operating points together, with damping from the no-load loop gain, and Newton's
     method for points without convergence.
 
-    net: from `gridsec.planning.droop.ac_sensitivity.network`.
-    s (…, N): complex injections without the inverters, pu.
     v0 (…) or scalar: voltage of the busbar, pu.
     Returns (…, m), (…, N): reactive injections, and complex voltages, pu.
     """
@@ -114,7 +112,6 @@ class Band:
 def always(net: PhasorNetwork, droop: Droop, loads: InjectionBox) -> Band:
     """Limits at all times, for any motion of the loads in their box, from any reachable state.
 
-    loads: injections without the droop inverters.
     Raises DesignInfeasible if the box is too large for a bound.
     """
     found = reach(net, droop, loads).region
@@ -128,7 +125,6 @@ def at_rest(net: PhasorNetwork, droop: Droop, loads: InjectionBox) -> Band:
     wrong sign. Two equilibria differ by `dv = Jw dw - Jq Delta dv`; with `|dv| <= U |dw|`,
     `U = (I - |Jq| D)^-1 |Jw|`, the lower end of every sensitivity is `L = Jw - |Jq| D U`.
 
-    net, droop, loads: as in `always`.
     Raises DesignInfeasible if the box is too large for a bound, or the loop gain is 1 or more.
     """
     found, own = reach(net, droop, loads), droop.customer
@@ -174,7 +170,6 @@ def shares(given: Loop, allowed: float) -> Share:
     `lambda_max(D^1/2 S D^1/2) <= a` is `a D^-1 - S >= 0`. A larger d_i subtracts a multiple of `e_i e_i'`, so
     with `w_i = [(a I - D^1/2 S D^1/2)^-1]_ii` the largest factor is `1 / (1 - 1 / (a w_i))`.
 
-    given: the loop; S enters by its symmetric part.
     allowed: a, the allowed gain.
     """
     S = 0.5 * (given.S + given.S.T)

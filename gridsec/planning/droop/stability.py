@@ -105,7 +105,6 @@ class Reach:
 def reach(net: PhasorNetwork, droop: Droop, loads: InjectionBox, *, rounds: int = _REACH_ROUNDS) -> Reach:
     """Shrink the box of the inverters' injections: voltages bound set-points, and set-points voltages.
 
-    net: from `gridsec.planning.droop.ac_sensitivity.network`.
     loads: injections without the droop inverters; a point, or a box in which they move arbitrarily.
     rounds: largest number of rounds; 0 for the saturation of the curves.
     Raises DesignInfeasible if the box is too large for a bound.
@@ -149,7 +148,6 @@ def steepened(droop: Droop, times: float) -> Droop:
     Outer ramps are compressed towards the inner breakpoints; where those do not enclose a deadband, the
     whole curve is compressed towards the middle between them.
 
-    times: factor, above 0.
     Raises FeederInvalid if the first breakpoint of a curve would not be positive.
     """
     v = droop.v.copy()
@@ -267,8 +265,6 @@ def verified(given: Loop, times: float = 1.0) -> bool:
         [*                         G' P G - (2 - eps) ]  <  0,
 
     which is verified here on the numbers.
-
-    times: factor on all slopes.
     """
     m, d = given.tau.size, given.update.dead
     if not m:
@@ -360,7 +356,6 @@ def growth(J: Floats, slope: Floats, tau: Floats, update: Update) -> float:
 
     J (m, m): sensitivities `d|v|/dq` between the inverters at rest, pu.
     slope (m,): slopes of the curves there, `-dq/dv`.
-    tau (m,): time constants, s.
     update: timing. For continuous filters: growth in the smallest time constant.
     """
     if not tau.size:
