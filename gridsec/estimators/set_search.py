@@ -40,7 +40,16 @@ from gridsec.errors import DesignInfeasible, NotObservable, Problem
 from gridsec.estimators import thresholds
 from gridsec.estimators.decision import Counters, DecisionInputs, count, decide, no_counts
 from gridsec.estimators.exact_bank import bank as banks
-from gridsec.estimators.inputs import Inputs, PreviousStep, clean, injections, known, nothing_new, reconstruct
+from gridsec.estimators.inputs import (
+    Inputs,
+    PreviousStep,
+    Reconstruction,
+    clean,
+    injections,
+    known,
+    nothing_new,
+    reconstruct,
+)
 from gridsec.estimators.plant import (
     EstimatorContext,
     Options,
@@ -186,18 +195,9 @@ def init(design: SetSearchDesign, t: float) -> SetSearchState:
 class TrustedEstimate:
     """Estimate of the feeder from the trusted set. N customers, p meters, m inverters."""
 
-    # bank, x, z, bound, level, sure, settled: as in `SetSearchState`, at this frame
-    bank: banks.BankState
-    x: Floats
-    z: Floats
-    bound: ErrorBound
-    level: ErrorBound
-    sure: Floats
-    settled: bool
-    # v2, v2_bus (N,), (b + 1,): reconstructed squared voltages, pu
-    v2: Floats
-    v2_bus: Floats
-    base: Floats  # (N,) error of `v2` for known injections, squared pu
+    state: SetSearchState  # after the frame, with the trusted meters and the answer before it
+    seen: Reconstruction
+    base: Floats  # (N,) error of the voltages for known injections, squared pu
     # score, threshold (p,): residuals, NaN without a reading, and their limits if no trusted meter is
     # manipulated
     score: Floats
@@ -230,21 +230,21 @@ def advance(design: SetSearchDesign, state: SetSearchState, frame: Frame, inputs
     error = thresholds.gap(errors, now, bound)
     threshold = threshold_of(design, seen.v2[at], error[at])
     score = np.where(inputs.live, np.abs(inputs.y - seen.v2[at]), np.nan)
-    return TrustedEstimate(
+    after = replace(
+        state,
+        t=frame.t,
         bank=bank,
         x=x,
         z=z,
+        y=np.where(inputs.live, inputs.z, np.nan),
         bound=bound,
         level=level,
         sure=_sure(design, state, inputs, J, motion),
         settled=state.settled or _settled(design, now, motion, error, threshold),
-        v2=seen.v2,
-        v2_bus=seen.v2_bus,
-        base=now.base,
-        score=score,
-        threshold=threshold,
-        over=inputs.live & (np.nan_to_num(score) > threshold),
+        v0_squared=inputs.v0_squared,
     )
+    over = inputs.live & (np.nan_to_num(score) > threshold)
+    return TrustedEstimate(after, seen, now.base, score, threshold, over)
 
 
 def driven_by(design: SetSearchDesign, J: Bools) -> Bools:
@@ -325,8 +325,9 @@ def _search(design: SetSearchDesign, inputs: Inputs, view: TrustedEstimate, stat
     """Test all sets of at most M dropped meters by the injections that their own readings imply."""
     errors, at, live = design.errors, design.setting.plant.meters, inputs.live
     sets = design.dropped[~(design.dropped & ~live).any(axis=1)]
-    error = (view.base + errors.inverters @ view.sure)[at] + sets @ lost(errors, view.sure)[at].T
-    limit = threshold_of(design, view.v2[at], error)
+    sure = view.state.sure
+    error = (view.base + errors.inverters @ sure)[at] + sets @ lost(errors, sure)[at].T
+    limit = threshold_of(design, view.seen.v2[at], error)
     excess = np.where(live & ~sets, np.nan_to_num(view.score) / limit, 0.0).max(axis=1, initial=0.0)
     fine = np.flatnonzero(excess <= 1.0)
     if not fine.size:
@@ -363,61 +364,49 @@ def _conclude(  # noqa: PLR0917  # design, state and frame, then the results of 
     switched = bool((dropped & ~state.dropped).any())
     # Effect of an attack on the meter's own inverter and, through the model, on those without a trusted
     # meter.
-    driven = driven_by(design, live & ~dropped)
-    free = np.where(driven, view.bound.free, design.errors.span)
-    estimate = Estimate(
-        frame.t, view.v2, _error(design, view, found.torn), view.v2_bus, live & ~dropped, view.x
-    )
-    verdict = _verdict(design, inputs, view, found, tally, dropped, switched)
-    after = SetSearchState(
-        t=frame.t,
-        bank=view.bank,
-        x=view.x,
-        z=view.z,
-        y=np.where(live, inputs.z, np.nan),
-        bound=ErrorBound(view.sure, free) if switched else view.bound,
-        level=thresholds.widest(design.errors) if switched else view.level,
-        sure=view.sure,
-        settled=view.settled and not switched,
+    bound, level, settled = view.state.bound, view.state.level, view.state.settled
+    if switched:
+        free = np.where(driven_by(design, live & ~dropped), bound.free, design.errors.span)
+        bound, level, settled = ErrorBound(view.state.sure, free), thresholds.widest(design.errors), False
+    after = replace(
+        view.state,
+        bound=bound,
+        level=level,
+        settled=settled,
         dropped=dropped,
         innocent=np.where(dropped, innocent, np.inf),
         readings=np.where(dropped, readings, 0),
         tally=tally,
-        v0_squared=inputs.v0_squared,
-        last=(estimate, verdict),
     )
-    return after, estimate, verdict
+    error = _error(design, view, found.torn)
+    estimate = Estimate(frame.t, view.seen.v2, error, view.seen.v2_bus, live & ~dropped, after.x)
+    verdict = _verdict(design, after, inputs, view, found)
+    return replace(after, last=(estimate, verdict)), estimate, verdict
 
 
 def _error(design: SetSearchDesign, view: TrustedEstimate, torn: bool) -> Floats:
     """Half-width of the estimate for any M manipulated meters, detected or not; (N,)."""
-    errors = design.errors
+    errors, sure = design.errors, view.state.sure
     if torn:
         return np.asarray(view.base + errors.inverters @ errors.span)
-    most = thresholds.largest(lost(errors, view.sure), design.setting.max_attacked)
-    return np.asarray(view.base + errors.inverters @ view.sure + most)
+    most = thresholds.largest(lost(errors, sure), design.setting.max_attacked)
+    return np.asarray(view.base + errors.inverters @ sure + most)
 
 
-def _verdict(  # noqa: PLR0917  # all results of one tick
-    design: SetSearchDesign,
-    inputs: Inputs,
-    view: TrustedEstimate,
-    found: _Found,
-    tally: Counters,
-    dropped: Bools,
-    switched: bool,
+def _verdict(
+    design: SetSearchDesign, after: SetSearchState, inputs: Inputs, view: TrustedEstimate, found: _Found
 ) -> Verdict:
-    plant, live = design.setting.plant, inputs.live
+    plant, live, tally = design.setting.plant, inputs.live, after.tally
     decision, cause, reason = decide(
         DecisionInputs(
             names=plant.meter_names,
             max_attacked=design.setting.max_attacked,
             live=live,
-            suspected=(tally.above > 0) | dropped,
+            suspected=(tally.above > 0) | after.dropped,
             named=tally.named,
             wide=live & ~(view.threshold <= design.setting.options.widest),
             valid=True,
-            settled=view.settled and not switched,
+            settled=after.settled,
             busbar=inputs.busbar,
         )
     )
@@ -427,7 +416,7 @@ def _verdict(  # noqa: PLR0917  # all results of one tick
             f"Without any {design.setting.max_attacked} meters, the others contradict each other: "
             "more are manipulated, or the busbar reading, a switch or a line in the model is wrong."
         )
-    attack = np.where(tally.named & live, inputs.y - view.v2[plant.meters], 0.0)
+    attack = np.where(tally.named & live, inputs.y - view.seen.v2[plant.meters], 0.0)
     none = np.zeros(plant.droop.tau.size, dtype=np.bool_)
     share = 1.0 / max(len(found.rivals), 1)
     return Verdict(

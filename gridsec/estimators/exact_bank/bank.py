@@ -21,7 +21,7 @@ from typing import Literal
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, Ints
+from gridsec.arrays import Bools, Floats
 from gridsec.errors import DesignInfeasible, InputInvalid, Problem, no_choice, raise_if_any
 from gridsec.estimators.exact_bank import direct as direct_bank
 from gridsec.estimators.exact_bank.direct import SlotState
@@ -241,8 +241,6 @@ class Bank:
     lure: Lure  # the plant
     sets: Subsets  # sensor subsets and the pairs that are compared
     masks: Bools  # (o, p) meters used by each observer; the C(p, M) large sets first
-    sizes: Ints  # (o,) number of meters of each observer
-    direct: bool  # True for direct injection
     gains: Gains | None  # stacked gains; None for direct injection
     # layout, base: the structured form of direct injection; None otherwise
     layout: direct_bank.SlotLayout | None
@@ -276,14 +274,13 @@ def design(
     p = lure.C.shape[0]
     sets = subsets(p, max_attacked, most=most)
     masks = sets.masks()
-    sizes = masks.sum(axis=1)
     if isinstance(gains, str):
         raise_if_any(no_choice("gains", ("direct",), gains))
         lay = direct_bank.layout(lure, reactive)
         base = direct_bank.make_plan(lay, sets, np.ones(p, dtype=np.bool_))
-        return Bank(lure, sets, masks, sizes, True, None, lay, base, policy)
+        return Bank(lure, sets, masks, None, lay, base, policy)
     _check_gains(lure, masks, gains)
-    return Bank(lure, sets, masks, sizes, False, gains, None, None, policy)
+    return Bank(lure, sets, masks, gains, None, None, policy)
 
 
 def lmi_gains(

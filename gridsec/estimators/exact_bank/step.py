@@ -21,13 +21,22 @@ from typing import Literal
 
 import numpy as np
 
-from gridsec.arrays import Floats, Ints
+from gridsec.arrays import Bools, Floats
 from gridsec.errors import DesignInfeasible
 from gridsec.estimators import thresholds
 from gridsec.estimators.decision import Counters, DecisionInputs, count, decide, no_counts, residual_excess
 from gridsec.estimators.exact_bank import bank as banks
 from gridsec.estimators.exact_bank.bank import StackedState
-from gridsec.estimators.inputs import Inputs, PreviousStep, clean, injections, known, nothing_new, reconstruct
+from gridsec.estimators.inputs import (
+    Inputs,
+    PreviousStep,
+    Reconstruction,
+    clean,
+    injections,
+    known,
+    nothing_new,
+    reconstruct,
+)
 from gridsec.estimators.plant import EstimatorContext, Options, Plant, check_plant, usual_options
 from gridsec.estimators.thresholds import ErrorBound, ErrorModel, Majorant, Motion
 from gridsec.grid.meter import reading_error
@@ -62,7 +71,7 @@ class MonitorDesign:
             self.errors,
             self.options,
             self.bank.sets.max_attacked,
-            self.bank.direct,
+            self.bank.gains is None,
         )
 
     @property
@@ -120,7 +129,8 @@ def design(
     options = usual_options(step_s) if options is None else options
     lure = close_loop(plant.feeder, plant.droop, meters)
     model = plant.feeder.linear()
-    bank = banks.design(lure, max_attacked, gains=gains, reactive=_reactive(model, meters, gains))
+    reactive = -2.0 * model.X[:, meters] if isinstance(gains, str) else None
+    bank = banks.design(lure, max_attacked, gains=gains, reactive=reactive)
     errors = thresholds.error_model(plant.droop, model, meters, max_attacked)
     proven = lure
     if bank.gains is not None:
@@ -129,17 +139,13 @@ def design(
         proven = replace(lure, H=-_loop(lure, big))
     proof = certificate
     if proof is None:
-        proof = _proof(proven) if bank.direct else small_gain(proven)
+        proof = _proof(proven) if bank.gains is None else small_gain(proven)
     margin = verify(proof, proven)
     if not margin > 0:
         raise DesignInfeasible(
             f"{proof.kind} certificate", "the verification fails", margin, code="not-verified"
         )
     return MonitorDesign(plant, model, bank, errors, proof, proven, step_s, options)
-
-
-def _reactive(model: LinDistFlow, meters: Ints, gains: object) -> Floats | None:
-    return -2.0 * model.X[:, meters] if isinstance(gains, str) else None
 
 
 # Decay rate requested from the solver, as a fraction of the slowest inverter's rate.
@@ -251,17 +257,12 @@ class _View:
     """Estimate of the feeder from one selected set of meters, with residuals and bounds."""
 
     index: int
-    x: Floats
-    z: Floats
-    spread: Floats
-    bound: ErrorBound
-    level: ErrorBound
-    settled: bool
-    v2: Floats
-    v2_bus: Floats
+    state: MonitorState  # after the frame, with the counters and the answer before it
+    seen: Reconstruction
     error: Floats  # (N,)
     score: Floats  # (p,) NaN where unavailable
     threshold: Floats  # (p,)
+    over: Bools  # (p,) meters with a score above their threshold
 
 
 def _conclude(  # noqa: PLR0917  # design, state and frame, then the results of this step
@@ -274,11 +275,9 @@ def _conclude(  # noqa: PLR0917  # design, state and frame, then the results of 
 ) -> tuple[MonitorState, Estimate, Verdict]:
     plant, options, live = design.plant, design.options, inputs.live
     view = _select(design, state, frame, inputs, bank, h)
-    over = live & (np.nan_to_num(view.score) > view.threshold)
-    enough = banks.decided(design.bank, bank)
-    tally = state.tally
-    if enough:
-        tally = count(tally, over, live, confirm=options.confirm, release=options.release)
+    after, v2, tally = view.state, view.seen.v2, state.tally
+    if banks.decided(design.bank, bank):
+        tally = count(tally, view.over, live, confirm=options.confirm, release=options.release)
     decision, cause, reason = decide(
         DecisionInputs(
             names=plant.meter_names,
@@ -288,7 +287,7 @@ def _conclude(  # noqa: PLR0917  # design, state and frame, then the results of 
             named=tally.named,
             wide=live & ~(view.threshold <= options.widest),
             valid=state.valid,
-            settled=view.settled,
+            settled=after.settled,
             busbar=inputs.busbar,
         )
     )
@@ -298,26 +297,11 @@ def _conclude(  # noqa: PLR0917  # design, state and frame, then the results of 
     error = view.error
     if np.count_nonzero(tally.named) > design.bank.sets.max_attacked:
         # More manipulated meters than the bank covers: only saturation bounds their effect on the estimate.
-        error = _saturated(design, inputs, frame, view.x)
-    estimate = Estimate(t=frame.t, v2=view.v2, bound=error, v2_bus=view.v2_bus, trusted=trusted, x=view.x)
-    accused = tally.named & live
-    attack = np.where(accused, inputs.y - view.v2[plant.meters], 0.0)
+        error = _saturated(design, inputs, frame, after.x)
+    estimate = Estimate(frame.t, v2, error, view.seen.v2_bus, trusted, after.x)
+    attack = np.where(tally.named & live, inputs.y - v2[plant.meters], 0.0)
     verdict = Verdict(decision, cause, reason, tally.named, view.score, view.threshold, attack)
-    after = MonitorState(
-        t=frame.t,
-        valid=state.valid,
-        bank=bank,
-        x=view.x,
-        z=view.z,
-        spread=view.spread,
-        bound=view.bound,
-        level=view.level,
-        settled=view.settled,
-        tally=tally,
-        v0_squared=inputs.v0_squared,
-        last=(estimate, verdict),
-    )
-    return after, estimate, verdict
+    return replace(after, tally=tally, last=(estimate, verdict)), estimate, verdict
 
 
 def _select(  # noqa: PLR0917  # as _conclude
@@ -342,10 +326,9 @@ def _select(  # noqa: PLR0917  # as _conclude
             allowed = np.asarray(~(masks & excluded).any(axis=1))
             index = banks.select(pi, allowed=allowed, penalty=penalty, tie=tie)
         view = _view(design, state, frame, inputs, bank, index, h)
-        over = live & (np.nan_to_num(view.score) > view.threshold)
-        if index < 0 or not over.any():
+        if index < 0 or not view.over.any():
             return view
-        wanted = excluded | over
+        wanted = excluded | view.over
         if np.count_nonzero(wanted) <= sets.max_attacked:
             if not (masks[index] & wanted).any():
                 return view
@@ -397,12 +380,25 @@ def _view(  # noqa: PLR0917  # as _conclude
         rest = thresholds.gap(errors, now, thresholds.at_rest(errors, now, motion))
         transient = thresholds.gap(errors, now, bound)[at] - rest[at]
         settled = bool(np.all(transient <= design.options.settled * threshold))
-    return _View(index, x, z, spread, bound, level, settled, v2, seen.v2_bus, error, score, threshold)
+    after = replace(
+        state,
+        t=frame.t,
+        bank=bank,
+        x=x,
+        z=z,
+        spread=spread,
+        bound=bound,
+        level=level,
+        settled=settled,
+        v0_squared=inputs.v0_squared,
+    )
+    over = inputs.live & (np.nan_to_num(score) > threshold)
+    return _View(index, after, seen, error, score, threshold, over)
 
 
 def _saturated(design: MonitorDesign, inputs: Inputs, frame: Frame, x: Floats) -> Floats:
     """Error of the estimate (N,) under any attack: inverters saturate, and used reports are plausible."""
     errors = design.errors
     told = np.where(inputs.now.told, 2.0 * frame.q_error[design.plant.meters], 0.0)
-    far = thresholds.widest(errors, None if design.bank.direct else x).free
+    far = thresholds.widest(errors, None if design.bank.gains is None else x).free
     return np.asarray(inputs.now.base + errors.inverters @ far + errors.reach @ told)

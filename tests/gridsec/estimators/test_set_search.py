@@ -117,12 +117,12 @@ def test_the_search_finds_what_brute_force_finds() -> None:
         for j in set(range(9)) - set(D):
             off = view.base[j]
             for i, customer in enumerate(plant.droop.customer):
-                known = view.sure[i] if customer not in D else made.errors.span[i]
+                known = view.state.sure[i] if customer not in D else made.errors.span[i]
                 off += 2.0 * abs(X[j, customer]) * known
-            v = np.sqrt(view.v2[j] + off)
+            v = np.sqrt(view.seen.v2[j] + off)
             accuracy = plant.accuracy
             e = accuracy.class_fraction[j] * v + accuracy.resolution[j] / 2 + 4.0 * accuracy.jitter[j]
-            fits &= bool(abs(frame.y[j] - view.v2[j]) <= off + e * (2.0 * v + e))
+            fits &= bool(abs(frame.y[j] - view.seen.v2[j]) <= off + e * (2.0 * v + e))
         if fits:
             passing.append(D)
     assert passing == [(2, 6)]
