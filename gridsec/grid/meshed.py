@@ -31,12 +31,12 @@ from scipy.sparse.linalg import splu
 
 from gridsec.arrays import Bools, Floats, Ints, Phasors, frozen, frozen_ints, put
 from gridsec.errors import FeederInvalid, Problem, wrong_shapes
+from gridsec.grid import three_phase
 from gridsec.grid.intervals import Sweeps, bounds
 from gridsec.grid.network import Balanced, InPhases, LinDistFlow, OfMatrices, WithMatrices, unbounded
 from gridsec.grid.phased import PhasedFeeder
-from gridsec.grid.radial import Feeder, common_paths
-from gridsec.grid.three_phase import PHASES, ROTATION, ThreePhaseFeeder, customers_at, line_problems, named
-from gridsec.grid.three_phase import common_paths as phase_paths
+from gridsec.grid.radial import Feeder, common_paths, line_problems
+from gridsec.grid.three_phase import PHASES, ROTATION, ThreePhaseFeeder, customers_at, named
 from gridsec.grid.trees import OnTree
 
 
@@ -254,14 +254,7 @@ def _problems(feeder: MeshedFeeder) -> list[Problem]:
         )
         if one == other:
             out.append(Problem("self-loop", f"tie {k}: both ends are bus {one}; a line needs two"))
-        for what in ("r", "x", "charging"):
-            value = getattr(feeder, what)[k]
-            if not (np.isfinite(value) and value >= 0):
-                out.append(
-                    Problem("negative", f"tie {k}: {what} is {value}; it must be finite and not negative")
-                )
-        if feeder.r[k] == 0 and feeder.x[k] == 0:
-            out.append(Problem("zero-impedance", f"tie {k}: r and x are both 0; fuse the two buses"))
+        out.extend(line_problems(f"tie {k}", feeder.r[k], feeder.x[k], feeder.charging[k]))
     return out
 
 
@@ -416,7 +409,7 @@ def _phased_problems(feeder: PhasedMesh) -> list[Problem]:
             out.append(Problem("self-loop", f"{where}: both ends are bus {one}; a line needs two"))
         if not here.any():
             out.append(Problem("no-phase", f"{where}: it has no phase; expected one, two or three"))
-        lines = line_problems(feeder.z[k], feeder.charging[k], here)
+        lines = three_phase.line_problems(feeder.z[k], feeder.charging[k], here)
         out.extend(Problem(problem.code, f"{where}: {problem}") for problem in lines)
     return out
 
@@ -431,7 +424,7 @@ def _impedances(feeder: PhasedMesh) -> Phasors:
     tree = feeder.tree
 
     def paths(bus: Ints, phase: Ints) -> Phasors:
-        found = phase_paths(tree, tree.z, bus, phase)
+        found = three_phase.common_paths(tree, tree.z, bus, phase)
         return np.moveaxis(found, 0, 1).reshape(3 * len(tree.buses), bus.size)
 
     Z = paths(tree.at, tree.phase)

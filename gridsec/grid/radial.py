@@ -247,14 +247,7 @@ def _problems(feeder: Feeder) -> list[Problem]:
                     "not-radial", f"{where}: parent {feeder.parent[k]} does not precede it; expected 0 to {k}"
                 )
             )
-        for what in ("r", "x", "charging"):
-            value = getattr(feeder, what)[k]
-            if not (np.isfinite(value) and value >= 0):
-                out.append(
-                    Problem("negative", f"{where}: {what} is {value}; it must be finite and not negative")
-                )
-        if feeder.r[k] == 0 and feeder.x[k] == 0:
-            out.append(Problem("zero-impedance", f"{where}: r and x are both 0; fuse the two buses"))
+        out.extend(line_problems(where, feeder.r[k], feeder.x[k], feeder.charging[k]))
     for j, bus in enumerate(feeder.bus):
         if not 0 <= bus <= branches:
             out.append(
@@ -264,6 +257,18 @@ def _problems(feeder: Feeder) -> list[Problem]:
                 )
             )
     return out + duplicates(feeder)
+
+
+def line_problems(where: str, r: float, x: float, charging: float) -> list[Problem]:
+    """Problems of the impedance and the susceptance of a line, pu."""
+    out = [
+        Problem("negative", f"{where}: {what} is {value}; it must be finite and not negative")
+        for what, value in (("r", r), ("x", x), ("charging", charging))
+        if not (np.isfinite(value) and value >= 0)
+    ]
+    if r == 0 and x == 0:
+        out.append(Problem("zero-impedance", f"{where}: r and x are both 0; fuse the two buses"))
+    return out
 
 
 def common_paths(feeder: Feeder, branch: Floats, buses: Ints) -> Floats:

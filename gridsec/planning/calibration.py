@@ -322,7 +322,6 @@ class Whitening:
     # are 0
     inverse: Floats
     gain: Floats  # (T, m, p) Kalman gain
-    log_det: float  # logarithm of the determinant of the readings' covariance
 
     def __call__(self, columns: Floats) -> Floats:
         """Whiten columns (T, p, k): normalised innovations, in standard deviations."""
@@ -359,7 +358,7 @@ def whitening(
     p, m = L.shape
     decay = np.append(np.exp(-np.diff(t) / time_s), 0.0)
     inverse, gain = np.zeros((t.size, p, p)), np.zeros((t.size, m, p))
-    P, log_det = np.eye(m), 0.0
+    P = np.eye(m)
     for k in range(t.size):
         rows = np.flatnonzero(seen[k])
         if rows.size:
@@ -367,16 +366,14 @@ def whitening(
             cross = P @ own.T
             covariance = own @ cross + extra @ extra.T
             covariance[np.diag_indices_from(covariance)] += white[k, rows]
-            C = np.linalg.cholesky(covariance)
-            half = solve_triangular(C, np.eye(rows.size), lower=True)
+            half = solve_triangular(np.linalg.cholesky(covariance), np.eye(rows.size), lower=True)
             inverse[k][np.ix_(rows, rows)] = half
             K = cross @ half.T @ half
             gain[k][:, rows] = K
             P = P - K @ cross.T
             P = 0.5 * (P + P.T)
-            log_det += 2.0 * float(np.log(C.diagonal()).sum())
         P = decay[k] ** 2 * P + (1.0 - decay[k] ** 2) * np.eye(m)
-    return Whitening(L, decay, inverse, gain, log_det)
+    return Whitening(L, decay, inverse, gain)
 
 
 def _modes(S: Floats, white: Floats) -> Floats:

@@ -67,8 +67,6 @@ from gridsec.estimators.unknown_input.pairs import (
 from gridsec.interface import Cause, Decision, Estimate, Explanation, Frame, Verdict
 
 __all__ = [
-    "Answer",
-    "PairResults",
     "TickRelations",
     "UnknownInputDesign",
     "UnknownInputState",
@@ -279,21 +277,6 @@ def _seen(design: UnknownInputDesign, inputs: Inputs, believed: Bools, v2: Float
     )
 
 
-Answer = tuple[Decision, Cause, str]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PairResults:
-    """Result of the pairs of one tick. p meters, m inverters."""
-
-    # meters, inverters (p,), (m,): members of every possible pair
-    meters: Bools
-    inverters: Bools
-    threshold: Floats  # (p,) largest score of each meter without manipulation, squared pu
-    trial: PairResult  # result of the likeliest pair
-    explanations: tuple[Explanation, ...]  # the smallest possible pairs where there are several
-
-
 _SHOWN = 8
 
 
@@ -317,12 +300,19 @@ def answer(
     design: UnknownInputDesign,
     state: UnknownInputState,
     tick: TickRelations,
-    found: PairResults,
-) -> Answer:
-    """Decision, cause and one sentence; `estimators.decision` decides on meters as for every estimator."""
+    *,
+    trial: PairResult,
+    threshold: Floats,
+    explanations: tuple[Explanation, ...],
+) -> tuple[Decision, Cause, str]:
+    """Decision, cause and one sentence; `estimators.decision` decides on meters as for every estimator.
+
+    state: after the tick, with the members of every possible pair named. trial: result of the likeliest pair.
+    threshold (p,): largest score of each meter without manipulation, squared pu.
+    explanations: the smallest possible pairs where there are several.
+    """
     now, live = design.setting, tick.inputs.live
-    plant = now.plant
-    meters, inverters, explanations = found.meters, found.inverters, found.explanations
+    plant, meters, inverters = now.plant, state.named, state.inverters
     customers = plant.feeder.customers
     names = plant.meter_names
     owners = [customers[c] for c in plant.droop.customer]
@@ -335,7 +325,7 @@ def answer(
             live=live,
             suspected=np.zeros(live.size, dtype=np.bool_),
             named=meters,
-            wide=live & ~(found.threshold <= now.options.widest),
+            wide=live & ~(threshold <= now.options.widest),
             valid=True,
             settled=bool(memory <= now.options.settled),
             busbar=tick.inputs.busbar,
@@ -361,12 +351,12 @@ def answer(
     elif base[0] is Decision.CLEAN and pending.any():
         base = *ambiguous, "Readings were further off than allowed lately, but not often enough."
     elif base[0] is Decision.CLEAN:
-        deaf = deaf_inverters(design, found.trial)
+        deaf = deaf_inverters(design, trial)
         unjudged = _list(np.zeros_like(live), deaf, names, owners)
         base = (
             (*ambiguous, f"No meter disagrees, but readings are too coarse to judge {unjudged}.")
             if deaf.any()
-            else (*base[:2], _agreement(design, found.trial, owners))
+            else (*base[:2], _agreement(design, trial, owners))
         )
     return base
 
@@ -512,8 +502,9 @@ def _conclude(
     score, threshold = _scores(tick, both.meters[chosen], both.inverters[chosen], trial)
     explanations = explain(design.pairs, trials, order) if len(order) > 1 else ()
     v2 = estimate.v2[design.setting.plant.meters]
+    after = replace(state, x=x, v0_squared=inputs.v0_squared, named=meters, inverters=inverters)
     verdict = Verdict(
-        *answer(design, state, tick, PairResults(meters, inverters, threshold, trial, explanations)),
+        *answer(design, after, tick, trial=trial, threshold=threshold, explanations=explanations),
         meters,
         score,
         threshold,
@@ -523,10 +514,7 @@ def _conclude(
         (),
         explanations,
     )
-    after = replace(
-        state, x=x, v0_squared=inputs.v0_squared, named=meters, inverters=inverters, last=(estimate, verdict)
-    )
-    return after, estimate, verdict
+    return replace(after, last=(estimate, verdict)), estimate, verdict
 
 
 def _estimate(
