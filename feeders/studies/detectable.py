@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from contextlib import closing
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,7 +19,7 @@ import pandas as pd
 from feeders.format.tables import FeederTables
 from feeders.model.load_uncertainty import load_doubt
 from feeders.model.site import from_tables, plant
-from feeders.studies.journal import Journal, Progress, Where
+from feeders.studies.journal import Progress, Where, run_pieces
 from feeders.studies.operating import SHARE, box, volts_of_lie
 from feeders.studies.unobservable import CurvePositions
 from feeders.studies.workers import Here, Runner, cores
@@ -148,33 +147,20 @@ def detectable(
         "share": share,
         "risk": risk,
     }
-    asked = _Asked(site.tables, max_attacked, share, risk)
-    given = _Given.of(site, asked)  # errors of the arguments occur here, not in a worker
-    keys = [f"meter|{j}" for j in range(site.meters.size)]
-    keys += [f"customer|{i}" for i in range(site.feeder.bus.size)]
+    asked = site.tables, max_attacked, share, risk
+    given = _Given.of(site, *asked[1:])  # errors of the arguments occur here, not in a worker
     here = runner is None or isinstance(runner, Here)
-    work = partial(_row, given) if here else partial(_worked, asked)
-    with Journal(journal, subject, of=len(keys)) as kept:
-        todo = [piece for piece, key in enumerate(keys) if key not in kept]
-        done = len(keys) - len(todo)
-        if progress is not None:
-            progress(done, len(keys))
-        with closing((runner or Here()).run(work, todo)) as results:
-            for piece, row in results:
-                kept.put(keys[piece], row)
-                done += 1
-                if progress is not None:
-                    progress(done, len(keys))
-        rows = [kept[key] for key in keys]
-    return Detectable(
-        site.feeder.name,
-        site.digest,
-        max_attacked,
-        risk,
-        pd.DataFrame(rows[: site.meters.size]),
-        pd.DataFrame(rows[site.meters.size :]),
-        share,
+    p = site.meters.size
+    rows = run_pieces(
+        journal,
+        subject,
+        [*(f"meter|{j}" for j in range(p)), *(f"customer|{i}" for i in range(site.feeder.bus.size))],
+        partial(_row, given) if here else partial(_worked, *asked),
+        runner=runner or Here(),
+        progress=progress,
     )
+    meters, customers = pd.DataFrame(rows[:p]), pd.DataFrame(rows[p:])
+    return Detectable(site.feeder.name, site.digest, max_attacked, risk, meters, customers, share)
 
 
 def workers(site: Site, count: int | None) -> Runner:
@@ -190,16 +176,6 @@ def workers(site: Site, count: int | None) -> Runner:
     return Here() if count is None and site.meters.size < MANY else cores(count)
 
 
-@dataclass(frozen=True, slots=True)
-class _Asked:
-    """Arguments of the study, for workers."""
-
-    tables: FeederTables
-    max_attacked: int
-    share: float
-    risk: float
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Given:
     """Common data of all rows. Corridors are by detection and number of manipulated meters."""
@@ -212,33 +188,31 @@ class _Given:
     claims: Floats
 
     @classmethod
-    def of(cls, site: Site, asked: _Asked) -> _Given:
-        given = monitor_rule(site, risk=asked.risk, share=asked.share)
+    def of(cls, site: Site, max_attacked: int, share: float, risk: float) -> _Given:
+        given = monitor_rule(site, risk=risk, share=share)
         return cls(
             site,
-            asked.max_attacked,
+            max_attacked,
             given,
             {
                 (seen, count): within(given, count, seen=seen)
                 for seen in (False, True)
-                for count in (1, asked.max_attacked)
+                for count in (1, max_attacked)
             },
-            box(site, share=asked.share, curves=CurvePositions.DEADBAND),
-            _claims(site, given, asked.share),
+            box(site, share=share, curves=CurvePositions.DEADBAND),
+            _claims(site, given, share),
         )
 
 
-# Last preparation of this process, and its arguments.
-_prepared: list[tuple[_Asked, _Given]] = []
+@lru_cache(maxsize=1)
+def _prepared(tables: FeederTables, max_attacked: int, share: float, risk: float) -> _Given:
+    """Common data of all rows, computed once in each process."""
+    return _Given.of(from_tables(tables), max_attacked, share, risk)
 
 
-def _worked(asked: _Asked, piece: int) -> dict[str, Any]:
-    """One row in any process; the common data are computed once in each."""
-    given = next((made for what, made in _prepared if what == asked), None)
-    if given is None:
-        given = _Given.of(from_tables(asked.tables), asked)
-        _prepared[:] = [(asked, given)]
-    return _row(given, piece)
+def _worked(tables: FeederTables, max_attacked: int, share: float, risk: float, piece: int) -> dict[str, Any]:
+    """One row in any process."""
+    return _row(_prepared(tables, max_attacked, share, risk), piece)
 
 
 def _row(given: _Given, piece: int) -> dict[str, Any]:

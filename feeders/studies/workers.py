@@ -33,7 +33,6 @@ __all__ = [
     "WorkerLost",
     "agree",
     "cores",
-    "versions",
 ]
 
 Work = Callable[[int], Any]

@@ -8,22 +8,18 @@ honest frames and then the attack.
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import closing
 from dataclasses import asdict, dataclass
-from functools import cache, partial
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 
-from feeders.format.tables import FeederTables
-from feeders.model.site import from_tables
 from feeders.simulation.attacks import AttackKind
 from feeders.studies.campaign.plan import AttackClass, Promise
 from feeders.studies.detectable import Detectable, monitor_rule
-from feeders.studies.journal import Journal, Progress, Where, worked
+from feeders.studies.journal import Progress, Where, run_pieces
 from feeders.studies.operating import SHARE, squared, volts_of_lie
-from feeders.studies.workers import Here, Runner
 from gridsec.arrays import Bools, Floats
 from gridsec.estimators import sequential
 from gridsec.estimators.sequential import LoadDoubt
@@ -33,7 +29,7 @@ from gridsec.planning.detectability import Rule, largest_shift
 if TYPE_CHECKING:
     from feeders.model.site import Site
 
-__all__ = ["Rehearsal", "promised", "rehearse", "rehearse_everywhere"]
+__all__ = ["Rehearsal", "promised", "rehearse"]
 
 
 _HONEST, _LYING = 4, 16
@@ -124,8 +120,8 @@ def rehearse(
         named = _named(given, site, share, rng, sign * lies)
         return [int(caught), int(not named[j]), int((named & (lies == 0.0)).any())]
 
-    done = worked(journal, subject, ((str(k), partial(trial, k)) for k in range(trials)), progress)
-    return Rehearsal(trials, *(sum(each[i] for each in done.values()) for i in range(3)))
+    counts = run_pieces(journal, subject, [str(k) for k in range(trials)], trial, progress=progress)
+    return Rehearsal(trials, *(sum(each[i] for each in counts) for i in range(3)))
 
 
 def _large(site: Site, found: Detectable, rng: np.random.Generator, j: int, *, together: bool) -> Floats:
@@ -214,9 +210,6 @@ def _bounded(rng: np.random.Generator, size: int) -> Floats:
     return np.asarray(np.sqrt(3.0) * rng.uniform(-1.0, 1.0, size))
 
 
-PIECE = 1_000
-"""Trials per piece of work."""
-
 HIDDEN, NAMED = (0.5, 1.0), (1.0, 1.2)
 """Factors on the sizes of attacks to stay hidden, and of attacks to be named."""
 
@@ -277,74 +270,3 @@ def _collusions(site: Site, found: Detectable, share: float) -> tuple[tuple[floa
     volts = [np.sign(lies) * volts_of_lie(base, np.abs(lies)) for lies in worst]
     volts = [np.where(np.abs(row) > NOTHING, row, 0.0) for row in volts]
     return tuple(tuple(row.tolist()) for row in volts if row.any())
-
-
-def rehearse_everywhere(
-    site: Site,
-    found: Detectable,
-    *,
-    trials: int,
-    seed: int = 0,
-    share: float = SHARE,
-    runner: Runner | None = None,
-    piece: int = PIECE,
-    journal: Where = None,
-    progress: Progress | None = None,
-) -> Rehearsal:
-    """`guarantees.rehearse` in pieces, for any runner.
-
-    Parameters
-    ----------
-    site, found, trials, share
-        As in `rehearse`.
-    seed
-        Seed of all random numbers; piece k has the seed `seed + k piece`.
-    runner
-        Runner of the pieces, see `feeders.studies.workers`.
-    piece
-        Trials per piece.
-    journal
-        File of finished pieces.
-    progress
-        Called with (done, total) trials.
-
-    Raises
-    ------
-    OtherStudy
-        If the journal is that of another study.
-    InUse
-        If another process writes the journal.
-    ClusterUnusable, WorkerLost
-        From the runner; finished pieces are in the journal.
-    """
-    subject = {
-        "study": "rehearsal",
-        "digest": site.digest,
-        "found": {"max_attacked": found.max_attacked, "risk": found.risk},
-        "trials": [trials, piece],
-        "seed": seed,
-        "share": share,
-    }
-    sizes = [min(piece, trials - begin) for begin in range(0, trials, piece)]
-    work = partial(_piece, site.tables, found, sizes, seed, share)
-    with Journal(journal, subject, of=len(sizes)) as kept:
-        todo = [k for k in range(len(sizes)) if str(k) not in kept]
-        done = trials - sum(sizes[k] for k in todo)
-        if progress is not None:
-            progress(done, trials)
-        with closing((runner or Here()).run(work, todo)) as results:
-            for k, counted in results:
-                kept.put(str(k), counted)
-                done += sizes[k]
-                if progress is not None:
-                    progress(done, trials)
-        counts = [kept[str(k)] for k in range(len(sizes))]
-    return Rehearsal(trials, *(sum(each[i] for each in counts) for i in range(3)))
-
-
-def _piece(  # noqa: PLR0917  # all that a worker needs
-    tables: FeederTables, found: Detectable, sizes: list[int], seed: int, share: float, k: int
-) -> list[int]:
-    begin = sum(sizes[:k])
-    seen = rehearse(from_tables(tables), found, trials=sizes[k], seed=seed + begin, share=share)
-    return [seen.hidden_named, seen.large_missed, seen.honest_named]

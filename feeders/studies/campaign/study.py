@@ -10,9 +10,8 @@ docs/studies.md; docs/theory-studies.md.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import closing
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -23,8 +22,8 @@ from feeders.format.tables import FeederTables
 from feeders.model.site import from_tables
 from feeders.studies.campaign.plan import CLEAN, CampaignPlan, Promise
 from feeders.studies.campaign.scene import Prepared, prepare, watch
-from feeders.studies.journal import Journal, Progress, Where
-from feeders.studies.workers import Here, Runner, versions
+from feeders.studies.journal import Progress, Where, run_pieces, versions
+from feeders.studies.workers import Here, Runner
 from gridsec.errors import GridsecError
 
 if TYPE_CHECKING:
@@ -360,51 +359,30 @@ def campaign(
     plan = CampaignPlan() if plan is None else plan
     plan = plan if seed is None else replace(plan, seed=seed)
     prepare(site, plan)  # errors of the plan occur here, not in a worker
-    used = versions()
-    subject = {
-        "study": "campaign",
-        "rows": ROWS,
-        "digest": site.digest,
-        "plan": plan.subject,
-    }
-    with Journal(journal, subject, of=plan.scenes) as kept:
-        rows = _played(site, plan, runner or Here(), kept, progress)
-    return _campaign(site, plan, used, rows)
+    subject = {"study": "campaign", "rows": ROWS, "digest": site.digest, "plan": plan.subject}
+    scenes = run_pieces(
+        journal,
+        subject,
+        [f"scene|{scene}" for scene in range(plan.scenes)],
+        partial(_scene, site.tables, plan),
+        runner=runner or Here(),
+        progress=None if progress is None else lambda done, _: progress(done * plan.together, plan.scenarios),
+    )
+    return _campaign(site, plan, [row for rows in scenes for row in rows])
 
 
-def _played(
-    site: Site, plan: CampaignPlan, runner: Runner, kept: Journal, progress: Progress | None
-) -> list[dict[str, Any]]:
-    """Rows of all scenes; scenes that the journal lacks are simulated."""
-    keys = [f"scene|{scene}" for scene in range(plan.scenes)]
-    todo = [scene for scene, key in enumerate(keys) if key not in kept]
-    done = plan.scenes - len(todo)
-    if progress is not None:
-        progress(done * plan.together, plan.scenarios)
-    with closing(runner.run(partial(_scene, site.tables, plan), todo)) as results:
-        for scene, rows in results:
-            kept.put(keys[scene], rows)
-            done += 1
-            if progress is not None:
-                progress(done * plan.together, plan.scenarios)
-    return [row for key in keys for row in kept[key]]
-
-
-# Last preparation of this process, and its arguments.
-_prepared: list[tuple[str, Prepared]] = []
+@lru_cache(maxsize=1)
+def _prepared(tables: FeederTables, plan: CampaignPlan) -> Prepared:
+    """Designs of a campaign, made once in each process."""
+    return prepare(from_tables(tables), plan)
 
 
 def _scene(tables: FeederTables, plan: CampaignPlan, scene: int) -> list[dict[str, Any]]:
-    """Simulate a scene in any process; designs are made once in each process."""
-    asked = repr((tables, plan))
-    given = next((made for what, made in _prepared if what == asked), None)
-    if given is None:
-        given = prepare(from_tables(tables), plan)
-        _prepared[:] = [(asked, given)]
-    return watch(given, scene)
+    """Simulate a scene in any process."""
+    return watch(_prepared(tables, plan), scene)
 
 
-def _campaign(site: Site, plan: CampaignPlan, used: dict[str, str], rows: list[dict[str, Any]]) -> Campaign:
+def _campaign(site: Site, plan: CampaignPlan, rows: list[dict[str, Any]]) -> Campaign:
     if all(row["reason"] for row in rows):
         raise NothingPlayed(
             f"{site.feeder.name}: no scenario can be simulated; the first: {rows[0]['reason']}"
@@ -423,7 +401,7 @@ def _campaign(site: Site, plan: CampaignPlan, used: dict[str, str], rows: list[d
         feeder=site.feeder.name,
         digest=site.digest,
         plan=plan,
-        versions=used,
+        versions=versions(),
         scenarios=found,
         liars=liars,
         **by,
