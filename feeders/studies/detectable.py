@@ -100,22 +100,16 @@ def detectable(
 ) -> Detectable:
     """Find the smallest attacks that are named for sure, and the largest that stay unnoticed.
 
+    Inverters are in their deadbands. The result is the same for every runner.
+
     Parameters
     ----------
-    site
-        The feeder.
     max_attacked
         M: largest number of manipulated meters.
     share
-        Load relative to its peak, the same for all, 1; inverters are in their deadbands.
+        Load relative to its peak, the same for all, 1.
     risk
         Probability that honest errors exceed the monitor's limits.
-    runner
-        `workers.Here`, `Processes` or `Dask`; the results are equal.
-    journal
-        File of finished work; an interrupted study resumes from it.
-    progress
-        Called with (done, total).
 
     Raises
     ------
@@ -164,15 +158,7 @@ def detectable(
 
 
 def workers(site: Site, count: int | None) -> Runner:
-    """Fastest runner for a feeder's study.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    count
-        Number of processes; by default all cores, from MANY meters on.
-    """
+    """Fastest runner for a feeder's study: `count` processes; by default all cores, from MANY meters on."""
     return Here() if count is None and site.meters.size < MANY else cores(count)
 
 
@@ -223,11 +209,6 @@ def _row(given: _Given, piece: int) -> dict[str, Any]:
 
 def monitor_rule(site: Site, *, risk: float = RISK, share: float = SHARE) -> Rule:
     """Rule of the sequential monitor with the settings of the feeder's files.
-
-    Parameters
-    ----------
-    site, risk, share
-        As in `detectable`.
 
     Raises
     ------

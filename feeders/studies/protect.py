@@ -52,8 +52,6 @@ class Protect:
 
     Attributes
     ----------
-    feeder, digest
-        Name and content digest of the feeder.
     goal, max_attacked, attack, lie_volt
         Requested or default question: M, the attacks that count, and the bound of attacks (NaN for goals
         without one).
@@ -97,9 +95,8 @@ class Protect:
     def no_answer(self) -> bool:
         """True if the goal requires no protection on this feeder, which is no safety.
 
-        Attacks that are to be identified or noticed hide behind unknown powers. With all powers known no
-        attack is exactly consistent, however small. Sizes of attacks within honest errors are not part of
-        these goals.
+        With all powers known no attack is exactly consistent, however small. Sizes of attacks within honest
+        errors are not part of the goals `IDENTIFY` and `NOTICE`.
         """
         return not self.goal.in_volts and math.isinf(self.before)
 
@@ -143,10 +140,10 @@ def protect(
 ) -> Protect:
     """Find the fewest meters to protect; a protected meter cannot be manipulated.
 
+    `progress` is called with the number of known attacks, and of meters protected against them.
+
     Parameters
     ----------
-    site
-        The feeder.
     max_attacked
         M: largest number of manipulated meters among the others.
     goal
@@ -170,10 +167,6 @@ def protect(
         Meters that cannot be protected.
     exact
         True: prove the smallest number; otherwise greedy, with `gap`.
-    journal
-        File of attacks found; an interrupted study resumes from it.
-    progress
-        Called with the number of known attacks, and of meters protected against them.
 
     Raises
     ------
@@ -181,10 +174,8 @@ def protect(
         If no protection of the other meters suffices.
     ValueError
         For an unknown customer or meter, or as `check`.
-    OtherStudy
-        If the journal is that of another study.
-    InUse
-        If another process writes the journal.
+    OtherStudy, InUse
+        As `feeders.studies.journal.Journal`.
     """
     check(
         max_attacked=max_attacked,
@@ -262,11 +253,6 @@ def check(
     share: float = SHARE,
 ) -> None:
     """Check the arguments of `protect`: contradictions, and arguments without effect for the goal.
-
-    Parameters
-    ----------
-    max_attacked, goal, lie_volt, attack, unknown, busbar_known, curves, share
-        As in `protect`.
 
     Raises
     ------

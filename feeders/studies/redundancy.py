@@ -48,14 +48,8 @@ class Redundancy:
 
     Attributes
     ----------
-    feeder, digest
-        Name and content digest of the feeder.
     unknown, unknown_silent
         Customers with unknown powers, in the two cases.
-    silent
-        Meters without readings in the second case.
-    curves
-        Operating region of the inverters.
     summary
         One row for each case and kind of attack: `patterns` (dimension of hidden attacks), `blind` (customers
         with a voltage that no meter determines, even without an attack), `index`, `detected` (largest number
@@ -107,25 +101,14 @@ def redundancy(
 ) -> Redundancy:
     """Count manipulated meters that stay invisible even with exact knowledge of feeder and honest loads.
 
-    Parameters
-    ----------
-    site
-        The feeder.
-    unknown, silent, busbar_known, curves
-        As in `feeders.studies.unobservable.knowledge`.
-    journal
-        File of finished work; an interrupted study resumes from it.
-    progress
-        Called with (done, total).
+    The arguments are those of `feeders.studies.unobservable.knowledge`.
 
     Raises
     ------
     ValueError
         For an unknown customer, meter or region of the curves.
-    OtherStudy
-        If the journal is that of another study.
-    InUse
-        If another process writes the journal.
+    OtherStudy, InUse
+        As `feeders.studies.journal.Journal`.
     """
     see_names(site, unknown=unknown, meters=silent, curves=curves)
     curves = CurvePositions(curves)

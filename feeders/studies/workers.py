@@ -76,18 +76,10 @@ class Here:
 
 @dataclass(frozen=True, slots=True)
 class Processes:
-    """Processes of this machine, spawned rather than forked: equal on every system.
+    """Processes of this machine, spawned rather than forked: equal on every system."""
 
-    Attributes
-    ----------
-    count
-        Number of processes.
-    retries
-        Largest number of repetitions of a piece after the death of its process.
-    """
-
-    count: int
-    retries: int = RETRIES
+    count: int  # number of processes
+    retries: int = RETRIES  # repetitions of a piece after the death of its process
 
     def run(self, work: Work, pieces: Sequence[int]) -> Made:
         """As `Runner`.
@@ -132,13 +124,7 @@ class Processes:
 
 
 def cores(count: int | None = None) -> Runner:
-    """Processes of this machine, or this process if there is one core.
-
-    Parameters
-    ----------
-    count
-        Number of processes; by default one for each core.
-    """
+    """`count` processes of this machine, by default one for each core; this process if there is one core."""
     count = count or os.cpu_count() or 1
     return Processes(count) if count > 1 else Here()
 
@@ -167,21 +153,12 @@ def _single(work: Work, piece: int) -> Any:
 class Dask:
     """Dask cluster; requires the extra `cluster`, and gridsec on its workers.
 
-    Attributes
-    ----------
-    address
-        Address of its scheduler, such as tcp://10.0.0.1:8786.
-    timeout_s
-        Longest wait for its answer, s.
-
-    Notes
-    -----
     The scheduler repeats the pieces of a dead worker, up to `distributed.scheduler.allowed-failures` times
     (3).
     """
 
-    address: str
-    timeout_s: float = 10.0
+    address: str  # of the scheduler, such as tcp://10.0.0.1:8786
+    timeout_s: float = 10.0  # longest wait for its answer
 
     def run(self, work: Work, pieces: Sequence[int]) -> Made:
         """As `Runner`.
@@ -238,17 +215,12 @@ class Dask:
 
 
 def agree(worker: str, theirs: Any) -> None:
-    """Reject a worker with other versions, or without any.
-
-    Parameters
-    ----------
-    worker, theirs
-        Its name, and its versions or the error of the request.
+    """Reject a worker with other versions than those of this process, or with an error in their place.
 
     Raises
     ------
     ClusterUnusable
-        For versions other than those of this process.
+        For other versions.
     """
     mine = versions()
     if theirs != mine:

@@ -36,27 +36,13 @@ __all__ = ["Lateral", "MergedNetwork", "alone", "laterals", "network", "site_of"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lateral:
-    """Part of a feeder behind a single-phase line from a bus of several phases; or a customer there.
+    """Part of a feeder behind a single-phase line from a bus of several phases; or a customer there."""
 
-    Attributes
-    ----------
-    customers
-        All its customers, by index.
-    lines
-        All its lines, indices into the tables, the first line first; none for a customer.
-    phase
-        Its phase.
-    place
-        Place that feeds it.
-    others
-        Places of the other phases at the same bus, by phase.
-    """
-
-    customers: Ints
-    lines: tuple[int, ...]
+    customers: Ints  # all its customers, by index
+    lines: tuple[int, ...]  # indices into the tables, the first line first; none for a customer
     phase: str
-    place: int
-    others: Mapping[str, int]
+    place: int  # place that feeds it
+    others: Mapping[str, int]  # places of the other phases at the same bus, by phase
 
     def to(self, phase: str) -> tuple[Ints, int, int]:
         """Customers, place that feeds the part, and place of another phase there."""
@@ -66,14 +52,8 @@ class Lateral:
 def laterals(feeder: ThreePhaseFeeder, lines: Sequence[tuple[int, ...]], place: Ints) -> tuple[Lateral, ...]:
     """Single-phase laterals of a tree.
 
-    Parameters
-    ----------
-    feeder
-        The tree.
-    lines
-        The lines of each branch, indices into the tables.
-    place : (Q, 2)
-        Bus and phase of each place.
+    `lines` are those of each branch, indices into the tables; `place`, (Q, 2), has bus and phase of each
+    place.
     """
     at = {(bus, PHASES[phase]): q for q, (bus, phase) in enumerate(place.tolist())}
     above, own = feeder.phases[feeder.parent], feeder.phases[1:]
@@ -95,17 +75,7 @@ def laterals(feeder: ThreePhaseFeeder, lines: Sequence[tuple[int, ...]], place: 
 
 
 def alone(feeder: ThreePhaseFeeder, phases: Sequence[str], place: Ints) -> tuple[Lateral, ...]:
-    """Single-phase customers at buses of several phases.
-
-    Parameters
-    ----------
-    feeder
-        The tree.
-    phases
-        Phases of each customer.
-    place : (Q, 2)
-        Bus and phase of each place.
-    """
+    """Single-phase customers at buses of several phases; `place` as in `laterals`."""
     at = {(bus, PHASES[phase]): q for q, (bus, phase) in enumerate(place.tolist())}
     out = []
     for k, (bus, own) in enumerate(zip(feeder.bus.tolist(), phases, strict=True)):
@@ -143,37 +113,16 @@ _CHUNK: Final = 64
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MergedNetwork:
-    """Feeder, in which lines in series are merged if it is large.
+    """Feeder, in which lines in series are merged if it is large."""
 
-    Attributes
-    ----------
-    site
-        Feeder of the files.
-    feeder
-        Its tree, merged; or with closed loops.
-    lines : (L,)
-        The lines of each branch, and then each that closes a loop, indices into the tables.
-    ends : (L, 2)
-        Their buses, of a branch the one nearer to the busbar first.
-    place : (Q, 2)
-        Bus of the feeder and phase of each place.
-    places
-        Model of the readings.
-    laterals
-        Its single-phase laterals.
-    parts
-        Laterals, and single-phase customers at buses of several phases: all parts with a possibly wrong
-        phase.
-    """
-
-    site: Site | ThreePhaseSite
-    feeder: Model
-    lines: tuple[tuple[int, ...], ...]
-    ends: Ints
-    place: Ints
-    places: Places
-    laterals: tuple[Lateral, ...]
-    parts: tuple[Lateral, ...]
+    site: Site | ThreePhaseSite  # feeder of the files
+    feeder: Model  # its tree, merged; or with closed loops
+    lines: tuple[tuple[int, ...], ...]  # (L,) branches, then lines that close loops: indices into the tables
+    ends: Ints  # (L, 2) their buses, of a branch the one nearer to the busbar first
+    place: Ints  # (Q, 2) bus of the feeder and phase of each place
+    places: Places  # model of the readings
+    laterals: tuple[Lateral, ...]  # single-phase laterals
+    parts: tuple[Lateral, ...]  # laterals, and single-phase customers at buses of several phases
 
     @property
     def meter_of(self) -> dict[int, int]:
@@ -195,12 +144,12 @@ class MergedNetwork:
 
 
 def site_of(path_or_name: Path | str) -> Site | ThreePhaseSite:
-    """Load a feeder, balanced or in three phases.
+    """Load a feeder, balanced or in three phases, as `feeders.model.site.load`.
 
-    Parameters
-    ----------
-    path_or_name
-        As in `feeders.model.site.load`, with the same errors; closed loops in three phases are invalid, too.
+    Raises
+    ------
+    FeederInvalid
+        As there, and for closed loops in three phases.
     """
     return _site(find(path_or_name))
 
@@ -224,12 +173,7 @@ def _site(tables: FeederTables) -> Site | ThreePhaseSite:
 
 
 def network(tables: FeederTables) -> MergedNetwork:
-    """Prepare a feeder for calibration.
-
-    Parameters
-    ----------
-    tables
-        Its files; with single-phase customers or zero-sequence impedances it is in three phases.
+    """Prepare a feeder for calibration; single-phase customers or zero-sequence impedances need three phases.
 
     Raises
     ------
@@ -345,14 +289,7 @@ def _shares(feeder: Model, bus: Ints) -> Floats | Phasors:
 class CustomerPowers:
     """Customers' powers by the readings and the files. T frames, N customers, pu.
 
-    Attributes
-    ----------
-    p, q, load, roof, steep : (T, N)
-        See `gridsec.planning.calibration.Series`.
-    metered_q : (N,)
-        Mask of customers with metered reactive power.
-    missing : (T, N)
-        Interpolated powers of metered customers.
+    `p`, `q`, `load`, `roof`, `steep`, (T, N), are those of `gridsec.planning.calibration.Series`.
     """
 
     p: Floats
@@ -360,8 +297,8 @@ class CustomerPowers:
     load: Floats
     roof: Floats
     steep: Floats
-    metered_q: Bools
-    missing: Bools
+    metered_q: Bools  # (N,) customers with metered reactive power
+    missing: Bools  # (T, N) interpolated powers of metered customers
 
 
 def powers(site: Site | ThreePhaseSite, given: Frames) -> CustomerPowers:
@@ -369,13 +306,6 @@ def powers(site: Site | ThreePhaseSite, given: Frames) -> CustomerPowers:
 
     Without a reading of q it is that of the load, by the middle of the limits of its power factor, less the
     injection of the inverter's curve at the voltage read.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    given
-        The readings.
     """
     model, base, T = site.loads, site.feeder.base_kva, given.t.size
     N = model.load_peak.size
@@ -429,19 +359,7 @@ def _sun(draws: Floats, pv_peak: Floats) -> Floats:
 
 
 def series(net: MergedNetwork, given: Frames, drawn: CustomerPowers, excluded: Collection[str]) -> Series:
-    """Readings and power flow of a feeder.
-
-    Parameters
-    ----------
-    net
-        The feeder.
-    given
-        The readings.
-    drawn
-        From `powers`.
-    excluded
-        Meters with voltages that are not used.
-    """
+    """Readings and power flow of a feeder, without the voltages of the excluded meters."""
     site = net.site
     order = [given.meter_ids.index(name) for name in site.meter_ids]
     v = given.v_volt[:, order] / net.places.unit
@@ -502,18 +420,8 @@ def doubts(
 ) -> PriorUncertainty:
     """Prior standard deviations of the errors of the files, uniform within the stated limits.
 
-    Parameters
-    ----------
-    net
-        The feeder.
-    drawn
-        From `powers`.
-    tolerance
-        Relative error of lengths that counts as correct, 1 sigma.
-    free
-        Branches with estimated lengths.
-    spread
-        Prior standard deviation of their relative error.
+    `tolerance` is the relative error of lengths that counts as correct, 1 sigma. The branches `free` have
+    estimated lengths, with relative errors of the prior standard deviation `spread`.
     """
     site, model = net.site, net.site.loads
     without = np.ones(model.load_peak.size, dtype=np.bool_)

@@ -62,36 +62,17 @@ FEWEST_SPANS: Final = 6.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frames:
-    """Readings of T frames in SI, net import positive. p meters; NaN for missing values.
-
-    Attributes
-    ----------
-    meter_ids : (p,)
-        Ids of the meters.
-    t : (T,)
-        Middle of each frame, Unix s.
-    v_volt, p_kw, q_kvar : (T, p)
-        Means of the readings.
-    v0_volt : (T,)
-        Busbar voltage.
-    v0_phases : (T, 3)
-        Phase voltages of the busbar; NaN in all frames for an unread phase.
-    count : (T, p + 1)
-        Number of readings of each mean, the busbar's last; of a meter of three channels their effective
-        number.
-    step_s
-        Interval between readings, s.
-    """
+    """Readings of T frames in SI, net import positive. p meters; NaN for missing values."""
 
     meter_ids: tuple[str, ...]
-    t: Floats
-    v_volt: Floats
+    t: Floats  # (T,) middle of each frame, Unix s
+    v_volt: Floats  # (T, p) means of the readings, as p_kw and q_kvar
     p_kw: Floats
     q_kvar: Floats
-    v0_volt: Floats
-    v0_phases: Floats
-    count: Floats
-    step_s: float
+    v0_volt: Floats  # (T,) busbar voltage
+    v0_phases: Floats  # (T, 3) NaN in all frames for an unread phase
+    count: Floats  # (T, p + 1) readings of each mean, the busbar's last; effective number for three channels
+    step_s: float  # interval between readings
 
     @property
     def unread(self) -> str:
@@ -124,20 +105,11 @@ def frames(
     *,
     exclude: Collection[str] = (),
 ) -> Frames:
-    """Average readings to frames.
+    """Average readings to frames; the values of the meters in `exclude` are not checked.
 
     A meter of a three-phase customer may be read as a whole, or as its three channels
     (`feeders.model.site.one_phase_each`). Its voltage is then their mean and its powers are their sums, where
     all three exist.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    readings
-        A recording, a table, or a file with one.
-    exclude
-        Meters without a check of their values.
 
     Raises
     ------
@@ -197,15 +169,7 @@ def frames(
 
 
 def blind(site: Site | ThreePhaseSite, unread: str) -> tuple[str, ...]:
-    """Meters on phases without a voltage of the busbar; their errors cannot be determined.
-
-    Parameters
-    ----------
-    site
-        A feeder in three phases.
-    unread
-        The phases.
-    """
+    """Meters on unread phases of the busbar; their errors cannot be determined."""
     rows = [site.tables.customers[k] for k in site.meters]
     return tuple(row.meter for row in rows if set(row.phases) & set(unread))
 

@@ -403,38 +403,18 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SearchResult:
-    """Result of a search.
+    """Result of a search."""
 
-    Attributes
-    ----------
-    now
-        The files with all errors corrected, fitted.
-    said
-        Comparison of all further hypotheses for these files.
-    rows
-        The errors, in the order of their corrections.
-    """
-
-    now: Round
-    said: HypothesisComparison
-    rows: list[Row]
+    now: Round  # the files with all errors corrected, fitted
+    said: HypothesisComparison  # comparison of all further hypotheses for these files
+    rows: list[Row]  # the errors, in the order of their corrections
 
 
 class FileErrorSearch:
-    """Search for the errors of a feeder's files.
+    """Search for the errors of a feeder's files; an interrupted search resumes from its journal.
 
-    Parameters
-    ----------
-    files
-        The files.
-    fitted
-        Fits files under the assumption that they are correct.
-    weighed
-        Compares all hypotheses for such a fit.
-    risk
-        Probability of any proposal for correct files.
-    kept
-        Journal of the steps; an interrupted search resumes from it.
+    `fitted` fits files under the assumption that they are correct; `weighed` compares all hypotheses for such
+    a fit. `risk` is the probability of any proposal for correct files.
     """
 
     def __init__(
@@ -686,14 +666,7 @@ class Calibrate:
         return {name: getattr(self, name) for name in names}
 
     def corrected(self, site_folder: Path | str, out: Path | str) -> None:
-        """Write a copy of a feeder's folder with the decided corrections.
-
-        Parameters
-        ----------
-        site_folder
-            Folder or name of the studied feeder.
-        out
-            A new or empty folder.
+        """Write a copy of the studied feeder with the decided corrections to a new or empty folder.
 
         Raises
         ------
@@ -729,12 +702,11 @@ def calibrate(
 ) -> Calibrate:
     """Compare recorded readings with a feeder's files.
 
+    The feeder is balanced (with loops or without) or of three phases. The readings are a recording, a table
+    with its columns, or a Parquet or CSV file.
+
     Parameters
     ----------
-    site
-        The feeder, balanced (with loops or without) or of three phases.
-    readings
-        A recording, a table with its columns, or a Parquet or CSV file.
     risk
         Probability of any proposal for correct files, 0 to 1.
     tolerance
@@ -744,8 +716,6 @@ def calibrate(
     kinds
         Kinds of errors to search; fewer take less time, and an error of another kind may pass for one of
         these.
-    journal
-        File for each error found; an interrupted study resumes from it.
     progress
         Called with (done, total) of the present comparison.
 
@@ -758,10 +728,8 @@ def calibrate(
         For an unknown meter, or a number out of range.
     FeederInvalid
         If closed lines form loops in three phases.
-    OtherStudy
-        If the journal is that of another study.
-    InUse
-        If another process writes the journal.
+    OtherStudy, InUse
+        As `feeders.studies.journal.Journal`.
     """
     problems = wrong_numbers(risk, tolerance)
     if unknown := sorted(set(exclude) - set(site.meter_ids)):
@@ -802,13 +770,7 @@ def calibrate(
 
 
 def wrong_numbers(risk: float, tolerance: float) -> list[Problem]:
-    """Problems of the numbers of a calibration.
-
-    Parameters
-    ----------
-    risk, tolerance
-        As in `calibrate`.
-    """
+    """Problems of the numbers of a calibration."""
     problems = []
     if not 0.0 < risk < 1.0:
         problems.append(Problem("out-of-range", f"risk is {risk}; it must be between 0 and 1"))
