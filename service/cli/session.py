@@ -56,28 +56,14 @@ class Stopped(KeyboardInterrupt):
 
 @dataclass(slots=True)
 class Keeping(Keeper):
-    """Journals of a command.
+    """Journals of a command."""
 
-    Attributes
-    ----------
-    study, feeder
-        Study of the command, and its feeder as on the command line.
-    chosen
-        Journal file of the option; further studies of the command have theirs beside it.
-    folder
-        Folder of the other journals; None without any.
-    stay
-        True if they stay there after the command.
-    resumed
-        Names of studies that were continued.
-    """
-
-    study: str
-    feeder: str
-    chosen: Path | None
-    folder: Path | None
-    stay: bool = False
-    resumed: set[str] = field(default_factory=set)
+    study: str  # of the command
+    feeder: str  # as on the command line
+    chosen: Path | None  # file of the option; further studies have theirs beside it
+    folder: Path | None  # of the other journals; None without any
+    stay: bool = False  # they stay there after the command
+    resumed: set[str] = field(default_factory=set)  # names of studies that were continued
     _journals: list[tuple[str, Journal]] = field(default_factory=list)
     _name: str = ""
     _warned: bool = False

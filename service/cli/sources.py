@@ -31,15 +31,8 @@ def converted(feeder: str, out: Path | None) -> str:
     """Return a feeder for `model.site.load`; another tool's network is converted, with a message.
 
     The conversion is repeated each time: an OpenDSS file may refer to others that have changed. A different
-    earlier conversion in the folder is kept under another name, see `spared`.
-
-    Parameters
-    ----------
-    feeder
-        A folder, the name of a feeder of the project, or any source of `feeders.convert.convert`.
-    out
-        Folder of the results, in which the feeder's becomes `feeder`; None: a temporary folder, which stays
-        with its list of changes.
+    earlier conversion in the folder is kept under another name, see `spared`. The feeder's folder is `feeder`
+    in the folder of the results; without one, in a temporary folder, which stays.
 
     Raises
     ------
@@ -91,11 +84,6 @@ def spared(folder: Path) -> Iterator[None]:
     """Keep a copy of an earlier conversion, as `FOLDER-1`, unless the new one is equal.
 
     A copy, since the folder may be the source, contain its files, or be the working directory.
-
-    Parameters
-    ----------
-    folder
-        Destination of a conversion.
     """
     from feeders.convert.convert import WRITTEN
 

@@ -76,13 +76,8 @@ def planned(
 ) -> CampaignPlan:
     """Return the plan of a campaign; all problems of its options are raised at once.
 
-    Parameters
-    ----------
-    step, duration, load_error_kw, load_error_kvar
-        As on the command line; None for the values of the files. With one of the load errors the other is
-        zero.
-    chosen
-        Attributes of the plan by name; None for the values of the files.
+    None stands for the values of the files. With one of the load errors the other is zero. `chosen` are
+    attributes of the plan by name.
 
     Raises
     ------
@@ -115,13 +110,7 @@ def planned(
 
 
 def sources(site: Site, plan: CampaignPlan, given: Mapping[str, object]) -> str:
-    """Summary of a campaign, with the origin of its parameters: files or options.
-
-    Parameters
-    ----------
-    given
-        Options such as --step, and None for those not given.
-    """
+    """Summary of a campaign, with the origin of its parameters: files, or options with a value."""
     from feeders.model.load_uncertainty import load_doubt
 
     some = {option for option, value in given.items() if value is not None}

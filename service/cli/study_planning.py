@@ -240,13 +240,7 @@ def _unknowns(names: Sequence[str], feeder: str) -> str:
 
 @contextmanager
 def bar(what: str) -> Iterator[Tell]:
-    """A progress bar on the terminal.
-
-    Parameters
-    ----------
-    what
-        Name of the counted pieces of work.
-    """
+    """A progress bar on the terminal, with the name of the counted pieces of work."""
     with Progress(
         TextColumn("{task.description}"),
         BarColumn(),

@@ -65,72 +65,37 @@ LIBRARIES: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """Options of a report; every study uses those that concern it.
+    """Options of a report; every study uses those that concern it."""
 
-    Attributes
-    ----------
-    feeder
-        As on the command line.
-    max_attacked
-        M.
-    goal, lie_volt
-        Goal of the protection, by default that of the study, and the bound of an attack, V.
-    unknown, silent, busbar_unknown
-        Customers with unknown powers; missing meters; True without a busbar meter.
-    scenarios, seed, workers
-        Options of the simulated attacks; the seed is for all random numbers.
-    step, estimator, load_error_kw, load_error_kvar
-        Options of the simulated attacks: interval of the readings, s, estimator, and uncertainty of powers;
-        None for the values of the feeder's files.
-    preset, busbar, band
-        Options of the inverters' study, as in `DroopOptions`; None for its defaults.
-    hosting
-        Compute hosting capacities.
-    readings
-        A recording to compare with the files.
-    """
-
-    feeder: str
-    max_attacked: int = 2
-    goal: str | None = None
-    lie_volt: float = math.nan
-    unknown: tuple[str, ...] | None = None
-    silent: tuple[str, ...] = ()
+    feeder: str  # as on the command line
+    max_attacked: int = 2  # M
+    goal: str | None = None  # of the protection; None: that of the study
+    lie_volt: float = math.nan  # bound of an attack
+    unknown: tuple[str, ...] | None = None  # customers with unknown powers
+    silent: tuple[str, ...] = ()  # missing meters
     busbar_unknown: bool = False
     scenarios: int = 160
-    seed: int = 0
+    seed: int = 0  # of all random numbers
     workers: int = 1
-    step: float | None = None
+    step: float | None = None  # of the simulated attacks, s; None, here and below: the feeder's files
     estimator: str | None = None
     load_error_kw: float | None = None
     load_error_kvar: float | None = None
-    preset: str | None = None
+    preset: str | None = None  # options of the inverters' study; None: its defaults
     busbar: tuple[float, float] | None = None
     band: tuple[float, float] | None = None
     hosting: bool = False
-    readings: Path | None = None
+    readings: Path | None = None  # a recording to compare with the files
 
 
 @dataclass(frozen=True, slots=True)
 class Study:
-    """Properties of a study in a report.
-
-    Attributes
-    ----------
-    run
-        Runs the study.
-    options
-        Equivalent options of its own command.
-    what
-        Name of the counted pieces of work, for the progress bar.
-    seeded
-        True if it uses the seed.
-    """
+    """Properties of a study in a report."""
 
     run: Callable[[Site, Asked, Where, Progress | None], Result]
-    options: Callable[[Asked], list[str]]
-    what: str
-    seeded: bool = False
+    options: Callable[[Asked], list[str]]  # equivalent options of its own command
+    what: str  # name of the counted pieces of work, for the progress bar
+    seeded: bool = False  # uses the seed
 
 
 def _detectable(site: Site, asked: Asked, journal: Where, report_progress: Progress | None) -> Result:
@@ -286,13 +251,7 @@ STUDIES: Final[dict[str, Study]] = {
 
 
 def misplaced(asked: Asked, chosen: Collection[str]) -> list[str]:
-    """Return the options that none of the chosen studies uses, one sentence each.
-
-    Parameters
-    ----------
-    asked, chosen
-        Options, and names of studies.
-    """
+    """Return the options that none of the chosen studies uses, one sentence each."""
     problems = []
     for each in fields(asked):
         if each.default is MISSING:
@@ -312,15 +271,7 @@ def outcome(
     kept: Keeping,
     bar: Callable[[str], AbstractContextManager[Progress]],
 ) -> StudyOutcome:
-    """Run a study; a failure becomes part of the report.
-
-    Parameters
-    ----------
-    name
-        Key of STUDIES.
-    bar
-        Progress bar.
-    """
+    """Run a study of STUDIES by its name; a failure becomes part of the report."""
     from feeders.report.html import StudyOutcome
     from feeders.studies.droop.fleets import NOTHING, NoInverters
 
@@ -369,14 +320,7 @@ def versions() -> dict[str, str]:
 
 
 def write(made: Report, out: Path, folder: Path) -> None:
-    """Write the files of a report; the page comes last, after its figures and tables.
-
-    Parameters
-    ----------
-    made
-        The report.
-    out, folder
-        The page, and the folder beside it.
+    """Write the page of a report, and the folder beside it; the page comes last, after figures and tables.
 
     Raises
     ------

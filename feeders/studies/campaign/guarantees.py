@@ -40,24 +40,12 @@ _SETTLING = 25
 
 @dataclass(frozen=True, slots=True)
 class Rehearsal:
-    """Outcome of attacks of the guaranteed sizes.
+    """Outcome of attacks of the guaranteed sizes."""
 
-    Attributes
-    ----------
-    trials
-        Number of trials of each kind.
-    hidden_named
-        Trials with an attack of at most the hidden size and a named meter.
-    large_missed
-        Trials with an attack of at least the named size and its meter not named.
-    honest_named
-        Of the latter, those with an honest meter named.
-    """
-
-    trials: int
-    hidden_named: int
-    large_missed: int
-    honest_named: int
+    trials: int  # number of trials of each kind
+    hidden_named: int  # trials of at most the hidden size with a named meter
+    large_missed: int  # trials of at least the named size with its meter not named
+    honest_named: int  # of the latter, those with an honest meter named
 
     @property
     def table(self) -> pd.DataFrame:
@@ -79,28 +67,12 @@ def rehearse(
 
     Hidden attacks are the worst of their size, from the mixed-integer program. Large ones are on one meter,
     beyond its size. In every second trial M - 1 other meters are attacked as well, by up to twice their size.
-
-    Parameters
-    ----------
-    site, found
-        The feeder, and the result of `detectable`.
-    trials
-        Number of trials of each kind.
-    seed
-        Seed of all random numbers.
-    share
-        As for `found`.
-    journal
-        File of finished trials; an interrupted run resumes from it, also with more trials.
-    progress
-        Called with (done, total) trials.
+    `share` is that of `found`. An interrupted run resumes from its journal, also with more trials.
 
     Raises
     ------
-    OtherStudy
-        If the journal is that of another study.
-    InUse
-        If another process writes the journal.
+    OtherStudy, InUse
+        As `feeders.studies.journal.Journal`.
     """
     sizes = [float(size) for name in ("hidden", "named", "named_alone") for size in found.meters[name]]
     told = {"max_attacked": found.max_attacked, "risk": found.risk, "sizes": sizes}
@@ -220,14 +192,8 @@ NOTHING = 1e-6
 def promised(site: Site, found: Detectable, *, share: float = SHARE) -> tuple[AttackClass, ...]:
     """Attacks of the sizes of `detectable`, for a campaign.
 
-    Parameters
-    ----------
-    site
-        The feeder, with the campaign's errors of loads and meters.
-    found
-        Result of `detectable` for it.
-    share
-        As for `found`.
+    The feeder has the campaign's errors of loads and meters. For M = 1 there are only attacks on one meter.
+    Kinds without an attack of guaranteed outcome are left out.
 
     Returns
     -------
@@ -235,10 +201,6 @@ def promised(site: Site, found: Detectable, *, share: float = SHARE) -> tuple[At
         One meter, and M meters in the worst collusion of this size; no device is to be named.
     named_alone, named
         One meter, and any M meters, each by its size; all are to be named.
-
-    Notes
-    -----
-    For M = 1 there are only attacks on one meter. Kinds without an attack of guaranteed outcome are left out.
     """
     most, alone = found.max_attacked, (1,)
     kinds = [

@@ -54,14 +54,7 @@ __all__ = ["Prepared", "attacks", "liars", "prepare", "risings", "watch"]
 def attacks(
     site: Site, plan: CampaignPlan, case: CampaignCase, honest: Scenario
 ) -> tuple[tuple[Attack, ...], tuple[InverterAttack, ...]]:
-    """Build the attacks of a scenario.
-
-    Parameters
-    ----------
-    site, plan, case
-        The feeder, the campaign, and a scenario with an attack.
-    honest
-        The scene without the attack.
+    """Build the attacks of a scenario; `honest` is the scene without them.
 
     Raises
     ------
@@ -105,21 +98,7 @@ def attacks(
 
 
 def liars(site: Site, case: CampaignCase, random: np.random.Generator) -> tuple[Ints, Floats]:
-    """Choose the manipulated meters by a scenario's rule.
-
-    Parameters
-    ----------
-    site, case
-        The feeder, and the scenario.
-    random
-        Random generator.
-
-    Returns
-    -------
-    meters : (k,)
-        Manipulated meters, ascending.
-    signs : (k,)
-        Sign of each attack.
+    """Choose the manipulated meters by a scenario's rule: k meters, ascending, and their signs.
 
     Raises
     ------
@@ -185,36 +164,17 @@ IMPOSSIBLE = (NoSuchAttack, PowerFlowDiverged, NoEquilibrium)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prepared:
-    """Common data of all scenes of a campaign.
-
-    Attributes
-    ----------
-    site
-        The feeder.
-    plan
-        The campaign.
-    stated
-        The feeder with the errors of loads and meters.
-    watchers
-        Designed estimators by false-alarm rate.
-    learners
-        The same for the interval of the readings for learning; empty without learning.
-    """
+    """Common data of all scenes of a campaign."""
 
     site: Site
     plan: CampaignPlan
-    stated: Site
-    watchers: dict[float, DesignedEstimator]
-    learners: dict[float, DesignedEstimator]
+    stated: Site  # the feeder with the errors of loads and meters
+    watchers: dict[float, DesignedEstimator]  # designed estimators by false-alarm rate
+    learners: dict[float, DesignedEstimator]  # the same for the readings for learning; empty without
 
 
 def prepare(site: Site, plan: CampaignPlan) -> Prepared:
     """Design the estimators of a campaign.
-
-    Parameters
-    ----------
-    site, plan
-        The feeder, and the campaign.
 
     Raises
     ------
@@ -238,17 +198,7 @@ def _designed(plan: CampaignPlan, stated: Site) -> dict[float, DesignedEstimator
 def watch(given: Prepared, scene: int) -> list[dict[str, Any]]:
     """Simulate and monitor all scenarios of one scene.
 
-    Parameters
-    ----------
-    given
-        From `prepare`.
-    scene
-        Number of the scene.
-
-    Returns
-    -------
-    list of dict
-        One for each scenario and false-alarm rate, in plain JSON types. See `study.Campaign`.
+    One row for each scenario and false-alarm rate, in plain JSON types; see `study.Campaign`.
     """
     plan, moment, cases = given.plan, given.plan.moment(scene), given.plan.cases(scene)
     trial = plan.trial(given.site, moment)
@@ -499,13 +449,7 @@ def _everybody(seen: _Seen, lies: Bools) -> Bools:
 
 
 def risings(flags: Bools) -> int:
-    """Number of rises of any flag; all are down before the first row.
-
-    Parameters
-    ----------
-    flags : (T, k)
-        The flags over time.
-    """
+    """Number of rises of any flag (T, k); all are down before the first row."""
     before = np.vstack([np.zeros((1, flags.shape[1]), dtype=np.bool_), flags[:-1]])
     return int(np.count_nonzero(flags & ~before))
 

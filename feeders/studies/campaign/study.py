@@ -53,13 +53,7 @@ YEAR_S: Final = 365.25 * 86_400.0
 
 
 def scenarios(rows: Sequence[dict[str, Any]]) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Tables of all scenarios, and of all manipulated devices.
-
-    Parameters
-    ----------
-    rows
-        From `scene.watch`.
-    """
+    """Tables of all scenarios, and of all manipulated devices, from the rows of `scene.watch`."""
     kept = ("scenario", "alarms_per_year", "kind", "size", "liars", "place")
     each = [{name: row[name] for name in kept} | one for row in rows for one in row.get("each", ())]
     frame = pd.DataFrame([{name: cell for name, cell in row.items() if name != "each"} for row in rows])
@@ -68,15 +62,7 @@ def scenarios(rows: Sequence[dict[str, Any]]) -> tuple[pd.DataFrame, pd.DataFram
 
 
 def grouped(found: pd.DataFrame, liars: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
-    """One row for each group of scenarios.
-
-    Parameters
-    ----------
-    found, liars
-        From `scenarios`.
-    by
-        Columns of the groups, besides the false-alarm rate.
-    """
+    """One row for each group of scenarios by false-alarm rate and columns; from the tables of `scenarios`."""
     keys = ["alarms_per_year", *by]
     tried = found[found["reason"] == ""]
     lied = dict(list(liars.groupby(keys, sort=True)))
@@ -108,13 +94,7 @@ def grouped(found: pd.DataFrame, liars: pd.DataFrame, by: Sequence[str]) -> pd.D
 
 
 def delays(liars: pd.DataFrame) -> pd.DataFrame:
-    """Share of the manipulated devices named within some time of their onset, by kind and size.
-
-    Parameters
-    ----------
-    liars
-        From `scenarios`.
-    """
+    """Share of the manipulated devices named within some time of their onset, by kind and size."""
     rows = []
     for key, group in liars.groupby(["alarms_per_year", "kind", "size"], sort=True):
         for within in WITHIN_S:
@@ -129,11 +109,6 @@ def delays(liars: pd.DataFrame) -> pd.DataFrame:
 
 def false_names(found: pd.DataFrame, liars: pd.DataFrame) -> pd.DataFrame:
     """Operating curve: false names per year without an attack, and share of manipulated devices named.
-
-    Parameters
-    ----------
-    found, liars
-        From `scenarios`.
 
     Notes
     -----
@@ -167,17 +142,8 @@ def false_names(found: pd.DataFrame, liars: pd.DataFrame) -> pd.DataFrame:
 
 
 def promises(found: pd.DataFrame, liars: pd.DataFrame, promised: Mapping[str, Promise]) -> pd.DataFrame:
-    """Outcome of attacks with a guarantee; columns as in `study.Campaign`.
+    """Outcome of attacks with a guarantee by their kind; columns as in `Campaign`.
 
-    Parameters
-    ----------
-    found, liars
-        From `scenarios`.
-    promised
-        Guarantee by kind.
-
-    Notes
-    -----
     Attacks of a scene have loads and errors of meters in common; scenes are independent. So the limit is that
     of the scenes with a broken guarantee, each of which counts once. It is valid for the probability that an
     attack breaks it, for any dependence within a scene.
@@ -326,22 +292,9 @@ def campaign(
     journal: Where = None,
     progress: Progress | None = None,
 ) -> Campaign:
-    """Run a campaign on a feeder.
+    """Run a campaign on a feeder; the result is the same for every runner.
 
-    Parameters
-    ----------
-    site
-        The feeder.
-    plan
-        The campaign.
-    seed
-        Seed in place of the plan's.
-    runner
-        `workers.Here`, `Processes` or `Dask`; the results are equal.
-    journal
-        File of finished scenes; an interrupted campaign resumes from it.
-    progress
-        Called with (done, total) scenarios.
+    `seed` replaces the plan's. `progress` is called with (done, total) scenarios.
 
     Raises
     ------
@@ -349,12 +302,8 @@ def campaign(
         If the estimator cannot monitor this feeder with these settings, or for an invalid plan.
     NothingPlayed
         If the power flow has no solution at any scene.
-    OtherStudy
-        If the journal is that of another study.
-    InUse
-        If another process writes the journal.
-    ClusterUnusable, WorkerLost
-        From the runner; finished scenes are in the journal.
+    OtherStudy, InUse, ClusterUnusable, WorkerLost
+        As `feeders.studies.journal.run_pieces`.
     """
     plan = CampaignPlan() if plan is None else plan
     plan = plan if seed is None else replace(plan, seed=seed)

@@ -76,19 +76,7 @@ def equip(
     """Equip customers of a feeder with inverters of one preset, in place of its own fleet.
 
     A customer's own inverter keeps its rating; others get 1.1 kVA for each kW of generation, or 5 kVA.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    preset
-        One of `gridsec.grid.droop.PRESETS`.
-    who
-        Customers with generation, or all.
-    customers
-        These customers instead.
-    kva
-        Rating of each inverter instead, kVA.
+    `customers` and `kva` (of each inverter) take precedence.
 
     Raises
     ------
@@ -120,31 +108,14 @@ def equip(
 
 
 def made(site: Site, own: Ints, preset: str, kva: Floats) -> Droop:
-    """Inverters of a preset, with the curve in the nominal voltage at each customer.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    own : (m,)
-        Customers.
-    preset
-        One of `gridsec.grid.droop.PRESETS`.
-    kva : (m,)
-        Ratings, kVA.
-    """
+    """Inverters of a preset at customers `own`, (m,), with curves in the nominal voltage; `kva` is (m,)."""
     usual = fleet(own, preset, kva, site.feeder.base_kva)
     ratio = Bases.of(site).ratio[own]
     return usual if (ratio == 1.0).all() else replace(usual, v=usual.v / ratio[:, None])
 
 
 def chosen_fleet(site: Site, preset: str | None, who: Who = Who.PV) -> Droop:
-    """The feeder's own fleet, or one of a preset.
-
-    Parameters
-    ----------
-    site, preset, who
-        As in `equip`; without a preset, the inverters of the feeder's files.
+    """The feeder's own fleet, or one of a preset as in `equip`.
 
     Raises
     ------
@@ -170,16 +141,9 @@ def chosen_fleet(site: Site, preset: str | None, who: Who = Who.PV) -> Droop:
 
 
 def points(site: Site, v0: float = 1.0) -> dict[str, InjectionBox]:
-    """Operating points of the study, each a box without width.
+    """Operating points of the study, each a box without width, at a busbar voltage `v0`, pu.
 
     Evening: full load, no generation. Noon: a fifth of the load, full generation. Half: half of both.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    v0
-        Voltage of the busbar, pu.
     """
     return {name: point(site, at.load, at.pv, v0) for name, at in _POINTS.items()}
 
@@ -187,14 +151,7 @@ def points(site: Site, v0: float = 1.0) -> dict[str, InjectionBox]:
 def point(site: Site, load: Floats | float, pv: Floats | float, v0: float = 1.0) -> InjectionBox:
     """Operating point without the inverters' reactive power, the loads at their expected power factor.
 
-    Parameters
-    ----------
-    site
-        The feeder.
-    load, pv : (N,) or scalar
-        Shares of the peaks.
-    v0
-        Voltage of the busbar, pu.
+    `load` and `pv` are shares of the peaks, (N,) or scalar; `v0` is the busbar voltage, pu.
     """
     meta, rows = site.tables.meta, site.tables.customers
     usual = [meta.load.power_factor if row.power_factor is None else row.power_factor for row in rows]
@@ -215,17 +172,8 @@ def box(
 ) -> InjectionBox:
     """Box of all powers within the feeder's files, independent for each customer.
 
-    Loads from `load_low load_kw` to `load_high load_kw`, with q from `load tan_min - floor` to
-    `load tan_max + floor`; generation from `pv_low pv_kw` to `pv_high pv_kw` at unity power factor.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    load_low, load_high, pv_low, pv_high
-        Shares of the peaks.
-    v0_low, v0_high
-        Voltage of the busbar, pu.
+    Loads from `load_low load_kw` to `load_high load_kw`, with q from `load tan_min - floor` to `load tan_max
+    + floor`; generation from `pv_low pv_kw` to `pv_high pv_kw` at unity power factor; busbar voltage in pu.
 
     Raises
     ------
@@ -250,26 +198,12 @@ def box(
 
 
 def range_problem(what: str, low: float, high: float) -> list[Problem]:
-    """Problem of two limits; empty without one.
-
-    Parameters
-    ----------
-    what, low, high
-        Name of the quantity, and the limits.
-    """
+    """Problem of two limits of a quantity; empty without one."""
     if 0.0 <= low <= high < math.inf:
         return []
     return [Problem("order", f"{what}: from {low:g} to {high:g}; expected two ascending numbers from 0 on")]
 
 
 def inverter_names(site: Site, droop: Droop, rows: Ints) -> list[str]:
-    """Customers of inverters.
-
-    Parameters
-    ----------
-    site, droop
-        The feeder and the fleet.
-    rows : (k,)
-        Rows of the fleet.
-    """
+    """Customers of inverters, by rows of the fleet."""
     return [site.feeder.customers[int(k)] for k in droop.customer[rows]]

@@ -73,61 +73,30 @@ HOSTING: Final = {
 class DroopOptions:
     """Options of the study.
 
-    Attributes
-    ----------
-    preset
-        Preset of all inverters; None: the feeder's own fleet.
-    who
-        Customers that a preset equips: those with generation (`pv`), or `all`.
-    interval_s, dead
-        Sampling interval of the inverters, s (0: continuous), and dead time in whole intervals.
-    v0_low, v0_high
-        Limits of the busbar voltage, pu; operating points have the middle, hosting the upper one.
-    v_min, v_max
-        The band, relative to the nominal voltage; None: the limits of the feeder's files.
-    load_high, pv_high
-        Largest shares of the peaks in the box of all loads.
-    presets
-        Presets to compare, each instead of the feeder's own.
-    tau_factors
-        Factors on all time constants to compare.
-    hosting
-        True: search for hosting capacities.
-    hosting_presets
-        Presets of new generation; empty: without reactive power.
-    hosting_load
-        Loads relative to their peaks meanwhile, 1.
-    hosting_customers
-        Customers with the generation; None: those of the files, in proportion.
-    unit_kw
-        Size of a unit at a random customer, kW.
-    draws
-        Number of random orders of customers.
-
     Raises
     ------
     ValueError
         With every option that is out of range or has no effect.
     """
 
-    preset: str | None = None
-    who: Who = Who.PV
-    interval_s: float = 1.0
-    dead: int = 0
-    v0_low: float = 1.0
-    v0_high: float = 1.0
-    v_min: float | None = None
+    preset: str | None = None  # of all inverters; None: the feeder's own fleet
+    who: Who = Who.PV  # customers that a preset equips
+    interval_s: float = 1.0  # sampling of the inverters; 0: continuous
+    dead: int = 0  # dead time, whole intervals
+    v0_low: float = 1.0  # limits of the busbar voltage, pu; operating points have the middle
+    v0_high: float = 1.0  # hosting has this one
+    v_min: float | None = None  # band relative to the nominal voltage; None: that of the files
     v_max: float | None = None
-    load_high: float = 1.0
+    load_high: float = 1.0  # largest shares of the peaks in the box of all loads
     pv_high: float = 1.0
-    presets: tuple[str, ...] = PRESETS
-    tau_factors: tuple[float, ...] = (0.01, 0.1, 0.3, 1.0, 3.0)
-    hosting: bool = False
-    hosting_presets: tuple[str, ...] = ("", "ieee1547-b")
-    hosting_load: float = 0.1
-    hosting_customers: tuple[str, ...] | None = None
-    unit_kw: float = 5.0
-    draws: int = 30
+    presets: tuple[str, ...] = PRESETS  # to compare, each instead of the feeder's own
+    tau_factors: tuple[float, ...] = (0.01, 0.1, 0.3, 1.0, 3.0)  # on all time constants, to compare
+    hosting: bool = False  # search for hosting capacities
+    hosting_presets: tuple[str, ...] = ("", "ieee1547-b")  # of new generation; empty: without reactive power
+    hosting_load: float = 0.1  # relative to the peaks, 1
+    hosting_customers: tuple[str, ...] | None = None  # None: those of the files, in proportion
+    unit_kw: float = 5.0  # of generation at a random customer
+    draws: int = 30  # random orders of customers
 
     def __post_init__(self) -> None:
         problems = [*self._fleet_problems(), *self._limit_problems(), *self._hosting_problems()]
@@ -185,13 +154,7 @@ class DroopOptions:
 
 
 def band_problem(low: float, high: float) -> list[Problem]:
-    """Problem of a band of voltages; empty without one.
-
-    Parameters
-    ----------
-    low, high
-        Its limits, relative to the nominal voltage.
-    """
+    """Problem of a band of voltages, relative to the nominal voltage; empty without one."""
     if 0.0 < low < high < math.inf:
         return []
     text = f"the band from {low:g} to {high:g} is empty; expected two ascending voltages, pu"
@@ -289,20 +252,9 @@ def droop(
     journal: Where = None,
     progress: Progress | None = None,
 ) -> DroopStudy:
-    """Study the droop fleet of a feeder.
+    """Study the droop fleet of a feeder; by default its own, sampled once a second.
 
-    Parameters
-    ----------
-    site
-        The feeder.
-    options
-        Options; by default the feeder's own fleet, sampled once a second.
-    seed
-        Seed of small deviations from equilibrium, and of the orders of generation.
-    journal
-        File of finished work; an interrupted study resumes from it.
-    progress
-        Called with (done, total).
+    `seed` is that of small deviations from equilibrium, and of the orders of generation.
 
     Raises
     ------
@@ -310,10 +262,8 @@ def droop(
         Without inverters and without a preset.
     ValueError
         For an invalid band, or new generation at an unknown customer.
-    OtherStudy
-        If the journal is that of another study.
-    InUse
-        If another process writes the journal.
+    OtherStudy, InUse
+        As `feeders.studies.journal.Journal`.
     """
     given = options or DroopOptions()
     study = _Study(Subject.of(site), chosen_fleet(site, given.preset, given.who), given, seed)
@@ -528,20 +478,7 @@ def presets_of(
     journal: Where = None,
     progress: Progress | None = None,
 ) -> pd.DataFrame:
-    """Table `presets` of several feeders, one below the other.
-
-    Parameters
-    ----------
-    sites
-        The feeders.
-    options, seed, journal, progress
-        As in `droop`.
-
-    Raises
-    ------
-    OtherStudy, InUse
-        As `droop`.
-    """
+    """Table `presets` of several feeders, one below the other; arguments and errors as in `droop`."""
     given = options or DroopOptions()
     digests = [site.digest for site in sites]
     subject = {"study": "presets", "digests": digests, "seed": seed, "options": asdict(given)}
