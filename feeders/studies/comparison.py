@@ -7,7 +7,6 @@ a design for the feeder, or with a failure in a step, keeps its rows, with the r
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field, fields
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+import pandas as pd
 
 from feeders.registry.plugins import EstimatorUnusable
 from feeders.registry.registry import FAMILIES, DesignedEstimator, choose, design
@@ -139,17 +139,11 @@ class ComparisonPlan:
 
     def __post_init__(self) -> None:
         """Reject an empty comparison."""
-        raise_if_any(
-            [
-                *no_choice("family", FAMILIES, *self.families),
-                *no_choice("case", (case.name for case in CASES), *self.cases),
-                *(
-                    []
-                    if self.seeds >= 1
-                    else [Problem("not-positive", f"seeds is {self.seeds}; at least one run is needed")]
-                ),
-            ]
-        )
+        problems = no_choice("family", FAMILIES, *self.families)
+        problems += no_choice("case", (case.name for case in CASES), *self.cases)
+        if self.seeds < 1:
+            problems.append(Problem("not-positive", f"seeds is {self.seeds}; at least one run is needed"))
+        raise_if_any(problems)
 
     def trial(self, site: Site, case: ComparisonCase, seed: int) -> Trial:
         """One run."""
@@ -256,7 +250,8 @@ def _case(
                 try:
                     outcomes[name].append(judge(watcher, trial, played=played))
                 except Exception as failure:  # noqa: BLE001  # external code may raise anything
-                    reasons[name] = _failed(failure)
+                    what = " ".join(f"{type(failure).__name__}: {failure}".split())
+                    reasons[name] = f"failed in a step: {what}"
     except NoSuchAttack as error:
         return [ComparisonRow(name, case.name, str(error)) for name in watchers]
     return [
@@ -265,10 +260,6 @@ def _case(
         else _row(name, case.name, watcher.observers, outcomes[name])
         for name, watcher in watchers.items()
     ]
-
-
-def _failed(failure: Exception) -> str:
-    return "failed in a step: " + " ".join(f"{type(failure).__name__}: {failure}".split())
 
 
 def _row(family: str, case: str, observers: int, outcomes: Sequence[TrialResult]) -> ComparisonRow:
@@ -306,15 +297,9 @@ def _most(values: Floats) -> float:
 
 def write_csv(rows: Iterable[ComparisonRow], path: Path) -> None:
     """Write all numbers; an existing file is replaced when the new one is complete."""
-
-    def write(new: Path) -> None:
-        with new.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, [each.name for each in fields(ComparisonRow)])
-            writer.writeheader()
-            writer.writerows(asdict(row) for row in rows)
-
     path.parent.mkdir(parents=True, exist_ok=True)
-    replace_file(path, write)
+    table = pd.DataFrame([asdict(row) for row in rows], columns=[each.name for each in fields(ComparisonRow)])
+    replace_file(path, partial(table.to_csv, index=False, na_rep="nan", lineterminator="\r\n"))
 
 
 HEADERS: Final = (

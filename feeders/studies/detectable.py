@@ -24,7 +24,7 @@ from feeders.studies.operating import SHARE, box, volts_of_lie
 from feeders.studies.unobservable import CurvePositions
 from feeders.studies.workers import Here, Runner, cores
 from gridsec.arrays import Floats
-from gridsec.errors import DesignInfeasible, InputInvalid, Problem
+from gridsec.errors import DesignInfeasible, Problem, raise_if_any
 from gridsec.estimators.sequential import SequentialOptions
 from gridsec.estimators.sequential import design as design_sequential
 from gridsec.planning.collusion import Corridor, furthest
@@ -122,18 +122,13 @@ def detectable(
     InUse
         If another process writes the journal.
     """
-    if not 1 <= max_attacked <= site.meters.size:
-        raise InputInvalid(
-            [
-                Problem(
-                    "out-of-range", f"max_attacked is {max_attacked}; it must be from 1 to {site.meters.size}"
-                )
-            ]
-        )
-    if not 0.0 < risk < 1.0:
-        raise InputInvalid([Problem("out-of-range", f"risk is {risk}; it must be between 0 and 1")])
-    if not 0.0 <= share < math.inf:
-        raise InputInvalid([Problem("negative", f"share is {share}; it must be finite and not negative")])
+    p = site.meters.size
+    checks = (
+        (1 <= max_attacked <= p, "out-of-range", f"max_attacked is {max_attacked}; it must be from 1 to {p}"),
+        (0.0 < risk < 1.0, "out-of-range", f"risk is {risk}; it must be between 0 and 1"),
+        (0.0 <= share < math.inf, "negative", f"share is {share}; it must be finite and not negative"),
+    )
+    raise_if_any(Problem(code, text) for right, code, text in checks if not right)
     subject = {
         "study": "detectable",
         "digest": site.digest,
@@ -144,7 +139,6 @@ def detectable(
     asked = site.tables, max_attacked, share, risk
     given = _Given.of(site, *asked[1:])  # errors of the arguments occur here, not in a worker
     here = runner is None or isinstance(runner, Here)
-    p = site.meters.size
     rows = run_pieces(
         journal,
         subject,

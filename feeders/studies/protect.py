@@ -267,40 +267,29 @@ def check(
     bounded = not math.isnan(lie_volt)
     hiding = goal in (Goal.IDENTIFY, Goal.NOTICE)
     in_volts = goal in (Goal.BOUND, Goal.CONTAIN) or (goal is None and bounded)
-    for problem, wrong in (
-        (Problem("not-positive", f"max_attacked is {max_attacked}; it must be at least 1"), max_attacked < 1),
+    checks = (
+        (max_attacked < 1, "not-positive", f"max_attacked is {max_attacked}; it must be at least 1"),
         (
-            Problem(
-                "not-positive",
-                f"lie_volt is {lie_volt}; a bound of attacks must be a positive number of volts",
-            ),
             not 0.0 < lie_volt < math.inf and (bounded or goal == Goal.BOUND),
+            "not-positive",
+            f"lie_volt is {lie_volt}; a bound of attacks must be a positive number of volts",
         ),
+        (not 0.0 <= share < math.inf, "negative", f"share is {share}; it must be finite and not negative"),
+        (in_volts and not busbar_known, "inconsistent", "a bound of attacks requires a known busbar voltage"),
+        (bounded and hiding, "inconsistent", f"lie_volt goes with goals in volts, not with {goal}"),
+        (share != SHARE and hiding, "inconsistent", f"share goes with goals in volts, not with {goal}"),
         (
-            Problem("negative", f"share is {share}; it must be finite and not negative"),
-            not 0.0 <= share < math.inf,
-        ),
-        (
-            Problem("inconsistent", "a bound of attacks requires a known busbar voltage"),
-            in_volts and not busbar_known,
-        ),
-        (Problem("inconsistent", f"lie_volt goes with goals in volts, not with {goal}"), bounded and hiding),
-        (
-            Problem("inconsistent", f"share goes with goals in volts, not with {goal}"),
-            share != SHARE and hiding,
-        ),
-        (
-            Problem("inconsistent", "attack goes with goals identify and notice, not with bounds of attacks"),
             in_volts and attack == Attack.ANY,
+            "inconsistent",
+            "attack goes with goals identify and notice, not with bounds of attacks",
         ),
         (
-            Problem("inconsistent", "unknown powers do not go with bound, which assumes true powers"),
-            goal == Goal.BOUND and unknown,
+            goal == Goal.BOUND and bool(unknown),
+            "inconsistent",
+            "unknown powers do not go with bound, which assumes true powers",
         ),
-    ):
-        if wrong:
-            problems.append(problem)
-    raise_if_any(problems)
+    )
+    raise_if_any([*problems, *(Problem(code, text) for wrong, code, text in checks if wrong)])
 
 
 def _unmet(liars: Sequence[str]) -> str:

@@ -118,18 +118,11 @@ class AttackClass:
     def __post_init__(self) -> None:
         object.__setattr__(self, "trick", choice("trick", AttackKind, self.trick))
         if not self.sizes or self.name == CLEAN:
-            raise InputInvalid(
-                [Problem("missing", f"kind {self.name!r} needs a size, and a name other than {CLEAN!r}")]
-            )
+            text = f"kind {self.name!r} needs a size, and a name other than {CLEAN!r}"
+            raise InputInvalid([Problem("missing", text)])
         if (self.volts or self.together) and self.trick is not AttackKind.BIAS:
-            raise InputInvalid(
-                [
-                    Problem(
-                        "inconsistent",
-                        f"kind {self.name!r}: sizes in volts of each meter are for {AttackKind.BIAS}",
-                    )
-                ]
-            )
+            text = f"kind {self.name!r}: sizes in volts of each meter are for {AttackKind.BIAS}"
+            raise InputInvalid([Problem("inconsistent", text)])
 
     def every(self, step_s: float) -> AttackClass:
         """Kind for readings every `step_s`: ages and rates are counted in readings."""
@@ -213,52 +206,50 @@ class CampaignPlan:
         set_("design", choice("design", Design, self.design))
         set_("meters", choice("meters", TrialMeterErrors, self.meters))
         times = (self.duration_s, self.step_s, *self.onset_s, self.lying_s, self.settling_s, self.learn_s)
+        rates = self.alarms_per_year
         checks = (
             (
-                Problem("not-positive", "a campaign needs scenes, and a scene scenarios"),
                 min(self.scenes, self.together) < 1,
+                "not-positive",
+                "a campaign needs scenes, and a scene scenarios",
             ),
-            (Problem("negative", "the seed must not be negative"), self.seed < 0),
+            (self.seed < 0, "negative", "the seed must not be negative"),
             (
-                Problem("missing", "there are no kinds of attack, numbers of manipulated devices or places"),
                 not self._combined and self.together > 1,
+                "missing",
+                "there are no kinds of attack, numbers of manipulated devices or places",
             ),
+            (min((*self.liars, 1)) < 1, "not-positive", "numbers of manipulated devices must be positive"),
+            (not self.seasons, "missing", "there are no seasons"),
             (
-                Problem("not-positive", "numbers of manipulated devices must be positive"),
-                min((*self.liars, 1)) < 1,
-            ),
-            (Problem("missing", "there are no seasons"), not self.seasons),
-            (
-                Problem("duplicate", "kinds of attack need different names"),
                 len({k.name for k in self.kinds}) < len(self.kinds),
+                "duplicate",
+                "kinds of attack need different names",
             ),
             (
-                Problem("not-positive", "a false-alarm rate is missing, or not positive and finite"),
-                not self.alarms_per_year or not all(0.0 < rate < math.inf for rate in self.alarms_per_year),
+                not rates or not all(0.0 < rate < math.inf for rate in rates),
+                "not-positive",
+                "a false-alarm rate is missing, or not positive and finite",
             ),
-            (Problem("not-finite", "times must be finite numbers"), not all(map(math.isfinite, times))),
+            (not all(map(math.isfinite, times)), "not-finite", "times must be finite numbers"),
+            (min(self.step_s, self.lying_s) <= 0.0, "not-positive", "step_s and lying_s must be positive"),
             (
-                Problem("not-positive", "step_s and lying_s must be positive"),
-                min(self.step_s, self.lying_s) <= 0.0,
-            ),
-            (
-                Problem("out-of-range", f"learn_s must be 0 or from {self.learn_step_s:g} s on"),
                 0.0 != self.learn_s < self.learn_step_s,
+                "out-of-range",
+                f"learn_s must be 0 or from {self.learn_step_s:g} s on",
             ),
             (
-                Problem("out-of-range", "attacks must begin after the first frame and before the last"),
                 not self.step_s <= self.onset_s[0] <= self.onset_s[1] <= self.duration_s - self.step_s,
+                "out-of-range",
+                "attacks must begin after the first frame and before the last",
             ),
             (
-                Problem(
-                    "unknown-name",
-                    f"estimator {self.estimator!r} does not exist; there are {', '.join(ESTIMATORS)}",
-                ),
                 self.estimator not in ESTIMATORS,
+                "unknown-name",
+                f"estimator {self.estimator!r} does not exist; there are {', '.join(ESTIMATORS)}",
             ),
         )
-        problems = [problem for problem, wrong in checks if wrong]
-        raise_if_any(problems)
+        raise_if_any(Problem(code, text) for wrong, code, text in checks if wrong)
 
     @classmethod
     def of(cls, site: Site, **chosen: Any) -> CampaignPlan:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from feeders.studies.operating import Bases
-from feeders.studies.unobservable import customer_indices
 from gridsec.arrays import Floats, Ints
 from gridsec.errors import FeederInvalid, Problem, raise_if_any
 from gridsec.grid.droop import Droop, fleet
@@ -55,56 +53,27 @@ class Who(StrEnum):
     ALL = "all"
 
 
-@dataclass(frozen=True, slots=True)
-class _Point:
-    load: float
-    pv: float
-
-
-_POINTS: Final = {"evening": _Point(1.0, 0.0), "noon": _Point(0.2, 1.0), "half": _Point(0.5, 0.5)}
+_POINTS: Final = {"evening": (1.0, 0.0), "noon": (0.2, 1.0), "half": (0.5, 0.5)}
 """Shares of the peaks of load and generation."""
 
 
-def equip(
-    site: Site,
-    preset: str,
-    who: Who = Who.PV,
-    *,
-    customers: Sequence[str] | None = None,
-    kva: float | None = None,
-) -> Droop:
+def equip(site: Site, preset: str, who: Who = Who.PV) -> Droop:
     """Equip customers of a feeder with inverters of one preset, in place of its own fleet.
 
     A customer's own inverter keeps its rating; others get 1.1 kVA for each kW of generation, or 5 kVA.
-    `customers` and `kva` (of each inverter) take precedence.
 
     Raises
     ------
     FeederInvalid
         For an unknown preset, or without a customer to equip.
-    ValueError
-        For an unknown customer.
     """
     rows = site.tables.customers
-    if customers is not None:
-        own = customer_indices(site, customers)
-    else:
-        kept = [k for k, row in enumerate(rows) if who is Who.ALL or row.pv_kw > 0 or row.inverter_kva > 0]
-        own = np.array(kept, dtype=np.intp)
-    if not own.size:
-        raise FeederInvalid(
-            [
-                Problem(
-                    "nothing-to-design",
-                    f"{site.feeder.name}: no customer has generation; equip all (--who all)",
-                )
-            ]
-        )
-    rated = [
-        kva or rows[k].inverter_kva or (KVA_PER_KW * rows[k].pv_kw if rows[k].pv_kw > 0 else SMALLEST_KVA)
-        for k in own
-    ]
-    return made(site, own, preset, np.array(rated))
+    own = [k for k, row in enumerate(rows) if who is Who.ALL or row.pv_kw > 0 or row.inverter_kva > 0]
+    if not own:
+        text = f"{site.feeder.name}: no customer has generation; equip all (--who all)"
+        raise FeederInvalid([Problem("nothing-to-design", text)])
+    rated = [rows[k].inverter_kva or KVA_PER_KW * rows[k].pv_kw or SMALLEST_KVA for k in own]
+    return made(site, np.array(own, dtype=np.intp), preset, np.array(rated))
 
 
 def made(site: Site, own: Ints, preset: str, kva: Floats) -> Droop:
@@ -127,16 +96,12 @@ def chosen_fleet(site: Site, preset: str | None, who: Who = Who.PV) -> Droop:
     if preset is not None:
         return equip(site, preset, who)
     if not site.droop.tau.size:
-        raise NoInverters(
-            [
-                Problem(
-                    "nothing-to-design",
-                    f"{site.feeder.name} has no droop inverters: fill the columns inverter_kva and "
-                    "droop of its customers.csv, or give a preset (--preset ieee1547-b) to equip customers "
-                    "with generation, or all (--who all)",
-                )
-            ]
+        text = (
+            f"{site.feeder.name} has no droop inverters: fill the columns inverter_kva and droop of its "
+            "customers.csv, or give a preset (--preset ieee1547-b) to equip customers with generation, or "
+            "all (--who all)"
         )
+        raise NoInverters([Problem("nothing-to-design", text)])
     return site.droop
 
 
@@ -145,7 +110,7 @@ def points(site: Site, v0: float = 1.0) -> dict[str, InjectionBox]:
 
     Evening: full load, no generation. Noon: a fifth of the load, full generation. Half: half of both.
     """
-    return {name: point(site, at.load, at.pv, v0) for name, at in _POINTS.items()}
+    return {name: point(site, load, pv, v0) for name, (load, pv) in _POINTS.items()}
 
 
 def point(site: Site, load: Floats | float, pv: Floats | float, v0: float = 1.0) -> InjectionBox:
