@@ -12,11 +12,12 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import pandas as pd
 
+from feeders.model.site import Site
 from feeders.registry.plugins import EstimatorUnusable
 from feeders.registry.registry import FAMILIES, DesignedEstimator, choose, design
 from feeders.simulation.attacks import AttackKind, AttackSpec, NoSuchAttack
@@ -26,9 +27,6 @@ from feeders.studies.journal import Journal, Where
 from feeders.util import replace_file
 from gridsec.arrays import Floats
 from gridsec.errors import DesignInfeasible, GridsecError, NotObservable, Problem, no_choice, raise_if_any
-
-if TYPE_CHECKING:
-    from feeders.model.site import Site
 
 __all__ = [
     "BEGIN",

@@ -11,18 +11,18 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from feeders.format.tables import FeederTables
 from feeders.model.load_uncertainty import load_doubt
-from feeders.model.site import from_tables, plant
-from feeders.studies.journal import Progress, Where, run_pieces
+from feeders.model.site import Site, from_tables, plant
+from feeders.studies.journal import Progress, Runner, Where, run_pieces
 from feeders.studies.operating import SHARE, box, volts_of_lie
 from feeders.studies.unobservable import CurvePositions
-from feeders.studies.workers import Here, Runner, cores
+from feeders.studies.workers import Here, cores
 from gridsec.arrays import Floats
 from gridsec.errors import DesignInfeasible, Problem, raise_if_any
 from gridsec.estimators.sequential import SequentialOptions
@@ -31,10 +31,7 @@ from gridsec.planning.collusion import Corridor, furthest
 from gridsec.planning.detectability import Rule, named_size, rule, within
 from gridsec.planning.stealthy_attacks import ErrorBox, largest_lie, worst_error
 
-if TYPE_CHECKING:
-    from feeders.model.site import Site
-
-__all__ = ["MANY", "RISK", "Detectable", "detectable", "monitor_rule", "workers"]
+__all__ = ["Detectable", "detectable", "monitor_rule", "workers"]
 
 RISK = 1e-3
 """Probability at one moment that honest errors exceed the monitor's limits."""

@@ -11,18 +11,15 @@ import hashlib
 import json
 import platform
 import sqlite3
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from importlib.metadata import entry_points, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Protocol, Self
 
 from feeders.registry.plugins import GROUP
 from feeders.util import plain
 from gridsec.errors import GridsecError
-
-if TYPE_CHECKING:
-    from feeders.studies.workers import Runner
 
 __all__ = [
     "InUse",
@@ -69,6 +66,19 @@ class Keeper:
     def refused(self, path: Path, why: OSError | OtherStudy | InUse) -> bool:  # noqa: ARG002  # for others
         """A journal cannot be used (any more). True: try again; False: continue without it; or raise."""
         raise why
+
+
+Work = Callable[[int], Any]
+"""Result of a piece of work by its number, in plain JSON types."""
+
+Made = Generator[tuple[int, Any], None, None]
+
+
+class Runner(Protocol):
+    """Runner of pieces of work."""
+
+    def run(self, work: Work, pieces: Sequence[int]) -> Made:
+        """Work on all pieces; yield each with its result when finished."""
 
 
 Where = Path | str | Keeper | None
@@ -248,15 +258,15 @@ def run_pieces(
     where: Where,
     subject: Mapping[str, Any],
     keys: Sequence[str],
-    work: Callable[[int], Any],
+    work: Work,
     *,
     runner: Runner | None = None,
     progress: Progress | None = None,
 ) -> list[Any]:
     """Do the pieces of work that the journal lacks, and return the results of all in the order of the keys.
 
-    `work` computes the result of a piece by its number, in plain JSON types; `runner` calls it, by default in
-    this process in order. `progress` is called before the first piece and after each.
+    `runner` calls `work`, by default in this process in order. `progress` is called before the first piece and
+    after each.
 
     Raises
     ------

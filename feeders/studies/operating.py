@@ -8,14 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Self
+from typing import Final, Self
 
 import numpy as np
 
 from feeders.format.topology import Edge, tree
 from feeders.model.forecast import always
 from feeders.model.load_uncertainty import unread
-from feeders.model.site import Snapshot, to_frame
+from feeders.model.site import Site, Snapshot, to_frame
+from feeders.model.three_phase import ThreePhaseSite
 from feeders.studies.unobservable import CurvePositions, customer_indices
 from gridsec.arrays import Floats
 from gridsec.errors import choice
@@ -25,11 +26,7 @@ from gridsec.interface import Frame
 from gridsec.planning.redundancy import from_busbar
 from gridsec.planning.stealthy_attacks import ErrorBox, PowerErrorModel
 
-if TYPE_CHECKING:
-    from feeders.model.site import Site
-    from feeders.model.three_phase import ThreePhaseSite
-
-__all__ = ["SHARE", "SIGMAS", "Bases", "box", "false_powers", "line_rows", "squared", "volts_of_lie"]
+__all__ = ["SHARE", "Bases", "box", "false_powers", "line_rows", "squared", "volts_of_lie"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

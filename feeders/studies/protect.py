@@ -12,11 +12,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 
+from feeders.model.site import Site
 from feeders.studies.journal import Journal, Where
 from feeders.studies.operating import SHARE, box, false_powers, squared, volts_of_lie
 from feeders.studies.unobservable import Attack, CurvePositions, knowledge, meter_mask, see_names
@@ -25,9 +25,6 @@ from gridsec.errors import DesignInfeasible, Problem, choice, no_choice, raise_i
 from gridsec.planning.protection import Attacker, Unprotectable, fewest_protected, hides, lies_beyond
 from gridsec.planning.redundancy import Patterns, fewest_meters
 from gridsec.planning.stealthy_attacks import ErrorBox, PowerErrorModel, largest_lie, largest_of
-
-if TYPE_CHECKING:
-    from feeders.model.site import Site
 
 __all__ = ["Goal", "Protect", "check", "protect"]
 

@@ -11,11 +11,12 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import pandas as pd
 
+from feeders.model.site import Site
 from feeders.studies.journal import Progress, Where, worked
 from feeders.studies.unobservable import Attack, CurvePositions, Knowledge, knowledge, see_names
 from gridsec.errors import DesignInfeasible
@@ -27,9 +28,6 @@ from gridsec.planning.redundancy import (
     parts,
 )
 from gridsec.secure.index import Index
-
-if TYPE_CHECKING:
-    from feeders.model.site import Site
 
 __all__ = ["ALL", "SILENT", "Redundancy", "redundancy"]
 

@@ -5,20 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
+from feeders.model.site import Site
 from gridsec.arrays import Bools, Floats, Ints, unit_rows
 from gridsec.errors import Problem, choice, no_choice, raise_if_any
 from gridsec.observers.lure import close_loop
 from gridsec.planning.redundancy import Patterns, patterns, unknown_pair, unknown_voltages
 
-if TYPE_CHECKING:
-    from feeders.model.site import Site
-
 __all__ = [
-    "TOLERANCE",
     "Attack",
     "CurvePositions",
     "Knowledge",

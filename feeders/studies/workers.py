@@ -9,34 +9,22 @@ from __future__ import annotations
 import multiprocessing
 import os
 from collections import Counter, deque
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Generator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from importlib import import_module
 from threading import Thread
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]  # has no stubs
 
-from feeders.studies.journal import versions
+from feeders.studies.journal import Made, Runner, Work, versions
 from feeders.util import extra
 from gridsec.errors import GridsecError
 from gridsec.processes import deaf, listen, stop
 
-__all__ = [
-    "ClusterUnusable",
-    "Dask",
-    "Here",
-    "Processes",
-    "Runner",
-    "WorkerLost",
-    "agree",
-    "cores",
-]
-
-Work = Callable[[int], Any]
-Made = Generator[tuple[int, Any], None, None]
+__all__ = ["ClusterUnusable", "Dask", "Here", "Processes", "Runner", "WorkerLost", "agree", "cores"]
 
 RETRIES: Final = 3
 """Largest number of repetitions of a piece after the death of its worker."""
@@ -52,13 +40,6 @@ class ClusterUnusable(GridsecError):
     """No usable Dask cluster."""
 
     code = "cluster-unusable"
-
-
-class Runner(Protocol):
-    """Runner of pieces of work."""
-
-    def run(self, work: Work, pieces: Sequence[int]) -> Made:
-        """Work on all pieces; yield each with its result when finished."""
 
 
 @dataclass(frozen=True, slots=True)

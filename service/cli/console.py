@@ -13,26 +13,6 @@ from rich.markup import escape
 
 from service.cli.paths import Given, Unusable, check_paths
 
-__all__ = [
-    "ADDRESS",
-    "DATABASE",
-    "FAILED",
-    "FEEDER",
-    "FILE",
-    "USAGE",
-    "WRITER_LOST",
-    "Feeder",
-    "Studied",
-    "err",
-    "finite",
-    "options_of",
-    "out",
-    "print_error",
-    "read_all",
-    "refuse_options",
-]
-
-
 Told = TypeVar("Told")
 
 

@@ -17,8 +17,6 @@ from gridsec.errors import GridsecError, InputInvalid, Problem
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["A_FEEDER", "Unusable", "check_paths", "is_feeder", "write_tables"]
-
 
 A_FEEDER: Final = "a feeder's folder; tables go into another folder"
 

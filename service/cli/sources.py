@@ -21,8 +21,6 @@ from service.cli import console
 if TYPE_CHECKING:
     from feeders.convert.convert import Conversion
 
-__all__ = ["FOLDER", "converted", "show_check", "spared"]
-
 FOLDER: Final = "feeder"
 """Name of a converted feeder's folder within the folder of the results."""
 

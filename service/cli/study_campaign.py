@@ -26,37 +26,7 @@ if TYPE_CHECKING:
     from feeders.model.site import Site
     from feeders.studies.campaign.plan import AttackClass, CampaignPlan
     from feeders.studies.campaign.study import Campaign
-    from feeders.studies.workers import Runner
-
-__all__ = [
-    "NO_LIES",
-    "AlarmsPerYear",
-    "Choice",
-    "DaskAt",
-    "DesignOf",
-    "Duration",
-    "EstimatorName",
-    "Kinds",
-    "KnownKvar",
-    "KnownKw",
-    "Learned",
-    "Liars",
-    "LoadErrorKvar",
-    "LoadErrorKw",
-    "MetersAs",
-    "Places",
-    "Promised",
-    "Scenarios",
-    "Seasons",
-    "Seed",
-    "Settings",
-    "Step",
-    "Together",
-    "Workers",
-    "campaign",
-    "planned",
-    "sources",
-]
+    from feeders.studies.journal import Runner
 
 
 SHORTEST: Final = 10

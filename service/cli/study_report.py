@@ -36,26 +36,6 @@ if TYPE_CHECKING:
     from feeders.studies.journal import Progress, Where
     from service.cli.session import Keeping
 
-__all__ = [
-    "STUDIES",
-    "Asked",
-    "At",
-    "BusbarLimits",
-    "Hosting",
-    "MaxAttacked",
-    "Page",
-    "Readings",
-    "Scenarios",
-    "Studies",
-    "Study",
-    "Workers",
-    "misplaced",
-    "outcome",
-    "report",
-    "versions",
-    "write",
-]
-
 
 LIBRARIES: Final = (
     *("gridsec", "numpy", "scipy", "pandas", "cvxpy", "clarabel", "highspy", "power-grid-model"),
@@ -185,67 +165,62 @@ def plan(site: Site, asked: Asked) -> CampaignPlan:
 def attacks(site: Site, asked: Asked) -> str:
     """Summary of the simulated attacks of a report, with the origin of their parameters: files or options."""
     names = ("step", "estimator", "load_error_kw", "load_error_kvar")
-    return sources(site, plan(site, asked), {option(name): getattr(asked, name) for name in names})
+    return sources(site, plan(site, asked), {option_of(name): getattr(asked, name) for name in names})
 
 
-def _liars(asked: Asked) -> list[str]:
-    return ["--max-attacked", str(asked.max_attacked)]
-
-
-def _known(asked: Asked) -> list[str]:
-    who = [word for name in asked.unknown or () for word in ("--unknown", name)]
-    return who + ["--busbar-unknown"] * asked.busbar_unknown
-
-
-def _protection(asked: Asked) -> list[str]:
-    bound = [] if math.isnan(asked.lie_volt) else ["--lie-volt", word(asked.lie_volt)]
-    goal = [] if asked.goal is None else ["--goal", asked.goal]
-    return [*_liars(asked), *goal, *bound, *_known(asked)]
-
-
-def _campaigned(asked: Asked) -> list[str]:
-    count = [word for number in sorted({1, asked.max_attacked}) for word in ("--liars", str(number))]
-    setting = ["--setting", f"max_attacked={asked.max_attacked}"]
-    watched = _given(asked, "step", "estimator", "load_error_kw", "load_error_kvar")
-    return ["--scenarios", str(asked.scenarios), "--seed", str(asked.seed), *count, *setting, *watched]
-
-
-def _fleet(asked: Asked) -> list[str]:
-    words = _given(asked, "preset", "busbar", "band")
-    return ["--seed", str(asked.seed), *words] + ["--hosting"] * asked.hosting
-
-
-def _given(asked: Asked, *names: str) -> list[str]:
-    """Options with other values than the defaults."""
-    words = []
+def _words(asked: Asked, *names: str) -> list[str]:
+    """Options with other values than the defaults, as words of a command line."""
+    words: list[str] = []
+    defaults = {each.name: each.default for each in fields(Asked)}
     for name in names:
-        value = getattr(asked, name)
-        if value is not None:
-            values = value if isinstance(value, tuple) else (value,)
-            words += [option(name), *map(word, values)]
+        value, option = getattr(asked, name), option_of(name)
+        if value in (defaults[name], None, ()) or (isinstance(value, float) and math.isnan(value)):
+            continue
+        if value is True:
+            words.append(option)
+        elif name in ("unknown", "silent"):
+            words += [each for one in value for each in (option, one)]
+        else:
+            words += [option, *map(word, value if isinstance(value, tuple) else (value,))]
     return words
 
 
-def option(name: str) -> str:
+def _m(asked: Asked) -> list[str]:
+    return ["--max-attacked", str(asked.max_attacked)]
+
+
+def _campaigned(asked: Asked) -> list[str]:
+    count = [each for number in sorted({1, asked.max_attacked}) for each in ("--liars", str(number))]
+    setting = ["--setting", f"max_attacked={asked.max_attacked}"]
+    watched = _words(asked, "step", "estimator", "load_error_kw", "load_error_kvar")
+    return ["--scenarios", str(asked.scenarios), "--seed", str(asked.seed), *count, *setting, *watched]
+
+
+def option_of(name: str) -> str:
     """Name of an attribute of `Asked` on the command line."""
     return f"--{name.replace('_', '-')}"
 
 
 STUDIES: Final[dict[str, Study]] = {
-    "detectable": Study(_detectable, _liars, "attacks on meters, errors of customers"),
-    "protect": Study(_protect, _protection, "meters protected, against attacks"),
-    "droop": Study(_droop, _fleet, "fleets, steps and loads", seeded=True),
+    "detectable": Study(_detectable, _m, "attacks on meters, errors of customers"),
+    "protect": Study(
+        _protect,
+        lambda asked: _m(asked) + _words(asked, "goal", "lie_volt", "unknown", "busbar_unknown"),
+        "meters protected, against attacks",
+    ),
+    "droop": Study(
+        _droop,
+        lambda asked: ["--seed", str(asked.seed), *_words(asked, "preset", "busbar", "band", "hosting")],
+        "fleets, steps and loads",
+        seeded=True,
+    ),
     "campaign": Study(_campaign, _campaigned, "simulated attacks", seeded=True),
     "redundancy": Study(
         _redundancy,
-        lambda asked: [word for name in asked.silent for word in ("--silent", name)] + _known(asked),
+        lambda asked: _words(asked, "silent", "unknown", "busbar_unknown"),
         "search for invisible attacks",
     ),
-    "calibrate": Study(
-        _calibrate,
-        lambda asked: [] if asked.readings is None else ["--readings", str(asked.readings)],
-        "possible errors of the files",
-    ),
+    "calibrate": Study(_calibrate, lambda asked: _words(asked, "readings"), "possible errors of the files"),
 }
 """Studies of a report, in the order of its sections."""
 
@@ -259,7 +234,7 @@ def misplaced(asked: Asked, chosen: Collection[str]) -> list[str]:
         without = replace(asked, **{each.name: each.default})
         takers = [name for name, study in STUDIES.items() if study.options(asked) != study.options(without)]
         if takers and not set(takers) & set(chosen):
-            problems.append(f"{option(each.name)} goes with {', '.join(takers)}")
+            problems.append(f"{option_of(each.name)} goes with {', '.join(takers)}")
     return problems
 
 
@@ -527,24 +502,7 @@ def _told(given: datetime) -> str:
 
 def _command(asked: Asked, out: Path, studies: str | None) -> str:
     """Command line of the same report: options that differ from the defaults."""
-    usual = replace(
-        asked, **{each.name: each.default for each in fields(asked) if each.default is not MISSING}
-    )
     words: list[object] = ["gridsec", "study", "report", asked.feeder, "--out", out]
     words += [] if studies is None else ["--studies", studies]
-    for each in fields(asked):
-        value = getattr(asked, each.name)
-        if each.name in ("feeder", "workers") or value in (getattr(usual, each.name), None):
-            continue
-        if isinstance(value, float) and math.isnan(value):
-            continue
-        option = f"--{each.name.replace('_', '-')}"
-        if value is True:
-            words.append(option)
-        elif each.name in ("busbar", "band"):
-            words += [option, *value]
-        elif isinstance(value, tuple):
-            words += [word for name in value for word in (option, name)]
-        else:
-            words += [option, value]
+    words += _words(asked, *(each.name for each in fields(asked) if each.name not in ("feeder", "workers")))
     return command_line(words)

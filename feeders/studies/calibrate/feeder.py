@@ -10,12 +10,14 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
+from feeders.format.tables import FeederTables
 from feeders.model.site import Site, find, from_tables
 from feeders.model.three_phase import ThreePhaseSite, spanned
+from feeders.studies.calibrate.readings import Frames
 from feeders.studies.operating import line_rows
 from gridsec.arrays import Bools, Floats, Ints, Phasors
 from gridsec.errors import FeederInvalid, Problem
@@ -27,11 +29,7 @@ from gridsec.grid.three_phase import PHASES, ThreePhaseFeeder, lindist3flow
 from gridsec.planning.calibration import Field, Places, PriorUncertainty, Series
 from gridsec.planning.droop.ac_sensitivity import lines
 
-if TYPE_CHECKING:
-    from feeders.format.tables import FeederTables
-    from feeders.studies.calibrate.readings import Frames
-
-__all__ = ["Lateral", "MergedNetwork", "alone", "laterals", "network", "site_of"]
+__all__ = ["Lateral", "MergedNetwork", "network", "site_of"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,7 +6,7 @@ import json
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 import pandas as pd
@@ -18,20 +18,16 @@ from pandas.api.types import (
     is_string_dtype,
 )
 
-from feeders.model.site import one_phase_each
+from feeders.model.site import Site, one_phase_each
+from feeders.model.three_phase import ThreePhaseSite
 from feeders.simulation.meters import BUSBAR
-from feeders.simulation.recording import REQUIRED, RecordingInvalid, read_recording
+from feeders.simulation.recording import REQUIRED, Recording, RecordingInvalid, read_recording
 from feeders.simulation.scenario import LATEST_S
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import Problem
 from gridsec.grid.three_phase import PHASES
 
-if TYPE_CHECKING:
-    from feeders.model.site import Site
-    from feeders.model.three_phase import ThreePhaseSite
-    from feeders.simulation.recording import Recording
-
-__all__ = ["Frames", "blind", "frames", "open_readings"]
+__all__ = ["Frames", "blind", "frames"]
 
 MOST_FRAMES: Final = 720
 """Number of frames from which on frames are averaged."""

@@ -7,18 +7,20 @@ docs/theory-studies.md, Calibration.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import partial
 from itertools import combinations
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
 from feeders.format.columns import MATRIX_NAMES, PHASE_NAMES
-from feeders.format.tables import LineRow
+from feeders.format.tables import FeederTables, LineRow
 from feeders.studies.calibrate import feeder as model
+from feeders.studies.calibrate.feeder import CustomerPowers, Lateral, MergedNetwork
+from feeders.studies.calibrate.readings import Frames
 from gridsec.arrays import Floats, Ints
 from gridsec.grid.three_phase import PHASES, ThreePhaseFeeder
 from gridsec.planning.calibration import (
@@ -38,13 +40,6 @@ from gridsec.planning.calibration import (
     weigh,
     whitening,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from feeders.format.tables import FeederTables
-    from feeders.studies.calibrate.feeder import CustomerPowers, Lateral, MergedNetwork
-    from feeders.studies.calibrate.readings import Frames
 
 __all__ = [
     "PLACES",

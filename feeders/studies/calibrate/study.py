@@ -16,14 +16,17 @@ import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import pandas as pd
 from scipy.stats import norm
 
-from feeders.format.tables import write
+from feeders.format.tables import FeederTables, write
 from feeders.model.equipment import digest, find
+from feeders.model.site import Site
+from feeders.model.three_phase import ThreePhaseSite
+from feeders.simulation.recording import Recording
 from feeders.studies.calibrate.readings import Frames, blind, frames
 from feeders.studies.calibrate.search import (
     LENGTH_SPREAD,
@@ -44,33 +47,11 @@ from feeders.studies.calibrate.search import (
     prepare,
 )
 from feeders.studies.journal import Journal, Progress, Where
+from gridsec.arrays import Floats
 from gridsec.errors import FeederInvalid, InputInvalid, Problem, raise_if_any
 from gridsec.planning.calibration import explain, lengthened
 
-if TYPE_CHECKING:
-    from feeders.format.tables import FeederTables
-    from feeders.model.site import Site
-    from feeders.model.three_phase import ThreePhaseSite
-    from feeders.simulation.recording import Recording
-    from gridsec.arrays import Floats
-
-__all__ = [
-    "Calibrate",
-    "FileErrorSearch",
-    "OtherFeeder",
-    "SearchResult",
-    "calibrate",
-    "customers",
-    "described",
-    "errors",
-    "final",
-    "line_table",
-    "loads",
-    "meters",
-    "present",
-    "read",
-    "wrong_numbers",
-]
+__all__ = ["Calibrate", "OtherFeeder", "calibrate", "wrong_numbers"]
 
 
 AS_FILED, PROPOSED, UNTOLD, EXCLUDED = "as in the files", "proposed", "cannot be told", "excluded"

@@ -10,11 +10,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 
+from feeders.model.site import Site
 from feeders.simulation.attacks import AttackKind
 from feeders.studies.campaign.plan import AttackClass, Promise
 from feeders.studies.detectable import Detectable, monitor_rule
@@ -25,9 +25,6 @@ from gridsec.estimators import sequential
 from gridsec.estimators.sequential import LoadDoubt
 from gridsec.interface import Frame
 from gridsec.planning.detectability import Rule, largest_shift
-
-if TYPE_CHECKING:
-    from feeders.model.site import Site
 
 __all__ = ["Rehearsal", "promised", "rehearse"]
 

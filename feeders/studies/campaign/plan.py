@@ -14,13 +14,13 @@ from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
 from functools import partial
 from itertools import product
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
 from feeders.format.columns import ESTIMATORS
 from feeders.model.profiles import Season, library
-from feeders.model.site import from_tables
+from feeders.model.site import Site, from_tables
 from feeders.simulation.attacks import AttackKind
 from feeders.simulation.demand import Variation
 from feeders.simulation.trial import LoadError, Trial, TrialMeterErrors
@@ -28,21 +28,7 @@ from feeders.util import own_numbers, plain
 from gridsec.arrays import Ints
 from gridsec.errors import InputInvalid, Problem, choice, each_choice, raise_if_any
 
-if TYPE_CHECKING:
-    from feeders.model.site import Site
-
-__all__ = [
-    "CLEAN",
-    "KINDS",
-    "LEARN_STEP_S",
-    "AttackClass",
-    "CampaignCase",
-    "CampaignPlan",
-    "Design",
-    "Place",
-    "Promise",
-    "SceneTime",
-]
+__all__ = ["CLEAN", "KINDS", "AttackClass", "CampaignCase", "CampaignPlan", "Design", "Place", "Promise"]
 
 CLEAN: Final = "clean"
 """Kind of the scenario without an attack."""

@@ -8,10 +8,11 @@ inverters and false powers are simulated in full.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from feeders.model.site import Site
 from feeders.registry.registry import DesignedEstimator, design
 from feeders.simulation.attacks import (
     AttackKind,
@@ -44,9 +45,6 @@ from gridsec.errors import InputInvalid, Problem
 from gridsec.estimators.sequential import Commission
 from gridsec.grid.network import Power
 from gridsec.interface import Decision, Frame
-
-if TYPE_CHECKING:
-    from feeders.model.site import Site
 
 __all__ = ["Prepared", "attacks", "liars", "prepare", "risings", "watch"]
 

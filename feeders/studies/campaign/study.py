@@ -12,35 +12,21 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import pandas as pd
 from scipy.stats import binomtest, chi2
 
 from feeders.format.tables import FeederTables
-from feeders.model.site import from_tables
+from feeders.model.site import Site, from_tables
 from feeders.studies.campaign.plan import CLEAN, CampaignPlan, Promise
 from feeders.studies.campaign.scene import Prepared, prepare, watch
-from feeders.studies.journal import Progress, Where, run_pieces, versions
-from feeders.studies.workers import Here, Runner
+from feeders.studies.journal import Progress, Runner, Where, run_pieces, versions
+from feeders.studies.workers import Here
 from gridsec.errors import GridsecError
 
-if TYPE_CHECKING:
-    from feeders.model.site import Site
-
-__all__ = [
-    "CONFIDENCE",
-    "WITHIN_S",
-    "Campaign",
-    "NothingPlayed",
-    "campaign",
-    "delays",
-    "false_names",
-    "grouped",
-    "promises",
-    "scenarios",
-]
+__all__ = ["Campaign", "NothingPlayed", "campaign", "false_names", "grouped", "scenarios"]
 
 
 CONFIDENCE: Final = 0.95

@@ -5,18 +5,16 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
+from feeders.model.site import Site
 from feeders.studies.operating import Bases
 from gridsec.arrays import Floats, Ints
 from gridsec.errors import FeederInvalid, Problem, raise_if_any
 from gridsec.grid.droop import Droop, fleet
 from gridsec.planning.droop.ac_sensitivity import InjectionBox
-
-if TYPE_CHECKING:
-    from feeders.model.site import Site
 
 __all__ = [
     "KVA_PER_KW",

@@ -16,10 +16,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
+from feeders.model.site import Site
 from feeders.simulation.powerflow import PowerFlowDiverged
 from feeders.studies.droop.fleets import KVA_PER_KW, made, point
 from feeders.studies.droop.verdict import CLEARLY, Subject, judge
@@ -38,9 +39,6 @@ from gridsec.planning.droop.ac_sensitivity import (
 )
 from gridsec.planning.droop.equilibrium import Band, always, at_rest, injected, rest
 from gridsec.planning.droop.stability import Update, growth, slopes
-
-if TYPE_CHECKING:
-    from feeders.model.site import Site
 
 __all__ = [
     "BandGuarantee",

@@ -11,11 +11,12 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import pandas as pd
 
+from feeders.model.site import Site
 from feeders.studies.droop.fleets import Who, box, chosen_fleet, equip, points, range_problem
 from feeders.studies.droop.limits import (
     BandGuarantee,
@@ -53,10 +54,7 @@ from gridsec.planning.droop.ac_sensitivity import InjectionBox
 from gridsec.planning.droop.equilibrium import rest
 from gridsec.planning.droop.stability import Update, enlarged
 
-if TYPE_CHECKING:
-    from feeders.model.site import Site
-
-__all__ = ["ANY", "DroopOptions", "DroopStudy", "band_problem", "droop", "presets_of"]
+__all__ = ["DroopOptions", "DroopStudy", "droop", "presets_of"]
 
 
 HOSTING: Final = {

@@ -15,11 +15,12 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import pandas as pd
 
+from feeders.model.site import Site
 from feeders.simulation.powerflow import PowerFlow, PowerFlowDiverged
 from feeders.simulation.powerflow_three_phase import PlacesFlow, power_flow
 from feeders.studies.droop.fleets import inverter_names, point
@@ -31,14 +32,9 @@ from gridsec.planning.droop.ac_sensitivity import InjectionBox, PhasorNetwork, n
 from gridsec.planning.droop.equilibrium import Share, injected, rest, shares, shares_of_gain
 from gridsec.planning.droop.stability import Loop, Update, growth, loop, proof, reach, slopes, steepened
 
-if TYPE_CHECKING:
-    from feeders.model.site import Site
-
 __all__ = [
     "FleetOutcome",
     "FleetVerdict",
-    "Judgement",
-    "StepChange",
     "StepResponse",
     "Subject",
     "edge",
