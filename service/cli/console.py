@@ -106,3 +106,8 @@ def finite(value: float | None) -> float | None:
 def print_error(message: str) -> None:
     """Print an error message without markup."""
     err.print(f"[bold red]gridsec:[/] {escape(message)}")
+
+
+def say(message: str) -> None:
+    """Print a message without markup."""
+    out.print(escape(message))

@@ -72,7 +72,7 @@ def converted(feeder: str, out: Path | None) -> str:
             shutil.rmtree(temporary or folder, ignore_errors=True)
     fates = Counter(change.done for change in done.changes)
     counts = ", ".join(f"{times} {fate}" for fate, times in fates.items()) or "nothing changed"
-    console.out.print(escape(f"{feeder} becomes {folder}: {counts}; the list: {folder / CHANGES_FILE}"))
+    console.say(f"{feeder} becomes {folder}: {counts}; the list: {folder / CHANGES_FILE}")
     show_check(done)
     return str(folder)
 
@@ -101,7 +101,7 @@ def spared(folder: Path) -> Iterator[None]:
         if all((folder / name).read_bytes() == (kept / name).read_bytes() for name in old):
             shutil.rmtree(kept)
         else:
-            console.out.print(escape(f"the earlier content of {folder} differs; it is now in {kept}"))
+            console.say(f"the earlier content of {folder} differs; it is now in {kept}")
 
 
 def _name(feeder: str) -> str:

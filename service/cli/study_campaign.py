@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar
 
 import numpy as np
 import typer
-from rich.markup import escape
 
 from gridsec.errors import raise_if_any
 from service.cli import console
@@ -285,7 +284,7 @@ def campaign(
             "--load-error-kw": load_error_kw,
             "--load-error-kvar": load_error_kvar,
         }
-        console.out.print(escape(sources(site, plan, given)))
+        console.say(sources(site, plan, given))
         if promised:
             plan = _with_promised(site, plan, plan.kinds if kind else (), kept)
         with bar("scenarios") as report_progress:
@@ -305,7 +304,7 @@ def _print(found: Campaign) -> None:
     plan, impossible = found.plan, int((found.scenarios["reason"] != "").sum())
     told = f"{plan.scenarios} scenarios of {plan.duration_s:g} s monitored by {plan.estimator}"
     note = f"; {impossible} cannot be played, see `reason`" if impossible else ""
-    console.out.print(escape(f"{found.feeder}: {told}{note}"))
+    console.say(f"{found.feeder}: {told}{note}")
     if not found.promises.empty:
         show("Guarantees of `study detectable`", found.promises)
     show("By kind and size", _short(found.by_size))

@@ -182,4 +182,4 @@ def _show(rows: list[ComparisonRow], plan: ComparisonPlan) -> None:
                 table.add_row(*map(escape, cells(row)))
         console.out.print(table, soft_wrap=False)
         for reason in reasons:
-            console.out.print(escape(reason))
+            console.say(reason)

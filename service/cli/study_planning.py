@@ -156,14 +156,12 @@ def protect(
 def _tell_protection(found: Protect, of: int) -> None:
     count = len(found.meters)
     if found.no_answer:
-        console.out.print(
-            escape(f"{found.feeder}: {found.goal} requires no protection here; that is no safety")
-        )
+        console.say(f"{found.feeder}: {found.goal} requires no protection here; that is no safety")
         console.out.print(NO_ANSWER)
         return
     proof = "no fewer suffice" if not found.gap else f"at least {found.least} are needed"
     measure = "largest hidden attack, V" if found.goal.in_volts else "fewest meters of an invisible attack"
-    console.out.print(escape(f"{found.feeder}: protect {count} of {of} meters; {proof}"))
+    console.say(f"{found.feeder}: protect {count} of {of} meters; {proof}")
     console.out.print(f"{measure}: {_cell(found.before)} before, {_cell(found.after)} after")
     if found.goal.in_volts:
         console.out.print(

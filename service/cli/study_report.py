@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
-from rich.markup import escape
 
 from feeders.util import command_line, replace_file, word
 from gridsec.errors import GridsecError, InputInvalid, Problem
@@ -454,14 +453,14 @@ def _make(asked: Asked, chosen: tuple[str, ...], out: Path, *, made: str, comman
         site, source = load(studied), origin(studied)
         see_readings(chosen, site, asked)
         if "campaign" in chosen:
-            console.out.print(escape(attacks(site, asked)))
+            console.say(attacks(site, asked))
         outcomes = [outcome(name, site, asked, kept=kept, bar=bar) for name in chosen]
         about = About(made, command, versions(), seeds(chosen, asked), folder.name)
         write(make(site, outcomes, about, source), out, folder)
-    console.out.print(escape(f"{out}: {len(outcomes)} studies; figures and tables in {folder}"))
+    console.say(f"{out}: {len(outcomes)} studies; figures and tables in {folder}")
     for each in outcomes:
         if each.absent:
-            console.out.print(escape(f"{each.study}: {each.problem}"))
+            console.say(f"{each.study}: {each.problem}")
     failed = [each for each in outcomes if each.result is None and not each.absent]
     for each in failed:
         print_error(f"{each.study}: {each.problem}")
