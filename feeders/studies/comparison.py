@@ -44,8 +44,7 @@ __all__ = [
 
 FEEDER: Final = "simbench-lv-rural1"
 
-ONSET_S: Final = 60.0
-"""Onset of the attacks, s after the start; the estimators have settled by then."""
+ONSET_S: Final = 60.0  # onset of the attacks, s after the start; the estimators have settled by then
 
 BEGIN: Final = "<!-- comparison: begin -->"
 END: Final = "<!-- comparison: end -->"

@@ -1,8 +1,6 @@
 """Sizes of attacks that stay unnoticed, are noticed and are named, in volts; resulting estimation errors.
 
-References
-----------
-docs/theory-studies.md, sections 3 and 5.
+References: docs/theory-studies.md, sections 3 and 5.
 """
 
 from __future__ import annotations
@@ -33,11 +31,8 @@ from gridsec.planning.stealthy_attacks import ErrorBox, largest_lie, worst_error
 
 __all__ = ["Detectable", "detectable", "monitor_rule", "workers"]
 
-RISK = 1e-3
-"""Probability at one moment that honest errors exceed the monitor's limits."""
-
-MANY = 50
-"""Number of meters from which on several processes are faster than one."""
+RISK = 1e-3  # probability at one moment that honest errors exceed the monitor's limits
+MANY = 50  # number of meters from which on several processes are faster than one
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -265,8 +265,8 @@ def run_pieces(
 ) -> list[Any]:
     """Do the pieces of work that the journal lacks, and return the results of all in the order of the keys.
 
-    `runner` calls `work`, by default in this process in order. `progress` is called before the first piece and
-    after each.
+    `runner` calls `work`, by default in this process in order. `progress` is called before the first piece
+    and after each.
 
     Raises
     ------

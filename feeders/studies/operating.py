@@ -76,8 +76,7 @@ def line_rows(site: Site | ThreePhaseSite) -> list[int]:
     return [closed[k] for k in (*found.branch, *found.ties)]
 
 
-SHARE: Final = 0.5
-"""Default load relative to its peak, the same for all, 1, without generation."""
+SHARE: Final = 0.5  # default load relative to its peak, the same for all, 1, without generation
 
 SIGMAS: Final = 4.0
 """Limit of an honest reading's jitter in standard deviations, as in `estimators.plant.Options`."""

@@ -1,8 +1,6 @@
 """Fewest meters to protect such that attacks are identified, are noticed, or have a bounded size.
 
-References
-----------
-docs/theory-studies.md, section 4.
+References: docs/theory-studies.md, section 4.
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
 """Number of manipulated meters that a feeder withstands: in total, by meter, by part, with silent meters.
 
-References
-----------
-lee2018, chapter 3; docs/theory-studies.md, section 2.
+References: lee2018, chapter 3; docs/theory-studies.md, section 2.
 """
 
 from __future__ import annotations

@@ -26,8 +26,7 @@ from gridsec.processes import deaf, listen, stop
 
 __all__ = ["ClusterUnusable", "Dask", "Here", "Processes", "Runner", "WorkerLost", "agree", "cores"]
 
-RETRIES: Final = 3
-"""Largest number of repetitions of a piece after the death of its worker."""
+RETRIES: Final = 3  # largest number of repetitions of a piece after the death of its worker
 
 
 class WorkerLost(GridsecError):

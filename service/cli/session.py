@@ -39,11 +39,8 @@ NoJournal = Annotated[
 
 SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
 
-PATIENCE_S: Final = 3.0
-"""Time limit for the reaction to a signal, and then for the end of the processes, s."""
-
-MOST: Final = 64
-"""Largest number of journals of interrupted studies in the user's cache folder."""
+PATIENCE_S: Final = 3.0  # time limit for the reaction to a signal, and then for the end of the processes, s
+MOST: Final = 64  # largest number of journals of interrupted studies in the user's cache folder
 
 
 class Stopped(KeyboardInterrupt):

@@ -21,8 +21,7 @@ from service.cli import console
 if TYPE_CHECKING:
     from feeders.convert.convert import Conversion
 
-FOLDER: Final = "feeder"
-"""Name of a converted feeder's folder within the folder of the results."""
+FOLDER: Final = "feeder"  # name of a converted feeder's folder within the folder of the results
 
 
 def converted(feeder: str, out: Path | None) -> str:

@@ -28,8 +28,7 @@ if TYPE_CHECKING:
     from feeders.studies.journal import Runner
 
 
-SHORTEST: Final = 10
-"""Smallest number of readings of a scenario: attacks start after a tenth of it."""
+SHORTEST: Final = 10  # smallest number of readings of a scenario: attacks start after a tenth of it
 
 FILES: Final = "feeder's files"
 

@@ -1,8 +1,6 @@
 """Feeder, radial, meshed or in three phases, with its single-phase parts, for calibration.
 
-References
-----------
-docs/theory-studies.md, Calibration.
+References: docs/theory-studies.md, Calibration.
 """
 
 from __future__ import annotations
@@ -92,17 +90,13 @@ def _below(feeder: ThreePhaseFeeder, buses: Ints, first: int) -> Bools:
 MOST_BUSES: Final = 150
 """Number of buses above which lines in series without customers between them are merged."""
 
-IDLE: Final = 0.25
-"""Assumed load of an unmetered customer, relative to its peak."""
+IDLE: Final = 0.25  # assumed load of an unmetered customer, relative to its peak
 
 HIDDEN: Final = 3.0**-0.5
 """Standard deviation of the load hidden by generation, relative to its limit: uniform within it."""
 
-CLOUDS: Final = 0.1
-"""Part of it that varies in time."""
-
-STEEP_PU: Final = 0.003
-"""Half of the voltage range for the slope of an inverter's curve, pu."""
+CLOUDS: Final = 0.1  # part of it that varies in time
+STEEP_PU: Final = 0.003  # half of the voltage range for the slope of an inverter's curve, pu
 
 _STEPS: Final = 2
 _ROUNDS: Final = 4

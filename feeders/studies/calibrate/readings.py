@@ -29,17 +29,13 @@ from gridsec.grid.three_phase import PHASES
 
 __all__ = ["Frames", "blind", "frames"]
 
-MOST_FRAMES: Final = 720
-"""Number of frames from which on frames are averaged."""
-
-FEWEST_FRAMES: Final = 48
-"""Smallest number of frames that determines the varying errors."""
+MOST_FRAMES: Final = 720  # number of frames from which on frames are averaged
+FEWEST_FRAMES: Final = 48  # smallest number of frames that determines the varying errors
 
 FARTHEST_S: Final = 10.0 * 365.25 * 86400.0
 """Largest distance of times from their median, s; beyond it a clock was not set."""
 
-NUMBERS: Final = ("t", "v_volt", "p_kw", "q_kvar")
-"""Columns of numbers."""
+NUMBERS: Final = ("t", "v_volt", "p_kw", "q_kvar")  # columns of numbers
 
 USUAL: Final = (0.5, 1.5)
 """Range of a meter's median voltage, relative to nominal, for volts from phase to neutral."""
@@ -49,11 +45,8 @@ _KILOVOLT: Final = (0.5e-3, 2e-3)
 
 _EXPECTED: Final = {"t": "expected Unix time in seconds"}
 
-OFTEN: Final = 0.5
-"""Smallest share of frames with voltages of a phase of the busbar that counts as read."""
-
-FEWEST_SPANS: Final = 6.0
-"""Smallest length of a recording in correlation times of the load errors."""
+OFTEN: Final = 0.5  # smallest share of frames with voltages of a phase of the busbar that counts as read
+FEWEST_SPANS: Final = 6.0  # smallest length of a recording in correlation times of the load errors
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,8 +1,6 @@
 """Search for single errors of a feeder's files that recorded readings support, and their corrections.
 
-References
-----------
-docs/theory-studies.md, Calibration.
+References: docs/theory-studies.md, Calibration.
 """
 
 from __future__ import annotations
@@ -201,20 +199,14 @@ def as_filed(tables: FeederTables, wrong: Correction, bus_of_file: Mapping[str, 
     return here and all(lines[name].phases == phases for name, phases in lines_on.items())
 
 
-LENGTH_SPREAD: Final = 0.3
-"""Prior standard deviation of the relative error of a wrong length."""
-
-CHANGE_SPREAD: Final = 0.005
-"""Prior standard deviation of a change of a meter's relative error."""
-
-SHORTEST: Final = 0.05
-"""Smallest factor on a line's length."""
+LENGTH_SPREAD: Final = 0.3  # prior standard deviation of the relative error of a wrong length
+CHANGE_SPREAD: Final = 0.005  # prior standard deviation of a change of a meter's relative error
+SHORTEST: Final = 0.05  # smallest factor on a line's length
 
 LIE_SPREAD: Final = 0.05
 """Prior standard deviation of a constant relative error beyond that of honest meters of the class."""
 
-PIECES: Final = 8
-"""Number of time intervals with possibly different errors of a meter."""
+PIECES: Final = 8  # number of time intervals with possibly different errors of a meter
 
 _CHUNK: Final = 128
 _REFIT: Final = 3

@@ -4,9 +4,7 @@ A forward step corrects the error that the readings support most. At an early st
 the files, and it may stand in for them. Re-examination therefore withdraws each error alone, with all others
 corrected, and compares all hypotheses again: the error stays, is replaced, or is dropped.
 
-References
-----------
-docs/theory-studies.md, Calibration.
+References: docs/theory-studies.md, Calibration.
 """
 
 from __future__ import annotations
@@ -58,17 +56,13 @@ AS_FILED, PROPOSED, UNTOLD, EXCLUDED = "as in the files", "proposed", "cannot be
 UNASKED: Final = "not looked for"
 UNREAD: Final = "phase not read"
 
-WIDE: Final = 1.96
-"""Half-width of intervals, in standard errors: 95 %."""
+WIDE: Final = 1.96  # half-width of intervals, in standard errors: 95 %
 
 VAGUE: Final = 0.7
 """Ratio of posterior to prior standard deviation above which the readings give no information."""
 
-ALIKE: Final = 0.98
-"""Correlation from which on the effects of two lines count as equal."""
-
-UNSURE_LENGTH: Final = 0.25
-"""Standard error from which on a length is unknown."""
+ALIKE: Final = 0.98  # correlation from which on the effects of two lines count as equal
+UNSURE_LENGTH: Final = 0.25  # standard error from which on a length is unknown
 
 _SHOWN: Final = 5
 
@@ -372,11 +366,8 @@ def _some(items: Sequence[str]) -> str:
     return ", ".join(items[:_SHOWN]) + tail
 
 
-MOST_ERRORS: Final = 24
-"""Largest number of errors; with more, the files are those of another feeder."""
-
-MOST_REVISIONS: Final = 3
-"""Largest number of re-examinations of all errors; most searches need one."""
+MOST_ERRORS: Final = 24  # largest number of errors; with more, the files are those of another feeder
+MOST_REVISIONS: Final = 3  # largest number of re-examinations of all errors; most searches need one
 
 Row = dict[str, Any]
 """One error in plain JSON types, for the journal."""

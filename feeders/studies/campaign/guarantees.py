@@ -31,8 +31,7 @@ __all__ = ["Rehearsal", "promised", "rehearse"]
 
 _HONEST, _LYING = 4, 16
 """Number of frames before and after the onset of an attack."""
-_SETTLING = 25
-"""Iterations to the inverters' equilibrium; their loop gain is below one."""
+_SETTLING = 25  # iterations to the inverters' equilibrium; their loop gain is below one
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,8 +181,7 @@ def _bounded(rng: np.random.Generator, size: int) -> Floats:
 HIDDEN, NAMED = (0.5, 1.0), (1.0, 1.2)
 """Factors on the sizes of attacks to stay hidden, and of attacks to be named."""
 
-NOTHING = 1e-6
-"""Numerical error of a solver for zero, V."""
+NOTHING = 1e-6  # numerical error of a solver for zero, V
 
 
 def promised(site: Site, found: Detectable, *, share: float = SHARE) -> tuple[AttackClass, ...]:

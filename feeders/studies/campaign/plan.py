@@ -30,8 +30,7 @@ from gridsec.errors import InputInvalid, Problem, choice, each_choice, raise_if_
 
 __all__ = ["CLEAN", "KINDS", "AttackClass", "CampaignCase", "CampaignPlan", "Design", "Place", "Promise"]
 
-CLEAN: Final = "clean"
-"""Kind of the scenario without an attack."""
+CLEAN: Final = "clean"  # kind of the scenario without an attack
 
 
 LEARN_STEP_S: Final = 10.0

@@ -2,9 +2,7 @@
 
 The truth is full AC power flow with the droop inverters in closed loop, over days of profiles.
 
-References
-----------
-docs/studies.md; docs/theory-studies.md.
+References: docs/studies.md; docs/theory-studies.md.
 """
 
 from __future__ import annotations
@@ -29,8 +27,7 @@ from gridsec.errors import GridsecError
 __all__ = ["Campaign", "NothingPlayed", "campaign", "false_names", "grouped", "scenarios"]
 
 
-CONFIDENCE: Final = 0.95
-"""Confidence level of every interval, 1."""
+CONFIDENCE: Final = 0.95  # confidence level of every interval, 1
 
 WITHIN_S: Final = (1.0, 2.0, 5.0, 10.0, 30.0, 60.0, 120.0, 300.0)
 """Times of the operating curve, s after the onset."""
@@ -187,8 +184,7 @@ def _largest(values: np.ndarray) -> float:
     return float(known.max()) if known.size else np.nan
 
 
-ROWS: Final = 2
-"""Version of the rows in journals."""
+ROWS: Final = 2  # version of the rows in journals
 
 
 class NothingPlayed(GridsecError):

@@ -33,11 +33,8 @@ __all__ = [
 KVA_PER_KW: Final = 1.1
 """Rating of an inverter per kW of its generation, kVA/kW: at full sun 0.46 of it remains for q."""
 
-SMALLEST_KVA: Final = 5.0
-"""Rating of inverters of customers without generation, kVA."""
-
-NOTHING: Final = "no inverters: stability does not apply"
-"""Statement for a feeder without inverters."""
+SMALLEST_KVA: Final = 5.0  # rating of inverters of customers without generation, kVA
+NOTHING: Final = "no inverters: stability does not apply"  # statement for a feeder without inverters
 
 
 class NoInverters(FeederInvalid):

@@ -6,9 +6,7 @@ refuted by loads with which the AC power flow of `feeders.simulation.powerflow` 
 Hosting has generation at its peak and loads at a small share of theirs. Every operating point is an AC power
 flow with the inverters in equilibrium.
 
-References
-----------
-chong2020, (13); docs/theory-studies.md, section on the droop fleet.
+References: chong2020, (13); docs/theory-studies.md, section on the droop fleet.
 """
 
 from __future__ import annotations
@@ -241,11 +239,8 @@ def _confirmed(
     ]
 
 
-RESOLUTION: Final = 1e-3
-"""Relative accuracy of a capacity."""
-
-MOST: Final = 2.0**14
-"""Upper limit of the search for a capacity, kW per possible customer."""
+RESOLUTION: Final = 1e-3  # relative accuracy of a capacity
+MOST: Final = 2.0**14  # upper limit of the search for a capacity, kW per possible customer
 
 
 @dataclass(frozen=True, slots=True)

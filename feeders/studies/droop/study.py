@@ -1,8 +1,6 @@
 """Study of the droop fleet of a feeder: stability, voltage band, hosting capacity.
 
-References
-----------
-chong2020, (13), (16) to (18); docs/theory-studies.md, section on the droop fleet.
+References: chong2020, (13), (16) to (18); docs/theory-studies.md, section on the droop fleet.
 """
 
 from __future__ import annotations
@@ -159,8 +157,7 @@ def band_problem(low: float, high: float) -> list[Problem]:
     return [Problem("order", text)]
 
 
-ANY = "any loads"
-"""Row for all loads within their limits."""
+ANY = "any loads"  # row for all loads within their limits
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -4,9 +4,7 @@ The inverters are those of `gridsec.planning.droop.stability`: sampled, with dea
 simulated at intervals of a small part of their time constants. The power flow is that of
 `feeders.simulation.powerflow`, which is independent of the proofs.
 
-References
-----------
-docs/theory-studies.md, section on the droop fleet.
+References: docs/theory-studies.md, section on the droop fleet.
 """
 
 from __future__ import annotations
@@ -56,14 +54,12 @@ FINE: Final = 40.0
 SETTLED: Final = 1e-6
 """Largest movement within a window, relative to the largest limit, of settled injections."""
 
-DECAYS: Final = 0.9
-"""Smallest ratio of movements in successive windows that do not decay."""
+DECAYS: Final = 0.9  # smallest ratio of movements in successive windows that do not decay
 
 BAND: Final = 0.02
 """Largest distance from the final voltage, relative to the largest change, of settled voltages."""
 
-LEAST_PU: Final = 1e-5
-"""Voltage change that counts as zero, pu."""
+LEAST_PU: Final = 1e-5  # voltage change that counts as zero, pu
 
 
 class FleetOutcome(StrEnum):
@@ -222,17 +218,10 @@ def trajectories(site: Site, runs: Mapping[str, StepResponse]) -> pd.DataFrame:
 KICK: Final = 1e-3
 """Largest deviation from equilibrium in simulations of an unstable fleet, relative to each limit."""
 
-CLEARLY: Final = 1e-4
-"""Smallest growth per update beyond 1 of an unstable fleet."""
-
-_AWAY: Final = 80
-"""Number of updates in simulations of an unstable fleet."""
-
-MOST: Final = 1024.0
-"""Largest factor on slopes."""
-
-PLACES: Final = 4
-"""Number of bisections of an interval of factor 2: factors have an accuracy of 4 %."""
+CLEARLY: Final = 1e-4  # smallest growth per update beyond 1 of an unstable fleet
+_AWAY: Final = 80  # number of updates in simulations of an unstable fleet
+MOST: Final = 1024.0  # largest factor on slopes
+PLACES: Final = 4  # number of bisections of an interval of factor 2: factors have an accuracy of 4 %
 
 
 class FleetVerdict(StrEnum):
