@@ -346,7 +346,11 @@ def markdown(rows: Sequence[ComparisonRow], plan: ComparisonPlan) -> str:
     ]
     lines += _head(("family", *names))
     for family in FAMILIES:
-        lines.append(_line((family, *(_short(found[family, name]) for name in names))))
+        rows_of = (found[family, name] for name in names)
+        short = (
+            "none" if row.reason else f"{row.named}/{row.liars} ({row.falsely_named})" for row in rows_of
+        )
+        lines.append(_line((family, *short)))
     for name in names:
         lines += ["", f"### {name}", "", f"{meanings[name][0].upper()}{meanings[name][1:]}.", ""]
         lines += _head(HEADERS)
@@ -369,10 +373,6 @@ def splice(text: str, table: str) -> str:
     if not end or text.count(BEGIN) != 1 or text.count(END) != 1:
         raise GridsecError(f"the document must hold {BEGIN} and, after it, {END}, once each", code="missing")
     return f"{before}{BEGIN}\n\n{table.strip()}\n\n{END}{after}"
-
-
-def _short(row: ComparisonRow) -> str:
-    return "none" if row.reason else f"{row.named}/{row.liars} ({row.falsely_named})"
 
 
 def _head(headers: tuple[str, ...]) -> list[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -86,7 +86,8 @@ def redundancy(
                 journal=kept,
                 progress=report_progress,
             )
-        console.out.print(_unknowns(found.unknown, found.feeder))
+        shown = ", ".join(found.unknown) or "none"
+        console.say(f"{found.feeder}: customers with unknown powers: {shown}")
         show("Manipulated meters of invisible attacks", found.summary)
         show("By meter", found.meters)
         show("Invisible attacks inside one part", found.parts)
@@ -231,11 +232,6 @@ def detectable(
             write_tables(out, "detectable", {**found.tables, "trials": seen.table})
 
 
-def _unknowns(names: Sequence[str], feeder: str) -> str:
-    shown = ", ".join(names) if names else "none"
-    return escape(f"{feeder}: customers with unknown powers: {shown}")
-
-
 @contextmanager
 def bar(what: str) -> Iterator[Tell]:
     """A progress bar on the terminal, with the name of the counted pieces of work."""
@@ -263,15 +259,11 @@ def as_usage_error() -> Iterator[None]:
 
 def show(title: str, frame: pd.DataFrame) -> None:
     """Print a table without its empty columns."""
-    kept = [name for name in frame.columns if not all(_empty(cell) for cell in frame[name])]
+    kept = [name for name in frame.columns if not all(isinstance(c, str) and not c for c in frame[name])]
     table = Table(*(escape(name.replace("_", " ")) for name in kept), title=title, title_justify="left")
     for row in frame[kept].itertuples(index=False):
         table.add_row(*(escape(_cell(cell)) for cell in row))
     console.out.print(table, soft_wrap=False)
-
-
-def _empty(cell: Any) -> bool:
-    return isinstance(cell, str) and not cell
 
 
 def _cell(cell: Any) -> str:

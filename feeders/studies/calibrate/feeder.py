@@ -176,7 +176,8 @@ def network(tables: FeederTables) -> MergedNetwork:
     feeder, rows = _merged(_model(site), tuple((row,) for row in line_rows(site)))
     single, parts = tuple[Lateral, ...](), tuple[Lateral, ...]()
     if isinstance(feeder, ThreePhaseFeeder):
-        place, ends = np.argwhere(feeder.phases), _branches(feeder)
+        place = np.argwhere(feeder.phases)
+        ends = np.column_stack([feeder.parent, np.arange(1, len(feeder.buses))])
         single = laterals(feeder, rows, place)
         parts = (*single, *alone(feeder, [row.phases for row in tables.customers], place))
     else:
@@ -195,10 +196,6 @@ def _model(site: Site | ThreePhaseSite) -> Model:
     return site.tree if isinstance(site, Site) else site.feeder
 
 
-def _branches(feeder: ThreePhaseFeeder) -> Ints:
-    return np.column_stack([feeder.parent, np.arange(1, len(feeder.buses))])
-
-
 def _merged(feeder: Model, rows: tuple[tuple[int, ...], ...]) -> tuple[Model, tuple[tuple[int, ...], ...]]:
     """Merge lines in series without customers between them, in large feeders without loops."""
     count = len(feeder.buses)
@@ -213,7 +210,8 @@ def _merged(feeder: Model, rows: tuple[tuple[int, ...], ...]) -> tuple[Model, tu
             keep[above] |= bool((feeder.phases[k + 1] != feeder.phases[above]).any())
     new = np.cumsum(keep) - 1
     above_of, chain = np.zeros(count, dtype=np.intp), list[tuple[int, ...]]([()] * count)
-    impedances = {name: np.array(getattr(feeder, name)) for name in _impedances(feeder)}
+    own = ("r", "x", "charging") if isinstance(feeder, Feeder) else ("z", "charging")
+    impedances = {name: np.array(getattr(feeder, name)) for name in own}
     for k, above in enumerate(feeder.parent.tolist()):
         chain[k + 1] = rows[k]
         above_of[k + 1] = above
@@ -229,10 +227,6 @@ def _merged(feeder: Model, rows: tuple[tuple[int, ...], ...]) -> tuple[Model, tu
     if isinstance(feeder, ThreePhaseFeeder):
         change["phases"] = feeder.phases[kept]
     return replace(feeder, **change), tuple(chain[k] for k in kept[1:])
-
-
-def _impedances(feeder: Feeder | ThreePhaseFeeder) -> tuple[str, ...]:
-    return ("r", "x", "charging") if isinstance(feeder, Feeder) else ("z", "charging")
 
 
 def _places(site: Site | ThreePhaseSite, feeder: Model, place: Ints) -> Places:

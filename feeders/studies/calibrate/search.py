@@ -161,17 +161,13 @@ def left(earlier: Correction, later: Correction) -> Correction | None:
     """
     if later.kind is FileErrorKind.BUS and set(earlier.names) <= set(later.names) and earlier.lines:
         # No customer remains on the lateral to confirm the phase of its lines.
-        return _without_lines(earlier)
+        return _of_phases(earlier, earlier.on[0], {})
     if earlier.kind is not later.kind or later.kind not in PLACES:
         return earlier
     on, lines_on = earlier.on
     on = {name: phases for name, phases in on.items() if name not in later.names}
     lines_on = {name: phases for name, phases in lines_on.items() if name not in later.lines}
     return _of_phases(earlier, on, lines_on) if on else None
-
-
-def _without_lines(earlier: Correction) -> Correction:
-    return _of_phases(earlier, earlier.on[0], {})
 
 
 def _of_phases(earlier: Correction, on: dict[str, str], lines_on: dict[str, str]) -> Correction:
@@ -314,7 +310,7 @@ def prepare(state: CorrectionState, frames: Frames, *, tolerance: float, errors:
     white, common = model.meter_noise(net, frames)
     own, gap = model.field(net, drawn), model.gaps(net, drawn)
     rest = series.residual(net.places)
-    size = _typical(net)
+    size = 0.02 * float(np.median(net.site.loads.load_peak[net.site.meters]))  # typical
     noise = LoadErrors(size, size, net.site.tables.meta.load.correlation_s, 1.0, np.full(4, np.nan))
     shared = np.einsum("tjf,tkf->jk", common, common) / len(common)
     guess, left = noise, rest
@@ -339,10 +335,6 @@ def prepare(state: CorrectionState, frames: Frames, *, tolerance: float, errors:
     return Round(
         state, net, drawn, series, noise, whiten, given, _spread_out(found, used, given), flat[:, -1]
     )
-
-
-def _typical(net: MergedNetwork) -> float:
-    return 0.02 * float(np.median(net.site.loads.load_peak[net.site.meters]))
 
 
 def _spread_out(found: RegressionFit, used: Ints, given: Regressors) -> RegressionFit:

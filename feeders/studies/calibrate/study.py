@@ -33,7 +33,6 @@ from feeders.studies.calibrate.search import (
     Correction,
     CorrectionState,
     FileErrorKind,
-    Guess,
     HypothesisComparison,
     Round,
     apply,
@@ -472,7 +471,7 @@ class FileErrorSearch:
             if (
                 row not in rows
                 or wrong.kind is FileErrorKind.METER
-                or not _files_of(rest)
+                or all(each["correction"]["kind"] == FileErrorKind.METER for each in rest)
                 or _chained(wrong, rest)
             ):
                 continue
@@ -485,11 +484,6 @@ class FileErrorSearch:
             elif again["correction"]["kind"] != FileErrorKind.METER:
                 rows = _together(rest, again, self._files.tables, now.net.site.bus_of_file)
         return rows
-
-
-def _files_of(rows: Sequence[Row]) -> bool:
-    """True if any error is one of the files; otherwise nothing has changed since the first comparison."""
-    return any(row["correction"]["kind"] != FileErrorKind.METER for row in rows)
 
 
 def _same_subject(one: Correction, other: Correction) -> bool:
@@ -539,8 +533,9 @@ def _best(now: Round, said: HypothesisComparison, risk: float, files: FeederTabl
     shift = g / (h + LENGTH_SPREAD**-2) if guess.kind is FileErrorKind.LENGTH else 0.0
     wrong = correction(now, guess, max(1.0 + shift, SHORTEST))
     others = [correction(now, said.guesses[k]) for k in said.kept[1:]]
-    if wrong.kind is FileErrorKind.PHASE:
-        others += _unread(wrong, guess, now.state.unread)
+    if wrong.kind is FileErrorKind.PHASE and not guess.exchange:
+        # A single part may be on a phase without a voltage of the busbar.
+        others += [replace(wrong, phases=phase) for phase in now.state.unread]
     return {
         "correction": asdict(wrong),
         "estimate": g / h if h > 0.0 else 0.0,
@@ -553,11 +548,6 @@ def _best(now: Round, said: HypothesisComparison, risk: float, files: FeederTabl
         "until": guess.until,
         "alternatives": [described(other) for other in others],
     }
-
-
-def _unread(wrong: Correction, guess: Guess, unread: str) -> list[Correction]:
-    """Alternatives on phases without a voltage of the busbar, for a single part."""
-    return [] if guess.exchange else [replace(wrong, phases=phase) for phase in unread]
 
 
 def read(row: Row) -> Correction:
@@ -711,7 +701,7 @@ def calibrate(
     subject = _subject(site, given, risk, tolerance) | {"exclude": sorted(exclude), "kinds": sorted(kinds)}
 
     def weighed(now: Round) -> HypothesisComparison:
-        return compare(now, given, risk, progress or _quiet, kinds)
+        return compare(now, given, risk, progress or (lambda *_: None), kinds)
 
     def fitted(state: CorrectionState) -> Round:
         return prepare(state, given, tolerance=tolerance, errors=True)
@@ -751,10 +741,6 @@ def wrong_numbers(risk: float, tolerance: float) -> list[Problem]:
             Problem("out-of-range", f"tolerance is {tolerance}; it must be between 0 and {LENGTH_SPREAD}")
         )
     return problems
-
-
-def _quiet(done: int, total: int) -> None:
-    """Progress without effect."""
 
 
 def _subject(site: Site | ThreePhaseSite, given: Frames, risk: float, tolerance: float) -> dict[str, Any]:

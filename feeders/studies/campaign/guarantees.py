@@ -122,7 +122,7 @@ def _world(given: Rule, site: Site, share: float, rng: np.random.Generator) -> C
     """Frames of a feeder in equilibrium, with fixed errors of true powers, busbar and meters."""
     design, doubt, loads = given.design, given.design.doubt, site.loads
     accuracy, own = site.accuracy, site.droop.customer
-    draw = _bounded if rng.integers(2) else _gaussian
+    draw = _uniform if rng.integers(2) else np.random.Generator.standard_normal
     p = -share * loads.load_peak
     q = 0.5 * (loads.tan_min + loads.tan_max) * p
     off_p, off_q = _errors(doubt, draw, rng)
@@ -170,11 +170,7 @@ def _errors(
     return doubt.p * own[0], doubt.q * own[1]
 
 
-def _gaussian(rng: np.random.Generator, size: int) -> Floats:
-    return rng.standard_normal(size)
-
-
-def _bounded(rng: np.random.Generator, size: int) -> Floats:
+def _uniform(rng: np.random.Generator, size: int) -> Floats:
     return np.asarray(np.sqrt(3.0) * rng.uniform(-1.0, 1.0, size))
 
 

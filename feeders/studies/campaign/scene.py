@@ -7,6 +7,7 @@ inverters and false powers are simulated in full.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -215,9 +216,8 @@ def watch(given: Prepared, scene: int) -> list[dict[str, Any]]:
     onsets = {round(case.onset_s / plan.step_s) for case in cases[1:]}
     clean, states = {}, {}
     for rate, watcher in given.watchers.items():
-        clean[rate], states[rate] = _clean(
-            watcher, watcher.init(honest.start, known.get(rate)), played, onsets
-        )
+        begin = watcher.init(honest.start, known.get(rate))
+        clean[rate], states[rate] = _monitored(watcher, begin, played.frames, onsets)
     rows = [_told(given, head, cases[0], rate, seen, played, 0, seen) for rate, seen in clean.items()]
     for case in cases[1:]:
         onset = round(case.onset_s / plan.step_s)
@@ -227,7 +227,7 @@ def watch(given: Prepared, scene: int) -> list[dict[str, Any]]:
             rows += [_row(head, case, rate) | _nothing(error) for rate in given.watchers]
             continue
         for rate, watcher in given.watchers.items():
-            seen, _ = _step(watcher, states[rate][onset], lied.frames[onset:])
+            seen, _ = _monitored(watcher, states[rate][onset], lied.frames[onset:])
             rows.append(_told(given, head, case, rate, seen, lied, onset, clean[rate]))
     return rows
 
@@ -280,39 +280,24 @@ def _learned(given: Prepared, trial: Trial, honest: Scenario) -> dict[float, Com
     for frame, _ in frames(replace(trial, step_s=step_s), before):
         for rate, watcher in given.learners.items():
             states[rate], _, _ = watcher.step(states[rate], frame)
-    found = {}
-    for rate, watcher in given.learners.items():
-        if watcher.bias_learning is not None:
-            found[rate] = watcher.bias_learning.commission(states[rate])
-    return found
+    learning = {rate: watcher.bias_learning for rate, watcher in given.learners.items()}
+    return {rate: each.commission(states[rate]) for rate, each in learning.items() if each is not None}
 
 
-def _clean(
-    watcher: DesignedEstimator, state: Any, played: _Played, onsets: set[int]
+def _monitored(
+    watcher: DesignedEstimator, state: Any, some: list[Frame], onsets: Collection[int] = ()
 ) -> tuple[_Seen, dict[int, Any]]:
-    """Monitor the scene without an attack, and keep the states before some frames."""
-    states, parts, begin = {}, [], 0
-    for end in sorted({*onsets, len(played.frames)}):
-        seen, state = _step(watcher, state, played.frames[begin:end])
-        states[end], begin = state, end
-        parts.append(seen)
-    columns = (
-        [getattr(part, name) for part in parts] for name in ("named", "inverters", "clean", "undecided", "v2")
-    )
-    return _Seen(*(np.concatenate(column) for column in columns)), states
-
-
-def _step(watcher: DesignedEstimator, state: Any, some: list[Frame]) -> tuple[_Seen, Any]:
-    named, inverters, decisions, v2 = [], [], [], []
-    for frame in some:
+    """Monitor frames, and keep the states before those of the onsets."""
+    states, outputs = {}, []
+    for k, frame in enumerate(some):
+        if k in onsets:
+            states[k] = state
         state, estimate, verdict = watcher.step(state, frame)
-        named.append(verdict.suspects)
-        inverters.append(verdict.inverters)
-        decisions.append(verdict.decision)
-        v2.append(estimate.v2)
+        outputs.append((verdict.suspects, verdict.inverters, verdict.decision, estimate.v2))
+    named, inverters, decisions, v2 = zip(*outputs, strict=True)
     clean = np.array([each is Decision.CLEAN for each in decisions], dtype=np.bool_)
     undecided = np.array([each is Decision.UNDECIDED for each in decisions], dtype=np.bool_)
-    return _Seen(np.array(named), np.array(inverters), clean, undecided, np.array(v2)), state
+    return _Seen(np.array(named), np.array(inverters), clean, undecided, np.array(v2)), states
 
 
 # ------------------------------------------------------------------------------------------ reports

@@ -67,9 +67,9 @@ def grouped(found: pd.DataFrame, liars: pd.DataFrame, by: Sequence[str]) -> pd.D
                 "delay_95_s": _most(delay[named]),
                 "clear_median_s": _median(group["clear_s"][lying].to_numpy()),
                 "error_liars_95": _median(group["error_liars_95"].to_numpy()),
-                "error_liars_worst": _largest(group["error_liars"].to_numpy()),
+                "error_liars_worst": float(group["error_liars"].max()),
                 "error_others_95": _median(group["error_others_95"].to_numpy()),
-                "error_others_worst": _largest(group["error_others"].to_numpy()),
+                "error_others_worst": float(group["error_others"].max()),
                 "undecided": float(group["undecided_s"].sum() / group["watched_s"].sum()),
             }
         )
@@ -177,11 +177,6 @@ def _median(values: np.ndarray) -> float:
 
 def _most(values: np.ndarray) -> float:
     return float(np.percentile(values, 95.0, method="higher")) if values.size else np.nan
-
-
-def _largest(values: np.ndarray) -> float:
-    known = values[~np.isnan(values)]
-    return float(known.max()) if known.size else np.nan
 
 
 ROWS: Final = 2  # version of the rows in journals

@@ -314,14 +314,8 @@ def checked(subject: Subject, plan: DroopPlan, kw: float, at: Conditions, rating
     s = loads.p_low + 1j * loads.q_low
     x, V = rest(subject.net, droop, s, at.v0)
     if not np.isfinite(V).all():
-        nan = float("nan")
-        return {
-            "v_low_volt": nan,
-            "v_high_volt": nan,
-            "line_percent": nan,
-            "growth": nan,
-            "broken": "no power flow",
-        }
+        unknown = dict.fromkeys(("v_low_volt", "v_high_volt", "line_percent", "growth"), float("nan"))
+        return unknown | {"broken": "no power flow"}
     net, own, v = injected(droop, s, x), droop.customer, np.abs(V)
     full = (currents(site.feeder, subject.net, net, V, at.v0) / ratings).max(axis=1)
     near = 1e-7

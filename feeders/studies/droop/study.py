@@ -46,7 +46,7 @@ from feeders.studies.droop.verdict import (
 from feeders.studies.journal import Progress, Where, worked
 from feeders.studies.operating import Bases
 from feeders.util import word
-from gridsec.errors import InputInvalid, Problem, raise_if_any
+from gridsec.errors import InputInvalid, Problem, no_choice, raise_if_any
 from gridsec.grid.droop import PRESETS, Droop
 from gridsec.planning.droop.ac_sensitivity import InjectionBox
 from gridsec.planning.droop.equilibrium import rest
@@ -95,28 +95,23 @@ class DroopOptions:
     draws: int = 30  # random orders of customers
 
     def __post_init__(self) -> None:
-        problems = [*self._fleet_problems(), *self._limit_problems(), *self._hosting_problems()]
-        raise_if_any(problems)
+        raise_if_any([*self._fleet_problems(), *self._limit_problems(), *self._hosting_problems()])
 
     def _fleet_problems(self) -> Iterator[str]:
         presets = [name for name in (self.preset, *self.presets) if name is not None]
         for name in dict.fromkeys([*presets, *filter(None, self.hosting_presets)]):
             if name not in PRESETS:
-                yield Problem(
-                    "unknown-name", f"preset {name!r} does not exist; expected one of {', '.join(PRESETS)}"
-                )
-        chosen, known = self.who, tuple(Who)
-        if chosen not in known:
-            yield Problem("unknown-name", f"`who` is {chosen!r}; expected one of {', '.join(known)}")
+                text = f"preset {name!r} does not exist; expected one of {', '.join(PRESETS)}"
+                yield Problem("unknown-name", text)
+        yield from no_choice("`who`", Who, self.who)
         try:
             Update(self.interval_s, self.dead)
         except InputInvalid as error:
             yield from error.problems
         for times in self.tau_factors:
             if not 0.0 < times < math.inf:
-                yield Problem(
-                    "not-positive", f"a factor on time constants is {times:g}; it must be a positive number"
-                )
+                text = f"a factor on time constants is {times:g}; it must be a positive number"
+                yield Problem("not-positive", text)
 
     def _limit_problems(self) -> Iterator[Problem]:
         yield from range_problem("busbar voltage", self.v0_low, self.v0_high)
@@ -127,26 +122,23 @@ class DroopOptions:
         shares = {"load": self.load_high, "generation": self.pv_high, "load while hosting": self.hosting_load}
         for what, share in shares.items():
             if not 0.0 <= share < math.inf:
-                yield Problem(
-                    "negative", f"share of the {what} is {share:g}; it must be a number that is not negative"
-                )
+                text = f"share of the {what} is {share:g}; it must be a number that is not negative"
+                yield Problem("negative", text)
 
     def _hosting_problems(self) -> Iterator[Problem]:
         if not 0.0 < self.unit_kw < math.inf:
-            yield Problem(
-                "not-positive", f"a unit of generation is {self.unit_kw:g} kW; it must be a positive number"
-            )
+            text = f"a unit of generation is {self.unit_kw:g} kW; it must be a positive number"
+            yield Problem("not-positive", text)
         if self.draws < 0:
             yield Problem("negative", f"{self.draws} random orders; the number must not be negative")
         if self.hosting_customers == ():
             yield Problem("missing", "new generation has no customer")
-        if not self.hosting:
-            usual = {each.name: each.default for each in fields(self)}
-            given = [
-                f"{name} ({option})" for name, option in HOSTING.items() if getattr(self, name) != usual[name]
-            ]
-            if given:
-                yield Problem("inconsistent", f"{', '.join(given)}: only with hosting (--hosting)")
+        usual = {each.name: each.default for each in fields(self)}
+        given = [
+            f"{name} ({option})" for name, option in HOSTING.items() if getattr(self, name) != usual[name]
+        ]
+        if given and not self.hosting:
+            yield Problem("inconsistent", f"{', '.join(given)}: only with hosting (--hosting)")
 
 
 def band_problem(low: float, high: float) -> list[Problem]:
