@@ -61,8 +61,8 @@ def planned(
     if duration is not None and duration < SHORTEST * step_s:
         problems.append(
             f"--duration: {duration:g} s are too short for one reading every {step_s:g} s "
-            f"({_from(step, '--step')}): at least {SHORTEST * step_s:g} s, or more frequent readings with "
-            "--step"
+            f"({FILES if step is None else '--step'}): at least {SHORTEST * step_s:g} s, or more frequent "
+            "readings with --step"
         )
         duration = None
     chosen |= {"step_s": step, "duration_s": duration}
@@ -95,10 +95,6 @@ def sources(site: Site, plan: CampaignPlan, given: Mapping[str, object]) -> str:
         f"metered customers within {kw:.2g} kW and {kvar:.2g} kvar, medians of 1 sigma "
         f"({', '.join(loads) or FILES})"
     )
-
-
-def _from(value: float | None, option: str) -> str:
-    return FILES if value is None else option
 
 
 Scenarios = Annotated[

@@ -12,7 +12,7 @@ from dataclasses import MISSING, dataclass, fields, replace
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from feeders.report.build import Report
     from feeders.report.html import Result, StudyOutcome
     from feeders.studies.campaign.plan import CampaignPlan
-    from feeders.studies.journal import Progress, Where
+    from feeders.studies.journal import Progress
     from service.cli.session import Keeping
 
 
@@ -71,22 +71,20 @@ class Asked:
 class Study:
     """Properties of a study in a report."""
 
-    run: Callable[[Site, Asked, Where, Progress | None], Result]
+    run: Callable[..., Result]  # of a feeder and options, with a journal and a progress
     options: Callable[[Asked], list[str]]  # equivalent options of its own command
     what: str  # name of the counted pieces of work, for the progress bar
     seeded: bool = False  # uses the seed
 
 
-def _detectable(site: Site, asked: Asked, journal: Where, report_progress: Progress | None) -> Result:
+def _detectable(site: Site, asked: Asked, **kept: Any) -> Result:
     from feeders.studies.detectable import detectable, workers
 
     runner = workers(site, None if asked.workers > 1 else 1)
-    return detectable(
-        site, max_attacked=asked.max_attacked, runner=runner, journal=journal, progress=report_progress
-    )
+    return detectable(site, max_attacked=asked.max_attacked, runner=runner, **kept)
 
 
-def _protect(site: Site, asked: Asked, journal: Where, report_progress: Progress | None) -> Result:
+def _protect(site: Site, asked: Asked, **kept: Any) -> Result:
     from feeders.studies.protect import Goal, protect
 
     return protect(
@@ -96,25 +94,19 @@ def _protect(site: Site, asked: Asked, journal: Where, report_progress: Progress
         lie_volt=asked.lie_volt,
         unknown=asked.unknown,
         busbar_known=not asked.busbar_unknown,
-        journal=journal,
-        progress=None if report_progress is None else lambda known, done: report_progress(done, known),
+        journal=kept["journal"],
+        progress=lambda known, done: kept["progress"](done, known),
     )
 
 
-def _redundancy(site: Site, asked: Asked, journal: Where, report_progress: Progress | None) -> Result:
+def _redundancy(site: Site, asked: Asked, **kept: Any) -> Result:
     from feeders.studies.redundancy import redundancy
 
-    return redundancy(
-        site,
-        unknown=asked.unknown,
-        silent=asked.silent,
-        busbar_known=not asked.busbar_unknown,
-        journal=journal,
-        progress=report_progress,
-    )
+    busbar_known = not asked.busbar_unknown
+    return redundancy(site, unknown=asked.unknown, silent=asked.silent, busbar_known=busbar_known, **kept)
 
 
-def _droop(site: Site, asked: Asked, journal: Where, report_progress: Progress | None) -> Result:
+def _droop(site: Site, asked: Asked, **kept: Any) -> Result:
     from feeders.studies.droop.study import DroopOptions, droop
 
     low, high = asked.busbar or (1.0, 1.0)
@@ -122,24 +114,22 @@ def _droop(site: Site, asked: Asked, journal: Where, report_progress: Progress |
     options = DroopOptions(
         preset=asked.preset, v0_low=low, v0_high=high, v_min=least, v_max=most, hosting=asked.hosting
     )
-    return droop(site, options, seed=asked.seed, journal=journal, progress=report_progress)
+    return droop(site, options, seed=asked.seed, **kept)
 
 
-def _calibrate(site: Site, asked: Asked, journal: Where, report_progress: Progress | None) -> Result:
+def _calibrate(site: Site, asked: Asked, **kept: Any) -> Result:
     from feeders.studies.calibrate.study import calibrate
 
     if asked.readings is None:
         raise InputInvalid([Problem("missing", "recorded readings are missing")])
-    return calibrate(site, asked.readings, journal=journal, progress=report_progress)
+    return calibrate(site, asked.readings, **kept)
 
 
-def _campaign(site: Site, asked: Asked, journal: Where, report_progress: Progress | None) -> Result:
+def _campaign(site: Site, asked: Asked, **kept: Any) -> Result:
     from feeders.studies.campaign.study import campaign
     from feeders.studies.workers import cores
 
-    return campaign(
-        site, plan(site, asked), runner=cores(asked.workers), journal=journal, progress=report_progress
-    )
+    return campaign(site, plan(site, asked), runner=cores(asked.workers), **kept)
 
 
 def plan(site: Site, asked: Asked) -> CampaignPlan:
@@ -256,7 +246,7 @@ def outcome(
     problem, absent = "", False
     with bar(study.what) as report_progress:
         try:
-            found = study.run(site, asked, kept, report_progress)
+            found = study.run(site, asked, journal=kept, progress=report_progress)
         except NoInverters as error:
             absent = not asked.hosting
             problem = NOTHING if absent else str(error)
@@ -387,7 +377,7 @@ def report(
     problems += no_choice("--preset", PRESETS, *([preset] if preset else []))
     problems += no_choice("--estimator", ESTIMATORS, *([estimator] if estimator else []))
     problems += [*_no_limits("--busbar", busbar), *_no_limits("--band", band, apart=True)]
-    moments = [_now()] if at is None else read_all("--at", [at], _moment, problems)
+    moments = [_told(datetime.now(UTC))] if at is None else read_all("--at", [at], _moment, problems)
     asked = Asked(
         feeder=feeder,
         max_attacked=max_attacked,
@@ -481,10 +471,6 @@ def _studies(
     if "calibrate" in names and not recorded:
         problems.append("--studies: calibrate needs --readings")
     return tuple(name for name in known if name in names)
-
-
-def _now() -> str:
-    return _told(datetime.now(UTC))
 
 
 def _moment(text: str) -> str:

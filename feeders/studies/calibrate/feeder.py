@@ -116,11 +116,6 @@ class MergedNetwork:
     laterals: tuple[Lateral, ...]  # single-phase laterals
     parts: tuple[Lateral, ...]  # laterals, and single-phase customers at buses of several phases
 
-    @property
-    def meter_of(self) -> dict[int, int]:
-        """Meter index of each metered customer."""
-        return {int(customer): j for j, customer in enumerate(self.site.meters)}
-
     def weight(self, bus: int, phases: str) -> Floats:
         """Weights (Q,) of a customer at a bus of the feeder."""
         at = self.place[:, 0] == bus

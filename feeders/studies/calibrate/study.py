@@ -552,14 +552,8 @@ def _best(now: Round, said: HypothesisComparison, risk: float, files: FeederTabl
 
 def read(row: Row) -> Correction:
     """Correction from the plain types of the journal."""
-    return Correction(
-        FileErrorKind(row["kind"]),
-        tuple(row["names"]),
-        row["bus"],
-        row["phases"],
-        row["factor"],
-        tuple(row["lines"]),
-    )
+    tuples = {name: tuple(row[name]) for name in ("names", "lines")}
+    return Correction(**row | tuples | {"kind": FileErrorKind(row["kind"])})
 
 
 class OtherFeeder(InputInvalid):
