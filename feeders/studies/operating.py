@@ -77,9 +77,7 @@ def line_rows(site: Site | ThreePhaseSite) -> list[int]:
 
 
 SHARE: Final = 0.5  # default load relative to its peak, the same for all, 1, without generation
-
-SIGMAS: Final = 4.0
-"""Limit of an honest reading's jitter in standard deviations, as in `estimators.plant.Options`."""
+SIGMAS: Final = 4.0  # limit of an honest reading's jitter, as in `estimators.plant.Options`
 
 
 def box(site: Site, *, share: float = SHARE, curves: CurvePositions = CurvePositions.DEADBAND) -> ErrorBox:

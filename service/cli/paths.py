@@ -69,8 +69,7 @@ def _for_parquet(frame: pd.DataFrame) -> pd.DataFrame:
     return frame.assign(**{name: frame[name].map(str, na_action="ignore") for name in mixed})
 
 
-Given = Mapping[str, Path | None]
-"""Path by option; None for an option that was not given."""
+Given = Mapping[str, Path | None]  # path by option; None for an option that was not given
 
 NONE: Final[Given] = {}
 

@@ -123,32 +123,27 @@ def protect(
     from feeders.studies.protect import protect as study
     from feeders.studies.unobservable import Attack
 
-    bound = math.nan if lie_volt is None else lie_volt
+    asked: dict[str, Any] = {
+        "max_attacked": max_attacked,
+        "lie_volt": math.nan if lie_volt is None else lie_volt,
+        "unknown": unknown,
+        "busbar_known": not busbar_unknown,
+    }
     with as_usage_error():
-        check(
-            max_attacked=max_attacked,
-            goal=goal,
-            lie_volt=bound,
-            attack=attack,
-            unknown=unknown,
-            busbar_known=not busbar_unknown,
-        )
+        check(goal=goal, attack=attack, **asked)
     check_paths(folders={"--out": out}, files={"--journal": journal})
     with keeping("protect", feeder, journal, without=no_journal) as kept:
         site = load(converted(feeder, out))
         with bar("meters protected, against attacks") as report_progress, as_usage_error():
             found = study(
                 site,
-                max_attacked=max_attacked,
                 goal=Goal(goal) if goal else None,
-                lie_volt=bound,
                 attack=Attack(attack),
-                unknown=unknown,
-                busbar_known=not busbar_unknown,
                 never=never or (),
                 exact=not greedy,
                 journal=kept,
                 progress=lambda known, done: report_progress(done, known),
+                **asked,
             )
         _tell_protection(found, len(site.meter_ids))
         write_tables(out, "protect", found.tables)

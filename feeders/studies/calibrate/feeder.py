@@ -87,14 +87,9 @@ def _below(feeder: ThreePhaseFeeder, buses: Ints, first: int) -> Bools:
     return np.asarray((feeder.start[first] <= start) & (start < feeder.stop[first]))
 
 
-MOST_BUSES: Final = 150
-"""Number of buses above which lines in series without customers between them are merged."""
-
+MOST_BUSES: Final = 150  # above it lines in series without customers between them are merged
 IDLE: Final = 0.25  # assumed load of an unmetered customer, relative to its peak
-
-HIDDEN: Final = 3.0**-0.5
-"""Standard deviation of the load hidden by generation, relative to its limit: uniform within it."""
-
+HIDDEN: Final = 3.0**-0.5  # std of the load hidden by generation, relative to its limit: uniform
 CLOUDS: Final = 0.1  # part of it that varies in time
 STEEP_PU: Final = 0.003  # half of the voltage range for the slope of an inverter's curve, pu
 

@@ -31,14 +31,9 @@ __all__ = ["Frames", "blind", "frames"]
 
 MOST_FRAMES: Final = 720  # number of frames from which on frames are averaged
 FEWEST_FRAMES: Final = 48  # smallest number of frames that determines the varying errors
-
-FARTHEST_S: Final = 10.0 * 365.25 * 86400.0
-"""Largest distance of times from their median, s; beyond it a clock was not set."""
-
+FARTHEST_S: Final = 10.0 * 365.25 * 86400.0  # of times from their median; beyond it a clock was not set
 NUMBERS: Final = ("t", "v_volt", "p_kw", "q_kvar")  # columns of numbers
-
-USUAL: Final = (0.5, 1.5)
-"""Range of a meter's median voltage, relative to nominal, for volts from phase to neutral."""
+USUAL: Final = (0.5, 1.5)  # range of a meter's median voltage, relative to nominal, from phase to neutral
 
 _PAIR: Final = (0.9 * 3.0**0.5, 1.1 * 3.0**0.5)
 _KILOVOLT: Final = (0.5e-3, 2e-3)

@@ -68,8 +68,7 @@ class FileErrorKind(StrEnum):
     METER = "meter"
 
 
-PLACES: Final = (FileErrorKind.BUS, FileErrorKind.PHASE)
-"""Errors of a customer's place; a customer has at most one of each."""
+PLACES: Final = (FileErrorKind.BUS, FileErrorKind.PHASE)  # a customer has at most one of each
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,10 +197,7 @@ def as_filed(tables: FeederTables, wrong: Correction, bus_of_file: Mapping[str, 
 LENGTH_SPREAD: Final = 0.3  # prior standard deviation of the relative error of a wrong length
 CHANGE_SPREAD: Final = 0.005  # prior standard deviation of a change of a meter's relative error
 SHORTEST: Final = 0.05  # smallest factor on a line's length
-
-LIE_SPREAD: Final = 0.05
-"""Prior standard deviation of a constant relative error beyond that of honest meters of the class."""
-
+LIE_SPREAD: Final = 0.05  # prior std of a constant relative error beyond that of the class
 PIECES: Final = 8  # number of time intervals with possibly different errors of a meter
 
 _CHUNK: Final = 128

@@ -56,10 +56,7 @@ UNASKED: Final = "not looked for"
 UNREAD: Final = "phase not read"
 
 WIDE: Final = 1.96  # half-width of intervals, in standard errors: 95 %
-
-VAGUE: Final = 0.7
-"""Ratio of posterior to prior standard deviation above which the readings give no information."""
-
+VAGUE: Final = 0.7  # ratio of posterior to prior std above which the readings give no information
 ALIKE: Final = 0.98  # correlation from which on the effects of two lines count as equal
 UNSURE_LENGTH: Final = 0.25  # standard error from which on a length is unknown
 
@@ -368,8 +365,7 @@ def _some(items: Sequence[str]) -> str:
 MOST_ERRORS: Final = 24  # largest number of errors; with more, the files are those of another feeder
 MOST_REVISIONS: Final = 3  # largest number of re-examinations of all errors; most searches need one
 
-Row = dict[str, Any]
-"""One error in plain JSON types, for the journal."""
+Row = dict[str, Any]  # one error in plain JSON types, for the journal
 
 
 @dataclass(frozen=True, slots=True, eq=False)

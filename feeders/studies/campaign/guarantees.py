@@ -29,8 +29,7 @@ from gridsec.planning.detectability import Rule, largest_shift
 __all__ = ["Rehearsal", "promised", "rehearse"]
 
 
-_HONEST, _LYING = 4, 16
-"""Number of frames before and after the onset of an attack."""
+_HONEST, _LYING = 4, 16  # frames before and after the onset of an attack
 _SETTLING = 25  # iterations to the inverters' equilibrium; their loop gain is below one
 
 
@@ -174,9 +173,7 @@ def _uniform(rng: np.random.Generator, size: int) -> Floats:
     return np.asarray(np.sqrt(3.0) * rng.uniform(-1.0, 1.0, size))
 
 
-HIDDEN, NAMED = (0.5, 1.0), (1.0, 1.2)
-"""Factors on the sizes of attacks to stay hidden, and of attacks to be named."""
-
+HIDDEN, NAMED = (0.5, 1.0), (1.0, 1.2)  # factors on the sizes of attacks of each kind
 NOTHING = 1e-6  # numerical error of a solver for zero, V
 
 

@@ -33,8 +33,7 @@ __all__ = ["CLEAN", "KINDS", "AttackClass", "CampaignCase", "CampaignPlan", "Des
 CLEAN: Final = "clean"  # kind of the scenario without an attack
 
 
-LEARN_STEP_S: Final = 10.0
-"""Interval of the readings for learning of fixed errors, s, unless readings are rarer."""
+LEARN_STEP_S: Final = 10.0  # interval of the readings for learning, unless readings are rarer
 
 
 class Place(StrEnum):

@@ -157,8 +157,7 @@ def _story(
 
 ERROR_PERCENTILE = 95.0
 
-IMPOSSIBLE = (NoSuchAttack, PowerFlowDiverged, NoEquilibrium)
-"""Errors that prevent one scenario, and not the others."""
+IMPOSSIBLE = (NoSuchAttack, PowerFlowDiverged, NoEquilibrium)  # they prevent one scenario only
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -28,9 +28,7 @@ __all__ = ["Campaign", "NothingPlayed", "campaign", "false_names", "grouped", "s
 
 
 CONFIDENCE: Final = 0.95  # confidence level of every interval, 1
-
-WITHIN_S: Final = (1.0, 2.0, 5.0, 10.0, 30.0, 60.0, 120.0, 300.0)
-"""Times of the operating curve, s after the onset."""
+WITHIN_S: Final = (1.0, 2.0, 5.0, 10.0, 30.0, 60.0, 120.0, 300.0)  # after the onset
 
 YEAR_S: Final = 365.25 * 86_400.0
 

@@ -30,8 +30,7 @@ __all__ = [
     "points",
 ]
 
-KVA_PER_KW: Final = 1.1
-"""Rating of an inverter per kW of its generation, kVA/kW: at full sun 0.46 of it remains for q."""
+KVA_PER_KW: Final = 1.1  # rating of an inverter per kW of generation: at full sun 0.46 of it remains for q
 
 SMALLEST_KVA: Final = 5.0  # rating of inverters of customers without generation, kVA
 NOTHING: Final = "no inverters: stability does not apply"  # statement for a feeder without inverters
@@ -48,8 +47,7 @@ class Who(StrEnum):
     ALL = "all"
 
 
-_POINTS: Final = {"evening": (1.0, 0.0), "noon": (0.2, 1.0), "half": (0.5, 0.5)}
-"""Shares of the peaks of load and generation."""
+_POINTS: Final = {"evening": (1.0, 0.0), "noon": (0.2, 1.0), "half": (0.5, 0.5)}  # load, generation
 
 
 def equip(site: Site, preset: str, who: Who = Who.PV) -> Droop:

@@ -54,8 +54,7 @@ __all__ = [
 ]
 
 
-EXACT: Final = 1e-6
-"""Largest difference between the set-points of the second power flow and a witness's injections, pu."""
+EXACT: Final = 1e-6  # largest difference between set-points and a witness's injections, pu
 
 
 class BandGuarantee(StrEnum):
@@ -148,8 +147,7 @@ def _or_none(
         return None
 
 
-Limits = tuple[Floats, Floats]
-"""Band, pu of every customer."""
+Limits = tuple[Floats, Floats]  # band, pu of every customer
 
 
 def _inside(band: Band | None, limits: Limits) -> bool:

@@ -48,17 +48,10 @@ __all__ = [
 ]
 
 
-FINE: Final = 40.0
-"""Number of simulation intervals of continuous filters in the shortest time constant / (1 + gain)."""
-
-SETTLED: Final = 1e-6
-"""Largest movement within a window, relative to the largest limit, of settled injections."""
-
+FINE: Final = 40.0  # simulation intervals in the shortest time constant / (1 + gain)
+SETTLED: Final = 1e-6  # largest movement within a window, relative to the largest limit
 DECAYS: Final = 0.9  # smallest ratio of movements in successive windows that do not decay
-
-BAND: Final = 0.02
-"""Largest distance from the final voltage, relative to the largest change, of settled voltages."""
-
+BAND: Final = 0.02  # largest distance of settled voltages from the final one, relative to the change
 LEAST_PU: Final = 1e-5  # voltage change that counts as zero, pu
 
 
@@ -215,9 +208,7 @@ def trajectories(site: Site, runs: Mapping[str, StepResponse]) -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
 
 
-KICK: Final = 1e-3
-"""Largest deviation from equilibrium in simulations of an unstable fleet, relative to each limit."""
-
+KICK: Final = 1e-3  # largest deviation from equilibrium in simulations, relative to each limit
 CLEARLY: Final = 1e-4  # smallest growth per update beyond 1 of an unstable fleet
 _AWAY: Final = 80  # number of updates in simulations of an unstable fleet
 MOST: Final = 1024.0  # largest factor on slopes
