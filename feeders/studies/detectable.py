@@ -41,12 +41,6 @@ class Detectable:
 
     Attributes
     ----------
-    feeder, digest
-        Name and content digest of the feeder.
-    max_attacked
-        M.
-    risk, share
-        As in `detectable`.
     meters
         One row for each meter, `alone` or in collusion with M - 1 others of the attacker's choice:
 

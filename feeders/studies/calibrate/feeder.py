@@ -141,16 +141,11 @@ def _site(tables: FeederTables) -> Site | ThreePhaseSite:
         return from_tables(tables)
     site, ties = spanned(tables)
     if ties.ends.size:
-        raise FeederInvalid(
-            [
-                Problem(
-                    "not-radial",
-                    "lines: closed lines form loops; in three phases calibration requires a radial "
-                    "feeder: "
-                    "in a loop a longer line changes all phases everywhere, without a model of it",
-                )
-            ]
+        text = (
+            "lines: closed lines form loops; in three phases calibration requires a radial feeder: in a loop "
+            "a longer line changes all phases everywhere, without a model of it"
         )
+        raise FeederInvalid([Problem("not-radial", text)])
     return site
 
 

@@ -106,11 +106,8 @@ def frames(
     given = open_readings(readings) if isinstance(readings, (Path, str)) else readings
     if not isinstance(given, pd.DataFrame):
         if given.feeder is not None and given.feeder != site.feeder.name:
-            raise RecordingInvalid(
-                Problem(
-                    "other-origin", f"{given.path}: recorded on {given.feeder}, not on {site.feeder.name}"
-                )
-            )
+            text = f"{given.path}: recorded on {given.feeder}, not on {site.feeder.name}"
+            raise RecordingInvalid(Problem("other-origin", text))
         given = given.frame()
     missing = [name for name in REQUIRED if name not in given.columns]
     problems = [Problem("missing", f"columns {', '.join(missing)} are missing")] if missing else []
@@ -125,30 +122,25 @@ def frames(
     unknown = sorted(set(meter[column.isna()]))
     if unknown:
         shown = ", ".join(unknown[:10]) + (f" and {len(unknown) - 10} more" if len(unknown) > 10 else "")
-        problems.append(
-            Problem("unknown-name", f"there are meters that {site.feeder.name} does not have: {shown}")
-        )
+        text = f"there are meters that {site.feeder.name} does not have: {shown}"
+        problems.append(Problem("unknown-name", text))
     if "meter" in given and not (column == len(site.meter_ids)).any():
-        problems.append(
-            Problem("missing", "no reading of the busbar (empty meter id); it is the reference of all others")
-        )
+        text = "no reading of the busbar (empty meter id); it is the reference of all others"
+        problems.append(Problem("missing", text))
     if "meter" in given:
         problems += _twice(meter, channels)
-        problems += _wrong_units(
-            site, numbers, meter.mask(meter.isin(channels), meter.map(channels)), exclude
-        )
+        whole_meter = meter.mask(meter.isin(channels), meter.map(channels))
+        problems += _wrong_units(site, numbers, whole_meter, exclude)
     if problems:
         raise RecordingInvalid(*problems, where="readings: ")
     whole = [site.meter_ids.index(name) for name in dict.fromkeys(channels.values())]
     found = _binned(site, given, numbers, np.asarray(column, dtype=np.intp), whole)
     if site.tables.in_phases and len(blind(site, found.unread)) == len(site.meter_ids):
-        raise RecordingInvalid(
-            Problem(
-                "missing",
-                f"readings: the busbar has no voltages of phase {' and '.join(found.unread)}, and "
-                "without them no meter can be compared; expected v_phases, as [230.1, 230.4, 229.9]",
-            )
+        text = (
+            f"readings: the busbar has no voltages of phase {' and '.join(found.unread)}, and without them "
+            "no meter can be compared; expected v_phases, as [230.1, 230.4, 229.9]"
         )
+        raise RecordingInvalid(Problem("missing", text))
     return found
 
 
@@ -195,9 +187,8 @@ def _numbers(column: pd.Series, problems: list[Problem]) -> Floats | None:
     nothing = text.fillna("").str.strip().str.lower().isin(["", "nan"]).to_numpy()
     wrong = np.flatnonzero(np.isnan(values) & ~nothing)
     if wrong.size:
-        problems.append(
-            Problem("wrong-type", f"{column.name} of {_rows(wrong)} is {text.iloc[wrong[0]]!r}; {expected}")
-        )
+        told = f"{column.name} of {_rows(wrong)} is {text.iloc[wrong[0]]!r}; {expected}"
+        problems.append(Problem("wrong-type", told))
         return None
     return values
 
@@ -299,13 +290,11 @@ def _binned(
     T = int(there.sum())
     span, wanted = T * step * together, max(FEWEST_FRAMES * step * together, FEWEST_SPANS * tau)
     if T < FEWEST_FRAMES or span < wanted:
-        raise RecordingInvalid(
-            Problem(
-                "too-little-data",
-                f"too little data: {T} frames over {span / 3600:.3g} h; at least {FEWEST_FRAMES} frames over "
-                f"{wanted / 3600:.3g} h are required; days give more information than hours",
-            )
+        text = (
+            f"too little data: {T} frames over {span / 3600:.3g} h; at least {FEWEST_FRAMES} frames over "
+            f"{wanted / 3600:.3g} h are required; days give more information than hours"
         )
+        raise RecordingInvalid(Problem("too-little-data", text))
     middle = first + (used * together + 0.5 * (together - 1)) * step
     return Frames(
         meter_ids=site.meter_ids,
@@ -331,9 +320,8 @@ def _phases(given: pd.DataFrame, number: Ints, ticks: int) -> Floats:
         ]
         told = np.array(rows, dtype=np.float64).reshape(len(rows), 3)
     except (TypeError, ValueError) as error:
-        raise RecordingInvalid(
-            Problem("shape", "readings: v_phases are three voltages, as [230.1, 230.4, 229.9]")
-        ) from error
+        text = "readings: v_phases are three voltages, as [230.1, 230.4, 229.9]"
+        raise RecordingInvalid(Problem("shape", text)) from error
     cell = (number[there, None] * 3 + np.arange(3)).ravel()
     return _means(cell, told.ravel(), (ticks, 3))[0]
 
@@ -371,9 +359,8 @@ def _step(t: Floats, column: Ints) -> float:
     gap = np.diff(t[order])[np.diff(column[order]) == 0]
     gap = gap[gap > 0.0]
     if not gap.size:
-        raise RecordingInvalid(
-            Problem("too-little-data", "too little data: no meter has two readings at different times")
-        )
+        text = "too little data: no meter has two readings at different times"
+        raise RecordingInvalid(Problem("too-little-data", text))
     return float(np.median(gap))
 
 

@@ -562,12 +562,6 @@ class Calibrate:
 
     Attributes
     ----------
-    feeder, digest
-        Name and content digest of the feeder.
-    frames, span_h
-        Number of frames, and their time span, h.
-    risk
-        Probability of any proposal for correct files.
     meters
         One row for each meter: `meter`, `customer`, `frames` (readings used), `bias_percent`, `std_percent`,
         `low_percent`, `high_percent` (95 %; of the voltage, relative to the busbar meter: a common error of
@@ -599,9 +593,9 @@ class Calibrate:
 
     feeder: str
     digest: str
-    frames: int
+    frames: int  # number of frames
     span_h: float
-    risk: float
+    risk: float  # probability of any proposal for correct files
     meters: pd.DataFrame
     lines: pd.DataFrame
     customers: pd.DataFrame
@@ -631,9 +625,8 @@ class Calibrate:
         """
         tables, target = find(site_folder), Path(out)
         if digest(tables) != self.digest:
-            raise OtherFeeder(
-                [Problem("other-origin", f"{site_folder}: not the studied feeder, or changed since")]
-            )
+            text = f"{site_folder}: not the studied feeder, or changed since"
+            raise OtherFeeder([Problem("other-origin", text)])
         if target.exists() and (not target.is_dir() or any(target.iterdir())):
             raise FileExistsError(f"{target}: is not empty; expected a new folder")
         for wrong in self.corrections:
@@ -723,14 +716,12 @@ def calibrate(
 
 def wrong_numbers(risk: float, tolerance: float) -> list[Problem]:
     """Problems of the numbers of a calibration."""
-    problems = []
-    if not 0.0 < risk < 1.0:
-        problems.append(Problem("out-of-range", f"risk is {risk}; it must be between 0 and 1"))
-    if not 0.0 < tolerance < LENGTH_SPREAD:
-        problems.append(
-            Problem("out-of-range", f"tolerance is {tolerance}; it must be between 0 and {LENGTH_SPREAD}")
-        )
-    return problems
+    ranges = (("risk", risk, 1), ("tolerance", tolerance, LENGTH_SPREAD))
+    return [
+        Problem("out-of-range", f"{name} is {value}; it must be between 0 and {most}")
+        for name, value, most in ranges
+        if not 0.0 < value < most
+    ]
 
 
 def _subject(site: Site | ThreePhaseSite, given: Frames, risk: float, tolerance: float) -> dict[str, Any]:

@@ -192,12 +192,6 @@ class Campaign:
 
     Attributes
     ----------
-    feeder, digest
-        Name and content digest of the feeder.
-    plan
-        The campaign.
-    versions
-        Versions of all libraries that numbers depend on.
     scenarios
         One row for each scenario and false-alarm rate: `scenario`, `scene`, `season`, `weekday` (0 is
         Monday), `hour` of its begin; `alarms_per_year`; `kind`, `size`, `liars`, `place`, `onset_s`; `reason`
@@ -234,7 +228,7 @@ class Campaign:
     feeder: str
     digest: str
     plan: CampaignPlan
-    versions: dict[str, str]
+    versions: dict[str, str]  # of all libraries that numbers depend on
     scenarios: pd.DataFrame
     liars: pd.DataFrame
     by_kind: pd.DataFrame

@@ -158,14 +158,6 @@ class DroopStudy:
 
     Attributes
     ----------
-    feeder, digest
-        Name and content digest of the feeder.
-    seed, options
-        As in `droop`.
-    verdict
-        Stability of the fleet with constant loads anywhere within their limits.
-    rest, always
-        Proof status of the band for slow and for arbitrary load changes.
     tables
         - `stability`: a row for each operating point, and one for any loads. `verdict`, `proof`, `gain` (of
           the loop at rest), `growth` (of a small deviation in one update), `margin` (all curves with the same
@@ -190,9 +182,9 @@ class DroopStudy:
     digest: str
     seed: int
     options: DroopOptions
-    verdict: FleetVerdict
-    rest: BandGuarantee
-    always: BandGuarantee
+    verdict: FleetVerdict  # with constant loads anywhere within their limits
+    rest: BandGuarantee  # for slow load changes
+    always: BandGuarantee  # for arbitrary load changes
     tables: dict[str, pd.DataFrame]
 
 
