@@ -13,6 +13,7 @@ import platform
 import sqlite3
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
+from functools import cache
 from importlib.metadata import entry_points, version
 from pathlib import Path
 from typing import Any, Protocol, Self
@@ -85,6 +86,7 @@ Where = Path | str | Keeper | None
 """Journal file, or owner of journals; None: no file."""
 
 
+@cache
 def versions() -> dict[str, str]:
     """Versions of all libraries that numbers depend on, packages with estimators included."""
     names = ["gridsec", "numpy", "scipy", "power-grid-model", "cvxpy", "clarabel"]
