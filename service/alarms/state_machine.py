@@ -34,11 +34,12 @@ from service.alarms.alarm import (
     from_json,
     to_json,
 )
-from service.alarms.conditions import AlarmKind, Condition, ConditionEvidence, Severity, conditions
+from service.alarms.conditions import AlarmEvidence, AlarmKind, Condition, Severity, conditions
 
 __all__ = [
     "Alarm",
     "AlarmBook",
+    "AlarmEvidence",
     "AlarmKind",
     "AlarmRules",
     "AlarmState",
@@ -47,7 +48,6 @@ __all__ = [
     "AlreadyAcknowledged",
     "Change",
     "Condition",
-    "ConditionEvidence",
     "RaisedAgain",
     "Severity",
     "acknowledge",
@@ -277,7 +277,7 @@ def _present(
     return replace(entry, alarm=alarm), (AlarmTransition(alarm, change, t),)
 
 
-def _explains_more(now: ConditionEvidence, before: ConditionEvidence) -> bool:
+def _explains_more(now: AlarmEvidence, before: AlarmEvidence) -> bool:
     """True if an error of the feeder's files explains the condition and is new to the alarm."""
     error, told = now.data_error, before.data_error
     if error is None or told is None:
@@ -310,6 +310,9 @@ def _raise(old: Alarm | None, condition: Condition, rules: AlarmRules, onset: fl
         t_cleared=None,
         reason=condition.reason,
         evidence=condition.evidence,
+        acknowledged_by=None,
+        t_acknowledged=None,
+        comment=None,
         customer=condition.customer,
     )
 

@@ -37,8 +37,7 @@ from service.alarms.state_machine import (
     restore,
 )
 from service.alarms.state_machine import to_json as alarm_json
-from service.engine.commissioning import FeederCommissioning
-from service.engine.commissioning import to_json as commissioning_json
+from service.engine.commissioning import CommissioningProgress, FeederCommissioning
 from service.engine.feeder_monitor import FeederMonitor, TickResult, align_rules, known_of
 from service.engine.suspicions import Suspicions
 from service.errors import FeederUnknown
@@ -585,7 +584,7 @@ class Engine:
 
     def acknowledge(
         self, alarm_id: str, who: str, comment: str, *, count: int | None = None
-    ) -> Future[dict[str, Any]]:
+    ) -> Future[Alarm]:
         """Acknowledge an alarm. The result is the stored alarm; the book follows after the commit.
 
         Repeating the same acknowledgement of the same occurrence gives the same result.
@@ -604,7 +603,7 @@ class Engine:
         OutcomeUnknown
             As the result, if it is not known to be stored.
         """
-        answer: Future[dict[str, Any]] = Future()
+        answer: Future[Alarm] = Future()
         t = self._wall()
 
         def store(alarm: Alarm | None) -> None:
@@ -612,13 +611,13 @@ class Engine:
                 raise AlarmUnknown(alarm_id)
             occurrence = alarm.count if count is None else count
             if (alarm.acknowledged_by, alarm.comment, alarm.count) == (who, comment, occurrence):
-                answer.set_result(alarm_json(alarm))
+                answer.set_result(alarm)
                 return
             transition = acknowledged(alarm, who, comment, t, count=count)
 
-            def landed() -> dict[str, Any]:
+            def landed() -> Alarm:
                 self._acknowledged(transition.alarm)
-                return alarm_json(transition.alarm)
+                return transition.alarm
 
             self.committer.store(Wish((transition,)), _landing(answer, landed), partial(_refuse, answer))
 
@@ -646,7 +645,9 @@ class Engine:
             except (AlarmUnknown, AlreadyAcknowledged, RaisedAgain):
                 _log.info("the acknowledged occurrence is over", feeder=alarm.feeder, id=alarm.id)
 
-    def recommission(self, name: str, meters: Sequence[str], who: str, reason: str) -> Future[dict[str, Any]]:
+    def recommission(
+        self, name: str, meters: Sequence[str], who: str, reason: str
+    ) -> Future[CommissioningProgress]:
         """Restart the learning of meters' errors. The result is the stored progress.
 
         Parameters
@@ -661,7 +662,7 @@ class Engine:
         OutcomeUnknown
             As in `acknowledge`.
         """
-        answer: Future[dict[str, Any]] = Future()
+        answer: Future[CommissioningProgress] = Future()
         monitor = self.monitors.get(name)
         if monitor is None:
             raise FeederUnknown(name)
@@ -671,7 +672,7 @@ class Engine:
         kept, wanted = (*kept, *monitor.suspicions.due()), happened[-1:]
         take_back()
 
-        def landed() -> dict[str, Any]:
+        def landed() -> CommissioningProgress:
             # Ticks since then have changed the state: the restart is repeated from the present state, stored
             # with the next batch.
             monitor.recommission(meters, t, who, reason)
@@ -681,7 +682,7 @@ class Engine:
             for one in wanted:
                 _say(one)
             self._count_learned(monitor)
-            return commissioning_json(monitor.commissioning.progress())
+            return monitor.commissioning.progress()
 
         wish = Wish(kept=kept, happened=wanted)
         self.committer.store(wish, _landing(answer, landed), partial(_refuse, answer))

@@ -246,27 +246,6 @@ class FeederMonitor:
         self.skipped += tick.skipped
         return self._result(tick)
 
-    def ingest(self, reading: Reading, now: float) -> tuple[ReadingOutcome, list[TickResult]]:
-        """Align one reading and evaluate the ticks that become due.
-
-        Parameters
-        ----------
-        reading, now
-            As in `Aligner.take`.
-        """
-        return self.place(reading, now), self._judged()
-
-    def advance(self, now: float) -> list[TickResult]:
-        """Evaluate the ticks that are due without a new reading.
-
-        Parameters
-        ----------
-        now
-            Wall time, Unix s.
-        """
-        self.reach(now)
-        return self._judged()
-
     def finish(self) -> None:
         """Add all ticks that the time has reached to the pending ones: the input has ended."""
         self.pending.extend(self.aligner.flush())
@@ -306,9 +285,6 @@ class FeederMonitor:
             self._state, self.commissioning, self.suspicions = state, before, believed
 
         return take_back
-
-    def _judged(self) -> list[TickResult]:
-        return [self.judge() for _ in range(len(self.pending))]
 
     def _result(self, tick: Tick) -> TickResult:
         """Evaluate a tick; a defect costs its verdict, but no alarm of earlier ticks."""

@@ -22,8 +22,9 @@ import structlog
 from feeders.model.site import Site
 from feeders.registry.registry import DesignedEstimator
 from gridsec.errors import GridsecError
+from service.alarms.state_machine import Alarm
 from service.engine import design_jobs
-from service.engine.commissioning import to_json as commissioning_json
+from service.engine.commissioning import CommissioningProgress
 from service.engine.engine import Engine, RuntimeConfig
 from service.engine.feeder_monitor import FeederMonitor, Phase
 from service.errors import FeederFixed, TooManyFeeders
@@ -363,10 +364,10 @@ class Runtime:
         since = now - self._engine.reported.get(report.feeder, now)
         return since if self._engine.config.clock is Clock.EVENTS else max(since, self._wall() - report.t)
 
-    def commissioning(self, name: str) -> dict[str, Any] | None:
+    def commissioning(self, name: str) -> CommissioningProgress | None:
         """Return the progress of a feeder's commissioning, or None."""
         monitor = self._engine.monitors.get(name)
-        return None if monitor is None else commissioning_json(monitor.commissioning.progress())
+        return None if monitor is None else monitor.commissioning.progress()
 
     def unstored(self) -> tuple[int, str | None]:
         """Return the number of alarm changes that wait for the database, and its problem or None."""
@@ -459,9 +460,7 @@ class Runtime:
         await self._command(partial(self._engine.remove, name))
         self._notify("state")
 
-    async def acknowledge(
-        self, alarm_id: str, who: str, comment: str, *, count: int | None = None
-    ) -> dict[str, Any]:
+    async def acknowledge(self, alarm_id: str, who: str, comment: str, *, count: int | None = None) -> Alarm:
         """Acknowledge an alarm; it is stored when this returns.
 
         Parameters
@@ -480,7 +479,9 @@ class Runtime:
         """
         return await self._command(partial(self._engine.acknowledge, alarm_id, who, comment, count=count))
 
-    async def recommission(self, name: str, meters: Sequence[str], who: str, reason: str) -> dict[str, Any]:
+    async def recommission(
+        self, name: str, meters: Sequence[str], who: str, reason: str
+    ) -> CommissioningProgress:
         """Restart the learning of meters' errors; it is stored when this returns.
 
         Parameters

@@ -139,15 +139,12 @@ class Bus:
         """Open the session, subscribe, and declare the queryables."""
         with ExitStack() as stack:
             live = stack.enter_context(session(self._config))
-            # One subscription for all kinds of readings keeps their order. Its pattern also matches nearly
-            # correct keys: they are reported as bad readings.
-            key = f"{self._prefix}/*/**/reading$*"
             # A full ring drops the oldest samples; the gap shows in the sequence numbers.
-            subscriber = (
-                live.declare_subscriber(key, zenoh.handlers.FifoChannel(RING))
-                if self._lossless
-                else live.declare_subscriber(key, zenoh.handlers.RingChannel(RING))
-            )
+            ring = zenoh.handlers.FifoChannel(RING) if self._lossless else zenoh.handlers.RingChannel(RING)
+            # One subscription for all kinds of readings keeps their order. Its pattern also matches wrong
+            # keys: they are reported as bad readings.
+            remote = zenoh.Locality.REMOTE
+            subscriber = live.declare_subscriber(f"{self._prefix}/**", ring, allowed_origin=remote)
             stack.callback(subscriber.undeclare)
             self._start("zenoh readings", self._receive, subscriber.handler)
             for key in (f"{self._prefix}/*/estimate", f"{self._prefix}/*/alarm/*"):
@@ -183,20 +180,29 @@ class Bus:
                 return
             batch: list[Sample] = []
             while raw is not None:
-                if raw.kind == zenoh.SampleKind.DELETE:
+                key = str(raw.key_expr)
+                if self._published_by_others(key):
+                    pass
+                elif raw.kind == zenoh.SampleKind.DELETE:
                     self.counts.deleted += 1
                 else:
-                    batch.append(self._copy(raw))
+                    batch.append(self._copy(raw, key))
                 raw = _try_recv(handler) if len(batch) < BATCH else None
             self._deliver(batch)
 
-    def _copy(self, raw: zenoh.Sample) -> Sample:
+    def _published_by_others(self, key: str) -> bool:
+        """True for keys that another service with this prefix publishes."""
+        match key.removeprefix(f"{self._prefix}/").split("/"):
+            case [_, "estimate"] | [_, "alarm", _]:
+                return True
+        return False
+
+    def _copy(self, raw: zenoh.Sample, key: str) -> Sample:
         payload = raw.payload.to_bytes()
         size = len(payload)
         kept = payload if size <= self._max_payload else payload[:_HEAD]
         # A key that is cut here is longer than every valid key, and stays invalid.
-        key = str(raw.key_expr)[: len(self._prefix) + _HEAD]
-        return Sample(key, kept, str(raw.encoding), self._wall(), size)
+        return Sample(key[: len(self._prefix) + _HEAD], kept, str(raw.encoding), self._wall(), size)
 
     # ---------------------------------------------------------------- out
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
-from typing import Any, Literal, TypeAlias
+from dataclasses import dataclass
+from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
+from pydantic import Field
 
 from feeders.model.site import Site, Snapshot, volts
 from gridsec.arrays import Bools, Floats
@@ -167,60 +168,63 @@ BUSBAR = "substation"
 """Name of the busbar meter in reports, as in its zenoh key; reserved for it."""
 
 
+ModelOnly: TypeAlias = Annotated[
+    bool,
+    Field(
+        description="The estimates use no voltage reading of this tick, only powers, the model and the state "
+        "of the estimator."
+    ),
+]
+"""See `ReferenceVoltages`."""
+ClockOffset: TypeAlias = Annotated[
+    float | None,
+    Field(description="Lead of its clock relative to the other meters, s; null if not measurable."),
+]
+
+
 @dataclass(frozen=True, slots=True)
-class BusbarReport:
-    """The busbar meter at one tick; in three phases the numbers belong to one phase.
+class BusbarMeterState:
+    """The busbar meter at the latest tick; in three phases the numbers belong to one phase."""
 
-    Attributes
-    ----------
-    judged
-        True if the estimator tests this meter, and this tick has readings for the test: of this meter and of
-        a trusted meter in the same phase. Estimators that trust this meter, or do not use it, never test it.
-    seen
-        True if a usable reading of it belongs to this tick.
-    suspect
-        True if the verdict names it as manipulated.
-    phases
-        The manipulated phases: of a, b and c; empty on a balanced feeder.
-    phase
-        Phase of the numbers: the one with the largest deviation, among the suspect ones if there are any;
-        None on a balanced feeder.
-    v_volt_reported
-        Reported RMS phase-to-neutral voltage, V; None if unavailable.
-    v_volt_estimated
-        Reconstructed voltage of the busbar, V: the reported one while the meter is trusted. None without an
-        estimate.
-    attack_volt_estimated
-        Reconstructed manipulation, V: the mean over the time scale of its detection; 0 if not suspect.
-    model_only
-        True if `v_volt_estimated` uses no reading of this tick, see `voltages.ReferenceVoltages`.
-    clock_offset_s
-        Lead of its clock relative to the other meters, s; None if not measurable.
-    """
-
-    judged: bool
-    seen: bool
-    suspect: bool
-    phases: tuple[str, ...] = ()
-    phase: str | None = None
-    v_volt_reported: float | None = None
-    v_volt_estimated: float | None = None
-    attack_volt_estimated: float | None = None
-    model_only: bool = False
-    clock_offset_s: float | None = None
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the JSON object of REST's `state`."""
-        return {"meter": BUSBAR} | asdict(self) | {"phases": list(self.phases)}
+    # Estimators that trust this meter, or do not use it, never test it.
+    judged: Annotated[
+        bool,
+        Field(
+            description="The estimator tests this meter, and this tick has the readings for the test: of "
+            "this meter and of a trusted meter in the same phase."
+        ),
+    ] = False
+    seen: Annotated[bool, Field(description="A usable reading belongs to this tick.")] = False
+    suspect: Annotated[bool, Field(description="The verdict names it as manipulated.")] = False
+    phases: Annotated[
+        tuple[str, ...], Field(description="Manipulated phases, a, b or c; empty on a balanced feeder.")
+    ] = ()
+    phase: Annotated[
+        str | None,
+        Field(description="Phase of the numbers, the one with the largest deviation; null if balanced."),
+    ] = None
+    v_volt_reported: Annotated[float | None, Field(description="Reported voltage, phase to neutral, V.")] = (
+        None
+    )
+    # The reported voltage while the meter is trusted.
+    v_volt_estimated: Annotated[
+        float | None, Field(description="Reconstructed voltage of the busbar, V.")
+    ] = None
+    attack_volt_estimated: Annotated[
+        float | None, Field(description="Mean excess of its reading, V; 0 if not suspect.")
+    ] = None
+    model_only: ModelOnly = False
+    clock_offset_s: ClockOffset = None
+    meter: Annotated[str, Field(description="Its name in alarms and explanations.")] = BUSBAR
 
 
-UNKNOWN_BUSBAR = BusbarReport(judged=False, seen=False, suspect=False)
+UNKNOWN_BUSBAR = BusbarMeterState()
 """Default without any data."""
 
 
 def busbar_report(
     site: Site, tick: Tick, estimate: Estimate | None = None, verdict: Verdict | None = None
-) -> BusbarReport:
+) -> BusbarMeterState:
     """Return the report of the busbar meter.
 
     Parameters
@@ -244,7 +248,7 @@ def busbar_report(
     def number(values: Floats) -> float | None:
         return float(values[k]) if math.isfinite(values[k]) else None
 
-    return BusbarReport(
+    return BusbarMeterState(
         judged=judges and bool((np.isfinite(reported) & rests_on.meters).any()),
         seen=math.isfinite(reported[k]),
         suspect=bool(suspect.any()),

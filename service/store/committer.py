@@ -26,7 +26,7 @@ from service.alarms.state_machine import to_json as alarm_json
 from service.ingest.queues import BusCounts
 from service.metrics import Metrics
 from service.report.report import FeederReport
-from service.store import OutcomeUnknown, Store, StoredTransition, StoreUnavailable
+from service.store import AlarmEvent, OutcomeUnknown, Store, StoreUnavailable
 from service.store.schema import CommissioningEvent
 from service.store.state_codec import StateSnapshot
 from service.store.write_queue import Batch, WriteQueue
@@ -124,7 +124,7 @@ class WriteResult:
 
     numbers: tuple[int, ...] | None = None
     marked: bool = False
-    page: tuple[StoredTransition, ...] | None = None
+    page: tuple[AlarmEvent, ...] | None = None
     found: Any = None
     error: StoreUnavailable | None = None
 

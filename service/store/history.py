@@ -16,7 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from service.report.report import BUSBAR, FeederReport, MeterReport, finite
+from service.report.report import FeederReport, MeterState, finite
+from service.report.voltages import BUSBAR
 
 _COLUMNS = ("v_volt_reported", "v_volt_estimated", "score", "threshold")
 _SEEN, _SUSPECT, _MODEL_ONLY = 1, 2, 4
@@ -68,12 +69,12 @@ def worth_keeping(last: Mark | None, now: Mark, rules: HistoryRules) -> bool:
     return changed or step <= 0.0 or math.floor(now.t / step) > math.floor(last.t / step)
 
 
-def rows(report: FeederReport) -> tuple[MeterReport, ...]:
+def rows(report: FeederReport) -> tuple[MeterState, ...]:
     """Return the meters of a row: those of the report, and the busbar meter as `BUSBAR`, without a score."""
     now = report.busbar
-    busbar = MeterReport(
+    busbar = MeterState(
         meter=BUSBAR,
-        bus=report.bus_v_volt[0][0] if report.bus_v_volt else "",
+        bus=report.buses[0].bus if report.buses else "",
         seen=now.seen,
         suspect=now.suspect,
         score=None,
@@ -88,7 +89,7 @@ def rows(report: FeederReport) -> tuple[MeterReport, ...]:
     return (*report.meters, busbar)
 
 
-def pack(meters: Sequence[MeterReport]) -> bytes:
+def pack(meters: Sequence[MeterState]) -> bytes:
     """Pack the meters of a report: four float32 columns (NaN for None), then one byte of flags each."""
     none = math.nan
     table = np.array(

@@ -23,10 +23,10 @@ from service.store.schema import (
     HISTORY,
     LAYOUT,
     OUTBOX,
+    AlarmEvent,
     CommissioningChange,
     CommissioningEvent,
     Rejected,
-    StoredTransition,
 )
 from service.store.state_codec import SnapshotKind, StateSnapshot
 
@@ -127,7 +127,7 @@ class Reader:
         with self._read() as connection:
             return [from_json(json.loads(data)) for data in connection.scalars(query)]
 
-    def events(self, alarm_id: str, *, after: int = 0, limit: int = 1000) -> list[StoredTransition]:
+    def events(self, alarm_id: str, *, after: int = 0, limit: int = 1000) -> list[AlarmEvent]:
         """Return the events of an alarm, oldest first.
 
         Parameters
@@ -142,9 +142,7 @@ class Reader:
         with self._read() as connection:
             return [_event(row) for row in connection.execute(query).mappings()]
 
-    def events_after(
-        self, number: int, *, feeder: str | None = None, limit: int = 100
-    ) -> list[StoredTransition]:
+    def events_after(self, number: int, *, feeder: str | None = None, limit: int = 100) -> list[AlarmEvent]:
         """Return the events after a number, oldest first.
 
         Parameters
@@ -162,7 +160,7 @@ class Reader:
         with self._read() as connection:
             return [_event(row) for row in connection.execute(query).mappings()]
 
-    def outbox_pending(self, limit: int = 1000, *, after: int = 0) -> list[StoredTransition]:
+    def outbox_pending(self, limit: int = 1000, *, after: int = 0) -> list[AlarmEvent]:
         """Return the unpublished events, oldest first.
 
         Parameters
@@ -279,8 +277,8 @@ class Reader:
         ]
 
 
-def _event(row: sa.RowMapping) -> StoredTransition:
-    return StoredTransition(
+def _event(row: sa.RowMapping) -> AlarmEvent:
+    return AlarmEvent(
         row["seq"],
         row["t"],
         Change(row["change"]),

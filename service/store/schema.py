@@ -6,8 +6,10 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Annotated
 
 import sqlalchemy as sa
+from pydantic import Field
 
 from gridsec.errors import GridsecError
 from service.alarms.state_machine import Alarm, Change
@@ -23,26 +25,14 @@ class CommissioningChange(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class CommissioningEvent:
-    """One entry of a feeder's record of commissioning.
+    """One change of a commissioning."""
 
-    Attributes
-    ----------
-    t
-        Unix time, s.
-    change
-        Kind of the entry.
-    meters
-        Their ids.
-    who, reason
-        Operator or None, and reason.
-    """
-
-    feeder: str
+    feeder: Annotated[str, Field(exclude=True)]
     t: float
     change: CommissioningChange
     meters: tuple[str, ...]
-    who: str | None = None
-    reason: str = ""
+    who: str | None
+    reason: str
 
 
 class StoreUnavailable(GridsecError):
@@ -64,10 +54,10 @@ class WriterLost(StoreUnavailable):
 
 
 @dataclass(frozen=True, slots=True)
-class StoredTransition:
-    """One stored transition. `seq` increases in the order of commits and is never reused."""
+class AlarmEvent:
+    """One event of an alarm, and the alarm after it."""
 
-    seq: int
+    seq: int  # increases in the order of commits and is never reused
     t: float
     change: Change
     who: str | None

@@ -17,6 +17,7 @@ from gridsec.interface import Cause
 from service.alarms.state_machine import (
     Alarm,
     AlarmBook,
+    AlarmEvidence,
     AlarmKind,
     AlarmRules,
     AlarmState,
@@ -25,7 +26,6 @@ from service.alarms.state_machine import (
     AlreadyAcknowledged,
     Change,
     Condition,
-    ConditionEvidence,
     Severity,
     acknowledge,
     acknowledged,
@@ -78,9 +78,7 @@ def tick(truth: str, name: str | None = "m1") -> list[Condition]:
     if truth == "A":
         return []
     kind = AlarmKind.METER_MANIPULATED
-    return [
-        Condition(kind, FEEDER, name, Severity.CRITICAL, ConditionEvidence(1.0), "why", known=truth == "P")
-    ]
+    return [Condition(kind, FEEDER, name, Severity.CRITICAL, AlarmEvidence(1.0), "why", known=truth == "P")]
 
 
 Tick = tuple[float, str]
@@ -437,7 +435,7 @@ def test_json_and_back() -> None:
     assert type(data["state"]) is str
     assert from_json({**data, "unknown": 1}) == alarm
     shown = (ExplanationReport(("m1", "m2"), ("Miller",), 0.5, ("Smith",)),)
-    rich = replace(alarm, customer="Miller", evidence=ConditionEvidence(kind="stuck", explanations=shown))
+    rich = replace(alarm, customer="Miller", evidence=AlarmEvidence(kind="stuck", explanations=shown))
     assert from_json(json.loads(json.dumps(to_json(rich)))) == rich
 
 

@@ -360,7 +360,7 @@ WRITER = """
     while True:
         number += 1
         alarm = Alarm(uuid.uuid4().hex[:26], AlarmKind.DATA_LOSS, "village", None, Severity.MINOR,
-                      AlarmState.RAISED, 1, 0.0, 1.0, None, "", ConditionEvidence())
+                      AlarmState.RAISED, 1, 0.0, 1.0, None, "", AlarmEvidence())
         over = replace(alarm, state=AlarmState.CLEARED, t_cleared=2.0)
         a = store.commit([AlarmTransition(alarm, Change.RAISED, 1.0)])
         print(alarm.id, a[0], "raised", flush=True)
