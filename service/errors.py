@@ -17,15 +17,7 @@ __all__ = [
 
 
 def prefixed(start: str, problem: str) -> Problem:
-    """Return a problem with its place in front, once, and with its code.
-
-    Parameters
-    ----------
-    start
-        The place, with a separator.
-    problem
-        The sentence.
-    """
+    """Return a problem with its place in front, once, and with its code."""
     return Problem(getattr(problem, "code", ""), start + problem.removeprefix(start))
 
 

@@ -69,31 +69,21 @@ class AlarmEvidence:
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """One condition that is present at a tick or, with `known=False`, unknown.
+    """One condition that is present at a tick or, with `known=False`, unknown."""
 
-    Attributes
-    ----------
-    kind, feeder, meter
-        Kind and subject; the meter is None for a condition of the whole feeder.
-    customer
-        Customer of the inverter that the condition refers to, or None. `meter` is that customer's, if any.
-    severity, evidence, reason
-        Severity, numbers, and a sentence for the operator.
-    known
-        False: the tick gives no answer; an existing alarm is held.
-    unheard
-        The condition is present because readings are missing of meters that are not silent yet: it raises an
-        alarm only if it lasts for longer than `silence_s`.
-    """
-
+    # kind, feeder, meter: kind and subject; the meter is None for a condition of the whole feeder.
     kind: AlarmKind
     feeder: str
     meter: str | None
+    # severity, evidence, reason: severity, numbers, and a sentence for the operator.
     severity: Severity
     evidence: AlarmEvidence = AlarmEvidence()
     reason: str = ""
-    known: bool = True
+    known: bool = True  # false: the tick gives no answer; an existing alarm is held
+    # Customer of the inverter that the condition refers to, or None. `meter` is that customer's, if any.
     customer: str | None = None
+    # The condition is present because readings are missing of meters that are not silent yet: it raises an
+    # alarm only if it lasts for longer than `silence_s`.
     unheard: bool = False
 
     @property
@@ -122,10 +112,7 @@ def conditions(report: FeederReport) -> list[Condition]:
     - `clock-offset`: the clock of a meter, or of the busbar meter, is measurably ahead or behind, or its
       readings are late.
 
-    Returns
-    -------
-    list of Condition
-        A condition that is not in the list is absent.
+    A condition that is not in the list is absent.
     """
     manipulated = (*_manipulated(report), *_busbar(report), *_inverters(report))
     found = [*manipulated, *_data_loss(report), *_undecided(report), *_learning(report), *_clocks(report)]

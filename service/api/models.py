@@ -210,15 +210,7 @@ class Recommissioning(BaseModel):
 
     @classmethod
     def of(cls, body: bytes, known: Sequence[str]) -> Recommissioning | list[Any]:
-        """Return the request in a body, or all its problems.
-
-        Parameters
-        ----------
-        body
-            JSON.
-        known
-            Ids of the feeder's meters.
-        """
+        """Return the request in a body, or all its problems."""
         try:
             given = json.loads(body)
         except (ValueError, RecursionError) as error:

@@ -159,12 +159,7 @@ _NAME = r"^[A-Za-z0-9_-]{1,64}$"
 def create_api(backend: Backend, hosts: Collection[str] = (), *, max_streams: int = MAX_STREAMS) -> FastAPI:
     """Return the HTTP application.
 
-    Parameters
-    ----------
-    hosts
-        Host names for requests that change something, besides `localhost` and the machine's name.
-    max_streams
-        Largest number of open event streams.
+    `hosts` are host names for requests that change something, besides `localhost` and the machine's name.
     """
     app = FastAPI(
         title="gridsec",

@@ -184,15 +184,7 @@ class FeederCommissioning:
                 self.restored = True
 
     def follow(self, state: Any, t: float) -> None:
-        """Update from the result of a tick.
-
-        Parameters
-        ----------
-        state
-            State of the monitor after the tick.
-        t
-            Unix time of the tick, s.
-        """
+        """Update from the result of a tick."""
         if self.learner is None:
             return
         before, self.known, self._t = self.known, self.learner.commission(state), t
@@ -205,24 +197,8 @@ class FeederCommissioning:
     def renew(self, state: Any, meters: Sequence[str], t: float, who: str, reason: str) -> Any:
         """Restart the learning of meters.
 
-        Parameters
-        ----------
-        state
-            State of the monitor; None before the first tick.
-        meters
-            Their ids; empty for all.
-        t, who, reason
-            Time (Unix s), operator and reason.
-
-        Returns
-        -------
-        Any
-            New state of the monitor; None if it was None.
-
-        Raises
-        ------
-        NothingToLearn
-            If the monitor does not learn.
+        `meters` is empty for all; `state` is None before the first tick. Returns the new state of the monitor;
+        None if it was None. Raises NothingToLearn if the monitor does not learn.
         """
         learner, watcher = self.learner, self._watcher
         if learner is None or watcher is None:
@@ -266,10 +242,7 @@ class FeederCommissioning:
     ) -> tuple[tuple[StateSnapshot, ...], tuple[CommissioningEvent, ...]]:
         """Return the state that is due for the store; it counts as stored afterwards.
 
-        Parameters
-        ----------
-        at_once
-            Include state that is not due yet.
+        With `at_once` it includes state that is not due yet.
         """
         happened, self._happened = self._happened, ()
         if self.known is None or self._t is None:

@@ -127,10 +127,7 @@ class Runtime:
     async def run(self) -> None:
         """Run rounds until `stop`.
 
-        Raises
-        ------
-        WriterLost
-            If another process may have written the database; nothing more is stored.
+        Raises WriterLost if another process may have written the database; nothing more is stored.
         """
         self._loop = asyncio.get_running_loop()
         try:
@@ -413,15 +410,8 @@ class Runtime:
     async def put_feeder(self, name: str, tables: dict[str, Any]) -> None:
         """Take over a feeder's tables: check, design, store, start monitoring; all or nothing.
 
-        Parameters
-        ----------
-        name, tables
-            Name of the feeder, and the columns of its files as JSON.
-
-        Raises
-        ------
-        FeederInvalid, NotObservable, DesignInfeasible, TooManyFeeders, StoreUnavailable
-            If it cannot be taken over; the feeder stays unchanged.
+        Raises FeederInvalid, NotObservable, DesignInfeasible, TooManyFeeders, StoreUnavailable if it cannot
+        be taken over; the feeder stays unchanged.
         """
         self._go_on()
         self._make_room(name)
@@ -450,10 +440,8 @@ class Runtime:
     async def delete_feeder(self, name: str) -> None:
         """Stop monitoring a feeder that was added over REST; its alarms are cleared, its history stays.
 
-        Raises
-        ------
-        FeederUnknown, FeederFixed, StoreUnavailable
-            If it cannot be deleted; monitoring then continues.
+        Raises FeederUnknown, FeederFixed, StoreUnavailable if it cannot be deleted; monitoring then
+        continues.
         """
         if name in self._given:
             raise FeederFixed(name)
@@ -463,19 +451,9 @@ class Runtime:
     async def acknowledge(self, alarm_id: str, who: str, comment: str, *, count: int | None = None) -> Alarm:
         """Acknowledge an alarm; it is stored when this returns.
 
-        Parameters
-        ----------
-        alarm_id, who, comment
-            Id of the alarm, operator, and comment.
-        count
-            Occurrence; None: the latest.
-
-        Raises
-        ------
-        AlarmUnknown, RaisedAgain, AlreadyAcknowledged, StoreUnavailable
-            If it cannot be acknowledged; nothing is changed then.
-        OutcomeUnknown
-            If it is not known to be stored; repeating the acknowledgement gives the answer.
+        `count` is the occurrence; None: the latest. Raises AlarmUnknown, RaisedAgain, AlreadyAcknowledged,
+        StoreUnavailable if it cannot be acknowledged; nothing is changed then. Raises OutcomeUnknown if it is
+        not known to be stored; repeating the acknowledgement gives the answer.
         """
         return await self._command(partial(self._engine.acknowledge, alarm_id, who, comment, count=count))
 
@@ -484,15 +462,8 @@ class Runtime:
     ) -> CommissioningProgress:
         """Restart the learning of meters' errors; it is stored when this returns.
 
-        Parameters
-        ----------
-        name, meters, who, reason
-            The feeder, its meters (empty for all), operator, and reason.
-
-        Raises
-        ------
-        FeederUnknown, NothingToLearn, StoreUnavailable
-            If it is not possible; nothing is changed then.
+        `meters` is empty for all. Raises FeederUnknown, NothingToLearn, StoreUnavailable if it is not
+        possible; nothing is changed then.
         """
         return await self._command(partial(self._engine.recommission, name, meters, who, reason))
 

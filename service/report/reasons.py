@@ -54,13 +54,7 @@ class DataErrors:
         self._window = data_errors.begin()
 
     def follow(self, frame: Frame, estimate: Estimate, verdict: Verdict) -> DataErrorReport | None:
-        """Add one tick to the window; return the error that explains a meter accused at this tick.
-
-        Parameters
-        ----------
-        frame, estimate, verdict
-            Input and output of the estimator.
-        """
+        """Add one tick to the window; return the error that explains a meter accused at this tick."""
         accused = data_errors.accused(verdict)
         if not self._designed:
             if not accused.any():
@@ -138,15 +132,7 @@ _SHOWN: Final = 5
 
 
 def reason_of(site: Site, tick: Tick, max_attacked: int, verdict: Verdict) -> str:
-    """Return the reason of a verdict, with the meters' ids as in alarms: the monitor uses customers only.
-
-    Parameters
-    ----------
-    site, tick
-        The feeder, and the readings.
-    max_attacked
-        M of the design.
-    """
+    """Return the reason of a verdict, with the meters' ids as in alarms: the monitor uses customers only."""
     suspects = np.flatnonzero(verdict.suspects).tolist()
     unseen = [k for k, reading in enumerate(tick.readings) if reading is None]
     named = _meters(site, suspects)

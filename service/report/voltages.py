@@ -60,17 +60,10 @@ class ReferenceVoltages:
 
     A value without such a reading in its phase is *model only*: it follows from powers, the model and the
     state of the estimator. All buses of a phase are connected, so that one reading counts for all of them.
-
-    Attributes
-    ----------
-    meters : (b,)
-        At least one meter of the phase reports and is trusted.
-    busbar : (b,)
-        The busbar's meter reports the phase and is not named as manipulated.
     """
 
-    meters: Bools
-    busbar: Bools
+    meters: Bools  # (b,): At least one meter of the phase reports and is trusted
+    busbar: Bools  # (b,): The busbar's meter reports the phase and is not named as manipulated
 
     @property
     def measured(self) -> Bools:
@@ -85,13 +78,7 @@ class ReferenceVoltages:
 def grounds(
     site: Site, tick: Tick, estimate: Estimate | None = None, verdict: Verdict | None = None
 ) -> ReferenceVoltages:
-    """Return the readings that the values of a tick use.
-
-    Parameters
-    ----------
-    estimate, verdict
-        None without a monitor: each reading then counts.
-    """
+    """Return the readings that the values of a tick use. Without a monitor each reading counts."""
     used = np.array([reading is not None for reading in tick.readings], dtype=np.bool_)
     busbar = np.isfinite(np.broadcast_to(busbar_volt(site, tick), len(busbar_phases(site))))
     if estimate is not None:
@@ -225,13 +212,7 @@ UNKNOWN_BUSBAR = BusbarMeterState()
 def busbar_report(
     site: Site, tick: Tick, estimate: Estimate | None = None, verdict: Verdict | None = None
 ) -> BusbarMeterState:
-    """Return the report of the busbar meter.
-
-    Parameters
-    ----------
-    estimate, verdict
-        None without a monitor.
-    """
+    """Return the report of the busbar meter."""
     names, reported = busbar_phases(site), _reported(site, tick)
     nothing = np.full(reported.size, math.nan)
     judges = verdict is not None and verdict.busbar.size > 0
@@ -263,13 +244,7 @@ def busbar_report(
 
 
 def busbar_in_words(site: Site, which: Bools) -> str:
-    """Return the name of the busbar meter for a sentence, with the phases if there are several.
-
-    Parameters
-    ----------
-    which : (b,)
-        Phases, one on a balanced feeder.
-    """
+    """Return the name of the busbar meter for a sentence, with the phases if there are several."""
     names = [name for name, one in zip(busbar_phases(site), which, strict=True) if one and name is not None]
     phases = f" (phase{'s' * (len(names) > 1)} {', '.join(names)})" if names else ""
     return f"the substation's meter{phases}"

@@ -194,13 +194,7 @@ def _add_distrust(connection: sa.Connection) -> None:
 
 
 def digest(meters: str) -> str:
-    """Return the lookup key of a layout.
-
-    Parameters
-    ----------
-    meters
-        Text of the layout, of any length.
-    """
+    """Return the lookup key of a layout."""
     return hashlib.sha256(meters.encode()).hexdigest()
 
 
@@ -232,17 +226,7 @@ MIGRATIONS: tuple[Callable[[sa.Connection], None], ...] = (
 def migrate(connection: sa.Connection, name: str) -> None:
     """Create the tables, or migrate those of an older version.
 
-    Parameters
-    ----------
-    connection
-        Transaction of the writer.
-    name
-        Name of the database in messages.
-
-    Raises
-    ------
-    StoreUnavailable
-        If the database is newer than this program.
+    Raises StoreUnavailable if the database is newer than this program.
     """
     newest = 1 + len(MIGRATIONS)
     if not sa.inspect(connection).has_table(VERSION.name):

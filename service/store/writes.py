@@ -229,13 +229,7 @@ class Store(Reader):
                 connection.execute(OUTBOX.delete().where(OUTBOX.c.seq == sa.bindparam("number")), rows)
 
     def check(self) -> None:
-        """Test a write.
-
-        Raises
-        ------
-        StoreUnavailable
-            If the database cannot be written.
-        """
+        """Test a write. Raises StoreUnavailable if the database cannot be written."""
         with self._write() as connection:
             connection.execute(WRITER.update().values(checks=WRITER.c.checks + 1))
 
