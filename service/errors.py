@@ -7,14 +7,6 @@ from __future__ import annotations
 
 from gridsec.errors import GridsecError, Problem
 
-__all__ = [
-    "FeederFixed",
-    "FeederNotLoaded",
-    "FeederUnknown",
-    "TooManyFeeders",
-    "prefixed",
-]
-
 
 def prefixed(start: str, problem: str) -> Problem:
     """Return a problem with its place in front, once, and with its code."""

@@ -50,10 +50,10 @@ __all__ = [
     "Condition",
     "RaisedAgain",
     "Severity",
-    "acknowledge",
     "acknowledged",
     "advance",
     "carried",
+    "carry",
     "close",
     "conditions",
     "from_json",
@@ -119,7 +119,7 @@ class Entry:
 
 @dataclass(frozen=True, slots=True)
 class AlarmBook:
-    """Alarm state of one feeder. A value: `advance` and `acknowledge` return a new one."""
+    """Alarm state of one feeder. A value: `advance` and `carry` return a new one."""
 
     feeder: str
     t: float | None = None  # time of the last tick, s; None before the first one
@@ -331,26 +331,14 @@ def carried(alarm: Alarm, answered: Alarm) -> Alarm:
     )
 
 
-def acknowledge(
-    book: AlarmBook, alarm_id: str, who: str, comment: str, t: float, *, count: int | None = None
-) -> tuple[AlarmBook, tuple[AlarmTransition, ...]]:
-    """Acknowledge an alarm of the book.
-
-    `count` is the occurrence; None: the latest. Raises AlarmUnknown if the book has no such alarm: never
-    raised, or cleared and dropped (the store may have it). Raises RaisedAgain, AlreadyAcknowledged if the
-    alarm has been raised again, or is already acknowledged.
-
-    Returns
-    -------
-    book, transitions
-        As from `advance`.
-    """
+def carry(book: AlarmBook, answered: Alarm) -> AlarmBook | None:
+    """Return the book with a stored acknowledgement; None if its occurrence is over."""
     for key, entry in book.entries.items():
-        if entry.alarm is not None and entry.alarm.id == alarm_id:
-            transition = acknowledged(entry.alarm, who, comment, t, count=count)
-            entries = {**book.entries, key: replace(entry, alarm=transition.alarm)}
-            return replace(book, entries=entries), (transition,)
-    raise AlarmUnknown(alarm_id)
+        alarm = entry.alarm
+        if alarm is not None and (alarm.id, alarm.count) == (answered.id, answered.count):
+            entries = {**book.entries, key: replace(entry, alarm=carried(alarm, answered))}
+            return replace(book, entries=entries)
+    return None
 
 
 def close(alarms: Iterable[Alarm], t: float, why: str) -> tuple[AlarmTransition, ...]:

@@ -183,8 +183,8 @@ def _end(process: subprocess.Popen[str]) -> None:
 def run(plan: DemoPlan, console: Console, *, check: bool, keep: bool) -> DemoResult:
     """Run the demo.
 
-    With `check` it lasts until every alarm has cleared, with `keep` until it is interrupted. Returns the meters
-    named as manipulated, and all problems. Raises DemoFailed, FeederInvalid, BusUnavailable if it cannot run.
+    With `check` it lasts until every alarm has cleared, with `keep` until it is interrupted. Raises
+    DemoFailed, FeederInvalid, BusUnavailable if it cannot run.
     """
     site = load(plan.feeder)
     with started(plan.feeder, plan.http) as service:

@@ -197,8 +197,8 @@ class FeederCommissioning:
     def renew(self, state: Any, meters: Sequence[str], t: float, who: str, reason: str) -> Any:
         """Restart the learning of meters.
 
-        `meters` is empty for all; `state` is None before the first tick. Returns the new state of the monitor;
-        None if it was None. Raises NothingToLearn if the monitor does not learn.
+        `meters` is empty for all; `state` is None before the first tick, as is then the result. Raises
+        NothingToLearn if the monitor does not learn.
         """
         learner, watcher = self.learner, self._watcher
         if learner is None or watcher is None:

@@ -30,9 +30,8 @@ from service.alarms.state_machine import (
     Alarm,
     AlarmRules,
     AlarmUnknown,
-    AlreadyAcknowledged,
-    RaisedAgain,
     acknowledged,
+    carry,
     close,
     restore,
 )
@@ -564,17 +563,12 @@ class Engine:
         """Copy a stored acknowledgement to the book, and to results since the start of the write."""
         self.committer.waiting.carry(alarm)
         monitor = self.monitors.get(alarm.feeder)
-        if monitor is not None and alarm.acknowledged_by is not None and alarm.t_acknowledged is not None:
-            try:
-                monitor.acknowledge(
-                    alarm.id,
-                    alarm.acknowledged_by,
-                    alarm.comment or "",
-                    alarm.t_acknowledged,
-                    count=alarm.count,
-                )
-            except (AlarmUnknown, AlreadyAcknowledged, RaisedAgain):
-                _log.info("the acknowledged occurrence is over", feeder=alarm.feeder, id=alarm.id)
+        if monitor is None:
+            return
+        if (book := carry(monitor.book, alarm)) is not None:
+            monitor.book = book
+        else:
+            _log.info("the acknowledged occurrence is over", feeder=alarm.feeder, id=alarm.id)
 
     def recommission(
         self, name: str, meters: Sequence[str], who: str, reason: str

@@ -19,7 +19,7 @@ from feeders.model.site import Site, to_frame
 from feeders.registry import registry
 from gridsec.interface import Cause
 from service.alarms.conditions import conditions
-from service.alarms.state_machine import AlarmBook, AlarmRules, AlarmTransition, acknowledge, advance, hold
+from service.alarms.state_machine import AlarmBook, AlarmRules, AlarmTransition, advance, hold
 from service.engine.commissioning import FeederCommissioning
 from service.engine.suspicions import Suspicions
 from service.ingest.align import Aligner, AlignRules, Clock, ReadingOutcome, Tick, rules
@@ -203,13 +203,6 @@ class FeederMonitor:
     def finish(self) -> None:
         """Add all ticks that the time has reached to the pending ones: the input has ended."""
         self.pending.extend(self.aligner.flush())
-
-    def acknowledge(
-        self, alarm_id: str, who: str, comment: str, t: float, *, count: int | None = None
-    ) -> tuple[AlarmTransition, ...]:
-        """Acknowledge an alarm of this feeder."""
-        self.book, transitions = acknowledge(self.book, alarm_id, who, comment, t, count=count)
-        return transitions
 
     def recommission(self, meters: Sequence[str], t: float, who: str, reason: str) -> Callable[[], None]:
         """Restart the learning of meters' errors, after their replacement.

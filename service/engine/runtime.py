@@ -449,22 +449,13 @@ class Runtime:
         self._notify("state")
 
     async def acknowledge(self, alarm_id: str, who: str, comment: str, *, count: int | None = None) -> Alarm:
-        """Acknowledge an alarm; it is stored when this returns.
-
-        `count` is the occurrence; None: the latest. Raises AlarmUnknown, RaisedAgain, AlreadyAcknowledged,
-        StoreUnavailable if it cannot be acknowledged; nothing is changed then. Raises OutcomeUnknown if it is
-        not known to be stored; repeating the acknowledgement gives the answer.
-        """
+        """Acknowledge an alarm as `Engine.acknowledge` does; it is stored when this returns."""
         return await self._command(partial(self._engine.acknowledge, alarm_id, who, comment, count=count))
 
     async def recommission(
         self, name: str, meters: Sequence[str], who: str, reason: str
     ) -> CommissioningProgress:
-        """Restart the learning of meters' errors; it is stored when this returns.
-
-        `meters` is empty for all. Raises FeederUnknown, NothingToLearn, StoreUnavailable if it is not
-        possible; nothing is changed then.
-        """
+        """Restart the learning as `Engine.recommission` does; it is stored when this returns."""
         return await self._command(partial(self._engine.recommission, name, meters, who, reason))
 
     async def subscribe(self) -> AsyncGenerator[dict[str, Any], None]:

@@ -216,7 +216,8 @@ class Wire:
         """Return the readings and the bad readings in one payload.
 
         `size` is the length of the whole payload, bytes, if `payload` is only its beginning. A schema after
-        `;` in the encoding is ignored. The result is never empty: a payload without readings is a bad reading.
+        `;` in the encoding is ignored. The result is never empty: a payload without readings is a
+        bad reading.
         """
         source = source_of(key, self.prefix, self.known)
         head = head_of(payload[:HEAD_BYTES])

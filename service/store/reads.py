@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from collections.abc import Collection
 from typing import Any
 
 import sqlalchemy as sa
@@ -36,12 +35,8 @@ class Reader:
 
     def __init__(self, connections: Connections) -> None:
         self._connections = connections
+        self._read = connections.read
         self.name = connections.name
-
-    @contextmanager
-    def _read(self) -> Iterator[sa.Connection]:
-        with self._connections.read() as connection:
-            yield connection
 
     def alarm(self, alarm_id: str) -> Alarm | None:
         """Return an alarm by its id."""

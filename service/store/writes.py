@@ -233,14 +233,6 @@ class Store(Reader):
         with self._write() as connection:
             connection.execute(WRITER.update().values(checks=WRITER.c.checks + 1))
 
-    def writable(self) -> bool:
-        """True if the database can be written now; `check` raises the reason otherwise."""
-        try:
-            self.check()
-        except StoreUnavailable:
-            return False
-        return True
-
     def _put_transition(self, connection: sa.Connection, transition: AlarmTransition) -> int:
         alarm = transition.alarm
         data = json.dumps(to_json(alarm), allow_nan=False)

@@ -27,7 +27,6 @@ from service.alarms.state_machine import (
     AlarmBook,
     AlarmRules,
     AlarmUnknown,
-    acknowledge,
     advance,
     conditions,
 )
@@ -41,6 +40,7 @@ from service.store.schema import CommissioningChange, CommissioningEvent
 from tests.service.asking import T0, Setup
 from tests.service.databases import Cluster, find_postgresql
 from tests.service.looking import Site
+from tests.service.reports import acknowledge
 
 CHROMIUM = [
     *("--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"),
@@ -281,10 +281,10 @@ class SmallService:
         for name, book in self.books.items():
             if any(alarm.id == alarm_id for alarm in book.alarms):
                 t = self.reports[name].t
-                self.books[name], transitions = acknowledge(book, alarm_id, who, comment, t, count=count)
-                await asyncio.to_thread(self.store.commit, transitions)
+                self.books[name], transition = acknowledge(book, alarm_id, who, comment, t, count=count)
+                await asyncio.to_thread(self.store.commit, [transition])
                 self.wake({"type": "alarm", "data": None})
-                return transitions[0].alarm
+                return transition.alarm
         raise AlarmUnknown(alarm_id)
 
     async def subscribe(self) -> AsyncGenerator[dict[str, Any], None]:

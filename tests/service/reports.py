@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from gridsec.interface import Cause, Decision
+from service.alarms.state_machine import AlarmBook, AlarmTransition, AlarmUnknown, acknowledged, carry
 from service.report.report import BusbarMeterState, FeederReport, InverterState, MeterState, Silence, finite
 from tests.service.asking import T0
 
@@ -28,6 +29,19 @@ def report(
     silences = tuple(Silence(meter, finite(seconds)) for meter, seconds in silent)
     made = FeederReport(FEEDER, t, verdict, "the reason", cause, 2, meters, (), silences, 207.0, 253.0)
     return replace(made, busbar=BusbarMeterState(judged=True, seen=True, suspect=False))
+
+
+def acknowledge(
+    book: AlarmBook, alarm_id: str, who: str, comment: str, t: float, *, count: int | None = None
+) -> tuple[AlarmBook, AlarmTransition]:
+    """Acknowledge an alarm of a book as the engine does."""
+    alarm = next((one for one in book.alarms if one.id == alarm_id), None)
+    if alarm is None:
+        raise AlarmUnknown(alarm_id)
+    transition = acknowledged(alarm, who, comment, t, count=count)
+    after = carry(book, transition.alarm)
+    assert after is not None
+    return after, transition
 
 
 def inverter(customer: str = "Miller", **changes: object) -> InverterState:

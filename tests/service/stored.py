@@ -15,6 +15,7 @@ from service.alarms.state_machine import (
     Severity,
 )
 from service.report.report import FeederReport, MeterState
+from service.store import Store, StoreUnavailable
 from tests.service.asking import T0
 
 
@@ -53,3 +54,12 @@ def a_report(
     )
     verdict = (Decision.ATTACKED, Cause.RESIDUALS) if suspects else (Decision.CLEAN, Cause.AGREEMENT)
     return FeederReport("village", t, verdict[0], "", verdict[1], 2, meters, (), (), 207.0, 253.0)
+
+
+def writable(store: Store) -> bool:
+    """True if the database can be written now."""
+    try:
+        store.check()
+    except StoreUnavailable:
+        return False
+    return True

@@ -27,7 +27,6 @@ from service.alarms.state_machine import (
     Change,
     Condition,
     Severity,
-    acknowledge,
     acknowledged,
     advance,
     conditions,
@@ -37,7 +36,7 @@ from service.alarms.state_machine import (
 )
 from service.report.report import ExplanationReport
 from tests.codes import refused
-from tests.service.reports import FEEDER, T0, inverter, meter, report, with_inverters
+from tests.service.reports import FEEDER, T0, acknowledge, inverter, meter, report, with_inverters
 
 
 def test_an_inverter_s_alarm_lives_like_any_other() -> None:
@@ -347,7 +346,7 @@ def raised() -> tuple[AlarmBook, Alarm]:
 
 def test_acknowledging_keeps_the_alarm_and_says_who() -> None:
     book, alarm = raised()
-    book, (item,) = acknowledge(book, alarm.id, "Ada", "on my way", T0 + 10)
+    book, item = acknowledge(book, alarm.id, "Ada", "on my way", T0 + 10)
     assert item == AlarmTransition(book.active[0], Change.ACKNOWLEDGED, T0 + 10, "Ada", "on my way")
     assert item.alarm == replace(
         alarm,
@@ -389,7 +388,7 @@ def test_an_acknowledged_alarm_clears_and_remembers_who() -> None:
 def test_a_cleared_alarm_can_still_be_answered_and_stays_cleared() -> None:
     book, alarm = raised()
     book, _ = run([(T0 + 20 + k, "A") for k in range(6)], book=book)
-    book, (item,) = acknowledge(book, alarm.id, "Ada", "", T0 + 30)
+    book, item = acknowledge(book, alarm.id, "Ada", "", T0 + 30)
     assert (item.alarm.state, item.alarm.acknowledged_by) == (AlarmState.CLEARED, "Ada")
     with pytest.raises(AlreadyAcknowledged):
         acknowledged(book.alarms[0], "Grace", "", T0 + 31)

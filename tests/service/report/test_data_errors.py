@@ -22,7 +22,6 @@ from service.alarms.state_machine import (
     AlarmKind,
     AlarmRules,
     Change,
-    acknowledge,
     advance,
     conditions,
 )
@@ -34,7 +33,7 @@ from service.engine.feeder_monitor import TickResult
 from service.engine.replay import ReplayCounts, replay
 from service.report.reasons import DataErrorReport, DataErrors
 from service.report.report import to_json, with_data_error
-from tests.service.reports import FEEDER, T0, meter, report
+from tests.service.reports import FEEDER, T0, acknowledge, meter, report
 from tests.service.running import service, until
 
 NAME = "simbench-lv-rural1"
