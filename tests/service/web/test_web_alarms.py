@@ -8,13 +8,15 @@ from dataclasses import replace
 import pytest
 from playwright.sync_api import APIResponse, Route, expect
 
+from gridsec.estimators.data_errors import DataErrorKind
+from gridsec.estimators.sequential import LearningReason, LearningState
 from gridsec.interface import Cause
 from service.alarms.state_machine import AlarmState, AlarmTransition, Change
 from service.report.report import (
-    BusbarReport,
-    CustomerReport,
+    BusbarMeterState,
+    CustomerState,
     DataErrorReport,
-    InverterReport,
+    InverterState,
     LearningReport,
     StalledMeter,
     with_data_error,
@@ -31,8 +33,8 @@ LIST = re.compile(r"/api/v1/alarms\?")
 
 
 def test_a_manipulated_inverter_and_its_alarm(site: Site) -> None:
-    wrong = InverterReport("H7", "drop-7", "H7", True, True, 4.5, -6.0)
-    customers = tuple(CustomerReport(f"H{k}", 230.0, 0.25) for k in range(13))
+    wrong = InverterState("H7", "drop-7", "H7", True, True, 4.5, -6.0)
+    customers = tuple(CustomerState(f"H{k}", 230.0, 0.25) for k in range(13))
     for k in range(4):
         report = site.village.report(T0 + k, cause=Cause.RESIDUALS)
         liar = replace(report.meters[2], suspect=True, attack_volt_estimated=9.0, kind="drift")
@@ -57,7 +59,8 @@ def test_a_manipulated_inverter_and_its_alarm(site: Site) -> None:
 def test_an_error_of_the_files_stands_beside_the_accusation(site: Site) -> None:
     """In the reason of the verdict, at the alarm, which has it later than it was raised, and at the meter."""
     text = "An error of the feeder's files explains this as well: customer H3 at another bus (bus drop-9)."
-    error = DataErrorReport("bus", ("H3",), ("H3",), ("bus drop-9",), "gridsec study calibrate village", text)
+    study = "gridsec study calibrate village"
+    error = DataErrorReport(DataErrorKind.BUS, ("H3",), ("H3",), ("bus drop-9",), study, text)
     page = site.open()
     for k in range(5):
         report = site.village.report(T0 + k, cause=Cause.RESIDUALS)
@@ -75,7 +78,7 @@ def test_an_error_of_the_files_stands_beside_the_accusation(site: Site) -> None:
 @pytest.mark.parametrize("size", [DESKTOP, PHONE])
 def test_a_busbar_meter_that_lies_is_marked(site: Site, size: dict[str, int]) -> None:
     """In words and shapes, wherever a suspect meter is; and everything is as before once it is believed."""
-    honest = BusbarReport(True, True, False, (), None, 231.0, 231.0, 0.0)
+    honest = BusbarMeterState(True, True, False, (), None, 231.0, 231.0, 0.0)
     site.service.tick(replace(site.village.report(T0), busbar=honest))
     page = site.open(size)
     note, mark, name = (
@@ -87,7 +90,7 @@ def test_a_busbar_meter_that_lies_is_marked(site: Site, size: dict[str, int]) ->
     expect(note).to_be_hidden()
     expect(mark).to_be_hidden()
     expect(name).to_have_text("Busbar (busbar): 230.9 V")
-    liar = BusbarReport(True, True, True, ("b",), "b", 238.0, 231.0, 7.0)
+    liar = BusbarMeterState(True, True, True, ("b",), "b", 238.0, 231.0, 7.0)
     for k in range(1, 5):
         site.service.tick(replace(site.village.report(T0 + k, cause=Cause.RESIDUALS), busbar=liar))
     off = "Busbar meter suspect, phase b: reports 238.0 V, reconstructed 231.0 V (+7.0 V)"
@@ -168,11 +171,12 @@ def test_a_commissioning_that_begins_anew_says_why(site: Site) -> None:
 
 
 def test_stalled_learning_is_shown_with_its_reasons_and_its_alarm(site: Site) -> None:
-    why = {"H2": "silent", "H3": "no-busbar", "H5": "no-busbar"}
+    silent, no_busbar = LearningReason.SILENT, LearningReason.NO_BUSBAR
+    why = {"H2": silent, "H3": no_busbar, "H5": no_busbar}
     site.service.learning.update(["H1", *why])
     site.service.stalled.update(why)
     learning = LearningReport(
-        tuple("stalled" if m in why else "learned" for m in site.village.meters),
+        tuple(LearningState.STALLED if m in why else LearningState.LEARNED for m in site.village.meters),
         tuple(map(why.get, site.village.meters)),
         86_401.0,
         tuple(StalledMeter(m, reason, 0.0) for m, reason in why.items()),
