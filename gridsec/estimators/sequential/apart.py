@@ -1,16 +1,12 @@
-"""Estimates without the readings of meters that withhold their customer's power.
+"""Posterior without the readings of meters that withhold their customer's power.
 
-A voltage reading beside a power that is not read has no check of its own: each lie within the load's range is
-a load. With w and M of all trusted meters, and w', M' of those that are vouched for (`Doubts.vouched`), the
-variance at every bus is
+A voltage reading beside an unread power has no check of its own: each error within the load's range is a
+load. With w and M of all trusted meters, and w', M' of the vouched ones, the variance at every bus is
 
     M' + (w - w')^2
 
-about w. It covers the truth if the other readings are false, and is M' plus little if they are true.
-
-References
-----------
-docs/theory-sequential.md, section 7.
+about w. It covers the truth if the other readings are false, and is M' plus little if they are true
+(docs/theory-sequential.md, section 7).
 """
 
 from __future__ import annotations
@@ -27,30 +23,14 @@ from gridsec.estimators.sequential.doubts import Doubts
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Apart:
-    """A fit without some of its meters. p meters.
+    """Posterior without some meters. p meters."""
 
-    Attributes
-    ----------
-    whole
-        The fit with them.
-    fallen : (p,)
-        Trusted meters that are not vouched for.
-    rest
-        The fit without them.
-    """
-
-    whole: Fit
-    fallen: Bools
-    rest: Fit
+    whole: Fit  # posterior with them
+    fallen: Bools  # (p,) trusted meters without a check
+    rest: Fit  # posterior without them
 
     def added(self, judged: Judged) -> Floats:
-        """Variance that the fit with all meters is short of at every bus, (n,), squared pu^2.
-
-        Parameters
-        ----------
-        judged
-            What the fit with all meters says.
-        """
+        """Variance to be added to the posterior with all meters, (n,), squared pu^2."""
         moved = judged.w - judge(self.rest, judged.m).w
         return np.asarray(np.maximum(self.rest.variance - self.whole.variance, 0.0) + moved**2)
 
@@ -58,17 +38,7 @@ class Apart:
 def apart(
     before: tuple[Apart | None, ...], fits: tuple[Fit | None, ...], doubts: Doubts
 ) -> tuple[Apart | None, ...]:
-    """Fits without the meters that are not vouched for, by scale; None where all are.
-
-    Parameters
-    ----------
-    before
-        From the last tick, used again for the same meters.
-    fits : (s,)
-        The trusted meters.
-    doubts
-        Of this tick.
-    """
+    """Posteriors without meters that are not vouched, by scale; None where all are. `before` is reused."""
     if all_of(doubts.vouched):
         return before if not any(before) else (None,) * len(fits)
     pairs = zip(before, fits, doubts.vouched, strict=True)
@@ -83,15 +53,7 @@ def _apart(kept: Apart | None, now: Fit, vouched: Bools) -> Apart | None:
 
 
 def set_apart(now: Fit, vouched: Bools) -> Apart | None:
-    """A fit without the meters that are not vouched for; None where it has none.
-
-    Parameters
-    ----------
-    now
-        The trusted meters.
-    vouched : (p,)
-        Meters with a check by their customer's power.
-    """
+    """Posterior without meters that are not vouched (p,); None if all are."""
     fallen = now.trusted & ~vouched
     if not any_of(fallen):
         return None

@@ -1,4 +1,4 @@
-"""What one tick comes to: an estimate with its error, and a verdict with its reason.
+"""Output of one tick: an estimate with its error, and a verdict with its reason.
 
 References
 ----------
@@ -32,52 +32,21 @@ from gridsec.interface import Cause, Decision, Estimate, Explanation, Frame, Pow
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tick:
-    """What one tick brought. N customers, p meters, n buses.
+    """Results of one tick. N customers, p meters, n buses."""
 
-    Attributes
-    ----------
-    frame
-        With powers that can be.
-    heard
-        What is believed of it.
-    q : (N,)
-        Net reactive injections that the model was given, pu.
-    v2_bus : (n,)
-        Squared voltages that the model alone says.
-    transient : (p,)
-        What is left of the unknown initial state at each meter, squared pu.
-    seen
-        What the scales say.
-    rivals
-        Explanations about as likely as the one that was found.
-    """
-
-    frame: Frame
-    heard: Heard
-    q: Floats
-    v2_bus: Floats
-    transient: Floats
-    seen: Examined
-    rivals: tuple[Explanation, ...]
+    frame: Frame  # with possible powers
+    heard: Heard  # its measurements
+    q: Floats  # (N,) net reactive injections of the model, pu
+    v2_bus: Floats  # (n,) squared voltages of the model
+    transient: Floats  # (p,) remainder of the unknown initial state, squared pu
+    seen: Examined  # identification
+    rivals: tuple[Explanation, ...]  # hypotheses about as likely as the best
 
 
 def conclude(
     design: SequentialDesign, state: SequentialState, tick: Tick
 ) -> tuple[SequentialState, Estimate, Verdict]:
-    """Put the answer together.
-
-    Parameters
-    ----------
-    design, state
-        The design, and the state after this tick.
-    tick
-        What it brought.
-
-    Returns
-    -------
-    SequentialState, Estimate, Verdict
-        The state with the answer in it, and the answer.
-    """
+    """State with the output in it, estimate and verdict, from the state after this tick."""
     trust, heard = state.trust, tick.heard
     beside = apart(state.apart, state.fits, state.doubts)
     state = state if beside is state.apart else changed(state, apart=beside)
@@ -127,7 +96,7 @@ def conclude(
 
 
 def _busbar(design: SequentialDesign, state: SequentialState, heard: Heard, estimate: Estimate) -> Busbar:
-    """What is thought of the busbar's meter now."""
+    """Trust of the busbar's meter after this tick."""
     before = state.busbar
     if all_of(before.believed):
         return before
@@ -140,7 +109,7 @@ def _busbar(design: SequentialDesign, state: SequentialState, heard: Heard, esti
 
 
 def _inverters(design: SequentialDesign, state: SequentialState) -> Bools:
-    """Inverters named: by the voltages, unless what is metered agrees with their curves, or by that."""
+    """Named inverters: by the voltages unless their metered power follows the curve, or by that power."""
     named, curves = state.trust.inverters, state.curves
     return named if curves.idle else (named & ~curves.agrees(design)) | curves.named(design)
 
@@ -148,7 +117,7 @@ def _inverters(design: SequentialDesign, state: SequentialState) -> Bools:
 def _injected(
     design: SequentialDesign, state: SequentialState, inverters: Bools, amounts: dict[int, float]
 ) -> Floats:
-    """What named inverters inject that their curves do not ask for, as metered where that is so, (m,)."""
+    """Deviation of named inverters from their curves, as metered where it is, (m,)."""
     out = np.zeros(inverters.size)
     if any_of(inverters):
         for k, amount in amounts.items():
@@ -162,14 +131,14 @@ def _injected(
 def _estimate(
     design: SequentialDesign, state: SequentialState, tick: Tick, s: int, moved: float
 ) -> tuple[Estimate, Released | None]:
-    """The estimate by scale s, whose mean is short of a part `moved` of the loads' variance."""
+    """Estimate by scale s, with a mean that lacks a part `moved` of the loads' variance."""
     plant = design.plant
     heard = tick.heard
     w, variance, released = _reconstructed(design, state, tick, s, moved)
     v2_bus = tick.v2_bus + w
     first = plant.feeder.busbar_places()
     v2_bus[first] = np.where(heard.busbar, heard.v0_squared, v2_bus[first])
-    # That is a reading, however well the others know the voltage.
+    # This is a reading; the posterior of the others does not lower its variance.
     variance = variance.copy()
     variance[first] = np.maximum(variance[first], np.where(heard.busbar, design.busbar**2, 0.0))
     trusted = state.trust.trusted & heard.live
@@ -191,14 +160,14 @@ def _estimate(
 
 
 _Said = tuple[Decision, Cause, str]
-# What a verdict about inverters and loads may add to: nothing more serious was found.
 _MILD = (Cause.AGREEMENT, Cause.AMBIGUOUS)
+"""Causes that findings on inverters and loads replace."""
 
 
-def _of_meters(  # what there is to say of meters
+def _of_meters(
     design: SequentialDesign, trust: Trust, live: Bools, beyond: Bools, *, wide: Bools, settled: bool
 ) -> _Said:
-    """The answer by the meters alone: those that report, are beyond, and have too wide limits, (p,) each."""
+    """Verdict on the meters: available, beyond their limits, with too wide limits, (p,) each."""
     said = decide(
         DecisionInputs(
             names=design.names,
@@ -216,13 +185,13 @@ def _of_meters(  # what there is to say of meters
 
 
 def _judged_seldom(design: SequentialDesign, skew: Skew, state: SequentialState) -> Bools:
-    """Meters with a clock offset, (p,): of a scale that judges them there is not a look at every tick."""
+    """Meters with a clock offset, (p,), on scales that test them without a look at this tick."""
     need = np.array([needed(design, s) for s in range(len(design.lengths))])
     return skew.judged(state.window.counts, need)
 
 
 def _contradicted(design: SequentialDesign, beyond: Bools, named: Bools, said: _Said) -> _Said:
-    """The answer, unless with the meters named more than M are beyond what a decoder calls honest."""
+    """Verdict, UNDECIDED if a decoder leaves more than `max_attacked` meters beyond their limits."""
     if design.decoder is None or said[1] is not Cause.RESIDUALS:
         return said
     more, most = int(np.count_nonzero(beyond)), design.most
@@ -234,11 +203,7 @@ def _contradicted(design: SequentialDesign, beyond: Bools, named: Bools, said: _
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Differs:
-    """What there is to say of the busbar's meter. b phases.
-
-    named: which are named, (b,). meter, off: whose reading is not believed, and what it says; empty where all
-    is believed.
-    """
+    """Findings on the busbar's meter: named phases (b,), meter and deviation in words, empty if trusted."""
 
     named: Bools
     meter: str = ""
@@ -256,10 +221,10 @@ def _differs(design: SequentialDesign, busbar: Busbar, estimate: Estimate) -> _D
 def _unvouched(
     design: SequentialDesign, busbar: Bools | bool, live: Bools, differs: _Differs, said: _Said
 ) -> _Said:
-    """The answer, unless nobody would notice that a phase without a busbar voltage is lied about as a whole.
+    """Verdict, UNDECIDED if too few meters of a phase without a busbar voltage report.
 
-    On a balanced feeder most meters are honest, and they say where the busbar is. In three phases those of
-    the same phase say it, and that most of these are honest takes more than twice as many as may lie.
+    On a balanced feeder most meters are honest and determine the busbar. In three phases those of one phase
+    do, which takes more than twice as many as may be manipulated.
     """
     if said[0] is not Decision.CLEAN or all_of(np.asarray(busbar)):
         return said
@@ -280,13 +245,13 @@ def _unvouched(
 
 
 def _unexplained(misfit: tuple[bool, ...], said: _Said) -> _Said:
-    """The answer, unless the trusted meters are inconsistent on a scale and no search explains it."""
+    """Verdict, with the misfit of the trusted meters on a scale that no search explains."""
     decision, cause, reason = said
     if not any(misfit):
         return said
     if decision is Decision.ATTACKED:
         return decision, cause, f"{reason} The other meters, taken together, still disagree with the feeder."
-    # Silence hides no evidence.
+    # Silent meters do not outweigh this evidence.
     if cause not in (Cause.AGREEMENT, Cause.SILENT_METERS):
         return said
     sentence = (
@@ -297,7 +262,7 @@ def _unexplained(misfit: tuple[bool, ...], said: _Said) -> _Said:
 
 
 def _unread(design: SequentialDesign, frame: Frame, unread: Bools, estimate: Estimate, said: _Said) -> _Said:
-    """The answer, unless a voltage beside a power that is not read is known too badly to be called clean."""
+    """Verdict, UNDECIDED if a voltage beside an unread power is too uncertain."""
     if said[1] not in _MILD or not any_of(unread):
         return said
     at, limit = design.plant.meters, design.options.unread_std_percent
@@ -312,7 +277,7 @@ def _unread(design: SequentialDesign, frame: Frame, unread: Bools, estimate: Est
 
 
 def _untimely(design: SequentialDesign, frame: Frame, live: Bools, said: _Said) -> _Said:
-    """The answer, with the meters that count as silent for a clock offset that no scale judges."""
+    """Verdict, with the meters that count as silent for a clock offset that no scale covers."""
     decision, cause, reason = said
     far = unusable(design, frame.clock_offset)
     if far is None or cause not in (Cause.SILENT_METERS, Cause.TOO_FEW_METERS):
@@ -324,18 +289,18 @@ def _untimely(design: SequentialDesign, frame: Frame, live: Bools, said: _Said) 
 
 
 _DEAD = 1e-2
-"""Least squared voltage by which a standard deviation is related to the voltage, pu."""
+"""Least squared voltage that relates a standard deviation to the voltage, pu."""
 
 
 def _open(design: SequentialDesign, state: SequentialState, said: _Said) -> tuple[Explanation, ...]:
-    """What metered reactive powers leave open, whoever else is named."""
+    """Hypotheses about metered reactive powers that the voltages leave open."""
     if state.curves.idle:
         return ()
     sure = state.trust.named if said[1] is Cause.RESIDUALS else np.zeros_like(state.trust.named)
     return state.curves.explanations(design, sure) if said[1] in (*_MILD, Cause.RESIDUALS) else ()
 
 
-def _beside_meters(  # noqa: PLR0917  # what was found
+def _beside_meters(  # noqa: PLR0917
     design: SequentialDesign,
     inverters: Bools,
     differs: _Differs,
@@ -344,7 +309,7 @@ def _beside_meters(  # noqa: PLR0917  # what was found
     open_: tuple[Explanation, ...],
     said: _Said,
 ) -> _Said:
-    """The answer, with what was found besides meters."""
+    """Verdict, with findings other than meters."""
     decision, cause, reason = said
     plant, found = design.plant, []
     if any_of(inverters):
@@ -353,9 +318,9 @@ def _beside_meters(  # noqa: PLR0917  # what was found
     if any_of(differs.named):
         found.append((differs.meter, f"it {differs.off}"))
     if cause is Cause.RESIDUALS:
-        reason = f"{reason[:-1]}; and {' and '.join(who for who, _ in found)}." if found else reason
+        reason = f"{reason[:-1]}; and {' and '.join(each for each, _ in found)}." if found else reason
         return decision, cause, f"{reason} {words.ways(design, open_)}" if open_ else reason
-    # Silence hides no evidence.
+    # Silent meters do not outweigh this evidence.
     if cause not in ((*_MILD, Cause.SILENT_METERS) if found else _MILD):
         return said
     if found:
@@ -372,7 +337,7 @@ def _beside_meters(  # noqa: PLR0917  # what was found
 
 
 def _amounts(design: SequentialDesign, state: SequentialState, seen: Examined) -> dict[int, float]:
-    """How much of each suspicion besides meters there is, by index of the book, pu.
+    """Amount of each accused fault, by index of the dictionary, pu.
 
     With prior variance s^2 and direction a the posterior mean is ``s^2 a^T Q m``.
     """
@@ -398,13 +363,13 @@ def _mean(state: SequentialState, s: int) -> Floats:
 def _reconstructed(
     design: SequentialDesign, state: SequentialState, tick: Tick, s: int, moved: float
 ) -> tuple[Floats, Floats, Released | None]:
-    """What the trusted meters add to the model at every bus, its variance, and what is kept of the work."""
+    """Correction of the model by the trusted meters at every bus, its variance, and the doubted powers."""
     prior_, told = state.doubts.priors[max(s, 0)], tick.frame.p_std
     now, view = (None, None) if s < 0 else (state.fits[s], tick.seen.views[s])
     if now is None:
         return np.zeros_like(prior_.variance), prior_.variance, None
     judged = judge(now, _mean(state, s)) if view is None else view.judged
-    # The model begins at this reading of the busbar, a mean takes only its part of that one's jitter off.
+    # The model starts at this busbar reading; a mean removes only its part of the jitter.
     jitter = (1.0 - 1.0 / design.lengths[s]) * design.flicker
     flicker = design.plant.feeder.broadcast_busbar(np.where(tick.heard.busbar, jitter, 0.0))
     after = moved * prior_.variance + _hidden(state, prior_) + flicker
@@ -412,7 +377,7 @@ def _reconstructed(
     if beside is not None:
         after = after + beside.added(judged)
     liars = design.plant.meters[~state.trust.trusted]
-    # Nobody lies about powers that nobody told, which are known by a standard deviation.
+    # Unreported powers, known by a standard deviation, are not false.
     liars = liars if told is None else liars[np.isnan(told[liars]) | _late(tick.frame)[liars]]
     if not liars.size:
         return judged.w, now.variance + after, None
@@ -425,16 +390,16 @@ def _reconstructed(
 
 
 def _late(frame: Frame) -> Bools:
-    """Customers with a power that is read and known by a standard deviation all the same, (N,)."""
+    """Customers with a power that is read and has a standard deviation all the same, (N,)."""
     if frame.p_origin is None:
         return np.zeros(frame.p.size, dtype=np.bool_)
     return np.asarray(frame.p_origin != PowerOrigin.UNREAD)
 
 
 def _best(design: SequentialDesign, state: SequentialState) -> tuple[int, float]:
-    """The scale that leaves least open, -1 for none, and what part of the loads' variance it is short of.
+    """Scale of the least posterior variance, -1 for none, and the part of the loads' variance it lacks.
 
-    A mean over many ticks does not know what the loads did meanwhile.
+    A mean over many ticks does not contain the present loads.
     """
     at, least, moved = -1, np.inf, 0.0
     for s, (now, length) in enumerate(zip(state.fits, design.lengths, strict=True)):
@@ -448,7 +413,7 @@ def _best(design: SequentialDesign, state: SequentialState) -> tuple[int, float]
 
 
 def _hidden(state: SequentialState, prior_: Prior) -> Floats:
-    """What learning could not tell from errors of the loads that last, at every bus, (n,)."""
+    """Variance of lasting load errors that learning cannot separate, at every bus, (n,)."""
     hidden, late = state.learned.hidden, state.learned.late
     if not any_of(hidden):
         return np.zeros(prior_.variance.size)
@@ -458,7 +423,7 @@ def _hidden(state: SequentialState, prior_: Prior) -> Floats:
 
 
 def _worst(design: SequentialDesign, seen: Examined, p: int) -> tuple[Floats, Floats, Bools]:
-    """Offset and limit of each meter on the scale that speaks most against it; who was judged."""
+    """Residual and limit of each meter on the scale with the strongest evidence; tested meters."""
     views = [view for view in seen.views if view is not None]
     if not views:
         return np.full(p, np.nan), np.full(p, design.options.widest), np.zeros(p, dtype=np.bool_)

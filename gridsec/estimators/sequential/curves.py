@@ -1,18 +1,18 @@
-"""Whether the reactive power that meters report is what the droop curves ask for.
+"""Comparison of metered reactive powers with the droop curves.
 
-Where a customer's net reactive power is metered, what is left of it after the load is what the inverter
-injects. It is known a second time, from the voltage. No honest errors explain more than
+A metered net reactive power less the load is the inverter's injection, which the voltage gives a second
+time. Honest errors explain no more than
 
-    |q_net - q - x| <= q_error + q_net_error + e + min(span, d (|offset| + z std)):
+    |q_net - q - x| <= q_error + q_net_error + e + min(span, d (|residual| + z std)):
 
-e bounds the error of the observed injection x (`gridsec.estimators.sequential.bounds`), and the last term
-lets the inverter follow what the other meters say of its voltage rather than its own meter. Beyond that
-either the inverter does not follow its curve, or what is reported is false. The voltages say which, where the
-amount ``a = q_net - q - x`` moves them: if x were true rather than what is reported, the misfit would rise by
+e bounds the error of the observed injection x (`gridsec.estimators.sequential.bounds`); the last term lets
+the inverter follow the voltage by the other meters. Beyond that either the inverter leaves its curve or the
+report is false. The amount ``a = q_net - q - x`` decides by the voltages: if x were true instead of the
+report, the chi-square would rise by
 
-    2 a c^T Q m + a^2 c^T Q c,   c the column of 2X,   m the residuals with what is reported,
+    2 a c^T Q m + a^2 c^T Q c,   c the column of 2X,   m the residuals with the report,
 
-and half of that is the logarithm of the likelihood ratio. Where it says little, both are reported.
+twice the logarithm of the likelihood ratio. Where it is small, both are given.
 
 References
 ----------
@@ -35,33 +35,15 @@ from gridsec.interface import Explanation, Frame
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Curves:
-    """What the metered reactive powers say of the inverters. p meters, m inverters.
+    """Results of the comparison. p meters, m inverters."""
 
-    Attributes
-    ----------
-    count : (p,)
-        Ticks in which a report and the curve disagreed, four times, less those in which they agreed.
-    off : (p,)
-        Whose do, for long enough.
-    amount : (p,)
-        By how much, pu; 0 for others.
-    share : (p,)
-        Probability that the inverter is wrong and not the report; 0 for others.
-    sure : (p,)
-        Where it is the inverter, by the voltages, and nothing has spoken against it since.
-    heard : (m,)
-        Inverters whose injection is metered well enough to notice if they were where they can be.
-    idle
-        Derived. Whether nobody's reports are compared with anything.
-    """
-
-    count: Ints
-    off: Bools
-    amount: Floats
-    share: Floats
-    sure: Bools
-    heard: Bools
-    idle: bool = field(init=False)
+    count: Ints  # (p,) disagreeing ticks times `_EACH` less agreeing ones
+    off: Bools  # (p,) lasting disagreement
+    amount: Floats  # (p,) its size, pu; 0 for others
+    share: Floats  # (p,) probability of a wrong inverter rather than a false report; 0 for others
+    sure: Bools  # (p,) wrong inverter by the voltages, without later evidence against it
+    heard: Bools  # (m,) injection metered well enough to show its whole range
+    idle: bool = field(init=False)  # derived: no report is compared
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "idle", not (any_of(self.heard) or any_of(self.count)))
@@ -71,7 +53,7 @@ class Curves:
         return (design.meter_of >= 0) & self.sure[design.meter_of] if self.sure.size else self.heard
 
     def amounts(self, design: SequentialDesign) -> Floats:
-        """What each inverter injects that its curve does not ask for, (m,) in pu."""
+        """Deviation of each inverter from its curve, (m,), pu."""
         metered, at = design.meter_of >= 0, design.meter_of
         if not any_of(metered):
             return np.zeros(at.size)
@@ -80,17 +62,11 @@ class Curves:
         return np.where(metered, self.amount[at] / np.maximum(share[at], 1), 0.0)
 
     def agrees(self, design: SequentialDesign) -> Bools:
-        """Inverters that are metered and do what their curves ask for, (m,)."""
+        """Metered inverters that follow their curves, (m,)."""
         return self.heard & (self.count[design.meter_of] == 0) if self.count.size else self.heard
 
     def renewed(self, which: Bools) -> Curves:
-        """Nothing of meters that were replaced counts any more.
-
-        Parameters
-        ----------
-        which : (p,)
-            The meters.
-        """
+        """Results without meters that were replaced, (p,)."""
         return Curves(
             np.where(which, 0, self.count),
             self.off & ~which,
@@ -101,14 +77,9 @@ class Curves:
         )
 
     def explanations(self, design: SequentialDesign, named: Bools) -> tuple[Explanation, ...]:
-        """What may be the case where the voltages do not decide: that of the strangest customers.
+        """Possible cases where the voltages do not decide, for the customers of the largest deviations.
 
-        Parameters
-        ----------
-        design
-            The design.
-        named : (p,)
-            Meters that are manipulated in any case.
+        named: (p,) meters manipulated in any case.
         """
         open_ = self.off & ~self.sure
         if self.idle or not any_of(open_):
@@ -127,70 +98,40 @@ class Curves:
 
 
 def empty(meters: int, inverters: int) -> Curves:
-    """Nothing heard yet.
-
-    Parameters
-    ----------
-    meters, inverters
-        p and m.
-    """
+    """No comparison yet."""
     no = np.zeros(meters, dtype=np.bool_)
     zero = np.zeros(meters)
     return Curves(np.zeros(meters, dtype=np.intp), no, zero, zero, no, np.zeros(inverters, dtype=np.bool_))
 
 
-# Customers whose reports or inverters are wrong, of all of which explanations tell.
 _TOGETHER = 3
+"""Largest number of customers in the combined cases."""
 
 CONFIRM = 5
-"""Ticks of the longest means that say which of both is wrong."""
+"""Ticks of the longest mean that decides between report and inverter."""
 
-# A disagreement counts so much, an agreement takes one away: who comes back after a pause is not forgotten.
 _EACH = 4
-# So much must be counted, and so much is at most.
+"""Count of a disagreement; an agreement counts -1."""
 _ENOUGH, _MOST = 12, 48
+"""Count that is evidence, and largest count."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evidence:
-    """One tick. N customers, p meters, m inverters.
+    """Inputs of one tick. N customers, p meters, m inverters."""
 
-    Attributes
-    ----------
-    frame
-        Everything known.
-    reported, told : (N,)
-        Whose net reactive power is reported, and whose the model was given.
-    trusted : (p,)
-        Meters that report and are believed, and have been for long enough that the observer followed them.
-    x
-        Observed injections, (m,), pu.
-    lag
-        Their errors.
-    fit, judged
-        What the trusted meters say, on the longest scale of at most CONFIRM ticks.
-    """
-
-    frame: Frame
-    reported: Bools
-    told: Bools
-    trusted: Bools
-    x: Floats
-    lag: Lag
-    fit: Fit | None
-    judged: Judged | None
+    frame: Frame  # the frame
+    reported: Bools  # (N,) net reactive power is reported
+    told: Bools  # (N,) net reactive power is used by the model
+    trusted: Bools  # (p,) available meters, trusted for long enough that the observer followed them
+    x: Floats  # (m,) observed injections, pu
+    lag: Lag  # their errors
+    fit: Fit | None  # posterior of the trusted meters on the longest scale of at most `CONFIRM` ticks
+    judged: Judged | None  # its leave-one-out residuals
 
 
 def compare(design: SequentialDesign, before: Curves, now: Evidence) -> Curves:
-    """Compare what is reported with the curves.
-
-    Parameters
-    ----------
-    design, before
-        The design, and what was known.
-    now
-        One tick.
-    """
+    """Compare the reports of one tick with the curves."""
     droop, at, size = design.plant.droop, design.plant.meters, design.customers
     own = np.bincount(droop.customer, minlength=size) > 0
     asked = now.reported[at] & now.trusted & own[at]
@@ -214,7 +155,7 @@ def compare(design: SequentialDesign, before: Curves, now: Evidence) -> Curves:
         told = bool(asked[j] and now.told[at[j]])
         share[j], sigmas = _share(design, now.fit, judged.weights, j, float(amount[j]), told=told)
         beyond[j] |= bool(asked[j] and sigmas > design.sigmas[0])
-    # Who reports no more stays accused, unless the voltages say that it is over.
+    # Without reports the accusation stays until the voltages contradict it.
     over = lasts & ~asked & (share <= 1.0 / design.options.like)
     count = np.where(over, count - 1, count)
     share = np.where(asked | over, share, before.share * lasts)
@@ -228,10 +169,10 @@ def compare(design: SequentialDesign, before: Curves, now: Evidence) -> Curves:
 def _share(
     design: SequentialDesign, now: Fit, weights: Floats, j: int, a: float, *, told: bool
 ) -> tuple[float, float]:
-    """Probability that a report is true and the inverter wrong, for equal odds beforehand.
+    """Probability that a report is true and the inverter wrong, for even prior odds.
 
-    And by how many standard deviations the voltages are off along its column if the inverter is not wrong:
-    who asks at every tick for years is told something unlikely at some of them.
+    And the standard deviations by which the voltages deviate along its column if the inverter is right. Both
+    are needed: a test at every tick for years meets an unlikely ratio.
     """
     inverter = int(np.argmax(design.meter_of == j))
     column = design.book.columns(np.array([design.customers + inverter]))[now.prior.meters, 0]
@@ -241,8 +182,9 @@ def _share(
         along += a * form  # as if x were true
     worse = 2.0 * a * along - a * a * form
     share = 1.0 / (1.0 + np.exp(-0.5 * np.clip(worse, -_FAR, _FAR)))
-    # Who hangs on the busbar moves nothing.
+    # Inverters at the busbar have zero sensitivity.
     return float(share), abs(along) / max(float(np.sqrt(form)), np.finfo(np.float64).tiny)
 
 
 _FAR = 1000.0
+"""Largest twice the logarithm of a likelihood ratio, against overflow."""

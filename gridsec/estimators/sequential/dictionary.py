@@ -1,12 +1,11 @@
-"""What else but meters can be wrong: directions that an explanation may loosen, and what that gains.
+"""Fault dictionary: wrong powers and inverters as directions of the voltages, and the gain of each.
 
-Loosening direction a with standard deviation s lowers the misfit ``m^T Q m`` by
+An unknown amplitude of direction a with standard deviation s lowers the chi-square ``m^T Q m`` by
 
     (a^T Q m)^2 / (1 / s^2 + a^T Q a),
 
-dropping meter j as well by ``g^T G^-1 g`` with g and G the weights and the precision of both. A customer who
-lies about its voltage may lie about its powers, and a made-up load only fits to made-up voltages: so the pair
-is one move.
+removing meter j as well by ``g^T G^-1 g`` with g and G the weights and the precision of both. A manipulated
+voltage may come with false powers of the same customer, so the pair is one move.
 """
 
 from __future__ import annotations
@@ -20,94 +19,52 @@ from gridsec.arrays import Bools, Floats, Ints
 from gridsec.estimators.sequential.conditional import Fit, Judged, Move, drop, loosen
 
 _OF_A_LIAR, _FEW, _OF_MANY = 2.0, 3, 0.5
+"""Charge of a suspect's false power: up to `_FEW` suspects, and least, in accusations."""
 
 
 def of_a_liar(liars: int) -> float:
-    """What accusing the powers of a customer costs whose meter is accused already, in accusations of a meter.
+    """Charge for the false power of a suspect meter's customer, in accusations of a meter.
 
-    Where many lie the next one is no surprise (`search.price`), and neither is that its powers are false as
-    well: were that dear, honest neighbours would be accused instead. Two up to three liars, then in inverse
-    proportion to their number, half at least.
-
-    Parameters
-    ----------
-    liars
-        How many meters are accused.
+    The charge is 2 up to three suspects, then inversely proportional to their number, at least 0.5. Among
+    many suspects a high charge would accuse honest neighbours instead.
     """
     return max(_OF_A_LIAR * min(1.0, _FEW / max(liars, 1)), _OF_MANY)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Dictionary:
-    """Directions that can be loosened. n buses, p meters, k directions.
+    """Directions of possible faults. n buses, p meters, k directions."""
 
-    Attributes
-    ----------
-    std : (k,)
-        How much of what is doubted there may be, pu.
-    charge : (k,)
-        What accusing it costs, in accusations of a meter.
-    size : (k,)
-        Sum over the meters of the squares of what a direction changes there.
-    columns
-        `columns(which)` are the changes of every squared voltage per unit of what is doubted, (n, …).
-    meter : (k,)
-        Meter of the customer whose powers it doubts; -1 for none. Who is accused of lying about the voltage
-        is not believed about powers either: that costs no more than `of_a_liar`.
-    along
-        `along(weights)` is the weighted sum of each direction's changes at the meters, (k,).
-    """
-
-    std: Floats
-    charge: Floats
-    size: Floats
-    meter: Ints
-    columns: Callable[[Ints], Floats]
-    along: Callable[[Floats], Floats]
+    std: Floats  # (k,) standard deviation of each amplitude, pu
+    charge: Floats  # (k,) cost of accusing it, in accusations of a meter
+    size: Floats  # (k,) sum over the meters of its squared changes
+    meter: Ints  # (k,) meter of its customer, charged at most `false_power_charge` as a suspect; -1 for none
+    columns: Callable[[Ints], Floats]  # `columns(which)`: changes of every squared voltage per unit, (n, …)
+    along: Callable[[Floats], Floats]  # `along(weights)`: weighted sum of its changes at the meters, (k,)
 
     def charges(self, which: Ints, trusted: Bools, liars: int) -> Floats:
-        """What accusing some directions costs, in accusations of a meter.
-
-        Parameters
-        ----------
-        which : (c,)
-            The directions.
-        trusted : (p,)
-            Which meters are believed.
-        liars
-            How many of those that report are not.
-        """
+        """Cost of accusing directions (c,), in accusations of a meter; liars: number of suspects."""
         charge, of_liar = self.charge[which], (self.meter[which] >= 0) & ~trusted[self.meter[which]]
         return np.where(of_liar, np.minimum(charge, of_a_liar(liars)), charge)
 
     def doubtful(self) -> Dictionary:
-        """The book for those who look for reasons not to name anybody."""
+        """Fault dictionary with reduced charges, for searching alternative explanations."""
         return replace(self, charge=np.minimum(self.charge, _OF_A_LIAR))
 
 
-# So many directions are tried, those that the residuals point at most.
 _CANDIDATES = 64
+"""Directions that a search tries, those of the largest gradient."""
 _TINY = 1e-6
 
 Step = Callable[[], Move]
-"""Changes a fit when called."""
+"""Changes a posterior when called."""
 
 
 class Powers:
-    """Gains of loosening, kept up to date: Q A changes with Q by rank one, diag(A^T Q A) by squares.
+    """Gains of the directions during a search: Q A follows Q by rank one, diag(A^T Q A) by squares.
 
-    Parameters
-    ----------
-    now
-        Where a search begins; its steps change it.
-    dictionary
-        What may be loosened.
-    weights : (p,)
-        Q m.
-    live : (p,)
-        Which meters report.
-    innocent : (k,)
-        Meters that are not dropped.
+    The moves of the search change the posterior `now`. weights: (p,) Q m. live: (p,) meters with a reading.
+    innocent: (k,) meters that stay trusted.
     """
 
     def __init__(
@@ -129,20 +86,13 @@ class Powers:
 
     @property
     def loosened(self) -> tuple[int, ...]:
-        """What has been loosened, indices into the dictionary."""
+        """Accused directions, indices of the dictionary."""
         return tuple(self.index[self.accused].tolist())
 
     def best(self, judged: Judged, penalty: float, than: float) -> list[Step]:
-        """Loosening a direction, alone or with its meter dropped as well; nothing unless it gains more.
+        """Steps of the best direction, alone or with its meter removed, if it gains more than `than`.
 
-        Parameters
-        ----------
-        judged
-            Where the search stands.
-        penalty
-            What an accusation must gain at least.
-        than
-            What something else would gain.
+        penalty: least gain of an accusation.
         """
         trusted = self.now.trusted
         liars = int(np.count_nonzero(self.live & ~trusted))
@@ -159,24 +109,18 @@ class Powers:
         return [lambda: self._loosen(pair), lambda: self.follow(drop(self.now, int(self.meter[pair])))]
 
     def follow(self, move: Move) -> Move:
-        """Take note of a change of the fit.
-
-        Parameters
-        ----------
-        move
-            The change.
-        """
+        """Update the gains after a change of the posterior."""
         along = move.q @ self.seen
         self.spread += np.multiply.outer(move.factor * move.q, along)
         self.form += move.factor * along**2
         return move
 
     def _alone(self, weights: Floats) -> Floats:
-        """How much each direction would lower the misfit, (k,)."""
+        """Fall of the chi-square by each direction, (k,)."""
         return np.asarray((weights @ self.seen) ** 2 / (self.std**-2.0 + self.form))
 
     def _with_meter(self, weights: Floats) -> Floats:
-        """The same if its meter were dropped as well, (k,); -inf where that has none, or is not trusted."""
+        """The same with its meter removed, (k,); -inf without a trusted meter."""
         at = self.meter
         a, b = self.std**-2.0 + self.form, self.now.diagonal()[at]
         c = self.spread[at, np.arange(at.size)]

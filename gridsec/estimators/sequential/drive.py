@@ -1,9 +1,9 @@
-"""The one observer: inverters of trusted meters follow their readings, all others the model.
+"""Observer of the droop inverters, driven by trusted meters or by the model.
 
     tau x' = -x + K(zeta),   zeta = vbar^2 - y at trusted meters,   H x + w elsewhere
 
-It converges for every trusted set and every switching between them by one certificate
-(docs/theory-certificates.md). Where everything is trusted, a step is exact and costs O(m).
+One certificate covers every trusted set and every switching (docs/theory-certificates.md). With all meters
+trusted a step is exact and costs O(m).
 """
 
 from __future__ import annotations
@@ -22,24 +22,14 @@ _PATIENT = replace(POLICY, settled=0.0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Free:
-    """The inverters that follow the model, prepared: they stay the same for many steps.
+    """Prepared loop of the model-driven inverters, reused for the same inverters and step."""
 
-    Attributes
-    ----------
-    rows : (k,)
-        Which inverters.
-    loop
-        They among themselves; its input is what all others and the loads do to their voltages.
-    transition
-        Of the loop, for the last step's length.
-    """
-
-    rows: Ints
-    loop: Lure
-    transition: LureTransition
+    rows: Ints  # (k,) inverters
+    loop: Lure  # their mutual loop; its input is the effect of all other injections and loads
+    transition: LureTransition  # of the loop, for the last step's length
 
 
-def drive(  # noqa: PLR0917  # state, what drives it, and for how long
+def drive(  # noqa: PLR0917
     design: SequentialDesign,
     x: Floats,
     y: Floats,
@@ -48,33 +38,10 @@ def drive(  # noqa: PLR0917  # state, what drives it, and for how long
     h: float,
     before: Free | None = None,
 ) -> tuple[Floats, Free | None]:
-    """The injections a time h later.
+    """Injections a time h later, and the prepared loop; chong2020 (5) with K = E_J, L = 0.
 
-    Parameters
-    ----------
-    design
-        The design.
-    x : (m,)
-        Injections, pu.
-    y : (m,)
-        Squared voltage that each inverter's meter reads, pu; any finite value where not driven.
-    driven : (m,)
-        Which inverters follow their meters.
-    w : (N,)
-        Known input of the others; None where all are driven.
-    h
-        Step, s.
-    before
-        What the last step prepared; used again while it fits.
-
-    Returns
-    -------
-    (m,), Free or None
-        The injections, and what the next step may use.
-
-    References
-    ----------
-    chong2020 (5) with K = E_J, L = 0.
+    x, y, driven: (m,) injections, squared voltages of the inverters' meters, and use of these. w: (N,) input
+    of the model-driven inverters; None if all are driven.
     """
     droop = design.plant.droop
     decay = np.exp(-h / droop.tau)
@@ -83,7 +50,7 @@ def drive(  # noqa: PLR0917  # state, what drives it, and for how long
         return np.asarray(target + decay * (x - target)), before
     out = np.where(driven, target + decay * (x - target), x)
     free = _prepared(design, indices(~driven), h, before)
-    # The driven ones take the mean of their way from x to out.
+    # Driven inverters enter by the mean of x and out.
     held = np.where(driven, 0.5 * (x + out), 0.0)
     at = w[droop.customer[free.rows]] + design.loop[free.rows] @ held
     try:
@@ -94,20 +61,9 @@ def drive(  # noqa: PLR0917  # state, what drives it, and for how long
 
 
 def ahead(design: SequentialDesign, believed: Bools, h: float, before: Free | None) -> Free | None:
-    """What the next step needs if the same meters are believed then and it is as long.
+    """Loop for the next step if the trusted meters with a reading, (p,), stay the same.
 
-    The step after that at which somebody is suspected has the most to do.
-
-    Parameters
-    ----------
-    design
-        The design.
-    believed : (p,)
-        Meters that are heard and trusted.
-    h
-        Step, s.
-    before
-        What was prepared so far.
+    Prepared at the tick of a suspicion, since the tick after it has more to compute.
     """
     driven = (design.meter_of >= 0) & believed[design.meter_of]
     return before if all_of(driven) else _prepared(design, indices(~driven), h, before)

@@ -1,4 +1,4 @@
-"""Who is believed: every scale judges, and where one finds evidence the likeliest liars are looked for.
+"""Identification: tests on every scale, and a search for the likeliest manipulated meters where one fails.
 
 References
 ----------
@@ -29,49 +29,26 @@ from gridsec.estimators.sequential.windows import Window
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Examined:
-    """The outcome of one tick. s scales.
+    """Identification of one tick. s scales."""
 
-    Attributes
-    ----------
-    trust
-        Who is believed now.
-    fits, wholes, views : (s,)
-        By scale, as in the state; a view is None where the scale was not looked at.
-    found
-        The likeliest explanation that a search came to, and the others, by scale.
-    misfit : (s,)
-        Scales whose trusted meters were inconsistent at the last look, after the search.
-    busbar
-        The phase of the busbar whose meter lies, and the scale that found it: then nothing else counts, and
-        the tick has to begin anew without it.
-    """
-
-    trust: Trust
-    fits: tuple[Fit | None, ...]
-    wholes: tuple[Fit | None, ...]
-    views: tuple[View | None, ...]
-    found: dict[int, Found]
-    misfit: tuple[bool, ...]
-    busbar: tuple[int, int] | None = None
+    trust: Trust  # trust state after the tests
+    fits: tuple[Fit | None, ...]  # (s,) posteriors of the trusted meters
+    wholes: tuple[Fit | None, ...]  # (s,) kept posteriors of all meters
+    views: tuple[View | None, ...]  # (s,) tests; None for a scale without a look at this tick
+    found: dict[int, Found]  # candidates by scale that searched
+    misfit: tuple[bool, ...]  # (s,) trusted meters inconsistent at the last look, after the search
+    busbar: tuple[int, int] | None = None  # busbar phase and scale of a wrong meter: the tick restarts
 
 
-# For so many ticks it is asked at each who could be honest, after that once in so many.
 _AGAIN = 8
+"""Ticks with a search at each before a meter is named, and interval of the searches after them."""
 
 
 def examine(design: SequentialDesign, state: SequentialState, model: Floats, honest: Honest) -> Examined:
-    """Judge every meter on every scale that is due, shortest first.
+    """Test every meter on every due scale, shortest first.
 
-    Parameters
-    ----------
-    design
-        The design.
-    state
-        With this tick's window and doubts, and all else from the last tick.
-    model : (p,)
-        What the model may be off, squared pu.
-    honest
-        What all other errors are bounded by.
+    state: with the window and uncertainty of this tick, else of the last. model: (p,) largest model error,
+    squared pu. honest: bounds of all other honest errors.
     """
     fits, tick, trust = state.fits, state.ticks, state.trust
     calm = trust.calm
@@ -113,7 +90,7 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats, hon
                 if liar is not None:
                     none = (None,) * len(fits)
                     return Examined(state.trust, fits, state.wholes, none, {}, state.misfit, (liar, s))
-                # Where no meter was beyond chance nobody is suspected for what is said of the busbar.
+                # With no meter beyond its limit the test of the busbar makes no suspect.
                 if over:
                     found[s], trust = outcome, believed
         if s in found:
@@ -136,26 +113,26 @@ def _note(trust: Trust, view: View, s: int) -> None:
     trust.bad[s], trust.still[s] = view.over & ~trust.trusted, stands & ~trust.trusted
 
 
-# Meters up to which it is kept what all of them said: 4 MB for each scale, and what they rest on.
 _REMEMBERED = 724
+"""Largest number of meters for a kept posterior of all of them: 4 MB for each scale."""
 
 
 def _whole(kept: Fit | None, before: Fit | None, now: Fit, here: Scale) -> Fit | None:
-    """A fit that `covers` all that report, or what is kept of one."""
+    """Posterior that `covers` all meters with a reading, or the one kept before."""
     if now is before:
         return kept
     if kept is not None and not covers(kept, here.prior, here.noise, np.zeros_like(here.enough)):
         kept = None
     if here.enough.size > _REMEMBERED or not covers(now, here.prior, here.noise, here.enough):
         return kept
-    # Who is silent for a tick will be heard again.
+    # A meter silent for one tick will report again.
     if kept is not None and any_of(kept.trusted & ~now.trusted) and not any_of(now.trusted & ~kept.trusted):
         return kept
     return now
 
 
 def _own(trust: Trust) -> Trust:
-    """The same, with evidence that can be written into."""
+    """Trust state with evidence that can be written."""
     return replace(trust, bad=trust.bad.copy(), still=trust.still.copy())
 
 
@@ -169,10 +146,10 @@ def _all_alike(design: SequentialDesign, here: Scale, now: Fit, view: View, hone
     return bool(view.judged.misfit <= (room(design, at, v, fixed, honest) + busbar)[0])
 
 
-def _phases(  # noqa: PLR0917  # the scale, and what it rests on
+def _phases(  # noqa: PLR0917
     design: SequentialDesign, scales: Scales, s: int, now: Fit, view: View, honest: Honest
 ) -> list[int]:
-    """Phases of the busbar that the meters contradict by more than honest errors that are all alike."""
+    """Busbar phases that the meters contradict by more than honest errors of one direction."""
     here, doubt = scales[s], Doubt(design.sigmas[s], scales.model, scales.doubts.busbar[s])
     phases = opposed(design, doubt, now, view.judged)
     if not phases:
@@ -182,9 +159,9 @@ def _phases(  # noqa: PLR0917  # the scale, and what it rests on
 
 
 def _disputed(search: Search, best: Solution, powers: Powers, phases: list[int]) -> list[int]:
-    """Phases of which the busbar's meter may be what an explanation accuses other meters for.
+    """Busbar phases with a meter that may be wrong instead of the accused meters.
 
-    Its trusted meters contradict it too, it accuses many meters of the phase, or, in three phases, a few.
+    The trusted meters contradict it too, many meters of the phase are accused, or, in three phases, few.
     """
     if not phases:
         return phases
@@ -202,7 +179,7 @@ def _disputed(search: Search, best: Solution, powers: Powers, phases: list[int])
 
 
 def _claimed(search: Search, best: Solution) -> Bools:
-    """Customers who claim much, and whose powers are false if an explanation is right or may be, (N,)."""
+    """Customers with a large reported power that a hypothesis takes for false or may, (N,)."""
     design = search.design
     out = np.zeros(design.customers, dtype=np.bool_)
     out[design.plant.meters[search.here.enough & ~best.trusted]] = True
@@ -210,18 +187,17 @@ def _claimed(search: Search, best: Solution) -> Bools:
     return out & (search.book.std[: design.customers] > design.options.hidden_power)
 
 
-# More than one in so many must be accused on a phase before its busbar's meter is doubted by that alone, or
-# no more than this: one wrong busbar meter looks like some wrong meters close to it.
 _MANY, _CLOSE = 3, 8
+"""Accused meters of a phase that dispute its busbar meter: more than 1 / `_MANY` of it, or up to `_CLOSE`."""
 
 
 def _without_busbar(
     search: Search, found: Found, now: Fit, powers: Powers, phases: list[int]
 ) -> tuple[Found, int | None]:
-    """What was found, and the phase of the busbar of which it is far likelier that its meter lies.
+    """Candidates, and the busbar phase with a meter that is far likelier manipulated than they are.
 
-    If that is about as likely it is one of the other explanations. It is none if it accuses more meters than
-    can be told apart where the others do without.
+    About equally likely it is one of the other hypotheses. It is not, if it accuses more than `max_attacked`
+    meters and the others do not.
     """
     design, here = search.design, search.scales[search.s]
     phases = _disputed(search, found.best, powers, phases)
@@ -237,10 +213,10 @@ def _without_busbar(
     worse = lying.cost - found.best.cost
     vouching = (here.enough & each[best].trusted) @ design.hangs_on[:, phases[best]]
     if vouching < design.most:
-        # All meters that speak against it may be manipulated themselves.
+        # All meters that contradict it may be manipulated themselves.
         return replace(found, others=(*found.others, lying)), None
     if worse < -like:
-        # A false power may look the same: it need not be as unlikely as to accuse somebody of it.
+        # A false power may look the same; as an alternative it has a reduced charge.
         power = search.beside_powers(now)
         if power.cost > lying.cost + like:
             return found, phases[best]
@@ -251,21 +227,10 @@ def _without_busbar(
 def ended(
     design: SequentialDesign, priors: tuple[Prior, ...], trust: Trust, seen: Examined, window: Window
 ) -> Bools:
-    """Distrusted meters whose manipulation is over, though long means still contain it.
+    """Suspects with an ended manipulation that long means still contain, (p,).
 
-    What a short scale sees of them is honest, and further from what a longer one sees than the short one's
-    noise and the wandering of loads, and of a busbar that is not read, explain.
-
-    Parameters
-    ----------
-    design
-        The design.
-    priors : (s,)
-        What is known on each scale without any meter.
-    trust
-        From the last tick.
-    seen, window
-        What this tick brought.
+    The short scale finds them honest, and further from a longer one than its noise and the wandering of
+    loads, and of an unmetered busbar, explain.
     """
     out = np.zeros_like(trust.trusted)
     suspected = ~trust.trusted & ~seen.trust.trusted
@@ -288,10 +253,10 @@ def ended(
 
 
 def _due(design: SequentialDesign, trust: Trust, view: View, s: int, tick: int, *, searched: bool) -> bool:
-    """Whether what is believed is looked into again, though nothing new speaks against it.
+    """True if a scale searches again without new evidence.
 
-    Before a meter is named, and now and then while that is in doubt; while more is suspected than meters;
-    and from time to time, at ticks at which no shorter scale has just searched.
+    Before a meter is named, at intervals while that is open, while other faults are suspected, and at long
+    intervals at ticks without a search on a shorter scale.
     """
     if trust.calm:
         return False
@@ -309,7 +274,7 @@ def _due(design: SequentialDesign, trust: Trust, view: View, s: int, tick: int, 
 
 
 def _decoded(design: SequentialDesign, here: Scale, now: Fit, trust: Trust, s: int) -> tuple[Found, Trust]:
-    """What the design's decoder says, as explanations, and whom that leaves trusted."""
+    """Candidates of the design's decoder, and the resulting trust state."""
     judged = judge(now, here.m)
     over = here.enough & (np.abs(judged.offset) > here.limits.of(judged.std))
     tight = now if not now.loose.shape[1] else None

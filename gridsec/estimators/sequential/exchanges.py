@@ -1,6 +1,6 @@
-"""Explanations next to the likeliest one: somebody else is accused in place of one who is.
+"""Hypotheses next to the likeliest one: one accused meter or direction is exchanged for another.
 
-What an exchange changes follows from the fit of the likeliest explanation: nothing is fitted anew.
+An exchange follows from the posterior of the likeliest hypothesis, without a new factorisation.
 """
 
 from __future__ import annotations
@@ -17,47 +17,23 @@ from gridsec.estimators.sequential.search import Limits, Solution
 
 @dataclass(frozen=True, slots=True)
 class Swap:
-    """Accusing `innocent` instead of `accused` fits almost as well.
-
-    Attributes
-    ----------
-    accused, innocent
-        Meters; or directions, as indices into the dictionary.
-    worse
-        By how much J would rise; half of it is the logarithm of the likelihood ratio.
-    """
+    """Exchange of an accused meter or direction for an innocent one; J rises by `worse`."""
 
     accused: int
     innocent: int
     worse: float
 
 
-# Accused meters that are exchanged together.
 _COLUMNS = 64
+"""Accused meters of one block of a product."""
 
 
 def swaps(found: Solution, live: Bools, within: float, limits: Limits) -> list[Swap]:
-    """Exchanges of one accused meter for a trusted one that cost at most `within`; O(p^2) per accused.
+    """Best exchange of each accused meter for a trusted one, rise at most `within`; O(p^2) per accused.
 
     With accused k back, ``Q' = Q + v v^T / s`` with ``v = Q S_:k - e_k`` and ``s = M_kk + d_k``, and then
     meter j gains ``(Q' m)_j^2 / Q'_jj``. Without j, k is off by ``(Q'' m)_k / Q''_kk`` with
-    ``Q'' = Q' - Q'_:j Q'_j: / Q'_jj``: if that is more than any honest meter is, it is no explanation.
-
-    Parameters
-    ----------
-    found
-        An explanation.
-    live : (p,)
-        Which meters have a reading.
-    within
-        Largest rise of J.
-    limits
-        What is evidence.
-
-    Returns
-    -------
-    list of Swap
-        The best exchange of each accused meter for which there is one, cheapest first.
+    ``Q'' = Q' - Q'_:j Q'_j: / Q'_jj``; the exchange counts only if that is within k's limit. Cheapest first.
     """
     now, judged = found.fit, found.judged
     prior, accused, out = now.prior, indices(live & ~now.trusted), []
@@ -86,24 +62,11 @@ def swaps(found: Solution, live: Bools, within: float, limits: Limits) -> list[S
 def turns(
     found: Solution, dictionary: Dictionary, accused: Sequence[int], instead: Ints, within: float
 ) -> list[Swap]:
-    """Exchanges of one loosened direction for another that cost at most `within`; O(p^2) per direction.
+    """Exchanges of an accused direction for one of `instead` (k,) of the same charge, rise at most `within`.
 
-    With the accused direction, u times its standard deviation, closed again,
-    ``Q' = Q + c c^T / d`` with ``c = Q u`` and ``d = 1 - u^T c``, and then direction b lowers the misfit by
-    ``(b^T Q' m)^2 / (1 / s_b^2 + b^T Q' b)``.
-
-    Parameters
-    ----------
-    found
-        An explanation.
-    dictionary
-        Of whose directions it loosened some.
-    accused
-        Those that might be exchanged; others than the explanation's are none.
-    instead : (k,)
-        What for; all at the price of the accused.
-    within
-        Largest rise of J.
+    With the accused direction, u times its standard deviation, removed, ``Q' = Q + c c^T / d`` with ``c = Q
+    u`` and ``d = 1 - u^T c``; then direction b lowers the chi-square by ``(b^T Q' m)^2 / (1 / s_b^2 + b^T Q'
+    b)``. O(p^2) per direction, cheapest first. accused: directions to be exchanged.
     """
     now, weights = found.fit, found.judged.weights
     out: list[Swap] = []
@@ -113,7 +76,7 @@ def turns(
         return out
     at, Q = now.trusting()
     buses, w = now.prior.meters[at], weights[at]
-    # What this explanation loosened comes last, in its order.
+    # The directions of this hypothesis come last, in its order.
     first = now.loose.shape[1] - len(found.loosened)
     seen = dictionary.columns(others)[buses]
     along, form = w @ seen, np.einsum("ij,ij->j", seen, Q @ seen)

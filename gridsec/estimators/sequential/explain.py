@@ -1,4 +1,4 @@
-"""The explanations that several starts lead to on one scale, and how rivals compare over all of them.
+"""Hypotheses of several starts on one scale, and their comparison over all scales.
 
 References
 ----------
@@ -28,37 +28,37 @@ from gridsec.estimators.sequential.scales import Scales, View, adapt, believe, v
 from gridsec.estimators.sequential.search import Explanation, Found, Limits, Solution, likelier
 from gridsec.estimators.sequential.state import Trust
 
-# With more meters than this beyond their limits at once, moving one after the other is no good start.
 _FEW = 32
-# With no more suspects than this, whether each of them could be honest is looked into by a search.
+"""Largest number of meters beyond their limits for a start from the trusted set."""
 _CLOSE = 8
-# Correlation from which on two meters are moved by the same loads.
+"""Largest number of suspects for a search with each of them honest."""
 _TOGETHER = 0.5
-# Rounds in which groups are believed one after the other.
+"""Least prior correlation of two meters moved by the same loads."""
 _TURNS = 6
-# And so many times that the number of meters to the third, times that, is no more than this: two seconds.
+"""Largest number of rounds of reversed groups."""
 _EFFORT = 4e9
-# Beside so many sets of liars false powers are looked for where nothing else explains the readings.
+"""Limits group searches so that count x p^3 <= _EFFORT (about 2 s)."""
 _BESIDE = 3
-# Those no worse than the likeliest by this many times log(like) are looked at more closely.
+"""Sets of suspects beside which false powers, and neighbourhoods that, are searched."""
 _NEAR = 8.0
-# A fit of more meters helps where there are so many times as many wanted as it rests on beside these.
+"""Largest distance from the best cost for a closer comparison, in log(like)."""
 _PART = 2
-# Neighbourhoods are looked for around this many meters, and have at most this many.
+"""Downdate a larger posterior only if it has at most 1/_PART extra meters."""
 _SEEDS, _STREET = 32, 64
-# Meters up to which neighbourhoods are looked for: each start takes a matrix of 8 bytes x meters^2, 4 MB.
+"""Number of centres of neighbourhoods, and largest size."""
 _MOST = 724
-# Groups that are off by one amount each, in one explanation.
+"""Largest number of meters for neighbourhoods: each start takes a matrix of 8 bytes x meters^2, 4 MB."""
 _PARTS = 2
-# A group of similar size has at most this many times as many members.
+"""Groups with a common offset in one hypothesis."""
 _SIMILAR = 2
-# Standard deviations of chi-square that chance may add; what all of a group may be off by, squared pu.
+"""Largest ratio of the sizes of similar groups."""
 _CHANCE, _ANY_LIE = 4.0, 0.2
+"""Standard deviations of chi-square within chance; standard deviation of a common offset, squared pu."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Group:
-    """A neighbourhood off by one amount: its meters (p,), what the amount gains, and what it costs."""
+    """Neighbourhood with one common offset: meters (p,), gain and charge of the offset."""
 
     meters: Bools
     gain: float
@@ -66,31 +66,22 @@ class _Group:
 
 
 class Search:
-    """The explanations that several starts lead to on one scale.
+    """Hypotheses from several starts on one scale.
 
-    The starts: what was believed, without what this scale and shorter ones suspect besides meters; where
-    several meters are suspected, a robust fit and all meters close to the model; and where any is, what was
-    believed with suspicions besides meters. Where few are, everybody is believed once more, and meters may
-    fall in pairs; then for each suspect the likeliest explanation in which it is honest. Longer means know
-    better, so they decide anew about what shorter ones suspected.
+    Starts: the set trusted before, without faults suspected on this scale and shorter ones; with several
+    suspects a robust set and all meters close to the model; with any suspect the trusted set with the fault
+    dictionary. With few suspects, all meters are trusted once more and removed in pairs; then, for each
+    suspect, the likeliest hypothesis in which it is honest. Longer means know more, so they decide again
+    about faults suspected on shorter ones.
 
-    Meters against which other scales have evidence are not admitted, or lies that have just begun would
-    be believed again. Unless the explanation that does admit them is cheaper over all scales together, and
-    the scales that caught them have readings enough to know.
+    Meters with evidence on other scales are not added, or a manipulation that has just begun would be trusted
+    again. A hypothesis that adds them wins if it is cheaper over all scales together and the detecting scales
+    have enough readings.
 
-    Parameters
-    ----------
-    design, scales
-        The design, and the scales.
-    wholes
-        Fits of all that reported, from when they were trusted, by scale; None where none is kept.
-    trust
-        Who is believed.
-    s
-        The scale.
+    wholes: (s,) kept posteriors of all meters. s: the scale.
     """
 
-    def __init__(  # what is known, in the order it becomes known
+    def __init__(
         self,
         design: SequentialDesign,
         scales: Scales,
@@ -112,26 +103,14 @@ class Search:
         self.left: dict[tuple[bytes, tuple[int, ...]], list[float]] = {}
 
     def __call__(self, now: Fit, view: View) -> tuple[Found, Trust]:
-        """What is found, and whom that leaves trusted.
-
-        Parameters
-        ----------
-        now, view
-            The fit of those who were believed, and what the scale says then.
-        """
+        """Candidates with compared rivals, and the resulting trust state."""
         found = self.likeliest(now, view)
         rivals = (*found.others, *self.turned, *self._instead(found.best))
         others = (*self._compared(found.best, rivals), *self._alike_groups(found.best))
         return replace(found, others=others), self._believe(found.best)
 
     def likeliest(self, now: Fit, view: View) -> Found:
-        """What is found, before rivals are looked for and compared.
-
-        Parameters
-        ----------
-        now, view
-            As in a call.
-        """
+        """Candidates before the comparison with rivals."""
         start = now if len(self.accused) == len(self.trust.accused) else self._fit(now.trusted)
         few = np.count_nonzero(view.over & now.trusted) <= _FEW
         judged = view.judged if start is now else None
@@ -141,7 +120,7 @@ class Search:
             free = self._free(found)
             if any_of(free.best.trusted & self.keep):
                 trusted = free.best.trusted & ~self.keep
-                # From where a descent began already it would come to the same.
+                # A descent from an earlier start would end at the same set.
                 if found is None or not np.array_equal(trusted & self.here.enough, start.trusted):
                     held = self._descend(self._fit(trusted), self.keep, fresh=True)
                     found = likelier(found, Found(held))
@@ -173,32 +152,18 @@ class Search:
         return Doubt(self.here.limits.sigmas, self.scales.model, self.scales.doubts.busbar[self.s])
 
     def opposed(self, now: Fit, judged: Judged) -> list[int]:
-        """Phases of the busbar whose meter the trusted meters contradict, or did before some were suspected.
-
-        Parameters
-        ----------
-        now, judged
-            The trusted meters, and what they say.
-        """
+        """Busbar phases that the trusted meters contradict, now or before some became suspects."""
         doubt = self.doubt
         out = opposed(self.design, doubt, now, judged)
         self.disputed = bool(out)
-        # On a balanced feeder all meters speak against a wrong busbar, in a phase only some.
+        # On a balanced feeder all meters contradict a wrong busbar, in a phase only some.
         if self.design.hangs_on.shape[1] > 1 and any_of(self.here.enough & ~now.trusted & ~self.trust.named):
             every = self._fit(self.here.enough & ~(self.trust.named & ~now.trusted))
             out = sorted({*out, *opposed(self.design, doubt, every, judge(every, self.here.m))})
         return out
 
     def beside_busbar(self, now: Fit, phase: int) -> Explanation:
-        """The likeliest explanation in which the busbar's meter lies.
-
-        Parameters
-        ----------
-        now
-            The fit of those who were believed.
-        phase
-            Of the busbar; among what is loosened it comes after all that is in the book.
-        """
+        """Likeliest hypothesis with a manipulated busbar meter; the phase is numbered after the faults."""
         design, trust = self.design, self.trust
         here = np.arange(design.hangs_on.shape[1]) == phase
         scales = self.scales.wider(UNMETERED * design.plant.feeder.broadcast_busbar(here))
@@ -206,7 +171,7 @@ class Search:
         there = adapt(None, wide, now.trusted, self.scales.loosened(trust.accused))
         lying = Search(design, scales, self.wholes, trust, self.s)
         best = lying.likeliest(there, view_of(design, wide, judge(there, wide.m))).best
-        # Meters that are suspected only beside an honest busbar meter are trusted again.
+        # Meters that are suspects only beside an honest busbar meter are trusted again.
         honest = lying._descend(lying._fit(wide.enough), np.zeros_like(wide.enough), fresh=True)
         best = min(best, honest, key=lambda one: one.cost)
         charge = search.price(int(np.count_nonzero(self.here.enough)), 1)
@@ -214,17 +179,11 @@ class Search:
         return Explanation(best.trusted, loosened, best.charge + charge, best.cost + charge)
 
     def beside_powers(self, now: Fit) -> Explanation:
-        """The likeliest explanation in which powers are false, at the price of a reason not to name anybody.
-
-        Parameters
-        ----------
-        now
-            The fit of those who were believed.
-        """
+        """Likeliest hypothesis with false powers at the reduced charges of an alternative."""
         return self._descend(now, self.keep, self.book.doubtful()).bare()
 
     def _instead(self, best: Solution) -> list[Explanation]:
-        """Explanations in which one of those who might be named is honest."""
+        """Hypotheses in which one of the meters about to be named is honest."""
         fresh = self.here.enough & ~best.trusted & ~self.trust.named
         if np.count_nonzero(fresh) > _CLOSE:
             return []
@@ -240,10 +199,10 @@ class Search:
         return out
 
     def _turned(self, best: Solution) -> list[Solution]:
-        """Explanations in which those who are accused of the same are honest, and who contradicts them lies.
+        """Hypotheses in which a group accused of the same offset is honest and its opponents are manipulated.
 
-        Where many of a street, or of a phase, tell the same small lie, the word of many stands against that
-        of many, and no single meter that changes sides makes either explanation better.
+        With many meters of a street or phase off alike, two groups contradict each other. No move of a single
+        meter leads from one hypothesis to the other.
         """
         out: list[Solution] = []
         left = int(_EFFORT / best.trusted.size**3)
@@ -261,7 +220,7 @@ class Search:
         return out
 
     def _believing(self, best: Solution, group: Ints) -> list[Solution]:
-        """The nearest explanation in which a group that `best` accuses is honest; none if that is absurd."""
+        """Nearest hypothesis in which a group accused by `best` is honest; none if it accuses too many."""
         here, prior, loose = self.here, self.here.prior, best.fit.loose
         # As many meters stay trusted as may be manipulated.
         most = int(np.count_nonzero(here.enough)) - self.design.most
@@ -269,7 +228,7 @@ class Search:
             return []
         among = np.zeros_like(best.trusted)
         among[group] = True
-        # What these leave unexplained among themselves, all others can only add to.
+        # Further meters can only raise the chi-square of these.
         most_left = best.cost - best.charge + 2.0 * np.log(self.design.options.like)
         if misfit(prior, here.noise, here.m, among, loose) > most_left:
             return []
@@ -282,12 +241,11 @@ class Search:
         return [self._after(best, other)] if self._admissible(other) else []
 
     def _streets(self, best: Solution) -> Iterator[Solution]:
-        """Explanations that begin by accusing the neighbourhoods that gain most.
+        """Hypotheses that start by accusing the neighbourhoods of the largest gain.
 
-        A whole street that is off alike is consistent within itself: dropping any one of its meters gains
-        little, so a descent accuses its honest neighbours. With b = Q m and G = Q of a group,
-        dropping the group gains ``b^T G^-1 b`` at once, which one Cholesky factor tells of all groups of
-        the k meters nearest to a meter.
+        A street that is off alike is consistent within itself: removing any of its meters gains little, and a
+        descent accuses its honest neighbours. With b = Q m and G = Q of a group, removing the group gains
+        ``b^T G^-1 b`` at once; one Cholesky factor gives it for all groups of the k meters nearest to one.
         """
         here = self.here
         if not self._about_to_be_named(best):
@@ -328,11 +286,11 @@ class Search:
         return here.enough.size <= _MOST and any_of(here.enough & ~best.trusted & (lasting | self.disputed))
 
     def _alike_groups(self, best: Solution) -> Iterator[Explanation]:
-        """Explanations in which one neighbourhood, or two, are off by one amount each.
+        """Hypotheses in which one neighbourhood, or two, have one common offset each.
 
-        Such a group is one hypothesis, not one for each of its meters: it costs ``2 ln(p K)`` for its centre
-        and its size of at most K meters, and ``2 ln binom(k, e)`` for e honest ones among its k. Its meters
-        keep telling their differences.
+        Such a group is one hypothesis: it costs ``2 ln(p K)`` for its centre and its size of at most K
+        meters, and ``2 ln binom(k, e)`` for e honest ones among its k. Its meters keep informing by their
+        differences.
         """
         if not self._about_to_be_named(best):
             return
@@ -354,8 +312,8 @@ class Search:
     def _neighbourhoods(self, every: Fit, best: Solution) -> list[_Group]:
         """Groups of nearest meters that gain more than they cost, best first.
 
-        With the sums b of Q m and q of Q over a group, its amount gains ``b^2 / q``. Groups are taken whole,
-        and without accused meters: one meter that differs from all around it stands against its street.
+        With the sums b of Q m and q of Q over a group, its offset gains ``b^2 / q``. Groups are taken whole,
+        and without accused meters: a single meter may differ from its street.
         """
         (at, Q), prior = every.trusting(), self.here.prior
         # As many meters stay trusted as may be manipulated.
@@ -369,7 +327,7 @@ class Search:
         centre = 2.0 * np.log(at.size * largest)
         out: list[_Group] = []
         for j in np.argsort(-(b * b) / Q.diagonal())[:_SEEDS].tolist():
-            # By correlation a stretch of a street comes first, by covariance all that is behind one bus.
+            # Correlation orders along a street, covariance by the bus they are behind.
             for likeness, some in product((between[j] / std, between[j]), (whole, believed)):
                 near = np.argsort(-likeness, kind="stable")[: largest + 1]
                 part = some[near].astype(np.float64)
@@ -387,7 +345,7 @@ class Search:
         return sorted(out, key=lambda one: one.charge - one.gain)
 
     def _off_alike(self, best: Solution, base: Bools, groups: list[_Group]) -> tuple[Solution, Explanation]:
-        """The search that begins with groups off by one amount each, and its explanation on all scales."""
+        """Candidate that starts with groups off by one amount each, and its hypothesis on all scales."""
         here = self.here
         directions = np.zeros((here.prior.variance.size, len(groups)))
         for k, group in enumerate(groups):
@@ -405,18 +363,18 @@ class Search:
         return end, replace(other, cost=best.cost + price - self._prices(best) + worse)
 
     def _admissible(self, found: Explanation) -> bool:
-        """True where at least `most` meters stay trusted."""
+        """True where at least `max_attacked` meters stay trusted."""
         return bool(np.count_nonzero(self.here.enough & found.trusted) >= self.design.most)
 
     def _closer(self, group: Ints, other: Solution) -> Explanation:
-        """One that believes the group on less evidence against the rest: what might be the case."""
+        """Candidate that trusts the group, with the lower limits of alternatives."""
         nobody = np.zeros_like(other.trusted)
         fair, judged = self._fair(), other.judged
         closer = self._descend(other.fit, nobody, innocent=group, limits=fair, judged=judged)
         return (self._after(other, closer) if self._admissible(closer) else other).bare()
 
     def _after(self, before: Solution, found: Solution) -> Solution:
-        """What a descent without a book found, from all that another loosened: powers of liars cost less."""
+        """Candidate of a descent without dictionary, charged for the directions of the one before."""
         loosened, live = before.loosened, self.here.enough
         if not loosened:
             return found
@@ -426,12 +384,12 @@ class Search:
         return replace(found, loosened=loosened, charge=charge, cost=found.cost + charge)
 
     def _fair(self) -> Limits:
-        """Limits by which nobody is named: whatever makes an explanation cheaper is worth trying."""
+        """Limits of alternatives: every accusation that lowers the cost is tried; none names a meter."""
         fair = float(np.sqrt(search.price(self.keep.size, 1)))
         return replace(self.here.limits, sigmas=min(self.here.limits.sigmas, fair))
 
     def _contradict(self, j: int, loose: Floats) -> Bools:
-        """Meters that cannot be honest if meter j is, as far as the two of them alone can tell, (p,)."""
+        """Meters that cannot be honest if meter j is, from the two readings alone, (p,)."""
         here, prior = self.here, self.here.prior
         more = loose[prior.meters]
         column = prior.of_meters[prior.meters, j] + more @ more[j]
@@ -440,7 +398,7 @@ class Search:
         return np.asarray(here.enough & (np.abs(here.m - here.m[j]) > here.limits.of(np.sqrt(apart))))
 
     def _agreeing(self, best: Solution) -> list[Ints]:
-        """Accused meters of one kind: they read too high, or too low, where the same loads move them."""
+        """Accused meters of one kind: too high, or too low, and moved by the same loads."""
         accused, out = self.here.enough & ~best.trusted, []
         for sign in (accused & (best.judged.offset > 0.0), accused & (best.judged.offset < 0.0)):
             at = indices(sign)
@@ -448,9 +406,9 @@ class Search:
         return out
 
     def _compared(self, best: Solution, rivals: tuple[Explanation, ...]) -> tuple[Explanation, ...]:
-        """Rivals, each once, at what it costs on the scale that speaks most against it.
+        """Rivals, each once, at the cost on the scale with the strongest evidence against it.
 
-        Long means hardly know yet of a lie that has just begun, short ones hardly see a small one.
+        Long means hardly contain a manipulation that has just begun, short ones hardly show a small one.
         """
         like, ours = np.log(self.design.options.like), None
         out: dict[tuple[bytes, tuple[int, ...]], Explanation] = {}
@@ -468,11 +426,11 @@ class Search:
         return tuple(out.values())
 
     def relief(self, best: Explanation, other: Explanation) -> float:
-        """Part of another explanation's cost that does not count beside the best one.
+        """Part of another hypothesis's cost that does not count beside the best one.
 
-        The surcharge on accusing more meters than can be told apart keeps the estimate on the side of the
-        majority. It is no evidence against a majority that is manipulated: it does not count against an
-        explanation that accuses a group of similar size.
+        The surcharge beyond `max_attacked` keeps the estimate on the side of the majority. It is not evidence
+        against a manipulated majority: it does not count against a hypothesis that accuses a group of similar
+        size.
         """
         live = self.here.enough
         ours, theirs = (int(np.count_nonzero(live & ~each.trusted)) for each in (best, other))
@@ -487,11 +445,11 @@ class Search:
         return surcharge(theirs) - surcharge(ours)
 
     def _swapped(self, best: Solution, other: Explanation) -> float:
-        """What a rival costs where groups change sides and either group tells one lie; infinite elsewhere.
+        """Cost of a rival where groups change sides and each group has one common offset; infinite elsewhere.
 
-        Dropping a group drops what chance does to its meters, which differs from group to group by more than
-        the explanations do. Both sides are therefore asked about the same meters: all that either trusts,
-        with one unknown amount for each group that it accuses.
+        Removing a group removes its chance residuals too, which differ between groups by more than the
+        hypotheses. Both are therefore compared on the meters that either trusts, with one unknown amount per
+        accused group.
         """
         here = self.here
         believed = here.enough & other.trusted & ~best.trusted
@@ -500,19 +458,19 @@ class Search:
             return np.inf
         ours, freedom = self._alike(best, believed)
         if _beyond_chance(ours[self.s] - best.judged.misfit, freedom):
-            return np.inf  # those it accuses do not tell one lie
+            return np.inf  # the accused meters have no common offset
         theirs, _ = self._alike(other, accused)
         return self._beside(best, other, ours, theirs)
 
     def _beside(self, best: Solution, other: Explanation, ours: list[float], theirs: list[float]) -> float:
-        """What another explanation costs beside the best by what both leave unexplained, scale by scale."""
+        """Cost of another hypothesis beside the best, on the scale of the largest chi-square difference."""
         worse = max(his - own for his, own in zip(theirs, ours, strict=True))
         return best.cost + self._prices(other) - self._prices(best) + worse
 
     def _alike(self, found: Explanation, group: Bools) -> tuple[list[float], int]:
-        """What an explanation leaves unexplained where a group it accuses is off by one amount a street.
+        """Chi-square of a hypothesis, by scale, with one common offset per street of an accused group.
 
-        By scale; and how many meters more than amounts there are.
+        And the number of its meters less that of the offsets.
         """
         at = indices(group)
         parts = _linked(self._together(at))
@@ -522,7 +480,7 @@ class Search:
         return self._misfits(found, group, alike), at.size - len(parts)
 
     def _together(self, at: Ints) -> Bools:
-        """Which of some meters are moved by the same loads, (k, k)."""
+        """Pairs of meters moved by the same loads, (k, k)."""
         prior = self.here.prior
         between = prior.among(at)
         std = np.sqrt(between.diagonal())
@@ -530,29 +488,29 @@ class Search:
         return np.asarray((between >= limit) & (limit > 0.0) | np.eye(at.size, dtype=np.bool_))
 
     def _unexplained(self, best: Solution) -> bool:
-        """Whether more is left of the readings of those who are believed than chance leaves."""
+        """True if the chi-square of the trusted meters is beyond chance."""
         return _beyond_chance(best.judged.misfit, int(np.count_nonzero(best.trusted)))
 
     def _sets(self, found: Found) -> list[Bools]:
-        """Whom the cheapest explanations believe, each set once.
+        """Trusted meters of the cheapest hypotheses, each set once.
 
-        A false power bends voltages far and near. Where it was loosened first, or another one in its place,
-        the liars are hard to find; once they are, it stands out.
+        A false power changes voltages far and near. Accused first, it hides the manipulated meters; with
+        these known it stands out.
         """
         each = sorted((found.best, *found.others), key=lambda one: one.cost)
         sets = {one.trusted.tobytes(): one.trusted for one in each if not any_of(one.trusted & self.keep)}
         return list(sets.values())[:_BESIDE]
 
     def _suspected(self, found: Found) -> int:
-        """How many meters are suspected at least."""
+        """Least number of suspects in the candidates."""
         enough = self.here.enough
         return min(int(np.count_nonzero(enough & ~each.trusted)) for each in (found.best, *found.others))
 
     def _free(self, held: Found | None) -> Found:
-        """What is found from starts that owe nothing to what was believed.
+        """Candidates of starts that do not depend on the meters trusted before.
 
-        A descent stays where another one has ended: `held` too, unless there is somebody whom it only may
-        not admit.
+        A descent stays where another one ended: `held` counts too, unless a meter was only kept from being
+        added.
         """
         found: Found | None = None
         ends = [] if held is None or self._holds_back(held.best) else [held.best]
@@ -567,12 +525,12 @@ class Search:
         return found
 
     def _holds_back(self, found: Solution) -> bool:
-        """Whether it would admit somebody who must stay distrusted."""
+        """True if a meter that must stay suspect would be added."""
         judged, who = found.judged, self.keep & self.here.enough & ~found.trusted
         return any_of(who & (np.abs(judged.offset) < self.here.limits.of(judged.std)))
 
     def _starts(self) -> tuple[Bools, Bools]:
-        """A robust fit, and the meters close to the model."""
+        """Robust set, and the meters close to the model."""
         here, prior = self.here, self.here.prior
         focus, std = self.design.options.focus, np.sqrt(here.noise)
         bound = here.limits.model + focus * std
@@ -612,7 +570,7 @@ class Search:
         return fit(self.here.prior, self.here.noise, wanted, loose) if near is None else without(*near)
 
     def _near(self, s: int, wanted: Bools) -> tuple[Fit, Bools] | None:
-        """A fit just as it was factorised that rests on not many more, and these; None for none."""
+        """Fresh posterior of few more meters than wanted, and these; None for none."""
         whole = self._whole(s)
         if whole is None or not sound(whole.prior, whole.noise):
             return None
@@ -620,7 +578,7 @@ class Search:
         return (whole, more) if np.count_nonzero(more) * _PART <= np.count_nonzero(wanted) else None
 
     def _whole(self, s: int) -> Fit | None:
-        """The same of all that report on a scale and perhaps of others, whatever is wanted."""
+        """Kept posterior that covers all meters with readings on a scale."""
         if s not in self.covering:
             whole, here = self.wholes[s], self.scales[s]
             good = whole is not None and covers(whole, here.prior, here.noise, here.enough)
@@ -628,7 +586,7 @@ class Search:
         return self.covering[s]
 
     def _total(self, found: Explanation) -> float:
-        """The misfit on all scales and, once, what the accusations cost."""
+        """Chi-square on all scales plus the cost of the accusations."""
         return self._prices(found) + sum(self._misfits(found))
 
     def _prices(self, found: Explanation) -> float:
@@ -641,7 +599,7 @@ class Search:
     def _misfits(
         self, found: Explanation, more: Bools | None = None, alike: Floats | None = None
     ) -> list[float]:
-        """What an explanation leaves unexplained on each scale; of `more` meters, which may be off alike."""
+        """Chi-square on each scale, with `more` meters that may have common offsets."""
         trusted, out = self._trusted(found), []
         who = trusted.tobytes(), found.loosened
         if more is None and who in self.left:
@@ -668,12 +626,12 @@ class Search:
 
 
 def _beyond_chance(left: float, freedom: int) -> bool:
-    """Whether a misfit of so many degrees of freedom is more than chance leaves."""
+    """True if a chi-square is beyond chance for its degrees of freedom."""
     return bool(left > freedom + _CHANCE * np.sqrt(2.0 * freedom))
 
 
 def _linked(link: Bools) -> list[Ints]:
-    """Connected parts of a graph of few nodes, each of which is linked to itself."""
+    """Connected components of a small graph in which each node is linked to itself."""
     out, left = [], np.ones(len(link), dtype=np.bool_)
     while any_of(left):
         part, more = link[left.argmax()], True
@@ -686,6 +644,6 @@ def _linked(link: Bools) -> list[Ints]:
 
 
 def _held(trust: Trust, s: int) -> Bools:
-    """Meters that must stay distrusted: named ones, and those other scales have evidence against."""
+    """Meters that must stay suspect: named ones, and those with evidence on other scales."""
     other = trust.still[:s].any(axis=0) | trust.still[s + 1 :].any(axis=0)
     return np.asarray(~trust.trusted & (other | (trust.named & trust.still[s])))

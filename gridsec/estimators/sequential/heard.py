@@ -1,4 +1,4 @@
-"""One frame, cleaned: what is believed of it before anybody judges it."""
+"""Measurements of one frame after plausibility checks."""
 
 from __future__ import annotations
 
@@ -17,46 +17,21 @@ from gridsec.interface import Frame
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Heard:
-    """One frame, cleaned. N customers, p meters, b phases, one on a balanced feeder.
+    """Plausible measurements of one frame. N customers, p meters, b busbar phases (1 if balanced)."""
 
-    Attributes
-    ----------
-    live : (p,)
-        Which meters have a reading.
-    y : (p,)
-        Squared voltages, 0 where there is none, pu.
-    q : (N,)
-        Reactive injections of the loads, or metered net ones where told, pu.
-    told : (N,)
-        Whose metered net reactive power is used.
-    reported : (N,)
-        Who tells one.
-    v0_squared, busbar
-        Squared busbar voltage, the last one that was where there is none now, and whether it is metered and
-        believed; in three phases (3,) each.
-    said, says : (b,)
-        What the busbar's meter reports, and where it does, believed or not.
-    """
-
-    live: Bools
-    y: Floats
-    q: Floats
-    told: Bools
-    reported: Bools
-    v0_squared: Floats | float
-    busbar: Bools | bool
-    said: Floats
-    says: Bools
+    live: Bools  # (p,) meters with a reading
+    y: Floats  # (p,) squared voltages, pu, 0 without a reading
+    q: Floats  # (N,) reactive injections of the loads; net ones where `uses_q`, pu
+    told: Bools  # (N,) metered net reactive power is used
+    reported: Bools  # (N,) net reactive power is reported
+    v0_squared: Floats | float  # squared busbar voltage, the last trusted one if need be, pu
+    busbar: Bools | bool  # busbar voltage is metered and trusted; (3,) in three phases
+    said: Floats  # (b,) reading of the busbar's meter
+    says: Bools  # (b,) the busbar's meter has a plausible reading
 
 
 def possible(design: SequentialDesign, frame: Frame) -> Frame:
-    """The frame with powers that can be, and without readings of a moment that no scale covers.
-
-    Parameters
-    ----------
-    design, frame
-        The design, and everything known at one tick.
-    """
+    """Frame with physically possible powers, and without readings at clock offsets that no scale covers."""
     far = unusable(design, frame.clock_offset)
     frame = frame if far is None else replace(frame, seen=frame.seen & ~far)
     p, p_error = _possible(frame.p, frame.p_error, design.most_p)
@@ -68,7 +43,7 @@ def possible(design: SequentialDesign, frame: Frame) -> Frame:
 
 
 def _sure(std: Floats | None, same: Bools) -> Floats | None:
-    """Standard deviations, but of powers that cannot be."""
+    """Standard deviations of unchanged powers; NaN for replaced ones."""
     return None if std is None else np.where(same, std, np.nan)
 
 
@@ -81,15 +56,7 @@ def _possible(power: Floats, error: Floats, most: Floats) -> tuple[Floats, Float
 
 
 def clean(design: SequentialDesign, state: SequentialState, frame: Frame) -> Heard:
-    """Clean one frame.
-
-    Parameters
-    ----------
-    design, state
-        The design, and the state before.
-    frame
-        From `possible`.
-    """
+    """Measurements of a frame from `plausible`."""
     plant = design.plant
     live, y = frame.seen & np.isfinite(frame.y), frame.y
     if all_of(live):
@@ -97,7 +64,7 @@ def clean(design: SequentialDesign, state: SequentialState, frame: Frame) -> Hea
     else:
         y = np.where(live, y, 0.0)
     told, q = np.zeros(frame.q.size, dtype=np.bool_), frame.q
-    # As `possible` has it: who is sure of nothing tells nothing.
+    # An error beyond every possible power makes the report worthless.
     within = (frame.q_net_error >= 0.0) & (frame.q_net_error <= design.most_q)
     reported = (np.abs(frame.q_net) <= design.most_q) & within
     if any_of(reported):
@@ -122,7 +89,7 @@ def clean(design: SequentialDesign, state: SequentialState, frame: Frame) -> Hea
 
 @cache
 def _everybody(meters: int) -> Bools:
-    """The same array whenever all report: who compares it with an earlier one need not look inside."""
+    """The same array for all ticks with every reading: identity replaces comparison."""
     out = np.ones(meters, dtype=np.bool_)
     out.flags.writeable = False
     return out
@@ -131,7 +98,7 @@ def _everybody(meters: int) -> Bools:
 def _busbar(
     design: SequentialDesign, state: SequentialState, frame: Frame
 ) -> tuple[Floats | float, Bools | bool, Floats, Bools]:
-    """The last four of `Heard`."""
+    """Last four fields of `Measurements`."""
     low, high = design.options.v2_limits
     believed = state.busbar.believed
     if design.plant.feeder.busbar_phases == 1:
@@ -139,7 +106,7 @@ def _busbar(
         there = bool(low <= v0 <= high)  # False for NaN
         metered = there and bool(believed[0])
         return v0 if metered else state.v0_squared, metered, np.array([v0]), np.array([there])
-    # One voltage for all phases says where they are, but not how far from it each.
+    # One voltage for all phases is a start value, not a reading of each.
     given = np.broadcast_to(frame.v0_squared if frame.v0_phases is None else frame.v0_phases, 3)
     within = (low <= given) & (given <= high)
     says = within & (frame.v0_phases is not None)

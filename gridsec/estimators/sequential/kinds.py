@@ -1,8 +1,7 @@
-"""What a manipulation looks like: stuck, replayed, of another time, one load's trace, drifting, constant.
+"""Kind of a manipulation: stuck, replayed, of another time, one load's trace, drifting, constant.
 
-Stuck and replaying meters are evidence of their own and come from `gridsec.estimators.sequential.repeats`.
-For meters that are named, whatever the evidence, the last readings are compared with what the *other* meters
-say, by the question that explains most first:
+Stuck and replaying meters are evidence of their own (`gridsec.estimators.sequential.repeats`). The last
+readings of named meters are compared with their predictions by the *other* meters, in this order:
 
     replay         the last readings are an earlier stretch, reading by reading
     clock shift    y(t) = v2(t - lag):  reading and reconstruction agree at another time, level included
@@ -10,7 +9,7 @@ say, by the question that explains most first:
     offset         y(t) - v2(t) is a constant, perhaps after a step
     coordinated    the offsets of several meters are those that one customer's load would leave
 
-None where nothing fits: no kind is not no attack.
+None where nothing fits: an attack without a kind is still an attack.
 
 References
 ----------
@@ -32,98 +31,64 @@ from gridsec.estimators.sequential.effects import Effects
 from gridsec.estimators.sequential.repeats import Memory, Rules
 from gridsec.interface import ManipulationKind
 
-# A named meter's readings are looked at every so many ticks, and every so many seconds where ticks are long.
 _EVERY, _EVERY_S = 16, 240.0
-# So many times more seldom they are looked for in the past.
+"""Interval of the looks at a named meter's readings: ticks, and seconds where ticks are long."""
 _SELDOM = 4
-# Surprise from which repetition of a meter that is named anyway is called stuck, or a replay.
+"""Interval of the looks at the past, in looks at the last readings."""
 _CALLED = 12.0
-# Means that the shape of a lie is judged by, and fewest ticks for it.
+"""Surprise at which repetition of a named meter is called stuck, or a replay."""
 _BINS, _SHORTEST = 32, 8
-# A drift must last this part of what is seen, and a ramp leave this part of what the best step leaves.
+"""Number of means that describe a shape, and fewest ticks for it."""
 _LASTS, _BETTER = 0.25, 0.5
-# A shape explains a lie if this part of its size is the most that is left, as a standard deviation.
+"""Least duration of a drift as a part of the data; largest remainder as a part of the best step's."""
 _LEFT = 0.5
-# The linear model of a load's trace is off by this part.
+"""Largest standard deviation of the remainder, as a part of the size."""
 _TRACE = 0.05
-# Entries of two columns this close, as a part, are equal.
+"""Relative error of the linear model of a load's trace."""
 _SAME = 1e-9
+"""Relative difference up to which entries of two columns are equal."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Traces:
-    """Change of the meters' squared voltages per customer's power: columns of 2R, then of 2X. p meters.
+    """Change of the meters' squared voltages per customer's power: columns of 2R, then of 2X. p meters."""
 
-    Attributes
-    ----------
-    effects
-        Of the feeder.
-    at : (p,)
-        Bus of each meter.
-    """
-
-    effects: Effects
-    at: Ints
+    effects: Effects  # sensitivities of the feeder
+    at: Ints  # (p,) bus of each meter
 
     def of(self, meters: Ints) -> Iterator[Floats]:
-        """All traces at some meters, (k, …) each, in parts that are small."""
+        """All traces at some meters, (k, …) each, in small parts."""
         return self.effects.at(self.at[meters])
 
     def trace(self, which: int) -> Floats:
-        """One of them, (p,)."""
+        """Trace of one power, (p,)."""
         return np.asarray(self.effects.of(np.array([which]))[self.at, 0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shapes:
-    """What lies are compared with. p meters, K traces.
+    """References of the kinds. p meters."""
 
-    Attributes
-    ----------
-    rules
-        When repetition is evidence.
-    traces
-        What each customer's power would do to the meters.
-    noise : (p,)
-        Variance of a squared reading from tick to tick, squared pu^2.
-    active, reactive : (p,)
-        What the squared voltage at a meter changes by per power of its own customer, 2 R_jj and 2 X_jj.
-    every
-        Ticks between two looks at a named meter.
-    """
-
-    rules: Rules
-    traces: Traces
-    noise: Floats
-    active: Floats
-    reactive: Floats
-    every: int
+    rules: Rules  # limits of repetition
+    traces: Traces  # effect of each customer's power at the meters
+    noise: Floats  # (p,) variance of a squared reading from tick to tick, squared pu^2
+    active: Floats  # (p,) 2 R_jj of each meter's own customer
+    reactive: Floats  # (p,) 2 X_jj likewise
+    every: int  # ticks between two looks at a named meter
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Kinds:
-    """What is remembered, and what was found. p meters.
+    """Reading history and kinds found. p meters."""
 
-    Attributes
-    ----------
-    memory
-        Past readings and reconstructions.
-    since : (p,)
-        Tick at which each named meter was named; -1 for others.
-    alone : (p,)
-        What each named meter's manipulation looks like by itself.
-    told : (p,)
-        Meters that together tell of a load that is not there.
-    """
-
-    memory: Memory
-    since: Ints
-    alone: tuple[ManipulationKind | None, ...]
-    told: Bools
+    memory: Memory  # past readings and reconstructions
+    since: Ints  # (p,) tick at which each named meter was named; -1 for others
+    alone: tuple[ManipulationKind | None, ...]  # (p,) kind of each named meter by itself
+    told: Bools  # (p,) meters that together show a load that does not exist
 
     @property
     def kinds(self) -> tuple[ManipulationKind | None, ...]:
-        """What each named meter's manipulation looks like, (p,)."""
+        """Kind of each named meter's manipulation, (p,)."""
         if not any_of(self.told):
             return self.alone
         return tuple(
@@ -133,13 +98,7 @@ class Kinds:
 
 
 def empty(meters: int) -> Kinds:
-    """Nothing seen yet.
-
-    Parameters
-    ----------
-    meters
-        p.
-    """
+    """No readings yet."""
     return Kinds(
         repeats.empty(meters),
         np.full(meters, -1, dtype=np.intp),
@@ -149,70 +108,29 @@ def empty(meters: int) -> Kinds:
 
 
 def pace(step_s: float) -> int:
-    """Ticks between two looks at a named meter.
-
-    Parameters
-    ----------
-    step_s
-        Expected time between readings, s.
-    """
+    """Ticks between two looks at a named meter."""
     return int(np.clip(_EVERY_S // step_s, 1, _EVERY))
 
 
 def listen(shapes: Shapes, before: Kinds, y: Floats, live: Bools) -> Kinds:
-    """Take readings in; `describe` has to follow before the next.
-
-    Parameters
-    ----------
-    shapes
-        What lies are compared with.
-    before
-        So far; not changed.
-    y : (p,)
-        Squared readings, pu; any finite numbers where not live.
-    live : (p,)
-        Where there is a reading.
-    """
+    """History with the readings y (p,), squared pu; `classify` has to follow before the next."""
     return Kinds(
         repeats.listen(shapes.rules, before.memory, y, live), before.since, before.alone, before.told
     )
 
 
 def repeated(kinds: Kinds) -> Ints:
-    """Ticks after which readings repeat that are evidence by themselves, whatever the others say, (p,).
-
-    Parameters
-    ----------
-    kinds
-        From `listen`.
-
-    Returns
-    -------
-    (p,)
-        1 for a stuck meter, 0 for one that does not repeat itself.
-    """
+    """Ticks after which readings repeat beyond chance, (p,): 1 for a stuck meter, 0 for none."""
     return repeats.lags(kinds.memory)
 
 
-def describe(  # noqa: PLR0917  # what each meter says, and what the others say of it
+def describe(  # noqa: PLR0917
     shapes: Shapes, heard: Kinds, model: Floats, own: Floats, named: Bools, variance: Floats
 ) -> Kinds:
-    """Say what the manipulation of every named meter looks like.
+    """Kind of the manipulation of every named meter, (p,).
 
-    Parameters
-    ----------
-    shapes
-        What lies are compared with.
-    heard
-        From `listen`.
-    model : (p,)
-        What each meter should read by what the *others* say, its fixed error included, squared pu.
-    own : (p,)
-        What each meter's own reported powers contribute to `model`, squared pu.
-    named : (p,)
-        Who is named.
-    variance : (p,)
-        Of `model`, fixed errors included, squared pu^2.
+    model, variance: (p,) prediction of each meter by the *others*, its fixed error included, squared pu, and
+    its variance. own: (p,) part of `model` by the meter's own reported powers, squared pu.
     """
     memory = repeats.keep(heard.memory, model, own)
     if not any_of(named):
@@ -242,14 +160,14 @@ def describe(  # noqa: PLR0917  # what each meter says, and what the others say 
     return Kinds(memory, since, tuple(alone), told)
 
 
-# Parts of the named meters that take turns: one look at several takes hardly longer than one at one.
 _PARTS = 4
-# Meters named at once that are looked at in the same tick; of the others as many in each of the next.
+"""Groups of named meters that take turns: a look at several takes hardly longer than at one."""
 _FIRST = 16
+"""Newly named meters with a look at the same tick; as many of the others at each of the next."""
 
 
 def _turns(since: Ints, tick: int, every: int) -> Bools:
-    """Whose turn it is to be looked at for the first time, (p,): after so many ticks everybody has been."""
+    """Meters with their first look at this tick, (p,): after `every` ticks all have had it."""
     out = np.zeros(since.size, dtype=np.bool_)
     for start in set(since[since > tick - every].tolist()):
         first = (tick - start) * _FIRST
@@ -266,15 +184,14 @@ def _nobody(meters: int) -> tuple[Ints, tuple[ManipulationKind | None, ...], Boo
 def _alone(
     shapes: Shapes, memory: Memory, meters: Ints, age: int, before: tuple[ManipulationKind | None, ...]
 ) -> Iterator[ManipulationKind | None]:
-    """What the lies of meters named at the same time look like, each by itself."""
+    """Kinds of meters named at the same time, each by itself."""
     start = max(memory.first, memory.tick - 2 * age - 4 * _BINS)
     code, model = repeats.past(memory, meters, start, memory.kept)
     lies = (code * shapes.rules.step[meters]) ** 2 - model
     found = _shapes(lies, np.sqrt(shapes.noise[meters]), age)
     moves = _moves(shapes, meters, code)
     for meter, begin, lie, looks in zip(meters.tolist(), moves.tolist(), lies.T, found, strict=True):
-        # What takes a long look to see stays true when the lie rests: a drift that has arrived, a clock in
-        # calm.
+        # A kind that needs a long look stays: a drift that has ended, a clock shift at constant voltage.
         if before[meter] in _LASTING:
             yield before[meter]
         else:
@@ -282,7 +199,7 @@ def _alone(
 
 
 def _moves(shapes: Shapes, meters: Ints, code: Floats) -> Ints:
-    """Since which of the readings (n, k) meters move that have been stuck before; 0 for others, (k,)."""
+    """First of the readings (n, k) after the last stuck stretch; 0 for others, (k,)."""
     out, surprise = np.zeros(meters.size, dtype=np.intp), shapes.rules.surprise[meters]
     for k in indices(_longest(code) * surprise >= _CALLED).tolist():
         heard = indices(np.isfinite(code[:, k]))
@@ -295,7 +212,7 @@ def _moves(shapes: Shapes, meters: Ints, code: Floats) -> Ints:
 
 
 def _longest(code: Floats) -> Ints:
-    """How often each of several meters' readings, (n, k), repeats itself in a row at most; silence does."""
+    """Longest run of equal readings in a row, (n, k); silence continues a run."""
     same = (code[1:] == code[:-1]) | np.isnan(code[1:]) | np.isnan(code[:-1])
     count = np.cumsum(same, axis=0)
     run = count - np.maximum.accumulate(np.where(same, 0, count), axis=0)
@@ -303,7 +220,7 @@ def _longest(code: Floats) -> Ints:
 
 
 def _again(shapes: Shapes, meter: int, lie: Floats, age: int) -> ManipulationKind | None:
-    """What the lie of a meter that was stuck looks like since it moves, if that is for long enough."""
+    """Kind of a formerly stuck meter since it moves, if that is long enough."""
     heard = int(np.isfinite(lie).sum())
     if heard < max(shapes.every, _SHORTEST):
         return ManipulationKind.STUCK
@@ -311,17 +228,16 @@ def _again(shapes: Shapes, meter: int, lie: Floats, age: int) -> ManipulationKin
 
 
 def _turn(shapes: Shapes, tick: int, meters: Ints) -> Bools:
-    """Which of some meters are looked at again."""
+    """Meters with a repeated look at this tick."""
     early = (tick + meters % _PARTS * -(-shapes.every // _PARTS)) % shapes.every
     return np.asarray(early == 0)
 
 
 def _backward(shapes: Shapes, tick: int, since: Ints) -> tuple[Ints, Bools]:
-    """Number of the look at each meter's past, and whose turn it is, (p,) each; `since` when each was named.
+    """Number of the look at each meter's past, and the meters with one at this tick, (p,) each.
 
-    A past is long, and each takes its own time: every meter has its own turn, or number, whenever it is
-    named. The tick of naming has the most to do: where ticks are short, what would fall on it is left to the
-    next.
+    `since`: tick of naming. A past is long, so every meter has its own tick. On short ticks a look that
+    coincides with the tick of naming is left to the next, since that tick has the most to compute.
     """
     number, early = np.divmod(tick + np.arange(since.size), shapes.every * _SELDOM)
     if shapes.every == 1:
@@ -333,12 +249,12 @@ def _backward(shapes: Shapes, tick: int, since: Ints) -> tuple[Ints, Bools]:
 _LASTING = (ManipulationKind.REPLAY, ManipulationKind.CLOCK_SHIFT, ManipulationKind.DRIFT)
 
 
-def _of_the_past(  # noqa: PLR0917  # one meter, and where to look
+def _of_the_past(  # noqa: PLR0917
     shapes: Shapes, memory: Memory, meter: int, spread: float, window: int, before: ManipulationKind | None
 ) -> ManipulationKind | None:
-    """Replay or clock shift if a meter's readings are of another time; else what it was before.
+    """Replay or clock shift if a meter's readings are of another time; else the kind before.
 
-    A clock that is off, or set wrong, never makes a meter say again what it has said: that comes first.
+    A wrong clock never repeats readings, so replay is tested first.
     """
     if before is ManipulationKind.REPLAY:
         return before
@@ -356,20 +272,12 @@ def _of_the_past(  # noqa: PLR0917  # one meter, and where to look
 
 
 def shape(lie: Floats, noise: float, age: int) -> ManipulationKind | None:
-    """Whether a lie is constant or grows.
+    """Kind of a manipulation by its shape: drift, offset or None.
 
-    A ramp from nothing to its full size that begins and ends at any two of `_BINS` moments is fitted by
-    least squares; one of no duration is a step. The ramp is a drift where it lasts, and leaves far less
-    than the best step.
-
-    Parameters
-    ----------
-    lie : (n,)
-        Readings minus reconstruction, squared pu; NaN where there is none.
-    noise
-        Its standard deviation from tick to tick, squared pu.
-    age
-        How many ticks ago the meter was named.
+    lie: (n,) readings minus reconstruction, squared pu, NaN if missing. noise: its standard deviation from
+    tick to tick. age: ticks since the meter was named. Ramps from zero to full size between any two of
+    `_BINS` moments are fitted by least squares; one of no duration is a step. A drift lasts and leaves far
+    less than the best step.
     """
     heard = lie[np.isfinite(lie)]
     if heard.size and _drifts(heard[:, None], np.array([noise]))[0]:
@@ -380,7 +288,7 @@ def shape(lie: Floats, noise: float, age: int) -> ManipulationKind | None:
 
 
 def _shapes(lies: Floats, noise: Floats, age: int) -> list[ManipulationKind | None]:
-    """`shape` of several meters' lies, (n, k)."""
+    """`shape` of several meters, (n, k)."""
     if not all_of(np.isfinite(lies)):
         return [shape(lie, std, age) for lie, std in zip(lies.T, noise.tolist(), strict=True)]
     now = lies[-(age + 2) :]
@@ -393,7 +301,7 @@ def _shapes(lies: Floats, noise: Floats, age: int) -> list[ManipulationKind | No
 
 
 def _drifts(lies: Floats, noise: Floats) -> Bools:
-    """Which lies, (n, k), grow; by means over equal parts of what was heard."""
+    """Columns of `lies` (n, k) that grow, by means over equal parts."""
     width = max(1, len(lies) // _BINS)
     count = len(lies) // width
     if count < _SHORTEST:
@@ -409,13 +317,13 @@ def _drifts(lies: Floats, noise: Floats) -> Bools:
     floor = count * noise**2 / width
     lasting = lasts[best] >= _LASTS * count
     lasting &= least + floor < _BETTER * (by_step + floor)
-    # What is left must be small against what has grown, or this is just a wild lie.
+    # The remainder must be small against the growth.
     return np.asarray(lasting & (np.sqrt(least / count) < _LEFT * np.abs(grown)))
 
 
 @cache
 def _ramps(n: int) -> tuple[Floats, Floats, Ints]:
-    """All ramps from 0 to 1 over n bins, less their means and of size 1; their sizes, and bins they last."""
+    """All ramps from 0 to 1 over n bins, centred and of norm 1; their norms, and durations in bins."""
     begin, end = np.triu_indices(n, 1)
     at = np.arange(n)
     ramps = np.clip((at - begin[:, None]) / (end - begin)[:, None], 0.0, 1.0)
@@ -425,12 +333,12 @@ def _ramps(n: int) -> tuple[Floats, Floats, Ints]:
 
 
 def _together(shapes: Shapes, memory: Memory, since: Ints, variance: Floats) -> Bools:
-    """Named meters whose lies are one load's trace."""
+    """Named meters with deviations that are one load's trace."""
     named = since >= 0
     who = indices(named)
-    if who.size < 2:  # one meter has no story to share
+    if who.size < 2:  # one meter has no common trace
         return np.zeros_like(named)
-    # From when all of them are named; evidence is a tick older than a name.
+    # Since all of them are named; evidence is one tick older than a name.
     start = max(memory.first, memory.kept - _EVERY, int(since.max()) - 1)
     code, model = repeats.past(memory, who, start, memory.kept)
     lies = (code * shapes.rules.step[who]) ** 2 - model
@@ -443,22 +351,12 @@ def _together(shapes: Shapes, memory: Memory, since: Ints, variance: Floats) -> 
 
 
 def traced(traces: Traces, who: Ints, lies: Floats, variance: Floats) -> bool:
-    """Whether several meters' lies are the trace of one customer's load, rather than anything else.
+    """True if the deviations of several meters are the trace of one customer's load.
 
-    The lies must be proportional to a column of 2R or 2X within their errors; the meters must be among
-    those that this load affects most, twice their number at most, since it is these a consistent story
-    needs; and one constant for all must fit worse by more than the number of columns explains.
-
-    Parameters
-    ----------
-    traces
-        Columns of 2R and 2X.
-    who : (k,)
-        The meters.
-    lies : (k,)
-        Readings minus reconstruction, squared pu.
-    variance : (k,)
-        Of them.
+    They must be proportional to a column of 2R or 2X within their errors; the meters must be among those that
+    the load affects most, at most twice their number; and a common constant must fit worse by more than the
+    number of columns explains. Shapes (k,): meters, readings minus reconstruction, squared pu,
+    and variance of these.
     """
     weight = 1.0 / (variance + (_TRACE * lies) ** 2)
     whole = float(weight @ lies**2)
@@ -473,10 +371,10 @@ def traced(traces: Traces, who: Ints, lies: Floats, variance: Floats) -> bool:
         return False
     fits = np.concatenate([misfit(part) for part in traces.of(who)])
     for k in indices(fits <= most).tolist():
-        # In three phases a load lowers its own phase and moves the others either way: how much counts.
+        # In three phases a load lowers its own phase and moves the others either way: the size counts.
         felt = np.abs(traces.trace(k))
         weakest = felt[who].min()
-        # Meters beyond the same branch feel it alike: only those that feel more are counted.
+        # Meters behind the same branch are affected alike: only more affected ones are counted.
         if weakest > 0.0 and np.count_nonzero(felt > weakest * (1.0 + _SAME)) <= 2 * who.size:
             return True
     return False

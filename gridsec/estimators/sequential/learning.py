@@ -37,7 +37,7 @@ _ROUNDED = 1e-9
 
 
 class LearningState(StrEnum):
-    """State of a meter's learning."""
+    """State of a meter's learning: no tick counted, some did, known, late beyond twice the expected time."""
 
     WAITING = "waiting"
     LEARNING = "learning"
@@ -47,44 +47,21 @@ class LearningState(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LearningProgress:
-    """Progress of all meters. p meters.
+    """Progress of all meters. p meters."""
 
-    Attributes
-    ----------
-    state : (p,)
-        `waiting`: no tick counted yet. `learning`: some did. `stalled`: not learned after twice `expected_s`.
-        `learned`: the fixed error is known.
-    reason : (p,)
-        Reason that took most of the time that was lost; None for learned meters and for those on schedule.
-    expected_s
-        Time that learning takes if every tick counts, s.
-    """
-
-    state: tuple[LearningState, ...]
-    reason: tuple[LearningReason | None, ...]
-    expected_s: float
+    state: tuple[LearningState, ...]  # (p,) state of each
+    reason: tuple[LearningReason | None, ...]  # (p,) reason of most lost time; None if on schedule
+    expected_s: float  # time that learning takes if every tick counts, s
 
 
 def expected_s(design: SequentialDesign) -> float:
-    """Time that learning takes if every tick counts, s.
-
-    Parameters
-    ----------
-    design
-        The design.
-    """
+    """Time that learning takes if every tick counts, s."""
     ticks = int(np.ceil(design.options.commission_s / design.step_s - _ROUNDED))
     return (1 + ticks) * design.step_s
 
 
 def progress(design: SequentialDesign, commission: Commission) -> LearningProgress:
-    """State and reason of each meter.
-
-    Parameters
-    ----------
-    design, commission
-        The design, and what is known and gathered.
-    """
+    """State and reason of each meter."""
     expected, learning = expected_s(design), commission.learning
     p = commission.learned.at.size
     if learning is None:
@@ -113,43 +90,19 @@ def _lags(design: SequentialDesign, learning: Learning) -> Bools:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tick:
-    """One frame, as learning needs it. p meters.
+    """One frame for learning. p meters."""
 
-    Attributes
-    ----------
-    frame
-        The frame.
-    live, trusted : (p,)
-        Meters with a reading, and those that are trusted after it.
-    accused
-        A customer's power or an inverter is under suspicion.
-    doubts
-        Uncertainty of its powers.
-    """
-
-    frame: Frame
-    live: Bools
-    trusted: Bools
-    accused: bool
-    doubts: Doubts
+    frame: Frame  # the frame
+    live: Bools  # (p,) meters with a reading
+    trusted: Bools  # (p,) meters trusted after it
+    accused: bool  # a customer's power or an inverter is suspect
+    doubts: Doubts  # uncertainty of its powers
 
 
 def counts(design: SequentialDesign, before: Learning, tick: Tick) -> tuple[Bools, Ints]:
-    """Meters for which a tick counts, (p,), and the reason where it brings learning no further, (p,).
+    """Meters to gather from, (p,), and the index of `REASONS`, or `COUNTED`, of each, (p,).
 
-    Parameters
-    ----------
-    design, before
-        The design, and what was gathered before the tick.
-    tick
-        The tick.
-
-    Returns
-    -------
-    use : (p,)
-        Meters to gather from.
-    why : (p,)
-        Index of `REASONS`, or `COUNTED`. A meter that has time enough and is not learned waits for others.
+    A meter that has time enough and is not learned waits for others.
     """
     use = tick.live & tick.trusted
     why = np.full(use.size, COUNTED, dtype=np.intp)

@@ -1,16 +1,13 @@
-"""Readings of the busbar's meter with a measured clock offset: of another moment than those beside them.
+"""Busbar readings with a measured clock offset, hence of another moment than the readings beside them.
 
-With a clock that is o ahead the reading at the tick t is of the moment t - o. It is left out while the
-busbar's squared voltage changed lately by more than the meter's accuracy class e allows:
+With a clock that is o ahead, the reading at tick t is of the moment t - o. It is left out while the busbar's
+squared voltage changed lately by more than the meter's accuracy class e:
 
     max over k = 1 .. K of |u(t) - u(t - k h)| > e,   K = ceil(|o| / h) + 1,
 
 h being the interval of the ticks. u is the meter's own reading, which changes first where the clock is
-behind, or the median change of the trusted meters of the phase, which changes first where it is ahead.
-
-References
-----------
-docs/theory-sequential.md, section 3.
+behind, or the median change of the trusted meters of the phase, which changes first where it is ahead
+(docs/theory-sequential.md, section 3).
 """
 
 from __future__ import annotations
@@ -31,42 +28,18 @@ _LONGEST = 64
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Moment:
-    """Readings of the last ticks, the newest last, squared pu, NaN where missing. p meters, b phases.
+    """Readings of the last k ticks, the newest last, squared pu, NaN where missing. p meters, b phases."""
 
-    Attributes
-    ----------
-    busbar : (k, b)
-        Of the busbar's meter.
-    y : (k, p)
-        Of the meters.
-    """
-
-    busbar: Floats
-    y: Floats
+    busbar: Floats  # (k, b) of the busbar's meter
+    y: Floats  # (k, p) of the meters
 
 
 def present(
     design: SequentialDesign, before: Moment | None, frame: Frame, trusted: Bools, v0_squared: Floats | float
 ) -> tuple[Moment | None, Frame]:
-    """Leave the busbar's reading out while it is of another moment.
+    """Frame without busbar phases that changed within the clock offset, and history; None if not measured.
 
-    Parameters
-    ----------
-    design, before
-        The design, and the readings of the last ticks; None after a pause.
-    frame
-        Everything known at one tick.
-    trusted : (p,)
-        Trusted meters.
-    v0_squared
-        Last squared busbar voltage that was believed, pu; in three phases (3,).
-
-    Returns
-    -------
-    Moment or None
-        None while the offset is not measured.
-    Frame
-        Without the busbar's voltage of the phases that changed.
+    trusted: (p,) meters. v0_squared: last trusted squared busbar voltage, pu; (3,) in three phases.
     """
     offset = abs(frame.busbar_offset)
     if not offset > 0.0:  # also for NaN
@@ -94,10 +67,10 @@ def present(
 
 
 def _is(phase: int, phases: int) -> Bools:
-    """The phase among those of the busbar's readings; each of them where one reading serves for all."""
+    """Phase among those of the busbar's readings; all of them where one reading serves for all."""
     return np.arange(phases) == phase if phases > 1 else np.ones(1, dtype=np.bool_)
 
 
 def _beyond(change: Floats, allowed: Floats) -> Bools:
-    """Changes beyond the class; a missing reading has no change."""
+    """Changes beyond the accuracy class; a missing reading has none."""
     return np.asarray(np.abs(np.nan_to_num(change, posinf=0.0, neginf=0.0)) > allowed)

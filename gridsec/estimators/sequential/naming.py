@@ -1,4 +1,4 @@
-"""Who is named: evidence that lasts, and no explanation about as likely that leaves them out.
+"""Confirmation: suspects are named on lasting evidence without a rival hypothesis about as likely.
 
 References
 ----------
@@ -25,29 +25,20 @@ from gridsec.estimators.sequential.state import Trust
 from gridsec.grid.network import Power
 from gridsec.interface import Explanation
 
-# An accusation of an inverter counts up with every tick that repeats it, and down with every other at which
-# somebody is heard and believed who feels it this much of what those do who feel it most.
 MOST_COUNTED, _FELT = 12, 0.25
+"""Largest count of an inverter's accusations; part of its largest effect that makes a meter its witness.
+
+The count rises at a tick that accuses it and falls at others with a trusted reading of a witness.
+"""
 
 
 def name(
     design: SequentialDesign, before: Trust, seen: Examined, live: Bools, curves: Curves
 ) -> tuple[Trust, tuple[Explanation, ...]]:
-    """Who is named now; and explanations that fit about as well where somebody would have been named.
+    """Trust state with named meters and inverters, and rival hypotheses where one prevents a name.
 
-    Parameters
-    ----------
-    design
-        The design.
-    before
-        From the last tick.
-    seen
-        What this tick brought.
-    live : (p,)
-        Which meters have a reading: silence clears nobody.
-    curves
-        What metered reactive powers said so far: an inverter that does what its curve asks for is nobody's
-        rival.
+    live: (p,) meters with a reading; silence releases none. curves: an inverter that follows its curve is not
+    a rival.
     """
     trust = seen.trust
     if trust.calm and before.calm:
@@ -57,7 +48,7 @@ def name(
         return trust, ()
     quiet = np.where(trust.still.any(axis=0), 0, trust.quiet + live)
     trusted = (trust.trusted & ~before.named) | (quiet >= design.options.release)
-    # Who is caught again within the longest scale was never cleared.
+    # A meter detected again within the longest scale keeps its age.
     age = np.where(trusted & (quiet > design.lengths[-1]), 0, trust.age + ~trusted)
     owed = np.where(trusted, 0, np.maximum(trust.owed - live, 0))
     need = design.confirmed[trust.scale]
@@ -87,15 +78,7 @@ def name(
 
 
 def supported(scales: Scales, before: Trust, seen: Examined, trust: Trust) -> Trust:
-    """Only those newly named that are beyond their limits without the meters that withhold powers.
-
-    Parameters
-    ----------
-    scales
-        The scales of this tick.
-    before, seen, trust
-        From the last tick, what this tick brought, and what `name` made of it.
-    """
+    """Trust state without new names that rest on meters that withhold powers."""
     fresh, vouched = trust.named & ~before.named, scales.doubts.vouched
     if all_of(vouched) or not any_of(fresh):
         return trust
@@ -111,7 +94,7 @@ def supported(scales: Scales, before: Trust, seen: Examined, trust: Trust) -> Tr
 
 
 def _accused(seen: Examined, meters: int) -> Bools:
-    """Whom the likeliest explanation of a scale accuses that was searched for at this very tick, (p,)."""
+    """Meters accused by the likeliest candidate of a scale that searched at this tick, (p,)."""
     out = np.zeros(meters, dtype=np.bool_)
     for found in seen.found.values():
         out |= ~found.best.trusted
@@ -121,16 +104,16 @@ def _accused(seen: Examined, meters: int) -> Bools:
 def _inverters(
     design: SequentialDesign, before: Trust, trust: Trust, seen: Examined, live: Bools
 ) -> tuple[Ints, Bools]:
-    """How long every inverter has been accused, and which are named, (m,) each.
+    """Ticks that accuse each inverter, and the named ones, (m,) each.
 
-    As with meters, only where the likeliest explanation of this very tick accuses it; silence clears none.
+    An accusation counts at ticks with a search that accuses it; silence releases none.
     """
     accused = [k for k, _ in trust.accused]
     if not accused and not any_of(before.counted):
         return before.counted, before.inverters
     now = inverters_of(design, accused)
     less = np.where(_felt(design, before.counted > 0, live & trust.trusted), -1, 0)
-    # Who was named before the monitor began anew is counted beyond that, down from there.
+    # An inverter named before a restart starts above that and counts down.
     most = np.maximum(MOST_COUNTED, before.counted + less)
     count = np.clip(before.counted + np.where(now, 1, less), 0, most)
     need, confirmed = np.full(now.size, MOST_COUNTED), design.confirmed
@@ -142,7 +125,7 @@ def _inverters(
 
 
 def _felt(design: SequentialDesign, which: Bools, heard: Bools) -> Bools:
-    """Which of some inverters move the voltage of somebody who is heard, (m,)."""
+    """Inverters that move the voltage of some available meter, (m,)."""
     if all_of(heard) or not any_of(which):
         return which
     out, at = which.copy(), indices(which)
@@ -154,48 +137,31 @@ def _felt(design: SequentialDesign, which: Bools, heard: Bools) -> Bools:
 
 
 def inverters_of(design: SequentialDesign, accused: Sequence[int]) -> Bools:
-    """Which inverters are among other suspicions, (m,).
-
-    Parameters
-    ----------
-    design
-        The design.
-    accused
-        Indices of its book.
-    """
+    """Inverters among accused faults, (m,)."""
     return _suspicions(design, accused)[design.customers : design.book.std.size]
 
 
 def powers_of(design: SequentialDesign, accused: Sequence[int]) -> Bools:
-    """Whose powers are among other suspicions, (N,).
-
-    Parameters
-    ----------
-    design
-        The design.
-    accused
-        Indices of its book.
-    """
+    """Customers with a false power among accused faults, (N,)."""
     return _suspicions(design, accused)[: design.customers]
 
 
 def _busbar_of(design: SequentialDesign, accused: Sequence[int]) -> Bools:
-    """Phases of the busbar among other suspicions, (b,)."""
+    """Busbar phases among accused faults, (b,)."""
     return _suspicions(design, accused)[design.book.std.size :]
 
 
 def _suspicions(design: SequentialDesign, accused: Sequence[int]) -> Bools:
-    """The book's powers and inverters, and phases of the busbar, (N + m + b,): which are accused."""
+    """Accused powers, inverters and busbar phases, (N + m + b,)."""
     out = np.zeros(design.book.std.size + design.hangs_on.shape[1], dtype=np.bool_)
     out[list(accused)] = True
     return out
 
 
 class _Rivals:
-    """Explanations about as likely as the best, where one leaves out somebody about to be named.
+    """Hypotheses about as likely as the best, if one leaves out a meter or inverter about to be named.
 
-    fresh, new: meters and inverters that are about to be, (p,) and (m,). agrees: inverters that none can be
-    taken for.
+    fresh, new: meters (p,) and inverters (m,) about to be named. agrees: inverters that follow their curves.
     """
 
     def __init__(self, design: SequentialDesign, fresh: Bools, new: Bools, agrees: Bools) -> None:
@@ -205,7 +171,7 @@ class _Rivals:
         self.out: dict[bytes, tuple[Bools, Bools, float, tuple[int, ...]]] = {}
 
     def collect(self, seen: Examined) -> None:
-        """Take in what every scale found that was searched."""
+        """Take the candidates of every scale that searched."""
         for s, found in seen.found.items():
             view = seen.views[s]
             if view is not None:
@@ -214,14 +180,11 @@ class _Rivals:
             self.out.clear()
 
     def ways(self) -> list[tuple[Bools, Bools]]:
-        """Meters and inverters that each of them accuses; meters that were not heard are among the former."""
+        """Meters and inverters that each accuses; meters without a reading are among the former."""
         return [(meters, inverters) for meters, inverters, *_ in self.out.values()]
 
     def explanations(self, heard: Bools) -> tuple[Explanation, ...]:
-        """All of them, the likeliest first; none where everybody is named by all.
-
-        Of meters that were not heard (p,) nothing is said.
-        """
+        """All of them, the likeliest first; meters without a reading, `heard` (p,) False, are left out."""
         design, total = self.design, sum(way[2] for way in self.out.values())
         return tuple(
             Explanation(
@@ -235,7 +198,6 @@ class _Rivals:
         )
 
     def _collect(self, found: Found, view: View) -> None:
-        """Those of one scale."""
         best, within = found.best, self.within
         near = [(~each.trusted, each.loosened, each.cost - best.cost) for each in (best, *found.others)]
         for swap in swaps(best, view.enough, within, view.limits):
@@ -254,5 +216,5 @@ class _Rivals:
                     self.out[who] = (meters, inverters, weight, loosened)
 
     def _differs(self, meters: Bools, inverters: Bools) -> bool:
-        """Whether somebody about to be named is left out."""
+        """True if a meter or inverter about to be named is left out."""
         return any_of(self.fresh & ~meters) or any_of(self.new & ~inverters)

@@ -1,27 +1,24 @@
-"""What the trusted meters say where the powers that the others tell are not believed either.
+"""Posterior in which the powers reported by suspects are doubted.
 
-Who lies about the voltage may lie about its powers: the active power of customer k, whose meter is not
-trusted, by as much as the search allows for, evenly spread, and the reactive one by half of that. Whether it
-does is as likely as not, before the trusted meters are asked. With a its column of 2R, times the standard
-deviation of a false power, what they say is a Bayes factor,
+A suspect meter may report false powers: the active power of customer k is uniformly false within the size of
+its fault, the reactive power within half of that, with prior odds of one. With a the column of 2R times the
+standard deviation of a false power, the trusted meters give the Bayes factor
 
     log B_k = (a_T^T Q m)^2 / (2 (1 + a_T^T Q a_T)) - log(1 + a_T^T Q a_T) / 2,
 
-and the variance of what is false of k's power is that of a false one times ``B_k / (1 + B_k)``: where nobody
-feels this load its power is doubted for good, where many do and find nothing odd it is believed after all.
-With U the columns of 2R and 2X of all these customers, each times its standard deviation, the prior
-covariance of `gridsec.estimators.sequential.conditional` is ``S + U U^T``, hence
+and the variance of k's false power is that of a false one times ``B_k / (1 + B_k)``. A power that no trusted
+meter feels stays doubted; one that many feel without a contradiction is used again. With U the columns of 2R
+and 2X of all these customers, each times its standard deviation, the prior covariance is ``S + U U^T``, hence
 
     C = U - S_:T Q U_T,   G = I + U_T^T Q U_T,
     w' = w + C G^-1 U_T^T Q m,   M' = M + C G^-1 C^T.
 
-At the buses of trusted meters, whose readings have variances D, ``S_TT Q = I - D Q`` leaves
-``C = D Q U_T``.
+At the buses of trusted meters, with variances D of the readings, ``S_TT Q = I - D Q`` gives ``C = D Q U_T``.
 
 References
 ----------
-Sherman, Morrison and Woodbury's identity; Mitchell and Beauchamp 1988 (spike and slab); here each customer is
-asked as if no other lied about powers, and the mixture is taken for the normal distribution of the same
+Sherman, Morrison and Woodbury's identity; Mitchell and Beauchamp 1988 (spike and slab). Each customer is
+tested as if all other powers were true, and the mixture is replaced by the normal distribution of the same
 variance. docs/theory-sequential.md, section 7.
 """
 
@@ -42,104 +39,48 @@ from gridsec.grid.network import Power
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Released:
-    """A fit in which liars' powers are not believed. n buses, p meters, l liars.
+    """Posterior with doubted powers. n buses, t trusted meters, l suspects."""
 
-    Attributes
-    ----------
-    fit
-        The fit, in which they are.
-    customers, sizes : (l,)
-        Whose powers, and by how much they may be false, pu.
-    share : (l,)
-        Part of the standard deviation of a false power that was reckoned with.
-    seen : (t, 2 l)
-        What false powers do to the trusted meters, as standard deviations; the active ones first.
-    gram : (2 l, 2 l)
-        U_T^T Q U_T of whole standard deviations.
-    C : (n, 2 l)
-        What such false powers do to every voltage beside what the meters say of it.
-    factor : (2 l, 2 l)
-        Cholesky factor of G, of the parts that were reckoned with, lower triangle.
-    variance : (n,)
-        Diagonal of M'.
-    """
-
-    fit: Fit
-    customers: Ints
-    sizes: Floats
-    share: Floats
-    seen: Floats
-    gram: Floats
-    C: Floats
-    factor: Floats
-    variance: Floats
+    fit: Fit  # posterior with all powers used
+    customers: Ints  # (l,) suspects' customers
+    sizes: Floats  # (l,) largest false active powers, pu
+    share: Floats  # (l,) used part of the standard deviation of a false power
+    seen: Floats  # (t, 2 l) effects of false powers at the trusted meters, active ones first
+    gram: Floats  # (2 l, 2 l) U_T^T Q U_T of whole standard deviations
+    C: Floats  # (n, 2 l) posterior covariance with such false powers
+    factor: Floats  # (2 l, 2 l) Cholesky factor of G for the used parts, lower triangle
+    variance: Floats  # (n,) diagonal of M'
 
     def said(self, judged: Judged) -> Floats:
-        """w', (n,).
-
-        Parameters
-        ----------
-        judged
-            What the fit says.
-        """
+        """w', (n,)."""
         both = np.tile(self.share, 2)
         along = both * (judged.weights[self.fit.trusted] @ self.seen)
         amount, _ = lapack.dpotrs(self.factor, along, lower=True)
         return np.asarray(judged.w + self.C @ (both * amount))
 
     def about(self, fit: Fit, customers: Ints, sizes: Floats) -> bool:
-        """Whether `release` would begin with the same, whatever the meters say.
-
-        Parameters
-        ----------
-        fit, customers, sizes
-            As there.
-        """
+        """True if `release` would start from the same posterior, customers and sizes."""
         same = fit is self.fit and np.array_equal(customers, self.customers)
         return same and np.array_equal(sizes, self.sizes)
 
     def holds(self, judged: Judged) -> bool:
-        """Whether the parts that were reckoned with are as good as those that the meters now ask for.
-
-        Parameters
-        ----------
-        judged
-            What the fit says.
-        """
+        """True if the used parts are close to those of the present residuals."""
         share = _share(self.seen, self.gram, judged.weights[self.fit.trusted])
         return all_of((share <= _MORE * self.share) & (share >= _LESS * self.share))
 
     def anew(self, judged: Judged) -> Released:
-        """The same with the parts that the meters ask for.
-
-        Parameters
-        ----------
-        judged
-            What the fit says.
-        """
+        """The same with the parts of the present residuals."""
         share = _share(self.seen, self.gram, judged.weights[self.fit.trusted])
         factor, variance = _parts(self.fit, self.gram, self.C, share)
         return replace(self, share=share, factor=factor, variance=variance)
 
 
-# Parts of a false power's standard deviation that are as good as one another; and the least.
 _MORE, _LESS, _LEAST = 1.25, 0.5, 0.125
+"""Range of parts that are reused, as ratios to the wanted ones, and the least part."""
 
 
 def release(effects: Effects, fit: Fit, customers: Ints, sizes: Floats, judged: Judged) -> Released:
-    """Doubt some customers' powers; O(n p l).
-
-    Parameters
-    ----------
-    effects
-        Of the feeder.
-    fit
-        The trusted meters.
-    customers, sizes : (l,)
-        Whose powers, and by how much the active ones may be false, pu.
-    judged
-        What the fit says.
-    """
+    """Doubt the powers of customers (l,) by at most `sizes` (l,), pu; O(n p l)."""
     prior, (at, inverse), std = fit.prior, fit.trusting(), sizes / np.sqrt(3.0)
     U = np.empty((prior.variance.size, 2 * sizes.size))
     U[:, : sizes.size] = effects.columns(Power.ACTIVE, customers) * std
@@ -153,7 +94,7 @@ def release(effects: Effects, fit: Fit, customers: Ints, sizes: Floats, judged: 
 
 
 def _parts(fit: Fit, gram: Floats, C: Floats, share: Floats) -> tuple[Floats, Floats]:
-    """The Cholesky factor of G and the diagonal of M' where powers are false by parts of their sizes."""
+    """Cholesky factor of G and diagonal of M' for powers false by parts of their sizes."""
     both = np.tile(share, 2)
     G = gram * np.multiply.outer(both, both)
     G[np.diag_indices(both.size)] += 1.0
@@ -170,7 +111,7 @@ def _parts(fit: Fit, gram: Floats, C: Floats, share: Floats) -> tuple[Floats, Fl
 
 
 def _conditioned(fit: Fit, U: Floats, known: Floats) -> None:
-    """Put C in the place of U, some rows at a time: they are large where many lie."""
+    """Replace U by C in place, in blocks of rows."""
     prior, at = fit.prior, indices(fit.trusted)
     buses, left = prior.meters[at], np.ones(len(U), dtype=np.bool_)
     left[buses] = False
@@ -181,8 +122,8 @@ def _conditioned(fit: Fit, U: Floats, known: Floats) -> None:
     U[buses] = fit.noise[at, None] * known
 
 
-# Rows that are worked on together.
 _ROWS = 256
+"""Rows of one block of a product."""
 
 
 def _share(seen: Floats, gram: Floats, weights: Floats) -> Floats:

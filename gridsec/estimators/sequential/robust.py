@@ -1,16 +1,12 @@
-"""A start for the search that owes nothing to whom it believed before: a robust fit.
+"""Robust start of a search, independent of the meters trusted before.
 
-With the readings m of the meters, their variances d, and the prior covariance S of
-`gridsec.estimators.sequential.conditional`:
+With the readings m, their variances d and the prior covariance S,
 
     minimise   w^T S^-1 w + sum_j min((m_j - w_j)^2, bound_j^2) / d_j
 
-by graduated non-convexity, which first fits with a convex cost and hardens it step by step: every round is a
-fit with weights, in which the variance of meter j is d_j / weight_j. What such a fit leaves of the readings,
-``r = m - w_hat``, is ``D W^-1 (S + D W^-1)^-1 m`` for weights above zero.
-
-Where the inverse covariance Q of all meters is known already, the meters K of smaller weights are all that is
-worked on. With a = Q m,
+by graduated non-convexity, from a convex cost to the truncated one. Every round conditions with the variance
+d_j / weight_j of meter j; its residual ``r = m - w_hat`` is ``D W^-1 (S + D W^-1)^-1 m`` for positive
+weights. With the precision Q of all meters and a = Q m, only the meters K of weights below one are solved:
 
     r = D (a - Q_:K z) + E_K z,   z = (diag(weight / (d (1 - weight)))_K + Q_KK)^-1 a_K,
 
@@ -33,35 +29,22 @@ from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, indices, submatr
 from gridsec.estimators.sequential.conditional import Fit, Prior, solved
 
 _HARDER = 2.5
+"""Factor on the hardness of the cost from round to round."""
 _ROUNDS = 30
-# Weights up to this are zero to the fit; well above where Cholesky would notice.
+"""Largest number of rounds."""
 _FEATHER = 1e-6
+"""Weights up to this count as zero, well above the rounding of Cholesky."""
 _TINY = float(np.finfo(np.float64).tiny)
 
 
-def robust(  # noqa: PLR0917  # a prior, readings, and what is known of them
+def robust(  # noqa: PLR0917
     prior: Prior, noise: Floats, m: Floats, live: Bools, bound: Floats, whole: Fit | None = None
 ) -> Bools:
-    """Meters that a robust fit trusts, whatever was trusted before; O(p^3).
+    """Trusted meters of a robust fit, (p,); O(p^3).
 
-    Parameters
-    ----------
-    prior, noise
-        As in `conditional.fit`.
-    m : (p,)
-        Readings minus what the model explains.
-    live : (p,)
-        Which meters have a reading.
-    bound : (p,)
-        Largest honest difference between a reading and the truth, squared pu.
-    whole
-        A fit of the same that `covers` these meters, if there is one: the cube is then that of the number of
-        those which are not fully believed.
-
-    Returns
-    -------
-    (p,)
-        The trusted ones.
+    live: (p,) meters with a reading. bound: (p,) largest honest difference between reading and truth, squared
+    pu. whole: a posterior that `covers` these meters, if there is one; the cube is then that of the number of
+    meters with weights below one.
     """
     at = indices(live)
     trusted = np.zeros(m.size, dtype=np.bool_)
@@ -89,16 +72,8 @@ def robust(  # noqa: PLR0917  # a prior, readings, and what is known of them
 
 
 def covers(whole: Fit, prior: Prior, noise: Floats, live: Bools) -> bool:
-    """Whether a fit tells the residuals of some meters, whatever their weights.
-
-    Parameters
-    ----------
-    whole
-        The fit.
-    prior, noise, live
-        As in `robust`.
-    """
-    # Changes of rank one leave rounding, which a start that owes nothing to what was believed must not owe.
+    """True if a posterior gives the residuals of meters `live` (p,) for all weights."""
+    # A start must not depend on the rounding of earlier rank-one updates.
     fresh = not whole.changes and not whole.loose.shape[1]
     same = fresh and whole.prior is prior and np.array_equal(whole.noise, noise)
     return same and not any_of(live & ~whole.trusted)
@@ -122,7 +97,7 @@ def _residual(signal: Floats, noise: Floats, y: Floats, weight: Floats) -> Float
 
 
 def _beside(whole: Fit, m: Floats, at: Ints) -> Callable[[Floats], Floats]:
-    """The same of meters `at` by their weights, from a fit of all of them and perhaps of others."""
+    """`_residual` of meters `at` by their weights, from a posterior of all of them and perhaps of others."""
     who, Q = whole.trusting()
     noise, a = whole.noise[who], Q @ m[who]
     place = np.searchsorted(who, at)

@@ -1,8 +1,6 @@
-"""What every scale judges by: its means and limits, the view of a fit, and fits made from one another.
+"""Tests of each scale: means and limits, views of a posterior, and cheap updates of posteriors.
 
-References
-----------
-docs/theory-sequential.md, section 3.
+The window of a scale needs a minimum of readings to test a meter (docs/theory-sequential.md, section 3).
 """
 
 from __future__ import annotations
@@ -28,98 +26,50 @@ from gridsec.estimators.sequential.windows import Window
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """What one scale says. p meters.
+    """Tests of all meters on one scale. p meters."""
 
-    Attributes
-    ----------
-    judged
-        Every meter, judged by the trusted others.
-    enough : (p,)
-        Meters with enough readings on this scale.
-    limit : (p,)
-        Largest honest offset, squared pu.
-    over : (p,)
-        Whose offset is larger.
-    limits, lower
-        How the limits come about, and the part of `sigmas` that is expected of a meter that is to be
-        trusted again.
-    """
-
-    judged: Judged
-    enough: Bools
-    limit: Floats
-    over: Bools
-    limits: Limits
-    lower: float
+    judged: Judged  # leave-one-out residuals
+    enough: Bools  # (p,) meters with enough readings on this scale
+    limit: Floats  # (p,) largest honest residual, squared pu
+    over: Bools  # (p,) residual above the limit
+    limits: Limits  # rule of the limits
+    lower: float  # factor on `sigmas` of the release limit
 
     @property
     def still(self) -> Bools:
-        """Whose offset is larger than what is expected of a meter that is to be trusted again, (p,)."""
+        """Residual above the release limit, (p,)."""
         judged = self.judged
         return self.enough & (np.abs(judged.offset) > self.limits.of(judged.std, self.lower))
 
 
-# A fit is made anew when that part of its meters changed, or after so many changes (rounding).
 _ANEW = 6
-# Unless all that changed is that some fell, no more than that part of all meters, since a factorisation.
+"""A posterior is factorised again when more than one in `_ANEW` of its meters changed."""
 _WHOLE = 3
+"""Fewer than one in `_WHOLE` meters leave a fresh posterior by one block update instead."""
 _MOST_CHANGES = 400
+"""Largest number of rank-one updates since a factorisation (rounding)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scale:
-    """What one scale has to judge by. p meters.
+    """Data and limits of one scale. p meters."""
 
-    Attributes
-    ----------
-    prior
-        What the powers may do.
-    noise : (p,)
-        Variance of each meter's mean, squared pu^2.
-    m : (p,)
-        Mean residual, squared pu.
-    enough : (p,)
-        Meters with enough readings.
-    limits
-        What is evidence.
-    """
-
-    prior: Prior
-    noise: Floats
-    m: Floats
-    enough: Bools
-    limits: Limits
+    prior: Prior  # prior of the voltages
+    noise: Floats  # (p,) variance of each meter's mean, squared pu^2
+    m: Floats  # (p,) mean residual, squared pu
+    enough: Bools  # (p,) meters with enough readings
+    limits: Limits  # rule of the limits
 
 
 def needed(design: SequentialDesign, s: int) -> int:
-    """Readings of a meter that a scale judges it by at least.
-
-    Parameters
-    ----------
-    design
-        The design.
-    s
-        The scale.
-    """
+    """Least number of readings of a meter that scale s tests."""
     return max(1, ceil(design.options.enough * design.lengths[s]))
 
 
 class Scales:
-    """All scales at one tick, by index.
+    """All scales of one tick, computed on access. model: (p,) largest model error, squared pu."""
 
-    Parameters
-    ----------
-    design
-        The design.
-    doubts, window, learned
-        What is not known of powers, the last residuals, and what is known of the meters' errors.
-    model : (p,)
-        What the model may be off, squared pu.
-    skew
-        Changes of the voltages within clock offsets; None for none.
-    """
-
-    def __init__(  # noqa: PLR0917  # what every scale is made of
+    def __init__(  # noqa: PLR0917
         self,
         design: SequentialDesign,
         doubts: Doubts,
@@ -133,7 +83,7 @@ class Scales:
 
     @cached_property
     def book(self) -> Dictionary:
-        """What else but meters can be wrong now."""
+        """Fault dictionary with the sizes of this tick."""
         return replace(self.design.book, std=self.doubts.sizes)
 
     def __getitem__(self, s: int) -> Scale:
@@ -159,58 +109,28 @@ class Scales:
         )
 
     def loosened(self, accused: tuple[tuple[int, int], ...]) -> Floats | None:
-        """Loosened directions with their standard deviations, (n, k); None for none.
-
-        Parameters
-        ----------
-        accused
-            Indices of the book, each with a scale.
-        """
+        """Unknown directions of accused faults times their standard deviations, (n, k); None for none."""
         if not accused:
             return None
         which = np.array([k for k, _ in accused])
         return np.asarray(self.book.columns(which) * self.book.std[which])
 
     def wider(self, direction: Floats) -> Scales:
-        """The same with priors that leave one more direction open.
-
-        Parameters
-        ----------
-        direction : (n,)
-            As in `Prior.wider`.
-        """
+        """Scales with one more unknown direction (n,) in their priors."""
         each = {id(prior): prior.wider(direction) for prior in self.doubts.priors}
         doubts = replace(self.doubts, priors=tuple(each[id(prior)] for prior in self.doubts.priors))
         return Scales(self.design, doubts, self.window, self.learned, self.model, self.skew)
 
 
 def view_of(design: SequentialDesign, here: Scale, judged: Judged) -> View:
-    """What a scale says of every meter when it rests on a fit.
-
-    Parameters
-    ----------
-    design, here, judged
-        The design, the scale, and every meter judged by the fit.
-    """
+    """View of a scale from the leave-one-out residuals of a posterior."""
     limit = here.limits.of(judged.std)
     over = here.enough & (np.abs(judged.offset) > limit)
     return View(judged, here.enough, limit, over, here.limits, design.options.lower)
 
 
 def adapt(before: Fit | None, here: Scale, wanted: Bools, loose: Floats | None) -> Fit:
-    """A fit of the wanted meters, from the last one where that is cheaper.
-
-    Parameters
-    ----------
-    before
-        The last fit of this scale.
-    here
-        The scale.
-    wanted : (p,)
-        The meters to rest on.
-    loose : (n, k)
-        Loosened directions.
-    """
+    """Posterior of wanted meters (p,) with unknown directions (n, k), from the last one where cheaper."""
     prior, noise = here.prior, here.noise
     if before is None or before.prior is not prior:
         return fit(prior, noise, wanted, loose)
@@ -233,19 +153,7 @@ def adapt(before: Fit | None, here: Scale, wanted: Bools, loose: Floats | None) 
 
 
 def believe(trust: Trust, trusted: Bools, s: int, accused: tuple[tuple[int, int], ...]) -> Trust:
-    """Whom an explanation leaves trusted.
-
-    Parameters
-    ----------
-    trust
-        Who was believed.
-    trusted : (p,)
-        Who is.
-    s
-        The scale that it was found on.
-    accused
-        What else is suspected, each with a scale.
-    """
+    """Trust state after a search on scale s: `trusted` (p,) meters, and accused faults with their scales."""
     fallen = trust.trusted & ~trusted
     scale, quiet = np.where(fallen, s, trust.scale), np.where(fallen, 0, trust.quiet)
     return replace(trust, trusted=trusted, scale=scale, quiet=quiet, accused=accused)

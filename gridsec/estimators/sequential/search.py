@@ -1,20 +1,20 @@
-"""Which meters lie: the likeliest set, without swamping honest meters or masking liars.
+"""Search for the likeliest set of manipulated meters, without swamping honest or masking manipulated ones.
 
-An explanation drops some meters and loosens some directions (a customer's powers, an inverter). Its cost is
+A hypothesis removes some meters and accuses some directions of the fault dictionary. Its cost is
 
-    J = m_T^T Q m_T + 2 ln binom(p, k) + what the loosened directions are charged
+    J = m_T^T Q m_T + 2 ln binom(p, k) + charges of the directions,
 
-which is, up to a constant, minus twice the logarithm of its posterior probability when every number k of
-liars is as likely as any other, and every set of k as any other of k. Many accusations at once are thus
-cheaper, each, than a single one: where a third of the meters lies, the next liar is no surprise.
+up to a constant minus twice the logarithm of its posterior probability, if every number k of manipulated
+meters is equally likely, and every set of k among those of k. Each of many accusations is thus cheaper than a
+single one.
 
-Dropping trusted meter j lowers the misfit by ``offset_j^2 / std_j^2`` exactly, loosening direction a by
-``(a^T Q m)^2 / (1 / std_a^2 + a^T Q a)``; admitting a meter raises it likewise. So steepest descent needs no
-refitting. It drops and admits where an offset is beyond, or back within, what chance explains.
+Removing trusted meter j lowers the chi-square by ``residual_j^2 / std_j^2``, an unknown amplitude of
+direction a by ``(a^T Q m)^2 / (1 / std_a^2 + a^T Q a)``; adding a meter raises it likewise. Steepest descent
+therefore needs no refitting. It removes and adds meters with residuals beyond, or back within, the limits.
 
-Descent alone swamps when many lie in the same way: their neighbours look wrong. So there are two starts:
-the set that was trusted before, and a robust one (`gridsec.estimators.sequential.robust`). The cheaper
-explanation wins.
+Descent alone swamps where many meters are off alike: their neighbours look wrong. It therefore starts from
+the set trusted before and from a robust one (`gridsec.estimators.sequential.robust`); the cheaper hypothesis
+wins.
 
 References
 ----------
@@ -37,7 +37,7 @@ from gridsec.estimators.sequential.dictionary import Dictionary, Powers, Step
 
 
 class Recent:
-    """The last answer of `Limits.of`: in calm the same is asked at every tick."""
+    """Last result of `Limits.limit`, which repeats while no meter is suspect."""
 
     __slots__ = ("answer",)
 
@@ -47,48 +47,25 @@ class Recent:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Limits:
-    """What is evidence. p meters.
+    """Rule of the limits of honest residuals. p meters."""
 
-    Attributes
-    ----------
-    sigmas
-        Standard deviations beyond which an offset is none of chance.
-    model : (p,)
-        What the model's own error may add, squared pu.
-    allowed : (p,)
-        Offsets that are honest whatever their probability, the accuracy class, squared pu.
-    certain : (p,)
-        Variance within the meters' noise that `allowed` stands for.
-    most
-        How many liars can be told apart; None: however many.
-    late : (p,)
-        Variance of offsets beside that by which they are judged, squared pu^2; None for none.
-    recent
-        The last answer where `allowed`, `certain` and `late` were these very ones; None where none is kept.
-    """
-
-    sigmas: float
-    model: Floats
-    allowed: Floats
-    certain: Floats
-    most: int | None = None
-    late: Floats | None = None
-    recent: Recent | None = None
+    sigmas: float  # standard deviations within chance
+    model: Floats  # (p,) largest error of the model, squared pu
+    allowed: Floats  # (p,) honest offset of any probability, the accuracy class, squared pu
+    certain: Floats  # (p,) variance within the meters' noise that `allowed` replaces
+    most: int | None = None  # largest number of manipulated meters told apart; None for no limit
+    late: Floats | None = None  # (p,) additional variance of the residuals, squared pu^2; None for none
+    recent: Recent | None = None  # last result for these `allowed`, `certain` and `late`
 
     @property
     def penalty(self) -> float:
-        """What dropping a meter must gain at least."""
+        """Least gain of removing a meter."""
         return self.sigmas**2
 
     def of(self, std: Floats, part: float = 1.0) -> Floats:
-        """Largest honest offset: by chance alone, or by the class and chance for the rest; the smaller.
+        """Largest honest residual for its standard deviation (p,): by chance, or by class and chance.
 
-        Parameters
-        ----------
-        std : (p,)
-            Standard deviation of each offset.
-        part
-            Of `sigmas`, how many count.
+        part: used part of `sigmas`.
         """
         sigmas, recent = part * self.sigmas, self.recent
         last = None if recent is None else recent.answer
@@ -105,92 +82,52 @@ class Limits:
         return np.asarray(np.minimum(sigmas * std, self.allowed + sigmas * rest))
 
     def some(self, at: Ints) -> Limits:
-        """The same of some meters.
-
-        Parameters
-        ----------
-        at : (k,)
-            Which.
-        """
+        """The same for meters `at` (k,)."""
         late = None if self.late is None else self.late[at]
         return Limits(self.sigmas, self.model[at], self.allowed[at], self.certain[at], self.most, late)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Explanation:
-    """What a search came to. p meters.
+    """Hypothesis of a search. p meters."""
 
-    Attributes
-    ----------
-    trusted : (p,)
-        The meters that it does not accuse.
-    loosened
-        What else it accuses, indices into the dictionary.
-    charge
-        What that costs.
-    cost
-        J.
-    """
-
-    trusted: Bools
-    loosened: tuple[int, ...]
-    charge: float
-    cost: float
+    trusted: Bools  # (p,) meters that it does not accuse
+    loosened: tuple[int, ...]  # accused directions, indices of the fault dictionary
+    charge: float  # cost of these
+    cost: float  # J
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution(Explanation):
-    """An explanation with all that follows from it.
+    """Hypothesis with its posterior."""
 
-    Attributes
-    ----------
-    fit
-        The trusted meters.
-    judged
-        Every meter, judged by them.
-    """
-
-    fit: Fit
-    judged: Judged
+    fit: Fit  # posterior of the trusted meters
+    judged: Judged  # leave-one-out residuals
 
     def bare(self) -> Explanation:
-        """The explanation alone: fits are large."""
+        """The hypothesis without its posterior, which is large."""
         return Explanation(self.trusted, self.loosened, self.charge, self.cost)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """What several searches came to.
+    """Results of several searches."""
 
-    Attributes
-    ----------
-    best
-        The likeliest.
-    others
-        The rest, in no order.
-    """
-
-    best: Solution
-    others: tuple[Explanation, ...] = ()
+    best: Solution  # the likeliest
+    others: tuple[Explanation, ...] = ()  # the rest, in no order
 
 
 def likelier(one: Found | None, other: Found) -> Found:
-    """Both together.
-
-    Parameters
-    ----------
-    one, other
-        The first one's best is kept where both are equally likely.
-    """
+    """Union of the results; the first best one stays where both are equally likely."""
     if one is None:
         return other
     first, second = (other, one) if other.best.cost < one.best.cost else (one, other)
     return Found(first.best, (*first.others, second.best.bare(), *second.others))
 
 
-# No meters.
 NOBODY = frozen_ints(np.zeros(0, dtype=np.intp))
 _MOVES_PER_METER = 4
+"""Largest number of moves of a descent per meter."""
 
 
 def descend(
@@ -206,31 +143,12 @@ def descend(
     fresh: bool = False,
     judged: Judged | None = None,
 ) -> Solution:
-    """Drop, admit and loosen until no move makes the explanation better.
+    """Remove, add and accuse until no move lowers the cost.
 
-    Parameters
-    ----------
-    start
-        Where to begin; not changed unless `fresh`, and the fit of the solution where it needs no change.
-    m : (p,)
-        Readings minus what the model explains, squared pu.
-    live : (p,)
-        Which meters have a reading.
-    limits
-        What is evidence.
-    keep : (p,)
-        Meters that must not be admitted.
-    dictionary
-        Directions that may be loosened; none by default.
-    innocent : (k,)
-        Meters that must be believed.
-    pairs
-        Whether two meters may be dropped at once. Two that tell the same story vouch for each other, so that
-        dropping either of them gains little; O(p^2) per move.
-    fresh
-        `start` is of no further use.
-    judged
-        Every meter judged by `start`, where that is known.
+    start: changed in place only if `fresh`; the posterior of the result where no move helps. live: (p,)
+    meters with a reading. keep: (p,) meters that are not added. innocent: (k,) meters that stay trusted.
+    judged: the residuals of `start` if known. pairs: remove two meters at once as well, O(p^2) per move; two
+    meters of equal error support each other, and removing either gains little.
     """
     now, changed = start if fresh else start.copy(), start.changes
     barred = ~live | keep
@@ -254,11 +172,11 @@ def descend(
             judged = judge(now, m) if move is None else follow(now, m, judged, move)
         moves += now.changes - changed - 1 if anew else 0
     if not fresh and now.changes == start.changes:
-        now = start  # and what is kept with it
+        now = start  # with its cached values
     else:
         now.shrink()
     if now.changes > before and not anew:
-        judged = judge(now, m)  # without what rounding has left
+        judged = judge(now, m)  # without accumulated rounding
     dropped = int(np.count_nonzero(live & ~now.trusted))
     loosened = () if powers is None else powers.loosened
     size = int(np.count_nonzero(live))
@@ -272,27 +190,19 @@ def descend(
 
 @cache
 def price(meters: int, liars: int, most: int | None = None) -> float:
-    """What accusing so many of so many meters costs: `2 ln binom(meters, liars)`, but always rising.
-
-    Parameters
-    ----------
-    meters, liars
-        p and k.
-    most
-        How many lie at most, if that is supposed: whoever else is accused costs far more.
-    """
+    """Cost of k accusations among p meters: `2 ln binom(p, k)`, always rising, steeply beyond `most`."""
     k = np.arange(liars)
     least = np.where(k < (meters if most is None else most), _LEAST, _BEYOND)
     return float(np.sum(np.maximum(2.0 * np.log((meters - k) / (k + 1.0)), least)))
 
 
-# Beyond half of the meters, each further accusation still costs this; beyond those that lie at most, this.
 _LEAST, _BEYOND = 1.0, 9.0
+"""Least cost of an accusation beyond half of the meters, and of one beyond the largest number told apart."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Place:
-    """Where a descent stands."""
+    """Position of a descent."""
 
     fit: Fit
     judged: Judged
@@ -305,7 +215,7 @@ class _Place:
 
 
 def _best(here: _Place) -> Sequence[Callable[[], Move | None]]:
-    """The next move in steps; none where none helps. A step that is no single change returns None."""
+    """Steps of the next move; none if none helps. A step that is not a rank-one update returns None."""
     now, judged, powers = here.fit, here.judged, here.powers
     excess = np.abs(judged.offset) / here.limits.of(judged.std)
     inside = np.where(now.trusted, excess, -np.inf)
@@ -336,17 +246,16 @@ def _best(here: _Place) -> Sequence[Callable[[], Move | None]]:
     return [lambda: _moved(admit(now, nearest), powers)]
 
 
-# From so many on that might be admitted, or dropped, it is faster to follow them beside each other, unless so
-# many times more are asked; and at most so many at once, or there would be large matrices of large feeders.
 _MANY, _ASKED, _AT_ONCE = 6, 8, 64
+"""Block moves: least candidates, least share of the examined meters (1 / `_ASKED`), and largest block."""
 
 
 def _admit_many(here: _Place, at: Ints, first: int) -> Move | None:
-    """Admit one after the other as long as the nearest is close enough and nobody is to be dropped.
+    """Add meters one after the other while the nearest is within its limit and no trusted one is beyond.
 
-    What is open of those outside is followed alone; whether anybody inside would have had to be dropped is
-    then asked for all moves at once, and the moves from there on are taken back. `first` alone is admitted
-    where rounding has it that nobody is.
+    Only the covariance of the excluded meters is followed. The trusted ones are tested for all moves at once,
+    and the moves after the first violation are taken back. Where rounding leaves no move, `first` alone is
+    added.
     """
     now, judged = here.fit, here.judged
     outside = Outside.of(now, at)
@@ -360,7 +269,7 @@ def _admit_many(here: _Place, at: Ints, first: int) -> Move | None:
     weights = judged.weights + np.cumsum(changes * error[:, None], axis=0)[:-1]
     inside = pivot > 0.0
     pivot = np.where(inside, pivot, 1.0)
-    # Not to be remembered: it is asked for once.
+    # Not kept: it is used once.
     limit = replace(here.limits, recent=None).of(np.sqrt(1.0 / pivot))
     beyond = inside & (np.abs(weights) > pivot * limit)
     beyond[:, here.innocent] = False
@@ -370,13 +279,10 @@ def _admit_many(here: _Place, at: Ints, first: int) -> Move | None:
 
 
 def _nearest(apart: Floats, offset: Floats, limits: Limits) -> Ints:
-    """The order in which meters outside are admitted, each time the one that is closest, places, (r,).
-
-    `apart` (k, k): what the trusted leave open of their readings.
-    """
+    """Order in which excluded meters are added, the closest first, places, (r,); `apart`: (k, k)."""
     order: list[int] = []
     open_, done = apart.diagonal().copy(), np.zeros(offset.size)
-    # Rows of the Cholesky factor, as far as it is known.
+    # Rows of the Cholesky factor so far.
     rows = np.empty((min(offset.size, _AT_ONCE), offset.size))
     for k in range(len(rows)):
         excess = np.abs(offset) / limits.of(np.sqrt(open_)) + done
@@ -394,9 +300,9 @@ def _nearest(apart: Floats, offset: Floats, limits: Limits) -> Ints:
 
 
 def _drop_many(here: _Place, first: int) -> Move | None:
-    """Drop one after the other as long as the worst is beyond chance; only what they leave is followed.
+    """Remove meters one after the other while the worst is beyond its limit; only precision is followed.
 
-    `first` alone where rounding has it that nobody is.
+    Where rounding leaves no move, `first` alone is removed.
     """
     now, (at, Q) = here.fit, here.fit.trusting()
     limits, weights = here.limits.some(at), here.judged.weights[at]
@@ -424,14 +330,14 @@ def _drop_many(here: _Place, first: int) -> Move | None:
     return None
 
 
-# Pairs are looked for among so many meters, those that dropping alone gains most for.
 _PAIRED = 256
+"""Meters among which pairs are searched, those of the largest single gains."""
 
 
 def _pair(here: _Place, than: float) -> tuple[tuple[int, ...], float]:
-    """Two meters that it pays to drop together, and what that gains; none unless more than `than`.
+    """Two meters to be removed together and their gain; none unless the gain is above `than`.
 
-    With b = Q m and G = Q of the two, ``b^T G^-1 b``; their offsets judged by all others are ``G^-1 b``.
+    With b = Q m and G = Q of the two the gain is ``b^T G^-1 b``; their residuals without both are ``G^-1 b``.
     """
     now, weights = here.fit, here.judged.weights
     free = now.trusted.copy()

@@ -1,28 +1,25 @@
-"""Who lies, from one set of readings alone: the likeliest explanation, and those about as likely.
+"""Manipulated meters from one set of readings: the likeliest hypothesis, and those about as likely.
 
-No time, nothing that was believed before. The error of a liar's reading has the standard deviation A, far
-beyond an honest meter's. A customer whose meter lies may report false powers too, which moves the squared
-voltages along the columns of ``B_c = std_c [2 R_:c, 2 X_:c]``. With the liars L and, of those, F whose
-powers are false too,
+No time, no earlier trust. The error of a manipulated reading has the standard deviation A, far beyond an
+honest meter's. Its customer may report false powers too, which move the squared voltages along the columns of
+``B_c = std_c [2 R_:c, 2 X_:c]``. With the manipulated meters L and, of those, F with false powers,
 
     K = S + diag(d) + A^2 sum_{j in L} e_j e_j^T + sum_{c in F} B_c B_c^T
-    J = m^T K^-1 m + ln det K + price(|L|) + false |F| + anybody [L not empty]
+    J = m^T K^-1 m + ln det K + price(|L|) + false |F| + first [L not empty]
 
-is minus twice the logarithm of an explanation's probability. ``ln det K`` charges an accusation for the
-freedom that it gives: what one meter costs follows from A and from how well the others know its voltage.
-What *all* single accusations change follows from ``Q = K^-1`` and ``g = Q m``:
-`gridsec.estimators.sequential.rises`.
+is minus twice the logarithm of a hypothesis's probability. ``ln det K`` charges an accusation for its
+freedom, which follows from A and the precision of the meter's prediction. The change of J by *all* single
+accusations follows from ``Q = K^-1`` and ``g = Q m``: `gridsec.estimators.sequential.rises`.
 
-The price is that of sets whose members each lie with a probability that is Beta(a, b) distributed: the k-th
-liar costs ``2 ln((p - k + b) / (k - 1 + a)) + each``, less the more there are already. Up to eight liars
-whose lies are alike have fewer freedoms, and independent ones cost more:
-`gridsec.estimators.sequential.alike`.
+The price is that of sets with members manipulated at a Beta(a, b) distributed probability: the k-th costs
+``2 ln((p - k + b) / (k - 1 + a)) + each``, less the more there are already. Up to eight errors that are alike
+have fewer freedoms, and independent ones cost more: `gridsec.estimators.sequential.alike`.
 
-`anybody` is what makes a false alarm as rare as asked for. Nobody is named unless accusing one meter lowers
-J, and with it that takes a leave-one-out residual beyond the ``1 - r / (2 p)`` quantile of the normal
-distribution; or unless a meter together with its customer's powers explains more than the ``1 - r' / p``
-quantile of chi-square with three degrees of freedom. ``r + r'`` is `rate`, an upper bound: where freedom and
-price alone cost more, `anybody` is zero and fewer are named. Once one is accused, others lie more probably.
+`first` sets the false-alarm rate. No meter is accused unless accusing one lowers J, which takes a
+leave-one-out residual beyond the ``1 - r / (2 p)`` quantile of the normal distribution; or unless a meter
+with its customer's powers explains more than the ``1 - r' / p`` quantile of chi-square with three degrees of
+freedom. ``r + r'`` is `rate`, an upper bound: where freedom and price alone cost more, `first` is zero and
+fewer are accused. Once one is accused, further ones are likelier.
 
 References
 ----------
@@ -44,44 +41,30 @@ from gridsec.estimators.sequential.rises import Curved, FalsePowers, Lies, Probl
 
 __all__ = ["Curved", "Explained", "FalsePowers", "Lies", "identify"]
 
-# Rises of J below this are rounding.
 _LEAST = 1e-9
-# A fit this many standard deviations above its expectation leaves something unexplained.
+"""Change of J within rounding."""
 _MISFIT = 3.0
+"""Standard deviations of the chi-square above its expectation that leave something unexplained."""
 _MOVES = 4
-# So many customers, those whose meters are most suspicious, are where a search with false powers may begin.
+"""Largest number of moves of a descent per meter."""
 _STARTS = 8
-# After so many starts, the rest only where the best explanation is implausible: many accused, or a bad fit.
+"""Customers of the most suspicious meters, at which a search with false powers may start."""
 _BEGUN = 2
+"""Starts before the rest depends on an implausible best hypothesis: many accused, or a bad fit."""
 _MANY = 0.25
+"""Part of the meters that counts as many."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Explained:
-    """One explanation. p meters.
+    """One hypothesis. p meters."""
 
-    Attributes
-    ----------
-    liars : (p,)
-        Whose readings are manipulated.
-    powers : (p,)
-        Whose powers are false as well.
-    probability
-        Among all that are reported.
-    cost
-        J.
-    weights : (p,)
-        ``K^-1 m``; what the readings say about any voltage is its covariance with them times this.
-    lies : (p,)
-        What each liar's reading is expected to be off by, squared pu; 0 elsewhere.
-    """
-
-    liars: Bools
-    powers: Bools
-    probability: float
-    cost: float
-    weights: Floats
-    lies: Floats
+    liars: Bools  # (p,) manipulated readings
+    powers: Bools  # (p,) false powers as well
+    probability: float  # among all that are reported
+    cost: float  # J
+    weights: Floats  # (p,) ``K^-1 m``; covariance with the readings times this predicts any voltage
+    lies: Floats  # (p,) expected error of each manipulated reading, squared pu; 0 elsewhere
 
 
 def identify(
@@ -94,32 +77,13 @@ def identify(
     false: FalsePowers | None = None,
     curved: Curved | None = None,
 ) -> tuple[Explained, ...]:
-    """The likeliest explanations of one set of readings.
+    """Likeliest hypotheses of one set of readings, the best first; there is always one.
 
-    Parameters
-    ----------
-    prior
-        What is known without meters.
-    noise : (p,)
-        Variance of each meter's reading, > 0.
-    m : (p,)
-        Readings minus what the model explains, squared pu; any finite value where there is none.
-    live : (p,)
-        Which meters have a reading.
-    lies
-        What lies are expected to be like; the defaults of `Lies` by default.
-    false
-        What false powers do to voltages, and how false they may be; none by default. From snapshot to
-        snapshot `FalsePowers.claimed` hands on what depends on the feeder alone.
-    curved
-        The power flow is not linear, and false powers may be large: `curved(weights, powers)` is `m` for the
-        live meters linearised about the powers of an explanation, by its weights and who reports false ones,
-        (p_live,) each. Without it, `m` is good for all.
-
-    Returns
-    -------
-    tuple of Explained
-        The likeliest first; there is always one.
+    noise, m, live: (p,) variance of each reading, > 0; readings minus the model, squared pu, finite; meters
+    with a reading. lies: prior of the manipulations. false: effects of false powers; none by default.
+    `FalsePowers.claimed` reuses values that depend on the feeder alone. curved: for large false powers,
+    `curved(weights, powers)` is `m` of the live meters linearised about the powers of a hypothesis, by its
+    weights and false powers, (p_live,) each.
 
     Raises
     ------
@@ -150,7 +114,7 @@ def identify(
 
 def _whitening(K: Floats) -> Floats:
     """W, lower triangular, with ``W^T W = K^-1``; destroys K."""
-    # Symmetric: its transpose is the same in the order that LAPACK wants.
+    # Symmetric: the transpose is the same in the order of LAPACK.
     factor, failed = lapack.dpotrf(K.T, lower=True, overwrite_a=True)
     if failed:
         raise np.linalg.LinAlgError("the covariance is not positive definite")
@@ -163,14 +127,14 @@ def _explanations(problem: Problem, start: State, false: bool) -> list[State]:
     known: dict[bytes, State] = {start.key: start}
     first = _descend(problem, start, known, false)
     if false and (first is start or _misfits(problem, first)):
-        for k, c in enumerate(_doubtful(problem, start, anybody=first is not start)):
+        for k, c in enumerate(_doubtful(problem, start, accused=first is not start)):
             if k >= _BEGUN and _plausible(problem, known):
                 break
             _descend(problem, _doubted(problem, start, c), known, false)
     if len(known) == 1:
         return [start]
     if false and not _plausible(problem, known):
-        # False powers may lead astray: who lies if all powers are true, and only then whose are false.
+        # False powers may mislead: first the meters with all powers true, then the powers.
         apart: dict[bytes, State] = {}
         _descend(problem, _descend(problem, start, apart, False), known, false)
         known.update(apart)
@@ -188,13 +152,12 @@ def _plausible(problem: Problem, known: dict[bytes, State]) -> bool:
     return best.counts[0] <= _MANY * problem.size and not _misfits(problem, best)
 
 
-def _doubtful(problem: Problem, at: State, *, anybody: bool) -> list[int]:
-    """Customers whose false powers explain more than their lying meter alone, the best first.
+def _doubtful(problem: Problem, at: State, *, accused: bool) -> list[int]:
+    """Customers with false powers that explain more than their manipulated meter alone, the best first.
 
-    Unless `anybody` is named anyway, only those whose meters are suspicious and who explain so much that it
-    is rare.
+    Before any accusation (`accused` False), only those with suspicious meters and rare evidence.
     """
-    if anybody:
+    if accused:
         single = problem.meters(at)
         who = np.argsort(single)[:_STARTS]
         rise, _ = problem.pairs(at, who)
@@ -219,7 +182,7 @@ def _doubted(problem: Problem, at: State, c: int) -> State:
 
 
 def _descend(problem: Problem, at: State, known: dict[bytes, State], false: bool) -> State:
-    """Steepest descent; remembers every explanation that it passes."""
+    """Steepest descent; remembers every hypothesis that it passes."""
     known.setdefault(at.key, at)
     for _ in range(_MOVES * at.g.size):
         after = _best(problem, at, false)
@@ -232,12 +195,12 @@ def _descend(problem: Problem, at: State, known: dict[bytes, State], false: bool
 
 
 def _best(problem: Problem, at: State, false: bool) -> State | None:
-    """The state after the move that lowers J most, or None where none does."""
+    """State after the move that lowers J most, or None where none does."""
     rise = problem.meters(at)
     j = int(rise.argmin())
     least, move = float(rise[j]), "meter"
     if false and at.counts[0]:
-        # Whose powers are false, and who might be next.
+        # Powers to be trusted again, and further false powers.
         for who, what in ((at.powers, "believe"), (at.liars & ~at.powers, "powers")):
             if (some := who.nonzero()[0]).size:
                 rise = problem.believed(at, some) if what == "believe" else problem.pairs(at, some)[0]
@@ -257,7 +220,7 @@ def _best(problem: Problem, at: State, false: bool) -> State | None:
 
 
 def _exchange(problem: Problem, at: State, known: dict[bytes, State], false: bool) -> None:
-    """Trust each liar again, and see what explains the readings instead."""
+    """Trust each accused meter again, and search from the best replacement."""
     least, within = problem.cost(at), 2.0 * np.log(problem.lies.like)
     for j in at.liars.nonzero()[0].tolist():
         after = _without(problem, at, j, known)
@@ -272,7 +235,7 @@ def _exchange(problem: Problem, at: State, known: dict[bytes, State], false: boo
 
 
 def _without(problem: Problem, at: State, j: int, known: dict[bytes, State]) -> State:
-    """The explanation that trusts a liar and its customer's powers again."""
+    """Hypothesis that trusts an accused meter and its customer's powers again."""
     after = at.copy()
     if at.counts[1]:
         if at.powers[j]:
@@ -287,7 +250,7 @@ def _without(problem: Problem, at: State, j: int, known: dict[bytes, State]) -> 
 
 
 def _more(problem: Problem, at: State, known: dict[bytes, State], false: bool) -> None:
-    """Accuse one more, although that alone does not lower J, and go on from there."""
+    """Accuse one more, although that alone does not lower J, and descend from there."""
     rise = np.where(at.liars, np.inf, problem.meters(at))
     for j in np.flatnonzero(rise <= 2.0 * np.log(problem.lies.like)).tolist():
         after = at.copy()
@@ -297,7 +260,7 @@ def _more(problem: Problem, at: State, known: dict[bytes, State], false: bool) -
 
 
 def _reported(problem: Problem, found: list[State], live: Bools, lies: Lies) -> tuple[Explained, ...]:
-    """The likeliest of them as explanations of all meters, one for each set of liars."""
+    """The likeliest ones as hypotheses of all meters, one for each set of manipulated meters."""
     ranked = sorted(((problem.cost(each), each) for each in found), key=lambda pair: pair[0])
     if worth(problem, ranked):
         sets = alike(problem, ranked)
@@ -317,7 +280,7 @@ def _reported(problem: Problem, found: list[State], live: Bools, lies: Lies) -> 
 
 
 def _explained(each: Set, probability: float, live: Bools) -> Explained:
-    """An explanation of the live meters as one of all."""
+    """Hypothesis of the live meters as one of all."""
     weights, lies = np.zeros(live.size), np.zeros(live.size)
     weights[live], lies[live] = each.weights, each.lies
     liars, powers = _spread(each.liars, live), _spread(each.powers, live)

@@ -1,4 +1,4 @@
-"""What the sequential monitor carries from frame to frame."""
+"""State of the sequential monitor between frames."""
 
 from __future__ import annotations
 
@@ -33,54 +33,24 @@ from gridsec.interface import Estimate, Frame, Verdict
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trust:
-    """Who is believed, and since when not. p meters, s scales.
+    """Trust of meters and inverters. p meters, m inverters, s scales."""
 
-    Attributes
-    ----------
-    trusted : (p,)
-        Meters that the estimate rests on.
-    scale : (p,)
-        Scale on which each distrusted meter was caught.
-    age : (p,)
-        Ticks under suspicion; forgotten after the longest scale without evidence.
-    quiet : (p,)
-        Readings without evidence against a meter.
-    bad : (s, p)
-        Evidence at the last look on each scale.
-    still : (s, p)
-        Evidence enough to go on distrusting a meter.
-    owed : (p,)
-        Readings that a meter distrusted from before still has to give until its scale can speak for it.
-    lag : (p,)
-        Ticks after which a distrusted meter repeats its readings, 1 for a stuck one; 0 for all others.
-    named : (p,)
-        Meters named as manipulated.
-    accused : tuple of (k, s)
-        What else is suspected, indices of `design.book`, each with the scale that found it.
-    counted : (m,)
-        Ticks that accused each inverter, less those that did not.
-    inverters : (m,)
-        Inverters named as manipulated.
-    calm
-        Derived. Nobody is suspected, nor was lately.
-    """
-
-    trusted: Bools
-    scale: Ints
-    age: Ints
-    quiet: Ints
-    bad: Bools
-    still: Bools
-    owed: Ints
-    lag: Ints
-    named: Bools
-    accused: tuple[tuple[int, int], ...]
-    counted: Ints
-    inverters: Bools
-    calm: bool = field(init=False)
+    trusted: Bools  # (p,) meters used by the estimate
+    scale: Ints  # (p,) scale of the detection of each suspect
+    age: Ints  # (p,) ticks as a suspect; reset after the longest scale without evidence
+    quiet: Ints  # (p,) readings without evidence
+    bad: Bools  # (s, p) residual above the limit at the last look
+    still: Bools  # (s, p) residual above the release limit at the last look
+    owed: Ints  # (p,) readings a suspect of an earlier run owes before its scale can release it
+    lag: Ints  # (p,) ticks after which a suspect repeats its readings, 1 if stuck, 0 if none
+    named: Bools  # (p,) meters named as manipulated
+    accused: tuple[tuple[int, int], ...]  # other suspicions: index of the fault dictionary, scale
+    counted: Ints  # (m,) ticks that accuse each inverter, less those that do not
+    inverters: Bools  # (m,) inverters named as manipulated
+    calm: bool = field(init=False)  # derived: no suspicion, now or within the longest scale
 
     def __post_init__(self) -> None:
-        # Evidence is written in place afterwards, but only against those who are not trusted.
+        # Later in-place writes concern meters that are not trusted: the state is not calm then either.
         against = any_of(self.bad) or any_of(self.still) or any_of(self.named) or any_of(self.inverters)
         lately = bool(self.accused) or any_of(self.age) or any_of(self.counted)
         calm = all_of(self.trusted) and not against and not lately
@@ -89,109 +59,45 @@ class Trust:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SequentialState:
-    """What is carried from frame to frame. N customers, m inverters, p meters, s scales.
+    """State between frames. N customers, m inverters, p meters, s scales."""
 
-    Attributes
-    ----------
-    t, since
-        Time of the last frame used, and of the first one, s.
-    frame
-        The last one used; None before the first.
-    ticks
-        Frames used.
-    x : (m,) or None
-        Injections, pu; None before the first frame.
-    free
-        What was prepared for inverters without a trusted meter; None while there were none.
-    lag
-        How far the injections may be from the true ones.
-    v0_squared
-        Last squared busbar voltage that was believed, pu; in three phases (3,).
-    busbar
-        What is thought of its meter.
-    window
-        The last residuals.
-    trust
-        Who is believed.
-    fits : (s,)
-        What the trusted meters say on each scale; None where no meter can be judged yet.
-    wholes : (s,)
-        Fits of all that reported, or of more, from when they were trusted; None where none is kept.
-    apart : (s,)
-        Fits without the meters that withhold their customer's power; None where there is no such meter.
-    misfit : (s,)
-        Scales whose trusted meters were inconsistent at the last look, after the search.
-    released
-        What they say where the powers of the others are not believed; None where all are.
-    doubts
-        What the frames do not know.
-    skew
-        Changes of the voltages within clock offsets; None while no offset is measured.
-    moment
-        Last readings of all meters; None while the clock offset of the busbar's is not measured.
-    learning
-        What was gathered of the meters' fixed errors; None once they are known.
-    learned
-        What is known of them.
-    model_error : (p,)
-        What the model may be off at each meter, squared pu.
-    swing
-        By how much powers changed a squared voltage at most when that was bounded, pu.
-    curves
-        What metered reactive powers say of the inverters.
-    kinds
-        The past, and what the named meters' manipulations look like.
-    last
-        The last answer.
-    """
-
-    t: float
-    frame: Frame | None
-    since: float
-    ticks: int
-    x: Floats | None
-    free: Free | None
-    lag: Lag
-    v0_squared: Floats | float
-    busbar: Busbar
-    window: Window
-    trust: Trust
-    fits: tuple[Fit | None, ...]
-    wholes: tuple[Fit | None, ...]
-    apart: tuple[Apart | None, ...]
-    misfit: tuple[bool, ...]
-    released: Released | None
-    doubts: Doubts
-    skew: Skew | None
-    moment: Moment | None
-    learning: Learning | None
-    learned: Learned
-    model_error: Floats
-    swing: float
-    curves: Curves
-    kinds: Kinds
-    last: tuple[Estimate, Verdict] | None
+    t: float  # time of the last frame used, s
+    frame: Frame | None  # last frame used; None before the first
+    since: float  # time of the first frame used, s
+    ticks: int  # frames used
+    x: Floats | None  # (m,) injections, pu; None before the first frame
+    free: Free | None  # prepared loop of the inverters without a trusted meter
+    lag: Lag  # errors of the injections
+    v0_squared: Floats | float  # last trusted squared busbar voltage, pu; (3,) in three phases
+    busbar: Busbar  # trust of the busbar's meter
+    window: Window  # residuals of the last ticks
+    trust: Trust  # trust of the meters
+    fits: tuple[Fit | None, ...]  # (s,) of the trusted meters; None without a test
+    wholes: tuple[Fit | None, ...]  # (s,) kept, of all meters that reported
+    apart: tuple[Apart | None, ...]  # (s,) without meters that withhold a power
+    misfit: tuple[bool, ...]  # (s,) trusted meters inconsistent at the last look, after the search
+    released: Released | None  # posterior with doubted powers of the suspects; None without suspects
+    doubts: Doubts  # uncertainty of the frames
+    skew: Skew | None  # voltage changes within clock offsets; None while no offset is measured
+    moment: Moment | None  # readings for the busbar's clock offset; None while it is not measured
+    learning: Learning | None  # sums of the commissioning; None once complete
+    learned: Learned  # fixed errors of the meters
+    model_error: Floats  # (p,) largest error of the model, squared pu
+    swing: float  # largest change of a squared voltage by powers when `model_error` was computed, pu
+    curves: Curves  # comparison of metered reactive powers with the droop curves
+    kinds: Kinds  # reading history and kinds of the manipulations
+    last: tuple[Estimate, Verdict] | None  # last output
 
     @property
     def commission(self) -> Commission:
-        """All that is known of the meters' fixed errors."""
+        """Fixed errors of the meters, known and being learned."""
         return Commission(self.learned, self.learning)
 
 
 def init(
     design: SequentialDesign, t: float, learned: Learned | None = None, learning: Learning | None = None
 ) -> SequentialState:
-    """Begin to watch; the observer starts with the first frame.
-
-    Parameters
-    ----------
-    design
-        From `design`.
-    t
-        Unix time, s.
-    learned, learning
-        What is known of the meters' fixed errors and what was gathered, if there is anything from before.
-    """
+    """Initial state at Unix time t, s, with errors learned before; the observer starts at the first frame."""
     known = fresh(design, t) if learned is None else Commission(learned, learning)
     p, s = design.plant.meters.size, len(design.lengths)
     m = design.plant.droop.tau.size
@@ -242,16 +148,7 @@ def init(
 
 
 def renew(design: SequentialDesign, state: SequentialState, which: Bools) -> SequentialState:
-    """Learn some meters anew, because they were replaced: nothing of the old ones counts any more.
-
-    Parameters
-    ----------
-    design, state
-        The design, and the state.
-    which : (p,)
-        The meters. What spoke against the old ones does not speak against the new ones: they are trusted
-        until something does.
-    """
+    """State after meters `which` (p,) were replaced: trusted again, with their errors to be learned."""
     known, trust = learn_anew(design, state.commission, which, state.t), state.trust
     return replace(
         state,

@@ -1,4 +1,4 @@
-"""One frame in, an estimate and a verdict out."""
+"""Step of the monitor: measurements, prediction, detection, identification, confirmation, output."""
 
 from __future__ import annotations
 
@@ -33,13 +33,6 @@ from gridsec.interface import Estimate, Explanation, Frame, Verdict
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Look:
-    """One frame as the monitor sees it before anybody is named. N customers, n places, p meters.
-
-    state: from the last tick, with what is bounded anew. x, free, lag: injections of the inverters. q: net
-    reactive injections, (N,). v2_bus: what the model makes of all that, (n,). residual: (p,). copies: who
-    repeats itself, (p,). now: the state that was judged.
-    """
-
     state: SequentialState
     heard: Heard
     doubts: Doubts
@@ -59,34 +52,23 @@ class _Look:
 def step(
     design: SequentialDesign, state: SequentialState, frame: Frame
 ) -> tuple[SequentialState, Estimate, Verdict]:
-    """Take one frame in.
+    """Process one frame.
 
-    Parameters
-    ----------
-    design, state
-        From `design`, and from `init` or the last step.
-    frame
-        Everything known at one tick. A frame that is not later than the last one changes nothing: it
-        gets the last estimate again, and UNDECIDED.
-
-    Returns
-    -------
-    SequentialState, Estimate, Verdict
-        As every estimator's step; see `gridsec.interface`.
+    A frame that is not later than the last one changes nothing: it repeats the last estimate, with UNDECIDED.
     """
     if not np.isfinite(frame.t) or (state.x is not None and not frame.t > state.t):
         return state, *_unused(design, state, frame)
     state, frame = _present(design, state, possible(design, frame))
     look = _look(design, state, frame)
     while look.seen.busbar is not None:
-        # As if nobody read it at this tick either.
+        # The busbar counts as not metered from this tick on.
         state = changed(state, busbar=state.busbar.caught(*look.seen.busbar))
         look = _look(design, state, frame)
     return _answer(design, look, frame)
 
 
 def _look(design: SequentialDesign, state: SequentialState, frame: Frame) -> _Look:
-    """Reconstruct by the model, and judge what the meters say beside that."""
+    """Predict by the model, then identify the meters that contradict it."""
     heard = clean(design, state, frame)
     doubts = doubted(design, state.doubts, frame, heard.live, heard.busbar)
     if doubts.priors is not state.doubts.priors:
@@ -98,7 +80,7 @@ def _look(design: SequentialDesign, state: SequentialState, frame: Frame) -> _Lo
     x, free, lag = _inverters(design, state, frame, heard, doubts.sizes)
     q, v2_bus = _voltages(design, frame, heard, x)
     if _paused(design, state, frame):
-        # After a pause as long as the longest scale loads are others: nothing is remembered.
+        # Loads before a pause as long as the longest scale say nothing about those after it.
         window = empty(design.lengths, heard.y.size)
         state = changed(state, window=window, fits=(None,) * len(state.fits), skew=None)
     state = _clocks(design, state, frame, v2_bus[design.prior.meters])
@@ -116,19 +98,19 @@ def _look(design: SequentialDesign, state: SequentialState, frame: Frame) -> _Lo
 
 
 def _paused(design: SequentialDesign, state: SequentialState, frame: Frame) -> bool:
-    """A pause as long as the longest scale."""
+    """True if the pause since the last frame is at least as long as the longest scale."""
     return state.x is not None and frame.t - state.t >= design.lengths[-1] * design.step_s
 
 
 def _present(design: SequentialDesign, state: SequentialState, frame: Frame) -> tuple[SequentialState, Frame]:
-    """The frame without a busbar's reading of another moment, and the state with the readings of this one."""
+    """Frame without a busbar reading of another moment, and the state with the readings of this one."""
     before = None if _paused(design, state, frame) else state.moment
     moment, frame = present(design, before, frame, state.trust.trusted, state.v0_squared)
     return state if moment is before is state.moment else changed(state, moment=moment), frame
 
 
 def _clocks(design: SequentialDesign, state: SequentialState, frame: Frame, v2: Floats) -> SequentialState:
-    """The state with the voltages' changes within clock offsets, and without fits of other variances."""
+    """State with the voltage changes within clock offsets, and without posteriors of other variances."""
     before = state.skew
     if before is None and frame.clock_offset is None:
         return state
@@ -144,7 +126,7 @@ def _clocks(design: SequentialDesign, state: SequentialState, frame: Frame, v2: 
 
 
 def _answer(design: SequentialDesign, look: _Look, frame: Frame) -> tuple[SequentialState, Estimate, Verdict]:
-    """Name who lies, remember, and put the answer together."""
+    """Confirm suspects, update the state, and put the output together."""
     state, heard = look.state, look.heard
     seen, window, rivals = _judge(design, look, state.trust)
     v2 = look.v2_bus[design.prior.meters]
@@ -172,13 +154,13 @@ def _answer(design: SequentialDesign, look: _Look, frame: Frame) -> tuple[Sequen
     tick = Tick(frame, heard, look.q, look.v2_bus, look.transient, seen, rivals)
     after, estimate, verdict = conclude(design, after, tick)
     if after.learning is not state.learning:
-        # Only from the next frame on: this one was judged by what was known before.
+        # From the next frame on: this one was tested with the errors known before.
         after = _learned(design, after)
     return after, estimate, verdict
 
 
 def _free(design: SequentialDesign, look: _Look, trust: Trust, t: float) -> Free | None:
-    """What was prepared for inverters that follow no meter; anew where meters have just been suspected."""
+    """Prepared loop of the model-driven inverters, renewed where meters have just been suspected."""
     state = look.state
     if state.x is None or not any_of(state.trust.trusted & ~trust.trusted):
         return look.free
@@ -186,7 +168,7 @@ def _free(design: SequentialDesign, look: _Look, trust: Trust, t: float) -> Free
 
 
 def _lied_to(design: SequentialDesign, before: Trust, now: Trust) -> Bools:
-    """Inverters whose meters were believed until now, (m,)."""
+    """Inverters with a meter that was trusted until this tick, (m,)."""
     caught = before.trusted & ~now.trusted
     if not any_of(caught):
         return np.zeros(design.meter_of.size, dtype=np.bool_)
@@ -194,7 +176,7 @@ def _lied_to(design: SequentialDesign, before: Trust, now: Trust) -> Bools:
 
 
 def _unused(design: SequentialDesign, state: SequentialState, frame: Frame) -> tuple[Estimate, Verdict]:
-    """What is answered to a frame that is not later than the last one."""
+    """Output for a frame that is not later than the last one."""
     none = np.zeros(design.plant.droop.tau.size)
     estimate, verdict = nothing_new(design.plant, frame, state.t, state.last, state.v0_squared, none)
     if state.last is None:
@@ -205,7 +187,7 @@ def _unused(design: SequentialDesign, state: SequentialState, frame: Frame) -> t
 def _judge(
     design: SequentialDesign, look: _Look, before: Trust
 ) -> tuple[Examined, Window, tuple[Explanation, ...]]:
-    """Who is believed and named now, what is remembered then, and rivals of what was found."""
+    """Confirmed suspects, the window after it, and rival hypotheses."""
     seen, now = look.seen, look.now
     if seen.trust.calm and now.trust.calm:
         return seen, now.window, ()
@@ -221,15 +203,15 @@ def _judge(
 
 
 def _transient(design: SequentialDesign, age: float) -> Floats:
-    """What is left of the unknown initial state at each meter, (p,)."""
-    # Without inverters the rate is infinite, and times no time at all it would be no number.
+    """Remainder of the unknown initial state at each meter, (p,)."""
+    # Without inverters the rate is infinite; infinity times zero is NaN.
     return np.asarray(design.reach * (np.exp(-design.certificate.rate * age) if age > 0 else 1.0))
 
 
 def _undecided(
     design: SequentialDesign, last: tuple[Estimate, Verdict] | None, before: Trust, trust: Trust
 ) -> tuple[Explanation, ...]:
-    """The last explanations, as long as the same are suspected: they are not looked for at every tick."""
+    """Last explanations while the suspects stay the same: they are not searched at every tick."""
     anybody = not all_of(trust.trusted) or any_of(trust.counted)
     if last is None or design.decoder is not None or not anybody:
         return ()
@@ -239,7 +221,7 @@ def _undecided(
 
 
 def _acquit(seen: Examined, over: Bools) -> Examined:
-    """Evidence against meters whose manipulation is over counts no more."""
+    """Identification without evidence against meters with an ended manipulation."""
     trust = seen.trust
     if not any_of(over):
         return seen
@@ -247,7 +229,7 @@ def _acquit(seen: Examined, over: Bools) -> Examined:
 
 
 def _voltages(design: SequentialDesign, frame: Frame, heard: Heard, x: Floats) -> tuple[Floats, Floats]:
-    """Reactive injections, (N,), and what the model makes of all of them, (n,)."""
+    """Net reactive injections, (N,), and the voltages of the model, (n,)."""
     plant = design.plant
     q = _net(design, heard, x)
     with np.errstate(all="ignore"):
@@ -260,18 +242,18 @@ def _voltages(design: SequentialDesign, frame: Frame, heard: Heard, x: Floats) -
 
 
 def _net(design: SequentialDesign, heard: Heard, x: Floats) -> Floats:
-    """Net reactive injections with observed ones of the inverters where they are not metered, (N,)."""
+    """Net reactive injections, observed for inverters without metered reactive power, (N,)."""
     observed = design.plant.droop.per_customer(x, heard.q.size)
     return heard.q + (np.where(heard.told, 0.0, observed) if any_of(heard.told) else observed)
 
 
 def _swing(design: SequentialDesign, v2_bus: Floats, v0_squared: Floats | float) -> float:
-    """By how much the powers change a squared voltage at most."""
+    """Largest change of a squared voltage by the powers."""
     return float(np.abs(v2_bus - design.plant.feeder.broadcast_busbar(v0_squared)).max())
 
 
 def _distrust(trust: Trust, copies: Ints) -> Trust:
-    """Meters that repeat themselves are named, whatever the others say."""
+    """Trust state in which meters that repeat themselves are named."""
     if not any_of(copies):
         return trust
     which = copies > 0
@@ -286,7 +268,7 @@ def _distrust(trust: Trust, copies: Ints) -> Trust:
 
 
 def _curves(design: SequentialDesign, look: _Look, frame: Frame, seen: Examined) -> Curves:
-    """What the metered reactive powers say beside the curves."""
+    """Comparison of metered reactive powers with the droop curves."""
     before, heard = look.state.curves, look.heard
     if before.idle and not any_of(heard.reported):
         return before
@@ -298,7 +280,7 @@ def _curves(design: SequentialDesign, look: _Look, frame: Frame, seen: Examined)
     return compare(design, before, now)
 
 
-def _kinds(  # noqa: PLR0917  # everything that lies are compared with
+def _kinds(  # noqa: PLR0917
     design: SequentialDesign,
     look: _Look,
     seen: Examined,
@@ -306,7 +288,7 @@ def _kinds(  # noqa: PLR0917  # everything that lies are compared with
     v2: Floats,
     own: Floats,
 ) -> Kinds:
-    """What the manipulations look like, by what the other meters say of each."""
+    """Kinds of the manipulations, from the leave-one-out residuals of the shortest scale."""
     state, view = look.state, seen.views[0]
     expected = v2 + state.learned.bias
     if view is None:
@@ -322,7 +304,7 @@ def _kinds(  # noqa: PLR0917  # everything that lies are compared with
 
 
 def _own(design: SequentialDesign, p: Floats, q: Floats) -> Floats:
-    """What each meter's own reported powers contribute to what the model says of it, (p,)."""
+    """Contribution of each meter's own reported powers to its modelled voltage, (p,)."""
     shapes, meters = design.shapes, design.plant.meters
     return np.asarray(shapes.active * p[meters] + shapes.reactive * q[meters])
 
@@ -335,19 +317,19 @@ def _gathered(design: SequentialDesign, look: _Look, frame: Frame, trust: Trust)
     this = learning.Tick(frame, look.heard.live, trust.trusted, bool(trust.accused), look.doubts)
     use, why = learning.counts(design, state.learning, this)
     h = frame.t - state.t
-    # A pause of the frames is no time in which anything was heard.
+    # A pause of the frames is not time with readings.
     return gather(
         state.learning, look.residual, use, h if h <= _PAUSE * design.step_s else design.step_s, why
     )
 
 
 def _learned(design: SequentialDesign, state: SequentialState) -> SequentialState:
-    """Rely on what was gathered of the meters' fixed errors, once that was for long enough."""
+    """State that uses the learned fixed errors once they are known."""
     trust, gathered = state.trust, state.learning
     if gathered is None or trust.accused:
         return state
     ready = ripe(design, gathered) & trust.trusted
-    # Whoever is named has no say; suspects that report may yet turn out to be right.
+    # Meters that are suspect and not yet named may turn out to be honest.
     if not any_of(ready) or not all_of(trust.trusted | trust.named | (state.window.counts[-1] == 0)):
         return state
     known = learn(design, state.learned, gathered, ready, state.t)
@@ -356,17 +338,16 @@ def _learned(design: SequentialDesign, state: SequentialState) -> SequentialStat
     return changed(state, learning=known.learning, learned=known.learned, window=window, fits=fits)
 
 
-# Ticks without a frame after which there was a pause.
 _PAUSE = 60.0
-# The model's error is bounded anew every so many ticks, and where powers change a voltage by so many times
-# what they did then, and by so much, squared pu: it grows with the cube of that.
+"""Ticks without a frame that count as a pause."""
 _STALE, _GROWN, _CALM = 16, 1.1, 0.01
+"""Renewal of the model error: ticks, ratio of the largest voltage change, and least change, squared pu."""
 
 
 def _inverters(
     design: SequentialDesign, state: SequentialState, frame: Frame, heard: Heard, sizes: Floats
 ) -> tuple[Floats, Free | None, Lag]:
-    """The injections at this frame, at rest at the first one and a step later at any other; their errors."""
+    """Injections at this frame, their errors, and the prepared loop; at rest at the first frame."""
     droop, meter = design.plant.droop, design.meter_of
     believed = state.trust.trusted & heard.live
     driven = (meter >= 0) & believed[meter]
@@ -382,7 +363,7 @@ def _inverters(
         now, v2 = _linear(design, frame.p, np.stack([frame.q + injected, frame.q]), heard.v0_squared)
         if state.last is not None and state.frame is not None:
             before = state.frame
-            # What losses took off at the last frame, and what the meters added, hardly changes between two.
+            # Losses and the correction by the meters hardly change between two frames.
             v2 += state.last[0].v2 - _linear(design, before.p, before.q + injected, state.v0_squared)
         w, y = droop.vbar**2 - v2, np.where(driven, y, now[droop.customer])
         follows = ~driven, _given(design, state, frame, heard, sizes), heard.busbar
@@ -393,7 +374,7 @@ def _inverters(
 def _given(
     design: SequentialDesign, state: SequentialState, frame: Frame, heard: Heard, sizes: Floats
 ) -> Powers:
-    """The powers that inverters follow which follow the model."""
+    """Power errors for the model-driven inverters."""
     x = np.zeros(0) if state.x is None else state.x
     return Powers(frame, _net(design, heard, x), heard.told, heard.v0_squared, state.trust.trusted, sizes)
 
@@ -405,7 +386,7 @@ def _linear(design: SequentialDesign, p: Floats, q: Floats, v0_squared: Floats |
 
 
 def _model_error(design: SequentialDesign, p: Floats, q: Floats, v0_squared: Floats | float) -> Floats:
-    """What the loss-corrected model may be off at each meter, (p,)."""
+    """Largest error of the loss-corrected model at each meter, (p,)."""
     plant = design.plant
     with np.errstate(all="ignore"):
         error = plant.feeder.model_error_bound(p, q, v0_squared)[plant.meters]
