@@ -75,4 +75,4 @@ def test_a_state_keeps_all_else() -> None:
     quick, slow = (each(state, t=7.0, swing=0.25) for each in (changed, replace))
     for each in fields(state):
         assert getattr(quick, each.name) is getattr(slow, each.name) or each.name in ("t", "swing")
-    assert (quick.t, quick.swing, state.t, state.swing) == (7.0, 0.25, 5.0, 0.0)
+    assert (quick.t, quick.voltage_swing, state.t, state.voltage_swing) == (7.0, 0.25, 5.0, 0.0)

@@ -16,47 +16,51 @@ from dataclasses import dataclass
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, all_of, any_of
-from gridsec.estimators.sequential.blocks import sound, without
-from gridsec.estimators.sequential.conditional import Fit, Judged, fit, judge
-from gridsec.estimators.sequential.doubts import Doubts
+from gridsec.estimators.sequential.blocks import remove_meters, well_conditioned
+from gridsec.estimators.sequential.conditional import LeaveOneOut, Posterior, condition, leave_one_out
+from gridsec.estimators.sequential.doubts import FrameUncertainty
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Apart:
+class VouchedPosterior:
     """Posterior without some meters. p meters."""
 
-    whole: Fit  # posterior with them
-    fallen: Bools  # (p,) trusted meters without a check
-    rest: Fit  # posterior without them
+    whole: Posterior  # posterior with them
+    removed: Bools  # (p,) trusted meters without a check
+    vouched: Posterior  # posterior without them
 
-    def added(self, judged: Judged) -> Floats:
+    def added_variance(self, loo: LeaveOneOut) -> Floats:
         """Variance to be added to the posterior with all meters, (n,), squared pu^2."""
-        moved = judged.w - judge(self.rest, judged.m).w
-        return np.asarray(np.maximum(self.rest.variance - self.whole.variance, 0.0) + moved**2)
+        moved = loo.mean - leave_one_out(self.vouched, loo.m).mean
+        return np.asarray(np.maximum(self.vouched.variance - self.whole.variance, 0.0) + moved**2)
 
 
-def apart(
-    before: tuple[Apart | None, ...], fits: tuple[Fit | None, ...], doubts: Doubts
-) -> tuple[Apart | None, ...]:
+def vouched_posteriors(
+    before: tuple[VouchedPosterior | None, ...],
+    posteriors: tuple[Posterior | None, ...],
+    uncertainty: FrameUncertainty,
+) -> tuple[VouchedPosterior | None, ...]:
     """Posteriors without meters that are not vouched, by scale; None where all are. `before` is reused."""
-    if all_of(doubts.vouched):
-        return before if not any(before) else (None,) * len(fits)
-    pairs = zip(before, fits, doubts.vouched, strict=True)
-    return tuple(None if now is None else _apart(kept, now, vouched) for kept, now, vouched in pairs)
+    if all_of(uncertainty.vouched):
+        return before if not any(before) else (None,) * len(posteriors)
+    pairs = zip(before, posteriors, uncertainty.vouched, strict=True)
+    return tuple(None if now is None else _reused(kept, now, vouched) for kept, now, vouched in pairs)
 
 
-def _apart(kept: Apart | None, now: Fit, vouched: Bools) -> Apart | None:
-    fallen = now.trusted & ~vouched
-    if kept is not None and kept.whole is now and np.array_equal(kept.fallen, fallen):
+def _reused(kept: VouchedPosterior | None, now: Posterior, vouched: Bools) -> VouchedPosterior | None:
+    removed = now.trusted & ~vouched
+    if kept is not None and kept.whole is now and np.array_equal(kept.removed, removed):
         return kept
-    return set_apart(now, vouched)
+    return vouched_posterior(now, vouched)
 
 
-def set_apart(now: Fit, vouched: Bools) -> Apart | None:
+def vouched_posterior(now: Posterior, vouched: Bools) -> VouchedPosterior | None:
     """Posterior without meters that are not vouched (p,); None if all are."""
-    fallen = now.trusted & ~vouched
-    if not any_of(fallen):
+    removed = now.trusted & ~vouched
+    if not any_of(removed):
         return None
-    if sound(now.prior, now.noise):
-        return Apart(now, fallen, without(now, fallen))
-    return Apart(now, fallen, fit(now.prior, now.noise, now.trusted & ~fallen, now.loose))
+    if well_conditioned(now.prior, now.noise):
+        return VouchedPosterior(now, removed, remove_meters(now, removed))
+    return VouchedPosterior(
+        now, removed, condition(now.prior, now.noise, now.trusted & ~removed, now.unknowns)
+    )

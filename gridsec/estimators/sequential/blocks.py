@@ -20,45 +20,45 @@ import numpy as np
 from scipy.linalg import blas, lapack
 
 from gridsec.arrays import Bools, Floats, Ints, indices, submatrix
-from gridsec.estimators.sequential.conditional import MUCH_NOISE, Fit, Prior, fit, solved
+from gridsec.estimators.sequential.conditional import MAX_NOISE_RATIO, Posterior, Prior, condition, solve_spd
 
 _ROWS = 256
 """Rows of one block of a product."""
-_SEVERAL = 8
+_COLUMN_COST = 8
 """Cost of selecting a column of a matrix, in rows of a product with it."""
-_LEAST = 1e-6
+_LEAST_NOISE = 1e-6
 """Least ratio of noise to the largest prior variance for block updates; below it rounding dominates."""
 
 
-def sound(prior: Prior, noise: Floats) -> bool:
+def well_conditioned(prior: Prior, noise: Floats) -> bool:
     """True if rounding leaves block updates as exact as a factorisation."""
-    return bool(noise.min(initial=np.inf) >= _LEAST * prior.variance.max(initial=0.0))
+    return bool(noise.min(initial=np.inf) >= _LEAST_NOISE * prior.variance.max(initial=0.0))
 
 
-def without(now: Fit, fallen: Bools) -> Fit:
-    """Posterior without meters `fallen` (p,), k of them trusted; O(p^2 k). The given one is not changed."""
-    at, Q = now.trusting()
-    gone, stay = indices(fallen[at]), indices(~fallen[at])
+def remove_meters(now: Posterior, removed: Bools) -> Posterior:
+    """Posterior without meters `removed` (p,), k of them trusted; O(p^2 k). The given one is not changed."""
+    at, Q = now.precision()
+    gone, stay = indices(removed[at]), indices(~removed[at])
     if not gone.size:
         return now.copy()
     if not stay.size:
-        empty = fit(now.prior, now.noise, np.zeros_like(now.trusted), now.loose)
-        empty.changes = now.changes + gone.size
+        empty = condition(now.prior, now.noise, np.zeros_like(now.trusted), now.unknowns)
+        empty.updates = now.updates + gone.size
         return empty
-    factor = _factor(submatrix(Q, gone, gone).T)
+    factor = _cholesky(submatrix(Q, gone, gone).T)
     # Symmetric: the transpose is the same in the order of LAPACK.
     half, _ = lapack.dtrtrs(factor, submatrix(Q, stay, gone).T, lower=True, overwrite_b=True)
     inverse = submatrix(Q, stay, stay)
     inverse = blas.dgemm(-1.0, half, half, beta=1.0, c=inverse.T, trans_a=True, overwrite_c=True).T
-    variance = _opened(now, at, Q, gone, factor)
+    variance = _released_variance(now, at, Q, gone, factor)
     buses = now.prior.meters[at[stay]]
     # At the meters themselves ``S_TT Q = I - D Q`` replaces a sum.
     variance[buses] = now.variance[buses] + now.noise[at[stay]] ** 2 * np.einsum("ij,ij->j", half, half)
-    trusted = now.trusted & ~fallen
-    return Fit(now.prior, now.noise, trusted, inverse, variance, now.loose, now.changes + gone.size)
+    trusted = now.trusted & ~removed
+    return Posterior(now.prior, now.noise, trusted, inverse, variance, now.unknowns, now.updates + gone.size)
 
 
-def _factor(matrix: Floats) -> Floats:
+def _cholesky(matrix: Floats) -> Floats:
     """Cholesky factor, lower triangle; `matrix` is in the order of LAPACK, and lost."""
     factor, failed = lapack.dpotrf(matrix, lower=True, clean=True, overwrite_a=True)
     if failed:
@@ -66,13 +66,13 @@ def _factor(matrix: Floats) -> Floats:
     return np.asarray(factor)
 
 
-def _opened(now: Fit, at: Ints, Q: Floats, gone: Ints, factor: Floats) -> Floats:
+def _released_variance(now: Posterior, at: Ints, Q: Floats, gone: Ints, factor: Floats) -> Floats:
     """Variance at every bus without some trusted meters, except at the buses of the remaining ones."""
-    who, prior, out = at[gone], now.prior, now.variance.copy()
-    noise, buses, left = now.noise[who], prior.meters[who], np.ones(out.size, dtype=np.bool_)
+    which, prior, out = at[gone], now.prior, now.variance.copy()
+    noise, buses, left = now.noise[which], prior.meters[which], np.ones(out.size, dtype=np.bool_)
     # The posterior variance of a reading is its noise plus the variance at its bus.
     upper, _ = lapack.dtrtri(factor, lower=True)
-    good = noise < MUCH_NOISE * prior.variance[buses]
+    good = noise < MAX_NOISE_RATIO * prior.variance[buses]
     own = np.einsum("ij,ij->j", upper, upper) - noise
     out[buses[good]] = np.maximum(out[buses], own)[good]
     left[prior.meters[at]] = False
@@ -82,67 +82,67 @@ def _opened(now: Fit, at: Ints, Q: Floats, gone: Ints, factor: Floats) -> Floats
     rows = indices(left)
     for first in range(0, rows.size, _ROWS):
         some = rows[first : first + _ROWS]
-        between = submatrix(prior.of_meters, some, at)
-        if now.loose.shape[1]:
-            between += now.loose[some] @ now.loose[prior.meters[at]].T
+        between = submatrix(prior.covariance, some, at)
+        if now.unknowns.shape[1]:
+            between += now.unknowns[some] @ now.unknowns[prior.meters[at]].T
         # A product with all of Q costs less than picking most of it.
-        whole = some.size * _SEVERAL < gone.size
+        whole = some.size * _COLUMN_COST < gone.size
         known = (between @ Q).take(gone, axis=1) if whole else between @ Q.take(gone, axis=1)
         part, _ = lapack.dtrtrs(factor, known.T, lower=True)
         out[some] += np.einsum("ij,ij->j", part, part)
     return out
 
 
-def misfit_without(whole: Fit, m: Floats, fallen: Bools) -> float:
-    """``m^T Q m`` without meters `fallen` (p,), k of them; O(p^2 + k^3). m: anything at these."""
-    gone = indices(fallen & whole.trusted)
-    m = np.where(whole.trusted & ~fallen, m, 0.0)
+def chi_square_without(whole: Posterior, m: Floats, removed: Bools) -> float:
+    """``m^T Q m`` without meters `removed` (p,), k of them; O(p^2 + k^3). m: anything at these."""
+    gone = indices(removed & whole.trusted)
+    m = np.where(whole.trusted & ~removed, m, 0.0)
     weights = whole.weights(m)
     left = float(m @ weights)
     if not gone.size:
         return left
     at = gone if len(whole.inverse) == m.size else np.searchsorted(indices(whole.trusted), gone)
     b = weights[gone]
-    return left - float(b @ solved(submatrix(whole.inverse, at, at).T, b))
+    return left - float(b @ solve_spd(submatrix(whole.inverse, at, at).T, b))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Outside:
+class ExcludedMeters:
     """Excluded meters beside a posterior. n buses, t trusted and k excluded meters."""
 
-    fit: Fit  # posterior of the trusted meters
+    fit: Posterior  # posterior of the trusted meters
     at: Ints  # (k,) excluded meters
     columns: Floats  # (n, k) prior covariance of every bus with them
-    seen: Floats  # (t, k) Q S_TA
+    explained: Floats  # (t, k) Q S_TA
     open: Floats  # (k, k) posterior covariance at their buses
     apart: Floats  # (k, k) posterior covariance of their readings
 
     @staticmethod
-    def of(now: Fit, at: Ints) -> Outside:
+    def of(now: Posterior, at: Ints) -> ExcludedMeters:
         """Excluded meters `at` (k,) of a posterior; O(p^2 k)."""
-        prior, (who, Q) = now.prior, now.trusting()
-        columns = prior.of_meters.take(at, axis=1)
-        if now.loose.shape[1]:
-            columns += now.loose @ now.loose[prior.meters[at]].T
-        inside = columns[prior.meters[who]]
+        prior, (which, Q) = now.prior, now.precision()
+        columns = prior.covariance.take(at, axis=1)
+        if now.unknowns.shape[1]:
+            columns += now.unknowns @ now.unknowns[prior.meters[at]].T
+        inside = columns[prior.meters[which]]
         seen = Q @ inside
         left = columns[prior.meters[at]] - inside.T @ seen
         apart = left.copy()
         apart[np.diag_indices(at.size)] += now.noise[at]
-        return Outside(now, at, columns, seen, left, apart)
+        return ExcludedMeters(now, at, columns, seen, left, apart)
 
     def factor(self, order: Ints) -> Floats:
         """Cholesky factor of `apart` in an order (r,) of places in `at`, r > 0, lower triangle, (r, r)."""
-        return _factor(submatrix(self.apart, order, order).T)
+        return _cholesky(submatrix(self.apart, order, order).T)
 
     def changes(self, order: Ints, factor: Floats) -> Floats:
         """F for an order (r,) and its factor: the rank-one updates, each as its square, (r, p)."""
         out = np.zeros((order.size, self.fit.noise.size))
-        out[:, self.fit.trusted] = -self.seen.take(order, axis=1).T
+        out[:, self.fit.trusted] = -self.explained.take(order, axis=1).T
         out[np.arange(order.size), self.at[order]] = 1.0
         return np.asarray(lapack.dtrtrs(factor, out, lower=True)[0])
 
-    def admit(self, order: Ints, factor: Floats, changes: Floats) -> None:
+    def add(self, order: Ints, factor: Floats, changes: Floats) -> None:
         """Add meters `order`, the first ones of `factor` and `changes`; O(p^2 r). Not usable afterwards."""
         now, r = self.fit, order.size
         spread, _ = lapack.dtrtrs(factor[:r, :r], self._open(order).T, lower=True)
@@ -151,21 +151,21 @@ class Outside:
         now.inverse = blas.dgemm(1.0, some, some, beta=1.0, c=now.Q.T, trans_a=True, overwrite_c=True).T
         now.variance = np.maximum(now.variance - np.einsum("ij,ij->j", spread, spread), 0.0)
         now.trusted[self.at[order]] = True
-        now.changes += r
-        now.pivot = now.std = now.together = now.left = None
+        now.updates += r
+        now.pivot = now.std = now.busbar_weights = now.variance_sum = None
 
     def _open(self, order: Ints) -> Floats:
         """Posterior covariance between every bus and excluded meters `order`, (n, r)."""
         now, prior, r = self.fit, self.fit.prior, order.size
-        who, seen = indices(now.trusted), self.seen.take(order, axis=1)
+        which, seen = indices(now.trusted), self.explained.take(order, axis=1)
         out, left = np.empty((now.variance.size, r)), np.ones(now.variance.size, dtype=np.bool_)
         # At the meters it is known, or ``S_TT Q = I - D Q`` replaces a sum.
         out[prior.meters[self.at]] = self.open.take(order, axis=1)
-        out[prior.meters[who]] = now.noise[who, None] * seen
-        left[prior.meters[self.at]] = left[prior.meters[who]] = False
+        out[prior.meters[which]] = now.noise[which, None] * seen
+        left[prior.meters[self.at]] = left[prior.meters[which]] = False
         rows = indices(left)
-        between = submatrix(prior.of_meters, rows, who)
-        if now.loose.shape[1]:
-            between += now.loose[rows] @ now.loose[prior.meters[who]].T
+        between = submatrix(prior.covariance, rows, which)
+        if now.unknowns.shape[1]:
+            between += now.unknowns[rows] @ now.unknowns[prior.meters[which]].T
         out[rows] = self.columns[np.ix_(rows, order)] - between @ seen
         return out

@@ -24,36 +24,36 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of
 from gridsec.estimators.inputs import busbar_errors
-from gridsec.estimators.sequential.bounds import Powers
-from gridsec.estimators.sequential.conditional import Fit, Judged
+from gridsec.estimators.sequential.bounds import PowerErrors
+from gridsec.estimators.sequential.conditional import LeaveOneOut, Posterior
 from gridsec.estimators.sequential.design import SequentialDesign
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Busbar:
+class BusbarTrust:
     """Trust of the busbar's meter. b phases, 1 on a balanced feeder."""
 
-    believed: Bools  # (b,) its voltage is used
+    trusted: Bools  # (b,) its voltage is used
     scale: Ints  # (b,) scale of the detection
-    age: Ints  # (b,) ticks without trust
-    quiet: Ints  # (b,) successive ticks of agreement; negative after a restart: ticks owed
+    ticks_suspect: Ints  # (b,) ticks without trust
+    ticks_agreeing: Ints  # (b,) successive ticks of agreement; negative after a restart: ticks owed
     off: Floats  # (b,) excess of its reading, mean over the scale, squared pu
     named: Bools  # (b,) named as manipulated
 
-    def caught(self, phase: int, scale: int) -> Busbar:
+    def suspect(self, phase: int, scale: int) -> BusbarTrust:
         """Trust without one phase, detected on a scale."""
-        here = np.arange(self.believed.size) == phase
-        return replace(self, believed=self.believed & ~here, scale=np.where(here, scale, self.scale))
+        here = np.arange(self.trusted.size) == phase
+        return replace(self, trusted=self.trusted & ~here, scale=np.where(here, scale, self.scale))
 
 
-def believed(phases: int) -> Busbar:
+def trusted_busbar(phases: int) -> BusbarTrust:
     """All phases trusted."""
     zero, no = np.zeros(phases, dtype=np.intp), np.zeros(phases, dtype=np.bool_)
-    return Busbar(~no, zero, zero, zero, np.zeros(phases), no)
+    return BusbarTrust(~no, zero, zero, zero, np.zeros(phases), no)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Doubt:
+class BusbarTest:
     """Limits of the test. p meters, b phases."""
 
     sigmas: float  # standard deviations within chance
@@ -61,37 +61,41 @@ class Doubt:
     metered: Bools  # (b,) busbar voltage is metered and trusted
 
 
-def opposed(design: SequentialDesign, doubt: Doubt, now: Fit, judged: Judged) -> list[int]:
+def contradicted_phases(
+    design: SequentialDesign, doubt: BusbarTest, now: Posterior, loo: LeaveOneOut
+) -> list[int]:
     """Phases of the busbar with a meter that the trusted ones contradict beyond chance."""
     # Weights are zero where no meter is trusted.
-    along, form = np.abs(judged.weights @ design.hangs_on), weight(design, now)
+    along, form = np.abs(loo.weights @ design.busbar_incidence), busbar_weights(design, now)
     chance = doubt.sigmas * np.sqrt(form)
     if all_of(along <= chance):
         return []
     # The model may err at all meters in the worst direction: more than `form` where weights differ in sign.
-    at, Q = now.trusting()
-    reach = np.abs(Q @ design.hangs_on[at]).sum(axis=0)
+    at, Q = now.precision()
+    reach = np.abs(Q @ design.busbar_incidence[at]).sum(axis=0)
     return np.flatnonzero(doubt.metered & (along > chance + doubt.model.max() * reach)).tolist()
 
 
-def weight(design: SequentialDesign, now: Fit) -> Floats:
+def busbar_weights(design: SequentialDesign, now: Posterior) -> Floats:
     """d^T Q d of every phase of the busbar, (b,); cached in the posterior."""
-    if now.together is None:
-        at, Q = now.trusting()
-        hangs = design.hangs_on[at]
-        now.together = np.einsum("ij,ij->j", hangs, Q @ hangs)
-    return now.together
+    if now.busbar_weights is None:
+        at, Q = now.precision()
+        hangs = design.busbar_incidence[at]
+        now.busbar_weights = np.einsum("ij,ij->j", hangs, Q @ hangs)
+    return now.busbar_weights
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Honest:
+class HonestErrors:
     """Bounds of honest errors other than the meters'. m inverters."""
 
-    powers: Powers  # power errors of the frame
+    powers: PowerErrors  # power errors of the frame
     injected: Floats  # (m,) largest errors of the observed injections, pu
 
 
-def aligned(design: SequentialDesign, now: Fit, m: Floats, fixed: Floats, honest: Honest) -> Bools:
+def explained_phases(
+    design: SequentialDesign, now: Posterior, m: Floats, fixed: Floats, honest: HonestErrors
+) -> Bools:
     """Phases where honest errors at their ends, all in one direction, explain the test, (b,).
 
     The trusted meters give ``v^T m`` of the busbar, with ``v = Q d / (d^T Q d)``. Honest errors change it by
@@ -101,13 +105,15 @@ def aligned(design: SequentialDesign, now: Fit, m: Floats, fixed: Floats, honest
 
     fixed: (p,) largest honest fixed error of each meter and of the model, squared pu.
     """
-    at, Q = now.trusting()
-    v = Q @ design.hangs_on[at] / np.maximum(weight(design, now), np.finfo(np.float64).tiny)
+    at, Q = now.precision()
+    v = Q @ design.busbar_incidence[at] / np.maximum(busbar_weights(design, now), np.finfo(np.float64).tiny)
     error = busbar_errors(design.plant, honest.powers.v0_squared, design.sigmas[0])
-    return np.abs(m[at] @ v) <= room(design, at, v, fixed, honest) + error
+    return np.abs(m[at] @ v) <= largest_sums(design, at, v, fixed, honest) + error
 
 
-def room(design: SequentialDesign, at: Ints, v: Floats, fixed: Floats, honest: Honest) -> Floats:
+def largest_sums(
+    design: SequentialDesign, at: Ints, v: Floats, fixed: Floats, honest: HonestErrors
+) -> Floats:
     """Largest sums ``v^T m`` over honest errors at their ends, (k,), squared pu.
 
         |2 v^T R| dp + 2 |v^T X| dq + |v|^T (fixed + jitter)
@@ -119,19 +125,19 @@ def room(design: SequentialDesign, at: Ints, v: Floats, fixed: Floats, honest: H
     errors = np.concatenate(honest.powers.errors(plant, injected))
     out = np.abs(v).T @ (fixed + design.sigmas[0] * np.sqrt(design.white))[at]
     for k, one in enumerate(v.T):
-        out[k] += np.abs(design.effects.along(plant.meters[at], one)) @ errors
+        out[k] += np.abs(design.sensitivities.weighted(plant.meters[at], one)) @ errors
     return np.asarray(out)
 
 
-def follow(  # noqa: PLR0917
+def track_busbar(  # noqa: PLR0917
     design: SequentialDesign,
-    before: Busbar,
+    before: BusbarTrust,
     reported: Floats,
     heard: Bools,
     v0_squared: Floats,
     variance: Floats,
     allowed: float,
-) -> Busbar:
+) -> BusbarTrust:
     """Compare the reading of a suspect busbar meter with the other meters.
 
     It is named if it differs for the confirmation time by more than an honest offset of all meters. It is
@@ -139,24 +145,24 @@ def follow(  # noqa: PLR0917
     release time of any meter. reported, heard: (b,) its squared voltages, pu, and available ones. v0_squared,
     variance: (b,) by the other meters. allowed: largest honest fixed error, squared pu.
     """
-    out = ~before.believed
+    out = ~before.trusted
     if not any_of(out):
         return before
     length = np.array(design.lengths)[before.scale]
-    age = before.age + out
+    age = before.ticks_suspect + out
     off = np.where(heard, reported - v0_squared, before.off)
     off = before.off + (off - before.off) / np.clip(age, 1, length)
-    std = np.sqrt(variance + design.busbar**2 + design.flicker)
+    std = np.sqrt(variance + design.busbar**2 + design.busbar_noise)
     limit = design.options.lower * np.array(design.sigmas)[before.scale] * std
     agrees = out & heard & (np.abs(off) <= limit)
-    quiet = np.where(heard, (before.quiet + 1) * agrees, before.quiet)
+    quiet = np.where(heard, (before.ticks_agreeing + 1) * agrees, before.ticks_agreeing)
     lasts = out & heard & (age >= design.confirmed[before.scale]) & (np.abs(off) > allowed + limit)
     still = out & (quiet < np.maximum(design.options.release, length))
-    return Busbar(
-        believed=~still,
+    return BusbarTrust(
+        trusted=~still,
         scale=before.scale,
-        age=np.where(still, age, 0),
-        quiet=np.where(still, quiet, 0),
+        ticks_suspect=np.where(still, age, 0),
+        ticks_agreeing=np.where(still, quiet, 0),
         off=np.where(still, off, 0.0),
         named=still & (before.named | lasts),
     )

@@ -21,14 +21,14 @@ from gridsec.arrays import Floats, all_of
 WINDOWS = (32, 128, 512)
 """Numbers of last readings compared with other times, one at each look."""
 
-_ALIKE, _SURE = 4.0, 5.0
+_CORRELATED, _EVIDENCE = 4.0, 5.0
 """Correlated readings that count as one; evidence required beyond the number of lags, nats."""
-_BETWEEN = 0.5
+_WITHIN_TICK = 0.5
 """Largest shift of a reading within its own tick, ticks."""
 _TINY = float(np.finfo(np.float64).tiny)
 
 
-def shifted(  # noqa: PLR0917
+def clock_shift(  # noqa: PLR0917
     y: Floats, model: Floats, own: Floats, heard: int, room: float, most: float
 ) -> int:
     """Lag in ticks at which readings agree with the reconstruction, far better than without one; 0 for none.
@@ -44,7 +44,7 @@ def shifted(  # noqa: PLR0917
     number of last readings, < n. room: largest difference of the levels by a fixed error, squared pu. most:
     largest mean square of an honest meter, squared pu^2. A negative lag means readings ahead of their time.
     """
-    if _ALIKE * np.count_nonzero(np.isnan(y[-heard:])) > heard:
+    if _CORRELATED * np.count_nonzero(np.isnan(y[-heard:])) > heard:
         return 0
     y = _filled(y)
     left, lag, lags = np.inf, 0, 4 * (y.size - heard)
@@ -58,26 +58,26 @@ def shifted(  # noqa: PLR0917
         return 0
     # Early readings are the older ones: the alternatives are tested on the same readings.
     same = slice(y.size + min(lag, 0) - heard, y.size + min(lag, 0))
-    lie, models = y[same] - model[same], np.array([model[same], model[same] - own[same]])
-    most_left = max(left, _TINY) * np.exp(2.0 * _ALIKE / heard * (np.log(lags) + _SURE))
+    deviation, models = y[same] - model[same], np.array([model[same], model[same] - own[same]])
+    most_left = max(left, _TINY) * np.exp(2.0 * _CORRELATED / heard * (np.log(lags) + _EVIDENCE))
     # The slowest test comes last.
-    if not min(float(y[same].var()), float(lie.var())) > most_left:
+    if not min(float(y[same].var()), float(deviation.var())) > most_left:
         return 0
-    return lag if _in_time(lie, np.diff(models)) > most_left else 0
+    return lag if _in_time(deviation, np.diff(models)) > most_left else 0
 
 
-def _in_time(lie: Floats, later: Floats) -> float:
+def _in_time(deviation: Floats, later: Floats) -> float:
     """Least mean square of readings in their own tick, about any level and slope.
 
     later: (k, n - 1) changes of some models from tick to tick.
     """
-    lies, ways = _straightened(lie), _straightened(later)
-    best = float(lies @ lies) / lies.size
+    deviations, ways = _straightened(deviation), _straightened(later)
+    best = float(deviations @ deviations) / deviations.size
     size = np.maximum(np.einsum("ij,ij->i", ways, ways), _TINY)[:, None]
     # Late towards the tick before, which the oldest does not have; early towards the one after.
-    for part, sign in ((lie[1:], -1.0), (lie[:-1], 1.0)):
+    for part, sign in ((deviation[1:], -1.0), (deviation[:-1], 1.0)):
         rest = _straightened(part)
-        amount = np.clip(sign * (ways @ rest)[:, None] / size, 0.0, _BETWEEN)
+        amount = np.clip(sign * (ways @ rest)[:, None] / size, 0.0, _WITHIN_TICK)
         left = rest - sign * amount * ways
         best = min(best, float(np.einsum("ij,ij->i", left, left).min()) / rest.size)
     return best
@@ -98,19 +98,19 @@ def _lags(short: Floats, long: Floats, room: float, most: float = np.inf) -> Flo
     n, level = short.size, float(long.mean())
     short, long = short - level, long - level
     # The last stretch has lag zero.
-    mean = float(short.mean()) - _sums(long, n) / n
+    mean = float(short.mean()) - _moving_sums(long, n) / n
     # About the level that is nearest to the mean and within the room.
     beyond = np.maximum(np.abs(mean) - room, 0.0)
     if beyond.min() ** 2 > most:
         return np.full(mean.size, np.inf)
-    whole = _sums(long * long, n) - 2.0 * np.correlate(long, short, "valid")[:-1]
+    whole = _moving_sums(long * long, n) - 2.0 * np.correlate(long, short, "valid")[:-1]
     whole += float(short @ short)
     whole /= n
     whole += beyond * beyond - mean * mean
     return whole[::-1]
 
 
-def _sums(x: Floats, n: int) -> Floats:
+def _moving_sums(x: Floats, n: int) -> Floats:
     """Sum of each n successive values, without the last n."""
     sums = np.cumsum(x)
     out = sums[n - 1 : -1].copy()

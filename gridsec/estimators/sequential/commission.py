@@ -32,9 +32,9 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, submatrix
 from gridsec.errors import Problem, raise_if_any
-from gridsec.estimators.sequential.conditional import invert
+from gridsec.estimators.sequential.conditional import invert_spd
 from gridsec.estimators.sequential.design import SequentialDesign
-from gridsec.estimators.sequential.search import Recent
+from gridsec.estimators.sequential.search import LimitCache
 
 
 class LearningReason(StrEnum):
@@ -77,9 +77,9 @@ class Learned:
         return np.where(unknown, self.hidden.max(), 0.0)
 
     @cached_property
-    def recent(self) -> defaultdict[int, Recent]:
+    def recent(self) -> defaultdict[int, LimitCache]:
         """Last results of the limits, by scale."""
-        return defaultdict(Recent)
+        return defaultdict(LimitCache)
 
     def __getstate__(self) -> dict[str, Any]:
         # Results can be computed again.
@@ -111,13 +111,13 @@ class Commission:
     learning: Learning | None  # sums so far; None once complete
 
 
-def nothing(design: SequentialDesign) -> Learned:
+def class_only(design: SequentialDesign) -> Learned:
     """Fixed errors by the accuracy class alone."""
     p = design.allowed.size
     return Learned(np.zeros(p), design.fixed, design.allowed, np.full(p, np.nan), np.zeros(p))
 
 
-def begin(which: Bools, t: float) -> Learning:
+def no_readings(which: Bools, t: float) -> Learning:
     """Empty sums for meters `which` (p,) from Unix time t, s."""
     p = which.size
     return Learning(
@@ -130,22 +130,22 @@ def begin(which: Bools, t: float) -> Learning:
     )
 
 
-def fresh(design: SequentialDesign, t: float) -> Commission:
+def initial(design: SequentialDesign, t: float) -> Commission:
     """Commissioning of a new feeder by classes alone; ``commission_s = 0`` learns nothing."""
     learns = design.options.commission_s > 0
     every = np.ones(design.allowed.size, dtype=np.bool_)
-    return Commission(nothing(design), begin(every, t) if learns else None)
+    return Commission(class_only(design), no_readings(every, t) if learns else None)
 
 
 def renew(design: SequentialDesign, before: Commission, which: Bools, t: float) -> Commission:
     """Commissioning with meters `which` (p,) to be learned anew; all others stay."""
     if not any_of(which) or not design.options.commission_s > 0:
         return before
-    known, blank = before.learned, nothing(design)
+    known, blank = before.learned, class_only(design)
     learned = Learned(
         *(np.where(which, getattr(blank, f.name), getattr(known, f.name)) for f in fields(Learned))
     )
-    start = begin(which, t)
+    start = no_readings(which, t)
     if before.learning is None:
         return Commission(learned, start)
     so_far = before.learning
@@ -174,7 +174,7 @@ def gather(before: Learning, residual: Floats, use: Bools, h: float, why: Ints |
     )
 
 
-def ripe(design: SequentialDesign, gathered: Learning) -> Bools:
+def ready_meters(design: SequentialDesign, gathered: Learning) -> Bools:
     """Meters with enough time, (p,).
 
     Once one open meter reaches `commission_s`, all with the part `enough` of it are ready: together they
@@ -189,9 +189,7 @@ def ripe(design: SequentialDesign, gathered: Learning) -> Bools:
     return np.asarray(heard >= design.options.enough * needed)
 
 
-def conclude(
-    design: SequentialDesign, known: Learned, gathered: Learning, which: Bools, t: float
-) -> Commission:
+def learn(design: SequentialDesign, known: Learned, gathered: Learning, which: Bools, t: float) -> Commission:
     """Known errors after learning meters `which` (p,); meters without a reading keep their class."""
     heard = np.flatnonzero(gathered.count * gathered.time_s > 0)
     done = which & (gathered.count > 0) & (gathered.time_s > 0)
@@ -201,15 +199,15 @@ def conclude(
     # One matrix of this size, inverted in place.
     K = design.prior.among(heard)
     time = gathered.time_s[heard] / design.doubt.time_s
-    for first in range(0, heard.size, _COLUMNS):
-        some = slice(first, first + _COLUMNS)
-        share = _share(time, time[some])
+    for first in range(0, heard.size, _BLOCK):
+        some = slice(first, first + _BLOCK)
+        share = _mean_covariance(time, time[some])
         K[:, some] = share * K[:, some] + (1.0 - share) * _lasting(design, heard, some)
     K[np.diag_indices_from(K)] += B + design.white[heard] / n
-    invert(K)
+    invert_spd(K)
     bias, variance, allowed = known.bias.copy(), known.variance.copy(), known.allowed.copy()
     hidden = np.zeros(known.at.size)
-    hidden[heard] = _hidden(design, heard, K)
+    hidden[heard] = _hidden_variance(design, heard, K)
     bias[heard] += B * (K @ (gathered.total[heard] / n))
     left = np.maximum(B - B * B * K.diagonal(), 0.0)
     rounded = design.rounded[heard]
@@ -229,7 +227,7 @@ def conclude(
     if not any_of(rest):
         return Commission(learned, None)
     # The sums of the others are used; they start again as witnesses of the loads.
-    start = begin(rest, t)
+    start = no_readings(rest, t)
     left_open = Learning(
         *(np.where(rest, getattr(gathered, f.name), getattr(start, f.name)) for f in fields(Learning))
     )
@@ -241,29 +239,29 @@ def _lasting(design: SequentialDesign, heard: Ints, some: slice) -> Floats:
 
     The fixed error of the busbar's meter is one of them, by phase.
     """
-    of_loads = submatrix(design.prior.of_meters, design.prior.meters[heard], heard[some])
+    of_loads = submatrix(design.prior.covariance, design.prior.meters[heard], heard[some])
     lasting = design.doubt.lasting
     places, feeder = design.prior.meters, design.plant.feeder
     same = feeder.same_busbar_phase(places[heard], places[heard[some]])
     return lasting * of_loads + (1.0 - lasting) * design.busbar**2 * same
 
 
-def _hidden(design: SequentialDesign, heard: Ints, inverse: Floats) -> Floats:
+def _hidden_variance(design: SequentialDesign, heard: Ints, inverse: Floats) -> Floats:
     """Posterior variance ``diag(L - L K^-1 L)`` of lasting errors L, (h,)."""
     out = np.empty(heard.size)
-    for first in range(0, heard.size, _COLUMNS):
-        some = slice(first, first + _COLUMNS)
+    for first in range(0, heard.size, _BLOCK):
+        some = slice(first, first + _BLOCK)
         L = _lasting(design, heard, some)
         own = L[np.arange(heard.size)[some], np.arange(L.shape[1])]
         out[some] = own - np.einsum("ij,ij->j", L, inverse @ L)
     return np.maximum(out, 0.0)
 
 
-_COLUMNS = 128
+_BLOCK = 128
 """Columns of one block of a product."""
 
 
-def _share(one: Floats, other: Floats) -> Floats:
+def _mean_covariance(one: Floats, other: Floats) -> Floats:
     """Covariance of two means of an Ornstein-Uhlenbeck process of variance 1 that end together, (j, k).
 
     The times are in units of its correlation time.
@@ -284,7 +282,7 @@ def to_arrays(commission: Commission) -> dict[str, Floats]:
     """Persistent form of a commissioning: arrays of p numbers by name."""
     learned = commission.learned
     none = np.zeros(learned.at.size, dtype=np.bool_)
-    learning = commission.learning or begin(none, 0.0)
+    learning = commission.learning or no_readings(none, 0.0)
     known = {name: getattr(learned, name) for name in _KNOWN}
     gathered = {
         name: np.asarray(getattr(learning, name), dtype=np.float64) for name in (*_GATHERED, _WATCHED)
@@ -317,7 +315,7 @@ def from_arrays(design: SequentialDesign, arrays: Mapping[str, Floats]) -> Commi
     return Commission(learned, learning)
 
 
-_ROUNDED = 1.0 + 1e-9
+_STORED_TOLERANCE = 1.0 + 1e-9
 """Tolerance of stored numbers for rounding."""
 
 
@@ -336,7 +334,7 @@ def _problems(design: SequentialDesign, arrays: Mapping[str, Floats]) -> list[Pr
     ]
     if problems:
         return problems
-    widest, at, since = design.allowed * _ROUNDED, arrays["at"], arrays["since"]
+    widest, at, since = design.allowed * _STORED_TOLERANCE, arrays["at"], arrays["since"]
     count, time_s = arrays["count"], arrays["time_s"]
     idle = np.isnan(since) & (not design.options.commission_s > 0)
     # Comparisons with NaN are false: NaN breaks every rule.
@@ -347,7 +345,7 @@ def _problems(design: SequentialDesign, arrays: Mapping[str, Floats]) -> list[Pr
         },
         Problem("out-of-range", "bias is beyond the class"): np.abs(arrays["bias"]) <= widest,
         Problem("out-of-range", "variance is not within that of the class"): (arrays["variance"] >= 0)
-        & (arrays["variance"] <= design.fixed * _ROUNDED),
+        & (arrays["variance"] <= design.fixed * _STORED_TOLERANCE),
         Problem("out-of-range", "allowed is not within the class"): (arrays["allowed"] >= 0)
         & (arrays["allowed"] <= widest),
         Problem("negative", "hidden is no variance"): (arrays["hidden"] >= 0) & np.isfinite(arrays["hidden"]),

@@ -15,18 +15,18 @@ import numpy as np
 from gridsec.arrays import Bools, Floats, all_of, any_of, changed
 from gridsec.estimators.decision import DecisionInputs, decide
 from gridsec.estimators.sequential import words
-from gridsec.estimators.sequential.apart import apart
-from gridsec.estimators.sequential.bounds import Bounded, Grounds, Powers
-from gridsec.estimators.sequential.busbar import Busbar, follow
-from gridsec.estimators.sequential.conditional import Prior, judge
+from gridsec.estimators.sequential.apart import vouched_posteriors
+from gridsec.estimators.sequential.bounds import BoundedEstimate, BoundInputs, PowerErrors
+from gridsec.estimators.sequential.busbar import BusbarTrust, track_busbar
+from gridsec.estimators.sequential.conditional import Prior, leave_one_out
 from gridsec.estimators.sequential.design import SequentialDesign
 from gridsec.estimators.sequential.doubts import checked
-from gridsec.estimators.sequential.examine import Examined
-from gridsec.estimators.sequential.heard import Heard
-from gridsec.estimators.sequential.release import Released, release
-from gridsec.estimators.sequential.scales import needed
-from gridsec.estimators.sequential.skew import Skew, largest, unusable
-from gridsec.estimators.sequential.state import SequentialState, Trust
+from gridsec.estimators.sequential.examine import Identification
+from gridsec.estimators.sequential.heard import Measurements
+from gridsec.estimators.sequential.release import DoubtedPowers, doubt_powers
+from gridsec.estimators.sequential.scales import min_readings
+from gridsec.estimators.sequential.skew import ClockSkew, largest_offset, unusable_offsets
+from gridsec.estimators.sequential.state import SequentialState, TrustState
 from gridsec.interface import Cause, Decision, Estimate, Explanation, Frame, PowerOrigin, Verdict
 
 
@@ -35,46 +35,46 @@ class Tick:
     """Results of one tick. N customers, p meters, n buses."""
 
     frame: Frame  # with possible powers
-    heard: Heard  # its measurements
+    heard: Measurements  # its measurements
     q: Floats  # (N,) net reactive injections of the model, pu
     v2_bus: Floats  # (n,) squared voltages of the model
     transient: Floats  # (p,) remainder of the unknown initial state, squared pu
-    seen: Examined  # identification
+    seen: Identification  # identification
     rivals: tuple[Explanation, ...]  # hypotheses about as likely as the best
 
 
-def conclude(
+def output(
     design: SequentialDesign, state: SequentialState, tick: Tick
 ) -> tuple[SequentialState, Estimate, Verdict]:
     """State with the output in it, estimate and verdict, from the state after this tick."""
-    trust, heard = state.trust, tick.heard
-    beside = apart(state.apart, state.fits, state.doubts)
-    state = state if beside is state.apart else changed(state, apart=beside)
-    s, moved = _best(design, state)
+    trust, measured = state.trust, tick.heard
+    beside = vouched_posteriors(state.vouched_posteriors, state.posteriors, state.uncertainty)
+    state = state if beside is state.vouched_posteriors else changed(state, vouched_posteriors=beside)
+    s, moved = _best_scale(design, state)
     estimate, released = _estimate(design, state, tick, s, moved)
-    busbar, inverters = _busbar(design, state, heard, estimate), _inverters(design, state)
-    score, threshold, judged = _worst(design, tick.seen, heard.live.size)
-    if state.skew is not None:
-        judged = judged | _judged_seldom(design, state.skew, state)
-    live, beyond = judged & heard.live, score > threshold
-    attack = np.zeros(live.size)
+    busbar, inverters = _busbar(design, state, measured, estimate), _inverters(design, state)
+    score, threshold, loo = _strongest(design, tick.seen, measured.available.size)
+    if state.clock_skew is not None:
+        loo = loo | _tested_seldom(design, state.clock_skew, state)
+    available, beyond = loo & measured.available, score > threshold
+    attack = np.zeros(available.size)
     if any_of(trust.named):
-        off = heard.y - state.learned.bias - estimate.v2_bus[design.prior.meters]
-        attack = np.where(trust.named & heard.live, off, 0.0)
+        off = measured.y - state.learned.bias - estimate.v2_bus[design.prior.meters]
+        attack = np.where(trust.named & measured.available, off, 0.0)
     amounts = _amounts(design, state, tick.seen)
     settled = all_of(tick.transient <= design.options.settled * threshold)
-    said = _of_meters(
-        design, trust, live, beyond, wide=~(threshold <= design.options.widest), settled=settled
+    finding = _of_meters(
+        design, trust, available, beyond, wide=~(threshold <= design.options.widest), settled=settled
     )
-    differs = _differs(design, busbar, estimate)
-    said = _unvouched(design, heard.busbar, live, differs, said)
-    open_ = _open(design, state, said)
-    said = _beside_meters(design, inverters, differs, amounts, tick.rivals, open_, said)
-    said = _unexplained(tick.seen.misfit, said)
-    if not (tick.rivals or open_ or all_of(state.doubts.vouched)):
-        said = _unread(design, tick.frame, ~state.doubts.vouched[max(s, 0)], estimate, said)
-    said = _untimely(design, tick.frame, live, said)
-    decision, cause, reason = said
+    differs = _busbar_finding(design, busbar, estimate)
+    finding = _unvouched(design, measured.busbar_metered, available, differs, finding)
+    open_cases = _open_checks(design, state, finding)
+    finding = _beside_meters(design, inverters, differs, amounts, tick.rivals, open_cases, finding)
+    finding = _unexplained(tick.seen.inconsistent, finding)
+    if not (tick.rivals or open_cases or all_of(state.uncertainty.vouched)):
+        finding = _unread_powers(design, tick.frame, ~state.uncertainty.vouched[max(s, 0)], estimate, finding)
+    finding = _clock_offsets(design, tick.frame, available, finding)
+    decision, cause, reason = finding
     verdict = Verdict(
         decision,
         cause,
@@ -85,33 +85,37 @@ def conclude(
         attack,
         inverters=inverters,
         inverter_attack=_injected(design, state, inverters, amounts),
-        kinds=state.kinds.kinds,
-        explanations=tick.rivals or open_,
-        unjudged=design.unseen & ~(state.curves.heard | inverters),
+        kinds=state.attack_kinds.kinds,
+        explanations=tick.rivals or open_cases,
+        unjudged=design.inverter_undetectable & ~(state.inverter_checks.observable | inverters),
         busbar=differs.named,
         busbar_attack=np.where(differs.named, busbar.off, 0.0),
     )
     last = estimate, verdict
-    return changed(state, released=released, busbar=busbar, last=last), estimate, verdict
+    return changed(state, doubted_powers=released, busbar=busbar, last=last), estimate, verdict
 
 
-def _busbar(design: SequentialDesign, state: SequentialState, heard: Heard, estimate: Estimate) -> Busbar:
+def _busbar(
+    design: SequentialDesign, state: SequentialState, measured: Measurements, estimate: Estimate
+) -> BusbarTrust:
     """Trust of the busbar's meter after this tick."""
     before = state.busbar
-    if all_of(before.believed):
+    if all_of(before.trusted):
         return before
-    fits = (state.fits[s] for s in before.scale.tolist())
-    left = np.array([np.nan if fit is None else fit.variance[k] for k, fit in enumerate(fits)])
-    judged = heard.says & np.isfinite(left)
+    posteriors = (state.posteriors[s] for s in before.scale.tolist())
+    left = np.array([np.nan if fit is None else fit.variance[k] for k, fit in enumerate(posteriors)])
+    loo = measured.busbar_available & np.isfinite(left)
     v0_squared = estimate.v2_bus[design.plant.feeder.busbar_places()]
     allowed = float(state.learned.allowed.max())
-    return follow(design, before, heard.said, judged, v0_squared, np.where(judged, left, 0.0), allowed)
+    return track_busbar(
+        design, before, measured.busbar_reading, loo, v0_squared, np.where(loo, left, 0.0), allowed
+    )
 
 
 def _inverters(design: SequentialDesign, state: SequentialState) -> Bools:
     """Named inverters: by the voltages unless their metered power follows the curve, or by that power."""
-    named, curves = state.trust.inverters, state.curves
-    return named if curves.idle else (named & ~curves.agrees(design)) | curves.named(design)
+    named, curves = state.trust.inverters, state.inverter_checks
+    return named if curves.idle else (named & ~curves.consistent(design)) | curves.named(design)
 
 
 def _injected(
@@ -123,86 +127,97 @@ def _injected(
         for k, amount in amounts.items():
             if k >= design.customers:
                 out[k - design.customers] = amount
-        metered = state.curves.amounts(design)
+        metered = state.inverter_checks.amounts(design)
         out = np.where(inverters, np.where(metered != 0.0, metered, out), 0.0)
     return out
 
 
 def _estimate(
     design: SequentialDesign, state: SequentialState, tick: Tick, s: int, moved: float
-) -> tuple[Estimate, Released | None]:
+) -> tuple[Estimate, DoubtedPowers | None]:
     """Estimate by scale s, with a mean that lacks a part `moved` of the loads' variance."""
     plant = design.plant
-    heard = tick.heard
+    measured = tick.heard
     w, variance, released = _reconstructed(design, state, tick, s, moved)
     v2_bus = tick.v2_bus + w
     first = plant.feeder.busbar_places()
-    v2_bus[first] = np.where(heard.busbar, heard.v0_squared, v2_bus[first])
+    v2_bus[first] = np.where(measured.busbar_metered, measured.v0_squared, v2_bus[first])
     # This is a reading; the posterior of the others does not lower its variance.
     variance = variance.copy()
-    variance[first] = np.maximum(variance[first], np.where(heard.busbar, design.busbar**2, 0.0))
-    trusted = state.trust.trusted & heard.live
-    grounds = Grounds(
+    variance[first] = np.maximum(variance[first], np.where(measured.busbar_metered, design.busbar**2, 0.0))
+    trusted = state.trust.trusted & measured.available
+    grounds = BoundInputs(
         plant=plant,
-        powers=Powers(
-            tick.frame, tick.q, heard.told, heard.v0_squared, state.trust.trusted, state.doubts.sizes
+        powers=PowerErrors(
+            tick.frame,
+            tick.q,
+            measured.uses_q,
+            measured.v0_squared,
+            state.trust.trusted,
+            state.uncertainty.sizes,
         ),
-        injected=state.lag.error,
+        injected=state.injection_error.error,
         model=tick.v2_bus[plant.feeder.bus],
-        busbar=heard.busbar,
-        y=heard.y,
+        busbar=measured.busbar_metered,
+        y=measured.y,
         trusted=trusted,
-        reads=partial(checked, design, tick.frame),
+        checked=partial(checked, design, tick.frame),
         sigmas=design.sigmas[0],
     )
     x = np.zeros(0) if state.x is None else state.x
-    return Bounded.on(grounds, state.t, v2_bus, variance, x), released
+    return BoundedEstimate.of(grounds, state.t, v2_bus, variance, x), released
 
 
-_Said = tuple[Decision, Cause, str]
-_MILD = (Cause.AGREEMENT, Cause.AMBIGUOUS)
+_Finding = tuple[Decision, Cause, str]
+_REPLACEABLE = (Cause.AGREEMENT, Cause.AMBIGUOUS)
 """Causes that findings on inverters and loads replace."""
 
 
 def _of_meters(
-    design: SequentialDesign, trust: Trust, live: Bools, beyond: Bools, *, wide: Bools, settled: bool
-) -> _Said:
+    design: SequentialDesign,
+    trust: TrustState,
+    available: Bools,
+    beyond: Bools,
+    *,
+    wide: Bools,
+    settled: bool,
+) -> _Finding:
     """Verdict on the meters: available, beyond their limits, with too wide limits, (p,) each."""
-    said = decide(
+    finding = decide(
         DecisionInputs(
             names=design.names,
-            max_attacked=max(1, min(design.most, int(np.count_nonzero(live)) // 3)),
-            live=live,
+            max_attacked=max(1, min(design.max_attacked, int(np.count_nonzero(available)) // 3)),
+            live=available,
             suspected=~trust.trusted | beyond,
             named=trust.named,
-            wide=live & wide,
+            wide=available & wide,
             valid=True,
             settled=settled,
             busbar=True,
         )
     )
-    return _contradicted(design, beyond & ~trust.named, trust.named, said)
+    return _contradicted(design, beyond & ~trust.named, trust.named, finding)
 
 
-def _judged_seldom(design: SequentialDesign, skew: Skew, state: SequentialState) -> Bools:
+def _tested_seldom(design: SequentialDesign, skew: ClockSkew, state: SequentialState) -> Bools:
     """Meters with a clock offset, (p,), on scales that test them without a look at this tick."""
-    need = np.array([needed(design, s) for s in range(len(design.lengths))])
-    return skew.judged(state.window.counts, need)
+    need = np.array([min_readings(design, s) for s in range(len(design.lengths))])
+    return skew.tested(state.window.counts, need)
 
 
-def _contradicted(design: SequentialDesign, beyond: Bools, named: Bools, said: _Said) -> _Said:
+def _contradicted(design: SequentialDesign, beyond: Bools, named: Bools, finding: _Finding) -> _Finding:
     """Verdict, UNDECIDED if a decoder leaves more than `max_attacked` meters beyond their limits."""
-    if design.decoder is None or said[1] is not Cause.RESIDUALS:
-        return said
-    more, most = int(np.count_nonzero(beyond)), design.most
+    if design.decoder is None or finding[1] is not Cause.RESIDUALS:
+        return finding
+    more, most = int(np.count_nonzero(beyond)), design.max_attacked
     if not more or int(np.count_nonzero(named)) + more <= most:
-        return said
-    sentence = f"{said[2][:-1]}; but so are {more} of the others, and at most {most} can be told apart."
+        return finding
+    sentence = f"{finding[2][:-1]}; but so are {more} of the others, and at most {most} can be told apart."
     return Decision.UNDECIDED, Cause.TOO_MANY_SUSPECTS, sentence
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Differs:
+class _BusbarFinding:
     """Findings on the busbar's meter: named phases (b,), meter and deviation in words, empty if trusted."""
 
     named: Bools
@@ -210,30 +225,34 @@ class _Differs:
     off: str = ""
 
 
-def _differs(design: SequentialDesign, busbar: Busbar, estimate: Estimate) -> _Differs:
-    if all_of(busbar.believed):
-        return _Differs(busbar.named)
-    doubted, v0_squared = ~busbar.believed, estimate.v2_bus[design.plant.feeder.busbar_places()]
-    off = words.busbar_off(busbar.off, v0_squared, doubted)
-    return _Differs(busbar.named, words.busbar_meter(doubted), off)
+def _busbar_finding(design: SequentialDesign, busbar: BusbarTrust, estimate: Estimate) -> _BusbarFinding:
+    if all_of(busbar.trusted):
+        return _BusbarFinding(busbar.named)
+    doubted, v0_squared = ~busbar.trusted, estimate.v2_bus[design.plant.feeder.busbar_places()]
+    off = words.busbar_deviation(busbar.off, v0_squared, doubted)
+    return _BusbarFinding(busbar.named, words.busbar_meter(doubted), off)
 
 
 def _unvouched(
-    design: SequentialDesign, busbar: Bools | bool, live: Bools, differs: _Differs, said: _Said
-) -> _Said:
+    design: SequentialDesign,
+    busbar: Bools | bool,
+    available: Bools,
+    differs: _BusbarFinding,
+    finding: _Finding,
+) -> _Finding:
     """Verdict, UNDECIDED if too few meters of a phase without a busbar voltage report.
 
     On a balanced feeder most meters are honest and determine the busbar. In three phases those of one phase
     do, which takes more than twice as many as may be manipulated.
     """
-    if said[0] is not Decision.CLEAN or all_of(np.asarray(busbar)):
-        return said
-    feeder, meters = design.plant.feeder, design.prior.meters[live]
-    heard = feeder.same_busbar_phase(np.arange(np.size(busbar)), meters) * np.ones(meters.size)
-    count = np.where(busbar, meters.size, heard.sum(axis=-1)).min()
-    most = max(1, min(design.most, meters.size // 3))
+    if finding[0] is not Decision.CLEAN or all_of(np.asarray(busbar)):
+        return finding
+    feeder, meters = design.plant.feeder, design.prior.meters[available]
+    measured = feeder.same_busbar_phase(np.arange(np.size(busbar)), meters) * np.ones(meters.size)
+    count = np.where(busbar, meters.size, measured.sum(axis=-1)).min()
+    most = max(1, min(design.max_attacked, meters.size // 3))
     if count > 2 * most:
-        return said
+        return finding
     why = "The busbar voltage of a phase is missing"
     if differs.meter:
         why = f"{differs.meter.capitalize()} {differs.off}"
@@ -244,16 +263,16 @@ def _unvouched(
     return Decision.UNDECIDED, Cause.TOO_FEW_METERS, sentence
 
 
-def _unexplained(misfit: tuple[bool, ...], said: _Said) -> _Said:
+def _unexplained(misfit: tuple[bool, ...], finding: _Finding) -> _Finding:
     """Verdict, with the misfit of the trusted meters on a scale that no search explains."""
-    decision, cause, reason = said
+    decision, cause, reason = finding
     if not any(misfit):
-        return said
+        return finding
     if decision is Decision.ATTACKED:
         return decision, cause, f"{reason} The other meters, taken together, still disagree with the feeder."
     # Silent meters do not outweigh this evidence.
     if cause not in (Cause.AGREEMENT, Cause.SILENT_METERS):
-        return said
+        return finding
     sentence = (
         "The meters, taken together, disagree with the feeder by more than chance, though none of them does "
         "by itself."
@@ -261,56 +280,64 @@ def _unexplained(misfit: tuple[bool, ...], said: _Said) -> _Said:
     return Decision.UNDECIDED, Cause.MISFIT, sentence
 
 
-def _unread(design: SequentialDesign, frame: Frame, unread: Bools, estimate: Estimate, said: _Said) -> _Said:
+def _unread_powers(
+    design: SequentialDesign, frame: Frame, unread: Bools, estimate: Estimate, finding: _Finding
+) -> _Finding:
     """Verdict, UNDECIDED if a voltage beside an unread power is too uncertain."""
-    if said[1] not in _MILD or not any_of(unread):
-        return said
+    if finding[1] not in _REPLACEABLE or not any_of(unread):
+        return finding
     at, limit = design.plant.meters, design.options.unread_std_percent
-    v = np.sqrt(np.maximum(estimate.v2[at], _DEAD))
+    v = np.sqrt(np.maximum(estimate.v2[at], _LEAST_V2))
     percent = 50.0 * estimate.std[at] / (v * design.plant.droop.vbar)
     wide = unread & ~(percent <= limit)
     if not any_of(wide):
-        return said
+        return finding
     origins = np.zeros(frame.p.size, dtype=np.intp) if frame.p_origin is None else frame.p_origin
-    sentence = words.unread(design.names, wide, origins[at], percent, limit)
+    sentence = words.unread_sentence(design.names, wide, origins[at], percent, limit)
     return Decision.UNDECIDED, Cause.MISSING_POWERS, sentence
 
 
-def _untimely(design: SequentialDesign, frame: Frame, live: Bools, said: _Said) -> _Said:
+def _clock_offsets(design: SequentialDesign, frame: Frame, available: Bools, finding: _Finding) -> _Finding:
     """Verdict, with the meters that count as silent for a clock offset that no scale covers."""
-    decision, cause, reason = said
-    far = unusable(design, frame.clock_offset)
+    decision, cause, reason = finding
+    far = unusable_offsets(design, frame.clock_offset)
     if far is None or cause not in (Cause.SILENT_METERS, Cause.TOO_FEW_METERS):
-        return said
-    sentence = words.untimely(design.names, far, largest(design))
-    if cause is Cause.SILENT_METERS and not any_of(~live & ~far):
+        return finding
+    sentence = words.clock_sentence(design.names, far, largest_offset(design))
+    if cause is Cause.SILENT_METERS and not any_of(~available & ~far):
         return decision, Cause.CLOCK_OFFSET, sentence
     return decision, cause, f"{reason} {sentence}"
 
 
-_DEAD = 1e-2
+_LEAST_V2 = 1e-2
 """Least squared voltage that relates a standard deviation to the voltage, pu."""
 
 
-def _open(design: SequentialDesign, state: SequentialState, said: _Said) -> tuple[Explanation, ...]:
+def _open_checks(
+    design: SequentialDesign, state: SequentialState, finding: _Finding
+) -> tuple[Explanation, ...]:
     """Hypotheses about metered reactive powers that the voltages leave open."""
-    if state.curves.idle:
+    if state.inverter_checks.idle:
         return ()
-    sure = state.trust.named if said[1] is Cause.RESIDUALS else np.zeros_like(state.trust.named)
-    return state.curves.explanations(design, sure) if said[1] in (*_MILD, Cause.RESIDUALS) else ()
+    sure = state.trust.named if finding[1] is Cause.RESIDUALS else np.zeros_like(state.trust.named)
+    return (
+        state.inverter_checks.explanations(design, sure)
+        if finding[1] in (*_REPLACEABLE, Cause.RESIDUALS)
+        else ()
+    )
 
 
 def _beside_meters(  # noqa: PLR0917
     design: SequentialDesign,
     inverters: Bools,
-    differs: _Differs,
+    differs: _BusbarFinding,
     amounts: dict[int, float],
     rivals: tuple[Explanation, ...],
-    open_: tuple[Explanation, ...],
-    said: _Said,
-) -> _Said:
+    open_cases: tuple[Explanation, ...],
+    finding: _Finding,
+) -> _Finding:
     """Verdict, with findings other than meters."""
-    decision, cause, reason = said
+    decision, cause, reason = finding
     plant, found = design.plant, []
     if any_of(inverters):
         owners = ", ".join(plant.feeder.customers[c] for c in plant.droop.customer[inverters])
@@ -319,39 +346,45 @@ def _beside_meters(  # noqa: PLR0917
         found.append((differs.meter, f"it {differs.off}"))
     if cause is Cause.RESIDUALS:
         reason = f"{reason[:-1]}; and {' and '.join(each for each, _ in found)}." if found else reason
-        return decision, cause, f"{reason} {words.ways(design, open_)}" if open_ else reason
+        return (
+            decision,
+            cause,
+            f"{reason} {words.explanations_sentence(design, open_cases)}" if open_cases else reason,
+        )
     # Silent meters do not outweigh this evidence.
-    if cause not in ((*_MILD, Cause.SILENT_METERS) if found else _MILD):
-        return said
+    if cause not in ((*_REPLACEABLE, Cause.SILENT_METERS) if found else _REPLACEABLE):
+        return finding
     if found:
         sentence = f"Manipulated: {'; and '.join('; '.join(each) for each in found)}."
         return Decision.ATTACKED, Cause.RESIDUALS, sentence
     sentence = ""
     if differs.meter:
         sentence = f"{differs.meter.capitalize()} {differs.off}; it is not believed."
-    elif rivals or open_:
-        sentence = words.ways(design, rivals or open_)
+    elif rivals or open_cases:
+        sentence = words.explanations_sentence(design, rivals or open_cases)
     elif amounts:
-        sentence = words.doubt(design, *next(iter(amounts.items())))
-    return (Decision.UNDECIDED, Cause.AMBIGUOUS, sentence) if sentence else said
+        sentence = words.fault_sentence(design, *next(iter(amounts.items())))
+    return (Decision.UNDECIDED, Cause.AMBIGUOUS, sentence) if sentence else finding
 
 
-def _amounts(design: SequentialDesign, state: SequentialState, seen: Examined) -> dict[int, float]:
+def _amounts(
+    design: SequentialDesign, state: SequentialState, identified: Identification
+) -> dict[int, float]:
     """Amount of each accused fault, by index of the dictionary, pu.
 
     With prior variance s^2 and direction a the posterior mean is ``s^2 a^T Q m``.
     """
     out: dict[int, float] = {}
-    book, std = design.book, state.doubts.sizes
+    faults, std = design.faults, state.uncertainty.sizes
     for k, s in state.trust.accused:
-        view, now = seen.views[s], state.fits[s]
+        view, now = identified.tests[s], state.posteriors[s]
         if view is not None:
-            weights = view.judged.weights
+            weights = view.loo.weights
         elif now is not None:
             weights = now.weights(_mean(state, s))
         else:
             continue
-        out[k] = float(std[k] ** 2 * book.along(weights)[k])
+        out[k] = float(std[k] ** 2 * faults.weighted(weights)[k])
     return out
 
 
@@ -362,31 +395,31 @@ def _mean(state: SequentialState, s: int) -> Floats:
 
 def _reconstructed(
     design: SequentialDesign, state: SequentialState, tick: Tick, s: int, moved: float
-) -> tuple[Floats, Floats, Released | None]:
+) -> tuple[Floats, Floats, DoubtedPowers | None]:
     """Correction of the model by the trusted meters at every bus, its variance, and the doubted powers."""
-    prior_, told = state.doubts.priors[max(s, 0)], tick.frame.p_std
-    now, view = (None, None) if s < 0 else (state.fits[s], tick.seen.views[s])
+    prior_, told = state.uncertainty.priors[max(s, 0)], tick.frame.p_std
+    now, view = (None, None) if s < 0 else (state.posteriors[s], tick.seen.tests[s])
     if now is None:
         return np.zeros_like(prior_.variance), prior_.variance, None
-    judged = judge(now, _mean(state, s)) if view is None else view.judged
+    loo = leave_one_out(now, _mean(state, s)) if view is None else view.loo
     # The model starts at this busbar reading; a mean removes only its part of the jitter.
-    jitter = (1.0 - 1.0 / design.lengths[s]) * design.flicker
-    flicker = design.plant.feeder.broadcast_busbar(np.where(tick.heard.busbar, jitter, 0.0))
+    jitter = (1.0 - 1.0 / design.lengths[s]) * design.busbar_noise
+    flicker = design.plant.feeder.broadcast_busbar(np.where(tick.heard.busbar_metered, jitter, 0.0))
     after = moved * prior_.variance + _hidden(state, prior_) + flicker
-    beside = state.apart[s]
+    beside = state.vouched_posteriors[s]
     if beside is not None:
-        after = after + beside.added(judged)
-    liars = design.plant.meters[~state.trust.trusted]
+        after = after + beside.added_variance(loo)
+    suspects = design.plant.meters[~state.trust.trusted]
     # Unreported powers, known by a standard deviation, are not false.
-    liars = liars if told is None else liars[np.isnan(told[liars]) | _late(tick.frame)[liars]]
-    if not liars.size:
-        return judged.w, now.variance + after, None
-    sizes, released = state.doubts.sizes[liars], state.released
-    if released is None or not released.about(now, liars, sizes):
-        released = release(design.effects, now, liars, sizes, judged)
-    elif s in tick.seen.found or not released.holds(judged):
-        released = released.anew(judged)
-    return released.said(judged), released.variance + after, released
+    suspects = suspects if told is None else suspects[np.isnan(told[suspects]) | _late(tick.frame)[suspects]]
+    if not suspects.size:
+        return loo.mean, now.variance + after, None
+    sizes, released = state.uncertainty.sizes[suspects], state.doubted_powers
+    if released is None or not released.matches(now, suspects, sizes):
+        released = doubt_powers(design.sensitivities, now, suspects, sizes, loo)
+    elif s in tick.seen.candidates or not released.is_current(loo):
+        released = released.renewed(loo)
+    return released.mean(loo), released.variance + after, released
 
 
 def _late(frame: Frame) -> Bools:
@@ -396,17 +429,20 @@ def _late(frame: Frame) -> Bools:
     return np.asarray(frame.p_origin != PowerOrigin.UNREAD)
 
 
-def _best(design: SequentialDesign, state: SequentialState) -> tuple[int, float]:
+def _best_scale(design: SequentialDesign, state: SequentialState) -> tuple[int, float]:
     """Scale of the least posterior variance, -1 for none, and the part of the loads' variance it lacks.
 
     A mean over many ticks does not contain the present loads.
     """
     at, least, moved = -1, np.inf, 0.0
-    for s, (now, length) in enumerate(zip(state.fits, design.lengths, strict=True)):
+    for s, (now, length) in enumerate(zip(state.posteriors, design.lengths, strict=True)):
         if now is None:
             continue
-        lag, beside = min(1.0, length * design.step_s / design.doubt.time_s) * (length > 1), state.apart[s]
-        total = (now if beside is None else beside.rest).total() + lag * now.prior.total
+        lag, beside = (
+            min(1.0, length * design.step_s / design.doubt.time_s) * (length > 1),
+            state.vouched_posteriors[s],
+        )
+        total = (now if beside is None else beside.vouched).total_variance() + lag * now.prior.total
         if total < least:
             at, least, moved = s, total, lag
     return at, moved
@@ -422,20 +458,20 @@ def _hidden(state: SequentialState, prior_: Prior) -> Floats:
     return np.asarray(np.minimum(out, prior_.variance))
 
 
-def _worst(design: SequentialDesign, seen: Examined, p: int) -> tuple[Floats, Floats, Bools]:
+def _strongest(design: SequentialDesign, identified: Identification, p: int) -> tuple[Floats, Floats, Bools]:
     """Residual and limit of each meter on the scale with the strongest evidence; tested meters."""
-    views = [view for view in seen.views if view is not None]
+    views = [view for view in identified.tests if view is not None]
     if not views:
         return np.full(p, np.nan), np.full(p, design.options.widest), np.zeros(p, dtype=np.bool_)
-    score, limit, judged = np.abs(views[0].judged.offset), views[0].limit, views[0].enough
-    ratio = score / limit if all_of(judged) else np.where(judged, score / limit, -1.0)
+    score, limit, loo = np.abs(views[0].loo.residual), views[0].limit, views[0].enough
+    ratio = score / limit if all_of(loo) else np.where(loo, score / limit, -1.0)
     for view in views[1:]:
-        offset = np.abs(view.judged.offset)
+        offset = np.abs(view.loo.residual)
         here = offset / view.limit
         more = view.enough & (here > ratio)
         ratio = np.where(more, here, ratio)
         score, limit = np.where(more, offset, score), np.where(more, view.limit, limit)
-        judged = judged | view.enough
-    if all_of(judged):
-        return score, limit, judged
-    return np.where(judged, score, np.nan), np.where(judged, limit, design.options.widest), judged
+        loo = loo | view.enough
+    if all_of(loo):
+        return score, limit, loo
+    return np.where(loo, score, np.nan), np.where(loo, limit, design.options.widest), loo

@@ -19,22 +19,22 @@ import numpy as np
 from scipy.special import chdtri
 
 from gridsec.arrays import Floats
-from gridsec.estimators.sequential.conditional import Fit, Judged
+from gridsec.estimators.sequential.conditional import LeaveOneOut, Posterior
 
 
-def inconsistent(now: Fit, judged: Judged, model: Floats, tail: float) -> bool:
+def inconsistent(now: Posterior, loo: LeaveOneOut, model: Floats, tail: float) -> bool:
     """True where the chi-square of the trusted meters is beyond its limit; O(p), O(p^2) close to the limit.
 
     model: (p,) largest model errors, squared pu. tail: probability of a false alarm.
     """
-    root, chance = np.sqrt(max(judged.misfit, 0.0)), np.sqrt(misfit_limit(now.count, tail))
+    root, chance = np.sqrt(max(loo.chi_square, 0.0)), np.sqrt(chi_square_limit(now.count, tail))
     if root <= chance:
         return False
-    at, Q = now.trusting()
+    at, Q = now.precision()
     return bool(root > chance + np.sqrt(model[at] @ np.abs(Q) @ model[at]))
 
 
 @lru_cache(maxsize=4096)
-def misfit_limit(freedom: int, tail: float) -> float:
+def chi_square_limit(freedom: int, tail: float) -> float:
     """Quantile of chi-square with `freedom` degrees of freedom at the upper tail."""
     return float(chdtri(freedom, tail)) if freedom else 0.0

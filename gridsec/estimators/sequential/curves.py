@@ -27,30 +27,30 @@ from itertools import product
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, any_of
-from gridsec.estimators.sequential.bounds import Lag
-from gridsec.estimators.sequential.conditional import Fit, Judged
+from gridsec.estimators.sequential.bounds import InjectionError
+from gridsec.estimators.sequential.conditional import LeaveOneOut, Posterior
 from gridsec.estimators.sequential.design import SequentialDesign
 from gridsec.interface import Explanation, Frame
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Curves:
+class InverterChecks:
     """Results of the comparison. p meters, m inverters."""
 
-    count: Ints  # (p,) disagreeing ticks times `_EACH` less agreeing ones
+    count: Ints  # (p,) disagreeing ticks times `_DISAGREEMENT` less agreeing ones
     off: Bools  # (p,) lasting disagreement
     amount: Floats  # (p,) its size, pu; 0 for others
     share: Floats  # (p,) probability of a wrong inverter rather than a false report; 0 for others
     sure: Bools  # (p,) wrong inverter by the voltages, without later evidence against it
-    heard: Bools  # (m,) injection metered well enough to show its whole range
+    observable: Bools  # (m,) injection metered well enough to show its whole range
     idle: bool = field(init=False)  # derived: no report is compared
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "idle", not (any_of(self.heard) or any_of(self.count)))
+        object.__setattr__(self, "idle", not (any_of(self.observable) or any_of(self.count)))
 
     def named(self, design: SequentialDesign) -> Bools:
         """Inverters that do not follow their curves, (m,)."""
-        return (design.meter_of >= 0) & self.sure[design.meter_of] if self.sure.size else self.heard
+        return (design.meter_of >= 0) & self.sure[design.meter_of] if self.sure.size else self.observable
 
     def amounts(self, design: SequentialDesign) -> Floats:
         """Deviation of each inverter from its curve, (m,), pu."""
@@ -61,19 +61,19 @@ class Curves:
         share = np.bincount(at[metered], minlength=self.amount.size)
         return np.where(metered, self.amount[at] / np.maximum(share[at], 1), 0.0)
 
-    def agrees(self, design: SequentialDesign) -> Bools:
+    def consistent(self, design: SequentialDesign) -> Bools:
         """Metered inverters that follow their curves, (m,)."""
-        return self.heard & (self.count[design.meter_of] == 0) if self.count.size else self.heard
+        return self.observable & (self.count[design.meter_of] == 0) if self.count.size else self.observable
 
-    def renewed(self, which: Bools) -> Curves:
+    def without_meters(self, which: Bools) -> InverterChecks:
         """Results without meters that were replaced, (p,)."""
-        return Curves(
+        return InverterChecks(
             np.where(which, 0, self.count),
             self.off & ~which,
             np.where(which, 0.0, self.amount),
             np.where(which, 0.0, self.share),
             self.sure & ~which,
-            self.heard,
+            self.observable,
         )
 
     def explanations(self, design: SequentialDesign, named: Bools) -> tuple[Explanation, ...]:
@@ -85,75 +85,82 @@ class Curves:
         if self.idle or not any_of(open_):
             return ()
         strange = np.argsort(-np.where(open_, np.abs(self.amount), -1.0), kind="stable")
-        who = np.sort(strange[: min(int(open_.sum()), _TOGETHER)])
+        which = np.sort(strange[: min(int(open_.sum()), _MAX_COMBINED)])
         ways = []
-        for wrong in map(np.array, product((True, False), repeat=who.size)):
-            inverters = np.isin(design.meter_of, who[wrong])
+        for wrong in map(np.array, product((True, False), repeat=which.size)):
+            inverters = np.isin(design.meter_of, which[wrong])
             powers = np.zeros(design.customers, dtype=np.bool_)
-            powers[design.plant.meters[who[~wrong]]] = True
-            each = np.where(wrong, self.share[who], 1.0 - self.share[who])
+            powers[design.plant.meters[which[~wrong]]] = True
+            each = np.where(wrong, self.share[which], 1.0 - self.share[which])
             ways.append(Explanation(named, inverters, float(each.prod()), powers))
         likely = [way for way in ways if way.probability > 1.0 / design.options.like]
         return tuple(sorted(likely, key=lambda way: -way.probability))
 
 
-def empty(meters: int, inverters: int) -> Curves:
+def no_checks(meters: int, inverters: int) -> InverterChecks:
     """No comparison yet."""
     no = np.zeros(meters, dtype=np.bool_)
     zero = np.zeros(meters)
-    return Curves(np.zeros(meters, dtype=np.intp), no, zero, zero, no, np.zeros(inverters, dtype=np.bool_))
+    return InverterChecks(
+        np.zeros(meters, dtype=np.intp), no, zero, zero, no, np.zeros(inverters, dtype=np.bool_)
+    )
 
 
-_TOGETHER = 3
+_MAX_COMBINED = 3
 """Largest number of customers in the combined cases."""
 
-CONFIRM = 5
+LONGEST_MEAN = 5
 """Ticks of the longest mean that decides between report and inverter."""
 
-_EACH = 4
+_DISAGREEMENT = 4
 """Count of a disagreement; an agreement counts -1."""
-_ENOUGH, _MOST = 12, 48
+_EVIDENCE, _MAX_COUNT = 12, 48
 """Count that is evidence, and largest count."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Evidence:
+class ReportedPowers:
     """Inputs of one tick. N customers, p meters, m inverters."""
 
     frame: Frame  # the frame
-    reported: Bools  # (N,) net reactive power is reported
-    told: Bools  # (N,) net reactive power is used by the model
+    reports_q: Bools  # (N,) net reactive power is reported
+    uses_q: Bools  # (N,) net reactive power is used by the model
     trusted: Bools  # (p,) available meters, trusted for long enough that the observer followed them
     x: Floats  # (m,) observed injections, pu
-    lag: Lag  # their errors
-    fit: Fit | None  # posterior of the trusted meters on the longest scale of at most `CONFIRM` ticks
-    judged: Judged | None  # its leave-one-out residuals
+    injection_error: InjectionError  # their errors
+    posterior: (
+        Posterior | None
+    )  # posterior of the trusted meters on the longest scale of at most `LONGEST_MEAN` ticks
+    loo: LeaveOneOut | None  # its leave-one-out residuals
 
 
-def compare(design: SequentialDesign, before: Curves, now: Evidence) -> Curves:
+def check_inverters(design: SequentialDesign, before: InverterChecks, now: ReportedPowers) -> InverterChecks:
     """Compare the reports of one tick with the curves."""
     droop, at, size = design.plant.droop, design.plant.meters, design.customers
     own = np.bincount(droop.customer, minlength=size) > 0
-    asked = now.reported[at] & now.trusted & own[at]
-    if now.fit is None or now.judged is None:
+    asked = now.reports_q[at] & now.trusted & own[at]
+    if now.posterior is None or now.loo is None:
         return before
     if not (any_of(asked) or any_of(before.count)):
-        return before if before.idle else empty(at.size, droop.tau.size)
+        return before if before.idle else no_checks(at.size, droop.tau.size)
     x, error, slope, span = (
-        droop.per_customer(of, size)[at] for of in (now.x, now.lag.error, droop.slope, now.lag.span)
+        droop.per_customer(of, size)[at]
+        for of in (now.x, now.injection_error.error, droop.slope, now.injection_error.span)
     )
-    frame, judged = now.frame, now.judged
+    frame, loo = now.frame, now.loo
     amount = np.where(asked, frame.q_net[at] - frame.q[at] - x, 0.0)
-    other = np.minimum(span, slope * (np.abs(judged.offset) + design.sigmas[0] * judged.std))
+    other = np.minimum(span, slope * (np.abs(loo.residual) + design.sigmas[0] * loo.std))
     room = frame.q_error[at] + frame.q_net_error[at] + error + other
-    off = asked & (np.abs(amount) > room)
-    count = np.where(asked, np.clip(before.count + np.where(off, _EACH, -1), 0, _MOST), before.count)
-    lasts = (count >= _ENOUGH) | (before.off & (count > 0))
+    disagrees = asked & (np.abs(amount) > room)
+    count = np.where(
+        asked, np.clip(before.count + np.where(disagrees, _DISAGREEMENT, -1), 0, _MAX_COUNT), before.count
+    )
+    lasts = (count >= _EVIDENCE) | (before.off & (count > 0))
     share, beyond = np.zeros(at.size), before.sure.copy()
     amount = np.where(asked, amount, before.amount) * lasts
     for j in np.flatnonzero(lasts).tolist():
-        told = bool(asked[j] and now.told[at[j]])
-        share[j], sigmas = _share(design, now.fit, judged.weights, j, float(amount[j]), told=told)
+        told = bool(asked[j] and now.uses_q[at[j]])
+        share[j], sigmas = _share(design, now.posterior, loo.weights, j, float(amount[j]), told=told)
         beyond[j] |= bool(asked[j] and sigmas > design.sigmas[0])
     # Without reports the accusation stays until the voltages contradict it.
     over = lasts & ~asked & (share <= 1.0 / design.options.like)
@@ -163,11 +170,11 @@ def compare(design: SequentialDesign, before: Curves, now: Evidence) -> Curves:
     least, most = (of[at] for of in droop.saturated(size))
     enough = asked & (room < np.maximum(most - x, x - least))
     heard = (design.meter_of >= 0) & enough[design.meter_of]
-    return Curves(count, lasts, amount, share, sure, heard)
+    return InverterChecks(count, lasts, amount, share, sure, heard)
 
 
 def _share(
-    design: SequentialDesign, now: Fit, weights: Floats, j: int, a: float, *, told: bool
+    design: SequentialDesign, now: Posterior, weights: Floats, j: int, a: float, *, told: bool
 ) -> tuple[float, float]:
     """Probability that a report is true and the inverter wrong, for even prior odds.
 
@@ -175,16 +182,16 @@ def _share(
     are needed: a test at every tick for years meets an unlikely ratio.
     """
     inverter = int(np.argmax(design.meter_of == j))
-    column = design.book.columns(np.array([design.customers + inverter]))[now.prior.meters, 0]
-    at, Q = now.trusting()
+    column = design.faults.columns(np.array([design.customers + inverter]))[now.prior.meters, 0]
+    at, Q = now.precision()
     along, form = float(column @ weights), float(column[at] @ Q @ column[at])
     if told:
         along += a * form  # as if x were true
     worse = 2.0 * a * along - a * a * form
-    share = 1.0 / (1.0 + np.exp(-0.5 * np.clip(worse, -_FAR, _FAR)))
+    share = 1.0 / (1.0 + np.exp(-0.5 * np.clip(worse, -_MAX_LOG_RATIO, _MAX_LOG_RATIO)))
     # Inverters at the busbar have zero sensitivity.
     return float(share), abs(along) / max(float(np.sqrt(form)), np.finfo(np.float64).tiny)
 
 
-_FAR = 1000.0
+_MAX_LOG_RATIO = 1000.0
 """Largest twice the logarithm of a likelihood ratio, against overflow."""

@@ -10,31 +10,31 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from gridsec.arrays import Bools, Floats
-from gridsec.estimators.sequential.conditional import Fit
+from gridsec.estimators.sequential.conditional import Posterior
 from gridsec.estimators.sequential.search import Limits
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Evidence:
+class DecoderInput:
     """Input of a decoder. p meters."""
 
-    whole: Fit  # posterior of all meters with a reading, not to be changed
+    whole: Posterior  # posterior of all meters with a reading, not to be changed
     m: Floats  # (p,) readings minus the model, squared pu; any finite value without a reading
-    live: Bools  # (p,) meters with a reading
+    available: Bools  # (p,) meters with a reading
     limits: Limits  # rule of the limits
-    believed: Bools  # (p,) meters trusted before
-    over: Bools  # (p,) residual above the limit with these
-    most: int  # largest number of accusations
+    trusted: Bools  # (p,) meters trusted before
+    above_limit: Bools  # (p,) residual above the limit with these
+    max_attacked: int  # largest number of accusations
     like: float  # least likelihood ratio that decides against a rival
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Accused:
+class DecoderAnswer:
     """Answer of a decoder."""
 
     meters: Bools  # (p,) accused meters
     worse: float = 0.0  # cost above that of the best answer
 
 
-Decoder = Callable[[Evidence], tuple[Accused, ...]]
+Decoder = Callable[[DecoderInput], tuple[DecoderAnswer, ...]]
 """The best answer first, then those about as good."""

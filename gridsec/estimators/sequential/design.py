@@ -18,11 +18,11 @@ from gridsec.errors import DesignInfeasible, NotObservable, Problem, raise_if_an
 from gridsec.estimators.plant import Plant, check_plant, judging_problems
 from gridsec.estimators.sequential.conditional import Prior
 from gridsec.estimators.sequential.decoder import Decoder
-from gridsec.estimators.sequential.dictionary import Dictionary
-from gridsec.estimators.sequential.effects import Effects
-from gridsec.estimators.sequential.kinds import Shapes, Traces, pace
+from gridsec.estimators.sequential.dictionary import FaultDictionary
+from gridsec.estimators.sequential.effects import Sensitivities
+from gridsec.estimators.sequential.kinds import KindReferences, LoadTraces, look_interval
 from gridsec.estimators.sequential.loads import UNMETERED, LoadDoubt, injection_doubt, prior
-from gridsec.estimators.sequential.repeats import rules
+from gridsec.estimators.sequential.repeats import repeat_limits
 from gridsec.estimators.thresholds import curve_mismatch
 from gridsec.grid.meter import ToldError, busbar_error, steady_rounding
 from gridsec.grid.network import Network, Power
@@ -146,9 +146,9 @@ class SequentialDesign:
     prior: Prior  # resulting prior of the voltages
     injections: Floats  # (N,) standard deviation of the observed injections, pu
     busbar: float  # standard deviation of the squared busbar voltage, squared pu
-    flicker: float  # variance of the busbar's reading from tick to tick, squared pu^2
+    busbar_noise: float  # variance of the busbar's reading from tick to tick, squared pu^2
     lengths: tuple[int, ...]  # (s,) ticks of each scale
-    every: tuple[int, ...]  # (s,) ticks from one look at each scale to the next
+    look_every: tuple[int, ...]  # (s,) ticks from one look at each scale to the next
     confirmed: Ints  # (s,) ticks that evidence on each scale must last before a meter is named
     tails: tuple[float, ...]  # (s,) probability that one test of one look exceeds its limit by chance
     sigmas: tuple[float, ...]  # (s,) standard deviations of evidence: two-sided Gaussian quantiles of `tails`
@@ -157,17 +157,19 @@ class SequentialDesign:
     fixed: Floats  # (p,) variance of its fixed error, squared pu^2
     allowed: Floats  # (p,) largest fixed error by the accuracy class, `rounded` included, squared pu
     rounded: Floats  # (p,) largest lasting rounding error, which cannot be learned, squared pu
-    hangs_on: Floats  # (p, b) 1 where a busbar phase supplies the meter, else 0
-    reach: Floats  # (p,) effect of all inverters between their limits at each meter, squared pu
+    busbar_incidence: Floats  # (p, b) 1 where a busbar phase supplies the meter, else 0
+    inverter_reach: Floats  # (p,) effect of all inverters between their limits at each meter, squared pu
     meter_of: Ints  # (m,) meter that drives each inverter; -1 for none
-    heard: ToldError  # (m,) errors of the readings of the inverters' meters
+    reading_errors: ToldError  # (m,) errors of the readings of the inverters' meters
     mismatch: Floats  # (m,) difference of a real curve, linear in v, from the model's, linear in z, pu
-    unseen: Bools  # (m,) inverters with a range too small to be detected by the voltages
-    book: Dictionary = field(repr=False)  # faults: customers' active powers, then inverters
-    shapes: Shapes = field(repr=False)  # references of the kinds of manipulations, and limits of repetition
-    most: int  # largest number of manipulated meters told apart
-    most_p: Floats  # (N,) largest possible active power, pu: more would move the voltage beyond all limits
-    most_q: Floats  # (N,) largest possible reactive power, pu
+    inverter_undetectable: Bools  # (m,) inverters with a range too small to be detected by the voltages
+    faults: FaultDictionary = field(repr=False)  # faults: customers' active powers, then inverters
+    references: KindReferences = field(
+        repr=False
+    )  # references of the kinds of manipulations, and limits of repetition
+    max_attacked: int  # largest number of manipulated meters told apart
+    max_p: Floats  # (N,) largest possible active power, pu: more would move the voltage beyond all limits
+    max_q: Floats  # (N,) largest possible reactive power, pu
     step_s: float  # expected interval between frames, s
     options: SequentialOptions = field(repr=False)  # tuning parameters
     decoder: Decoder | None = None  # decoder in place of the search; None for the search
@@ -178,9 +180,9 @@ class SequentialDesign:
         return self.plant.feeder.bus.size
 
     @property
-    def effects(self) -> Effects:
+    def sensitivities(self) -> Sensitivities:
         """Sensitivities of the voltages to every customer's powers."""
-        return self.shapes.traces.effects
+        return self.references.traces.sensitivities
 
     @property
     def observers(self) -> int:
@@ -214,31 +216,31 @@ def design(
     meters = plant.meters
     _check(plant, doubt, step_s, max_attacked)
     lure = close_loop(plant.feeder, plant.droop, meters)
-    effects = Effects(plant.feeder)
+    sensitivities = Sensitivities(plant.feeder)
     injections = injection_doubt(plant.droop, plant.accuracy, meters, plant.feeder.bus.size)
     busbar = min(busbar_error(plant.accuracy, plant.droop.vbar**2, 2.0) / 2.0, UNMETERED)
     lengths = _lengths(options.scales_s, step_s)
-    accuracy, slope = plant.accuracy, 2.0 * _HIGH * plant.droop.vbar
-    white = np.maximum(slope**2 * (accuracy.jitter**2 + accuracy.resolution**2 / 12.0), _WHITE)
+    accuracy, slope = plant.accuracy, 2.0 * _CONVERSION_VOLTAGE * plant.droop.vbar
+    white = np.maximum(slope**2 * (accuracy.jitter**2 + accuracy.resolution**2 / 12.0), _LEAST_NOISE)
     rounded = slope * steady_rounding(accuracy)
     fixed = slope**2 * accuracy.class_fraction**2 / 3.0 + 0.5 * rounded**2
     known = prior(plant.feeder, plant.feeder.bus[meters], doubt, busbar=busbar, inverters=injections)
     suspect = -float(ndtri(0.5 * options.suspect / meters.size))
-    every = _every(lengths)
+    every = _look_intervals(lengths)
     tails = tuple(_tail(options.alarms_per_year, plant, n * step_s, len(lengths)) for n in every)
     sigmas = tuple(-float(ndtri(tail / 2.0)) for tail in tails)
     return SequentialDesign(
         plant=plant,
         names=tuple(plant.feeder.customers[c] for c in meters),
         loop=lure.H,
-        certificate=_proof(lure),
+        certificate=_certificate(lure),
         doubt=doubt,
         prior=known,
         injections=injections,
         busbar=busbar,
-        flicker=slope**2 * (accuracy.busbar_jitter**2 + accuracy.busbar_resolution**2 / 12.0),
+        busbar_noise=slope**2 * (accuracy.busbar_jitter**2 + accuracy.busbar_resolution**2 / 12.0),
         lengths=lengths,
-        every=every,
+        look_every=every,
         confirmed=2 + np.array(lengths) // 6,
         tails=tails,
         sigmas=sigmas,
@@ -247,49 +249,53 @@ def design(
         fixed=fixed,
         allowed=slope * accuracy.class_fraction + rounded,
         rounded=rounded,
-        hangs_on=plant.feeder.busbar_incidence()[meters],
-        reach=np.abs(lure.C) @ (2.0 * plant.droop.limit),
+        busbar_incidence=plant.feeder.busbar_incidence()[meters],
+        inverter_reach=np.abs(lure.C) @ (2.0 * plant.droop.limit),
         meter_of=_meter_of(plant),
         mismatch=curve_mismatch(plant.droop),
-        heard=ToldError.over(plant.accuracy, _meter_of(plant), sigmas[0]),
-        unseen=_unseen(plant, effects, known, fixed + white / lengths[-1], suspect),
-        book=_suspicions(plant, effects, options),
-        shapes=_shapes(plant, effects, options.alarms_per_year, step_s, lengths),
-        most=meters.size // 3 if max_attacked is None else max_attacked,
-        most_p=_most_power(plant.feeder, Power.ACTIVE),
-        most_q=_most_power(plant.feeder, Power.REACTIVE),
+        reading_errors=ToldError.over(plant.accuracy, _meter_of(plant), sigmas[0]),
+        inverter_undetectable=_undetectable(
+            plant, sensitivities, known, fixed + white / lengths[-1], suspect
+        ),
+        faults=_fault_dictionary(plant, sensitivities, options),
+        references=_references(plant, sensitivities, options.alarms_per_year, step_s, lengths),
+        max_attacked=meters.size // 3 if max_attacked is None else max_attacked,
+        max_p=_max_power(plant.feeder, Power.ACTIVE),
+        max_q=_max_power(plant.feeder, Power.REACTIVE),
         step_s=step_s,
         options=options,
     )
 
 
-_CHANCE = 2.0
+_HIDDEN_SIGMAS = 2.0
 """Standard deviations by which chance may hide an effect."""
 
 
-def _unseen(plant: Plant, effects: Effects, known: Prior, noise: Floats, suspect: float) -> Bools:
+def _undetectable(
+    plant: Plant, sensitivities: Sensitivities, known: Prior, noise: Floats, suspect: float
+) -> Bools:
     """Inverters with a range within the limits of the evidence: ``span sqrt(c^T Q c)``."""
     whole: Floats = known.among(np.arange(noise.size))
     whole[np.diag_indices_from(whole)] += noise
-    moved = effects.columns(Power.REACTIVE, plant.droop.customer)[known.meters]
+    moved = sensitivities.columns(Power.REACTIVE, plant.droop.customer)[known.meters]
     failed = lapack.dpotrf(whole, lower=True, clean=False, overwrite_a=True)[1]
     half, _ = lapack.dtrtrs(whole, moved, lower=True)
     if failed:
         raise np.linalg.LinAlgError("the matrix is not positive definite")
-    return np.asarray(plant.droop.span * np.sqrt((half * half).sum(axis=0)) <= suspect + _CHANCE)
+    return np.asarray(plant.droop.span * np.sqrt((half * half).sum(axis=0)) <= suspect + _HIDDEN_SIGMAS)
 
 
-_COLLAPSE, _NO_POWER = 1.0, 1e4
+_COLLAPSE, _MAX_POWER = 1.0, 1e4
 """Injections that alone change v^2 by more than 1 pu, or exceed 1e4 pu, are impossible."""
 
 
-def _most_power(feeder: Network, power: Power) -> Floats:
-    return np.asarray(_COLLAPSE / np.maximum(2.0 * feeder.self_impedance(power), _COLLAPSE / _NO_POWER))
+def _max_power(feeder: Network, power: Power) -> Floats:
+    return np.asarray(_COLLAPSE / np.maximum(2.0 * feeder.self_impedance(power), _COLLAPSE / _MAX_POWER))
 
 
-_WHITE = 1e-12
+_LEAST_NOISE = 1e-12
 """Least variance of a reading, squared pu^2: two perfect meters at one bus make a singular matrix."""
-_HIGH = 1.03
+_CONVERSION_VOLTAGE = 1.03
 """Voltage that converts relative meter errors into squared ones, in parts of nominal."""
 
 
@@ -308,16 +314,16 @@ def _check(plant: Plant, doubt: LoadDoubt, step_s: float, most: int | None) -> N
 
 _FEWEST = 3
 """Fewest meters: two contradicting ones cannot be told apart."""
-_RATE = 0.1
+_DECAY_PART = 0.1
 """Decay rate asked of the solver, as a part of the slowest inverter's."""
 
 
-def _proof(lure: Lure) -> Certificate:
+def _certificate(lure: Lure) -> Certificate:
     """Best closed form of the certificate, or the solver's where none applies; verified."""
     try:
         found = certify(lure)
     except DesignInfeasible:
-        found = contraction(lure, rate=_RATE * float(np.min(-np.diagonal(lure.A))))
+        found = contraction(lure, rate=_DECAY_PART * float(np.min(-np.diagonal(lure.A))))
     margin = verify(found, lure)
     if not margin > 0:
         raise DesignInfeasible(
@@ -335,12 +341,12 @@ _LOOKS = 8
 """Looks per length of every scale but the shortest: a long mean hardly changes from tick to tick."""
 
 
-def _every(lengths: tuple[int, ...]) -> tuple[int, ...]:
+def _look_intervals(lengths: tuple[int, ...]) -> tuple[int, ...]:
     """Ticks from one look at each scale to the next; the shortest scale answers at every tick."""
     return (1, *(max(1, round(length / _LOOKS)) for length in lengths[1:]))
 
 
-_REPEATS = 2
+_REPEAT_TESTS = 2
 """Tests of repetition, with the share of the false alarms of a scale each: stuck meters and replays."""
 
 
@@ -351,44 +357,48 @@ def _tail(rate: float, plant: Plant, look_s: float, scales: int) -> float:
     trusted meters. Each of the scales and of the two tests of repetition has an equal share of the rate.
     """
     tests = plant.meters.size + plant.feeder.busbar_incidence().shape[1] + 1
-    return min(float(rate * look_s / (YEAR_S * tests * (scales + _REPEATS))), 0.5)
+    return min(float(rate * look_s / (YEAR_S * tests * (scales + _REPEAT_TESTS))), 0.5)
 
 
-def _shapes(plant: Plant, effects: Effects, rate: float, step_s: float, lengths: tuple[int, ...]) -> Shapes:
+def _references(
+    plant: Plant, sensitivities: Sensitivities, rate: float, step_s: float, lengths: tuple[int, ...]
+) -> KindReferences:
     """References of the kinds at this feeder's meters."""
-    accuracy, slope = plant.accuracy, 2.0 * _HIGH * plant.droop.vbar
-    tests = plant.meters.size * (len(lengths) + _REPEATS) * YEAR_S / step_s
+    accuracy, slope = plant.accuracy, 2.0 * _CONVERSION_VOLTAGE * plant.droop.vbar
+    tests = plant.meters.size * (len(lengths) + _REPEAT_TESTS) * YEAR_S / step_s
     active, reactive = (2.0 * plant.feeder.self_impedance(power)[plant.meters] for power in Power)
-    return Shapes(
-        rules=rules(accuracy.resolution, accuracy.jitter, min(rate / tests, 0.5), step_s),
-        traces=Traces(effects, plant.feeder.bus[plant.meters]),
+    return KindReferences(
+        limits=repeat_limits(accuracy.resolution, accuracy.jitter, min(rate / tests, 0.5), step_s),
+        traces=LoadTraces(sensitivities, plant.feeder.bus[plant.meters]),
         noise=slope**2 * (accuracy.jitter**2 + accuracy.resolution**2 / 12.0),
         active=active,
         reactive=reactive,
-        every=pace(step_s),
+        interval=look_interval(step_s),
     )
 
 
-def _suspicions(plant: Plant, effects: Effects, options: SequentialOptions) -> Dictionary:
+def _fault_dictionary(
+    plant: Plant, sensitivities: Sensitivities, options: SequentialOptions
+) -> FaultDictionary:
     """Columns of 2R for the customers' active powers, and of 2X for the inverters."""
     feeder, meters, owner = plant.feeder, plant.meters, plant.droop.customer
     customers = feeder.bus.size
     of = np.concatenate([np.arange(customers), customers + owner])
 
     def changes(which: Ints) -> Floats:
-        return effects.of(of[which])
+        return sensitivities.numbered(of[which])
 
     def towards(weights: Floats) -> Floats:
-        return np.asarray(effects.along(meters, weights)[of])
+        return np.asarray(sensitivities.weighted(meters, weights)[of])
 
     load, injection = (feeder.squared_sensitivity(power, meters) for power in Power)
-    return Dictionary(
+    return FaultDictionary(
         std=np.concatenate([np.full(customers, options.hidden_power), 2.0 * plant.droop.limit]),
         charge=np.repeat([options.hidden_charge, 1.0], [customers, owner.size]),
         size=np.concatenate([load, injection[owner]]),
         meter=np.concatenate([_meter_at(plant), np.full(owner.size, -1)]),
         columns=changes,
-        along=towards,
+        weighted=towards,
     )
 
 

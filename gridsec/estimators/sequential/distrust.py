@@ -15,11 +15,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints
-from gridsec.estimators.sequential.busbar import Busbar
+from gridsec.estimators.sequential.busbar import BusbarTrust
 from gridsec.estimators.sequential.design import SequentialDesign
-from gridsec.estimators.sequential.naming import MOST_COUNTED
-from gridsec.estimators.sequential.repeats import BLOCKS, ROWS, unnoticed
-from gridsec.estimators.sequential.scales import needed
+from gridsec.estimators.sequential.naming import MAX_INVERTER_TICKS
+from gridsec.estimators.sequential.repeats import BLOCKS, ROWS, detection_readings
+from gridsec.estimators.sequential.scales import min_readings
 from gridsec.estimators.sequential.state import SequentialState
 
 
@@ -70,18 +70,18 @@ def distrusted(design: SequentialDesign, state: SequentialState) -> SuspicionRec
     trust = state.trust
     inverters = trust.inverters if state.last is None else state.last[1].inverters
     busbar = state.busbar
-    if trust.trusted.all() and busbar.believed.all() and not inverters.any():
-        return SuspicionRecord.empty(trust.trusted.size, inverters.size, busbar.believed.size)
+    if trust.trusted.all() and busbar.trusted.all() and not inverters.any():
+        return SuspicionRecord.empty(trust.trusted.size, inverters.size, busbar.trusted.size)
     scales_s = np.array(design.lengths) * design.step_s
     # Repetition shows on no scale; the longest one tests such a meter.
-    repeats = ~trust.trusted & (trust.lag > 0)
+    repeats = ~trust.trusted & (trust.repeat_lag > 0)
     scale = np.where(repeats, len(design.lengths) - 1, trust.scale)
     return SuspicionRecord(
         np.where(trust.trusted, np.nan, scales_s[scale]),
-        np.where(repeats, trust.lag * design.step_s, np.nan),
+        np.where(repeats, trust.repeat_lag * design.step_s, np.nan),
         trust.named,
         inverters,
-        np.where(busbar.believed, np.nan, scales_s[busbar.scale]),
+        np.where(busbar.trusted, np.nan, scales_s[busbar.scale]),
         busbar.named,
         busbar.off,
     )
@@ -100,15 +100,15 @@ def warm_start(design: SequentialDesign, state: SequentialState, before: Suspici
     trust, which = state.trust, np.isfinite(before.scale_s)
     scale = _closest(design, before.scale_s)
     need, settling = (
-        np.array([needed(design, s) for s in range(len(design.lengths))]),
+        np.array([min_readings(design, s) for s in range(len(design.lengths))]),
         _settling(design, state),
     )
-    still = trust.still.copy()
+    still = trust.above_release_limit.copy()
     still[scale[which], np.flatnonzero(which)] = True
     repeats = np.isfinite(before.repeats_s)
     ticks = np.where(repeats, np.rint(before.repeats_s / design.step_s), 0.0)
     lag = np.where(repeats, np.clip(ticks, 1.0, ROWS * BLOCKS), 0.0).astype(np.intp)
-    owed = np.maximum(np.maximum(need[scale], settling), unnoticed(design.shapes.rules, lag))
+    owed = np.maximum(np.maximum(need[scale], settling), detection_readings(design.references.limits, lag))
     longest = max(int(need[-1]), int(settling.max(initial=0)))
     return replace(
         state,
@@ -117,29 +117,29 @@ def warm_start(design: SequentialDesign, state: SequentialState, before: Suspici
             trust,
             trusted=~which,
             scale=scale,
-            age=np.where(before.named, design.confirmed[scale], which),
-            still=still,
-            owed=np.where(which, owed, 0),
-            lag=np.where(which, lag, 0),
+            ticks_suspect=np.where(before.named, design.confirmed[scale], which),
+            above_release_limit=still,
+            readings_owed=np.where(which, owed, 0),
+            repeat_lag=np.where(which, lag, 0),
             named=before.named & which,
-            counted=np.where(before.inverters, longest + MOST_COUNTED, 0),
+            inverter_ticks=np.where(before.inverters, longest + MAX_INVERTER_TICKS, 0),
             inverters=before.inverters,
         ),
     )
 
 
-def _busbar(design: SequentialDesign, before: SuspicionRecord, need: Ints, settling: int) -> Busbar:
+def _busbar(design: SequentialDesign, before: SuspicionRecord, need: Ints, settling: int) -> BusbarTrust:
     """Trust of the busbar's meter from a record."""
     out = np.isfinite(before.busbar_scale_s)
     scale = _closest(design, before.busbar_scale_s)
     known = before.busbar_named & out
     # The mean continues over the whole of its scale.
     length = np.maximum(design.confirmed, design.lengths)[scale]
-    return Busbar(
-        believed=~out,
+    return BusbarTrust(
+        trusted=~out,
         scale=scale,
-        age=np.where(known, length, 0),
-        quiet=np.where(out, -np.maximum(need[scale], settling), 0),
+        ticks_suspect=np.where(known, length, 0),
+        ticks_agreeing=np.where(out, -np.maximum(need[scale], settling), 0),
         off=np.where(known, before.busbar_off, 0.0),
         named=known,
     )
@@ -155,6 +155,6 @@ def _closest(design: SequentialDesign, scale_s: Floats) -> Ints:
 def _settling(design: SequentialDesign, state: SequentialState) -> Ints:
     """Ticks until the unknown initial state is negligible at each meter, (p,)."""
     least = design.options.settled * np.maximum(state.learned.allowed, np.finfo(np.float64).tiny)
-    more = np.log(np.maximum(design.reach / least, 1.0))
+    more = np.log(np.maximum(design.inverter_reach / least, 1.0))
     rate = design.certificate.rate * design.step_s
     return np.asarray(np.where(more > 0.0, np.ceil(more / rate), 0.0)).astype(np.intp)

@@ -21,7 +21,7 @@ _PATIENT = replace(POLICY, settled=0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Free:
+class ModelDriven:
     """Prepared loop of the model-driven inverters, reused for the same inverters and step."""
 
     rows: Ints  # (k,) inverters
@@ -29,15 +29,15 @@ class Free:
     transition: LureTransition  # of the loop, for the last step's length
 
 
-def drive(  # noqa: PLR0917
+def advance_inverters(  # noqa: PLR0917
     design: SequentialDesign,
     x: Floats,
     y: Floats,
     driven: Bools,
     w: Floats | None,
     h: float,
-    before: Free | None = None,
-) -> tuple[Floats, Free | None]:
+    before: ModelDriven | None = None,
+) -> tuple[Floats, ModelDriven | None]:
     """Injections a time h later, and the prepared loop; chong2020 (5) with K = E_J, L = 0.
 
     x, y, driven: (m,) injections, squared voltages of the inverters' meters, and use of these. w: (N,) input
@@ -60,7 +60,9 @@ def drive(  # noqa: PLR0917
     return out, free
 
 
-def ahead(design: SequentialDesign, believed: Bools, h: float, before: Free | None) -> Free | None:
+def prepare(
+    design: SequentialDesign, believed: Bools, h: float, before: ModelDriven | None
+) -> ModelDriven | None:
     """Loop for the next step if the trusted meters with a reading, (p,), stay the same.
 
     Prepared at the tick of a suspicion, since the tick after it has more to compute.
@@ -69,14 +71,14 @@ def ahead(design: SequentialDesign, believed: Bools, h: float, before: Free | No
     return before if all_of(driven) else _prepared(design, indices(~driven), h, before)
 
 
-def _prepared(design: SequentialDesign, rows: Ints, h: float, before: Free | None) -> Free:
+def _prepared(design: SequentialDesign, rows: Ints, h: float, before: ModelDriven | None) -> ModelDriven:
     if before is None or not np.array_equal(before.rows, rows):
-        loop = _among(design, rows)
-        return Free(rows, loop, transition(loop, h))
+        loop = _loop(design, rows)
+        return ModelDriven(rows, loop, transition(loop, h))
     return before if before.transition.h == h else replace(before, transition=transition(before.loop, h))
 
 
-def _among(design: SequentialDesign, rows: Ints) -> Lure:
+def _loop(design: SequentialDesign, rows: Ints) -> Lure:
     droop = design.plant.droop
     H = submatrix(design.loop, rows, rows)
     rate, size = 1.0 / droop.tau[rows], rows.size

@@ -16,14 +16,14 @@ from gridsec.grid.network import Network, Power
 
 _KEPT = 1 << 19
 """Largest number of entries of 2R and 2X that are kept, 4 MB."""
-_SOME = 0.25
+_SELECTED_PART = 0.25
 """Part of the table's rows from which the whole product is faster than a selection."""
-_PART = 256
+_BLOCK = 256
 """Columns computed at once where they are not kept."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Effects:
+class Sensitivities:
     """Changes of the squared voltages per power. N customers, n places.
 
     Powers have numbers: active ones first, customer by customer, then reactive ones.
@@ -46,7 +46,7 @@ class Effects:
             return self.feeder.columns(power, customers)
         return self.table.take(customers + self.feeder.bus.size * (power is Power.REACTIVE), axis=1)
 
-    def of(self, which: Ints) -> Floats:
+    def numbered(self, which: Ints) -> Floats:
         """Changes at every place by powers with numbers `which` (k,), (n, k)."""
         if self.table is not None:
             return self.table.take(which, axis=1)
@@ -55,24 +55,24 @@ class Effects:
             out[:, some] = self.feeder.columns(power, which[some] % count)
         return out
 
-    def along(self, customers: Ints, weights: Floats) -> Floats:
+    def weighted(self, customers: Ints, weights: Floats) -> Floats:
         """Change of the weighted sum of the voltages of customers (p,) by each power, (2 N,)."""
         if self.table is None:
             return np.concatenate(
                 [self.feeder.weighted_sensitivity(power, customers, weights) for power in Power]
             )
         at = self.feeder.bus[customers]
-        if at.size < _SOME * len(self.table):
+        if at.size < _SELECTED_PART * len(self.table):
             return np.asarray(weights @ self.table[at])
         # A product with the whole table is faster than a selection of most rows.
         return np.asarray(np.bincount(at, weights=weights, minlength=len(self.table)) @ self.table)
 
-    def at(self, places: Ints) -> Iterator[Floats]:
+    def rows(self, places: Ints) -> Iterator[Floats]:
         """Changes at places (k,) by all powers in the order of their numbers, in parts (k, …)."""
         if self.table is not None:
             yield self.table[places]
             return
         every = np.arange(self.feeder.bus.size)
         for power in Power:
-            for first in range(0, every.size, _PART):
-                yield self.feeder.columns(power, every[first : first + _PART])[places]
+            for first in range(0, every.size, _BLOCK):
+                yield self.feeder.columns(power, every[first : first + _BLOCK])[places]

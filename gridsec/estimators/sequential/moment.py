@@ -27,16 +27,20 @@ _LONGEST = 64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Moment:
+class BusbarHistory:
     """Readings of the last k ticks, the newest last, squared pu, NaN where missing. p meters, b phases."""
 
     busbar: Floats  # (k, b) of the busbar's meter
     y: Floats  # (k, p) of the meters
 
 
-def present(
-    design: SequentialDesign, before: Moment | None, frame: Frame, trusted: Bools, v0_squared: Floats | float
-) -> tuple[Moment | None, Frame]:
+def without_shifted_busbar(
+    design: SequentialDesign,
+    history_before: BusbarHistory | None,
+    frame: Frame,
+    trusted: Bools,
+    v0_squared: Floats | float,
+) -> tuple[BusbarHistory | None, Frame]:
     """Frame without busbar phases that changed within the clock offset, and history; None if not measured.
 
     trusted: (p,) meters. v0_squared: last trusted squared busbar voltage, pu; (3,) in three phases.
@@ -45,28 +49,30 @@ def present(
     if not offset > 0.0:  # also for NaN
         return None, frame
     ticks = min(ceil(offset / design.step_s) + 1, _LONGEST)
-    said = np.atleast_1d(np.asarray(frame.v0_squared if frame.v0_phases is None else frame.v0_phases))
+    reading = np.atleast_1d(np.asarray(frame.v0_squared if frame.v0_phases is None else frame.v0_phases))
     y = np.where(frame.seen, frame.y, np.nan)
-    if before is None or before.busbar.shape[1] != said.size:
-        before = Moment(np.zeros((0, said.size)), np.zeros((0, y.size)))
+    if history_before is None or history_before.busbar.shape[1] != reading.size:
+        history_before = BusbarHistory(np.zeros((0, reading.size)), np.zeros((0, y.size)))
     allowed = np.atleast_1d(np.asarray(busbar_errors(design.plant, v0_squared, design.sigmas[0])))
-    here = (design.hangs_on > 0.0) & trusted[:, None]
-    moved: Bools = np.asarray(_beyond(said - before.busbar[-ticks:], allowed).any(axis=0))
+    here = (design.busbar_incidence > 0.0) & trusted[:, None]
+    moved: Bools = np.asarray(_beyond(reading - history_before.busbar[-ticks:], allowed).any(axis=0))
     for phase in range(here.shape[1]):
-        change = (y - before.y[-ticks:])[:, here[:, phase]]
+        change = (y - history_before.y[-ticks:])[:, here[:, phase]]
         known = np.isfinite(change)
         middle = [np.median(row[one]) for row, one in zip(change, known, strict=True) if any_of(one)]
         if any_of(_beyond(np.array(middle), allowed[phase])):
-            moved = np.asarray(moved | _is(phase, said.size))
-    kept = Moment(np.vstack([before.busbar, said])[-_LONGEST:], np.vstack([before.y, y])[-_LONGEST:])
+            moved = np.asarray(moved | _phase_mask(phase, reading.size))
+    history = BusbarHistory(
+        np.vstack([history_before.busbar, reading])[-_LONGEST:], np.vstack([history_before.y, y])[-_LONGEST:]
+    )
     if not any_of(moved):
-        return kept, frame
+        return history, frame
     if frame.v0_phases is None:
-        return kept, replace(frame, v0_squared=np.nan)
-    return kept, replace(frame, v0_squared=np.nan, v0_phases=np.where(moved, np.nan, frame.v0_phases))
+        return history, replace(frame, v0_squared=np.nan)
+    return history, replace(frame, v0_squared=np.nan, v0_phases=np.where(moved, np.nan, frame.v0_phases))
 
 
-def _is(phase: int, phases: int) -> Bools:
+def _phase_mask(phase: int, phases: int) -> Bools:
     """Phase among those of the busbar's readings; all of them where one reading serves for all."""
     return np.arange(phases) == phase if phases > 1 else np.ones(1, dtype=np.bool_)
 

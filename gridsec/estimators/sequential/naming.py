@@ -13,147 +13,169 @@ from dataclasses import replace
 import numpy as np
 
 from gridsec.arrays import Bools, Ints, all_of, any_of, indices
-from gridsec.estimators.sequential.apart import set_apart
-from gridsec.estimators.sequential.conditional import judge
-from gridsec.estimators.sequential.curves import Curves
+from gridsec.estimators.sequential.apart import vouched_posterior
+from gridsec.estimators.sequential.conditional import leave_one_out
+from gridsec.estimators.sequential.curves import InverterChecks
 from gridsec.estimators.sequential.design import SequentialDesign
-from gridsec.estimators.sequential.examine import Examined
-from gridsec.estimators.sequential.exchanges import swaps, turns
-from gridsec.estimators.sequential.scales import Scales, View
-from gridsec.estimators.sequential.search import Found
-from gridsec.estimators.sequential.state import Trust
+from gridsec.estimators.sequential.examine import Identification
+from gridsec.estimators.sequential.exchanges import fault_exchanges, meter_exchanges
+from gridsec.estimators.sequential.scales import Scales, ScaleTest
+from gridsec.estimators.sequential.search import Candidates
+from gridsec.estimators.sequential.state import TrustState
 from gridsec.grid.network import Power
 from gridsec.interface import Explanation
 
-MOST_COUNTED, _FELT = 12, 0.25
+MAX_INVERTER_TICKS, _WITNESS_PART = 12, 0.25
 """Largest count of an inverter's accusations; part of its largest effect that makes a meter its witness.
 
 The count rises at a tick that accuses it and falls at others with a trusted reading of a witness.
 """
 
 
-def name(
-    design: SequentialDesign, before: Trust, seen: Examined, live: Bools, curves: Curves
-) -> tuple[Trust, tuple[Explanation, ...]]:
+def confirm(
+    design: SequentialDesign,
+    before: TrustState,
+    identified: Identification,
+    available: Bools,
+    curves: InverterChecks,
+) -> tuple[TrustState, tuple[Explanation, ...]]:
     """Trust state with named meters and inverters, and rival hypotheses where one prevents a name.
 
     live: (p,) meters with a reading; silence releases none. curves: an inverter that follows its curve is not
     a rival.
     """
-    trust = seen.trust
-    if trust.calm and before.calm:
+    trust = identified.trust
+    if trust.clear and before.clear:
         return trust, ()
-    open_ = trust.accused or any_of(trust.age) or any_of(before.named) or any_of(before.counted)
+    open_ = (
+        trust.accused or any_of(trust.ticks_suspect) or any_of(before.named) or any_of(before.inverter_ticks)
+    )
     if all_of(trust.trusted) and not open_:
         return trust, ()
-    quiet = np.where(trust.still.any(axis=0), 0, trust.quiet + live)
+    quiet = np.where(trust.above_release_limit.any(axis=0), 0, trust.ticks_clear + available)
     trusted = (trust.trusted & ~before.named) | (quiet >= design.options.release)
     # A meter detected again within the longest scale keeps its age.
-    age = np.where(trusted & (quiet > design.lengths[-1]), 0, trust.age + ~trusted)
-    owed = np.where(trusted, 0, np.maximum(trust.owed - live, 0))
+    age = np.where(trusted & (quiet > design.lengths[-1]), 0, trust.ticks_suspect + ~trusted)
+    owed = np.where(trusted, 0, np.maximum(trust.readings_owed - available, 0))
     need = design.confirmed[trust.scale]
-    fresh = ~trusted & ~before.named & trust.bad.any(axis=0) & (age >= need) & _accused(seen, trusted.size)
+    fresh = (
+        ~trusted
+        & ~before.named
+        & trust.above_limit.any(axis=0)
+        & (age >= need)
+        & _accused(identified, trusted.size)
+    )
     named = before.named & (quiet < design.options.release)
-    count, inverters = _inverters(design, before, trust, seen, live)
+    count, inverters = _inverter_counts(design, before, trust, identified, available)
     new = inverters & ~before.inverters
     rivals: tuple[Explanation, ...] = ()
     if any_of(fresh) or any_of(new):
-        found = _Rivals(design, fresh, new, curves.agrees(design))
-        found.collect(seen)
-        for meters, accused in found.ways():
+        found = _Rivals(design, fresh, new, curves.consistent(design))
+        found.collect(identified)
+        for meters, accused in found.accusations():
             fresh, inverters = fresh & meters, inverters & (before.inverters | accused)
-        rivals = found.explanations(live | before.named)
+        rivals = found.explanations(available | before.named)
     trust = replace(
         trust,
         trusted=trusted,
-        age=age,
-        quiet=quiet,
-        owed=owed,
-        lag=np.where(trusted, 0, trust.lag),
+        ticks_suspect=age,
+        ticks_clear=quiet,
+        readings_owed=owed,
+        repeat_lag=np.where(trusted, 0, trust.repeat_lag),
         named=named | fresh,
-        counted=count,
+        inverter_ticks=count,
         inverters=inverters,
     )
     return trust, rivals
 
 
-def supported(scales: Scales, before: Trust, seen: Examined, trust: Trust) -> Trust:
+def supported(
+    scales: Scales, before: TrustState, identified: Identification, trust: TrustState
+) -> TrustState:
     """Trust state without new names that rest on meters that withhold powers."""
-    fresh, vouched = trust.named & ~before.named, scales.doubts.vouched
+    fresh, vouched = trust.named & ~before.named, scales.uncertainty.vouched
     if all_of(vouched) or not any_of(fresh):
         return trust
     out = np.zeros_like(fresh)
-    for s, now in enumerate(seen.fits):
+    for s, now in enumerate(identified.posteriors):
         which = fresh & (trust.scale == s)
-        beside = None if now is None or not any_of(which) else set_apart(now, vouched[s])
+        beside = None if now is None or not any_of(which) else vouched_posterior(now, vouched[s])
         if beside is not None:
             here = scales[s]
-            judged = judge(beside.rest, here.m)
-            out |= which & (np.abs(judged.offset) <= here.limits.of(judged.std))
+            loo = leave_one_out(beside.vouched, here.m)
+            out |= which & (np.abs(loo.residual) <= here.limits.limit(loo.std))
     return replace(trust, named=trust.named & ~out) if any_of(out) else trust
 
 
-def _accused(seen: Examined, meters: int) -> Bools:
+def _accused(identified: Identification, meters: int) -> Bools:
     """Meters accused by the likeliest candidate of a scale that searched at this tick, (p,)."""
     out = np.zeros(meters, dtype=np.bool_)
-    for found in seen.found.values():
+    for found in identified.candidates.values():
         out |= ~found.best.trusted
     return out
 
 
-def _inverters(
-    design: SequentialDesign, before: Trust, trust: Trust, seen: Examined, live: Bools
+def _inverter_counts(
+    design: SequentialDesign,
+    before: TrustState,
+    trust: TrustState,
+    identified: Identification,
+    available: Bools,
 ) -> tuple[Ints, Bools]:
     """Ticks that accuse each inverter, and the named ones, (m,) each.
 
     An accusation counts at ticks with a search that accuses it; silence releases none.
     """
     accused = [k for k, _ in trust.accused]
-    if not accused and not any_of(before.counted):
-        return before.counted, before.inverters
-    now = inverters_of(design, accused)
-    less = np.where(_felt(design, before.counted > 0, live & trust.trusted), -1, 0)
+    if not accused and not any_of(before.inverter_ticks):
+        return before.inverter_ticks, before.inverters
+    now = accused_inverters(design, accused)
+    less = np.where(_witnessed(design, before.inverter_ticks > 0, available & trust.trusted), -1, 0)
     # An inverter named before a restart starts above that and counts down.
-    most = np.maximum(MOST_COUNTED, before.counted + less)
-    count = np.clip(before.counted + np.where(now, 1, less), 0, most)
-    need, confirmed = np.full(now.size, MOST_COUNTED), design.confirmed
+    most = np.maximum(MAX_INVERTER_TICKS, before.inverter_ticks + less)
+    count = np.clip(before.inverter_ticks + np.where(now, 1, less), 0, most)
+    need, confirmed = np.full(now.size, MAX_INVERTER_TICKS), design.confirmed
     for k, s in trust.accused:
         if k >= design.customers:
-            need[k - design.customers] = min(confirmed[s], MOST_COUNTED)
-    sought = inverters_of(design, [k for found in seen.found.values() for k in found.best.loosened])
+            need[k - design.customers] = min(confirmed[s], MAX_INVERTER_TICKS)
+    sought = accused_inverters(
+        design, [k for found in identified.candidates.values() for k in found.best.faults]
+    )
     return count, (before.inverters & (count > 0)) | (now & sought & (count >= need))
 
 
-def _felt(design: SequentialDesign, which: Bools, heard: Bools) -> Bools:
+def _witnessed(design: SequentialDesign, which: Bools, heard: Bools) -> Bools:
     """Inverters that move the voltage of some available meter, (m,)."""
     if all_of(heard) or not any_of(which):
         return which
     out, at = which.copy(), indices(which)
     own = design.plant.droop.customer[at]
-    effect = np.abs(design.effects.columns(Power.REACTIVE, own)[design.prior.meters])
+    effect = np.abs(design.sensitivities.columns(Power.REACTIVE, own)[design.prior.meters])
     most = effect.max(axis=0, initial=0.0)
-    out[at] = effect[heard].max(axis=0, initial=0.0) >= np.maximum(_FELT * most, np.finfo(np.float64).tiny)
+    out[at] = effect[heard].max(axis=0, initial=0.0) >= np.maximum(
+        _WITNESS_PART * most, np.finfo(np.float64).tiny
+    )
     return out
 
 
-def inverters_of(design: SequentialDesign, accused: Sequence[int]) -> Bools:
+def accused_inverters(design: SequentialDesign, accused: Sequence[int]) -> Bools:
     """Inverters among accused faults, (m,)."""
-    return _suspicions(design, accused)[design.customers : design.book.std.size]
+    return _accused_faults(design, accused)[design.customers : design.faults.std.size]
 
 
-def powers_of(design: SequentialDesign, accused: Sequence[int]) -> Bools:
+def accused_powers(design: SequentialDesign, accused: Sequence[int]) -> Bools:
     """Customers with a false power among accused faults, (N,)."""
-    return _suspicions(design, accused)[: design.customers]
+    return _accused_faults(design, accused)[: design.customers]
 
 
-def _busbar_of(design: SequentialDesign, accused: Sequence[int]) -> Bools:
+def _accused_phases(design: SequentialDesign, accused: Sequence[int]) -> Bools:
     """Busbar phases among accused faults, (b,)."""
-    return _suspicions(design, accused)[design.book.std.size :]
+    return _accused_faults(design, accused)[design.faults.std.size :]
 
 
-def _suspicions(design: SequentialDesign, accused: Sequence[int]) -> Bools:
+def _accused_faults(design: SequentialDesign, accused: Sequence[int]) -> Bools:
     """Accused powers, inverters and busbar phases, (N + m + b,)."""
-    out = np.zeros(design.book.std.size + design.hangs_on.shape[1], dtype=np.bool_)
+    out = np.zeros(design.faults.std.size + design.busbar_incidence.shape[1], dtype=np.bool_)
     out[list(accused)] = True
     return out
 
@@ -168,52 +190,54 @@ class _Rivals:
         self.design, self.fresh, self.new = design, fresh, new
         self.others = design.customers + indices(~agrees)
         self.within = 2.0 * float(np.log(design.options.like))
-        self.out: dict[bytes, tuple[Bools, Bools, float, tuple[int, ...]]] = {}
+        self.found: dict[bytes, tuple[Bools, Bools, float, tuple[int, ...]]] = {}
 
-    def collect(self, seen: Examined) -> None:
+    def collect(self, identified: Identification) -> None:
         """Take the candidates of every scale that searched."""
-        for s, found in seen.found.items():
-            view = seen.views[s]
+        for s, found in identified.candidates.items():
+            view = identified.tests[s]
             if view is not None:
                 self._collect(found, view)
-        if not any(self._differs(meters, inverters) for meters, inverters, *_ in self.out.values()):
-            self.out.clear()
+        if not any(self._differs(meters, inverters) for meters, inverters, *_ in self.found.values()):
+            self.found.clear()
 
-    def ways(self) -> list[tuple[Bools, Bools]]:
+    def accusations(self) -> list[tuple[Bools, Bools]]:
         """Meters and inverters that each accuses; meters without a reading are among the former."""
-        return [(meters, inverters) for meters, inverters, *_ in self.out.values()]
+        return [(meters, inverters) for meters, inverters, *_ in self.found.values()]
 
     def explanations(self, heard: Bools) -> tuple[Explanation, ...]:
         """All of them, the likeliest first; meters without a reading, `heard` (p,) False, are left out."""
-        design, total = self.design, sum(way[2] for way in self.out.values())
+        design, total = self.design, sum(way[2] for way in self.found.values())
         return tuple(
             Explanation(
                 meters & heard,
                 inverters,
                 weight / total,
-                powers_of(design, loosened),
-                _busbar_of(design, loosened),
+                accused_powers(design, accused_faults),
+                _accused_phases(design, accused_faults),
             )
-            for meters, inverters, weight, loosened in sorted(self.out.values(), key=lambda way: -way[2])
+            for meters, inverters, weight, accused_faults in sorted(
+                self.found.values(), key=lambda way: -way[2]
+            )
         )
 
-    def _collect(self, found: Found, view: View) -> None:
+    def _collect(self, found: Candidates, view: ScaleTest) -> None:
         best, within = found.best, self.within
-        near = [(~each.trusted, each.loosened, each.cost - best.cost) for each in (best, *found.others)]
-        for swap in swaps(best, view.enough, within, view.limits):
+        near = [(~each.trusted, each.faults, each.cost - best.cost) for each in (best, *found.others)]
+        for swap in meter_exchanges(best, view.enough, within, view.limits):
             other = near[0][0].copy()
             other[swap.accused], other[swap.innocent] = False, True
-            near.append((other, best.loosened, swap.worse))
+            near.append((other, best.faults, swap.worse))
         accused = (self.design.customers + indices(self.new)).tolist()
-        for turn in turns(best, self.design.book, accused, self.others, within):
-            loosened = tuple(turn.innocent if k == turn.accused else k for k in best.loosened)
-            near.append((near[0][0], loosened, turn.worse))
-        for k, (meters, loosened, worse) in enumerate(near):
-            inverters = inverters_of(self.design, loosened)
+        for turn in fault_exchanges(best, self.design.faults, accused, self.others, within):
+            accused_faults = tuple(turn.innocent if k == turn.accused else k for k in best.faults)
+            near.append((near[0][0], accused_faults, turn.worse))
+        for k, (meters, accused_faults, worse) in enumerate(near):
+            inverters = accused_inverters(self.design, accused_faults)
             if not k or (worse <= within and self._differs(meters, inverters)):
-                who, weight = meters.tobytes() + inverters.tobytes(), float(np.exp(-0.5 * worse))
-                if who not in self.out or self.out[who][2] < weight:
-                    self.out[who] = (meters, inverters, weight, loosened)
+                which, weight = meters.tobytes() + inverters.tobytes(), float(np.exp(-0.5 * worse))
+                if which not in self.found or self.found[which][2] < weight:
+                    self.found[which] = (meters, inverters, weight, accused_faults)
 
     def _differs(self, meters: Bools, inverters: Bools) -> bool:
         """True if a meter or inverter about to be named is left out."""

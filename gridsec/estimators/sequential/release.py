@@ -32,68 +32,70 @@ from scipy.special import expit
 
 from gridsec.arrays import Floats, Ints, all_of, indices, submatrix
 from gridsec.estimators.sequential.bounds import FALSE_Q
-from gridsec.estimators.sequential.conditional import Fit, Judged
-from gridsec.estimators.sequential.effects import Effects
+from gridsec.estimators.sequential.conditional import LeaveOneOut, Posterior
+from gridsec.estimators.sequential.effects import Sensitivities
 from gridsec.grid.network import Power
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Released:
+class DoubtedPowers:
     """Posterior with doubted powers. n buses, t trusted meters, l suspects."""
 
-    fit: Fit  # posterior with all powers used
+    fit: Posterior  # posterior with all powers used
     customers: Ints  # (l,) suspects' customers
     sizes: Floats  # (l,) largest false active powers, pu
     share: Floats  # (l,) used part of the standard deviation of a false power
-    seen: Floats  # (t, 2 l) effects of false powers at the trusted meters, active ones first
+    effects: Floats  # (t, 2 l) effects of false powers at the trusted meters, active ones first
     gram: Floats  # (2 l, 2 l) U_T^T Q U_T of whole standard deviations
     C: Floats  # (n, 2 l) posterior covariance with such false powers
     factor: Floats  # (2 l, 2 l) Cholesky factor of G for the used parts, lower triangle
     variance: Floats  # (n,) diagonal of M'
 
-    def said(self, judged: Judged) -> Floats:
+    def mean(self, loo: LeaveOneOut) -> Floats:
         """w', (n,)."""
         both = np.tile(self.share, 2)
-        along = both * (judged.weights[self.fit.trusted] @ self.seen)
+        along = both * (loo.weights[self.fit.trusted] @ self.effects)
         amount, _ = lapack.dpotrs(self.factor, along, lower=True)
-        return np.asarray(judged.w + self.C @ (both * amount))
+        return np.asarray(loo.mean + self.C @ (both * amount))
 
-    def about(self, fit: Fit, customers: Ints, sizes: Floats) -> bool:
-        """True if `release` would start from the same posterior, customers and sizes."""
+    def matches(self, fit: Posterior, customers: Ints, sizes: Floats) -> bool:
+        """True if `doubt_powers` would start from the same posterior, customers and sizes."""
         same = fit is self.fit and np.array_equal(customers, self.customers)
         return same and np.array_equal(sizes, self.sizes)
 
-    def holds(self, judged: Judged) -> bool:
+    def is_current(self, loo: LeaveOneOut) -> bool:
         """True if the used parts are close to those of the present residuals."""
-        share = _share(self.seen, self.gram, judged.weights[self.fit.trusted])
+        share = _share(self.effects, self.gram, loo.weights[self.fit.trusted])
         return all_of((share <= _MORE * self.share) & (share >= _LESS * self.share))
 
-    def anew(self, judged: Judged) -> Released:
+    def renewed(self, loo: LeaveOneOut) -> DoubtedPowers:
         """The same with the parts of the present residuals."""
-        share = _share(self.seen, self.gram, judged.weights[self.fit.trusted])
-        factor, variance = _parts(self.fit, self.gram, self.C, share)
+        share = _share(self.effects, self.gram, loo.weights[self.fit.trusted])
+        factor, variance = _factorised(self.fit, self.gram, self.C, share)
         return replace(self, share=share, factor=factor, variance=variance)
 
 
-_MORE, _LESS, _LEAST = 1.25, 0.5, 0.125
+_MORE, _LESS, _LEAST_SHARE = 1.25, 0.5, 0.125
 """Range of parts that are reused, as ratios to the wanted ones, and the least part."""
 
 
-def release(effects: Effects, fit: Fit, customers: Ints, sizes: Floats, judged: Judged) -> Released:
+def doubt_powers(
+    sensitivities: Sensitivities, fit: Posterior, customers: Ints, sizes: Floats, loo: LeaveOneOut
+) -> DoubtedPowers:
     """Doubt the powers of customers (l,) by at most `sizes` (l,), pu; O(n p l)."""
-    prior, (at, inverse), std = fit.prior, fit.trusting(), sizes / np.sqrt(3.0)
+    prior, (at, inverse), std = fit.prior, fit.precision(), sizes / np.sqrt(3.0)
     U = np.empty((prior.variance.size, 2 * sizes.size))
-    U[:, : sizes.size] = effects.columns(Power.ACTIVE, customers) * std
-    U[:, sizes.size :] = effects.columns(Power.REACTIVE, customers) * (FALSE_Q * std)
+    U[:, : sizes.size] = sensitivities.columns(Power.ACTIVE, customers) * std
+    U[:, sizes.size :] = sensitivities.columns(Power.REACTIVE, customers) * (FALSE_Q * std)
     seen = U[prior.meters[at]]
     known = inverse @ seen
     gram = seen.T @ known
     _conditioned(fit, U, known)
-    share = _share(seen, gram, judged.weights[at])
-    return Released(fit, customers, sizes, share, seen, gram, U, *_parts(fit, gram, U, share))
+    share = _share(seen, gram, loo.weights[at])
+    return DoubtedPowers(fit, customers, sizes, share, seen, gram, U, *_factorised(fit, gram, U, share))
 
 
-def _parts(fit: Fit, gram: Floats, C: Floats, share: Floats) -> tuple[Floats, Floats]:
+def _factorised(fit: Posterior, gram: Floats, C: Floats, share: Floats) -> tuple[Floats, Floats]:
     """Cholesky factor of G and diagonal of M' for powers false by parts of their sizes."""
     both = np.tile(share, 2)
     G = gram * np.multiply.outer(both, both)
@@ -110,15 +112,15 @@ def _parts(fit: Fit, gram: Floats, C: Floats, share: Floats) -> tuple[Floats, Fl
     return factor, variance
 
 
-def _conditioned(fit: Fit, U: Floats, known: Floats) -> None:
+def _conditioned(fit: Posterior, U: Floats, known: Floats) -> None:
     """Replace U by C in place, in blocks of rows."""
     prior, at = fit.prior, indices(fit.trusted)
     buses, left = prior.meters[at], np.ones(len(U), dtype=np.bool_)
     left[buses] = False
-    others, loose = indices(left), fit.loose[buses].T @ known
+    others, loose = indices(left), fit.unknowns[buses].T @ known
     for first in range(0, others.size, _ROWS):
         rows = others[first : first + _ROWS]
-        U[rows] -= submatrix(prior.of_meters, rows, at) @ known + fit.loose[rows] @ loose
+        U[rows] -= submatrix(prior.covariance, rows, at) @ known + fit.unknowns[rows] @ loose
     U[buses] = fit.noise[at, None] * known
 
 
@@ -131,4 +133,4 @@ def _share(seen: Floats, gram: Floats, weights: Floats) -> Floats:
     count = len(gram) // 2
     form, along = gram.diagonal()[:count], weights @ seen[:, :count]
     odds = 0.5 * (along**2 / (1.0 + form) - np.log1p(form))
-    return np.asarray(np.maximum(np.sqrt(expit(odds)), _LEAST))
+    return np.asarray(np.maximum(np.sqrt(expit(odds)), _LEAST_SHARE))

@@ -71,7 +71,7 @@ _VERIFIED = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Rules:
+class RepeatLimits:
     """Limits of repetition. p meters."""
 
     step: Floats  # (p,) step of each register, pu
@@ -92,7 +92,7 @@ class Block:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Memory:
+class ReadingHistory:
     """History of the readings. p meters."""
 
     tick: int  # number of the newest tick, from 0; -1 before the first
@@ -116,20 +116,20 @@ class Memory:
         return self.kept - len(self.tail) - ROWS * len(self.blocks)
 
 
-def forget(memory: Memory, meters: Bools) -> Memory:
+def forget(history: ReadingHistory, meters: Bools) -> ReadingHistory:
     """History without the statistics and repetitions of some meters, (p,)."""
     none = ~meters
     return replace(
-        memory,
-        count=memory.count * none,
-        run=memory.run * none,
-        longest=memory.longest * none,
-        stuck=memory.stuck & none,
-        lag=memory.lag * none,
+        history,
+        count=history.count * none,
+        run=history.run * none,
+        longest=history.longest * none,
+        stuck=history.stuck & none,
+        lag=history.lag * none,
     )
 
 
-def rules(resolution: Floats, jitter: Floats, chance: float, step_s: float) -> Rules:
+def repeat_limits(resolution: Floats, jitter: Floats, chance: float, step_s: float) -> RepeatLimits:
     """Limits of repetition.
 
     resolution, jitter: (p,) register step and standard deviation of the jitter, pu. chance: probability per
@@ -140,7 +140,7 @@ def rules(resolution: Floats, jitter: Floats, chance: float, step_s: float) -> R
         once = erf(step / (np.sqrt(8.0) * jitter))
         surprise = 0.0 - np.log(once)
     budget = -float(np.log(chance))
-    return Rules(
+    return RepeatLimits(
         step=step,
         surprise=surprise,
         stuck=budget,
@@ -149,94 +149,98 @@ def rules(resolution: Floats, jitter: Floats, chance: float, step_s: float) -> R
     )
 
 
-def empty(meters: int) -> Memory:
+def empty(meters: int) -> ReadingHistory:
     """History before the first tick."""
     silent = np.full(meters, SILENT, dtype=np.int32)
     zero = np.zeros(meters, dtype=np.intp)
     no = np.zeros(meters, dtype=np.bool_)
-    return Memory(
+    return ReadingHistory(
         -1, 0, silent, silent, np.zeros(meters, dtype=np.uint32), zero, zero, zero, no, zero, (), ()
     )
 
 
-def listen(law: Rules, before: Memory, y: Floats, live: Bools) -> Memory:
+def ingest(limits: RepeatLimits, before: ReadingHistory, y: Floats, available: Bools) -> ReadingHistory:
     """History with the readings y (p,), squared pu, of one tick; `store` has to follow before the next."""
     tick = before.tick + 1
-    code = now = told = np.rint(np.sqrt(np.minimum(np.maximum(y, 0.0), _HIGHEST)) / law.step).astype(np.int32)
+    code = now = told = np.rint(np.sqrt(np.minimum(np.maximum(y, 0.0), _HIGHEST)) / limits.step).astype(
+        np.int32
+    )
     same = code == before.code
     run, longest = (before.run + same) * same, before.longest
-    if not all_of(live):
-        run = np.where(live, run, before.run)
+    if not all_of(available):
+        run = np.where(available, run, before.run)
         # A silent tick has a code of its own in the hash.
-        told = np.where(live, code, np.int32(tick % 2**31))
-        now, code = np.where(live, code, np.int32(SILENT)), np.where(live, code, before.code)
+        told = np.where(available, code, np.int32(tick % 2**31))
+        now, code = np.where(available, code, np.int32(SILENT)), np.where(available, code, before.code)
     # Rare, hence the test first.
     longer = before.run > longest
     if any_of(longer):
         longest = np.where(longer & (run == 0) & ~before.stuck, before.run, longest)
-    count, stuck = before.count + live, run >= _FEWEST
+    count, stuck = before.count + available, run >= _FEWEST
     if any_of(stuck):
-        stuck &= (run * _surprise(law, count, longest) >= law.stuck) & (count >= law.known)
-    after = Memory(
+        stuck &= (run * _surprise(limits, count, longest) >= limits.stuck) & (count >= limits.known)
+    after = ReadingHistory(
         tick=tick,
         kept=before.kept,
         code=code,
         now=now,
-        hash=_roll(before.hash, told),
+        hash=_rolled(before.hash, told),
         count=count,
         run=run,
         longest=longest,
         stuck=stuck,
-        lag=_follow(before, now, tick),
+        lag=_continued_lags(before, now, tick),
         blocks=before.blocks,
         tail=before.tail,
     )
-    return _search(law, after)
+    return _find_repeats(limits, after)
 
 
-def keep(memory: Memory, model: Floats, own: Floats) -> Memory:
+def store(history: ReadingHistory, model: Floats, own: Floats) -> ReadingHistory:
     """History with the tick last ingested, its reconstruction and the own part of that, (p,), squared pu."""
-    tail = (*memory.tail, (memory.now, memory.hash, model.astype(np.float32), own.astype(np.float32)))
+    tail = (*history.tail, (history.now, history.hash, model.astype(np.float32), own.astype(np.float32)))
     if len(tail) < ROWS:
-        return changed(memory, kept=memory.kept + 1, tail=tail)
+        return changed(history, kept=history.kept + 1, tail=tail)
     block = Block(*(np.stack(rows) for rows in zip(*tail, strict=True)))
-    blocks = (*memory.blocks, block)[-_kept(memory.now.size) :]
-    return changed(memory, kept=memory.kept + 1, blocks=blocks, tail=())
+    blocks = (*history.blocks, block)[-_max_blocks(history.now.size) :]
+    return changed(history, kept=history.kept + 1, blocks=blocks, tail=())
 
 
-def _kept(meters: int) -> int:
+def _max_blocks(meters: int) -> int:
     """Number of blocks that are kept."""
     return int(min(BLOCKS, max(1, MOST_BYTES // (BYTES * ROWS * max(meters, 1)))))
 
 
-def lags(memory: Memory) -> Ints:
+def repeat_lags(history: ReadingHistory) -> Ints:
     """Ticks after which each meter repeats itself beyond chance, (p,): 1 if stuck, 0 for none."""
-    return np.where(memory.stuck, 1, memory.lag)
+    return np.where(history.stuck, 1, history.lag)
 
 
-def unnoticed(law: Rules, lag: Ints) -> Ints:
+def detection_readings(limits: RepeatLimits, lag: Ints) -> Ints:
     """Readings until a repetition with lag (p,) is detected from an empty history, (p,).
 
     A calm meter takes longer than its data sheet states: twice the time is granted.
     """
-    replays, judged = lag > 1, np.maximum(law.surprise, np.finfo(np.float64).tiny)
-    run = np.where(replays, np.maximum(np.ceil(law.replay / judged), SPAN), np.ceil(law.stuck / judged))
+    replays, loo = lag > 1, np.maximum(limits.surprise, np.finfo(np.float64).tiny)
+    run = np.where(replays, np.maximum(np.ceil(limits.replay / loo), SPAN), np.ceil(limits.stuck / loo))
     # The repeated stretch has to be in a whole block, and blocks take turns.
     past = np.where(replays, lag + ROWS + lag // ROWS + 2, 0)
-    most = np.minimum(np.maximum(law.known, past) + 2.0 * run, ROWS * BLOCKS)
+    most = np.minimum(np.maximum(limits.known, past) + 2.0 * run, ROWS * BLOCKS)
     return np.where(lag > 0, most, 0).astype(np.intp)
 
 
-def past(memory: Memory, meter: int | Ints, start: int, stop: int) -> tuple[Floats, Floats]:
+def past(history: ReadingHistory, meter: int | Ints, start: int, stop: int) -> tuple[Floats, Floats]:
     """Readings in steps, NaN if missing, and models of one meter or some, at ticks start to stop - 1."""
-    code, model = (_column(memory, name, meter, start, stop).astype(np.float64) for name in ("code", "model"))
+    code, model = (
+        _column(history, name, meter, start, stop).astype(np.float64) for name in ("code", "model")
+    )
     code[code == SILENT] = np.nan
     return code, model
 
 
-def own_part(memory: Memory, meter: int) -> Floats:
+def own_part(history: ReadingHistory, meter: int) -> Floats:
     """Part of the models by a meter's own powers at all kept ticks, squared pu, (n,)."""
-    return _column(memory, "own", meter, memory.first, memory.kept).astype(np.float64)
+    return _column(history, "own", meter, history.first, history.kept).astype(np.float64)
 
 
 def recurring(code: Floats) -> int:
@@ -259,25 +263,25 @@ def recurring(code: Floats) -> int:
     return best
 
 
-def surprise(law: Rules, memory: Memory) -> Floats:
+def surprise(limits: RepeatLimits, history: ReadingHistory) -> Floats:
     """Surprise of one repetition by each meter's data sheet and past, (p,)."""
-    return _surprise(law, memory.count, memory.longest)
+    return _surprise(limits, history.count, history.longest)
 
 
-def _surprise(law: Rules, count: Ints, longest: Ints) -> Floats:
+def _surprise(limits: RepeatLimits, count: Ints, longest: Ints) -> Floats:
     """The data sheet's, or, for a calmer meter, that of its longest run; (p,)."""
-    calm = longest * law.surprise > np.log(np.maximum(count, 1)) + _UNLIKELY
-    return np.where(calm, np.minimum(_FEW_RUNS / np.maximum(longest, 1), law.surprise), law.surprise)
+    calm = longest * limits.surprise > np.log(np.maximum(count, 1)) + _UNLIKELY
+    return np.where(calm, np.minimum(_FEW_RUNS / np.maximum(longest, 1), limits.surprise), limits.surprise)
 
 
-def _roll(before: _Hashes, told: _Codes) -> _Hashes:
+def _rolled(before: _Hashes, told: _Codes) -> _Hashes:
     """Hash of the last SPAN ticks: older ones have been shifted out (a gear hash)."""
     mixed = told.view(np.uint32) * _ODD
     mixed ^= mixed >> _HALF
     return (before << _ONE) + mixed
 
 
-def _follow(before: Memory, now: _Codes, tick: int) -> Ints:
+def _continued_lags(before: ReadingHistory, now: _Codes, tick: int) -> Ints:
     """Lags at which meters still repeat themselves."""
     if not any_of(before.lag):
         return before.lag
@@ -293,55 +297,57 @@ def _follow(before: Memory, now: _Codes, tick: int) -> Ints:
     return lag
 
 
-def _search(law: Rules, memory: Memory) -> Memory:
+def _find_repeats(limits: RepeatLimits, history: ReadingHistory) -> ReadingHistory:
     """History with repetitions of the newest stretch found in one block of the past."""
-    if not memory.blocks:
-        return memory
-    turn = memory.tick % len(memory.blocks)
-    hit = memory.blocks[turn].hash == memory.hash
+    if not history.blocks:
+        return history
+    turn = history.tick % len(history.blocks)
+    hit = history.blocks[turn].hash == history.hash
     if not any_of(hit):
-        return memory
+        return history
     rows, meters = np.nonzero(hit)
-    ask = (memory.lag == 0) & (memory.now != SILENT) & (memory.run < SPAN) & (memory.count >= law.known)
+    ask = (
+        (history.lag == 0) & (history.now != SILENT) & (history.run < SPAN) & (history.count >= limits.known)
+    )
     with np.errstate(divide="ignore"):
-        need = np.maximum(np.ceil(law.replay / _surprise(law, memory.count, memory.longest)), _FEWEST)
+        need = np.maximum(np.ceil(limits.replay / _surprise(limits, history.count, history.longest)), _FEWEST)
     ask &= need <= ROWS * BLOCKS // 2
     wanted = indices(ask[meters])
-    begin = memory.first + ROWS * turn
-    lag = memory.lag.copy()
-    for k in np.roll(wanted, -memory.tick)[:_VERIFIED].tolist():
-        j, back = int(meters[k]), memory.tick - begin - int(rows[k])
-        if repeated(memory, j, back, int(need[j])) >= need[j]:
+    begin = history.first + ROWS * turn
+    lag = history.lag.copy()
+    for k in np.roll(wanted, -history.tick)[:_VERIFIED].tolist():
+        j, back = int(meters[k]), history.tick - begin - int(rows[k])
+        if matching_readings(history, j, back, int(need[j])) >= need[j]:
             lag[j] = back
-    return replace(memory, lag=lag)
+    return replace(history, lag=lag)
 
 
-def repeated(memory: Memory, meter: int, lag: int, most: int) -> int:
+def matching_readings(history: ReadingHistory, meter: int, lag: int, most: int) -> int:
     """Number of a meter's last readings that equal those one lag earlier without a difference between.
 
     most: largest number of ticks to look back. Pairs with a missing reading are passed over.
     """
     # Twice as many ticks make up for missing readings.
-    start = max(memory.tick + 1 - 2 * most, memory.first + lag)
-    if start > memory.tick:
+    start = max(history.tick + 1 - 2 * most, history.first + lag)
+    if start > history.tick:
         return 0
-    new = memory.now[meter : meter + 1]
-    if start < memory.tick:
-        new = np.append(_column(memory, "code", meter, start, memory.tick), new)
-    old = _column(memory, "code", meter, start - lag, memory.tick - lag + 1)
+    new = history.now[meter : meter + 1]
+    if start < history.tick:
+        new = np.append(_column(history, "code", meter, start, history.tick), new)
+    old = _column(history, "code", meter, start - lag, history.tick - lag + 1)
     both = (new != SILENT) & (old != SILENT)
     differ = indices(both & (new != old))
     return int(np.count_nonzero(both[differ[-1] + 1 if differ.size else 0 :]))
 
 
-def _column(memory: Memory, name: str, meter: int | Ints, start: int, stop: int) -> NDArray[Any]:
+def _column(history: ReadingHistory, name: str, meter: int | Ints, start: int, stop: int) -> NDArray[Any]:
     """Past of one meter or some at ticks start to stop - 1, from the blocks and the tail."""
     place, one = ("code", "hash", "model", "own").index(name), isinstance(meter, int)
-    begin, tail = memory.first, memory.kept - len(memory.tail)
+    begin, tail = history.first, history.kept - len(history.tail)
     skip, last = (start - begin) // ROWS, (stop - 1 - begin) // ROWS
-    parts = [getattr(block, name)[:, meter] for block in memory.blocks[skip : last + 1]]
+    parts = [getattr(block, name)[:, meter] for block in history.blocks[skip : last + 1]]
     skipped = begin + ROWS * skip if parts else start
     if stop > tail:
-        rows = [row[place] for row in memory.tail[max(start - tail, 0) : stop - tail]]
+        rows = [row[place] for row in history.tail[max(start - tail, 0) : stop - tail]]
         parts.append(np.array([row[meter] for row in rows]) if one else np.array(rows)[:, meter])
     return np.concatenate(parts)[start - skipped : stop - skipped]

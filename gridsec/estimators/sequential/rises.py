@@ -32,7 +32,7 @@ _OF_PAIRS = 0.2
 
 
 @dataclass(frozen=True, slots=True)
-class Lies:
+class ErrorPrior:
     """Prior of the manipulations."""
 
     size: float = 0.2  # standard deviation A of an error, squared pu: 0.2 is 10 % of the voltage
@@ -46,7 +46,7 @@ class Lies:
     apart: float = 4.0  # additional cost of each error after the first if independent
     pair: float = 5.0  # additional cost of the second equal error
     more: float = 2.0  # additional cost of each further equal error
-    story: float = 5.5  # cost of a load that does not exist, beside the choice of the customer
+    load: float = 5.5  # cost of a load that does not exist, beside the choice of the customer
 
     def __post_init__(self) -> None:
         if min(self.size, self.amplitude, self.differ) <= 0.0:
@@ -79,16 +79,16 @@ class FalsePowers:
 
     def claimed(self, p: Floats, q: Floats) -> FalsePowers:
         """Other powers (p,) of the same meters; values that depend on the feeder alone are reused."""
-        return FalsePowers(self.R, self.X, p, q, strongest(self.R) if self.felt is None else self.felt)
+        return FalsePowers(self.R, self.X, p, q, largest_effects(self.R) if self.felt is None else self.felt)
 
-    def of(self, live: Ints) -> FalsePowers:
+    def of(self, available: Ints) -> FalsePowers:
         """For some of the meters."""
-        R, X = (submatrix(each, live, live) for each in (self.R, self.X))
-        return FalsePowers(R, X, self.p[live], self.q[live])
+        R, X = (submatrix(each, available, available) for each in (self.R, self.X))
+        return FalsePowers(R, X, self.p[available], self.q[available])
 
 
 @dataclass(slots=True, eq=False)
-class State:
+class SnapshotHypothesis:
     """Hypothesis under way: accused meters L, false powers F, and what follows. p meters.
 
     Q itself is never needed: every change subtracts a matrix of rank one,
@@ -98,7 +98,7 @@ class State:
     so that a change costs O(p) beside one product with Q, and a copy almost nothing.
     """
 
-    liars: Bools  # (p,) L
+    meters: Bools  # (p,) L
     powers: Bools  # (p,) F
     m: Floats  # (p,) readings minus the model
     W: Floats  # (p, p) whitens the readings without manipulations
@@ -109,24 +109,24 @@ class State:
     U: Floats  # (r, p) subtracted
     V: Floats  # (r, p) rows of U times numbers
     counts: tuple[int, int] = (0, 0)  # |L| and |F|
-    rise: Floats | None = None  # (p,) `meter_rises`; None until computed
+    rises: Floats | None = None  # (p,) `meter_rises`; None until computed
 
     @classmethod
-    def nobody(cls, m: Floats, W: Floats) -> State:
+    def without_accusations(cls, m: Floats, W: Floats) -> SnapshotHypothesis:
         """Hypothesis without accusations."""
         none, white = np.zeros(m.size, dtype=np.bool_), W @ m
         diagonal, nothing = np.einsum("ij,ij->j", W, W), np.empty((0, m.size))
         fit = float(white @ white)
         return cls(none, none.copy(), m, W, white @ W, diagonal, 0.0, fit, nothing, nothing)
 
-    def copy(self) -> State:
+    def copy(self) -> SnapshotHypothesis:
         """Copy that can be changed alone."""
-        return replace(self, liars=self.liars.copy(), powers=self.powers.copy())
+        return replace(self, meters=self.meters.copy(), powers=self.powers.copy())
 
     @property
     def key(self) -> bytes:
         """L and F as a key of dictionaries."""
-        return self.liars.tobytes() + self.powers.tobytes()
+        return self.meters.tobytes() + self.powers.tobytes()
 
     def times(self, x: Floats) -> Floats:
         """Q x, (p,)."""
@@ -136,9 +136,9 @@ class State:
         """Q e_j, (p,)."""
         return np.asarray(self.W[:, j] @ self.W - self.V[:, j] @ self.U)
 
-    def rows(self, who: Ints) -> Floats:
+    def rows(self, which: Ints) -> Floats:
         """Rows of Q of some meters, (k, p)."""
-        return np.asarray(self.W[:, who].T @ self.W - self.V[:, who].T @ self.U)
+        return np.asarray(self.W[:, which].T @ self.W - self.V[:, which].T @ self.U)
 
     def change(self, q: Floats, delta: float, u_q: float, u_g: float) -> None:
         """Add ``delta u u^T`` to K, by q = Q u, ``u^T q`` and ``u^T g``."""
@@ -149,19 +149,25 @@ class State:
         self.g = self.g - u_g * by
         self.diagonal = self.diagonal - by * q
         self.U, self.V = np.concatenate((self.U, q[None])), np.concatenate((self.V, by[None]))
-        self.rise = None
+        self.rises = None
 
 
-class Problem:
+class LikelihoodProblem:
     """Readings, and possible manipulations."""
 
-    def __init__(self, lies: Lies, start: State, false: FalsePowers | None, curved: Curved | None) -> None:
-        self.lies, self.false, self.curved = lies, false, curved
+    def __init__(
+        self,
+        error_prior: ErrorPrior,
+        start: SnapshotHypothesis,
+        false: FalsePowers | None,
+        curved: Curved | None,
+    ) -> None:
+        self.prior, self.false, self.curved = error_prior, false, curved
         diagonal, self.W = start.diagonal, start.W
-        self.size, self.a2 = diagonal.size, lies.size**2
+        self.size, self.a2 = diagonal.size, error_prior.size**2
         # Of examined customers: B, and its products in the hypothesis without accusations.
-        self.known: dict[int, tuple[Floats, Floats, Floats]] = {}
-        prices, least, self.rare = _charges(lies, self.size)
+        self.directions: dict[int, tuple[Floats, Floats, Floats]] = {}
+        prices, least, self.rare = _charges(error_prior, self.size)
         # The meter with the least precise prediction is accused for the least freedom.
         first = max(0.0, least - float(prices[1]) - float(np.log1p(self.a2 * diagonal.min())))
         self.prices = prices + first
@@ -172,7 +178,7 @@ class Problem:
         """Largest effects of each customer's load; see `FalsePowers`. ValueError without false powers."""
         if self.false is None:
             raise errors.InputInvalid([errors.Problem("missing", "there are no false powers")])
-        return strongest(self.false.R) if self.false.felt is None else self.false.felt
+        return largest_effects(self.false.R) if self.false.felt is None else self.false.felt
 
     def quiet(self, g: Floats, diagonal: Floats) -> bool:
         """True if no meter would be accused and no power doubted."""
@@ -182,44 +188,44 @@ class Problem:
 
     def charge(self, count: int, false: int) -> float:
         """Cost of manipulated meters and false powers beside their freedom."""
-        return float(self.prices[count]) + self.lies.false * false
+        return float(self.prices[count]) + self.prior.false * false
 
-    def cost(self, at: State) -> float:
+    def cost(self, at: SnapshotHypothesis) -> float:
         """J."""
         return at.fit + at.logdet + self.charge(*at.counts)
 
-    def meters(self, at: State) -> Floats:
+    def meter_rises(self, at: SnapshotHypothesis) -> Floats:
         """Rise of J by accusing each meter, or by trusting it again, (p,); to be read only."""
-        if at.rise is not None:
-            return at.rise
+        if at.rises is not None:
+            return at.rises
         k, _ = at.counts
         now = self.prices[k]
         pivot = 1.0 + self.a2 * at.diagonal
         rise: Floats = np.log(pivot) - self.a2 * at.g**2 / pivot + (self.prices[min(k + 1, self.size)] - now)
         if k:
-            on = at.liars.nonzero()[0]
+            on = at.meters.nonzero()[0]
             pivot = np.maximum(1.0 - self.a2 * at.diagonal[on], _TINY)
             less = np.log(pivot) + self.a2 * at.g[on] ** 2 / pivot + (self.prices[k - 1] - now)
             # Powers are false only where the meter lies.
             rise[on] = less
             if at.counts[1]:
                 rise[at.powers] = np.inf
-        at.rise = rise
+        at.rises = rise
         return rise
 
-    def pairs(self, at: State, who: Ints) -> tuple[Floats, Floats]:
+    def power_rises(self, at: SnapshotHypothesis, which: Ints) -> tuple[Floats, Floats]:
         """Rise of J by false powers of some customers, and the chi-square these explain, (k,) each.
 
         Their meters are accused with them where they are trusted.
         """
         k, _ = at.counts
         accused = float(self.prices[min(k + 1, self.size)] - self.prices[k])
-        out = np.empty((2, who.size))
+        out = np.empty((2, which.size))
         # Few are examined: numbers are faster than short arrays.
-        for n, c in enumerate(who.tolist()):
+        for n, c in enumerate(which.tolist()):
             (a, b, d), (s, t), (h, i) = self._against(at, c)
-            pivot, rise, gain = 1.0, self.lies.false, 0.0
-            if not at.liars[c]:
+            pivot, rise, gain = 1.0, self.prior.false, 0.0
+            if not at.meters[c]:
                 # First the meter, which changes Q and g by rank one; then its customer's powers.
                 g, pivot = float(at.g[c]), 1.0 + self.a2 * float(at.diagonal[c])
                 by = self.a2 / pivot
@@ -231,22 +237,22 @@ class Problem:
             out[:, n] = np.inf if at.powers[c] else log(pivot * det) - gain + rise, gain
         return out[0], out[1]
 
-    def believed(self, at: State, who: Ints) -> Floats:
+    def trust_rises(self, at: SnapshotHypothesis, which: Ints) -> Floats:
         """Rise of J by trusting the powers of some customers again, (k,)."""
-        out = np.empty(who.size)
-        for n, c in enumerate(who.tolist()):
+        out = np.empty(which.size)
+        for n, c in enumerate(which.tolist()):
             (a, b, d), _, (h, i) = self._against(at, c)
             det, gain = _by_two(a - 1.0, b, d - 1.0, h, i)
-            out[n] = log(det) - gain - self.lies.false
+            out[n] = log(det) - gain - self.prior.false
         return out
 
-    def _against(self, at: State, c: int) -> tuple[list[float], list[float], list[float]]:
+    def _against(self, at: SnapshotHypothesis, c: int) -> tuple[list[float], list[float], list[float]]:
         """``B^T Q B``, its three numbers, ``e^T Q B`` of the customer's own meter, and ``B^T g``."""
-        if c not in self.known:
+        if c not in self.directions:
             B = self._columns(c)
             white = np.array([self.W @ u for u in B])
-            self.known[c] = B, white @ white.T, white @ self.W[:, c]
-        B, M, own = self.known[c]
+            self.directions[c] = B, white @ white.T, white @ self.W[:, c]
+        B, M, own = self.directions[c]
         if len(at.U):
             off, by = at.U @ B.T, B @ at.V.T
             M, own = M - by @ off, own - by @ at.U[:, c]
@@ -259,7 +265,7 @@ class Problem:
             raise errors.InputInvalid([errors.Problem("missing", "there are no false powers")])
         return np.stack([self.false.R[:, c] * self.false.p[c], self.false.X[:, c] * self.false.q[c]])
 
-    def settle(self, at: State) -> None:
+    def linearise(self, at: SnapshotHypothesis) -> None:
         """Linearise about this hypothesis's powers, and once more where that changed much."""
         if self.curved is None:
             return
@@ -267,19 +273,19 @@ class Problem:
             before = at.fit
             at.m = self.curved(at.g, at.powers)
             at.g = at.times(at.m)
-            at.fit, at.rise = float(at.m @ at.g), None
+            at.fit, at.rises = float(at.m @ at.g), None
             if abs(at.fit - before) <= _LITTLE:
                 return
 
-    def toggle(self, at: State, j: int) -> None:
+    def toggle(self, at: SnapshotHypothesis, j: int) -> None:
         """Accuse a meter, or trust it again."""
-        at.change(at.column(j), -self.a2 if at.liars[j] else self.a2, float(at.diagonal[j]), float(at.g[j]))
-        at.liars[j] = not at.liars[j]
-        at.counts = at.counts[0] + (1 if at.liars[j] else -1), at.counts[1]
+        at.change(at.column(j), -self.a2 if at.meters[j] else self.a2, float(at.diagonal[j]), float(at.g[j]))
+        at.meters[j] = not at.meters[j]
+        at.counts = at.counts[0] + (1 if at.meters[j] else -1), at.counts[1]
 
-    def powers(self, at: State, c: int, sign: float = 1.0) -> None:
+    def doubt_powers(self, at: SnapshotHypothesis, c: int, sign: float = 1.0) -> None:
         """Doubt a customer's powers, or with `sign` -1 trust them again."""
-        for u in self.known[c][0] if c in self.known else self._columns(c):
+        for u in self.directions[c][0] if c in self.directions else self._columns(c):
             q = at.times(u)
             at.change(q, sign, float(u @ q), float(u @ at.g))
         at.powers[c] = sign > 0
@@ -287,17 +293,17 @@ class Problem:
 
 
 @cache
-def _charges(lies: Lies, meters: int) -> tuple[Floats, float, float]:
+def _charges(error_prior: ErrorPrior, meters: int) -> tuple[Floats, float, float]:
     """Costs of 0, 1, 2, … accusations, and the rare evidence of one meter and of a pair."""
-    prices = frozen(_prices(meters, *lies.seen) + lies.each * np.arange(meters + 1))
-    least = float(ndtri(lies.rate * (1.0 - _OF_PAIRS) / (2.0 * meters)) ** 2)
-    return prices, least, float(chdtri(3, lies.rate * _OF_PAIRS / meters))
+    prices = frozen(_prices(meters, *error_prior.seen) + error_prior.each * np.arange(meters + 1))
+    least = float(ndtri(error_prior.rate * (1.0 - _OF_PAIRS) / (2.0 * meters)) ** 2)
+    return prices, least, float(chdtri(3, error_prior.rate * _OF_PAIRS / meters))
 
 
-def _prices(meters: int, liars: float, honest: float) -> Floats:
+def _prices(meters: int, suspects: float, honest: float) -> Floats:
     """Costs by the prior over sets alone, but always rising."""
     k = np.arange(meters)
-    each = np.maximum(2.0 * np.log((meters - 1 - k + honest) / (k + liars)), 0.0)
+    each = np.maximum(2.0 * np.log((meters - 1 - k + honest) / (k + suspects)), 0.0)
     return frozen(np.concatenate([[0.0], np.cumsum(each)]))
 
 
@@ -306,7 +312,7 @@ def suspicious(g: Floats, diagonal: Floats) -> Bools:
     return np.asarray(g**2 > _SUSPICIOUS**2 * diagonal)
 
 
-def strongest(R: Floats) -> Floats:
+def largest_effects(R: Floats) -> Floats:
     """Largest entries of each column of R, the largest first, (MOST, p) or all of fewer."""
     return frozen(-np.sort(-R, axis=0)[:MOST])
 

@@ -26,19 +26,19 @@ from functools import partial
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, indices, submatrix
-from gridsec.estimators.sequential.conditional import Fit, Prior, solved
+from gridsec.estimators.sequential.conditional import Posterior, Prior, solve_spd
 
-_HARDER = 2.5
+_HARDENING = 2.5
 """Factor on the hardness of the cost from round to round."""
-_ROUNDS = 30
+_ROBUST_ROUNDS = 30
 """Largest number of rounds."""
-_FEATHER = 1e-6
+_LEAST_WEIGHT = 1e-6
 """Weights up to this count as zero, well above the rounding of Cholesky."""
 _TINY = float(np.finfo(np.float64).tiny)
 
 
-def robust(  # noqa: PLR0917
-    prior: Prior, noise: Floats, m: Floats, live: Bools, bound: Floats, whole: Fit | None = None
+def robust_set(  # noqa: PLR0917
+    prior: Prior, noise: Floats, m: Floats, available: Bools, bound: Floats, whole: Posterior | None = None
 ) -> Bools:
     """Trusted meters of a robust fit, (p,); O(p^3).
 
@@ -46,47 +46,51 @@ def robust(  # noqa: PLR0917
     pu. whole: a posterior that `covers` these meters, if there is one; the cube is then that of the number of
     meters with weights below one.
     """
-    at = indices(live)
+    at = indices(available)
     trusted = np.zeros(m.size, dtype=np.bool_)
     if not at.size:
         return trusted
     limit = bound[at] ** 2
     left: Callable[[Floats], Floats]
-    left = partial(_residual, prior.among(at), noise[at], m[at]) if whole is None else _beside(whole, m, at)
+    left = (
+        partial(_weighted_residual, prior.among(at), noise[at], m[at])
+        if whole is None
+        else _residual_by_posterior(whole, m, at)
+    )
     rest = left(np.ones(at.size))
     largest = float((rest * rest / limit).max())
     if largest <= 1.0:
         trusted[at] = True
         return trusted
     hardness = 1.0 / (2.0 * largest - 1.0)
-    for _ in range(_ROUNDS):
+    for _ in range(_ROBUST_ROUNDS):
         ratio = np.maximum(rest * rest / limit, _TINY)
         soft = np.sqrt(hardness * (hardness + 1.0) / ratio) - hardness
         weight = np.minimum(np.maximum(soft, 0.0), 1.0)
         rest = left(weight)
         if all_of((weight == 0.0) | (weight == 1.0)):
             break
-        hardness *= _HARDER
+        hardness *= _HARDENING
     trusted[at] = rest * rest <= limit
     return trusted
 
 
-def covers(whole: Fit, prior: Prior, noise: Floats, live: Bools) -> bool:
-    """True if a posterior gives the residuals of meters `live` (p,) for all weights."""
+def covers(whole: Posterior, prior: Prior, noise: Floats, available: Bools) -> bool:
+    """True if a posterior gives the residuals of meters `available` (p,) for all weights."""
     # A start must not depend on the rounding of earlier rank-one updates.
-    fresh = not whole.changes and not whole.loose.shape[1]
+    fresh = not whole.updates and not whole.unknowns.shape[1]
     same = fresh and whole.prior is prior and np.array_equal(whole.noise, noise)
-    return same and not any_of(live & ~whole.trusted)
+    return same and not any_of(available & ~whole.trusted)
 
 
-def _residual(signal: Floats, noise: Floats, y: Floats, weight: Floats) -> Floats:
+def _weighted_residual(signal: Floats, noise: Floats, y: Floats, weight: Floats) -> Floats:
     """``y - w_hat`` of meters with covariance `signal`, their noise, and weights in the fit from 0 to 1."""
-    use = indices(weight > _FEATHER)
+    use = indices(weight > _LEAST_WEIGHT)
     # Symmetric: the transpose is the same in the order of LAPACK.
     some = submatrix(signal.T, use, use).T if use.size < y.size else signal.copy(order="F")
     noise = noise[use] / weight[use]
     some.T.flat[:: use.size + 1] += noise
-    amount = solved(some, y[use])
+    amount = solve_spd(some, y[use])
     if use.size == y.size:
         return np.asarray(noise * amount)
     weights = np.zeros(y.size)
@@ -96,22 +100,22 @@ def _residual(signal: Floats, noise: Floats, y: Floats, weight: Floats) -> Float
     return np.asarray(rest)
 
 
-def _beside(whole: Fit, m: Floats, at: Ints) -> Callable[[Floats], Floats]:
-    """`_residual` of meters `at` by their weights, from a posterior of all of them and perhaps of others."""
-    who, Q = whole.trusting()
-    noise, a = whole.noise[who], Q @ m[who]
-    place = np.searchsorted(who, at)
+def _residual_by_posterior(whole: Posterior, m: Floats, at: Ints) -> Callable[[Floats], Floats]:
+    """`_weighted_residual` of meters `at` by their weights, from a posterior that covers them."""
+    which, Q = whole.precision()
+    noise, a = whole.noise[which], Q @ m[which]
+    place = np.searchsorted(which, at)
 
     def left(weight: Floats) -> Floats:
-        each = np.zeros(who.size)
-        each[place] = np.where(weight > _FEATHER, weight, 0.0)
+        each = np.zeros(which.size)
+        each[place] = np.where(weight > _LEAST_WEIGHT, weight, 0.0)
         less = indices(each < 1.0)
         rest = noise * a
         if less.size:
             # Symmetric: the transpose is the same in the order of LAPACK.
             some, part = submatrix(Q, less, less).T, each[less]
             some.T.flat[:: less.size + 1] += part / (noise[less] * (1.0 - part))
-            z = solved(some, a[less])
+            z = solve_spd(some, a[less])
             rest -= noise * (z @ Q[less])
             rest[less] += z
         return np.asarray(rest[place])

@@ -31,18 +31,26 @@ import numpy as np
 from scipy.linalg import lapack
 
 from gridsec.arrays import Bools, Floats, Ints, frozen_ints, indices, submatrix
-from gridsec.estimators.sequential.blocks import Outside, sound, without
-from gridsec.estimators.sequential.conditional import Fit, Judged, Move, admit, drop, follow, judge
-from gridsec.estimators.sequential.dictionary import Dictionary, Powers, Step
+from gridsec.estimators.sequential.blocks import ExcludedMeters, remove_meters, well_conditioned
+from gridsec.estimators.sequential.conditional import (
+    LeaveOneOut,
+    Posterior,
+    RankOneUpdate,
+    add_meter,
+    leave_one_out,
+    remove_meter,
+    updated,
+)
+from gridsec.estimators.sequential.dictionary import FaultDictionary, FaultGains, Move
 
 
-class Recent:
+class LimitCache:
     """Last result of `Limits.limit`, which repeats while no meter is suspect."""
 
-    __slots__ = ("answer",)
+    __slots__ = ("last",)
 
     def __init__(self) -> None:
-        self.answer: tuple[float, Floats, Floats] | None = None
+        self.last: tuple[float, Floats, Floats] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,97 +60,99 @@ class Limits:
     sigmas: float  # standard deviations within chance
     model: Floats  # (p,) largest error of the model, squared pu
     allowed: Floats  # (p,) honest offset of any probability, the accuracy class, squared pu
-    certain: Floats  # (p,) variance within the meters' noise that `allowed` replaces
-    most: int | None = None  # largest number of manipulated meters told apart; None for no limit
-    late: Floats | None = None  # (p,) additional variance of the residuals, squared pu^2; None for none
-    recent: Recent | None = None  # last result for these `allowed`, `certain` and `late`
+    replaced: Floats  # (p,) variance within the meters' noise that `allowed` replaces
+    max_attacked: int | None = None  # largest number of manipulated meters told apart; None for no limit
+    added: Floats | None = None  # (p,) additional variance of the residuals, squared pu^2; None for none
+    cache: LimitCache | None = None  # last result for these `allowed`, `certain` and `late`
 
     @property
     def penalty(self) -> float:
         """Least gain of removing a meter."""
         return self.sigmas**2
 
-    def of(self, std: Floats, part: float = 1.0) -> Floats:
+    def limit(self, std: Floats, part: float = 1.0) -> Floats:
         """Largest honest residual for its standard deviation (p,): by chance, or by class and chance.
 
         part: used part of `sigmas`.
         """
-        sigmas, recent = part * self.sigmas, self.recent
-        last = None if recent is None else recent.answer
+        sigmas, recent = part * self.sigmas, self.cache
+        last = None if recent is None else recent.last
         if last is None or last[0] != sigmas or last[1] is not std:
             last = sigmas, std, self._within(std, sigmas)
             if recent is not None and part == 1.0:
-                recent.answer = last
+                recent.last = last
         return np.asarray(self.model + last[2])
 
     def _within(self, std: Floats, sigmas: float) -> Floats:
-        if self.late is not None:
-            std = np.sqrt(std * std + self.late)
-        rest = np.sqrt(np.maximum(std * std - self.certain, 0.0))
+        if self.added is not None:
+            std = np.sqrt(std * std + self.added)
+        rest = np.sqrt(np.maximum(std * std - self.replaced, 0.0))
         return np.asarray(np.minimum(sigmas * std, self.allowed + sigmas * rest))
 
-    def some(self, at: Ints) -> Limits:
+    def subset(self, at: Ints) -> Limits:
         """The same for meters `at` (k,)."""
-        late = None if self.late is None else self.late[at]
-        return Limits(self.sigmas, self.model[at], self.allowed[at], self.certain[at], self.most, late)
+        late = None if self.added is None else self.added[at]
+        return Limits(
+            self.sigmas, self.model[at], self.allowed[at], self.replaced[at], self.max_attacked, late
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Explanation:
+class Hypothesis:
     """Hypothesis of a search. p meters."""
 
     trusted: Bools  # (p,) meters that it does not accuse
-    loosened: tuple[int, ...]  # accused directions, indices of the fault dictionary
+    faults: tuple[int, ...]  # accused directions, indices of the fault dictionary
     charge: float  # cost of these
     cost: float  # J
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Solution(Explanation):
+class Candidate(Hypothesis):
     """Hypothesis with its posterior."""
 
-    fit: Fit  # posterior of the trusted meters
-    judged: Judged  # leave-one-out residuals
+    posterior: Posterior  # posterior of the trusted meters
+    loo: LeaveOneOut  # leave-one-out residuals
 
-    def bare(self) -> Explanation:
+    def hypothesis(self) -> Hypothesis:
         """The hypothesis without its posterior, which is large."""
-        return Explanation(self.trusted, self.loosened, self.charge, self.cost)
+        return Hypothesis(self.trusted, self.faults, self.charge, self.cost)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Found:
+class Candidates:
     """Results of several searches."""
 
-    best: Solution  # the likeliest
-    others: tuple[Explanation, ...] = ()  # the rest, in no order
+    best: Candidate  # the likeliest
+    others: tuple[Hypothesis, ...] = ()  # the rest, in no order
 
 
-def likelier(one: Found | None, other: Found) -> Found:
+def merged(one: Candidates | None, other: Candidates) -> Candidates:
     """Union of the results; the first best one stays where both are equally likely."""
     if one is None:
         return other
     first, second = (other, one) if other.best.cost < one.best.cost else (one, other)
-    return Found(first.best, (*first.others, second.best.bare(), *second.others))
+    return Candidates(first.best, (*first.others, second.best.hypothesis(), *second.others))
 
 
-NOBODY = frozen_ints(np.zeros(0, dtype=np.intp))
+NO_METERS = frozen_ints(np.zeros(0, dtype=np.intp))
 _MOVES_PER_METER = 4
 """Largest number of moves of a descent per meter."""
 
 
 def descend(
-    start: Fit,
+    start: Posterior,
     m: Floats,
-    live: Bools,
+    available: Bools,
     limits: Limits,
     *,
     keep: Bools,
-    dictionary: Dictionary | None = None,
-    innocent: Ints = NOBODY,
+    faults: FaultDictionary | None = None,
+    protected: Ints = NO_METERS,
     pairs: bool = False,
     fresh: bool = False,
-    judged: Judged | None = None,
-) -> Solution:
+    loo: LeaveOneOut | None = None,
+) -> Candidate:
     """Remove, add and accuse until no move lowers the cost.
 
     start: changed in place only if `fresh`; the posterior of the result where no move helps. live: (p,)
@@ -150,142 +160,142 @@ def descend(
     judged: the residuals of `start` if known. pairs: remove two meters at once as well, O(p^2) per move; two
     meters of equal error support each other, and removing either gains little.
     """
-    now, changed = start if fresh else start.copy(), start.changes
-    barred = ~live | keep
-    for j in innocent[~now.trusted[innocent]].tolist():
-        admit(now, j)
-    for j in indices(now.trusted & ~live):
-        drop(now, int(j))
-    if judged is None or now.changes != changed:
-        judged = judge(now, m)
-    before, moves, anew = now.changes, 0, True
-    many = dictionary is None and not pairs and sound(now.prior, now.noise)
-    powers = None if dictionary is None else Powers(now, dictionary, judged.weights, live, innocent)
+    now, changed = start if fresh else start.copy(), start.updates
+    barred = ~available | keep
+    for j in protected[~now.trusted[protected]].tolist():
+        add_meter(now, j)
+    for j in indices(now.trusted & ~available):
+        remove_meter(now, int(j))
+    if loo is None or now.updates != changed:
+        loo = leave_one_out(now, m)
+    before, moves, anew = now.updates, 0, True
+    many = faults is None and not pairs and well_conditioned(now.prior, now.noise)
+    gains = None if faults is None else FaultGains(now, faults, loo.weights, available, protected)
     while moves < _MOVES_PER_METER * m.size:
-        steps = _best(_Place(now, judged, limits, barred, innocent, pairs, powers, many))
+        steps = _next_move(_Descent(now, loo, limits, barred, protected, pairs, gains, many))
         if not steps:
             break
-        moves, changed = moves + 1, now.changes
+        moves, changed = moves + 1, now.updates
         for step in steps:
-            move = step()
-            anew = move is None
-            judged = judge(now, m) if move is None else follow(now, m, judged, move)
-        moves += now.changes - changed - 1 if anew else 0
-    if not fresh and now.changes == start.changes:
+            update = step()
+            anew = update is None
+            loo = leave_one_out(now, m) if update is None else updated(now, m, loo, update)
+        moves += now.updates - changed - 1 if anew else 0
+    if not fresh and now.updates == start.updates:
         now = start  # with its cached values
     else:
-        now.shrink()
-    if now.changes > before and not anew:
-        judged = judge(now, m)  # without accumulated rounding
-    dropped = int(np.count_nonzero(live & ~now.trusted))
-    loosened = () if powers is None else powers.loosened
-    size = int(np.count_nonzero(live))
+        now.compact()
+    if now.updates > before and not anew:
+        loo = leave_one_out(now, m)  # without accumulated rounding
+    dropped = int(np.count_nonzero(available & ~now.trusted))
+    accused_faults = () if gains is None else gains.accused_faults
+    size = int(np.count_nonzero(available))
     charge = 0.0
-    if dictionary is not None and loosened:
-        charges = dictionary.charges(np.array(loosened, dtype=np.intp), now.trusted, dropped)
-        charge = float(charges.sum()) * price(size, 1)
-    cost = judged.misfit + price(size, dropped, limits.most) + charge
-    return Solution(now.trusted, loosened, charge, cost, now, judged)
+    if faults is not None and accused_faults:
+        charges = faults.charges(np.array(accused_faults, dtype=np.intp), now.trusted, dropped)
+        charge = float(charges.sum()) * set_cost(size, 1)
+    cost = loo.chi_square + set_cost(size, dropped, limits.max_attacked) + charge
+    return Candidate(now.trusted, accused_faults, charge, cost, now, loo)
 
 
 @cache
-def price(meters: int, liars: int, most: int | None = None) -> float:
+def set_cost(meters: int, suspects: int, most: int | None = None) -> float:
     """Cost of k accusations among p meters: `2 ln binom(p, k)`, always rising, steeply beyond `most`."""
-    k = np.arange(liars)
-    least = np.where(k < (meters if most is None else most), _LEAST, _BEYOND)
+    k = np.arange(suspects)
+    least = np.where(k < (meters if most is None else most), _LEAST_COST, _EXCESS_COST)
     return float(np.sum(np.maximum(2.0 * np.log((meters - k) / (k + 1.0)), least)))
 
 
-_LEAST, _BEYOND = 1.0, 9.0
+_LEAST_COST, _EXCESS_COST = 1.0, 9.0
 """Least cost of an accusation beyond half of the meters, and of one beyond the largest number told apart."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Place:
+class _Descent:
     """Position of a descent."""
 
-    fit: Fit
-    judged: Judged
+    posterior: Posterior
+    loo: LeaveOneOut
     limits: Limits
     barred: Bools
-    innocent: Ints
+    protected: Ints
     pairs: bool
-    powers: Powers | None
-    many: bool
+    gains: FaultGains | None
+    blocks: bool
 
 
-def _best(here: _Place) -> Sequence[Callable[[], Move | None]]:
+def _next_move(here: _Descent) -> Sequence[Callable[[], RankOneUpdate | None]]:
     """Steps of the next move; none if none helps. A step that is not a rank-one update returns None."""
-    now, judged, powers = here.fit, here.judged, here.powers
-    excess = np.abs(judged.offset) / here.limits.of(judged.std)
+    now, loo, gains = here.posterior, here.loo, here.gains
+    excess = np.abs(loo.residual) / here.limits.limit(loo.std)
     inside = np.where(now.trusted, excess, -np.inf)
-    inside[here.innocent] = -np.inf
+    inside[here.protected] = -np.inf
     worst = int(inside.argmax())
     drops = bool(inside[worst] > 1.0)
-    if drops and here.many and np.count_nonzero(inside > 1.0) >= _MANY:
-        return [partial(_drop_many, here, worst)]
-    steps: list[Step] = [partial(_drop, now, worst, powers)] if drops else []
-    if here.pairs or powers is not None:
-        gain = (judged.offset[worst] / judged.std[worst]) ** 2 - here.limits.penalty if drops else 0.0
+    if drops and here.blocks and np.count_nonzero(inside > 1.0) >= _MANY:
+        return [partial(_remove_block, here, worst)]
+    steps: list[Move] = [partial(_remove, now, worst, gains)] if drops else []
+    if here.pairs or gains is not None:
+        gain = (loo.residual[worst] / loo.std[worst]) ** 2 - here.limits.penalty if drops else 0.0
         gain = max(float(gain), 0.0)
         if here.pairs:
-            pair, gain = _pair(here, gain)
-            steps = [partial(_drop, now, j, powers) for j in pair] or steps
-        if powers is not None:
-            steps = powers.best(judged, here.limits.penalty, gain) or steps
+            pair, gain = _best_pair(here, gain)
+            steps = [partial(_remove, now, j, gains) for j in pair] or steps
+        if gains is not None:
+            steps = gains.best_move(loo, here.limits.penalty, gain) or steps
     if steps:
         return steps
     outside = np.where(now.trusted | here.barred, np.inf, excess)
     nearest = int(outside.argmin())
     if not outside[nearest] < 1.0:
         return []
-    if here.many:
+    if here.blocks:
         at = indices(outside < np.inf)
-        if np.count_nonzero(outside < 1.0) >= max(_MANY, at.size / _ASKED):
-            return [partial(_admit_many, here, at, nearest)]
-    return [lambda: _moved(admit(now, nearest), powers)]
+        if np.count_nonzero(outside < 1.0) >= max(_MANY, at.size / _EXAMINED):
+            return [partial(_add_block, here, at, nearest)]
+    return [lambda: _noted(add_meter(now, nearest), gains)]
 
 
-_MANY, _ASKED, _AT_ONCE = 6, 8, 64
-"""Block moves: least candidates, least share of the examined meters (1 / `_ASKED`), and largest block."""
+_MANY, _EXAMINED, _AT_ONCE = 6, 8, 64
+"""Block moves: least candidates, least share of the examined meters (1 / `_EXAMINED`), and largest block."""
 
 
-def _admit_many(here: _Place, at: Ints, first: int) -> Move | None:
+def _add_block(here: _Descent, at: Ints, first: int) -> RankOneUpdate | None:
     """Add meters one after the other while the nearest is within its limit and no trusted one is beyond.
 
     Only the covariance of the excluded meters is followed. The trusted ones are tested for all moves at once,
     and the moves after the first violation are taken back. Where rounding leaves no move, `first` alone is
     added.
     """
-    now, judged = here.fit, here.judged
-    outside = Outside.of(now, at)
-    order = _nearest(outside.apart, judged.offset[at], here.limits.some(at))
+    now, loo = here.posterior, here.loo
+    outside = ExcludedMeters.of(now, at)
+    order = _addition_order(outside.apart, loo.residual[at], here.limits.subset(at))
     if not order.size:
-        return admit(now, first)
+        return add_meter(now, first)
     factor = outside.factor(order)
     changes = outside.changes(order, factor)
-    error, _ = lapack.dtrtrs(factor, judged.offset[at[order]], lower=True)
+    error, _ = lapack.dtrtrs(factor, loo.residual[at[order]], lower=True)
     pivot = now.diagonal() + np.cumsum(changes * changes, axis=0)[:-1]
-    weights = judged.weights + np.cumsum(changes * error[:, None], axis=0)[:-1]
+    weights = loo.weights + np.cumsum(changes * error[:, None], axis=0)[:-1]
     inside = pivot > 0.0
     pivot = np.where(inside, pivot, 1.0)
     # Not kept: it is used once.
-    limit = replace(here.limits, recent=None).of(np.sqrt(1.0 / pivot))
+    limit = replace(here.limits, cache=None).limit(np.sqrt(1.0 / pivot))
     beyond = inside & (np.abs(weights) > pivot * limit)
-    beyond[:, here.innocent] = False
+    beyond[:, here.protected] = False
     wrong = indices(beyond.any(axis=1))
-    outside.admit(order[: wrong[0] + 1] if wrong.size else order, factor, changes)
+    outside.add(order[: wrong[0] + 1] if wrong.size else order, factor, changes)
     return None
 
 
-def _nearest(apart: Floats, offset: Floats, limits: Limits) -> Ints:
+def _addition_order(apart: Floats, offset: Floats, limits: Limits) -> Ints:
     """Order in which excluded meters are added, the closest first, places, (r,); `apart`: (k, k)."""
     order: list[int] = []
     open_, done = apart.diagonal().copy(), np.zeros(offset.size)
     # Rows of the Cholesky factor so far.
     rows = np.empty((min(offset.size, _AT_ONCE), offset.size))
     for k in range(len(rows)):
-        excess = np.abs(offset) / limits.of(np.sqrt(open_)) + done
+        excess = np.abs(offset) / limits.limit(np.sqrt(open_)) + done
         j = int(excess.argmin())
         row = apart[j] - rows[:k, j] @ rows[:k] if k else apart[j]
         if not (excess[j] < 1.0 and row[j] > 0.0):
@@ -299,52 +309,52 @@ def _nearest(apart: Floats, offset: Floats, limits: Limits) -> Ints:
     return np.array(order, dtype=np.intp)
 
 
-def _drop_many(here: _Place, first: int) -> Move | None:
+def _remove_block(here: _Descent, first: int) -> RankOneUpdate | None:
     """Remove meters one after the other while the worst is beyond its limit; only precision is followed.
 
     Where rounding leaves no move, `first` alone is removed.
     """
-    now, (at, Q) = here.fit, here.fit.trusting()
-    limits, weights = here.limits.some(at), here.judged.weights[at]
-    pivot, kept = Q.diagonal().copy(), np.where(np.isin(at, here.innocent), np.inf, 0.0)
+    now, (at, Q) = here.posterior, here.posterior.precision()
+    limits, weights = here.limits.subset(at), here.loo.weights[at]
+    pivot, kept = Q.diagonal().copy(), np.where(np.isin(at, here.protected), np.inf, 0.0)
     rows = np.empty((min(at.size, _AT_ONCE), at.size))
-    fallen = np.zeros_like(now.trusted)
+    removed = np.zeros_like(now.trusted)
     for k in range(len(rows)):
-        excess = np.abs(weights / pivot) / limits.of(np.sqrt(1.0 / pivot)) - kept
+        excess = np.abs(weights / pivot) / limits.limit(np.sqrt(1.0 / pivot)) - kept
         j = int(excess.argmax())
         row = Q[j] - rows[:k, j] @ rows[:k]
         if not (excess[j] > 1.0 and row[j] > 0.0):
             break
-        fallen[at[j]] = True
+        removed[at[j]] = True
         root = float(row[j]) ** 0.5
         rows[k] = row = row / root
         weights = weights - row * (weights[j] / root)
         pivot -= row * row
         pivot[j], kept[j] = 1.0, np.inf
-    if not fallen.any():
-        return drop(now, first)
-    after = without(now, fallen)
-    now.inverse, now.variance, now.changes = after.inverse, after.variance, after.changes
-    now.trusted[fallen] = False
-    now.pivot = now.std = now.together = now.left = None
+    if not removed.any():
+        return remove_meter(now, first)
+    after = remove_meters(now, removed)
+    now.inverse, now.variance, now.updates = after.inverse, after.variance, after.updates
+    now.trusted[removed] = False
+    now.pivot = now.std = now.busbar_weights = now.variance_sum = None
     return None
 
 
-_PAIRED = 256
+_PAIR_METERS = 256
 """Meters among which pairs are searched, those of the largest single gains."""
 
 
-def _pair(here: _Place, than: float) -> tuple[tuple[int, ...], float]:
+def _best_pair(here: _Descent, than: float) -> tuple[tuple[int, ...], float]:
     """Two meters to be removed together and their gain; none unless the gain is above `than`.
 
     With b = Q m and G = Q of the two the gain is ``b^T G^-1 b``; their residuals without both are ``G^-1 b``.
     """
-    now, weights = here.fit, here.judged.weights
+    now, weights = here.posterior, here.loo.weights
     free = now.trusted.copy()
-    free[here.innocent] = False
+    free[here.protected] = False
     at = indices(free)
-    if at.size > _PAIRED:
-        at = np.sort(at[np.argsort(-(weights[at] ** 2) / now.Q[at, at])[:_PAIRED]])
+    if at.size > _PAIR_METERS:
+        at = np.sort(at[np.argsort(-(weights[at] ** 2) / now.Q[at, at])[:_PAIR_METERS]])
     if at.size < 2:
         return (), than
     Q, b = submatrix(now.Q, at, at), weights[at]
@@ -360,14 +370,14 @@ def _pair(here: _Place, than: float) -> tuple[tuple[int, ...], float]:
     pick = np.array([first, second])
     left_open, std = np.linalg.inv(Q[np.ix_(pick, pick)]), np.zeros(weights.size)
     std[at[pick]] = np.sqrt(left_open.diagonal())
-    if not (np.abs(left_open @ b[pick]) > here.limits.of(std)[at[pick]]).all():
+    if not (np.abs(left_open @ b[pick]) > here.limits.limit(std)[at[pick]]).all():
         return (), than
     return tuple(at[pick].tolist()), net
 
 
-def _drop(now: Fit, j: int, powers: Powers | None) -> Move:
-    return _moved(drop(now, j), powers)
+def _remove(now: Posterior, j: int, gains: FaultGains | None) -> RankOneUpdate:
+    return _noted(remove_meter(now, j), gains)
 
 
-def _moved(move: Move, powers: Powers | None) -> Move:
-    return move if powers is None else powers.follow(move)
+def _noted(update: RankOneUpdate, gains: FaultGains | None) -> RankOneUpdate:
+    return update if gains is None else gains.update(update)

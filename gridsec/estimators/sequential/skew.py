@@ -26,50 +26,50 @@ from gridsec.estimators.sequential.design import SequentialDesign
 
 _OFFSETS = 4.0
 """Shortest scale that tests a meter, in offsets of its clock."""
-_LITTLE = 0.1
+_NEGLIGIBLE = 0.1
 """Variance of a change, as a part of that of a mean, below which it is left out."""
-_STEP = 4.0
+_VARIANCE_RANGE = 4.0
 """Largest ratio of a used variance to the found one: each other one is a new factorisation."""
-_HOLD = 4
+_FALL_TICKS = 4
 """Smallest number of ticks from one fall of the variances of a scale to the next."""
 
 
-def largest(design: SequentialDesign) -> float:
+def largest_offset(design: SequentialDesign) -> float:
     """Largest clock offset with a scale that tests the meter, s."""
     return design.lengths[-1] * design.step_s / _OFFSETS
 
 
-def unusable(design: SequentialDesign, offset_s: Floats | None) -> Bools | None:
+def unusable_offsets(design: SequentialDesign, offset_s: Floats | None) -> Bools | None:
     """Meters with clock offsets (p,), s, that no scale covers, (p,); None for none. NaN: not measurable."""
     if offset_s is None:
         return None
-    far: Bools = np.asarray(np.abs(offset_s) > largest(design))  # False for NaN
+    far: Bools = np.asarray(np.abs(offset_s) > largest_offset(design))  # False for NaN
     return far if any_of(far) else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Skew:
+class ClockSkew:
     """Changes of the voltages within the clock offsets. p meters, s scales."""
 
     model: Floats  # (k, p) squared voltages of the model at the last ticks, the newest last, pu
-    moved: Floats  # (longest, p) c at the last ticks, the newest last, squared pu
-    variance: Floats  # (s, p) added variance of the means, squared pu^2, at most `_STEP` times the found one
+    change: Floats  # (longest, p) c at the last ticks, the newest last, squared pu
+    variance: Floats  # (s, p) added variance of the means, squared pu^2
     aside: Bools  # (s, p) meters that a scale does not test
 
-    def judged(self, counts: Ints, needed: Ints) -> Bools:
+    def tested(self, counts: Ints, needed: Ints) -> Bools:
         """Meters with enough readings, (s, p) counts and (s,) needed, on a scale that tests them, (p,)."""
         enough = (counts >= needed[:, None]) & ~self.aside
         return np.asarray(enough.any(axis=0) & self.aside.any(axis=0))
 
 
-def follow(  # noqa: PLR0917
+def update_skew(  # noqa: PLR0917
     design: SequentialDesign,
-    before: Skew | None,
+    before: ClockSkew | None,
     tick: int,
     offset_s: Floats | None,
     v2: Floats,
     noise: Floats,
-) -> Skew | None:
+) -> ClockSkew | None:
     """Changes with one more tick; None while no offset is measured and no added variance is left.
 
     tick: its number; variances of a scale change only when it is due. offset_s: (p,) lead of each clock, s,
@@ -77,7 +77,7 @@ def follow(  # noqa: PLR0917
     squared pu. noise: (s, p) variances of the means without offsets, squared pu^2.
     """
     size = np.zeros(v2.size) if offset_s is None else np.abs(np.nan_to_num(offset_s))
-    size = np.where(size <= largest(design), size, 0.0)
+    size = np.where(size <= largest_offset(design), size, 0.0)
     if not any_of(size) and (before is None or not any_of(before.variance)):
         return None
     lengths, step = np.array(design.lengths), design.step_s
@@ -86,32 +86,32 @@ def follow(  # noqa: PLR0917
     change = np.zeros(v2.size)
     for k in range(1, min(int(ticks.max()), len(old)) + 1):
         change = np.where(ticks >= k, np.maximum(change, np.abs(v2 - old[-k])), change)
-    moved = np.zeros((lengths[-1], v2.size)) if before is None else before.moved
-    moved = np.vstack([moved[1:], change])
+    change_history = np.zeros((lengths[-1], v2.size)) if before is None else before.change
+    change_history = np.vstack([change_history[1:], change])
     aside = lengths[:, None] * step < _OFFSETS * size
     variance = np.zeros_like(noise) if before is None else before.variance.copy()
     for s, length in enumerate(design.lengths):
-        if tick % design.every[s] == 0:
-            mean = moved[-length:].mean(axis=0)
+        if tick % design.look_every[s] == 0:
+            mean = change_history[-length:].mean(axis=0)
             # The variance of a meter that the scale does not test is not used.
             found = np.where((size > 0.0) & ~aside[s], mean * mean, 0.0)
-            looks = -(-_HOLD // design.every[s])
-            falls = tick % (looks * design.every[s]) == 0
+            looks = -(-_FALL_TICKS // design.look_every[s])
+            falls = tick % (looks * design.look_every[s]) == 0
             variance[s] = _variance(found, noise[s], variance[s], falls=falls)
-    kept = ceil(largest(design) / step) + 1
-    return Skew(np.vstack([old, v2])[-kept:], moved, variance, aside)
+    kept = ceil(largest_offset(design) / step) + 1
+    return ClockSkew(np.vstack([old, v2])[-kept:], change_history, variance, aside)
 
 
 def _variance(found: Floats, noise: Floats, before: Floats, *, falls: bool) -> Floats:
-    """Variances of one scale: the present ones while they are 1 to `_STEP` times those found, (p,).
+    """Variances of one scale: the present ones while they are 1 to `_VARIANCE_RANGE` times those found, (p,).
 
     Each other variance is a new factorisation of the scale. One out of its range therefore renews all of
-    them, to the middle of the range, and a variance falls at most once in `_HOLD` ticks.
+    them, to the middle of the range, and a variance falls at most once in `_FALL_TICKS` ticks.
     """
-    little = _LITTLE * noise
-    wanted = np.where(found > np.where(before > 0.0, little / _STEP, little), found, 0.0)
-    rises, fallen = wanted > before, wanted * _STEP < before
-    if not any_of(rises) and not (falls and any_of(fallen)):
+    little = _NEGLIGIBLE * noise
+    wanted = np.where(found > np.where(before > 0.0, little / _VARIANCE_RANGE, little), found, 0.0)
+    rises, removed = wanted > before, wanted * _VARIANCE_RANGE < before
+    if not any_of(rises) and not (falls and any_of(removed)):
         return before
-    wanted = wanted * np.sqrt(_STEP)
+    wanted = wanted * np.sqrt(_VARIANCE_RANGE)
     return np.asarray(wanted if falls else np.maximum(wanted, before))

@@ -35,11 +35,18 @@ from scipy.linalg import lapack
 
 from gridsec import errors
 from gridsec.arrays import Bools, Floats, submatrix
-from gridsec.estimators.sequential.alike import Set, alike, worth
+from gridsec.estimators.sequential.alike import ErrorSet, likely_sets, may_change
 from gridsec.estimators.sequential.conditional import Prior
-from gridsec.estimators.sequential.rises import Curved, FalsePowers, Lies, Problem, State, suspicious
+from gridsec.estimators.sequential.rises import (
+    Curved,
+    ErrorPrior,
+    FalsePowers,
+    LikelihoodProblem,
+    SnapshotHypothesis,
+    suspicious,
+)
 
-__all__ = ["Curved", "Explained", "FalsePowers", "Lies", "identify"]
+__all__ = ["Curved", "ErrorPrior", "FalsePowers", "SnapshotExplanation", "identify"]
 
 _LEAST = 1e-9
 """Change of J within rounding."""
@@ -56,27 +63,27 @@ _MANY = 0.25
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Explained:
+class SnapshotExplanation:
     """One hypothesis. p meters."""
 
-    liars: Bools  # (p,) manipulated readings
+    meters: Bools  # (p,) manipulated readings
     powers: Bools  # (p,) false powers as well
     probability: float  # among all that are reported
     cost: float  # J
     weights: Floats  # (p,) ``K^-1 m``; covariance with the readings times this predicts any voltage
-    lies: Floats  # (p,) expected error of each manipulated reading, squared pu; 0 elsewhere
+    errors: Floats  # (p,) expected error of each manipulated reading, squared pu; 0 elsewhere
 
 
 def identify(
     prior: Prior,
     noise: Floats,
     m: Floats,
-    live: Bools,
+    available: Bools,
     *,
-    lies: Lies | None = None,
+    error_prior: ErrorPrior | None = None,
     false: FalsePowers | None = None,
     curved: Curved | None = None,
-) -> tuple[Explained, ...]:
+) -> tuple[SnapshotExplanation, ...]:
     """Likeliest hypotheses of one set of readings, the best first; there is always one.
 
     noise, m, live: (p,) variance of each reading, > 0; readings minus the model, squared pu, finite; meters
@@ -90,26 +97,30 @@ def identify(
     ValueError
         If `false` is of other meters.
     """
-    if false is not None and false.p.size != live.size:
+    if false is not None and false.p.size != available.size:
         raise errors.InputInvalid(
-            [errors.Problem("shape", f"false powers of {false.p.size} meters cannot explain {live.size}")]
+            [
+                errors.Problem(
+                    "shape", f"false powers of {false.p.size} meters cannot explain {available.size}"
+                )
+            ]
         )
-    lies = Lies() if lies is None else lies
-    if not live.any():
+    error_prior = ErrorPrior() if error_prior is None else error_prior
+    if not available.any():
         none = np.zeros(0, dtype=np.bool_)
-        return (_explained(Set(none, none, 0.0, m[:0], m[:0]), 1.0, live),)
-    if live.all():
+        return (_explained(ErrorSet(none, none, 0.0, m[:0], m[:0]), 1.0, available),)
+    if available.all():
         d, y, K = noise, m, prior.between
     else:
-        at = np.flatnonzero(live)
-        d, y, K = noise[at], m[at], submatrix(prior.of_meters, prior.meters[at], at)
+        at = np.flatnonzero(available)
+        d, y, K = noise[at], m[at], submatrix(prior.covariance, prior.meters[at], at)
         false = None if false is None else false.of(at)
     K.ravel()[:: d.size + 1] += d
-    start = State.nobody(y, _whitening(K))
-    problem = Problem(lies, start, false, curved)
+    start = SnapshotHypothesis.without_accusations(y, _whitening(K))
+    problem = LikelihoodProblem(error_prior, start, false, curved)
     quiet = problem.quiet(start.g, start.diagonal)
     found = [start] if quiet else _explanations(problem, start, false is not None)
-    return _reported(problem, found, live, lies)
+    return _reported(problem, found, available, error_prior)
 
 
 def _whitening(K: Floats) -> Floats:
@@ -122,9 +133,11 @@ def _whitening(K: Floats) -> Floats:
     return np.asarray(W)
 
 
-def _explanations(problem: Problem, start: State, false: bool) -> list[State]:
+def _explanations(
+    problem: LikelihoodProblem, start: SnapshotHypothesis, false: bool
+) -> list[SnapshotHypothesis]:
     """Local minima of J from several starts, and their neighbours."""
-    known: dict[bytes, State] = {start.key: start}
+    known: dict[bytes, SnapshotHypothesis] = {start.key: start}
     first = _descend(problem, start, known, false)
     if false and (first is start or _misfits(problem, first)):
         for k, c in enumerate(_doubtful(problem, start, accused=first is not start)):
@@ -135,7 +148,7 @@ def _explanations(problem: Problem, start: State, false: bool) -> list[State]:
         return [start]
     if false and not _plausible(problem, known):
         # False powers may mislead: first the meters with all powers true, then the powers.
-        apart: dict[bytes, State] = {}
+        apart: dict[bytes, SnapshotHypothesis] = {}
         _descend(problem, _descend(problem, start, apart, False), known, false)
         known.update(apart)
     _exchange(problem, min(known.values(), key=problem.cost), known, false)
@@ -143,45 +156,47 @@ def _explanations(problem: Problem, start: State, false: bool) -> list[State]:
     return list(known.values())
 
 
-def _misfits(problem: Problem, at: State) -> bool:
+def _misfits(problem: LikelihoodProblem, at: SnapshotHypothesis) -> bool:
     return at.fit > problem.size + _MISFIT * float(np.sqrt(2.0 * problem.size))
 
 
-def _plausible(problem: Problem, known: dict[bytes, State]) -> bool:
+def _plausible(problem: LikelihoodProblem, known: dict[bytes, SnapshotHypothesis]) -> bool:
     best = min(known.values(), key=problem.cost)
     return best.counts[0] <= _MANY * problem.size and not _misfits(problem, best)
 
 
-def _doubtful(problem: Problem, at: State, *, accused: bool) -> list[int]:
+def _doubtful(problem: LikelihoodProblem, at: SnapshotHypothesis, *, accused: bool) -> list[int]:
     """Customers with false powers that explain more than their manipulated meter alone, the best first.
 
     Before any accusation (`accused` False), only those with suspicious meters and rare evidence.
     """
     if accused:
-        single = problem.meters(at)
-        who = np.argsort(single)[:_STARTS]
-        rise, _ = problem.pairs(at, who)
-        worth = rise < single[who]
+        single = problem.meter_rises(at)
+        which = np.argsort(single)[:_STARTS]
+        rise, _ = problem.power_rises(at, which)
+        worth = rise < single[which]
     else:
-        who = np.flatnonzero(suspicious(at.g, at.diagonal))
-        if not who.size:
+        which = np.flatnonzero(suspicious(at.g, at.diagonal))
+        if not which.size:
             return []
-        rise, gain = problem.pairs(at, who)
+        rise, gain = problem.power_rises(at, which)
         worth = (rise < 0.0) & (gain > problem.rare)
     order = np.argsort(rise)
-    return [int(c) for c in who[order][worth[order]]]
+    return [int(c) for c in which[order][worth[order]]]
 
 
-def _doubted(problem: Problem, at: State, c: int) -> State:
+def _doubted(problem: LikelihoodProblem, at: SnapshotHypothesis, c: int) -> SnapshotHypothesis:
     after = at.copy()
-    if not after.liars[c]:
+    if not after.meters[c]:
         problem.toggle(after, c)
-    problem.powers(after, c)
-    problem.settle(after)
+    problem.doubt_powers(after, c)
+    problem.linearise(after)
     return after
 
 
-def _descend(problem: Problem, at: State, known: dict[bytes, State], false: bool) -> State:
+def _descend(
+    problem: LikelihoodProblem, at: SnapshotHypothesis, known: dict[bytes, SnapshotHypothesis], false: bool
+) -> SnapshotHypothesis:
     """Steepest descent; remembers every hypothesis that it passes."""
     known.setdefault(at.key, at)
     for _ in range(_MOVES * at.g.size):
@@ -194,37 +209,41 @@ def _descend(problem: Problem, at: State, known: dict[bytes, State], false: bool
     return at
 
 
-def _best(problem: Problem, at: State, false: bool) -> State | None:
+def _best(problem: LikelihoodProblem, at: SnapshotHypothesis, false: bool) -> SnapshotHypothesis | None:
     """State after the move that lowers J most, or None where none does."""
-    rise = problem.meters(at)
+    rise = problem.meter_rises(at)
     j = int(rise.argmin())
-    least, move = float(rise[j]), "meter"
+    least, update = float(rise[j]), "meter"
     if false and at.counts[0]:
         # Powers to be trusted again, and further false powers.
-        for who, what in ((at.powers, "believe"), (at.liars & ~at.powers, "powers")):
-            if (some := who.nonzero()[0]).size:
-                rise = problem.believed(at, some) if what == "believe" else problem.pairs(at, some)[0]
+        for which, what in ((at.powers, "believe"), (at.meters & ~at.powers, "powers")):
+            if (some := which.nonzero()[0]).size:
+                rise = (
+                    problem.trust_rises(at, some) if what == "believe" else problem.power_rises(at, some)[0]
+                )
                 c = int(rise.argmin())
                 if rise[c] < least:
-                    j, least, move = int(some[c]), float(rise[c]), what
+                    j, least, update = int(some[c]), float(rise[c]), what
     if least >= -_LEAST:
         return None
-    if move == "powers":
+    if update == "powers":
         return _doubted(problem, at, j)
     after = at.copy()
-    if move == "believe":
-        problem.powers(after, j, -1.0)
+    if update == "believe":
+        problem.doubt_powers(after, j, -1.0)
     else:
         problem.toggle(after, j)
     return after
 
 
-def _exchange(problem: Problem, at: State, known: dict[bytes, State], false: bool) -> None:
+def _exchange(
+    problem: LikelihoodProblem, at: SnapshotHypothesis, known: dict[bytes, SnapshotHypothesis], false: bool
+) -> None:
     """Trust each accused meter again, and search from the best replacement."""
-    least, within = problem.cost(at), 2.0 * np.log(problem.lies.like)
-    for j in at.liars.nonzero()[0].tolist():
+    least, within = problem.cost(at), 2.0 * np.log(problem.prior.like)
+    for j in at.meters.nonzero()[0].tolist():
         after = _without(problem, at, j, known)
-        rise = problem.meters(after).copy()
+        rise = problem.meter_rises(after).copy()
         rise[j] = np.inf
         k = int(rise.argmin())
         if problem.cost(after) + rise[k] - least <= within:
@@ -234,60 +253,66 @@ def _exchange(problem: Problem, at: State, known: dict[bytes, State], false: boo
                 _descend(problem, after, known, false)
 
 
-def _without(problem: Problem, at: State, j: int, known: dict[bytes, State]) -> State:
+def _without(
+    problem: LikelihoodProblem, at: SnapshotHypothesis, j: int, known: dict[bytes, SnapshotHypothesis]
+) -> SnapshotHypothesis:
     """Hypothesis that trusts an accused meter and its customer's powers again."""
     after = at.copy()
     if at.counts[1]:
         if at.powers[j]:
-            problem.powers(after, j, -1.0)
+            problem.doubt_powers(after, j, -1.0)
     else:
-        after.liars[j] = False
+        after.meters[j] = False
         if after.key in known:
             return known[after.key]
-        after.liars[j] = True
+        after.meters[j] = True
     problem.toggle(after, j)
     return after
 
 
-def _more(problem: Problem, at: State, known: dict[bytes, State], false: bool) -> None:
+def _more(
+    problem: LikelihoodProblem, at: SnapshotHypothesis, known: dict[bytes, SnapshotHypothesis], false: bool
+) -> None:
     """Accuse one more, although that alone does not lower J, and descend from there."""
-    rise = np.where(at.liars, np.inf, problem.meters(at))
-    for j in np.flatnonzero(rise <= 2.0 * np.log(problem.lies.like)).tolist():
+    rise = np.where(at.meters, np.inf, problem.meter_rises(at))
+    for j in np.flatnonzero(rise <= 2.0 * np.log(problem.prior.like)).tolist():
         after = at.copy()
         problem.toggle(after, j)
         if after.key not in known:
             _descend(problem, after, known, false)
 
 
-def _reported(problem: Problem, found: list[State], live: Bools, lies: Lies) -> tuple[Explained, ...]:
+def _reported(
+    problem: LikelihoodProblem, found: list[SnapshotHypothesis], available: Bools, error_prior: ErrorPrior
+) -> tuple[SnapshotExplanation, ...]:
     """The likeliest ones as hypotheses of all meters, one for each set of manipulated meters."""
     ranked = sorted(((problem.cost(each), each) for each in found), key=lambda pair: pair[0])
-    if worth(problem, ranked):
-        sets = alike(problem, ranked)
+    if may_change(problem, ranked):
+        sets = likely_sets(problem, ranked)
     else:
         sets = [
-            Set(each.liars, each.powers, cost, each.g, problem.a2 * each.liars * each.g)
+            ErrorSet(each.meters, each.powers, cost, each.g, problem.a2 * each.meters * each.g)
             for cost, each in ranked
         ]
     sets.sort(key=lambda each: each.cost)
-    best: dict[bytes, Set] = {}
+    best: dict[bytes, ErrorSet] = {}
     for each in sets:
-        if each.cost - sets[0].cost <= 2.0 * np.log(lies.like):
-            best.setdefault(each.liars.tobytes(), each)
+        if each.cost - sets[0].cost <= 2.0 * np.log(error_prior.like):
+            best.setdefault(each.meters.tobytes(), each)
     likely = {key: float(np.exp(-0.5 * (each.cost - sets[0].cost))) for key, each in best.items()}
     total = sum(likely.values())
-    return tuple(_explained(each, likely[key] / total, live) for key, each in best.items())
+    return tuple(_explained(each, likely[key] / total, available) for key, each in best.items())
 
 
-def _explained(each: Set, probability: float, live: Bools) -> Explained:
+def _explained(each: ErrorSet, probability: float, available: Bools) -> SnapshotExplanation:
     """Hypothesis of the live meters as one of all."""
-    weights, lies = np.zeros(live.size), np.zeros(live.size)
-    weights[live], lies[live] = each.weights, each.lies
-    liars, powers = _spread(each.liars, live), _spread(each.powers, live)
-    return Explained(liars, powers, probability, each.cost, weights, lies)
+    weights, error_prior = np.zeros(available.size), np.zeros(available.size)
+    weights[available], error_prior[available] = each.weights, each.errors
+    suspects, powers = _spread(each.meters, available), _spread(each.powers, available)
+    return SnapshotExplanation(suspects, powers, probability, each.cost, weights, error_prior)
 
 
-def _spread(some: Bools, live: Bools) -> Bools:
-    out = np.zeros(live.size, dtype=np.bool_)
-    out[live] = some
+def _spread(some: Bools, available: Bools) -> Bools:
+    out = np.zeros(available.size, dtype=np.bool_)
+    out[available] = some
     return out

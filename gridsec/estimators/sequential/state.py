@@ -7,52 +7,57 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of
-from gridsec.estimators.sequential.apart import Apart
-from gridsec.estimators.sequential.bounds import Lag
-from gridsec.estimators.sequential.bounds import start as no_lag
-from gridsec.estimators.sequential.busbar import Busbar
-from gridsec.estimators.sequential.busbar import believed as believed_busbar
-from gridsec.estimators.sequential.commission import Commission, Learned, Learning, fresh
+from gridsec.estimators.sequential.apart import VouchedPosterior
+from gridsec.estimators.sequential.bounds import InjectionError
+from gridsec.estimators.sequential.bounds import unknown_injections as no_lag
+from gridsec.estimators.sequential.busbar import BusbarTrust
+from gridsec.estimators.sequential.busbar import trusted_busbar as believed_busbar
+from gridsec.estimators.sequential.commission import Commission, Learned, Learning, initial
 from gridsec.estimators.sequential.commission import renew as learn_anew
-from gridsec.estimators.sequential.conditional import Fit
-from gridsec.estimators.sequential.curves import Curves
-from gridsec.estimators.sequential.curves import empty as no_curves
+from gridsec.estimators.sequential.conditional import Posterior
+from gridsec.estimators.sequential.curves import InverterChecks
+from gridsec.estimators.sequential.curves import no_checks as no_curves
 from gridsec.estimators.sequential.design import SequentialDesign
-from gridsec.estimators.sequential.doubts import Doubts
-from gridsec.estimators.sequential.doubts import none as no_doubts
-from gridsec.estimators.sequential.drive import Free
-from gridsec.estimators.sequential.kinds import Kinds
+from gridsec.estimators.sequential.doubts import FrameUncertainty
+from gridsec.estimators.sequential.doubts import nominal as no_doubts
+from gridsec.estimators.sequential.drive import ModelDriven
+from gridsec.estimators.sequential.kinds import AttackKinds
 from gridsec.estimators.sequential.kinds import empty as no_kinds
-from gridsec.estimators.sequential.moment import Moment
-from gridsec.estimators.sequential.release import Released
+from gridsec.estimators.sequential.moment import BusbarHistory
+from gridsec.estimators.sequential.release import DoubtedPowers
 from gridsec.estimators.sequential.repeats import forget as forget_calm
-from gridsec.estimators.sequential.skew import Skew
+from gridsec.estimators.sequential.skew import ClockSkew
 from gridsec.estimators.sequential.windows import Window, empty, forget
 from gridsec.interface import Estimate, Frame, Verdict
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Trust:
+class TrustState:
     """Trust of meters and inverters. p meters, m inverters, s scales."""
 
     trusted: Bools  # (p,) meters used by the estimate
     scale: Ints  # (p,) scale of the detection of each suspect
-    age: Ints  # (p,) ticks as a suspect; reset after the longest scale without evidence
-    quiet: Ints  # (p,) readings without evidence
-    bad: Bools  # (s, p) residual above the limit at the last look
-    still: Bools  # (s, p) residual above the release limit at the last look
-    owed: Ints  # (p,) readings a suspect of an earlier run owes before its scale can release it
-    lag: Ints  # (p,) ticks after which a suspect repeats its readings, 1 if stuck, 0 if none
+    ticks_suspect: Ints  # (p,) ticks as a suspect; reset after the longest scale without evidence
+    ticks_clear: Ints  # (p,) readings without evidence
+    above_limit: Bools  # (s, p) residual above the limit at the last look
+    above_release_limit: Bools  # (s, p) residual above the release limit at the last look
+    readings_owed: Ints  # (p,) readings a suspect of an earlier run owes before its scale can release it
+    repeat_lag: Ints  # (p,) ticks after which a suspect repeats its readings, 1 if stuck, 0 if none
     named: Bools  # (p,) meters named as manipulated
     accused: tuple[tuple[int, int], ...]  # other suspicions: index of the fault dictionary, scale
-    counted: Ints  # (m,) ticks that accuse each inverter, less those that do not
+    inverter_ticks: Ints  # (m,) ticks that accuse each inverter, less those that do not
     inverters: Bools  # (m,) inverters named as manipulated
-    calm: bool = field(init=False)  # derived: no suspicion, now or within the longest scale
+    clear: bool = field(init=False)  # derived: no suspicion, now or within the longest scale
 
     def __post_init__(self) -> None:
         # Later in-place writes concern meters that are not trusted: the state is not calm then either.
-        against = any_of(self.bad) or any_of(self.still) or any_of(self.named) or any_of(self.inverters)
-        lately = bool(self.accused) or any_of(self.age) or any_of(self.counted)
+        against = (
+            any_of(self.above_limit)
+            or any_of(self.above_release_limit)
+            or any_of(self.named)
+            or any_of(self.inverters)
+        )
+        lately = bool(self.accused) or any_of(self.ticks_suspect) or any_of(self.inverter_ticks)
         calm = all_of(self.trusted) and not against and not lately
         object.__setattr__(self, "calm", calm)
 
@@ -66,26 +71,30 @@ class SequentialState:
     since: float  # time of the first frame used, s
     ticks: int  # frames used
     x: Floats | None  # (m,) injections, pu; None before the first frame
-    free: Free | None  # prepared loop of the inverters without a trusted meter
-    lag: Lag  # errors of the injections
+    model_driven: ModelDriven | None  # prepared loop of the inverters without a trusted meter
+    injection_error: InjectionError  # errors of the injections
     v0_squared: Floats | float  # last trusted squared busbar voltage, pu; (3,) in three phases
-    busbar: Busbar  # trust of the busbar's meter
+    busbar: BusbarTrust  # trust of the busbar's meter
     window: Window  # residuals of the last ticks
-    trust: Trust  # trust of the meters
-    fits: tuple[Fit | None, ...]  # (s,) of the trusted meters; None without a test
-    wholes: tuple[Fit | None, ...]  # (s,) kept, of all meters that reported
-    apart: tuple[Apart | None, ...]  # (s,) without meters that withhold a power
-    misfit: tuple[bool, ...]  # (s,) trusted meters inconsistent at the last look, after the search
-    released: Released | None  # posterior with doubted powers of the suspects; None without suspects
-    doubts: Doubts  # uncertainty of the frames
-    skew: Skew | None  # voltage changes within clock offsets; None while no offset is measured
-    moment: Moment | None  # readings for the busbar's clock offset; None while it is not measured
+    trust: TrustState  # trust of the meters
+    posteriors: tuple[Posterior | None, ...]  # (s,) of the trusted meters; None without a test
+    full_posteriors: tuple[Posterior | None, ...]  # (s,) kept, of all meters that reported
+    vouched_posteriors: tuple[VouchedPosterior | None, ...]  # (s,) without meters that withhold a power
+    inconsistent: tuple[bool, ...]  # (s,) trusted meters inconsistent at the last look, after the search
+    doubted_powers: (
+        DoubtedPowers | None
+    )  # posterior with doubted powers of the suspects; None without suspects
+    uncertainty: FrameUncertainty  # uncertainty of the frames
+    clock_skew: ClockSkew | None  # voltage changes within clock offsets; None while no offset is measured
+    busbar_history: (
+        BusbarHistory | None
+    )  # readings for the busbar's clock offset; None while it is not measured
     learning: Learning | None  # sums of the commissioning; None once complete
     learned: Learned  # fixed errors of the meters
     model_error: Floats  # (p,) largest error of the model, squared pu
-    swing: float  # largest change of a squared voltage by powers when `model_error` was computed, pu
-    curves: Curves  # comparison of metered reactive powers with the droop curves
-    kinds: Kinds  # reading history and kinds of the manipulations
+    voltage_swing: float  # largest change of a squared voltage by powers when `model_error` was computed, pu
+    inverter_checks: InverterChecks  # comparison of metered reactive powers with the droop curves
+    attack_kinds: AttackKinds  # reading history and kinds of the manipulations
     last: tuple[Estimate, Verdict] | None  # last output
 
     @property
@@ -98,7 +107,7 @@ def init(
     design: SequentialDesign, t: float, learned: Learned | None = None, learning: Learning | None = None
 ) -> SequentialState:
     """Initial state at Unix time t, s, with errors learned before; the observer starts at the first frame."""
-    known = fresh(design, t) if learned is None else Commission(learned, learning)
+    known = initial(design, t) if learned is None else Commission(learned, learning)
     p, s = design.plant.meters.size, len(design.lengths)
     m = design.plant.droop.tau.size
     zeros = np.zeros(p, dtype=np.intp)
@@ -110,12 +119,12 @@ def init(
         since=t,
         ticks=0,
         x=None,
-        free=None,
-        lag=no_lag(design.plant, np.zeros(m)),
+        model_driven=None,
+        injection_error=no_lag(design.plant, np.zeros(m)),
         v0_squared=design.plant.droop.vbar**2,
-        busbar=believed_busbar(design.hangs_on.shape[1]),
+        busbar=believed_busbar(design.busbar_incidence.shape[1]),
         window=empty(design.lengths, p),
-        trust=Trust(
+        trust=TrustState(
             ~no,
             zeros,
             zeros,
@@ -129,20 +138,20 @@ def init(
             np.zeros(m, dtype=np.intp),
             np.zeros(m, dtype=np.bool_),
         ),
-        fits=(None,) * s,
-        wholes=(None,) * s,
-        apart=(None,) * s,
-        misfit=(False,) * s,
-        released=None,
-        doubts=no_doubts(design),
-        skew=None,
-        moment=None,
+        posteriors=(None,) * s,
+        full_posteriors=(None,) * s,
+        vouched_posteriors=(None,) * s,
+        inconsistent=(False,) * s,
+        doubted_powers=None,
+        uncertainty=no_doubts(design),
+        clock_skew=None,
+        busbar_history=None,
         learning=known.learning,
         learned=known.learned,
         model_error=np.zeros(p),
-        swing=0.0,
-        curves=no_curves(p, m),
-        kinds=no_kinds(p),
+        voltage_swing=0.0,
+        inverter_checks=no_curves(p, m),
+        attack_kinds=no_kinds(p),
         last=None,
     )
 
@@ -155,18 +164,18 @@ def renew(design: SequentialDesign, state: SequentialState, which: Bools) -> Seq
         learned=known.learned,
         learning=known.learning,
         window=forget(state.window, which),
-        fits=(None,) * len(state.fits),
-        curves=state.curves.renewed(which),
-        kinds=replace(state.kinds, memory=forget_calm(state.kinds.memory, which)),
+        posteriors=(None,) * len(state.posteriors),
+        inverter_checks=state.inverter_checks.without_meters(which),
+        attack_kinds=replace(state.attack_kinds, history=forget_calm(state.attack_kinds.history, which)),
         trust=replace(
             trust,
             trusted=trust.trusted | which,
-            age=np.where(which, 0, trust.age),
-            quiet=np.where(which, 0, trust.quiet),
-            bad=trust.bad & ~which,
-            still=trust.still & ~which,
-            owed=np.where(which, 0, trust.owed),
-            lag=np.where(which, 0, trust.lag),
+            ticks_suspect=np.where(which, 0, trust.ticks_suspect),
+            ticks_clear=np.where(which, 0, trust.ticks_clear),
+            above_limit=trust.above_limit & ~which,
+            above_release_limit=trust.above_release_limit & ~which,
+            readings_owed=np.where(which, 0, trust.readings_owed),
+            repeat_lag=np.where(which, 0, trust.repeat_lag),
             named=trust.named & ~which,
         ),
     )

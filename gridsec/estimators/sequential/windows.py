@@ -14,8 +14,8 @@ class Window:
     """Residuals of the last ticks. p meters, s scales."""
 
     residuals: tuple[Floats, ...]  # (longest,) of (p,), the newest last; 0 without a reading
-    heard: tuple[Bools, ...]  # (longest,) of (p,): meters with a reading
-    turn: int  # ticks since the sums were computed from the residuals
+    available: tuple[Bools, ...]  # (longest,) of (p,): meters with a reading
+    since_resum: int  # ticks since the sums were computed from the residuals
     sums: Floats  # (s, p) sum of the residuals of each scale
     counts: Ints  # (s, p) number of these residuals
 
@@ -25,8 +25,8 @@ def empty(lengths: tuple[int, ...], meters: int) -> Window:
     longest = max(lengths)
     return Window(
         residuals=(np.zeros(meters),) * longest,
-        heard=(np.zeros(meters, dtype=np.bool_),) * longest,
-        turn=0,
+        available=(np.zeros(meters, dtype=np.bool_),) * longest,
+        since_resum=0,
         sums=np.zeros((len(lengths), meters)),
         counts=np.zeros((len(lengths), meters), dtype=np.intp),
     )
@@ -34,7 +34,7 @@ def empty(lengths: tuple[int, ...], meters: int) -> Window:
 
 def push(window: Window, lengths: tuple[int, ...], residual: Floats, heard: Bools) -> Window:
     """Window with the residuals (p,) of one more tick, squared pu, and the meters with a reading, (p,)."""
-    before, marks, turn = window.residuals, window.heard, window.turn + 1
+    before, marks, turn = window.residuals, window.available, window.since_resum + 1
     # While every meter reports, the same array enters and leaves.
     steady = all(marks[-length] is heard for length in lengths)
     values = residual if all_of(heard) else np.where(heard, residual, 0.0)
@@ -55,14 +55,16 @@ def forget(window: Window, meters: Bools) -> Window:
     if not any_of(meters):
         return window
     residuals = tuple(np.where(meters, 0.0, each) for each in window.residuals)
-    marks = tuple(each & ~meters for each in window.heard)
+    marks = tuple(each & ~meters for each in window.available)
     sums = np.where(meters, 0.0, window.sums)
     counts = np.where(meters, 0, window.counts)
-    return Window(residuals, marks, window.turn, sums, counts)
+    return Window(residuals, marks, window.since_resum, sums, counts)
 
 
 def shift(window: Window, change: Floats) -> Window:
     """Window with all residuals increased by `change` (p,), squared pu."""
-    pairs = zip(window.residuals, window.heard, strict=True)
+    pairs = zip(window.residuals, window.available, strict=True)
     residuals = tuple(np.where(heard, each + change, 0.0) for each, heard in pairs)
-    return Window(residuals, window.heard, window.turn, window.sums + window.counts * change, window.counts)
+    return Window(
+        residuals, window.available, window.since_resum, window.sums + window.counts * change, window.counts
+    )

@@ -10,7 +10,7 @@ from gridsec.grid.three_phase import PHASES
 from gridsec.interface import Explanation, PowerOrigin
 
 
-def doubt(design: SequentialDesign, k: int, amount: float) -> str:
+def fault_sentence(design: SequentialDesign, k: int, amount: float) -> str:
     """Sentence about accused fault k of the dictionary with its amount, pu."""
     plant = design.plant
     power = f"{abs(amount) * plant.feeder.base_kva:.1f}"
@@ -29,14 +29,16 @@ def busbar_meter(which: Bools) -> str:
     return f"the meter of the busbar (phase{'s' * (len(names) > 1)} {', '.join(names)})"
 
 
-def busbar_off(off: Floats, v0_squared: Floats, which: Bools) -> str:
+def busbar_deviation(off: Floats, v0_squared: Floats, which: Bools) -> str:
     """Largest deviation of the busbar's meter from the others, (b,) `off` beside `v0_squared`, squared pu."""
     parts = 100.0 * (np.sqrt(np.maximum(1.0 + off / v0_squared, 0.0)) - 1.0)[which]
     worst = float(parts[np.abs(parts).argmax()])
     return f"reads {abs(worst):.1f} % {'more' if worst > 0 else 'less'} than the meters of the feeder say"
 
 
-def unread(names: tuple[str, ...], which: Bools, origins: Ints, percent: Floats, limit: float) -> str:
+def unread_sentence(
+    names: tuple[str, ...], which: Bools, origins: Ints, percent: Floats, limit: float
+) -> str:
     """Customers without a usable active power, and the precision of the voltage there.
 
     which, origins, percent: (p,) meters in question, `PowerOrigin`, and standard deviation of the voltage in
@@ -62,7 +64,7 @@ _ORIGINS = {
 """Sentence per origin. `READ`: the power is usable again, and the mean still contains ticks without it."""
 
 
-def untimely(names: tuple[str, ...], which: Bools, limit_s: float) -> str:
+def clock_sentence(names: tuple[str, ...], which: Bools, limit_s: float) -> str:
     """Meters `which` (p,) with readings of another moment."""
     found = _list([name for name, one in zip(names, which, strict=True) if one])
     return (
@@ -74,9 +76,9 @@ _SHOWN = 5
 """Largest number of explanations in a sentence, and of names in each."""
 
 
-def ways(design: SequentialDesign, explanations: tuple[Explanation, ...]) -> str:
+def explanations_sentence(design: SequentialDesign, explanations: tuple[Explanation, ...]) -> str:
     """Possible explanations in one sentence."""
-    shown = [_way(design, each) for each in explanations[:_SHOWN]]
+    shown = [_explanation(design, each) for each in explanations[:_SHOWN]]
     if len(explanations) == 1:
         return f"Wrong is {shown[0]}; nothing else explains the readings."
     more, told = len(explanations) - len(shown), " or else ".join(shown)
@@ -84,7 +86,7 @@ def ways(design: SequentialDesign, explanations: tuple[Explanation, ...]) -> str
     return f"Wrong are either {told}{f' or {more} more' if more else ''}; {each} the readings."
 
 
-def _way(design: SequentialDesign, explanation: Explanation) -> str:
+def _explanation(design: SequentialDesign, explanation: Explanation) -> str:
     customers, owner = design.plant.feeder.customers, design.plant.droop.customer
     accused = (
         ("meter", [name for name, bad in zip(design.names, explanation.meters, strict=True) if bad]),

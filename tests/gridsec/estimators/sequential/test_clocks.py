@@ -35,7 +35,7 @@ def noise(rng: np.random.Generator, ticks: int) -> Floats:
 
 
 def found(y: Floats, model: Floats, own: Floats | None = None, heard: int = 128) -> int:
-    return clocks.shifted(y, model, np.zeros_like(y) if own is None else own, heard, ROOM, MOST)
+    return clocks.clock_shift(y, model, np.zeros_like(y) if own is None else own, heard, ROOM, MOST)
 
 
 class TestLags:
@@ -57,17 +57,17 @@ class TestLags:
     def test_the_misfit_within_a_tick_is_that_of_a_search(self, seed: int, n: int) -> None:
         """Oracle: least squares about level and slope, for many parts of a tick between -1/2 and 1/2."""
         rng = np.random.default_rng(seed)
-        lie, later = rng.standard_normal(n), rng.standard_normal((2, n - 1))
-        got = clocks._in_time(lie, later)
+        deviation, later = rng.standard_normal(n), rng.standard_normal((2, n - 1))
+        got = clocks._in_time(deviation, later)
 
-        def left(lie: Floats) -> float:
-            basis = np.vander(np.arange(lie.size), 2)
-            return float(np.mean((lie - basis @ np.linalg.lstsq(basis, lie, rcond=None)[0]) ** 2))
+        def left(deviation: Floats) -> float:
+            basis = np.vander(np.arange(deviation.size), 2)
+            return float(np.mean((deviation - basis @ np.linalg.lstsq(basis, deviation, rcond=None)[0]) ** 2))
 
         parts = np.linspace(0.0, 0.5, 101)
-        late = [left(lie[1:] + part * way) for part in parts for way in later]
-        early = [left(lie[:-1] - part * way) for part in parts for way in later]
-        best = min(left(lie), *late, *early)
+        late = [left(deviation[1:] + part * way) for part in parts for way in later]
+        early = [left(deviation[:-1] - part * way) for part in parts for way in later]
+        best = min(left(deviation), *late, *early)
         assert best * (1.0 - 1e-3) - 1e-9 <= got <= best * (1.0 + 1e-9) + 1e-12
 
 
@@ -80,8 +80,8 @@ class TestShifted:
             model, y = (truth[k : k + 2500] + noise(rng, 2500) for k in (2000, 2000 - lag))
             assert abs(found(y, model, heard=400) - lag) <= 2
             honest = truth[2000:4500] + noise(rng, 2500)
-            for lie in (0.0, 0.1, np.linspace(0.0, 0.1, 2500)):
-                assert found(honest + lie, model, heard=400) == 0
+            for deviation in (0.0, 0.1, np.linspace(0.0, 0.1, 2500)):
+                assert found(honest + deviation, model, heard=400) == 0
 
     @pytest.mark.parametrize("lag", [-4, -1, 1, 4])
     @pytest.mark.parametrize("heard", clocks.WINDOWS)
@@ -107,13 +107,13 @@ class TestShifted:
     def test_readings_up_to_half_a_tick_off_are_of_their_tick(self) -> None:
         for seed in range(10):
             rng = np.random.default_rng(seed)
-            truth, lie = restless(rng, 601), rng.choice([-0.05, 0.05])
+            truth, deviation = restless(rng, 601), rng.choice([-0.05, 0.05])
             model = truth[1:] + noise(rng, 600)
             for part in (0.1, 0.3, 0.5):
                 late = (1.0 - part) * truth[1:] + part * truth[:-1] + noise(rng, 600)
                 early = (1.0 - part) * truth[:-1] + part * truth[1:] + noise(rng, 600)
-                assert found(late + lie, model) == 0
-                assert found(early + lie, truth[:-1] + noise(rng, 600)) == 0
+                assert found(late + deviation, model) == 0
+                assert found(early + deviation, truth[:-1] + noise(rng, 600)) == 0
 
     def test_neither_steps_nor_ramps_nor_silence_nor_a_stuck_meter_are_of_another_time(self) -> None:
         for seed in range(20):
@@ -134,9 +134,9 @@ class TestShifted:
         for seed in range(10):
             rng = np.random.default_rng(seed)
             truth = 1.0 + 0.003 * np.sin(np.arange(1100) / 300.0)
-            lie = np.where(np.arange(1100) >= 1050, 0.06, 0.0)
+            deviation = np.where(np.arange(1100) >= 1050, 0.06, 0.0)
             for now in (1055, 1070, 1100):
-                y, model = ((truth + one + noise(rng, 1100))[:now] for one in (lie, 0.0))
+                y, model = ((truth + one + noise(rng, 1100))[:now] for one in (deviation, 0.0))
                 for heard in clocks.WINDOWS:
                     assert found(y, model, heard=heard) == 0
 
@@ -145,9 +145,9 @@ class TestShifted:
         truth = walk(rng, 700, 0.01)
         model, y = truth[10:610] + noise(rng, 600), truth[:600] + noise(rng, 600)
         y[rng.random(600) < 0.03] = np.nan
-        assert clocks.shifted(y, model, np.zeros(600), 128, ROOM, 1e-3) == 10
+        assert clocks.clock_shift(y, model, np.zeros(600), 128, ROOM, 1e-3) == 10
         y[-128::3] = np.nan
-        assert clocks.shifted(y, model, np.zeros(600), 128, ROOM, 1e-3) == 0
+        assert clocks.clock_shift(y, model, np.zeros(600), 128, ROOM, 1e-3) == 0
 
 
 def by_definition(y: Floats, model: Floats, own: Floats, heard: int) -> int:
@@ -169,12 +169,12 @@ def by_definition(y: Floats, model: Floats, own: Floats, heard: int) -> int:
         at = np.arange(x.size)
         return np.asarray(x - np.polyval(np.polyfit(at, x, 1), at))
 
-    lie = (y - model)[last]
-    least = [float(y[last].var()), float(np.mean(rest(lie) ** 2))]
+    deviation = (y - model)[last]
+    least = [float(y[last].var()), float(np.mean(rest(deviation) ** 2))]
     for says, other in ways:
-        assert np.allclose((says - other)[last], lie)
+        assert np.allclose((says - other)[last], deviation)
         steps = np.diff(other[last])
-        for part, way in ((lie[1:], -steps), (lie[:-1], steps)):
+        for part, way in ((deviation[1:], -steps), (deviation[:-1], steps)):
             a, b = rest(part), rest(way)
             theta = np.clip(a @ b / (b @ b), 0.0, 0.5)
             least.append(float(np.mean((a - theta * b) ** 2)))
@@ -195,7 +195,7 @@ def test_the_lag_is_that_of_the_definition() -> None:
         own = power[there] if whole else power[here]
         model = others[here] + own + noise(rng, n)
         y = (others + power)[there] + noise(rng, n) + rng.choice([0.0, 0.0, 0.004, 0.05])
-        got = clocks.shifted(y, model, own, heard, ROOM, MOST)
+        got = clocks.clock_shift(y, model, own, heard, ROOM, MOST)
         assert got == by_definition(y, model, own, heard)
         hits[whole] += got != 0
     assert min(hits) > 20
@@ -233,12 +233,12 @@ class TestQuartersOfAnHour:
         ],
     )
     def test_lies_over_days_are_called_what_they_are(
-        self, quarters: tuple[Site, DesignedEstimator, Days], lie: str, kind: ManipulationKind
+        self, quarters: tuple[Site, DesignedEstimator, Days], deviation: str, kind: ManipulationKind
     ) -> None:
         site, watcher, days = quarters
-        told, who, on = lied(site, days, lie, 4)
-        seen: Seen = watch(site, watcher, told, who, on)
-        assert seen.last == {int(j): str(kind) for j in who}
+        told, which, on = lied(site, days, deviation, 4)
+        seen: Seen = watch(site, watcher, told, which, on)
+        assert seen.last == {int(j): str(kind) for j in which}
         assert not seen.honest
         wrong = {
             str(other)

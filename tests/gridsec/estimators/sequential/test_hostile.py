@@ -56,7 +56,7 @@ class TestNumbersThatAreNone:
         verdicts, state = run(put(name, value), frames=6, after=70)
         assert not any(verdict.suspects.any() for verdict in verdicts)
         assert verdicts[-1].decision is Decision.CLEAN
-        assert (state.doubts.p == 1.0).all()
+        assert (state.uncertainty.p == 1.0).all()
 
     @pytest.mark.parametrize("value", [-1e308, 0.0, 1e8, 1e15, 1e200, 1e308])
     def test_a_reading_that_is_none_is_a_lie_of_one_meter(self, value: float) -> None:
@@ -98,7 +98,7 @@ class TestNumbersThatAreNone:
         for error in (0.05, 50.0, np.inf):
             given = replace(frame, p_error=np.full(12, error))
             state, _, _ = sequential.step(made, sequential.init(made, frame.t - 1.0), given)
-            assert (state.doubts.priors[-1].variance[1:] > made.prior.variance[1:]).all()
+            assert (state.uncertainty.priors[-1].variance[1:] > made.prior.variance[1:]).all()
 
 
 @pytest.mark.parametrize(("factor", "before"), [(4.0, 30), (30.0, 21)])
@@ -108,7 +108,7 @@ def test_the_models_error_is_that_of_the_loads_there_are(factor: float, before: 
     plant = make_plant(rng, customers=12, drop=0.03)
     plain, street = prepare(plant), Street(plant, rng)
     most = np.full(12, 1e3)
-    design = replace(plain, most_p=most, most_q=most)
+    design = replace(plain, max_p=most, max_q=most)
     state, _ = watch(street, design, before)
     frame = street.frame()
     frame = replace(frame, t=state.t + 1.0, p=factor * frame.p)
@@ -121,7 +121,7 @@ def test_the_models_error_is_that_of_the_loads_there_are(factor: float, before: 
 class TestLiarsWhoComeAndGo:
     """Nobody else is ever named, and who lies is not better off for being silent or honest in between."""
 
-    def watched(self, lies: Callable[[int], bool], heard: Callable[[int], bool], frames: int) -> Bools:
+    def watched(self, deviations: Callable[[int], bool], heard: Callable[[int], bool], frames: int) -> Bools:
         """Whether meter 4 is named at each frame."""
         rng = np.random.default_rng(1)
         plant = make_plant(rng, customers=12, drop=0.03)
@@ -129,8 +129,8 @@ class TestLiarsWhoComeAndGo:
         state, _ = watch(street, design, 40)
         named = []
         for k in range(frames):
-            lie, silent = {4: 0.05} if lies(k) else {}, () if heard(k) else (4,)
-            state, ((_, verdict),) = watch(street, design, 1, state=state, lies=lie, silent=silent)
+            deviation, silent = {4: 0.05} if deviations(k) else {}, () if heard(k) else (4,)
+            state, ((_, verdict),) = watch(street, design, 1, state=state, lies=deviation, silent=silent)
             assert not np.delete(verdict.suspects, 4).any()
             named.append(bool(verdict.suspects[4]))
         return np.array(named)
@@ -157,13 +157,15 @@ class TestLiarsWhoComeAndGo:
 class TestWhatIsLearnedUnderDifficulties:
     LEARN_S = 400
 
-    def learned(self, change: Change, lies: dict[int, float], seed: int) -> tuple[SequentialState, Street]:
+    def learned(
+        self, change: Change, deviations: dict[int, float], seed: int
+    ) -> tuple[SequentialState, Street]:
         rng = np.random.default_rng(seed)
         plant = make_plant(rng, customers=12, drop=0.03)
         design, street = prepare(plant, commission_s=self.LEARN_S), Street(plant, rng)
-        state, _ = watch(street, design, self.LEARN_S, lies=lies, change=change)
-        state, answers = watch(street, design, self.LEARN_S + 90, state=state, lies=lies)
-        honest = np.setdiff1d(np.arange(12), list(lies))
+        state, _ = watch(street, design, self.LEARN_S, lies=deviations, change=change)
+        state, answers = watch(street, design, self.LEARN_S + 90, state=state, lies=deviations)
+        honest = np.setdiff1d(np.arange(12), list(deviations))
         assert not any(verdict.suspects[honest].any() for _, verdict in answers)
         return state, street
 

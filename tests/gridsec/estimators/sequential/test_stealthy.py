@@ -8,8 +8,8 @@ import pytest
 from benchmarks import _stealthy
 from benchmarks._scenes import Model, Setting, neighbours, site
 from benchmarks.stealthy_lies import LARGE_VOLT, calm, chosen, run
-from gridsec.estimators.sequential.conditional import judge
-from gridsec.estimators.sequential.scales import Scales, view_of
+from gridsec.estimators.sequential.conditional import leave_one_out
+from gridsec.estimators.sequential.scales import Scales, test
 
 CASES = [
     ("kerber-dorfnetz", "contiguous", 0.5),
@@ -34,13 +34,13 @@ def test_no_single_meter_is_over_its_limit_under_the_lie() -> None:
     made, state, _ = calm(setting)
     given = _stealthy.linear_tests(made, state)
     where = site(setting.feeder)
-    lie = chosen(where, given, "contiguous", 0.6, 2)
+    deviation = chosen(where, given, "contiguous", 0.6, 2)
     first = int(np.argmax(given.fits[-1].prior.variance[given.buses]))
-    assert np.array_equal(lie.meters, np.sort(neighbours(where, first)[: where.meters.size // 3]))
-    assert np.count_nonzero(lie.lie) <= lie.meters.size
-    scales = Scales(made, state.doubts, state.window, state.learned, state.model_error)
+    assert np.array_equal(deviation.meters, np.sort(neighbours(where, first)[: where.meters.size // 3]))
+    assert np.count_nonzero(deviation.lie) <= deviation.meters.size
+    scales = Scales(made, state.uncertainty, state.window, state.learned, state.model_error)
     for s, now in enumerate(given.fits):
-        view = view_of(made, scales[s], judge(now, lie.lie))
-        assert (np.abs(view.judged.offset) <= (0.6 + 1e-6) * view.limit).all()
-    error = abs(judge(given.fits[-1], lie.lie).w).max()
-    assert error >= lie.error * (1.0 - 1e-9) > 0.02
+        view = test(made, scales[s], leave_one_out(now, deviation.lie))
+        assert (np.abs(view.loo.residual) <= (0.6 + 1e-6) * view.limit).all()
+    error = abs(leave_one_out(given.fits[-1], deviation.lie).mean).max()
+    assert error >= deviation.error * (1.0 - 1e-9) > 0.02
