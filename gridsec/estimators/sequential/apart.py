@@ -18,7 +18,6 @@ import numpy as np
 from gridsec.arrays import Bools, Floats, all_of, any_of
 from gridsec.estimators.sequential.blocks import remove_meters, well_conditioned
 from gridsec.estimators.sequential.conditional import LeaveOneOut, Posterior, condition, leave_one_out
-from gridsec.estimators.sequential.doubts import FrameUncertainty
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,12 +37,12 @@ class VouchedPosterior:
 def vouched_posteriors(
     before: tuple[VouchedPosterior | None, ...],
     posteriors: tuple[Posterior | None, ...],
-    uncertainty: FrameUncertainty,
+    vouched: Bools,
 ) -> tuple[VouchedPosterior | None, ...]:
     """Posteriors without meters that are not vouched, by scale; None where all are. `before` is reused."""
-    if all_of(uncertainty.vouched):
+    if all_of(vouched):
         return before if not any(before) else (None,) * len(posteriors)
-    pairs = zip(before, posteriors, uncertainty.vouched, strict=True)
+    pairs = zip(before, posteriors, vouched, strict=True)
     return tuple(None if now is None else _reused(kept, now, vouched) for kept, now, vouched in pairs)
 
 

@@ -7,7 +7,7 @@ docs/theory-sequential.md, sections 5 and 7.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -16,83 +16,72 @@ from gridsec.arrays import Bools, Floats, all_of, any_of, changed
 from gridsec.estimators.decision import DecisionInputs, decide
 from gridsec.estimators.sequential import words
 from gridsec.estimators.sequential.apart import vouched_posteriors
-from gridsec.estimators.sequential.bounds import BoundedEstimate, BoundInputs, PowerErrors
+from gridsec.estimators.sequential.bounds import BoundedEstimate, BoundInputs
 from gridsec.estimators.sequential.busbar import BusbarTrust, track_busbar
 from gridsec.estimators.sequential.conditional import Prior, leave_one_out
 from gridsec.estimators.sequential.design import SequentialDesign
 from gridsec.estimators.sequential.doubts import checked
+from gridsec.estimators.sequential.drive import Prediction
 from gridsec.estimators.sequential.examine import Identification
 from gridsec.estimators.sequential.heard import Measurements
 from gridsec.estimators.sequential.release import DoubtedPowers, doubt_powers
 from gridsec.estimators.sequential.scales import min_readings
 from gridsec.estimators.sequential.skew import ClockSkew, largest_offset, unusable_offsets
-from gridsec.estimators.sequential.state import SequentialState, TrustState
+from gridsec.estimators.sequential.state import SequentialState
+from gridsec.estimators.sequential.trust import TrustState
 from gridsec.interface import Cause, Decision, Estimate, Explanation, Frame, PowerOrigin, Verdict
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Tick:
-    """Results of one tick. N customers, p meters, n buses."""
-
-    frame: Frame  # with possible powers
-    heard: Measurements  # its measurements
-    q: Floats  # (N,) net reactive injections of the model, pu
-    v2_bus: Floats  # (n,) squared voltages of the model
-    transient: Floats  # (p,) remainder of the unknown initial state, squared pu
-    seen: Identification  # identification
-    rivals: tuple[Explanation, ...]  # hypotheses about as likely as the best
-
-
 def output(
-    design: SequentialDesign, state: SequentialState, tick: Tick
+    design: SequentialDesign,
+    state: SequentialState,
+    measured: Measurements,
+    predicted: Prediction,
+    identified: Identification,
 ) -> tuple[SequentialState, Estimate, Verdict]:
     """State with the output in it, estimate and verdict, from the state after this tick."""
-    trust, measured = state.trust, tick.heard
-    beside = vouched_posteriors(state.vouched_posteriors, state.posteriors, state.uncertainty)
+    beside = vouched_posteriors(state.vouched_posteriors, state.posteriors, state.uncertainty.vouched)
     state = state if beside is state.vouched_posteriors else changed(state, vouched_posteriors=beside)
-    s, moved = _best_scale(design, state)
-    estimate, released = _estimate(design, state, tick, s, moved)
-    busbar, inverters = _busbar(design, state, measured, estimate), _inverters(design, state)
-    score, threshold, loo = _strongest(design, tick.seen, measured.available.size)
-    if state.clock_skew is not None:
-        loo = loo | _tested_seldom(design, state.clock_skew, state)
-    available, beyond = loo & measured.available, score > threshold
-    attack = np.zeros(available.size)
-    if any_of(trust.named):
-        off = measured.y - state.learned.bias - estimate.v2_bus[design.prior.meters]
-        attack = np.where(trust.named & measured.available, off, 0.0)
-    amounts = _amounts(design, state, tick.seen)
-    settled = all_of(tick.transient <= design.options.settled * threshold)
-    finding = _of_meters(
-        design, trust, available, beyond, wide=~(threshold <= design.options.widest), settled=settled
+    estimate, doubted = _estimate(design, state, measured, predicted, identified)
+    busbar, named, available = (
+        _busbar(design, state, measured, estimate),
+        state.trust.named,
+        measured.available,
     )
-    differs = _busbar_finding(design, busbar, estimate)
-    finding = _unvouched(design, measured.busbar_metered, available, differs, finding)
+    score, threshold, tested = _strongest(design, identified, available.size)
+    if state.clock_skew is not None:
+        tested = tested | _tested_seldom(design, state.clock_skew, state)
+    attack = np.zeros(available.size)
+    if any_of(named):
+        off = measured.y - state.learned.bias - estimate.v2_bus[design.prior.meters]
+        attack = np.where(named & available, off, 0.0)
+    settled = all_of(predicted.transient <= design.options.settled * threshold)
+    finding = _of_meters(design, state.trust, tested & available, score, threshold, settled=settled)
+    deviation = _busbar_finding(design, busbar, estimate)
+    finding = _unvouched(design, measured.busbar_metered, tested & available, deviation, finding)
+    inverters, amounts = _inverters(design, state), _amounts(design, state, identified)
     open_cases = _open_checks(design, state, finding)
-    finding = _beside_meters(design, inverters, differs, amounts, tick.rivals, open_cases, finding)
-    finding = _unexplained(tick.seen.inconsistent, finding)
-    if not (tick.rivals or open_cases or all_of(state.uncertainty.vouched)):
-        finding = _unread_powers(design, tick.frame, ~state.uncertainty.vouched[max(s, 0)], estimate, finding)
-    finding = _clock_offsets(design, tick.frame, available, finding)
-    decision, cause, reason = finding
+    finding = _beside_meters(design, inverters, deviation, amounts, identified.rivals, open_cases, finding)
+    finding = _unexplained(identified.inconsistent, finding)
+    if not (identified.rivals or open_cases or all_of(state.uncertainty.vouched)):
+        unread = ~state.uncertainty.vouched[max(_best_scale(design, state)[0], 0)]
+        finding = _unread_powers(design, measured.frame, unread, estimate, finding)
     verdict = Verdict(
-        decision,
-        cause,
-        reason,
-        trust.named,
+        *_clock_offsets(design, measured.frame, tested & available, finding),
+        named,
         score,
         threshold,
         attack,
         inverters=inverters,
         inverter_attack=_injected(design, state, inverters, amounts),
         kinds=state.attack_kinds.kinds,
-        explanations=tick.rivals or open_cases,
+        explanations=identified.rivals or open_cases,
         unjudged=design.inverter_undetectable & ~(state.inverter_checks.observable | inverters),
-        busbar=differs.named,
-        busbar_attack=np.where(differs.named, busbar.off, 0.0),
+        busbar=deviation.named,
+        busbar_attack=np.where(deviation.named, busbar.off, 0.0),
     )
     last = estimate, verdict
-    return changed(state, doubted_powers=released, busbar=busbar, last=last), estimate, verdict
+    return changed(state, doubted_powers=doubted, busbar=busbar, last=last), estimate, verdict
 
 
 def _busbar(
@@ -133,39 +122,33 @@ def _injected(
 
 
 def _estimate(
-    design: SequentialDesign, state: SequentialState, tick: Tick, s: int, moved: float
+    design: SequentialDesign,
+    state: SequentialState,
+    measured: Measurements,
+    predicted: Prediction,
+    identified: Identification,
 ) -> tuple[Estimate, DoubtedPowers | None]:
-    """Estimate by scale s, with a mean that lacks a part `moved` of the loads' variance."""
+    """Estimate by the best scale."""
     plant = design.plant
-    measured = tick.heard
-    w, variance, released = _reconstructed(design, state, tick, s, moved)
-    v2_bus = tick.v2_bus + w
+    w, variance, doubted = _reconstructed(design, state, measured, identified)
+    v2_bus = predicted.v2_bus + w
     first = plant.feeder.busbar_places()
     v2_bus[first] = np.where(measured.busbar_metered, measured.v0_squared, v2_bus[first])
     # This is a reading; the posterior of the others does not lower its variance.
     variance = variance.copy()
     variance[first] = np.maximum(variance[first], np.where(measured.busbar_metered, design.busbar**2, 0.0))
-    trusted = state.trust.trusted & measured.available
-    grounds = BoundInputs(
+    inputs = BoundInputs(
         plant=plant,
-        powers=PowerErrors(
-            tick.frame,
-            tick.q,
-            measured.uses_q,
-            measured.v0_squared,
-            state.trust.trusted,
-            state.uncertainty.sizes,
-        ),
+        powers=replace(predicted.powers, trusted=state.trust.trusted),
         injected=state.injection_error.error,
-        model=tick.v2_bus[plant.feeder.bus],
+        model=predicted.v2_bus[plant.feeder.bus],
         busbar=measured.busbar_metered,
         y=measured.y,
-        trusted=trusted,
-        checked=partial(checked, design, tick.frame),
+        trusted=state.trust.trusted & measured.available,
+        checked=partial(checked, design, measured.frame),
         sigmas=design.sigmas[0],
     )
-    x = np.zeros(0) if state.x is None else state.x
-    return BoundedEstimate.of(grounds, state.t, v2_bus, variance, x), released
+    return BoundedEstimate.of(inputs, state.t, v2_bus, variance, predicted.x), doubted
 
 
 _Finding = tuple[Decision, Cause, str]
@@ -177,12 +160,13 @@ def _of_meters(
     design: SequentialDesign,
     trust: TrustState,
     available: Bools,
-    beyond: Bools,
+    score: Floats,
+    threshold: Floats,
     *,
-    wide: Bools,
     settled: bool,
 ) -> _Finding:
-    """Verdict on the meters: available, beyond their limits, with too wide limits, (p,) each."""
+    """Verdict on the meters: available ones, their residuals and limits, (p,) each."""
+    beyond = score > threshold
     finding = decide(
         DecisionInputs(
             names=design.names,
@@ -190,7 +174,7 @@ def _of_meters(
             live=available,
             suspected=~trust.trusted | beyond,
             named=trust.named,
-            wide=available & wide,
+            wide=available & ~(threshold <= design.options.widest),
             valid=True,
             settled=settled,
             busbar=True,
@@ -394,32 +378,34 @@ def _mean(state: SequentialState, s: int) -> Floats:
 
 
 def _reconstructed(
-    design: SequentialDesign, state: SequentialState, tick: Tick, s: int, moved: float
+    design: SequentialDesign, state: SequentialState, measured: Measurements, identified: Identification
 ) -> tuple[Floats, Floats, DoubtedPowers | None]:
     """Correction of the model by the trusted meters at every bus, its variance, and the doubted powers."""
-    prior_, told = state.uncertainty.priors[max(s, 0)], tick.frame.p_std
-    now, view = (None, None) if s < 0 else (state.posteriors[s], tick.seen.tests[s])
+    s, moved = _best_scale(design, state)
+    prior, p_std = state.uncertainty.priors[max(s, 0)], measured.frame.p_std
+    now, test = (None, None) if s < 0 else (state.posteriors[s], identified.tests[s])
     if now is None:
-        return np.zeros_like(prior_.variance), prior_.variance, None
-    loo = leave_one_out(now, _mean(state, s)) if view is None else view.loo
+        return np.zeros_like(prior.variance), prior.variance, None
+    loo = leave_one_out(now, _mean(state, s)) if test is None else test.loo
     # The model starts at this busbar reading; a mean removes only its part of the jitter.
     jitter = (1.0 - 1.0 / design.lengths[s]) * design.busbar_noise
-    flicker = design.plant.feeder.broadcast_busbar(np.where(tick.heard.busbar_metered, jitter, 0.0))
-    after = moved * prior_.variance + _hidden(state, prior_) + flicker
+    noise = design.plant.feeder.broadcast_busbar(np.where(measured.busbar_metered, jitter, 0.0))
+    more = moved * prior.variance + _hidden(state, prior) + noise
     beside = state.vouched_posteriors[s]
     if beside is not None:
-        after = after + beside.added_variance(loo)
+        more = more + beside.added_variance(loo)
     suspects = design.plant.meters[~state.trust.trusted]
     # Unreported powers, known by a standard deviation, are not false.
-    suspects = suspects if told is None else suspects[np.isnan(told[suspects]) | _late(tick.frame)[suspects]]
+    if p_std is not None:
+        suspects = suspects[np.isnan(p_std[suspects]) | _late(measured.frame)[suspects]]
     if not suspects.size:
-        return loo.mean, now.variance + after, None
-    sizes, released = state.uncertainty.sizes[suspects], state.doubted_powers
-    if released is None or not released.matches(now, suspects, sizes):
-        released = doubt_powers(design.sensitivities, now, suspects, sizes, loo)
-    elif s in tick.seen.candidates or not released.is_current(loo):
-        released = released.renewed(loo)
-    return released.mean(loo), released.variance + after, released
+        return loo.mean, now.variance + more, None
+    sizes, doubted = state.uncertainty.sizes[suspects], state.doubted_powers
+    if doubted is None or not doubted.matches(now, suspects, sizes):
+        doubted = doubt_powers(design.sensitivities, now, suspects, sizes, loo)
+    elif s in identified.candidates or not doubted.is_current(loo):
+        doubted = doubted.renewed(loo)
+    return doubted.mean(loo), doubted.variance + more, doubted
 
 
 def _late(frame: Frame) -> Bools:
@@ -448,30 +434,30 @@ def _best_scale(design: SequentialDesign, state: SequentialState) -> tuple[int, 
     return at, moved
 
 
-def _hidden(state: SequentialState, prior_: Prior) -> Floats:
+def _hidden(state: SequentialState, prior: Prior) -> Floats:
     """Variance of lasting load errors that learning cannot separate, at every bus, (n,)."""
     hidden, late = state.learned.hidden, state.learned.late
     if not any_of(hidden):
-        return np.zeros(prior_.variance.size)
-    out = np.full(prior_.variance.size, hidden.max(initial=0.0))
-    out[prior_.meters] = hidden if late is None else np.maximum(hidden, late)
-    return np.asarray(np.minimum(out, prior_.variance))
+        return np.zeros(prior.variance.size)
+    out = np.full(prior.variance.size, hidden.max(initial=0.0))
+    out[prior.meters] = hidden if late is None else np.maximum(hidden, late)
+    return np.asarray(np.minimum(out, prior.variance))
 
 
 def _strongest(design: SequentialDesign, identified: Identification, p: int) -> tuple[Floats, Floats, Bools]:
     """Residual and limit of each meter on the scale with the strongest evidence; tested meters."""
-    views = [view for view in identified.tests if view is not None]
-    if not views:
+    tests = [test for test in identified.tests if test is not None]
+    if not tests:
         return np.full(p, np.nan), np.full(p, design.options.widest), np.zeros(p, dtype=np.bool_)
-    score, limit, loo = np.abs(views[0].loo.residual), views[0].limit, views[0].enough
-    ratio = score / limit if all_of(loo) else np.where(loo, score / limit, -1.0)
-    for view in views[1:]:
-        offset = np.abs(view.loo.residual)
-        here = offset / view.limit
-        more = view.enough & (here > ratio)
+    score, limit, tested = np.abs(tests[0].loo.residual), tests[0].limit, tests[0].enough
+    ratio = score / limit if all_of(tested) else np.where(tested, score / limit, -1.0)
+    for test in tests[1:]:
+        residual = np.abs(test.loo.residual)
+        here = residual / test.limit
+        more = test.enough & (here > ratio)
         ratio = np.where(more, here, ratio)
-        score, limit = np.where(more, offset, score), np.where(more, view.limit, limit)
-        loo = loo | view.enough
-    if all_of(loo):
-        return score, limit, loo
-    return np.where(loo, score, np.nan), np.where(loo, limit, design.options.widest), loo
+        score, limit = np.where(more, residual, score), np.where(more, test.limit, limit)
+        tested = tested | test.enough
+    if all_of(tested):
+        return score, limit, tested
+    return np.where(tested, score, np.nan), np.where(tested, limit, design.options.widest), tested

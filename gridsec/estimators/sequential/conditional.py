@@ -166,7 +166,7 @@ class LeaveOneOut:
     def mean(self) -> Floats:
         """Posterior mean of every bus, (n,)."""
         if self.cached_mean is None:
-            object.__setattr__(self, "said", _mean(self.prior, self.unknowns, self.weights))
+            object.__setattr__(self, "cached_mean", _mean(self.prior, self.unknowns, self.weights))
         return cast("Floats", self.cached_mean)
 
 

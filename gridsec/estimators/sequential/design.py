@@ -213,22 +213,18 @@ def design(
         As `plant.check_plant`, or if `doubt` is that of other customers.
     """
     options = SequentialOptions() if options is None else options
-    meters = plant.meters
+    meters, sensitivities = plant.meters, Sensitivities(plant.feeder)
     _check(plant, doubt, step_s, max_attacked)
     lure = close_loop(plant.feeder, plant.droop, meters)
-    sensitivities = Sensitivities(plant.feeder)
+    white, fixed, allowed, rounded = _noise(plant)
     injections = injection_doubt(plant.droop, plant.accuracy, meters, plant.feeder.bus.size)
     busbar = min(busbar_error(plant.accuracy, plant.droop.vbar**2, 2.0) / 2.0, UNMETERED)
-    lengths = _lengths(options.scales_s, step_s)
-    accuracy, slope = plant.accuracy, 2.0 * _CONVERSION_VOLTAGE * plant.droop.vbar
-    white = np.maximum(slope**2 * (accuracy.jitter**2 + accuracy.resolution**2 / 12.0), _LEAST_NOISE)
-    rounded = slope * steady_rounding(accuracy)
-    fixed = slope**2 * accuracy.class_fraction**2 / 3.0 + 0.5 * rounded**2
     known = prior(plant.feeder, plant.feeder.bus[meters], doubt, busbar=busbar, inverters=injections)
-    suspect = -float(ndtri(0.5 * options.suspect / meters.size))
+    lengths = _lengths(options.scales_s, step_s)
     every = _look_intervals(lengths)
     tails = tuple(_tail(options.alarms_per_year, plant, n * step_s, len(lengths)) for n in every)
     sigmas = tuple(-float(ndtri(tail / 2.0)) for tail in tails)
+    suspect = -float(ndtri(0.5 * options.suspect / meters.size))
     return SequentialDesign(
         plant=plant,
         names=tuple(plant.feeder.customers[c] for c in meters),
@@ -238,7 +234,7 @@ def design(
         prior=known,
         injections=injections,
         busbar=busbar,
-        busbar_noise=slope**2 * (accuracy.busbar_jitter**2 + accuracy.busbar_resolution**2 / 12.0),
+        busbar_noise=_busbar_noise(plant),
         lengths=lengths,
         look_every=every,
         confirmed=2 + np.array(lengths) // 6,
@@ -247,7 +243,7 @@ def design(
         suspect=suspect,
         white=white,
         fixed=fixed,
-        allowed=slope * accuracy.class_fraction + rounded,
+        allowed=allowed,
         rounded=rounded,
         busbar_incidence=plant.feeder.busbar_incidence()[meters],
         inverter_reach=np.abs(lure.C) @ (2.0 * plant.droop.limit),
@@ -265,6 +261,26 @@ def design(
         step_s=step_s,
         options=options,
     )
+
+
+def _slope(plant: Plant) -> float:
+    """Factor from relative voltage errors to squared ones, pu."""
+    return 2.0 * _CONVERSION_VOLTAGE * plant.droop.vbar
+
+
+def _noise(plant: Plant) -> tuple[Floats, Floats, Floats, Floats]:
+    """`white`, `fixed`, `allowed` and `rounded` of the design, (p,) each."""
+    accuracy, slope = plant.accuracy, _slope(plant)
+    rounded = slope * steady_rounding(accuracy)
+    white = np.maximum(slope**2 * (accuracy.jitter**2 + accuracy.resolution**2 / 12.0), _LEAST_NOISE)
+    fixed = slope**2 * accuracy.class_fraction**2 / 3.0 + 0.5 * rounded**2
+    return white, fixed, slope * accuracy.class_fraction + rounded, rounded
+
+
+def _busbar_noise(plant: Plant) -> float:
+    """Variance of the busbar's squared reading from tick to tick, squared pu^2."""
+    accuracy = plant.accuracy
+    return _slope(plant) ** 2 * (accuracy.busbar_jitter**2 + accuracy.busbar_resolution**2 / 12.0)
 
 
 _HIDDEN_SIGMAS = 2.0
@@ -364,7 +380,7 @@ def _references(
     plant: Plant, sensitivities: Sensitivities, rate: float, step_s: float, lengths: tuple[int, ...]
 ) -> KindReferences:
     """References of the kinds at this feeder's meters."""
-    accuracy, slope = plant.accuracy, 2.0 * _CONVERSION_VOLTAGE * plant.droop.vbar
+    accuracy, slope = plant.accuracy, _slope(plant)
     tests = plant.meters.size * (len(lengths) + _REPEAT_TESTS) * YEAR_S / step_s
     active, reactive = (2.0 * plant.feeder.self_impedance(power)[plant.meters] for power in Power)
     return KindReferences(

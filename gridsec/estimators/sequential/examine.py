@@ -28,10 +28,12 @@ from gridsec.estimators.sequential.decoder import DecoderAnswer, DecoderInput
 from gridsec.estimators.sequential.design import SequentialDesign
 from gridsec.estimators.sequential.explain import HypothesisSearch
 from gridsec.estimators.sequential.robust import covers
-from gridsec.estimators.sequential.scales import ScaleData, Scales, ScaleTest, suspect, test, update_posterior
+from gridsec.estimators.sequential.scales import ScaleData, Scales, ScaleTest, scale_test, update_posterior
 from gridsec.estimators.sequential.search import Candidate, Candidates, Hypothesis
-from gridsec.estimators.sequential.state import SequentialState, TrustState
+from gridsec.estimators.sequential.state import SequentialState
+from gridsec.estimators.sequential.trust import TrustState
 from gridsec.estimators.sequential.windows import Window
+from gridsec.interface import Explanation
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,6 +46,7 @@ class Identification:
     tests: tuple[ScaleTest | None, ...]  # (s,) tests; None for a scale without a look at this tick
     candidates: dict[int, Candidates]  # candidates by scale that searched
     inconsistent: tuple[bool, ...]  # (s,) trusted meters inconsistent at the last look, after the search
+    rivals: tuple[Explanation, ...] = ()  # hypotheses about as likely as the best, from the confirmation
     busbar: tuple[int, int] | None = None  # busbar phase and scale of a wrong meter: the tick restarts
 
 
@@ -59,80 +62,87 @@ def identify(
     state: with the window and uncertainty of this tick, else of the last. model: (p,) largest model error,
     squared pu. honest: bounds of all other honest errors.
     """
-    posteriors, tick, trust = state.posteriors, state.ticks, state.trust
-    calm = trust.clear
-    trust = trust if calm else _writable(trust)
-    views: list[ScaleTest | None] = []
-    after: list[Posterior | None] = []
-    full_posteriors = list(state.full_posteriors)
-    candidates: dict[int, Candidates] = {}
-    misfit = list(state.inconsistent)
-    scales = Scales(design, state.uncertainty, state.window, state.learned, model, state.clock_skew)
-    for s, every in enumerate(design.look_every):
-        before = posteriors[s]
-        stale = before is None or (not trust.clear and any_of(before.trusted & ~trust.trusted))
-        if tick % every and not stale:
-            views.append(None)
-            after.append(before)
-            continue
-        here = scales[s]
-        now = update_posterior(before, here, trust.trusted & here.enough, scales.unknowns(trust.accused))
-        view = test(design, here, leave_one_out(now, here.m))
+    tick = _Tick(design, state, model, honest)
+    both = []
+    for s in range(len(design.lengths)):
+        both.append(tick.scale(s))
+        if tick.busbar is not None:
+            return Identification(
+                trust=state.trust,
+                posteriors=state.posteriors,
+                full_posteriors=state.full_posteriors,
+                tests=(None,) * len(design.lengths),
+                candidates={},
+                inconsistent=state.inconsistent,
+                busbar=tick.busbar,
+            )
+    posteriors, tests = zip(*both, strict=True)
+    kept, misfit = tuple(tick.full_posteriors), tuple(tick.inconsistent)
+    return Identification(tick.trust, posteriors, kept, tests, tick.candidates, misfit)
+
+
+class _Tick:
+    """Progress of the identification over the scales of one tick."""
+
+    def __init__(
+        self, design: SequentialDesign, state: SequentialState, model: Floats, honest: HonestErrors
+    ) -> None:
+        self.design, self.state, self.model, self.honest = design, state, model, honest
+        self.clear = state.trust.clear
+        self.trust = state.trust if self.clear else state.trust.writable()
+        self.full_posteriors, self.inconsistent = list(state.full_posteriors), list(state.inconsistent)
+        self.candidates: dict[int, Candidates] = {}
+        self.busbar: tuple[int, int] | None = None
+        self.scales = Scales(design, state.uncertainty, state.window, state.learned, model, state.clock_skew)
+
+    def scale(self, s: int) -> tuple[Posterior | None, ScaleTest | None]:
+        """Posterior and tests of a scale; the posterior before and None where it is not due."""
+        design, before = self.design, self.state.posteriors[s]
+        stale = before is None or (not self.trust.clear and any_of(before.trusted & ~self.trust.trusted))
+        if self.state.ticks % design.look_every[s] and not stale:
+            return before, None
+        here, unknowns = self.scales[s], self.scales.unknowns(self.trust.accused)
+        now = update_posterior(before, here, self.trust.trusted & here.enough, unknowns)
+        test = scale_test(design, here, leave_one_out(now, here.m))
         if design.decoder is not None:
-            candidates[s], trust = _by_decoder(design, here, now, trust, s)
+            self.candidates[s], self.trust = _by_decoder(design, here, now, self.trust, s)
         else:
-            full_posteriors[s] = _kept_posterior(full_posteriors[s], before, now, here)
-            due = _search_due(design, trust, view, s, tick, searched=bool(candidates))
-            alone = due or any_of(view.above_limit & trust.trusted)
-            left = inconsistent(now, view.loo, model, design.tails[s])
-            # A misfit that no search explains is searched again from time to time only.
-            again = left and (not misfit[s] or tick % _SEARCH_INTERVAL == 0)
-            over = alone or (again and not _aligned_misfit(design, here, now, view, honest))
-            misfit[s] = left
-            phases = [] if alone else _contradicted_phases(design, scales, s, now, view, honest)
-            if over or phases:
-                search = HypothesisSearch(design, scales, tuple(full_posteriors), trust, s)
-                # Once something is beyond chance, less is suspected too.
-                phases = search.contradicted_phases(now, view.loo) if alone else phases
-                outcome, believed = search(now, view) if over else (search.likeliest(now, view), trust)
-                outcome, liar = _busbar_hypothesis(search, outcome, now, honest.powers, phases)
-                if liar is not None:
-                    none = (None,) * len(posteriors)
-                    return Identification(
-                        state.trust,
-                        posteriors,
-                        state.full_posteriors,
-                        none,
-                        {},
-                        state.inconsistent,
-                        (liar, s),
-                    )
-                # With no meter beyond its limit the test of the busbar makes no suspect.
-                if over:
-                    candidates[s], trust = outcome, believed
-        if s in candidates:
-            trust, calm = _writable(trust) if calm else trust, False
-            now = candidates[s].best.posterior
-            view = test(design, here, candidates[s].best.loo)
+            self.full_posteriors[s] = _kept_posterior(self.full_posteriors[s], before, now, here)
+            self._search(s, now, test)
+        if s in self.candidates:
+            self.trust, self.clear = self.trust.writable() if self.clear else self.trust, False
+            best = self.candidates[s].best
+            now, test = best.posterior, scale_test(design, here, best.loo)
             busbar_weights(design, now)
-            misfit[s] = design.decoder is None and inconsistent(now, view.loo, model, design.tails[s])
-        if not calm:
-            _record(trust, view, s)
-        views.append(view)
-        after.append(now)
-    return Identification(
-        trust, tuple(after), tuple(full_posteriors), tuple(views), candidates, tuple(misfit)
-    )
+            left = design.decoder is None and inconsistent(now, test.loo, self.model, design.tails[s])
+            self.inconsistent[s] = left
+        if not self.clear:
+            self.trust.record(s, test.enough, test.above_limit, test.above_release_limit)
+        return now, test
 
-
-def _record(trust: TrustState, view: ScaleTest, s: int) -> None:
-    """Write the evidence of a scale; one with too few readings keeps its earlier detection."""
-    owed = (trust.readings_owed > 0) & (trust.scale == s)
-    stands = np.where(view.enough, view.above_release_limit, trust.above_release_limit[s]) | owed
-    trust.above_limit[s], trust.above_release_limit[s] = (
-        view.above_limit & ~trust.trusted,
-        stands & ~trust.trusted,
-    )
+    def _search(self, s: int, now: Posterior, test: ScaleTest) -> None:
+        """Search a scale with a failed test, or one that is due again."""
+        design, here, tick = self.design, self.scales[s], self.state.ticks
+        due = _search_due(design, self.trust, test, s, tick, searched=bool(self.candidates))
+        single = due or any_of(test.above_limit & self.trust.trusted)
+        left = inconsistent(now, test.loo, self.model, design.tails[s])
+        # A misfit that no search explains is searched again from time to time only.
+        again = left and (not self.inconsistent[s] or tick % _SEARCH_INTERVAL == 0)
+        over = single or (again and not _aligned_misfit(design, here, now, test, self.honest))
+        self.inconsistent[s] = left
+        phases = [] if single else _contradicted_phases(design, self.scales, s, now, test, self.honest)
+        if not (over or phases):
+            return
+        search = HypothesisSearch(design, self.scales, tuple(self.full_posteriors), self.trust, s)
+        # Once something is beyond chance, less is suspected too.
+        phases = search.contradicted_phases(now, test.loo) if single else phases
+        outcome, trust = search(now, test) if over else (search.likeliest(now, test), self.trust)
+        outcome, phase = _busbar_hypothesis(search, outcome, now, self.honest.powers, phases)
+        if phase is not None:
+            self.busbar = phase, s
+        # With no meter beyond its limit the test of the busbar makes no suspect.
+        elif over:
+            self.candidates[s], self.trust = outcome, trust
 
 
 _MAX_KEPT = 724
@@ -153,13 +163,6 @@ def _kept_posterior(
     if kept is not None and any_of(kept.trusted & ~now.trusted) and not any_of(now.trusted & ~kept.trusted):
         return kept
     return now
-
-
-def _writable(trust: TrustState) -> TrustState:
-    """Trust state with evidence that can be written."""
-    return replace(
-        trust, above_limit=trust.above_limit.copy(), above_release_limit=trust.above_release_limit.copy()
-    )
 
 
 def _aligned_misfit(
@@ -332,7 +335,7 @@ def _by_decoder(
     best = answers[0]
     others = (Hypothesis(here.enough & ~each.meters, (), 0.0, each.worse) for each in answers[1:])
     candidates = Candidates(_candidate(here, whole, best), tuple(others))
-    return candidates, suspect(trust, np.where(here.enough, ~best.meters, trust.trusted), s, ())
+    return candidates, trust.suspected(np.where(here.enough, ~best.meters, trust.trusted), s, ())
 
 
 def _candidate(here: ScaleData, whole: Posterior, answer: DecoderAnswer) -> Candidate:

@@ -30,9 +30,9 @@ from gridsec.estimators.sequential.design import SequentialDesign
 from gridsec.estimators.sequential.dictionary import FaultDictionary
 from gridsec.estimators.sequential.loads import UNMETERED
 from gridsec.estimators.sequential.robust import covers, robust_set
-from gridsec.estimators.sequential.scales import Scales, ScaleTest, suspect, test, update_posterior
+from gridsec.estimators.sequential.scales import Scales, ScaleTest, scale_test, update_posterior
 from gridsec.estimators.sequential.search import Candidate, Candidates, Hypothesis, Limits, merged
-from gridsec.estimators.sequential.state import TrustState
+from gridsec.estimators.sequential.trust import TrustState
 
 _FEW = 32
 """Largest number of meters beyond their limits for a start from the trusted set."""
@@ -186,7 +186,7 @@ class HypothesisSearch:
         wide = scales[self.s]
         there = update_posterior(None, wide, now.trusted, self.scales.unknowns(trust.accused))
         lying = HypothesisSearch(design, scales, self.full_posteriors, trust, self.s)
-        best = lying.likeliest(there, test(design, wide, leave_one_out(there, wide.m))).best
+        best = lying.likeliest(there, scale_test(design, wide, leave_one_out(there, wide.m))).best
         # Meters that are suspects only beside an honest busbar meter are trusted again.
         honest = lying._descend(lying._condition(wide.enough), np.zeros_like(wide.enough), fresh=True)
         best = min(best, honest, key=lambda one: one.cost)
@@ -652,7 +652,7 @@ class HypothesisSearch:
 
     def _trust(self, best: Hypothesis) -> TrustState:
         accused = (*self.accused, *((k, self.s) for k in best.faults))
-        return suspect(self.trust, self._trusted(best), self.s, accused)
+        return self.trust.suspected(self._trusted(best), self.s, accused)
 
 
 def _beyond_chance(left: float, freedom: int) -> bool:

@@ -19,6 +19,7 @@ from gridsec.interface import Frame
 class Measurements:
     """Plausible measurements of one frame. N customers, p meters, b busbar phases (1 if balanced)."""
 
+    frame: Frame  # with possible powers
     available: Bools  # (p,) meters with a reading
     y: Floats  # (p,) squared voltages, pu, 0 without a reading
     q: Floats  # (N,) reactive injections of the loads; net ones where `uses_q`, pu
@@ -78,6 +79,7 @@ def measurements(design: SequentialDesign, state: SequentialState, frame: Frame)
         uses_q = trusted & reports_q & (least - room <= rest) & (rest <= most + room)
         q = np.where(uses_q, frame.q_net, frame.q)
     return Measurements(
+        frame,
         available,
         np.minimum(np.maximum(y, 0.0), NO_VOLTAGE),
         q,

@@ -8,7 +8,6 @@ docs/theory-sequential.md, section 5.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -21,7 +20,7 @@ from gridsec.estimators.sequential.examine import Identification
 from gridsec.estimators.sequential.exchanges import fault_exchanges, meter_exchanges
 from gridsec.estimators.sequential.scales import Scales, ScaleTest
 from gridsec.estimators.sequential.search import Candidates
-from gridsec.estimators.sequential.state import TrustState
+from gridsec.estimators.sequential.trust import TrustState
 from gridsec.grid.network import Power
 from gridsec.interface import Explanation
 
@@ -41,31 +40,18 @@ def confirm(
 ) -> tuple[TrustState, tuple[Explanation, ...]]:
     """Trust state with named meters and inverters, and rival hypotheses where one prevents a name.
 
-    live: (p,) meters with a reading; silence releases none. curves: an inverter that follows its curve is not
-    a rival.
+    available: (p,) meters with a reading; silence releases none. curves: an inverter that follows its curve
+    is not a rival.
     """
     trust = identified.trust
     if trust.clear and before.clear:
         return trust, ()
-    open_ = (
-        trust.accused or any_of(trust.ticks_suspect) or any_of(before.named) or any_of(before.inverter_ticks)
-    )
-    if all_of(trust.trusted) and not open_:
+    lately = any_of(trust.ticks_suspect) or any_of(before.named) or any_of(before.inverter_ticks)
+    if all_of(trust.trusted) and not (trust.accused or lately):
         return trust, ()
-    quiet = np.where(trust.above_release_limit.any(axis=0), 0, trust.ticks_clear + available)
-    trusted = (trust.trusted & ~before.named) | (quiet >= design.options.release)
-    # A meter detected again within the longest scale keeps its age.
-    age = np.where(trusted & (quiet > design.lengths[-1]), 0, trust.ticks_suspect + ~trusted)
-    owed = np.where(trusted, 0, np.maximum(trust.readings_owed - available, 0))
-    need = design.confirmed[trust.scale]
-    fresh = (
-        ~trusted
-        & ~before.named
-        & trust.above_limit.any(axis=0)
-        & (age >= need)
-        & _accused(identified, trusted.size)
-    )
-    named = before.named & (quiet < design.options.release)
+    now = trust.counted(before.named, available, design.options.release, design.lengths[-1])
+    lasting = trust.above_limit.any(axis=0) & (now.ticks_suspect >= design.confirmed[trust.scale])
+    fresh = ~now.trusted & ~before.named & lasting & _accused(identified, available.size)
     count, inverters = _inverter_counts(design, before, trust, identified, available)
     new = inverters & ~before.inverters
     rivals: tuple[Explanation, ...] = ()
@@ -75,18 +61,7 @@ def confirm(
         for meters, accused in found.accusations():
             fresh, inverters = fresh & meters, inverters & (before.inverters | accused)
         rivals = found.explanations(available | before.named)
-    trust = replace(
-        trust,
-        trusted=trusted,
-        ticks_suspect=age,
-        ticks_clear=quiet,
-        readings_owed=owed,
-        repeat_lag=np.where(trusted, 0, trust.repeat_lag),
-        named=named | fresh,
-        inverter_ticks=count,
-        inverters=inverters,
-    )
-    return trust, rivals
+    return now.with_names(fresh, count, inverters), rivals
 
 
 def supported(
@@ -104,7 +79,7 @@ def supported(
             here = scales[s]
             loo = leave_one_out(beside.vouched, here.m)
             out |= which & (np.abs(loo.residual) <= here.limits.limit(loo.std))
-    return replace(trust, named=trust.named & ~out) if any_of(out) else trust
+    return trust.without_names(out)
 
 
 def _accused(identified: Identification, meters: int) -> Bools:

@@ -27,7 +27,6 @@ from gridsec.estimators.sequential.dictionary import FaultDictionary
 from gridsec.estimators.sequential.doubts import FrameUncertainty
 from gridsec.estimators.sequential.search import Limits
 from gridsec.estimators.sequential.skew import ClockSkew
-from gridsec.estimators.sequential.state import TrustState
 from gridsec.estimators.sequential.windows import Window
 
 
@@ -138,8 +137,8 @@ class Scales:
         return Scales(self.design, uncertainty, self.window, self.learned, self.model, self.clock_skew)
 
 
-def test(design: SequentialDesign, here: ScaleData, loo: LeaveOneOut) -> ScaleTest:
-    """View of a scale from the leave-one-out residuals of a posterior."""
+def scale_test(design: SequentialDesign, here: ScaleData, loo: LeaveOneOut) -> ScaleTest:
+    """Tests of a scale by the leave-one-out residuals of a posterior."""
     limit = here.limits.limit(loo.std)
     over = here.enough & (np.abs(loo.residual) > limit)
     return ScaleTest(loo, here.enough, limit, over, here.limits, design.options.lower)
@@ -168,10 +167,3 @@ def update_posterior(
     for j in change.tolist():
         (add_meter if wanted[j] else remove_meter)(now, j)
     return now
-
-
-def suspect(trust: TrustState, trusted: Bools, s: int, accused: tuple[tuple[int, int], ...]) -> TrustState:
-    """Trust state after a search on scale s: `trusted` (p,) meters, and accused faults with their scales."""
-    removed = trust.trusted & ~trusted
-    scale, quiet = np.where(removed, s, trust.scale), np.where(removed, 0, trust.ticks_clear)
-    return replace(trust, trusted=trusted, scale=scale, ticks_clear=quiet, accused=accused)

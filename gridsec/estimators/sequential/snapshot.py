@@ -87,7 +87,7 @@ def identify(
     """Likeliest hypotheses of one set of readings, the best first; there is always one.
 
     noise, m, live: (p,) variance of each reading, > 0; readings minus the model, squared pu, finite; meters
-    with a reading. lies: prior of the manipulations. false: effects of false powers; none by default.
+    with a reading. error_prior: that of the manipulations. false: effects of false powers; none by default.
     `FalsePowers.claimed` reuses values that depend on the feeder alone. curved: for large false powers,
     `curved(weights, powers)` is `m` of the live meters linearised about the powers of a hypothesis, by its
     weights and false powers, (p_live,) each.
@@ -306,10 +306,10 @@ def _reported(
 
 def _explained(each: ErrorSet, probability: float, available: Bools) -> SnapshotExplanation:
     """Hypothesis of the live meters as one of all."""
-    weights, error_prior = np.zeros(available.size), np.zeros(available.size)
-    weights[available], error_prior[available] = each.weights, each.errors
+    weights, errors_ = np.zeros(available.size), np.zeros(available.size)
+    weights[available], errors_[available] = each.weights, each.errors
     suspects, powers = _spread(each.meters, available), _spread(each.powers, available)
-    return SnapshotExplanation(suspects, powers, probability, each.cost, weights, error_prior)
+    return SnapshotExplanation(suspects, powers, probability, each.cost, weights, errors_)
 
 
 def _spread(some: Bools, available: Bools) -> Bools:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, Ints, all_of, any_of
+from gridsec.arrays import Bools, Floats, Ints
 from gridsec.estimators.sequential.apart import VouchedPosterior
 from gridsec.estimators.sequential.bounds import InjectionError
 from gridsec.estimators.sequential.bounds import unknown_injections as no_lag
@@ -20,46 +20,25 @@ from gridsec.estimators.sequential.curves import no_checks as no_curves
 from gridsec.estimators.sequential.design import SequentialDesign
 from gridsec.estimators.sequential.doubts import FrameUncertainty
 from gridsec.estimators.sequential.doubts import nominal as no_doubts
-from gridsec.estimators.sequential.drive import ModelDriven
 from gridsec.estimators.sequential.kinds import AttackKinds
 from gridsec.estimators.sequential.kinds import empty as no_kinds
 from gridsec.estimators.sequential.moment import BusbarHistory
 from gridsec.estimators.sequential.release import DoubtedPowers
 from gridsec.estimators.sequential.repeats import forget as forget_calm
 from gridsec.estimators.sequential.skew import ClockSkew
+from gridsec.estimators.sequential.trust import TrustState
 from gridsec.estimators.sequential.windows import Window, empty, forget
 from gridsec.interface import Estimate, Frame, Verdict
+from gridsec.observers.lure import Lure, LureTransition
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TrustState:
-    """Trust of meters and inverters. p meters, m inverters, s scales."""
+class ModelDriven:
+    """Prepared loop of the model-driven inverters, reused for the same inverters and step."""
 
-    trusted: Bools  # (p,) meters used by the estimate
-    scale: Ints  # (p,) scale of the detection of each suspect
-    ticks_suspect: Ints  # (p,) ticks as a suspect; reset after the longest scale without evidence
-    ticks_clear: Ints  # (p,) readings without evidence
-    above_limit: Bools  # (s, p) residual above the limit at the last look
-    above_release_limit: Bools  # (s, p) residual above the release limit at the last look
-    readings_owed: Ints  # (p,) readings a suspect of an earlier run owes before its scale can release it
-    repeat_lag: Ints  # (p,) ticks after which a suspect repeats its readings, 1 if stuck, 0 if none
-    named: Bools  # (p,) meters named as manipulated
-    accused: tuple[tuple[int, int], ...]  # other suspicions: index of the fault dictionary, scale
-    inverter_ticks: Ints  # (m,) ticks that accuse each inverter, less those that do not
-    inverters: Bools  # (m,) inverters named as manipulated
-    clear: bool = field(init=False)  # derived: no suspicion, now or within the longest scale
-
-    def __post_init__(self) -> None:
-        # Later in-place writes concern meters that are not trusted: the state is not calm then either.
-        against = (
-            any_of(self.above_limit)
-            or any_of(self.above_release_limit)
-            or any_of(self.named)
-            or any_of(self.inverters)
-        )
-        lately = bool(self.accused) or any_of(self.ticks_suspect) or any_of(self.inverter_ticks)
-        calm = all_of(self.trusted) and not against and not lately
-        object.__setattr__(self, "calm", calm)
+    rows: Ints  # (k,) inverters
+    loop: Lure  # their mutual loop; its input is the effect of all other injections and loads
+    transition: LureTransition  # of the loop, for the last step's length
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,9 +89,6 @@ def init(
     known = initial(design, t) if learned is None else Commission(learned, learning)
     p, s = design.plant.meters.size, len(design.lengths)
     m = design.plant.droop.tau.size
-    zeros = np.zeros(p, dtype=np.intp)
-    no = np.zeros(p, dtype=np.bool_)
-    none = np.zeros((s, p), dtype=np.bool_)
     return SequentialState(
         t=t,
         frame=None,
@@ -124,20 +100,7 @@ def init(
         v0_squared=design.plant.droop.vbar**2,
         busbar=believed_busbar(design.busbar_incidence.shape[1]),
         window=empty(design.lengths, p),
-        trust=TrustState(
-            ~no,
-            zeros,
-            zeros,
-            zeros,
-            none,
-            none,
-            zeros,
-            zeros,
-            no,
-            (),
-            np.zeros(m, dtype=np.intp),
-            np.zeros(m, dtype=np.bool_),
-        ),
+        trust=TrustState.initial(p, m, s),
         posteriors=(None,) * s,
         full_posteriors=(None,) * s,
         vouched_posteriors=(None,) * s,
@@ -158,7 +121,7 @@ def init(
 
 def renew(design: SequentialDesign, state: SequentialState, which: Bools) -> SequentialState:
     """State after meters `which` (p,) were replaced: trusted again, with their errors to be learned."""
-    known, trust = learn_anew(design, state.commission, which, state.t), state.trust
+    known = learn_anew(design, state.commission, which, state.t)
     return replace(
         state,
         learned=known.learned,
@@ -167,15 +130,5 @@ def renew(design: SequentialDesign, state: SequentialState, which: Bools) -> Seq
         posteriors=(None,) * len(state.posteriors),
         inverter_checks=state.inverter_checks.without_meters(which),
         attack_kinds=replace(state.attack_kinds, history=forget_calm(state.attack_kinds.history, which)),
-        trust=replace(
-            trust,
-            trusted=trust.trusted | which,
-            ticks_suspect=np.where(which, 0, trust.ticks_suspect),
-            ticks_clear=np.where(which, 0, trust.ticks_clear),
-            above_limit=trust.above_limit & ~which,
-            above_release_limit=trust.above_release_limit & ~which,
-            readings_owed=np.where(which, 0, trust.readings_owed),
-            repeat_lag=np.where(which, 0, trust.repeat_lag),
-            named=trust.named & ~which,
-        ),
+        trust=state.trust.replaced(which),
     )

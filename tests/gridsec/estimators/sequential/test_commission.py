@@ -31,7 +31,7 @@ from gridsec.estimators.sequential.commission import (
 from gridsec.estimators.sequential.conditional import condition, leave_one_out
 from gridsec.estimators.sequential.doubts import nominal as no_doubts
 from gridsec.estimators.sequential.loads import LoadDoubt
-from gridsec.estimators.sequential.scales import Scales, test
+from gridsec.estimators.sequential.scales import Scales, scale_test
 from gridsec.estimators.sequential.windows import empty
 from gridsec.interface import Frame
 from tests.codes import refused
@@ -178,7 +178,7 @@ def test_an_honest_meter_not_learned_is_within_its_limit_as_seldom_as_is_said() 
     window = empty(design.lengths, P)
     scale = Scales(design, no_doubts(design), window, known, np.zeros(P))[-1]
     everybody = condition(scale.prior, scale.noise, np.ones(P, dtype=np.bool_))
-    view = test(design, scale, leave_one_out(everybody, scale.m))
+    view = scale_test(design, scale, leave_one_out(everybody, scale.m))
     Q = np.linalg.inv(scale.prior.between + np.diag(scale.noise))
     offset = Q[2] @ np.hstack([residuals[:, : 2 * P], np.diag(np.sqrt(design.white / 60))]) / Q[2, 2]
     own = np.arange(3 * P) == P + 2

@@ -22,7 +22,7 @@ from gridsec.estimators.sequential.conditional import (
 )
 from gridsec.estimators.sequential.dictionary import false_power_charge
 from gridsec.estimators.sequential.explain import HypothesisSearch, _components
-from gridsec.estimators.sequential.scales import Scales, ScaleTest, test, update_posterior
+from gridsec.estimators.sequential.scales import Scales, ScaleTest, scale_test, update_posterior
 from gridsec.estimators.sequential.search import Candidate, Candidates, Hypothesis, descend, set_cost
 from gridsec.estimators.sequential.windows import push
 from gridsec.grid.droop import fleet
@@ -71,7 +71,7 @@ def prepared(design: SequentialDesign, m: Floats) -> tuple[HypothesisSearch, Pos
     window = push(state.window, design.lengths, m, everybody)
     scales = Scales(design, state.uncertainty, window, state.learned, np.zeros(m.size))
     now = update_posterior(None, scales[0], everybody, None)
-    view = test(design, scales[0], leave_one_out(now, scales[0].m))
+    view = scale_test(design, scales[0], leave_one_out(now, scales[0].m))
     return HypothesisSearch(design, scales, state.full_posteriors, state.trust, 0), now, view
 
 
@@ -259,7 +259,7 @@ def test_what_is_judged_is_what_each_search_begins_with(
         trust = replace(made.trust, accused=((0, 0),))
         direction = made.scales.unknowns(trust.accused)
         now = update_posterior(None, made.scales[0], np.ones(m.size, dtype=np.bool_), direction)
-        view = test(design, made.scales[0], leave_one_out(now, m))
+        view = scale_test(design, made.scales[0], leave_one_out(now, m))
         made = HypothesisSearch(design, made.scales, made.full_posteriors, trust, 0)
     plain = descend
 

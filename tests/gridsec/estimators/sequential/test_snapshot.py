@@ -132,7 +132,7 @@ def test_lies_that_are_alike_are_found_where_they_are_weak(like_a_load: bool) ->
         costs = {each: dense((prior, noise, false), m, each) for each in subsets(4)}
         exact += who(found[0]) == min(costs, key=lambda each: costs[each])
         right += who(found[0]) == tuple(lying.tolist())
-        right_apart += who(identify(prior, noise, m, LIVE, deviations=APART, false=false)[0]) == tuple(
+        right_apart += who(identify(prior, noise, m, LIVE, error_prior=APART, false=false)[0]) == tuple(
             lying.tolist()
         )
         for other in found[1:]:
@@ -229,7 +229,7 @@ def clean_and_named(rate: float, noise: Floats, trials: int) -> int:
     root = np.linalg.cholesky(prior.between + np.diag(noise))
     deviations = ErrorPrior(rate=rate)
     told = rng.normal(size=(trials, P)) @ root.T
-    found = [identify(prior, noise, m, LIVE, deviations=deviations, false=false)[0] for m in told]
+    found = [identify(prior, noise, m, LIVE, error_prior=deviations, false=false)[0] for m in told]
     return sum(bool(each.meters.any()) for each in found)
 
 

@@ -9,7 +9,7 @@ from benchmarks import _stealthy
 from benchmarks._scenes import Model, Setting, neighbours, site
 from benchmarks.stealthy_lies import LARGE_VOLT, calm, chosen, run
 from gridsec.estimators.sequential.conditional import leave_one_out
-from gridsec.estimators.sequential.scales import Scales, test
+from gridsec.estimators.sequential.scales import Scales, scale_test
 
 CASES = [
     ("kerber-dorfnetz", "contiguous", 0.5),
@@ -40,7 +40,7 @@ def test_no_single_meter_is_over_its_limit_under_the_lie() -> None:
     assert np.count_nonzero(deviation.lie) <= deviation.meters.size
     scales = Scales(made, state.uncertainty, state.window, state.learned, state.model_error)
     for s, now in enumerate(given.fits):
-        view = test(made, scales[s], leave_one_out(now, deviation.lie))
+        view = scale_test(made, scales[s], leave_one_out(now, deviation.lie))
         assert (np.abs(view.loo.residual) <= (0.6 + 1e-6) * view.limit).all()
     error = abs(leave_one_out(given.fits[-1], deviation.lie).mean).max()
     assert error >= deviation.error * (1.0 - 1e-9) > 0.02
