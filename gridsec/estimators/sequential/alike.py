@@ -158,8 +158,8 @@ class _SamePowers:
         error_prior, p = self.problem.prior, self.problem.size
         if k < 2:
             return 0.0
-        told = error_prior.load + 2.0 * (log(p) - log(comb(p, k)))
-        return min(error_prior.apart * (k - 1), error_prior.pair + error_prior.more * (k - 2), told)
+        of_load = error_prior.load + 2.0 * (log(p) - log(comb(p, k)))
+        return min(error_prior.apart * (k - 1), error_prior.pair + error_prior.more * (k - 2), of_load)
 
     def _places(self, L: Ints, sizes: Ints) -> Ints:
         """Rows of Q of the members of each set, (b, k), 0 where a set is smaller."""
@@ -284,11 +284,11 @@ def _continued(problem: LikelihoodProblem, best: SnapshotHypothesis) -> bool:
     if not odd.size or not suspects.size:
         return False
     column = R[:, suspects]
-    told = column >= problem.felt[k - 1, suspects] * (1.0 - _ALIKE)
+    shown = column >= problem.felt[k - 1, suspects] * (1.0 - _ALIKE)
     off = best.g[odd] / best.diagonal[odd]
     expected = column[odd] * (problem.a2 * best.g[suspects] / R[suspects, suspects])
     like = off[:, None] * expected >= _LIKE * expected**2
-    return bool((told[best.meters].all(axis=0) & (told[odd] & like).any(axis=0)).any())
+    return bool((shown[best.meters].all(axis=0) & (shown[odd] & like).any(axis=0)).any())
 
 
 def least(problem: LikelihoodProblem, k: int) -> float:

@@ -185,9 +185,9 @@ class BoundInputs:
         known = np.atleast_1d(busbar_errors(plant, self.powers.v0_squared, self.sigmas))
         known = np.where(self.busbar, known, np.inf)
         off, room = self.y - self.model[at], np.where(use, reading + spread[at], np.inf)
-        heard = np.where(plant.feeder.busbar_incidence()[at] > 0.0, room[:, None], np.inf)
-        low = (off[:, None] - heard).max(axis=0, initial=-np.inf)
-        high = (off[:, None] + heard).min(axis=0, initial=np.inf)
+        reach = np.where(plant.feeder.busbar_incidence()[at] > 0.0, room[:, None], np.inf)
+        low = (off[:, None] - reach).max(axis=0, initial=-np.inf)
+        high = (off[:, None] + reach).min(axis=0, initial=np.inf)
         return _intersection(-known, known, low, high)
 
 

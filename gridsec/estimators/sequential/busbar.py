@@ -133,7 +133,7 @@ def track_busbar(  # noqa: PLR0917
     design: SequentialDesign,
     before: BusbarTrust,
     reported: Floats,
-    heard: Bools,
+    available: Bools,
     v0_squared: Floats,
     variance: Floats,
     allowed: float,
@@ -142,21 +142,21 @@ def track_busbar(  # noqa: PLR0917
 
     It is named if it differs for the confirmation time by more than an honest offset of all meters. It is
     trusted again once the mean over its scale stays within the release limit for that scale, and for the
-    release time of any meter. reported, heard: (b,) its squared voltages, pu, and available ones. v0_squared,
-    variance: (b,) by the other meters. allowed: largest honest fixed error, squared pu.
+    release time of any meter. reported, available: (b,) its squared voltages, pu, and where it has one.
+    v0_squared, variance: (b,) by the other meters. allowed: largest honest fixed error, squared pu.
     """
     out = ~before.trusted
     if not any_of(out):
         return before
     length = np.array(design.lengths)[before.scale]
     age = before.ticks_suspect + out
-    off = np.where(heard, reported - v0_squared, before.off)
+    off = np.where(available, reported - v0_squared, before.off)
     off = before.off + (off - before.off) / np.clip(age, 1, length)
     std = np.sqrt(variance + design.busbar**2 + design.busbar_noise)
     limit = design.options.lower * np.array(design.sigmas)[before.scale] * std
-    agrees = out & heard & (np.abs(off) <= limit)
-    quiet = np.where(heard, (before.ticks_agreeing + 1) * agrees, before.ticks_agreeing)
-    lasts = out & heard & (age >= design.confirmed[before.scale]) & (np.abs(off) > allowed + limit)
+    agrees = out & available & (np.abs(off) <= limit)
+    quiet = np.where(available, (before.ticks_agreeing + 1) * agrees, before.ticks_agreeing)
+    lasts = out & available & (age >= design.confirmed[before.scale]) & (np.abs(off) > allowed + limit)
     still = out & (quiet < np.maximum(design.options.release, length))
     return BusbarTrust(
         trusted=~still,

@@ -29,7 +29,7 @@ _TINY = float(np.finfo(np.float64).tiny)
 
 
 def clock_shift(  # noqa: PLR0917
-    y: Floats, model: Floats, own: Floats, heard: int, room: float, most: float
+    y: Floats, model: Floats, own: Floats, count: int, room: float, most: float
 ) -> int:
     """Lag in ticks at which readings agree with the reconstruction, far better than without one; 0 for none.
 
@@ -40,26 +40,26 @@ def clock_shift(  # noqa: PLR0917
 
         (n / 8) log(least without a lag / left at lag) > log(lags) + 5
 
-    y, model, own: (n,) readings, NaN if missing, reconstruction, and the own part of it, squared pu. heard:
+    y, model, own: (n,) readings, NaN if missing, reconstruction, and the own part of it, squared pu. count:
     number of last readings, < n. room: largest difference of the levels by a fixed error, squared pu. most:
     largest mean square of an honest meter, squared pu^2. A negative lag means readings ahead of their time.
     """
-    if _CORRELATED * np.count_nonzero(np.isnan(y[-heard:])) > heard:
+    if _CORRELATED * np.count_nonzero(np.isnan(y[-count:])) > count:
         return 0
     y = _filled(y)
-    left, lag, lags = np.inf, 0, 4 * (y.size - heard)
+    left, lag, lags = np.inf, 0, 4 * (y.size - count)
     for says, other in ((y, model), (y - own, model - own)):
         for sign, new, old in ((1, says, other), (-1, other, says)):
-            each = _lags(new[-heard:], old, room, most)
+            each = _lags(new[-count:], old, room, most)
             ago = int(each.argmin())
             if each[ago] < left:
                 left, lag = float(each[ago]), sign * (ago + 1)
     if left > most:
         return 0
     # Early readings are the older ones: the alternatives are tested on the same readings.
-    same = slice(y.size + min(lag, 0) - heard, y.size + min(lag, 0))
+    same = slice(y.size + min(lag, 0) - count, y.size + min(lag, 0))
     deviation, models = y[same] - model[same], np.array([model[same], model[same] - own[same]])
-    most_left = max(left, _TINY) * np.exp(2.0 * _CORRELATED / heard * (np.log(lags) + _EVIDENCE))
+    most_left = max(left, _TINY) * np.exp(2.0 * _CORRELATED / count * (np.log(lags) + _EVIDENCE))
     # The slowest test comes last.
     if not min(float(y[same].var()), float(deviation.var())) > most_left:
         return 0

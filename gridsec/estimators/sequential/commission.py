@@ -183,38 +183,38 @@ def ready_meters(design: SequentialDesign, gathered: Learning) -> Bools:
     needed = design.options.commission_s
     if not gathered.time_s.max(initial=0.0) >= needed > 0:
         return np.zeros(gathered.since.size, dtype=np.bool_)
-    heard = np.where(gathered.open, gathered.time_s, 0.0)
-    if not heard.max(initial=0.0) >= needed > 0:
+    time_s = np.where(gathered.open, gathered.time_s, 0.0)
+    if not time_s.max(initial=0.0) >= needed > 0:
         return np.zeros_like(gathered.open)
-    return np.asarray(heard >= design.options.enough * needed)
+    return np.asarray(time_s >= design.options.enough * needed)
 
 
 def learn(design: SequentialDesign, known: Learned, gathered: Learning, which: Bools, t: float) -> Commission:
     """Known errors after learning meters `which` (p,); meters without a reading keep their class."""
-    heard = np.flatnonzero(gathered.count * gathered.time_s > 0)
+    meters = np.flatnonzero(gathered.count * gathered.time_s > 0)
     done = which & (gathered.count > 0) & (gathered.time_s > 0)
     if not any_of(done):
         return Commission(known, gathered)
-    B, n = known.variance[heard], gathered.count[heard]
+    B, n = known.variance[meters], gathered.count[meters]
     # One matrix of this size, inverted in place.
-    K = design.prior.among(heard)
-    time = gathered.time_s[heard] / design.doubt.time_s
-    for first in range(0, heard.size, _BLOCK):
+    K = design.prior.among(meters)
+    time = gathered.time_s[meters] / design.doubt.time_s
+    for first in range(0, meters.size, _BLOCK):
         some = slice(first, first + _BLOCK)
         share = _mean_covariance(time, time[some])
-        K[:, some] = share * K[:, some] + (1.0 - share) * _lasting(design, heard, some)
-    K[np.diag_indices_from(K)] += B + design.white[heard] / n
+        K[:, some] = share * K[:, some] + (1.0 - share) * _lasting(design, meters, some)
+    K[np.diag_indices_from(K)] += B + design.white[meters] / n
     invert_spd(K)
     bias, variance, allowed = known.bias.copy(), known.variance.copy(), known.allowed.copy()
     hidden = np.zeros(known.at.size)
-    hidden[heard] = _hidden_variance(design, heard, K)
-    bias[heard] += B * (K @ (gathered.total[heard] / n))
+    hidden[meters] = _hidden_variance(design, meters, K)
+    bias[meters] += B * (K @ (gathered.total[meters] / n))
     left = np.maximum(B - B * B * K.diagonal(), 0.0)
-    rounded = design.rounded[heard]
-    aging = design.options.stability * (design.allowed[heard] - rounded)
+    rounded = design.rounded[meters]
+    aging = design.options.stability * (design.allowed[meters] - rounded)
     # A uniform error of half-width a has the variance a^2 / 3; rounding follows the voltage.
-    variance[heard] = np.minimum(left + aging**2 / 3.0 + 0.5 * rounded**2, B)
-    allowed[heard] = np.minimum(aging + 3.0 * np.sqrt(left) + rounded, design.allowed[heard])
+    variance[meters] = np.minimum(left + aging**2 / 3.0 + 0.5 * rounded**2, B)
+    allowed[meters] = np.minimum(aging + 3.0 * np.sqrt(left) + rounded, design.allowed[meters])
     learned = Learned(
         # Honest meters stay within their class, so a larger bias is not learned.
         bias=np.where(done, np.clip(bias, -design.allowed, design.allowed), known.bias),
@@ -234,25 +234,25 @@ def learn(design: SequentialDesign, known: Learned, gathered: Learning, which: B
     return Commission(learned, left_open)
 
 
-def _lasting(design: SequentialDesign, heard: Ints, some: slice) -> Floats:
+def _lasting(design: SequentialDesign, meters: Ints, some: slice) -> Floats:
     """Covariance at the meters of errors that no mean reduces, some columns, (h, k).
 
     The fixed error of the busbar's meter is one of them, by phase.
     """
-    of_loads = submatrix(design.prior.covariance, design.prior.meters[heard], heard[some])
+    of_loads = submatrix(design.prior.covariance, design.prior.meters[meters], meters[some])
     lasting = design.doubt.lasting
     places, feeder = design.prior.meters, design.plant.feeder
-    same = feeder.same_busbar_phase(places[heard], places[heard[some]])
+    same = feeder.same_busbar_phase(places[meters], places[meters[some]])
     return lasting * of_loads + (1.0 - lasting) * design.busbar**2 * same
 
 
-def _hidden_variance(design: SequentialDesign, heard: Ints, inverse: Floats) -> Floats:
+def _hidden_variance(design: SequentialDesign, meters: Ints, inverse: Floats) -> Floats:
     """Posterior variance ``diag(L - L K^-1 L)`` of lasting errors L, (h,)."""
-    out = np.empty(heard.size)
-    for first in range(0, heard.size, _BLOCK):
+    out = np.empty(meters.size)
+    for first in range(0, meters.size, _BLOCK):
         some = slice(first, first + _BLOCK)
-        L = _lasting(design, heard, some)
-        own = L[np.arange(heard.size)[some], np.arange(L.shape[1])]
+        L = _lasting(design, meters, some)
+        own = L[np.arange(meters.size)[some], np.arange(L.shape[1])]
         out[some] = own - np.einsum("ij,ij->j", L, inverse @ L)
     return np.maximum(out, 0.0)
 

@@ -221,7 +221,7 @@ def _unvouched(
     design: SequentialDesign,
     busbar: Bools | bool,
     available: Bools,
-    differs: _BusbarFinding,
+    deviation: _BusbarFinding,
     finding: _Finding,
 ) -> _Finding:
     """Verdict, UNDECIDED if too few meters of a phase without a busbar voltage report.
@@ -238,8 +238,8 @@ def _unvouched(
     if count > 2 * most:
         return finding
     why = "The busbar voltage of a phase is missing"
-    if differs.meter:
-        why = f"{differs.meter.capitalize()} {differs.off}"
+    if deviation.meter:
+        why = f"{deviation.meter.capitalize()} {deviation.off}"
     sentence = (
         f"{why}, and {count:.0f} meters report from there; "
         f"at least {2 * most + 1} are needed to tell {most} manipulated from the others."
@@ -314,7 +314,7 @@ def _open_checks(
 def _beside_meters(  # noqa: PLR0917
     design: SequentialDesign,
     inverters: Bools,
-    differs: _BusbarFinding,
+    deviation: _BusbarFinding,
     amounts: dict[int, float],
     rivals: tuple[Explanation, ...],
     open_cases: tuple[Explanation, ...],
@@ -326,8 +326,8 @@ def _beside_meters(  # noqa: PLR0917
     if any_of(inverters):
         owners = ", ".join(plant.feeder.customers[c] for c in plant.droop.customer[inverters])
         found.append((f"the inverters of {owners}", "their reactive power is not that of their curves"))
-    if any_of(differs.named):
-        found.append((differs.meter, f"it {differs.off}"))
+    if any_of(deviation.named):
+        found.append((deviation.meter, f"it {deviation.off}"))
     if cause is Cause.RESIDUALS:
         reason = f"{reason[:-1]}; and {' and '.join(each for each, _ in found)}." if found else reason
         return (
@@ -342,8 +342,8 @@ def _beside_meters(  # noqa: PLR0917
         sentence = f"Manipulated: {'; and '.join('; '.join(each) for each in found)}."
         return Decision.ATTACKED, Cause.RESIDUALS, sentence
     sentence = ""
-    if differs.meter:
-        sentence = f"{differs.meter.capitalize()} {differs.off}; it is not believed."
+    if deviation.meter:
+        sentence = f"{deviation.meter.capitalize()} {deviation.off}; it is not believed."
     elif rivals or open_cases:
         sentence = words.explanations_sentence(design, rivals or open_cases)
     elif amounts:
@@ -361,9 +361,9 @@ def _amounts(
     out: dict[int, float] = {}
     faults, std = design.faults, state.uncertainty.sizes
     for k, s in state.trust.accused:
-        view, now = identified.tests[s], state.posteriors[s]
-        if view is not None:
-            weights = view.loo.weights
+        test, now = identified.tests[s], state.posteriors[s]
+        if test is not None:
+            weights = test.loo.weights
         elif now is not None:
             weights = now.weights(_mean(state, s))
         else:

@@ -170,12 +170,12 @@ class LeaveOneOut:
         return cast("Floats", self.cached_mean)
 
 
-def condition(prior: Prior, noise: Floats, trusted: Bools, loose: Floats | None = None) -> Posterior:
+def condition(prior: Prior, noise: Floats, trusted: Bools, unknowns: Floats | None = None) -> Posterior:
     """Posterior of a set of trusted meters (p,) by one factorisation; O(p^3).
 
-    noise: (p,) variance of each reading, > 0. loose: (n, k) unknown directions, see `add_unknown`.
+    noise: (p,) variance of each reading, > 0. unknowns: (n, k) unknown directions, see `add_unknown`.
     """
-    more = np.zeros((prior.variance.size, 0)) if loose is None else loose
+    more = np.zeros((prior.variance.size, 0)) if unknowns is None else unknowns
     at = indices(trusted)
     inverse = _reading_covariance(prior, noise[at], at, more)
     invert_spd(inverse)
@@ -189,7 +189,7 @@ def chi_square(  # noqa: PLR0917
     noise: Floats,
     m: Floats,
     trusted: Bools,
-    loose: Floats | None = None,
+    unknowns: Floats | None = None,
     alike: Floats | None = None,
 ) -> float:
     """``m^T Q m`` alone, in a third of the time of `condition`.
@@ -199,7 +199,7 @@ def chi_square(  # noqa: PLR0917
     at = indices(trusted)
     if not at.size:
         return 0.0
-    more = np.zeros((prior.variance.size, 0)) if loose is None else loose
+    more = np.zeros((prior.variance.size, 0)) if unknowns is None else unknowns
     between = _reading_covariance(prior, noise[at], at, more)
     if alike is not None:
         between += alike[at] @ alike[at].T
@@ -288,11 +288,11 @@ def _leave_one_out(now: Posterior, m: Floats, weights: Floats, w: Floats | None)
     return LeaveOneOut(weights, offset, now.std, m, now.prior, now.unknowns, w)
 
 
-def _mean(prior: Prior, loose: Floats, weights: Floats) -> Floats:
+def _mean(prior: Prior, unknowns: Floats, weights: Floats) -> Floats:
     """Covariance of all buses' w with a combination of the meters' w, (n,)."""
     out = prior.covariance @ weights
-    if loose.shape[1]:
-        out += loose @ (weights @ loose[prior.meters])
+    if unknowns.shape[1]:
+        out += unknowns @ (weights @ unknowns[prior.meters])
     return np.asarray(out)
 
 

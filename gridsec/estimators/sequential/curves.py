@@ -5,10 +5,11 @@ time. Honest errors explain no more than
 
     |q_net - q - x| <= q_error + q_net_error + e + min(span, d (|residual| + z std)):
 
-e bounds the error of the observed injection x (`gridsec.estimators.sequential.bounds`); the last term lets
-the inverter follow the voltage by the other meters. Beyond that either the inverter leaves its curve or the
-report is false. The amount ``a = q_net - q - x`` decides by the voltages: if x were true instead of the
-report, the chi-square would rise by
+e bounds the error of the observed injection x
+(`gridsec.estimators.sequential.bounds`); the last term lets the inverter follow the voltage by the other
+meters. Beyond that either the inverter leaves its curve or the report is false. The amount
+``a = q_net - q - x`` decides by the voltages: if x were true instead of the report, the chi-square would rise
+by
 
     2 a c^T Q m + a^2 c^T Q c,   c the column of 2X,   m the residuals with the report,
 
@@ -159,8 +160,8 @@ def check_inverters(design: SequentialDesign, before: InverterChecks, now: Repor
     share, beyond = np.zeros(at.size), before.sure.copy()
     amount = np.where(asked, amount, before.amount) * lasts
     for j in np.flatnonzero(lasts).tolist():
-        told = bool(asked[j] and now.uses_q[at[j]])
-        share[j], sigmas = _share(design, now.posterior, loo.weights, j, float(amount[j]), told=told)
+        uses_q = bool(asked[j] and now.uses_q[at[j]])
+        share[j], sigmas = _share(design, now.posterior, loo.weights, j, float(amount[j]), uses_q=uses_q)
         beyond[j] |= bool(asked[j] and sigmas > design.sigmas[0])
     # Without reports the accusation stays until the voltages contradict it.
     over = lasts & ~asked & (share <= 1.0 / design.options.like)
@@ -169,12 +170,12 @@ def check_inverters(design: SequentialDesign, before: InverterChecks, now: Repor
     sure = lasts & beyond & ((share >= 1.0 - 1.0 / design.options.like) | (before.sure & (share >= 0.5)))
     least, most = (of[at] for of in droop.saturated(size))
     enough = asked & (room < np.maximum(most - x, x - least))
-    heard = (design.meter_of >= 0) & enough[design.meter_of]
-    return InverterChecks(count, lasts, amount, share, sure, heard)
+    observable = (design.meter_of >= 0) & enough[design.meter_of]
+    return InverterChecks(count, lasts, amount, share, sure, observable)
 
 
 def _share(
-    design: SequentialDesign, now: Posterior, weights: Floats, j: int, a: float, *, told: bool
+    design: SequentialDesign, now: Posterior, weights: Floats, j: int, a: float, *, uses_q: bool
 ) -> tuple[float, float]:
     """Probability that a report is true and the inverter wrong, for even prior odds.
 
@@ -185,7 +186,7 @@ def _share(
     column = design.faults.columns(np.array([design.customers + inverter]))[now.prior.meters, 0]
     at, Q = now.precision()
     along, form = float(column @ weights), float(column[at] @ Q @ column[at])
-    if told:
+    if uses_q:
         along += a * form  # as if x were true
     worse = 2.0 * a * along - a * a * form
     share = 1.0 / (1.0 + np.exp(-0.5 * np.clip(worse, -_MAX_LOG_RATIO, _MAX_LOG_RATIO)))

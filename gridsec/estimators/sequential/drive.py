@@ -144,13 +144,13 @@ def advance_inverters(  # noqa: PLR0917
 
 
 def prepare(
-    design: SequentialDesign, believed: Bools, h: float, before: ModelDriven | None
+    design: SequentialDesign, trusted: Bools, h: float, before: ModelDriven | None
 ) -> ModelDriven | None:
     """Loop for the next step if the trusted meters with a reading, (p,), stay the same.
 
     Prepared at the tick of a suspicion, since the tick after it has more to compute.
     """
-    driven = (design.meter_of >= 0) & believed[design.meter_of]
+    driven = (design.meter_of >= 0) & trusted[design.meter_of]
     return before if all_of(driven) else _prepared(design, indices(~driven), h, before)
 
 

@@ -166,23 +166,23 @@ def _kept_posterior(
 
 
 def _aligned_misfit(
-    design: SequentialDesign, here: ScaleData, now: Posterior, view: ScaleTest, honest: HonestErrors
+    design: SequentialDesign, here: ScaleData, now: Posterior, test: ScaleTest, honest: HonestErrors
 ) -> bool:
     """True where honest errors at their ends, all in the direction Q m, explain ``m^T Q m``."""
     at = indices(now.trusted)
-    v = view.loo.weights[at, None]
+    v = test.loo.weights[at, None]
     error = busbar_errors(design.plant, honest.powers.v0_squared, design.sigmas[0])
     busbar = np.abs(v.T @ design.busbar_incidence[at]) @ np.atleast_1d(error)
     fixed = here.limits.model + here.limits.allowed
-    return bool(view.loo.chi_square <= (largest_sums(design, at, v, fixed, honest) + busbar)[0])
+    return bool(test.loo.chi_square <= (largest_sums(design, at, v, fixed, honest) + busbar)[0])
 
 
 def _contradicted_phases(  # noqa: PLR0917
-    design: SequentialDesign, scales: Scales, s: int, now: Posterior, view: ScaleTest, honest: HonestErrors
+    design: SequentialDesign, scales: Scales, s: int, now: Posterior, test: ScaleTest, honest: HonestErrors
 ) -> list[int]:
     """Busbar phases that the meters contradict by more than honest errors of one direction."""
     here, doubt = scales[s], BusbarTest(design.sigmas[s], scales.model, scales.uncertainty.busbar[s])
-    phases = contradicted_phases(design, doubt, now, view.loo)
+    phases = contradicted_phases(design, doubt, now, test.loo)
     if not phases:
         return phases
     could = explained_phases(design, now, here.m, here.limits.model + here.limits.allowed, honest)
@@ -242,19 +242,19 @@ def _busbar_hypothesis(
     if suspects[0] > max(design.max_attacked, suspects[1]):
         return candidates, None
     like = 2.0 * float(np.log(design.options.like))
-    lying = replace(each[best], cost=each[best].cost - search.relief(candidates.best, each[best]))
-    worse = lying.cost - candidates.best.cost
+    rival = replace(each[best], cost=each[best].cost - search.relief(candidates.best, each[best]))
+    worse = rival.cost - candidates.best.cost
     vouching = (here.enough & each[best].trusted) @ design.busbar_incidence[:, phases[best]]
     if vouching < design.max_attacked:
         # All meters that contradict it may be manipulated themselves.
-        return replace(candidates, others=(*candidates.others, lying)), None
+        return replace(candidates, others=(*candidates.others, rival)), None
     if worse < -like:
         # A false power may look the same; as an alternative it has a reduced charge.
         power = search.with_false_powers(now)
-        if power.cost > lying.cost + like:
+        if power.cost > rival.cost + like:
             return candidates, phases[best]
-        return replace(candidates, others=(*candidates.others, lying, power)), None
-    return replace(candidates, others=(*candidates.others, lying)) if worse <= like else candidates, None
+        return replace(candidates, others=(*candidates.others, rival, power)), None
+    return replace(candidates, others=(*candidates.others, rival)) if worse <= like else candidates, None
 
 
 def ended(
@@ -290,7 +290,7 @@ def ended(
 
 
 def _search_due(
-    design: SequentialDesign, trust: TrustState, view: ScaleTest, s: int, tick: int, *, searched: bool
+    design: SequentialDesign, trust: TrustState, test: ScaleTest, s: int, tick: int, *, searched: bool
 ) -> bool:
     """True if a scale searches again without new evidence.
 
@@ -304,7 +304,7 @@ def _search_due(
     if all_of(trust.trusted):
         return False
     since = trust.ticks_suspect + 1 - design.confirmed[trust.scale]
-    about = ~trust.trusted & ~trust.named & view.above_limit & (since >= 0)
+    about = ~trust.trusted & ~trust.named & test.above_limit & (since >= 0)
     first = (since < max(design.look_every[s], _SEARCH_INTERVAL)) | ~trust.above_limit[s]
     if any_of(about & first) or (tick % _SEARCH_INTERVAL == 0 and any_of(about)):
         return True

@@ -108,18 +108,18 @@ class HypothesisSearch:
         self.busbar_disputed = False
         self.chi_squares: dict[tuple[bytes, tuple[int, ...]], list[float]] = {}
 
-    def __call__(self, now: Posterior, view: ScaleTest) -> tuple[Candidates, TrustState]:
+    def __call__(self, now: Posterior, test: ScaleTest) -> tuple[Candidates, TrustState]:
         """Candidates with compared rivals, and the resulting trust state."""
-        candidates = self.likeliest(now, view)
+        candidates = self.likeliest(now, test)
         rivals = (*candidates.others, *self.reversed, *self._exonerations(candidates.best))
         others = (*self._compared(candidates.best, rivals), *self._common_offsets(candidates.best))
         return replace(candidates, others=others), self._trust(candidates.best)
 
-    def likeliest(self, now: Posterior, view: ScaleTest) -> Candidates:
+    def likeliest(self, now: Posterior, test: ScaleTest) -> Candidates:
         """Candidates before the comparison with rivals."""
         start = now if len(self.accused) == len(self.trust.accused) else self._condition(now.trusted)
-        few = np.count_nonzero(view.above_limit & now.trusted) <= _FEW
-        loo = view.loo if start is now else None
+        few = np.count_nonzero(test.above_limit & now.trusted) <= _FEW
+        loo = test.loo if start is now else None
         candidates = Candidates(self._descend(start, self.barred, loo=loo)) if few else None
         free = None
         if candidates is None or self._suspects(candidates) > self.design.options.several:
@@ -185,10 +185,10 @@ class HypothesisSearch:
         scales = self.scales.with_direction(UNMETERED * design.plant.feeder.broadcast_busbar(here))
         wide = scales[self.s]
         there = update_posterior(None, wide, now.trusted, self.scales.unknowns(trust.accused))
-        lying = HypothesisSearch(design, scales, self.full_posteriors, trust, self.s)
-        best = lying.likeliest(there, scale_test(design, wide, leave_one_out(there, wide.m))).best
+        wider = HypothesisSearch(design, scales, self.full_posteriors, trust, self.s)
+        best = wider.likeliest(there, scale_test(design, wide, leave_one_out(there, wide.m))).best
         # Meters that are suspects only beside an honest busbar meter are trusted again.
-        honest = lying._descend(lying._condition(wide.enough), np.zeros_like(wide.enough), fresh=True)
+        honest = wider._descend(wider._condition(wide.enough), np.zeros_like(wide.enough), fresh=True)
         best = min(best, honest, key=lambda one: one.cost)
         charge = search.set_cost(int(np.count_nonzero(self.here.enough)), 1)
         accused_faults = (*best.faults, self.faults.std.size + phase)
@@ -237,22 +237,22 @@ class HypothesisSearch:
 
     def _exonerated(self, best: Candidate, group: Ints) -> list[Candidate]:
         """Nearest hypothesis in which a group accused by `best` is honest; none if it accuses too many."""
-        here, prior, loose = self.here, self.here.prior, best.posterior.unknowns
+        here, prior, unknowns = self.here, self.here.prior, best.posterior.unknowns
         # As many meters stay trusted as may be manipulated.
         most = int(np.count_nonzero(here.enough)) - self.design.max_attacked
-        if np.count_nonzero(self._contradicting(group[group.size // 2], loose)) > most:
+        if np.count_nonzero(self._contradicting(group[group.size // 2], unknowns)) > most:
             return []
         among = np.zeros_like(best.trusted)
         among[group] = True
         # Further meters can only raise the chi-square of these.
         most_left = best.cost - best.charge + 2.0 * np.log(self.design.options.like)
-        if chi_square(prior, here.noise, here.m, among, loose) > most_left:
+        if chi_square(prior, here.noise, here.m, among, unknowns) > most_left:
             return []
-        loo = leave_one_out(condition(prior, here.noise, among, loose), here.m)
+        loo = leave_one_out(condition(prior, here.noise, among, unknowns), here.m)
         start = among | (best.trusted & (np.abs(loo.residual) <= here.limits.limit(loo.std)))
         if np.count_nonzero(here.enough & ~start) > most:
             return []
-        now = condition(prior, here.noise, start, loose) if loose.shape[1] else self._condition(start)
+        now = condition(prior, here.noise, start, unknowns) if unknowns.shape[1] else self._condition(start)
         other = self._descend(now, np.zeros_like(among), protected=group, fresh=True)
         return [self._charged(best, other)] if self._admissible(other) else []
 
@@ -342,13 +342,13 @@ class HypothesisSearch:
             return []
         b, between, place = every.weights(self.here.m)[at], prior.among(at), prior.meters[at]
         std = np.sqrt(np.maximum(between.diagonal(), np.finfo(np.float64).tiny))
-        whole, believed = np.ones(at.size, dtype=np.bool_), best.trusted[at]
+        whole, honest = np.ones(at.size, dtype=np.bool_), best.trusted[at]
         count = np.arange(1, largest + 1)
         centre = 2.0 * np.log(at.size * largest)
         out: list[_OffsetGroup] = []
         for j in np.argsort(-(b * b) / Q.diagonal())[:_SEEDS].tolist():
             # Correlation orders along a street, covariance by the bus they are behind.
-            for likeness, some in product((between[j] / std, between[j]), (whole, believed)):
+            for likeness, some in product((between[j] / std, between[j]), (whole, honest)):
                 near = np.argsort(-likeness, kind="stable")[: largest + 1]
                 part = some[near].astype(np.float64)
                 sums = np.cumsum(np.cumsum(submatrix(Q, near, near) * np.multiply.outer(part, part), 0), 1)
@@ -373,8 +373,10 @@ class HypothesisSearch:
         for k, group in enumerate(groups):
             directions[here.prior.meters[group.meters], k] = _OFFSET_STD
         accused_faults = self.scales.unknowns(self.accused)
-        loose = directions if accused_faults is None else np.hstack([accused_faults, directions])
-        end = self._descend(condition(here.prior, here.noise, base, loose), here.enough & ~base, fresh=True)
+        unknowns = directions if accused_faults is None else np.hstack([accused_faults, directions])
+        end = self._descend(
+            condition(here.prior, here.noise, base, unknowns), here.enough & ~base, fresh=True
+        )
         dropped = int(np.count_nonzero(here.enough & ~end.trusted))
         alike = np.where(end.trusted[:, None], directions[here.prior.meters], 0.0)
         kept, charge = np.asarray(alike.any(axis=1)), sum(group.charge for group in groups)
@@ -410,10 +412,10 @@ class HypothesisSearch:
         fair = float(np.sqrt(search.set_cost(self.barred.size, 1)))
         return replace(self.here.limits, sigmas=min(self.here.limits.sigmas, fair))
 
-    def _contradicting(self, j: int, loose: Floats) -> Bools:
+    def _contradicting(self, j: int, unknowns: Floats) -> Bools:
         """Meters that cannot be honest if meter j is, from the two readings alone, (p,)."""
         here, prior = self.here, self.here.prior
-        more = loose[prior.meters]
+        more = unknowns[prior.meters]
         column = prior.covariance[prior.meters, j] + more @ more[j]
         own = prior.variance[prior.meters] + here.noise + (more * more).sum(axis=1)
         apart = np.maximum(own + own[j] - 2.0 * column, 0.0)
@@ -474,11 +476,11 @@ class HypothesisSearch:
         accused group.
         """
         here = self.here
-        believed = here.enough & other.trusted & ~best.trusted
+        honest = here.enough & other.trusted & ~best.trusted
         accused = here.enough & best.trusted & ~other.trusted
-        if min(np.count_nonzero(believed), np.count_nonzero(accused)) < 2:
+        if min(np.count_nonzero(honest), np.count_nonzero(accused)) < 2:
             return np.inf
-        ours, freedom = self._offset_chi_squares(best, believed)
+        ours, freedom = self._offset_chi_squares(best, honest)
         if _beyond_chance(ours[self.s] - best.loo.chi_square, freedom):
             return np.inf  # the accused meters have no common offset
         theirs, _ = self._offset_chi_squares(other, accused)
@@ -591,10 +593,10 @@ class HypothesisSearch:
         )
 
     def _condition(self, trusted: Bools) -> Posterior:
-        loose, wanted = self.scales.unknowns(self.accused), trusted & self.here.enough
-        near = self._close_posterior(self.s, wanted) if loose is None else None
+        unknowns, wanted = self.scales.unknowns(self.accused), trusted & self.here.enough
+        near = self._close_posterior(self.s, wanted) if unknowns is None else None
         return (
-            condition(self.here.prior, self.here.noise, wanted, loose)
+            condition(self.here.prior, self.here.noise, wanted, unknowns)
             if near is None
             else remove_meters(*near)
         )
@@ -635,17 +637,17 @@ class HypothesisSearch:
         if more is None and which in self.chi_squares:
             return self.chi_squares[which]
         trusted = trusted if more is None else trusted | more
-        loose = self.scales.unknowns((*self.accused, *((k, self.s) for k in candidates.faults)))
+        unknowns = self.scales.unknowns((*self.accused, *((k, self.s) for k in candidates.faults)))
         for s in range(len(self.design.lengths)):
             there = self.scales[s]
             wanted = trusted & there.enough
-            near = self._close_posterior(s, wanted) if loose is None and more is None else None
+            near = self._close_posterior(s, wanted) if unknowns is None and more is None else None
             if s == self.s and more is None and isinstance(candidates, Candidate):
                 out.append(candidates.loo.chi_square)
             elif near is not None:
                 out.append(chi_square_without(near[0], there.m, near[1]))
             else:
-                out.append(chi_square(there.prior, there.noise, there.m, wanted, loose, alike))
+                out.append(chi_square(there.prior, there.noise, there.m, wanted, unknowns, alike))
         if more is None:
             self.chi_squares[which] = out
         return out

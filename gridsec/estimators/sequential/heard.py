@@ -102,15 +102,15 @@ def _busbar(
 ) -> tuple[Floats | float, Bools | bool, Floats, Bools]:
     """Last four fields of `Measurements`."""
     low, high = design.options.v2_limits
-    believed = state.busbar.trusted
+    trusted = state.busbar.trusted
     if design.plant.feeder.busbar_phases == 1:
         v0 = frame.v0_squared
         there = bool(low <= v0 <= high)  # False for NaN
-        metered = there and bool(believed[0])
+        metered = there and bool(trusted[0])
         return v0 if metered else state.v0_squared, metered, np.array([v0]), np.array([there])
     # One voltage for all phases is a start value, not a reading of each.
     given = np.broadcast_to(frame.v0_squared if frame.v0_phases is None else frame.v0_phases, 3)
     within = (low <= given) & (given <= high)
     says = within & (frame.v0_phases is not None)
-    v0_squared = np.where(within & believed, given, state.v0_squared)
-    return v0_squared, says & believed, given, says
+    v0_squared = np.where(within & trusted, given, state.v0_squared)
+    return v0_squared, says & trusted, given, says

@@ -92,8 +92,8 @@ class AttackKinds:
         if not any_of(self.coordinated):
             return self.single
         return tuple(
-            ManipulationKind.COORDINATED if told and kind is ManipulationKind.OFFSET else kind
-            for kind, told in zip(self.single, self.coordinated.tolist(), strict=True)
+            ManipulationKind.COORDINATED if shared and kind is ManipulationKind.OFFSET else kind
+            for kind, shared in zip(self.single, self.coordinated.tolist(), strict=True)
         )
 
 
@@ -128,20 +128,25 @@ def repeat_lags(kinds: AttackKinds) -> Ints:
 
 
 def classify(  # noqa: PLR0917
-    references: KindReferences, heard: AttackKinds, model: Floats, own: Floats, named: Bools, variance: Floats
+    references: KindReferences,
+    ingested: AttackKinds,
+    model: Floats,
+    own: Floats,
+    named: Bools,
+    variance: Floats,
 ) -> AttackKinds:
     """Kind of the manipulation of every named meter, (p,).
 
     model, variance: (p,) prediction of each meter by the *others*, its fixed error included, squared pu, and
     its variance. own: (p,) part of `model` by the meter's own reported powers, squared pu.
     """
-    history = repeats.store(heard.history, model, own)
+    history = repeats.store(ingested.history, model, own)
     if not any_of(named):
         return AttackKinds(history, *(_none_named(named.size)))
     tick = history.tick
-    since = np.where(named, np.where(heard.since < 0, tick, heard.since), -1)
-    alone = [kind if there else None for kind, there in zip(heard.single, named.tolist(), strict=True)]
-    told, new = heard.coordinated & named, any_of(since == tick)
+    since = np.where(named, np.where(ingested.since < 0, tick, ingested.since), -1)
+    alone = [kind if there else None for kind, there in zip(ingested.single, named.tolist(), strict=True)]
+    shared, new = ingested.coordinated & named, any_of(since == tick)
     stuck = named & (history.stuck | (history.run * references.limits.surprise >= _CALLED_SURPRISE))
     replays = named & ~stuck & (history.lag > 0)
     for kind, which in ((ManipulationKind.STUCK, stuck), (ManipulationKind.REPLAY, replays)):
@@ -162,8 +167,8 @@ def classify(  # noqa: PLR0917
         for j, looks in zip(meters.tolist(), found, strict=True):
             alone[j] = looks
     if new or tick % references.interval == 0:
-        told = _coordinated(references, history, since, variance)
-    return AttackKinds(history, since, tuple(alone), told)
+        shared = _coordinated(references, history, since, variance)
+    return AttackKinds(history, since, tuple(alone), shared)
 
 
 _GROUPS = 4
@@ -214,12 +219,12 @@ def _restarts(references: KindReferences, meters: Ints, code: Floats) -> Ints:
     """First of the readings (n, k) after the last stuck stretch; 0 for others, (k,)."""
     out, surprise = np.zeros(meters.size, dtype=np.intp), references.limits.surprise[meters]
     for k in indices(_longest(code) * surprise >= _CALLED_SURPRISE).tolist():
-        heard = indices(np.isfinite(code[:, k]))
-        read = code[heard, k]
-        ends = np.concatenate([[-1], indices(read[1:] != read[:-1]), [heard.size - 1]])
+        readings = indices(np.isfinite(code[:, k]))
+        read = code[readings, k]
+        ends = np.concatenate([[-1], indices(read[1:] != read[:-1]), [readings.size - 1]])
         stuck = indices((np.diff(ends) - 1) * surprise[k] >= _CALLED_SURPRISE)
         if stuck.size:
-            out[k] = heard[ends[stuck[-1] + 1]] + 1
+            out[k] = readings[ends[stuck[-1] + 1]] + 1
     return out
 
 
@@ -235,8 +240,8 @@ def _after_stuck(
     references: KindReferences, meter: int, deviation: Floats, age: int
 ) -> ManipulationKind | None:
     """Kind of a formerly stuck meter since it moves, if that is long enough."""
-    heard = int(np.isfinite(deviation).sum())
-    if heard < max(references.interval, _SHORTEST):
+    readings = int(np.isfinite(deviation).sum())
+    if readings < max(references.interval, _SHORTEST):
         return ManipulationKind.STUCK
     return shape(deviation, float(np.sqrt(references.noise[meter])), min(age, deviation.size))
 
@@ -281,13 +286,13 @@ def _of_the_past(  # noqa: PLR0917
     same = repeats.recurring(code) * repeats.surprise(references.limits, history)[meter]
     if same >= _CALLED_SURPRISE + np.log(code.size):
         return ManipulationKind.REPLAY
-    heard = min(window, code.size // 2)
-    if before is ManipulationKind.CLOCK_SHIFT or heard < clocks.WINDOWS[0]:
+    readings = min(window, code.size // 2)
+    if before is ManipulationKind.CLOCK_SHIFT or readings < clocks.WINDOWS[0]:
         return before
     y = (code * references.limits.step[meter]) ** 2
     own = repeats.own_part(history, meter)
     lag = clocks.clock_shift(
-        y, model, own, heard, 3.0 * np.sqrt(spread), spread + float(references.noise[meter])
+        y, model, own, readings, 3.0 * np.sqrt(spread), spread + float(references.noise[meter])
     )
     return ManipulationKind.CLOCK_SHIFT if lag else before
 
@@ -300,8 +305,8 @@ def shape(deviation: Floats, noise: float, age: int) -> ManipulationKind | None:
     `_BINS` moments are fitted by least squares; one of no duration is a step. A drift lasts and leaves far
     less than the best step.
     """
-    heard = deviation[np.isfinite(deviation)]
-    if heard.size and _drifts(heard[:, None], np.array([noise]))[0]:
+    readings = deviation[np.isfinite(deviation)]
+    if readings.size and _drifts(readings[:, None], np.array([noise]))[0]:
         return ManipulationKind.DRIFT
     now = deviation[-(age + 2) :]
     now = now[np.isfinite(now)]
@@ -365,11 +370,11 @@ def _coordinated(references: KindReferences, history: ReadingHistory, since: Int
     start = max(history.first, history.kept - _EVERY, int(since.max()) - 1)
     code, model = repeats.past(history, which, start, history.kept)
     deviations = (code * references.limits.step[which]) ** 2 - model
-    heard = np.isfinite(deviations).sum(axis=0)
-    if not all_of(heard):
+    readings = np.isfinite(deviations).sum(axis=0)
+    if not all_of(readings):
         return np.zeros_like(named)
-    spread = variance[which] + references.noise[which] / heard
-    same = is_load_trace(references.traces, which, np.nansum(deviations, axis=0) / heard, spread)
+    spread = variance[which] + references.noise[which] / readings
+    same = is_load_trace(references.traces, which, np.nansum(deviations, axis=0) / readings, spread)
     return named if same else np.zeros_like(named)
 
 

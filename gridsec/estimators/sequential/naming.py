@@ -119,15 +119,15 @@ def _inverter_counts(
     return count, (before.inverters & (count > 0)) | (now & sought & (count >= need))
 
 
-def _witnessed(design: SequentialDesign, which: Bools, heard: Bools) -> Bools:
+def _witnessed(design: SequentialDesign, which: Bools, available: Bools) -> Bools:
     """Inverters that move the voltage of some available meter, (m,)."""
-    if all_of(heard) or not any_of(which):
+    if all_of(available) or not any_of(which):
         return which
     out, at = which.copy(), indices(which)
     own = design.plant.droop.customer[at]
     effect = np.abs(design.sensitivities.columns(Power.REACTIVE, own)[design.prior.meters])
     most = effect.max(axis=0, initial=0.0)
-    out[at] = effect[heard].max(axis=0, initial=0.0) >= np.maximum(
+    out[at] = effect[available].max(axis=0, initial=0.0) >= np.maximum(
         _WITNESS_PART * most, np.finfo(np.float64).tiny
     )
     return out
@@ -170,9 +170,9 @@ class _Rivals:
     def collect(self, identified: Identification) -> None:
         """Take the candidates of every scale that searched."""
         for s, found in identified.candidates.items():
-            view = identified.tests[s]
-            if view is not None:
-                self._collect(found, view)
+            test = identified.tests[s]
+            if test is not None:
+                self._collect(found, test)
         if not any(self._differs(meters, inverters) for meters, inverters, *_ in self.found.values()):
             self.found.clear()
 
@@ -180,12 +180,12 @@ class _Rivals:
         """Meters and inverters that each accuses; meters without a reading are among the former."""
         return [(meters, inverters) for meters, inverters, *_ in self.found.values()]
 
-    def explanations(self, heard: Bools) -> tuple[Explanation, ...]:
-        """All of them, the likeliest first; meters without a reading, `heard` (p,) False, are left out."""
+    def explanations(self, available: Bools) -> tuple[Explanation, ...]:
+        """All of them, the likeliest first; meters that are not `available`, (p,), are left out."""
         design, total = self.design, sum(way[2] for way in self.found.values())
         return tuple(
             Explanation(
-                meters & heard,
+                meters & available,
                 inverters,
                 weight / total,
                 accused_powers(design, accused_faults),
@@ -196,10 +196,10 @@ class _Rivals:
             )
         )
 
-    def _collect(self, found: Candidates, view: ScaleTest) -> None:
+    def _collect(self, found: Candidates, test: ScaleTest) -> None:
         best, within = found.best, self.within
         near = [(~each.trusted, each.faults, each.cost - best.cost) for each in (best, *found.others)]
-        for swap in meter_exchanges(best, view.enough, within, view.limits):
+        for swap in meter_exchanges(best, test.enough, within, test.limits):
             other = near[0][0].copy()
             other[swap.accused], other[swap.innocent] = False, True
             near.append((other, best.faults, swap.worse))

@@ -162,7 +162,7 @@ def empty(meters: int) -> ReadingHistory:
 def ingest(limits: RepeatLimits, before: ReadingHistory, y: Floats, available: Bools) -> ReadingHistory:
     """History with the readings y (p,), squared pu, of one tick; `store` has to follow before the next."""
     tick = before.tick + 1
-    code = now = told = np.rint(np.sqrt(np.minimum(np.maximum(y, 0.0), _HIGHEST)) / limits.step).astype(
+    code = now = hashed = np.rint(np.sqrt(np.minimum(np.maximum(y, 0.0), _HIGHEST)) / limits.step).astype(
         np.int32
     )
     same = code == before.code
@@ -170,7 +170,7 @@ def ingest(limits: RepeatLimits, before: ReadingHistory, y: Floats, available: B
     if not all_of(available):
         run = np.where(available, run, before.run)
         # A silent tick has a code of its own in the hash.
-        told = np.where(available, code, np.int32(tick % 2**31))
+        hashed = np.where(available, code, np.int32(tick % 2**31))
         now, code = np.where(available, code, np.int32(SILENT)), np.where(available, code, before.code)
     # Rare, hence the test first.
     longer = before.run > longest
@@ -184,7 +184,7 @@ def ingest(limits: RepeatLimits, before: ReadingHistory, y: Floats, available: B
         kept=before.kept,
         code=code,
         now=now,
-        hash=_rolled(before.hash, told),
+        hash=_rolled(before.hash, hashed),
         count=count,
         run=run,
         longest=longest,
@@ -251,8 +251,8 @@ def recurring(code: Floats) -> int:
     lags = np.arange(1, code.size)
     count, best = np.zeros(lags.size, dtype=np.intp), 0
     for newest in range(code.size - 1, 0, -1):
-        heard = lags <= newest
-        lags, count = lags[heard], count[heard]
+        within = lags <= newest
+        lags, count = lags[within], count[within]
         if not lags.size or best >= SPAN:
             break
         old = code[newest - lags]
@@ -274,9 +274,9 @@ def _surprise(limits: RepeatLimits, count: Ints, longest: Ints) -> Floats:
     return np.where(calm, np.minimum(_FEW_RUNS / np.maximum(longest, 1), limits.surprise), limits.surprise)
 
 
-def _rolled(before: _Hashes, told: _Codes) -> _Hashes:
+def _rolled(before: _Hashes, hashed: _Codes) -> _Hashes:
     """Hash of the last SPAN ticks: older ones have been shifted out (a gear hash)."""
-    mixed = told.view(np.uint32) * _ODD
+    mixed = hashed.view(np.uint32) * _ODD
     mixed ^= mixed >> _HALF
     return (before << _ONE) + mixed
 

@@ -1,6 +1,6 @@
 """Rise of J by each accusation, for all meters at once.
 
-J, K, Q and g are those of `gridsec.estimators.sequential.snapshot`. Accusing a meter changes K by a matrix of
+J, K, Q and g are those of `gridsec.estimators.sequential.snapshot`. An accusation changes K by a matrix of
 rank one, false powers by one of rank two: by the determinant lemma and Woodbury's formula every rise of J
 follows from Q and g without a system larger than two by two.
 """

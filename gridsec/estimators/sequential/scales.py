@@ -145,14 +145,14 @@ def scale_test(design: SequentialDesign, here: ScaleData, loo: LeaveOneOut) -> S
 
 
 def update_posterior(
-    before: Posterior | None, here: ScaleData, wanted: Bools, loose: Floats | None
+    before: Posterior | None, here: ScaleData, wanted: Bools, unknowns: Floats | None
 ) -> Posterior:
     """Posterior of wanted meters (p,) with unknown directions (n, k), from the last one where cheaper."""
     prior, noise = here.prior, here.noise
     if before is None or before.prior is not prior:
-        return condition(prior, noise, wanted, loose)
-    if before.unknowns.shape[1] if loose is None else not np.array_equal(before.unknowns, loose):
-        return condition(prior, noise, wanted, loose)
+        return condition(prior, noise, wanted, unknowns)
+    if before.unknowns.shape[1] if unknowns is None else not np.array_equal(before.unknowns, unknowns):
+        return condition(prior, noise, wanted, unknowns)
     differs = before.trusted != wanted
     if not any_of(differs):
         return before
@@ -162,7 +162,7 @@ def update_posterior(
     if many and few and well_conditioned(prior, before.noise):
         return remove_meters(before, differs)
     if many or before.updates + change.size > _MAX_UPDATES:
-        return condition(prior, noise, wanted, loose)
+        return condition(prior, noise, wanted, unknowns)
     now = before.copy()
     for j in change.tolist():
         (add_meter if wanted[j] else remove_meter)(now, j)

@@ -32,12 +32,12 @@ def empty(lengths: tuple[int, ...], meters: int) -> Window:
     )
 
 
-def push(window: Window, lengths: tuple[int, ...], residual: Floats, heard: Bools) -> Window:
+def push(window: Window, lengths: tuple[int, ...], residual: Floats, available: Bools) -> Window:
     """Window with the residuals (p,) of one more tick, squared pu, and the meters with a reading, (p,)."""
     before, marks, turn = window.residuals, window.available, window.since_resum + 1
     # While every meter reports, the same array enters and leaves.
-    steady = all(marks[-length] is heard for length in lengths)
-    values = residual if all_of(heard) else np.where(heard, residual, 0.0)
+    steady = all(marks[-length] is available for length in lengths)
+    values = residual if all_of(available) else np.where(available, residual, 0.0)
     after = (*before[1:], values)
     if turn == len(after):
         # Differences of running sums gather rounding errors; a new sum every `longest` ticks bounds them.
@@ -46,8 +46,8 @@ def push(window: Window, lengths: tuple[int, ...], residual: Floats, heard: Bool
         sums = window.sums + values - np.array([before[-length] for length in lengths])
     counts = window.counts
     if not steady:
-        counts = counts + heard - np.array([marks[-length] for length in lengths])
-    return Window(after, (*marks[1:], heard), turn, sums, counts)
+        counts = counts + available - np.array([marks[-length] for length in lengths])
+    return Window(after, (*marks[1:], available), turn, sums, counts)
 
 
 def forget(window: Window, meters: Bools) -> Window:
@@ -64,7 +64,7 @@ def forget(window: Window, meters: Bools) -> Window:
 def shift(window: Window, change: Floats) -> Window:
     """Window with all residuals increased by `change` (p,), squared pu."""
     pairs = zip(window.residuals, window.available, strict=True)
-    residuals = tuple(np.where(heard, each + change, 0.0) for each, heard in pairs)
+    residuals = tuple(np.where(available, each + change, 0.0) for each, available in pairs)
     return Window(
         residuals, window.available, window.since_resum, window.sums + window.counts * change, window.counts
     )

@@ -81,9 +81,9 @@ def explanations_sentence(design: SequentialDesign, explanations: tuple[Explanat
     shown = [_explanation(design, each) for each in explanations[:_SHOWN]]
     if len(explanations) == 1:
         return f"Wrong is {shown[0]}; nothing else explains the readings."
-    more, told = len(explanations) - len(shown), " or else ".join(shown)
+    more, text = len(explanations) - len(shown), " or else ".join(shown)
     each = "both explain" if len(explanations) == 2 else "each of these explains"
-    return f"Wrong are either {told}{f' or {more} more' if more else ''}; {each} the readings."
+    return f"Wrong are either {text}{f' or {more} more' if more else ''}; {each} the readings."
 
 
 def _explanation(design: SequentialDesign, explanation: Explanation) -> str:
