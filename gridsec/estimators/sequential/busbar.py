@@ -118,7 +118,7 @@ def largest_sums(
 
         |2 v^T R| dp + 2 |v^T X| dq + |v|^T (fixed + jitter)
 
-    at: (t,) meters. v: (t, k) weights. fixed: (p,) as in `aligned_errors`.
+    at: (t,) meters. v: (t, k) weights. fixed: (p,) as in `explained_phases`.
     """
     plant = design.plant
     injected = plant.droop.per_customer(honest.injected, design.customers)

@@ -69,8 +69,8 @@ Move = Callable[[], RankOneUpdate]
 class FaultGains:
     """Gains of the directions during a search: Q A follows Q by rank one, diag(A^T Q A) by squares.
 
-    The moves of the search change the posterior `now`. weights: (p,) Q m. live: (p,) meters with a reading.
-    innocent: (k,) meters that stay trusted.
+    The moves of the search change the posterior `now`. weights: (p,) Q m. available: (p,) meters with a
+    reading. protected: (k,) meters that stay trusted.
     """
 
     def __init__(

@@ -84,7 +84,7 @@ class HypothesisSearch:
     again. A hypothesis that adds them wins if it is cheaper over all scales together and the detecting scales
     have enough readings.
 
-    wholes: (s,) kept posteriors of all meters. s: the scale.
+    full_posteriors: (s,) kept posteriors of all meters. s: the scale.
     """
 
     def __init__(

@@ -300,8 +300,8 @@ def _of_the_past(  # noqa: PLR0917
 def shape(deviation: Floats, noise: float, age: int) -> ManipulationKind | None:
     """Kind of a manipulation by its shape: drift, offset or None.
 
-    lie: (n,) readings minus reconstruction, squared pu, NaN if missing. noise: its standard deviation from
-    tick to tick. age: ticks since the meter was named. Ramps from zero to full size between any two of
+    deviation: (n,) readings minus reconstruction, squared pu, NaN if missing. noise: its standard deviation
+    from tick to tick. age: ticks since the meter was named. Ramps from zero to full size between any two of
     `_BINS` moments are fitted by least squares; one of no duration is a step. A drift lasts and leaves far
     less than the best step.
     """

@@ -42,9 +42,9 @@ def robust_set(  # noqa: PLR0917
 ) -> Bools:
     """Trusted meters of a robust fit, (p,); O(p^3).
 
-    live: (p,) meters with a reading. bound: (p,) largest honest difference between reading and truth, squared
-    pu. whole: a posterior that `covers` these meters, if there is one; the cube is then that of the number of
-    meters with weights below one.
+    available: (p,) meters with a reading. bound: (p,) largest honest difference between reading and truth,
+    squared pu. whole: a posterior that `covers` these meters, if there is one; the cube is then that of the
+    number of meters with weights below one.
     """
     at = indices(available)
     trusted = np.zeros(m.size, dtype=np.bool_)

@@ -155,9 +155,9 @@ def descend(
 ) -> Candidate:
     """Remove, add and accuse until no move lowers the cost.
 
-    start: changed in place only if `fresh`; the posterior of the result where no move helps. live: (p,)
-    meters with a reading. keep: (p,) meters that are not added. innocent: (k,) meters that stay trusted.
-    judged: the residuals of `start` if known. pairs: remove two meters at once as well, O(p^2) per move; two
+    start: changed in place only if `fresh`; the posterior of the result where no move helps. available: (p,)
+    meters with a reading. keep: (p,) meters that are not added. protected: (k,) meters that stay trusted.
+    loo: the residuals of `start` if known. pairs: remove two meters at once as well, O(p^2) per move; two
     meters of equal error support each other, and removing either gains little.
     """
     now, changed = start if fresh else start.copy(), start.updates

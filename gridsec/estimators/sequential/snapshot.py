@@ -86,11 +86,11 @@ def identify(
 ) -> tuple[SnapshotExplanation, ...]:
     """Likeliest hypotheses of one set of readings, the best first; there is always one.
 
-    noise, m, live: (p,) variance of each reading, > 0; readings minus the model, squared pu, finite; meters
-    with a reading. error_prior: that of the manipulations. false: effects of false powers; none by default.
-    `FalsePowers.claimed` reuses values that depend on the feeder alone. curved: for large false powers,
-    `curved(weights, powers)` is `m` of the live meters linearised about the powers of a hypothesis, by its
-    weights and false powers, (p_live,) each.
+    noise, m, available: (p,) variance of each reading, > 0; readings minus the model, squared pu, finite;
+    meters with a reading. error_prior: that of the manipulations. false: effects of false powers; none by
+    default. `FalsePowers.claimed` reuses values that depend on the feeder alone. curved: for large false
+    powers, `curved(weights, powers)` is `m` of the live meters linearised about the powers of a hypothesis,
+    by its weights and false powers, (p_live,) each.
 
     Raises
     ------

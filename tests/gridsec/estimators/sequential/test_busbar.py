@@ -169,13 +169,13 @@ class TestStreets:
     def test_beside_as_many_liars_as_can_be_told_apart(self) -> None:
         road, design = street(3)
         state, _ = watch(road, design, 30)
-        deviations = {1: 0.03, 4: -0.03, 6: 0.03, 9: -0.03}
-        state, answers = watch(road, design, 30, state=state, lies=deviations, change=reads(-0.03))
+        lies = {1: 0.03, 4: -0.03, 6: 0.03, 9: -0.03}
+        state, answers = watch(road, design, 30, state=state, lies=lies, change=reads(-0.03))
         verdict = answers[-1][1]
-        assert np.flatnonzero(verdict.suspects).tolist() == list(deviations)
+        assert np.flatnonzero(verdict.suspects).tolist() == list(lies)
         assert verdict.busbar.all()
         assert verdict.reason.endswith("; and the meter of the busbar.")
-        assert not any(np.delete(verdict.suspects, list(deviations)).any() for _, verdict in answers)
+        assert not any(np.delete(verdict.suspects, list(lies)).any() for _, verdict in answers)
 
     @pytest.mark.parametrize("part", [0.03, 0.015])
     def test_many_who_lie_alike_do_not_make_it_a_liar(self, part: float) -> None:

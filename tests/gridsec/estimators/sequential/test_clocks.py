@@ -57,17 +57,17 @@ class TestLags:
     def test_the_misfit_within_a_tick_is_that_of_a_search(self, seed: int, n: int) -> None:
         """Oracle: least squares about level and slope, for many parts of a tick between -1/2 and 1/2."""
         rng = np.random.default_rng(seed)
-        deviation, later = rng.standard_normal(n), rng.standard_normal((2, n - 1))
-        got = clocks._in_time(deviation, later)
+        lie, later = rng.standard_normal(n), rng.standard_normal((2, n - 1))
+        got = clocks._in_time(lie, later)
 
-        def left(deviation: Floats) -> float:
-            basis = np.vander(np.arange(deviation.size), 2)
-            return float(np.mean((deviation - basis @ np.linalg.lstsq(basis, deviation, rcond=None)[0]) ** 2))
+        def left(lie: Floats) -> float:
+            basis = np.vander(np.arange(lie.size), 2)
+            return float(np.mean((lie - basis @ np.linalg.lstsq(basis, lie, rcond=None)[0]) ** 2))
 
         parts = np.linspace(0.0, 0.5, 101)
-        late = [left(deviation[1:] + part * way) for part in parts for way in later]
-        early = [left(deviation[:-1] - part * way) for part in parts for way in later]
-        best = min(left(deviation), *late, *early)
+        late = [left(lie[1:] + part * way) for part in parts for way in later]
+        early = [left(lie[:-1] - part * way) for part in parts for way in later]
+        best = min(left(lie), *late, *early)
         assert best * (1.0 - 1e-3) - 1e-9 <= got <= best * (1.0 + 1e-9) + 1e-12
 
 
@@ -80,8 +80,8 @@ class TestShifted:
             model, y = (truth[k : k + 2500] + noise(rng, 2500) for k in (2000, 2000 - lag))
             assert abs(found(y, model, heard=400) - lag) <= 2
             honest = truth[2000:4500] + noise(rng, 2500)
-            for deviation in (0.0, 0.1, np.linspace(0.0, 0.1, 2500)):
-                assert found(honest + deviation, model, heard=400) == 0
+            for lie in (0.0, 0.1, np.linspace(0.0, 0.1, 2500)):
+                assert found(honest + lie, model, heard=400) == 0
 
     @pytest.mark.parametrize("lag", [-4, -1, 1, 4])
     @pytest.mark.parametrize("heard", clocks.WINDOWS)
@@ -107,13 +107,13 @@ class TestShifted:
     def test_readings_up_to_half_a_tick_off_are_of_their_tick(self) -> None:
         for seed in range(10):
             rng = np.random.default_rng(seed)
-            truth, deviation = restless(rng, 601), rng.choice([-0.05, 0.05])
+            truth, lie = restless(rng, 601), rng.choice([-0.05, 0.05])
             model = truth[1:] + noise(rng, 600)
             for part in (0.1, 0.3, 0.5):
                 late = (1.0 - part) * truth[1:] + part * truth[:-1] + noise(rng, 600)
                 early = (1.0 - part) * truth[:-1] + part * truth[1:] + noise(rng, 600)
-                assert found(late + deviation, model) == 0
-                assert found(early + deviation, truth[:-1] + noise(rng, 600)) == 0
+                assert found(late + lie, model) == 0
+                assert found(early + lie, truth[:-1] + noise(rng, 600)) == 0
 
     def test_neither_steps_nor_ramps_nor_silence_nor_a_stuck_meter_are_of_another_time(self) -> None:
         for seed in range(20):
@@ -134,9 +134,9 @@ class TestShifted:
         for seed in range(10):
             rng = np.random.default_rng(seed)
             truth = 1.0 + 0.003 * np.sin(np.arange(1100) / 300.0)
-            deviation = np.where(np.arange(1100) >= 1050, 0.06, 0.0)
+            lie = np.where(np.arange(1100) >= 1050, 0.06, 0.0)
             for now in (1055, 1070, 1100):
-                y, model = ((truth + one + noise(rng, 1100))[:now] for one in (deviation, 0.0))
+                y, model = ((truth + one + noise(rng, 1100))[:now] for one in (lie, 0.0))
                 for heard in clocks.WINDOWS:
                     assert found(y, model, heard=heard) == 0
 
@@ -169,12 +169,12 @@ def by_definition(y: Floats, model: Floats, own: Floats, heard: int) -> int:
         at = np.arange(x.size)
         return np.asarray(x - np.polyval(np.polyfit(at, x, 1), at))
 
-    deviation = (y - model)[last]
-    least = [float(y[last].var()), float(np.mean(rest(deviation) ** 2))]
+    lie = (y - model)[last]
+    least = [float(y[last].var()), float(np.mean(rest(lie) ** 2))]
     for says, other in ways:
-        assert np.allclose((says - other)[last], deviation)
+        assert np.allclose((says - other)[last], lie)
         steps = np.diff(other[last])
-        for part, way in ((deviation[1:], -steps), (deviation[:-1], steps)):
+        for part, way in ((lie[1:], -steps), (lie[:-1], steps)):
             a, b = rest(part), rest(way)
             theta = np.clip(a @ b / (b @ b), 0.0, 0.5)
             least.append(float(np.mean((a - theta * b) ** 2)))
@@ -233,10 +233,10 @@ class TestQuartersOfAnHour:
         ],
     )
     def test_lies_over_days_are_called_what_they_are(
-        self, quarters: tuple[Site, DesignedEstimator, Days], deviation: str, kind: ManipulationKind
+        self, quarters: tuple[Site, DesignedEstimator, Days], lie: str, kind: ManipulationKind
     ) -> None:
         site, watcher, days = quarters
-        told, which, on = lied(site, days, deviation, 4)
+        told, which, on = lied(site, days, lie, 4)
         seen: Seen = watch(site, watcher, told, which, on)
         assert seen.last == {int(j): str(kind) for j in which}
         assert not seen.honest

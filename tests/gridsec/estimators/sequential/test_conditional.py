@@ -90,7 +90,7 @@ def test_any_sequence_of_moves_is_a_fit_of_where_it_ends(seed: int, moves: int) 
             loo = updated(now, m, loo, (remove_meter if now.trusted[j] else add_meter)(now, j))
     agrees(now, S, m)
     anew = leave_one_out(now, m)
-    for name in ("weights", "offset", "std", "w", "misfit"):
+    for name in ("weights", "residual", "std", "mean", "chi_square"):
         np.testing.assert_allclose(getattr(loo, name), getattr(anew, name), rtol=1e-7, atol=1e-7)
 
 

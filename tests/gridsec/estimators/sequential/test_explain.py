@@ -92,11 +92,11 @@ def draw(design: SequentialDesign, seed: int, size: float) -> tuple[Floats, Bool
     rng = np.random.default_rng([5, seed])
     count = NEAR + FAR
     w = rng.multivariate_normal(np.zeros(count), design.prior.between + 1e-18 * np.eye(count))
-    deviations = np.zeros(count)
-    deviations[rng.choice(NEAR, 6, replace=False)] = size * rng.choice([-1.0, 1.0], 6)
-    deviations[NEAR + rng.choice(FAR, 7, replace=False)] = -size
-    m = w + np.sqrt(design.white) * rng.normal(size=count) + deviations
-    return np.asarray(m), deviations != 0.0
+    lies = np.zeros(count)
+    lies[rng.choice(NEAR, 6, replace=False)] = size * rng.choice([-1.0, 1.0], 6)
+    lies[NEAR + rng.choice(FAR, 7, replace=False)] = -size
+    m = w + np.sqrt(design.white) * rng.normal(size=count) + lies
+    return np.asarray(m), lies != 0.0
 
 
 @pytest.mark.canary("0.022")
@@ -267,7 +267,7 @@ def test_what_is_judged_is_what_each_search_begins_with(
         start: Posterior, m: Floats, *rest: Any, loo: LeaveOneOut | None = None, **more: Any
     ) -> Candidate:
         # Those that believe somebody begin with what another one came to.
-        told.append(loo is not None and not more["innocent"].size)
+        told.append(loo is not None and not more["protected"].size)
         if loo is not None:
             np.testing.assert_allclose(loo.residual, leave_one_out(start, m).residual)
         return plain(start, m, *rest, loo=loo, **more)

@@ -121,7 +121,7 @@ def test_the_models_error_is_that_of_the_loads_there_are(factor: float, before: 
 class TestLiarsWhoComeAndGo:
     """Nobody else is ever named, and who lies is not better off for being silent or honest in between."""
 
-    def watched(self, deviations: Callable[[int], bool], heard: Callable[[int], bool], frames: int) -> Bools:
+    def watched(self, lies: Callable[[int], bool], heard: Callable[[int], bool], frames: int) -> Bools:
         """Whether meter 4 is named at each frame."""
         rng = np.random.default_rng(1)
         plant = make_plant(rng, customers=12, drop=0.03)
@@ -129,8 +129,8 @@ class TestLiarsWhoComeAndGo:
         state, _ = watch(street, design, 40)
         named = []
         for k in range(frames):
-            deviation, silent = {4: 0.05} if deviations(k) else {}, () if heard(k) else (4,)
-            state, ((_, verdict),) = watch(street, design, 1, state=state, lies=deviation, silent=silent)
+            lie, silent = {4: 0.05} if lies(k) else {}, () if heard(k) else (4,)
+            state, ((_, verdict),) = watch(street, design, 1, state=state, lies=lie, silent=silent)
             assert not np.delete(verdict.suspects, 4).any()
             named.append(bool(verdict.suspects[4]))
         return np.array(named)
@@ -157,15 +157,13 @@ class TestLiarsWhoComeAndGo:
 class TestWhatIsLearnedUnderDifficulties:
     LEARN_S = 400
 
-    def learned(
-        self, change: Change, deviations: dict[int, float], seed: int
-    ) -> tuple[SequentialState, Street]:
+    def learned(self, change: Change, lies: dict[int, float], seed: int) -> tuple[SequentialState, Street]:
         rng = np.random.default_rng(seed)
         plant = make_plant(rng, customers=12, drop=0.03)
         design, street = prepare(plant, commission_s=self.LEARN_S), Street(plant, rng)
-        state, _ = watch(street, design, self.LEARN_S, lies=deviations, change=change)
-        state, answers = watch(street, design, self.LEARN_S + 90, state=state, lies=deviations)
-        honest = np.setdiff1d(np.arange(12), list(deviations))
+        state, _ = watch(street, design, self.LEARN_S, lies=lies, change=change)
+        state, answers = watch(street, design, self.LEARN_S + 90, state=state, lies=lies)
+        honest = np.setdiff1d(np.arange(12), list(lies))
         assert not any(verdict.suspects[honest].any() for _, verdict in answers)
         return state, street
 

@@ -292,8 +292,8 @@ class TestShapes:
             if column[which].min() < 0.5 * column.max():
                 tried += 1
                 variance = np.full(4, 1e-6)
-                deviations = -0.1 * column[which] / column[which].max() + 1e-3 * rng.standard_normal(4)
-                found += kinds.is_load_trace(made.references.traces, which, deviations, variance)
+                lies = -0.1 * column[which] / column[which].max() + 1e-3 * rng.standard_normal(4)
+                found += kinds.is_load_trace(made.references.traces, which, lies, variance)
                 assert not kinds.is_load_trace(made.references.traces, which, np.full(4, -0.1), variance)
             some = np.sort(rng.choice(len(traces), 3, replace=False))
             chance += kinds.is_load_trace(
@@ -433,7 +433,7 @@ class TestTurns:
 
     def turns(self, every: int, since: Ints, ticks: range) -> list[tuple[Ints, Bools]]:
         """At each of some ticks: numbers, and whose turn it is."""
-        shapes = cast("KindReferences", SimpleNamespace(every=every))
+        shapes = cast("KindReferences", SimpleNamespace(interval=every))
         return [kinds._past_looks(shapes, tick, since) for tick in ticks]
 
     def test_each_has_a_turn_in_each_round_and_few_have_the_same(self, every: int) -> None:

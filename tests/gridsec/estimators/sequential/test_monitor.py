@@ -35,7 +35,7 @@ def watch(
     *,
     h: float = 1.0,
     state: SequentialState | None = None,
-    deviations: dict[int, float] | None = None,
+    lies: dict[int, float] | None = None,
     silent: tuple[int, ...] = (),
     change: object = None,
 ) -> tuple[SequentialState, Answers]:
@@ -44,7 +44,7 @@ def watch(
     answers = []
     for _ in range(frames):
         street.advance(h)
-        frame = street.frame(deviations, silent)
+        frame = street.frame(lies, silent)
         if callable(change):
             frame = change(frame)
         state, estimate, verdict = sequential.step(design, state, frame)
@@ -135,8 +135,8 @@ class TestLiars:
         design, street = prepare(plant), Street(plant, rng)
         suspects = np.sort(rng.choice(15, 5, replace=False))
         state, _ = watch(street, design, 40)
-        deviations = {int(j): float(rng.choice([-1.0, 1.0])) * 0.03 for j in suspects}
-        state, answers = watch(street, design, 60, state=state, lies=deviations)
+        lies = {int(j): float(rng.choice([-1.0, 1.0])) * 0.03 for j in suspects}
+        state, answers = watch(street, design, 60, state=state, lies=lies)
         honest = np.setdiff1d(np.arange(15), suspects)
         assert not any(verdict.suspects[honest].any() for _, verdict in answers)
         for _, verdict in answers[5:]:
@@ -144,7 +144,7 @@ class TestLiars:
             assert verdict.decision is Decision.ATTACKED
         estimate, verdict = answers[-1]
         assert np.abs(estimate.v2 - street.truth()).max() < 0.006
-        reported = street.truth()[suspects] * (1.0 + np.array([deviations[int(j)] for j in suspects])) ** 2
+        reported = street.truth()[suspects] * (1.0 + np.array([lies[int(j)] for j in suspects])) ** 2
         np.testing.assert_allclose(verdict.attack[suspects], reported - street.truth()[suspects], atol=0.018)
         _, after = watch(street, design, 90, state=state)
         assert not after[-1][1].suspects.any()

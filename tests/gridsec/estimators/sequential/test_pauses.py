@@ -68,10 +68,10 @@ def test_who_fell_silent_does_not_stand_for_others() -> None:
     plant = make_plant(np.random.default_rng(7), customers=13, drop=0.03)
     made, street = prepare(plant), Street(plant, np.random.default_rng(8), load_kw=0.3)
     street.bias[:] = 0.0
-    deviations = {1: 0.06, 4: -0.06, 8: 0.06}
-    state, answers = watch(street, made, 20, lies=deviations)
+    lies = {1: 0.06, 4: -0.06, 8: 0.06}
+    state, answers = watch(street, made, 20, lies=lies)
     assert np.flatnonzero(answers[-1][1].suspects).tolist() == [1, 4, 8]
-    state, answers = watch(street, made, 20, state=state, lies=deviations | {11: 0.15}, silent=(1, 4, 8))
+    state, answers = watch(street, made, 20, state=state, lies=lies | {11: 0.15}, silent=(1, 4, 8))
     last = answers[-1][1]
     assert np.flatnonzero(last.suspects).tolist() == [1, 4, 8, 11]
     assert last.decision is Decision.ATTACKED

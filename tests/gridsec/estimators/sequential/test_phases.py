@@ -94,7 +94,7 @@ def prepare(plant: Plant, phases: int, commission_s: float = 0.0) -> SequentialD
 
 
 def side_by_side(
-    deviations: tuple[dict[int, float], ...],
+    lies: tuple[dict[int, float], ...],
     silent: tuple[tuple[int, ...], ...] = ((), (), ()),
     count: int = 30,
     *,
@@ -113,7 +113,7 @@ def side_by_side(
     answers: list[tuple[Estimate, Verdict]] = []
     state = sequential.init(whole, 1000.0)
     for tick in range(count):
-        told = deviations if tick >= 10 else ({}, {}, {})
+        told = lies if tick >= 10 else ({}, {}, {})
         for street in streets:
             street.advance(1.0)
         heard = [street.frame(told[k], silent[k] if tick >= 10 else ()) for k, street in enumerate(streets)]
@@ -135,7 +135,7 @@ class TestPhasesThatDoNotTouch:
         np.testing.assert_allclose(
             whole.prior.variance.reshape(-1, 3).T, [alone.prior.variance] * 3, rtol=1e-12
         )
-        for name in ("most_p", "most_q", "reach", "white", "fixed"):
+        for name in ("max_p", "max_q", "inverter_reach", "white", "fixed"):
             np.testing.assert_allclose(getattr(whole, name), np.tile(getattr(alone, name), 3), rtol=1e-12)
         # Each phase has the rate of the balanced monitor, but for one misfit test in place of three.
         tests = CUSTOMERS + 2.0
@@ -155,10 +155,10 @@ class TestPhasesThatDoNotTouch:
         ],
     )
     def test_each_phase_gets_the_answers_of_a_balanced_monitor(
-        self, deviations: tuple[dict[int, float], ...], *, meshed: bool
+        self, lies: tuple[dict[int, float], ...], *, meshed: bool
     ) -> None:
-        alone, (estimate, verdict), _ = side_by_side(deviations, meshed=meshed)
-        assert verdict.suspects.sum() == sum(map(len, deviations))
+        alone, (estimate, verdict), _ = side_by_side(lies, meshed=meshed)
+        assert verdict.suspects.sum() == sum(map(len, lies))
         for name in ("v2", "std", "trusted"):
             expected = np.concatenate([getattr(each, name) for each, _ in alone])
             np.testing.assert_allclose(getattr(estimate, name), expected, rtol=0, atol=2e-9)
@@ -208,14 +208,14 @@ class TestTheEuropeanFeeder:
     """55 single-phase customers, 19 inverters; the truth is asymmetric AC power flow."""
 
     @staticmethod
-    def trial(deviation: AttackSpec | None, seconds: float = 40.0, kw: float = 0.6) -> Trial:
+    def trial(lie: AttackSpec | None, seconds: float = 40.0, kw: float = 0.6) -> Trial:
         return Trial(
             load("ieee-european-lv"),
             seed=4,
             duration_s=seconds,
             meters=TrialMeterErrors.WHITE,
             load_error=LoadError(kw, kw / 3.0),
-            lie=deviation,
+            lie=lie,
             profile_s=300_000.0,
         )
 

@@ -72,8 +72,8 @@ def test_whether_a_power_is_false_is_bayes_rule(seed: int) -> None:
         + now.unknowns[now.prior.meters] @ now.unknowns[now.prior.meters].T
         + np.diag(now.noise)
     )
-    for deviation in (0.0, 3.0):
-        readings = m + deviation * a[:, 0]
+    for lie in (0.0, 3.0):
+        readings = m + lie * a[:, 0]
         found = doubt_powers(sensitivities, now, which, size, leave_one_out(now, readings))
         logs = [_density(S[np.ix_(at, at)] + more, readings[at]) for more in (0.0, a[at] @ a[at].T)]
         false = 1.0 / (1.0 + np.exp(logs[0] - logs[1]))
@@ -110,14 +110,14 @@ def test_a_third_lies_about_voltages_and_powers_alike() -> None:
     """Nobody honest is named for powers that liars tell, and errors are as large as is said."""
     site = load("kerber-dorfnetz")
     count, ratios = site.meters.size // 3, []
-    deviation = AttackSpec(AttackKind.BIAS, count, 3.0, onset_s=10.0)
+    lie = AttackSpec(AttackKind.BIAS, count, 3.0, onset_s=10.0)
     trial = Trial(
         site,
         seed=5,
         duration_s=35.0,
         load_error=LoadError(0.3, 0.1),
         meters=TrialMeterErrors.REAL,
-        lie=deviation,
+        lie=lie,
     )
     watcher = design(trial.stated)
     state, rng = watcher.init(START), np.random.default_rng(5)

@@ -30,21 +30,21 @@ def street(rng: np.random.Generator, customers: int) -> Prior:
     return prior(tree, np.arange(1, customers + 1), doubt, busbar=4e-4)
 
 
-def readings(rng: np.random.Generator, p: Prior, noise: Floats, deviation: float) -> tuple[Floats, Bools]:
+def readings(rng: np.random.Generator, p: Prior, noise: Floats, lie: float) -> tuple[Floats, Bools]:
     """A third of the meters lie."""
     w = rng.multivariate_normal(np.zeros(noise.size), p.between)
     m = w + np.sqrt(noise) * rng.normal(size=noise.size)
     suspects = np.zeros(noise.size, dtype=np.bool_)
     suspects[rng.choice(noise.size, noise.size // 3, replace=False)] = True
-    return np.asarray(m + deviation * rng.choice([-1.0, 1.0], noise.size) * suspects), suspects
+    return np.asarray(m + lie * rng.choice([-1.0, 1.0], noise.size) * suspects), suspects
 
 
 @given(seed=SEEDS, count=st.integers(3, 24), silent=st.integers(0, 8), lie=st.floats(1e-4, 0.2))
 @settings(max_examples=150, deadline=None)
-def test_from_a_fit_of_all_the_same_are_trusted(seed: int, count: int, silent: int, deviation: float) -> None:
+def test_from_a_fit_of_all_the_same_are_trusted(seed: int, count: int, silent: int, lie: float) -> None:
     rng = np.random.default_rng(seed)
     p, noise = street(rng, count), rng.uniform(0.5, 2.0, count) * 0.002**2
-    m, _ = readings(rng, p, noise, deviation)
+    m, _ = readings(rng, p, noise, lie)
     before, available = np.ones(count, dtype=np.bool_), np.ones(count, dtype=np.bool_)
     before[rng.choice(count, min(silent // 2, count - 2), replace=False)] = False
     available &= before

@@ -70,7 +70,7 @@ def test_offsets_add_no_look_and_few_factorisations(monkeypatch: pytest.MonkeyPa
         seen.append(identify(*given))
         return seen[-1]
 
-    monkeypatch.setattr(sys.modules["gridsec.estimators.sequential.step"], "examine", watched)
+    monkeypatch.setattr(sys.modules["gridsec.estimators.sequential.step"], "identify", watched)
     offset = np.linspace(-3.0, 3.0, P)
     state, wander, fresh = init(made, street.t - 1.0), 0.0, 0
     for k in range(300):

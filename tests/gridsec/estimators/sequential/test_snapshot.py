@@ -227,9 +227,9 @@ def clean_and_named(rate: float, noise: Floats, trials: int) -> int:
     rng = np.random.default_rng(5)
     prior, _, false = street(rng)
     root = np.linalg.cholesky(prior.between + np.diag(noise))
-    deviations = ErrorPrior(rate=rate)
+    lies = ErrorPrior(rate=rate)
     told = rng.normal(size=(trials, P)) @ root.T
-    found = [identify(prior, noise, m, LIVE, error_prior=deviations, false=false)[0] for m in told]
+    found = [identify(prior, noise, m, LIVE, error_prior=lies, false=false)[0] for m in told]
     return sum(bool(each.meters.any()) for each in found)
 
 

@@ -34,13 +34,13 @@ def test_no_single_meter_is_over_its_limit_under_the_lie() -> None:
     made, state, _ = calm(setting)
     given = _stealthy.linear_tests(made, state)
     where = site(setting.feeder)
-    deviation = chosen(where, given, "contiguous", 0.6, 2)
+    lie = chosen(where, given, "contiguous", 0.6, 2)
     first = int(np.argmax(given.fits[-1].prior.variance[given.buses]))
-    assert np.array_equal(deviation.meters, np.sort(neighbours(where, first)[: where.meters.size // 3]))
-    assert np.count_nonzero(deviation.lie) <= deviation.meters.size
+    assert np.array_equal(lie.meters, np.sort(neighbours(where, first)[: where.meters.size // 3]))
+    assert np.count_nonzero(lie.lie) <= lie.meters.size
     scales = Scales(made, state.uncertainty, state.window, state.learned, state.model_error)
     for s, now in enumerate(given.fits):
-        view = scale_test(made, scales[s], leave_one_out(now, deviation.lie))
+        view = scale_test(made, scales[s], leave_one_out(now, lie.lie))
         assert (np.abs(view.loo.residual) <= (0.6 + 1e-6) * view.limit).all()
-    error = abs(leave_one_out(given.fits[-1], deviation.lie).mean).max()
-    assert error >= deviation.error * (1.0 - 1e-9) > 0.02
+    error = abs(leave_one_out(given.fits[-1], lie.lie).mean).max()
+    assert error >= lie.error * (1.0 - 1e-9) > 0.02
