@@ -7,7 +7,7 @@ docs/theory-sequential.md, sections 5 and 7.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -139,7 +139,7 @@ def _estimate(
     variance[first] = np.maximum(variance[first], np.where(measured.busbar_metered, design.busbar**2, 0.0))
     inputs = BoundInputs(
         plant=plant,
-        powers=replace(predicted.powers, trusted=state.trust.trusted),
+        powers=changed(predicted.powers, trusted=state.trust.trusted),
         injected=state.injection_error.error,
         model=predicted.v2_bus[plant.feeder.bus],
         busbar=measured.busbar_metered,

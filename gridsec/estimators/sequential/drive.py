@@ -59,7 +59,8 @@ def _powers(
     design: SequentialDesign, state: SequentialState, measured: Measurements, x: Floats, sizes: Floats
 ) -> PowerErrors:
     """Powers of a frame with net reactive injections, observed for inverters without metered power."""
-    q = measured.q + np.where(measured.uses_q, 0.0, design.plant.droop.per_customer(x, measured.q.size))
+    observed = design.plant.droop.per_customer(x, measured.q.size)
+    q = measured.q + (np.where(measured.uses_q, 0.0, observed) if any_of(measured.uses_q) else observed)
     return PowerErrors(measured.frame, q, measured.uses_q, measured.v0_squared, state.trust.trusted, sizes)
 
 

@@ -8,7 +8,6 @@ import numpy as np
 
 from gridsec.arrays import Floats, Ints, all_of, any_of, changed
 from gridsec.estimators.inputs import nothing_new
-from gridsec.estimators.sequential.bounds import InjectionError
 from gridsec.estimators.sequential.busbar import HonestErrors
 from gridsec.estimators.sequential.commission import Learning, gather, learn, ready_meters
 from gridsec.estimators.sequential.conclude import output
@@ -24,7 +23,7 @@ from gridsec.estimators.sequential.learning import LearningTick, usable
 from gridsec.estimators.sequential.moment import without_shifted_busbar
 from gridsec.estimators.sequential.naming import confirm, supported
 from gridsec.estimators.sequential.scales import Scales, min_readings
-from gridsec.estimators.sequential.skew import update_skew
+from gridsec.estimators.sequential.skew import ClockSkew, update_skew
 from gridsec.estimators.sequential.state import SequentialState
 from gridsec.estimators.sequential.trust import TrustState
 from gridsec.estimators.sequential.windows import Window, empty, forget, push, shift
@@ -60,7 +59,8 @@ def step(
         # The busbar counts as not metered from this tick on.
         state = changed(state, busbar=state.busbar.suspect(*identified.busbar))
     identified, window = _confirmation(design, state, now, predicted, identified, measured)
-    after = _state(design, state, changed(now, window=window), measured, predicted, identified)
+    now = now if window is now.window else changed(now, window=window)
+    after = _state(design, state, now, measured, predicted, identified)
     after, estimate, verdict = output(design, after, measured, predicted, identified)
     # Errors learned at this tick count from the next frame on.
     return after if after.learning is state.learning else _learned(design, after), estimate, verdict
@@ -96,21 +96,24 @@ def _detection(
     uncertainty: FrameUncertainty,
 ) -> SequentialState:
     """State with the residuals of this tick, and without posteriors that no longer hold."""
-    v2, history = predicted.v2_bus[design.prior.meters], state.attack_kinds
-    now = changed(
-        state,
-        uncertainty=uncertainty,
-        posteriors=_of_priors(state, uncertainty),
-        attack_kinds=ingest(design.references, history, measured.y, measured.available),
-    )
-    now = changed(now, trust=state.trust.repeating(_repeat_lags(design, now)))
+    v2, window, skew = predicted.v2_bus[design.prior.meters], state.window, state.clock_skew
+    posteriors = _of_priors(state, uncertainty)
     if _paused(design, state, measured.frame):
         # Loads before a pause as long as the longest scale say nothing about those after it.
-        window = empty(design.lengths, v2.size)
-        now = changed(now, window=window, posteriors=(None,) * len(now.posteriors), clock_skew=None)
-    now = _with_clock_skew(design, now, measured.frame, v2)
+        window, posteriors, skew = empty(design.lengths, v2.size), (None,) * len(posteriors), None
+    if skew is not None or measured.frame.clock_offset is not None:
+        skew, posteriors = _clock_skew(design, state, skew, measured.frame, v2, posteriors)
+    kinds = ingest(design.references, state.attack_kinds, measured.y, measured.available)
     residual = measured.y - v2 - state.learned.bias
-    now = changed(now, window=push(now.window, design.lengths, residual, measured.available))
+    now = changed(
+        state,
+        trust=state.trust.repeating(_repeat_lags(design, kinds)),
+        window=push(window, design.lengths, residual, measured.available),
+        posteriors=posteriors,
+        uncertainty=uncertainty,
+        clock_skew=skew,
+        attack_kinds=kinds,
+    )
     # Largest change of a squared voltage by the powers.
     v0 = design.plant.feeder.broadcast_busbar(measured.v0_squared)
     swing = float(np.abs(predicted.v2_bus - v0).max())
@@ -127,18 +130,20 @@ def _of_priors(state: SequentialState, uncertainty: FrameUncertainty) -> tuple[P
     return tuple(now if now is not None and now.prior is prior else None for now, prior in pairs)
 
 
-def _repeat_lags(design: SequentialDesign, now: SequentialState) -> Ints:
+def _repeat_lags(design: SequentialDesign, kinds: AttackKinds) -> Ints:
     """Ticks after which meters repeat their readings beyond chance, (p,); 0 for all with a decoder."""
-    return repeat_lags(now.attack_kinds) * (design.decoder is None)
+    return repeat_lags(kinds) * (design.decoder is None)
 
 
-def _with_clock_skew(
-    design: SequentialDesign, state: SequentialState, frame: Frame, v2: Floats
-) -> SequentialState:
-    """State with the voltage changes within clock offsets, and without posteriors of other variances."""
-    before = state.clock_skew
-    if before is None and frame.clock_offset is None:
-        return state
+def _clock_skew(  # noqa: PLR0917
+    design: SequentialDesign,
+    state: SequentialState,
+    before: ClockSkew | None,
+    frame: Frame,
+    v2: Floats,
+    posteriors: tuple[Posterior | None, ...],
+) -> tuple[ClockSkew | None, tuple[Posterior | None, ...]]:
+    """Voltage changes within clock offsets, and the posteriors of unchanged variances."""
     need = np.array([min_readings(design, s) for s in range(len(design.lengths))])
     noise = design.white / need[:, None] + state.learned.variance
     skew = update_skew(design, before, state.ticks, frame.clock_offset, v2, noise)
@@ -146,8 +151,7 @@ def _with_clock_skew(
     old, new = (none if each is None else each.variance for each in (before, skew))
     # Variances change only at ticks at which their scale is due: no further look follows from that.
     same = (old == new).all(axis=1).tolist()
-    posteriors = tuple(now if one else None for now, one in zip(state.posteriors, same, strict=True))
-    return changed(state, clock_skew=skew, posteriors=posteriors)
+    return skew, tuple(now if one else None for now, one in zip(posteriors, same, strict=True))
 
 
 def _confirmation(  # noqa: PLR0917
@@ -168,7 +172,7 @@ def _confirmation(  # noqa: PLR0917
     trust, rivals = confirm(design, now.trust, tested, measured.available, now.inverter_checks)
     model = now.model_error + predicted.transient
     scales = Scales(design, now.uncertainty, now.window, now.learned, model, now.clock_skew)
-    trust = supported(scales, now.trust, identified, trust).repeating(_repeat_lags(design, now))
+    trust = supported(scales, now.trust, identified, trust).repeating(_repeat_lags(design, now.attack_kinds))
     rivals = rivals or _last_rivals(design, state, trust)
     return replace(identified, trust=trust, rivals=rivals), forget(now.window, over)
 
@@ -195,9 +199,14 @@ def _state(  # noqa: PLR0917
 ) -> SequentialState:
     """State after this tick, from those before it and of its detection."""
     frame, trust = measured.frame, identified.trust
-    model_driven = predicted.model_driven
-    if state.x is not None and any_of(state.trust.trusted & ~trust.trusted):
-        model_driven = prepare(design, trust.trusted & measured.available, frame.t - state.t, model_driven)
+    model_driven, error = predicted.model_driven, predicted.injection_error
+    new = state.trust.trusted & ~trust.trusted
+    if any_of(new):
+        # A manipulated meter drove these inverters.
+        error = error.reset((design.meter_of >= 0) & new[design.meter_of])
+        if state.x is not None:
+            available = trust.trusted & measured.available
+            model_driven = prepare(design, available, frame.t - state.t, model_driven)
     return changed(
         now,
         t=frame.t,
@@ -206,7 +215,7 @@ def _state(  # noqa: PLR0917
         ticks=state.ticks + 1,
         x=predicted.x,
         model_driven=model_driven,
-        injection_error=_injection_error(design, state.trust, trust, predicted.injection_error),
+        injection_error=error,
         v0_squared=measured.v0_squared,
         trust=trust,
         posteriors=identified.posteriors,
@@ -216,14 +225,6 @@ def _state(  # noqa: PLR0917
         attack_kinds=_classified(design, now, predicted, measured, identified),
         learning=_gathered(design, now, measured, trust),
     )
-
-
-def _injection_error(
-    design: SequentialDesign, before: TrustState, trust: TrustState, error: InjectionError
-) -> InjectionError:
-    """Errors of the injections, at their span where a meter was trusted until this tick."""
-    new = before.trusted & ~trust.trusted
-    return error.reset((design.meter_of >= 0) & new[design.meter_of]) if any_of(new) else error
 
 
 def _checked_inverters(
@@ -257,7 +258,7 @@ def _classified(
     assert test is not None  # noqa: S101  # the shortest scale looks at every tick
     # Part of each meter's own reported powers in its modelled voltage.
     own = np.asarray(references.active * measured.frame.p[meters] + references.reactive * measured.q[meters])
-    mean = window.sums[0] / np.maximum(window.counts[0], 1)
+    mean = test.loo.m if identified.trust.clear else window.sums[0] / np.maximum(window.counts[0], 1)
     expected = predicted.v2_bus[design.prior.meters] + now.learned.bias + mean - test.loo.residual
     return classify(references, now.attack_kinds, expected, own, identified.trust.named, test.loo.std**2)
 
