@@ -293,7 +293,7 @@ FAMILIES: Final = Families(
             sequential.step,
             lambda d: int(d.observers),
             _certificate,
-            lambda d: int(d.most),
+            lambda d: int(d.max_attacked),
             BiasLearning(
                 needed_s=lambda d: float(d.options.commission_s),
                 init=lambda d, t, known: sequential.init(d, t, known.learned, known.learning),
