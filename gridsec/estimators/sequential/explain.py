@@ -45,7 +45,7 @@ _REVERSALS = 6
 _EFFORT = 4e9
 """Limits group searches so that count x p^3 <= _EFFORT (about 2 s)."""
 _BESIDE = 3
-"""Sets of suspects beside which false powers, and neighbourhoods that, are searched."""
+"""Number of sets of suspects searched for false powers, and of neighbourhoods searched."""
 _NEAR = 8.0
 """Largest distance from the best cost for a closer comparison, in log(like)."""
 _PART = 2
@@ -191,8 +191,8 @@ class HypothesisSearch:
         honest = wider._descend(wider._condition(wide.enough), np.zeros_like(wide.enough), fresh=True)
         best = min(best, honest, key=lambda one: one.cost)
         charge = search.set_cost(int(np.count_nonzero(self.here.enough)), 1)
-        accused_faults = (*best.faults, self.faults.std.size + phase)
-        return Hypothesis(best.trusted, accused_faults, best.charge + charge, best.cost + charge)
+        accused = (*best.faults, self.faults.std.size + phase)
+        return Hypothesis(best.trusted, accused, best.charge + charge, best.cost + charge)
 
     def with_false_powers(self, now: Posterior) -> Hypothesis:
         """Likeliest hypothesis with false powers at the reduced charges of an alternative."""
@@ -210,8 +210,8 @@ class HypothesisSearch:
             honest = self.scales[self.s].limits.limit(other.loo.std)[j]
             if self._admissible(other) and abs(other.loo.residual[j]) <= honest:
                 charge = best.charge + other.charge
-                cost, accused_faults = best.charge + other.cost, best.faults + other.faults
-                out.append(Hypothesis(other.trusted, accused_faults, charge, cost))
+                cost, accused = best.charge + other.cost, best.faults + other.faults
+                out.append(Hypothesis(other.trusted, accused, charge, cost))
         return out
 
     def _reversals(self, best: Candidate) -> list[Candidate]:
@@ -372,8 +372,8 @@ class HypothesisSearch:
         directions = np.zeros((here.prior.variance.size, len(groups)))
         for k, group in enumerate(groups):
             directions[here.prior.meters[group.meters], k] = _OFFSET_STD
-        accused_faults = self.scales.unknowns(self.accused)
-        unknowns = directions if accused_faults is None else np.hstack([accused_faults, directions])
+        accused = self.scales.unknowns(self.accused)
+        unknowns = directions if accused is None else np.hstack([accused, directions])
         end = self._descend(
             condition(here.prior, here.noise, base, unknowns), here.enough & ~base, fresh=True
         )
@@ -382,13 +382,13 @@ class HypothesisSearch:
         kept, charge = np.asarray(alike.any(axis=1)), sum(group.charge for group in groups)
         other = Hypothesis(end.trusted & ~kept, (), charge, 0.0)
         theirs = self._chi_squares(other, kept, alike)
-        worse = max(his - own for his, own in zip(theirs, self._chi_squares(best), strict=True))
+        worse = max(more - less for more, less in zip(theirs, self._chi_squares(best), strict=True))
         price = charge + search.set_cost(self.barred.size, dropped, self.design.max_attacked)
         return end, replace(other, cost=best.cost + price - self._accusation_cost(best) + worse)
 
-    def _admissible(self, candidates: Hypothesis) -> bool:
+    def _admissible(self, hypothesis: Hypothesis) -> bool:
         """True where at least `max_attacked` meters stay trusted."""
-        return bool(np.count_nonzero(self.here.enough & candidates.trusted) >= self.design.max_attacked)
+        return bool(np.count_nonzero(self.here.enough & hypothesis.trusted) >= self.design.max_attacked)
 
     def _relaxed(self, group: Ints, other: Candidate) -> Hypothesis:
         """Candidate that trusts the group, with the lower limits of alternatives."""
@@ -397,15 +397,15 @@ class HypothesisSearch:
         closer = self._descend(other.posterior, no_meters, protected=group, limits=fair, loo=loo)
         return (self._charged(other, closer) if self._admissible(closer) else other).hypothesis()
 
-    def _charged(self, before: Candidate, candidates: Candidate) -> Candidate:
+    def _charged(self, before: Candidate, hypothesis: Candidate) -> Candidate:
         """Candidate of a descent without dictionary, charged for the directions of the one before."""
-        accused_faults, available = before.faults, self.here.enough
-        if not accused_faults:
-            return candidates
-        suspects = int(np.count_nonzero(available & ~candidates.trusted))
-        charges = self.faults.charges(np.array(accused_faults, dtype=np.intp), candidates.trusted, suspects)
+        accused, available = before.faults, self.here.enough
+        if not accused:
+            return hypothesis
+        suspects = int(np.count_nonzero(available & ~hypothesis.trusted))
+        charges = self.faults.charges(np.array(accused, dtype=np.intp), hypothesis.trusted, suspects)
         charge = float(charges.sum()) * search.set_cost(int(np.count_nonzero(available)), 1)
-        return replace(candidates, faults=accused_faults, charge=charge, cost=candidates.cost + charge)
+        return replace(hypothesis, faults=accused, charge=charge, cost=hypothesis.cost + charge)
 
     def _lowered_limits(self) -> Limits:
         """Limits of alternatives: every accusation that lowers the cost is tried; none names a meter."""
@@ -490,10 +490,10 @@ class HypothesisSearch:
         self, best: Candidate, other: Hypothesis, ours: list[float], theirs: list[float]
     ) -> float:
         """Cost of another hypothesis beside the best, on the scale of the largest chi-square difference."""
-        worse = max(his - own for his, own in zip(theirs, ours, strict=True))
+        worse = max(more - less for more, less in zip(theirs, ours, strict=True))
         return best.cost + self._accusation_cost(other) - self._accusation_cost(best) + worse
 
-    def _offset_chi_squares(self, candidates: Hypothesis, group: Bools) -> tuple[list[float], int]:
+    def _offset_chi_squares(self, hypothesis: Hypothesis, group: Bools) -> tuple[list[float], int]:
         """Chi-square of a hypothesis, by scale, with one common offset per street of an accused group.
 
         And the number of its meters less that of the offsets.
@@ -503,7 +503,7 @@ class HypothesisSearch:
         alike = np.zeros((group.size, len(parts)))
         for k, part in enumerate(parts):
             alike[at[part], k] = _OFFSET_STD
-        return self._chi_squares(candidates, group, alike), at.size - len(parts)
+        return self._chi_squares(hypothesis, group, alike), at.size - len(parts)
 
     def _linked(self, at: Ints) -> Bools:
         """Pairs of meters moved by the same loads, (k, k)."""
@@ -552,9 +552,9 @@ class HypothesisSearch:
         assert candidates is not None  # noqa: S101  # there is a start
         return candidates
 
-    def _holds_back(self, candidates: Candidate) -> bool:
+    def _holds_back(self, hypothesis: Candidate) -> bool:
         """True if a meter that must stay suspect would be added."""
-        loo, which = candidates.loo, self.barred & self.here.enough & ~candidates.trusted
+        loo, which = hypothesis.loo, self.barred & self.here.enough & ~hypothesis.trusted
         return any_of(which & (np.abs(loo.residual) < self.here.limits.limit(loo.std)))
 
     def _starts(self) -> tuple[Bools, Bools]:
@@ -617,33 +617,33 @@ class HypothesisSearch:
             self.covering[s] = whole if good else None
         return self.covering[s]
 
-    def _total_cost(self, candidates: Hypothesis) -> float:
+    def _total_cost(self, hypothesis: Hypothesis) -> float:
         """Chi-square on all scales plus the cost of the accusations."""
-        return self._accusation_cost(candidates) + sum(self._chi_squares(candidates))
+        return self._accusation_cost(hypothesis) + sum(self._chi_squares(hypothesis))
 
-    def _accusation_cost(self, candidates: Hypothesis) -> float:
-        suspects = int(np.count_nonzero(~self._trusted(candidates)))
-        return candidates.charge + search.set_cost(self.barred.size, suspects, self.design.max_attacked)
+    def _accusation_cost(self, hypothesis: Hypothesis) -> float:
+        suspects = int(np.count_nonzero(~self._trusted(hypothesis)))
+        return hypothesis.charge + search.set_cost(self.barred.size, suspects, self.design.max_attacked)
 
-    def _trusted(self, candidates: Hypothesis) -> Bools:
-        return np.where(self.here.enough, candidates.trusted, self.trust.trusted)
+    def _trusted(self, hypothesis: Hypothesis) -> Bools:
+        return np.where(self.here.enough, hypothesis.trusted, self.trust.trusted)
 
     def _chi_squares(
-        self, candidates: Hypothesis, more: Bools | None = None, alike: Floats | None = None
+        self, hypothesis: Hypothesis, more: Bools | None = None, alike: Floats | None = None
     ) -> list[float]:
         """Chi-square on each scale, with `more` meters that may have common offsets."""
-        trusted, out = self._trusted(candidates), []
-        which = trusted.tobytes(), candidates.faults
+        trusted, out = self._trusted(hypothesis), []
+        which = trusted.tobytes(), hypothesis.faults
         if more is None and which in self.chi_squares:
             return self.chi_squares[which]
         trusted = trusted if more is None else trusted | more
-        unknowns = self.scales.unknowns((*self.accused, *((k, self.s) for k in candidates.faults)))
+        unknowns = self.scales.unknowns((*self.accused, *((k, self.s) for k in hypothesis.faults)))
         for s in range(len(self.design.lengths)):
             there = self.scales[s]
             wanted = trusted & there.enough
             near = self._close_posterior(s, wanted) if unknowns is None and more is None else None
-            if s == self.s and more is None and isinstance(candidates, Candidate):
-                out.append(candidates.loo.chi_square)
+            if s == self.s and more is None and isinstance(hypothesis, Candidate):
+                out.append(hypothesis.loo.chi_square)
             elif near is not None:
                 out.append(chi_square_without(near[0], there.m, near[1]))
             else:

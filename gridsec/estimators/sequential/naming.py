@@ -188,12 +188,10 @@ class _Rivals:
                 meters & available,
                 inverters,
                 weight / total,
-                accused_powers(design, accused_faults),
-                _accused_phases(design, accused_faults),
+                accused_powers(design, faults),
+                _accused_phases(design, faults),
             )
-            for meters, inverters, weight, accused_faults in sorted(
-                self.found.values(), key=lambda way: -way[2]
-            )
+            for meters, inverters, weight, faults in sorted(self.found.values(), key=lambda way: -way[2])
         )
 
     def _collect(self, found: Candidates, test: ScaleTest) -> None:
@@ -205,14 +203,14 @@ class _Rivals:
             near.append((other, best.faults, swap.worse))
         accused = (self.design.customers + indices(self.new)).tolist()
         for turn in fault_exchanges(best, self.design.faults, accused, self.others, within):
-            accused_faults = tuple(turn.innocent if k == turn.accused else k for k in best.faults)
-            near.append((near[0][0], accused_faults, turn.worse))
-        for k, (meters, accused_faults, worse) in enumerate(near):
-            inverters = accused_inverters(self.design, accused_faults)
+            faults = tuple(turn.innocent if k == turn.accused else k for k in best.faults)
+            near.append((near[0][0], faults, turn.worse))
+        for k, (meters, faults, worse) in enumerate(near):
+            inverters = accused_inverters(self.design, faults)
             if not k or (worse <= within and self._differs(meters, inverters)):
                 which, weight = meters.tobytes() + inverters.tobytes(), float(np.exp(-0.5 * worse))
                 if which not in self.found or self.found[which][2] < weight:
-                    self.found[which] = (meters, inverters, weight, accused_faults)
+                    self.found[which] = (meters, inverters, weight, faults)
 
     def _differs(self, meters: Bools, inverters: Bools) -> bool:
         """True if a meter or inverter about to be named is left out."""
