@@ -1,7 +1,7 @@
 """Manipulations that no meter's own test of the sequential monitor notices: linear programs.
 
 A constant lie a of the meters J, squared pu, moves the leave-one-out residual of meter j on scale s by
-``(Q_s a)_j / Q_s,jj`` and the reconstruction of bus b by ``S_b: Q_s a``. With the limits l of `Limits.of`
+``(Q_s a)_j / Q_s,jj`` and the reconstruction of bus b by ``S_b: Q_s a``. With the limits l of `Limits.limit`
 
     maximise  S_b: Q_s a   subject to   |(Q_s a)_j| <= share l_s,j Q_s,jj   for all j and s,   a = 0 outside J
 
@@ -25,7 +25,7 @@ from scipy.stats import chi2
 
 from gridsec.arrays import Floats, Ints
 from gridsec.estimators.sequential import SequentialDesign, SequentialState
-from gridsec.estimators.sequential.conditional import Fit, fit
+from gridsec.estimators.sequential.conditional import Posterior, condition
 from gridsec.estimators.sequential.scales import Scales
 
 SHARE = 0.7
@@ -56,7 +56,7 @@ class LinearTests:
 
     rows: Floats
     gain: Floats
-    fits: tuple[Fit, ...]
+    fits: tuple[Posterior, ...]
     buses: Ints
 
 
@@ -89,21 +89,21 @@ def linear_tests(design: SequentialDesign, state: SequentialState, *, busbar: bo
     busbar
         Whether the busbar's test is one of them.
     """
-    scales = Scales(design, state.doubts, state.window, state.learned, state.model_error)
+    scales = Scales(design, state.uncertainty, state.window, state.learned, state.model_error)
     every = np.ones(design.plant.meters.size, dtype=np.bool_)
     rows, fits = [], []
     for s in range(len(design.lengths)):
         here = scales[s]
-        now = fit(here.prior, here.noise, every)
+        now = condition(here.prior, here.noise, every)
         Q, std = now.Q, np.sqrt(1.0 / now.diagonal())
         fits.append(now)
-        rows.append(Q * (std**2 / here.limits.of(std))[:, None])
+        rows.append(Q * (std**2 / here.limits.limit(std))[:, None])
         if busbar:
-            together = design.hangs_on.T @ Q
-            form = np.sqrt(np.einsum("bp,pb->b", together, design.hangs_on))
+            together = design.busbar_incidence.T @ Q
+            form = np.sqrt(np.einsum("bp,pb->b", together, design.busbar_incidence))
             rows.append(together[form > 0.0] / (design.sigmas[s] * form[form > 0.0])[:, None])
     last = fits[-1]
-    return LinearTests(np.vstack(rows), last.prior.of_meters @ last.Q, tuple(fits), design.prior.meters)
+    return LinearTests(np.vstack(rows), last.prior.covariance @ last.Q, tuple(fits), design.prior.meters)
 
 
 def largest(

@@ -65,7 +65,7 @@ def watch(site: Site, watcher: DesignedEstimator, scenario: Scenario) -> Seen:
     state, seen = watcher.init(START), Seen()
     for snapshot in snapshots(simulate(site, scenario)):
         state, _, verdict = watcher.step(state, to_frame(site, snapshot))
-        seen.alone |= bool(kinds.repeated(state.kinds).any())
+        seen.alone |= bool(kinds.repeat_lags(state.attack_kinds).any())
         for j in np.flatnonzero(verdict.suspects).tolist():
             if j not in liars:
                 seen.honest.add(j)
@@ -120,18 +120,18 @@ def clean(name: str, hours: float, seeds: Iterable[int], errors: MeterErrors, pr
 def cost(name: str, ticks: int = 4200) -> str:
     """What listening and describing cost per tick once the memory is full."""
     watcher = design(choose(load(name), estimator=SEQUENTIAL))
-    shapes, random = watcher.design.shapes, np.random.default_rng(0)
-    p = shapes.rules.step.size
+    shapes, random = watcher.design.references, np.random.default_rng(0)
+    p = shapes.limits.step.size
     live, nobody, state, times = np.ones(p, np.bool_), np.zeros(p, np.bool_), kinds.empty(p), []
     for k in range(ticks):
         v = 1.0 + 0.01 * np.sin(k / 500.0) + 5e-4 * random.standard_normal(p)
-        y = (np.rint(v / shapes.rules.step) * shapes.rules.step) ** 2
+        y = (np.rint(v / shapes.limits.step) * shapes.limits.step) ** 2
         begin = process_time()
-        heard = kinds.listen(shapes, state, y, live)
-        kinds.repeated(heard)
-        state = kinds.describe(shapes, heard, y, y, nobody, y)
+        heard = kinds.ingest(shapes, state, y, live)
+        kinds.repeat_lags(heard)
+        state = kinds.classify(shapes, heard, y, y, nobody, y)
         times.append(process_time() - begin)
-    kept = state.memory.blocks
+    kept = state.history.blocks
     size = sum(b.code.nbytes + b.hash.nbytes + b.model.nbytes + b.own.nbytes for b in kept) / 1e6
     last = np.array(times[-256:]) * 1e6
     return f"{name:20} {p} meters: {last.mean():.0f} us per tick, {size:.1f} MB"

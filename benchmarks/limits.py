@@ -100,7 +100,7 @@ class World:
     def __init__(self, front: SequentialDesign, seed: int) -> None:
         self.front, self.random, self.k = front, np.random.default_rng([seed, 9]), 0
         count = front.customers
-        self.effects = front.effects.of(np.arange(2 * count))
+        self.effects = front.sensitivities.numbered(np.arange(2 * count))
         self.std = np.concatenate([front.doubt.p, front.doubt.q])
         self.rho = exp(-front.step_s / front.doubt.time_s)
         self.powers = self.std * self.random.standard_normal(2 * count)
@@ -119,7 +119,7 @@ class World:
             Manipulation, squared pu.
         """
         front, random = self.front, self.random
-        flick = np.sqrt(front.flicker) * float(random.standard_normal())
+        flick = np.sqrt(front.busbar_noise) * float(random.standard_normal())
         truth = self.effects @ self.powers + self.busbar + flick
         white = np.sqrt(front.white) * random.standard_normal(front.white.size)
         residual = truth[front.prior.meters] + self.fixed + white + lie

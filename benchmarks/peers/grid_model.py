@@ -24,7 +24,7 @@ from benchmarks.peers.answer import Answer
 from benchmarks.peers.scene import Reading, Scene
 from feeders.simulation import powerflow
 from gridsec.arrays import Bools, Floats
-from gridsec.estimators.sequential.conditional import drop, fit
+from gridsec.estimators.sequential.conditional import condition, remove_meter
 from gridsec.estimators.sequential.loads import LoadDoubt, prior
 
 _SQRT3 = np.sqrt(3.0)
@@ -157,7 +157,7 @@ class GreedyChi:
             LoadDoubt(told.std_p, told.std_q, 1.0),
             busbar=2.0 * told.v0 * told.std_v,
         )
-        left = fit(known, noise, np.ones(v.size, dtype=np.bool_))
+        left = condition(known, noise, np.ones(v.size, dtype=np.bool_))
         try:
             while True:
                 estimate, misfit = self.grid.judged(told, left.trusted)
@@ -167,7 +167,7 @@ class GreedyChi:
                 open_ = np.sqrt(np.maximum(left.Q.diagonal(), np.finfo(np.float64).tiny))
                 size = np.where(left.trusted, np.abs(v - estimate) * 2.0 * v / noise / open_, -1.0)
                 worst = int(np.argmax(size))
-                drop(left, worst)
+                remove_meter(left, worst)
                 self.grid.mute(worst)
         except PowerGridError:
             return Answer(~left.trusted, failed=True)

@@ -10,7 +10,7 @@ from benchmarks.peers.answer import Answer
 from benchmarks.peers.scene import Reading, Scene
 from gridsec.arrays import Bools, Floats
 from gridsec.estimators.sequential.conditional import Prior
-from gridsec.estimators.sequential.snapshot import FalsePowers, Lies, identify
+from gridsec.estimators.sequential.snapshot import ErrorPrior, FalsePowers, identify
 from gridsec.grid.radial import Feeder
 
 _STEPS = 2
@@ -88,9 +88,9 @@ class Covariance:
 class Ours:
     """One feeder, prepared once: matrices of the feeder, nothing of any reading or its noise."""
 
-    def __init__(self, here: Scene, lies: Lies | None = None, *, false_powers: bool = True) -> None:
+    def __init__(self, here: Scene, lies: ErrorPrior | None = None, *, false_powers: bool = True) -> None:
         self.flow, model = Flow(here.feeder), here.feeder.linear()
-        self.lies = Lies() if lies is None else lies
+        self.lies = ErrorPrior() if lies is None else lies
         self.R, self.X = (np.ascontiguousarray(2.0 * each) for each in (model.R, model.X))
         self.covariance = Covariance(here.feeder, self.R, self.X)
         none = np.zeros(len(self.R))
@@ -114,8 +114,8 @@ class Ours:
             return np.asarray(v2 - self.flow(p - dp, q - dq, v0) + R @ dp + X @ dq)
 
         m = v2 - self.flow(p, q, v0)
-        found = identify(known, noise, m, self.live, lies=self.lies, false=false, curved=curved)
+        found = identify(known, noise, m, self.live, error_prior=self.lies, false=false, curved=curved)
         best = found[0]
-        estimate = v2 - best.lies - noise * best.weights
-        others = tuple((each.liars, each.probability) for each in found[1:])
-        return Answer(best.liars, others, np.sqrt(np.maximum(estimate, 0.0)))
+        estimate = v2 - best.errors - noise * best.weights
+        others = tuple((each.meters, each.probability) for each in found[1:])
+        return Answer(best.meters, others, np.sqrt(np.maximum(estimate, 0.0)))

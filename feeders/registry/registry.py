@@ -246,7 +246,7 @@ FAMILIES: Final = Families(
                 "one switched observer, correlated loads, evidence on several time scales",
                 design=_sequential,
             ),
-            withstands=lambda d: int(d.most),
+            withstands=lambda d: int(d.max_attacked),
             bias_learning=BiasLearning(
                 needed_s=lambda d: float(d.options.commission_s),
                 init=lambda d, t, known: sequential.init(d, t, known.learned, known.learning),

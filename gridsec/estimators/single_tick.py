@@ -28,8 +28,8 @@ from gridsec.errors import DesignInfeasible
 from gridsec.estimators.plant import Plant
 from gridsec.estimators.sequential import LoadDoubt, SequentialDesign, SequentialOptions
 from gridsec.estimators.sequential import design as sequential_design
-from gridsec.estimators.sequential.conditional import drop, judge
-from gridsec.estimators.sequential.decoder import Accused, Decoder, Evidence
+from gridsec.estimators.sequential.conditional import leave_one_out, remove_meter
+from gridsec.estimators.sequential.decoder import Decoder, DecoderAnswer, DecoderInput
 from gridsec.secure.decode.search import basis_pursuit, matching_pursuit
 
 MOST_SETS = 20_000
@@ -59,49 +59,49 @@ def check(candidates: int, most: int) -> None:
         )
 
 
-def outcomes(evidence: Evidence, size: int) -> SetMisfits:
+def outcomes(evidence: DecoderInput, size: int) -> SetMisfits:
     """Evaluate every set of `size` meters."""
     Q, m = evidence.whole.Q, evidence.m
     weights = Q @ m
-    sets = list(combinations(np.flatnonzero(evidence.live).tolist(), size))
+    sets = list(combinations(np.flatnonzero(evidence.available).tolist(), size))
     members = np.array(sets, dtype=np.intp).reshape(len(sets), size)
     b, columns = weights[members], Q[:, members].transpose(1, 0, 2)
     G = Q[members[:, :, None], members[:, None, :]]
     solved = np.linalg.solve(G, np.concatenate([b[:, :, None], columns.transpose(0, 2, 1)], axis=2))
     left = weights - np.einsum("cpr,cr->cp", columns, solved[:, :, 0])
     precision = Q.diagonal() - np.einsum("cpr,crp->cp", columns, solved[:, :, 1:])
-    judged = np.broadcast_to(evidence.live, precision.shape) & (precision > 0)
+    judged = np.broadcast_to(evidence.available, precision.shape) & (precision > 0)
     judged[np.arange(len(sets))[:, None], members] = False
     with np.errstate(divide="ignore", invalid="ignore"):
         offset, std = np.abs(left / precision), 1.0 / np.sqrt(precision)
-        excess = np.where(judged, offset / evidence.limits.of(std), 0.0)
+        excess = np.where(judged, offset / evidence.limits.limit(std), 0.0)
     misfit = float(m @ weights) - np.einsum("cr,cr->c", b, solved[:, :, 0])
     return SetMisfits(members, misfit, excess.max(axis=1, initial=0.0))
 
 
-def least_squares(evidence: Evidence) -> tuple[Accused, ...]:
+def least_squares(evidence: DecoderInput) -> tuple[DecoderAnswer, ...]:
     """Weighted least squares with the chi-square test; remove the largest normalised residual and repeat.
 
     Returns tuple of Accused: at most `most` meters, in the order of their residuals; a removed meter never
         returns.
     Source: lee2018, Algorithm 2.2 with the corrected degrees of freedom.
     """
-    now, live = evidence.whole.copy(), evidence.live
+    now, live = evidence.whole.copy(), evidence.available
     accused = np.zeros(live.size, dtype=np.bool_)
     alarm = float(np.clip(2.0 * ndtr(-evidence.limits.sigmas) * max(live.sum(), 1), 1e-300, 0.5))
-    for _ in range(evidence.most):
-        judged = judge(now, evidence.m)
+    for _ in range(evidence.max_attacked):
+        judged = leave_one_out(now, evidence.m)
         freedom = int(np.count_nonzero(now.trusted))
-        offset = np.abs(judged.offset) / evidence.limits.of(judged.std)
+        offset = np.abs(judged.residual) / evidence.limits.limit(judged.std)
         worst = int(np.argmax(np.where(now.trusted, offset, -1.0)))
-        if not freedom or (judged.misfit <= chdtri(freedom, alarm) and offset[worst] <= 1.0):
+        if not freedom or (judged.chi_square <= chdtri(freedom, alarm) and offset[worst] <= 1.0):
             break
         accused[worst] = True
-        drop(now, worst)
-    return (Accused(accused),)
+        remove_meter(now, worst)
+    return (DecoderAnswer(accused),)
 
 
-def fewest(evidence: Evidence) -> tuple[Accused, ...]:
+def fewest(evidence: DecoderInput) -> tuple[DecoderAnswer, ...]:
     """The smallest set of meters without which every other one is within its limits.
 
     Returns tuple of Accused: the set with the smallest misfit among those of the smallest size, and its
@@ -110,19 +110,19 @@ def fewest(evidence: Evidence) -> tuple[Accused, ...]:
     """
     within = 2.0 * float(np.log(evidence.like))
     found: SetMisfits | None = None
-    for size in range(min(evidence.most, int(np.count_nonzero(evidence.live))) + 1):
+    for size in range(min(evidence.max_attacked, int(np.count_nonzero(evidence.available))) + 1):
         found = outcomes(evidence, size)
         fine = np.flatnonzero(found.excess <= 1.0)
         if fine.size:
             order = fine[np.argsort(found.misfit[fine], kind="stable")]
             near = order[found.misfit[order] - found.misfit[order[0]] <= within]
-            return tuple(_answer(evidence.live, found, int(c), int(order[0])) for c in near)
+            return tuple(_answer(evidence.available, found, int(c), int(order[0])) for c in near)
     assert found is not None  # noqa: S101  # size 0 is always tried
     best = int(np.argmin(found.misfit))
-    return (_answer(evidence.live, found, best, best),)
+    return (_answer(evidence.available, found, best, best),)
 
 
-def pursue(evidence: Evidence) -> tuple[Accused, ...]:
+def pursue(evidence: DecoderInput) -> tuple[DecoderAnswer, ...]:
     """Basis pursuit: the attack and load errors of smallest weighted sum that explain the readings exactly.
 
     ``min |a / sigma|_1 + |c|_1`` subject to ``a + V c = m`` with ``S = V V^T``: the stack of readings and
@@ -135,22 +135,22 @@ def pursue(evidence: Evidence) -> tuple[Accused, ...]:
     return (_beyond(evidence, at, attack),)
 
 
-def match(evidence: Evidence) -> tuple[Accused, ...]:
+def match(evidence: DecoderInput) -> tuple[DecoderAnswer, ...]:
     """Orthogonal matching pursuit on the whitened readings: column after column, without removal.
 
     Source: lee2018, Algorithm 2.1, Theorem 2.1.2.
     """
-    at = np.flatnonzero(evidence.live)
+    at = np.flatnonzero(evidence.available)
     if not at.size:
-        return (Accused(np.zeros_like(evidence.live)),)
+        return (DecoderAnswer(np.zeros_like(evidence.available)),)
     root = np.asarray(np.linalg.cholesky(evidence.whole.Q[np.ix_(at, at)]).T, np.float64)
-    attack, _ = matching_pursuit(root, root @ evidence.m[at], min(evidence.most, at.size))
+    attack, _ = matching_pursuit(root, root @ evidence.m[at], min(evidence.max_attacked, at.size))
     return (_beyond(evidence, at, attack),)
 
 
-def _stack(evidence: Evidence) -> tuple[Ints, Floats, Floats]:
+def _stack(evidence: DecoderInput) -> tuple[Ints, Floats, Floats]:
     """Columns of unit weight: those of the meters, then the principal directions of the loads' covariance."""
-    at = np.flatnonzero(evidence.live)
+    at = np.flatnonzero(evidence.available)
     prior = evidence.whole.prior
     S = prior.among(at)
     values, vectors = np.linalg.eigh(S)
@@ -159,18 +159,18 @@ def _stack(evidence: Evidence) -> tuple[Ints, Floats, Floats]:
     return at, F, evidence.m[at]
 
 
-def _beyond(evidence: Evidence, at: Ints, attack: Floats) -> Accused:
+def _beyond(evidence: DecoderInput, at: Ints, attack: Floats) -> DecoderAnswer:
     """Accuse the meters with a share of the attack beyond their limit."""
-    now = judge(evidence.whole, evidence.m)
-    accused = np.zeros(evidence.live.size, dtype=np.bool_)
-    accused[at] = np.abs(attack) > evidence.limits.of(now.std)[at]
-    return Accused(accused)
+    now = leave_one_out(evidence.whole, evidence.m)
+    accused = np.zeros(evidence.available.size, dtype=np.bool_)
+    accused[at] = np.abs(attack) > evidence.limits.limit(now.std)[at]
+    return DecoderAnswer(accused)
 
 
-def _answer(live: Bools, found: SetMisfits, which: int, best: int) -> Accused:
+def _answer(live: Bools, found: SetMisfits, which: int, best: int) -> DecoderAnswer:
     accused = np.zeros(live.size, dtype=np.bool_)
     accused[found.members[which]] = True
-    return Accused(accused, float(found.misfit[which] - found.misfit[best]))
+    return DecoderAnswer(accused, float(found.misfit[which] - found.misfit[best]))
 
 
 def design(

@@ -25,8 +25,8 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats
 from gridsec.estimators.sequential.design import SequentialDesign
-from gridsec.estimators.sequential.dictionary import of_a_liar
-from gridsec.estimators.sequential.search import Limits, price
+from gridsec.estimators.sequential.dictionary import false_power_charge
+from gridsec.estimators.sequential.search import Limits, set_cost
 from gridsec.planning.collusion import Corridor, Shift, corridor, furthest
 
 __all__ = ["Rule", "Shift", "largest_shift", "named_size", "rule", "within"]
@@ -49,12 +49,12 @@ class Rule:
 
     def weights(self, bus: int) -> Floats:
         """Effect of each meter's attack on the reconstruction of a bus, on each scale, (s, p)."""
-        return np.asarray(self.inverse @ self.design.prior.of_meters[bus])
+        return np.asarray(self.inverse @ self.design.prior.covariance[bus])
 
     def spread(self, bus: int) -> float:
         """Uncertainty of a bus without attack, with the same probability on any scale, squared pu."""
         prior = self.design.prior
-        row = prior.of_meters[bus]
+        row = prior.covariance[bus]
         left = prior.variance[bus] - np.einsum("p,spq,q->s", row, self.inverse, row)
         return self.deviations * float(np.sqrt(np.maximum(left, 0.0).max())) + float(self.model.max())
 
@@ -73,7 +73,7 @@ def rule(design: SequentialDesign, *, risk: float, model: Floats) -> Rule:
     t = float(np.sqrt(2.0 * np.log(2.0 * std.size / risk)))
     limit = np.array(
         [
-            Limits(sigmas, np.zeros_like(model), design.allowed, design.fixed).of(row)
+            Limits(sigmas, np.zeros_like(model), design.allowed, design.fixed).limit(row)
             for sigmas, row in zip(design.sigmas, std, strict=True)
         ]
     )
@@ -139,26 +139,26 @@ def named_size(given: Rule, meter: int, liars: int, *, claims: Floats) -> float:
     """
     design, (_, p) = given.design, given.limit.shape
     bus = np.array([design.prior.meters[meter]])
-    book = design.book
+    book = design.faults
     std = np.concatenate([claims, book.std[design.customers :]])
     at = book.columns(np.arange(std.size))[bus[0]]
     loose = (std * at) ** 2
     # The charge of a power is lowest while its customer's meter is not trusted, and falls with the number of
     # accused meters: use the next number with a lower charge.
-    numbers = [0, *(k for k in range(1, p) if of_a_liar(k) < of_a_liar(k - 1))]
+    numbers = [0, *(k for k in range(1, p) if false_power_charge(k) < false_power_charge(k - 1))]
     of_customers = np.arange(std.size) < design.customers
     ways = [
-        (np.where(of_customers, np.minimum(book.charge, of_a_liar(k)), book.charge), price(p, k))
+        (np.where(of_customers, np.minimum(book.charge, false_power_charge(k)), book.charge), set_cost(p, k))
         for k in numbers
     ]
     t = -float(np.log(given.risk))
-    truth = p + 2.0 * np.sqrt(p * t) + 2.0 * t + price(p, liars) + 2.0 * np.log(design.options.like)
+    truth = p + 2.0 * np.sqrt(p * t) + 2.0 * t + set_cost(p, liars) + 2.0 * np.log(design.options.like)
     sizes = []
     for d, sigmas in zip(given.noise[:, meter], design.sigmas, strict=True):
         own = float(design.prior.variance[bus[0]] + d)
         honest = given.deviations * np.sqrt(own) + float(given.model[meter])
         evidence = sigmas * np.sqrt(own) + float(given.model[meter])
-        rivals = (_worst(own, loose, each * price(p, 1), truth - others) for each, others in ways)
+        rivals = (_worst(own, loose, each * set_cost(p, 1), truth - others) for each, others in ways)
         sizes.append(max(np.sqrt(max(rivals)), evidence) + honest)
     return float(min(sizes))
 

@@ -147,7 +147,7 @@ def design(front: SequentialDesign, most: Floats | None = None) -> Core:
     """
     every = np.arange(front.customers)
     most = np.full(every.size, CONNECTION) if most is None else most
-    powers = front.effects.columns(Power.ACTIVE, every)
+    powers = front.sensitivities.columns(Power.ACTIVE, every)
     gamma = max(1.0, YEAR_S / (front.step_s * front.options.alarms_per_year))
     return assemble(residual_model(front), powers, most, gamma=gamma)
 
@@ -161,7 +161,7 @@ def residuals(state: SequentialState) -> tuple[Floats, Bools]:
         State of the default monitor after a tick.
     """
     window = state.window
-    seen = window.heard[-1]
+    seen = window.available[-1]
     return np.where(seen, window.residuals[-1] + state.learned.bias, 0.0), seen
 
 

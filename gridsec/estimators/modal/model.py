@@ -191,16 +191,16 @@ def residual_model(design: SequentialDesign) -> ResidualModel:
     """
     feeder, doubt, meters = design.plant.feeder, design.doubt, design.prior.meters
     loads = prior(feeder, meters, doubt, busbar=0.0, inverters=design.injections)
-    phases = design.hangs_on.shape[1]
+    phases = design.busbar_incidence.shape[1]
     places = np.arange(loads.variance.size)
     return ResidualModel(
-        of_meters=loads.of_meters,
+        of_meters=loads.covariance,
         variance=loads.variance,
         meters=meters,
         white=design.white,
         fixed=design.fixed,
         busbar=design.busbar**2,
-        flicker=design.flicker,
+        flicker=design.busbar_noise,
         busbar_of=np.equal.outer(places % phases, np.arange(phases)).astype(np.float64),
         lasting=min(float(doubt.lasting), MOST_LASTING),
         time_s=doubt.time_s,

@@ -1,12 +1,21 @@
-"""The monitor that scales: one observer, correlated loads, evidence on several time scales.
+"""Default monitor: one observer, correlated load uncertainty, evidence on several time scales.
 
     design(plant, doubt=..., step_s=...) -> SequentialDesign
     init(design, t) -> SequentialState
     step(design, state, frame) -> (SequentialState, Estimate, Verdict)
 
-One circle-criterion observer carries the inverters, certified for every set of trusted meters and every
-switching between them. What the readings then deviate from it is explained by loads that are wrong in a
-way that neighbours share, by meters' errors, and, where these do not suffice, by as few liars as possible.
+Pipeline of `step`, by module:
+
+    measurements    plausibility of the frame; clock_offsets: readings of another moment
+    observer        injections of the inverters, voltages by the model (prediction)
+    time_scales     running means of the residuals and their limits (detection)
+    identify        likeliest sets of manipulated meters: search, hypotheses, busbar_meter
+    confirmation    lasting evidence without a likely rival; inverter_check, attack_kind, replay
+    output          estimate with bounds, verdict with reason
+
+One circle-criterion observer carries the inverters. Its certificate holds for every set of trusted meters and
+every switching between them. The residuals are explained by correlated load errors, by meter errors, and by
+as few manipulated meters as possible.
 """
 
 from gridsec.estimators.sequential.commission import (

@@ -1,21 +1,20 @@
-"""The lies of one attack are alike: what that says about who lies.
+"""Sets of manipulations that are alike, and the evidence in it.
 
-Liars that act together read high by the same amount, or as if one of them drew more power than it does: their
-lies are one number times a shape. With u the shape, s its amplitude's standard deviation and d the part by
+Meters attacked together read high by the same amount, or as if one customer drew more power: their errors
+are one number times a shape. With u the shape, s the standard deviation of its amplitude and d the part by
 which each may differ from it,
 
     a_L ~ N(0, C_L),   C_L = A^2 I   or   s^2 (u u^T + d^2 diag(u)^2),   u = 1 or u_j = R_jc / R_cc,  c in L
 
-The second has one large number to explain all lies with, and so pays for one freedom instead of |L|: weak
-lies that fit to strong ones are named, and readings that err by chance into another direction are not.
-Who tells of a load that is not there has no choice of whose meters to use: any honest one that the load would
-move more than a lying one contradicts the story. So whose load it is says who lies, and such a set costs the
-choice of one of p customers, not that of |L| of p meters; other sets do not tell stories.
-With ``Q = K^-1`` and ``z = Q m`` of the same explanation without liars,
+The second has one large number for all errors and pays for one freedom instead of |L|: weak errors that fit
+to strong ones are accused, and readings that err by chance in another direction are not. A load that does
+not exist determines its meters: an honest meter that the load would move more than a manipulated one
+contradicts it. Such a set therefore costs the choice of one of p customers, not that of |L| of p meters.
+With ``Q = K^-1`` and ``z = Q m`` of the same hypothesis without manipulated meters,
 
     J(L, C) - J({}) = ln det C_L + ln det(C_L^-1 + Q_LL) - z_L^T (C_L^-1 + Q_LL)^-1 z_L + price
 
-All shapes of many sets are judged at once.
+All shapes of many sets are evaluated at once.
 """
 
 from __future__ import annotations
@@ -30,151 +29,140 @@ import numpy as np
 from scipy.special import binom
 
 from gridsec.arrays import Bools, Floats, Ints, frozen, submatrix
-from gridsec.estimators.sequential.conditional import solved
-from gridsec.estimators.sequential.rises import MOST, Lies, Problem, State
+from gridsec.estimators.sequential.conditional import solve_spd
+from gridsec.estimators.sequential.rises import MOST, ErrorPrior, LikelihoodProblem, SnapshotHypothesis
 
-__all__ = ["MOST", "Set", "alike", "worth"]
+__all__ = ["MOST", "ErrorSet", "likely_sets", "may_change"]
 
-# So many sets, no more than so much worse than the best, are gone on from.
 _WIDTH, _NEAR = 2, 6.0
+"""Number of continued sets, and their largest distance from the best cost."""
 _ROUNDS = 6
-# No explanation that is so much worse becomes the best because its lies are alike.
+"""Largest number of rounds of a descent."""
 _WORSE = 30.0
-# Any two of so many meters may be where a search begins.
+"""Largest fall of J by likeness of the errors."""
 _PAIRED = 8
-# Shapes of lies: independent, all the same; others are stories, by the number of the customer.
+"""Meters of which any two may start a search."""
+# Shapes of errors: independent, all the same; others are loads, by the number of the customer.
 _ALONE, _SAME = -1, -2
-# Who is not off by this part of what liars have in common, or not unusually, by the square, is none of them.
 _LIKE, _UNUSUAL = 0.5, 2.0
-# Loads this much alike, as a part, are felt alike.
+"""Least part of the common error, and least squared residual, of a further member."""
 _ALIKE = 1e-9
+"""Relative difference up to which effects of a load are equal."""
 # Pivots are positive; rounding may make them less.
 _TINY = float(np.finfo(np.float64).tiny)
 
 
-Ranked = list[tuple[float, State]]
+Ranked = list[tuple[float, SnapshotHypothesis]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Set:
-    """One explanation, its lies alike or not. p meters.
+class ErrorSet:
+    """One hypothesis, with errors alike or not. p meters."""
 
-    Attributes
-    ----------
-    liars, powers : (p,)
-        Whose readings are manipulated, and whose powers are false as well.
-    cost
-        J.
-    weights : (p,)
-        ``K^-1 m``.
-    lies : (p,)
-        What each liar's reading is expected to be off by; 0 elsewhere.
-    """
-
-    liars: Bools
-    powers: Bools
-    cost: float
-    weights: Floats
-    lies: Floats
+    meters: Bools  # (p,) manipulated readings
+    powers: Bools  # (p,) false powers as well
+    cost: float  # J
+    weights: Floats  # (p,) ``K^-1 m``
+    errors: Floats  # (p,) expected error of each manipulated reading; 0 elsewhere
 
 
-class _Base:
-    """Explanations with the same false powers, by what they say without liars."""
+class _SamePowers:
+    """Hypotheses with the same false powers, relative to the one without manipulated meters."""
 
-    def __init__(self, problem: Problem, at: State, m: Floats) -> None:
+    def __init__(self, problem: LikelihoodProblem, at: SnapshotHypothesis, m: Floats) -> None:
         self.problem, self.powers = problem, at.powers
-        self.honest = honest = at.copy() if at.liars.any() else at
-        for j in np.flatnonzero(at.liars).tolist():
+        self.honest = honest = at.copy() if at.meters.any() else at
+        for j in np.flatnonzero(at.meters).tolist():
             problem.toggle(honest, j)
-        # Linearised about the likeliest of them.
+        # Linearised about the likeliest hypothesis.
         self.z, self.diagonal = honest.times(m), honest.diagonal
-        self.nobody = float(m @ self.z) + honest.logdet + problem.lies.false * at.counts[1]
-        self.known: dict[tuple[int, ...], tuple[float, int]] = {}
-        self.told: dict[tuple[int, ...], Set] = {}
-        # Rows of Q are made where somebody asks. Place 0 is nobody, who fills up the smaller sets.
+        self.honest_cost = float(m @ self.z) + honest.logdet + problem.prior.false * at.counts[1]
+        self.costed: dict[tuple[int, ...], tuple[float, int]] = {}
+        self.details: dict[tuple[int, ...], ErrorSet] = {}
+        # Rows of Q on demand. Place 0 is empty and fills up the smaller sets.
         self.place, self.members = np.zeros(self.z.size, dtype=np.intp), np.zeros(0, dtype=np.intp)
         self.rows, self.Q, self.at = np.empty((0, self.z.size)), np.zeros((1, 1)), np.zeros(1)
 
     @property
     def limit(self) -> float:
-        """What costs more is neither reported nor gone on from."""
-        lowest, _ = min(self.known.values())
-        return lowest + max(_NEAR, 2.0 * log(self.problem.lies.like))
+        """Largest cost of a hypothesis that is reported or continued."""
+        lowest, _ = min(self.costed.values())
+        return lowest + max(_NEAR, 2.0 * log(self.problem.prior.like))
 
-    def costs(self, sets: Iterable[tuple[int, ...]]) -> None:
-        """Learn J of some sets, and the likeliest shape of each."""
-        new = [each for each in dict.fromkeys(sets) if each not in self.known]
+    def evaluate(self, sets: Iterable[tuple[int, ...]]) -> None:
+        """Compute J of some sets, and the likeliest shape of each."""
+        new = [each for each in dict.fromkeys(sets) if each not in self.costed]
         if () in new:
             new.remove(())
-            self.known[()] = self.nobody, _ALONE
+            self.costed[()] = self.honest_cost, _ALONE
         if not new:
             return
         for k, shape, cost in zip(*(each.tolist() for each in self.shapes(new)), strict=True):
-            if cost < self.known.get(new[k], (np.inf, 0))[0]:
-                self.known[new[k]] = cost, shape
+            if cost < self.costed.get(new[k], (np.inf, 0))[0]:
+                self.costed[new[k]] = cost, shape
 
     def shapes(self, sets: list[tuple[int, ...]]) -> tuple[Ints, Ints, Floats]:
-        """J of all shapes that some sets' lies may have: which set, which shape, and J, (s,) each."""
+        """J of all shapes of some sets: index of the set, shape, and J, (s,) each."""
         sizes = np.array([len(each) for each in sets])
         L = np.array([each + each[:1] * (sizes.max() - len(each)) for each in sets])
         at, every, plain = self._places(L, sizes), np.arange(sizes.size), np.zeros(2 * sizes.size)
         of, shape = np.concatenate((every, every)), np.repeat((_ALONE, _SAME), sizes.size)
         price, u = plain, np.ones((1, 1))
         if self.problem.false is not None and L.shape[1] > 1:
-            rows, about, chosen = self._stories(L, sizes)
+            rows, about, chosen = self._load_shapes(L, sizes)
             if rows.size:
                 of, shape = np.concatenate((of, rows)), np.concatenate((shape, about))
                 price, u = np.concatenate((plain, chosen)), np.ones((of.size, L.shape[1]))
-                u[plain.size :] = self._moved(L[rows], about)
-        table, like, size = _table(self.problem.lies, L.shape[1]), np.minimum(shape, 0), sizes[of]
-        gain, freedom = self._judged(at[of], u, table.inverse[size, like])
-        J = self.nobody + self.problem.prices[size] + table.cost[size, like] + price + freedom - gain
+                u[plain.size :] = self._load_effects(L[rows], about)
+        table, like, size = _table(self.problem.prior, L.shape[1]), np.minimum(shape, 0), sizes[of]
+        gain, freedom = self._log_terms(at[of], u, table.inverse[size, like])
+        J = self.honest_cost + self.problem.prices[size] + table.cost[size, like] + price + freedom - gain
         return of, shape, J
 
-    def explained(self, liars: tuple[int, ...]) -> Set:
-        """All about a set whose cost is known."""
-        if liars in self.told:
-            return self.told[liars]
-        cost, shape = self.known[liars]
-        out, lies, weights = np.zeros(self.z.size, dtype=np.bool_), np.zeros(self.z.size), self.z
-        if liars:
-            L, u = np.array(liars), np.ones(len(liars))
+    def detail(self, suspects: tuple[int, ...]) -> ErrorSet:
+        """Details of a set with known cost."""
+        if suspects in self.details:
+            return self.details[suspects]
+        cost, shape = self.costed[suspects]
+        out, error_prior, weights = np.zeros(self.z.size, dtype=np.bool_), np.zeros(self.z.size), self.z
+        if suspects:
+            L, u = np.array(suspects), np.ones(len(suspects))
             at = self.place[L]
             if shape >= 0:
-                u = self._moved(L[None], np.array([shape]))[0]
-            inverse = _table(self.problem.lies, L.size).inverse[L.size, min(shape, 0)]
+                u = self._load_effects(L[None], np.array([shape]))[0]
+            inverse = _table(self.problem.prior, L.size).inverse[L.size, min(shape, 0)]
             M = inverse + submatrix(self.Q, at, at) * np.multiply.outer(u, u)
-            out[L], lies[L] = True, u * solved(M.T, u * self.z[L])
-            weights = self.z - lies[L] @ self.rows[at - 1]
-        self.told[liars] = Set(out, self.powers, cost, weights, lies)
-        return self.told[liars]
+            out[L], error_prior[L] = True, u * solve_spd(M.T, u * self.z[L])
+            weights = self.z - error_prior[L] @ self.rows[at - 1]
+        self.details[suspects] = ErrorSet(out, self.powers, cost, weights, error_prior)
+        return self.details[suspects]
 
-    def without(self, liars: tuple[int, ...]) -> tuple[Floats, Floats]:
-        """What follows of a set where its lies are free: a bound of J without each, and variances.
+    def without(self, suspects: tuple[int, ...]) -> tuple[Floats, Floats]:
+        """Lower bound of J without each member of a set with free errors, (k,), and variances, (p,).
 
-        With ``H = Q_LL^-1`` no lies explain more than ``z^T H z``, and without the i-th ``(H z)_i^2 / H_ii``
-        less, (k,). The variances are those of everybody's weights, (p,): the diagonal of Q without the set.
+        With ``H = Q_LL^-1`` free errors explain at most ``z^T H z``, and without the i-th ``(H z)_i^2 /
+        H_ii`` less. The variances are those of all weights: the diagonal of Q without the set.
         """
-        lies, L, k = self.problem.lies, list(liars), len(liars) - 1
+        error_prior, L, k = self.problem.prior, list(suspects), len(suspects) - 1
         Q = self.rows[self.place[L] - 1]
         H = np.linalg.inv(Q[:, L])
         by, own = H @ self.z[L], H.diagonal()
         gain = float(self.z[L] @ by) - by**2 / own
-        # Some one of them is free by as much at least as the others leave open.
-        freedom = float(np.log1p(min(lies.size, lies.amplitude) ** 2 / own.max()))
-        least = self.nobody + self.problem.prices[k] + freedom + self._extra(k) - gain
+        # One of the errors has at least the freedom left by the others.
+        freedom = float(np.log1p(min(error_prior.size, error_prior.amplitude) ** 2 / own.max()))
+        least = self.honest_cost + self.problem.prices[k] + freedom + self._extra(k) - gain
         return least, np.asarray(self.diagonal - np.einsum("kj,kj->j", H @ Q, Q))
 
     def _extra(self, k: int) -> float:
-        """What the shape of k lies costs at least beside their freedom and the price of the set."""
-        lies, p = self.problem.lies, self.problem.size
+        """Least cost of the shape of k errors beside their freedom and the price of the set."""
+        error_prior, p = self.problem.prior, self.problem.size
         if k < 2:
             return 0.0
-        told = lies.story + 2.0 * (log(p) - log(comb(p, k)))
-        return min(lies.apart * (k - 1), lies.pair + lies.more * (k - 2), told)
+        of_load = error_prior.load + 2.0 * (log(p) - log(comb(p, k)))
+        return min(error_prior.apart * (k - 1), error_prior.pair + error_prior.more * (k - 2), of_load)
 
     def _places(self, L: Ints, sizes: Ints) -> Ints:
-        """Where the members of each set have their row of Q, (b, k), 0 where a set is smaller."""
+        """Rows of Q of the members of each set, (b, k), 0 where a set is smaller."""
         unknown = self.place[L] == 0
         if unknown.any():
             new = np.unique(L[unknown])
@@ -185,14 +173,14 @@ class _Base:
             self.Q[1:, 1:] = self.rows[:, members]
         return self.place[L] * (np.arange(L.shape[1]) < sizes[:, None])
 
-    def _moved(self, L: Ints, c: Ints) -> Floats:
-        """How far one customer's load moves each of a set, its own voltage by one, (b, k)."""
+    def _load_effects(self, L: Ints, c: Ints) -> Floats:
+        """Change of each member of a set by one customer's load, its own voltage by one, (b, k)."""
         false = self.problem.false
         assert false is not None  # noqa: S101  # the callers have looked
         return np.asarray(false.R[L, c[:, None]] / false.R[c, c][:, None])
 
-    def _stories(self, L: Ints, sizes: Ints) -> tuple[Ints, Ints, Floats]:
-        """Which of some sets tell a story, whose, and what that costs, (s,) each.
+    def _load_shapes(self, L: Ints, sizes: Ints) -> tuple[Ints, Ints, Floats]:
+        """Sets that show one customer's load, the customer, and the cost, (s,) each.
 
         `L` are the sets, (b, k), the smaller ones filled up with their first member.
         """
@@ -201,27 +189,27 @@ class _Base:
         R, real = problem.false.R, np.arange(L.shape[1]) < sizes[:, None]
         among = R[L[:, :, None], L[:, None, :]]
         weakest = among.min(axis=1)
-        # Whom the load does not move, as at the busbar, or moves the other way tells nothing of it.
+        # Meters that the load does not move, or moves the other way, show nothing of it.
         enough = weakest >= problem.felt[sizes[:, None] - 1, L] * (1.0 - _ALIKE)
         rows, of = np.nonzero(enough & real & (weakest > 0.0) & (sizes > 1)[:, None])
         if not rows.size:
             return rows, rows, weakest[rows, of]
         low, high = (weakest[rows, of] * (1.0 + side) for side in (-_ALIKE, _ALIKE))
         c, more = L[rows, of], ((among[rows, :, of] > high[:, None]) & real[rows]).sum(axis=1)
-        # Others who feel it as little as some of a set may be many, but none of them feels it more.
+        # Meters outside may be affected as little as a member, but not more.
         tells = (problem.felt[:, c] > high).sum(axis=0) == more
         rows, c, more, low, high = (each[tells] for each in (rows, c, more, low, high))
-        # Of those that would feel it alike, some are chosen; whose story it is belongs to it.
+        # Of the equally affected meters some are chosen; the customer's own meter belongs to the set.
         own, k = R[c, c] <= high, sizes[rows]
         ties = (R[:, c] >= low).sum(axis=0) - more - own
         choices = np.log(p * binom(ties, k - more - own)) - np.log(binom(p, k))
-        return rows, c, problem.lies.story + 2.0 * choices
+        return rows, c, problem.prior.load + 2.0 * choices
 
-    def _judged(self, at: Ints, u: Floats, inverse: Floats) -> tuple[Floats, Floats]:
+    def _log_terms(self, at: Ints, u: Floats, inverse: Floats) -> tuple[Floats, Floats]:
         """``z^T (C^-1 + Q_LL)^-1 z`` and ``ln det(E^-1 + U Q_LL U)`` of many sets, (s,) each.
 
         By their places, (s, k); ``C = U E U`` with U = diag(u), and `inverse` is ``E^-1``, (s, k, k). By
-        elimination: the matrix is bordered by z, and what is left in the corner is what z explains.
+        elimination: the matrix is bordered by z, and the corner left is explained by z.
         """
         L, u, k = at.T, u.T, at.shape[1]
         T = np.zeros((k + 1, k + 1, len(at)))
@@ -234,164 +222,141 @@ class _Base:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Table:
-    """E of sets of 0, 1, … k lies, by their shape: a story, independent, all the same.
+    """E of sets of 0, 1, … k errors, by their shape: one load, independent, all the same."""
 
-    Attributes
-    ----------
-    inverse : (k + 1, 3, k, k)
-        ``E^-1``: ``1 / A^2``, or that of ``s^2 (1 1^T + d^2)``; of those there are not, 1.
-    cost : (k + 1, 3)
-        ``ln det E`` with what lies cost beside the price of the set.
-    """
-
-    inverse: Floats
-    cost: Floats
+    inverse: Floats  # (k + 1, 3, k, k) ``E^-1``: ``1 / A^2``, or that of ``s^2 (1 1^T + d^2)``, padded with 1
+    cost: Floats  # (k + 1, 3) ``ln det E`` plus the cost of the errors beside the price of the set
 
 
 @cache
-def _table(lies: Lies, most: int) -> _Table:
-    d2, s2, sizes = lies.differ**2, lies.amplitude**2, np.arange(most + 1)
+def _table(error_prior: ErrorPrior, most: int) -> _Table:
+    d2, s2, sizes = error_prior.differ**2, error_prior.amplitude**2, np.arange(most + 1)
     inverse = np.tile(np.eye(most), (most + 1, 3, 1, 1))
     for k in range(1, most + 1):
-        alone, same = np.eye(k) / lies.size**2, (np.eye(k) - 1.0 / (d2 + k)) / (s2 * d2)
+        alone, same = np.eye(k) / error_prior.size**2, (np.eye(k) - 1.0 / (d2 + k)) / (s2 * d2)
         inverse[k, :, :k, :k] = same, same, alone
     alike = sizes * np.log(s2) + (sizes - 1) * np.log(d2) + np.log(d2 + sizes)
-    same = np.where(sizes > 1, alike + lies.pair + lies.more * (sizes - 2), np.inf)
-    alone = 2.0 * sizes * np.log(lies.size) + lies.apart * (sizes - 1)
+    same = np.where(sizes > 1, alike + error_prior.pair + error_prior.more * (sizes - 2), np.inf)
+    alone = 2.0 * sizes * np.log(error_prior.size) + error_prior.apart * (sizes - 1)
     cost = np.column_stack([alike, same, alone])
     return _Table(frozen(inverse), frozen(cost))
 
 
-def worth(problem: Problem, ranked: Ranked) -> bool:
-    """Whether anything could change.
+def may_change(problem: LikelihoodProblem, ranked: Ranked) -> bool:
+    """True if likeness could change the result.
 
-    It could not where nobody else's reading is odd, every accusation is beyond doubt, and no other
-    explanation comes near.
-
-    Parameters
-    ----------
-    problem, ranked
-        As in `alike`.
+    It could not where no other reading is odd, every accusation is beyond doubt, and no other hypothesis
+    comes near.
     """
     lowest, best = ranked[0]
     count = best.counts[0]
     if not 0 < count <= MOST:
         return False
-    if ((best.g**2 > least(problem, count + 1) * best.diagonal) & ~best.liars).any():
+    if ((best.g**2 > least(problem, count + 1) * best.diagonal) & ~best.meters).any():
         return True
-    if count > 1 and (problem.meters(best)[best.liars] <= _WORSE).any():
+    if count > 1 and (problem.meter_rises(best)[best.meters] <= _WORSE).any():
         return True
-    if _like_all(problem, best) or (problem.false is not None and _continued(problem, best)):
+    if _like_others(problem, best) or (problem.false is not None and _continued(problem, best)):
         return True
     return any(each.counts[0] > 1 and cost - lowest <= _WORSE for cost, each in ranked[1:])
 
 
-def _like_all(problem: Problem, best: State) -> bool:
-    """Whether somebody else reads about as far off as the liars do on average."""
-    others = np.flatnonzero((best.g**2 > _UNUSUAL * best.diagonal) & ~best.liars)
-    expected = problem.a2 * float(best.g[best.liars].mean())
+def _like_others(problem: LikelihoodProblem, best: SnapshotHypothesis) -> bool:
+    """True if another meter is about as far off as the manipulated ones on average."""
+    others = np.flatnonzero((best.g**2 > _UNUSUAL * best.diagonal) & ~best.meters)
+    expected = problem.a2 * float(best.g[best.meters].mean())
     off = best.g[others] / best.diagonal[others]
     return bool((off * expected >= _LIKE * expected**2).any())
 
 
-def _continued(problem: Problem, best: State) -> bool:
-    """Whether somebody reads as off as who comes next in a story that all liars tell about one of them."""
+def _continued(problem: LikelihoodProblem, best: SnapshotHypothesis) -> bool:
+    """True if another meter is as odd as the next one of a load that all manipulated meters show."""
     assert problem.false is not None  # noqa: S101  # the caller has looked
     p, k, R = problem.size, best.counts[0] + 1, problem.false.R
     if k > min(MOST, p):
         return False
-    # Several tell a story already, and one more has no choice; one alone does not.
+    # A load shown by several determines the next meter; one alone does not show a load.
     price = float(problem.prices[k] - problem.prices[k - 1]) - 2.0 * float(np.log((p - k + 1.0) / k))
-    price += problem.lies.story if k == 2 else 0.0
-    odd = np.flatnonzero((best.g**2 > max(price, 0.0) * best.diagonal) & ~best.liars)
-    liars = np.flatnonzero(best.liars)
-    liars = liars[R[liars, liars] > 0.0]
-    if not odd.size or not liars.size:
+    price += problem.prior.load if k == 2 else 0.0
+    odd = np.flatnonzero((best.g**2 > max(price, 0.0) * best.diagonal) & ~best.meters)
+    suspects = np.flatnonzero(best.meters)
+    suspects = suspects[R[suspects, suspects] > 0.0]
+    if not odd.size or not suspects.size:
         return False
-    column = R[:, liars]
-    told = column >= problem.felt[k - 1, liars] * (1.0 - _ALIKE)
+    column = R[:, suspects]
+    shown = column >= problem.felt[k - 1, suspects] * (1.0 - _ALIKE)
     off = best.g[odd] / best.diagonal[odd]
-    expected = column[odd] * (problem.a2 * best.g[liars] / R[liars, liars])
+    expected = column[odd] * (problem.a2 * best.g[suspects] / R[suspects, suspects])
     like = off[:, None] * expected >= _LIKE * expected**2
-    return bool((told[best.liars].all(axis=0) & (told[odd] & like).any(axis=0)).any())
+    return bool((shown[best.meters].all(axis=0) & (shown[odd] & like).any(axis=0)).any())
 
 
-def least(problem: Problem, k: int) -> float:
-    """What the k-th liar costs at least; no accusation explains more than the square of its residual."""
-    lies, prices, k = problem.lies, problem.prices, min(k, problem.size)
-    return max(float(prices[k] - prices[k - 1]) + (lies.pair if k == 2 else lies.more), 0.0)
+def least(problem: LikelihoodProblem, k: int) -> float:
+    """Least cost of the k-th manipulated meter; an accusation explains at most the square of its residual."""
+    error_prior, prices, k = problem.prior, problem.prices, min(k, problem.size)
+    return max(float(prices[k] - prices[k - 1]) + (error_prior.pair if k == 2 else error_prior.more), 0.0)
 
 
-def alike(problem: Problem, ranked: Ranked) -> list[Set]:
-    """The explanations that were found, and what is likelier still because lies are alike.
+def likely_sets(problem: LikelihoodProblem, ranked: Ranked) -> list[ErrorSet]:
+    """Hypotheses found so far, and likelier ones with errors that are alike, in no order.
 
-    Parameters
-    ----------
-    problem
-        The readings, and what may be wrong with them.
-    ranked
-        Explanations with J, the best first; those of more than `MOST` liars stay out.
-
-    Returns
-    -------
-    list of Set
-        In no order, none twice.
+    ranked: hypotheses with J, the best first; those of more than `MOST` manipulated meters stay out.
     """
-    bases: dict[bytes, _Base] = {}
-    likely: dict[bytes, list[State]] = {}
+    bases: dict[bytes, _SamePowers] = {}
+    likely: dict[bytes, list[SnapshotHypothesis]] = {}
     for cost, at in ranked:
         if cost - ranked[0][0] <= _WORSE and at.counts[0] <= MOST:
             likely.setdefault(at.powers.tobytes(), []).append(at)
     first = ranked[0][1]
     for key, some in likely.items():
-        # Other powers matter where they say something else about who lies.
+        # Other powers matter where they change the accused meters.
         if not any(at is first or _differs(problem, first, at) for at in some):
             continue
         same = [at for _, at in ranked if at.powers.tobytes() == key]
-        base = bases[key] = _Base(problem, min(same, key=lambda at: at.counts[0]), some[0].m)
-        sets = [_members(at.liars) for at in some]
+        base = bases[key] = _SamePowers(problem, min(same, key=lambda at: at.counts[0]), some[0].m)
+        sets = [_members(at.meters) for at in some]
         if not (base.powers.any() or ranked[0][1].counts[1]):
-            # Likely the best ones; they are asked for at once.
-            sets += [*combinations(_strongest(base), 2), *_stories(base, sets[0])]
-        base.costs(sets)
-    best = min(bases.values(), key=lambda base: min(base.known.values())[0])
+            # Likely the best ones, computed at once.
+            sets += [*combinations(_strongest(base), 2), *_load_sets(base, sets[0])]
+        base.evaluate(sets)
+    best = min(bases.values(), key=lambda base: min(base.costed.values())[0])
     if not best.powers.any():
-        best.costs(combinations(_strongest(best), 2))
-        best.costs(_stories(best, min(best.known, key=lambda each: best.known[each][0])))
+        best.evaluate(combinations(_strongest(best), 2))
+        best.evaluate(_load_sets(best, min(best.costed, key=lambda each: best.costed[each][0])))
     _descend(best)
-    within = min(best.known.values())[0] + 2.0 * np.log(problem.lies.like)
+    within = min(best.costed.values())[0] + 2.0 * np.log(problem.prior.like)
     return [
-        base.explained(liars)
+        base.detail(suspects)
         for base in bases.values()
-        for liars, (cost, _) in base.known.items()
+        for suspects, (cost, _) in base.costed.items()
         if cost <= within
     ]
 
 
-def _differs(problem: Problem, first: State, at: State) -> bool:
-    """Whether another explanation may be likelier than the first, or close to it, with other liars."""
+def _differs(problem: LikelihoodProblem, first: SnapshotHypothesis, at: SnapshotHypothesis) -> bool:
+    """True if another hypothesis may be likelier than the first, or close to it, with other meters."""
     if at.counts[0] > 1:
-        return not np.array_equal(at.liars, first.liars)
-    # One lie is like no other.
-    most = problem.cost(first) + problem.lies.apart * (first.counts[0] - 1)
-    return bool(problem.cost(at) <= most + max(_NEAR, 2.0 * log(problem.lies.like)))
+        return not np.array_equal(at.meters, first.meters)
+    # One error alone has no likeness.
+    most = problem.cost(first) + problem.prior.apart * (first.counts[0] - 1)
+    return bool(problem.cost(at) <= most + max(_NEAR, 2.0 * log(problem.prior.like)))
 
 
-def _stories(base: _Base, liars: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
-    """Stories about one of the likeliest liars, about as long as that explanation."""
+def _load_sets(base: _SamePowers, suspects: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
+    """Load shapes about one of the likeliest manipulated meters, about as many members."""
     if base.problem.false is None:
         return
     R, size = base.problem.false.R, base.z**2 / base.diagonal
-    for c in (c for c in liars if R[c, c] > 0.0):
+    for c in (c for c in suspects if R[c, c] > 0.0):
         felt = np.round(R[:, c] / R[c, c], 9)
         felt[c] = np.inf
         order = np.lexsort((-size, -felt)).tolist()
-        for k in range(max(2, len(liars) - 1), min(MOST, len(liars) + 2, len(order)) + 1):
+        for k in range(max(2, len(suspects) - 1), min(MOST, len(suspects) + 2, len(order)) + 1):
             yield tuple(sorted(order[:k]))
 
 
-def _strongest(base: _Base) -> list[int]:
-    """Meters whose readings fit worst while nobody is accused."""
+def _strongest(base: _SamePowers) -> list[int]:
+    """Meters with the worst residuals in the hypothesis without accusations."""
     size = base.z**2 / base.diagonal
     far = np.flatnonzero(size > least(base.problem, 2))
     return [int(j) for j in np.sort(far[np.argsort(-size[far])[:_PAIRED]])]
@@ -401,23 +366,23 @@ def _members(some: Bools) -> tuple[int, ...]:
     return tuple(np.flatnonzero(some).tolist())
 
 
-def _descend(base: _Base) -> None:
+def _descend(base: _SamePowers) -> None:
     """Accuse one more, trust one again, exchange two: from the best few sets, until they stay the best."""
     done: set[tuple[int, ...]] = set()
     for _ in range(_ROUNDS):
-        best = sorted(base.known, key=lambda each: base.known[each][0])[:_WIDTH]
-        least = base.known[best[0]][0]
-        near = [each for each in best if each not in done and base.known[each][0] - least <= _NEAR]
+        best = sorted(base.costed, key=lambda each: base.costed[each][0])[:_WIDTH]
+        least = base.costed[best[0]][0]
+        near = [each for each in best if each not in done and base.costed[each][0] - least <= _NEAR]
         if not near:
             return
         done.update(near)
-        base.costs([new for each in near for new in _neighbours(base, each)])
+        base.evaluate([new for each in near for new in _neighbours(base, each)])
 
 
-def _neighbours(base: _Base, at: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
+def _neighbours(base: _SamePowers, at: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
     if not at:
         return
-    now, (least_without, left) = base.explained(at), base.without(at)
+    now, (least_without, left) = base.detail(at), base.without(at)
     beyond = now.weights**2 > least(base.problem, len(at) + 1) * left
     beyond[list(at)] = False
     others = np.flatnonzero(beyond).tolist()

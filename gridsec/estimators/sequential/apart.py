@@ -1,16 +1,12 @@
-"""Estimates without the readings of meters that withhold their customer's power.
+"""Posterior without the readings of meters that withhold their customer's power.
 
-A voltage reading beside a power that is not read has no check of its own: each lie within the load's range is
-a load. With w and M of all trusted meters, and w', M' of those that are vouched for (`Doubts.vouched`), the
-variance at every bus is
+A voltage reading beside an unread power has no check of its own: each error within the load's range is a
+load. With w and M of all trusted meters, and w', M' of the vouched ones, the variance at every bus is
 
     M' + (w - w')^2
 
-about w. It covers the truth if the other readings are false, and is M' plus little if they are true.
-
-References
-----------
-docs/theory-sequential.md, section 7.
+about w. It covers the truth if the other readings are false, and is M' plus little if they are true
+(docs/theory-sequential.md, section 7).
 """
 
 from __future__ import annotations
@@ -20,81 +16,50 @@ from dataclasses import dataclass
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, all_of, any_of
-from gridsec.estimators.sequential.blocks import sound, without
-from gridsec.estimators.sequential.conditional import Fit, Judged, fit, judge
-from gridsec.estimators.sequential.doubts import Doubts
+from gridsec.estimators.sequential.blocks import remove_meters, well_conditioned
+from gridsec.estimators.sequential.conditional import LeaveOneOut, Posterior, condition, leave_one_out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Apart:
-    """A fit without some of its meters. p meters.
+class VouchedPosterior:
+    """Posterior without some meters. p meters."""
 
-    Attributes
-    ----------
-    whole
-        The fit with them.
-    fallen : (p,)
-        Trusted meters that are not vouched for.
-    rest
-        The fit without them.
-    """
+    whole: Posterior  # posterior with them
+    removed: Bools  # (p,) trusted meters without a check
+    vouched: Posterior  # posterior without them
 
-    whole: Fit
-    fallen: Bools
-    rest: Fit
-
-    def added(self, judged: Judged) -> Floats:
-        """Variance that the fit with all meters is short of at every bus, (n,), squared pu^2.
-
-        Parameters
-        ----------
-        judged
-            What the fit with all meters says.
-        """
-        moved = judged.w - judge(self.rest, judged.m).w
-        return np.asarray(np.maximum(self.rest.variance - self.whole.variance, 0.0) + moved**2)
+    def added_variance(self, loo: LeaveOneOut) -> Floats:
+        """Variance to be added to the posterior with all meters, (n,), squared pu^2."""
+        moved = loo.mean - leave_one_out(self.vouched, loo.m).mean
+        return np.asarray(np.maximum(self.vouched.variance - self.whole.variance, 0.0) + moved**2)
 
 
-def apart(
-    before: tuple[Apart | None, ...], fits: tuple[Fit | None, ...], doubts: Doubts
-) -> tuple[Apart | None, ...]:
-    """Fits without the meters that are not vouched for, by scale; None where all are.
-
-    Parameters
-    ----------
-    before
-        From the last tick, used again for the same meters.
-    fits : (s,)
-        The trusted meters.
-    doubts
-        Of this tick.
-    """
-    if all_of(doubts.vouched):
-        return before if not any(before) else (None,) * len(fits)
-    pairs = zip(before, fits, doubts.vouched, strict=True)
-    return tuple(None if now is None else _apart(kept, now, vouched) for kept, now, vouched in pairs)
+def vouched_posteriors(
+    before: tuple[VouchedPosterior | None, ...],
+    posteriors: tuple[Posterior | None, ...],
+    vouched: Bools,
+) -> tuple[VouchedPosterior | None, ...]:
+    """Posteriors without meters that are not vouched, by scale; None where all are. `before` is reused."""
+    if all_of(vouched):
+        return before if not any(before) else (None,) * len(posteriors)
+    pairs = zip(before, posteriors, vouched, strict=True)
+    return tuple(None if now is None else _reused(kept, now, vouched) for kept, now, vouched in pairs)
 
 
-def _apart(kept: Apart | None, now: Fit, vouched: Bools) -> Apart | None:
-    fallen = now.trusted & ~vouched
-    if kept is not None and kept.whole is now and np.array_equal(kept.fallen, fallen):
+def _reused(kept: VouchedPosterior | None, now: Posterior, vouched: Bools) -> VouchedPosterior | None:
+    removed = now.trusted & ~vouched
+    if kept is not None and kept.whole is now and np.array_equal(kept.removed, removed):
         return kept
-    return set_apart(now, vouched)
+    return vouched_posterior(now, vouched)
 
 
-def set_apart(now: Fit, vouched: Bools) -> Apart | None:
-    """A fit without the meters that are not vouched for; None where it has none.
-
-    Parameters
-    ----------
-    now
-        The trusted meters.
-    vouched : (p,)
-        Meters with a check by their customer's power.
-    """
-    fallen = now.trusted & ~vouched
-    if not any_of(fallen):
+def vouched_posterior(now: Posterior, vouched: Bools) -> VouchedPosterior | None:
+    """Posterior without meters that are not vouched (p,); None if all are."""
+    removed = now.trusted & ~vouched
+    if not any_of(removed):
         return None
-    if sound(now.prior, now.noise):
-        return Apart(now, fallen, without(now, fallen))
-    return Apart(now, fallen, fit(now.prior, now.noise, now.trusted & ~fallen, now.loose))
+    if well_conditioned(now.prior, now.noise):
+        return VouchedPosterior(now, removed, remove_meters(now, removed))
+    return VouchedPosterior(
+        now, removed, condition(now.prior, now.noise, now.trusted & ~removed, now.unknowns)
+    )

@@ -1,27 +1,22 @@
-"""How far honest errors can lead, whatever they are within what was stated: intervals, no probabilities.
+"""Bounds of the estimate under all honest errors within their stated limits: intervals, not probabilities.
 
-All else in this package calls an offset unlikely. But classes and power factors err in the same direction for
-years, and all of them may err together; what then still holds is a sum of worst cases:
+Accuracy classes and power factors err in one direction for years, and all of them may err together. The
+bound is a sum of worst cases:
 
     |v2 - model| <= 2 |R| dp + 2 |X| (dq + e) + losses + busbar      everywhere
     |v2 - y|     <= error of the reading                             at trusted meters
 
-with e the error of the observed injections. Every ``|e_i|`` is a first-order lag of what drives it,
+e is the error of the observed injections. Every ``|e_i|`` is a first-order lag of its input error,
 
-    tau_i |e_i|' <= -|e_i| + min(span_i, d_i (error of what it is given + hold) + mismatch),
+    tau_i |e_i|' <= -|e_i| + min(span_i, d_i (input error + hold) + mismatch),
 
-where `hold` is what the inverter's voltage changed from frame to frame: saturation keeps it finite, whatever
-happens. An inverter that follows a trusted meter is given a reading, any other the model. Supposed is that
-inverters follow their curves, and that between two frames a voltage stays between its values at them: what
-comes and goes unseen moves inverters that nobody knows of.
+with `hold` the change of the inverter's voltage between frames; saturation keeps it finite. The input is a
+reading of a trusted meter or the model. Assumptions: inverters follow their curves, and a voltage stays
+between its values at two successive frames.
 
-Powers told by customers whose meters are not trusted may be false, by as much as the book of the search
-allows for. The busbar voltage is metered, or what the trusted meters leave of it: it is eliminated, not
-assumed.
-
-References
-----------
-docs/theory-sequential.md, section 7; docs/theory-detection.md for the lag and for `mismatch`.
+Powers reported by customers of suspect meters may be false by the sizes of the fault dictionary. The busbar
+voltage is metered, or eliminated by the trusted meters (docs/theory-sequential.md, section 7;
+docs/theory-detection.md for the lag and for `mismatch`).
 """
 
 from __future__ import annotations
@@ -39,108 +34,56 @@ from gridsec.grid.meter import told_error
 from gridsec.interface import Estimate, Frame
 
 FALSE_Q = 0.5
-"""Reactive power per active power that a false power is told with at most."""
+"""Largest reactive power per active power of a false report."""
 
-# The monotone map of the free inverters is applied so often from above.
-_ROUNDS = 2
+_ITERATIONS = 2
+"""Iterations of the monotone map of the model-driven inverters, from above."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Lag:
-    """How far the observed injections may be from the true ones. m inverters.
+class InjectionError:
+    """Errors of the observed injections. m inverters."""
 
-    Attributes
-    ----------
-    error : (m,)
-        Half-widths, pu.
-    given : (m,)
-        Squared voltage that each was given at the last frame, pu.
-    width : (m,)
-        How far that may have been from the truth, squared pu.
-    span : (m,)
-        Distance between the saturated values of each curve, pu: no error is larger.
-    """
+    error: Floats  # (m,) half-widths, pu
+    input: Floats  # (m,) squared voltage at each input at the last frame, pu
+    width: Floats  # (m,) largest error of that, squared pu
+    span: Floats  # (m,) distance between the saturated values of each curve, pu: no error is larger
 
-    error: Floats
-    given: Floats
-    width: Floats
-    span: Floats
-
-    def lied_to(self, which: Bools) -> Lag:
-        """Of inverters that followed a liar nothing is known but where they saturate.
-
-        Parameters
-        ----------
-        which : (m,)
-            Their inverters.
-        """
+    def reset(self, which: Bools) -> InjectionError:
+        """Errors with inverters `which` (m,) at their span: a manipulated meter drove them."""
         return replace(self, error=np.where(which, self.span, self.error)) if any_of(which) else self
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Powers:
-    """The powers of one frame and how far they may be off. N customers, p meters.
+class PowerErrors:
+    """Powers of one frame and their errors. N customers, p meters."""
 
-    Attributes
-    ----------
-    frame
-        With powers that can be.
-    q : (N,)
-        Net reactive injections that the model was given, observed ones of inverters included, pu.
-    told : (N,)
-        Whose net reactive power is metered and used: observed injections do not matter there.
-    v0_squared
-        Squared busbar voltage, pu; in three phases (3,).
-    trusted : (p,)
-        Which meters are believed: powers that customers of the others tell may be false.
-    sizes : (k,)
-        How much there may be of whatever is in the book of the design, pu.
-    """
+    frame: Frame  # with possible powers
+    q: Floats  # (N,) net reactive injections of the model, observed ones included, pu
+    uses_q: Bools  # (N,) metered net reactive power is used: observed injections do not matter
+    v0_squared: Floats | float  # squared busbar voltage, pu; (3,) in three phases
+    trusted: Bools  # (p,) trusted meters: powers of the other customers may be false
+    sizes: Floats  # (k,) standard deviation of each fault of the dictionary, pu
 
-    frame: Frame
-    q: Floats
-    told: Bools
-    v0_squared: Floats | float
-    trusted: Bools
-    sizes: Floats
+    def linear_error(self, plant: Plant, injected: Floats) -> Floats:
+        """Largest error of the linear model at each customer for a known busbar voltage, (N,).
 
-    def linear(self, plant: Plant, injected: Floats) -> Floats:
-        """What the linear model can be off at each customer for a known busbar voltage, (N,).
-
-        Parameters
-        ----------
-        plant
-            The feeder.
-        injected : (N,)
-            How far the inverters' injections may be off, pu.
+        injected: (N,) largest errors of the inverters' injections, pu; also in `loss_error` and `errors`.
         """
         return plant.feeder.reach(*self.errors(plant, injected))[plant.feeder.bus]
 
-    def lost(self, plant: Plant, injected: Floats) -> tuple[Floats, Floats]:
-        """What the loss correction can be off at each customer, (N,), and the correction itself.
-
-        Parameters
-        ----------
-        plant, injected
-            As in `linear`.
-        """
+    def loss_error(self, plant: Plant, injected: Floats) -> tuple[Floats, Floats]:
+        """Largest error of the loss correction at each customer, (N,), and the correction."""
         p_error, q_error = self.errors(plant, injected)
         v0 = self.v0_squared
         correction, off = losses(plant, self.frame.p, self.q, v0, p_error=p_error, q_error=q_error)
         return off, correction[plant.feeder.bus]
 
-    def bent(self, plant: Plant, which: Bools) -> Floats:
-        """What some customers' reports change at each meter, but for the linear effect of active power, (p,).
+    def report_effect(self, plant: Plant, which: Bools) -> Floats:
+        """Effect of customers' reports `which` (N,) at each meter, without that of active power, (p,).
 
-        That is what a direction of the dictionary leaves of a report that is false: its reactive power, and
-        what the losses of both have added to the model.
-
-        Parameters
-        ----------
-        plant
-            The feeder.
-        which : (N,)
-            The customers.
+        This remains of a false report beside its direction in the fault dictionary: reactive power and
+        losses.
         """
         if not any_of(which):
             return np.zeros(plant.meters.size)
@@ -153,156 +96,107 @@ class Powers:
         return np.minimum(np.nan_to_num(off[at], nan=NO_VOLTAGE), NO_VOLTAGE)
 
     def errors(self, plant: Plant, injected: Floats) -> tuple[Floats, Floats]:
-        """How far the net powers may be off, (N,) each.
-
-        Parameters
-        ----------
-        plant, injected
-            As in `linear`.
-        """
+        """Largest errors of the net powers, (N,) each."""
         frame = self.frame
-        p_error, q_error = frame.p_error.copy(), np.where(self.told, frame.q_net_error, frame.q_error)
-        liars = plant.meters[~self.trusted]
-        p_error[liars] += self.sizes[liars]
-        q_error[liars] += np.abs(frame.q[liars]) + FALSE_Q * self.sizes[liars]
-        return p_error, q_error + np.where(self.told, 0.0, injected)
+        p_error, q_error = frame.p_error.copy(), np.where(self.uses_q, frame.q_net_error, frame.q_error)
+        suspects = plant.meters[~self.trusted]
+        p_error[suspects] += self.sizes[suspects]
+        q_error[suspects] += np.abs(frame.q[suspects]) + FALSE_Q * self.sizes[suspects]
+        return p_error, q_error + np.where(self.uses_q, 0.0, injected)
 
 
-def start(plant: Plant, given: Floats) -> Lag:
-    """Nothing is known of the injections but where they saturate.
-
-    Parameters
-    ----------
-    plant
-        The inverters.
-    given : (m,)
-        Squared voltage that each is given, pu.
-    """
+def unknown_injections(plant: Plant, given: Floats) -> InjectionError:
+    """Errors before the first frame: injections within saturation. given: (m,) inputs, squared pu."""
     span = plant.droop.span
-    return Lag(span, given, np.full(span.size, NO_VOLTAGE), span)
+    return InjectionError(span, given, np.full(span.size, NO_VOLTAGE), span)
 
 
-def follow(
+def update_injection_error(
     design: SequentialDesign,
-    before: Lag,
+    before: InjectionError,
     given: Floats,
-    free: tuple[Bools, Powers, Bools | bool] | None,
+    free: tuple[Bools, PowerErrors, Bools | bool] | None,
     h: float,
-) -> Lag:
-    """The errors a time h later.
+) -> InjectionError:
+    """Errors a time h later.
 
-    Parameters
-    ----------
-    design, before
-        The design, and the errors at the last frame.
-    given : (m,)
-        Squared voltage that each inverter is given: its meter's reading or the model's, pu.
-    free
-        Which inverters follow the model, (m,), what the frame says of powers, and whether the busbar voltage
-        is metered; None where all follow their meters.
-    h
-        Step, s.
+    given: (m,) squared voltage at each input, pu. free: inverters that follow the model, (m,), power errors,
+    and metered busbar phases; None where all follow their meters.
     """
     plant, droop, span = design.plant, design.plant.droop, before.span
-    hold = np.abs(given - before.given)
-    width = design.heard.of(given)
+    hold = np.abs(given - before.input)
+    width = design.reading_errors.of(given)
     wider = np.maximum(width, before.width)
     target = np.minimum(span, droop.slope * (wider + hold) + design.mismatch)
     if free is not None:
         (which, powers, metered), size = free, plant.feeder.bus.size
         # The map is monotone: from above its images stay above the error.
         top = np.where(which, span, np.maximum(before.error, target))
-        lost, _ = powers.lost(plant, droop.per_customer(top, size))
+        lost, _ = powers.loss_error(plant, droop.per_customer(top, size))
         meter = np.minimum(busbar_errors(plant, powers.v0_squared, design.sigmas[0]), NO_VOLTAGE)
         known = np.where(metered, meter, NO_VOLTAGE)
         busbar = plant.feeder.broadcast_busbar(known)[plant.feeder.bus]
-        for _ in range(_ROUNDS):
-            model = powers.linear(plant, droop.per_customer(top, size)) + lost + busbar
+        for _ in range(_ITERATIONS):
+            model = powers.linear_error(plant, droop.per_customer(top, size)) + lost + busbar
             width = np.where(which, model[droop.customer], width)
             wider = np.maximum(width, before.width)
             image = np.minimum(span, droop.slope * (wider + hold) + design.mismatch)
             target = np.where(which, image, target)
             top = np.where(which, np.maximum(before.error, image), top)
     error = target + np.exp(-h / droop.tau) * (before.error - target)
-    return Lag(error, given, width, span)
+    return InjectionError(error, given, width, span)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Grounds:
-    """What the bound of one estimate rests on. N customers, p meters.
+class BoundInputs:
+    """Inputs of the bound of one estimate. N customers, p meters."""
 
-    Attributes
-    ----------
-    plant
-        The feeder.
-    powers
-        The frame's, and how far they may be off.
-    injected : (m,)
-        How far the observed injections may be off, pu.
-    model : (N,)
-        What the model makes of it, squared pu.
-    busbar
-        Whether its voltage is metered; in three phases (3,).
-    y, trusted : (p,)
-        Squared readings, and the meters that the estimate rests on.
-    reads
-        Meters whose customer's power is known, (p,): the bound rests on these. Asked for with the bound.
-    sigmas
-        Standard deviations of jitter that an honest reading may be off.
-    """
-
-    plant: Plant
-    powers: Powers
-    injected: Floats
-    model: Floats
-    busbar: Bools | bool
-    y: Floats
-    trusted: Bools
-    reads: Callable[[], Bools]
-    sigmas: float
+    plant: Plant  # the feeder
+    powers: PowerErrors  # power errors of the frame
+    injected: Floats  # (m,) largest errors of the observed injections, pu
+    model: Floats  # (N,) voltages of the model, squared pu
+    busbar: Bools | bool  # busbar phases that are metered
+    y: Floats  # (p,) squared readings
+    trusted: Bools  # (p,) meters used by the estimate
+    checked: Callable[[], Bools]  # meters with a known customer's power, (p,); evaluated with the bound
+    sigmas: float  # standard deviations of jitter within an honest reading
 
     def half_width(self, v2: Floats) -> Floats:
-        """Largest distance of the truth from some squared voltages, pu.
-
-        Parameters
-        ----------
-        v2 : (N,)
-            The squared voltages.
-        """
+        """Largest distance of the true squared voltages from v2, (N,), pu."""
         plant, at = self.plant, self.plant.meters
         injected = plant.droop.per_customer(self.injected, plant.feeder.bus.size)
-        lost, correction = self.powers.lost(plant, injected)
-        spread = np.minimum(self.powers.linear(plant, injected) + lost, NO_VOLTAGE)
-        reading, use = told_error(plant.accuracy, self.y, self.sigmas), self.trusted & self.reads()
+        lost, correction = self.powers.loss_error(plant, injected)
+        spread = np.minimum(self.powers.linear_error(plant, injected) + lost, NO_VOLTAGE)
+        reading, use = told_error(plant.accuracy, self.y, self.sigmas), self.trusted & self.checked()
         ends = self._busbar(spread, reading, use)
         low, high = (plant.feeder.broadcast_busbar(end)[plant.feeder.bus] for end in ends)
-        # What losses take off is that of the assumed busbar voltage.
+        # The loss correction is that of the assumed busbar voltage.
         moved = np.minimum(np.maximum(np.abs(low), np.abs(high)), NO_VOLTAGE)
         base = plant.feeder.broadcast_busbar(self.powers.v0_squared)[plant.feeder.bus]
-        spread = spread + np.abs(correction) * moved / np.maximum(base - moved, _LEAST)
+        spread = spread + np.abs(correction) * moved / np.maximum(base - moved, _LEAST_BUSBAR)
         low, high = self.model + low - spread, self.model + high + spread
         own = np.where(use, reading, np.inf)
-        low[at], high[at] = _both(low[at], high[at], self.y - own, self.y + own)
+        low[at], high[at] = _intersection(low[at], high[at], self.y - own, self.y + own)
         return np.minimum(np.maximum(high - v2, v2 - low), NO_VOLTAGE)
 
     def _busbar(self, spread: Floats, reading: Floats, use: Bools) -> tuple[Floats, Floats]:
-        """How far squared busbar voltages may be from those assumed: by their meters, and by all others."""
+        """Interval of the busbar's squared voltage about the assumed one: by its meter, and by the others."""
         plant, at = self.plant, self.plant.meters
         known = np.atleast_1d(busbar_errors(plant, self.powers.v0_squared, self.sigmas))
         known = np.where(self.busbar, known, np.inf)
         off, room = self.y - self.model[at], np.where(use, reading + spread[at], np.inf)
-        heard = np.where(plant.feeder.busbar_incidence()[at] > 0.0, room[:, None], np.inf)
-        low = (off[:, None] - heard).max(axis=0, initial=-np.inf)
-        high = (off[:, None] + heard).min(axis=0, initial=np.inf)
-        return _both(-known, known, low, high)
+        reach = np.where(plant.feeder.busbar_incidence()[at] > 0.0, room[:, None], np.inf)
+        low = (off[:, None] - reach).max(axis=0, initial=-np.inf)
+        high = (off[:, None] + reach).min(axis=0, initial=np.inf)
+        return _intersection(-known, known, low, high)
 
 
-# No supply is lower, squared pu.
-_LEAST = 0.1
+_LEAST_BUSBAR = 0.1
+"""Least squared busbar voltage of the loss correction, pu."""
 
 
-def _both(low: Floats, high: Floats, other_low: Floats, other_high: Floats) -> tuple[Floats, Floats]:
-    """What two intervals have in common; where they have nothing, all that is between their ends."""
+def _intersection(low: Floats, high: Floats, other_low: Floats, other_high: Floats) -> tuple[Floats, Floats]:
+    """Intersection of two intervals; their hull where they do not meet."""
     below, above = np.maximum(low, other_low), np.minimum(high, other_high)
     apart = below > above
     return (
@@ -311,45 +205,35 @@ def _both(low: Floats, high: Floats, other_low: Floats, other_high: Floats) -> t
     )
 
 
-# In place of a bound that nobody has asked for yet.
-_LATER: Floats = np.zeros(0)
+# Placeholder of a bound that is not computed yet.
+_PENDING: Floats = np.zeros(0)
 
 
-class Bounded(Estimate):
-    """An estimate whose bound is worked out when it is first asked for: that is half a step more.
+class BoundedEstimate(Estimate):
+    """Estimate with a bound computed on first access, which takes half a step.
 
-    From the arrays of its frame, which must not be changed meanwhile.
+    It keeps the arrays of its frame, which must not be changed.
     """
 
     __slots__ = ("_grounds",)
-    _grounds: Grounds
+    _grounds: BoundInputs
 
     @classmethod
-    def on(cls, grounds: Grounds, t: float, v2_bus: Floats, variance: Floats, x: Floats) -> Bounded:
-        """Put an estimate together.
-
-        Parameters
-        ----------
-        grounds
-            What its bound rests on.
-        t
-            Unix time, s.
-        v2_bus, variance : (n,)
-            Squared voltage of every place and its variance, pu.
-        x : (m,)
-            Observed injections, pu.
-        """
+    def of(
+        cls, grounds: BoundInputs, t: float, v2_bus: Floats, variance: Floats, x: Floats
+    ) -> BoundedEstimate:
+        """Estimate at Unix time t, s, with variance (n,) at every place."""
         bus = grounds.plant.feeder.bus
-        made = cls(t, v2_bus[bus], _LATER, v2_bus, grounds.trusted, x, np.sqrt(variance[bus]))
+        made = cls(t, v2_bus[bus], _PENDING, v2_bus, grounds.trusted, x, np.sqrt(variance[bus]))
         object.__setattr__(made, "_grounds", grounds)
         return made
 
     @property
     def bound(self) -> Floats:
-        """Half-width of the interval around `v2` that holds the truth while errors are as stated, (N,)."""
+        """Half-width of the interval around `v2` that contains the truth within the stated errors, (N,)."""
         slot = Estimate.__dict__["bound"]
         found: Floats = slot.__get__(self)
-        if found is _LATER:
+        if found is _PENDING:
             found = self._grounds.half_width(self.v2)
             slot.__set__(self, found)
         return found

@@ -1,17 +1,15 @@
-"""The busbar's own meter, judged by all others.
+"""Test of the busbar's meter by all others.
 
-What it reads is in every residual: if it is off by b, all residuals of its phase are off by -b, and whoever
-takes its word suspects everybody else. It is a meter like any other, only with more weight. With d one at the
-meters of its phase and zero elsewhere, letting the busbar differ by any amount lowers the misfit by
+The busbar's error b is in every residual of its phase as -b. With d one at the meters of the phase and zero
+elsewhere, an unknown busbar error lowers the chi-square by
 
     z^2 = (d^T Q m)^2 / (d^T Q d),
 
-and z is its leave-one-out residual in standard deviations: Q already contains its honest error. Where that is
-beyond chance, and, while no meter is suspected, beyond what honest errors explain that are all at their ends
-and in one direction, the likeliest explanation in which the busbar's meter lies is compared with that in
-which only others do (`gridsec.estimators.sequential.examine`). If it wins, the tick begins anew as one at
-which nobody reads the busbar, from the last voltage that was believed. The meters then say where the busbar
-is, and what its own meter says is compared with that until both agree again.
+and z is its leave-one-out residual in standard deviations: Q contains its honest error. Where z is beyond
+chance, and, without suspects, beyond honest errors of one direction at their ends, the likeliest hypothesis
+with a manipulated busbar meter is compared with those without (`gridsec.estimators.sequential.examine`). If
+it wins, the tick starts again without that reading, from the last trusted voltage. The meters then determine
+the busbar, and its reading is compared with them until both agree again.
 
 References
 ----------
@@ -26,235 +24,145 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of
 from gridsec.estimators.inputs import busbar_errors
-from gridsec.estimators.sequential.bounds import Powers
-from gridsec.estimators.sequential.conditional import Fit, Judged
+from gridsec.estimators.sequential.bounds import PowerErrors
+from gridsec.estimators.sequential.conditional import LeaveOneOut, Posterior
 from gridsec.estimators.sequential.design import SequentialDesign
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Busbar:
-    """What is thought of the busbar's meter. b phases, one on a balanced feeder.
+class BusbarTrust:
+    """Trust of the busbar's meter. b phases, 1 on a balanced feeder."""
 
-    Attributes
-    ----------
-    believed : (b,)
-        Whether its voltage is used.
-    scale : (b,)
-        Scale on which it was caught.
-    age : (b,)
-        For how many ticks it has not been believed.
-    quiet : (b,)
-        Ticks in a row, of these, in which it agreed with the meters; negative after a restart, while so many
-        more are owed.
-    off : (b,)
-        What it reads too much, the mean over its scale, squared pu.
-    named : (b,)
-        Whether it is called manipulated.
-    """
+    trusted: Bools  # (b,) its voltage is used
+    scale: Ints  # (b,) scale of the detection
+    ticks_suspect: Ints  # (b,) ticks without trust
+    ticks_agreeing: Ints  # (b,) successive ticks of agreement; negative after a restart: ticks owed
+    off: Floats  # (b,) excess of its reading, mean over the scale, squared pu
+    named: Bools  # (b,) named as manipulated
 
-    believed: Bools
-    scale: Ints
-    age: Ints
-    quiet: Ints
-    off: Floats
-    named: Bools
-
-    def caught(self, phase: int, scale: int) -> Busbar:
-        """A phase is believed no more.
-
-        Parameters
-        ----------
-        phase, scale
-            Which, and the scale that found it.
-        """
-        here = np.arange(self.believed.size) == phase
-        return replace(self, believed=self.believed & ~here, scale=np.where(here, scale, self.scale))
+    def suspect(self, phase: int, scale: int) -> BusbarTrust:
+        """Trust without one phase, detected on a scale."""
+        here = np.arange(self.trusted.size) == phase
+        return replace(self, trusted=self.trusted & ~here, scale=np.where(here, scale, self.scale))
 
 
-def believed(phases: int) -> Busbar:
-    """Nothing speaks against the busbar's meter.
-
-    Parameters
-    ----------
-    phases
-        b.
-    """
+def trusted_busbar(phases: int) -> BusbarTrust:
+    """All phases trusted."""
     zero, no = np.zeros(phases, dtype=np.intp), np.zeros(phases, dtype=np.bool_)
-    return Busbar(~no, zero, zero, zero, np.zeros(phases), no)
+    return BusbarTrust(~no, zero, zero, zero, np.zeros(phases), no)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Doubt:
-    """What speaks against the busbar's meter. p meters, b phases.
+class BusbarTest:
+    """Limits of the test. p meters, b phases."""
 
-    Attributes
-    ----------
-    sigmas
-        Standard deviations beyond which an offset is none of chance.
-    model : (p,)
-        What the model may be off, squared pu.
-    metered : (b,)
-        Whether there is a busbar voltage that is believed.
-    """
-
-    sigmas: float
-    model: Floats
-    metered: Bools
+    sigmas: float  # standard deviations within chance
+    model: Floats  # (p,) largest model error, squared pu
+    metered: Bools  # (b,) busbar voltage is metered and trusted
 
 
-def opposed(design: SequentialDesign, doubt: Doubt, now: Fit, judged: Judged) -> list[int]:
-    """The phases of the busbar whose meter the trusted ones contradict beyond chance.
-
-    Parameters
-    ----------
-    design, doubt
-        The design, and what is beyond chance.
-    now, judged
-        The trusted meters, and what they say.
-    """
-    # Weights are zero where nobody is trusted.
-    along, form = np.abs(judged.weights @ design.hangs_on), weight(design, now)
+def contradicted_phases(
+    design: SequentialDesign, doubt: BusbarTest, now: Posterior, loo: LeaveOneOut
+) -> list[int]:
+    """Phases of the busbar with a meter that the trusted ones contradict beyond chance."""
+    # Weights are zero where no meter is trusted.
+    along, form = np.abs(loo.weights @ design.busbar_incidence), busbar_weights(design, now)
     chance = doubt.sigmas * np.sqrt(form)
     if all_of(along <= chance):
         return []
-    # The model may be off by that at all meters, in the direction that says most: more than form where
-    # weights differ in sign.
-    at, Q = now.trusting()
-    reach = np.abs(Q @ design.hangs_on[at]).sum(axis=0)
+    # The model may err at all meters in the worst direction: more than `form` where weights differ in sign.
+    at, Q = now.precision()
+    reach = np.abs(Q @ design.busbar_incidence[at]).sum(axis=0)
     return np.flatnonzero(doubt.metered & (along > chance + doubt.model.max() * reach)).tolist()
 
 
-def weight(design: SequentialDesign, now: Fit) -> Floats:
-    """d^T Q d of every phase of the busbar, (b,); kept with the fit.
-
-    Parameters
-    ----------
-    design, now
-        The design, and the trusted meters.
-    """
-    if now.together is None:
-        at, Q = now.trusting()
-        hangs = design.hangs_on[at]
-        now.together = np.einsum("ij,ij->j", hangs, Q @ hangs)
-    return now.together
+def busbar_weights(design: SequentialDesign, now: Posterior) -> Floats:
+    """d^T Q d of every phase of the busbar, (b,); cached in the posterior."""
+    if now.busbar_weights is None:
+        at, Q = now.precision()
+        hangs = design.busbar_incidence[at]
+        now.busbar_weights = np.einsum("ij,ij->j", hangs, Q @ hangs)
+    return now.busbar_weights
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Honest:
-    """What honest errors are bounded by at one tick, besides those of the meters. m inverters.
+class HonestErrors:
+    """Bounds of honest errors other than the meters'. m inverters."""
 
-    Attributes
-    ----------
-    powers
-        The frame's, and how far they may be off.
-    injected : (m,)
-        How far the observed injections may be off, pu.
-    """
-
-    powers: Powers
-    injected: Floats
+    powers: PowerErrors  # power errors of the frame
+    injected: Floats  # (m,) largest errors of the observed injections, pu
 
 
-def aligned(  # who says what, and how far that may be off
-    design: SequentialDesign, now: Fit, m: Floats, fixed: Floats, honest: Honest
+def explained_phases(
+    design: SequentialDesign, now: Posterior, m: Floats, fixed: Floats, honest: HonestErrors
 ) -> Bools:
-    """Where honest errors at their ends, all in one direction, explain what meters say of the busbar, (b,).
+    """Phases where honest errors at their ends, all in one direction, explain the test, (b,).
 
-    The trusted meters say ``v^T m`` of it, with ``v = Q d / (d^T Q d)``, and that is off by no more than
+    The trusted meters give ``v^T m`` of the busbar, with ``v = Q d / (d^T Q d)``. Honest errors change it by
+    at most
 
-        |2 v^T R| dp + 2 |v^T X| dq + |v|^T (fixed + jitter) + error of the busbar's meter,
+        |2 v^T R| dp + 2 |v^T X| dq + |v|^T (fixed + jitter) + error of the busbar's meter.
 
-    were jitter as large as it ever is at all meters at once, and lasting.
-
-    Parameters
-    ----------
-    design, now
-        The design, and the trusted meters.
-    m : (p,)
-        Readings minus what the model explains, squared pu.
-    fixed : (p,)
-        Largest honest fixed error of each meter, with that of the model, squared pu.
-    honest
-        How far all else may be off.
+    fixed: (p,) largest honest fixed error of each meter and of the model, squared pu.
     """
-    at, Q = now.trusting()
-    v = Q @ design.hangs_on[at] / np.maximum(weight(design, now), np.finfo(np.float64).tiny)
+    at, Q = now.precision()
+    v = Q @ design.busbar_incidence[at] / np.maximum(busbar_weights(design, now), np.finfo(np.float64).tiny)
     error = busbar_errors(design.plant, honest.powers.v0_squared, design.sigmas[0])
-    return np.abs(m[at] @ v) <= room(design, at, v, fixed, honest) + error
+    return np.abs(m[at] @ v) <= largest_sums(design, at, v, fixed, honest) + error
 
 
-def room(design: SequentialDesign, at: Ints, v: Floats, fixed: Floats, honest: Honest) -> Floats:
-    """Largest sums ``v^T m`` over honest errors at their ends, without the busbar's meter, (k,), squared pu.
+def largest_sums(
+    design: SequentialDesign, at: Ints, v: Floats, fixed: Floats, honest: HonestErrors
+) -> Floats:
+    """Largest sums ``v^T m`` over honest errors at their ends, (k,), squared pu.
 
         |2 v^T R| dp + 2 |v^T X| dq + |v|^T (fixed + jitter)
 
-    Parameters
-    ----------
-    design
-        The design.
-    at : (t,)
-        Some meters.
-    v : (t, k)
-        Their weights.
-    fixed : (p,)
-        Largest honest fixed error of each meter, with that of the model, squared pu.
-    honest
-        How far all else may be off.
+    at: (t,) meters. v: (t, k) weights. fixed: (p,) as in `explained_phases`.
     """
     plant = design.plant
     injected = plant.droop.per_customer(honest.injected, design.customers)
     errors = np.concatenate(honest.powers.errors(plant, injected))
     out = np.abs(v).T @ (fixed + design.sigmas[0] * np.sqrt(design.white))[at]
     for k, one in enumerate(v.T):
-        out[k] += np.abs(design.effects.along(plant.meters[at], one)) @ errors
+        out[k] += np.abs(design.sensitivities.weighted(plant.meters[at], one)) @ errors
     return np.asarray(out)
 
 
-def follow(  # noqa: PLR0917  # what was thought, what it says, and what the others say
+def track_busbar(  # noqa: PLR0917
     design: SequentialDesign,
-    before: Busbar,
+    before: BusbarTrust,
     reported: Floats,
-    heard: Bools,
+    available: Bools,
     v0_squared: Floats,
     variance: Floats,
     allowed: float,
-) -> Busbar:
-    """Compare what a meter that is not believed reports with what the meters say.
+) -> BusbarTrust:
+    """Compare the reading of a suspect busbar meter with the other meters.
 
-    It is named when it still differs from them after as many ticks as evidence has to last, by more than all
-    of them could honestly be off alike. It is believed again once the mean over the scale on which it was
-    caught has been within what is expected of an honest one for as long as that scale, and for as long as any
-    meter has to.
-
-    Parameters
-    ----------
-    design, before
-        The design, and what was thought of it.
-    reported, heard : (b,)
-        Its squared voltages, and where there are any, pu.
-    v0_squared, variance : (b,)
-        What the meters say, and the variance of that on the scale on which it was caught.
-    allowed
-        Largest honest fixed error of a meter, squared pu.
+    It is named if it differs for the confirmation time by more than an honest offset of all meters. It is
+    trusted again once the mean over its scale stays within the release limit for that scale, and for the
+    release time of any meter. reported, available: (b,) its squared voltages, pu, and where it has one.
+    v0_squared, variance: (b,) by the other meters. allowed: largest honest fixed error, squared pu.
     """
-    out = ~before.believed
+    out = ~before.trusted
     if not any_of(out):
         return before
     length = np.array(design.lengths)[before.scale]
-    age = before.age + out
-    off = np.where(heard, reported - v0_squared, before.off)
+    age = before.ticks_suspect + out
+    off = np.where(available, reported - v0_squared, before.off)
     off = before.off + (off - before.off) / np.clip(age, 1, length)
-    std = np.sqrt(variance + design.busbar**2 + design.flicker)
+    std = np.sqrt(variance + design.busbar**2 + design.busbar_noise)
     limit = design.options.lower * np.array(design.sigmas)[before.scale] * std
-    agrees = out & heard & (np.abs(off) <= limit)
-    quiet = np.where(heard, (before.quiet + 1) * agrees, before.quiet)
-    lasts = out & heard & (age >= design.confirmed[before.scale]) & (np.abs(off) > allowed + limit)
+    agrees = out & available & (np.abs(off) <= limit)
+    quiet = np.where(available, (before.ticks_agreeing + 1) * agrees, before.ticks_agreeing)
+    lasts = out & available & (age >= design.confirmed[before.scale]) & (np.abs(off) > allowed + limit)
     still = out & (quiet < np.maximum(design.options.release, length))
-    return Busbar(
-        believed=~still,
+    return BusbarTrust(
+        trusted=~still,
         scale=before.scale,
-        age=np.where(still, age, 0),
-        quiet=np.where(still, quiet, 0),
+        ticks_suspect=np.where(still, age, 0),
+        ticks_agreeing=np.where(still, quiet, 0),
         off=np.where(still, off, 0.0),
         named=still & (before.named | lasts),
     )

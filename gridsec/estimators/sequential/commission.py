@@ -1,19 +1,18 @@
-"""What a meter's own fixed error is, learned while nothing speaks against it.
+"""Fixed errors of the meters, learned while no meter is suspect.
 
-A meter of class 0.5 may be off by 0.5 %, always by the same amount; a lie of that size is no evidence. But
-the amount can be learned: over a long time the load errors cancel, and what is left of a meter's residual
-is its own. With B the prior variance of the fixed errors and M the long-run means,
+A meter of class 0.5 may be off by a constant 0.5 %, and a manipulation of that size is not evidence. Over a
+long time load errors cancel, and the mean residual is the meter's own error. With B the prior variance of
+the fixed errors and M the long-run means,
 
     cov M = B + c * S + D / n,      b_hat = B (cov M)^-1 M,      P = B - B (cov M)^-1 B
 
-where ``c_ij`` says what the loads' errors, of correlation time tau, still contribute to two means over the
-last a and b >= a seconds (in units of tau):
+where ``c_ij`` is the remaining share of load errors, of correlation time tau, in two means over the last
+a and b >= a seconds (in units of tau):
 
     c = (2 a + e^-a + e^-b - e^-(b - a) - 1) / (a b)
 
-and a share `lasting` of the variances stays whole (c = 1), since it is the same all the time. After that a
-meter counts as manipulated when it *changes*, even inside its class. A meter that is replaced is learned anew
-while the others stay; they then say what the loads did meanwhile, with B their P.
+and a share `lasting` of the variances stays whole (c = 1). Afterwards a meter is manipulated when it
+*changes*, even within its class. A replaced meter is learned anew beside the others, with B their P.
 
 References
 ----------
@@ -33,9 +32,9 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, submatrix
 from gridsec.errors import Problem, raise_if_any
-from gridsec.estimators.sequential.conditional import invert
+from gridsec.estimators.sequential.conditional import invert_spd
 from gridsec.estimators.sequential.design import SequentialDesign
-from gridsec.estimators.sequential.search import Recent
+from gridsec.estimators.sequential.search import LimitCache
 
 
 class LearningReason(StrEnum):
@@ -53,39 +52,24 @@ class LearningReason(StrEnum):
 
 REASONS = tuple(LearningReason)
 COUNTED = -1
-"""In place of an index of `REASONS`: the tick counts."""
+"""Value in place of an index of `REASONS` for a tick that counts."""
 
 
 @dataclass(frozen=True, eq=False)
 class Learned:
-    """What is known of the meters' fixed errors. p meters.
+    """Known fixed errors. p meters."""
 
-    Attributes
-    ----------
-    bias : (p,)
-        Expected fixed error, squared pu.
-    variance : (p,)
-        Its variance.
-    allowed : (p,)
-        Largest honest change from it, squared pu.
-    at : (p,)
-        When it was learned, Unix s; NaN where only the class is known.
-    hidden : (p,)
-        What lasting errors of the loads leave open of the voltage at each learned meter, squared pu^2: these
-        errors and the meters' own are known as a sum only, and no averaging over meters takes them apart.
-    """
-
-    bias: Floats
-    variance: Floats
-    allowed: Floats
-    at: Floats
-    hidden: Floats
+    bias: Floats  # (p,) expected fixed error, squared pu
+    variance: Floats  # (p,) its variance
+    allowed: Floats  # (p,) largest honest change from it, squared pu
+    at: Floats  # (p,) Unix time of learning, s; NaN where only the class is known
+    hidden: Floats  # (p,) variance of lasting load errors, inseparable from the own error, squared pu^2
 
     @cached_property
     def late(self) -> Floats | None:
-        """Variance that `hidden` of the others adds to what they say of each meter not learned, squared pu^2.
+        """Variance that `hidden` of learned meters adds at the others, squared pu^2; (p,), zero if learned.
 
-        (p,), the largest of them, and zero at learned meters; None where nobody or everybody is learned.
+        None where no meter or every meter is learned.
         """
         unknown = np.isnan(self.at)
         if all_of(unknown) or not any_of(unknown):
@@ -93,86 +77,48 @@ class Learned:
         return np.where(unknown, self.hidden.max(), 0.0)
 
     @cached_property
-    def recent(self) -> defaultdict[int, Recent]:
-        """What was answered last of the largest honest offsets, by scale."""
-        return defaultdict(Recent)
+    def recent(self) -> defaultdict[int, LimitCache]:
+        """Last results of the limits, by scale."""
+        return defaultdict(LimitCache)
 
     def __getstate__(self) -> dict[str, Any]:
-        # What was answered can be worked out again.
+        # Results can be computed again.
         return {name: each for name, each in vars(self).items() if name != "recent"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Learning:
-    """Sums and times of a commissioning. p meters, r reasons.
+    """Sums and times of a commissioning. p meters, r reasons."""
 
-    Attributes
-    ----------
-    total : (p,)
-        Sum of each meter's residuals while it was trusted, squared pu.
-    count : (p,)
-        Number of these residuals.
-    time_s : (p,)
-        Time over which they were gathered, s.
-    since : (p,)
-        Start of the meter's learning, Unix s; NaN for meters that only witness the loads.
-    watched_s : (p,)
-        Time of all ticks since then, s. Pauses of the frames are not in it.
-    lost_s : (r, p)
-        Time of the ticks that brought learning no further, s, by reason in the order of `REASONS`.
-    """
-
-    total: Floats
-    count: Ints
-    time_s: Floats
-    since: Floats
-    watched_s: Floats
-    lost_s: Floats
+    total: Floats  # (p,) sum of the residuals while trusted, squared pu
+    count: Ints  # (p,) number of these residuals
+    time_s: Floats  # (p,) time over which they were gathered, s
+    since: Floats  # (p,) start of the meter's learning, Unix s; NaN for witnesses of the loads
+    watched_s: Floats  # (p,) time of all ticks since then without pauses of the frames, s
+    lost_s: Floats  # (r, p) time of ticks without progress, s, by reason in the order of `REASONS`
 
     @property
     def open(self) -> Bools:
-        """Which meters are being learned, (p,)."""
+        """Meters that are being learned, (p,)."""
         return np.isfinite(self.since)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Commission:
-    """All that commissioning has brought so far.
+    """Results of the commissioning."""
 
-    Attributes
-    ----------
-    learned
-        What is known.
-    learning
-        What was gathered; None where there is nothing left to learn.
-    """
-
-    learned: Learned
-    learning: Learning | None
+    learned: Learned  # known errors
+    learning: Learning | None  # sums so far; None once complete
 
 
-def nothing(design: SequentialDesign) -> Learned:
-    """What the accuracy class alone says.
-
-    Parameters
-    ----------
-    design
-        The design.
-    """
+def class_only(design: SequentialDesign) -> Learned:
+    """Fixed errors by the accuracy class alone."""
     p = design.allowed.size
     return Learned(np.zeros(p), design.fixed, design.allowed, np.full(p, np.nan), np.zeros(p))
 
 
-def begin(which: Bools, t: float) -> Learning:
-    """Nothing gathered yet.
-
-    Parameters
-    ----------
-    which : (p,)
-        Meters to learn.
-    t
-        Unix time, s.
-    """
+def no_readings(which: Bools, t: float) -> Learning:
+    """Empty sums for meters `which` (p,) from Unix time t, s."""
     p = which.size
     return Learning(
         total=np.zeros(p),
@@ -184,42 +130,22 @@ def begin(which: Bools, t: float) -> Learning:
     )
 
 
-def fresh(design: SequentialDesign, t: float) -> Commission:
-    """A feeder that has just been built: only the classes are known, and all meters are to be learned.
-
-    Parameters
-    ----------
-    design
-        The design; with ``commission_s = 0`` nothing is ever learned.
-    t
-        Unix time, s.
-    """
+def initial(design: SequentialDesign, t: float) -> Commission:
+    """Commissioning of a new feeder by classes alone; ``commission_s = 0`` learns nothing."""
     learns = design.options.commission_s > 0
     every = np.ones(design.allowed.size, dtype=np.bool_)
-    return Commission(nothing(design), begin(every, t) if learns else None)
+    return Commission(class_only(design), no_readings(every, t) if learns else None)
 
 
 def renew(design: SequentialDesign, before: Commission, which: Bools, t: float) -> Commission:
-    """Forget what is known of some meters and learn them anew; all others stay.
-
-    Parameters
-    ----------
-    design
-        The design.
-    before
-        What is known.
-    which : (p,)
-        The meters.
-    t
-        Unix time, s.
-    """
+    """Commissioning with meters `which` (p,) to be learned anew; all others stay."""
     if not any_of(which) or not design.options.commission_s > 0:
         return before
-    known, blank = before.learned, nothing(design)
+    known, blank = before.learned, class_only(design)
     learned = Learned(
         *(np.where(which, getattr(blank, f.name), getattr(known, f.name)) for f in fields(Learned))
     )
-    start = begin(which, t)
+    start = no_readings(which, t)
     if before.learning is None:
         return Commission(learned, start)
     so_far = before.learning
@@ -230,20 +156,10 @@ def renew(design: SequentialDesign, before: Commission, which: Bools, t: float) 
 
 
 def gather(before: Learning, residual: Floats, use: Bools, h: float, why: Ints | None = None) -> Learning:
-    """Take one tick in.
+    """Sums after one tick of h seconds.
 
-    Parameters
-    ----------
-    before
-        So far.
-    residual : (p,)
-        Readings minus what the model and the errors learned before explain.
-    use : (p,)
-        Meters that are trusted and have a reading.
-    h
-        Time since the last tick, s.
-    why : (p,)
-        Index of `REASONS` where the tick brings learning no further, else `COUNTED`; None: all `COUNTED`.
+    residual: (p,) readings minus the model and the known errors. use: (p,) meters to gather from. why: (p,)
+    index of `REASONS` for a tick without progress, else `COUNTED`; None for all `COUNTED`.
     """
     lost_s = before.lost_s
     if why is not None and any_of(why != COUNTED):
@@ -258,70 +174,49 @@ def gather(before: Learning, residual: Floats, use: Bools, h: float, why: Ints |
     )
 
 
-def ripe(design: SequentialDesign, gathered: Learning) -> Bools:
-    """Which meters have been heard for long enough, (p,).
+def ready_meters(design: SequentialDesign, gathered: Learning) -> Bools:
+    """Meters with enough time, (p,).
 
-    Once one of those being learned was heard for `commission_s`, so are all that have `enough` of it: they
-    are learned together, since together they tell errors of loads from their own.
-
-    Parameters
-    ----------
-    design, gathered
-        The design, and what was gathered.
+    Once one open meter reaches `commission_s`, all with the part `enough` of it are ready: together they
+    separate load errors from their own.
     """
     needed = design.options.commission_s
     if not gathered.time_s.max(initial=0.0) >= needed > 0:
         return np.zeros(gathered.since.size, dtype=np.bool_)
-    heard = np.where(gathered.open, gathered.time_s, 0.0)
-    if not heard.max(initial=0.0) >= needed > 0:
+    time_s = np.where(gathered.open, gathered.time_s, 0.0)
+    if not time_s.max(initial=0.0) >= needed > 0:
         return np.zeros_like(gathered.open)
-    return np.asarray(heard >= design.options.enough * needed)
+    return np.asarray(time_s >= design.options.enough * needed)
 
 
-def conclude(
-    design: SequentialDesign, known: Learned, gathered: Learning, which: Bools, t: float
-) -> Commission:
-    """The fixed errors of some meters; meters with no reading at all keep their class.
-
-    Parameters
-    ----------
-    design
-        The design.
-    known
-        What is known of all meters.
-    gathered
-        What was gathered relative to that.
-    which : (p,)
-        Meters to conclude about.
-    t
-        Unix time, s.
-    """
-    heard = np.flatnonzero(gathered.count * gathered.time_s > 0)
+def learn(design: SequentialDesign, known: Learned, gathered: Learning, which: Bools, t: float) -> Commission:
+    """Known errors after learning meters `which` (p,); meters without a reading keep their class."""
+    meters = np.flatnonzero(gathered.count * gathered.time_s > 0)
     done = which & (gathered.count > 0) & (gathered.time_s > 0)
     if not any_of(done):
         return Commission(known, gathered)
-    B, n = known.variance[heard], gathered.count[heard]
-    # One matrix of this size, inverted where it is.
-    K = design.prior.among(heard)
-    time = gathered.time_s[heard] / design.doubt.time_s
-    for first in range(0, heard.size, _COLUMNS):
-        some = slice(first, first + _COLUMNS)
-        share = _share(time, time[some])
-        K[:, some] = share * K[:, some] + (1.0 - share) * _lasting(design, heard, some)
-    K[np.diag_indices_from(K)] += B + design.white[heard] / n
-    invert(K)
+    B, n = known.variance[meters], gathered.count[meters]
+    # One matrix of this size, inverted in place.
+    K = design.prior.among(meters)
+    time = gathered.time_s[meters] / design.doubt.time_s
+    for first in range(0, meters.size, _BLOCK):
+        some = slice(first, first + _BLOCK)
+        share = _mean_covariance(time, time[some])
+        K[:, some] = share * K[:, some] + (1.0 - share) * _lasting(design, meters, some)
+    K[np.diag_indices_from(K)] += B + design.white[meters] / n
+    invert_spd(K)
     bias, variance, allowed = known.bias.copy(), known.variance.copy(), known.allowed.copy()
     hidden = np.zeros(known.at.size)
-    hidden[heard] = _hidden(design, heard, K)
-    bias[heard] += B * (K @ (gathered.total[heard] / n))
+    hidden[meters] = _hidden_variance(design, meters, K)
+    bias[meters] += B * (K @ (gathered.total[meters] / n))
     left = np.maximum(B - B * B * K.diagonal(), 0.0)
-    rounded = design.rounded[heard]
-    aging = design.options.stability * (design.allowed[heard] - rounded)
-    # A uniform error of half-width a has the variance a^2 / 3; what rounding adds goes with the voltage.
-    variance[heard] = np.minimum(left + aging**2 / 3.0 + 0.5 * rounded**2, B)
-    allowed[heard] = np.minimum(aging + 3.0 * np.sqrt(left) + rounded, design.allowed[heard])
+    rounded = design.rounded[meters]
+    aging = design.options.stability * (design.allowed[meters] - rounded)
+    # A uniform error of half-width a has the variance a^2 / 3; rounding follows the voltage.
+    variance[meters] = np.minimum(left + aging**2 / 3.0 + 0.5 * rounded**2, B)
+    allowed[meters] = np.minimum(aging + 3.0 * np.sqrt(left) + rounded, design.allowed[meters])
     learned = Learned(
-        # No honest meter leaves its class, so nothing beyond it is learned as an error.
+        # Honest meters stay within their class, so a larger bias is not learned.
         bias=np.where(done, np.clip(bias, -design.allowed, design.allowed), known.bias),
         variance=np.where(done, variance, known.variance),
         allowed=np.where(done, allowed, known.allowed),
@@ -331,43 +226,42 @@ def conclude(
     rest = gathered.open & ~done
     if not any_of(rest):
         return Commission(learned, None)
-    # What the others gathered is in what is known now; they begin anew as witnesses of the loads.
-    start = begin(rest, t)
+    # The sums of the others are used; they start again as witnesses of the loads.
+    start = no_readings(rest, t)
     left_open = Learning(
         *(np.where(rest, getattr(gathered, f.name), getattr(start, f.name)) for f in fields(Learning))
     )
     return Commission(learned, left_open)
 
 
-def _lasting(design: SequentialDesign, heard: Ints, some: slice) -> Floats:
-    """Covariance at the meters of errors that no mean takes away, some columns, (h, k).
+def _lasting(design: SequentialDesign, meters: Ints, some: slice) -> Floats:
+    """Covariance at the meters of errors that no mean reduces, some columns, (h, k).
 
-    The fixed error of the busbar's meter is one of them, whatever is known of the loads; phases have their
-    own.
+    The fixed error of the busbar's meter is one of them, by phase.
     """
-    of_loads = submatrix(design.prior.of_meters, design.prior.meters[heard], heard[some])
+    of_loads = submatrix(design.prior.covariance, design.prior.meters[meters], meters[some])
     lasting = design.doubt.lasting
     places, feeder = design.prior.meters, design.plant.feeder
-    same = feeder.same_busbar_phase(places[heard], places[heard[some]])
+    same = feeder.same_busbar_phase(places[meters], places[meters[some]])
     return lasting * of_loads + (1.0 - lasting) * design.busbar**2 * same
 
 
-def _hidden(design: SequentialDesign, heard: Ints, inverse: Floats) -> Floats:
-    """``diag(L - L K^-1 L)``: what is left open of errors L that last, (h,)."""
-    out = np.empty(heard.size)
-    for first in range(0, heard.size, _COLUMNS):
-        some = slice(first, first + _COLUMNS)
-        L = _lasting(design, heard, some)
-        own = L[np.arange(heard.size)[some], np.arange(L.shape[1])]
+def _hidden_variance(design: SequentialDesign, meters: Ints, inverse: Floats) -> Floats:
+    """Posterior variance ``diag(L - L K^-1 L)`` of lasting errors L, (h,)."""
+    out = np.empty(meters.size)
+    for first in range(0, meters.size, _BLOCK):
+        some = slice(first, first + _BLOCK)
+        L = _lasting(design, meters, some)
+        own = L[np.arange(meters.size)[some], np.arange(L.shape[1])]
         out[some] = own - np.einsum("ij,ij->j", L, inverse @ L)
     return np.maximum(out, 0.0)
 
 
-# Columns that are worked on together.
-_COLUMNS = 128
+_BLOCK = 128
+"""Columns of one block of a product."""
 
 
-def _share(one: Floats, other: Floats) -> Floats:
+def _mean_covariance(one: Floats, other: Floats) -> Floats:
     """Covariance of two means of an Ornstein-Uhlenbeck process of variance 1 that end together, (j, k).
 
     The times are in units of its correlation time.
@@ -379,22 +273,16 @@ def _share(one: Floats, other: Floats) -> Floats:
 
 _KNOWN = tuple(f.name for f in fields(Learned))
 _GATHERED = ("total", "count", "time_s", "since")
-# Texts of earlier versions lack these.
+# Absent in texts of earlier versions.
 _WATCHED = "watched_s"
 _LOST = tuple(f"lost_s.{reason}" for reason in REASONS)
 
 
 def to_arrays(commission: Commission) -> dict[str, Floats]:
-    """Persistent form of a commissioning: arrays of p numbers by name.
-
-    Parameters
-    ----------
-    commission
-        What is known.
-    """
+    """Persistent form of a commissioning: arrays of p numbers by name."""
     learned = commission.learned
     none = np.zeros(learned.at.size, dtype=np.bool_)
-    learning = commission.learning or begin(none, 0.0)
+    learning = commission.learning or no_readings(none, 0.0)
     known = {name: getattr(learned, name) for name in _KNOWN}
     gathered = {
         name: np.asarray(getattr(learning, name), dtype=np.float64) for name in (*_GATHERED, _WATCHED)
@@ -403,19 +291,12 @@ def to_arrays(commission: Commission) -> dict[str, Floats]:
 
 
 def from_arrays(design: SequentialDesign, arrays: Mapping[str, Floats]) -> Commission:
-    """What `to_arrays` gave, for a design that it fits.
-
-    Parameters
-    ----------
-    design
-        The design.
-    arrays
-        By name.
+    """Commissioning from the arrays of `to_arrays`.
 
     Raises
     ------
     ValueError
-        If it does not fit; the message names every problem.
+        If the arrays do not fit the design; the message names every problem.
     """
     problems = _problems(design, arrays)
     raise_if_any(problems)
@@ -434,12 +315,12 @@ def from_arrays(design: SequentialDesign, arrays: Mapping[str, Floats]) -> Commi
     return Commission(learned, learning)
 
 
-# Numbers may have been rounded on their way.
-_ROUNDED = 1.0 + 1e-9
+_STORED_TOLERANCE = 1.0 + 1e-9
+"""Tolerance of stored numbers for rounding."""
 
 
 def _problems(design: SequentialDesign, arrays: Mapping[str, Floats]) -> list[Problem]:
-    """Everything that is wrong with arrays."""
+    """All problems of the arrays."""
     p, needed, times = design.allowed.size, {*_KNOWN, *_GATHERED}, {_WATCHED, *_LOST}
     problems = [Problem("missing", f"{name} is missing") for name in sorted(needed - arrays.keys())]
     problems += [
@@ -453,7 +334,7 @@ def _problems(design: SequentialDesign, arrays: Mapping[str, Floats]) -> list[Pr
     ]
     if problems:
         return problems
-    widest, at, since = design.allowed * _ROUNDED, arrays["at"], arrays["since"]
+    widest, at, since = design.allowed * _STORED_TOLERANCE, arrays["at"], arrays["since"]
     count, time_s = arrays["count"], arrays["time_s"]
     idle = np.isnan(since) & (not design.options.commission_s > 0)
     # Comparisons with NaN are false: NaN breaks every rule.
@@ -464,7 +345,7 @@ def _problems(design: SequentialDesign, arrays: Mapping[str, Floats]) -> list[Pr
         },
         Problem("out-of-range", "bias is beyond the class"): np.abs(arrays["bias"]) <= widest,
         Problem("out-of-range", "variance is not within that of the class"): (arrays["variance"] >= 0)
-        & (arrays["variance"] <= design.fixed * _ROUNDED),
+        & (arrays["variance"] <= design.fixed * _STORED_TOLERANCE),
         Problem("out-of-range", "allowed is not within the class"): (arrays["allowed"] >= 0)
         & (arrays["allowed"] <= widest),
         Problem("negative", "hidden is no variance"): (arrays["hidden"] >= 0) & np.isfinite(arrays["hidden"]),

@@ -1,4 +1,4 @@
-"""What one tick comes to: an estimate with its error, and a verdict with its reason.
+"""Output of one tick: an estimate with its error, and a verdict with its reason.
 
 References
 ----------
@@ -15,263 +15,231 @@ import numpy as np
 from gridsec.arrays import Bools, Floats, all_of, any_of, changed
 from gridsec.estimators.decision import DecisionInputs, decide
 from gridsec.estimators.sequential import words
-from gridsec.estimators.sequential.apart import apart
-from gridsec.estimators.sequential.bounds import Bounded, Grounds, Powers
-from gridsec.estimators.sequential.busbar import Busbar, follow
-from gridsec.estimators.sequential.conditional import Prior, judge
+from gridsec.estimators.sequential.apart import vouched_posteriors
+from gridsec.estimators.sequential.bounds import BoundedEstimate, BoundInputs
+from gridsec.estimators.sequential.busbar import BusbarTrust, track_busbar
+from gridsec.estimators.sequential.conditional import Prior, leave_one_out
 from gridsec.estimators.sequential.design import SequentialDesign
 from gridsec.estimators.sequential.doubts import checked
-from gridsec.estimators.sequential.examine import Examined
-from gridsec.estimators.sequential.heard import Heard
-from gridsec.estimators.sequential.release import Released, release
-from gridsec.estimators.sequential.scales import needed
-from gridsec.estimators.sequential.skew import Skew, largest, unusable
-from gridsec.estimators.sequential.state import SequentialState, Trust
+from gridsec.estimators.sequential.drive import Prediction
+from gridsec.estimators.sequential.examine import Identification
+from gridsec.estimators.sequential.heard import Measurements
+from gridsec.estimators.sequential.release import DoubtedPowers, doubt_powers
+from gridsec.estimators.sequential.scales import min_readings
+from gridsec.estimators.sequential.skew import ClockSkew, largest_offset, unusable_offsets
+from gridsec.estimators.sequential.state import SequentialState
+from gridsec.estimators.sequential.trust import TrustState
 from gridsec.interface import Cause, Decision, Estimate, Explanation, Frame, PowerOrigin, Verdict
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Tick:
-    """What one tick brought. N customers, p meters, n buses.
-
-    Attributes
-    ----------
-    frame
-        With powers that can be.
-    heard
-        What is believed of it.
-    q : (N,)
-        Net reactive injections that the model was given, pu.
-    v2_bus : (n,)
-        Squared voltages that the model alone says.
-    transient : (p,)
-        What is left of the unknown initial state at each meter, squared pu.
-    seen
-        What the scales say.
-    rivals
-        Explanations about as likely as the one that was found.
-    """
-
-    frame: Frame
-    heard: Heard
-    q: Floats
-    v2_bus: Floats
-    transient: Floats
-    seen: Examined
-    rivals: tuple[Explanation, ...]
-
-
-def conclude(
-    design: SequentialDesign, state: SequentialState, tick: Tick
+def output(
+    design: SequentialDesign,
+    state: SequentialState,
+    measured: Measurements,
+    predicted: Prediction,
+    identified: Identification,
 ) -> tuple[SequentialState, Estimate, Verdict]:
-    """Put the answer together.
-
-    Parameters
-    ----------
-    design, state
-        The design, and the state after this tick.
-    tick
-        What it brought.
-
-    Returns
-    -------
-    SequentialState, Estimate, Verdict
-        The state with the answer in it, and the answer.
-    """
-    trust, heard = state.trust, tick.heard
-    beside = apart(state.apart, state.fits, state.doubts)
-    state = state if beside is state.apart else changed(state, apart=beside)
-    s, moved = _best(design, state)
-    estimate, released = _estimate(design, state, tick, s, moved)
-    busbar, inverters = _busbar(design, state, heard, estimate), _inverters(design, state)
-    score, threshold, judged = _worst(design, tick.seen, heard.live.size)
-    if state.skew is not None:
-        judged = judged | _judged_seldom(design, state.skew, state)
-    live, beyond = judged & heard.live, score > threshold
-    attack = np.zeros(live.size)
-    if any_of(trust.named):
-        off = heard.y - state.learned.bias - estimate.v2_bus[design.prior.meters]
-        attack = np.where(trust.named & heard.live, off, 0.0)
-    amounts = _amounts(design, state, tick.seen)
-    settled = all_of(tick.transient <= design.options.settled * threshold)
-    said = _of_meters(
-        design, trust, live, beyond, wide=~(threshold <= design.options.widest), settled=settled
+    """State with the output in it, estimate and verdict, from the state after this tick."""
+    beside = vouched_posteriors(state.vouched_posteriors, state.posteriors, state.uncertainty.vouched)
+    state = state if beside is state.vouched_posteriors else changed(state, vouched_posteriors=beside)
+    estimate, doubted = _estimate(design, state, measured, predicted, identified)
+    busbar, named, available = (
+        _busbar(design, state, measured, estimate),
+        state.trust.named,
+        measured.available,
     )
-    differs = _differs(design, busbar, estimate)
-    said = _unvouched(design, heard.busbar, live, differs, said)
-    open_ = _open(design, state, said)
-    said = _beside_meters(design, inverters, differs, amounts, tick.rivals, open_, said)
-    said = _unexplained(tick.seen.misfit, said)
-    if not (tick.rivals or open_ or all_of(state.doubts.vouched)):
-        said = _unread(design, tick.frame, ~state.doubts.vouched[max(s, 0)], estimate, said)
-    said = _untimely(design, tick.frame, live, said)
-    decision, cause, reason = said
+    score, threshold, tested = _strongest(design, identified, available.size)
+    if state.clock_skew is not None:
+        tested = tested | _tested_seldom(design, state.clock_skew, state)
+    attack = np.zeros(available.size)
+    if any_of(named):
+        off = measured.y - state.learned.bias - estimate.v2_bus[design.prior.meters]
+        attack = np.where(named & available, off, 0.0)
+    settled = all_of(predicted.transient <= design.options.settled * threshold)
+    finding = _of_meters(design, state.trust, tested & available, score, threshold, settled=settled)
+    deviation = _busbar_finding(design, busbar, estimate)
+    finding = _unvouched(design, measured.busbar_metered, tested & available, deviation, finding)
+    inverters, amounts = _inverters(design, state), _amounts(design, state, identified)
+    open_cases = _open_checks(design, state, finding)
+    finding = _beside_meters(design, inverters, deviation, amounts, identified.rivals, open_cases, finding)
+    finding = _unexplained(identified.inconsistent, finding)
+    if not (identified.rivals or open_cases or all_of(state.uncertainty.vouched)):
+        unread = ~state.uncertainty.vouched[max(_best_scale(design, state)[0], 0)]
+        finding = _unread_powers(design, measured.frame, unread, estimate, finding)
     verdict = Verdict(
-        decision,
-        cause,
-        reason,
-        trust.named,
+        *_clock_offsets(design, measured.frame, tested & available, finding),
+        named,
         score,
         threshold,
         attack,
         inverters=inverters,
         inverter_attack=_injected(design, state, inverters, amounts),
-        kinds=state.kinds.kinds,
-        explanations=tick.rivals or open_,
-        unjudged=design.unseen & ~(state.curves.heard | inverters),
-        busbar=differs.named,
-        busbar_attack=np.where(differs.named, busbar.off, 0.0),
+        kinds=state.attack_kinds.kinds,
+        explanations=identified.rivals or open_cases,
+        unjudged=design.inverter_undetectable & ~(state.inverter_checks.observable | inverters),
+        busbar=deviation.named,
+        busbar_attack=np.where(deviation.named, busbar.off, 0.0),
     )
     last = estimate, verdict
-    return changed(state, released=released, busbar=busbar, last=last), estimate, verdict
+    return changed(state, doubted_powers=doubted, busbar=busbar, last=last), estimate, verdict
 
 
-def _busbar(design: SequentialDesign, state: SequentialState, heard: Heard, estimate: Estimate) -> Busbar:
-    """What is thought of the busbar's meter now."""
+def _busbar(
+    design: SequentialDesign, state: SequentialState, measured: Measurements, estimate: Estimate
+) -> BusbarTrust:
+    """Trust of the busbar's meter after this tick."""
     before = state.busbar
-    if all_of(before.believed):
+    if all_of(before.trusted):
         return before
-    fits = (state.fits[s] for s in before.scale.tolist())
-    left = np.array([np.nan if fit is None else fit.variance[k] for k, fit in enumerate(fits)])
-    judged = heard.says & np.isfinite(left)
+    posteriors = (state.posteriors[s] for s in before.scale.tolist())
+    left = np.array([np.nan if fit is None else fit.variance[k] for k, fit in enumerate(posteriors)])
+    loo = measured.busbar_available & np.isfinite(left)
     v0_squared = estimate.v2_bus[design.plant.feeder.busbar_places()]
     allowed = float(state.learned.allowed.max())
-    return follow(design, before, heard.said, judged, v0_squared, np.where(judged, left, 0.0), allowed)
+    return track_busbar(
+        design, before, measured.busbar_reading, loo, v0_squared, np.where(loo, left, 0.0), allowed
+    )
 
 
 def _inverters(design: SequentialDesign, state: SequentialState) -> Bools:
-    """Inverters named: by the voltages, unless what is metered agrees with their curves, or by that."""
-    named, curves = state.trust.inverters, state.curves
-    return named if curves.idle else (named & ~curves.agrees(design)) | curves.named(design)
+    """Named inverters: by the voltages unless their metered power follows the curve, or by that power."""
+    named, curves = state.trust.inverters, state.inverter_checks
+    return named if curves.idle else (named & ~curves.consistent(design)) | curves.named(design)
 
 
 def _injected(
     design: SequentialDesign, state: SequentialState, inverters: Bools, amounts: dict[int, float]
 ) -> Floats:
-    """What named inverters inject that their curves do not ask for, as metered where that is so, (m,)."""
+    """Deviation of named inverters from their curves, as metered where it is, (m,)."""
     out = np.zeros(inverters.size)
     if any_of(inverters):
         for k, amount in amounts.items():
             if k >= design.customers:
                 out[k - design.customers] = amount
-        metered = state.curves.amounts(design)
+        metered = state.inverter_checks.amounts(design)
         out = np.where(inverters, np.where(metered != 0.0, metered, out), 0.0)
     return out
 
 
 def _estimate(
-    design: SequentialDesign, state: SequentialState, tick: Tick, s: int, moved: float
-) -> tuple[Estimate, Released | None]:
-    """The estimate by scale s, whose mean is short of a part `moved` of the loads' variance."""
+    design: SequentialDesign,
+    state: SequentialState,
+    measured: Measurements,
+    predicted: Prediction,
+    identified: Identification,
+) -> tuple[Estimate, DoubtedPowers | None]:
+    """Estimate by the best scale."""
     plant = design.plant
-    heard = tick.heard
-    w, variance, released = _reconstructed(design, state, tick, s, moved)
-    v2_bus = tick.v2_bus + w
+    w, variance, doubted = _reconstructed(design, state, measured, identified)
+    v2_bus = predicted.v2_bus + w
     first = plant.feeder.busbar_places()
-    v2_bus[first] = np.where(heard.busbar, heard.v0_squared, v2_bus[first])
-    # That is a reading, however well the others know the voltage.
+    v2_bus[first] = np.where(measured.busbar_metered, measured.v0_squared, v2_bus[first])
+    # This is a reading; the posterior of the others does not lower its variance.
     variance = variance.copy()
-    variance[first] = np.maximum(variance[first], np.where(heard.busbar, design.busbar**2, 0.0))
-    trusted = state.trust.trusted & heard.live
-    grounds = Grounds(
+    variance[first] = np.maximum(variance[first], np.where(measured.busbar_metered, design.busbar**2, 0.0))
+    inputs = BoundInputs(
         plant=plant,
-        powers=Powers(
-            tick.frame, tick.q, heard.told, heard.v0_squared, state.trust.trusted, state.doubts.sizes
-        ),
-        injected=state.lag.error,
-        model=tick.v2_bus[plant.feeder.bus],
-        busbar=heard.busbar,
-        y=heard.y,
-        trusted=trusted,
-        reads=partial(checked, design, tick.frame),
+        powers=changed(predicted.powers, trusted=state.trust.trusted),
+        injected=state.injection_error.error,
+        model=predicted.v2_bus[plant.feeder.bus],
+        busbar=measured.busbar_metered,
+        y=measured.y,
+        trusted=state.trust.trusted & measured.available,
+        checked=partial(checked, design, measured.frame),
         sigmas=design.sigmas[0],
     )
-    x = np.zeros(0) if state.x is None else state.x
-    return Bounded.on(grounds, state.t, v2_bus, variance, x), released
+    return BoundedEstimate.of(inputs, state.t, v2_bus, variance, predicted.x), doubted
 
 
-_Said = tuple[Decision, Cause, str]
-# What a verdict about inverters and loads may add to: nothing more serious was found.
-_MILD = (Cause.AGREEMENT, Cause.AMBIGUOUS)
+_Finding = tuple[Decision, Cause, str]
+_REPLACEABLE = (Cause.AGREEMENT, Cause.AMBIGUOUS)
+"""Causes that findings on inverters and loads replace."""
 
 
-def _of_meters(  # what there is to say of meters
-    design: SequentialDesign, trust: Trust, live: Bools, beyond: Bools, *, wide: Bools, settled: bool
-) -> _Said:
-    """The answer by the meters alone: those that report, are beyond, and have too wide limits, (p,) each."""
-    said = decide(
+def _of_meters(
+    design: SequentialDesign,
+    trust: TrustState,
+    available: Bools,
+    score: Floats,
+    threshold: Floats,
+    *,
+    settled: bool,
+) -> _Finding:
+    """Verdict on the meters: available ones, their residuals and limits, (p,) each."""
+    beyond = score > threshold
+    finding = decide(
         DecisionInputs(
             names=design.names,
-            max_attacked=max(1, min(design.most, int(np.count_nonzero(live)) // 3)),
-            live=live,
+            max_attacked=max(1, min(design.max_attacked, int(np.count_nonzero(available)) // 3)),
+            live=available,
             suspected=~trust.trusted | beyond,
             named=trust.named,
-            wide=live & wide,
+            wide=available & ~(threshold <= design.options.widest),
             valid=True,
             settled=settled,
             busbar=True,
         )
     )
-    return _contradicted(design, beyond & ~trust.named, trust.named, said)
+    return _contradicted(design, beyond & ~trust.named, trust.named, finding)
 
 
-def _judged_seldom(design: SequentialDesign, skew: Skew, state: SequentialState) -> Bools:
-    """Meters with a clock offset, (p,): of a scale that judges them there is not a look at every tick."""
-    need = np.array([needed(design, s) for s in range(len(design.lengths))])
-    return skew.judged(state.window.counts, need)
+def _tested_seldom(design: SequentialDesign, skew: ClockSkew, state: SequentialState) -> Bools:
+    """Meters with a clock offset, (p,), on scales that test them without a look at this tick."""
+    need = np.array([min_readings(design, s) for s in range(len(design.lengths))])
+    return skew.tested(state.window.counts, need)
 
 
-def _contradicted(design: SequentialDesign, beyond: Bools, named: Bools, said: _Said) -> _Said:
-    """The answer, unless with the meters named more than M are beyond what a decoder calls honest."""
-    if design.decoder is None or said[1] is not Cause.RESIDUALS:
-        return said
-    more, most = int(np.count_nonzero(beyond)), design.most
+def _contradicted(design: SequentialDesign, beyond: Bools, named: Bools, finding: _Finding) -> _Finding:
+    """Verdict, UNDECIDED if a decoder leaves more than `max_attacked` meters beyond their limits."""
+    if design.decoder is None or finding[1] is not Cause.RESIDUALS:
+        return finding
+    more, most = int(np.count_nonzero(beyond)), design.max_attacked
     if not more or int(np.count_nonzero(named)) + more <= most:
-        return said
-    sentence = f"{said[2][:-1]}; but so are {more} of the others, and at most {most} can be told apart."
+        return finding
+    sentence = f"{finding[2][:-1]}; but so are {more} of the others, and at most {most} can be told apart."
     return Decision.UNDECIDED, Cause.TOO_MANY_SUSPECTS, sentence
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Differs:
-    """What there is to say of the busbar's meter. b phases.
-
-    named: which are named, (b,). meter, off: whose reading is not believed, and what it says; empty where all
-    is believed.
-    """
+class _BusbarFinding:
+    """Findings on the busbar's meter: named phases (b,), meter and deviation in words, empty if trusted."""
 
     named: Bools
     meter: str = ""
     off: str = ""
 
 
-def _differs(design: SequentialDesign, busbar: Busbar, estimate: Estimate) -> _Differs:
-    if all_of(busbar.believed):
-        return _Differs(busbar.named)
-    doubted, v0_squared = ~busbar.believed, estimate.v2_bus[design.plant.feeder.busbar_places()]
-    off = words.busbar_off(busbar.off, v0_squared, doubted)
-    return _Differs(busbar.named, words.busbar_meter(doubted), off)
+def _busbar_finding(design: SequentialDesign, busbar: BusbarTrust, estimate: Estimate) -> _BusbarFinding:
+    if all_of(busbar.trusted):
+        return _BusbarFinding(busbar.named)
+    doubted, v0_squared = ~busbar.trusted, estimate.v2_bus[design.plant.feeder.busbar_places()]
+    off = words.busbar_deviation(busbar.off, v0_squared, doubted)
+    return _BusbarFinding(busbar.named, words.busbar_meter(doubted), off)
 
 
 def _unvouched(
-    design: SequentialDesign, busbar: Bools | bool, live: Bools, differs: _Differs, said: _Said
-) -> _Said:
-    """The answer, unless nobody would notice that a phase without a busbar voltage is lied about as a whole.
+    design: SequentialDesign,
+    busbar: Bools | bool,
+    available: Bools,
+    deviation: _BusbarFinding,
+    finding: _Finding,
+) -> _Finding:
+    """Verdict, UNDECIDED if too few meters of a phase without a busbar voltage report.
 
-    On a balanced feeder most meters are honest, and they say where the busbar is. In three phases those of
-    the same phase say it, and that most of these are honest takes more than twice as many as may lie.
+    On a balanced feeder most meters are honest and determine the busbar. In three phases those of one phase
+    do, which takes more than twice as many as may be manipulated.
     """
-    if said[0] is not Decision.CLEAN or all_of(np.asarray(busbar)):
-        return said
-    feeder, meters = design.plant.feeder, design.prior.meters[live]
-    heard = feeder.same_busbar_phase(np.arange(np.size(busbar)), meters) * np.ones(meters.size)
-    count = np.where(busbar, meters.size, heard.sum(axis=-1)).min()
-    most = max(1, min(design.most, meters.size // 3))
+    if finding[0] is not Decision.CLEAN or all_of(np.asarray(busbar)):
+        return finding
+    feeder, meters = design.plant.feeder, design.prior.meters[available]
+    measured = feeder.same_busbar_phase(np.arange(np.size(busbar)), meters) * np.ones(meters.size)
+    count = np.where(busbar, meters.size, measured.sum(axis=-1)).min()
+    most = max(1, min(design.max_attacked, meters.size // 3))
     if count > 2 * most:
-        return said
+        return finding
     why = "The busbar voltage of a phase is missing"
-    if differs.meter:
-        why = f"{differs.meter.capitalize()} {differs.off}"
+    if deviation.meter:
+        why = f"{deviation.meter.capitalize()} {deviation.off}"
     sentence = (
         f"{why}, and {count:.0f} meters report from there; "
         f"at least {2 * most + 1} are needed to tell {most} manipulated from the others."
@@ -279,16 +247,16 @@ def _unvouched(
     return Decision.UNDECIDED, Cause.TOO_FEW_METERS, sentence
 
 
-def _unexplained(misfit: tuple[bool, ...], said: _Said) -> _Said:
-    """The answer, unless the trusted meters are inconsistent on a scale and no search explains it."""
-    decision, cause, reason = said
+def _unexplained(misfit: tuple[bool, ...], finding: _Finding) -> _Finding:
+    """Verdict, with the misfit of the trusted meters on a scale that no search explains."""
+    decision, cause, reason = finding
     if not any(misfit):
-        return said
+        return finding
     if decision is Decision.ATTACKED:
         return decision, cause, f"{reason} The other meters, taken together, still disagree with the feeder."
-    # Silence hides no evidence.
+    # Silent meters do not outweigh this evidence.
     if cause not in (Cause.AGREEMENT, Cause.SILENT_METERS):
-        return said
+        return finding
     sentence = (
         "The meters, taken together, disagree with the feeder by more than chance, though none of them does "
         "by itself."
@@ -296,97 +264,111 @@ def _unexplained(misfit: tuple[bool, ...], said: _Said) -> _Said:
     return Decision.UNDECIDED, Cause.MISFIT, sentence
 
 
-def _unread(design: SequentialDesign, frame: Frame, unread: Bools, estimate: Estimate, said: _Said) -> _Said:
-    """The answer, unless a voltage beside a power that is not read is known too badly to be called clean."""
-    if said[1] not in _MILD or not any_of(unread):
-        return said
+def _unread_powers(
+    design: SequentialDesign, frame: Frame, unread: Bools, estimate: Estimate, finding: _Finding
+) -> _Finding:
+    """Verdict, UNDECIDED if a voltage beside an unread power is too uncertain."""
+    if finding[1] not in _REPLACEABLE or not any_of(unread):
+        return finding
     at, limit = design.plant.meters, design.options.unread_std_percent
-    v = np.sqrt(np.maximum(estimate.v2[at], _DEAD))
+    v = np.sqrt(np.maximum(estimate.v2[at], _LEAST_V2))
     percent = 50.0 * estimate.std[at] / (v * design.plant.droop.vbar)
     wide = unread & ~(percent <= limit)
     if not any_of(wide):
-        return said
+        return finding
     origins = np.zeros(frame.p.size, dtype=np.intp) if frame.p_origin is None else frame.p_origin
-    sentence = words.unread(design.names, wide, origins[at], percent, limit)
+    sentence = words.unread_sentence(design.names, wide, origins[at], percent, limit)
     return Decision.UNDECIDED, Cause.MISSING_POWERS, sentence
 
 
-def _untimely(design: SequentialDesign, frame: Frame, live: Bools, said: _Said) -> _Said:
-    """The answer, with the meters that count as silent for a clock offset that no scale judges."""
-    decision, cause, reason = said
-    far = unusable(design, frame.clock_offset)
+def _clock_offsets(design: SequentialDesign, frame: Frame, available: Bools, finding: _Finding) -> _Finding:
+    """Verdict, with the meters that count as silent for a clock offset that no scale covers."""
+    decision, cause, reason = finding
+    far = unusable_offsets(design, frame.clock_offset)
     if far is None or cause not in (Cause.SILENT_METERS, Cause.TOO_FEW_METERS):
-        return said
-    sentence = words.untimely(design.names, far, largest(design))
-    if cause is Cause.SILENT_METERS and not any_of(~live & ~far):
+        return finding
+    sentence = words.clock_sentence(design.names, far, largest_offset(design))
+    if cause is Cause.SILENT_METERS and not any_of(~available & ~far):
         return decision, Cause.CLOCK_OFFSET, sentence
     return decision, cause, f"{reason} {sentence}"
 
 
-_DEAD = 1e-2
-"""Least squared voltage by which a standard deviation is related to the voltage, pu."""
+_LEAST_V2 = 1e-2
+"""Least squared voltage that relates a standard deviation to the voltage, pu."""
 
 
-def _open(design: SequentialDesign, state: SequentialState, said: _Said) -> tuple[Explanation, ...]:
-    """What metered reactive powers leave open, whoever else is named."""
-    if state.curves.idle:
+def _open_checks(
+    design: SequentialDesign, state: SequentialState, finding: _Finding
+) -> tuple[Explanation, ...]:
+    """Hypotheses about metered reactive powers that the voltages leave open."""
+    if state.inverter_checks.idle:
         return ()
-    sure = state.trust.named if said[1] is Cause.RESIDUALS else np.zeros_like(state.trust.named)
-    return state.curves.explanations(design, sure) if said[1] in (*_MILD, Cause.RESIDUALS) else ()
+    sure = state.trust.named if finding[1] is Cause.RESIDUALS else np.zeros_like(state.trust.named)
+    return (
+        state.inverter_checks.explanations(design, sure)
+        if finding[1] in (*_REPLACEABLE, Cause.RESIDUALS)
+        else ()
+    )
 
 
-def _beside_meters(  # noqa: PLR0917  # what was found
+def _beside_meters(  # noqa: PLR0917
     design: SequentialDesign,
     inverters: Bools,
-    differs: _Differs,
+    deviation: _BusbarFinding,
     amounts: dict[int, float],
     rivals: tuple[Explanation, ...],
-    open_: tuple[Explanation, ...],
-    said: _Said,
-) -> _Said:
-    """The answer, with what was found besides meters."""
-    decision, cause, reason = said
+    open_cases: tuple[Explanation, ...],
+    finding: _Finding,
+) -> _Finding:
+    """Verdict, with findings other than meters."""
+    decision, cause, reason = finding
     plant, found = design.plant, []
     if any_of(inverters):
         owners = ", ".join(plant.feeder.customers[c] for c in plant.droop.customer[inverters])
         found.append((f"the inverters of {owners}", "their reactive power is not that of their curves"))
-    if any_of(differs.named):
-        found.append((differs.meter, f"it {differs.off}"))
+    if any_of(deviation.named):
+        found.append((deviation.meter, f"it {deviation.off}"))
     if cause is Cause.RESIDUALS:
-        reason = f"{reason[:-1]}; and {' and '.join(who for who, _ in found)}." if found else reason
-        return decision, cause, f"{reason} {words.ways(design, open_)}" if open_ else reason
-    # Silence hides no evidence.
-    if cause not in ((*_MILD, Cause.SILENT_METERS) if found else _MILD):
-        return said
+        reason = f"{reason[:-1]}; and {' and '.join(each for each, _ in found)}." if found else reason
+        return (
+            decision,
+            cause,
+            f"{reason} {words.explanations_sentence(design, open_cases)}" if open_cases else reason,
+        )
+    # Silent meters do not outweigh this evidence.
+    if cause not in ((*_REPLACEABLE, Cause.SILENT_METERS) if found else _REPLACEABLE):
+        return finding
     if found:
         sentence = f"Manipulated: {'; and '.join('; '.join(each) for each in found)}."
         return Decision.ATTACKED, Cause.RESIDUALS, sentence
     sentence = ""
-    if differs.meter:
-        sentence = f"{differs.meter.capitalize()} {differs.off}; it is not believed."
-    elif rivals or open_:
-        sentence = words.ways(design, rivals or open_)
+    if deviation.meter:
+        sentence = f"{deviation.meter.capitalize()} {deviation.off}; it is not believed."
+    elif rivals or open_cases:
+        sentence = words.explanations_sentence(design, rivals or open_cases)
     elif amounts:
-        sentence = words.doubt(design, *next(iter(amounts.items())))
-    return (Decision.UNDECIDED, Cause.AMBIGUOUS, sentence) if sentence else said
+        sentence = words.fault_sentence(design, *next(iter(amounts.items())))
+    return (Decision.UNDECIDED, Cause.AMBIGUOUS, sentence) if sentence else finding
 
 
-def _amounts(design: SequentialDesign, state: SequentialState, seen: Examined) -> dict[int, float]:
-    """How much of each suspicion besides meters there is, by index of the book, pu.
+def _amounts(
+    design: SequentialDesign, state: SequentialState, identified: Identification
+) -> dict[int, float]:
+    """Amount of each accused fault, by index of the dictionary, pu.
 
     With prior variance s^2 and direction a the posterior mean is ``s^2 a^T Q m``.
     """
     out: dict[int, float] = {}
-    book, std = design.book, state.doubts.sizes
+    faults, std = design.faults, state.uncertainty.sizes
     for k, s in state.trust.accused:
-        view, now = seen.views[s], state.fits[s]
-        if view is not None:
-            weights = view.judged.weights
+        test, now = identified.tests[s], state.posteriors[s]
+        if test is not None:
+            weights = test.loo.weights
         elif now is not None:
             weights = now.weights(_mean(state, s))
         else:
             continue
-        out[k] = float(std[k] ** 2 * book.along(weights)[k])
+        out[k] = float(std[k] ** 2 * faults.weighted(weights)[k])
     return out
 
 
@@ -396,81 +378,86 @@ def _mean(state: SequentialState, s: int) -> Floats:
 
 
 def _reconstructed(
-    design: SequentialDesign, state: SequentialState, tick: Tick, s: int, moved: float
-) -> tuple[Floats, Floats, Released | None]:
-    """What the trusted meters add to the model at every bus, its variance, and what is kept of the work."""
-    prior_, told = state.doubts.priors[max(s, 0)], tick.frame.p_std
-    now, view = (None, None) if s < 0 else (state.fits[s], tick.seen.views[s])
+    design: SequentialDesign, state: SequentialState, measured: Measurements, identified: Identification
+) -> tuple[Floats, Floats, DoubtedPowers | None]:
+    """Correction of the model by the trusted meters at every bus, its variance, and the doubted powers."""
+    s, moved = _best_scale(design, state)
+    prior, p_std = state.uncertainty.priors[max(s, 0)], measured.frame.p_std
+    now, test = (None, None) if s < 0 else (state.posteriors[s], identified.tests[s])
     if now is None:
-        return np.zeros_like(prior_.variance), prior_.variance, None
-    judged = judge(now, _mean(state, s)) if view is None else view.judged
-    # The model begins at this reading of the busbar, a mean takes only its part of that one's jitter off.
-    jitter = (1.0 - 1.0 / design.lengths[s]) * design.flicker
-    flicker = design.plant.feeder.broadcast_busbar(np.where(tick.heard.busbar, jitter, 0.0))
-    after = moved * prior_.variance + _hidden(state, prior_) + flicker
-    beside = state.apart[s]
+        return np.zeros_like(prior.variance), prior.variance, None
+    loo = leave_one_out(now, _mean(state, s)) if test is None else test.loo
+    # The model starts at this busbar reading; a mean removes only its part of the jitter.
+    jitter = (1.0 - 1.0 / design.lengths[s]) * design.busbar_noise
+    noise = design.plant.feeder.broadcast_busbar(np.where(measured.busbar_metered, jitter, 0.0))
+    more = moved * prior.variance + _hidden(state, prior) + noise
+    beside = state.vouched_posteriors[s]
     if beside is not None:
-        after = after + beside.added(judged)
-    liars = design.plant.meters[~state.trust.trusted]
-    # Nobody lies about powers that nobody told, which are known by a standard deviation.
-    liars = liars if told is None else liars[np.isnan(told[liars]) | _late(tick.frame)[liars]]
-    if not liars.size:
-        return judged.w, now.variance + after, None
-    sizes, released = state.doubts.sizes[liars], state.released
-    if released is None or not released.about(now, liars, sizes):
-        released = release(design.effects, now, liars, sizes, judged)
-    elif s in tick.seen.found or not released.holds(judged):
-        released = released.anew(judged)
-    return released.said(judged), released.variance + after, released
+        more = more + beside.added_variance(loo)
+    suspects = design.plant.meters[~state.trust.trusted]
+    # Unreported powers, known by a standard deviation, are not false.
+    if p_std is not None:
+        suspects = suspects[np.isnan(p_std[suspects]) | _late(measured.frame)[suspects]]
+    if not suspects.size:
+        return loo.mean, now.variance + more, None
+    sizes, doubted = state.uncertainty.sizes[suspects], state.doubted_powers
+    if doubted is None or not doubted.matches(now, suspects, sizes):
+        doubted = doubt_powers(design.sensitivities, now, suspects, sizes, loo)
+    elif s in identified.candidates or not doubted.is_current(loo):
+        doubted = doubted.renewed(loo)
+    return doubted.mean(loo), doubted.variance + more, doubted
 
 
 def _late(frame: Frame) -> Bools:
-    """Customers with a power that is read and known by a standard deviation all the same, (N,)."""
+    """Customers with a power that is read and has a standard deviation all the same, (N,)."""
     if frame.p_origin is None:
         return np.zeros(frame.p.size, dtype=np.bool_)
     return np.asarray(frame.p_origin != PowerOrigin.UNREAD)
 
 
-def _best(design: SequentialDesign, state: SequentialState) -> tuple[int, float]:
-    """The scale that leaves least open, -1 for none, and what part of the loads' variance it is short of.
+def _best_scale(design: SequentialDesign, state: SequentialState) -> tuple[int, float]:
+    """Scale of the least posterior variance, -1 for none, and the part of the loads' variance it lacks.
 
-    A mean over many ticks does not know what the loads did meanwhile.
+    A mean over many ticks does not contain the present loads.
     """
     at, least, moved = -1, np.inf, 0.0
-    for s, (now, length) in enumerate(zip(state.fits, design.lengths, strict=True)):
+    for s, (now, length) in enumerate(zip(state.posteriors, design.lengths, strict=True)):
         if now is None:
             continue
-        lag, beside = min(1.0, length * design.step_s / design.doubt.time_s) * (length > 1), state.apart[s]
-        total = (now if beside is None else beside.rest).total() + lag * now.prior.total
+        lag, beside = (
+            min(1.0, length * design.step_s / design.doubt.time_s) * (length > 1),
+            state.vouched_posteriors[s],
+        )
+        total = (now if beside is None else beside.vouched).total_variance() + lag * now.prior.total
         if total < least:
             at, least, moved = s, total, lag
     return at, moved
 
 
-def _hidden(state: SequentialState, prior_: Prior) -> Floats:
-    """What learning could not tell from errors of the loads that last, at every bus, (n,)."""
+def _hidden(state: SequentialState, prior: Prior) -> Floats:
+    """Variance of lasting load errors that learning cannot separate, at every bus, (n,)."""
     hidden, late = state.learned.hidden, state.learned.late
     if not any_of(hidden):
-        return np.zeros(prior_.variance.size)
-    out = np.full(prior_.variance.size, hidden.max(initial=0.0))
-    out[prior_.meters] = hidden if late is None else np.maximum(hidden, late)
-    return np.asarray(np.minimum(out, prior_.variance))
+        return np.zeros(prior.variance.size)
+    out = np.full(prior.variance.size, hidden.max(initial=0.0))
+    out[prior.meters] = hidden if late is None else np.maximum(hidden, late)
+    return np.asarray(np.minimum(out, prior.variance))
 
 
-def _worst(design: SequentialDesign, seen: Examined, p: int) -> tuple[Floats, Floats, Bools]:
-    """Offset and limit of each meter on the scale that speaks most against it; who was judged."""
-    views = [view for view in seen.views if view is not None]
-    if not views:
+def _strongest(design: SequentialDesign, identified: Identification, p: int) -> tuple[Floats, Floats, Bools]:
+    """Residual and limit of each meter on the scale with the strongest evidence; tested meters."""
+    tests = [test for test in identified.tests if test is not None]
+    if not tests:
         return np.full(p, np.nan), np.full(p, design.options.widest), np.zeros(p, dtype=np.bool_)
-    score, limit, judged = np.abs(views[0].judged.offset), views[0].limit, views[0].enough
-    ratio = score / limit if all_of(judged) else np.where(judged, score / limit, -1.0)
-    for view in views[1:]:
-        offset = np.abs(view.judged.offset)
-        here = offset / view.limit
-        more = view.enough & (here > ratio)
+    score, limit, tested = np.abs(tests[0].loo.residual), tests[0].limit, tests[0].enough
+    ratio = score / limit if all_of(tested) else np.where(tested, score / limit, -1.0)
+    for test in tests[1:]:
+        residual = np.abs(test.loo.residual)
+        here = residual / test.limit
+        more = test.enough & (here > ratio)
         ratio = np.where(more, here, ratio)
-        score, limit = np.where(more, offset, score), np.where(more, view.limit, limit)
-        judged = judged | view.enough
-    if all_of(judged):
-        return score, limit, judged
-    return np.where(judged, score, np.nan), np.where(judged, limit, design.options.widest), judged
+        score, limit = np.where(more, residual, score), np.where(more, test.limit, limit)
+        tested = tested | test.enough
+    if all_of(tested):
+        return score, limit, tested
+    return np.where(tested, score, np.nan), np.where(tested, limit, design.options.widest), tested

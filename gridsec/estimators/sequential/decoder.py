@@ -1,8 +1,7 @@
-"""Where another method's decision takes the place of the search: same feeder, same inverters, same limits.
+"""Interface of decoders that replace the search: same feeder, inverters and limits.
 
-A decoder gets one tick's readings minus what the model explains, with what is known about both, and says
-whom it accuses. Everything around it, from the cleaning of frames to naming and reconstruction, is shared,
-so that methods differ by nothing but themselves.
+A decoder gets the mean residuals of one tick with their covariance, and returns accused meters. Everything
+else, from the measurements to confirmation and reconstruction, is shared.
 """
 
 from __future__ import annotations
@@ -11,58 +10,31 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from gridsec.arrays import Bools, Floats
-from gridsec.estimators.sequential.conditional import Fit
+from gridsec.estimators.sequential.conditional import Posterior
 from gridsec.estimators.sequential.search import Limits
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Evidence:
-    """What a decoder decides from. p meters.
+class DecoderInput:
+    """Input of a decoder. p meters."""
 
-    Attributes
-    ----------
-    whole
-        Fit of all meters that have a reading; its Q is the inverse covariance of `m` if nobody lies. Not to
-        be changed.
-    m : (p,)
-        Readings minus what the model explains, squared pu; any finite value where there is none.
-    live : (p,)
-        Which meters have a reading.
-    limits
-        What is evidence.
-    believed, over : (p,)
-        Who was trusted before; whose offset is too large as judged by these.
-    most
-        How many accusations are allowed.
-    like
-        Explanations no more than this factor less likely than the best are rivals.
-    """
-
-    whole: Fit
-    m: Floats
-    live: Bools
-    limits: Limits
-    believed: Bools
-    over: Bools
-    most: int
-    like: float
+    whole: Posterior  # posterior of all meters with a reading, not to be changed
+    m: Floats  # (p,) readings minus the model, squared pu; any finite value without a reading
+    available: Bools  # (p,) meters with a reading
+    limits: Limits  # rule of the limits
+    trusted: Bools  # (p,) meters trusted before
+    above_limit: Bools  # (p,) residual above the limit with these
+    max_attacked: int  # largest number of accusations
+    like: float  # least likelihood ratio that decides against a rival
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Accused:
-    """A decoder's answer.
+class DecoderAnswer:
+    """Answer of a decoder."""
 
-    Attributes
-    ----------
-    meters : (p,)
-        Who lies.
-    worse
-        By how much its cost exceeds that of the best answer.
-    """
-
-    meters: Bools
-    worse: float = 0.0
+    meters: Bools  # (p,) accused meters
+    worse: float = 0.0  # cost above that of the best answer
 
 
-Decoder = Callable[[Evidence], tuple[Accused, ...]]
-"""The best answer first, then those that are about as good."""
+Decoder = Callable[[DecoderInput], tuple[DecoderAnswer, ...]]
+"""The best answer first, then those about as good."""

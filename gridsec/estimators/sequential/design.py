@@ -1,4 +1,4 @@
-"""What is prepared offline for the sequential monitor.
+"""Offline design of the sequential monitor.
 
 References
 ----------
@@ -18,11 +18,11 @@ from gridsec.errors import DesignInfeasible, NotObservable, Problem, raise_if_an
 from gridsec.estimators.plant import Plant, check_plant, judging_problems
 from gridsec.estimators.sequential.conditional import Prior
 from gridsec.estimators.sequential.decoder import Decoder
-from gridsec.estimators.sequential.dictionary import Dictionary
-from gridsec.estimators.sequential.effects import Effects
-from gridsec.estimators.sequential.kinds import Shapes, Traces, pace
+from gridsec.estimators.sequential.dictionary import FaultDictionary
+from gridsec.estimators.sequential.effects import Sensitivities
+from gridsec.estimators.sequential.kinds import KindReferences, LoadTraces, look_interval
 from gridsec.estimators.sequential.loads import UNMETERED, LoadDoubt, injection_doubt, prior
-from gridsec.estimators.sequential.repeats import rules
+from gridsec.estimators.sequential.repeats import repeat_limits
 from gridsec.estimators.thresholds import curve_mismatch
 from gridsec.grid.meter import ToldError, busbar_error, steady_rounding
 from gridsec.grid.network import Network, Power
@@ -31,6 +31,7 @@ from gridsec.observers.lmi import contraction
 from gridsec.observers.lure import Lure, close_loop
 
 YEAR_S = 365.25 * 86400.0
+"""Julian year, s."""
 
 
 _SCALES = Problem("out-of-range", "must be at least one number of seconds, none of them negative")
@@ -38,7 +39,7 @@ _SCALES = Problem("out-of-range", "must be at least one number of seconds, none 
 
 @dataclass(frozen=True, slots=True)
 class SequentialOptions:
-    """Numbers that decide; none is hidden.
+    """Tuning parameters.
 
     Attributes
     ----------
@@ -47,28 +48,27 @@ class SequentialOptions:
     scales_s
         Time scales of the running means, s; those shorter than a tick are one tick.
     enough
-        A scale judges a meter of which it has at least this part of the readings.
+        Least part of a scale's readings with which it tests a meter.
     focus
-        Standard deviations within which a search begins to trust, where it begins anew.
+        Standard deviations within which a new search starts to trust.
     several
-        With more suspects than this at once a search begins anew as well.
+        Number of suspects above which a new search starts independently of the trusted set.
     release
-        Ticks in a row without evidence after which a meter is trusted again.
+        Successive ticks without evidence after which a meter is trusted again.
     suspect
-        Once something is beyond chance, smaller offsets are suspected too: so that one search suspects
-        any honest meter with this probability. To be named takes what the false-alarm rate asks for.
+        Probability that one search, once something is beyond chance, suspects any honest meter. Names follow
+        the false-alarm rate.
     lower
-        A distrusted meter must come below this part of `sigmas` to be trusted again.
+        Factor on `sigmas` below which a suspect is released.
     like
-        Explanations no more than this factor less likely than the best are given with it.
+        Largest likelihood ratio of the best explanation to a reported one.
     hidden_power
-        Power that a customer's readings may hide besides what they claim, standard deviation, pu: prior of
-        accusing a customer's powers.
+        Standard deviation of a power hidden beside the claimed one, pu: prior of accusing a customer's
+        powers.
     hidden_charge
-        What accusing a customer's powers costs, in accusations of a meter. Loads are promised to be
-        within `LoadDoubt`; the higher, the more meters' word is against that of one promise.
+        Cost of accusing a customer's powers, in accusations of a meter; a higher one trusts `LoadDoubt` more.
     commission_s
-        The meters' fixed errors are learned over this time, s; 0 for never.
+        Time over which the meters' fixed errors are learned, s; 0 for never.
     stability
         Part of its accuracy class by which an honest meter may change after that.
     unread_std_percent
@@ -136,108 +136,43 @@ class SequentialOptions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SequentialDesign:
-    """Everything that is prepared offline. N customers, n buses, p meters, m inverters, s scales.
+    """Offline design. N customers, n buses, p meters, m inverters, s scales, b busbar phases."""
 
-    Attributes
-    ----------
-    plant
-        What is watched.
-    names : (p,)
-        The meters' customers, for sentences.
-    loop : (m, m)
-        What the injections do to the voltages that the inverters see: H of the closed loop.
-    certificate
-        Why the observer converges, for every trusted set and every switching between them.
-    doubt
-        How wrong powers may be.
-    prior
-        What follows for the voltages.
-    injections : (N,)
-        Standard deviation of the observed injections, pu.
-    busbar
-        Standard deviation of the squared busbar voltage, squared pu.
-    flicker
-        Variance of what its meter says from tick to tick, squared pu^2.
-    lengths : (s,)
-        Ticks of each scale.
-    every : (s,)
-        Ticks from one look at each scale to the next.
-    confirmed : (s,)
-        Ticks that evidence on each scale must last before anybody is named.
-    tails : (s,)
-        Probability that one test of one look exceeds its limit by chance, for the false-alarm rate asked for.
-    sigmas : (s,)
-        Standard deviations beyond which an offset is evidence: the two-sided Gaussian quantiles of `tails`.
-    suspect
-        Standard deviations beyond which a search suspects; an accusation costs the square of it.
-    white, fixed : (p,)
-        Variance of a squared reading from tick to tick, and of its unknown fixed part, squared pu^2.
-    allowed : (p,)
-        Largest fixed part by the accuracy class, `rounded` included, squared pu.
-    rounded : (p,)
-        Largest error of rounding that stays as long as the voltage does, squared pu; nobody can learn it.
-    hangs_on : (p, b)
-        1 where a meter hangs on a phase of the busbar, else 0; b is 1 on a balanced feeder.
-    reach : (p,)
-        What all inverters between their limits can do to the voltage at each meter, squared pu.
-    meter_of : (m,)
-        Meter that drives each inverter; -1 for none.
-    heard : (m,)
-        How far the truth may be from what each inverter's meter reads.
-    mismatch : (m,)
-        How far a real curve, linear in v, can be from the model's, linear in z, pu.
-    unseen : (m,)
-        Inverters whose whole range does not move the voltages enough to be noticed there.
-    book
-        What else but meters can be wrong: every customer's active power, then every inverter.
-    shapes
-        What manipulations are compared with, and when repetition is evidence.
-    most
-        How many liars it claims to tell apart: a third of the meters.
-    most_p, most_q : (N,)
-        Largest power of each customer that is believed, pu: more would alone move the voltage beyond all
-        limits.
-    step_s
-        Expected interval between frames, s.
-    options
-        The numbers that decide.
-    decoder
-        What decides in place of the search; None: the search.
-    """
-
-    plant: Plant
-    names: tuple[str, ...]
-    loop: Floats
-    certificate: Certificate
-    doubt: LoadDoubt
-    prior: Prior
-    injections: Floats
-    busbar: float
-    flicker: float
-    lengths: tuple[int, ...]
-    every: tuple[int, ...]
-    confirmed: Ints
-    tails: tuple[float, ...]
-    sigmas: tuple[float, ...]
-    suspect: float
-    white: Floats
-    fixed: Floats
-    allowed: Floats
-    rounded: Floats
-    hangs_on: Floats
-    reach: Floats
-    meter_of: Ints
-    heard: ToldError
-    mismatch: Floats
-    unseen: Bools
-    book: Dictionary = field(repr=False)
-    shapes: Shapes = field(repr=False)
-    most: int
-    most_p: Floats
-    most_q: Floats
-    step_s: float
-    options: SequentialOptions = field(repr=False)
-    decoder: Decoder | None = None
+    plant: Plant  # feeder and inverters
+    names: tuple[str, ...]  # (p,) the meters' customers
+    loop: Floats  # (m, m) effect of the injections on the inverters' voltages: H of the closed loop
+    certificate: Certificate  # convergence of the observer for every trusted set and every switching
+    doubt: LoadDoubt  # uncertainty of the powers
+    prior: Prior  # resulting prior of the voltages
+    injections: Floats  # (N,) standard deviation of the observed injections, pu
+    busbar: float  # standard deviation of the squared busbar voltage, squared pu
+    busbar_noise: float  # variance of the busbar's reading from tick to tick, squared pu^2
+    lengths: tuple[int, ...]  # (s,) ticks of each scale
+    look_every: tuple[int, ...]  # (s,) ticks from one look at each scale to the next
+    confirmed: Ints  # (s,) ticks that evidence on each scale must last before a meter is named
+    tails: tuple[float, ...]  # (s,) probability that one test of one look exceeds its limit by chance
+    sigmas: tuple[float, ...]  # (s,) standard deviations of evidence: two-sided Gaussian quantiles of `tails`
+    suspect: float  # standard deviations of a suspicion; an accusation costs their square
+    white: Floats  # (p,) variance of a squared reading from tick to tick, squared pu^2
+    fixed: Floats  # (p,) variance of its fixed error, squared pu^2
+    allowed: Floats  # (p,) largest fixed error by the accuracy class, `rounded` included, squared pu
+    rounded: Floats  # (p,) largest lasting rounding error, which cannot be learned, squared pu
+    busbar_incidence: Floats  # (p, b) 1 where a busbar phase supplies the meter, else 0
+    inverter_reach: Floats  # (p,) effect of all inverters between their limits at each meter, squared pu
+    meter_of: Ints  # (m,) meter that drives each inverter; -1 for none
+    reading_errors: ToldError  # (m,) errors of the readings of the inverters' meters
+    mismatch: Floats  # (m,) difference of a real curve, linear in v, from the model's, linear in z, pu
+    inverter_undetectable: Bools  # (m,) inverters with a range too small to be detected by the voltages
+    faults: FaultDictionary = field(repr=False)  # faults: customers' active powers, then inverters
+    references: KindReferences = field(
+        repr=False
+    )  # references of the kinds of manipulations, and limits of repetition
+    max_attacked: int  # largest number of manipulated meters told apart
+    max_p: Floats  # (N,) largest possible active power, pu: more would move the voltage beyond all limits
+    max_q: Floats  # (N,) largest possible reactive power, pu
+    step_s: float  # expected interval between frames, s
+    options: SequentialOptions = field(repr=False)  # tuning parameters
+    decoder: Decoder | None = None  # decoder in place of the search; None for the search
 
     @property
     def customers(self) -> int:
@@ -245,13 +180,13 @@ class SequentialDesign:
         return self.plant.feeder.bus.size
 
     @property
-    def effects(self) -> Effects:
-        """What every customer's powers do to the voltages."""
-        return self.shapes.traces.effects
+    def sensitivities(self) -> Sensitivities:
+        """Sensitivities of the voltages to every customer's powers."""
+        return self.references.traces.sensitivities
 
     @property
     def observers(self) -> int:
-        """One observer, whatever is trusted."""
+        """One observer for every trusted set."""
         return 1
 
 
@@ -263,20 +198,10 @@ def design(
     options: SequentialOptions | None = None,
     max_attacked: int | None = None,
 ) -> SequentialDesign:
-    """Prepare to watch a feeder.
+    """Design the monitor of a feeder.
 
-    Parameters
-    ----------
-    plant
-        What is watched.
-    doubt
-        How wrong the powers of the frames may be.
-    step_s
-        Expected interval between frames, s.
-    options
-        The numbers that decide.
-    max_attacked
-        With more liars than this the verdict is UNDECIDED; by default a third of the meters.
+    step_s: expected interval between frames, s. max_attacked: number of suspects above which the verdict is
+    UNDECIDED; by default a third of the meters.
 
     Raises
     ------
@@ -288,87 +213,106 @@ def design(
         As `plant.check_plant`, or if `doubt` is that of other customers.
     """
     options = SequentialOptions() if options is None else options
-    meters = plant.meters
+    meters, sensitivities = plant.meters, Sensitivities(plant.feeder)
     _check(plant, doubt, step_s, max_attacked)
     lure = close_loop(plant.feeder, plant.droop, meters)
-    effects = Effects(plant.feeder)
+    white, fixed, allowed, rounded = _noise(plant)
     injections = injection_doubt(plant.droop, plant.accuracy, meters, plant.feeder.bus.size)
     busbar = min(busbar_error(plant.accuracy, plant.droop.vbar**2, 2.0) / 2.0, UNMETERED)
-    lengths = _lengths(options.scales_s, step_s)
-    accuracy, slope = plant.accuracy, 2.0 * _HIGH * plant.droop.vbar
-    white = np.maximum(slope**2 * (accuracy.jitter**2 + accuracy.resolution**2 / 12.0), _WHITE)
-    rounded = slope * steady_rounding(accuracy)
-    fixed = slope**2 * accuracy.class_fraction**2 / 3.0 + 0.5 * rounded**2
     known = prior(plant.feeder, plant.feeder.bus[meters], doubt, busbar=busbar, inverters=injections)
-    suspect = -float(ndtri(0.5 * options.suspect / meters.size))
-    every = _every(lengths)
+    lengths = _lengths(options.scales_s, step_s)
+    every = _look_intervals(lengths)
     tails = tuple(_tail(options.alarms_per_year, plant, n * step_s, len(lengths)) for n in every)
     sigmas = tuple(-float(ndtri(tail / 2.0)) for tail in tails)
+    suspect = -float(ndtri(0.5 * options.suspect / meters.size))
     return SequentialDesign(
         plant=plant,
         names=tuple(plant.feeder.customers[c] for c in meters),
         loop=lure.H,
-        certificate=_proof(lure),
+        certificate=_certificate(lure),
         doubt=doubt,
         prior=known,
         injections=injections,
         busbar=busbar,
-        flicker=slope**2 * (accuracy.busbar_jitter**2 + accuracy.busbar_resolution**2 / 12.0),
+        busbar_noise=_busbar_noise(plant),
         lengths=lengths,
-        every=every,
+        look_every=every,
         confirmed=2 + np.array(lengths) // 6,
         tails=tails,
         sigmas=sigmas,
         suspect=suspect,
         white=white,
         fixed=fixed,
-        allowed=slope * accuracy.class_fraction + rounded,
+        allowed=allowed,
         rounded=rounded,
-        hangs_on=plant.feeder.busbar_incidence()[meters],
-        reach=np.abs(lure.C) @ (2.0 * plant.droop.limit),
+        busbar_incidence=plant.feeder.busbar_incidence()[meters],
+        inverter_reach=np.abs(lure.C) @ (2.0 * plant.droop.limit),
         meter_of=_meter_of(plant),
         mismatch=curve_mismatch(plant.droop),
-        heard=ToldError.over(plant.accuracy, _meter_of(plant), sigmas[0]),
-        unseen=_unseen(plant, effects, known, fixed + white / lengths[-1], suspect),
-        book=_suspicions(plant, effects, options),
-        shapes=_shapes(plant, effects, options.alarms_per_year, step_s, lengths),
-        most=meters.size // 3 if max_attacked is None else max_attacked,
-        most_p=_most_power(plant.feeder, Power.ACTIVE),
-        most_q=_most_power(plant.feeder, Power.REACTIVE),
+        reading_errors=ToldError.over(plant.accuracy, _meter_of(plant), sigmas[0]),
+        inverter_undetectable=_undetectable(
+            plant, sensitivities, known, fixed + white / lengths[-1], suspect
+        ),
+        faults=_fault_dictionary(plant, sensitivities, options),
+        references=_references(plant, sensitivities, options.alarms_per_year, step_s, lengths),
+        max_attacked=meters.size // 3 if max_attacked is None else max_attacked,
+        max_p=_max_power(plant.feeder, Power.ACTIVE),
+        max_q=_max_power(plant.feeder, Power.REACTIVE),
         step_s=step_s,
         options=options,
     )
 
 
-# Standard deviations that chance may take off what shows.
-_CHANCE = 2.0
+def _slope(plant: Plant) -> float:
+    """Factor from relative voltage errors to squared ones, pu."""
+    return 2.0 * _CONVERSION_VOLTAGE * plant.droop.vbar
 
 
-def _unseen(plant: Plant, effects: Effects, known: Prior, noise: Floats, suspect: float) -> Bools:
-    """Inverters whose whole range is no evidence against them: ``span sqrt(c^T Q c)`` within the limits."""
+def _noise(plant: Plant) -> tuple[Floats, Floats, Floats, Floats]:
+    """`white`, `fixed`, `allowed` and `rounded` of the design, (p,) each."""
+    accuracy, slope = plant.accuracy, _slope(plant)
+    rounded = slope * steady_rounding(accuracy)
+    white = np.maximum(slope**2 * (accuracy.jitter**2 + accuracy.resolution**2 / 12.0), _LEAST_NOISE)
+    fixed = slope**2 * accuracy.class_fraction**2 / 3.0 + 0.5 * rounded**2
+    return white, fixed, slope * accuracy.class_fraction + rounded, rounded
+
+
+def _busbar_noise(plant: Plant) -> float:
+    """Variance of the busbar's squared reading from tick to tick, squared pu^2."""
+    accuracy = plant.accuracy
+    return _slope(plant) ** 2 * (accuracy.busbar_jitter**2 + accuracy.busbar_resolution**2 / 12.0)
+
+
+_HIDDEN_SIGMAS = 2.0
+"""Standard deviations by which chance may hide an effect."""
+
+
+def _undetectable(
+    plant: Plant, sensitivities: Sensitivities, known: Prior, noise: Floats, suspect: float
+) -> Bools:
+    """Inverters with a range within the limits of the evidence: ``span sqrt(c^T Q c)``."""
     whole: Floats = known.among(np.arange(noise.size))
     whole[np.diag_indices_from(whole)] += noise
-    moved = effects.columns(Power.REACTIVE, plant.droop.customer)[known.meters]
+    moved = sensitivities.columns(Power.REACTIVE, plant.droop.customer)[known.meters]
     failed = lapack.dpotrf(whole, lower=True, clean=False, overwrite_a=True)[1]
     half, _ = lapack.dtrtrs(whole, moved, lower=True)
     if failed:
         raise np.linalg.LinAlgError("the matrix is not positive definite")
-    return np.asarray(plant.droop.span * np.sqrt((half * half).sum(axis=0)) <= suspect + _CHANCE)
+    return np.asarray(plant.droop.span * np.sqrt((half * half).sum(axis=0)) <= suspect + _HIDDEN_SIGMAS)
 
 
-# Powers that alone would move a squared voltage by this, pu, are none; nor are any beyond so many pu.
-_COLLAPSE, _NO_POWER = 1.0, 1e4
+_COLLAPSE, _MAX_POWER = 1.0, 1e4
+"""Injections that alone change v^2 by more than 1 pu, or exceed 1e4 pu, are impossible."""
 
 
-def _most_power(feeder: Network, power: Power) -> Floats:
-    return np.asarray(_COLLAPSE / np.maximum(2.0 * feeder.self_impedance(power), _COLLAPSE / _NO_POWER))
+def _max_power(feeder: Network, power: Power) -> Floats:
+    return np.asarray(_COLLAPSE / np.maximum(2.0 * feeder.self_impedance(power), _COLLAPSE / _MAX_POWER))
 
 
-# Least variance of a reading, squared pu^2: two perfect meters at one bus are equal, and such a matrix has no
-# inverse.
-_WHITE = 1e-12
-# Voltage at which a meter's relative errors are turned into squared ones, in parts of the nominal.
-_HIGH = 1.03
+_LEAST_NOISE = 1e-12
+"""Least variance of a reading, squared pu^2: two perfect meters at one bus make a singular matrix."""
+_CONVERSION_VOLTAGE = 1.03
+"""Voltage that converts relative meter errors into squared ones, in parts of nominal."""
 
 
 def _check(plant: Plant, doubt: LoadDoubt, step_s: float, most: int | None) -> None:
@@ -385,16 +329,17 @@ def _check(plant: Plant, doubt: LoadDoubt, step_s: float, most: int | None) -> N
 
 
 _FEWEST = 3
-# Decay rate asked of the solver, as a part of the slowest inverter's.
-_RATE = 0.1
+"""Fewest meters: two contradicting ones cannot be told apart."""
+_DECAY_PART = 0.1
+"""Decay rate asked of the solver, as a part of the slowest inverter's."""
 
 
-def _proof(lure: Lure) -> Certificate:
-    """The best closed form, or the solver's certificate where none applies; verified."""
+def _certificate(lure: Lure) -> Certificate:
+    """Best closed form of the certificate, or the solver's where none applies; verified."""
     try:
         found = certify(lure)
     except DesignInfeasible:
-        found = contraction(lure, rate=_RATE * float(np.min(-np.diagonal(lure.A))))
+        found = contraction(lure, rate=_DECAY_PART * float(np.min(-np.diagonal(lure.A))))
     margin = verify(found, lure)
     if not margin > 0:
         raise DesignInfeasible(
@@ -408,17 +353,17 @@ def _lengths(scales_s: tuple[float, ...], step_s: float) -> tuple[int, ...]:
     return tuple(sorted({max(1, round(scale / step_s)) for scale in scales_s}))
 
 
-# A long mean hardly changes from tick to tick: every scale but the shortest has this many looks per length.
 _LOOKS = 8
+"""Looks per length of every scale but the shortest: a long mean hardly changes from tick to tick."""
 
 
-def _every(lengths: tuple[int, ...]) -> tuple[int, ...]:
+def _look_intervals(lengths: tuple[int, ...]) -> tuple[int, ...]:
     """Ticks from one look at each scale to the next; the shortest scale answers at every tick."""
     return (1, *(max(1, round(length / _LOOKS)) for length in lengths[1:]))
 
 
-# Stuck meters and replays have a share of the false alarms each, as every scale has.
-_REPEATS = 2
+_REPEAT_TESTS = 2
+"""Tests of repetition, with the share of the false alarms of a scale each: stuck meters and replays."""
 
 
 def _tail(rate: float, plant: Plant, look_s: float, scales: int) -> float:
@@ -428,44 +373,48 @@ def _tail(rate: float, plant: Plant, look_s: float, scales: int) -> float:
     trusted meters. Each of the scales and of the two tests of repetition has an equal share of the rate.
     """
     tests = plant.meters.size + plant.feeder.busbar_incidence().shape[1] + 1
-    return min(float(rate * look_s / (YEAR_S * tests * (scales + _REPEATS))), 0.5)
+    return min(float(rate * look_s / (YEAR_S * tests * (scales + _REPEAT_TESTS))), 0.5)
 
 
-def _shapes(plant: Plant, effects: Effects, rate: float, step_s: float, lengths: tuple[int, ...]) -> Shapes:
-    """What manipulations look like at this feeder's meters."""
-    accuracy, slope = plant.accuracy, 2.0 * _HIGH * plant.droop.vbar
-    tests = plant.meters.size * (len(lengths) + _REPEATS) * YEAR_S / step_s
+def _references(
+    plant: Plant, sensitivities: Sensitivities, rate: float, step_s: float, lengths: tuple[int, ...]
+) -> KindReferences:
+    """References of the kinds at this feeder's meters."""
+    accuracy, slope = plant.accuracy, _slope(plant)
+    tests = plant.meters.size * (len(lengths) + _REPEAT_TESTS) * YEAR_S / step_s
     active, reactive = (2.0 * plant.feeder.self_impedance(power)[plant.meters] for power in Power)
-    return Shapes(
-        rules=rules(accuracy.resolution, accuracy.jitter, min(rate / tests, 0.5), step_s),
-        traces=Traces(effects, plant.feeder.bus[plant.meters]),
+    return KindReferences(
+        limits=repeat_limits(accuracy.resolution, accuracy.jitter, min(rate / tests, 0.5), step_s),
+        traces=LoadTraces(sensitivities, plant.feeder.bus[plant.meters]),
         noise=slope**2 * (accuracy.jitter**2 + accuracy.resolution**2 / 12.0),
         active=active,
         reactive=reactive,
-        every=pace(step_s),
+        interval=look_interval(step_s),
     )
 
 
-def _suspicions(plant: Plant, effects: Effects, options: SequentialOptions) -> Dictionary:
+def _fault_dictionary(
+    plant: Plant, sensitivities: Sensitivities, options: SequentialOptions
+) -> FaultDictionary:
     """Columns of 2R for the customers' active powers, and of 2X for the inverters."""
     feeder, meters, owner = plant.feeder, plant.meters, plant.droop.customer
     customers = feeder.bus.size
     of = np.concatenate([np.arange(customers), customers + owner])
 
     def changes(which: Ints) -> Floats:
-        return effects.of(of[which])
+        return sensitivities.numbered(of[which])
 
     def towards(weights: Floats) -> Floats:
-        return np.asarray(effects.along(meters, weights)[of])
+        return np.asarray(sensitivities.weighted(meters, weights)[of])
 
     load, injection = (feeder.squared_sensitivity(power, meters) for power in Power)
-    return Dictionary(
+    return FaultDictionary(
         std=np.concatenate([np.full(customers, options.hidden_power), 2.0 * plant.droop.limit]),
         charge=np.repeat([options.hidden_charge, 1.0], [customers, owner.size]),
         size=np.concatenate([load, injection[owner]]),
         meter=np.concatenate([_meter_at(plant), np.full(owner.size, -1)]),
         columns=changes,
-        along=towards,
+        weighted=towards,
     )
 
 

@@ -1,8 +1,7 @@
-"""Whom the monitor does not believe, apart from all else it carries: what survives when it begins anew.
+"""Record of suspects that survives a restart.
 
-Means over many ticks are empty when a monitor begins, so small lies, which only long means tell from
-chance, would pass for honest until these are full again. What a scale found therefore stands until it has
-enough readings to say something else.
+Means over many ticks are empty after a restart, and small manipulations that only long means show would pass
+for honest. A detection therefore stands until its scale has enough readings for another result.
 
 References
 ----------
@@ -16,59 +15,34 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints
-from gridsec.estimators.sequential.busbar import Busbar
+from gridsec.estimators.sequential.busbar import BusbarTrust
 from gridsec.estimators.sequential.design import SequentialDesign
-from gridsec.estimators.sequential.naming import MOST_COUNTED
-from gridsec.estimators.sequential.repeats import BLOCKS, ROWS, unnoticed
-from gridsec.estimators.sequential.scales import needed
+from gridsec.estimators.sequential.naming import MAX_INVERTER_TICKS
+from gridsec.estimators.sequential.repeats import BLOCKS, ROWS, detection_readings
+from gridsec.estimators.sequential.scales import min_readings
 from gridsec.estimators.sequential.state import SequentialState
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SuspicionRecord:
-    """Who is not believed. p meters, m inverters, b phases of the busbar, one on a balanced feeder.
+    """Suspects. p meters, m inverters, b busbar phases (1 on a balanced feeder)."""
 
-    Attributes
-    ----------
-    scale_s : (p,)
-        Time scale on which each distrusted meter was caught, s; NaN for those that are trusted.
-    repeats_s : (p,)
-        Time after which a distrusted meter repeats its readings, s, that from one to the next for a stuck
-        one; NaN for all others.
-    named : (p,)
-        Meters named as manipulated; all of them are distrusted.
-    inverters : (m,)
-        Inverters named as manipulated.
-    busbar_scale_s : (b,)
-        Time scale on which the busbar's meter was caught, s; NaN where it is believed.
-    busbar_named : (b,)
-        Where it is named as manipulated; there it is not believed.
-    busbar_off : (b,)
-        What it reads too much, the mean over its scale, squared pu; 0 where it is believed.
-    """
-
-    scale_s: Floats
-    repeats_s: Floats
-    named: Bools
-    inverters: Bools
-    busbar_scale_s: Floats = field(default_factory=lambda: np.full(1, np.nan))
-    busbar_named: Bools = field(default_factory=lambda: np.zeros(1, dtype=np.bool_))
-    busbar_off: Floats = field(default_factory=lambda: np.zeros(1))
+    scale_s: Floats  # (p,) time scale of each suspect's detection, s; NaN for trusted meters
+    repeats_s: Floats  # (p,) time after which a suspect repeats its readings, s; NaN for others
+    named: Bools  # (p,) meters named as manipulated; all of them are suspects
+    inverters: Bools  # (m,) inverters named as manipulated
+    busbar_scale_s: Floats = field(default_factory=lambda: np.full(1, np.nan))  # (b,) s; NaN if trusted
+    busbar_named: Bools = field(default_factory=lambda: np.zeros(1, dtype=np.bool_))  # (b,) named
+    busbar_off: Floats = field(default_factory=lambda: np.zeros(1))  # (b,) excess reading, squared pu
 
     @property
     def is_empty(self) -> bool:
-        """Whether everybody is believed."""
+        """True if every meter, inverter and busbar phase is trusted."""
         scales_s = (self.scale_s, self.busbar_scale_s)
         return not (self.inverters.any() or any(np.isfinite(scale_s).any() for scale_s in scales_s))
 
     def same(self, other: SuspicionRecord) -> bool:
-        """Whether another says the same of everybody; by how much the busbar's meter is off does not count.
-
-        Parameters
-        ----------
-        other
-            Of the same feeder.
-        """
+        """True if the suspects are the same; the deviation of the busbar's meter does not count."""
         return (
             np.array_equal(self.scale_s, other.scale_s, equal_nan=True)
             and np.array_equal(self.repeats_s, other.repeats_s, equal_nan=True)
@@ -79,87 +53,62 @@ class SuspicionRecord:
         )
 
     def without(self, which: Bools) -> SuspicionRecord:
-        """What is left when some meters were replaced.
-
-        Parameters
-        ----------
-        which : (p,)
-            The meters.
-        """
+        """Record without meters that were replaced, (p,)."""
         scale_s, repeats_s = (np.where(which, np.nan, each) for each in (self.scale_s, self.repeats_s))
         return replace(self, scale_s=scale_s, repeats_s=repeats_s, named=self.named & ~which)
 
     @staticmethod
     def empty(meters: int, inverters: int, phases: int = 1) -> SuspicionRecord:
-        """Everybody is believed.
-
-        Parameters
-        ----------
-        meters, inverters, phases
-            p, m and b.
-        """
+        """Record without suspects."""
         no, none, here = (np.zeros(count, dtype=np.bool_) for count in (meters, inverters, phases))
         never = np.full(meters, np.nan)
         return SuspicionRecord(never, never, no, none, np.full(phases, np.nan), here, np.zeros(phases))
 
 
 def distrusted(design: SequentialDesign, state: SequentialState) -> SuspicionRecord:
-    """Whom a state does not believe.
-
-    Parameters
-    ----------
-    design, state
-        The design, and the state after a tick.
-    """
+    """Suspects of a state after a tick."""
     trust = state.trust
     inverters = trust.inverters if state.last is None else state.last[1].inverters
     busbar = state.busbar
-    if trust.trusted.all() and busbar.believed.all() and not inverters.any():
-        return SuspicionRecord.empty(trust.trusted.size, inverters.size, busbar.believed.size)
+    if trust.trusted.all() and busbar.trusted.all() and not inverters.any():
+        return SuspicionRecord.empty(trust.trusted.size, inverters.size, busbar.trusted.size)
     scales_s = np.array(design.lengths) * design.step_s
-    # Repetition shows on no scale; the longest is what is left to judge such a meter by.
-    repeats = ~trust.trusted & (trust.lag > 0)
+    # Repetition shows on no scale; the longest one tests such a meter.
+    repeats = ~trust.trusted & (trust.repeat_lag > 0)
     scale = np.where(repeats, len(design.lengths) - 1, trust.scale)
     return SuspicionRecord(
         np.where(trust.trusted, np.nan, scales_s[scale]),
-        np.where(repeats, trust.lag * design.step_s, np.nan),
+        np.where(repeats, trust.repeat_lag * design.step_s, np.nan),
         trust.named,
         inverters,
-        np.where(busbar.believed, np.nan, scales_s[busbar.scale]),
+        np.where(busbar.trusted, np.nan, scales_s[busbar.scale]),
         busbar.named,
         busbar.off,
     )
 
 
 def warm_start(design: SequentialDesign, state: SequentialState, before: SuspicionRecord) -> SequentialState:
-    """Go on distrusting who was, from a state that has not seen any frame.
+    """State from `init` with the suspects of an earlier run.
 
-    A meter is trusted again as always, but not before it has given as many readings as its scale needs to
-    judge, and the observer has settled, and one that repeated itself as many as it takes to notice that anew;
-    an inverter that is named, as many as the longest scale needs. The busbar's meter is compared with the
-    others as before, by the mean that was known, and has to agree with them for as much longer.
-
-    Parameters
-    ----------
-    design, state
-        The design, and a state from `init`.
-    before
-        Who was distrusted.
+    A meter is released as always, but not before it has given the readings that its scale needs and the
+    observer has settled; one that repeated itself, not before a repetition would be detected; a named
+    inverter, not before the longest scale has its readings. The busbar's meter is compared with the others
+    from its earlier mean.
     """
     if before.is_empty:
         return state
     trust, which = state.trust, np.isfinite(before.scale_s)
     scale = _closest(design, before.scale_s)
     need, settling = (
-        np.array([needed(design, s) for s in range(len(design.lengths))]),
+        np.array([min_readings(design, s) for s in range(len(design.lengths))]),
         _settling(design, state),
     )
-    still = trust.still.copy()
+    still = trust.above_release_limit.copy()
     still[scale[which], np.flatnonzero(which)] = True
     repeats = np.isfinite(before.repeats_s)
     ticks = np.where(repeats, np.rint(before.repeats_s / design.step_s), 0.0)
     lag = np.where(repeats, np.clip(ticks, 1.0, ROWS * BLOCKS), 0.0).astype(np.intp)
-    owed = np.maximum(np.maximum(need[scale], settling), unnoticed(design.shapes.rules, lag))
+    owed = np.maximum(np.maximum(need[scale], settling), detection_readings(design.references.limits, lag))
     longest = max(int(need[-1]), int(settling.max(initial=0)))
     return replace(
         state,
@@ -168,44 +117,44 @@ def warm_start(design: SequentialDesign, state: SequentialState, before: Suspici
             trust,
             trusted=~which,
             scale=scale,
-            age=np.where(before.named, design.confirmed[scale], which),
-            still=still,
-            owed=np.where(which, owed, 0),
-            lag=np.where(which, lag, 0),
+            ticks_suspect=np.where(before.named, design.confirmed[scale], which),
+            above_release_limit=still,
+            readings_owed=np.where(which, owed, 0),
+            repeat_lag=np.where(which, lag, 0),
             named=before.named & which,
-            counted=np.where(before.inverters, longest + MOST_COUNTED, 0),
+            inverter_ticks=np.where(before.inverters, longest + MAX_INVERTER_TICKS, 0),
             inverters=before.inverters,
         ),
     )
 
 
-def _busbar(design: SequentialDesign, before: SuspicionRecord, need: Ints, settling: int) -> Busbar:
-    """What is thought of the busbar's meter, as far as it was not believed."""
+def _busbar(design: SequentialDesign, before: SuspicionRecord, need: Ints, settling: int) -> BusbarTrust:
+    """Trust of the busbar's meter from a record."""
     out = np.isfinite(before.busbar_scale_s)
     scale = _closest(design, before.busbar_scale_s)
     known = before.busbar_named & out
-    # The mean goes on over the whole of its scale.
+    # The mean continues over the whole of its scale.
     length = np.maximum(design.confirmed, design.lengths)[scale]
-    return Busbar(
-        believed=~out,
+    return BusbarTrust(
+        trusted=~out,
         scale=scale,
-        age=np.where(known, length, 0),
-        quiet=np.where(out, -np.maximum(need[scale], settling), 0),
+        ticks_suspect=np.where(known, length, 0),
+        ticks_agreeing=np.where(out, -np.maximum(need[scale], settling), 0),
         off=np.where(known, before.busbar_off, 0.0),
         named=known,
     )
 
 
 def _closest(design: SequentialDesign, scale_s: Floats) -> Ints:
-    """The scales closest to those on which somebody was caught, 0 for NaN: they may have changed since."""
+    """Scales closest to those of the detections, 0 for NaN: they may have changed since."""
     scales_s = np.array(design.lengths) * design.step_s
     far = np.abs(np.log(np.where(np.isfinite(scale_s), scale_s, scales_s[0])[:, None] / scales_s))
     return np.asarray(far.argmin(axis=1))
 
 
 def _settling(design: SequentialDesign, state: SequentialState) -> Ints:
-    """Ticks until the unknown initial state moves each meter by less than matters, (p,)."""
+    """Ticks until the unknown initial state is negligible at each meter, (p,)."""
     least = design.options.settled * np.maximum(state.learned.allowed, np.finfo(np.float64).tiny)
-    more = np.log(np.maximum(design.reach / least, 1.0))
+    more = np.log(np.maximum(design.inverter_reach / least, 1.0))
     rate = design.certificate.rate * design.step_s
     return np.asarray(np.where(more > 0.0, np.ceil(more / rate), 0.0)).astype(np.intp)

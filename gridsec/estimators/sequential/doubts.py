@@ -1,11 +1,8 @@
-"""How much less the frames know of powers than the design supposes, and what then holds on every scale.
+"""Uncertainty of the frames beyond that of the design, and the resulting prior of each scale.
 
-A mean over some ticks contains residuals of all of them, so on each scale a customer's power is as uncertain
-as it was at worst within the ticks of that scale, and the busbar is known only where it was at all of them.
-
-References
-----------
-docs/theory-sequential.md, section 1.
+A mean over several ticks contains residuals of all of them. On each scale a power is therefore as uncertain
+as at the worst of its ticks, and the busbar is known only if it is metered at all of them
+(docs/theory-sequential.md, section 1).
 """
 
 from __future__ import annotations
@@ -23,167 +20,118 @@ from gridsec.interface import Frame, PowerOrigin
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Doubts:
-    """How much less the frames know than the design supposes. N customers, s scales.
+class FrameUncertainty:
+    """Uncertainty of the frames beyond that of the design. N customers, p meters, s scales, b busbar phases.
 
-    Attributes
-    ----------
-    p, q : (s, N)
-        Factors on the standard deviations of the design: the largest that any residual in the mean of a scale
-        was made with. Exact for a power that a reporting meter withholds, else powers of two.
-    p_calm, q_calm : (s, N)
-        For how many ticks a smaller one would have done.
-    p_rest, q_rest : (s, N)
-        The largest that these would have needed.
-    busbar : (s, b)
-        Whether there was a busbar voltage at all ticks of a scale; b is 3 in three phases, else 1.
-    busbar_calm : (s, b)
-        For how many ticks there has been one where there was none at all of them.
-    priors : (s,)
-        What follows.
-    sizes : (k,)
-        How much there may be of whatever else is in the book of the design, pu: false powers are of the size
-        of what the customers claim, rounded up.
-    vouched : (s, p)
-        Meters without a residual in the mean of a scale that was made without a reading of their customer's
-        active power.
-    vouched_calm : (s, p)
-        Consecutive ticks without such a residual, for meters that are not vouched.
-    read, read_calm : (s, p)
-        The same with late powers as readings.
-    heard
-        While no meter is heard: the same when one was, for the last time.
+    A `_ticks` field counts the consecutive ticks for which the better state of its field would hold.
     """
 
-    p: Floats
-    q: Floats
-    p_calm: Ints
-    q_calm: Ints
-    p_rest: Floats
-    q_rest: Floats
-    busbar: Bools
-    busbar_calm: Ints
-    priors: tuple[Prior, ...]
-    sizes: Floats
-    vouched: Bools
-    vouched_calm: Ints
-    read: Bools
-    read_calm: Ints
-    heard: Doubts | None = None
+    p: Floats  # (s, N) factors on the design's standard deviations: exact where withheld, else powers of 2
+    q: Floats  # (s, N) likewise
+    p_ticks: Ints  # (s, N)
+    q_ticks: Ints  # (s, N)
+    p_next: Floats  # (s, N) largest factor needed within these ticks
+    q_next: Floats  # (s, N)
+    busbar: Bools  # (s, b) a busbar voltage at all ticks of the scale
+    busbar_ticks: Ints  # (s, b)
+    priors: tuple[Prior, ...]  # (s,) resulting priors
+    sizes: Floats  # (k,) standard deviation of each fault, pu: false powers as large as the claims
+    vouched: Bools  # (s, p) no residual of the mean lacks a usable active power of the meter's customer
+    vouched_ticks: Ints  # (s, p)
+    read: Bools  # (s, p) as `vouched`, with late powers as readings
+    read_ticks: Ints  # (s, p)
+    before_silence: FrameUncertainty | None = (
+        None  # while no meter reports: the uncertainty at the last report
+    )
 
 
-def none(design: SequentialDesign) -> Doubts:
-    """The frames know what the design supposes.
-
-    Parameters
-    ----------
-    design
-        The design.
-    """
-    scales, phases = len(design.lengths), design.hangs_on.shape[1]
+def nominal(design: SequentialDesign) -> FrameUncertainty:
+    """Uncertainty of the design."""
+    scales, phases = len(design.lengths), design.busbar_incidence.shape[1]
     one, never = np.ones((scales, design.customers)), np.zeros((scales, design.customers), dtype=np.intp)
     known, unbroken = np.ones((scales, phases), dtype=np.bool_), np.zeros((scales, phases), dtype=np.intp)
     priors, meters = (design.prior,) * scales, design.plant.meters.size
     vouched, calm = np.ones((scales, meters), dtype=np.bool_), np.zeros((scales, meters), dtype=np.intp)
-    sizes = design.book.std
-    return Doubts(
+    sizes = design.faults.std
+    return FrameUncertainty(
         one, one, never, never, one, one, known, unbroken, priors, sizes, vouched, calm, vouched, calm
     )
 
 
-_MUCH_LESS = 4.0
+_WIDER = 4.0
 """Ratio of a frame's uncertainty to the design's beyond which it is used, unless a power is withheld."""
-_ROUNDED = 1.0 + 1e-9
-"""Ratio up to which two uncertainties are the same but for rounding."""
-_FELT = 0.5
-"""Part of the accuracy class that doubts about late or excessive powers must move a voltage by to count."""
-_ALIKE = 0.5
-"""Share of the variance of powers that are not read that all of them have in common."""
+_SAME_RATIO = 1.0 + 1e-9
+"""Ratio up to which two uncertainties differ by rounding only."""
+_LEAST_EFFECT = 0.5
+"""Part of the accuracy class by which late or excessive powers must be able to move a voltage to count."""
+_COMMON_SHARE = 0.5
+"""Common share of the variance of unread powers."""
 
 
-def doubted(
-    design: SequentialDesign, before: Doubts, frame: Frame, live: Bools, busbar: Bools | bool
-) -> Doubts:
-    """What is not known at this frame, and of the residuals that are remembered.
+def update_uncertainty(
+    design: SequentialDesign, before: FrameUncertainty, frame: Frame, available: Bools, busbar: Bools | bool
+) -> FrameUncertainty:
+    """Uncertainty of this frame and of the residuals in the means.
 
-    Where no meter is heard there is no residual that was made with what this frame does not know: once one is
-    heard again, doubts go on as they were before.
-
-    Parameters
-    ----------
-    design, before
-        The design, and the doubts so far.
-    frame
-        With powers that can be.
-    live : (p,)
-        Which meters have a reading.
-    busbar
-        Whether there is a busbar voltage that is believed; in three phases (3,).
+    Without any reading, (p,) `available`, no residual is made: at the next reading the uncertainty before
+    counts again. busbar: a trusted busbar voltage; (3,) in three phases.
     """
-    last = before if before.heard is None else before.heard
-    if any_of(live):
-        return _doubts(design, last, frame, live, busbar)
-    found = _doubts(design, before, frame, live, busbar)
-    return found if found.heard is last else replace(found, heard=last)
+    last = before if before.before_silence is None else before.before_silence
+    if any_of(available):
+        return _updated(design, last, frame, available, busbar)
+    found = _updated(design, before, frame, available, busbar)
+    return found if found.before_silence is last else replace(found, before_silence=last)
 
 
 def checked(design: SequentialDesign, frame: Frame) -> Bools:
-    """Meters with an active power that is known about as well as the design supposes, (p,).
-
-    A power that is not read is as good as one that is if the design supposes no more of it.
-
-    Parameters
-    ----------
-    design, frame
-        The design, and a frame with powers that can be.
-    """
+    """Meters with an active power known about as well as the design supposes, (p,)."""
     meters = design.plant.meters
     if frame.p_origin is None:
         return np.ones(meters.size, dtype=np.bool_)
     origins = frame.p_origin[meters]
     if not any_of(origins):
         return np.ones(meters.size, dtype=np.bool_)
-    least = np.where(origins == PowerOrigin.UNREAD, _ROUNDED, _MUCH_LESS)
+    least = np.where(origins == PowerOrigin.UNREAD, _SAME_RATIO, _WIDER)
     wide = frame.p_error[meters] > least * design.doubt.even_p[meters]
     return np.asarray((origins == PowerOrigin.READ) | ~wide)
 
 
-def _withheld(design: SequentialDesign, frame: Frame, live: Bools) -> tuple[Bools | None, Bools | None]:
-    """Meters with a voltage at this frame and without a usable active power of its moment, (p,); None: none.
+def _withheld(design: SequentialDesign, frame: Frame, available: Bools) -> tuple[Bools | None, Bools | None]:
+    """Meters with a voltage and no usable active power of its moment; those without a late one; (p,) or None.
 
-    And those of them without a late one. A late power, or one beyond the declared range, counts if all of
-    these together can move the voltage at its meter by `_FELT` of the accuracy class.
+    A late power, or one beyond the declared range, counts if all of these together can move the voltage at
+    its meter by `_LEAST_EFFECT` of the accuracy class.
     """
     meters = design.plant.meters
     if frame.p_origin is None or not any_of(frame.p_origin[meters]):
         return None, None
-    origins, out = frame.p_origin[meters], live & ~checked(design, frame)
+    origins, out = frame.p_origin[meters], available & ~checked(design, frame)
     doubted = out & (origins != PowerOrigin.UNREAD)
     if any_of(doubted):
         power = np.where(_customers(design, doubted), frame.p_error, 0.0)
         moved = design.plant.feeder.reach(power, np.zeros_like(power))[design.prior.meters]
-        out = out & ~(doubted & (moved <= _FELT * design.allowed))
+        out = out & ~(doubted & (moved <= _LEAST_EFFECT * design.allowed))
     unread = out & (origins != PowerOrigin.LATE)
     return out if any_of(out) else None, unread if any_of(unread) else None
 
 
-def _doubts(
-    design: SequentialDesign, before: Doubts, frame: Frame, live: Bools, busbar: Bools | bool
-) -> Doubts:
-    """What this frame does not know; new priors only where that changed."""
-    # The design has standard deviations, and so have frames that tell them apart from their intervals.
+def _updated(
+    design: SequentialDesign, before: FrameUncertainty, frame: Frame, available: Bools, busbar: Bools | bool
+) -> FrameUncertainty:
+    """Uncertainty with this frame; new priors only where factors changed."""
+    # Intervals in units of the design's standard deviations.
     frame, lengths = usual(frame), design.lengths
-    withheld, unread = _withheld(design, frame, live)
+    withheld, unread = _withheld(design, frame, available)
     exact = None if unread is None else _customers(design, unread)
     p, p_calm, p_rest = _factors(
-        frame.p_error, design.doubt.even_p, (before.p, before.p_calm, before.p_rest), lengths, exact
+        frame.p_error, design.doubt.even_p, (before.p, before.p_ticks, before.p_next), lengths, exact
     )
     q, q_calm, q_rest = _factors(
-        frame.q_error, design.doubt.even_q, (before.q, before.q_calm, before.q_rest), lengths, exact
+        frame.q_error, design.doubt.even_q, (before.q, before.q_ticks, before.q_next), lengths, exact
     )
-    sizes = _claims(np.abs(frame.p), design.options.hidden_power, before.sizes)
-    metered, calm = _metered(busbar, before.busbar, before.busbar_calm, lengths)
-    before = _checks(before, withheld, unread, lengths)
+    sizes = _claim_sizes(np.abs(frame.p), design.options.hidden_power, before.sizes)
+    metered, calm = _known_scales(busbar, before.busbar, before.busbar_ticks, lengths)
+    before = _update_checks(before, withheld, unread, lengths)
     if metered is before.busbar and p is before.p and q is before.q:
         return before if sizes is before.sizes else replace(before, sizes=sizes)
     same = np.ones(len(lengths), dtype=np.bool_)
@@ -194,18 +142,18 @@ def _doubts(
         return replace(
             before,
             sizes=sizes,
-            p_calm=p_calm,
-            q_calm=q_calm,
-            p_rest=p_rest,
-            q_rest=q_rest,
-            busbar_calm=calm,
+            p_ticks=p_calm,
+            q_ticks=q_calm,
+            p_next=p_rest,
+            q_next=q_rest,
+            busbar_ticks=calm,
         )
     priors: list[Prior] = []
     for s, known in enumerate(before.priors):
         if same[s]:
             priors.append(known)
             continue
-        # Scales that are in doubt about the same share what follows.
+        # Scales with equal factors share a prior.
         parts = (p, q, metered, before.read)
         shared = (k for k in range(s) if all(np.array_equal(of[k], of[s]) for of in parts))
         k = next(shared, None)
@@ -214,27 +162,31 @@ def _doubts(
         before,
         p=p,
         q=q,
-        p_calm=p_calm,
-        q_calm=q_calm,
-        p_rest=p_rest,
-        q_rest=q_rest,
+        p_ticks=p_calm,
+        q_ticks=q_calm,
+        p_next=p_rest,
+        q_next=q_rest,
         busbar=metered,
-        busbar_calm=calm,
+        busbar_ticks=calm,
         priors=tuple(priors),
         sizes=sizes,
-        heard=None,
+        before_silence=None,
     )
 
 
-def _checks(before: Doubts, withheld: Bools | None, unread: Bools | None, lengths: tuple[int, ...]) -> Doubts:
-    """The doubts with `vouched` and `read` of this tick."""
+def _update_checks(
+    before: FrameUncertainty, withheld: Bools | None, unread: Bools | None, lengths: tuple[int, ...]
+) -> FrameUncertainty:
+    """Uncertainty with `vouched` and `read` of this tick."""
     if withheld is None and all_of(before.vouched):
         return before
-    vouched, vouched_calm = _metered(
-        True if withheld is None else ~withheld, before.vouched, before.vouched_calm, lengths
+    vouched, vouched_calm = _known_scales(
+        True if withheld is None else ~withheld, before.vouched, before.vouched_ticks, lengths
     )
-    read, read_calm = _metered(True if unread is None else ~unread, before.read, before.read_calm, lengths)
-    return replace(before, vouched=vouched, vouched_calm=vouched_calm, read=read, read_calm=read_calm)
+    read, read_calm = _known_scales(
+        True if unread is None else ~unread, before.read, before.read_ticks, lengths
+    )
+    return replace(before, vouched=vouched, vouched_ticks=vouched_calm, read=read, read_ticks=read_calm)
 
 
 def _customers(design: SequentialDesign, meters: Bools) -> Bools:
@@ -250,9 +202,9 @@ def _prior(design: SequentialDesign, p: Floats, q: Floats, busbar: Bools, read: 
     unknown = np.where(busbar, design.busbar, UNMETERED)
     together = design.doubt.together
     if not all_of(read):
-        # Powers that are not read are low together by night, with a meter as without.
+        # Unread powers are low together by night, with a meter as without.
         unread = (p > 1.0) & _customers(design, ~read)
-        together = np.where(unread, np.maximum(together, _ALIKE), together)
+        together = np.where(unread, np.maximum(together, _COMMON_SHARE), together)
     doubt = replace(
         design.doubt,
         together=together,
@@ -268,8 +220,8 @@ def _prior(design: SequentialDesign, p: Floats, q: Floats, busbar: Bools, read: 
     )
 
 
-def _claims(power: Floats, least: float, before: Floats) -> Floats:
-    """False powers as large as what is claimed, in powers of two, and kept while they are close to that."""
+def _claim_sizes(power: Floats, least: float, before: Floats) -> Floats:
+    """Standard deviations of false powers: the claims in powers of two, with hysteresis."""
     old = before[: power.size]
     fine = (power <= old) & ((old <= least) | (4.0 * power >= old))
     if all_of(fine):
@@ -278,11 +230,10 @@ def _claims(power: Floats, least: float, before: Floats) -> Floats:
     return np.concatenate([new, before[power.size :]])
 
 
-def _metered(busbar: Bools | bool, old: Bools, calm: Ints, lengths: tuple[int, ...]) -> tuple[Bools, Ints]:
-    """On which scales the busbar is known: where no residual is remembered that was made without it.
-
-    Such residuals are as far off as it had moved meanwhile, and all meters alike.
-    """
+def _known_scales(
+    busbar: Bools | bool, old: Bools, calm: Ints, lengths: tuple[int, ...]
+) -> tuple[Bools, Ints]:
+    """Scales without a residual made while the busbar was unknown, and the ticks since."""
     now = np.asarray(busbar)
     if all_of(now) and all_of(old):
         return old, calm
@@ -290,17 +241,14 @@ def _metered(busbar: Bools | bool, old: Bools, calm: Ints, lengths: tuple[int, .
     return known, np.where(now & ~known, calm + 1, 0)
 
 
-def _factors(  # one power of all customers
+def _factors(
     error: Floats,
     known: Floats,
     before: tuple[Floats, Ints, Floats],
     lengths: tuple[int, ...],
     exact: Bools | None,
 ) -> tuple[Floats, Ints, Floats]:
-    """`_factor`, but as long as residuals are remembered that were made with a larger one, that one.
-
-    Then the largest of those made since, for as long again: they are remembered still.
-    """
+    """Factors held while the means contain residuals made with larger ones, then the largest since."""
     old, calm, rest = before
     new = _factor(error, known, old, exact)
     if new is old:
@@ -318,14 +266,14 @@ def _factor(error: Floats, known: Floats, old: Floats, exact: Bools | None) -> F
 
     The ratio itself where `exact`, else a power of two.
     """
-    if exact is None and all_of(error <= _MUCH_LESS * known) and all_of(old <= 1.0):
+    if exact is None and all_of(error <= _WIDER * known) and all_of(old <= 1.0):
         return old
     ratio = error / known
-    keep = (ratio <= old * _MUCH_LESS) & (ratio * _MUCH_LESS >= old) & (old > _MUCH_LESS)
+    keep = (ratio <= old * _WIDER) & (ratio * _WIDER >= old) & (old > _WIDER)
     raised = np.exp2(np.ceil(np.log2(np.maximum(ratio, 1.0))))
-    new = np.where(keep, old, np.where(ratio > _MUCH_LESS, raised, 1.0))
+    new = np.where(keep, old, np.where(ratio > _WIDER, raised, 1.0))
     if exact is None:
         return new
     # A forecast states its own standard deviation; rounding it up would widen more than is stated.
-    near = (ratio <= _ROUNDED * old) & (ratio * _MUCH_LESS >= old) & (old > 1.0)
-    return np.where(exact, np.where(near, old, np.where(ratio > _ROUNDED, ratio, 1.0)), new)
+    near = (ratio <= _SAME_RATIO * old) & (ratio * _WIDER >= old) & (old > 1.0)
+    return np.where(exact, np.where(near, old, np.where(ratio > _SAME_RATIO, ratio, 1.0)), new)

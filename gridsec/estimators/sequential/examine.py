@@ -1,4 +1,4 @@
-"""Who is believed: every scale judges, and where one finds evidence the likeliest liars are looked for.
+"""Identification: tests on every scale, and a search for the likeliest manipulated meters where one fails.
 
 References
 ----------
@@ -13,327 +13,333 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, all_of, any_of, indices
 from gridsec.estimators.inputs import busbar_errors
-from gridsec.estimators.sequential.bounds import Powers
-from gridsec.estimators.sequential.busbar import Doubt, Honest, aligned, opposed, room, weight
-from gridsec.estimators.sequential.conditional import Fit, Prior, drop, judge
+from gridsec.estimators.sequential.bounds import PowerErrors
+from gridsec.estimators.sequential.busbar import (
+    BusbarTest,
+    HonestErrors,
+    busbar_weights,
+    contradicted_phases,
+    explained_phases,
+    largest_sums,
+)
+from gridsec.estimators.sequential.conditional import Posterior, Prior, leave_one_out, remove_meter
 from gridsec.estimators.sequential.consistency import inconsistent
-from gridsec.estimators.sequential.decoder import Accused, Evidence
+from gridsec.estimators.sequential.decoder import DecoderAnswer, DecoderInput
 from gridsec.estimators.sequential.design import SequentialDesign
-from gridsec.estimators.sequential.explain import Search
+from gridsec.estimators.sequential.explain import HypothesisSearch
 from gridsec.estimators.sequential.robust import covers
-from gridsec.estimators.sequential.scales import Scale, Scales, View, adapt, believe, view_of
-from gridsec.estimators.sequential.search import Explanation, Found, Solution
-from gridsec.estimators.sequential.state import SequentialState, Trust
+from gridsec.estimators.sequential.scales import ScaleData, Scales, ScaleTest, scale_test, update_posterior
+from gridsec.estimators.sequential.search import Candidate, Candidates, Hypothesis
+from gridsec.estimators.sequential.state import SequentialState
+from gridsec.estimators.sequential.trust import TrustState
 from gridsec.estimators.sequential.windows import Window
+from gridsec.interface import Explanation
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Examined:
-    """The outcome of one tick. s scales.
+class Identification:
+    """Identification of one tick. s scales."""
 
-    Attributes
-    ----------
-    trust
-        Who is believed now.
-    fits, wholes, views : (s,)
-        By scale, as in the state; a view is None where the scale was not looked at.
-    found
-        The likeliest explanation that a search came to, and the others, by scale.
-    misfit : (s,)
-        Scales whose trusted meters were inconsistent at the last look, after the search.
-    busbar
-        The phase of the busbar whose meter lies, and the scale that found it: then nothing else counts, and
-        the tick has to begin anew without it.
+    trust: TrustState  # trust state after the tests
+    posteriors: tuple[Posterior | None, ...]  # (s,) posteriors of the trusted meters
+    full_posteriors: tuple[Posterior | None, ...]  # (s,) kept posteriors of all meters
+    tests: tuple[ScaleTest | None, ...]  # (s,) tests; None for a scale without a look at this tick
+    candidates: dict[int, Candidates]  # candidates by scale that searched
+    inconsistent: tuple[bool, ...]  # (s,) trusted meters inconsistent at the last look, after the search
+    rivals: tuple[Explanation, ...] = ()  # hypotheses about as likely as the best, from the confirmation
+    busbar: tuple[int, int] | None = None  # busbar phase and scale of a wrong meter: the tick restarts
+
+
+_SEARCH_INTERVAL = 8
+"""Ticks with a search at each before a meter is named, and interval of the searches after them."""
+
+
+def identify(
+    design: SequentialDesign, state: SequentialState, model: Floats, honest: HonestErrors
+) -> Identification:
+    """Test every meter on every due scale, shortest first.
+
+    state: with the window and uncertainty of this tick, else of the last. model: (p,) largest model error,
+    squared pu. honest: bounds of all other honest errors.
     """
+    tick = _Tick(design, state, model, honest)
+    both = []
+    for s in range(len(design.lengths)):
+        both.append(tick.scale(s))
+        if tick.busbar is not None:
+            return Identification(
+                trust=state.trust,
+                posteriors=state.posteriors,
+                full_posteriors=state.full_posteriors,
+                tests=(None,) * len(design.lengths),
+                candidates={},
+                inconsistent=state.inconsistent,
+                busbar=tick.busbar,
+            )
+    posteriors, tests = zip(*both, strict=True)
+    kept, misfit = tuple(tick.full_posteriors), tuple(tick.inconsistent)
+    return Identification(tick.trust, posteriors, kept, tests, tick.candidates, misfit)
 
-    trust: Trust
-    fits: tuple[Fit | None, ...]
-    wholes: tuple[Fit | None, ...]
-    views: tuple[View | None, ...]
-    found: dict[int, Found]
-    misfit: tuple[bool, ...]
-    busbar: tuple[int, int] | None = None
 
+class _Tick:
+    """Progress of the identification over the scales of one tick."""
 
-# For so many ticks it is asked at each who could be honest, after that once in so many.
-_AGAIN = 8
+    def __init__(
+        self, design: SequentialDesign, state: SequentialState, model: Floats, honest: HonestErrors
+    ) -> None:
+        self.design, self.state, self.model, self.honest = design, state, model, honest
+        self.clear = state.trust.clear
+        self.trust = state.trust if self.clear else state.trust.writable()
+        self.full_posteriors, self.inconsistent = list(state.full_posteriors), list(state.inconsistent)
+        self.candidates: dict[int, Candidates] = {}
+        self.busbar: tuple[int, int] | None = None
+        self.scales = Scales(design, state.uncertainty, state.window, state.learned, model, state.clock_skew)
 
-
-def examine(design: SequentialDesign, state: SequentialState, model: Floats, honest: Honest) -> Examined:
-    """Judge every meter on every scale that is due, shortest first.
-
-    Parameters
-    ----------
-    design
-        The design.
-    state
-        With this tick's window and doubts, and all else from the last tick.
-    model : (p,)
-        What the model may be off, squared pu.
-    honest
-        What all other errors are bounded by.
-    """
-    fits, tick, trust = state.fits, state.ticks, state.trust
-    calm = trust.calm
-    trust = trust if calm else _own(trust)
-    views: list[View | None] = []
-    after: list[Fit | None] = []
-    wholes = list(state.wholes)
-    found: dict[int, Found] = {}
-    misfit = list(state.misfit)
-    scales = Scales(design, state.doubts, state.window, state.learned, model, state.skew)
-    for s, every in enumerate(design.every):
-        before = fits[s]
-        stale = before is None or (not trust.calm and any_of(before.trusted & ~trust.trusted))
-        if tick % every and not stale:
-            views.append(None)
-            after.append(before)
-            continue
-        here = scales[s]
-        now = adapt(before, here, trust.trusted & here.enough, scales.loosened(trust.accused))
-        view = view_of(design, here, judge(now, here.m))
+    def scale(self, s: int) -> tuple[Posterior | None, ScaleTest | None]:
+        """Posterior and tests of a scale; the posterior before and None where it is not due."""
+        design, before = self.design, self.state.posteriors[s]
+        stale = before is None or (not self.trust.clear and any_of(before.trusted & ~self.trust.trusted))
+        if self.state.ticks % design.look_every[s] and not stale:
+            return before, None
+        here, unknowns = self.scales[s], self.scales.unknowns(self.trust.accused)
+        now = update_posterior(before, here, self.trust.trusted & here.enough, unknowns)
+        test = scale_test(design, here, leave_one_out(now, here.m))
         if design.decoder is not None:
-            found[s], trust = _decoded(design, here, now, trust, s)
+            self.candidates[s], self.trust = _by_decoder(design, here, now, self.trust, s)
         else:
-            wholes[s] = _whole(wholes[s], before, now, here)
-            due = _due(design, trust, view, s, tick, searched=bool(found))
-            alone = due or any_of(view.over & trust.trusted)
-            left = inconsistent(now, view.judged, model, design.tails[s])
-            # A misfit that no search explains is searched again from time to time only.
-            again = left and (not misfit[s] or tick % _AGAIN == 0)
-            over = alone or (again and not _all_alike(design, here, now, view, honest))
-            misfit[s] = left
-            phases = [] if alone else _phases(design, scales, s, now, view, honest)
-            if over or phases:
-                search = Search(design, scales, tuple(wholes), trust, s)
-                # Once something is beyond chance, less is suspected too.
-                phases = search.opposed(now, view.judged) if alone else phases
-                outcome, believed = search(now, view) if over else (search.likeliest(now, view), trust)
-                outcome, liar = _without_busbar(search, outcome, now, honest.powers, phases)
-                if liar is not None:
-                    none = (None,) * len(fits)
-                    return Examined(state.trust, fits, state.wholes, none, {}, state.misfit, (liar, s))
-                # Where no meter was beyond chance nobody is suspected for what is said of the busbar.
-                if over:
-                    found[s], trust = outcome, believed
-        if s in found:
-            trust, calm = _own(trust) if calm else trust, False
-            now = found[s].best.fit
-            view = view_of(design, here, found[s].best.judged)
-            weight(design, now)
-            misfit[s] = design.decoder is None and inconsistent(now, view.judged, model, design.tails[s])
-        if not calm:
-            _note(trust, view, s)
-        views.append(view)
-        after.append(now)
-    return Examined(trust, tuple(after), tuple(wholes), tuple(views), found, tuple(misfit))
+            self.full_posteriors[s] = _kept_posterior(self.full_posteriors[s], before, now, here)
+            self._search(s, now, test)
+        if s in self.candidates:
+            self.trust, self.clear = self.trust.writable() if self.clear else self.trust, False
+            best = self.candidates[s].best
+            now, test = best.posterior, scale_test(design, here, best.loo)
+            busbar_weights(design, now)
+            left = design.decoder is None and inconsistent(now, test.loo, self.model, design.tails[s])
+            self.inconsistent[s] = left
+        if not self.clear:
+            self.trust.record(s, test.enough, test.above_limit, test.above_release_limit)
+        return now, test
+
+    def _search(self, s: int, now: Posterior, test: ScaleTest) -> None:
+        """Search a scale with a failed test, or one that is due again."""
+        design, here, tick = self.design, self.scales[s], self.state.ticks
+        due = _search_due(design, self.trust, test, s, tick, searched=bool(self.candidates))
+        single = due or any_of(test.above_limit & self.trust.trusted)
+        left = inconsistent(now, test.loo, self.model, design.tails[s])
+        # A misfit that no search explains is searched again from time to time only.
+        again = left and (not self.inconsistent[s] or tick % _SEARCH_INTERVAL == 0)
+        over = single or (again and not _aligned_misfit(design, here, now, test, self.honest))
+        self.inconsistent[s] = left
+        phases = [] if single else _contradicted_phases(design, self.scales, s, now, test, self.honest)
+        if not (over or phases):
+            return
+        search = HypothesisSearch(design, self.scales, tuple(self.full_posteriors), self.trust, s)
+        # Once something is beyond chance, less is suspected too.
+        phases = search.contradicted_phases(now, test.loo) if single else phases
+        outcome, trust = search(now, test) if over else (search.likeliest(now, test), self.trust)
+        outcome, phase = _busbar_hypothesis(search, outcome, now, self.honest.powers, phases)
+        if phase is not None:
+            self.busbar = phase, s
+        # With no meter beyond its limit the test of the busbar makes no suspect.
+        elif over:
+            self.candidates[s], self.trust = outcome, trust
 
 
-def _note(trust: Trust, view: View, s: int) -> None:
-    """Write the evidence of a scale; one with too few readings keeps its earlier detection."""
-    owed = (trust.owed > 0) & (trust.scale == s)
-    stands = np.where(view.enough, view.still, trust.still[s]) | owed
-    trust.bad[s], trust.still[s] = view.over & ~trust.trusted, stands & ~trust.trusted
+_MAX_KEPT = 724
+"""Largest number of meters for a kept posterior of all of them: 4 MB for each scale."""
 
 
-# Meters up to which it is kept what all of them said: 4 MB for each scale, and what they rest on.
-_REMEMBERED = 724
-
-
-def _whole(kept: Fit | None, before: Fit | None, now: Fit, here: Scale) -> Fit | None:
-    """A fit that `covers` all that report, or what is kept of one."""
+def _kept_posterior(
+    kept: Posterior | None, before: Posterior | None, now: Posterior, here: ScaleData
+) -> Posterior | None:
+    """Posterior that `covers` all meters with a reading, or the one kept before."""
     if now is before:
         return kept
     if kept is not None and not covers(kept, here.prior, here.noise, np.zeros_like(here.enough)):
         kept = None
-    if here.enough.size > _REMEMBERED or not covers(now, here.prior, here.noise, here.enough):
+    if here.enough.size > _MAX_KEPT or not covers(now, here.prior, here.noise, here.enough):
         return kept
-    # Who is silent for a tick will be heard again.
+    # A meter silent for one tick will report again.
     if kept is not None and any_of(kept.trusted & ~now.trusted) and not any_of(now.trusted & ~kept.trusted):
         return kept
     return now
 
 
-def _own(trust: Trust) -> Trust:
-    """The same, with evidence that can be written into."""
-    return replace(trust, bad=trust.bad.copy(), still=trust.still.copy())
-
-
-def _all_alike(design: SequentialDesign, here: Scale, now: Fit, view: View, honest: Honest) -> bool:
+def _aligned_misfit(
+    design: SequentialDesign, here: ScaleData, now: Posterior, test: ScaleTest, honest: HonestErrors
+) -> bool:
     """True where honest errors at their ends, all in the direction Q m, explain ``m^T Q m``."""
     at = indices(now.trusted)
-    v = view.judged.weights[at, None]
+    v = test.loo.weights[at, None]
     error = busbar_errors(design.plant, honest.powers.v0_squared, design.sigmas[0])
-    busbar = np.abs(v.T @ design.hangs_on[at]) @ np.atleast_1d(error)
+    busbar = np.abs(v.T @ design.busbar_incidence[at]) @ np.atleast_1d(error)
     fixed = here.limits.model + here.limits.allowed
-    return bool(view.judged.misfit <= (room(design, at, v, fixed, honest) + busbar)[0])
+    return bool(test.loo.chi_square <= (largest_sums(design, at, v, fixed, honest) + busbar)[0])
 
 
-def _phases(  # noqa: PLR0917  # the scale, and what it rests on
-    design: SequentialDesign, scales: Scales, s: int, now: Fit, view: View, honest: Honest
+def _contradicted_phases(  # noqa: PLR0917
+    design: SequentialDesign, scales: Scales, s: int, now: Posterior, test: ScaleTest, honest: HonestErrors
 ) -> list[int]:
-    """Phases of the busbar that the meters contradict by more than honest errors that are all alike."""
-    here, doubt = scales[s], Doubt(design.sigmas[s], scales.model, scales.doubts.busbar[s])
-    phases = opposed(design, doubt, now, view.judged)
+    """Busbar phases that the meters contradict by more than honest errors of one direction."""
+    here, doubt = scales[s], BusbarTest(design.sigmas[s], scales.model, scales.uncertainty.busbar[s])
+    phases = contradicted_phases(design, doubt, now, test.loo)
     if not phases:
         return phases
-    could = aligned(design, now, here.m, here.limits.model + here.limits.allowed, honest)
+    could = explained_phases(design, now, here.m, here.limits.model + here.limits.allowed, honest)
     return [phase for phase in phases if not could[phase]]
 
 
-def _disputed(search: Search, best: Solution, powers: Powers, phases: list[int]) -> list[int]:
-    """Phases of which the busbar's meter may be what an explanation accuses other meters for.
+def _disputed_phases(
+    search: HypothesisSearch, best: Candidate, powers: PowerErrors, phases: list[int]
+) -> list[int]:
+    """Busbar phases with a meter that may be wrong instead of the accused meters.
 
-    Its trusted meters contradict it too, it accuses many meters of the phase, or, in three phases, a few.
+    The trusted meters contradict it too, many meters of the phase are accused, or, in three phases, few.
     """
     if not phases:
         return phases
     design, here = search.design, search.here
-    doubt = search.doubt
+    doubt = search.busbar_test
     accused = here.enough & ~best.trusted
-    if np.count_nonzero(accused) > design.most:
+    if np.count_nonzero(accused) > design.max_attacked:
         return phases
-    bent = powers.bent(design.plant, _claimed(search, best))
-    left = opposed(design, replace(doubt, model=doubt.model + bent), best.fit, best.judged)
-    suspects = accused @ design.hangs_on
-    few = (suspects > 0) & (suspects <= _CLOSE) & (suspects.size > 1)
-    open_ = few | (_MANY * suspects > here.enough @ design.hangs_on)
+    bent = powers.report_effect(design.plant, _large_claims(search, best))
+    left = contradicted_phases(design, replace(doubt, model=doubt.model + bent), best.posterior, best.loo)
+    suspects = accused @ design.busbar_incidence
+    few = (suspects > 0) & (suspects <= _FEW_ACCUSED) & (suspects.size > 1)
+    open_ = few | (_ACCUSED_PART * suspects > here.enough @ design.busbar_incidence)
     return [phase for phase in phases if phase in left or open_[phase]]
 
 
-def _claimed(search: Search, best: Solution) -> Bools:
-    """Customers who claim much, and whose powers are false if an explanation is right or may be, (N,)."""
+def _large_claims(search: HypothesisSearch, best: Candidate) -> Bools:
+    """Customers with a large reported power that a hypothesis takes for false or may, (N,)."""
     design = search.design
     out = np.zeros(design.customers, dtype=np.bool_)
     out[design.plant.meters[search.here.enough & ~best.trusted]] = True
-    out[[k for k in best.loosened if k < design.customers]] = True
-    return out & (search.book.std[: design.customers] > design.options.hidden_power)
+    out[[k for k in best.faults if k < design.customers]] = True
+    return out & (search.faults.std[: design.customers] > design.options.hidden_power)
 
 
-# More than one in so many must be accused on a phase before its busbar's meter is doubted by that alone, or
-# no more than this: one wrong busbar meter looks like some wrong meters close to it.
-_MANY, _CLOSE = 3, 8
+_ACCUSED_PART, _FEW_ACCUSED = 3, 8
+"""Accused meters of a phase that dispute its busbar meter: more than 1 / 3 of it, or up to 8."""
 
 
-def _without_busbar(
-    search: Search, found: Found, now: Fit, powers: Powers, phases: list[int]
-) -> tuple[Found, int | None]:
-    """What was found, and the phase of the busbar of which it is far likelier that its meter lies.
+def _busbar_hypothesis(
+    search: HypothesisSearch, candidates: Candidates, now: Posterior, powers: PowerErrors, phases: list[int]
+) -> tuple[Candidates, int | None]:
+    """Candidates, and the busbar phase with a meter that is far likelier manipulated than they are.
 
-    If that is about as likely it is one of the other explanations. It is none if it accuses more meters than
-    can be told apart where the others do without.
+    About equally likely it is one of the other hypotheses. It is not, if it accuses more than `max_attacked`
+    meters and the others do not.
     """
     design, here = search.design, search.scales[search.s]
-    phases = _disputed(search, found.best, powers, phases)
+    phases = _disputed_phases(search, candidates.best, powers, phases)
     if not phases:
-        return found, None
-    each = [search.beside_busbar(now, phase) for phase in phases]
+        return candidates, None
+    each = [search.with_busbar(now, phase) for phase in phases]
     best = min(range(len(each)), key=lambda k: each[k].cost)
-    suspects = [int(np.count_nonzero(here.enough & ~one.trusted)) for one in (each[best], found.best)]
-    if suspects[0] > max(design.most, suspects[1]):
-        return found, None
+    suspects = [int(np.count_nonzero(here.enough & ~one.trusted)) for one in (each[best], candidates.best)]
+    if suspects[0] > max(design.max_attacked, suspects[1]):
+        return candidates, None
     like = 2.0 * float(np.log(design.options.like))
-    lying = replace(each[best], cost=each[best].cost - search.relief(found.best, each[best]))
-    worse = lying.cost - found.best.cost
-    vouching = (here.enough & each[best].trusted) @ design.hangs_on[:, phases[best]]
-    # All meters that speak against it may be manipulated themselves, or are suspected for the most part.
-    if vouching < design.most or (worse < -like and suspects[0] > design.most):
-        return replace(found, others=(*found.others, lying)), None
+    rival = replace(each[best], cost=each[best].cost - search.relief(candidates.best, each[best]))
+    worse = rival.cost - candidates.best.cost
+    vouching = (here.enough & each[best].trusted) @ design.busbar_incidence[:, phases[best]]
+    # All meters that contradict it may be manipulated themselves, or are suspects for the most part.
+    if vouching < design.max_attacked or (worse < -like and suspects[0] > design.max_attacked):
+        return replace(candidates, others=(*candidates.others, rival)), None
     if worse < -like:
-        # A false power may look the same: it need not be as unlikely as to accuse somebody of it.
-        power = search.beside_powers(now)
-        if power.cost > lying.cost + like:
-            return found, phases[best]
-        return replace(found, others=(*found.others, lying, power)), None
-    return replace(found, others=(*found.others, lying)) if worse <= like else found, None
+        # A false power may look the same; as an alternative it has a reduced charge.
+        power = search.with_false_powers(now)
+        if power.cost > rival.cost + like:
+            return candidates, phases[best]
+        return replace(candidates, others=(*candidates.others, rival, power)), None
+    return replace(candidates, others=(*candidates.others, rival)) if worse <= like else candidates, None
 
 
 def ended(
-    design: SequentialDesign, priors: tuple[Prior, ...], trust: Trust, seen: Examined, window: Window
+    design: SequentialDesign,
+    priors: tuple[Prior, ...],
+    trust: TrustState,
+    identified: Identification,
+    window: Window,
 ) -> Bools:
-    """Distrusted meters whose manipulation is over, though long means still contain it.
+    """Suspects with an ended manipulation that long means still contain, (p,).
 
-    What a short scale sees of them is honest, and further from what a longer one sees than the short one's
-    noise and the wandering of loads, and of a busbar that is not read, explain.
-
-    Parameters
-    ----------
-    design
-        The design.
-    priors : (s,)
-        What is known on each scale without any meter.
-    trust
-        From the last tick.
-    seen, window
-        What this tick brought.
+    The short scale finds them honest, and further from a longer one than its noise and the wandering of
+    loads, and of an unmetered busbar, explain.
     """
     out = np.zeros_like(trust.trusted)
-    suspected = ~trust.trusted & ~seen.trust.trusted
+    suspected = ~trust.trusted & ~identified.trust.trusted
     if not any_of(suspected):
         return out
     means = window.sums / np.maximum(window.counts, 1)
     at, rate = design.prior.meters, 2.0 * design.step_s / design.doubt.time_s
-    for s, short in enumerate(seen.views[:-1]):
+    for s, short in enumerate(identified.tests[:-1]):
         if short is None:
             continue
-        quiet = suspected & short.enough & ~short.still
+        quiet = suspected & short.enough & ~short.above_release_limit
         for later in range(s + 1, len(design.lengths)):
-            if not any_of(quiet & seen.trust.still[later]):
+            if not any_of(quiet & identified.trust.above_release_limit[later]):
                 continue
             wander = priors[later].variance[at] * rate * design.lengths[later]
             variance = design.white / np.maximum(window.counts[s], 1) + wander
             far = np.abs(means[later] - means[s]) > design.sigmas[s] * np.sqrt(variance)
-            out |= quiet & seen.trust.still[later] & far
+            out |= quiet & identified.trust.above_release_limit[later] & far
     return out
 
 
-def _due(design: SequentialDesign, trust: Trust, view: View, s: int, tick: int, *, searched: bool) -> bool:
-    """Whether what is believed is looked into again, though nothing new speaks against it.
+def _search_due(
+    design: SequentialDesign, trust: TrustState, test: ScaleTest, s: int, tick: int, *, searched: bool
+) -> bool:
+    """True if a scale searches again without new evidence.
 
-    Before a meter is named, and now and then while that is in doubt; while more is suspected than meters;
-    and from time to time, at ticks at which no shorter scale has just searched.
+    Before a meter is named, at intervals while that is open, while other faults are suspected, and at long
+    intervals at ticks without a search on a shorter scale.
     """
-    if trust.calm:
+    if trust.clear:
         return False
     if any(scale <= s for _, scale in trust.accused):
         return True
     if all_of(trust.trusted):
         return False
-    since = trust.age + 1 - design.confirmed[trust.scale]
-    about = ~trust.trusted & ~trust.named & view.over & (since >= 0)
-    first = (since < max(design.every[s], _AGAIN)) | ~trust.bad[s]
-    if any_of(about & first) or (tick % _AGAIN == 0 and any_of(about)):
+    since = trust.ticks_suspect + 1 - design.confirmed[trust.scale]
+    about = ~trust.trusted & ~trust.named & test.above_limit & (since >= 0)
+    first = (since < max(design.look_every[s], _SEARCH_INTERVAL)) | ~trust.above_limit[s]
+    if any_of(about & first) or (tick % _SEARCH_INTERVAL == 0 and any_of(about)):
         return True
     last = len(design.lengths) - 1
     return s == last and tick % design.lengths[last] == 0 and not searched
 
 
-def _decoded(design: SequentialDesign, here: Scale, now: Fit, trust: Trust, s: int) -> tuple[Found, Trust]:
-    """What the design's decoder says, as explanations, and whom that leaves trusted."""
-    judged = judge(now, here.m)
-    over = here.enough & (np.abs(judged.offset) > here.limits.of(judged.std))
-    tight = now if not now.loose.shape[1] else None
-    whole = adapt(tight, here, here.enough, None)
-    evidence = Evidence(
+def _by_decoder(
+    design: SequentialDesign, here: ScaleData, now: Posterior, trust: TrustState, s: int
+) -> tuple[Candidates, TrustState]:
+    """Candidates of the design's decoder, and the resulting trust state."""
+    loo = leave_one_out(now, here.m)
+    over = here.enough & (np.abs(loo.residual) > here.limits.limit(loo.std))
+    tight = now if not now.unknowns.shape[1] else None
+    whole = update_posterior(tight, here, here.enough, None)
+    evidence = DecoderInput(
         whole=whole,
         m=here.m,
-        live=here.enough,
+        available=here.enough,
         limits=here.limits,
-        believed=trust.trusted,
-        over=over,
-        most=design.most,
+        trusted=trust.trusted,
+        above_limit=over,
+        max_attacked=design.max_attacked,
         like=design.options.like,
     )
     assert design.decoder is not None  # noqa: S101  # the caller has looked
     answers = design.decoder(evidence)
     best = answers[0]
-    others = (Explanation(here.enough & ~each.meters, (), 0.0, each.worse) for each in answers[1:])
-    found = Found(_solution(here, whole, best), tuple(others))
-    return found, believe(trust, np.where(here.enough, ~best.meters, trust.trusted), s, ())
+    others = (Hypothesis(here.enough & ~each.meters, (), 0.0, each.worse) for each in answers[1:])
+    candidates = Candidates(_candidate(here, whole, best), tuple(others))
+    return candidates, trust.suspected(np.where(here.enough, ~best.meters, trust.trusted), s, ())
 
 
-def _solution(here: Scale, whole: Fit, answer: Accused) -> Solution:
+def _candidate(here: ScaleData, whole: Posterior, answer: DecoderAnswer) -> Candidate:
     now = whole.copy()
     for j in np.flatnonzero(answer.meters & here.enough).tolist():
-        drop(now, j)
-    return Solution(now.trusted, (), 0.0, answer.worse, now, judge(now, here.m))
+        remove_meter(now, j)
+    return Candidate(now.trusted, (), 0.0, answer.worse, now, leave_one_out(now, here.m))

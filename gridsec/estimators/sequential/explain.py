@@ -1,4 +1,4 @@
-"""The explanations that several starts lead to on one scale, and how rivals compare over all of them.
+"""Hypotheses of several starts on one scale, and their comparison over all scales.
 
 References
 ----------
@@ -17,289 +17,263 @@ from scipy.special import binom
 
 from gridsec.arrays import Bools, Floats, Ints, any_of, indices, submatrix
 from gridsec.estimators.sequential import search
-from gridsec.estimators.sequential.blocks import misfit_without, sound, without
-from gridsec.estimators.sequential.busbar import Doubt, opposed
-from gridsec.estimators.sequential.conditional import Fit, Judged, fit, judge, misfit
+from gridsec.estimators.sequential.blocks import chi_square_without, remove_meters, well_conditioned
+from gridsec.estimators.sequential.busbar import BusbarTest, contradicted_phases
+from gridsec.estimators.sequential.conditional import (
+    LeaveOneOut,
+    Posterior,
+    chi_square,
+    condition,
+    leave_one_out,
+)
 from gridsec.estimators.sequential.design import SequentialDesign
-from gridsec.estimators.sequential.dictionary import Dictionary
+from gridsec.estimators.sequential.dictionary import FaultDictionary
 from gridsec.estimators.sequential.loads import UNMETERED
-from gridsec.estimators.sequential.robust import covers, robust
-from gridsec.estimators.sequential.scales import Scales, View, adapt, believe, view_of
-from gridsec.estimators.sequential.search import Explanation, Found, Limits, Solution, likelier
-from gridsec.estimators.sequential.state import Trust
+from gridsec.estimators.sequential.robust import covers, robust_set
+from gridsec.estimators.sequential.scales import Scales, ScaleTest, scale_test, update_posterior
+from gridsec.estimators.sequential.search import Candidate, Candidates, Hypothesis, Limits, merged
+from gridsec.estimators.sequential.trust import TrustState
 
-# With more meters than this beyond their limits at once, moving one after the other is no good start.
 _FEW = 32
-# With no more suspects than this, whether each of them could be honest is looked into by a search.
+"""Largest number of meters beyond their limits for a start from the trusted set."""
 _CLOSE = 8
-# Correlation from which on two meters are moved by the same loads.
+"""Largest number of suspects for a search with each of them honest."""
 _TOGETHER = 0.5
-# Rounds in which groups are believed one after the other.
-_TURNS = 6
-# And so many times that the number of meters to the third, times that, is no more than this: two seconds.
+"""Least prior correlation of two meters moved by the same loads."""
+_REVERSALS = 6
+"""Largest number of rounds of reversed groups."""
 _EFFORT = 4e9
-# Beside so many sets of liars false powers are looked for where nothing else explains the readings.
+"""Limits group searches so that count x p^3 <= _EFFORT (about 2 s)."""
 _BESIDE = 3
-# Those no worse than the likeliest by this many times log(like) are looked at more closely.
+"""Number of sets of suspects searched for false powers, and of neighbourhoods searched."""
 _NEAR = 8.0
-# A fit of more meters helps where there are so many times as many wanted as it rests on beside these.
+"""Largest distance from the best cost for a closer comparison, in log(like)."""
 _PART = 2
-# Neighbourhoods are looked for around this many meters, and have at most this many.
-_SEEDS, _STREET = 32, 64
-# Meters up to which neighbourhoods are looked for: each start takes a matrix of 8 bytes x meters^2, 4 MB.
+"""Downdate a larger posterior only if it has at most 1/_PART extra meters."""
+_SEEDS, _LARGEST = 32, 64
+"""Number of centres of neighbourhoods, and largest size."""
 _MOST = 724
-# Groups that are off by one amount each, in one explanation.
+"""Largest number of meters for neighbourhoods: each start takes a matrix of 8 bytes x meters^2, 4 MB."""
 _PARTS = 2
-# A group of similar size has at most this many times as many members.
+"""Groups with a common offset in one hypothesis."""
 _SIMILAR = 2
-# Standard deviations of chi-square that chance may add; what all of a group may be off by, squared pu.
-_CHANCE, _ANY_LIE = 4.0, 0.2
+"""Largest ratio of the sizes of similar groups."""
+_CHANCE, _OFFSET_STD = 4.0, 0.2
+"""Standard deviations of chi-square within chance; standard deviation of a common offset, squared pu."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Group:
-    """A neighbourhood off by one amount: its meters (p,), what the amount gains, and what it costs."""
+class _OffsetGroup:
+    """Neighbourhood with one common offset: meters (p,), gain and charge of the offset."""
 
     meters: Bools
     gain: float
     charge: float
 
 
-class Search:
-    """The explanations that several starts lead to on one scale.
+class HypothesisSearch:
+    """Hypotheses from several starts on one scale.
 
-    The starts: what was believed, without what this scale and shorter ones suspect besides meters; where
-    several meters are suspected, a robust fit and all meters close to the model; and where any is, what was
-    believed with suspicions besides meters. Where few are, everybody is believed once more, and meters may
-    fall in pairs; then for each suspect the likeliest explanation in which it is honest. Longer means know
-    better, so they decide anew about what shorter ones suspected.
+    Starts: the set trusted before, without faults suspected on this scale and shorter ones; with several
+    suspects a robust set and all meters close to the model; with any suspect the trusted set with the fault
+    dictionary. With few suspects, all meters are trusted once more and removed in pairs; then, for each
+    suspect, the likeliest hypothesis in which it is honest. Longer means know more, so they decide again
+    about faults suspected on shorter ones.
 
-    Meters against which other scales have evidence are not admitted, or lies that have just begun would
-    be believed again. Unless the explanation that does admit them is cheaper over all scales together, and
-    the scales that caught them have readings enough to know.
+    Meters with evidence on other scales are not added, or a manipulation that has just begun would be trusted
+    again. A hypothesis that adds them wins if it is cheaper over all scales together and the detecting scales
+    have enough readings.
 
-    Parameters
-    ----------
-    design, scales
-        The design, and the scales.
-    wholes
-        Fits of all that reported, from when they were trusted, by scale; None where none is kept.
-    trust
-        Who is believed.
-    s
-        The scale.
+    full_posteriors: (s,) kept posteriors of all meters. s: the scale.
     """
 
-    def __init__(  # what is known, in the order it becomes known
+    def __init__(
         self,
         design: SequentialDesign,
         scales: Scales,
-        wholes: tuple[Fit | None, ...],
-        trust: Trust,
+        full_posteriors: tuple[Posterior | None, ...],
+        trust: TrustState,
         s: int,
     ) -> None:
-        self.design, self.scales, self.book = design, scales, scales.book
-        self.wholes, self.trust, self.s = wholes, trust, s
+        self.design, self.scales, self.faults = design, scales, scales.faults
+        self.full_posteriors, self.trust, self.s = full_posteriors, trust, s
         here = scales[s]
         sigmas = min(design.suspect, here.limits.sigmas)
         self.here = replace(here, limits=replace(here.limits, sigmas=sigmas))
-        self.keep = _held(trust, s)
-        self.owed = ~trust.trusted & (trust.owed > 0)
+        self.barred = _barred(trust, s)
+        self.readings_owed = ~trust.trusted & (trust.readings_owed > 0)
         self.accused = tuple(suspicion for suspicion in trust.accused if suspicion[1] > s)
-        self.turned: list[Explanation] = []
-        self.covering: dict[int, Fit | None] = {}
-        self.disputed = False
-        self.left: dict[tuple[bytes, tuple[int, ...]], list[float]] = {}
+        self.reversed: list[Hypothesis] = []
+        self.covering: dict[int, Posterior | None] = {}
+        self.busbar_disputed = False
+        self.chi_squares: dict[tuple[bytes, tuple[int, ...]], list[float]] = {}
 
-    def __call__(self, now: Fit, view: View) -> tuple[Found, Trust]:
-        """What is found, and whom that leaves trusted.
+    def __call__(self, now: Posterior, test: ScaleTest) -> tuple[Candidates, TrustState]:
+        """Candidates with compared rivals, and the resulting trust state."""
+        candidates = self.likeliest(now, test)
+        rivals = (*candidates.others, *self.reversed, *self._exonerations(candidates.best))
+        others = (*self._compared(candidates.best, rivals), *self._common_offsets(candidates.best))
+        return replace(candidates, others=others), self._trust(candidates.best)
 
-        Parameters
-        ----------
-        now, view
-            The fit of those who were believed, and what the scale says then.
-        """
-        found = self.likeliest(now, view)
-        rivals = (*found.others, *self.turned, *self._instead(found.best))
-        others = (*self._compared(found.best, rivals), *self._alike_groups(found.best))
-        return replace(found, others=others), self._believe(found.best)
-
-    def likeliest(self, now: Fit, view: View) -> Found:
-        """What is found, before rivals are looked for and compared.
-
-        Parameters
-        ----------
-        now, view
-            As in a call.
-        """
-        start = now if len(self.accused) == len(self.trust.accused) else self._fit(now.trusted)
-        few = np.count_nonzero(view.over & now.trusted) <= _FEW
-        judged = view.judged if start is now else None
-        found = Found(self._descend(start, self.keep, judged=judged)) if few else None
+    def likeliest(self, now: Posterior, test: ScaleTest) -> Candidates:
+        """Candidates before the comparison with rivals."""
+        start = now if len(self.accused) == len(self.trust.accused) else self._condition(now.trusted)
+        few = np.count_nonzero(test.above_limit & now.trusted) <= _FEW
+        loo = test.loo if start is now else None
+        candidates = Candidates(self._descend(start, self.barred, loo=loo)) if few else None
         free = None
-        if found is None or self._suspected(found) > self.design.options.several:
-            free = self._free(found)
-            if any_of(free.best.trusted & self.keep):
-                trusted = free.best.trusted & ~self.keep
-                # From where a descent began already it would come to the same.
-                if found is None or not np.array_equal(trusted & self.here.enough, start.trusted):
-                    held = self._descend(self._fit(trusted), self.keep, fresh=True)
-                    found = likelier(found, Found(held))
+        if candidates is None or self._suspects(candidates) > self.design.options.several:
+            free = self._independent(candidates)
+            if any_of(free.best.trusted & self.barred):
+                trusted = free.best.trusted & ~self.barred
+                # A descent from an earlier start would end at the same set.
+                if candidates is None or not np.array_equal(trusted & self.here.enough, start.trusted):
+                    held = self._descend(self._condition(trusted), self.barred, fresh=True)
+                    candidates = merged(candidates, Candidates(held))
             else:
-                found, free = likelier(found, free), None
-        if few and self._suspected(found) > 0:
-            found = likelier(found, Found(self._descend(start, self.keep, self.book, judged=judged)))
-            if self._suspected(found) <= _CLOSE:
-                nobody, all_ = np.zeros_like(self.keep), self._fit(self.here.enough)
-                close = self._descend(all_, nobody, self.book, pairs=True, fresh=True)
-                free = likelier(free, Found(close))
-        if self._unexplained(found.best):
-            for trusted in self._sets(found):
-                beside = self._descend(self._fit(trusted), self.keep, self.book, fresh=True)
-                found = likelier(found, Found(beside))
-        best = found.best
-        for other in chain(self._turned(best), self._streets(best)):
-            free = likelier(free, Found(other))
+                candidates, free = merged(candidates, free), None
+        if few and self._suspects(candidates) > 0:
+            candidates = merged(
+                candidates, Candidates(self._descend(start, self.barred, self.faults, loo=loo))
+            )
+            if self._suspects(candidates) <= _CLOSE:
+                no_meters, all_ = np.zeros_like(self.barred), self._condition(self.here.enough)
+                close = self._descend(all_, no_meters, self.faults, pairs=True, fresh=True)
+                free = merged(free, Candidates(close))
+        if self._unexplained(candidates.best):
+            for trusted in self._cheapest_sets(candidates):
+                beside = self._descend(self._condition(trusted), self.barred, self.faults, fresh=True)
+                candidates = merged(candidates, Candidates(beside))
+        best = candidates.best
+        for other in chain(self._reversals(best), self._neighbourhood_starts(best)):
+            free = merged(free, Candidates(other))
         if free is not None:
-            unknown = any_of(self.owed & self._trusted(free.best))
-            better = not unknown and free.best.cost < best.cost and self._total(free.best) < self._total(best)
-            first, second = (free, found) if better else (found, free)
-            found = Found(first.best, (second.best.bare(), *first.others, *second.others))
-        return found
+            unknown = any_of(self.readings_owed & self._trusted(free.best))
+            better = (
+                not unknown
+                and free.best.cost < best.cost
+                and self._total_cost(free.best) < self._total_cost(best)
+            )
+            first, second = (free, candidates) if better else (candidates, free)
+            candidates = Candidates(first.best, (second.best.hypothesis(), *first.others, *second.others))
+        return candidates
 
     @property
-    def doubt(self) -> Doubt:
+    def busbar_test(self) -> BusbarTest:
         """Limits of the busbar's meter on this scale during a search."""
-        return Doubt(self.here.limits.sigmas, self.scales.model, self.scales.doubts.busbar[self.s])
+        return BusbarTest(self.here.limits.sigmas, self.scales.model, self.scales.uncertainty.busbar[self.s])
 
-    def opposed(self, now: Fit, judged: Judged) -> list[int]:
-        """Phases of the busbar whose meter the trusted meters contradict, or did before some were suspected.
-
-        Parameters
-        ----------
-        now, judged
-            The trusted meters, and what they say.
-        """
-        doubt = self.doubt
-        out = opposed(self.design, doubt, now, judged)
-        self.disputed = bool(out)
-        # On a balanced feeder all meters speak against a wrong busbar, in a phase only some.
-        if self.design.hangs_on.shape[1] > 1 and any_of(self.here.enough & ~now.trusted & ~self.trust.named):
-            every = self._fit(self.here.enough & ~(self.trust.named & ~now.trusted))
-            out = sorted({*out, *opposed(self.design, doubt, every, judge(every, self.here.m))})
+    def contradicted_phases(self, now: Posterior, loo: LeaveOneOut) -> list[int]:
+        """Busbar phases that the trusted meters contradict, now or before some became suspects."""
+        doubt = self.busbar_test
+        out = contradicted_phases(self.design, doubt, now, loo)
+        self.busbar_disputed = bool(out)
+        # On a balanced feeder all meters contradict a wrong busbar, in a phase only some.
+        if self.design.busbar_incidence.shape[1] > 1 and any_of(
+            self.here.enough & ~now.trusted & ~self.trust.named
+        ):
+            every = self._condition(self.here.enough & ~(self.trust.named & ~now.trusted))
+            out = sorted(
+                {*out, *contradicted_phases(self.design, doubt, every, leave_one_out(every, self.here.m))}
+            )
         return out
 
-    def beside_busbar(self, now: Fit, phase: int) -> Explanation:
-        """The likeliest explanation in which the busbar's meter lies.
-
-        Parameters
-        ----------
-        now
-            The fit of those who were believed.
-        phase
-            Of the busbar; among what is loosened it comes after all that is in the book.
-        """
+    def with_busbar(self, now: Posterior, phase: int) -> Hypothesis:
+        """Likeliest hypothesis with a manipulated busbar meter; the phase is numbered after the faults."""
         design, trust = self.design, self.trust
-        here = np.arange(design.hangs_on.shape[1]) == phase
-        scales = self.scales.wider(UNMETERED * design.plant.feeder.broadcast_busbar(here))
+        here = np.arange(design.busbar_incidence.shape[1]) == phase
+        scales = self.scales.with_direction(UNMETERED * design.plant.feeder.broadcast_busbar(here))
         wide = scales[self.s]
-        there = adapt(None, wide, now.trusted, self.scales.loosened(trust.accused))
-        lying = Search(design, scales, self.wholes, trust, self.s)
-        best = lying.likeliest(there, view_of(design, wide, judge(there, wide.m))).best
-        # Meters that are suspected only beside an honest busbar meter are trusted again.
-        honest = lying._descend(lying._fit(wide.enough), np.zeros_like(wide.enough), fresh=True)
+        there = update_posterior(None, wide, now.trusted, self.scales.unknowns(trust.accused))
+        wider = HypothesisSearch(design, scales, self.full_posteriors, trust, self.s)
+        best = wider.likeliest(there, scale_test(design, wide, leave_one_out(there, wide.m))).best
+        # Meters that are suspects only beside an honest busbar meter are trusted again.
+        honest = wider._descend(wider._condition(wide.enough), np.zeros_like(wide.enough), fresh=True)
         best = min(best, honest, key=lambda one: one.cost)
-        charge = search.price(int(np.count_nonzero(self.here.enough)), 1)
-        loosened = (*best.loosened, self.book.std.size + phase)
-        return Explanation(best.trusted, loosened, best.charge + charge, best.cost + charge)
+        charge = search.set_cost(int(np.count_nonzero(self.here.enough)), 1)
+        accused = (*best.faults, self.faults.std.size + phase)
+        return Hypothesis(best.trusted, accused, best.charge + charge, best.cost + charge)
 
-    def beside_powers(self, now: Fit) -> Explanation:
-        """The likeliest explanation in which powers are false, at the price of a reason not to name anybody.
+    def with_false_powers(self, now: Posterior) -> Hypothesis:
+        """Likeliest hypothesis with false powers at the reduced charges of an alternative."""
+        return self._descend(now, self.barred, self.faults.reduced()).hypothesis()
 
-        Parameters
-        ----------
-        now
-            The fit of those who were believed.
-        """
-        return self._descend(now, self.keep, self.book.doubtful()).bare()
-
-    def _instead(self, best: Solution) -> list[Explanation]:
-        """Explanations in which one of those who might be named is honest."""
+    def _exonerations(self, best: Candidate) -> list[Hypothesis]:
+        """Hypotheses in which one of the meters about to be named is honest."""
         fresh = self.here.enough & ~best.trusted & ~self.trust.named
         if np.count_nonzero(fresh) > _CLOSE:
             return []
-        out, keep, limits = [], self.keep & self.trust.named, self._fair()
+        out, keep, limits = [], self.barred & self.trust.named, self._lowered_limits()
         for j in indices(fresh).tolist():
-            book, one = self.book.doubtful(), np.array([j])
-            other = self._descend(best.fit, keep, book, innocent=one, pairs=True, limits=limits)
-            honest = self.scales[self.s].limits.of(other.judged.std)[j]
-            if self._admissible(other) and abs(other.judged.offset[j]) <= honest:
+            faults, one = self.faults.reduced(), np.array([j])
+            other = self._descend(best.posterior, keep, faults, protected=one, pairs=True, limits=limits)
+            honest = self.scales[self.s].limits.limit(other.loo.std)[j]
+            if self._admissible(other) and abs(other.loo.residual[j]) <= honest:
                 charge = best.charge + other.charge
-                cost, loosened = best.charge + other.cost, best.loosened + other.loosened
-                out.append(Explanation(other.trusted, loosened, charge, cost))
+                cost, accused = best.charge + other.cost, best.faults + other.faults
+                out.append(Hypothesis(other.trusted, accused, charge, cost))
         return out
 
-    def _turned(self, best: Solution) -> list[Solution]:
-        """Explanations in which those who are accused of the same are honest, and who contradicts them lies.
+    def _reversals(self, best: Candidate) -> list[Candidate]:
+        """Hypotheses in which a group accused of the same offset is honest and its opponents are manipulated.
 
-        Where many of a street, or of a phase, tell the same small lie, the word of many stands against that
-        of many, and no single meter that changes sides makes either explanation better.
+        With many meters of a street or phase off alike, two groups contradict each other. No move of a single
+        meter leads from one hypothesis to the other.
         """
-        out: list[Solution] = []
+        out: list[Candidate] = []
         left = int(_EFFORT / best.trusted.size**3)
-        for _ in range(_TURNS):
-            groups = sorted(self._agreeing(best), key=len, reverse=True)[:left]
-            pairs = [(group, other) for group in groups for other in self._believing(best, group)]
+        for _ in range(_REVERSALS):
+            groups = sorted(self._accused_groups(best), key=len, reverse=True)[:left]
+            pairs = [(group, other) for group in groups for other in self._exonerated(best, group)]
             out += [other for _, other in pairs]
             left -= len(groups)
             near = best.cost + _NEAR * np.log(self.design.options.like)
-            self.turned += [self._closer(group, other) for group, other in pairs if other.cost <= near]
+            self.reversed += [self._relaxed(group, other) for group, other in pairs if other.cost <= near]
             cheapest = min((other for _, other in pairs), key=lambda other: other.cost, default=best)
             if not cheapest.cost < best.cost:
                 break
             best = cheapest
         return out
 
-    def _believing(self, best: Solution, group: Ints) -> list[Solution]:
-        """The nearest explanation in which a group that `best` accuses is honest; none if that is absurd."""
-        here, prior, loose = self.here, self.here.prior, best.fit.loose
+    def _exonerated(self, best: Candidate, group: Ints) -> list[Candidate]:
+        """Nearest hypothesis in which a group accused by `best` is honest; none if it accuses too many."""
+        here, prior, unknowns = self.here, self.here.prior, best.posterior.unknowns
         # As many meters stay trusted as may be manipulated.
-        most = int(np.count_nonzero(here.enough)) - self.design.most
-        if np.count_nonzero(self._contradict(group[group.size // 2], loose)) > most:
+        most = int(np.count_nonzero(here.enough)) - self.design.max_attacked
+        if np.count_nonzero(self._contradicting(group[group.size // 2], unknowns)) > most:
             return []
         among = np.zeros_like(best.trusted)
         among[group] = True
-        # What these leave unexplained among themselves, all others can only add to.
+        # Further meters can only raise the chi-square of these.
         most_left = best.cost - best.charge + 2.0 * np.log(self.design.options.like)
-        if misfit(prior, here.noise, here.m, among, loose) > most_left:
+        if chi_square(prior, here.noise, here.m, among, unknowns) > most_left:
             return []
-        judged = judge(fit(prior, here.noise, among, loose), here.m)
-        start = among | (best.trusted & (np.abs(judged.offset) <= here.limits.of(judged.std)))
+        loo = leave_one_out(condition(prior, here.noise, among, unknowns), here.m)
+        start = among | (best.trusted & (np.abs(loo.residual) <= here.limits.limit(loo.std)))
         if np.count_nonzero(here.enough & ~start) > most:
             return []
-        now = fit(prior, here.noise, start, loose) if loose.shape[1] else self._fit(start)
-        other = self._descend(now, np.zeros_like(among), innocent=group, fresh=True)
-        return [self._after(best, other)] if self._admissible(other) else []
+        now = condition(prior, here.noise, start, unknowns) if unknowns.shape[1] else self._condition(start)
+        other = self._descend(now, np.zeros_like(among), protected=group, fresh=True)
+        return [self._charged(best, other)] if self._admissible(other) else []
 
-    def _streets(self, best: Solution) -> Iterator[Solution]:
-        """Explanations that begin by accusing the neighbourhoods that gain most.
+    def _neighbourhood_starts(self, best: Candidate) -> Iterator[Candidate]:
+        """Hypotheses that start by accusing the neighbourhoods of the largest gain.
 
-        A whole street that is off alike is consistent within itself: dropping any one of its meters gains
-        little, so a descent accuses its honest neighbours. With b = Q m and G = Q of a group,
-        dropping the group gains ``b^T G^-1 b`` at once, which one Cholesky factor tells of all groups of
-        the k meters nearest to a meter.
+        A street that is off alike is consistent within itself: removing any of its meters gains little, and a
+        descent accuses its honest neighbours. With b = Q m and G = Q of a group, removing the group gains
+        ``b^T G^-1 b`` at once; one Cholesky factor gives it for all groups of the k meters nearest to one.
         """
         here = self.here
-        if not self._about_to_be_named(best):
+        if not self._near_confirmation(best):
             return
-        every = self._fit(here.enough)
-        weights, (at, Q) = every.weights(here.m), every.trusting()
-        largest = min(self.design.most, _STREET, at.size - 1)
+        every = self._condition(here.enough)
+        weights, (at, Q) = every.weights(here.m), every.precision()
+        largest = min(self.design.max_attacked, _LARGEST, at.size - 1)
         if largest < 1:
             return
         b, between = weights[at], here.prior.among(at)
         std = np.sqrt(np.maximum(between.diagonal(), np.finfo(np.float64).tiny))
-        prices = np.array([search.price(at.size, k) for k in range(1, largest + 1)])
+        prices = np.array([search.set_cost(at.size, k) for k in range(1, largest + 1)])
         groups: list[tuple[float, Ints]] = []
         for j in np.argsort(-(b * b) / Q.diagonal())[:_SEEDS].tolist():
             near = np.argsort(-between[j] / std, kind="stable")[:largest]
@@ -319,26 +293,30 @@ class Search:
             covered[group], left = True, left - 1
             start = here.enough.copy()
             start[group] = False
-            yield self._descend(self._fit(start), np.zeros_like(start), fresh=True)
+            yield self._descend(self._condition(start), np.zeros_like(start), fresh=True)
 
-    def _about_to_be_named(self, best: Solution) -> bool:
+    def _near_confirmation(self, best: Candidate) -> bool:
         """True where the evidence against an accused meter has lasted, or the busbar meter is disputed."""
         here, trust = self.here, self.trust
-        lasting = ~trust.trusted & ~trust.named & (trust.age + 1 >= self.design.confirmed[trust.scale])
-        return here.enough.size <= _MOST and any_of(here.enough & ~best.trusted & (lasting | self.disputed))
+        lasting = (
+            ~trust.trusted & ~trust.named & (trust.ticks_suspect + 1 >= self.design.confirmed[trust.scale])
+        )
+        return here.enough.size <= _MOST and any_of(
+            here.enough & ~best.trusted & (lasting | self.busbar_disputed)
+        )
 
-    def _alike_groups(self, best: Solution) -> Iterator[Explanation]:
-        """Explanations in which one neighbourhood, or two, are off by one amount each.
+    def _common_offsets(self, best: Candidate) -> Iterator[Hypothesis]:
+        """Hypotheses in which one neighbourhood, or two, have one common offset each.
 
-        Such a group is one hypothesis, not one for each of its meters: it costs ``2 ln(p K)`` for its centre
-        and its size of at most K meters, and ``2 ln binom(k, e)`` for e honest ones among its k. Its meters
-        keep telling their differences.
+        Such a group is one hypothesis: it costs ``2 ln(p K)`` for its centre and its size of at most K
+        meters, and ``2 ln binom(k, e)`` for e honest ones among its k. Its meters keep informing by their
+        differences.
         """
-        if not self._about_to_be_named(best):
+        if not self._near_confirmation(best):
             return
         base = self.here.enough & ~self.trust.named
         taken: list[Bools] = []
-        for first in self._neighbourhoods(self._fit(base), best):
+        for first in self._neighbourhoods(self._condition(base), best):
             if len(taken) == _BESIDE:
                 return
             if any(
@@ -346,31 +324,31 @@ class Search:
             ):
                 continue
             taken.append(first.meters)
-            end, other = self._off_alike(best, base, [first])
-            seconds = self._neighbourhoods(end.fit, best)[: _PARTS - 1]
-            more = (self._off_alike(best, base, [first, second])[1] for second in seconds)
+            end, other = self._with_offsets(best, base, [first])
+            seconds = self._neighbourhoods(end.posterior, best)[: _PARTS - 1]
+            more = (self._with_offsets(best, base, [first, second])[1] for second in seconds)
             yield from (each for each in (other, *more) if self._admissible(each))
 
-    def _neighbourhoods(self, every: Fit, best: Solution) -> list[_Group]:
+    def _neighbourhoods(self, every: Posterior, best: Candidate) -> list[_OffsetGroup]:
         """Groups of nearest meters that gain more than they cost, best first.
 
-        With the sums b of Q m and q of Q over a group, its amount gains ``b^2 / q``. Groups are taken whole,
-        and without accused meters: one meter that differs from all around it stands against its street.
+        With the sums b of Q m and q of Q over a group, its offset gains ``b^2 / q``. Groups are taken whole,
+        and without accused meters: a single meter may differ from its street.
         """
-        (at, Q), prior = every.trusting(), self.here.prior
+        (at, Q), prior = every.precision(), self.here.prior
         # As many meters stay trusted as may be manipulated.
-        largest = min(at.size - self.design.most, _STREET, at.size - 1)
+        largest = min(at.size - self.design.max_attacked, _LARGEST, at.size - 1)
         if largest < 2:
             return []
         b, between, place = every.weights(self.here.m)[at], prior.among(at), prior.meters[at]
         std = np.sqrt(np.maximum(between.diagonal(), np.finfo(np.float64).tiny))
-        whole, believed = np.ones(at.size, dtype=np.bool_), best.trusted[at]
+        whole, honest = np.ones(at.size, dtype=np.bool_), best.trusted[at]
         count = np.arange(1, largest + 1)
         centre = 2.0 * np.log(at.size * largest)
-        out: list[_Group] = []
+        out: list[_OffsetGroup] = []
         for j in np.argsort(-(b * b) / Q.diagonal())[:_SEEDS].tolist():
-            # By correlation a stretch of a street comes first, by covariance all that is behind one bus.
-            for likeness, some in product((between[j] / std, between[j]), (whole, believed)):
+            # Correlation orders along a street, covariance by the bus they are behind.
+            for likeness, some in product((between[j] / std, between[j]), (whole, honest)):
                 near = np.argsort(-likeness, kind="stable")[: largest + 1]
                 part = some[near].astype(np.float64)
                 sums = np.cumsum(np.cumsum(submatrix(Q, near, near) * np.multiply.outer(part, part), 0), 1)
@@ -383,215 +361,223 @@ class Search:
                 if net[k] > 0.0:
                     among = np.zeros_like(every.trusted)
                     among[at[near[: k + 1]]] = some[near[: k + 1]]
-                    out.append(_Group(among, float(gain[k]), float(charge[k])))
+                    out.append(_OffsetGroup(among, float(gain[k]), float(charge[k])))
         return sorted(out, key=lambda one: one.charge - one.gain)
 
-    def _off_alike(self, best: Solution, base: Bools, groups: list[_Group]) -> tuple[Solution, Explanation]:
-        """The search that begins with groups off by one amount each, and its explanation on all scales."""
+    def _with_offsets(
+        self, best: Candidate, base: Bools, groups: list[_OffsetGroup]
+    ) -> tuple[Candidate, Hypothesis]:
+        """Candidate that starts with groups off by one amount each, and its hypothesis on all scales."""
         here = self.here
         directions = np.zeros((here.prior.variance.size, len(groups)))
         for k, group in enumerate(groups):
-            directions[here.prior.meters[group.meters], k] = _ANY_LIE
-        loosened = self.scales.loosened(self.accused)
-        loose = directions if loosened is None else np.hstack([loosened, directions])
-        end = self._descend(fit(here.prior, here.noise, base, loose), here.enough & ~base, fresh=True)
+            directions[here.prior.meters[group.meters], k] = _OFFSET_STD
+        accused = self.scales.unknowns(self.accused)
+        unknowns = directions if accused is None else np.hstack([accused, directions])
+        end = self._descend(
+            condition(here.prior, here.noise, base, unknowns), here.enough & ~base, fresh=True
+        )
         dropped = int(np.count_nonzero(here.enough & ~end.trusted))
         alike = np.where(end.trusted[:, None], directions[here.prior.meters], 0.0)
         kept, charge = np.asarray(alike.any(axis=1)), sum(group.charge for group in groups)
-        other = Explanation(end.trusted & ~kept, (), charge, 0.0)
-        theirs = self._misfits(other, kept, alike)
-        worse = max(his - own for his, own in zip(theirs, self._misfits(best), strict=True))
-        price = charge + search.price(self.keep.size, dropped, self.design.most)
-        return end, replace(other, cost=best.cost + price - self._prices(best) + worse)
+        other = Hypothesis(end.trusted & ~kept, (), charge, 0.0)
+        theirs = self._chi_squares(other, kept, alike)
+        worse = max(more - less for more, less in zip(theirs, self._chi_squares(best), strict=True))
+        price = charge + search.set_cost(self.barred.size, dropped, self.design.max_attacked)
+        return end, replace(other, cost=best.cost + price - self._accusation_cost(best) + worse)
 
-    def _admissible(self, found: Explanation) -> bool:
-        """True where at least `most` meters stay trusted."""
-        return bool(np.count_nonzero(self.here.enough & found.trusted) >= self.design.most)
+    def _admissible(self, hypothesis: Hypothesis) -> bool:
+        """True where at least `max_attacked` meters stay trusted."""
+        return bool(np.count_nonzero(self.here.enough & hypothesis.trusted) >= self.design.max_attacked)
 
-    def _closer(self, group: Ints, other: Solution) -> Explanation:
-        """One that believes the group on less evidence against the rest: what might be the case."""
-        nobody = np.zeros_like(other.trusted)
-        fair, judged = self._fair(), other.judged
-        closer = self._descend(other.fit, nobody, innocent=group, limits=fair, judged=judged)
-        return (self._after(other, closer) if self._admissible(closer) else other).bare()
+    def _relaxed(self, group: Ints, other: Candidate) -> Hypothesis:
+        """Candidate that trusts the group, with the lower limits of alternatives."""
+        no_meters = np.zeros_like(other.trusted)
+        fair, loo = self._lowered_limits(), other.loo
+        closer = self._descend(other.posterior, no_meters, protected=group, limits=fair, loo=loo)
+        return (self._charged(other, closer) if self._admissible(closer) else other).hypothesis()
 
-    def _after(self, before: Solution, found: Solution) -> Solution:
-        """What a descent without a book found, from all that another loosened: powers of liars cost less."""
-        loosened, live = before.loosened, self.here.enough
-        if not loosened:
-            return found
-        liars = int(np.count_nonzero(live & ~found.trusted))
-        charges = self.book.charges(np.array(loosened, dtype=np.intp), found.trusted, liars)
-        charge = float(charges.sum()) * search.price(int(np.count_nonzero(live)), 1)
-        return replace(found, loosened=loosened, charge=charge, cost=found.cost + charge)
+    def _charged(self, before: Candidate, hypothesis: Candidate) -> Candidate:
+        """Candidate of a descent without dictionary, charged for the directions of the one before."""
+        accused, available = before.faults, self.here.enough
+        if not accused:
+            return hypothesis
+        suspects = int(np.count_nonzero(available & ~hypothesis.trusted))
+        charges = self.faults.charges(np.array(accused, dtype=np.intp), hypothesis.trusted, suspects)
+        charge = float(charges.sum()) * search.set_cost(int(np.count_nonzero(available)), 1)
+        return replace(hypothesis, faults=accused, charge=charge, cost=hypothesis.cost + charge)
 
-    def _fair(self) -> Limits:
-        """Limits by which nobody is named: whatever makes an explanation cheaper is worth trying."""
-        fair = float(np.sqrt(search.price(self.keep.size, 1)))
+    def _lowered_limits(self) -> Limits:
+        """Limits of alternatives: every accusation that lowers the cost is tried; none names a meter."""
+        fair = float(np.sqrt(search.set_cost(self.barred.size, 1)))
         return replace(self.here.limits, sigmas=min(self.here.limits.sigmas, fair))
 
-    def _contradict(self, j: int, loose: Floats) -> Bools:
-        """Meters that cannot be honest if meter j is, as far as the two of them alone can tell, (p,)."""
+    def _contradicting(self, j: int, unknowns: Floats) -> Bools:
+        """Meters that cannot be honest if meter j is, from the two readings alone, (p,)."""
         here, prior = self.here, self.here.prior
-        more = loose[prior.meters]
-        column = prior.of_meters[prior.meters, j] + more @ more[j]
+        more = unknowns[prior.meters]
+        column = prior.covariance[prior.meters, j] + more @ more[j]
         own = prior.variance[prior.meters] + here.noise + (more * more).sum(axis=1)
         apart = np.maximum(own + own[j] - 2.0 * column, 0.0)
-        return np.asarray(here.enough & (np.abs(here.m - here.m[j]) > here.limits.of(np.sqrt(apart))))
+        return np.asarray(here.enough & (np.abs(here.m - here.m[j]) > here.limits.limit(np.sqrt(apart))))
 
-    def _agreeing(self, best: Solution) -> list[Ints]:
-        """Accused meters of one kind: they read too high, or too low, where the same loads move them."""
+    def _accused_groups(self, best: Candidate) -> list[Ints]:
+        """Accused meters of one kind: too high, or too low, and moved by the same loads."""
         accused, out = self.here.enough & ~best.trusted, []
-        for sign in (accused & (best.judged.offset > 0.0), accused & (best.judged.offset < 0.0)):
+        for sign in (accused & (best.loo.residual > 0.0), accused & (best.loo.residual < 0.0)):
             at = indices(sign)
-            out += [at[group] for group in _linked(self._together(at)) if group.size > 1]
+            out += [at[group] for group in _components(self._linked(at)) if group.size > 1]
         return out
 
-    def _compared(self, best: Solution, rivals: tuple[Explanation, ...]) -> tuple[Explanation, ...]:
-        """Rivals, each once, at what it costs on the scale that speaks most against it.
+    def _compared(self, best: Candidate, rivals: tuple[Hypothesis, ...]) -> tuple[Hypothesis, ...]:
+        """Rivals, each once, at the cost on the scale with the strongest evidence against it.
 
-        Long means hardly know yet of a lie that has just begun, short ones hardly see a small one.
+        Long means hardly contain a manipulation that has just begun, short ones hardly show a small one.
         """
         like, ours = np.log(self.design.options.like), None
-        out: dict[tuple[bytes, tuple[int, ...]], Explanation] = {}
+        out: dict[tuple[bytes, tuple[int, ...]], Hypothesis] = {}
         for other in sorted(rivals, key=lambda rival: rival.cost):
-            who = other.trusted.tobytes(), other.loosened
-            if who in out or who == (best.trusted.tobytes(), best.loosened):
+            which = other.trusted.tobytes(), other.faults
+            if which in out or which == (best.trusted.tobytes(), best.faults):
                 continue
             cost = other.cost
             if cost - best.cost <= 2.0 * like:
-                ours = self._misfits(best) if ours is None else ours
-                cost = self._beside(best, other, ours, self._misfits(other))
+                ours = self._chi_squares(best) if ours is None else ours
+                cost = self._relative_cost(best, other, ours, self._chi_squares(other))
             if other.cost - best.cost <= _NEAR * like:
-                cost = min(cost, self._swapped(best, other))
-            out[who] = replace(other, cost=cost - self.relief(best, other))
+                cost = min(cost, self._reversal_cost(best, other))
+            out[which] = replace(other, cost=cost - self.relief(best, other))
         return tuple(out.values())
 
-    def relief(self, best: Explanation, other: Explanation) -> float:
-        """Part of another explanation's cost that does not count beside the best one.
+    def relief(self, best: Hypothesis, other: Hypothesis) -> float:
+        """Part of another hypothesis's cost that does not count beside the best one.
 
-        The surcharge on accusing more meters than can be told apart keeps the estimate on the side of the
-        majority. It is no evidence against a majority that is manipulated: it does not count against an
-        explanation that accuses a group of similar size.
+        The surcharge beyond `max_attacked` keeps the estimate on the side of the majority. It is not evidence
+        against a manipulated majority: it does not count against a hypothesis that accuses a group of similar
+        size.
         """
-        live = self.here.enough
-        ours, theirs = (int(np.count_nonzero(live & ~each.trusted)) for each in (best, other))
-        fewer, more = sorted((ours + len(best.loosened), theirs + len(other.loosened)))
+        available = self.here.enough
+        ours, theirs = (int(np.count_nonzero(available & ~each.trusted)) for each in (best, other))
+        fewer, more = sorted((ours + len(best.faults), theirs + len(other.faults)))
         if more > _SIMILAR * fewer:
             return 0.0
-        size, most = int(np.count_nonzero(live)), self.design.most
+        size, most = int(np.count_nonzero(available)), self.design.max_attacked
 
         def surcharge(suspects: int) -> float:
-            return search.price(size, suspects, most) - search.price(size, suspects)
+            return search.set_cost(size, suspects, most) - search.set_cost(size, suspects)
 
         return surcharge(theirs) - surcharge(ours)
 
-    def _swapped(self, best: Solution, other: Explanation) -> float:
-        """What a rival costs where groups change sides and either group tells one lie; infinite elsewhere.
+    def _reversal_cost(self, best: Candidate, other: Hypothesis) -> float:
+        """Cost of a rival where groups change sides and each group has one common offset; infinite elsewhere.
 
-        Dropping a group drops what chance does to its meters, which differs from group to group by more than
-        the explanations do. Both sides are therefore asked about the same meters: all that either trusts,
-        with one unknown amount for each group that it accuses.
+        Removing a group removes its chance residuals too, which differ between groups by more than the
+        hypotheses. Both are therefore compared on the meters that either trusts, with one unknown amount per
+        accused group.
         """
         here = self.here
-        believed = here.enough & other.trusted & ~best.trusted
+        honest = here.enough & other.trusted & ~best.trusted
         accused = here.enough & best.trusted & ~other.trusted
-        if min(np.count_nonzero(believed), np.count_nonzero(accused)) < 2:
+        if min(np.count_nonzero(honest), np.count_nonzero(accused)) < 2:
             return np.inf
-        ours, freedom = self._alike(best, believed)
-        if _beyond_chance(ours[self.s] - best.judged.misfit, freedom):
-            return np.inf  # those it accuses do not tell one lie
-        theirs, _ = self._alike(other, accused)
-        return self._beside(best, other, ours, theirs)
+        ours, freedom = self._offset_chi_squares(best, honest)
+        if _beyond_chance(ours[self.s] - best.loo.chi_square, freedom):
+            return np.inf  # the accused meters have no common offset
+        theirs, _ = self._offset_chi_squares(other, accused)
+        return self._relative_cost(best, other, ours, theirs)
 
-    def _beside(self, best: Solution, other: Explanation, ours: list[float], theirs: list[float]) -> float:
-        """What another explanation costs beside the best by what both leave unexplained, scale by scale."""
-        worse = max(his - own for his, own in zip(theirs, ours, strict=True))
-        return best.cost + self._prices(other) - self._prices(best) + worse
+    def _relative_cost(
+        self, best: Candidate, other: Hypothesis, ours: list[float], theirs: list[float]
+    ) -> float:
+        """Cost of another hypothesis beside the best, on the scale of the largest chi-square difference."""
+        worse = max(more - less for more, less in zip(theirs, ours, strict=True))
+        return best.cost + self._accusation_cost(other) - self._accusation_cost(best) + worse
 
-    def _alike(self, found: Explanation, group: Bools) -> tuple[list[float], int]:
-        """What an explanation leaves unexplained where a group it accuses is off by one amount a street.
+    def _offset_chi_squares(self, hypothesis: Hypothesis, group: Bools) -> tuple[list[float], int]:
+        """Chi-square of a hypothesis, by scale, with one common offset per street of an accused group.
 
-        By scale; and how many meters more than amounts there are.
+        And the number of its meters less that of the offsets.
         """
         at = indices(group)
-        parts = _linked(self._together(at))
+        parts = _components(self._linked(at))
         alike = np.zeros((group.size, len(parts)))
         for k, part in enumerate(parts):
-            alike[at[part], k] = _ANY_LIE
-        return self._misfits(found, group, alike), at.size - len(parts)
+            alike[at[part], k] = _OFFSET_STD
+        return self._chi_squares(hypothesis, group, alike), at.size - len(parts)
 
-    def _together(self, at: Ints) -> Bools:
-        """Which of some meters are moved by the same loads, (k, k)."""
+    def _linked(self, at: Ints) -> Bools:
+        """Pairs of meters moved by the same loads, (k, k)."""
         prior = self.here.prior
         between = prior.among(at)
         std = np.sqrt(between.diagonal())
         limit = _TOGETHER * np.multiply.outer(std, std)
         return np.asarray((between >= limit) & (limit > 0.0) | np.eye(at.size, dtype=np.bool_))
 
-    def _unexplained(self, best: Solution) -> bool:
-        """Whether more is left of the readings of those who are believed than chance leaves."""
-        return _beyond_chance(best.judged.misfit, int(np.count_nonzero(best.trusted)))
+    def _unexplained(self, best: Candidate) -> bool:
+        """True if the chi-square of the trusted meters is beyond chance."""
+        return _beyond_chance(best.loo.chi_square, int(np.count_nonzero(best.trusted)))
 
-    def _sets(self, found: Found) -> list[Bools]:
-        """Whom the cheapest explanations believe, each set once.
+    def _cheapest_sets(self, candidates: Candidates) -> list[Bools]:
+        """Trusted meters of the cheapest hypotheses, each set once.
 
-        A false power bends voltages far and near. Where it was loosened first, or another one in its place,
-        the liars are hard to find; once they are, it stands out.
+        A false power changes voltages far and near. Accused first, it hides the manipulated meters; with
+        these known it stands out.
         """
-        each = sorted((found.best, *found.others), key=lambda one: one.cost)
-        sets = {one.trusted.tobytes(): one.trusted for one in each if not any_of(one.trusted & self.keep)}
+        each = sorted((candidates.best, *candidates.others), key=lambda one: one.cost)
+        sets = {one.trusted.tobytes(): one.trusted for one in each if not any_of(one.trusted & self.barred)}
         return list(sets.values())[:_BESIDE]
 
-    def _suspected(self, found: Found) -> int:
-        """How many meters are suspected at least."""
+    def _suspects(self, candidates: Candidates) -> int:
+        """Least number of suspects in the candidates."""
         enough = self.here.enough
-        return min(int(np.count_nonzero(enough & ~each.trusted)) for each in (found.best, *found.others))
+        return min(
+            int(np.count_nonzero(enough & ~each.trusted)) for each in (candidates.best, *candidates.others)
+        )
 
-    def _free(self, held: Found | None) -> Found:
-        """What is found from starts that owe nothing to what was believed.
+    def _independent(self, held: Candidates | None) -> Candidates:
+        """Candidates of starts that do not depend on the meters trusted before.
 
-        A descent stays where another one has ended: `held` too, unless there is somebody whom it only may
-        not admit.
+        A descent stays where another one ended: `held` counts too, unless a meter was only kept from being
+        added.
         """
-        found: Found | None = None
+        candidates: Candidates | None = None
         ends = [] if held is None or self._holds_back(held.best) else [held.best]
         for chosen in self._starts():
             end = next((end for end in ends if np.array_equal(chosen & self.here.enough, end.trusted)), None)
             if end is None:
-                end = self._descend(self._fit(chosen), np.zeros_like(chosen), fresh=True)
+                end = self._descend(self._condition(chosen), np.zeros_like(chosen), fresh=True)
                 ends.append(end)
-            if found is None or end is not found.best:
-                found = likelier(found, Found(end))
-        assert found is not None  # noqa: S101  # there is a start
-        return found
+            if candidates is None or end is not candidates.best:
+                candidates = merged(candidates, Candidates(end))
+        assert candidates is not None  # noqa: S101  # there is a start
+        return candidates
 
-    def _holds_back(self, found: Solution) -> bool:
-        """Whether it would admit somebody who must stay distrusted."""
-        judged, who = found.judged, self.keep & self.here.enough & ~found.trusted
-        return any_of(who & (np.abs(judged.offset) < self.here.limits.of(judged.std)))
+    def _holds_back(self, hypothesis: Candidate) -> bool:
+        """True if a meter that must stay suspect would be added."""
+        loo, which = hypothesis.loo, self.barred & self.here.enough & ~hypothesis.trusted
+        return any_of(which & (np.abs(loo.residual) < self.here.limits.limit(loo.std)))
 
     def _starts(self) -> tuple[Bools, Bools]:
-        """A robust fit, and the meters close to the model."""
+        """Robust set, and the meters close to the model."""
         here, prior = self.here, self.here.prior
         focus, std = self.design.options.focus, np.sqrt(here.noise)
         bound = here.limits.model + focus * std
-        chosen = robust(prior, here.noise, here.m, here.enough, bound, self._whole(self.s))
+        chosen = robust_set(prior, here.noise, here.m, here.enough, bound, self._full_posterior(self.s))
         alone = np.sqrt(prior.variance[prior.meters] + here.noise)
         return chosen, here.enough & (np.abs(here.m) <= here.limits.model + focus * alone)
 
     def _descend(
         self,
-        start: Fit,
+        start: Posterior,
         keep: Bools,
-        book: Dictionary | None = None,
+        faults: FaultDictionary | None = None,
         *,
-        innocent: Ints = search.NOBODY,
+        protected: Ints = search.NO_METERS,
         pairs: bool = False,
         limits: Limits | None = None,
         fresh: bool = False,
-        judged: Judged | None = None,
-    ) -> Solution:
+        loo: LeaveOneOut | None = None,
+    ) -> Candidate:
         here = self.here
         return search.descend(
             start,
@@ -599,81 +585,85 @@ class Search:
             here.enough,
             here.limits if limits is None else limits,
             keep=keep,
-            dictionary=book,
-            innocent=innocent,
+            faults=faults,
+            protected=protected,
             pairs=pairs,
             fresh=fresh,
-            judged=judged,
+            loo=loo,
         )
 
-    def _fit(self, trusted: Bools) -> Fit:
-        loose, wanted = self.scales.loosened(self.accused), trusted & self.here.enough
-        near = self._near(self.s, wanted) if loose is None else None
-        return fit(self.here.prior, self.here.noise, wanted, loose) if near is None else without(*near)
+    def _condition(self, trusted: Bools) -> Posterior:
+        unknowns, wanted = self.scales.unknowns(self.accused), trusted & self.here.enough
+        near = self._close_posterior(self.s, wanted) if unknowns is None else None
+        return (
+            condition(self.here.prior, self.here.noise, wanted, unknowns)
+            if near is None
+            else remove_meters(*near)
+        )
 
-    def _near(self, s: int, wanted: Bools) -> tuple[Fit, Bools] | None:
-        """A fit just as it was factorised that rests on not many more, and these; None for none."""
-        whole = self._whole(s)
-        if whole is None or not sound(whole.prior, whole.noise):
+    def _close_posterior(self, s: int, wanted: Bools) -> tuple[Posterior, Bools] | None:
+        """Fresh posterior of few more meters than wanted, and these; None for none."""
+        whole = self._full_posterior(s)
+        if whole is None or not well_conditioned(whole.prior, whole.noise):
             return None
         more = whole.trusted & ~wanted
         return (whole, more) if np.count_nonzero(more) * _PART <= np.count_nonzero(wanted) else None
 
-    def _whole(self, s: int) -> Fit | None:
-        """The same of all that report on a scale and perhaps of others, whatever is wanted."""
+    def _full_posterior(self, s: int) -> Posterior | None:
+        """Kept posterior that covers all meters with readings on a scale."""
         if s not in self.covering:
-            whole, here = self.wholes[s], self.scales[s]
+            whole, here = self.full_posteriors[s], self.scales[s]
             good = whole is not None and covers(whole, here.prior, here.noise, here.enough)
             self.covering[s] = whole if good else None
         return self.covering[s]
 
-    def _total(self, found: Explanation) -> float:
-        """The misfit on all scales and, once, what the accusations cost."""
-        return self._prices(found) + sum(self._misfits(found))
+    def _total_cost(self, hypothesis: Hypothesis) -> float:
+        """Chi-square on all scales plus the cost of the accusations."""
+        return self._accusation_cost(hypothesis) + sum(self._chi_squares(hypothesis))
 
-    def _prices(self, found: Explanation) -> float:
-        suspects = int(np.count_nonzero(~self._trusted(found)))
-        return found.charge + search.price(self.keep.size, suspects, self.design.most)
+    def _accusation_cost(self, hypothesis: Hypothesis) -> float:
+        suspects = int(np.count_nonzero(~self._trusted(hypothesis)))
+        return hypothesis.charge + search.set_cost(self.barred.size, suspects, self.design.max_attacked)
 
-    def _trusted(self, found: Explanation) -> Bools:
-        return np.where(self.here.enough, found.trusted, self.trust.trusted)
+    def _trusted(self, hypothesis: Hypothesis) -> Bools:
+        return np.where(self.here.enough, hypothesis.trusted, self.trust.trusted)
 
-    def _misfits(
-        self, found: Explanation, more: Bools | None = None, alike: Floats | None = None
+    def _chi_squares(
+        self, hypothesis: Hypothesis, more: Bools | None = None, alike: Floats | None = None
     ) -> list[float]:
-        """What an explanation leaves unexplained on each scale; of `more` meters, which may be off alike."""
-        trusted, out = self._trusted(found), []
-        who = trusted.tobytes(), found.loosened
-        if more is None and who in self.left:
-            return self.left[who]
+        """Chi-square on each scale, with `more` meters that may have common offsets."""
+        trusted, out = self._trusted(hypothesis), []
+        which = trusted.tobytes(), hypothesis.faults
+        if more is None and which in self.chi_squares:
+            return self.chi_squares[which]
         trusted = trusted if more is None else trusted | more
-        loose = self.scales.loosened((*self.accused, *((k, self.s) for k in found.loosened)))
+        unknowns = self.scales.unknowns((*self.accused, *((k, self.s) for k in hypothesis.faults)))
         for s in range(len(self.design.lengths)):
             there = self.scales[s]
             wanted = trusted & there.enough
-            near = self._near(s, wanted) if loose is None and more is None else None
-            if s == self.s and more is None and isinstance(found, Solution):
-                out.append(found.judged.misfit)
+            near = self._close_posterior(s, wanted) if unknowns is None and more is None else None
+            if s == self.s and more is None and isinstance(hypothesis, Candidate):
+                out.append(hypothesis.loo.chi_square)
             elif near is not None:
-                out.append(misfit_without(near[0], there.m, near[1]))
+                out.append(chi_square_without(near[0], there.m, near[1]))
             else:
-                out.append(misfit(there.prior, there.noise, there.m, wanted, loose, alike))
+                out.append(chi_square(there.prior, there.noise, there.m, wanted, unknowns, alike))
         if more is None:
-            self.left[who] = out
+            self.chi_squares[which] = out
         return out
 
-    def _believe(self, best: Explanation) -> Trust:
-        accused = (*self.accused, *((k, self.s) for k in best.loosened))
-        return believe(self.trust, self._trusted(best), self.s, accused)
+    def _trust(self, best: Hypothesis) -> TrustState:
+        accused = (*self.accused, *((k, self.s) for k in best.faults))
+        return self.trust.suspected(self._trusted(best), self.s, accused)
 
 
 def _beyond_chance(left: float, freedom: int) -> bool:
-    """Whether a misfit of so many degrees of freedom is more than chance leaves."""
+    """True if a chi-square is beyond chance for its degrees of freedom."""
     return bool(left > freedom + _CHANCE * np.sqrt(2.0 * freedom))
 
 
-def _linked(link: Bools) -> list[Ints]:
-    """Connected parts of a graph of few nodes, each of which is linked to itself."""
+def _components(link: Bools) -> list[Ints]:
+    """Connected components of a small graph in which each node is linked to itself."""
     out, left = [], np.ones(len(link), dtype=np.bool_)
     while any_of(left):
         part, more = link[left.argmax()], True
@@ -685,7 +675,7 @@ def _linked(link: Bools) -> list[Ints]:
     return out
 
 
-def _held(trust: Trust, s: int) -> Bools:
-    """Meters that must stay distrusted: named ones, and those other scales have evidence against."""
-    other = trust.still[:s].any(axis=0) | trust.still[s + 1 :].any(axis=0)
-    return np.asarray(~trust.trusted & (other | (trust.named & trust.still[s])))
+def _barred(trust: TrustState, s: int) -> Bools:
+    """Meters that must stay suspect: named ones, and those with evidence on other scales."""
+    other = trust.above_release_limit[:s].any(axis=0) | trust.above_release_limit[s + 1 :].any(axis=0)
+    return np.asarray(~trust.trusted & (other | (trust.named & trust.above_release_limit[s])))

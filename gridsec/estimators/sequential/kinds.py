@@ -1,8 +1,7 @@
-"""What a manipulation looks like: stuck, replayed, of another time, one load's trace, drifting, constant.
+"""Kind of a manipulation: stuck, replayed, of another time, one load's trace, drifting, constant.
 
-Stuck and replaying meters are evidence of their own and come from `gridsec.estimators.sequential.repeats`.
-For meters that are named, whatever the evidence, the last readings are compared with what the *other* meters
-say, by the question that explains most first:
+Stuck and replaying meters are evidence of their own (`gridsec.estimators.sequential.repeats`). The last
+readings of named meters are compared with their predictions by the *other* meters, in this order:
 
     replay         the last readings are an earlier stretch, reading by reading
     clock shift    y(t) = v2(t - lag):  reading and reconstruction agree at another time, level included
@@ -10,7 +9,7 @@ say, by the question that explains most first:
     offset         y(t) - v2(t) is a constant, perhaps after a step
     coordinated    the offsets of several meters are those that one customer's load would leave
 
-None where nothing fits: no kind is not no attack.
+None where nothing fits: an attack without a kind is still an attack.
 
 References
 ----------
@@ -28,119 +27,79 @@ from scipy.special import chdtri
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, indices
 from gridsec.estimators.sequential import clocks, repeats
-from gridsec.estimators.sequential.effects import Effects
-from gridsec.estimators.sequential.repeats import Memory, Rules
+from gridsec.estimators.sequential.effects import Sensitivities
+from gridsec.estimators.sequential.repeats import ReadingHistory, RepeatLimits
 from gridsec.interface import ManipulationKind
 
-# A named meter's readings are looked at every so many ticks, and every so many seconds where ticks are long.
 _EVERY, _EVERY_S = 16, 240.0
-# So many times more seldom they are looked for in the past.
-_SELDOM = 4
-# Surprise from which repetition of a meter that is named anyway is called stuck, or a replay.
-_CALLED = 12.0
-# Means that the shape of a lie is judged by, and fewest ticks for it.
+"""Interval of the looks at a named meter's readings: ticks, and seconds where ticks are long."""
+_PAST_LOOKS = 4
+"""Interval of the looks at the past, in looks at the last readings."""
+_CALLED_SURPRISE = 12.0
+"""Surprise at which repetition of a named meter is called stuck, or a replay."""
 _BINS, _SHORTEST = 32, 8
-# A drift must last this part of what is seen, and a ramp leave this part of what the best step leaves.
-_LASTS, _BETTER = 0.25, 0.5
-# A shape explains a lie if this part of its size is the most that is left, as a standard deviation.
-_LEFT = 0.5
-# The linear model of a load's trace is off by this part.
+"""Number of means that describe a shape, and fewest ticks for it."""
+_LEAST_DURATION, _RAMP_REMAINDER = 0.25, 0.5
+"""Least duration of a drift as a part of the data; largest remainder as a part of the best step's."""
+_REMAINDER = 0.5
+"""Largest standard deviation of the remainder, as a part of the size."""
 _TRACE = 0.05
-# Entries of two columns this close, as a part, are equal.
+"""Relative error of the linear model of a load's trace."""
 _SAME = 1e-9
+"""Relative difference up to which entries of two columns are equal."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Traces:
-    """Change of the meters' squared voltages per customer's power: columns of 2R, then of 2X. p meters.
+class LoadTraces:
+    """Change of the meters' squared voltages per customer's power: columns of 2R, then of 2X. p meters."""
 
-    Attributes
-    ----------
-    effects
-        Of the feeder.
-    at : (p,)
-        Bus of each meter.
-    """
-
-    effects: Effects
-    at: Ints
+    sensitivities: Sensitivities  # sensitivities of the feeder
+    at: Ints  # (p,) bus of each meter
 
     def of(self, meters: Ints) -> Iterator[Floats]:
-        """All traces at some meters, (k, …) each, in parts that are small."""
-        return self.effects.at(self.at[meters])
+        """All traces at some meters, (k, …) each, in small parts."""
+        return self.sensitivities.rows(self.at[meters])
 
     def trace(self, which: int) -> Floats:
-        """One of them, (p,)."""
-        return np.asarray(self.effects.of(np.array([which]))[self.at, 0])
+        """Trace of one power, (p,)."""
+        return np.asarray(self.sensitivities.numbered(np.array([which]))[self.at, 0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Shapes:
-    """What lies are compared with. p meters, K traces.
+class KindReferences:
+    """References of the kinds. p meters."""
 
-    Attributes
-    ----------
-    rules
-        When repetition is evidence.
-    traces
-        What each customer's power would do to the meters.
-    noise : (p,)
-        Variance of a squared reading from tick to tick, squared pu^2.
-    active, reactive : (p,)
-        What the squared voltage at a meter changes by per power of its own customer, 2 R_jj and 2 X_jj.
-    every
-        Ticks between two looks at a named meter.
-    """
-
-    rules: Rules
-    traces: Traces
-    noise: Floats
-    active: Floats
-    reactive: Floats
-    every: int
+    limits: RepeatLimits  # limits of repetition
+    traces: LoadTraces  # effect of each customer's power at the meters
+    noise: Floats  # (p,) variance of a squared reading from tick to tick, squared pu^2
+    active: Floats  # (p,) 2 R_jj of each meter's own customer
+    reactive: Floats  # (p,) 2 X_jj likewise
+    interval: int  # ticks between two looks at a named meter
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Kinds:
-    """What is remembered, and what was found. p meters.
+class AttackKinds:
+    """Reading history and kinds found. p meters."""
 
-    Attributes
-    ----------
-    memory
-        Past readings and reconstructions.
-    since : (p,)
-        Tick at which each named meter was named; -1 for others.
-    alone : (p,)
-        What each named meter's manipulation looks like by itself.
-    told : (p,)
-        Meters that together tell of a load that is not there.
-    """
-
-    memory: Memory
-    since: Ints
-    alone: tuple[ManipulationKind | None, ...]
-    told: Bools
+    history: ReadingHistory  # past readings and reconstructions
+    since: Ints  # (p,) tick at which each named meter was named; -1 for others
+    single: tuple[ManipulationKind | None, ...]  # (p,) kind of each named meter by itself
+    coordinated: Bools  # (p,) meters that together show a load that does not exist
 
     @property
     def kinds(self) -> tuple[ManipulationKind | None, ...]:
-        """What each named meter's manipulation looks like, (p,)."""
-        if not any_of(self.told):
-            return self.alone
+        """Kind of each named meter's manipulation, (p,)."""
+        if not any_of(self.coordinated):
+            return self.single
         return tuple(
-            ManipulationKind.COORDINATED if told and kind is ManipulationKind.OFFSET else kind
-            for kind, told in zip(self.alone, self.told.tolist(), strict=True)
+            ManipulationKind.COORDINATED if shared and kind is ManipulationKind.OFFSET else kind
+            for kind, shared in zip(self.single, self.coordinated.tolist(), strict=True)
         )
 
 
-def empty(meters: int) -> Kinds:
-    """Nothing seen yet.
-
-    Parameters
-    ----------
-    meters
-        p.
-    """
-    return Kinds(
+def empty(meters: int) -> AttackKinds:
+    """No readings yet."""
+    return AttackKinds(
         repeats.empty(meters),
         np.full(meters, -1, dtype=np.intp),
         (None,) * meters,
@@ -148,183 +107,159 @@ def empty(meters: int) -> Kinds:
     )
 
 
-def pace(step_s: float) -> int:
-    """Ticks between two looks at a named meter.
-
-    Parameters
-    ----------
-    step_s
-        Expected time between readings, s.
-    """
+def look_interval(step_s: float) -> int:
+    """Ticks between two looks at a named meter."""
     return int(np.clip(_EVERY_S // step_s, 1, _EVERY))
 
 
-def listen(shapes: Shapes, before: Kinds, y: Floats, live: Bools) -> Kinds:
-    """Take readings in; `describe` has to follow before the next.
-
-    Parameters
-    ----------
-    shapes
-        What lies are compared with.
-    before
-        So far; not changed.
-    y : (p,)
-        Squared readings, pu; any finite numbers where not live.
-    live : (p,)
-        Where there is a reading.
-    """
-    return Kinds(
-        repeats.listen(shapes.rules, before.memory, y, live), before.since, before.alone, before.told
+def ingest(references: KindReferences, before: AttackKinds, y: Floats, available: Bools) -> AttackKinds:
+    """History with the readings y (p,), squared pu; `classify` has to follow before the next."""
+    return AttackKinds(
+        repeats.ingest(references.limits, before.history, y, available),
+        before.since,
+        before.single,
+        before.coordinated,
     )
 
 
-def repeated(kinds: Kinds) -> Ints:
-    """Ticks after which readings repeat that are evidence by themselves, whatever the others say, (p,).
+def repeat_lags(kinds: AttackKinds) -> Ints:
+    """Ticks after which readings repeat beyond chance, (p,): 1 for a stuck meter, 0 for none."""
+    return repeats.repeat_lags(kinds.history)
 
-    Parameters
-    ----------
-    kinds
-        From `listen`.
 
-    Returns
-    -------
-    (p,)
-        1 for a stuck meter, 0 for one that does not repeat itself.
+def classify(  # noqa: PLR0917
+    references: KindReferences,
+    ingested: AttackKinds,
+    model: Floats,
+    own: Floats,
+    named: Bools,
+    variance: Floats,
+) -> AttackKinds:
+    """Kind of the manipulation of every named meter, (p,).
+
+    model, variance: (p,) prediction of each meter by the *others*, its fixed error included, squared pu, and
+    its variance. own: (p,) part of `model` by the meter's own reported powers, squared pu.
     """
-    return repeats.lags(kinds.memory)
-
-
-def describe(  # noqa: PLR0917  # what each meter says, and what the others say of it
-    shapes: Shapes, heard: Kinds, model: Floats, own: Floats, named: Bools, variance: Floats
-) -> Kinds:
-    """Say what the manipulation of every named meter looks like.
-
-    Parameters
-    ----------
-    shapes
-        What lies are compared with.
-    heard
-        From `listen`.
-    model : (p,)
-        What each meter should read by what the *others* say, its fixed error included, squared pu.
-    own : (p,)
-        What each meter's own reported powers contribute to `model`, squared pu.
-    named : (p,)
-        Who is named.
-    variance : (p,)
-        Of `model`, fixed errors included, squared pu^2.
-    """
-    memory = repeats.keep(heard.memory, model, own)
+    history = repeats.store(ingested.history, model, own)
     if not any_of(named):
-        return Kinds(memory, *(_nobody(named.size)))
-    tick = memory.tick
-    since = np.where(named, np.where(heard.since < 0, tick, heard.since), -1)
-    alone = [kind if there else None for kind, there in zip(heard.alone, named.tolist(), strict=True)]
-    told, new = heard.told & named, any_of(since == tick)
-    stuck = named & (memory.stuck | (memory.run * shapes.rules.surprise >= _CALLED))
-    replays = named & ~stuck & (memory.lag > 0)
+        return AttackKinds(history, *(_none_named(named.size)))
+    tick = history.tick
+    since = np.where(named, np.where(ingested.since < 0, tick, ingested.since), -1)
+    alone = [kind if there else None for kind, there in zip(ingested.single, named.tolist(), strict=True)]
+    shared, new = ingested.coordinated & named, any_of(since == tick)
+    stuck = named & (history.stuck | (history.run * references.limits.surprise >= _CALLED_SURPRISE))
+    replays = named & ~stuck & (history.lag > 0)
     for kind, which in ((ManipulationKind.STUCK, stuck), (ManipulationKind.REPLAY, replays)):
         for j in indices(which).tolist():
             alone[j] = kind
     others, meters = named & ~stuck & ~replays, np.arange(named.size)
-    numbers, back = _backward(shapes, tick, since)
+    numbers, back = _past_looks(references, tick, since)
     for j in indices(others & back).tolist():
         window = clocks.WINDOWS[numbers[j] % len(clocks.WINDOWS)]
-        alone[j] = _of_the_past(shapes, memory, j, float(variance[j]), window, alone[j])
-    due, before = others & (_turn(shapes, tick, meters) | _turns(since, tick, shapes.every)), tuple(alone)
+        alone[j] = _of_the_past(references, history, j, float(variance[j]), window, alone[j])
+    due, before = (
+        others & (_due_again(references, tick, meters) | _first_looks(since, tick, references.interval)),
+        tuple(alone),
+    )
     for age in sorted(set((tick - since[due]).tolist())):
         meters = indices(due & (since == tick - age))
-        found = _alone(shapes, memory, meters, age, before)
+        found = _single_kinds(references, history, meters, age, before)
         for j, looks in zip(meters.tolist(), found, strict=True):
             alone[j] = looks
-    if new or tick % shapes.every == 0:
-        told = _together(shapes, memory, since, variance)
-    return Kinds(memory, since, tuple(alone), told)
+    if new or tick % references.interval == 0:
+        shared = _coordinated(references, history, since, variance)
+    return AttackKinds(history, since, tuple(alone), shared)
 
 
-# Parts of the named meters that take turns: one look at several takes hardly longer than one at one.
-_PARTS = 4
-# Meters named at once that are looked at in the same tick; of the others as many in each of the next.
-_FIRST = 16
+_GROUPS = 4
+"""Groups of named meters that take turns: a look at several takes hardly longer than at one."""
+_FIRST_LOOKS = 16
+"""Newly named meters with a look at the same tick; as many of the others at each of the next."""
 
 
-def _turns(since: Ints, tick: int, every: int) -> Bools:
-    """Whose turn it is to be looked at for the first time, (p,): after so many ticks everybody has been."""
+def _first_looks(since: Ints, tick: int, every: int) -> Bools:
+    """Meters with their first look at this tick, (p,): after `every` ticks all have had it."""
     out = np.zeros(since.size, dtype=np.bool_)
     for start in set(since[since > tick - every].tolist()):
-        first = (tick - start) * _FIRST
-        out[indices(since == start)[first : first + _FIRST]] = start >= 0
+        first = (tick - start) * _FIRST_LOOKS
+        out[indices(since == start)[first : first + _FIRST_LOOKS]] = start >= 0
     return out
 
 
 @cache
-def _nobody(meters: int) -> tuple[Ints, tuple[ManipulationKind | None, ...], Bools]:
+def _none_named(meters: int) -> tuple[Ints, tuple[ManipulationKind | None, ...], Bools]:
     none = empty(meters)
-    return none.since, none.alone, none.told
+    return none.since, none.single, none.coordinated
 
 
-def _alone(
-    shapes: Shapes, memory: Memory, meters: Ints, age: int, before: tuple[ManipulationKind | None, ...]
+def _single_kinds(
+    references: KindReferences,
+    history: ReadingHistory,
+    meters: Ints,
+    age: int,
+    before: tuple[ManipulationKind | None, ...],
 ) -> Iterator[ManipulationKind | None]:
-    """What the lies of meters named at the same time look like, each by itself."""
-    start = max(memory.first, memory.tick - 2 * age - 4 * _BINS)
-    code, model = repeats.past(memory, meters, start, memory.kept)
-    lies = (code * shapes.rules.step[meters]) ** 2 - model
-    found = _shapes(lies, np.sqrt(shapes.noise[meters]), age)
-    moves = _moves(shapes, meters, code)
-    for meter, begin, lie, looks in zip(meters.tolist(), moves.tolist(), lies.T, found, strict=True):
-        # What takes a long look to see stays true when the lie rests: a drift that has arrived, a clock in
-        # calm.
+    """Kinds of meters named at the same time, each by itself."""
+    start = max(history.first, history.tick - 2 * age - 4 * _BINS)
+    code, model = repeats.past(history, meters, start, history.kept)
+    deviations = (code * references.limits.step[meters]) ** 2 - model
+    found = _shapes(deviations, np.sqrt(references.noise[meters]), age)
+    moves = _restarts(references, meters, code)
+    for meter, begin, deviation, looks in zip(
+        meters.tolist(), moves.tolist(), deviations.T, found, strict=True
+    ):
+        # A kind that needs a long look stays: a drift that has ended, a clock shift at constant voltage.
         if before[meter] in _LASTING:
             yield before[meter]
         else:
-            yield _again(shapes, meter, lie[begin:], age) if begin else looks
+            yield _after_stuck(references, meter, deviation[begin:], age) if begin else looks
 
 
-def _moves(shapes: Shapes, meters: Ints, code: Floats) -> Ints:
-    """Since which of the readings (n, k) meters move that have been stuck before; 0 for others, (k,)."""
-    out, surprise = np.zeros(meters.size, dtype=np.intp), shapes.rules.surprise[meters]
-    for k in indices(_longest(code) * surprise >= _CALLED).tolist():
-        heard = indices(np.isfinite(code[:, k]))
-        read = code[heard, k]
-        ends = np.concatenate([[-1], indices(read[1:] != read[:-1]), [heard.size - 1]])
-        stuck = indices((np.diff(ends) - 1) * surprise[k] >= _CALLED)
+def _restarts(references: KindReferences, meters: Ints, code: Floats) -> Ints:
+    """First of the readings (n, k) after the last stuck stretch; 0 for others, (k,)."""
+    out, surprise = np.zeros(meters.size, dtype=np.intp), references.limits.surprise[meters]
+    for k in indices(_longest(code) * surprise >= _CALLED_SURPRISE).tolist():
+        readings = indices(np.isfinite(code[:, k]))
+        read = code[readings, k]
+        ends = np.concatenate([[-1], indices(read[1:] != read[:-1]), [readings.size - 1]])
+        stuck = indices((np.diff(ends) - 1) * surprise[k] >= _CALLED_SURPRISE)
         if stuck.size:
-            out[k] = heard[ends[stuck[-1] + 1]] + 1
+            out[k] = readings[ends[stuck[-1] + 1]] + 1
     return out
 
 
 def _longest(code: Floats) -> Ints:
-    """How often each of several meters' readings, (n, k), repeats itself in a row at most; silence does."""
+    """Longest run of equal readings in a row, (n, k); silence continues a run."""
     same = (code[1:] == code[:-1]) | np.isnan(code[1:]) | np.isnan(code[:-1])
     count = np.cumsum(same, axis=0)
     run = count - np.maximum.accumulate(np.where(same, 0, count), axis=0)
     return np.asarray(run.max(axis=0, initial=0))
 
 
-def _again(shapes: Shapes, meter: int, lie: Floats, age: int) -> ManipulationKind | None:
-    """What the lie of a meter that was stuck looks like since it moves, if that is for long enough."""
-    heard = int(np.isfinite(lie).sum())
-    if heard < max(shapes.every, _SHORTEST):
+def _after_stuck(
+    references: KindReferences, meter: int, deviation: Floats, age: int
+) -> ManipulationKind | None:
+    """Kind of a formerly stuck meter since it moves, if that is long enough."""
+    readings = int(np.isfinite(deviation).sum())
+    if readings < max(references.interval, _SHORTEST):
         return ManipulationKind.STUCK
-    return shape(lie, float(np.sqrt(shapes.noise[meter])), min(age, lie.size))
+    return shape(deviation, float(np.sqrt(references.noise[meter])), min(age, deviation.size))
 
 
-def _turn(shapes: Shapes, tick: int, meters: Ints) -> Bools:
-    """Which of some meters are looked at again."""
-    early = (tick + meters % _PARTS * -(-shapes.every // _PARTS)) % shapes.every
+def _due_again(references: KindReferences, tick: int, meters: Ints) -> Bools:
+    """Meters with a repeated look at this tick."""
+    early = (tick + meters % _GROUPS * -(-references.interval // _GROUPS)) % references.interval
     return np.asarray(early == 0)
 
 
-def _backward(shapes: Shapes, tick: int, since: Ints) -> tuple[Ints, Bools]:
-    """Number of the look at each meter's past, and whose turn it is, (p,) each; `since` when each was named.
+def _past_looks(references: KindReferences, tick: int, since: Ints) -> tuple[Ints, Bools]:
+    """Number of the look at each meter's past, and the meters with one at this tick, (p,) each.
 
-    A past is long, and each takes its own time: every meter has its own turn, or number, whenever it is
-    named. The tick of naming has the most to do: where ticks are short, what would fall on it is left to the
-    next.
+    `since`: tick of naming. A past is long, so every meter has its own tick. On short ticks a look that
+    coincides with the tick of naming is left to the next, since that tick has the most to compute.
     """
-    number, early = np.divmod(tick + np.arange(since.size), shapes.every * _SELDOM)
-    if shapes.every == 1:
+    number, early = np.divmod(tick + np.arange(since.size), references.interval * _PAST_LOOKS)
+    if references.interval == 1:
         return number, early == 0
     age = tick - since
     return number, (early == 0) & (age > 0) | (early == 1) & (age == 1)
@@ -333,72 +268,73 @@ def _backward(shapes: Shapes, tick: int, since: Ints) -> tuple[Ints, Bools]:
 _LASTING = (ManipulationKind.REPLAY, ManipulationKind.CLOCK_SHIFT, ManipulationKind.DRIFT)
 
 
-def _of_the_past(  # noqa: PLR0917  # one meter, and where to look
-    shapes: Shapes, memory: Memory, meter: int, spread: float, window: int, before: ManipulationKind | None
+def _of_the_past(  # noqa: PLR0917
+    references: KindReferences,
+    history: ReadingHistory,
+    meter: int,
+    spread: float,
+    window: int,
+    before: ManipulationKind | None,
 ) -> ManipulationKind | None:
-    """Replay or clock shift if a meter's readings are of another time; else what it was before.
+    """Replay or clock shift if a meter's readings are of another time; else the kind before.
 
-    A clock that is off, or set wrong, never makes a meter say again what it has said: that comes first.
+    A wrong clock never repeats readings, so replay is tested first.
     """
     if before is ManipulationKind.REPLAY:
         return before
-    code, model = repeats.past(memory, meter, memory.first, memory.kept)
-    same = repeats.recurring(code) * repeats.surprise(shapes.rules, memory)[meter]
-    if same >= _CALLED + np.log(code.size):
+    code, model = repeats.past(history, meter, history.first, history.kept)
+    same = repeats.recurring(code) * repeats.surprise(references.limits, history)[meter]
+    if same >= _CALLED_SURPRISE + np.log(code.size):
         return ManipulationKind.REPLAY
-    heard = min(window, code.size // 2)
-    if before is ManipulationKind.CLOCK_SHIFT or heard < clocks.WINDOWS[0]:
+    readings = min(window, code.size // 2)
+    if before is ManipulationKind.CLOCK_SHIFT or readings < clocks.WINDOWS[0]:
         return before
-    y = (code * shapes.rules.step[meter]) ** 2
-    own = repeats.own_part(memory, meter)
-    lag = clocks.shifted(y, model, own, heard, 3.0 * np.sqrt(spread), spread + float(shapes.noise[meter]))
+    y = (code * references.limits.step[meter]) ** 2
+    own = repeats.own_part(history, meter)
+    lag = clocks.clock_shift(
+        y, model, own, readings, 3.0 * np.sqrt(spread), spread + float(references.noise[meter])
+    )
     return ManipulationKind.CLOCK_SHIFT if lag else before
 
 
-def shape(lie: Floats, noise: float, age: int) -> ManipulationKind | None:
-    """Whether a lie is constant or grows.
+def shape(deviation: Floats, noise: float, age: int) -> ManipulationKind | None:
+    """Kind of a manipulation by its shape: drift, offset or None.
 
-    A ramp from nothing to its full size that begins and ends at any two of `_BINS` moments is fitted by
-    least squares; one of no duration is a step. The ramp is a drift where it lasts, and leaves far less
-    than the best step.
-
-    Parameters
-    ----------
-    lie : (n,)
-        Readings minus reconstruction, squared pu; NaN where there is none.
-    noise
-        Its standard deviation from tick to tick, squared pu.
-    age
-        How many ticks ago the meter was named.
+    deviation: (n,) readings minus reconstruction, squared pu, NaN if missing. noise: its standard deviation
+    from tick to tick. age: ticks since the meter was named. Ramps from zero to full size between any two of
+    `_BINS` moments are fitted by least squares; one of no duration is a step. A drift lasts and leaves far
+    less than the best step.
     """
-    heard = lie[np.isfinite(lie)]
-    if heard.size and _drifts(heard[:, None], np.array([noise]))[0]:
+    readings = deviation[np.isfinite(deviation)]
+    if readings.size and _drifts(readings[:, None], np.array([noise]))[0]:
         return ManipulationKind.DRIFT
-    now = lie[-(age + 2) :]
+    now = deviation[-(age + 2) :]
     now = now[np.isfinite(now)]
-    return ManipulationKind.OFFSET if now.size and now.std() < _LEFT * abs(now.mean()) + noise else None
+    return ManipulationKind.OFFSET if now.size and now.std() < _REMAINDER * abs(now.mean()) + noise else None
 
 
-def _shapes(lies: Floats, noise: Floats, age: int) -> list[ManipulationKind | None]:
-    """`shape` of several meters' lies, (n, k)."""
-    if not all_of(np.isfinite(lies)):
-        return [shape(lie, std, age) for lie, std in zip(lies.T, noise.tolist(), strict=True)]
-    now = lies[-(age + 2) :]
-    constant = now.std(axis=0) < _LEFT * np.abs(now.mean(axis=0)) + noise
-    both = zip(_drifts(lies, noise).tolist(), constant.tolist(), strict=True)
+def _shapes(deviations: Floats, noise: Floats, age: int) -> list[ManipulationKind | None]:
+    """`shape` of several meters, (n, k)."""
+    if not all_of(np.isfinite(deviations)):
+        return [
+            shape(deviation, std, age) for deviation, std in zip(deviations.T, noise.tolist(), strict=True)
+        ]
+    now = deviations[-(age + 2) :]
+    constant = now.std(axis=0) < _REMAINDER * np.abs(now.mean(axis=0)) + noise
+    both = zip(_drifts(deviations, noise).tolist(), constant.tolist(), strict=True)
     return [
         ManipulationKind.DRIFT if drifts else ManipulationKind.OFFSET if rests else None
         for drifts, rests in both
     ]
 
 
-def _drifts(lies: Floats, noise: Floats) -> Bools:
-    """Which lies, (n, k), grow; by means over equal parts of what was heard."""
-    width = max(1, len(lies) // _BINS)
-    count = len(lies) // width
+def _drifts(deviations: Floats, noise: Floats) -> Bools:
+    """Columns of `deviations` (n, k) that grow, by means over equal parts."""
+    width = max(1, len(deviations) // _BINS)
+    count = len(deviations) // width
     if count < _SHORTEST:
         return np.zeros(noise.size, dtype=np.bool_)
-    means = lies[len(lies) - count * width :].reshape(count, width, -1).mean(axis=1)
+    means = deviations[len(deviations) - count * width :].reshape(count, width, -1).mean(axis=1)
     ramps, size, lasts = _ramps(count)
     centred = means - means.mean(axis=0)
     along = ramps @ centred
@@ -407,15 +343,15 @@ def _drifts(lies: Floats, noise: Floats) -> Bools:
     least, grown = np.maximum(whole - explained[best, at], 0.0), along[best, at] / size[best]
     by_step = np.maximum(whole - explained[lasts <= 1].max(axis=0), 0.0)
     floor = count * noise**2 / width
-    lasting = lasts[best] >= _LASTS * count
-    lasting &= least + floor < _BETTER * (by_step + floor)
-    # What is left must be small against what has grown, or this is just a wild lie.
-    return np.asarray(lasting & (np.sqrt(least / count) < _LEFT * np.abs(grown)))
+    lasting = lasts[best] >= _LEAST_DURATION * count
+    lasting &= least + floor < _RAMP_REMAINDER * (by_step + floor)
+    # The remainder must be small against the growth.
+    return np.asarray(lasting & (np.sqrt(least / count) < _REMAINDER * np.abs(grown)))
 
 
 @cache
 def _ramps(n: int) -> tuple[Floats, Floats, Ints]:
-    """All ramps from 0 to 1 over n bins, less their means and of size 1; their sizes, and bins they last."""
+    """All ramps from 0 to 1 over n bins, centred and of norm 1; their norms, and durations in bins."""
     begin, end = np.triu_indices(n, 1)
     at = np.arange(n)
     ramps = np.clip((at - begin[:, None]) / (end - begin)[:, None], 0.0, 1.0)
@@ -424,60 +360,50 @@ def _ramps(n: int) -> tuple[Floats, Floats, Ints]:
     return ramps / size[:, None], size, np.asarray(end - begin)
 
 
-def _together(shapes: Shapes, memory: Memory, since: Ints, variance: Floats) -> Bools:
-    """Named meters whose lies are one load's trace."""
+def _coordinated(references: KindReferences, history: ReadingHistory, since: Ints, variance: Floats) -> Bools:
+    """Named meters with deviations that are one load's trace."""
     named = since >= 0
-    who = indices(named)
-    if who.size < 2:  # one meter has no story to share
+    which = indices(named)
+    if which.size < 2:  # one meter has no common trace
         return np.zeros_like(named)
-    # From when all of them are named; evidence is a tick older than a name.
-    start = max(memory.first, memory.kept - _EVERY, int(since.max()) - 1)
-    code, model = repeats.past(memory, who, start, memory.kept)
-    lies = (code * shapes.rules.step[who]) ** 2 - model
-    heard = np.isfinite(lies).sum(axis=0)
-    if not all_of(heard):
+    # Since all of them are named; evidence is one tick older than a name.
+    start = max(history.first, history.kept - _EVERY, int(since.max()) - 1)
+    code, model = repeats.past(history, which, start, history.kept)
+    deviations = (code * references.limits.step[which]) ** 2 - model
+    readings = np.isfinite(deviations).sum(axis=0)
+    if not all_of(readings):
         return np.zeros_like(named)
-    spread = variance[who] + shapes.noise[who] / heard
-    same = traced(shapes.traces, who, np.nansum(lies, axis=0) / heard, spread)
+    spread = variance[which] + references.noise[which] / readings
+    same = is_load_trace(references.traces, which, np.nansum(deviations, axis=0) / readings, spread)
     return named if same else np.zeros_like(named)
 
 
-def traced(traces: Traces, who: Ints, lies: Floats, variance: Floats) -> bool:
-    """Whether several meters' lies are the trace of one customer's load, rather than anything else.
+def is_load_trace(traces: LoadTraces, which: Ints, deviations: Floats, variance: Floats) -> bool:
+    """True if the deviations of several meters are the trace of one customer's load.
 
-    The lies must be proportional to a column of 2R or 2X within their errors; the meters must be among
-    those that this load affects most, twice their number at most, since it is these a consistent story
-    needs; and one constant for all must fit worse by more than the number of columns explains.
-
-    Parameters
-    ----------
-    traces
-        Columns of 2R and 2X.
-    who : (k,)
-        The meters.
-    lies : (k,)
-        Readings minus reconstruction, squared pu.
-    variance : (k,)
-        Of them.
+    They must be proportional to a column of 2R or 2X within their errors; the meters must be among those that
+    the load affects most, at most twice their number; and a common constant must fit worse by more than the
+    number of columns explains. Shapes (k,): meters, readings minus reconstruction, squared pu,
+    and variance of these.
     """
-    weight = 1.0 / (variance + (_TRACE * lies) ** 2)
-    whole = float(weight @ lies**2)
+    weight = 1.0 / (variance + (_TRACE * deviations) ** 2)
+    whole = float(weight @ deviations**2)
 
     def misfit(of: Floats) -> Floats:
-        explained = ((weight * lies) @ of) ** 2 / np.maximum(weight @ of**2, np.finfo(np.float64).tiny)
+        explained = ((weight * deviations) @ of) ** 2 / np.maximum(weight @ of**2, np.finfo(np.float64).tiny)
         return np.maximum(whole - explained, 0.0)
 
-    same = misfit(np.ones((who.size, 1)))[0]
-    most = min(_quantile(who.size - 1), same - 2.0 * np.log(2 * traces.effects.feeder.bus.size))
+    same = misfit(np.ones((which.size, 1)))[0]
+    most = min(_quantile(which.size - 1), same - 2.0 * np.log(2 * traces.sensitivities.feeder.bus.size))
     if most < 0.0:
         return False
-    fits = np.concatenate([misfit(part) for part in traces.of(who)])
-    for k in indices(fits <= most).tolist():
-        # In three phases a load lowers its own phase and moves the others either way: how much counts.
+    posteriors = np.concatenate([misfit(part) for part in traces.of(which)])
+    for k in indices(posteriors <= most).tolist():
+        # In three phases a load lowers its own phase and moves the others either way: the size counts.
         felt = np.abs(traces.trace(k))
-        weakest = felt[who].min()
-        # Meters beyond the same branch feel it alike: only those that feel more are counted.
-        if weakest > 0.0 and np.count_nonzero(felt > weakest * (1.0 + _SAME)) <= 2 * who.size:
+        weakest = felt[which].min()
+        # Meters behind the same branch are affected alike: only more affected ones are counted.
+        if weakest > 0.0 and np.count_nonzero(felt > weakest * (1.0 + _SAME)) <= 2 * which.size:
             return True
     return False
 

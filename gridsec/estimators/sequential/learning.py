@@ -23,21 +23,21 @@ import numpy as np
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of
 from gridsec.estimators.sequential.commission import COUNTED, REASONS, Commission, Learning, LearningReason
 from gridsec.estimators.sequential.design import SequentialDesign
-from gridsec.estimators.sequential.doubts import Doubts
+from gridsec.estimators.sequential.doubts import FrameUncertainty
 from gridsec.estimators.sequential.loads import EXACT, UNMETERED
 from gridsec.grid.network import Power
 from gridsec.interface import Frame, PowerOrigin
 
-_WIDER = 2.0
+_WIDEST = 2.0
 """Largest standard deviation of a voltage at a tick that counts, in those of the design."""
 _PATIENCE = 2.0
 """Multiple of the expected time after which a meter is stalled."""
-_ROUNDED = 1e-9
+_TIME_TOLERANCE = 1e-9
 """Part of an interval by which a quotient of times may exceed a whole number from rounding alone."""
 
 
 class LearningState(StrEnum):
-    """State of a meter's learning."""
+    """State of a meter's learning: no tick counted, some did, known, late beyond twice the expected time."""
 
     WAITING = "waiting"
     LEARNING = "learning"
@@ -47,51 +47,28 @@ class LearningState(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LearningProgress:
-    """Progress of all meters. p meters.
+    """Progress of all meters. p meters."""
 
-    Attributes
-    ----------
-    state : (p,)
-        `waiting`: no tick counted yet. `learning`: some did. `stalled`: not learned after twice `expected_s`.
-        `learned`: the fixed error is known.
-    reason : (p,)
-        Reason that took most of the time that was lost; None for learned meters and for those on schedule.
-    expected_s
-        Time that learning takes if every tick counts, s.
-    """
-
-    state: tuple[LearningState, ...]
-    reason: tuple[LearningReason | None, ...]
-    expected_s: float
+    state: tuple[LearningState, ...]  # (p,) state of each
+    reason: tuple[LearningReason | None, ...]  # (p,) reason of most lost time; None if on schedule
+    expected_s: float  # time that learning takes if every tick counts, s
 
 
 def expected_s(design: SequentialDesign) -> float:
-    """Time that learning takes if every tick counts, s.
-
-    Parameters
-    ----------
-    design
-        The design.
-    """
-    ticks = int(np.ceil(design.options.commission_s / design.step_s - _ROUNDED))
+    """Time that learning takes if every tick counts, s."""
+    ticks = int(np.ceil(design.options.commission_s / design.step_s - _TIME_TOLERANCE))
     return (1 + ticks) * design.step_s
 
 
 def progress(design: SequentialDesign, commission: Commission) -> LearningProgress:
-    """State and reason of each meter.
-
-    Parameters
-    ----------
-    design, commission
-        The design, and what is known and gathered.
-    """
+    """State and reason of each meter."""
     expected, learning = expected_s(design), commission.learning
     p = commission.learned.at.size
     if learning is None:
         return LearningProgress((LearningState.LEARNED,) * p, (None,) * p, expected)
     late = learning.watched_s >= _PATIENCE * expected
     worst = learning.lost_s.argmax(axis=0)
-    lags = _lags(design, learning)
+    lags = _late(design, learning)
     state, reason = [], list[LearningReason | None]()
     for k, open_ in enumerate(learning.open):
         if not open_:
@@ -104,7 +81,7 @@ def progress(design: SequentialDesign, commission: Commission) -> LearningProgre
     return LearningProgress(tuple(state), tuple(reason), expected)
 
 
-def _lags(design: SequentialDesign, learning: Learning) -> Bools:
+def _late(design: SequentialDesign, learning: Learning) -> Bools:
     """Meters that are learned later than expected, (p,): too few ticks counted, or nothing is concluded."""
     few = learning.time_s < design.options.enough * learning.watched_s
     held = learning.time_s >= design.options.commission_s
@@ -112,82 +89,60 @@ def _lags(design: SequentialDesign, learning: Learning) -> Bools:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Tick:
-    """One frame, as learning needs it. p meters.
+class LearningTick:
+    """One frame for learning. p meters."""
 
-    Attributes
-    ----------
-    frame
-        The frame.
-    live, trusted : (p,)
-        Meters with a reading, and those that are trusted after it.
-    accused
-        A customer's power or an inverter is under suspicion.
-    doubts
-        Uncertainty of its powers.
+    frame: Frame  # the frame
+    available: Bools  # (p,) meters with a reading
+    trusted: Bools  # (p,) meters trusted after it
+    accused: bool  # a customer's power or an inverter is suspect
+    uncertainty: FrameUncertainty  # uncertainty of its powers
+
+
+def usable(design: SequentialDesign, before: Learning, tick: LearningTick) -> tuple[Bools, Ints]:
+    """Meters to gather from, (p,), and the index of `REASONS`, or `COUNTED`, of each, (p,).
+
+    A meter that has time enough and is not learned waits for others.
     """
-
-    frame: Frame
-    live: Bools
-    trusted: Bools
-    accused: bool
-    doubts: Doubts
-
-
-def counts(design: SequentialDesign, before: Learning, tick: Tick) -> tuple[Bools, Ints]:
-    """Meters for which a tick counts, (p,), and the reason where it brings learning no further, (p,).
-
-    Parameters
-    ----------
-    design, before
-        The design, and what was gathered before the tick.
-    tick
-        The tick.
-
-    Returns
-    -------
-    use : (p,)
-        Meters to gather from.
-    why : (p,)
-        Index of `REASONS`, or `COUNTED`. A meter that has time enough and is not learned waits for others.
-    """
-    use = tick.live & tick.trusted
+    use = tick.available & tick.trusted
     why = np.full(use.size, COUNTED, dtype=np.intp)
-    if not tick.accused and tick.doubts.priors[0] is not design.prior:
-        known = _known(design, tick.doubts)
+    if not tick.accused and tick.uncertainty.priors[0] is not design.prior:
+        known = _well_known(design, tick.uncertainty)
         if any_of(use & ~known):
-            why = np.where(known, COUNTED, _unknown(design, tick))
+            why = np.where(known, COUNTED, _main_uncertainty(design, tick))
         use &= known
     ripe = before.time_s >= design.options.commission_s
     for which, reason in (
         (ripe & use, LearningReason.OTHERS_SUSPECTED),
         (np.full(use.size, tick.accused), LearningReason.OTHERS_SUSPECTED),
         (~tick.trusted, LearningReason.SUSPECTED),
-        (~tick.live, LearningReason.SILENT),
+        (~tick.available, LearningReason.SILENT),
     ):
         why = np.where(which, REASONS.index(reason), why)
     return use & (not tick.accused), why
 
 
-def _known(design: SequentialDesign, doubts: Doubts) -> Bools:
+def _well_known(design: SequentialDesign, uncertainty: FrameUncertainty) -> Bools:
     """Meters at which the voltage is known about as well as the design supposes, (p,)."""
-    variance, at = doubts.priors[0].variance, design.prior.meters
-    return np.asarray(variance[at] <= _WIDER**2 * design.prior.variance[at])
+    variance, at = uncertainty.priors[0].variance, design.prior.meters
+    return np.asarray(variance[at] <= _WIDEST**2 * design.prior.variance[at])
 
 
-def _unknown(design: SequentialDesign, tick: Tick) -> Ints:
+def _main_uncertainty(design: SequentialDesign, tick: LearningTick) -> Ints:
     """Reason that adds most to the variance of the voltage at each meter, (p,), as index of `REASONS`."""
-    doubts, doubt, at = tick.doubts, design.doubt, design.prior.meters
+    uncertainty, doubt, at = tick.uncertainty, design.doubt, design.prior.meters
     added: dict[LearningReason, Floats] = {}
-    if not all_of(doubts.busbar[0]):
-        no_voltage = design.hangs_on @ np.where(doubts.busbar[0], 0.0, UNMETERED**2 - design.busbar**2)
+    if not all_of(uncertainty.busbar[0]):
+        no_voltage = design.busbar_incidence @ np.where(
+            uncertainty.busbar[0], 0.0, UNMETERED**2 - design.busbar**2
+        )
         added[LearningReason.NO_BUSBAR] = np.asarray(no_voltage)
     origin = tick.frame.p_origin
     unread = np.zeros(doubt.p.size, dtype=np.bool_) if origin is None else origin == PowerOrigin.UNREAD
     beyond = np.zeros(doubt.p.size, dtype=np.bool_) if origin is None else origin == PowerOrigin.BEYOND
     for power, std, factor, reason in (
-        (Power.ACTIVE, doubt.p, doubts.p[0], LearningReason.ACTIVE_UNCERTAINTY),
-        (Power.REACTIVE, doubt.q, doubts.q[0], LearningReason.REACTIVE_UNCERTAINTY),
+        (Power.ACTIVE, doubt.p, uncertainty.p[0], LearningReason.ACTIVE_UNCERTAINTY),
+        (Power.REACTIVE, doubt.q, uncertainty.q[0], LearningReason.REACTIVE_UNCERTAINTY),
     ):
         more = np.where(factor > 1.0, (np.maximum(std, EXACT) * factor) ** 2 - std**2, 0.0)
         for which, cause in (

@@ -1,12 +1,7 @@
-"""How wrong the customers' powers may be, and what that does to voltages.
+"""Uncertainty of the customers' powers, and the resulting prior of the voltages.
 
-Readings differ from the model because powers are not known exactly: dp, dq at every customer move *all*
-voltages by ``2 R dp + 2 X dq``, and neighbours nearly alike. That correlation is what makes a lying meter
-visible among its neighbours.
-
-References
-----------
-docs/theory-sequential.md, section 1.
+Errors dp, dq of all customers move all voltages by ``2 R dp + 2 X dq``, neighbours nearly alike. This
+correlation makes a manipulated meter visible among its neighbours (docs/theory-sequential.md, section 1).
 """
 
 from __future__ import annotations
@@ -23,39 +18,38 @@ from gridsec.grid.meter import MeterAccuracy
 from gridsec.grid.network import Network, Power
 
 EXACT = 1e-6
-"""Standard deviation of a power that is known exactly, pu: none is known better."""
+"""Least standard deviation of a power, pu."""
 UNMETERED = 0.1
-"""Standard deviation of a squared busbar voltage that nobody reads, squared pu."""
+"""Standard deviation of an unmetered squared busbar voltage, squared pu."""
 LONGEST_S = 1e12
-"""Longest correlation time of errors of powers, s: nothing learned would be left of those of longer ones."""
+"""Longest correlation time of power errors, s: longer ones leave nothing to learn."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadDoubt:
-    """How wrong the powers may be that the frames give. N customers.
+    """Uncertainty of the powers in the frames. N customers.
 
     Attributes
     ----------
     p, q : (N,)
-        Standard deviation of the error of each customer's active and reactive power, pu. A frame whose
-        `p_error` or `q_error` says more is believed.
+        Standard deviations of the errors of active and reactive power, pu. Larger `p_error`, `q_error` of a
+        frame take precedence.
     time_s
-        Correlation time of these errors, s: means over much less time still contain all of them.
+        Correlation time of these errors, s; means over much less time contain all of them.
     common_p, common_q
-        Shares of their variances that all customers have in common (weather, time of day), 0 to 1.
+        Shares of the variances common to all customers (weather, time of day), 0 to 1.
     lasting
-        Share of their variances that no mean takes away, however long, 0 to 1: an unknown power factor is
-        wrong in the same direction for years, and grows and shrinks with the load.
+        Share of the variances that no mean reduces, 0 to 1: a wrong power factor lasts for years.
     together : (N,) or one for all
-        Share of both variances, 0 to 1, that goes up and down with that of all others: powers that nobody
-        meters are low together by night, the active and the reactive one alike.
+        Share of both variances in phase with that of all others, 0 to 1: unmetered loads are low together by
+        night, active and reactive.
     even_p, even_q : (N,)
-        Derived. Half-widths of errors that are evenly spread and deviate by p and q, pu.
+        Derived: half-widths of uniform errors with standard deviations p and q, pu.
 
     Raises
     ------
     ValueError
-        If a number is none, negative, or a share outside [0, 1]; names every problem.
+        If a number is not finite, negative, or a share outside [0, 1]; names every problem.
     """
 
     p: Floats
@@ -94,23 +88,13 @@ def prior(
 ) -> Prior:
     """Covariance of the buses' squared voltages without any meter.
 
-    ``S = 4 R V_p R^T + 4 X V_q X^T + u u^T + busbar^2 1 1^T``, where ``u = 2 R g s_p + 2 X g s_q`` with
-    ``g^2 = together`` is what goes up and down together, and of the rest, s now for ``sqrt(1 - together) s``,
+    ``S = 4 R V_p R^T + 4 X V_q X^T + u u^T + busbar^2 1 1^T`` with ``u = 2 R g s_p + 2 X g s_q``,
+    ``g^2 = together``, and for the rest, s being ``sqrt(1 - together) s``,
     ``V = (1 - common) diag(s^2) + common s s^T``. In three phases places stand for buses, and only those of
-    the same phase share an error of the busbar's.
+    one phase share the busbar's error.
 
-    Parameters
-    ----------
-    feeder
-        The feeder.
-    at : (p,)
-        Bus of each meter.
-    doubt
-        How wrong the powers may be.
-    busbar
-        Standard deviation of the squared busbar voltage, squared pu; in three phases one or (3,).
-    inverters : (N,)
-        Standard deviation of the injections that observers attribute to the customers' inverters, pu.
+    at: (p,) bus of each meter. busbar: standard deviation of its squared voltage, squared pu; one or (3,).
+    inverters: (N,) standard deviation of the observed injections, pu.
     """
     alone, together = (np.sqrt(part) for part in (1.0 - doubt.together, doubt.together))
     p, q = alone * doubt.p, alone * doubt.q
@@ -136,17 +120,10 @@ def prior(
 
 
 def injection_doubt(droop: Droop, accuracy: MeterAccuracy, meters: Ints, customers: int) -> Floats:
-    """Standard deviation of what the meters' own errors do to the observers' injections, (N,) in pu.
+    """Standard deviation of the observed injections by the meters' own errors, (N,) in pu.
 
-    An inverter that is driven by its meter's reading follows the reading's error: the fixed part of it
-    through the steepest part of its curve, at most up to saturation.
-
-    Parameters
-    ----------
-    droop, accuracy, meters
-        The inverters and the meters.
-    customers
-        N.
+    An inverter driven by its meter follows the fixed error of the reading through the steepest part of its
+    curve, at most up to saturation.
     """
     error = np.zeros(customers)
     error[meters] = 2.0 * np.sqrt(

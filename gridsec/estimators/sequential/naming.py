@@ -1,4 +1,4 @@
-"""Who is named: evidence that lasts, and no explanation about as likely that leaves them out.
+"""Confirmation: suspects are named on lasting evidence without a rival hypothesis about as likely.
 
 References
 ----------
@@ -8,251 +8,210 @@ docs/theory-sequential.md, section 5.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from gridsec.arrays import Bools, Ints, all_of, any_of, indices
-from gridsec.estimators.sequential.apart import set_apart
-from gridsec.estimators.sequential.conditional import judge
-from gridsec.estimators.sequential.curves import Curves
+from gridsec.estimators.sequential.apart import vouched_posterior
+from gridsec.estimators.sequential.conditional import leave_one_out
+from gridsec.estimators.sequential.curves import InverterChecks
 from gridsec.estimators.sequential.design import SequentialDesign
-from gridsec.estimators.sequential.examine import Examined
-from gridsec.estimators.sequential.exchanges import swaps, turns
-from gridsec.estimators.sequential.scales import Scales, View
-from gridsec.estimators.sequential.search import Found
-from gridsec.estimators.sequential.state import Trust
+from gridsec.estimators.sequential.examine import Identification
+from gridsec.estimators.sequential.exchanges import fault_exchanges, meter_exchanges
+from gridsec.estimators.sequential.scales import Scales, ScaleTest
+from gridsec.estimators.sequential.search import Candidates
+from gridsec.estimators.sequential.trust import TrustState
 from gridsec.grid.network import Power
 from gridsec.interface import Explanation
 
-# An accusation of an inverter counts up with every tick that repeats it, and down with every other at which
-# somebody is heard and believed who feels it this much of what those do who feel it most.
-MOST_COUNTED, _FELT = 12, 0.25
+MAX_INVERTER_TICKS, _WITNESS_PART = 12, 0.25
+"""Largest count of an inverter's accusations; part of its largest effect that makes a meter its witness.
+
+The count rises at a tick that accuses it and falls at others with a trusted reading of a witness.
+"""
 
 
-def name(
-    design: SequentialDesign, before: Trust, seen: Examined, live: Bools, curves: Curves
-) -> tuple[Trust, tuple[Explanation, ...]]:
-    """Who is named now; and explanations that fit about as well where somebody would have been named.
+def confirm(
+    design: SequentialDesign,
+    before: TrustState,
+    identified: Identification,
+    available: Bools,
+    curves: InverterChecks,
+) -> tuple[TrustState, tuple[Explanation, ...]]:
+    """Trust state with named meters and inverters, and rival hypotheses where one prevents a name.
 
-    Parameters
-    ----------
-    design
-        The design.
-    before
-        From the last tick.
-    seen
-        What this tick brought.
-    live : (p,)
-        Which meters have a reading: silence clears nobody.
-    curves
-        What metered reactive powers said so far: an inverter that does what its curve asks for is nobody's
-        rival.
+    available: (p,) meters with a reading; silence releases none. curves: an inverter that follows its curve
+    is not a rival.
     """
-    trust = seen.trust
-    if trust.calm and before.calm:
+    trust = identified.trust
+    if trust.clear and before.clear:
         return trust, ()
-    open_ = trust.accused or any_of(trust.age) or any_of(before.named) or any_of(before.counted)
-    if all_of(trust.trusted) and not open_:
+    lately = any_of(trust.ticks_suspect) or any_of(before.named) or any_of(before.inverter_ticks)
+    if all_of(trust.trusted) and not (trust.accused or lately):
         return trust, ()
-    quiet = np.where(trust.still.any(axis=0), 0, trust.quiet + live)
-    trusted = (trust.trusted & ~before.named) | (quiet >= design.options.release)
-    # Who is caught again within the longest scale was never cleared.
-    age = np.where(trusted & (quiet > design.lengths[-1]), 0, trust.age + ~trusted)
-    owed = np.where(trusted, 0, np.maximum(trust.owed - live, 0))
-    need = design.confirmed[trust.scale]
-    fresh = ~trusted & ~before.named & trust.bad.any(axis=0) & (age >= need) & _accused(seen, trusted.size)
-    named = before.named & (quiet < design.options.release)
-    count, inverters = _inverters(design, before, trust, seen, live)
+    now = trust.counted(before.named, available, design.options.release, design.lengths[-1])
+    lasting = trust.above_limit.any(axis=0) & (now.ticks_suspect >= design.confirmed[trust.scale])
+    fresh = ~now.trusted & ~before.named & lasting & _accused(identified, available.size)
+    count, inverters = _inverter_counts(design, before, trust, identified, available)
     new = inverters & ~before.inverters
     rivals: tuple[Explanation, ...] = ()
     if any_of(fresh) or any_of(new):
-        found = _Rivals(design, fresh, new, curves.agrees(design))
-        found.collect(seen)
-        for meters, accused in found.ways():
+        found = _Rivals(design, fresh, new, curves.consistent(design))
+        found.collect(identified)
+        for meters, accused in found.accusations():
             fresh, inverters = fresh & meters, inverters & (before.inverters | accused)
-        rivals = found.explanations(live | before.named)
-    trust = replace(
-        trust,
-        trusted=trusted,
-        age=age,
-        quiet=quiet,
-        owed=owed,
-        lag=np.where(trusted, 0, trust.lag),
-        named=named | fresh,
-        counted=count,
-        inverters=inverters,
-    )
-    return trust, rivals
+        rivals = found.explanations(available | before.named)
+    return now.with_names(fresh, count, inverters), rivals
 
 
-def supported(scales: Scales, before: Trust, seen: Examined, trust: Trust) -> Trust:
-    """Only those newly named that are beyond their limits without the meters that withhold powers.
-
-    Parameters
-    ----------
-    scales
-        The scales of this tick.
-    before, seen, trust
-        From the last tick, what this tick brought, and what `name` made of it.
-    """
-    fresh, vouched = trust.named & ~before.named, scales.doubts.vouched
+def supported(
+    scales: Scales, before: TrustState, identified: Identification, trust: TrustState
+) -> TrustState:
+    """Trust state without new names that rest on meters that withhold powers."""
+    fresh, vouched = trust.named & ~before.named, scales.uncertainty.vouched
     if all_of(vouched) or not any_of(fresh):
         return trust
     out = np.zeros_like(fresh)
-    for s, now in enumerate(seen.fits):
+    for s, now in enumerate(identified.posteriors):
         which = fresh & (trust.scale == s)
-        beside = None if now is None or not any_of(which) else set_apart(now, vouched[s])
+        beside = None if now is None or not any_of(which) else vouched_posterior(now, vouched[s])
         if beside is not None:
             here = scales[s]
-            judged = judge(beside.rest, here.m)
-            out |= which & (np.abs(judged.offset) <= here.limits.of(judged.std))
-    return replace(trust, named=trust.named & ~out) if any_of(out) else trust
+            loo = leave_one_out(beside.vouched, here.m)
+            out |= which & (np.abs(loo.residual) <= here.limits.limit(loo.std))
+    return trust.without_names(out)
 
 
-def _accused(seen: Examined, meters: int) -> Bools:
-    """Whom the likeliest explanation of a scale accuses that was searched for at this very tick, (p,)."""
+def _accused(identified: Identification, meters: int) -> Bools:
+    """Meters accused by the likeliest candidate of a scale that searched at this tick, (p,)."""
     out = np.zeros(meters, dtype=np.bool_)
-    for found in seen.found.values():
+    for found in identified.candidates.values():
         out |= ~found.best.trusted
     return out
 
 
-def _inverters(
-    design: SequentialDesign, before: Trust, trust: Trust, seen: Examined, live: Bools
+def _inverter_counts(
+    design: SequentialDesign,
+    before: TrustState,
+    trust: TrustState,
+    identified: Identification,
+    available: Bools,
 ) -> tuple[Ints, Bools]:
-    """How long every inverter has been accused, and which are named, (m,) each.
+    """Ticks that accuse each inverter, and the named ones, (m,) each.
 
-    As with meters, only where the likeliest explanation of this very tick accuses it; silence clears none.
+    An accusation counts at ticks with a search that accuses it; silence releases none.
     """
     accused = [k for k, _ in trust.accused]
-    if not accused and not any_of(before.counted):
-        return before.counted, before.inverters
-    now = inverters_of(design, accused)
-    less = np.where(_felt(design, before.counted > 0, live & trust.trusted), -1, 0)
-    # Who was named before the monitor began anew is counted beyond that, down from there.
-    most = np.maximum(MOST_COUNTED, before.counted + less)
-    count = np.clip(before.counted + np.where(now, 1, less), 0, most)
-    need, confirmed = np.full(now.size, MOST_COUNTED), design.confirmed
+    if not accused and not any_of(before.inverter_ticks):
+        return before.inverter_ticks, before.inverters
+    now = accused_inverters(design, accused)
+    less = np.where(_witnessed(design, before.inverter_ticks > 0, available & trust.trusted), -1, 0)
+    # An inverter named before a restart starts above that and counts down.
+    most = np.maximum(MAX_INVERTER_TICKS, before.inverter_ticks + less)
+    count = np.clip(before.inverter_ticks + np.where(now, 1, less), 0, most)
+    need, confirmed = np.full(now.size, MAX_INVERTER_TICKS), design.confirmed
     for k, s in trust.accused:
         if k >= design.customers:
-            need[k - design.customers] = min(confirmed[s], MOST_COUNTED)
-    sought = inverters_of(design, [k for found in seen.found.values() for k in found.best.loosened])
+            need[k - design.customers] = min(confirmed[s], MAX_INVERTER_TICKS)
+    sought = accused_inverters(
+        design, [k for found in identified.candidates.values() for k in found.best.faults]
+    )
     return count, (before.inverters & (count > 0)) | (now & sought & (count >= need))
 
 
-def _felt(design: SequentialDesign, which: Bools, heard: Bools) -> Bools:
-    """Which of some inverters move the voltage of somebody who is heard, (m,)."""
-    if all_of(heard) or not any_of(which):
+def _witnessed(design: SequentialDesign, which: Bools, available: Bools) -> Bools:
+    """Inverters that move the voltage of some available meter, (m,)."""
+    if all_of(available) or not any_of(which):
         return which
     out, at = which.copy(), indices(which)
     own = design.plant.droop.customer[at]
-    effect = np.abs(design.effects.columns(Power.REACTIVE, own)[design.prior.meters])
+    effect = np.abs(design.sensitivities.columns(Power.REACTIVE, own)[design.prior.meters])
     most = effect.max(axis=0, initial=0.0)
-    out[at] = effect[heard].max(axis=0, initial=0.0) >= np.maximum(_FELT * most, np.finfo(np.float64).tiny)
+    out[at] = effect[available].max(axis=0, initial=0.0) >= np.maximum(
+        _WITNESS_PART * most, np.finfo(np.float64).tiny
+    )
     return out
 
 
-def inverters_of(design: SequentialDesign, accused: Sequence[int]) -> Bools:
-    """Which inverters are among other suspicions, (m,).
-
-    Parameters
-    ----------
-    design
-        The design.
-    accused
-        Indices of its book.
-    """
-    return _suspicions(design, accused)[design.customers : design.book.std.size]
+def accused_inverters(design: SequentialDesign, accused: Sequence[int]) -> Bools:
+    """Inverters among accused faults, (m,)."""
+    return _accused_faults(design, accused)[design.customers : design.faults.std.size]
 
 
-def powers_of(design: SequentialDesign, accused: Sequence[int]) -> Bools:
-    """Whose powers are among other suspicions, (N,).
-
-    Parameters
-    ----------
-    design
-        The design.
-    accused
-        Indices of its book.
-    """
-    return _suspicions(design, accused)[: design.customers]
+def accused_powers(design: SequentialDesign, accused: Sequence[int]) -> Bools:
+    """Customers with a false power among accused faults, (N,)."""
+    return _accused_faults(design, accused)[: design.customers]
 
 
-def _busbar_of(design: SequentialDesign, accused: Sequence[int]) -> Bools:
-    """Phases of the busbar among other suspicions, (b,)."""
-    return _suspicions(design, accused)[design.book.std.size :]
+def _accused_phases(design: SequentialDesign, accused: Sequence[int]) -> Bools:
+    """Busbar phases among accused faults, (b,)."""
+    return _accused_faults(design, accused)[design.faults.std.size :]
 
 
-def _suspicions(design: SequentialDesign, accused: Sequence[int]) -> Bools:
-    """The book's powers and inverters, and phases of the busbar, (N + m + b,): which are accused."""
-    out = np.zeros(design.book.std.size + design.hangs_on.shape[1], dtype=np.bool_)
+def _accused_faults(design: SequentialDesign, accused: Sequence[int]) -> Bools:
+    """Accused powers, inverters and busbar phases, (N + m + b,)."""
+    out = np.zeros(design.faults.std.size + design.busbar_incidence.shape[1], dtype=np.bool_)
     out[list(accused)] = True
     return out
 
 
 class _Rivals:
-    """Explanations about as likely as the best, where one leaves out somebody about to be named.
+    """Hypotheses about as likely as the best, if one leaves out a meter or inverter about to be named.
 
-    fresh, new: meters and inverters that are about to be, (p,) and (m,). agrees: inverters that none can be
-    taken for.
+    fresh, new: meters (p,) and inverters (m,) about to be named. agrees: inverters that follow their curves.
     """
 
     def __init__(self, design: SequentialDesign, fresh: Bools, new: Bools, agrees: Bools) -> None:
         self.design, self.fresh, self.new = design, fresh, new
         self.others = design.customers + indices(~agrees)
         self.within = 2.0 * float(np.log(design.options.like))
-        self.out: dict[bytes, tuple[Bools, Bools, float, tuple[int, ...]]] = {}
+        self.found: dict[bytes, tuple[Bools, Bools, float, tuple[int, ...]]] = {}
 
-    def collect(self, seen: Examined) -> None:
-        """Take in what every scale found that was searched."""
-        for s, found in seen.found.items():
-            view = seen.views[s]
-            if view is not None:
-                self._collect(found, view)
-        if not any(self._differs(meters, inverters) for meters, inverters, *_ in self.out.values()):
-            self.out.clear()
+    def collect(self, identified: Identification) -> None:
+        """Take the candidates of every scale that searched."""
+        for s, found in identified.candidates.items():
+            test = identified.tests[s]
+            if test is not None:
+                self._collect(found, test)
+        if not any(self._differs(meters, inverters) for meters, inverters, *_ in self.found.values()):
+            self.found.clear()
 
-    def ways(self) -> list[tuple[Bools, Bools]]:
-        """Meters and inverters that each of them accuses; meters that were not heard are among the former."""
-        return [(meters, inverters) for meters, inverters, *_ in self.out.values()]
+    def accusations(self) -> list[tuple[Bools, Bools]]:
+        """Meters and inverters that each accuses; meters without a reading are among the former."""
+        return [(meters, inverters) for meters, inverters, *_ in self.found.values()]
 
-    def explanations(self, heard: Bools) -> tuple[Explanation, ...]:
-        """All of them, the likeliest first; none where everybody is named by all.
-
-        Of meters that were not heard (p,) nothing is said.
-        """
-        design, total = self.design, sum(way[2] for way in self.out.values())
+    def explanations(self, available: Bools) -> tuple[Explanation, ...]:
+        """All of them, the likeliest first; meters that are not `available`, (p,), are left out."""
+        design, total = self.design, sum(way[2] for way in self.found.values())
         return tuple(
             Explanation(
-                meters & heard,
+                meters & available,
                 inverters,
                 weight / total,
-                powers_of(design, loosened),
-                _busbar_of(design, loosened),
+                accused_powers(design, faults),
+                _accused_phases(design, faults),
             )
-            for meters, inverters, weight, loosened in sorted(self.out.values(), key=lambda way: -way[2])
+            for meters, inverters, weight, faults in sorted(self.found.values(), key=lambda way: -way[2])
         )
 
-    def _collect(self, found: Found, view: View) -> None:
-        """Those of one scale."""
+    def _collect(self, found: Candidates, test: ScaleTest) -> None:
         best, within = found.best, self.within
-        near = [(~each.trusted, each.loosened, each.cost - best.cost) for each in (best, *found.others)]
-        for swap in swaps(best, view.enough, within, view.limits):
+        near = [(~each.trusted, each.faults, each.cost - best.cost) for each in (best, *found.others)]
+        for swap in meter_exchanges(best, test.enough, within, test.limits):
             other = near[0][0].copy()
             other[swap.accused], other[swap.innocent] = False, True
-            near.append((other, best.loosened, swap.worse))
+            near.append((other, best.faults, swap.worse))
         accused = (self.design.customers + indices(self.new)).tolist()
-        for turn in turns(best, self.design.book, accused, self.others, within):
-            loosened = tuple(turn.innocent if k == turn.accused else k for k in best.loosened)
-            near.append((near[0][0], loosened, turn.worse))
-        for k, (meters, loosened, worse) in enumerate(near):
-            inverters = inverters_of(self.design, loosened)
+        for turn in fault_exchanges(best, self.design.faults, accused, self.others, within):
+            faults = tuple(turn.innocent if k == turn.accused else k for k in best.faults)
+            near.append((near[0][0], faults, turn.worse))
+        for k, (meters, faults, worse) in enumerate(near):
+            inverters = accused_inverters(self.design, faults)
             if not k or (worse <= within and self._differs(meters, inverters)):
-                who, weight = meters.tobytes() + inverters.tobytes(), float(np.exp(-0.5 * worse))
-                if who not in self.out or self.out[who][2] < weight:
-                    self.out[who] = (meters, inverters, weight, loosened)
+                which, weight = meters.tobytes() + inverters.tobytes(), float(np.exp(-0.5 * worse))
+                if which not in self.found or self.found[which][2] < weight:
+                    self.found[which] = (meters, inverters, weight, faults)
 
     def _differs(self, meters: Bools, inverters: Bools) -> bool:
-        """Whether somebody about to be named is left out."""
+        """True if a meter or inverter about to be named is left out."""
         return any_of(self.fresh & ~meters) or any_of(self.new & ~inverters)

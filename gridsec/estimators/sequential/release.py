@@ -1,27 +1,24 @@
-"""What the trusted meters say where the powers that the others tell are not believed either.
+"""Posterior in which the powers reported by suspects are doubted.
 
-Who lies about the voltage may lie about its powers: the active power of customer k, whose meter is not
-trusted, by as much as the search allows for, evenly spread, and the reactive one by half of that. Whether it
-does is as likely as not, before the trusted meters are asked. With a its column of 2R, times the standard
-deviation of a false power, what they say is a Bayes factor,
+A suspect meter may report false powers: the active power of customer k is uniformly false within the size of
+its fault, the reactive power within half of that, with prior odds of one. With a the column of 2R times the
+standard deviation of a false power, the trusted meters give the Bayes factor
 
     log B_k = (a_T^T Q m)^2 / (2 (1 + a_T^T Q a_T)) - log(1 + a_T^T Q a_T) / 2,
 
-and the variance of what is false of k's power is that of a false one times ``B_k / (1 + B_k)``: where nobody
-feels this load its power is doubted for good, where many do and find nothing odd it is believed after all.
-With U the columns of 2R and 2X of all these customers, each times its standard deviation, the prior
-covariance of `gridsec.estimators.sequential.conditional` is ``S + U U^T``, hence
+and the variance of k's false power is that of a false one times ``B_k / (1 + B_k)``. A power that no trusted
+meter feels stays doubted; one that many feel without a contradiction is used again. With U the columns of 2R
+and 2X of all these customers, each times its standard deviation, the prior covariance is ``S + U U^T``, hence
 
     C = U - S_:T Q U_T,   G = I + U_T^T Q U_T,
     w' = w + C G^-1 U_T^T Q m,   M' = M + C G^-1 C^T.
 
-At the buses of trusted meters, whose readings have variances D, ``S_TT Q = I - D Q`` leaves
-``C = D Q U_T``.
+At the buses of trusted meters, with variances D of the readings, ``S_TT Q = I - D Q`` gives ``C = D Q U_T``.
 
 References
 ----------
-Sherman, Morrison and Woodbury's identity; Mitchell and Beauchamp 1988 (spike and slab); here each customer is
-asked as if no other lied about powers, and the mixture is taken for the normal distribution of the same
+Sherman, Morrison and Woodbury's identity; Mitchell and Beauchamp 1988 (spike and slab). Each customer is
+tested as if all other powers were true, and the mixture is replaced by the normal distribution of the same
 variance. docs/theory-sequential.md, section 7.
 """
 
@@ -35,125 +32,71 @@ from scipy.special import expit
 
 from gridsec.arrays import Floats, Ints, all_of, indices, submatrix
 from gridsec.estimators.sequential.bounds import FALSE_Q
-from gridsec.estimators.sequential.conditional import Fit, Judged
-from gridsec.estimators.sequential.effects import Effects
+from gridsec.estimators.sequential.conditional import LeaveOneOut, Posterior
+from gridsec.estimators.sequential.effects import Sensitivities
 from gridsec.grid.network import Power
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Released:
-    """A fit in which liars' powers are not believed. n buses, p meters, l liars.
+class DoubtedPowers:
+    """Posterior with doubted powers. n buses, t trusted meters, l suspects."""
 
-    Attributes
-    ----------
-    fit
-        The fit, in which they are.
-    customers, sizes : (l,)
-        Whose powers, and by how much they may be false, pu.
-    share : (l,)
-        Part of the standard deviation of a false power that was reckoned with.
-    seen : (t, 2 l)
-        What false powers do to the trusted meters, as standard deviations; the active ones first.
-    gram : (2 l, 2 l)
-        U_T^T Q U_T of whole standard deviations.
-    C : (n, 2 l)
-        What such false powers do to every voltage beside what the meters say of it.
-    factor : (2 l, 2 l)
-        Cholesky factor of G, of the parts that were reckoned with, lower triangle.
-    variance : (n,)
-        Diagonal of M'.
-    """
+    fit: Posterior  # posterior with all powers used
+    customers: Ints  # (l,) suspects' customers
+    sizes: Floats  # (l,) largest false active powers, pu
+    share: Floats  # (l,) used part of the standard deviation of a false power
+    effects: Floats  # (t, 2 l) effects of false powers at the trusted meters, active ones first
+    gram: Floats  # (2 l, 2 l) U_T^T Q U_T of whole standard deviations
+    C: Floats  # (n, 2 l) posterior covariance with such false powers
+    factor: Floats  # (2 l, 2 l) Cholesky factor of G for the used parts, lower triangle
+    variance: Floats  # (n,) diagonal of M'
 
-    fit: Fit
-    customers: Ints
-    sizes: Floats
-    share: Floats
-    seen: Floats
-    gram: Floats
-    C: Floats
-    factor: Floats
-    variance: Floats
-
-    def said(self, judged: Judged) -> Floats:
-        """w', (n,).
-
-        Parameters
-        ----------
-        judged
-            What the fit says.
-        """
+    def mean(self, loo: LeaveOneOut) -> Floats:
+        """w', (n,)."""
         both = np.tile(self.share, 2)
-        along = both * (judged.weights[self.fit.trusted] @ self.seen)
+        along = both * (loo.weights[self.fit.trusted] @ self.effects)
         amount, _ = lapack.dpotrs(self.factor, along, lower=True)
-        return np.asarray(judged.w + self.C @ (both * amount))
+        return np.asarray(loo.mean + self.C @ (both * amount))
 
-    def about(self, fit: Fit, customers: Ints, sizes: Floats) -> bool:
-        """Whether `release` would begin with the same, whatever the meters say.
-
-        Parameters
-        ----------
-        fit, customers, sizes
-            As there.
-        """
+    def matches(self, fit: Posterior, customers: Ints, sizes: Floats) -> bool:
+        """True if `doubt_powers` would start from the same posterior, customers and sizes."""
         same = fit is self.fit and np.array_equal(customers, self.customers)
         return same and np.array_equal(sizes, self.sizes)
 
-    def holds(self, judged: Judged) -> bool:
-        """Whether the parts that were reckoned with are as good as those that the meters now ask for.
-
-        Parameters
-        ----------
-        judged
-            What the fit says.
-        """
-        share = _share(self.seen, self.gram, judged.weights[self.fit.trusted])
+    def is_current(self, loo: LeaveOneOut) -> bool:
+        """True if the used parts are close to those of the present residuals."""
+        share = _share(self.effects, self.gram, loo.weights[self.fit.trusted])
         return all_of((share <= _MORE * self.share) & (share >= _LESS * self.share))
 
-    def anew(self, judged: Judged) -> Released:
-        """The same with the parts that the meters ask for.
-
-        Parameters
-        ----------
-        judged
-            What the fit says.
-        """
-        share = _share(self.seen, self.gram, judged.weights[self.fit.trusted])
-        factor, variance = _parts(self.fit, self.gram, self.C, share)
+    def renewed(self, loo: LeaveOneOut) -> DoubtedPowers:
+        """The same with the parts of the present residuals."""
+        share = _share(self.effects, self.gram, loo.weights[self.fit.trusted])
+        factor, variance = _factorised(self.fit, self.gram, self.C, share)
         return replace(self, share=share, factor=factor, variance=variance)
 
 
-# Parts of a false power's standard deviation that are as good as one another; and the least.
-_MORE, _LESS, _LEAST = 1.25, 0.5, 0.125
+_MORE, _LESS, _LEAST_SHARE = 1.25, 0.5, 0.125
+"""Range of parts that are reused, as ratios to the wanted ones, and the least part."""
 
 
-def release(effects: Effects, fit: Fit, customers: Ints, sizes: Floats, judged: Judged) -> Released:
-    """Doubt some customers' powers; O(n p l).
-
-    Parameters
-    ----------
-    effects
-        Of the feeder.
-    fit
-        The trusted meters.
-    customers, sizes : (l,)
-        Whose powers, and by how much the active ones may be false, pu.
-    judged
-        What the fit says.
-    """
-    prior, (at, inverse), std = fit.prior, fit.trusting(), sizes / np.sqrt(3.0)
+def doubt_powers(
+    sensitivities: Sensitivities, fit: Posterior, customers: Ints, sizes: Floats, loo: LeaveOneOut
+) -> DoubtedPowers:
+    """Doubt the powers of customers (l,) by at most `sizes` (l,), pu; O(n p l)."""
+    prior, (at, inverse), std = fit.prior, fit.precision(), sizes / np.sqrt(3.0)
     U = np.empty((prior.variance.size, 2 * sizes.size))
-    U[:, : sizes.size] = effects.columns(Power.ACTIVE, customers) * std
-    U[:, sizes.size :] = effects.columns(Power.REACTIVE, customers) * (FALSE_Q * std)
+    U[:, : sizes.size] = sensitivities.columns(Power.ACTIVE, customers) * std
+    U[:, sizes.size :] = sensitivities.columns(Power.REACTIVE, customers) * (FALSE_Q * std)
     seen = U[prior.meters[at]]
     known = inverse @ seen
     gram = seen.T @ known
     _conditioned(fit, U, known)
-    share = _share(seen, gram, judged.weights[at])
-    return Released(fit, customers, sizes, share, seen, gram, U, *_parts(fit, gram, U, share))
+    share = _share(seen, gram, loo.weights[at])
+    return DoubtedPowers(fit, customers, sizes, share, seen, gram, U, *_factorised(fit, gram, U, share))
 
 
-def _parts(fit: Fit, gram: Floats, C: Floats, share: Floats) -> tuple[Floats, Floats]:
-    """The Cholesky factor of G and the diagonal of M' where powers are false by parts of their sizes."""
+def _factorised(fit: Posterior, gram: Floats, C: Floats, share: Floats) -> tuple[Floats, Floats]:
+    """Cholesky factor of G and diagonal of M' for powers false by parts of their sizes."""
     both = np.tile(share, 2)
     G = gram * np.multiply.outer(both, both)
     G[np.diag_indices(both.size)] += 1.0
@@ -169,20 +112,20 @@ def _parts(fit: Fit, gram: Floats, C: Floats, share: Floats) -> tuple[Floats, Fl
     return factor, variance
 
 
-def _conditioned(fit: Fit, U: Floats, known: Floats) -> None:
-    """Put C in the place of U, some rows at a time: they are large where many lie."""
+def _conditioned(fit: Posterior, U: Floats, known: Floats) -> None:
+    """Replace U by C in place, in blocks of rows."""
     prior, at = fit.prior, indices(fit.trusted)
     buses, left = prior.meters[at], np.ones(len(U), dtype=np.bool_)
     left[buses] = False
-    others, loose = indices(left), fit.loose[buses].T @ known
+    others, loose = indices(left), fit.unknowns[buses].T @ known
     for first in range(0, others.size, _ROWS):
         rows = others[first : first + _ROWS]
-        U[rows] -= submatrix(prior.of_meters, rows, at) @ known + fit.loose[rows] @ loose
+        U[rows] -= submatrix(prior.covariance, rows, at) @ known + fit.unknowns[rows] @ loose
     U[buses] = fit.noise[at, None] * known
 
 
-# Rows that are worked on together.
 _ROWS = 256
+"""Rows of one block of a product."""
 
 
 def _share(seen: Floats, gram: Floats, weights: Floats) -> Floats:
@@ -190,4 +133,4 @@ def _share(seen: Floats, gram: Floats, weights: Floats) -> Floats:
     count = len(gram) // 2
     form, along = gram.diagonal()[:count], weights @ seen[:, :count]
     odds = 0.5 * (along**2 / (1.0 + form) - np.log1p(form))
-    return np.asarray(np.maximum(np.sqrt(expit(odds)), _LEAST))
+    return np.asarray(np.maximum(np.sqrt(expit(odds)), _LEAST_SHARE))

@@ -1,16 +1,12 @@
-"""A start for the search that owes nothing to whom it believed before: a robust fit.
+"""Robust start of a search, independent of the meters trusted before.
 
-With the readings m of the meters, their variances d, and the prior covariance S of
-`gridsec.estimators.sequential.conditional`:
+With the readings m, their variances d and the prior covariance S,
 
     minimise   w^T S^-1 w + sum_j min((m_j - w_j)^2, bound_j^2) / d_j
 
-by graduated non-convexity, which first fits with a convex cost and hardens it step by step: every round is a
-fit with weights, in which the variance of meter j is d_j / weight_j. What such a fit leaves of the readings,
-``r = m - w_hat``, is ``D W^-1 (S + D W^-1)^-1 m`` for weights above zero.
-
-Where the inverse covariance Q of all meters is known already, the meters K of smaller weights are all that is
-worked on. With a = Q m,
+by graduated non-convexity, from a convex cost to the truncated one. Every round conditions with the variance
+d_j / weight_j of meter j; its residual ``r = m - w_hat`` is ``D W^-1 (S + D W^-1)^-1 m`` for positive
+weights. With the precision Q of all meters and a = Q m, only the meters K of weights below one are solved:
 
     r = D (a - Q_:K z) + E_K z,   z = (diag(weight / (d (1 - weight)))_K + Q_KK)^-1 a_K,
 
@@ -30,88 +26,71 @@ from functools import partial
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, indices, submatrix
-from gridsec.estimators.sequential.conditional import Fit, Prior, solved
+from gridsec.estimators.sequential.conditional import Posterior, Prior, solve_spd
 
-_HARDER = 2.5
-_ROUNDS = 30
-# Weights up to this are zero to the fit; well above where Cholesky would notice.
-_FEATHER = 1e-6
+_HARDENING = 2.5
+"""Factor on the hardness of the cost from round to round."""
+_ROBUST_ROUNDS = 30
+"""Largest number of rounds."""
+_LEAST_WEIGHT = 1e-6
+"""Weights up to this count as zero, well above the rounding of Cholesky."""
 _TINY = float(np.finfo(np.float64).tiny)
 
 
-def robust(  # noqa: PLR0917  # a prior, readings, and what is known of them
-    prior: Prior, noise: Floats, m: Floats, live: Bools, bound: Floats, whole: Fit | None = None
+def robust_set(  # noqa: PLR0917
+    prior: Prior, noise: Floats, m: Floats, available: Bools, bound: Floats, whole: Posterior | None = None
 ) -> Bools:
-    """Meters that a robust fit trusts, whatever was trusted before; O(p^3).
+    """Trusted meters of a robust fit, (p,); O(p^3).
 
-    Parameters
-    ----------
-    prior, noise
-        As in `conditional.fit`.
-    m : (p,)
-        Readings minus what the model explains.
-    live : (p,)
-        Which meters have a reading.
-    bound : (p,)
-        Largest honest difference between a reading and the truth, squared pu.
-    whole
-        A fit of the same that `covers` these meters, if there is one: the cube is then that of the number of
-        those which are not fully believed.
-
-    Returns
-    -------
-    (p,)
-        The trusted ones.
+    available: (p,) meters with a reading. bound: (p,) largest honest difference between reading and truth,
+    squared pu. whole: a posterior that `covers` these meters, if there is one; the cube is then that of the
+    number of meters with weights below one.
     """
-    at = indices(live)
+    at = indices(available)
     trusted = np.zeros(m.size, dtype=np.bool_)
     if not at.size:
         return trusted
     limit = bound[at] ** 2
     left: Callable[[Floats], Floats]
-    left = partial(_residual, prior.among(at), noise[at], m[at]) if whole is None else _beside(whole, m, at)
+    left = (
+        partial(_weighted_residual, prior.among(at), noise[at], m[at])
+        if whole is None
+        else _residual_by_posterior(whole, m, at)
+    )
     rest = left(np.ones(at.size))
     largest = float((rest * rest / limit).max())
     if largest <= 1.0:
         trusted[at] = True
         return trusted
     hardness = 1.0 / (2.0 * largest - 1.0)
-    for _ in range(_ROUNDS):
+    for _ in range(_ROBUST_ROUNDS):
         ratio = np.maximum(rest * rest / limit, _TINY)
         soft = np.sqrt(hardness * (hardness + 1.0) / ratio) - hardness
         weight = np.minimum(np.maximum(soft, 0.0), 1.0)
         rest = left(weight)
         if all_of((weight == 0.0) | (weight == 1.0)):
             break
-        hardness *= _HARDER
+        hardness *= _HARDENING
     trusted[at] = rest * rest <= limit
     return trusted
 
 
-def covers(whole: Fit, prior: Prior, noise: Floats, live: Bools) -> bool:
-    """Whether a fit tells the residuals of some meters, whatever their weights.
-
-    Parameters
-    ----------
-    whole
-        The fit.
-    prior, noise, live
-        As in `robust`.
-    """
-    # Changes of rank one leave rounding, which a start that owes nothing to what was believed must not owe.
-    fresh = not whole.changes and not whole.loose.shape[1]
+def covers(whole: Posterior, prior: Prior, noise: Floats, available: Bools) -> bool:
+    """True if a posterior gives the residuals of meters `available` (p,) for all weights."""
+    # A start must not depend on the rounding of earlier rank-one updates.
+    fresh = not whole.updates and not whole.unknowns.shape[1]
     same = fresh and whole.prior is prior and np.array_equal(whole.noise, noise)
-    return same and not any_of(live & ~whole.trusted)
+    return same and not any_of(available & ~whole.trusted)
 
 
-def _residual(signal: Floats, noise: Floats, y: Floats, weight: Floats) -> Floats:
+def _weighted_residual(signal: Floats, noise: Floats, y: Floats, weight: Floats) -> Floats:
     """``y - w_hat`` of meters with covariance `signal`, their noise, and weights in the fit from 0 to 1."""
-    use = indices(weight > _FEATHER)
+    use = indices(weight > _LEAST_WEIGHT)
     # Symmetric: the transpose is the same in the order of LAPACK.
     some = submatrix(signal.T, use, use).T if use.size < y.size else signal.copy(order="F")
     noise = noise[use] / weight[use]
     some.T.flat[:: use.size + 1] += noise
-    amount = solved(some, y[use])
+    amount = solve_spd(some, y[use])
     if use.size == y.size:
         return np.asarray(noise * amount)
     weights = np.zeros(y.size)
@@ -121,22 +100,22 @@ def _residual(signal: Floats, noise: Floats, y: Floats, weight: Floats) -> Float
     return np.asarray(rest)
 
 
-def _beside(whole: Fit, m: Floats, at: Ints) -> Callable[[Floats], Floats]:
-    """The same of meters `at` by their weights, from a fit of all of them and perhaps of others."""
-    who, Q = whole.trusting()
-    noise, a = whole.noise[who], Q @ m[who]
-    place = np.searchsorted(who, at)
+def _residual_by_posterior(whole: Posterior, m: Floats, at: Ints) -> Callable[[Floats], Floats]:
+    """`_weighted_residual` of meters `at` by their weights, from a posterior that covers them."""
+    which, Q = whole.precision()
+    noise, a = whole.noise[which], Q @ m[which]
+    place = np.searchsorted(which, at)
 
     def left(weight: Floats) -> Floats:
-        each = np.zeros(who.size)
-        each[place] = np.where(weight > _FEATHER, weight, 0.0)
+        each = np.zeros(which.size)
+        each[place] = np.where(weight > _LEAST_WEIGHT, weight, 0.0)
         less = indices(each < 1.0)
         rest = noise * a
         if less.size:
             # Symmetric: the transpose is the same in the order of LAPACK.
             some, part = submatrix(Q, less, less).T, each[less]
             some.T.flat[:: less.size + 1] += part / (noise[less] * (1.0 - part))
-            z = solved(some, a[less])
+            z = solve_spd(some, a[less])
             rest -= noise * (z @ Q[less])
             rest[less] += z
         return np.asarray(rest[place])

@@ -1,8 +1,6 @@
-"""What every scale judges by: its means and limits, the view of a fit, and fits made from one another.
+"""Tests of each scale: means and limits, views of a posterior, and cheap updates of posteriors.
 
-References
-----------
-docs/theory-sequential.md, section 3.
+The window of a scale needs a minimum of readings to test a meter (docs/theory-sequential.md, section 3).
 """
 
 from __future__ import annotations
@@ -14,238 +12,158 @@ from math import ceil
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, any_of, indices
-from gridsec.estimators.sequential.blocks import sound, without
+from gridsec.estimators.sequential.blocks import remove_meters, well_conditioned
 from gridsec.estimators.sequential.commission import Learned
-from gridsec.estimators.sequential.conditional import Fit, Judged, Prior, admit, drop, fit
+from gridsec.estimators.sequential.conditional import (
+    LeaveOneOut,
+    Posterior,
+    Prior,
+    add_meter,
+    condition,
+    remove_meter,
+)
 from gridsec.estimators.sequential.design import SequentialDesign
-from gridsec.estimators.sequential.dictionary import Dictionary
-from gridsec.estimators.sequential.doubts import Doubts
+from gridsec.estimators.sequential.dictionary import FaultDictionary
+from gridsec.estimators.sequential.doubts import FrameUncertainty
 from gridsec.estimators.sequential.search import Limits
-from gridsec.estimators.sequential.skew import Skew
-from gridsec.estimators.sequential.state import Trust
+from gridsec.estimators.sequential.skew import ClockSkew
 from gridsec.estimators.sequential.windows import Window
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class View:
-    """What one scale says. p meters.
+class ScaleTest:
+    """Tests of all meters on one scale. p meters."""
 
-    Attributes
-    ----------
-    judged
-        Every meter, judged by the trusted others.
-    enough : (p,)
-        Meters with enough readings on this scale.
-    limit : (p,)
-        Largest honest offset, squared pu.
-    over : (p,)
-        Whose offset is larger.
-    limits, lower
-        How the limits come about, and the part of `sigmas` that is expected of a meter that is to be
-        trusted again.
-    """
-
-    judged: Judged
-    enough: Bools
-    limit: Floats
-    over: Bools
-    limits: Limits
-    lower: float
+    loo: LeaveOneOut  # leave-one-out residuals
+    enough: Bools  # (p,) meters with enough readings on this scale
+    limit: Floats  # (p,) largest honest residual, squared pu
+    above_limit: Bools  # (p,) residual above the limit
+    limits: Limits  # rule of the limits
+    release_factor: float  # factor on `sigmas` of the release limit
 
     @property
-    def still(self) -> Bools:
-        """Whose offset is larger than what is expected of a meter that is to be trusted again, (p,)."""
-        judged = self.judged
-        return self.enough & (np.abs(judged.offset) > self.limits.of(judged.std, self.lower))
+    def above_release_limit(self) -> Bools:
+        """Residual above the release limit, (p,)."""
+        loo = self.loo
+        return self.enough & (np.abs(loo.residual) > self.limits.limit(loo.std, self.release_factor))
 
 
-# A fit is made anew when that part of its meters changed, or after so many changes (rounding).
-_ANEW = 6
-# Unless all that changed is that some fell, no more than that part of all meters, since a factorisation.
-_WHOLE = 3
-_MOST_CHANGES = 400
+_REFACTORISE = 6
+"""A posterior is factorised again when more than one in `_REFACTORISE` of its meters changed."""
+_BLOCK_REMOVAL = 3
+"""Fewer than one in `_BLOCK_REMOVAL` meters leave a fresh posterior by one block update instead."""
+_MAX_UPDATES = 400
+"""Largest number of rank-one updates since a factorisation (rounding)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Scale:
-    """What one scale has to judge by. p meters.
+class ScaleData:
+    """Data and limits of one scale. p meters."""
 
-    Attributes
-    ----------
-    prior
-        What the powers may do.
-    noise : (p,)
-        Variance of each meter's mean, squared pu^2.
-    m : (p,)
-        Mean residual, squared pu.
-    enough : (p,)
-        Meters with enough readings.
-    limits
-        What is evidence.
-    """
-
-    prior: Prior
-    noise: Floats
-    m: Floats
-    enough: Bools
-    limits: Limits
+    prior: Prior  # prior of the voltages
+    noise: Floats  # (p,) variance of each meter's mean, squared pu^2
+    m: Floats  # (p,) mean residual, squared pu
+    enough: Bools  # (p,) meters with enough readings
+    limits: Limits  # rule of the limits
 
 
-def needed(design: SequentialDesign, s: int) -> int:
-    """Readings of a meter that a scale judges it by at least.
-
-    Parameters
-    ----------
-    design
-        The design.
-    s
-        The scale.
-    """
+def min_readings(design: SequentialDesign, s: int) -> int:
+    """Least number of readings of a meter that scale s tests."""
     return max(1, ceil(design.options.enough * design.lengths[s]))
 
 
 class Scales:
-    """All scales at one tick, by index.
+    """All scales of one tick, computed on access. model: (p,) largest model error, squared pu."""
 
-    Parameters
-    ----------
-    design
-        The design.
-    doubts, window, learned
-        What is not known of powers, the last residuals, and what is known of the meters' errors.
-    model : (p,)
-        What the model may be off, squared pu.
-    skew
-        Changes of the voltages within clock offsets; None for none.
-    """
-
-    def __init__(  # noqa: PLR0917  # what every scale is made of
+    def __init__(  # noqa: PLR0917
         self,
         design: SequentialDesign,
-        doubts: Doubts,
+        uncertainty: FrameUncertainty,
         window: Window,
         learned: Learned,
         model: Floats,
-        skew: Skew | None = None,
+        skew: ClockSkew | None = None,
     ) -> None:
-        self.design, self.doubts, self.window, self.model = design, doubts, window, model
-        self.learned, self.skew, self.made = learned, skew, dict[int, Scale]()
+        self.design, self.uncertainty, self.window, self.model = design, uncertainty, window, model
+        self.learned, self.clock_skew, self.made = learned, skew, dict[int, ScaleData]()
 
     @cached_property
-    def book(self) -> Dictionary:
-        """What else but meters can be wrong now."""
-        return replace(self.design.book, std=self.doubts.sizes)
+    def faults(self) -> FaultDictionary:
+        """Fault dictionary with the sizes of this tick."""
+        return replace(self.design.faults, std=self.uncertainty.sizes)
 
-    def __getitem__(self, s: int) -> Scale:
+    def __getitem__(self, s: int) -> ScaleData:
         if s not in self.made:
             self.made[s] = self._scale(s)
         return self.made[s]
 
-    def _scale(self, s: int) -> Scale:
+    def _scale(self, s: int) -> ScaleData:
         design, counts, learned = self.design, self.window.counts[s], self.learned
-        need = needed(design, s)
+        need = min_readings(design, s)
         noise, enough = design.white / need + learned.variance, counts >= need
-        if self.skew is not None:
-            noise, enough = noise + self.skew.variance[s], enough & ~self.skew.aside[s]
-        return Scale(
-            prior=self.doubts.priors[s],
+        if self.clock_skew is not None:
+            noise, enough = noise + self.clock_skew.variance[s], enough & ~self.clock_skew.aside[s]
+        return ScaleData(
+            prior=self.uncertainty.priors[s],
             noise=noise,
             m=self.window.sums[s] / np.maximum(counts, 1),
             enough=enough,
             limits=Limits(
-                *(design.sigmas[s], self.model, learned.allowed, learned.variance, design.most, learned.late),
+                *(
+                    design.sigmas[s],
+                    self.model,
+                    learned.allowed,
+                    learned.variance,
+                    design.max_attacked,
+                    learned.late,
+                ),
                 learned.recent[s],
             ),
         )
 
-    def loosened(self, accused: tuple[tuple[int, int], ...]) -> Floats | None:
-        """Loosened directions with their standard deviations, (n, k); None for none.
-
-        Parameters
-        ----------
-        accused
-            Indices of the book, each with a scale.
-        """
+    def unknowns(self, accused: tuple[tuple[int, int], ...]) -> Floats | None:
+        """Unknown directions of accused faults times their standard deviations, (n, k); None for none."""
         if not accused:
             return None
         which = np.array([k for k, _ in accused])
-        return np.asarray(self.book.columns(which) * self.book.std[which])
+        return np.asarray(self.faults.columns(which) * self.faults.std[which])
 
-    def wider(self, direction: Floats) -> Scales:
-        """The same with priors that leave one more direction open.
-
-        Parameters
-        ----------
-        direction : (n,)
-            As in `Prior.wider`.
-        """
-        each = {id(prior): prior.wider(direction) for prior in self.doubts.priors}
-        doubts = replace(self.doubts, priors=tuple(each[id(prior)] for prior in self.doubts.priors))
-        return Scales(self.design, doubts, self.window, self.learned, self.model, self.skew)
+    def with_direction(self, direction: Floats) -> Scales:
+        """Scales with one more unknown direction (n,) in their priors."""
+        each = {id(prior): prior.with_direction(direction) for prior in self.uncertainty.priors}
+        uncertainty = replace(
+            self.uncertainty, priors=tuple(each[id(prior)] for prior in self.uncertainty.priors)
+        )
+        return Scales(self.design, uncertainty, self.window, self.learned, self.model, self.clock_skew)
 
 
-def view_of(design: SequentialDesign, here: Scale, judged: Judged) -> View:
-    """What a scale says of every meter when it rests on a fit.
-
-    Parameters
-    ----------
-    design, here, judged
-        The design, the scale, and every meter judged by the fit.
-    """
-    limit = here.limits.of(judged.std)
-    over = here.enough & (np.abs(judged.offset) > limit)
-    return View(judged, here.enough, limit, over, here.limits, design.options.lower)
+def scale_test(design: SequentialDesign, here: ScaleData, loo: LeaveOneOut) -> ScaleTest:
+    """Tests of a scale by the leave-one-out residuals of a posterior."""
+    limit = here.limits.limit(loo.std)
+    over = here.enough & (np.abs(loo.residual) > limit)
+    return ScaleTest(loo, here.enough, limit, over, here.limits, design.options.lower)
 
 
-def adapt(before: Fit | None, here: Scale, wanted: Bools, loose: Floats | None) -> Fit:
-    """A fit of the wanted meters, from the last one where that is cheaper.
-
-    Parameters
-    ----------
-    before
-        The last fit of this scale.
-    here
-        The scale.
-    wanted : (p,)
-        The meters to rest on.
-    loose : (n, k)
-        Loosened directions.
-    """
+def update_posterior(
+    before: Posterior | None, here: ScaleData, wanted: Bools, unknowns: Floats | None
+) -> Posterior:
+    """Posterior of wanted meters (p,) with unknown directions (n, k), from the last one where cheaper."""
     prior, noise = here.prior, here.noise
     if before is None or before.prior is not prior:
-        return fit(prior, noise, wanted, loose)
-    if before.loose.shape[1] if loose is None else not np.array_equal(before.loose, loose):
-        return fit(prior, noise, wanted, loose)
+        return condition(prior, noise, wanted, unknowns)
+    if before.unknowns.shape[1] if unknowns is None else not np.array_equal(before.unknowns, unknowns):
+        return condition(prior, noise, wanted, unknowns)
     differs = before.trusted != wanted
     if not any_of(differs):
         return before
     change = indices(differs)
-    many = change.size * _ANEW > wanted.size
-    few = not before.changes and change.size * _WHOLE < wanted.size and not any_of(wanted[change])
-    if many and few and sound(prior, before.noise):
-        return without(before, differs)
-    if many or before.changes + change.size > _MOST_CHANGES:
-        return fit(prior, noise, wanted, loose)
+    many = change.size * _REFACTORISE > wanted.size
+    few = not before.updates and change.size * _BLOCK_REMOVAL < wanted.size and not any_of(wanted[change])
+    if many and few and well_conditioned(prior, before.noise):
+        return remove_meters(before, differs)
+    if many or before.updates + change.size > _MAX_UPDATES:
+        return condition(prior, noise, wanted, unknowns)
     now = before.copy()
     for j in change.tolist():
-        (admit if wanted[j] else drop)(now, j)
+        (add_meter if wanted[j] else remove_meter)(now, j)
     return now
-
-
-def believe(trust: Trust, trusted: Bools, s: int, accused: tuple[tuple[int, int], ...]) -> Trust:
-    """Whom an explanation leaves trusted.
-
-    Parameters
-    ----------
-    trust
-        Who was believed.
-    trusted : (p,)
-        Who is.
-    s
-        The scale that it was found on.
-    accused
-        What else is suspected, each with a scale.
-    """
-    fallen = trust.trusted & ~trusted
-    scale, quiet = np.where(fallen, s, trust.scale), np.where(fallen, 0, trust.quiet)
-    return replace(trust, trusted=trusted, scale=scale, quiet=quiet, accused=accused)

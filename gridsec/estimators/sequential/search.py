@@ -1,20 +1,20 @@
-"""Which meters lie: the likeliest set, without swamping honest meters or masking liars.
+"""Search for the likeliest set of manipulated meters, without swamping honest or masking manipulated ones.
 
-An explanation drops some meters and loosens some directions (a customer's powers, an inverter). Its cost is
+A hypothesis removes some meters and accuses some directions of the fault dictionary. Its cost is
 
-    J = m_T^T Q m_T + 2 ln binom(p, k) + what the loosened directions are charged
+    J = m_T^T Q m_T + 2 ln binom(p, k) + charges of the directions,
 
-which is, up to a constant, minus twice the logarithm of its posterior probability when every number k of
-liars is as likely as any other, and every set of k as any other of k. Many accusations at once are thus
-cheaper, each, than a single one: where a third of the meters lies, the next liar is no surprise.
+up to a constant minus twice the logarithm of its posterior probability, if every number k of manipulated
+meters is equally likely, and every set of k among those of k. Each of many accusations is thus cheaper than a
+single one.
 
-Dropping trusted meter j lowers the misfit by ``offset_j^2 / std_j^2`` exactly, loosening direction a by
-``(a^T Q m)^2 / (1 / std_a^2 + a^T Q a)``; admitting a meter raises it likewise. So steepest descent needs no
-refitting. It drops and admits where an offset is beyond, or back within, what chance explains.
+Removing trusted meter j lowers the chi-square by ``residual_j^2 / std_j^2``, an unknown amplitude of
+direction a by ``(a^T Q m)^2 / (1 / std_a^2 + a^T Q a)``; adding a meter raises it likewise. Steepest descent
+therefore needs no refitting. It removes and adds meters with residuals beyond, or back within, the limits.
 
-Descent alone swamps when many lie in the same way: their neighbours look wrong. So there are two starts:
-the set that was trusted before, and a robust one (`gridsec.estimators.sequential.robust`). The cheaper
-explanation wins.
+Descent alone swamps where many meters are off alike: their neighbours look wrong. It therefore starts from
+the set trusted before and from a robust one (`gridsec.estimators.sequential.robust`); the cheaper hypothesis
+wins.
 
 References
 ----------
@@ -31,355 +31,271 @@ import numpy as np
 from scipy.linalg import lapack
 
 from gridsec.arrays import Bools, Floats, Ints, frozen_ints, indices, submatrix
-from gridsec.estimators.sequential.blocks import Outside, sound, without
-from gridsec.estimators.sequential.conditional import Fit, Judged, Move, admit, drop, follow, judge
-from gridsec.estimators.sequential.dictionary import Dictionary, Powers, Step
+from gridsec.estimators.sequential.blocks import ExcludedMeters, remove_meters, well_conditioned
+from gridsec.estimators.sequential.conditional import (
+    LeaveOneOut,
+    Posterior,
+    RankOneUpdate,
+    add_meter,
+    leave_one_out,
+    remove_meter,
+    updated,
+)
+from gridsec.estimators.sequential.dictionary import FaultDictionary, FaultGains, Move
 
 
-class Recent:
-    """The last answer of `Limits.of`: in calm the same is asked at every tick."""
+class LimitCache:
+    """Last result of `Limits.limit`, which repeats while no meter is suspect."""
 
-    __slots__ = ("answer",)
+    __slots__ = ("last",)
 
     def __init__(self) -> None:
-        self.answer: tuple[float, Floats, Floats] | None = None
+        self.last: tuple[float, Floats, Floats] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Limits:
-    """What is evidence. p meters.
+    """Rule of the limits of honest residuals. p meters."""
 
-    Attributes
-    ----------
-    sigmas
-        Standard deviations beyond which an offset is none of chance.
-    model : (p,)
-        What the model's own error may add, squared pu.
-    allowed : (p,)
-        Offsets that are honest whatever their probability, the accuracy class, squared pu.
-    certain : (p,)
-        Variance within the meters' noise that `allowed` stands for.
-    most
-        How many liars can be told apart; None: however many.
-    late : (p,)
-        Variance of offsets beside that by which they are judged, squared pu^2; None for none.
-    recent
-        The last answer where `allowed`, `certain` and `late` were these very ones; None where none is kept.
-    """
-
-    sigmas: float
-    model: Floats
-    allowed: Floats
-    certain: Floats
-    most: int | None = None
-    late: Floats | None = None
-    recent: Recent | None = None
+    sigmas: float  # standard deviations within chance
+    model: Floats  # (p,) largest error of the model, squared pu
+    allowed: Floats  # (p,) honest offset of any probability, the accuracy class, squared pu
+    replaced: Floats  # (p,) variance within the meters' noise that `allowed` replaces
+    max_attacked: int | None = None  # largest number of manipulated meters told apart; None for no limit
+    added: Floats | None = None  # (p,) additional variance of the residuals, squared pu^2; None for none
+    cache: LimitCache | None = None  # last result for these `allowed`, `certain` and `late`
 
     @property
     def penalty(self) -> float:
-        """What dropping a meter must gain at least."""
+        """Least gain of removing a meter."""
         return self.sigmas**2
 
-    def of(self, std: Floats, part: float = 1.0) -> Floats:
-        """Largest honest offset: by chance alone, or by the class and chance for the rest; the smaller.
+    def limit(self, std: Floats, part: float = 1.0) -> Floats:
+        """Largest honest residual for its standard deviation (p,): by chance, or by class and chance.
 
-        Parameters
-        ----------
-        std : (p,)
-            Standard deviation of each offset.
-        part
-            Of `sigmas`, how many count.
+        part: used part of `sigmas`.
         """
-        sigmas, recent = part * self.sigmas, self.recent
-        last = None if recent is None else recent.answer
+        sigmas, recent = part * self.sigmas, self.cache
+        last = None if recent is None else recent.last
         if last is None or last[0] != sigmas or last[1] is not std:
             last = sigmas, std, self._within(std, sigmas)
             if recent is not None and part == 1.0:
-                recent.answer = last
+                recent.last = last
         return np.asarray(self.model + last[2])
 
     def _within(self, std: Floats, sigmas: float) -> Floats:
-        if self.late is not None:
-            std = np.sqrt(std * std + self.late)
-        rest = np.sqrt(np.maximum(std * std - self.certain, 0.0))
+        if self.added is not None:
+            std = np.sqrt(std * std + self.added)
+        rest = np.sqrt(np.maximum(std * std - self.replaced, 0.0))
         return np.asarray(np.minimum(sigmas * std, self.allowed + sigmas * rest))
 
-    def some(self, at: Ints) -> Limits:
-        """The same of some meters.
-
-        Parameters
-        ----------
-        at : (k,)
-            Which.
-        """
-        late = None if self.late is None else self.late[at]
-        return Limits(self.sigmas, self.model[at], self.allowed[at], self.certain[at], self.most, late)
+    def subset(self, at: Ints) -> Limits:
+        """The same for meters `at` (k,)."""
+        late = None if self.added is None else self.added[at]
+        return Limits(
+            self.sigmas, self.model[at], self.allowed[at], self.replaced[at], self.max_attacked, late
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Explanation:
-    """What a search came to. p meters.
+class Hypothesis:
+    """Hypothesis of a search. p meters."""
 
-    Attributes
-    ----------
-    trusted : (p,)
-        The meters that it does not accuse.
-    loosened
-        What else it accuses, indices into the dictionary.
-    charge
-        What that costs.
-    cost
-        J.
-    """
-
-    trusted: Bools
-    loosened: tuple[int, ...]
-    charge: float
-    cost: float
+    trusted: Bools  # (p,) meters that it does not accuse
+    faults: tuple[int, ...]  # accused directions, indices of the fault dictionary
+    charge: float  # cost of these
+    cost: float  # J
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Solution(Explanation):
-    """An explanation with all that follows from it.
+class Candidate(Hypothesis):
+    """Hypothesis with its posterior."""
 
-    Attributes
-    ----------
-    fit
-        The trusted meters.
-    judged
-        Every meter, judged by them.
-    """
+    posterior: Posterior  # posterior of the trusted meters
+    loo: LeaveOneOut  # leave-one-out residuals
 
-    fit: Fit
-    judged: Judged
-
-    def bare(self) -> Explanation:
-        """The explanation alone: fits are large."""
-        return Explanation(self.trusted, self.loosened, self.charge, self.cost)
+    def hypothesis(self) -> Hypothesis:
+        """The hypothesis without its posterior, which is large."""
+        return Hypothesis(self.trusted, self.faults, self.charge, self.cost)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Found:
-    """What several searches came to.
+class Candidates:
+    """Results of several searches."""
 
-    Attributes
-    ----------
-    best
-        The likeliest.
-    others
-        The rest, in no order.
-    """
-
-    best: Solution
-    others: tuple[Explanation, ...] = ()
+    best: Candidate  # the likeliest
+    others: tuple[Hypothesis, ...] = ()  # the rest, in no order
 
 
-def likelier(one: Found | None, other: Found) -> Found:
-    """Both together.
-
-    Parameters
-    ----------
-    one, other
-        The first one's best is kept where both are equally likely.
-    """
+def merged(one: Candidates | None, other: Candidates) -> Candidates:
+    """Union of the results; the first best one stays where both are equally likely."""
     if one is None:
         return other
     first, second = (other, one) if other.best.cost < one.best.cost else (one, other)
-    return Found(first.best, (*first.others, second.best.bare(), *second.others))
+    return Candidates(first.best, (*first.others, second.best.hypothesis(), *second.others))
 
 
-# No meters.
-NOBODY = frozen_ints(np.zeros(0, dtype=np.intp))
+NO_METERS = frozen_ints(np.zeros(0, dtype=np.intp))
 _MOVES_PER_METER = 4
+"""Largest number of moves of a descent per meter."""
 
 
 def descend(
-    start: Fit,
+    start: Posterior,
     m: Floats,
-    live: Bools,
+    available: Bools,
     limits: Limits,
     *,
     keep: Bools,
-    dictionary: Dictionary | None = None,
-    innocent: Ints = NOBODY,
+    faults: FaultDictionary | None = None,
+    protected: Ints = NO_METERS,
     pairs: bool = False,
     fresh: bool = False,
-    judged: Judged | None = None,
-) -> Solution:
-    """Drop, admit and loosen until no move makes the explanation better.
+    loo: LeaveOneOut | None = None,
+) -> Candidate:
+    """Remove, add and accuse until no move lowers the cost.
 
-    Parameters
-    ----------
-    start
-        Where to begin; not changed unless `fresh`, and the fit of the solution where it needs no change.
-    m : (p,)
-        Readings minus what the model explains, squared pu.
-    live : (p,)
-        Which meters have a reading.
-    limits
-        What is evidence.
-    keep : (p,)
-        Meters that must not be admitted.
-    dictionary
-        Directions that may be loosened; none by default.
-    innocent : (k,)
-        Meters that must be believed.
-    pairs
-        Whether two meters may be dropped at once. Two that tell the same story vouch for each other, so that
-        dropping either of them gains little; O(p^2) per move.
-    fresh
-        `start` is of no further use.
-    judged
-        Every meter judged by `start`, where that is known.
+    start: changed in place only if `fresh`; the posterior of the result where no move helps. available: (p,)
+    meters with a reading. keep: (p,) meters that are not added. protected: (k,) meters that stay trusted.
+    loo: the residuals of `start` if known. pairs: remove two meters at once as well, O(p^2) per move; two
+    meters of equal error support each other, and removing either gains little.
     """
-    now, changed = start if fresh else start.copy(), start.changes
-    barred = ~live | keep
-    for j in innocent[~now.trusted[innocent]].tolist():
-        admit(now, j)
-    for j in indices(now.trusted & ~live):
-        drop(now, int(j))
-    if judged is None or now.changes != changed:
-        judged = judge(now, m)
-    before, moves, anew = now.changes, 0, True
-    many = dictionary is None and not pairs and sound(now.prior, now.noise)
-    powers = None if dictionary is None else Powers(now, dictionary, judged.weights, live, innocent)
+    now, changed = start if fresh else start.copy(), start.updates
+    barred = ~available | keep
+    for j in protected[~now.trusted[protected]].tolist():
+        add_meter(now, j)
+    for j in indices(now.trusted & ~available):
+        remove_meter(now, int(j))
+    if loo is None or now.updates != changed:
+        loo = leave_one_out(now, m)
+    before, moves, anew = now.updates, 0, True
+    many = faults is None and not pairs and well_conditioned(now.prior, now.noise)
+    gains = None if faults is None else FaultGains(now, faults, loo.weights, available, protected)
     while moves < _MOVES_PER_METER * m.size:
-        steps = _best(_Place(now, judged, limits, barred, innocent, pairs, powers, many))
+        steps = _next_move(_Descent(now, loo, limits, barred, protected, pairs, gains, many))
         if not steps:
             break
-        moves, changed = moves + 1, now.changes
+        moves, changed = moves + 1, now.updates
         for step in steps:
-            move = step()
-            anew = move is None
-            judged = judge(now, m) if move is None else follow(now, m, judged, move)
-        moves += now.changes - changed - 1 if anew else 0
-    if not fresh and now.changes == start.changes:
-        now = start  # and what is kept with it
+            update = step()
+            anew = update is None
+            loo = leave_one_out(now, m) if update is None else updated(now, m, loo, update)
+        moves += now.updates - changed - 1 if anew else 0
+    if not fresh and now.updates == start.updates:
+        now = start  # with its cached values
     else:
-        now.shrink()
-    if now.changes > before and not anew:
-        judged = judge(now, m)  # without what rounding has left
-    dropped = int(np.count_nonzero(live & ~now.trusted))
-    loosened = () if powers is None else powers.loosened
-    size = int(np.count_nonzero(live))
+        now.compact()
+    if now.updates > before and not anew:
+        loo = leave_one_out(now, m)  # without accumulated rounding
+    dropped = int(np.count_nonzero(available & ~now.trusted))
+    accused_faults = () if gains is None else gains.accused_faults
+    size = int(np.count_nonzero(available))
     charge = 0.0
-    if dictionary is not None and loosened:
-        charges = dictionary.charges(np.array(loosened, dtype=np.intp), now.trusted, dropped)
-        charge = float(charges.sum()) * price(size, 1)
-    cost = judged.misfit + price(size, dropped, limits.most) + charge
-    return Solution(now.trusted, loosened, charge, cost, now, judged)
+    if faults is not None and accused_faults:
+        charges = faults.charges(np.array(accused_faults, dtype=np.intp), now.trusted, dropped)
+        charge = float(charges.sum()) * set_cost(size, 1)
+    cost = loo.chi_square + set_cost(size, dropped, limits.max_attacked) + charge
+    return Candidate(now.trusted, accused_faults, charge, cost, now, loo)
 
 
 @cache
-def price(meters: int, liars: int, most: int | None = None) -> float:
-    """What accusing so many of so many meters costs: `2 ln binom(meters, liars)`, but always rising.
-
-    Parameters
-    ----------
-    meters, liars
-        p and k.
-    most
-        How many lie at most, if that is supposed: whoever else is accused costs far more.
-    """
-    k = np.arange(liars)
-    least = np.where(k < (meters if most is None else most), _LEAST, _BEYOND)
+def set_cost(meters: int, suspects: int, most: int | None = None) -> float:
+    """Cost of k accusations among p meters: `2 ln binom(p, k)`, always rising, steeply beyond `most`."""
+    k = np.arange(suspects)
+    least = np.where(k < (meters if most is None else most), _LEAST_COST, _EXCESS_COST)
     return float(np.sum(np.maximum(2.0 * np.log((meters - k) / (k + 1.0)), least)))
 
 
-# Beyond half of the meters, each further accusation still costs this; beyond those that lie at most, this.
-_LEAST, _BEYOND = 1.0, 9.0
+_LEAST_COST, _EXCESS_COST = 1.0, 9.0
+"""Least cost of an accusation beyond half of the meters, and of one beyond the largest number told apart."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Place:
-    """Where a descent stands."""
+class _Descent:
+    """Position of a descent."""
 
-    fit: Fit
-    judged: Judged
+    posterior: Posterior
+    loo: LeaveOneOut
     limits: Limits
     barred: Bools
-    innocent: Ints
+    protected: Ints
     pairs: bool
-    powers: Powers | None
-    many: bool
+    gains: FaultGains | None
+    blocks: bool
 
 
-def _best(here: _Place) -> Sequence[Callable[[], Move | None]]:
-    """The next move in steps; none where none helps. A step that is no single change returns None."""
-    now, judged, powers = here.fit, here.judged, here.powers
-    excess = np.abs(judged.offset) / here.limits.of(judged.std)
+def _next_move(here: _Descent) -> Sequence[Callable[[], RankOneUpdate | None]]:
+    """Steps of the next move; none if none helps. A step that is not a rank-one update returns None."""
+    now, loo, gains = here.posterior, here.loo, here.gains
+    excess = np.abs(loo.residual) / here.limits.limit(loo.std)
     inside = np.where(now.trusted, excess, -np.inf)
-    inside[here.innocent] = -np.inf
+    inside[here.protected] = -np.inf
     worst = int(inside.argmax())
     drops = bool(inside[worst] > 1.0)
-    if drops and here.many and np.count_nonzero(inside > 1.0) >= _MANY:
-        return [partial(_drop_many, here, worst)]
-    steps: list[Step] = [partial(_drop, now, worst, powers)] if drops else []
-    if here.pairs or powers is not None:
-        gain = (judged.offset[worst] / judged.std[worst]) ** 2 - here.limits.penalty if drops else 0.0
+    if drops and here.blocks and np.count_nonzero(inside > 1.0) >= _MANY:
+        return [partial(_remove_block, here, worst)]
+    steps: list[Move] = [partial(_remove, now, worst, gains)] if drops else []
+    if here.pairs or gains is not None:
+        gain = (loo.residual[worst] / loo.std[worst]) ** 2 - here.limits.penalty if drops else 0.0
         gain = max(float(gain), 0.0)
         if here.pairs:
-            pair, gain = _pair(here, gain)
-            steps = [partial(_drop, now, j, powers) for j in pair] or steps
-        if powers is not None:
-            steps = powers.best(judged, here.limits.penalty, gain) or steps
+            pair, gain = _best_pair(here, gain)
+            steps = [partial(_remove, now, j, gains) for j in pair] or steps
+        if gains is not None:
+            steps = gains.best_move(loo, here.limits.penalty, gain) or steps
     if steps:
         return steps
     outside = np.where(now.trusted | here.barred, np.inf, excess)
     nearest = int(outside.argmin())
     if not outside[nearest] < 1.0:
         return []
-    if here.many:
+    if here.blocks:
         at = indices(outside < np.inf)
-        if np.count_nonzero(outside < 1.0) >= max(_MANY, at.size / _ASKED):
-            return [partial(_admit_many, here, at, nearest)]
-    return [lambda: _moved(admit(now, nearest), powers)]
+        if np.count_nonzero(outside < 1.0) >= max(_MANY, at.size / _EXAMINED):
+            return [partial(_add_block, here, at, nearest)]
+    return [lambda: _noted(add_meter(now, nearest), gains)]
 
 
-# From so many on that might be admitted, or dropped, it is faster to follow them beside each other, unless so
-# many times more are asked; and at most so many at once, or there would be large matrices of large feeders.
-_MANY, _ASKED, _AT_ONCE = 6, 8, 64
+_MANY, _EXAMINED, _AT_ONCE = 6, 8, 64
+"""Block moves: least candidates, least share of the examined meters (1 / `_EXAMINED`), and largest block."""
 
 
-def _admit_many(here: _Place, at: Ints, first: int) -> Move | None:
-    """Admit one after the other as long as the nearest is close enough and nobody is to be dropped.
+def _add_block(here: _Descent, at: Ints, first: int) -> RankOneUpdate | None:
+    """Add meters one after the other while the nearest is within its limit and no trusted one is beyond.
 
-    What is open of those outside is followed alone; whether anybody inside would have had to be dropped is
-    then asked for all moves at once, and the moves from there on are taken back. `first` alone is admitted
-    where rounding has it that nobody is.
+    Only the covariance of the excluded meters is followed. The trusted ones are tested for all moves at once,
+    and the moves after the first violation are taken back. Where rounding leaves no move, `first` alone is
+    added.
     """
-    now, judged = here.fit, here.judged
-    outside = Outside.of(now, at)
-    order = _nearest(outside.apart, judged.offset[at], here.limits.some(at))
+    now, loo = here.posterior, here.loo
+    outside = ExcludedMeters.of(now, at)
+    order = _addition_order(outside.apart, loo.residual[at], here.limits.subset(at))
     if not order.size:
-        return admit(now, first)
+        return add_meter(now, first)
     factor = outside.factor(order)
     changes = outside.changes(order, factor)
-    error, _ = lapack.dtrtrs(factor, judged.offset[at[order]], lower=True)
+    error, _ = lapack.dtrtrs(factor, loo.residual[at[order]], lower=True)
     pivot = now.diagonal() + np.cumsum(changes * changes, axis=0)[:-1]
-    weights = judged.weights + np.cumsum(changes * error[:, None], axis=0)[:-1]
+    weights = loo.weights + np.cumsum(changes * error[:, None], axis=0)[:-1]
     inside = pivot > 0.0
     pivot = np.where(inside, pivot, 1.0)
-    # Not to be remembered: it is asked for once.
-    limit = replace(here.limits, recent=None).of(np.sqrt(1.0 / pivot))
+    # Not kept: it is used once.
+    limit = replace(here.limits, cache=None).limit(np.sqrt(1.0 / pivot))
     beyond = inside & (np.abs(weights) > pivot * limit)
-    beyond[:, here.innocent] = False
+    beyond[:, here.protected] = False
     wrong = indices(beyond.any(axis=1))
-    outside.admit(order[: wrong[0] + 1] if wrong.size else order, factor, changes)
+    outside.add(order[: wrong[0] + 1] if wrong.size else order, factor, changes)
     return None
 
 
-def _nearest(apart: Floats, offset: Floats, limits: Limits) -> Ints:
-    """The order in which meters outside are admitted, each time the one that is closest, places, (r,).
-
-    `apart` (k, k): what the trusted leave open of their readings.
-    """
+def _addition_order(apart: Floats, offset: Floats, limits: Limits) -> Ints:
+    """Order in which excluded meters are added, the closest first, places, (r,); `apart`: (k, k)."""
     order: list[int] = []
     open_, done = apart.diagonal().copy(), np.zeros(offset.size)
-    # Rows of the Cholesky factor, as far as it is known.
+    # Rows of the Cholesky factor so far.
     rows = np.empty((min(offset.size, _AT_ONCE), offset.size))
     for k in range(len(rows)):
-        excess = np.abs(offset) / limits.of(np.sqrt(open_)) + done
+        excess = np.abs(offset) / limits.limit(np.sqrt(open_)) + done
         j = int(excess.argmin())
         row = apart[j] - rows[:k, j] @ rows[:k] if k else apart[j]
         if not (excess[j] < 1.0 and row[j] > 0.0):
@@ -393,52 +309,52 @@ def _nearest(apart: Floats, offset: Floats, limits: Limits) -> Ints:
     return np.array(order, dtype=np.intp)
 
 
-def _drop_many(here: _Place, first: int) -> Move | None:
-    """Drop one after the other as long as the worst is beyond chance; only what they leave is followed.
+def _remove_block(here: _Descent, first: int) -> RankOneUpdate | None:
+    """Remove meters one after the other while the worst is beyond its limit; only precision is followed.
 
-    `first` alone where rounding has it that nobody is.
+    Where rounding leaves no move, `first` alone is removed.
     """
-    now, (at, Q) = here.fit, here.fit.trusting()
-    limits, weights = here.limits.some(at), here.judged.weights[at]
-    pivot, kept = Q.diagonal().copy(), np.where(np.isin(at, here.innocent), np.inf, 0.0)
+    now, (at, Q) = here.posterior, here.posterior.precision()
+    limits, weights = here.limits.subset(at), here.loo.weights[at]
+    pivot, kept = Q.diagonal().copy(), np.where(np.isin(at, here.protected), np.inf, 0.0)
     rows = np.empty((min(at.size, _AT_ONCE), at.size))
-    fallen = np.zeros_like(now.trusted)
+    removed = np.zeros_like(now.trusted)
     for k in range(len(rows)):
-        excess = np.abs(weights / pivot) / limits.of(np.sqrt(1.0 / pivot)) - kept
+        excess = np.abs(weights / pivot) / limits.limit(np.sqrt(1.0 / pivot)) - kept
         j = int(excess.argmax())
         row = Q[j] - rows[:k, j] @ rows[:k]
         if not (excess[j] > 1.0 and row[j] > 0.0):
             break
-        fallen[at[j]] = True
+        removed[at[j]] = True
         root = float(row[j]) ** 0.5
         rows[k] = row = row / root
         weights = weights - row * (weights[j] / root)
         pivot -= row * row
         pivot[j], kept[j] = 1.0, np.inf
-    if not fallen.any():
-        return drop(now, first)
-    after = without(now, fallen)
-    now.inverse, now.variance, now.changes = after.inverse, after.variance, after.changes
-    now.trusted[fallen] = False
-    now.pivot = now.std = now.together = now.left = None
+    if not removed.any():
+        return remove_meter(now, first)
+    after = remove_meters(now, removed)
+    now.inverse, now.variance, now.updates = after.inverse, after.variance, after.updates
+    now.trusted[removed] = False
+    now.pivot = now.std = now.busbar_weights = now.variance_sum = None
     return None
 
 
-# Pairs are looked for among so many meters, those that dropping alone gains most for.
-_PAIRED = 256
+_PAIR_METERS = 256
+"""Meters among which pairs are searched, those of the largest single gains."""
 
 
-def _pair(here: _Place, than: float) -> tuple[tuple[int, ...], float]:
-    """Two meters that it pays to drop together, and what that gains; none unless more than `than`.
+def _best_pair(here: _Descent, than: float) -> tuple[tuple[int, ...], float]:
+    """Two meters to be removed together and their gain; none unless the gain is above `than`.
 
-    With b = Q m and G = Q of the two, ``b^T G^-1 b``; their offsets judged by all others are ``G^-1 b``.
+    With b = Q m and G = Q of the two the gain is ``b^T G^-1 b``; their residuals without both are ``G^-1 b``.
     """
-    now, weights = here.fit, here.judged.weights
+    now, weights = here.posterior, here.loo.weights
     free = now.trusted.copy()
-    free[here.innocent] = False
+    free[here.protected] = False
     at = indices(free)
-    if at.size > _PAIRED:
-        at = np.sort(at[np.argsort(-(weights[at] ** 2) / now.Q[at, at])[:_PAIRED]])
+    if at.size > _PAIR_METERS:
+        at = np.sort(at[np.argsort(-(weights[at] ** 2) / now.Q[at, at])[:_PAIR_METERS]])
     if at.size < 2:
         return (), than
     Q, b = submatrix(now.Q, at, at), weights[at]
@@ -454,14 +370,14 @@ def _pair(here: _Place, than: float) -> tuple[tuple[int, ...], float]:
     pick = np.array([first, second])
     left_open, std = np.linalg.inv(Q[np.ix_(pick, pick)]), np.zeros(weights.size)
     std[at[pick]] = np.sqrt(left_open.diagonal())
-    if not (np.abs(left_open @ b[pick]) > here.limits.of(std)[at[pick]]).all():
+    if not (np.abs(left_open @ b[pick]) > here.limits.limit(std)[at[pick]]).all():
         return (), than
     return tuple(at[pick].tolist()), net
 
 
-def _drop(now: Fit, j: int, powers: Powers | None) -> Move:
-    return _moved(drop(now, j), powers)
+def _remove(now: Posterior, j: int, gains: FaultGains | None) -> RankOneUpdate:
+    return _noted(remove_meter(now, j), gains)
 
 
-def _moved(move: Move, powers: Powers | None) -> Move:
-    return move if powers is None else powers.follow(move)
+def _noted(update: RankOneUpdate, gains: FaultGains | None) -> RankOneUpdate:
+    return update if gains is None else gains.update(update)

@@ -1,9 +1,4 @@
-"""Running means over several time scales: the longer, the smaller a lie that stands out.
-
-References
-----------
-docs/theory-sequential.md, section 3.
-"""
+"""Running means of the residuals over several time scales (docs/theory-sequential.md, section 3)."""
 
 from __future__ import annotations
 
@@ -16,108 +11,60 @@ from gridsec.arrays import Bools, Floats, Ints, all_of, any_of
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Window:
-    """The last ticks. p meters, s scales.
+    """Residuals of the last ticks. p meters, s scales."""
 
-    Attributes
-    ----------
-    residuals : (longest,) of (p,)
-        Residuals of each tick, the newest last; 0 where there was none.
-    heard : (longest,) of (p,)
-        Where there was one.
-    turn
-        Ticks since the sums were last added up from the beginning.
-    sums : (s, p)
-        Sum of the residuals within each scale.
-    counts : (s, p)
-        How many they are.
-    """
-
-    residuals: tuple[Floats, ...]
-    heard: tuple[Bools, ...]
-    turn: int
-    sums: Floats
-    counts: Ints
+    residuals: tuple[Floats, ...]  # (longest,) of (p,), the newest last; 0 without a reading
+    available: tuple[Bools, ...]  # (longest,) of (p,): meters with a reading
+    since_resum: int  # ticks since the sums were computed from the residuals
+    sums: Floats  # (s, p) sum of the residuals of each scale
+    counts: Ints  # (s, p) number of these residuals
 
 
 def empty(lengths: tuple[int, ...], meters: int) -> Window:
-    """A window before the first tick.
-
-    Parameters
-    ----------
-    lengths : (s,)
-        Ticks of each scale.
-    meters
-        p.
-    """
+    """Window before the first tick; lengths: ticks of each scale."""
     longest = max(lengths)
     return Window(
         residuals=(np.zeros(meters),) * longest,
-        heard=(np.zeros(meters, dtype=np.bool_),) * longest,
-        turn=0,
+        available=(np.zeros(meters, dtype=np.bool_),) * longest,
+        since_resum=0,
         sums=np.zeros((len(lengths), meters)),
         counts=np.zeros((len(lengths), meters), dtype=np.intp),
     )
 
 
-def push(window: Window, lengths: tuple[int, ...], residual: Floats, heard: Bools) -> Window:
-    """Take in the residuals of one tick.
-
-    Parameters
-    ----------
-    window
-        So far; not changed.
-    lengths : (s,)
-        Ticks of each scale.
-    residual : (p,)
-        Readings minus what the model explains, squared pu.
-    heard : (p,)
-        Where there is a reading.
-    """
-    before, marks, turn = window.residuals, window.heard, window.turn + 1
-    # In calm the same array comes at every tick: what it was is what drops out.
-    steady = all(marks[-length] is heard for length in lengths)
-    values = residual if all_of(heard) else np.where(heard, residual, 0.0)
+def push(window: Window, lengths: tuple[int, ...], residual: Floats, available: Bools) -> Window:
+    """Window with the residuals (p,) of one more tick, squared pu, and the meters with a reading, (p,)."""
+    before, marks, turn = window.residuals, window.available, window.since_resum + 1
+    # While every meter reports, the same array enters and leaves.
+    steady = all(marks[-length] is available for length in lengths)
+    values = residual if all_of(available) else np.where(available, residual, 0.0)
     after = (*before[1:], values)
     if turn == len(after):
-        # Differences of running sums gather rounding errors; one round's worth is all there ever is.
+        # Differences of running sums gather rounding errors; a new sum every `longest` ticks bounds them.
         sums, turn = np.stack([np.sum(after[-length:], axis=0) for length in lengths]), 0
     else:
         sums = window.sums + values - np.array([before[-length] for length in lengths])
     counts = window.counts
     if not steady:
-        counts = counts + heard - np.array([marks[-length] for length in lengths])
-    return Window(after, (*marks[1:], heard), turn, sums, counts)
+        counts = counts + available - np.array([marks[-length] for length in lengths])
+    return Window(after, (*marks[1:], available), turn, sums, counts)
 
 
 def forget(window: Window, meters: Bools) -> Window:
-    """Forget everything about some meters.
-
-    Parameters
-    ----------
-    window
-        So far; not changed.
-    meters : (p,)
-        Which.
-    """
+    """Window without the residuals of some meters, (p,)."""
     if not any_of(meters):
         return window
     residuals = tuple(np.where(meters, 0.0, each) for each in window.residuals)
-    marks = tuple(each & ~meters for each in window.heard)
+    marks = tuple(each & ~meters for each in window.available)
     sums = np.where(meters, 0.0, window.sums)
     counts = np.where(meters, 0, window.counts)
-    return Window(residuals, marks, window.turn, sums, counts)
+    return Window(residuals, marks, window.since_resum, sums, counts)
 
 
 def shift(window: Window, change: Floats) -> Window:
-    """Express all residuals relative to something else.
-
-    Parameters
-    ----------
-    window
-        So far; not changed.
-    change : (p,)
-        What every residual gains, squared pu.
-    """
-    pairs = zip(window.residuals, window.heard, strict=True)
-    residuals = tuple(np.where(heard, each + change, 0.0) for each, heard in pairs)
-    return Window(residuals, window.heard, window.turn, window.sums + window.counts * change, window.counts)
+    """Window with all residuals increased by `change` (p,), squared pu."""
+    pairs = zip(window.residuals, window.available, strict=True)
+    residuals = tuple(np.where(available, each + change, 0.0) for each, available in pairs)
+    return Window(
+        residuals, window.available, window.since_resum, window.sums + window.counts * change, window.counts
+    )

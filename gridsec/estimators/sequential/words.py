@@ -1,4 +1,4 @@
-"""What an operator is told, in sentences."""
+"""Sentences for the operator."""
 
 from __future__ import annotations
 
@@ -10,69 +10,39 @@ from gridsec.grid.three_phase import PHASES
 from gridsec.interface import Explanation, PowerOrigin
 
 
-def doubt(design: SequentialDesign, k: int, amount: float) -> str:
-    """What a suspicion besides meters means, in one sentence.
-
-    Parameters
-    ----------
-    design, k
-        The design, and the index of what is suspected in its book.
-    amount
-        How much of it there is, pu.
-    """
+def fault_sentence(design: SequentialDesign, k: int, amount: float) -> str:
+    """Sentence about accused fault k of the dictionary with its amount, pu."""
     plant = design.plant
     power = f"{abs(amount) * plant.feeder.base_kva:.1f}"
     if k < design.customers:
         way = "feeds in" if amount > 0 else "draws"
         return f"It looks as if {plant.feeder.customers[k]} {way} {power} kW more than its readings say."
-    who = plant.feeder.customers[plant.droop.customer[k - design.customers]]
-    return f"The inverter of {who} may inject {power} kvar that its curve does not ask for."
+    owner = plant.feeder.customers[plant.droop.customer[k - design.customers]]
+    return f"The inverter of {owner} may inject {power} kvar that its curve does not ask for."
 
 
 def busbar_meter(which: Bools) -> str:
-    """The busbar's meter, with the phases in question where there are several.
-
-    Parameters
-    ----------
-    which : (b,)
-        Phases, one on a balanced feeder.
-    """
+    """Name of the busbar's meter, with the phases `which` (b,) in three phases."""
     if which.size == 1:
         return "the meter of the busbar"
     names = [phase for phase, one in zip(PHASES, which, strict=True) if one]
     return f"the meter of the busbar (phase{'s' * (len(names) > 1)} {', '.join(names)})"
 
 
-def busbar_off(off: Floats, v0_squared: Floats, which: Bools) -> str:
-    """By how much the busbar's meter differs from what the meters of the feeder say, where most.
-
-    Parameters
-    ----------
-    off, v0_squared : (b,)
-        What it reads too much, and what the meters say, squared pu.
-    which : (b,)
-        Which phases are in question.
-    """
+def busbar_deviation(off: Floats, v0_squared: Floats, which: Bools) -> str:
+    """Largest deviation of the busbar's meter from the others, (b,) `off` beside `v0_squared`, squared pu."""
     parts = 100.0 * (np.sqrt(np.maximum(1.0 + off / v0_squared, 0.0)) - 1.0)[which]
     worst = float(parts[np.abs(parts).argmax()])
     return f"reads {abs(worst):.1f} % {'more' if worst > 0 else 'less'} than the meters of the feeder say"
 
 
-def unread(names: tuple[str, ...], which: Bools, origins: Ints, percent: Floats, limit: float) -> str:
-    """The customers without a usable active power, and the precision of the voltage there.
+def unread_sentence(
+    names: tuple[str, ...], which: Bools, origins: Ints, percent: Floats, limit: float
+) -> str:
+    """Customers without a usable active power, and the precision of the voltage there.
 
-    Parameters
-    ----------
-    names : (p,)
-        Customers of the meters.
-    which : (p,)
-        Meters in question.
-    origins : (p,)
-        `PowerOrigin` of their powers at this frame.
-    percent : (p,)
-        Standard deviation of the voltage, % of nominal.
-    limit
-        Largest permitted standard deviation, % of nominal.
+    which, origins, percent: (p,) meters in question, `PowerOrigin`, and standard deviation of the voltage in
+    % of nominal. limit: largest permitted one.
     """
     parts = []
     for origin, sentence in _ORIGINS.items():
@@ -94,52 +64,36 @@ _ORIGINS = {
 """Sentence per origin. `READ`: the power is usable again, and the mean still contains ticks without it."""
 
 
-def untimely(names: tuple[str, ...], which: Bools, limit_s: float) -> str:
-    """The meters with readings of another moment.
-
-    Parameters
-    ----------
-    names : (p,)
-        Customers of the meters.
-    which : (p,)
-        Meters in question.
-    limit_s
-        Largest usable clock offset, s.
-    """
+def clock_sentence(names: tuple[str, ...], which: Bools, limit_s: float) -> str:
+    """Meters `which` (p,) with readings of another moment."""
     found = _list([name for name, one in zip(names, which, strict=True) if one])
     return (
         f"The clock offset of {found} is above {limit_s:g} s: no scale compares the readings with the feeder."
     )
 
 
-# So many explanations, and so many names in each, are told in a sentence.
 _SHOWN = 5
+"""Largest number of explanations in a sentence, and of names in each."""
 
 
-def ways(design: SequentialDesign, explanations: tuple[Explanation, ...]) -> str:
-    """What may be the case, in one sentence.
-
-    Parameters
-    ----------
-    design, explanations
-        The design, and all that explains the readings.
-    """
-    shown = [_way(design, each) for each in explanations[:_SHOWN]]
+def explanations_sentence(design: SequentialDesign, explanations: tuple[Explanation, ...]) -> str:
+    """Possible explanations in one sentence."""
+    shown = [_explanation(design, each) for each in explanations[:_SHOWN]]
     if len(explanations) == 1:
         return f"Wrong is {shown[0]}; nothing else explains the readings."
-    more, told = len(explanations) - len(shown), " or else ".join(shown)
+    more, text = len(explanations) - len(shown), " or else ".join(shown)
     each = "both explain" if len(explanations) == 2 else "each of these explains"
-    return f"Wrong are either {told}{f' or {more} more' if more else ''}; {each} the readings."
+    return f"Wrong are either {text}{f' or {more} more' if more else ''}; {each} the readings."
 
 
-def _way(design: SequentialDesign, explanation: Explanation) -> str:
+def _explanation(design: SequentialDesign, explanation: Explanation) -> str:
     customers, owner = design.plant.feeder.customers, design.plant.droop.customer
     accused = (
         ("meter", [name for name, bad in zip(design.names, explanation.meters, strict=True) if bad]),
         ("inverter", [customers[c] for c in owner[explanation.inverters]]),
         ("reported power", [customers[c] for c in np.flatnonzero(explanation.powers)]),
     )
-    parts = [f"the {what}{'s' * (len(who) > 1)} of {_list(who)}" for what, who in accused if who]
+    parts = [f"the {what}{'s' * (len(some) > 1)} of {_list(some)}" for what, some in accused if some]
     if explanation.busbar.any():
         parts.append(busbar_meter(explanation.busbar))
     return " and ".join(parts) if parts else "none of them"

@@ -277,7 +277,7 @@ def test_a_told_deviation_is_believed_although_the_interval_is_wide() -> None:
         state = watcher.init(snapshot.t) if state is None else state
         state, _, _ = watcher.step(state, to_frame(site, snapshot))
         assert isinstance(state, SequentialState)
-        assert state.doubts.priors[-1] is watcher.design.prior
+        assert state.uncertainty.priors[-1] is watcher.design.prior
 
 
 def test_the_bound_holds_whatever_is_forecast() -> None:

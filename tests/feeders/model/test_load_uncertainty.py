@@ -89,7 +89,7 @@ def test_what_goes_up_and_down_together_moves_voltages_together() -> None:
     )
     w = roots @ np.hstack([2.0 * model.R_bus, 2.0 * model.X_bus]).T
     found = prior(feeder, feeder.bus, doubt, busbar=0.0)
-    np.testing.assert_allclose(found.of_meters, (w.T @ w)[:, feeder.bus], atol=1e-12)
+    np.testing.assert_allclose(found.covariance, (w.T @ w)[:, feeder.bus], atol=1e-12)
     np.testing.assert_allclose(found.variance, np.diag(w.T @ w), atol=1e-12)
     with refused(InputInvalid, "out-of-range"):
         LoadDoubt(doubt.p, doubt.q, 1.0, together=together + 1.0)
@@ -105,7 +105,7 @@ def test_a_step_counts_what_is_not_metered_once_and_errs_by_what_it_says() -> No
             state, estimate, verdict = watcher.step(state, frame)
             truth = (sample.v_volt / CIGRE.customer_volt) ** 2
         assert isinstance(state, SequentialState)
-        assert state.doubts.priors[-1] is watcher.design.prior
+        assert state.uncertainty.priors[-1] is watcher.design.prior
         assert not verdict.suspects.any()
         assert estimate.std is not None
         ratios.append(((estimate.v2 - truth) / estimate.std)[some])

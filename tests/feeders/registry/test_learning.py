@@ -9,7 +9,7 @@ import pytest
 
 from feeders.model.site import from_tables, load
 from feeders.registry.registry import SEQUENTIAL, DesignedEstimator, choose, design
-from gridsec.estimators.sequential.commission import begin, conclude, nothing, ripe
+from gridsec.estimators.sequential.commission import class_only, learn, no_readings, ready_meters
 
 
 @pytest.mark.parametrize(
@@ -26,8 +26,8 @@ def test_a_day_of_readings_leaves_what_the_operator_is_told(
     assert begun is not None
     day, every = 86_400.0, np.ones(len(site.meter_ids), dtype=bool)
     gathered = replace(begun, count=86_400 * every.astype(np.intp), time_s=day * every)
-    assert ripe(made.design, gathered).all()
-    found = conclude(made.design, nothing(made.design), gathered, every, day).learned
+    assert ready_meters(made.design, gathered).all()
+    found = learn(made.design, class_only(made.design), gathered, every, day).learned
     std, allowed = 0.5 * site.feeder.base_volt * np.stack([np.sqrt(found.variance), found.allowed])
     assert least <= std.min() <= std.max() <= most
     assert 0.25 <= allowed.min() <= allowed.max() <= change
@@ -43,8 +43,8 @@ def test_errors_that_come_and_go_are_learned_away_and_lasting_ones_are_not() -> 
         made = design(choose(from_tables(tables), estimator=SEQUENTIAL)).design
         assert made.doubt.lasting == (1.0 if name == "limits" else 0.0)
         day, every = 86_400.0, np.ones(made.allowed.size, dtype=bool)
-        gathered = replace(begin(every, 0.0), count=86_400 * every.astype(np.intp), time_s=day * every)
-        left[name] = conclude(made, nothing(made), gathered, every, day).learned.variance
+        gathered = replace(no_readings(every, 0.0), count=86_400 * every.astype(np.intp), time_s=day * every)
+        left[name] = learn(made, class_only(made), gathered, every, day).learned.variance
     assert (left["told"] < left["limits"]).all()
 
 

@@ -211,8 +211,8 @@ def test_one_power_that_comes_back_is_forgotten() -> None:
     assert verdict.decision is Decision.CLEAN
     np.testing.assert_allclose(estimate.std, usual.std, rtol=1e-6)
     assert isinstance(state, SequentialState)
-    assert state.doubts.vouched.all()
-    assert state.apart == (None,) * len(state.fits)
+    assert state.uncertainty.vouched.all()
+    assert state.vouched_posteriors == (None,) * len(state.posteriors)
 
 
 def test_a_customer_without_a_meter_and_one_whose_file_expects_no_reading_are_as_before() -> None:
@@ -235,4 +235,4 @@ def test_a_customer_without_a_meter_and_one_whose_file_expects_no_reading_are_as
         state, _, verdict = made.step(state, frame)
     assert verdict.decision is Decision.CLEAN
     assert isinstance(state, SequentialState)
-    assert state.doubts.vouched.all()
+    assert state.uncertainty.vouched.all()

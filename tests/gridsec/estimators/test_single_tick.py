@@ -22,8 +22,8 @@ from gridsec.errors import DesignInfeasible, NotObservable
 from gridsec.estimators import sequential, single_tick
 from gridsec.estimators.plant import Plant
 from gridsec.estimators.sequential import LoadDoubt, SequentialDesign, SequentialState
-from gridsec.estimators.sequential.conditional import fit, judge
-from gridsec.estimators.sequential.decoder import Decoder, Evidence
+from gridsec.estimators.sequential.conditional import condition, leave_one_out
+from gridsec.estimators.sequential.decoder import Decoder, DecoderInput
 from gridsec.estimators.sequential.loads import prior
 from gridsec.estimators.sequential.search import Limits
 from gridsec.estimators.single_tick import fewest, least_squares, match, pursue
@@ -44,7 +44,7 @@ class Bench:
     A: Floats
     stack: Stack
     P: Floats
-    evidence: Callable[..., Evidence]
+    evidence: Callable[..., DecoderInput]
 
     @property
     def covariance(self) -> Floats:
@@ -71,16 +71,16 @@ def bench(rng: np.random.Generator, p: int = 8, sigmas: float = 3.5, most: int =
     before = prior(tree, np.arange(1, p + 1), doubt, busbar=BUSBAR)
     none, zeros = np.zeros(p, dtype=bool), np.zeros(p)
 
-    def evidence(m: Floats, live: Bools | None = None) -> Evidence:
+    def evidence(m: Floats, live: Bools | None = None) -> DecoderInput:
         seen = np.ones(p, dtype=bool) if live is None else live
-        return Evidence(
-            whole=fit(before, np.full(p, NOISE**2), seen),
+        return DecoderInput(
+            whole=condition(before, np.full(p, NOISE**2), seen),
             m=m,
-            live=seen,
+            available=seen,
             limits=Limits(sigmas, zeros, zeros, zeros),
-            believed=seen,
-            over=none,
-            most=most,
+            trusted=seen,
+            above_limit=none,
+            max_attacked=most,
             like=100.0,
         )
 
@@ -133,7 +133,7 @@ class TestLeastSquares:
         alpha = 2.0 * norm.sf(sigmas) * 10
         now = made.evidence(np.zeros(10))
         readings = np.array([made.draw(rng) for _ in range(draws)])
-        misfit = np.array([judge(now.whole, m).misfit for m in readings])
+        misfit = np.array([leave_one_out(now.whole, m).chi_square for m in readings])
         assert np.mean(misfit > chi2.isf(alpha, 10)) == pytest.approx(alpha, rel=0.12)
         # With as many degrees of freedom as rows, which the paper prints, there would be none.
         assert np.mean(misfit > chi2.isf(alpha, len(made.stack.matrix))) < 0.02 * alpha
@@ -431,7 +431,7 @@ class TestDesign:
         plant = make_plant(np.random.default_rng(1), customers=60)
         with refused(DesignInfeasible, "too-many"):
             prepare(plant, fewest, most=3)
-        assert prepare(plant, match, most=3).most == 3
+        assert prepare(plant, match, most=3).max_attacked == 3
 
     @ALL
     def test_too_few_meters_are_refused(self, decoder: Decoder) -> None:

@@ -11,8 +11,8 @@ from scipy.optimize import linprog
 from gridsec.arrays import Floats
 from gridsec.estimators.plant import Plant
 from gridsec.estimators.sequential import LoadDoubt, design
-from gridsec.estimators.sequential.conditional import misfit
-from gridsec.estimators.sequential.search import price
+from gridsec.estimators.sequential.conditional import chi_square
+from gridsec.estimators.sequential.search import set_cost
 from gridsec.grid.droop import fleet
 from gridsec.grid.meter import MeterAccuracy
 from gridsec.planning.detectability import Rule, largest_shift, named_size, rule
@@ -102,8 +102,8 @@ def test_no_explanation_that_believes_a_large_liar_is_a_rival(seed: int) -> None
     given, rng = made(seed), np.random.default_rng(seed)
     monitor, p = given.design, given.model.size
     claims = np.full(monitor.customers, monitor.options.hidden_power)
-    std = np.concatenate([claims, monitor.book.std[monitor.customers :]])
-    columns = monitor.book.columns(np.arange(std.size)) * std
+    std = np.concatenate([claims, monitor.faults.std[monitor.customers :]])
+    columns = monitor.faults.columns(np.arange(std.size)) * std
     like = 2.0 * np.log(monitor.options.like)
     for k in range(p):
         size = named_size(given, k, 2, claims=claims)
@@ -115,7 +115,7 @@ def test_no_explanation_that_believes_a_large_liar_is_a_rival(seed: int) -> None
             worst = -np.inf
             for s in range(len(given.noise)):
                 m = draws(given, rng, s, 1)[0] + lies
-                truth = misfit(monitor.prior, given.noise[s], m, lies == 0.0) + price(p, 2)
+                truth = chi_square(monitor.prior, given.noise[s], m, lies == 0.0) + set_cost(p, 2)
                 rivals = [
                     _cost(given, s, m, accused, columns, direction=d)
                     for count in range(p)
@@ -133,10 +133,14 @@ def _cost(
     trusted = np.ones(p, dtype=np.bool_)
     trusted[list(accused)] = False
     if direction is None:
-        return misfit(monitor.prior, given.noise[s], m, trusted) + price(p, len(accused))
-    charge = monitor.book.charges(np.array([direction]), trusted, len(accused))[0] * price(p, 1)
+        return chi_square(monitor.prior, given.noise[s], m, trusted) + set_cost(p, len(accused))
+    charge = monitor.faults.charges(np.array([direction]), trusted, len(accused))[0] * set_cost(p, 1)
     loose = columns[:, [direction]]
-    return misfit(monitor.prior, given.noise[s], m, trusted, loose) + price(p, len(accused)) + float(charge)
+    return (
+        chi_square(monitor.prior, given.noise[s], m, trusted, loose)
+        + set_cost(p, len(accused))
+        + float(charge)
+    )
 
 
 def test_a_protected_meter_tells_no_lie() -> None:

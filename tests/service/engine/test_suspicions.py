@@ -16,7 +16,7 @@ from feeders.simulation.meters import MeterErrors
 from feeders.simulation.scenario import Scenario, SimulatedReading, by_arrival, simulate
 from gridsec.attack import Scaling
 from gridsec.estimators.sequential import Commission, to_arrays
-from gridsec.estimators.sequential.commission import nothing
+from gridsec.estimators.sequential.commission import class_only
 from service.engine.engine import Engine, RuntimeConfig
 from service.engine.feeder_monitor import design
 from service.engine.replay import ReplayCounts, replay
@@ -41,7 +41,7 @@ def site() -> Site:
 def learned(site: Site) -> StateSnapshot:
     """What a long commissioning leaves of meters without fixed errors: a tenth of the class is allowed."""
     made = design(site).design
-    known = nothing(made)
+    known = class_only(made)
     small = replace(
         known,
         variance=0.01 * known.variance,

@@ -44,7 +44,7 @@ def test_the_model_is_that_of_the_front_end() -> None:
     made, _ = front()
     model = residual_model(made)
     with_busbar = model.of_meters + model.busbar
-    assert np.allclose(with_busbar, made.prior.of_meters)
+    assert np.allclose(with_busbar, made.prior.covariance)
     assert np.allclose(model.variance + model.busbar, made.prior.variance)
     assert (model.white == made.white).all()
     assert (model.fixed == made.fixed).all()

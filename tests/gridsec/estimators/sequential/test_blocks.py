@@ -11,26 +11,39 @@ from hypothesis import strategies as st
 
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.estimators.sequential import search
-from gridsec.estimators.sequential.blocks import Outside, misfit_without, sound, without
-from gridsec.estimators.sequential.conditional import Fit, Prior, admit, drop, fit, judge, loosen
-from gridsec.estimators.sequential.search import Limits, Solution, descend
+from gridsec.estimators.sequential.blocks import (
+    ExcludedMeters,
+    chi_square_without,
+    remove_meters,
+    well_conditioned,
+)
+from gridsec.estimators.sequential.conditional import (
+    Posterior,
+    Prior,
+    add_meter,
+    add_unknown,
+    condition,
+    leave_one_out,
+    remove_meter,
+)
+from gridsec.estimators.sequential.search import Candidate, Limits, descend
 from tests.gridsec.estimators.sequential.test_conditional import agrees, problem
 
 SEEDS = st.integers(0, 2**32 - 1)
 
 
-def started(rng: np.random.Generator, prior: Prior, noise: Floats, *, loose: bool) -> Fit:
+def started(rng: np.random.Generator, prior: Prior, noise: Floats, *, loose: bool) -> Posterior:
     """Most meters trusted, perhaps with a direction loosened."""
-    now = fit(prior, noise, rng.random(noise.size) < 0.8)
+    now = condition(prior, noise, rng.random(noise.size) < 0.8)
     if loose:
-        loosen(now, rng.normal(size=prior.variance.size), 0.7)
-        now = fit(prior, noise, now.trusted, now.loose)
+        add_unknown(now, rng.normal(size=prior.variance.size), 0.7)
+        now = condition(prior, noise, now.trusted, now.unknowns)
     return now
 
 
-def opened(S: Floats, now: Fit) -> Floats:
+def opened(S: Floats, now: Posterior) -> Floats:
     """The covariance with what was loosened."""
-    return S + now.loose @ now.loose.T
+    return S + now.unknowns @ now.unknowns.T
 
 
 @settings(max_examples=80)
@@ -45,19 +58,19 @@ def test_who_falls_together_might_have_fallen_one_by_one(
     before = started(rng, prior, noise, loose=loose)
     if not lean:
         before.inverse = before.Q
-    kept, fallen = before.copy(), rng.random(meters) < 0.5
-    after, one_by_one = without(before, fallen), before.copy()
-    for j in np.flatnonzero(fallen & before.trusted).tolist():
-        drop(one_by_one, j)
+    kept, removed = before.copy(), rng.random(meters) < 0.5
+    after, one_by_one = remove_meters(before, removed), before.copy()
+    for j in np.flatnonzero(removed & before.trusted).tolist():
+        remove_meter(one_by_one, j)
     agrees(after, opened(S, before), m)
-    assert after.changes == one_by_one.changes
+    assert after.updates == one_by_one.updates
     np.testing.assert_array_equal(after.trusted, one_by_one.trusted)
     np.testing.assert_allclose(after.Q, one_by_one.Q, rtol=1e-9, atol=1e-9 * np.abs(after.Q).max(initial=0.0))
     np.testing.assert_array_equal(before.Q, kept.Q)
     np.testing.assert_array_equal(before.variance, kept.variance)
-    expected = float(judge(fit(prior, noise, after.trusted, before.loose), m).misfit)
-    wild = np.where(fallen, 1e6, m)
-    assert misfit_without(before, wild, fallen) == pytest.approx(expected, rel=1e-8, abs=1e-8)
+    expected = float(leave_one_out(condition(prior, noise, after.trusted, before.unknowns), m).chi_square)
+    wild = np.where(removed, 1e6, m)
+    assert chi_square_without(before, wild, removed) == pytest.approx(expected, rel=1e-8, abs=1e-8)
 
 
 @settings(max_examples=80)
@@ -68,25 +81,25 @@ def test_who_is_admitted_together_might_have_been_one_by_one(
     rng = np.random.default_rng(seed)
     S, prior, noise, m = problem(rng, meters + extra, meters)
     now = started(rng, prior, noise, loose=loose)
-    now = without(now, np.arange(meters) == 0)
+    now = remove_meters(now, np.arange(meters) == 0)
     at = np.flatnonzero(~now.trusted)
     order = rng.permutation(at.size)
-    outside, one_by_one = Outside.of(now, at), now.copy()
+    outside, one_by_one = ExcludedMeters.of(now, at), now.copy()
     factor = outside.factor(order)
     changes = outside.changes(order, factor)
     part = order[: rng.integers(1, order.size + 1)]
     for k, j in enumerate(at[part].tolist()):
-        move = admit(one_by_one, j)
-        square = move.factor * np.multiply.outer(move.q, move.q)
+        update = add_meter(one_by_one, j)
+        square = update.factor * np.multiply.outer(update.q, update.q)
         np.testing.assert_allclose(np.multiply.outer(changes[k], changes[k]), square, rtol=1e-7, atol=1e-8)
-    outside.admit(part, factor, changes)
-    assert now.changes == one_by_one.changes
+    outside.add(part, factor, changes)
+    assert now.updates == one_by_one.updates
     np.testing.assert_array_equal(now.trusted, one_by_one.trusted)
     np.testing.assert_allclose(now.Q, one_by_one.Q, rtol=1e-7, atol=1e-8)
     agrees(now, opened(S, now), m)
 
 
-def single(found: dict[str, Solution], seed: int, few: int, part: float) -> dict[str, Solution]:
+def single(found: dict[str, Candidate], seed: int, few: int, part: float) -> dict[str, Candidate]:
     """A descent from part of all, in which some must be believed; readings of one level, a few off."""
     rng = np.random.default_rng(seed)
     _, prior, noise, m = problem(rng, 24, 20)
@@ -94,11 +107,11 @@ def single(found: dict[str, Solution], seed: int, few: int, part: float) -> dict
     readings = 0.3 * m + np.where(off, rng.normal(size=20) * 10.0, 0.0)
     limits = Limits(2.5, np.full(20, 0.01), np.full(20, 0.3), np.full(20, 0.01), None, np.full(20, 0.02))
     keep: Bools = rng.random(20) < 0.1
-    innocent = np.flatnonzero(rng.random(20) < 0.2)
-    start = fit(prior, noise, rng.random(20) < part)
+    protected = np.flatnonzero(rng.random(20) < 0.2)
+    start = condition(prior, noise, rng.random(20) < part)
     return {
         **found,
-        str(few): descend(start, readings, np.ones(20, bool), limits, keep=keep, innocent=innocent),
+        str(few): descend(start, readings, np.ones(20, bool), limits, keep=keep, protected=protected),
     }
 
 
@@ -107,16 +120,16 @@ def single(found: dict[str, Solution], seed: int, few: int, part: float) -> dict
 def test_a_descent_moves_many_as_it_would_one_by_one(seed: int, at_once: int, part: float) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(search, "_AT_ONCE", at_once)
-        found: dict[str, Solution] = {}
+        found: dict[str, Candidate] = {}
         for few in (1, 10**6):
             patch.setattr(search, "_MANY", few)
             found = single(found, seed, few, part)
     many, one_by_one = found.values()
     np.testing.assert_array_equal(many.trusted, one_by_one.trusted)
     assert many.cost == pytest.approx(one_by_one.cost, rel=1e-8, abs=1e-8)
-    assert many.fit.changes == one_by_one.fit.changes
-    np.testing.assert_allclose(many.judged.offset, one_by_one.judged.offset, rtol=1e-6, atol=1e-7)
-    np.testing.assert_allclose(many.fit.variance, one_by_one.fit.variance, rtol=1e-6, atol=1e-7)
+    assert many.posterior.updates == one_by_one.posterior.updates
+    np.testing.assert_allclose(many.loo.residual, one_by_one.loo.residual, rtol=1e-6, atol=1e-7)
+    np.testing.assert_allclose(many.posterior.variance, one_by_one.posterior.variance, rtol=1e-6, atol=1e-7)
 
 
 def test_many_may_be_all() -> None:
@@ -124,13 +137,13 @@ def test_many_may_be_all() -> None:
     rng = np.random.default_rng(5)
     _, prior, noise, m = problem(rng, 12, 10)
     none, one = np.zeros(10), np.ones(10)
-    start = fit(prior, noise, np.ones(10, dtype=bool))
+    start = condition(prior, noise, np.ones(10, dtype=bool))
     found = descend(start, 1e3 * m, one > 0, Limits(0.01, none, none, none), keep=one > 0)
     assert not found.trusted.any()
     assert start.trusted.all()
-    assert found.fit.changes == 10
-    assert found.judged.misfit == 0.0
-    np.testing.assert_allclose(found.fit.variance, prior.variance)
+    assert found.posterior.updates == 10
+    assert found.loo.chi_square == 0.0
+    np.testing.assert_allclose(found.posterior.variance, prior.variance)
 
 
 @settings(max_examples=80)
@@ -142,14 +155,14 @@ def test_meters_may_share_a_bus(seed: int, loud: bool) -> None:
     S, at = A @ A.T, rng.integers(0, 7, 9)
     prior, noise, m = Prior(S[:, at], at, S.diagonal().copy()), rng.uniform(0.1, 0.5, 9), rng.normal(size=9)
     noise = np.where(rng.random(9) < 0.4, 1e3 * noise, noise) if loud else noise
-    before, fallen = fit(prior, noise, rng.random(9) < 0.8), rng.random(9) < 0.4
-    after = without(before, fallen)
+    before, removed = condition(prior, noise, rng.random(9) < 0.8), rng.random(9) < 0.4
+    after = remove_meters(before, removed)
     agrees(after, S, m)
     others = np.flatnonzero(~after.trusted)
-    outside, order = Outside.of(after, others), rng.permutation(others.size)[:4]
+    outside, order = ExcludedMeters.of(after, others), rng.permutation(others.size)[:4]
     if order.size:
         factor = outside.factor(order)
-        outside.admit(order, factor, outside.changes(order, factor))
+        outside.add(order, factor, outside.changes(order, factor))
         agrees(after, S, m)
 
 
@@ -163,14 +176,14 @@ def test_exact_meters_are_moved_one_by_one(seed: int, exact: float) -> None:
     noise = np.full(40, exact * float(S.diagonal().max()))
     prior, found = Prior(S, np.arange(40), S.diagonal().copy()), []
     m = A @ rng.normal(size=3) + np.sqrt(noise) * rng.normal(size=40)
-    assert sound(prior, noise) == (exact > 1e-6)
+    assert well_conditioned(prior, noise) == (exact > 1e-6)
     with pytest.MonkeyPatch.context() as patch:
         for few in (search._MANY, 10**6):
             patch.setattr(search, "_MANY", few)
-            start = fit(prior, noise, np.arange(40) % 2 == 0)
+            start = condition(prior, noise, np.arange(40) % 2 == 0)
             found.append(descend(start, m, every, Limits(5.0, zero, zero, zero), keep=~every))
     np.testing.assert_array_equal(found[0].trusted, found[1].trusted)
-    assert found[0].fit.changes == found[1].fit.changes
+    assert found[0].posterior.updates == found[1].posterior.updates
     # Still more exact ones are beyond what doubles tell apart.
     assert found[0].trusted.all() or exact < 1e-8
 
@@ -188,21 +201,23 @@ def test_a_descent_where_meters_share_a_bus_ends_in_a_fit_made_anew(seed: int, l
     m = (root @ rng.normal(size=4))[at] + np.sqrt(noise) * rng.normal(size=24)
     m[rng.choice(24, 8, replace=False)] += 4.0 * rng.choice([-1.0, 1.0], 8)
     zero, every = np.zeros(24), np.ones(24, dtype=np.bool_)
-    limits, found = Limits(2.5, zero, zero + 0.02, zero + 0.01), list[Solution]()
-    start = fit(prior, noise, rng.random(24) < (1.0 if seed % 2 else 0.3))
+    limits, found = Limits(2.5, zero, zero + 0.02, zero + 0.01), list[Candidate]()
+    start = condition(prior, noise, rng.random(24) < (1.0 if seed % 2 else 0.3))
     with pytest.MonkeyPatch.context() as patch:
         for few in (2, 10**6):
             patch.setattr(search, "_MANY", few)
             found.append(descend(start, m, every, limits, keep=~every))
     many, one_by_one = found
     np.testing.assert_array_equal(many.trusted, one_by_one.trusted)
-    assert many.fit.changes == one_by_one.fit.changes
+    assert many.posterior.updates == one_by_one.posterior.updates
     assert many.cost == pytest.approx(one_by_one.cost, rel=1e-8)
-    agrees(many.fit, S, m)
-    anew, fallen = judge(fit(prior, noise, many.trusted), m), start.trusted & ~many.trusted
-    assert many.judged.misfit == pytest.approx(anew.misfit, rel=1e-8)
-    left = judge(fit(prior, noise, start.trusted & ~fallen), m).misfit
-    assert misfit_without(start, np.where(fallen, 1e6, m), fallen) == pytest.approx(left, rel=1e-8, abs=1e-8)
+    agrees(many.posterior, S, m)
+    anew, removed = leave_one_out(condition(prior, noise, many.trusted), m), start.trusted & ~many.trusted
+    assert many.loo.chi_square == pytest.approx(anew.chi_square, rel=1e-8)
+    left = leave_one_out(condition(prior, noise, start.trusted & ~removed), m).chi_square
+    assert chi_square_without(start, np.where(removed, 1e6, m), removed) == pytest.approx(
+        left, rel=1e-8, abs=1e-8
+    )
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -212,8 +227,8 @@ def test_nobody_knows_more_of_a_bus_when_somebody_falls(seed: int) -> None:
     root = rng.uniform(0.5, 1.5, (50, 1))
     S = root @ root.T
     noise = np.where(np.arange(50) < 10, 8.0 * S.diagonal(), 1e-6)
-    before = fit(Prior(S, np.arange(50), S.diagonal().copy()), noise, np.ones(50, dtype=np.bool_))
-    after = without(before, np.arange(50) < 10)
+    before = condition(Prior(S, np.arange(50), S.diagonal().copy()), noise, np.ones(50, dtype=np.bool_))
+    after = remove_meters(before, np.arange(50) < 10)
     assert (after.variance >= before.variance).all()
     # Of one cause only: what all say of it together is known without a matrix.
     known = 1.0 + float((root[10:, 0] ** 2 / noise[10:]).sum())
@@ -229,11 +244,11 @@ def test_exact_numbers_tell_what_meters_leave_open_that_know_next_to_nothing(see
     noise = rng.uniform(0.1, 0.5, 6)
     noise[[1, 4]] = 1e12 * S.diagonal()[[1, 4]]
     prior, every = Prior(S, np.arange(6), S.diagonal().copy()), np.ones(6, dtype=np.bool_)
-    whole = fit(prior, noise, every)
+    whole = condition(prior, noise, every)
     np.testing.assert_allclose(whole.variance, exactly(S, noise, np.arange(6)), rtol=1e-9)
     for gone in ([1], [4, 2], [1, 4], [0, 1, 4]):
         stay = np.setdiff1d(np.arange(6), gone)
-        after = without(whole, np.isin(np.arange(6), gone))
+        after = remove_meters(whole, np.isin(np.arange(6), gone))
         np.testing.assert_allclose(after.variance, exactly(S, noise, stay), rtol=1e-9)
 
 

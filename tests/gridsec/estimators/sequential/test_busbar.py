@@ -10,11 +10,19 @@ import pytest
 
 from gridsec.estimators import sequential
 from gridsec.estimators.sequential import SequentialDesign
-from gridsec.estimators.sequential.bounds import Powers
-from gridsec.estimators.sequential.busbar import Busbar, Doubt, Honest, aligned, believed, follow, opposed
-from gridsec.estimators.sequential.conditional import fit, judge
+from gridsec.estimators.sequential.bounds import PowerErrors
+from gridsec.estimators.sequential.busbar import (
+    BusbarTest,
+    BusbarTrust,
+    HonestErrors,
+    contradicted_phases,
+    explained_phases,
+    track_busbar,
+    trusted_busbar,
+)
+from gridsec.estimators.sequential.conditional import condition, leave_one_out
 from gridsec.estimators.sequential.loads import prior
-from gridsec.estimators.sequential.words import ways
+from gridsec.estimators.sequential.words import explanations_sentence
 from gridsec.grid.meter import busbar_error
 from gridsec.interface import Cause, Decision, Explanation, Frame
 from tests.gridsec.estimators.sequential.test_monitor import Answers, prepare, watch
@@ -74,29 +82,38 @@ class TestOneMore:
 
     def test_its_residual_is_that_of_leaving_it_out(self) -> None:
         everybody, nothing = np.ones(CUSTOMERS, dtype=np.bool_), np.zeros(CUSTOMERS)
-        now = fit(self.design.prior, self.noise, everybody)
+        now = condition(self.design.prior, self.noise, everybody)
         shift = np.ones(CUSTOMERS)
         # Move all readings until exactly that many standard deviations are reached.
         slope = self.sigmas(self.m + shift) - self.sigmas(self.m)
         for limit in self.design.sigmas:
             at = (limit - self.sigmas(self.m)) / slope
             for part, expected in ((1.0 - 1e-6, []), (1.0 + 1e-6, [0])):
-                judged = judge(now, self.m + part * at * shift)
-                assert opposed(self.design, Doubt(limit, nothing, metered=True), now, judged) == expected
-                assert opposed(self.design, Doubt(limit, nothing, metered=False), now, judged) == []
+                loo = leave_one_out(now, self.m + part * at * shift)
+                assert (
+                    contradicted_phases(self.design, BusbarTest(limit, nothing, metered=True), now, loo)
+                    == expected
+                )
+                assert (
+                    contradicted_phases(self.design, BusbarTest(limit, nothing, metered=False), now, loo)
+                    == []
+                )
             # What the model may be off comes on top.
-            judged = judge(now, self.m + 1.001 * at * shift)
-            assert opposed(self.design, Doubt(limit, nothing + 1e-3, metered=True), now, judged) == []
+            loo = leave_one_out(now, self.m + 1.001 * at * shift)
+            assert (
+                contradicted_phases(self.design, BusbarTest(limit, nothing + 1e-3, metered=True), now, loo)
+                == []
+            )
 
     def test_the_model_may_be_off_in_the_direction_that_says_most(self) -> None:
         """Weights of good meters differ in sign; a model that is off with them is no busbar that lies."""
-        now = fit(self.design.prior, self.design.white, np.ones(CUSTOMERS, dtype=np.bool_))
+        now = condition(self.design.prior, self.design.white, np.ones(CUSTOMERS, dtype=np.bool_))
         weights, off = now.Q.sum(axis=0), 1e-3
         assert (weights < 0.0).any()
         shift = 0.999 * self.design.sigmas[0] / np.sqrt(weights.sum())
-        judged = judge(now, shift + off * np.sign(weights))
-        doubt = Doubt(self.design.sigmas[0], np.full(CUSTOMERS, off), np.ones(1, dtype=np.bool_))
-        assert opposed(self.design, doubt, now, judged) == []
+        loo = leave_one_out(now, shift + off * np.sign(weights))
+        doubt = BusbarTest(self.design.sigmas[0], np.full(CUSTOMERS, off), np.ones(1, dtype=np.bool_))
+        assert contradicted_phases(self.design, doubt, now, loo) == []
 
     @pytest.mark.parametrize("active", [True, False])
     def test_errors_of_powers_at_their_ends_explain_what_they_can_and_no_more(self, active: bool) -> None:
@@ -104,26 +121,26 @@ class TestOneMore:
         design, rng = self.design, np.random.default_rng(8)
         plant, model = design.plant, design.plant.feeder.linear()
         everybody, none = np.ones(CUSTOMERS, dtype=np.bool_), np.zeros(CUSTOMERS, dtype=np.bool_)
-        now, fixed = fit(design.prior, self.noise, everybody), rng.uniform(0.0, 1e-3, CUSTOMERS)
+        now, fixed = condition(design.prior, self.noise, everybody), rng.uniform(0.0, 1e-3, CUSTOMERS)
         errors, nothing = rng.uniform(0.01, 0.05, CUSTOMERS), np.zeros(CUSTOMERS)
         frame = Street(plant, rng).frame()
         p_error, q_error = (errors, nothing) if active else (nothing, errors)
         frame = replace(frame, p_error=p_error, q_error=q_error)
-        powers = Powers(frame, frame.q, none, frame.v0_squared, everybody, design.book.std)
-        honest = Honest(powers, np.zeros(plant.droop.tau.size))
+        powers = PowerErrors(frame, frame.q, none, frame.v0_squared, everybody, design.faults.std)
+        honest = HonestErrors(powers, np.zeros(plant.droop.tau.size))
         v = now.Q.sum(axis=0) / now.Q.sum()
         moved = 2.0 * (model.R_bus if active else model.X_bus)[design.prior.meters]
         room = np.abs(v) @ (fixed + design.sigmas[0] * np.sqrt(design.white)) + np.abs(v @ moved) @ errors
         room += busbar_error(plant.accuracy, float(frame.v0_squared), design.sigmas[0])
         for part, explained in ((1.0 - 1e-9, True), (1.0 + 1e-9, False)):
             m = np.full(CUSTOMERS, part * room)
-            assert aligned(design, now, m, fixed, honest).tolist() == [explained]
+            assert explained_phases(design, now, m, fixed, honest).tolist() == [explained]
 
     def test_nobody_trusted_contradicts_nobody(self) -> None:
-        nobody = np.zeros(CUSTOMERS, dtype=np.bool_)
-        now = fit(self.design.prior, self.noise, nobody)
-        judged, doubt = judge(now, self.m + 1.0), Doubt(3.0, np.zeros(CUSTOMERS), metered=True)
-        assert opposed(self.design, doubt, now, judged) == []
+        no_meters = np.zeros(CUSTOMERS, dtype=np.bool_)
+        now = condition(self.design.prior, self.noise, no_meters)
+        loo, doubt = leave_one_out(now, self.m + 1.0), BusbarTest(3.0, np.zeros(CUSTOMERS), metered=True)
+        assert contradicted_phases(self.design, doubt, now, loo) == []
 
 
 class TestStreets:
@@ -147,7 +164,7 @@ class TestStreets:
         assert not any(verdict.suspects.any() for _, verdict in answers)
         assert answers[-1][1].decision is Decision.CLEAN
         assert not answers[-1][1].busbar.any()
-        assert state.busbar.believed.all()
+        assert state.busbar.trusted.all()
 
     def test_beside_as_many_liars_as_can_be_told_apart(self) -> None:
         road, design = street(3)
@@ -251,27 +268,27 @@ class TestPhases:
 class TestBelieving:
     """What a meter that is not believed says, against what the others say."""
 
-    def played(self, says: np.ndarray, scale: int, heard: bool = True) -> list[Busbar]:
+    def played(self, says: np.ndarray, scale: int, heard: bool = True) -> list[BusbarTrust]:
         design = street(1)[1]
-        now, out = believed(1).caught(0, scale), []
+        now, out = trusted_busbar(1).suspect(0, scale), []
         for v0_squared in says:
             there = np.array([heard])
-            now = follow(design, now, np.array([v0_squared]), there, np.ones(1), np.full(1, 1e-6), 0.0)
+            now = track_busbar(design, now, np.array([v0_squared]), there, np.ones(1), np.full(1, 1e-6), 0.0)
             out.append(now)
         return out
 
     def test_it_takes_as_long_as_its_scale(self) -> None:
         for scale, ticks in ((0, 6), (2, 15), (3, 60)):
             out = self.played(np.full(100, 1.0001), scale)
-            assert [one.believed.all() for one in out].index(True) == ticks - 1
+            assert [one.trusted.all() for one in out].index(True) == ticks - 1
             assert not out[ticks].off.any()
 
     def test_what_it_said_before_is_forgotten_with_its_scale(self) -> None:
         says = np.concatenate([np.full(30, 1.06), np.ones(60)])
         out = self.played(says, 1)
         assert out[29].off[0] == pytest.approx(0.06)
-        assert not out[30 + 5].believed.all()
-        assert out[-1].believed.all()
+        assert not out[30 + 5].trusted.all()
+        assert out[-1].trusted.all()
 
     def test_once_is_not_enough_to_be_named(self) -> None:
         """A step that the meters hear of a tick later."""
@@ -280,14 +297,17 @@ class TestBelieving:
         assert [one.named.any() for one in twice] == [False, True, True, True]
 
     def test_silence_is_neither(self) -> None:
-        assert not any(one.believed.any() for one in self.played(np.ones(200), 0, heard=False))
+        assert not any(one.trusted.any() for one in self.played(np.ones(200), 0, heard=False))
 
 
 def test_explanations_name_it() -> None:
     design = street(1)[1]
-    nobody, none = np.zeros(CUSTOMERS, dtype=np.bool_), np.zeros(design.plant.droop.tau.size, dtype=np.bool_)
-    one = Explanation(nobody, none, 0.7, busbar=np.ones(1, dtype=np.bool_))
+    no_meters, none = (
+        np.zeros(CUSTOMERS, dtype=np.bool_),
+        np.zeros(design.plant.droop.tau.size, dtype=np.bool_),
+    )
+    one = Explanation(no_meters, none, 0.7, busbar=np.ones(1, dtype=np.bool_))
     other = Explanation(np.arange(CUSTOMERS) == 2, none, 0.3, busbar=np.zeros(1, dtype=np.bool_))
-    assert ways(design, (one, other)) == (
+    assert explanations_sentence(design, (one, other)) == (
         "Wrong are either the meter of the busbar or else the meter of c2; both explain the readings."
     )

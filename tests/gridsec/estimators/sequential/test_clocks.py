@@ -35,7 +35,7 @@ def noise(rng: np.random.Generator, ticks: int) -> Floats:
 
 
 def found(y: Floats, model: Floats, own: Floats | None = None, heard: int = 128) -> int:
-    return clocks.shifted(y, model, np.zeros_like(y) if own is None else own, heard, ROOM, MOST)
+    return clocks.clock_shift(y, model, np.zeros_like(y) if own is None else own, heard, ROOM, MOST)
 
 
 class TestLags:
@@ -145,9 +145,9 @@ class TestShifted:
         truth = walk(rng, 700, 0.01)
         model, y = truth[10:610] + noise(rng, 600), truth[:600] + noise(rng, 600)
         y[rng.random(600) < 0.03] = np.nan
-        assert clocks.shifted(y, model, np.zeros(600), 128, ROOM, 1e-3) == 10
+        assert clocks.clock_shift(y, model, np.zeros(600), 128, ROOM, 1e-3) == 10
         y[-128::3] = np.nan
-        assert clocks.shifted(y, model, np.zeros(600), 128, ROOM, 1e-3) == 0
+        assert clocks.clock_shift(y, model, np.zeros(600), 128, ROOM, 1e-3) == 0
 
 
 def by_definition(y: Floats, model: Floats, own: Floats, heard: int) -> int:
@@ -195,7 +195,7 @@ def test_the_lag_is_that_of_the_definition() -> None:
         own = power[there] if whole else power[here]
         model = others[here] + own + noise(rng, n)
         y = (others + power)[there] + noise(rng, n) + rng.choice([0.0, 0.0, 0.004, 0.05])
-        got = clocks.shifted(y, model, own, heard, ROOM, MOST)
+        got = clocks.clock_shift(y, model, own, heard, ROOM, MOST)
         assert got == by_definition(y, model, own, heard)
         hits[whole] += got != 0
     assert min(hits) > 20
@@ -236,9 +236,9 @@ class TestQuartersOfAnHour:
         self, quarters: tuple[Site, DesignedEstimator, Days], lie: str, kind: ManipulationKind
     ) -> None:
         site, watcher, days = quarters
-        told, who, on = lied(site, days, lie, 4)
-        seen: Seen = watch(site, watcher, told, who, on)
-        assert seen.last == {int(j): str(kind) for j in who}
+        told, which, on = lied(site, days, lie, 4)
+        seen: Seen = watch(site, watcher, told, which, on)
+        assert seen.last == {int(j): str(kind) for j in which}
         assert not seen.honest
         wrong = {
             str(other)

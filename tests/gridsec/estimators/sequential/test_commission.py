@@ -17,21 +17,21 @@ from gridsec.estimators.sequential import Commission, SequentialDesign, Sequenti
 from gridsec.estimators.sequential.commission import (
     Learned,
     Learning,
-    _share,
-    begin,
-    conclude,
-    fresh,
+    _mean_covariance,
+    class_only,
     from_arrays,
     gather,
-    nothing,
+    initial,
+    learn,
+    no_readings,
+    ready_meters,
     renew,
-    ripe,
     to_arrays,
 )
-from gridsec.estimators.sequential.conditional import fit, judge
-from gridsec.estimators.sequential.doubts import none as no_doubts
+from gridsec.estimators.sequential.conditional import condition, leave_one_out
+from gridsec.estimators.sequential.doubts import nominal as no_doubts
 from gridsec.estimators.sequential.loads import LoadDoubt
-from gridsec.estimators.sequential.scales import Scales, view_of
+from gridsec.estimators.sequential.scales import Scales, scale_test
 from gridsec.estimators.sequential.windows import empty
 from gridsec.interface import Frame
 from tests.codes import refused
@@ -56,7 +56,7 @@ def one(k: int) -> Bools:
 
 def summed(total: Floats, count: Ints, time_s: Floats, since: Floats) -> Learning:
     """Sums over ticks that all counted."""
-    start = begin(np.ones(P, dtype=np.bool_), 0.0)
+    start = no_readings(np.ones(P, dtype=np.bool_), 0.0)
     return replace(start, total=total, count=count, time_s=time_s, since=since, watched_s=time_s)
 
 
@@ -64,7 +64,7 @@ def learned(design: SequentialDesign, rng: np.random.Generator) -> Commission:
     every = np.ones(P, dtype=np.bool_)
     count = np.full(P, 3600)
     gathered = summed(rng.normal(size=P) * 0.002 * count, count, np.full(P, 3600.0), np.zeros(P))
-    known = conclude(design, nothing(design), gathered, every, 3600.0)
+    known = learn(design, class_only(design), gathered, every, 3600.0)
     assert known.learning is None
     return known
 
@@ -75,7 +75,7 @@ def test_means_that_end_together_covary_as_the_double_integral_says(short: float
     exact = dblquad(lambda s, u: np.exp(-abs(s - u)), 0.0, short, 0.0, lambda u: u)[0]
     exact += dblquad(lambda s, u: np.exp(-abs(s - u)), 0.0, short, lambda u: u, long)[0]
     times = np.array([short, long])
-    found = _share(times, times)
+    found = _mean_covariance(times, times)
     assert found[0, 1] == found[1, 0] == pytest.approx(exact / (short * long), rel=1e-6)
     assert np.linalg.eigvalsh(found).min() > -1e-12
 
@@ -92,8 +92,8 @@ def test_a_replaced_meter_is_learned_by_what_the_others_say_of_the_loads() -> No
     learning = known.learning
     for _ in range(40):
         learning = gather(learning, mean, use, 100.0)
-    assert ripe(design, learning).tolist() == one(2).tolist()
-    after = conclude(design, known.learned, learning, ripe(design, learning), 9000.0)
+    assert ready_meters(design, learning).tolist() == one(2).tolist()
+    after = learn(design, known.learned, learning, ready_meters(design, learning), 9000.0)
     assert after.learning is None
     B = np.diag(known.learned.variance)
     rho = 600.0 / 4000.0
@@ -119,7 +119,7 @@ def test_what_is_left_of_lasting_errors_is_in_the_standard_deviation(lasting: fl
     design = replace(design, doubt=replace(design.doubt, lasting=lasting))
     S, count = design.prior.between, 3600
     L = lasting * S + (1.0 - lasting) * design.busbar**2
-    share = float(_share(np.array([6.0]), np.array([6.0]))[0, 0])
+    share = float(_mean_covariance(np.array([6.0]), np.array([6.0]))[0, 0])
     noise = share * (S - L) + np.diag(design.white / count)
     inverse = np.linalg.inv(L + noise + np.diag(design.fixed))
     root, rest = np.linalg.cholesky(L + 1e-15 * np.eye(P)), np.linalg.cholesky(noise)
@@ -128,10 +128,10 @@ def test_what_is_left_of_lasting_errors_is_in_the_standard_deviation(lasting: fl
         own, lasts = np.sqrt(design.fixed) * rng.normal(size=P), root @ rng.normal(size=P)
         errors.append(lasts - L @ inverse @ (own + lasts + rest @ rng.normal(size=P)))
     gathered = summed(np.zeros(P), np.full(P, count), np.full(P, 3600.0), np.zeros(P))
-    found = conclude(design, nothing(design), gathered, every, 3600.0).learned
+    found = learn(design, class_only(design), gathered, every, 3600.0).learned
     np.testing.assert_allclose(found.hidden, np.diag(L - L @ inverse @ L), rtol=1e-6, atol=1e-14)
     np.testing.assert_allclose(found.hidden, np.var(errors, axis=0), rtol=0.1, atol=1e-14)
-    assert (nothing(design).hidden == 0.0).all()
+    assert (class_only(design).hidden == 0.0).all()
 
 
 def lasting_errors() -> tuple[SequentialDesign, Learned, Floats]:
@@ -146,7 +146,7 @@ def lasting_errors() -> tuple[SequentialDesign, Learned, Floats]:
     design = sequential.design(plant, doubt=doubt, step_s=1.0, options=options)
     others, count = np.flatnonzero(~one(2)), np.where(one(2), 0, 3600)
     gathered = summed(np.zeros(P), count, count.astype(np.float64), np.zeros(P))
-    known = conclude(design, nothing(design), gathered, ~one(2), 3600.0).learned
+    known = learn(design, class_only(design), gathered, ~one(2), 3600.0).learned
     S, B = design.prior.between, np.diag(design.fixed)
     means = np.hstack([np.linalg.cholesky(S), np.sqrt(B), np.zeros((P, P))])
     part, bias = np.ix_(others, others), np.zeros_like(means)
@@ -177,8 +177,8 @@ def test_an_honest_meter_not_learned_is_within_its_limit_as_seldom_as_is_said() 
     design, known, residuals = lasting_errors()
     window = empty(design.lengths, P)
     scale = Scales(design, no_doubts(design), window, known, np.zeros(P))[-1]
-    everybody = fit(scale.prior, scale.noise, np.ones(P, dtype=np.bool_))
-    view = view_of(design, scale, judge(everybody, scale.m))
+    everybody = condition(scale.prior, scale.noise, np.ones(P, dtype=np.bool_))
+    view = scale_test(design, scale, leave_one_out(everybody, scale.m))
     Q = np.linalg.inv(scale.prior.between + np.diag(scale.noise))
     offset = Q[2] @ np.hstack([residuals[:, : 2 * P], np.diag(np.sqrt(design.white / 60))]) / Q[2, 2]
     own = np.arange(3 * P) == P + 2
@@ -188,7 +188,7 @@ def test_an_honest_meter_not_learned_is_within_its_limit_as_seldom_as_is_said() 
 
 def test_where_nobody_or_everybody_is_learned_limits_are_as_they_were() -> None:
     design, rng = prepared(), np.random.default_rng(5)
-    assert nothing(design).late is None
+    assert class_only(design).late is None
     assert learned(design, rng).learned.late is None
     late = renew(design, learned(design, rng), one(2), 9.0).learned.late
     assert late is not None
@@ -204,7 +204,7 @@ def test_honest_meters_with_coarse_registers_are_not_suspected_once_learned() ->
     design = sequential.design(plant, doubt=doubt, step_s=1.0, options=options)
     every, none, rng = np.ones(P, dtype=np.bool_), np.zeros(P), np.random.default_rng(6)
     gathered = summed(none, np.full(P, 3600), np.full(P, 3600.0), none)
-    known = conclude(design, nothing(design), gathered, every, 0.0).learned
+    known = learn(design, class_only(design), gathered, every, 0.0).learned
     state = sequential.init(design, 0.0, known, None)
     # The truth is 230 V everywhere, and by their own errors one meter is rounded up and the others are down.
     off = np.where(one(4), 0.8, -0.8) / BASE_VOLT
@@ -219,13 +219,13 @@ def test_honest_meters_with_coarse_registers_are_not_suspected_once_learned() ->
 def test_a_silent_meter_is_waited_for_and_holds_up_nobody() -> None:
     design = prepared()
     use = ~one(4)
-    learning = begin(np.ones(P, dtype=np.bool_), 0.0)
+    learning = no_readings(np.ones(P, dtype=np.bool_), 0.0)
     for _ in range(35):
         learning = gather(learning, np.full(P, 1e-4), use, 100.0)
-    assert not ripe(design, learning).any()
+    assert not ready_meters(design, learning).any()
     learning = gather(learning, np.full(P, 1e-4), use, 100.0)
-    assert ripe(design, learning).tolist() == use.tolist()
-    first = conclude(design, nothing(design), learning, ripe(design, learning), 3600.0)
+    assert ready_meters(design, learning).tolist() == use.tolist()
+    first = learn(design, class_only(design), learning, ready_meters(design, learning), 3600.0)
     assert first.learning is not None
     assert first.learning.open.tolist() == one(4).tolist()
     assert np.isnan(first.learned.at[4])
@@ -237,7 +237,7 @@ def test_nothing_beyond_the_class_is_learned() -> None:
     design = prepared()
     every, count = np.ones(P, dtype=np.bool_), np.full(P, 10**6)
     gathered = summed(one(1) * 1.0 * count, count, np.full(P, 1e7), np.zeros(P))
-    known = conclude(design, nothing(design), gathered, every, 1e7)
+    known = learn(design, class_only(design), gathered, every, 1e7)
     assert known.learned.bias[1] == design.allowed[1]
     assert (np.abs(known.learned.bias) <= design.allowed).all()
 
@@ -253,12 +253,12 @@ def test_two_replaced_at_different_times_keep_their_own_time() -> None:
     np.testing.assert_array_equal(both.learning.time_s[[0, 1, 3]], [1800.0, 1800.0, 0.0])
     np.testing.assert_array_equal(both.learning.since[[0, 1, 3]], [4000.0, np.nan, 5800.0])
     later = gather(both.learning, np.zeros(P), use, 1800.0)
-    assert ripe(design, later).tolist() == one(0).tolist()
+    assert ready_meters(design, later).tolist() == one(0).tolist()
 
 
 def test_where_nothing_is_learned_nothing_is_begun_anew() -> None:
     design = prepared(0.0)
-    known = fresh(design, 0.0)
+    known = initial(design, 0.0)
     assert known.learning is None
     assert renew(design, known, one(1), 1.0) is known
 
@@ -267,7 +267,7 @@ class TestArrays:
     def test_there_and_back(self) -> None:
         design = prepared()
         for known in (
-            fresh(design, 7.0),
+            initial(design, 7.0),
             learned(design, np.random.default_rng(1)),
             renew(design, learned(design, np.random.default_rng(2)), one(1), 9.0),
         ):
@@ -303,7 +303,7 @@ class TestArrays:
 
     def test_all_problems_at_once(self) -> None:
         design = prepared()
-        arrays = to_arrays(fresh(design, 0.0))
+        arrays = to_arrays(initial(design, 0.0))
         del arrays["bias"]
         arrays |= {"more": np.zeros(P), "count": np.zeros(P + 1)}
         with refused(InputInvalid, "missing", "unknown-name", "shape"):
@@ -362,7 +362,7 @@ class TestStreets:
         assert (after.window.counts[:, 2] == 0).all()
         np.testing.assert_array_equal(after.window.sums[:, ~which], state.window.sums[:, ~which])
         for name in ("count", "run", "longest", "lag"):
-            now, was = getattr(after.kinds.memory, name), getattr(state.kinds.memory, name)
+            now, was = getattr(after.attack_kinds.history, name), getattr(state.attack_kinds.history, name)
             assert now[2] == 0
             np.testing.assert_array_equal(now[~which], was[~which])
         _, answers = watch(street, design, 60, state=after)

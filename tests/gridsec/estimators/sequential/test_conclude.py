@@ -11,12 +11,12 @@ import pytest
 from gridsec.estimators import sequential
 from gridsec.estimators.plant import Plant
 from gridsec.estimators.sequential import LoadDoubt, SequentialDesign, SequentialOptions
-from gridsec.estimators.sequential.conclude import _worst
-from gridsec.estimators.sequential.conditional import fit, judge
-from gridsec.estimators.sequential.examine import Examined
-from gridsec.estimators.sequential.scales import View
+from gridsec.estimators.sequential.conclude import _strongest
+from gridsec.estimators.sequential.conditional import condition, leave_one_out
+from gridsec.estimators.sequential.examine import Identification
+from gridsec.estimators.sequential.scales import ScaleTest
 from gridsec.estimators.sequential.search import Limits
-from gridsec.estimators.sequential.words import ways
+from gridsec.estimators.sequential.words import explanations_sentence
 from gridsec.interface import Cause, Decision, Explanation, Frame
 from tests.gridsec.estimators.sequential.test_monitor import prepare, watch
 from tests.gridsec.street import BASE_KVA, Street, accuracy, make_plant
@@ -35,16 +35,16 @@ def way(
 
 
 def test_every_explanation_is_told_as_what_it_is(design: SequentialDesign) -> None:
-    assert ways(design, (way((1,)), way())) == (
+    assert explanations_sentence(design, (way((1,)), way())) == (
         "Wrong are either the meter of c1 or else none of them; both explain the readings."
     )
-    three = ways(design, (way((1, 2)), way((3,), (4,)), way(powers=(5,))))
+    three = explanations_sentence(design, (way((1, 2)), way((3,), (4,)), way(powers=(5,))))
     assert three == (
         "Wrong are either the meters of c1, c2 or else the meter of c3 and the inverter of c4 or else the "
         "reported power of c5; each of these explains the readings."
     )
-    assert "c11" not in ways(design, (way(tuple(range(12))), way()))
-    assert "or 3 more; each of these" in ways(design, (way((1,)),) * 8)
+    assert "c11" not in explanations_sentence(design, (way(tuple(range(12))), way()))
+    assert "or 3 more; each of these" in explanations_sentence(design, (way((1,)),) * 8)
 
 
 def test_a_customer_on_the_busbar_is_known_as_well_as_its_meter_reads() -> None:
@@ -115,16 +115,18 @@ def test_a_meters_score_is_that_of_the_scale_that_speaks_most_against_it(design:
         enough = rng.random((4, 12)) < rng.choice([0.3, 0.9, 1.0])
         there = rng.random(4) < 0.7
         views = tuple(
-            replace(_view(design), judged=replace(_view(design).judged, offset=o), limit=a, enough=e)
+            replace(_view(design), loo=replace(_view(design).loo, residual=o), limit=a, enough=e)
             if here
             else None
             for o, a, e, here in zip(offset, limit, enough, there, strict=True)
         )
-        seen = Examined(sequential.init(design, 0.0).trust, (None,) * 4, (None,) * 4, views, {}, (False,) * 4)
-        score, threshold, judged = _worst(design, seen, 12)
+        seen = Identification(
+            sequential.init(design, 0.0).trust, (None,) * 4, (None,) * 4, views, {}, (False,) * 4
+        )
+        score, threshold, loo = _strongest(design, seen, 12)
         for j in range(12):
             by = [s for s in range(4) if there[s] and enough[s, j]]
-            assert judged[j] == bool(by)
+            assert loo[j] == bool(by)
             if not by:
                 assert np.isnan(score[j])
                 assert threshold[j] == design.options.widest
@@ -134,9 +136,9 @@ def test_a_meters_score_is_that_of_the_scale_that_speaks_most_against_it(design:
 
 
 @cache
-def _view(design: SequentialDesign) -> View:
+def _view(design: SequentialDesign) -> ScaleTest:
     """Any view of a scale."""
     zero, prior = np.zeros(12), design.prior
-    judged = judge(fit(prior, design.white, zero == 0.0), zero)
+    loo = leave_one_out(condition(prior, design.white, zero == 0.0), zero)
     limits = Limits(4.0, zero, design.allowed, design.fixed)
-    return View(judged, zero == 0.0, zero, zero > 0.0, limits, 0.5)
+    return ScaleTest(loo, zero == 0.0, zero, zero > 0.0, limits, 0.5)

@@ -67,7 +67,7 @@ def test_a_scale_speaks_for_a_meter_once_it_has_readings_enough(
         SuspicionRecord.empty(P, M), scale_s=np.where(which, scale_s, np.nan), named=which & named
     )
     state = warm_start(design, init(design, street.t), before)
-    readings = max(readings, int(state.trust.owed.max()))
+    readings = max(readings, int(state.trust.readings_owed.max()))
     state, silent = watch(street, design, 10, state=state, silent=LIARS)
     state, early = watch(street, design, readings - 1, state=state)
     assert not any(verdict.decision is Decision.CLEAN for _, verdict in (*silent, *early))
@@ -133,7 +133,7 @@ def test_a_busbar_that_has_become_honest_is_believed_once_it_has_agreed_long_eno
 ) -> None:
     design, street = begun
     state = warm_start(design, init(design, street.t), _busbar(scale_s, 0.06))
-    owed = int(-state.busbar.quiet[0])
+    owed = int(-state.busbar.ticks_agreeing[0])
     assert owed >= need
     # However long it says nothing, that pays nothing back.
     state, _ = watch(street, design, 80, state=state, change=lambda f: replace(f, v0_squared=np.nan))
@@ -150,7 +150,7 @@ def test_a_replaced_meter_owes_nothing(begun: tuple[SequentialDesign, Street]) -
     before = replace(SuspicionRecord.empty(P, M), scale_s=np.where(which, 60.0, np.nan), named=which)
     state = renew(design, warm_start(design, init(design, street.t), before), np.arange(P) == LIARS[0])
     assert distrusted(design, state).same(before.without(np.arange(P) == LIARS[0]))
-    assert state.trust.owed[LIARS[0]] == 0
+    assert state.trust.readings_owed[LIARS[0]] == 0
     _, _, verdict = sequential.step(design, state, street.frame())
     assert np.flatnonzero(verdict.suspects).tolist() == [LIARS[1]]
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gridsec.estimators.sequential import effects as module
-from gridsec.estimators.sequential.effects import Effects
+from gridsec.estimators.sequential.effects import Sensitivities
 from gridsec.grid.network import Network, Power
 from tests.gridsec.grid.test_network import phased
 from tests.gridsec.meshes import random_mesh
@@ -28,21 +28,23 @@ def test_numbers_are_active_powers_first(name: str, kept: bool, monkeypatch: pyt
     count, places = feeder.bus.size, len(feeder.buses)
     if not kept:
         monkeypatch.setattr(module, "_KEPT", 0)
-        monkeypatch.setattr(module, "_PART", 2)
-    effects, rng = Effects(feeder), np.random.default_rng(5)
-    assert (effects.table is not None) is kept
+        monkeypatch.setattr(module, "_BLOCK", 2)
+    sensitivities, rng = Sensitivities(feeder), np.random.default_rng(5)
+    assert (sensitivities.table is not None) is kept
     both = [feeder.columns(power, np.arange(count)) for power in Power]
     expected = np.hstack(both)
     assert not np.allclose(*both)
     which = rng.permutation(2 * count)[: count + 1]
-    np.testing.assert_allclose(effects.of(which), expected[:, which], atol=1e-12)
+    np.testing.assert_allclose(sensitivities.numbered(which), expected[:, which], atol=1e-12)
     for power, own in zip(Power, both, strict=True):
-        np.testing.assert_allclose(effects.columns(power, which % count), own[:, which % count], atol=1e-12)
+        np.testing.assert_allclose(
+            sensitivities.columns(power, which % count), own[:, which % count], atol=1e-12
+        )
     # Few customers, or most of them.
     for some in (rng.choice(count, 1), rng.permutation(count)):
         weights = rng.standard_normal(some.size)
         np.testing.assert_allclose(
-            effects.along(some, weights), weights @ expected[feeder.bus[some]], rtol=1e-9, atol=1e-12
+            sensitivities.weighted(some, weights), weights @ expected[feeder.bus[some]], rtol=1e-9, atol=1e-12
         )
     at = rng.choice(places, 2)
-    np.testing.assert_allclose(np.hstack(list(effects.at(at))), expected[at], atol=1e-12)
+    np.testing.assert_allclose(np.hstack(list(sensitivities.rows(at))), expected[at], atol=1e-12)

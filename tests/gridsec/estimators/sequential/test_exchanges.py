@@ -10,12 +10,12 @@ import pytest
 from gridsec.estimators import sequential
 from gridsec.estimators.plant import Plant
 from gridsec.estimators.sequential import LoadDoubt, SequentialOptions
-from gridsec.estimators.sequential.conditional import fit, judge, loosen
-from gridsec.estimators.sequential.dictionary import Dictionary
-from gridsec.estimators.sequential.exchanges import turns
+from gridsec.estimators.sequential.conditional import add_unknown, condition, leave_one_out
+from gridsec.estimators.sequential.dictionary import FaultDictionary
+from gridsec.estimators.sequential.exchanges import fault_exchanges
 from gridsec.estimators.sequential.loads import LoadDoubt as Doubt
 from gridsec.estimators.sequential.loads import prior
-from gridsec.estimators.sequential.search import Solution
+from gridsec.estimators.sequential.search import Candidate
 from gridsec.grid.droop import fleet
 from gridsec.interface import Cause, Decision, Verdict
 from tests.gridsec.street import BASE_KVA, Street, accuracy, make_plant, random_tree
@@ -100,29 +100,29 @@ def test_turns_are_what_the_misfit_rises_by() -> None:
     at = plant.feeder.bus[plant.meters]
     doubt = Doubt(np.full(10, 0.006), np.full(10, 0.002), 600.0)
     known = prior(plant.feeder, at, doubt, busbar=1e-3)
-    noise, live = np.full(10, 0.01**2), np.ones(10, dtype=bool)
-    live[3] = False
+    noise, available = np.full(10, 0.01**2), np.ones(10, dtype=bool)
+    available[3] = False
     columns = rng.normal(size=(11, 6)) * rng.uniform(0.02, 0.2, 6)
     std = rng.uniform(0.1, 2.0, 6)
-    book = Dictionary(
+    faults = FaultDictionary(
         std=std,
         charge=np.ones(6),
         size=(columns[at] ** 2).sum(axis=0),
         meter=np.full(6, -1),
         columns=lambda which: columns[:, which],
-        along=lambda weights: weights @ columns[at],
+        weighted=lambda weights: weights @ columns[at],
     )
     m = 0.03 * rng.normal(size=10)
 
     def misfit(which: tuple[int, ...]) -> float:
         loose = columns[:, [5, *which]] * std[[5, *which]]
-        return judge(fit(known, noise, live, loose), m).misfit
+        return leave_one_out(condition(known, noise, available, loose), m).chi_square
 
-    now = fit(known, noise, live, columns[:, [5]] * std[5])
+    now = condition(known, noise, available, columns[:, [5]] * std[5])
     for k in (1, 4):
-        loosen(now, columns[:, k], float(std[k]))
-    found = Solution(now.trusted, (1, 4), 0.0, 0.0, now, judge(now, m))
-    every = turns(found, book, (1, 4, 2), np.arange(5), 1e9)
+        add_unknown(now, columns[:, k], float(std[k]))
+    found = Candidate(now.trusted, (1, 4), 0.0, 0.0, now, leave_one_out(now, m))
+    every = fault_exchanges(found, faults, (1, 4, 2), np.arange(5), 1e9)
     assert {(one.accused, one.innocent) for one in every} == {(a, b) for a in (1, 4) for b in (0, 2, 3)}
     for one in every:
         which = (one.innocent, 4) if one.accused == 1 else (1, one.innocent)
@@ -130,5 +130,5 @@ def test_turns_are_what_the_misfit_rises_by() -> None:
         assert one.worse == pytest.approx(max(worse, 0.0), rel=1e-6, abs=1e-8)
     assert [one.worse for one in every] == sorted(one.worse for one in every)
     median = float(np.median([one.worse for one in every]))
-    assert len(turns(found, book, (1, 4), np.arange(5), median)) < len(every)
-    assert turns(found, book, (2,), np.arange(5), 1e9) == []
+    assert len(fault_exchanges(found, faults, (1, 4), np.arange(5), median)) < len(every)
+    assert fault_exchanges(found, faults, (2,), np.arange(5), 1e9) == []

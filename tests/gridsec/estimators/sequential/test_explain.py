@@ -13,11 +13,17 @@ from gridsec.arrays import Bools, Floats
 from gridsec.estimators import sequential
 from gridsec.estimators.plant import Plant
 from gridsec.estimators.sequential import LoadDoubt, SequentialDesign, explain
-from gridsec.estimators.sequential.conditional import Fit, Judged, fit, judge, misfit
-from gridsec.estimators.sequential.dictionary import of_a_liar
-from gridsec.estimators.sequential.explain import Search, _linked
-from gridsec.estimators.sequential.scales import Scales, View, adapt, view_of
-from gridsec.estimators.sequential.search import Explanation, Found, Solution, descend, price
+from gridsec.estimators.sequential.conditional import (
+    LeaveOneOut,
+    Posterior,
+    chi_square,
+    condition,
+    leave_one_out,
+)
+from gridsec.estimators.sequential.dictionary import false_power_charge
+from gridsec.estimators.sequential.explain import HypothesisSearch, _components
+from gridsec.estimators.sequential.scales import Scales, ScaleTest, scale_test, update_posterior
+from gridsec.estimators.sequential.search import Candidate, Candidates, Hypothesis, descend, set_cost
 from gridsec.estimators.sequential.windows import push
 from gridsec.grid.droop import fleet
 from gridsec.grid.meter import MeterAccuracy
@@ -53,28 +59,32 @@ def two_streets() -> SequentialDesign:
     return sequential.design(plant, doubt=doubt, step_s=1.0)
 
 
-def search(design: SequentialDesign, m: Floats) -> Found:
+def search(design: SequentialDesign, m: Floats) -> Candidates:
     """What the first scale finds when everybody was believed until now."""
     made, now, view = prepared(design, m)
     return made(now, view)[0]
 
 
-def prepared(design: SequentialDesign, m: Floats) -> tuple[Search, Fit, View]:
+def prepared(design: SequentialDesign, m: Floats) -> tuple[HypothesisSearch, Posterior, ScaleTest]:
     """The search itself, and what it begins with."""
     state, everybody = sequential.init(design, 0.0), np.ones(m.size, dtype=np.bool_)
     window = push(state.window, design.lengths, m, everybody)
-    scales = Scales(design, state.doubts, window, state.learned, np.zeros(m.size))
-    now = adapt(None, scales[0], everybody, None)
-    view = view_of(design, scales[0], judge(now, scales[0].m))
-    return Search(design, scales, state.wholes, state.trust, 0), now, view
+    scales = Scales(design, state.uncertainty, window, state.learned, np.zeros(m.size))
+    now = update_posterior(None, scales[0], everybody, None)
+    view = scale_test(design, scales[0], leave_one_out(now, scales[0].m))
+    return HypothesisSearch(design, scales, state.full_posteriors, state.trust, 0), now, view
 
 
-def cost(design: SequentialDesign, m: Floats, liars: Bools, loosened: tuple[int, ...] = ()) -> float:
+def cost(design: SequentialDesign, m: Floats, suspects: Bools, accused_faults: tuple[int, ...] = ()) -> float:
     """J by definition, without what loosened directions are charged."""
-    at = np.flatnonzero(~liars)
+    at = np.flatnonzero(~suspects)
     whole = design.prior.between[np.ix_(at, at)] + np.diag(design.white[at])
-    more = (design.book.columns(np.array(loosened, dtype=int)) * design.book.std[list(loosened)])[at + 1]
-    return float(m[at] @ np.linalg.solve(whole + more @ more.T, m[at])) + price(m.size, int(liars.sum()))
+    more = (
+        design.faults.columns(np.array(accused_faults, dtype=int)) * design.faults.std[list(accused_faults)]
+    )[at + 1]
+    return float(m[at] @ np.linalg.solve(whole + more @ more.T, m[at])) + set_cost(
+        m.size, int(suspects.sum())
+    )
 
 
 def draw(design: SequentialDesign, seed: int, size: float) -> tuple[Floats, Bools]:
@@ -95,11 +105,11 @@ def test_where_the_word_of_many_stands_against_that_of_many_nobody_is_sure(size:
     """Seven of fifteen tell the same lie: what they say is as likely as what the others say, or not."""
     design, both_told = two_streets(), 0
     for seed in range(60):
-        m, liars = draw(design, seed, size)
-        turned = np.where(np.arange(m.size) < NEAR, liars, ~liars)
+        m, suspects = draw(design, seed, size)
+        turned = np.where(np.arange(m.size) < NEAR, suspects, ~suspects)
         found = search(design, m)
         within = found.best.cost + 2.0 * np.log(design.options.like)
-        sides = cost(design, m, liars), cost(design, m, turned)
+        sides = cost(design, m, suspects), cost(design, m, turned)
         assert found.best.cost <= min(sides) + 0.1
         if max(sides) < within - 0.5:
             both_told += 1
@@ -134,14 +144,14 @@ def watched(design: SequentialDesign, seed: int, far: int) -> tuple[set[int], se
 @pytest.mark.parametrize("seed", [2, 6, 16, 20, 26])
 def test_nobody_of_the_other_side_is_named_by_a_breath_of_noise(seed: int) -> None:
     """Seven of fifteen tell one lie: without a common amount for them, noise tips the scales at some tick."""
-    named, liars = watched(two_streets(), seed, 7)
-    assert named <= liars
+    named, suspects = watched(two_streets(), seed, 7)
+    assert named <= suspects
 
 
 def test_a_third_of_a_street_is_named() -> None:
     for seed in range(4):
-        named, liars = watched(two_streets(), seed, 5)
-        assert named == liars
+        named, suspects = watched(two_streets(), seed, 5)
+        assert named == suspects
 
 
 def test_a_group_off_by_one_amount_gains_by_definition() -> None:
@@ -157,7 +167,7 @@ def test_a_group_off_by_one_amount_gains_by_definition() -> None:
         alike = 1e2 * group.meters
         with_amount = m @ np.linalg.solve(every + np.multiply.outer(alike, alike), m)
         assert group.gain == pytest.approx(m @ np.linalg.solve(every, m) - with_amount, rel=1e-4)
-        assert group.gain > group.charge >= 2.0 * np.log(m.size * design.most) - 1e-9
+        assert group.gain > group.charge >= 2.0 * np.log(m.size * design.max_attacked) - 1e-9
     net = [group.gain - group.charge for group in found]
     assert net == sorted(net, reverse=True)
 
@@ -168,20 +178,20 @@ def test_a_street_off_alike_is_a_rival_at_the_price_of_one_hypothesis() -> None:
     rng = np.random.default_rng(6)
     root = np.linalg.cholesky(design.prior.between + 1e-14 * np.eye(count))
     m = root @ rng.normal(size=count) + np.sqrt(design.white) * rng.normal(size=count)
-    design = replace(design, most=FAR)
+    design = replace(design, max_attacked=FAR)
     group = np.arange(NEAR, count - 2)
     m[group] -= 0.02
     hunt, _, _ = prepared(design, m)
     base = np.ones(count, dtype=np.bool_)
-    best = hunt._descend(hunt._fit(~np.isin(np.arange(count), [count - 2, count - 1])), ~base)
+    best = hunt._descend(hunt._condition(~np.isin(np.arange(count), [count - 2, count - 1])), ~base)
     first = next(
         one
-        for one in hunt._neighbourhoods(hunt._fit(base), best)
+        for one in hunt._neighbourhoods(hunt._condition(base), best)
         if set(group) == set(np.flatnonzero(one.meters))
     )
     charge = 2.0 * float(np.log(count * (count - FAR)))
     assert first.charge == pytest.approx(charge)
-    _, other = hunt._off_alike(best, base, [first])
+    _, other = hunt._with_offsets(best, base, [first])
     alike = np.where(np.isin(np.arange(count), group), 0.2, 0.0)
     every = design.prior.between + np.diag(design.white) + np.multiply.outer(alike, alike)
     assert np.array_equal(np.flatnonzero(~other.trusted), group)
@@ -199,20 +209,20 @@ def test_one_amount_for_a_group_by_definition() -> None:
     at = np.flatnonzero(trusted)
     whole = design.prior.between + np.diag(design.white) + alike @ alike.T
     wanted = m[at] @ np.linalg.solve(whole[np.ix_(at, at)], m[at])
-    found = misfit(design.prior, design.white, m, trusted, None, alike)
+    found = chi_square(design.prior, design.white, m, trusted, None, alike)
     assert found == pytest.approx(wanted, rel=1e-8)
     # One that may be off by anything by itself is as good as dropped.
     one, there = np.zeros((m.size, 1)), trusted.copy()
     one[at[3]], there[at[3]] = 1e3, False
-    without = misfit(design.prior, design.white, m, there)
-    assert misfit(design.prior, design.white, m, trusted, None, one) == pytest.approx(without, rel=1e-5)
+    without = chi_square(design.prior, design.white, m, there)
+    assert chi_square(design.prior, design.white, m, trusted, None, one) == pytest.approx(without, rel=1e-5)
 
 
 def test_a_street_is_turned_round_where_powers_are_accused_too() -> None:
     """One of the seven claims a load as well that is not there: if it is honest, that is charged in full."""
     plain, told, full = two_streets(), 0, 0
-    book = plain.book
-    design = replace(plain, book=replace(book, std=np.full(book.std.size, 0.4)))
+    faults = plain.faults
+    design = replace(plain, faults=replace(faults, std=np.full(faults.std.size, 0.4)))
     feeder, count = design.plant.feeder, NEAR + FAR
     for seed in range(8):
         rng = np.random.default_rng([8, seed])
@@ -222,13 +232,15 @@ def test_a_street_is_turned_round_where_powers_are_accused_too() -> None:
         m -= 0.2 * feeder.columns(Power.ACTIVE, group[:1])[feeder.bus, 0]
         m[group] -= 0.018
         made, now, _ = prepared(design, m)
-        for each in made._turned(made._descend(now, np.zeros(count, dtype=bool), design.book)):
-            liars, which = ~each.trusted, np.array(each.loosened, dtype=int)
-            honest = each.trusted[book.meter[which]]
-            charge = np.where(honest, book.charge[which], of_a_liar(liars.sum())).sum() * price(count, 1)
+        for each in made._reversals(made._descend(now, np.zeros(count, dtype=bool), design.faults)):
+            suspects, which = ~each.trusted, np.array(each.faults, dtype=int)
+            honest = each.trusted[faults.meter[which]]
+            charge = np.where(
+                honest, faults.charge[which], false_power_charge(suspects.sum())
+            ).sum() * set_cost(count, 1)
             told, full = told + bool(which.size), full + bool(honest.any())
             assert each.charge == pytest.approx(charge)
-            assert each.cost == pytest.approx(cost(design, m, liars, each.loosened) + charge, rel=1e-6)
+            assert each.cost == pytest.approx(cost(design, m, suspects, each.faults) + charge, rel=1e-6)
     assert told > 4
     assert full > 0
 
@@ -239,28 +251,30 @@ def test_what_is_judged_is_what_each_search_begins_with(
 ) -> None:
     """Also where this scale lifts a suspicion, and so begins with another fit than that it was asked of."""
     design, told = two_streets(), list[bool]()
-    m, liars = draw(design, 3, 0.05)
-    m[liars & (np.arange(m.size) >= NEAR)] += 0.05
-    liars[NEAR:] = False
+    m, suspects = draw(design, 3, 0.05)
+    m[suspects & (np.arange(m.size) >= NEAR)] += 0.05
+    suspects[NEAR:] = False
     made, now, view = prepared(design, m)
     if suspected:
         trust = replace(made.trust, accused=((0, 0),))
-        direction = made.scales.loosened(trust.accused)
-        now = adapt(None, made.scales[0], np.ones(m.size, dtype=np.bool_), direction)
-        view = view_of(design, made.scales[0], judge(now, m))
-        made = Search(design, made.scales, made.wholes, trust, 0)
+        direction = made.scales.unknowns(trust.accused)
+        now = update_posterior(None, made.scales[0], np.ones(m.size, dtype=np.bool_), direction)
+        view = scale_test(design, made.scales[0], leave_one_out(now, m))
+        made = HypothesisSearch(design, made.scales, made.full_posteriors, trust, 0)
     plain = descend
 
-    def checked(start: Fit, m: Floats, *rest: Any, judged: Judged | None = None, **more: Any) -> Solution:
+    def checked(
+        start: Posterior, m: Floats, *rest: Any, loo: LeaveOneOut | None = None, **more: Any
+    ) -> Candidate:
         # Those that believe somebody begin with what another one came to.
-        told.append(judged is not None and not more["innocent"].size)
-        if judged is not None:
-            np.testing.assert_allclose(judged.offset, judge(start, m).offset)
-        return plain(start, m, *rest, judged=judged, **more)
+        told.append(loo is not None and not more["protected"].size)
+        if loo is not None:
+            np.testing.assert_allclose(loo.residual, leave_one_out(start, m).residual)
+        return plain(start, m, *rest, loo=loo, **more)
 
     monkeypatch.setattr(explain.search, "descend", checked)
     found, _ = made(now, view)
-    np.testing.assert_array_equal(~found.best.trusted, liars)
+    np.testing.assert_array_equal(~found.best.trusted, suspects)
     assert any(told) is not suspected
 
 
@@ -277,24 +291,24 @@ def test_linked_are_connected_components() -> None:
         link = rng.random((size, size)) < 1.2 / max(size, 1)
         link |= link.T | np.eye(size, dtype=bool)
         _, label = connected_components(link) if size else (0, np.zeros(0))
-        parts = _linked(link)
+        parts = _components(link)
         assert sorted(np.concatenate([*parts, np.zeros(0, dtype=int)]).tolist()) == list(range(size))
         assert {frozenset(part.tolist()) for part in parts} == {
             frozenset(np.flatnonzero(label == k).tolist()) for k in set(label.tolist())
         }
 
 
-def several_scales(seed: int, accused: tuple[tuple[int, int], ...] = ()) -> Search:
+def several_scales(seed: int, accused: tuple[tuple[int, int], ...] = ()) -> HypothesisSearch:
     """A search on the first scale when each has seen something else, with a kept fit of all meters each."""
     rng, design = np.random.default_rng([17, seed]), two_streets()
     state, every = sequential.init(design, 0.0), np.ones(NEAR + FAR, dtype=np.bool_)
     window = state.window
     for _ in range(design.lengths[-1]):
         window = push(window, design.lengths, 0.01 * rng.normal(size=every.size), every)
-    scales = Scales(design, state.doubts, window, state.learned, np.zeros(every.size))
+    scales = Scales(design, state.uncertainty, window, state.learned, np.zeros(every.size))
     each = range(len(design.lengths))
-    wholes = tuple(fit(scales[s].prior, scales[s].noise, every) for s in each)
-    return Search(design, scales, wholes, replace(state.trust, accused=accused), 0)
+    full_posteriors = tuple(condition(scales[s].prior, scales[s].noise, every) for s in each)
+    return HypothesisSearch(design, scales, full_posteriors, replace(state.trust, accused=accused), 0)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -302,39 +316,39 @@ def test_each_scale_has_its_own_misfit(seed: int) -> None:
     """Whether it is worked out anew, from a kept fit, or with what else is accused; asked in any order."""
     rng, made = np.random.default_rng(seed), several_scales(seed)
     trusted = rng.random(NEAR + FAR) < 0.85
-    start = made._fit(trusted)
-    solution = Solution(trusted, (), 0.0, 0.0, start, judge(start, made.here.m))
-    lone, also = Explanation(trusted, (), 0.0, 0.0), Explanation(trusted, (3,), 0.0, 0.0)
+    start = made._condition(trusted)
+    solution = Candidate(trusted, (), 0.0, 0.0, start, leave_one_out(start, made.here.m))
+    lone, also = Hypothesis(trusted, (), 0.0, 0.0), Hypothesis(trusted, (3,), 0.0, 0.0)
     group = np.flatnonzero(~trusted)[:3]
     more, alike = np.isin(np.arange(trusted.size), group), np.zeros((trusted.size, 1))
     alike[group] = 0.2
 
-    def expected(who: Bools, loosened: tuple[int, ...], alike: Floats | None = None) -> list[float]:
-        book, all_ = made.scales.book, [made.scales[s] for s in range(len(made.design.lengths))]
-        which = np.array(loosened, dtype=int)
-        loose = book.columns(which) * book.std[which] if loosened else None
-        return [misfit(one.prior, one.noise, one.m, who, loose, alike) for one in all_]
+    def expected(who: Bools, accused_faults: tuple[int, ...], alike: Floats | None = None) -> list[float]:
+        faults, all_ = made.scales.faults, [made.scales[s] for s in range(len(made.design.lengths))]
+        which = np.array(accused_faults, dtype=int)
+        loose = faults.columns(which) * faults.std[which] if accused_faults else None
+        return [chi_square(one.prior, one.noise, one.m, who, loose, alike) for one in all_]
 
     plain = expected(trusted, ())
     assert len({round(each, 6) for each in plain}) == len(plain) > 2
     for _ in range(2):
-        np.testing.assert_allclose(made._misfits(lone), plain, rtol=1e-8)
-        np.testing.assert_allclose(made._misfits(also), expected(trusted, (3,)), rtol=1e-8)
-        np.testing.assert_allclose(made._misfits(solution), plain, rtol=1e-8)
+        np.testing.assert_allclose(made._chi_squares(lone), plain, rtol=1e-8)
+        np.testing.assert_allclose(made._chi_squares(also), expected(trusted, (3,)), rtol=1e-8)
+        np.testing.assert_allclose(made._chi_squares(solution), plain, rtol=1e-8)
         for found in (lone, solution):
             both = expected(trusted | more, (), alike)
-            np.testing.assert_allclose(made._misfits(found, more, alike), both, rtol=1e-8)
+            np.testing.assert_allclose(made._chi_squares(found, more, alike), both, rtol=1e-8)
 
 
 def test_what_else_is_accused_stays_so_in_every_start() -> None:
     """A kept fit of all meters knows nothing of it."""
     rng, made = np.random.default_rng(1), several_scales(1, accused=((4, 1),))
     trusted = rng.random(NEAR + FAR) < 0.85
-    loose = made.scales.loosened(made.accused)
+    loose = made.scales.unknowns(made.accused)
     assert loose is not None
-    found = made._fit(trusted)
-    anew = fit(made.here.prior, made.here.noise, trusted, loose)
-    np.testing.assert_array_equal(found.loose, anew.loose)
+    found = made._condition(trusted)
+    anew = condition(made.here.prior, made.here.noise, trusted, loose)
+    np.testing.assert_array_equal(found.unknowns, anew.unknowns)
     np.testing.assert_allclose(found.Q, anew.Q, rtol=1e-9, atol=1e-9 * np.abs(anew.Q).max())
 
 
@@ -342,10 +356,10 @@ def test_fits_of_exact_meters_are_not_made_from_a_kept_one() -> None:
     """What many that fall at once leave would be lost in rounding."""
     rng, made = np.random.default_rng(2), several_scales(2)
     trusted, prior = rng.random(NEAR + FAR) < 0.85, made.here.prior
-    assert made._fit(trusted).changes == np.count_nonzero(~trusted) > 0
+    assert made._condition(trusted).updates == np.count_nonzero(~trusted) > 0
     noise = np.full(trusted.size, 1e-8 * float(prior.variance.max()))
     made.here = replace(made.here, noise=noise)
-    made.covering[0] = fit(prior, noise, np.ones_like(trusted))
-    found, anew = made._fit(trusted), fit(prior, noise, trusted)
-    assert found.changes == 0
+    made.covering[0] = condition(prior, noise, np.ones_like(trusted))
+    found, anew = made._condition(trusted), condition(prior, noise, trusted)
+    assert found.updates == 0
     np.testing.assert_array_equal(found.Q, anew.Q)

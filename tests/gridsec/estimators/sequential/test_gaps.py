@@ -11,7 +11,7 @@ from gridsec.errors import InputInvalid
 from gridsec.estimators import sequential
 from gridsec.estimators.plant import Plant
 from gridsec.estimators.sequential import LoadDoubt, SequentialDesign, SequentialOptions, SequentialState
-from gridsec.estimators.sequential.commission import Learned, from_arrays, nothing, to_arrays
+from gridsec.estimators.sequential.commission import Learned, class_only, from_arrays, to_arrays
 from gridsec.grid.droop import fleet
 from gridsec.grid.meter import MeterAccuracy
 from gridsec.interface import Decision, Frame
@@ -27,7 +27,7 @@ def calm(seed: int = 4) -> tuple[SequentialDesign, Street, SequentialState]:
     plant = make_plant(np.random.default_rng(3), customers=9, drop=0.02)
     made, street = prepare(plant), Street(plant, np.random.default_rng(seed), load_kw=0.5)
     street.bias[:] = street.busbar_bias = 0.0
-    blank, aging = nothing(made), 0.1 * made.allowed
+    blank, aging = class_only(made), 0.1 * made.allowed
     known = Learned(blank.bias, aging**2 / 3.0, aging, np.full(9, 1000.0), np.zeros(9))
     return made, street, sequential.init(made, 1000.0, known, None)
 
@@ -250,7 +250,7 @@ def test_the_step_after_a_suspicion_finds_its_inverters_prepared() -> None:
     prepared = []
     for _ in range(4):
         state, _ = watch(street, made, 1, state=state, lies={LIAR: 0.05})
-        prepared.append(state.free)
+        prepared.append(state.model_driven)
     suspect = prepared[0]
     assert suspect is not None
     np.testing.assert_array_equal(suspect.rows, np.flatnonzero(made.meter_of == LIAR))

@@ -56,7 +56,7 @@ class TestNumbersThatAreNone:
         verdicts, state = run(put(name, value), frames=6, after=70)
         assert not any(verdict.suspects.any() for verdict in verdicts)
         assert verdicts[-1].decision is Decision.CLEAN
-        assert (state.doubts.p == 1.0).all()
+        assert (state.uncertainty.p == 1.0).all()
 
     @pytest.mark.parametrize("value", [-1e308, 0.0, 1e8, 1e15, 1e200, 1e308])
     def test_a_reading_that_is_none_is_a_lie_of_one_meter(self, value: float) -> None:
@@ -98,7 +98,7 @@ class TestNumbersThatAreNone:
         for error in (0.05, 50.0, np.inf):
             given = replace(frame, p_error=np.full(12, error))
             state, _, _ = sequential.step(made, sequential.init(made, frame.t - 1.0), given)
-            assert (state.doubts.priors[-1].variance[1:] > made.prior.variance[1:]).all()
+            assert (state.uncertainty.priors[-1].variance[1:] > made.prior.variance[1:]).all()
 
 
 @pytest.mark.parametrize(("factor", "before"), [(4.0, 30), (30.0, 21)])
@@ -108,7 +108,7 @@ def test_the_models_error_is_that_of_the_loads_there_are(factor: float, before: 
     plant = make_plant(rng, customers=12, drop=0.03)
     plain, street = prepare(plant), Street(plant, rng)
     most = np.full(12, 1e3)
-    design = replace(plain, most_p=most, most_q=most)
+    design = replace(plain, max_p=most, max_q=most)
     state, _ = watch(street, design, before)
     frame = street.frame()
     frame = replace(frame, t=state.t + 1.0, p=factor * frame.p)

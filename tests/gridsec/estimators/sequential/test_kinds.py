@@ -20,8 +20,16 @@ from feeders.simulation.scenario import START, Scenario, simulate, snapshots
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.attack import Bias, Replay
 from gridsec.estimators.sequential import kinds, repeats
-from gridsec.estimators.sequential.kinds import Shapes
-from gridsec.estimators.sequential.repeats import BLOCKS, BYTES, ROWS, SPAN, Block, Memory, Rules
+from gridsec.estimators.sequential.kinds import KindReferences
+from gridsec.estimators.sequential.repeats import (
+    BLOCKS,
+    BYTES,
+    ROWS,
+    SPAN,
+    Block,
+    ReadingHistory,
+    RepeatLimits,
+)
 from gridsec.interface import ManipulationKind
 
 STEP = 0.1 / 230.0
@@ -30,19 +38,19 @@ CHANCE = 1e-10
 SOON_S = {"stuck": 40.0, "replay": 40.0 + BLOCKS}
 
 
-def law(jitter: float = 5e-4, meters: int = 1) -> Rules:
+def law(jitter: float = 5e-4, meters: int = 1) -> RepeatLimits:
     """Registers of 0.1 V."""
-    return repeats.rules(np.full(meters, STEP), np.full(meters, jitter), CHANCE, 1.0)
+    return repeats.repeat_limits(np.full(meters, STEP), np.full(meters, jitter), CHANCE, 1.0)
 
 
-def play(rule: Rules, v: Floats, heard: Bools | None = None) -> list[Memory]:
+def play(rule: RepeatLimits, v: Floats, heard: Bools | None = None) -> list[ReadingHistory]:
     """All states while meters read v, (T, p) pu."""
     heard = np.ones(v.shape, dtype=np.bool_) if heard is None else heard
     memory, out = repeats.empty(v.shape[1]), []
-    for row, live in zip(np.rint(v / rule.step) * rule.step, heard, strict=True):
-        listened = repeats.listen(rule, memory, np.where(live, row**2, 0.0), live)
+    for row, available in zip(np.rint(v / rule.step) * rule.step, heard, strict=True):
+        listened = repeats.ingest(rule, memory, np.where(available, row**2, 0.0), available)
         out.append(listened)
-        memory = repeats.keep(listened, row**2, 0.1 * row)
+        memory = repeats.store(listened, row**2, 0.1 * row)
     return out
 
 
@@ -73,7 +81,7 @@ class TestRules:
         rule = law(0.0)
         assert rule.surprise[0] == 0.0
         still = np.ones((2000, 1))
-        assert not any(repeats.lags(memory).any() for memory in play(rule, still))
+        assert not any(repeats.repeat_lags(memory).any() for memory in play(rule, still))
 
     def test_a_run_is_evidence_exactly_from_the_surprise_on(self) -> None:
         rule, rng = law(), np.random.default_rng(1)
@@ -124,7 +132,7 @@ class TestMemory:
             v[k] = v[k - lag]
         heard = rng.random((ticks, 1)) < 0.9
         heard[-1] = True
-        got = repeats.repeated(play(law(), v, heard)[-1], 0, lag, 500)
+        got = repeats.matching_readings(play(law(), v, heard)[-1], 0, lag, 500)
         expected = 0
         for k in range(ticks - 1, lag - 1, -1):
             if heard[k, 0] and heard[k - lag, 0]:
@@ -159,8 +167,8 @@ class TestMemory:
         memory, rng = repeats.empty(meters), np.random.default_rng(2)
         rule = law(meters=meters)
         for _ in range(ticks):
-            memory = repeats.listen(rule, memory, rng.random(meters), np.ones(meters, dtype=np.bool_))
-            memory = repeats.keep(memory, np.zeros(meters), np.zeros(meters))
+            memory = repeats.ingest(rule, memory, rng.random(meters), np.ones(meters, dtype=np.bool_))
+            memory = repeats.store(memory, np.zeros(meters), np.zeros(meters))
         size = sum(held(block) for block in memory.blocks)
         assert 0.8 * repeats.MOST_BYTES < size <= repeats.MOST_BYTES
         assert memory.kept - memory.first <= size / (BYTES * meters) + ROWS
@@ -170,7 +178,7 @@ class TestMemory:
         ticks = ROWS * (BLOCKS + 2) + 17
         v, rule = noisy(rng, ticks, 2), law(meters=2)
         last = play(rule, v)[-1]
-        last = repeats.keep(last, v[-1] ** 2, 0.1 * v[-1])
+        last = repeats.store(last, v[-1] ** 2, 0.1 * v[-1])
         assert last.kept == ticks
         assert ROWS * BLOCKS <= last.kept - last.first <= ROWS * (BLOCKS + 1)
         for start, stop in ((last.first, ticks), (ticks - 5, ticks), (ticks - 100, ticks - 30)):
@@ -191,7 +199,7 @@ class TestMemory:
         for k in range(2200, 2600):
             v[k, 1] = v[k - lag, 1]
         states = play(law(meters=3), v)
-        found = [k for k, memory in enumerate(states) if repeats.lags(memory)[1]]
+        found = [k for k, memory in enumerate(states) if repeats.repeat_lags(memory)[1]]
         assert found
         assert 2200 + SPAN - 1 <= found[0] <= 2200 + SPAN + BLOCKS + ROWS
         assert found == list(range(found[0], 2600))
@@ -207,25 +215,25 @@ class TestMemory:
         assert all(memory.lag[0] in {0, 1000} for memory in states)
 
     def test_absurd_readings_do_no_harm(self) -> None:
-        rule = repeats.rules(np.zeros(3), np.zeros(3), CHANCE, 1.0)
+        rule = repeats.repeat_limits(np.zeros(3), np.zeros(3), CHANCE, 1.0)
         memory = repeats.empty(3)
         for y in (-1.0, 0.0, 1e300, 1.0):
-            memory = repeats.listen(rule, memory, np.full(3, y), np.ones(3, dtype=np.bool_))
-            memory = repeats.keep(memory, np.ones(3), np.zeros(3))
-        assert not repeats.lags(memory).any()
+            memory = repeats.ingest(rule, memory, np.full(3, y), np.ones(3, dtype=np.bool_))
+            memory = repeats.store(memory, np.ones(3), np.zeros(3))
+        assert not repeats.repeat_lags(memory).any()
 
 
 class TestHonestMeters:
     def test_at_the_worst_voltage_nothing_repeats_beyond_chance(self) -> None:
         """Every meter in the middle of a step, where repetition is likeliest: 2.9 million honest readings."""
         rng = np.random.default_rng(7)
-        rule = repeats.rules(np.full(146, STEP), np.full(146, 5e-4), 1.0 / (146 * 3.2e7 * 6), 1.0)
+        rule = repeats.repeat_limits(np.full(146, STEP), np.full(146, 5e-4), 1.0 / (146 * 3.2e7 * 6), 1.0)
         v = np.rint(1.0 / STEP) * STEP + 5e-4 * rng.standard_normal((20_000, 146))
         memory = repeats.empty(146)
-        live = np.ones(146, dtype=np.bool_)
+        available = np.ones(146, dtype=np.bool_)
         for row in np.rint(v / STEP) * STEP:
-            memory = repeats.keep(repeats.listen(rule, memory, row**2, live), row**2, np.zeros(146))
-            assert not repeats.lags(memory).any()
+            memory = repeats.store(repeats.ingest(rule, memory, row**2, available), row**2, np.zeros(146))
+            assert not repeats.repeat_lags(memory).any()
         assert memory.longest.max() >= 8
 
     @pytest.mark.canary("0.3")
@@ -239,7 +247,7 @@ class TestHonestMeters:
             wander[k] = wander[k - 1] * (1.0 - 1.0 / 1800.0) + steps[k]
         v = 1.0 + wander + share * 5e-4 * rng.standard_normal(steps.shape)
         states = play(law(meters=20), v)
-        assert not any(repeats.lags(memory).any() for memory in states)
+        assert not any(repeats.repeat_lags(memory).any() for memory in states)
         assert states[-1].longest.max() > 30
 
 
@@ -280,15 +288,17 @@ class TestShapes:
         tried = found = chance = 0
         for _ in range(200):
             column = traces[:, int(rng.integers(traces.shape[1]))]
-            who = np.sort(np.argsort(-column)[:4])
-            if column[who].min() < 0.5 * column.max():
+            which = np.sort(np.argsort(-column)[:4])
+            if column[which].min() < 0.5 * column.max():
                 tried += 1
                 variance = np.full(4, 1e-6)
-                lies = -0.1 * column[who] / column[who].max() + 1e-3 * rng.standard_normal(4)
-                found += kinds.traced(made.shapes.traces, who, lies, variance)
-                assert not kinds.traced(made.shapes.traces, who, np.full(4, -0.1), variance)
+                lies = -0.1 * column[which] / column[which].max() + 1e-3 * rng.standard_normal(4)
+                found += kinds.is_load_trace(made.references.traces, which, lies, variance)
+                assert not kinds.is_load_trace(made.references.traces, which, np.full(4, -0.1), variance)
             some = np.sort(rng.choice(len(traces), 3, replace=False))
-            chance += kinds.traced(made.shapes.traces, some, rng.uniform(-0.2, -0.1, 3), np.full(3, 4e-5))
+            chance += kinds.is_load_trace(
+                made.references.traces, some, rng.uniform(-0.2, -0.1, 3), np.full(3, 4e-5)
+            )
         assert 20 < tried < 180
         assert found >= 0.9 * tried
         assert chance <= 4
@@ -423,8 +433,8 @@ class TestTurns:
 
     def turns(self, every: int, since: Ints, ticks: range) -> list[tuple[Ints, Bools]]:
         """At each of some ticks: numbers, and whose turn it is."""
-        shapes = cast("Shapes", SimpleNamespace(every=every))
-        return [kinds._backward(shapes, tick, since) for tick in ticks]
+        shapes = cast("KindReferences", SimpleNamespace(interval=every))
+        return [kinds._past_looks(shapes, tick, since) for tick in ticks]
 
     def test_each_has_a_turn_in_each_round_and_few_have_the_same(self, every: int) -> None:
         whole, since = 4 * every, np.full(150, -1000)
@@ -466,7 +476,7 @@ class TestTurns:
 
 def test_who_has_repeated_itself_is_a_replay_for_good() -> None:
     """Nothing of the past is asked: there is none."""
-    shapes = cast("Shapes", SimpleNamespace())
+    shapes = cast("KindReferences", SimpleNamespace())
     found = kinds._of_the_past(shapes, repeats.empty(1), 0, 1.0, 32, ManipulationKind.REPLAY)
     assert found is ManipulationKind.REPLAY
 
@@ -474,10 +484,10 @@ def test_who_has_repeated_itself_is_a_replay_for_good() -> None:
 def test_many_who_are_named_at_once_are_looked_at_one_after_the_other() -> None:
     since = np.full(60, -1)
     since[:40], since[50] = 100, 101
-    turns = {tick: np.flatnonzero(kinds._turns(since, tick, 16)).tolist() for tick in range(99, 120)}
+    turns = {tick: np.flatnonzero(kinds._first_looks(since, tick, 16)).tolist() for tick in range(99, 120)}
     assert turns.pop(100) == list(range(16))
     assert turns.pop(101) == [*range(16, 32), 50]
     assert turns.pop(102) == list(range(32, 40))
     assert not any(turns.values())
     # Where readings are far apart everybody is looked at anyway.
-    assert kinds._turns(np.zeros(60, dtype=np.intp), 0, 1).sum() == 16
+    assert kinds._first_looks(np.zeros(60, dtype=np.intp), 0, 1).sum() == 16

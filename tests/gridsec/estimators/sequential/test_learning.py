@@ -25,12 +25,12 @@ from gridsec.estimators.sequential.commission import (
     REASONS,
     Learned,
     Learning,
-    begin,
     from_arrays,
+    no_readings,
     to_arrays,
 )
-from gridsec.estimators.sequential.doubts import none
-from gridsec.estimators.sequential.learning import Tick, counts
+from gridsec.estimators.sequential.doubts import nominal
+from gridsec.estimators.sequential.learning import LearningTick, usable
 from gridsec.interface import Frame, PowerOrigin
 from tests.codes import refused
 from tests.gridsec.estimators.sequential.test_monitor import prepare, watch
@@ -201,9 +201,11 @@ def test_a_named_meter_is_suspected_and_the_others_are_learned() -> None:
     assert found[ODD] != "learned"
 
 
-def lost(design: SequentialDesign, before: Learning, tick: Tick) -> tuple[list[bool], list[str | None]]:
+def lost(
+    design: SequentialDesign, before: Learning, tick: LearningTick
+) -> tuple[list[bool], list[str | None]]:
     """Meters for which a tick counts, and the reasons where it does not."""
-    use, why = counts(design, before, tick)
+    use, why = usable(design, before, tick)
     return use.tolist(), [None if k == COUNTED else str(REASONS[k]) for k in why]
 
 
@@ -211,8 +213,8 @@ def test_an_accused_power_holds_up_all_meters_and_silence_goes_first() -> None:
     design, street = scene()
     every = np.ones(P, dtype=np.bool_)
     frame = street.frame(silent=(ODD,))
-    start = begin(every, street.t)
-    calm = Tick(frame, frame.seen, every, accused=False, doubts=none(design))
+    start = no_readings(every, street.t)
+    calm = LearningTick(frame, frame.seen, every, accused=False, uncertainty=nominal(design))
     silent = ["silent" if k == ODD else None for k in range(P)]
     assert lost(design, start, calm) == (OTHERS.tolist(), silent)
     held = [one or "others-suspected" for one in silent]
@@ -226,15 +228,15 @@ def test_a_meter_with_time_enough_waits_for_suspects() -> None:
     """Its readings still count; what keeps it from being learned is another meter."""
     design, street = scene()
     every, frame = np.ones(P, dtype=np.bool_), street.frame()
-    start = replace(begin(every, street.t), time_s=np.where(OTHERS, NEEDED, 0.0))
-    tick = Tick(frame, frame.seen, OTHERS, accused=False, doubts=none(design))
+    start = replace(no_readings(every, street.t), time_s=np.where(OTHERS, NEEDED, 0.0))
+    tick = LearningTick(frame, frame.seen, OTHERS, accused=False, uncertainty=nominal(design))
     reason = ["others-suspected" if k != ODD else "suspected" for k in range(P)]
     assert lost(design, start, tick) == (OTHERS.tolist(), reason)
 
 
 def gathered(time_s: float, watched_s: float, **lost: float) -> Commission:
     """Nine meters with the same sums, by hand."""
-    start, every = begin(np.ones(P, dtype=np.bool_), 0.0), np.ones(P)
+    start, every = no_readings(np.ones(P, dtype=np.bool_), 0.0), np.ones(P)
     lost_s = np.array([lost.get(reason.replace("-", "_"), 0.0) * every for reason in REASONS])
     blank = Learned(*(np.zeros(P),) * 3, np.full(P, np.nan), np.zeros(P))
     learning = replace(start, time_s=time_s * every, watched_s=watched_s * every, lost_s=lost_s)

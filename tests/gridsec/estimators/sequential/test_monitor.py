@@ -133,19 +133,19 @@ class TestLiars:
         rng = np.random.default_rng([11, seed])
         plant = make_plant(rng, customers=15, drop=0.04)
         design, street = prepare(plant), Street(plant, rng)
-        liars = np.sort(rng.choice(15, 5, replace=False))
+        suspects = np.sort(rng.choice(15, 5, replace=False))
         state, _ = watch(street, design, 40)
-        lies = {int(j): float(rng.choice([-1.0, 1.0])) * 0.03 for j in liars}
+        lies = {int(j): float(rng.choice([-1.0, 1.0])) * 0.03 for j in suspects}
         state, answers = watch(street, design, 60, state=state, lies=lies)
-        honest = np.setdiff1d(np.arange(15), liars)
+        honest = np.setdiff1d(np.arange(15), suspects)
         assert not any(verdict.suspects[honest].any() for _, verdict in answers)
         for _, verdict in answers[5:]:
-            np.testing.assert_array_equal(np.flatnonzero(verdict.suspects), liars)
+            np.testing.assert_array_equal(np.flatnonzero(verdict.suspects), suspects)
             assert verdict.decision is Decision.ATTACKED
         estimate, verdict = answers[-1]
         assert np.abs(estimate.v2 - street.truth()).max() < 0.006
-        reported = street.truth()[liars] * (1.0 + np.array([lies[int(j)] for j in liars])) ** 2
-        np.testing.assert_allclose(verdict.attack[liars], reported - street.truth()[liars], atol=0.018)
+        reported = street.truth()[suspects] * (1.0 + np.array([lies[int(j)] for j in suspects])) ** 2
+        np.testing.assert_allclose(verdict.attack[suspects], reported - street.truth()[suspects], atol=0.018)
         _, after = watch(street, design, 90, state=state)
         assert not after[-1][1].suspects.any()
         assert after[-1][1].decision is Decision.CLEAN
@@ -173,7 +173,7 @@ class TestLiars:
         design = prepare(plant)
         n = len(plant.feeder.customers)
         narrow = sequential.design(plant, doubt=design.doubt, step_s=1.0, max_attacked=1)
-        assert (design.most, narrow.most, narrow.observers) == (3, 1, 1)
+        assert (design.max_attacked, narrow.max_attacked, narrow.observers) == (3, 1, 1)
         state, _ = watch(Street(plant, rng), narrow, 30)
         _, answers = watch(
             Street(plant, rng, t=2000.0), narrow, 20, state=state, lies={1: 0.05, n - 2: -0.05}
@@ -224,9 +224,9 @@ class TestGaps:
 
         state, answers = watch(street, design, 60, change=guess)
         assert not any(verdict.suspects.any() for _, verdict in answers)
-        assert state.doubts.p[-1, 6] > 1.0
+        assert state.uncertainty.p[-1, 6] > 1.0
         state, _ = watch(street, design, design.lengths[-1], state=state)
-        assert (state.doubts.p == 1.0).all()
+        assert (state.uncertainty.p == 1.0).all()
 
     def test_a_frame_that_is_not_later_changes_nothing(self) -> None:
         rng = np.random.default_rng(24)
@@ -285,8 +285,8 @@ class TestDesign:
         rng = np.random.default_rng(32)
         made = prepare(make_plant(rng))
         assert made.lengths == (1, 5, 15, 60)
-        assert made.every == (1, 1, 2, 8)
-        looks = [(9 + 1 + 1) * 365.25 * 86400.0 / every for every in made.every]
+        assert made.look_every == (1, 1, 2, 8)
+        looks = [(9 + 1 + 1) * 365.25 * 86400.0 / every for every in made.look_every]
         rate = sum(n * erfc(z / sqrt(2.0)) for n, z in zip(looks, made.sigmas, strict=True))
         # Stuck meters and replays have a share each, as every scale has; busbar and misfit are tests, too.
         assert rate == pytest.approx(4.0 / 6.0, rel=1e-6)

@@ -13,8 +13,8 @@ from scipy.integrate import solve_ivp
 from gridsec.arrays import Floats
 from gridsec.errors import InputInvalid
 from gridsec.estimators.sequential import LoadDoubt, SequentialOptions, curves, design
-from gridsec.estimators.sequential.commission import begin, conclude, gather, nothing
-from gridsec.estimators.sequential.drive import Free, drive
+from gridsec.estimators.sequential.commission import class_only, gather, learn, no_readings
+from gridsec.estimators.sequential.drive import ModelDriven, advance_inverters
 from gridsec.estimators.sequential.loads import injection_doubt, prior
 from gridsec.estimators.sequential.windows import empty, forget, push, shift
 from gridsec.grid.droop import fleet
@@ -39,7 +39,7 @@ class TestLoads:
             draws.append(v2 - base)
         sample = np.cov(np.array(draws).T)
         scale = np.sqrt(np.outer(found.variance, found.variance))
-        np.testing.assert_allclose(found.of_meters / scale[:, 1:], sample[:, 1:] / scale[:, 1:], atol=0.06)
+        np.testing.assert_allclose(found.covariance / scale[:, 1:], sample[:, 1:] / scale[:, 1:], atol=0.06)
         np.testing.assert_allclose(found.variance, np.diagonal(sample), rtol=0.08, atol=1e-7)
         np.testing.assert_allclose(found.between, found.between.T)
 
@@ -55,21 +55,21 @@ class TestLoads:
             (model.X_bus, np.hypot(doubt.q, inverters), 0.6),
         ):
             expected += 4.0 * R @ ((1.0 - c) * np.diag(s**2) + c * np.outer(s, s)) @ R.T
-        np.testing.assert_allclose(found.of_meters, expected[:, at], rtol=1e-12)
+        np.testing.assert_allclose(found.covariance, expected[:, at], rtol=1e-12)
         np.testing.assert_allclose(found.variance, np.diagonal(expected), rtol=1e-12)
 
     def test_what_else_can_be_wrong_is_what_the_matrices_say(self) -> None:
         rng = np.random.default_rng(3)
         doubt = LoadDoubt(np.full(9, 0.006), np.full(9, 0.002), 600.0)
         made = design(make_plant(rng), doubt=doubt, step_s=1.0)
-        plant, book = made.plant, made.book
+        plant, faults = made.plant, made.faults
         model, at = plant.feeder.linear(), plant.feeder.bus[plant.meters]
         columns = 2.0 * np.hstack([model.R_bus, model.X_bus[:, plant.droop.customer]])
         every = rng.permutation(columns.shape[1])
-        np.testing.assert_allclose(book.columns(every), columns[:, every], rtol=1e-12)
+        np.testing.assert_allclose(faults.columns(every), columns[:, every], rtol=1e-12)
         weights = rng.normal(size=at.size)
-        np.testing.assert_allclose(book.along(weights), weights @ columns[at], rtol=1e-9, atol=1e-12)
-        np.testing.assert_allclose(book.size, (columns[at] ** 2).sum(axis=0), rtol=1e-12)
+        np.testing.assert_allclose(faults.weighted(weights), weights @ columns[at], rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(faults.size, (columns[at] ** 2).sum(axis=0), rtol=1e-12)
 
     def test_every_problem_is_named(self) -> None:
         with refused(InputInvalid, "negative", "negative", "out-of-range", "out-of-range", "out-of-range"):
@@ -103,13 +103,13 @@ class TestInverters:
         doubt = LoadDoubt(np.full(9, 0.01), np.full(9, 0.01), 600.0)
         made = design(plant, doubt=doubt, step_s=1.0)
         X, droop = 2.0 * plant.feeder.linear().X, plant.droop
-        known, y, who = rng.uniform(*w, 9), np.full(9, 0.9), np.isin(np.arange(9), driven)
+        known, y, which = rng.uniform(*w, 9), np.full(9, 0.9), np.isin(np.arange(9), driven)
         x, free = np.zeros(9), None
         for h in steps:
-            x, free = drive(made, x, y, who, known, h, free)
+            x, free = advance_inverters(made, x, y, which, known, h, free)
 
         def change(_: float, x: Floats) -> Floats:
-            return np.asarray((droop(np.where(who, droop.vbar**2 - y, known - X @ x)) - x) / droop.tau)
+            return np.asarray((droop(np.where(which, droop.vbar**2 - y, known - X @ x)) - x) / droop.tau)
 
         exact = solve_ivp(change, (0.0, sum(steps)), np.zeros(9), rtol=1e-10, atol=1e-12).y[:, -1]
         np.testing.assert_allclose(x, exact, atol=2e-3 * np.abs(exact).max())
@@ -126,12 +126,12 @@ class TestInverters:
         made = design(plant, doubt=LoadDoubt(np.full(9, 0.01), np.full(9, 0.01), 600.0), step_s=1.0)
         w, y = rng.uniform(-0.08, 0.08, 9), rng.uniform(0.9, 1.1, 9)
         x, before = np.zeros(9), None
-        for who, h in steps:
-            driven = np.array([(who >> (k % 3)) & 1 for k in range(9)], dtype=np.bool_)
-            anew, _ = drive(made, x, y, driven, w, h)
-            x, free = drive(made, x, y, driven, w, h, before)
+        for which, h in steps:
+            driven = np.array([(which >> (k % 3)) & 1 for k in range(9)], dtype=np.bool_)
+            anew, _ = advance_inverters(made, x, y, driven, w, h)
+            x, free = advance_inverters(made, x, y, driven, w, h, before)
             np.testing.assert_array_equal(x, anew)
-            kept = isinstance(before, Free) and isinstance(free, Free)
+            kept = isinstance(before, ModelDriven) and isinstance(free, ModelDriven)
             if kept and np.array_equal(before.rows, free.rows):
                 assert free.loop is before.loop
             before = free
@@ -141,7 +141,7 @@ class TestInverters:
         plant = make_plant(rng, customers=4, inverters=np.array([0, 0, 1, 3]), meters=np.array([0, 1, 2]))
         made = design(plant, doubt=LoadDoubt(np.full(4, 0.01), np.full(4, 0.01), 600.0), step_s=1.0)
         np.testing.assert_array_equal(made.meter_of, [0, 0, 1, -1])
-        found = replace(curves.empty(3, 4), amount=np.array([0.04, -0.03, 0.5])).amounts(made)
+        found = replace(curves.no_checks(3, 4), amount=np.array([0.04, -0.03, 0.5])).amounts(made)
         np.testing.assert_array_equal(found, [0.02, 0.02, -0.03, 0.0])
 
 
@@ -191,9 +191,9 @@ class TestCommissioning:
         count = np.array([900, 900, 900, 0, 450, 900, 900, 900])
         mean = rng.normal(size=8) * 0.004
         heard = count > 0
-        start, time_s = begin(np.ones(8, dtype=bool), 100.0), np.where(heard, 3600.0, 0.0)
+        start, time_s = no_readings(np.ones(8, dtype=bool), 100.0), np.where(heard, 3600.0, 0.0)
         gathered = replace(start, total=mean * count, count=count, time_s=time_s)
-        known = conclude(made, nothing(made), gathered, np.ones(8, dtype=bool), 4000.0)
+        known = learn(made, class_only(made), gathered, np.ones(8, dtype=bool), 4000.0)
         found = known.learned
         rho = 600.0 / 3600.0
         share = 2 * rho * (1 - rho * (1 - np.exp(-1 / rho)))
@@ -231,9 +231,9 @@ class TestCommissioning:
         plant = make_plant(rng, customers=5)
         made = design(plant, doubt=LoadDoubt(np.full(5, 0.01), np.full(5, 0.01), 600.0), step_s=1.0)
         every = np.ones(5, dtype=bool)
-        start = begin(every, 7.0)
-        known = conclude(made, nothing(made), start, every, 9.0)
-        assert np.array_equal(known.learned.variance, nothing(made).variance)
+        start = no_readings(every, 7.0)
+        known = learn(made, class_only(made), start, every, 9.0)
+        assert np.array_equal(known.learned.variance, class_only(made).variance)
         assert known.learning is start
         some = gather(
             start, np.array([1.0, 2.0, np.nan, 4.0, 5.0]), np.array([1, 1, 0, 1, 0], dtype=bool), 2.0

@@ -75,4 +75,4 @@ def test_who_fell_silent_does_not_stand_for_others() -> None:
     last = answers[-1][1]
     assert np.flatnonzero(last.suspects).tolist() == [1, 4, 8, 11]
     assert last.decision is Decision.ATTACKED
-    assert sequential.init(made, 0.0).doubts.heard is None
+    assert sequential.init(made, 0.0).uncertainty.before_silence is None

@@ -135,7 +135,7 @@ class TestPhasesThatDoNotTouch:
         np.testing.assert_allclose(
             whole.prior.variance.reshape(-1, 3).T, [alone.prior.variance] * 3, rtol=1e-12
         )
-        for name in ("most_p", "most_q", "reach", "white", "fixed"):
+        for name in ("max_p", "max_q", "inverter_reach", "white", "fixed"):
             np.testing.assert_allclose(getattr(whole, name), np.tile(getattr(alone, name), 3), rtol=1e-12)
         # Each phase has the rate of the balanced monitor, but for one misfit test in place of three.
         tests = CUSTOMERS + 2.0

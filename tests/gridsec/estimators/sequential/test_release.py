@@ -15,17 +15,17 @@ from feeders.simulation.scenario import START
 from feeders.simulation.trial import LoadError, Trial, TrialMeterErrors, frames
 from gridsec.arrays import Floats
 from gridsec.estimators.sequential.bounds import FALSE_Q
-from gridsec.estimators.sequential.conditional import Fit, Prior, fit, judge, loosen
-from gridsec.estimators.sequential.effects import Effects
+from gridsec.estimators.sequential.conditional import Posterior, Prior, add_unknown, condition, leave_one_out
+from gridsec.estimators.sequential.effects import Sensitivities
 from gridsec.estimators.sequential.loads import LoadDoubt, prior
-from gridsec.estimators.sequential.release import release
+from gridsec.estimators.sequential.release import doubt_powers
 from gridsec.grid.network import Power
 from tests.gridsec.street import BASE_KVA, make_plant
 
 CUSTOMERS = 12
 
 
-def problem(seed: int) -> tuple[Effects, Fit, Floats]:
+def problem(seed: int) -> tuple[Sensitivities, Posterior, Floats]:
     """A street, nine of whose meters are believed, one load of it loosened, and what the meters say.
 
     Two of the meters are at one bus, and they err by different amounts.
@@ -38,24 +38,24 @@ def problem(seed: int) -> tuple[Effects, Fit, Floats]:
     doubt = LoadDoubt(np.full(CUSTOMERS, 0.5 / BASE_KVA), np.full(CUSTOMERS, 0.2 / BASE_KVA), 600.0)
     every = np.arange(CUSTOMERS)
     known: Prior = prior(plant.feeder, plant.feeder.bus, doubt, busbar=1e-4, inverters=np.zeros(CUSTOMERS))
-    now = fit(known, 10.0 ** rng.uniform(-7.0, -5.0, CUSTOMERS), ~np.isin(every, (3, 7, 11)))
-    effects = Effects(plant.feeder)
-    loosen(now, effects.columns(Power.ACTIVE, np.array([5]))[:, 0], 0.01)
-    return effects, now, rng.normal(size=CUSTOMERS) * 0.002
+    now = condition(known, 10.0 ** rng.uniform(-7.0, -5.0, CUSTOMERS), ~np.isin(every, (3, 7, 11)))
+    sensitivities = Sensitivities(plant.feeder)
+    add_unknown(now, sensitivities.columns(Power.ACTIVE, np.array([5]))[:, 0], 0.01)
+    return sensitivities, now, rng.normal(size=CUSTOMERS) * 0.002
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_it_is_conditioning_on_a_wider_prior(seed: int) -> None:
-    effects, now, m = problem(seed)
-    liars, sizes = np.array([3, 7, 11]), np.array([0.02, 0.05, 0.1])
-    judged = judge(now, m)
-    found = release(effects, now, liars, sizes, judged)
+    sensitivities, now, m = problem(seed)
+    suspects, sizes = np.array([3, 7, 11]), np.array([0.02, 0.05, 0.1])
+    loo = leave_one_out(now, m)
+    found = doubt_powers(sensitivities, now, suspects, sizes, loo)
     std = sizes / np.sqrt(3.0) * found.share
-    wider = [now.loose]
+    wider = [now.unknowns]
     for power, part in ((Power.ACTIVE, 1.0), (Power.REACTIVE, FALSE_Q)):
-        wider.append(effects.columns(power, liars) * std * part)
-    dense = fit(now.prior, now.noise, now.trusted, np.hstack(wider))
-    np.testing.assert_allclose(found.said(judged), judge(dense, m).w, rtol=1e-6, atol=1e-12)
+        wider.append(sensitivities.columns(power, suspects) * std * part)
+    dense = condition(now.prior, now.noise, now.trusted, np.hstack(wider))
+    np.testing.assert_allclose(found.mean(loo), leave_one_out(dense, m).mean, rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(found.variance, dense.variance, rtol=1e-6, atol=1e-15)
     assert (found.variance >= now.variance).all()
 
@@ -63,14 +63,18 @@ def test_it_is_conditioning_on_a_wider_prior(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(5))
 def test_whether_a_power_is_false_is_bayes_rule(seed: int) -> None:
     """The share is the root of a posterior probability: the ratio of two normal densities, made densely."""
-    effects, now, m = problem(seed)
-    who, size = np.array([7]), np.array([0.05])
-    a = (effects.columns(Power.ACTIVE, who) * size / np.sqrt(3.0))[now.prior.meters]
+    sensitivities, now, m = problem(seed)
+    which, size = np.array([7]), np.array([0.05])
+    a = (sensitivities.columns(Power.ACTIVE, which) * size / np.sqrt(3.0))[now.prior.meters]
     at = np.flatnonzero(now.trusted)
-    S = now.prior.between + now.loose[now.prior.meters] @ now.loose[now.prior.meters].T + np.diag(now.noise)
+    S = (
+        now.prior.between
+        + now.unknowns[now.prior.meters] @ now.unknowns[now.prior.meters].T
+        + np.diag(now.noise)
+    )
     for lie in (0.0, 3.0):
         readings = m + lie * a[:, 0]
-        found = release(effects, now, who, size, judge(now, readings))
+        found = doubt_powers(sensitivities, now, which, size, leave_one_out(now, readings))
         logs = [_density(S[np.ix_(at, at)] + more, readings[at]) for more in (0.0, a[at] @ a[at].T)]
         false = 1.0 / (1.0 + np.exp(logs[0] - logs[1]))
         assert found.share[0] ** 2 == pytest.approx(max(false, 1.0 / 64.0), rel=1e-6)
@@ -83,23 +87,23 @@ def _density(S: Floats, m: Floats) -> float:
 
 
 def test_who_feels_nothing_odd_believes_again_and_the_work_is_kept() -> None:
-    effects, now, m = problem(0)
-    who, size = np.array([7]), np.array([0.3])
-    calm = judge(now, 0.0 * m)
-    found = release(effects, now, who, size, calm)
+    sensitivities, now, m = problem(0)
+    which, size = np.array([7]), np.array([0.3])
+    calm = leave_one_out(now, 0.0 * m)
+    found = doubt_powers(sensitivities, now, which, size, calm)
     assert found.share[0] < 0.5
-    assert found.about(now, who, size)
-    assert found.holds(judge(now, 1e-6 * m))
-    assert not found.about(now, who, 2.0 * size)
-    assert not found.about(now, who + 1, size)
-    assert not found.about(now.copy(), who, size)
-    odd = effects.columns(Power.ACTIVE, who)[now.prior.meters, 0] * 0.3
-    asked = judge(now, odd)
-    assert not found.holds(asked)
-    again, whole = found.anew(asked), release(effects, now, who, size, asked)
+    assert found.matches(now, which, size)
+    assert found.is_current(leave_one_out(now, 1e-6 * m))
+    assert not found.matches(now, which, 2.0 * size)
+    assert not found.matches(now, which + 1, size)
+    assert not found.matches(now.copy(), which, size)
+    odd = sensitivities.columns(Power.ACTIVE, which)[now.prior.meters, 0] * 0.3
+    asked = leave_one_out(now, odd)
+    assert not found.is_current(asked)
+    again, whole = found.renewed(asked), doubt_powers(sensitivities, now, which, size, asked)
     for name in ("share", "factor", "variance"):
         np.testing.assert_allclose(getattr(again, name), getattr(whole, name), rtol=1e-12, atol=0)
-    np.testing.assert_allclose(again.said(asked), whole.said(asked), rtol=1e-12, atol=0)
+    np.testing.assert_allclose(again.mean(asked), whole.mean(asked), rtol=1e-12, atol=0)
 
 
 def test_a_third_lies_about_voltages_and_powers_alike() -> None:
@@ -108,7 +112,12 @@ def test_a_third_lies_about_voltages_and_powers_alike() -> None:
     count, ratios = site.meters.size // 3, []
     lie = AttackSpec(AttackKind.BIAS, count, 3.0, onset_s=10.0)
     trial = Trial(
-        site, seed=5, duration_s=35.0, load_error=LoadError(0.3, 0.1), meters=TrialMeterErrors.REAL, lie=lie
+        site,
+        seed=5,
+        duration_s=35.0,
+        load_error=LoadError(0.3, 0.1),
+        meters=TrialMeterErrors.REAL,
+        lie=lie,
     )
     watcher = design(trial.stated)
     state, rng = watcher.init(START), np.random.default_rng(5)

@@ -6,23 +6,23 @@ import numpy as np
 import pytest
 
 from gridsec.arrays import Bools
-from gridsec.estimators.sequential.conditional import Fit, Prior, drop, fit
-from gridsec.estimators.sequential.scales import Scale, adapt
+from gridsec.estimators.sequential.conditional import Posterior, Prior, condition, remove_meter
+from gridsec.estimators.sequential.scales import ScaleData, update_posterior
 from gridsec.estimators.sequential.search import Limits
 from tests.gridsec.estimators.sequential.test_conditional import problem
 
 
-def scale(rng: np.random.Generator, meters: int) -> Scale:
+def scale(rng: np.random.Generator, meters: int) -> ScaleData:
     """Any scale on which all meters report."""
     _, prior, noise, m = problem(rng, meters + 3, meters)
     zero = np.zeros(meters)
-    return Scale(prior, noise, m, zero == 0.0, Limits(3.0, zero, zero, zero))
+    return ScaleData(prior, noise, m, zero == 0.0, Limits(3.0, zero, zero, zero))
 
 
-def changed_to(before: Fit, here: Scale, wanted: Bools) -> Fit:
+def changed_to(before: Posterior, here: ScaleData, wanted: Bools) -> Posterior:
     """A fit of those wanted, looked at from all sides; the one before stays as it is."""
-    kept, now = before.copy(), adapt(before, here, wanted, None)
-    anew = fit(here.prior, here.noise, wanted)
+    kept, now = before.copy(), update_posterior(before, here, wanted, None)
+    anew = condition(here.prior, here.noise, wanted)
     np.testing.assert_array_equal(now.trusted, wanted)
     np.testing.assert_allclose(now.Q, anew.Q, rtol=1e-8, atol=1e-9)
     np.testing.assert_allclose(now.variance, anew.variance, rtol=1e-7, atol=1e-9)
@@ -37,7 +37,7 @@ def test_however_many_fall_or_come_back(seed: int) -> None:
     here, now = scale(rng, 12), None
     for _ in range(12):
         wanted = rng.random(12) < rng.choice([0.3, 0.8, 1.0])
-        before = fit(here.prior, here.noise, wanted) if now is None else now
+        before = condition(here.prior, here.noise, wanted) if now is None else now
         now = changed_to(before, here, wanted)
 
 
@@ -45,15 +45,15 @@ def test_many_that_fall_are_taken_off_a_fit_just_factorised_only() -> None:
     """Rounding does not gather: after other changes it is made anew."""
     rng = np.random.default_rng(2)
     here, every = scale(rng, 12), np.arange(12)
-    whole = fit(here.prior, here.noise, every >= 0)
-    assert changed_to(whole, here, every >= 3).changes == 3
+    whole = condition(here.prior, here.noise, every >= 0)
+    assert changed_to(whole, here, every >= 3).updates == 3
     worn = whole.copy()
-    drop(worn, 11)
-    assert changed_to(worn, here, (every >= 3) & (every < 11)).changes == 0
+    remove_meter(worn, 11)
+    assert changed_to(worn, here, (every >= 3) & (every < 11)).updates == 0
     # Nor where somebody is admitted as well.
-    part = fit(here.prior, here.noise, every >= 2)
-    assert changed_to(part, here, (every >= 4) | (every == 0)).changes == 0
-    assert changed_to(whole, here, every >= 5).changes == 0
+    part = condition(here.prior, here.noise, every >= 2)
+    assert changed_to(part, here, (every >= 4) | (every == 0)).updates == 0
+    assert changed_to(whole, here, every >= 5).updates == 0
 
 
 def test_who_falls_from_exact_meters_is_not_taken_off() -> None:
@@ -64,9 +64,9 @@ def test_who_falls_from_exact_meters_is_not_taken_off() -> None:
     for exact, changes in ((1e-5, 3), (1e-8, 0)):
         noise = np.full(12, exact * float(S.diagonal().max()))
         prior = Prior(S, every, S.diagonal().copy())
-        here = Scale(prior, noise, zero, every >= 0, Limits(3.0, zero, zero, zero))
-        now = adapt(fit(prior, noise, every >= 0), here, every >= 3, None)
+        here = ScaleData(prior, noise, zero, every >= 0, Limits(3.0, zero, zero, zero))
+        now = update_posterior(condition(prior, noise, every >= 0), here, every >= 3, None)
         np.testing.assert_array_equal(now.trusted, every >= 3)
-        assert now.changes == changes
-        anew = fit(prior, noise, every >= 3)
+        assert now.updates == changes
+        anew = condition(prior, noise, every >= 3)
         np.testing.assert_allclose(now.Q, anew.Q, rtol=1e-6, atol=1e-6 * np.abs(anew.Q).max())

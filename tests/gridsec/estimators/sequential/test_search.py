@@ -11,12 +11,12 @@ import pytest
 
 from gridsec.arrays import Bools, Floats
 from gridsec.estimators.sequential import search
-from gridsec.estimators.sequential.conditional import Prior, fit, judge
-from gridsec.estimators.sequential.dictionary import Dictionary
-from gridsec.estimators.sequential.exchanges import swaps
+from gridsec.estimators.sequential.conditional import Prior, condition, leave_one_out
+from gridsec.estimators.sequential.dictionary import FaultDictionary
+from gridsec.estimators.sequential.exchanges import meter_exchanges
 from gridsec.estimators.sequential.loads import LoadDoubt, prior
-from gridsec.estimators.sequential.robust import robust
-from gridsec.estimators.sequential.search import Limits, Recent, Solution, descend, price
+from gridsec.estimators.sequential.robust import robust_set
+from gridsec.estimators.sequential.search import Candidate, LimitCache, Limits, descend, set_cost
 from tests.gridsec.street import random_tree
 
 SIGMAS = 3.5
@@ -44,9 +44,9 @@ def cost(p: Prior, noise: Floats, m: Floats, trusted: Bools) -> float:
     """J by definition: a dense solve, and a binomial coefficient."""
     at = np.flatnonzero(trusted)
     whole = p.between[np.ix_(at, at)] + np.diag(noise[at])
-    liars = int((~trusted).sum())
-    assert liars <= m.size // 2
-    return float(m[at] @ np.linalg.solve(whole, m[at])) + 2.0 * log(comb(m.size, liars))
+    suspects = int((~trusted).sum())
+    assert suspects <= m.size // 2
+    return float(m[at] @ np.linalg.solve(whole, m[at])) + 2.0 * log(comb(m.size, suspects))
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -55,20 +55,20 @@ def test_no_set_explains_better_and_the_liars_are_it(seed: int) -> None:
     rng = np.random.default_rng([1, seed])
     _, p = street(rng, 10)
     noise = np.full(10, 0.002**2)
-    liars = np.sort(rng.choice(10, 3, replace=False))
+    suspects = np.sort(rng.choice(10, 3, replace=False))
     m = readings(rng, p, noise)
-    m[liars] += 0.06 * rng.choice([-1.0, 1.0], 3)
-    live, none = np.ones(10, dtype=bool), np.zeros(10, dtype=bool)
-    start = fit(p, noise, robust(p, noise, m, live, 2.0 * np.sqrt(noise)))
-    found = descend(start, m, live, limits(10), keep=none)
+    m[suspects] += 0.06 * rng.choice([-1.0, 1.0], 3)
+    available, none = np.ones(10, dtype=bool), np.zeros(10, dtype=bool)
+    start = condition(p, noise, robust_set(p, noise, m, available, 2.0 * np.sqrt(noise)))
+    found = descend(start, m, available, limits(10), keep=none)
     everything = [
         (cost(p, noise, m, ~np.isin(np.arange(10), out)), out)
         for size in range(4)
         for out in combinations(range(10), size)
     ]
-    best, who = min(everything)
+    best, which = min(everything)
     assert found.cost == pytest.approx(best, rel=1e-9)
-    assert tuple(np.flatnonzero(~found.fit.trusted)) == who == tuple(liars)
+    assert tuple(np.flatnonzero(~found.posterior.trusted)) == which == tuple(suspects)
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -77,13 +77,13 @@ def test_a_third_of_the_meters_in_collusion(seed: int, one_way: bool) -> None:
     rng = np.random.default_rng([2, seed])
     _, p = street(rng, 60)
     noise = np.full(60, 0.002**2)
-    liars = rng.choice(60, 20, replace=False)
+    suspects = rng.choice(60, 20, replace=False)
     m = readings(rng, p, noise)
-    m[liars] += 0.04 * (-1.0 if one_way else rng.choice([-1.0, 1.0], 20))
-    live, none = np.ones(60, dtype=bool), np.zeros(60, dtype=bool)
-    start = fit(p, noise, robust(p, noise, m, live, 2.0 * np.sqrt(noise)))
-    found = descend(start, m, live, limits(60), keep=none)
-    wrong = set(np.flatnonzero(~found.fit.trusted)) ^ set(liars)
+    m[suspects] += 0.04 * (-1.0 if one_way else rng.choice([-1.0, 1.0], 20))
+    available, none = np.ones(60, dtype=bool), np.zeros(60, dtype=bool)
+    start = condition(p, noise, robust_set(p, noise, m, available, 2.0 * np.sqrt(noise)))
+    found = descend(start, m, available, limits(60), keep=none)
+    wrong = set(np.flatnonzero(~found.posterior.trusted)) ^ set(suspects)
     assert not wrong
 
 
@@ -92,25 +92,25 @@ def test_honest_meters_are_all_trusted_at_once() -> None:
     _, p = street(rng, 30)
     noise = np.full(30, 0.002**2)
     m = readings(rng, p, noise)
-    live = np.arange(30) != 4
+    available = np.arange(30) != 4
     m[4] = 0.0
-    np.testing.assert_array_equal(robust(p, noise, m, live, 6.0 * np.sqrt(noise)), live)
-    found = descend(fit(p, noise, np.ones(30, dtype=bool)), m, live, limits(30), keep=~live)
-    np.testing.assert_array_equal(found.fit.trusted, live)
-    assert found.cost == pytest.approx(judge(fit(p, noise, live), m).misfit)
-    assert not robust(p, noise, m, np.zeros(30, dtype=bool), np.ones(30)).any()
+    np.testing.assert_array_equal(robust_set(p, noise, m, available, 6.0 * np.sqrt(noise)), available)
+    found = descend(condition(p, noise, np.ones(30, dtype=bool)), m, available, limits(30), keep=~available)
+    np.testing.assert_array_equal(found.posterior.trusted, available)
+    assert found.cost == pytest.approx(leave_one_out(condition(p, noise, available), m).chi_square)
+    assert not robust_set(p, noise, m, np.zeros(30, dtype=bool), np.ones(30)).any()
 
 
 def test_a_fit_that_needs_no_change_is_the_solutions_own_and_another_is_left_as_it_was() -> None:
     rng = np.random.default_rng(3)
     _, p = street(rng, 30)
     noise = np.full(30, 0.002**2)
-    m, live, nobody = readings(rng, p, noise), np.ones(30, dtype=bool), np.zeros(30, dtype=bool)
-    start = fit(p, noise, live)
-    assert descend(start, m, live, limits(30), keep=nobody).fit is start
+    m, available, no_meters = readings(rng, p, noise), np.ones(30, dtype=bool), np.zeros(30, dtype=bool)
+    start = condition(p, noise, available)
+    assert descend(start, m, available, limits(30), keep=no_meters).posterior is start
     inverse, variance = start.inverse.copy(), start.variance.copy()
     m[[2, 9]] += 0.05
-    found = descend(start, m, live, limits(30), keep=nobody)
+    found = descend(start, m, available, limits(30), keep=no_meters)
     assert np.flatnonzero(~found.trusted).tolist() == [2, 9]
     assert start.trusted.all()
     np.testing.assert_array_equal(start.inverse, inverse)
@@ -123,29 +123,31 @@ def test_a_solution_keeps_nothing_about_the_many_that_it_accuses(fresh: bool) ->
     _, p = street(rng, 30)
     noise, m = np.full(30, 0.002**2), np.zeros(30)
     m[::4] = 0.05
-    start = fit(p, noise, np.ones(30, dtype=bool))
+    start = condition(p, noise, np.ones(30, dtype=bool))
     found = descend(start, m, m < 1.0, limits(30), keep=np.zeros(30, dtype=bool), fresh=fresh)
-    assert found.fit.inverse.shape == (22, 22)
-    assert (found.fit is start) is fresh
+    assert found.posterior.inverse.shape == (22, 22)
+    assert (found.posterior is start) is fresh
 
 
 def test_what_was_judged_before_counts_only_where_nothing_has_changed_since() -> None:
     """Silent meters are dropped, and innocent ones admitted, before the search begins."""
     rng = np.random.default_rng(3)
     _, p = street(rng, 30)
-    noise, nobody = np.full(30, 0.002**2), np.zeros(30, dtype=bool)
+    noise, no_meters = np.full(30, 0.002**2), np.zeros(30, dtype=bool)
     m = readings(rng, p, noise)
     m[[2, 9]] += 0.05
-    start = fit(p, noise, np.arange(30) != 4)
+    start = condition(p, noise, np.arange(30) != 4)
     silent = np.arange(30) == 17
     m[17] = 10.0
-    for live, innocent in ((~silent, []), (~silent, [4]), (~nobody, [4])):
-        who = np.array(innocent, dtype=np.intp)
-        plain = descend(start, m, live, limits(30), keep=nobody, innocent=who)
-        told = descend(start, m, live, limits(30), keep=nobody, innocent=who, judged=judge(start, m))
+    for available, protected in ((~silent, []), (~silent, [4]), (~no_meters, [4])):
+        which = np.array(protected, dtype=np.intp)
+        plain = descend(start, m, available, limits(30), keep=no_meters, protected=which)
+        told = descend(
+            start, m, available, limits(30), keep=no_meters, protected=which, loo=leave_one_out(start, m)
+        )
         np.testing.assert_array_equal(told.trusted, plain.trusted)
         assert told.cost == pytest.approx(plain.cost, rel=1e-9)
-        np.testing.assert_allclose(told.judged.offset, plain.judged.offset, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(told.loo.residual, plain.loo.residual, rtol=1e-9, atol=1e-12)
 
 
 def test_readings_of_which_none_can_be_have_a_robust_fit_too() -> None:
@@ -154,7 +156,7 @@ def test_readings_of_which_none_can_be_have_a_robust_fit_too() -> None:
     _, p = street(rng, 12)
     for size in (0.1, 10.0, 1e4):
         m = size * rng.choice([-1.0, 1.0], 12) * rng.uniform(1.0, 2.0, 12)
-        assert robust(p, np.full(12, 1e-8), m, np.ones(12, dtype=bool), np.full(12, 1e-5)).sum() <= 1
+        assert robust_set(p, np.full(12, 1e-8), m, np.ones(12, dtype=bool), np.full(12, 1e-5)).sum() <= 1
 
 
 def test_the_truncated_cost_is_not_higher_than_anywhere_near() -> None:
@@ -165,11 +167,11 @@ def test_the_truncated_cost_is_not_higher_than_anywhere_near() -> None:
     m = readings(rng, p, noise)
     m[[2, 3, 7]] -= 0.05
     bound = 2.5 * np.sqrt(noise)
-    chosen = robust(p, noise, m, np.ones(14, dtype=bool), bound)
+    chosen = robust_set(p, noise, m, np.ones(14, dtype=bool), bound)
 
     def truncated(trusted: Bools) -> float:
         out = float((~trusted).sum()) * 2.5**2
-        return judge(fit(p, noise, trusted), m).misfit + out
+        return leave_one_out(condition(p, noise, trusted), m).chi_square + out
 
     for j in range(14):
         other = chosen.copy()
@@ -184,24 +186,24 @@ def test_a_load_that_nobody_knows_is_one_suspicion_and_not_many_liars() -> None:
     noise = np.full(20, 0.001**2)
     where = int(np.argmax(columns[1:].sum(axis=0)))
     m = readings(rng, p, noise) - 0.2 * columns[1:, where]
-    book = Dictionary(
+    faults = FaultDictionary(
         std=np.full(20, 0.1),
         charge=np.full(20, 3.0),
         size=(columns[1:] ** 2).sum(axis=0),
         meter=np.full(20, -1),
         columns=lambda which: columns[:, which],
-        along=lambda weights: weights @ columns[1:],
+        weighted=lambda weights: weights @ columns[1:],
     )
-    live, none = np.ones(20, dtype=bool), np.zeros(20, dtype=bool)
-    start = fit(p, noise, live)
-    plain = descend(start, m, live, limits(20), keep=none)
-    wider = descend(start, m, live, limits(20), keep=none, dictionary=book)
-    assert plain.fit.trusted.sum() < 20
-    assert wider.loosened == (where,)
-    assert wider.fit.trusted.all()
+    available, none = np.ones(20, dtype=bool), np.zeros(20, dtype=bool)
+    start = condition(p, noise, available)
+    plain = descend(start, m, available, limits(20), keep=none)
+    wider = descend(start, m, available, limits(20), keep=none, faults=faults)
+    assert plain.posterior.trusted.sum() < 20
+    assert wider.faults == (where,)
+    assert wider.posterior.trusted.all()
     assert wider.cost < plain.cost
-    assert wider.charge == pytest.approx(3.0 * price(20, 1))
-    assert wider.cost == pytest.approx(wider.judged.misfit + wider.charge)
+    assert wider.charge == pytest.approx(3.0 * set_cost(20, 1))
+    assert wider.cost == pytest.approx(wider.loo.chi_square + wider.charge)
 
 
 def test_swaps_are_what_the_cost_rises_by() -> None:
@@ -213,21 +215,23 @@ def test_swaps_are_what_the_cost_rises_by() -> None:
     p = Prior(S[:, at], at, S.diagonal().copy())
     noise = np.full(5, 0.002**2)
     m = np.array([0.04, -0.04, 0.0, 0.0, 0.0])
-    live, none = np.ones(5, dtype=bool), np.zeros(5, dtype=bool)
-    found = descend(fit(p, noise, live), m, live, limits(5), keep=none)
-    accused = np.flatnonzero(~found.fit.trusted)
+    available, none = np.ones(5, dtype=bool), np.zeros(5, dtype=bool)
+    found = descend(condition(p, noise, available), m, available, limits(5), keep=none)
+    accused = np.flatnonzero(~found.posterior.trusted)
     assert accused.size >= 1
     anybody, honest = replace(limits(5), sigmas=1e9), set()
-    everything = swaps(found, live, 50.0, anybody)
+    everything = meter_exchanges(found, available, 50.0, anybody)
     for swap in everything:
-        trusted = found.fit.trusted.copy()
+        trusted = found.posterior.trusted.copy()
         trusted[swap.accused], trusted[swap.innocent] = True, False
-        now = judge(fit(p, noise, trusted), m)
-        assert swap.worse == pytest.approx(max(now.misfit - found.judged.misfit, 0.0), rel=1e-6, abs=1e-9)
-        if abs(now.offset[swap.accused]) <= limits(5).of(now.std)[swap.accused]:
+        now = leave_one_out(condition(p, noise, trusted), m)
+        assert swap.worse == pytest.approx(
+            max(now.chi_square - found.loo.chi_square, 0.0), rel=1e-6, abs=1e-9
+        )
+        if abs(now.residual[swap.accused]) <= limits(5).limit(now.std)[swap.accused]:
             honest.add(swap.accused)
-    assert {swap.accused for swap in swaps(found, live, 50.0, limits(5))} == honest
-    assert swaps(found, live, -1.0, anybody) == []
+    assert {swap.accused for swap in meter_exchanges(found, available, 50.0, limits(5))} == honest
+    assert meter_exchanges(found, available, -1.0, anybody) == []
 
 
 def test_nobody_is_exchanged_who_would_be_accused_again() -> None:
@@ -235,20 +239,20 @@ def test_nobody_is_exchanged_who_would_be_accused_again() -> None:
     rng = np.random.default_rng(16)
     columns, _ = street(rng, 8)
     S = columns @ columns.T * 0.006**2
-    noise, live, none = np.full(9, 0.002**2), np.ones(9, dtype=bool), np.zeros(9, dtype=bool)
+    noise, available, none = np.full(9, 0.002**2), np.ones(9, dtype=bool), np.zeros(9, dtype=bool)
     seen: set[bool] = set()
     for size, alone in product(np.linspace(0.01, 0.05, 40), (True, False)):
         at = np.array([3, 4, 5, 6, 7, 8, 2, 1, 0]) if alone else np.array([3, 3, 5, 6, 7, 7, 8, 2, 1])
         p = Prior(S[:, at], at, S.diagonal().copy())
         m = 0.002 * rng.normal(size=9)
         m[[2, 4]] += size
-        found = descend(fit(p, noise, live), m, live, limits(9), keep=none)
-        told = {swap.accused for swap in swaps(found, live, 30.0, limits(9))}
-        for swap in swaps(found, live, 30.0, replace(limits(9), sigmas=1e9)):
-            trusted = found.fit.trusted.copy()
+        found = descend(condition(p, noise, available), m, available, limits(9), keep=none)
+        told = {swap.accused for swap in meter_exchanges(found, available, 30.0, limits(9))}
+        for swap in meter_exchanges(found, available, 30.0, replace(limits(9), sigmas=1e9)):
+            trusted = found.posterior.trusted.copy()
             trusted[swap.accused], trusted[swap.innocent] = True, False
-            now = judge(fit(p, noise, trusted), m)
-            fine = abs(now.offset[swap.accused]) <= limits(9).of(now.std)[swap.accused]
+            now = leave_one_out(condition(p, noise, trusted), m)
+            fine = abs(now.residual[swap.accused]) <= limits(9).limit(now.std)[swap.accused]
             assert fine == (swap.accused in told)
             seen.add(bool(fine))
     assert seen == {True, False}
@@ -257,10 +261,12 @@ def test_nobody_is_exchanged_who_would_be_accused_again() -> None:
 def test_where_nobody_is_trusted_nobody_is_exchanged() -> None:
     rng = np.random.default_rng(18)
     _, p = street(rng, 4)
-    live, none = np.ones(4, dtype=bool), np.zeros(4, dtype=bool)
-    found = descend(fit(p, np.full(4, 0.002**2), none), np.full(4, 0.5), live, limits(4), keep=live)
-    assert not found.fit.trusted.any()
-    assert swaps(found, live, 1e9, limits(4)) == []
+    available, none = np.ones(4, dtype=bool), np.zeros(4, dtype=bool)
+    found = descend(
+        condition(p, np.full(4, 0.002**2), none), np.full(4, 0.5), available, limits(4), keep=available
+    )
+    assert not found.posterior.trusted.any()
+    assert meter_exchanges(found, available, 1e9, limits(4)) == []
 
 
 def test_swaps_with_a_loosened_direction() -> None:
@@ -269,15 +275,15 @@ def test_swaps_with_a_loosened_direction() -> None:
     noise = np.full(9, 0.002**2)
     m = readings(rng, p, noise)
     m[4] += 0.05
-    live, none = np.ones(9, dtype=bool), np.zeros(9, dtype=bool)
+    available, none = np.ones(9, dtype=bool), np.zeros(9, dtype=bool)
     loose = 0.05 * columns[:, [6]]
-    found = descend(fit(p, noise, live, loose), m, live, limits(9), keep=none)
-    assert list(np.flatnonzero(~found.fit.trusted)) == [4]
-    (swap,) = swaps(found, live, 1e9, replace(limits(9), sigmas=1e9))
-    trusted = live.copy()
+    found = descend(condition(p, noise, available, loose), m, available, limits(9), keep=none)
+    assert list(np.flatnonzero(~found.posterior.trusted)) == [4]
+    (swap,) = meter_exchanges(found, available, 1e9, replace(limits(9), sigmas=1e9))
+    trusted = available.copy()
     trusted[swap.innocent] = False
-    now = judge(fit(p, noise, trusted, loose), m).misfit
-    assert swap.worse == pytest.approx(now - found.judged.misfit, rel=1e-6)
+    now = leave_one_out(condition(p, noise, trusted, loose), m).chi_square
+    assert swap.worse == pytest.approx(now - found.loo.chi_square, rel=1e-6)
 
 
 def test_meters_to_keep_out_are_kept_out() -> None:
@@ -285,12 +291,12 @@ def test_meters_to_keep_out_are_kept_out() -> None:
     _, p = street(rng, 9)
     noise = np.full(9, 0.002**2)
     m = readings(rng, p, noise)
-    live = np.ones(9, dtype=bool)
+    available = np.ones(9, dtype=bool)
     keep = np.arange(9) == 2
-    found = descend(fit(p, noise, ~keep), m, live, limits(9), keep=keep)
-    assert not found.fit.trusted[2]
-    back = descend(fit(p, noise, ~keep), m, live, limits(9), keep=np.zeros(9, dtype=bool))
-    assert back.fit.trusted[2]
+    found = descend(condition(p, noise, ~keep), m, available, limits(9), keep=keep)
+    assert not found.posterior.trusted[2]
+    back = descend(condition(p, noise, ~keep), m, available, limits(9), keep=np.zeros(9, dtype=bool))
+    assert back.posterior.trusted[2]
 
 
 def test_price_is_the_binomial_up_to_the_middle_and_rises_for_ever() -> None:
@@ -298,11 +304,11 @@ def test_price_is_the_binomial_up_to_the_middle_and_rises_for_ever() -> None:
         for k in range(count // 2 + 1):
             if k and (count - k + 1) / k < np.exp(0.5):
                 break
-            assert price(count, k) == pytest.approx(2.0 * log(comb(count, k)))
-        steps = np.diff([price(count, k) for k in range(count + 1)])
+            assert set_cost(count, k) == pytest.approx(2.0 * log(comb(count, k)))
+        steps = np.diff([set_cost(count, k) for k in range(count + 1)])
         third = count // 3
-        assert price(count, third, third) == price(count, third)
-        assert price(count, count, third) >= price(count, third) + 9.0 * (count - third)
+        assert set_cost(count, third, third) == set_cost(count, third)
+        assert set_cost(count, count, third) >= set_cost(count, third) + 9.0 * (count - third)
         assert (steps >= 1.0 - 1e-12).all()
 
 
@@ -310,15 +316,15 @@ def test_a_bounded_fixed_error_is_allowed_as_a_bound() -> None:
     """Within the class by bound, beyond by chance: the smaller of both views."""
     std = np.array([1.0, 1.0])
     both = Limits(4.0, np.array([0.1, 0.0]), np.array([1.5, 9.0]), np.array([0.75, 0.75]))
-    np.testing.assert_allclose(both.of(std), [0.1 + 1.5 + 4.0 * 0.5, 4.0])
-    np.testing.assert_allclose(both.of(std, 0.5), [0.1 + 2.0, 2.0])
+    np.testing.assert_allclose(both.limit(std), [0.1 + 1.5 + 4.0 * 0.5, 4.0])
+    np.testing.assert_allclose(both.limit(std, 0.5), [0.1 + 2.0, 2.0])
     assert both.penalty == 16.0
 
 
 def test_what_was_answered_last_is_answered_again_for_the_same_only() -> None:
     rng = np.random.default_rng(4)
     allowed, certain, late = (rng.uniform(0.1, 1.0, 5) for _ in range(3))
-    recent, stds = Recent(), [rng.uniform(0.5, 2.0, 5) for _ in range(2)]
+    recent, stds = LimitCache(), [rng.uniform(0.5, 2.0, 5) for _ in range(2)]
     for _ in range(40):
         std, sigmas, part = (
             stds[rng.integers(2)],
@@ -327,8 +333,10 @@ def test_what_was_answered_last_is_answered_again_for_the_same_only() -> None:
         )
         model = rng.uniform(0.0, 1.0, 5)
         given = (sigmas, model, allowed, certain, None, late)
-        np.testing.assert_array_equal(Limits(*given, recent).of(std, part), Limits(*given).of(std, part))
-    assert recent.answer is not None
+        np.testing.assert_array_equal(
+            Limits(*given, recent).limit(std, part), Limits(*given).limit(std, part)
+        )
+    assert recent.last is not None
 
 
 def crowd(seed: int, count: int) -> tuple[np.random.Generator, Prior, Floats, Floats]:
@@ -345,17 +353,19 @@ def test_who_was_believed_is_judged_by_those_admitted_too(seed: int) -> None:
     """The more is known the less an honest meter is off: one is dropped where, one by one, it would be."""
     rng, p, noise, m = crowd(seed, 24)
     m += np.where(rng.random(24) < 0.3, rng.normal(size=24) * 3.0, 0.0)
-    start, every, zero = fit(p, noise, rng.random(24) < 0.4), np.ones(24, dtype=bool), np.zeros(24)
+    start, every, zero = condition(p, noise, rng.random(24) < 0.4), np.ones(24, dtype=bool), np.zeros(24)
     # The better the others know, the less is left but for what is allowed.
-    strict, found = Limits(2.5, zero, zero + 0.02, noise), list[Solution]()
+    strict, found = Limits(2.5, zero, zero + 0.02, noise), list[Candidate]()
     with pytest.MonkeyPatch.context() as patch:
         for few in (search._MANY, 10**6):
             patch.setattr(search, "_MANY", few)
             found.append(descend(start, m, every, strict, keep=~every))
     many, one_by_one = found
     np.testing.assert_array_equal(many.trusted, one_by_one.trusted)
-    assert many.fit.changes == one_by_one.fit.changes
-    assert many.judged.misfit == pytest.approx(judge(fit(p, noise, many.trusted), m).misfit, rel=1e-8)
+    assert many.posterior.updates == one_by_one.posterior.updates
+    assert many.loo.chi_square == pytest.approx(
+        leave_one_out(condition(p, noise, many.trusted), m).chi_square, rel=1e-8
+    )
 
 
 def vouching(seed: int) -> tuple[Prior, Floats, Floats]:
@@ -363,7 +373,7 @@ def vouching(seed: int) -> tuple[Prior, Floats, Floats]:
     rng, p, noise, m = crowd(seed, 24)
     m[rng.choice(24, 8, replace=False)] += rng.choice([-1.0, 1.0], 8) * 4.0
     S = np.zeros((25, 25))
-    S[:24, :24], S[24, :24] = p.of_meters, 0.6 * p.of_meters[0]
+    S[:24, :24], S[24, :24] = p.covariance, 0.6 * p.covariance[0]
     S[:24, 24], S[24, 24] = S[24, :24], 0.36 * p.variance[0] + 0.05
     at = np.append(np.arange(24), [24, 24])
     m = np.append(m, 0.6 * m[0] + np.array([3.0, 3.05]))
@@ -375,16 +385,16 @@ def test_where_pairs_may_fall_nobody_falls_in_a_crowd() -> None:
     every, vouched = np.ones(26, dtype=bool), 0
     for seed in range(20):
         p, noise, m = vouching(seed)
-        start, found = fit(p, noise, every), list[Solution]()
-        judged = judge(start, m)
-        beyond = np.abs(judged.offset) > limits(26).of(judged.std)
+        start, found = condition(p, noise, every), list[Candidate]()
+        loo = leave_one_out(start, m)
+        beyond = np.abs(loo.residual) > limits(26).limit(loo.std)
         with pytest.MonkeyPatch.context() as patch:
             for few, pairs in ((search._MANY, True), (10**6, True), (10**6, False)):
                 patch.setattr(search, "_MANY", few)
                 found.append(descend(start, m, every, limits(26), keep=~every, pairs=pairs))
         asked, one_by_one, single = found
         np.testing.assert_array_equal(asked.trusted, one_by_one.trusted)
-        assert asked.fit.changes == one_by_one.fit.changes
+        assert asked.posterior.updates == one_by_one.posterior.updates
         assert asked.cost == pytest.approx(one_by_one.cost, rel=1e-9)
         enough = np.count_nonzero(beyond) >= 6
         vouched += bool(enough and single.trusted[24:].all() and not asked.trusted[24:].any())
@@ -400,27 +410,27 @@ def test_where_powers_may_be_false_nobody_falls_in_a_crowd(seed: int) -> None:
     m = readings(rng, p, noise)
     m[rng.choice(24, 8, replace=False)] += 0.03 * rng.choice([-1.0, 1.0], 8)
     m -= 0.3 * columns[1:, int(np.argmax(columns[1:].sum(axis=0)))]
-    book = Dictionary(
+    faults = FaultDictionary(
         std=np.full(24, 0.1),
         charge=np.full(24, 3.0),
         size=(columns[1:] ** 2).sum(axis=0),
         meter=np.full(24, -1),
         columns=lambda which: columns[:, which],
-        along=lambda weights: weights @ columns[1:],
+        weighted=lambda weights: weights @ columns[1:],
     )
-    start, found = fit(p, noise, every), list[Solution]()
+    start, found = condition(p, noise, every), list[Candidate]()
     with pytest.MonkeyPatch.context() as patch:
         for few in (search._MANY, 10**6):
             patch.setattr(search, "_MANY", few)
-            found.append(descend(start, m, every, limits(24), keep=~every, dictionary=book))
+            found.append(descend(start, m, every, limits(24), keep=~every, faults=faults))
     asked, one_by_one = found
     np.testing.assert_array_equal(asked.trusted, one_by_one.trusted)
-    assert asked.loosened == one_by_one.loosened
-    assert asked.fit.changes == one_by_one.fit.changes
-    loose = 0.1 * columns[:, list(asked.loosened)]
-    anew = judge(fit(p, noise, asked.trusted, loose), m).misfit
-    liars = int(np.count_nonzero(~asked.trusted))
-    assert asked.cost == pytest.approx(anew + price(24, liars) + asked.charge, rel=1e-6)
+    assert asked.faults == one_by_one.faults
+    assert asked.posterior.updates == one_by_one.posterior.updates
+    loose = 0.1 * columns[:, list(asked.faults)]
+    anew = leave_one_out(condition(p, noise, asked.trusted, loose), m).chi_square
+    suspects = int(np.count_nonzero(~asked.trusted))
+    assert asked.cost == pytest.approx(anew + set_cost(24, suspects) + asked.charge, rel=1e-6)
 
 
 @pytest.mark.parametrize("few", [1, 10**6])
@@ -428,10 +438,10 @@ def test_moves_are_bounded_though_many_are_made_at_once(few: int, monkeypatch: p
     """Each who moves counts, not each time that some do: half as many moves as meters leave half of them."""
     _, p, noise, m = crowd(0, 24)
     every = np.ones(24, dtype=bool)
-    start = fit(p, noise, ~every)
+    start = condition(p, noise, ~every)
     monkeypatch.setattr(search, "_MANY", few)
     monkeypatch.setattr(search, "_AT_ONCE", 6)
     assert descend(start, m, every, replace(limits(24), sigmas=9.0), keep=~every).trusted.all()
     monkeypatch.setattr(search, "_MOVES_PER_METER", 0.5)
     found = descend(start, m, every, replace(limits(24), sigmas=9.0), keep=~every)
-    assert found.fit.changes == np.count_nonzero(found.trusted) == 12
+    assert found.posterior.updates == np.count_nonzero(found.trusted) == 12

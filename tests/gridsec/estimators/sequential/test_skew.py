@@ -14,9 +14,9 @@ from benchmarks.late_powers import site, watcher, world
 from feeders.model.site import Snapshot, to_frame
 from feeders.simulation.scenario import START
 from gridsec.estimators.sequential import init, step
-from gridsec.estimators.sequential.examine import Examined, examine
-from gridsec.estimators.sequential.moment import present
-from gridsec.estimators.sequential.skew import follow, largest, unusable
+from gridsec.estimators.sequential.examine import Identification, identify
+from gridsec.estimators.sequential.moment import without_shifted_busbar
+from gridsec.estimators.sequential.skew import largest_offset, unusable_offsets, update_skew
 from gridsec.interface import Cause, Decision
 from tests.gridsec.estimators.sequential.test_monitor import prepare
 from tests.gridsec.street import Street, make_plant
@@ -35,42 +35,42 @@ def test_changes_means_and_scales_are_those_of_the_definition() -> None:
     v2, noise = 1.0 + 0.01 * rng.standard_normal((150, P)), np.full((len(made.lengths), P), 1e-9)
     skew, c = None, np.zeros(v2.shape)
     for t, now in enumerate(v2):
-        skew = follow(made, skew, t, offset, now, noise)
+        skew = update_skew(made, skew, t, offset, now, noise)
         for j in range(P):
             ticks = int(np.ceil(used[j])) + 1 if used[j] else 0
             c[t, j] = max((abs(now[j] - v2[t - k, j]) for k in range(1, min(ticks, t) + 1)), default=0.0)
         assert skew is not None
-        np.testing.assert_allclose(skew.moved[-1], c[t], rtol=1e-12)
+        np.testing.assert_allclose(skew.change[-1], c[t], rtol=1e-12)
     assert skew is not None
     for s, length in enumerate(made.lengths):
-        last = 149 - 149 % made.every[s]
+        last = 149 - 149 % made.look_every[s]
         square = np.where(skew.aside[s], 0.0, c[last - length + 1 : last + 1].mean(axis=0) ** 2)
         assert (skew.variance[s] >= square * (1.0 - 1e-12))[square > 1e-10].all()
     for s, length in enumerate(made.lengths):
         assert skew.aside[s].tolist() == (length < 4.0 * used).tolist()
-    assert unusable(made, offset).tolist() == [k == 5 for k in range(P)]
+    assert unusable_offsets(made, offset).tolist() == [k == 5 for k in range(P)]
 
 
 @pytest.mark.parametrize("offset", [None, np.zeros(P), np.full(P, np.nan)])
 def test_without_a_measured_offset_nothing_is_kept(offset: np.ndarray | None) -> None:
     made = prepare(make_plant(np.random.default_rng(1), customers=P, drop=0.02))
     noise = np.full((len(made.lengths), P), 1e-9)
-    kept = follow(made, None, 0, np.full(P, 1.0), np.ones(P), noise)
+    kept = update_skew(made, None, 0, np.full(P, 1.0), np.ones(P), noise)
     assert kept is not None
-    assert follow(made, kept, 1, offset, np.ones(P), noise) is None
+    assert update_skew(made, kept, 1, offset, np.ones(P), noise) is None
 
 
 def test_offsets_add_no_look_and_few_factorisations(monkeypatch: pytest.MonkeyPatch) -> None:
     """The busbar wanders and its transformer changes the tap; looks follow the design alone."""
     plant = make_plant(np.random.default_rng(3), customers=P, drop=0.02)
     made, street, rng = prepare(plant), Street(plant, np.random.default_rng(4)), np.random.default_rng(5)
-    seen: list[Examined] = []
+    seen: list[Identification] = []
 
-    def watched(*given: Any) -> Examined:
-        seen.append(examine(*given))
+    def watched(*given: Any) -> Identification:
+        seen.append(identify(*given))
         return seen[-1]
 
-    monkeypatch.setattr(sys.modules["gridsec.estimators.sequential.step"], "examine", watched)
+    monkeypatch.setattr(sys.modules["gridsec.estimators.sequential.step"], "identify", watched)
     offset = np.linspace(-3.0, 3.0, P)
     state, wander, fresh = init(made, street.t - 1.0), 0.0, 0
     for k in range(300):
@@ -80,11 +80,14 @@ def test_offsets_add_no_look_and_few_factorisations(monkeypatch: pytest.MonkeyPa
         before = state
         state, _, verdict = step(made, state, frame)
         assert verdict.decision is not Decision.ATTACKED
-        due = [k % every == 0 or fit is None for fit, every in zip(before.fits, made.every, strict=True)]
-        assert [view is not None for view in seen[-1].views] == due
-        if before.skew is not None and state.skew is not None:
-            changed = (before.skew.variance != state.skew.variance).any(axis=1)
-            assert all(k % every == 0 for every, one in zip(made.every, changed, strict=True) if one)
+        due = [
+            k % every == 0 or fit is None
+            for fit, every in zip(before.posteriors, made.look_every, strict=True)
+        ]
+        assert [view is not None for view in seen[-1].tests] == due
+        if before.clock_skew is not None and state.clock_skew is not None:
+            changed = (before.clock_skew.variance != state.clock_skew.variance).any(axis=1)
+            assert all(k % every == 0 for every, one in zip(made.look_every, changed, strict=True) if one)
             fresh += int(changed.sum())
     assert 0 < fresh < 100
 
@@ -98,7 +101,7 @@ def test_variances_that_cross_a_level_at_each_tick_change_seldom(level: float) -
     root = np.sqrt(level)
     for k in range(400):
         rise = 1.05 if k // 60 % 2 else 0.95
-        now = follow(made, skew, k, offset, np.full(P, (k % 2) * rise * root), noise)
+        now = update_skew(made, skew, k, offset, np.full(P, (k % 2) * rise * root), noise)
         assert now is not None
         fresh += skew is not None and not np.array_equal(now.variance[last], skew.variance[last])
         skew = now
@@ -112,7 +115,7 @@ def test_all_clocks_off_and_a_still_feeder_is_clean_and_liars_are_named() -> Non
     """Offsets of 15 s: the longest scale alone judges, also at ticks without a look at it."""
     plant = make_plant(np.random.default_rng(3), customers=P, drop=0.02)
     made, street = prepare(plant), Street(plant, np.random.default_rng(4))
-    state, offset = init(made, street.t - 1.0), np.full(P, largest(made))
+    state, offset = init(made, street.t - 1.0), np.full(P, largest_offset(made))
     said = []
     for k in range(200):
         frame = replace(street.frame(), t=street.t + k, clock_offset=offset)
@@ -123,7 +126,7 @@ def test_all_clocks_off_and_a_still_feeder_is_clean_and_liars_are_named() -> Non
     assert all(one.decision is Decision.CLEAN for one in said[70:100])
     assert said[-1].suspects.tolist() == [k == 2 for k in range(P)]
     state, _, verdict = step(made, state, replace(street.frame(), t=street.t + 200.0))
-    assert state.skew is None
+    assert state.clock_skew is None
 
 
 def test_a_meter_with_an_offset_that_no_scale_judges_is_neither_clean_nor_accused() -> None:
@@ -182,11 +185,11 @@ def test_a_reading_of_another_moment_is_left_out_within_the_offset_of_a_step() -
             y = np.full(P, 1.0 + 0.03 * (k >= 20))
             v0 = 1.0 + 0.03 * (k >= 20 + offset)
             frame = replace(one, y=y, seen=trusted, v0_squared=v0, busbar_offset=offset)
-            moment, out = present(made, moment, frame, trusted, 1.0)
+            moment, out = without_shifted_busbar(made, moment, frame, trusted, 1.0)
             left += [k] if np.isnan(out.v0_squared) else []
         first, last = sorted((20, int(np.ceil(20 + offset))))
         assert left == list(range(first, last + 4))
-    moment, out = present(made, moment, replace(one, busbar_offset=np.nan), trusted, 1.0)
+    moment, out = without_shifted_busbar(made, moment, replace(one, busbar_offset=np.nan), trusted, 1.0)
     assert moment is None
     assert np.isfinite(out.v0_squared)
 
@@ -202,13 +205,13 @@ def test_a_pause_that_empties_the_window_ends_the_changes_before_it() -> None:
             frame, rise = street.frame(), 0.02 * (k % 2)
             frame = replace(frame, t=t + k, v0_squared=frame.v0_squared + rise, y=frame.y + rise)
             state, _, _ = step(made, state, replace(frame, clock_offset=offset))
-        assert state.skew is not None
-        assert (state.skew.moved > 0.0).any()
+        assert state.clock_skew is not None
+        assert (state.clock_skew.change > 0.0).any()
         frame = replace(street.frame(), t=t + 39.0 + pause, clock_offset=offset)
         state, _, _ = step(made, state, replace(frame, v0_squared=frame.v0_squared + 0.05, y=frame.y + 0.05))
-        assert state.skew is not None
-        assert (not state.skew.moved.any()) is fresh
-        assert (len(state.skew.model) == 1) is fresh
+        assert state.clock_skew is not None
+        assert (not state.clock_skew.change.any()) is fresh
+        assert (len(state.clock_skew.model) == 1) is fresh
 
 
 @pytest.mark.acceptance

@@ -11,15 +11,15 @@ from scipy.special import betaln
 
 from gridsec.arrays import Bools, Floats
 from gridsec.errors import InputInvalid
-from gridsec.estimators.sequential.alike import _Base
+from gridsec.estimators.sequential.alike import _SamePowers
 from gridsec.estimators.sequential.conditional import Prior
-from gridsec.estimators.sequential.rises import Problem, State
-from gridsec.estimators.sequential.snapshot import Explained, FalsePowers, Lies, identify
+from gridsec.estimators.sequential.rises import LikelihoodProblem, SnapshotHypothesis
+from gridsec.estimators.sequential.snapshot import ErrorPrior, FalsePowers, SnapshotExplanation, identify
 from tests.codes import refused
 
 P = 7
-LIES = Lies()
-APART = Lies(apart=0.0, pair=1e3, more=1e3, story=1e3)
+LIES = ErrorPrior()
+APART = ErrorPrior(apart=0.0, pair=1e3, more=1e3, load=1e3)
 
 
 Known = tuple[Prior, Floats, FalsePowers]
@@ -37,10 +37,10 @@ def street(rng: np.random.Generator) -> Known:
     )
 
 
-def tells(moved: Floats, liars: tuple[int, ...]) -> bool:
+def tells(moved: Floats, suspects: tuple[int, ...]) -> bool:
     """Whether nobody else would be moved more than one of them."""
-    others = [moved[j] for j in range(P) if j not in liars]
-    return bool(min(moved[list(liars)]) >= max(others, default=0.0) * (1.0 - 1e-9))
+    others = [moved[j] for j in range(P) if j not in suspects]
+    return bool(min(moved[list(suspects)]) >= max(others, default=0.0) * (1.0 - 1e-9))
 
 
 def told(moved: Floats, c: int, size: int) -> int:
@@ -49,7 +49,7 @@ def told(moved: Floats, c: int, size: int) -> int:
 
 
 def dense(
-    known: Known, m: Floats, liars: tuple[int, ...], powers: tuple[int, ...] = (), *, drawn: bool = True
+    known: Known, m: Floats, suspects: tuple[int, ...], powers: tuple[int, ...] = (), *, drawn: bool = True
 ) -> float:
     """Minus twice the log evidence, from its definition, of the likeliest shape, relative to K of nobody."""
     prior, noise, false = known
@@ -58,17 +58,17 @@ def dense(
     for c in powers:
         B = np.column_stack([false.R[:, c] * false.p[c], false.X[:, c] * false.q[c]])
         K += B @ B.T
-    k, L = len(liars), np.array(liars, dtype=int)
+    k, L = len(suspects), np.array(suspects, dtype=int)
     shapes = [(LIES.size**2 * np.eye(k), LIES.apart * (k - 1))]
     if k > 1:
         same = (np.ones(k), LIES.pair + LIES.more * (k - 2))
         stories = [
             (
                 false.R[L, c] / false.R[c, c],
-                LIES.story + 2.0 * np.log(P * told(false.R[:, c], c, k) / comb(P, k)),
+                LIES.load + 2.0 * np.log(P * told(false.R[:, c], c, k) / comb(P, k)),
             )
-            for c in (liars if drawn else ())
-            if tells(false.R[:, c], liars)
+            for c in (suspects if drawn else ())
+            if tells(false.R[:, c], suspects)
         ]
         for u, price in (same, *stories):
             shapes.append((LIES.amplitude**2 * (np.outer(u, u) + LIES.differ**2 * np.diag(u**2)), price))
@@ -87,8 +87,8 @@ def subsets(most: int) -> list[tuple[int, ...]]:
     return list(chain.from_iterable(combinations(range(P), k) for k in range(1, most + 1)))
 
 
-def who(found: Explained) -> tuple[int, ...]:
-    return tuple(np.flatnonzero(found.liars).tolist())
+def who(found: SnapshotExplanation) -> tuple[int, ...]:
+    return tuple(np.flatnonzero(found.meters).tolist())
 
 
 LIVE: Bools = np.ones(P, dtype=np.bool_)
@@ -126,13 +126,13 @@ def test_lies_that_are_alike_are_found_where_they_are_weak(like_a_load: bool) ->
         shape = false.R[lying, P - 1] / false.R[P - 1, P - 1] if like_a_load else np.ones(3)
         m[lying] -= rng.uniform(0.012, 0.03) * shape
         found = identify(prior, noise, m, LIVE, false=false)
-        if found[0].powers.any() or not found[0].liars.any():
+        if found[0].powers.any() or not found[0].meters.any():
             continue
         named += 1
         costs = {each: dense((prior, noise, false), m, each) for each in subsets(4)}
         exact += who(found[0]) == min(costs, key=lambda each: costs[each])
         right += who(found[0]) == tuple(lying.tolist())
-        right_apart += who(identify(prior, noise, m, LIVE, lies=APART, false=false)[0]) == tuple(
+        right_apart += who(identify(prior, noise, m, LIVE, error_prior=APART, false=false)[0]) == tuple(
             lying.tolist()
         )
         for other in found[1:]:
@@ -140,7 +140,7 @@ def test_lies_that_are_alike_are_found_where_they_are_weak(like_a_load: bool) ->
                 gap = costs[who(other)] - costs[who(found[0])]
                 assert other.cost - found[0].cost == pytest.approx(gap, abs=1e-6)
         K = prior.between + np.diag(noise)
-        np.testing.assert_allclose(K @ found[0].weights + found[0].lies, m, atol=1e-9)
+        np.testing.assert_allclose(K @ found[0].weights + found[0].errors, m, atol=1e-9)
     assert named >= 15
     # The search is local: three of seven that agree may look like the other four.
     assert exact >= 0.6 * named
@@ -158,19 +158,19 @@ def test_who_tells_a_story_and_how_many_could(size: int, seed: int) -> None:
         on_path[k] += on_path[above[k]]
     R = on_path @ np.diag(rng.uniform(0.01, 0.05, P)) @ on_path.T
     false = FalsePowers(R, R, np.ones(P), np.ones(P))
-    nobody = State.nobody(np.zeros(P), np.eye(P))
-    problem = Problem(LIES, nobody, false, None)
-    base = _Base(problem, nobody, np.zeros(P))
+    no_meters = SnapshotHypothesis.without_accusations(np.zeros(P), np.eye(P))
+    problem = LikelihoodProblem(LIES, no_meters, false, None)
+    base = _SamePowers(problem, no_meters, np.zeros(P))
     L = np.array(list(combinations(range(P), size)))
     of, shape, cost = base.shapes([tuple(each) for each in L.tolist()])
     found = {(k, c): J for k, c, J in zip(of.tolist(), shape.tolist(), cost.tolist(), strict=True) if c >= 0}
-    for k, liars in enumerate(L.tolist()):
-        for c in liars:
-            assert ((k, c) in found) == tells(R[:, c], tuple(liars))
+    for k, suspects in enumerate(L.tolist()):
+        for c in suspects:
+            assert ((k, c) in found) == tells(R[:, c], tuple(suspects))
             if (k, c) in found:
-                u = R[liars, c] / R[c, c]
+                u = R[suspects, c] / R[c, c]
                 C = LIES.amplitude**2 * (np.outer(u, u) + LIES.differ**2 * np.diag(u**2))
-                price = LIES.story + 2.0 * np.log(P * told(R[:, c], c, size) / comb(P, size))
+                price = LIES.load + 2.0 * np.log(P * told(R[:, c], c, size) / comb(P, size))
                 freedom = np.linalg.slogdet(np.eye(size) + C)[1]
                 assert found[k, c] == pytest.approx(freedom + problem.prices[size] + price, abs=1e-9)
 
@@ -212,10 +212,10 @@ def test_false_powers_are_found_where_no_meter_alone_is_suspicious_enough() -> N
         honest = rng.multivariate_normal(np.zeros(P), prior.between + np.diag(noise))
         m = honest - 0.15 * false.R[:, c]
         m[c] = honest[c]
-        if identify(prior, noise, m, LIVE)[0].liars.any():
+        if identify(prior, noise, m, LIVE)[0].meters.any():
             continue
         best = identify(prior, noise, m, LIVE, false=false)[0]
-        if best.liars.any():
+        if best.meters.any():
             assert who(best) == (c,)
             assert best.powers[c]
             found += 1
@@ -227,10 +227,10 @@ def clean_and_named(rate: float, noise: Floats, trials: int) -> int:
     rng = np.random.default_rng(5)
     prior, _, false = street(rng)
     root = np.linalg.cholesky(prior.between + np.diag(noise))
-    lies = Lies(rate=rate)
+    lies = ErrorPrior(rate=rate)
     told = rng.normal(size=(trials, P)) @ root.T
-    found = [identify(prior, noise, m, LIVE, lies=lies, false=false)[0] for m in told]
-    return sum(bool(each.liars.any()) for each in found)
+    found = [identify(prior, noise, m, LIVE, error_prior=lies, false=false)[0] for m in told]
+    return sum(bool(each.meters.any()) for each in found)
 
 
 SAME = np.full(P, 0.004**2)
@@ -257,7 +257,7 @@ def test_the_voltage_follows_from_the_weights() -> None:
     m = truth + np.sqrt(noise) * rng.normal(size=P)
     m[4] += 0.3
     best = identify(prior, noise, m, LIVE)[0]
-    honest = np.flatnonzero(~best.liars)
+    honest = np.flatnonzero(~best.meters)
     K = prior.between[np.ix_(honest, honest)] + np.diag(noise[honest])
     expected = prior.between[:, honest] @ np.linalg.solve(K, m[honest])
     # A liar's reading counts with the tiny weight of its slab.
@@ -269,11 +269,11 @@ def test_a_silent_meter_has_no_influence() -> None:
     prior, noise, false = street(rng)
     m = rng.multivariate_normal(np.zeros(P), prior.between + np.diag(noise))
     m[1] += 0.1
-    live = LIVE.copy()
-    live[5] = False
-    first = identify(prior, noise, m, live, false=false)
+    available = LIVE.copy()
+    available[5] = False
+    first = identify(prior, noise, m, available, false=false)
     m[5] = np.nan
-    second = identify(prior, noise, m, live, false=false)
+    second = identify(prior, noise, m, available, false=false)
     assert who(first[0]) == who(second[0]) == (1,)
     assert not first[0].weights[5]
     np.testing.assert_array_equal(first[0].weights, second[0].weights)
@@ -283,7 +283,7 @@ def test_without_readings_nobody_is_named() -> None:
     prior, noise, _ = street(np.random.default_rng(1))
     found = identify(prior, noise, np.full(P, np.nan), ~LIVE)
     assert len(found) == 1
-    assert not found[0].liars.any()
+    assert not found[0].meters.any()
     assert found[0].probability == pytest.approx(1.0)
 
 
@@ -298,8 +298,8 @@ def test_what_is_handed_on_changes_no_answer() -> None:
         assert handed.felt is not None
         np.testing.assert_array_equal(handed.felt, -np.sort(-false.R, axis=0))
         plain = FalsePowers(false.R, false.X, p, q)
-        for live in (LIVE, np.arange(P) != 3):
-            one, other = (identify(prior, noise, m, live, false=each) for each in (plain, handed))
+        for available in (LIVE, np.arange(P) != 3):
+            one, other = (identify(prior, noise, m, available, false=each) for each in (plain, handed))
             assert [who(each) for each in one] == [who(each) for each in other]
             assert [each.cost for each in one] == [each.cost for each in other]
 
@@ -314,20 +314,20 @@ def test_false_powers_of_other_meters_are_refused() -> None:
     with refused(InputInvalid, "shape"):
         identify(prior, noise, np.zeros(P), LIVE, false=false.of(few))
     with refused(InputInvalid, "not-positive"):
-        Lies(differ=0.0)
+        ErrorPrior(differ=0.0)
 
 
 def test_a_state_is_what_dense_algebra_says_after_many_changes() -> None:
     rng = np.random.default_rng(8)
     prior, noise, false = street(rng)
     K, m = prior.between + np.diag(noise), rng.normal(size=P)
-    start = State.nobody(m, np.linalg.inv(np.linalg.cholesky(K)))
-    problem, at = Problem(LIES, start, false, None), start.copy()
+    start = SnapshotHypothesis.without_accusations(m, np.linalg.inv(np.linalg.cholesky(K)))
+    problem, at = LikelihoodProblem(LIES, start, false, None), start.copy()
     for j in (2, 5, 2, 6):
         problem.toggle(at, j)
-    problem.powers(at, 6)
-    problem.powers(at, 5)
-    problem.powers(at, 5, -1.0)
+    problem.doubt_powers(at, 6)
+    problem.doubt_powers(at, 5)
+    problem.doubt_powers(at, 5, -1.0)
     B = np.column_stack([false.R[:, 6] * false.p[6], false.X[:, 6] * false.q[6]])
     after = K + LIES.size**2 * np.diag(np.isin(np.arange(P), (5, 6))) + B @ B.T
     Q, x = np.linalg.inv(after), rng.normal(size=P)
@@ -339,7 +339,7 @@ def test_a_state_is_what_dense_algebra_says_after_many_changes() -> None:
     assert at.fit == pytest.approx(float(m @ Q @ m), rel=1e-8)
     assert at.logdet == pytest.approx(np.linalg.slogdet(after)[1] - np.linalg.slogdet(K)[1], abs=1e-8)
     assert start.counts == (0, 0)
-    assert not start.liars.any()
+    assert not start.meters.any()
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -8,8 +8,8 @@ import pytest
 from benchmarks import _stealthy
 from benchmarks._scenes import Model, Setting, neighbours, site
 from benchmarks.stealthy_lies import LARGE_VOLT, calm, chosen, run
-from gridsec.estimators.sequential.conditional import judge
-from gridsec.estimators.sequential.scales import Scales, view_of
+from gridsec.estimators.sequential.conditional import leave_one_out
+from gridsec.estimators.sequential.scales import Scales, scale_test
 
 CASES = [
     ("kerber-dorfnetz", "contiguous", 0.5),
@@ -38,9 +38,9 @@ def test_no_single_meter_is_over_its_limit_under_the_lie() -> None:
     first = int(np.argmax(given.fits[-1].prior.variance[given.buses]))
     assert np.array_equal(lie.meters, np.sort(neighbours(where, first)[: where.meters.size // 3]))
     assert np.count_nonzero(lie.lie) <= lie.meters.size
-    scales = Scales(made, state.doubts, state.window, state.learned, state.model_error)
+    scales = Scales(made, state.uncertainty, state.window, state.learned, state.model_error)
     for s, now in enumerate(given.fits):
-        view = view_of(made, scales[s], judge(now, lie.lie))
-        assert (np.abs(view.judged.offset) <= (0.6 + 1e-6) * view.limit).all()
-    error = abs(judge(given.fits[-1], lie.lie).w).max()
+        view = scale_test(made, scales[s], leave_one_out(now, lie.lie))
+        assert (np.abs(view.loo.residual) <= (0.6 + 1e-6) * view.limit).all()
+    error = abs(leave_one_out(given.fits[-1], lie.lie).mean).max()
     assert error >= lie.error * (1.0 - 1e-9) > 0.02
