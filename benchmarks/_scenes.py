@@ -25,7 +25,7 @@ from feeders.simulation.trial import FrameTruth, LoadError, Trial, TrialMeterErr
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.attack import Attack
 from gridsec.estimators.sequential import SequentialDesign, SequentialState, init, step
-from gridsec.estimators.sequential.commission import Learned
+from gridsec.estimators.sequential.meter_bias import Learned
 from gridsec.interface import Frame, PowerOrigin
 
 ONSET_S = 20.0

@@ -25,8 +25,8 @@ from scipy.stats import chi2
 
 from gridsec.arrays import Floats, Ints
 from gridsec.estimators.sequential import SequentialDesign, SequentialState
-from gridsec.estimators.sequential.conditional import Posterior, condition
-from gridsec.estimators.sequential.scales import Scales
+from gridsec.estimators.sequential.posterior import Posterior, condition
+from gridsec.estimators.sequential.time_scales import Scales
 
 SHARE = 0.7
 """Part of every limit that a lie uses."""

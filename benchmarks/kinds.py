@@ -20,7 +20,7 @@ from feeders.simulation.attacks import NoSuchAttack
 from feeders.simulation.meters import MeterErrors
 from feeders.simulation.scenario import START, Scenario, random_attacks, simulate, snapshots
 from gridsec.attack import Attack, Replay
-from gridsec.estimators.sequential import kinds
+from gridsec.estimators.sequential import attack_kind
 
 # Attack, number of liars, size in pu, begin and end in s. A clock's error is a replay since ever.
 ATTACKS: tuple[tuple[str, int, float, float, float], ...] = (
@@ -65,7 +65,7 @@ def watch(site: Site, watcher: DesignedEstimator, scenario: Scenario) -> Seen:
     state, seen = watcher.init(START), Seen()
     for snapshot in snapshots(simulate(site, scenario)):
         state, _, verdict = watcher.step(state, to_frame(site, snapshot))
-        seen.alone |= bool(kinds.repeat_lags(state.attack_kinds).any())
+        seen.alone |= bool(attack_kind.repeat_lags(state.attack_kinds).any())
         for j in np.flatnonzero(verdict.suspects).tolist():
             if j not in liars:
                 seen.honest.add(j)
@@ -122,14 +122,14 @@ def cost(name: str, ticks: int = 4200) -> str:
     watcher = design(choose(load(name), estimator=SEQUENTIAL))
     shapes, random = watcher.design.references, np.random.default_rng(0)
     p = shapes.limits.step.size
-    live, nobody, state, times = np.ones(p, np.bool_), np.zeros(p, np.bool_), kinds.empty(p), []
+    live, nobody, state, times = np.ones(p, np.bool_), np.zeros(p, np.bool_), attack_kind.empty(p), []
     for k in range(ticks):
         v = 1.0 + 0.01 * np.sin(k / 500.0) + 5e-4 * random.standard_normal(p)
         y = (np.rint(v / shapes.limits.step) * shapes.limits.step) ** 2
         begin = process_time()
-        heard = kinds.ingest(shapes, state, y, live)
-        kinds.repeat_lags(heard)
-        state = kinds.classify(shapes, heard, y, y, nobody, y)
+        heard = attack_kind.ingest(shapes, state, y, live)
+        attack_kind.repeat_lags(heard)
+        state = attack_kind.classify(shapes, heard, y, y, nobody, y)
         times.append(process_time() - begin)
     kept = state.history.blocks
     size = sum(b.code.nbytes + b.hash.nbytes + b.model.nbytes + b.own.nbytes for b in kept) / 1e6

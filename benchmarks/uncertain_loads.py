@@ -42,7 +42,7 @@ from feeders.simulation.trial import (
 )
 from gridsec.arrays import Floats, Ints
 from gridsec.estimators import sequential
-from gridsec.estimators.sequential.commission import Learned
+from gridsec.estimators.sequential.meter_bias import Learned
 
 FEEDER = "kerber-vorstadtnetz"
 LOAD_KW = 0.6

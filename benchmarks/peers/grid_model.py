@@ -24,8 +24,8 @@ from benchmarks.peers.answer import Answer
 from benchmarks.peers.scene import Reading, Scene
 from feeders.simulation import powerflow
 from gridsec.arrays import Bools, Floats
-from gridsec.estimators.sequential.conditional import condition, remove_meter
-from gridsec.estimators.sequential.loads import LoadDoubt, prior
+from gridsec.estimators.sequential.load_uncertainty import LoadDoubt, prior
+from gridsec.estimators.sequential.posterior import condition, remove_meter
 
 _SQRT3 = np.sqrt(3.0)
 

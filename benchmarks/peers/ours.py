@@ -9,8 +9,8 @@ import numpy as np
 from benchmarks.peers.answer import Answer
 from benchmarks.peers.scene import Reading, Scene
 from gridsec.arrays import Bools, Floats
-from gridsec.estimators.sequential.conditional import Prior
-from gridsec.estimators.sequential.snapshot import ErrorPrior, FalsePowers, identify
+from gridsec.estimators.sequential.posterior import Prior
+from gridsec.estimators.snapshot.identification import ErrorPrior, FalsePowers, identify
 from gridsec.grid.radial import Feeder
 
 _STEPS = 2

@@ -1,7 +1,7 @@
 """The monitor that `gridsec serve` runs, fed with the same readings one after the other.
 
 It watches: its false alarms are counted per year, not per snapshot, and it accuses powers only as a last
-resort. What one snapshot alone says is asked of `gridsec.estimators.sequential.snapshot`, which the service
+resort. What one snapshot alone says is asked of `gridsec.estimators.snapshot`, which the service
 does not run.
 """
 

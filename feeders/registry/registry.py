@@ -26,7 +26,7 @@ from gridsec.estimators import (
     unknown_input,
     windowed,
 )
-from gridsec.estimators.sequential.decoder import Decoder
+from gridsec.estimators.sequential.search import Decoder
 from gridsec.observers.certificates import certify
 from gridsec.observers.gains import CircleOptions, options_for
 from gridsec.observers.lure import Lure, close_loop

@@ -28,8 +28,8 @@ from gridsec.errors import DesignInfeasible
 from gridsec.estimators.plant import Plant
 from gridsec.estimators.sequential import LoadDoubt, SequentialDesign, SequentialOptions
 from gridsec.estimators.sequential import design as sequential_design
-from gridsec.estimators.sequential.conditional import leave_one_out, remove_meter
-from gridsec.estimators.sequential.decoder import Decoder, DecoderAnswer, DecoderInput
+from gridsec.estimators.sequential.posterior import leave_one_out, remove_meter
+from gridsec.estimators.sequential.search import Decoder, DecoderAnswer, DecoderInput
 from gridsec.secure.decode.search import basis_pursuit, matching_pursuit
 
 MOST_SETS = 20_000

@@ -38,7 +38,7 @@ from scipy.linalg import cholesky, eigh, solve_triangular
 from gridsec.arrays import Floats, Ints, submatrix
 from gridsec.errors import Problem, raise_if_any
 from gridsec.estimators.sequential.design import YEAR_S, SequentialDesign
-from gridsec.estimators.sequential.loads import prior
+from gridsec.estimators.sequential.load_uncertainty import prior
 
 FIXED_S = YEAR_S
 """Time constant of fixed errors, s. Meters age over years; with a day, lies of 0.5 %/h stay hidden."""

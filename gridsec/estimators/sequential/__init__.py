@@ -18,19 +18,21 @@ every switching between them. The residuals are explained by correlated load err
 as few manipulated meters as possible.
 """
 
-from gridsec.estimators.sequential.commission import (
+from gridsec.estimators.sequential.design import SequentialDesign, SequentialOptions, design
+from gridsec.estimators.sequential.load_uncertainty import LoadDoubt
+from gridsec.estimators.sequential.meter_bias import (
     Commission,
     Learning,
+    LearningProgress,
     LearningReason,
+    LearningState,
     from_arrays,
+    progress,
     to_arrays,
 )
-from gridsec.estimators.sequential.design import SequentialDesign, SequentialOptions, design
-from gridsec.estimators.sequential.distrust import SuspicionRecord, distrusted, warm_start
-from gridsec.estimators.sequential.learning import LearningProgress, LearningState, progress
-from gridsec.estimators.sequential.loads import LoadDoubt
 from gridsec.estimators.sequential.state import SequentialState, init, renew
 from gridsec.estimators.sequential.step import step
+from gridsec.estimators.sequential.suspicion_record import SuspicionRecord, distrusted, warm_start
 
 __all__ = [
     "Commission",

@@ -16,13 +16,12 @@ from scipy.special import ndtri
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import DesignInfeasible, NotObservable, Problem, raise_if_any
 from gridsec.estimators.plant import Plant, check_plant, judging_problems
-from gridsec.estimators.sequential.conditional import Prior
-from gridsec.estimators.sequential.decoder import Decoder
-from gridsec.estimators.sequential.dictionary import FaultDictionary
-from gridsec.estimators.sequential.effects import Sensitivities
-from gridsec.estimators.sequential.kinds import KindReferences, LoadTraces, look_interval
-from gridsec.estimators.sequential.loads import UNMETERED, LoadDoubt, injection_doubt, prior
-from gridsec.estimators.sequential.repeats import repeat_limits
+from gridsec.estimators.sequential.attack_kind import KindReferences, LoadTraces, look_interval
+from gridsec.estimators.sequential.fault_dictionary import FaultDictionary, Sensitivities
+from gridsec.estimators.sequential.load_uncertainty import UNMETERED, LoadDoubt, injection_doubt, prior
+from gridsec.estimators.sequential.posterior import Prior
+from gridsec.estimators.sequential.replay import repeat_limits
+from gridsec.estimators.sequential.search import Decoder
 from gridsec.estimators.thresholds import curve_mismatch
 from gridsec.grid.meter import ToldError, busbar_error, steady_rounding
 from gridsec.grid.network import Network, Power

@@ -7,27 +7,25 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints
-from gridsec.estimators.sequential.apart import VouchedPosterior
-from gridsec.estimators.sequential.bounds import InjectionError
-from gridsec.estimators.sequential.bounds import unknown_injections as no_lag
-from gridsec.estimators.sequential.busbar import BusbarTrust
-from gridsec.estimators.sequential.busbar import trusted_busbar as believed_busbar
-from gridsec.estimators.sequential.commission import Commission, Learned, Learning, initial
-from gridsec.estimators.sequential.commission import renew as learn_anew
-from gridsec.estimators.sequential.conditional import Posterior
-from gridsec.estimators.sequential.curves import InverterChecks
-from gridsec.estimators.sequential.curves import no_checks as no_curves
+from gridsec.estimators.sequential.attack_kind import AttackKinds
+from gridsec.estimators.sequential.attack_kind import empty as no_kinds
+from gridsec.estimators.sequential.busbar_meter import BusbarTrust
+from gridsec.estimators.sequential.busbar_meter import trusted_busbar as believed_busbar
+from gridsec.estimators.sequential.clock_offsets import BusbarHistory, ClockSkew
 from gridsec.estimators.sequential.design import SequentialDesign
-from gridsec.estimators.sequential.doubts import FrameUncertainty
-from gridsec.estimators.sequential.doubts import nominal as no_doubts
-from gridsec.estimators.sequential.kinds import AttackKinds
-from gridsec.estimators.sequential.kinds import empty as no_kinds
-from gridsec.estimators.sequential.moment import BusbarHistory
-from gridsec.estimators.sequential.release import DoubtedPowers
-from gridsec.estimators.sequential.repeats import forget as forget_calm
-from gridsec.estimators.sequential.skew import ClockSkew
+from gridsec.estimators.sequential.error_bounds import InjectionError
+from gridsec.estimators.sequential.error_bounds import unknown_injections as no_lag
+from gridsec.estimators.sequential.frame_uncertainty import FrameUncertainty
+from gridsec.estimators.sequential.frame_uncertainty import nominal as no_doubts
+from gridsec.estimators.sequential.inverter_check import InverterChecks
+from gridsec.estimators.sequential.inverter_check import no_checks as no_curves
+from gridsec.estimators.sequential.meter_bias import Commission, Learned, Learning, initial
+from gridsec.estimators.sequential.meter_bias import renew as learn_anew
+from gridsec.estimators.sequential.posterior import Posterior
+from gridsec.estimators.sequential.replay import forget as forget_calm
+from gridsec.estimators.sequential.suspect_powers import DoubtedPowers, VouchedPosterior
+from gridsec.estimators.sequential.time_scales import Window, empty, forget
 from gridsec.estimators.sequential.trust import TrustState
-from gridsec.estimators.sequential.windows import Window, empty, forget
 from gridsec.interface import Estimate, Frame, Verdict
 from gridsec.observers.lure import Lure, LureTransition
 

@@ -8,25 +8,34 @@ import numpy as np
 
 from gridsec.arrays import Floats, Ints, all_of, any_of, changed
 from gridsec.estimators.inputs import nothing_new
-from gridsec.estimators.sequential.busbar import HonestErrors
-from gridsec.estimators.sequential.commission import Learning, gather, learn, ready_meters
-from gridsec.estimators.sequential.conclude import output
-from gridsec.estimators.sequential.conditional import Posterior
-from gridsec.estimators.sequential.curves import LONGEST_MEAN, InverterChecks, ReportedPowers, check_inverters
+from gridsec.estimators.sequential.attack_kind import AttackKinds, classify, ingest, repeat_lags
+from gridsec.estimators.sequential.busbar_meter import HonestErrors
+from gridsec.estimators.sequential.clock_offsets import ClockSkew, update_skew, without_shifted_busbar
+from gridsec.estimators.sequential.confirmation import confirm, supported
 from gridsec.estimators.sequential.design import SequentialDesign
-from gridsec.estimators.sequential.doubts import FrameUncertainty, update_uncertainty
-from gridsec.estimators.sequential.drive import Prediction, model_error, predict, prepare
-from gridsec.estimators.sequential.examine import Identification, ended, identify
-from gridsec.estimators.sequential.heard import Measurements, measurements, plausible
-from gridsec.estimators.sequential.kinds import AttackKinds, classify, ingest, repeat_lags
-from gridsec.estimators.sequential.learning import LearningTick, usable
-from gridsec.estimators.sequential.moment import without_shifted_busbar
-from gridsec.estimators.sequential.naming import confirm, supported
-from gridsec.estimators.sequential.scales import Scales, min_readings
-from gridsec.estimators.sequential.skew import ClockSkew, update_skew
+from gridsec.estimators.sequential.frame_uncertainty import FrameUncertainty, update_uncertainty
+from gridsec.estimators.sequential.identify import Identification, ended, identify
+from gridsec.estimators.sequential.inverter_check import (
+    LONGEST_MEAN,
+    InverterChecks,
+    ReportedPowers,
+    check_inverters,
+)
+from gridsec.estimators.sequential.measurements import Measurements, measurements, plausible
+from gridsec.estimators.sequential.meter_bias import (
+    Learning,
+    LearningTick,
+    gather,
+    learn,
+    ready_meters,
+    usable,
+)
+from gridsec.estimators.sequential.observer import Prediction, model_error, predict, prepare
+from gridsec.estimators.sequential.output import output
+from gridsec.estimators.sequential.posterior import Posterior
 from gridsec.estimators.sequential.state import SequentialState
+from gridsec.estimators.sequential.time_scales import Scales, Window, empty, forget, min_readings, push, shift
 from gridsec.estimators.sequential.trust import TrustState
-from gridsec.estimators.sequential.windows import Window, empty, forget, push, shift
 from gridsec.interface import Estimate, Explanation, Frame, Verdict
 
 _PAUSE = 60.0

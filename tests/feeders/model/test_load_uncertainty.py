@@ -15,7 +15,7 @@ from feeders.registry.registry import design
 from feeders.simulation.scenario import START
 from gridsec.errors import InputInvalid
 from gridsec.estimators.sequential import LoadDoubt, SequentialDesign, SequentialState
-from gridsec.estimators.sequential.loads import prior
+from gridsec.estimators.sequential.load_uncertainty import prior
 from tests.codes import refused
 from tests.feeders.unmetered import CIGRE, played, unmetered
 

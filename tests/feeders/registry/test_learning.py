@@ -9,7 +9,7 @@ import pytest
 
 from feeders.model.site import from_tables, load
 from feeders.registry.registry import SEQUENTIAL, DesignedEstimator, choose, design
-from gridsec.estimators.sequential.commission import class_only, learn, no_readings, ready_meters
+from gridsec.estimators.sequential.meter_bias import class_only, learn, no_readings, ready_meters
 
 
 @pytest.mark.parametrize(

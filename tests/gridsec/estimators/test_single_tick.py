@@ -22,10 +22,9 @@ from gridsec.errors import DesignInfeasible, NotObservable
 from gridsec.estimators import sequential, single_tick
 from gridsec.estimators.plant import Plant
 from gridsec.estimators.sequential import LoadDoubt, SequentialDesign, SequentialState
-from gridsec.estimators.sequential.conditional import condition, leave_one_out
-from gridsec.estimators.sequential.decoder import Decoder, DecoderInput
-from gridsec.estimators.sequential.loads import prior
-from gridsec.estimators.sequential.search import Limits
+from gridsec.estimators.sequential.load_uncertainty import prior
+from gridsec.estimators.sequential.posterior import condition, leave_one_out
+from gridsec.estimators.sequential.search import Decoder, DecoderInput, Limits
 from gridsec.estimators.single_tick import fewest, least_squares, match, pursue
 from gridsec.interface import Cause, Decision, Estimate, Frame, Verdict
 from gridsec.secure.decode.gaussian import design_test, detect

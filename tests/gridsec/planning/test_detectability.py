@@ -11,7 +11,7 @@ from scipy.optimize import linprog
 from gridsec.arrays import Floats
 from gridsec.estimators.plant import Plant
 from gridsec.estimators.sequential import LoadDoubt, design
-from gridsec.estimators.sequential.conditional import chi_square
+from gridsec.estimators.sequential.posterior import chi_square
 from gridsec.estimators.sequential.search import set_cost
 from gridsec.grid.droop import fleet
 from gridsec.grid.meter import MeterAccuracy

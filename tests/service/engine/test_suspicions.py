@@ -16,7 +16,7 @@ from feeders.simulation.meters import MeterErrors
 from feeders.simulation.scenario import Scenario, SimulatedReading, by_arrival, simulate
 from gridsec.attack import Scaling
 from gridsec.estimators.sequential import Commission, to_arrays
-from gridsec.estimators.sequential.commission import class_only
+from gridsec.estimators.sequential.meter_bias import class_only
 from service.engine.engine import Engine, RuntimeConfig
 from service.engine.feeder_monitor import design
 from service.engine.replay import ReplayCounts, replay

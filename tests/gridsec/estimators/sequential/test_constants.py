@@ -12,9 +12,7 @@ from pathlib import Path
 
 import pytest
 
-import gridsec.estimators.sequential
-
-FOLDER = Path(gridsec.estimators.sequential.__file__).parent
+FOLDERS = ("gridsec.estimators.sequential", "gridsec.estimators.snapshot")
 PAGE = Path(__file__).resolve().parents[4] / "docs" / "sequential-constants.md"
 ROW = re.compile(r"^\| `(\w+)\.(\w+)` \|(.*)\|$", re.MULTILINE)
 CELLS = 3
@@ -64,15 +62,12 @@ def problems(text: str, expected: dict[str, object]) -> list[str]:
 
 
 def every() -> dict[str, object]:
-    """Numeric constants of all modules of the folder."""
+    """Numeric constants of all modules of the folders."""
     out: dict[str, object] = {}
-    for path in sorted(FOLDER.glob("*.py")):
-        name = (
-            "gridsec.estimators.sequential"
-            if path.stem == "__init__"
-            else f"gridsec.estimators.sequential.{path.stem}"
-        )
-        out |= constants(path.stem, path.read_text(), vars(importlib.import_module(name)))
+    for package in FOLDERS:
+        for path in sorted(Path(next(iter(importlib.import_module(package).__path__))).glob("*.py")):
+            name = package if path.stem == "__init__" else f"{package}.{path.stem}"
+            out |= constants(path.stem, path.read_text(), vars(importlib.import_module(name)))
     return out
 
 

@@ -10,11 +10,11 @@ import pytest
 from gridsec.estimators import sequential
 from gridsec.estimators.plant import Plant
 from gridsec.estimators.sequential import LoadDoubt, SequentialOptions
-from gridsec.estimators.sequential.conditional import add_unknown, condition, leave_one_out
-from gridsec.estimators.sequential.dictionary import FaultDictionary
-from gridsec.estimators.sequential.exchanges import fault_exchanges
-from gridsec.estimators.sequential.loads import LoadDoubt as Doubt
-from gridsec.estimators.sequential.loads import prior
+from gridsec.estimators.sequential.fault_dictionary import FaultDictionary
+from gridsec.estimators.sequential.hypotheses import fault_exchanges
+from gridsec.estimators.sequential.load_uncertainty import LoadDoubt as Doubt
+from gridsec.estimators.sequential.load_uncertainty import prior
+from gridsec.estimators.sequential.posterior import add_unknown, condition, leave_one_out
 from gridsec.estimators.sequential.search import Candidate
 from gridsec.grid.droop import fleet
 from gridsec.interface import Cause, Decision, Verdict

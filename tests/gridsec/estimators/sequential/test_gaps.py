@@ -11,7 +11,7 @@ from gridsec.errors import InputInvalid
 from gridsec.estimators import sequential
 from gridsec.estimators.plant import Plant
 from gridsec.estimators.sequential import LoadDoubt, SequentialDesign, SequentialOptions, SequentialState
-from gridsec.estimators.sequential.commission import Learned, class_only, from_arrays, to_arrays
+from gridsec.estimators.sequential.meter_bias import Learned, class_only, from_arrays, to_arrays
 from gridsec.grid.droop import fleet
 from gridsec.grid.meter import MeterAccuracy
 from gridsec.interface import Decision, Frame

@@ -20,17 +20,18 @@ from gridsec.estimators.sequential import (
     init,
     progress,
 )
-from gridsec.estimators.sequential.commission import (
+from gridsec.estimators.sequential.frame_uncertainty import nominal
+from gridsec.estimators.sequential.meter_bias import (
     COUNTED,
     REASONS,
     Learned,
     Learning,
+    LearningTick,
     from_arrays,
     no_readings,
     to_arrays,
+    usable,
 )
-from gridsec.estimators.sequential.doubts import nominal
-from gridsec.estimators.sequential.learning import LearningTick, usable
 from gridsec.interface import Frame, PowerOrigin
 from tests.codes import refused
 from tests.gridsec.estimators.sequential.test_monitor import prepare, watch

@@ -12,11 +12,11 @@ from scipy.integrate import solve_ivp
 
 from gridsec.arrays import Floats
 from gridsec.errors import InputInvalid
-from gridsec.estimators.sequential import LoadDoubt, SequentialOptions, curves, design
-from gridsec.estimators.sequential.commission import class_only, gather, learn, no_readings
-from gridsec.estimators.sequential.drive import ModelDriven, advance_inverters
-from gridsec.estimators.sequential.loads import injection_doubt, prior
-from gridsec.estimators.sequential.windows import empty, forget, push, shift
+from gridsec.estimators.sequential import LoadDoubt, SequentialOptions, design, inverter_check
+from gridsec.estimators.sequential.load_uncertainty import injection_doubt, prior
+from gridsec.estimators.sequential.meter_bias import class_only, gather, learn, no_readings
+from gridsec.estimators.sequential.observer import ModelDriven, advance_inverters
+from gridsec.estimators.sequential.time_scales import empty, forget, push, shift
 from gridsec.grid.droop import fleet
 from tests.codes import refused
 from tests.gridsec.street import ac_voltages, accuracy, make_plant, random_tree
@@ -141,7 +141,7 @@ class TestInverters:
         plant = make_plant(rng, customers=4, inverters=np.array([0, 0, 1, 3]), meters=np.array([0, 1, 2]))
         made = design(plant, doubt=LoadDoubt(np.full(4, 0.01), np.full(4, 0.01), 600.0), step_s=1.0)
         np.testing.assert_array_equal(made.meter_of, [0, 0, 1, -1])
-        found = replace(curves.no_checks(3, 4), amount=np.array([0.04, -0.03, 0.5])).amounts(made)
+        found = replace(inverter_check.no_checks(3, 4), amount=np.array([0.04, -0.03, 0.5])).amounts(made)
         np.testing.assert_array_equal(found, [0.02, 0.02, -0.03, 0.0])
 
 

@@ -16,7 +16,7 @@ from feeders.simulation.trial import AttackKind, AttackSpec, LoadError, Trial, T
 from gridsec.estimators import sequential
 from gridsec.estimators.plant import Plant
 from gridsec.estimators.sequential import LoadDoubt, SequentialDesign, SequentialOptions
-from gridsec.estimators.sequential.loads import prior
+from gridsec.estimators.sequential.load_uncertainty import prior
 from gridsec.grid.droop import Droop
 from gridsec.grid.meshed import MeshedFeeder, PhasedMesh
 from gridsec.grid.meter import MeterAccuracy

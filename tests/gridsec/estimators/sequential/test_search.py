@@ -11,12 +11,11 @@ import pytest
 
 from gridsec.arrays import Bools, Floats
 from gridsec.estimators.sequential import search
-from gridsec.estimators.sequential.conditional import Prior, condition, leave_one_out
-from gridsec.estimators.sequential.dictionary import FaultDictionary
-from gridsec.estimators.sequential.exchanges import meter_exchanges
-from gridsec.estimators.sequential.loads import LoadDoubt, prior
-from gridsec.estimators.sequential.robust import robust_set
-from gridsec.estimators.sequential.search import Candidate, LimitCache, Limits, descend, set_cost
+from gridsec.estimators.sequential.fault_dictionary import FaultDictionary
+from gridsec.estimators.sequential.hypotheses import meter_exchanges
+from gridsec.estimators.sequential.load_uncertainty import LoadDoubt, prior
+from gridsec.estimators.sequential.posterior import Prior, condition, leave_one_out
+from gridsec.estimators.sequential.search import Candidate, LimitCache, Limits, descend, robust_set, set_cost
 from tests.gridsec.street import random_tree
 
 SIGMAS = 3.5

@@ -8,8 +8,8 @@ import pytest
 from benchmarks import _stealthy
 from benchmarks._scenes import Model, Setting, neighbours, site
 from benchmarks.stealthy_lies import LARGE_VOLT, calm, chosen, run
-from gridsec.estimators.sequential.conditional import leave_one_out
-from gridsec.estimators.sequential.scales import Scales, scale_test
+from gridsec.estimators.sequential.posterior import leave_one_out
+from gridsec.estimators.sequential.time_scales import Scales, scale_test
 
 CASES = [
     ("kerber-dorfnetz", "contiguous", 0.5),

@@ -12,7 +12,7 @@ from feeders.registry.registry import design
 from feeders.simulation.scenario import Scenario, simulate, snapshots
 from gridsec.attack import Attack, Replay, Stuck
 from gridsec.estimators.sequential import SuspicionRecord, distrusted, init, warm_start
-from gridsec.estimators.sequential.doubts import nominal, update_uncertainty
+from gridsec.estimators.sequential.frame_uncertainty import nominal, update_uncertainty
 from gridsec.interface import Decision, Frame
 from tests.gridsec.estimators.sequential.test_gaps import LIAR, calm
 from tests.gridsec.estimators.sequential.test_monitor import prepare, watch

@@ -1,0 +1,197 @@
+"""Comparison of metered reactive powers with the droop curves.
+
+A metered net reactive power less the load is the inverter's injection, which the voltage gives a second
+time. Honest errors explain no more than
+
+    |q_net - q - x| <= q_error + q_net_error + e + min(span, d (|residual| + z std)):
+
+e bounds the error of the observed injection x (`gridsec.estimators.sequential.error_bounds`); the last term
+lets the inverter follow the voltage by the other meters. Beyond that either the inverter leaves its curve or
+the report is false. The amount ``a = q_net - q - x`` decides by the voltages: if x were true instead of the
+report, the chi-square would rise by
+
+    2 a c^T Q m + a^2 c^T Q c,   c the column of 2X,   m the residuals with the report,
+
+twice the logarithm of the likelihood ratio. Where it is small, both are given.
+
+References
+----------
+chong2020 (16) to (18) for the curves; docs/theory-sequential.md, section 4.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from itertools import product
+
+import numpy as np
+
+from gridsec.arrays import Bools, Floats, Ints, any_of
+from gridsec.estimators.sequential.design import SequentialDesign
+from gridsec.estimators.sequential.error_bounds import InjectionError
+from gridsec.estimators.sequential.posterior import LeaveOneOut, Posterior
+from gridsec.interface import Explanation, Frame
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class InverterChecks:
+    """Results of the comparison. p meters, m inverters."""
+
+    count: Ints  # (p,) disagreeing ticks times `_DISAGREEMENT` less agreeing ones
+    off: Bools  # (p,) lasting disagreement
+    amount: Floats  # (p,) its size, pu; 0 for others
+    share: Floats  # (p,) probability of a wrong inverter rather than a false report; 0 for others
+    sure: Bools  # (p,) wrong inverter by the voltages, without later evidence against it
+    observable: Bools  # (m,) injection metered well enough to show its whole range
+    idle: bool = field(init=False)  # derived: no report is compared
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "idle", not (any_of(self.observable) or any_of(self.count)))
+
+    def named(self, design: SequentialDesign) -> Bools:
+        """Inverters that do not follow their curves, (m,)."""
+        return (design.meter_of >= 0) & self.sure[design.meter_of] if self.sure.size else self.observable
+
+    def amounts(self, design: SequentialDesign) -> Floats:
+        """Deviation of each inverter from its curve, (m,), pu."""
+        metered, at = design.meter_of >= 0, design.meter_of
+        if not any_of(metered):
+            return np.zeros(at.size)
+        # Several inverters of a customer are metered together.
+        share = np.bincount(at[metered], minlength=self.amount.size)
+        return np.where(metered, self.amount[at] / np.maximum(share[at], 1), 0.0)
+
+    def consistent(self, design: SequentialDesign) -> Bools:
+        """Metered inverters that follow their curves, (m,)."""
+        return self.observable & (self.count[design.meter_of] == 0) if self.count.size else self.observable
+
+    def without_meters(self, which: Bools) -> InverterChecks:
+        """Results without meters that were replaced, (p,)."""
+        return InverterChecks(
+            np.where(which, 0, self.count),
+            self.off & ~which,
+            np.where(which, 0.0, self.amount),
+            np.where(which, 0.0, self.share),
+            self.sure & ~which,
+            self.observable,
+        )
+
+    def explanations(self, design: SequentialDesign, named: Bools) -> tuple[Explanation, ...]:
+        """Possible cases where the voltages do not decide, for the customers of the largest deviations.
+
+        named: (p,) meters manipulated in any case.
+        """
+        open_ = self.off & ~self.sure
+        if self.idle or not any_of(open_):
+            return ()
+        strange = np.argsort(-np.where(open_, np.abs(self.amount), -1.0), kind="stable")
+        which = np.sort(strange[: min(int(open_.sum()), _MAX_COMBINED)])
+        ways = []
+        for wrong in map(np.array, product((True, False), repeat=which.size)):
+            inverters = np.isin(design.meter_of, which[wrong])
+            powers = np.zeros(design.customers, dtype=np.bool_)
+            powers[design.plant.meters[which[~wrong]]] = True
+            each = np.where(wrong, self.share[which], 1.0 - self.share[which])
+            ways.append(Explanation(named, inverters, float(each.prod()), powers))
+        likely = [way for way in ways if way.probability > 1.0 / design.options.like]
+        return tuple(sorted(likely, key=lambda way: -way.probability))
+
+
+def no_checks(meters: int, inverters: int) -> InverterChecks:
+    """No comparison yet."""
+    no = np.zeros(meters, dtype=np.bool_)
+    zero = np.zeros(meters)
+    return InverterChecks(
+        np.zeros(meters, dtype=np.intp), no, zero, zero, no, np.zeros(inverters, dtype=np.bool_)
+    )
+
+
+_MAX_COMBINED = 3
+"""Largest number of customers in the combined cases."""
+
+LONGEST_MEAN = 5
+"""Ticks of the longest mean that decides between report and inverter."""
+
+_DISAGREEMENT = 4
+"""Count of a disagreement; an agreement counts -1."""
+_EVIDENCE, _MAX_COUNT = 12, 48
+"""Count that is evidence, and largest count."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReportedPowers:
+    """Inputs of one tick. N customers, p meters, m inverters."""
+
+    frame: Frame  # the frame
+    reports_q: Bools  # (N,) net reactive power is reported
+    uses_q: Bools  # (N,) net reactive power is used by the model
+    trusted: Bools  # (p,) available meters, trusted for long enough that the observer followed them
+    x: Floats  # (m,) observed injections, pu
+    injection_error: InjectionError  # their errors
+    posterior: (
+        Posterior | None
+    )  # posterior of the trusted meters on the longest scale of at most `LONGEST_MEAN` ticks
+    loo: LeaveOneOut | None  # its leave-one-out residuals
+
+
+def check_inverters(design: SequentialDesign, before: InverterChecks, now: ReportedPowers) -> InverterChecks:
+    """Compare the reports of one tick with the curves."""
+    droop, at, size = design.plant.droop, design.plant.meters, design.customers
+    own = np.bincount(droop.customer, minlength=size) > 0
+    asked = now.reports_q[at] & now.trusted & own[at]
+    if now.posterior is None or now.loo is None:
+        return before
+    if not (any_of(asked) or any_of(before.count)):
+        return before if before.idle else no_checks(at.size, droop.tau.size)
+    x, error, slope, span = (
+        droop.per_customer(of, size)[at]
+        for of in (now.x, now.injection_error.error, droop.slope, now.injection_error.span)
+    )
+    frame, loo = now.frame, now.loo
+    amount = np.where(asked, frame.q_net[at] - frame.q[at] - x, 0.0)
+    other = np.minimum(span, slope * (np.abs(loo.residual) + design.sigmas[0] * loo.std))
+    room = frame.q_error[at] + frame.q_net_error[at] + error + other
+    disagrees = asked & (np.abs(amount) > room)
+    count = np.where(
+        asked, np.clip(before.count + np.where(disagrees, _DISAGREEMENT, -1), 0, _MAX_COUNT), before.count
+    )
+    lasts = (count >= _EVIDENCE) | (before.off & (count > 0))
+    share, beyond = np.zeros(at.size), before.sure.copy()
+    amount = np.where(asked, amount, before.amount) * lasts
+    for j in np.flatnonzero(lasts).tolist():
+        uses_q = bool(asked[j] and now.uses_q[at[j]])
+        share[j], sigmas = _share(design, now.posterior, loo.weights, j, float(amount[j]), uses_q=uses_q)
+        beyond[j] |= bool(asked[j] and sigmas > design.sigmas[0])
+    # Without reports the accusation stays until the voltages contradict it.
+    over = lasts & ~asked & (share <= 1.0 / design.options.like)
+    count = np.where(over, count - 1, count)
+    share = np.where(asked | over, share, before.share * lasts)
+    sure = lasts & beyond & ((share >= 1.0 - 1.0 / design.options.like) | (before.sure & (share >= 0.5)))
+    least, most = (of[at] for of in droop.saturated(size))
+    enough = asked & (room < np.maximum(most - x, x - least))
+    observable = (design.meter_of >= 0) & enough[design.meter_of]
+    return InverterChecks(count, lasts, amount, share, sure, observable)
+
+
+def _share(
+    design: SequentialDesign, now: Posterior, weights: Floats, j: int, a: float, *, uses_q: bool
+) -> tuple[float, float]:
+    """Probability that a report is true and the inverter wrong, for even prior odds.
+
+    And the standard deviations by which the voltages deviate along its column if the inverter is right. Both
+    are needed: a test at every tick for years meets an unlikely ratio.
+    """
+    inverter = int(np.argmax(design.meter_of == j))
+    column = design.faults.columns(np.array([design.customers + inverter]))[now.prior.meters, 0]
+    at, Q = now.precision()
+    along, form = float(column @ weights), float(column[at] @ Q @ column[at])
+    if uses_q:
+        along += a * form  # as if x were true
+    worse = 2.0 * a * along - a * a * form
+    share = 1.0 / (1.0 + np.exp(-0.5 * np.clip(worse, -_MAX_LOG_RATIO, _MAX_LOG_RATIO)))
+    # Inverters at the busbar have zero sensitivity.
+    return float(share), abs(along) / max(float(np.sqrt(form)), np.finfo(np.float64).tiny)
+
+
+_MAX_LOG_RATIO = 1000.0
+"""Largest twice the logarithm of a likelihood ratio, against overflow."""

@@ -1,0 +1,179 @@
+"""Observer of the droop inverters, driven by trusted meters or by the model.
+
+    tau x' = -x + K(zeta),   zeta = vbar^2 - y at trusted meters,   H x + w elsewhere
+
+One certificate covers every trusted set and every switching (docs/theory-certificates.md). With all meters
+trusted a step is exact and costs O(m). The prediction of a frame is the loss-corrected model at the observed
+injections.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, indices, submatrix
+from gridsec.errors import DesignInfeasible
+from gridsec.estimators.inputs import NO_VOLTAGE
+from gridsec.estimators.sequential.design import SequentialDesign
+from gridsec.estimators.sequential.error_bounds import (
+    InjectionError,
+    PowerErrors,
+    unknown_injections,
+    update_injection_error,
+)
+from gridsec.estimators.sequential.measurements import Measurements
+from gridsec.estimators.sequential.state import ModelDriven, SequentialState
+from gridsec.observers.lure import POLICY, Lure, advance, step, transition
+
+_PATIENT = replace(POLICY, settled=0.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prediction:
+    """One frame by the model. m inverters, n places, p meters."""
+
+    x: Floats  # (m,) injections of the inverters, pu
+    model_driven: ModelDriven | None  # prepared loop of the inverters without a trusted meter
+    injection_error: InjectionError  # errors of the injections
+    powers: PowerErrors  # net injections of the model, and their errors
+    v2_bus: Floats  # (n,) squared voltages, pu
+    transient: Floats  # (p,) remainder of the unknown initial state, squared pu
+
+
+def predict(
+    design: SequentialDesign, state: SequentialState, measured: Measurements, sizes: Floats
+) -> Prediction:
+    """Prediction of a frame, with the sizes (k,) of false powers."""
+    x, model_driven, error = _inverters(design, state, measured, sizes)
+    powers = _powers(design, state, measured, x, sizes)
+    age = 0.0 if state.x is None else measured.frame.t - state.since
+    # Without inverters the rate is infinite; infinity times zero is NaN.
+    decay = np.exp(-design.certificate.rate * age) if age > 0 else 1.0
+    transient = np.asarray(design.inverter_reach * decay)
+    return Prediction(x, model_driven, error, powers, _voltages(design, powers), transient)
+
+
+def _powers(
+    design: SequentialDesign, state: SequentialState, measured: Measurements, x: Floats, sizes: Floats
+) -> PowerErrors:
+    """Powers of a frame with net reactive injections, observed for inverters without metered power."""
+    observed = design.plant.droop.per_customer(x, measured.q.size)
+    q = measured.q + (np.where(measured.uses_q, 0.0, observed) if any_of(measured.uses_q) else observed)
+    return PowerErrors(measured.frame, q, measured.uses_q, measured.v0_squared, state.trust.trusted, sizes)
+
+
+def _voltages(design: SequentialDesign, powers: PowerErrors) -> Floats:
+    """Squared voltages by the loss-corrected model, (n,)."""
+    plant, v0 = design.plant, powers.v0_squared
+    with np.errstate(all="ignore"):
+        v2_bus = plant.feeder.bus_voltages(powers.frame.p, powers.q, v0, steps=plant.loss_correction)
+        v2_bus = np.minimum(np.maximum(v2_bus, 0.0), NO_VOLTAGE)
+    none = np.isnan(v2_bus)
+    return np.where(none, plant.feeder.broadcast_busbar(v0), v2_bus) if any_of(none) else v2_bus
+
+
+def model_error(design: SequentialDesign, powers: PowerErrors) -> Floats:
+    """Largest error of the loss-corrected model at each meter, (p,)."""
+    plant = design.plant
+    with np.errstate(all="ignore"):
+        error = plant.feeder.model_error_bound(powers.frame.p, powers.q, powers.v0_squared)[plant.meters]
+    return np.where(np.isfinite(error), error, design.options.widest)
+
+
+def _inverters(
+    design: SequentialDesign, state: SequentialState, measured: Measurements, sizes: Floats
+) -> tuple[Floats, ModelDriven | None, InjectionError]:
+    """Injections at this frame, the prepared loop, and errors; at rest at the first frame."""
+    droop, meter, feeder, frame = design.plant.droop, design.meter_of, design.plant.feeder, measured.frame
+    driven = (meter >= 0) & (state.trust.trusted & measured.available)[meter]
+    y = measured.y[meter] if meter.size else np.zeros(0)
+    if not all_of(driven):
+        y = np.where(driven, y, feeder.broadcast_busbar(measured.v0_squared)[feeder.bus[droop.customer]])
+    if state.x is None:
+        return np.asarray(droop(droop.vbar**2 - y)), None, unknown_injections(design.plant, y)
+    w, follows, h = None, None, frame.t - state.t
+    if not all_of(driven):
+        injected = droop.per_customer(state.x, frame.q.size)
+        now, v2 = _linear(design, frame.p, np.stack([frame.q + injected, frame.q]), measured.v0_squared)
+        if state.last is not None and state.frame is not None:
+            before = state.frame
+            # Losses and the correction by the meters hardly change between two frames.
+            v2 += state.last[0].v2 - _linear(design, before.p, before.q + injected, state.v0_squared)
+        w, y = droop.vbar**2 - v2, np.where(driven, y, now[droop.customer])
+        follows = ~driven, _powers(design, state, measured, state.x, sizes), measured.busbar_metered
+    error = update_injection_error(design, state.injection_error, y, follows, h)
+    return *advance_inverters(design, state.x, y, driven, w, h, state.model_driven), error
+
+
+def _linear(design: SequentialDesign, p: Floats, q: Floats, v0_squared: Floats | float) -> Floats:
+    """Squared voltages of the customers by the linear model, (…, N) as q."""
+    feeder = design.plant.feeder
+    return np.asarray(feeder.bus_voltages(p, q, v0_squared, steps=0)[..., feeder.bus])
+
+
+def advance_inverters(  # noqa: PLR0917
+    design: SequentialDesign,
+    x: Floats,
+    y: Floats,
+    driven: Bools,
+    w: Floats | None,
+    h: float,
+    before: ModelDriven | None = None,
+) -> tuple[Floats, ModelDriven | None]:
+    """Injections a time h later, and the prepared loop; chong2020 (5) with K = E_J, L = 0.
+
+    x, y, driven: (m,) injections, squared voltages of the inverters' meters, and use of these. w: (N,) input
+    of the model-driven inverters; None if all are driven.
+    """
+    droop = design.plant.droop
+    decay = np.exp(-h / droop.tau)
+    target = droop(droop.vbar**2 - y)
+    if w is None or all_of(driven):
+        return np.asarray(target + decay * (x - target)), before
+    out = np.where(driven, target + decay * (x - target), x)
+    free = _prepared(design, indices(~driven), h, before)
+    # Driven inverters enter by the mean of x and out.
+    held = np.where(driven, 0.5 * (x + out), 0.0)
+    at = w[droop.customer[free.rows]] + design.loop[free.rows] @ held
+    try:
+        out[free.rows] = step(free.transition, free.loop, x[free.rows], at)
+    except DesignInfeasible:
+        out[free.rows] = advance(free.loop, x[free.rows], at, h, _PATIENT)
+    return out, free
+
+
+def prepare(
+    design: SequentialDesign, trusted: Bools, h: float, before: ModelDriven | None
+) -> ModelDriven | None:
+    """Loop for the next step if the trusted meters with a reading, (p,), stay the same.
+
+    Prepared at the tick of a suspicion, since the tick after it has more to compute.
+    """
+    driven = (design.meter_of >= 0) & trusted[design.meter_of]
+    return before if all_of(driven) else _prepared(design, indices(~driven), h, before)
+
+
+def _prepared(design: SequentialDesign, rows: Ints, h: float, before: ModelDriven | None) -> ModelDriven:
+    if before is None or not np.array_equal(before.rows, rows):
+        loop = _loop(design, rows)
+        return ModelDriven(rows, loop, transition(loop, h))
+    return before if before.transition.h == h else replace(before, transition=transition(before.loop, h))
+
+
+def _loop(design: SequentialDesign, rows: Ints) -> Lure:
+    droop = design.plant.droop
+    H = submatrix(design.loop, rows, rows)
+    rate, size = 1.0 / droop.tau[rows], rows.size
+    return Lure(
+        A=-np.diag(rate),
+        G=np.diag(rate),
+        H=H,
+        F=np.eye(size),
+        B=np.zeros((size, size)),
+        C=H,
+        D=np.eye(size),
+        slope=droop.slope[rows],
+        phi=droop.take(rows),
+    )
