@@ -318,7 +318,7 @@ def random_tables(customers: int, number: int, *, phases: bool) -> FeederTables:
             CustomerRow(
                 f"load-{c}",
                 f"c{c}",
-                peak,
+                load_kw=peak,
                 phases=phase,
                 meter=f"m{c}",
                 pv_kw=4.14 if solar else 0.0,

@@ -34,8 +34,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 from scipy.stats import poisson
 
-from feeders.model.profiles import Season, library
 from feeders.model.site import Site, from_tables, load, names
+from feeders.profiles import Season, library
 from feeders.simulation.scenario import START, Scenario, SimulatedReading, simulate
 from gridsec.arrays import Floats
 from gridsec.interface import Decision

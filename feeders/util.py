@@ -28,28 +28,15 @@ def command_line(words: Iterable[object]) -> str:
 
 
 def extra(name: str) -> str:
-    """Name of a missing extra and its installation command, as the end of a sentence.
-
-    Parameters
-    ----------
-    name
-        The extra, as in pyproject.toml.
-    """
+    """Name of a missing extra of pyproject.toml and its installation command, as the end of a sentence."""
     return f"the extra {name!r}, in a checkout: pip install -e '.[{name}]'"
 
 
 def replace_file(path: Path, write: Callable[[Path], object]) -> None:
-    """Replace a file once its new content is complete; an incomplete write leaves the old file.
+    """Replace a file by what `write` puts at the path it is given; an incomplete write leaves the old file.
 
     A symbolic link stays a link. A path that is not a regular file, such as a pipe or a terminal, cannot be
     replaced: it is written directly.
-
-    Parameters
-    ----------
-    path
-        The file.
-    write
-        Function that writes the content to the path that it is given.
 
     Raises
     ------
@@ -70,13 +57,7 @@ def replace_file(path: Path, write: Callable[[Path], object]) -> None:
 
 
 def plain(value: Any) -> Any:
-    """Convert a value to plain JSON types, recursively.
-
-    Parameters
-    ----------
-    value
-        Made of numbers, texts, arrays, tuples, lists and dictionaries.
-    """
+    """Convert numbers, texts, arrays, tuples, lists and dictionaries to plain JSON types, recursively."""
     if isinstance(value, dict):
         return {name: plain(each) for name, each in value.items()}
     if isinstance(value, (list, tuple)):
@@ -85,13 +66,7 @@ def plain(value: Any) -> Any:
 
 
 def own_numbers(given: DataclassInstance) -> None:
-    """Convert NumPy numbers of a frozen dataclass to Python's; a 32-bit float cannot hold a Unix time.
-
-    Parameters
-    ----------
-    given
-        The instance, called in its `__post_init__`.
-    """
+    """Convert NumPy numbers of a frozen dataclass to Python's; a 32-bit float cannot hold a Unix time."""
     for each in fields(given):
         value = getattr(given, each.name)
         if isinstance(value, np.generic):

@@ -3,7 +3,7 @@
 An attack is a frozen value. It names its meters and its active interval ``[t_on, t_off)``, and `apply` turns
 unmanipulated reports into manipulated ones. Time is an argument and no state is kept: an attack that needs
 the past (a stuck or a replaying meter) requests it from the caller. So one tick, a whole day at once and a
-second run give the same numbers. Attacks are for simulation; no estimator reads this module.
+repetition give the same numbers. Attacks are for simulation; no estimator reads this module.
 
 Voltages are magnitudes per unit of the nominal voltage, as a meter displays them (not squared). Powers are
 in the unit of the reports; imports are positive, as on the wire.
@@ -12,14 +12,14 @@ in the unit of the reports; imports are positive, as on the wire.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gridsec.arrays import Bools, Floats, Ints
-from gridsec.errors import InputInvalid, Problem
+from gridsec.errors import Problem, require
 
 Past: TypeAlias = Callable[[Floats], Floats]
 """Unmanipulated reports of all p meters at earlier times: (T,) s -> (T, p) pu."""
@@ -29,104 +29,56 @@ _Bits: TypeAlias = NDArray[np.uint64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reports:
-    """Reports of p meters at T times.
+    """Reports of p meters at T times."""
 
-    Attributes
-    ----------
-    v : (T, p)
-        Voltage magnitude, pu of nominal.
-    p : (T, p)
-        Net active import, kW or pu.
-    q : (T, p)
-        Net reactive import, kvar or pu; NaN where it is not reported.
-    """
-
-    v: Floats
-    p: Floats
-    q: Floats
+    v: Floats  # (T, p): voltage magnitude, pu of nominal
+    p: Floats  # (T, p): net active import, kW or pu
+    q: Floats  # (T, p): net reactive import, kvar or pu; NaN where it is not reported
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Attack:
-    """Common fields of all attacks.
+    """Common fields of all attacks."""
 
-    Attributes
-    ----------
-    meters : (k,)
-        Indices of the manipulated meters, each once.
-    t_on, t_off
-        The attack is active while t_on <= t < t_off, Unix s.
-    """
-
-    meters: Ints
+    meters: Ints  # (k,): indices of the manipulated meters, each once
+    # The attack is active while t_on <= t < t_off, Unix s.
     t_on: float
     t_off: float
 
     def __post_init__(self) -> None:
         _check_meters(self.meters, self.t_on, self.t_off)
+        for each in fields(self):
+            if each.type == "Floats":
+                _check_per_meter(self.meters, each.name, getattr(self, each.name))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bias(_Attack):
-    """Constant bias: v~ = v + size.
+    """Constant bias: v~ = v + size."""
 
-    Attributes
-    ----------
-    size : (k,)
-        Signed displacement, pu.
-    """
-
-    size: Floats
-
-    def __post_init__(self) -> None:
-        _check_meters(self.meters, self.t_on, self.t_off)
-        _check_per_meter(self.meters, size=self.size)
+    size: Floats  # (k,): signed displacement, pu
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scaling(_Attack):
-    """Scaled reading: v~ = (1 + factor) v.
+    """Scaled reading: v~ = (1 + factor) v."""
 
-    Attributes
-    ----------
-    factor : (k,)
-        Signed relative change, 1.
-    """
-
-    factor: Floats
-
-    def __post_init__(self) -> None:
-        _check_meters(self.meters, self.t_on, self.t_off)
-        _check_per_meter(self.meters, factor=self.factor)
+    factor: Floats  # (k,): signed relative change, 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drift(_Attack):
-    """Drifting reading: v~ = v + sign(rate) min(abs(rate) (t - t_on), limit).
+    """Drifting reading: v~ = v + sign(rate) min(abs(rate) (t - t_on), limit)."""
 
-    Attributes
-    ----------
-    rate : (k,)
-        Signed speed, pu/s.
-    limit : (k,)
-        Largest displacement, pu, >= 0.
-
-    Raises
-    ------
-    ValueError
-        If meters, times or numbers are inconsistent, or a limit is negative.
-    """
-
-    rate: Floats
-    limit: Floats
+    rate: Floats  # (k,): signed speed, pu/s
+    limit: Floats  # (k,): largest displacement, pu, >= 0
 
     def __post_init__(self) -> None:
-        _check_meters(self.meters, self.t_on, self.t_off)
-        _check_per_meter(self.meters, rate=self.rate, limit=self.limit)
-        if np.any(self.limit < 0.0):
-            raise InputInvalid(
-                [Problem("negative", "limit of a drift is a magnitude and cannot be negative")]
-            )
+        _Attack.__post_init__(self)
+        require(
+            not np.any(self.limit < 0.0),
+            Problem("negative", "limit of a drift is a magnitude and cannot be negative"),
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -136,62 +88,36 @@ class Stuck(_Attack):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Replay(_Attack):
-    """Replay of an earlier interval: v~(t) = v(t - delay_s).
+    """Replay of an earlier interval: v~(t) = v(t - delay_s)."""
 
-    Attributes
-    ----------
-    delay_s
-        Delay of the replayed interval, s, > 0.
-
-    Raises
-    ------
-    ValueError
-        If meters or times are inconsistent, or the delay is not positive.
-    """
-
-    delay_s: float
+    delay_s: float  # delay of the replayed interval, s, > 0
 
     def __post_init__(self) -> None:
-        _check_meters(self.meters, self.t_on, self.t_off)
-        if not self.delay_s > 0.0:
-            raise InputInvalid(
-                [Problem("not-positive", f"a replay needs a positive delay, got {self.delay_s}")]
-            )
+        _Attack.__post_init__(self)
+        require(
+            self.delay_s > 0.0,
+            Problem("not-positive", f"a replay needs a positive delay, got {self.delay_s}"),
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Random(_Attack):
-    """Random displacement, redrawn every `hold_s`: v~ = v + s u with s = +-1 and low <= u <= high.
+    """Random displacement, redrawn every `hold_s`: v~ = v + s u with s = +-1 and low <= u <= high."""
 
-    Attributes
-    ----------
-    low, high : (k,)
-        Smallest and largest magnitude of the displacement, pu.
-    hold_s
-        Duration of one draw, s, > 0.
-    seed
-        Seed of the draws.
-
-    Raises
-    ------
-    ValueError
-        If meters, times or numbers are inconsistent, not 0 <= low <= high, or `hold_s` is not positive.
-    """
-
+    # (k,): smallest and largest magnitude of the displacement, pu.
     low: Floats
     high: Floats
-    hold_s: float
-    seed: int
+    hold_s: float  # duration of one draw, s, > 0
+    seed: int  # seed of the draws
 
     def __post_init__(self) -> None:
-        _check_meters(self.meters, self.t_on, self.t_off)
-        _check_per_meter(self.meters, low=self.low, high=self.high)
-        if np.any(self.low < 0.0) or np.any(self.high < self.low):
-            raise InputInvalid([Problem("order", "a random attack needs 0 <= low <= high for every meter")])
-        if not self.hold_s > 0.0:
-            raise InputInvalid(
-                [Problem("not-positive", f"a random attack needs a positive hold time, got {self.hold_s}")]
-            )
+        _Attack.__post_init__(self)
+        ordered = not (np.any(self.low < 0.0) or np.any(self.high < self.low))
+        require(ordered, Problem("order", "a random attack needs 0 <= low <= high for every meter"))
+        held = self.hold_s > 0.0
+        require(
+            held, Problem("not-positive", f"a random attack needs a positive hold time, got {self.hold_s}")
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -199,22 +125,12 @@ class Coordinated(_Attack):
     """Consistent displacement of several meters: the voltage pattern of a load that does not exist.
 
     ``v~ = v + shift``, ``p~ = p + p_shift``, ``q~ = q + q_shift``. `coordinate` sizes the pattern.
-
-    Attributes
-    ----------
-    shift : (k,)
-        Signed displacement of the voltage, pu; negative for a fake load.
-    p_shift, q_shift : (k,)
-        Displacement of the reported import, unit of the reports; zero if only voltages are manipulated.
     """
 
-    shift: Floats
+    shift: Floats  # (k,): signed displacement of the voltage, pu; negative for a fake load
+    # (k,): displacement of the reported import, unit of the reports; zero if only voltages are manipulated.
     p_shift: Floats
     q_shift: Floats
-
-    def __post_init__(self) -> None:
-        _check_meters(self.meters, self.t_on, self.t_off)
-        _check_per_meter(self.meters, shift=self.shift, p_shift=self.p_shift, q_shift=self.q_shift)
 
 
 Attack: TypeAlias = Bias | Scaling | Drift | Stuck | Replay | Random | Coordinated
@@ -222,62 +138,29 @@ Attack: TypeAlias = Bias | Scaling | Drift | Stuck | Replay | Random | Coordinat
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InverterAttack:
-    """Wrong reactive injection of inverters: `x + q` in place of the droop curve's x.
+    """Injection `x + q` of inverters in place of the droop curve's x: a_u of yang2021 (1)."""
 
-    Attributes
-    ----------
-    inverters : (k,)
-        Indices of the manipulated inverters, each once.
-    q : (k,)
-        Additional injection of each, pu.
-    t_on, t_off
-        Active while t_on <= t < t_off, Unix s.
-
-    Raises
-    ------
-    ValueError
-        If inverters or times are inconsistent, or q is not one finite number for each.
-
-    References
-    ----------
-    yang2021 (1): the attack signal a_u on the inputs.
-    """
-
-    inverters: Ints
-    q: Floats
+    inverters: Ints  # (k,): indices of the manipulated inverters, each once
+    q: Floats  # (k,): additional injection of each, pu
+    # Active while t_on <= t < t_off, Unix s.
     t_on: float
     t_off: float
 
     def __post_init__(self) -> None:
         _check_meters(self.inverters, self.t_on, self.t_off, what="inverters")
-        if self.q.shape != self.inverters.shape or not np.all(np.isfinite(self.q)):
-            raise InputInvalid(
-                [
-                    Problem(
-                        "shape",
-                        f"q has shape {self.q.shape} or is not finite; one number per inverter is needed",
-                    )
-                ]
-            )
+        require(
+            self.q.shape == self.inverters.shape and np.all(np.isfinite(self.q)),
+            Problem(
+                "shape", f"q has shape {self.q.shape} or is not finite; one number per inverter is needed"
+            ),
+        )
 
 
 def apply(attack: Attack, t: Floats, honest: Reports, past: Past) -> Reports:
-    """Apply one attack to reports.
+    """Replace the reports (T, p) of `attack.meters` at times t (T,), Unix s, inside [t_on, t_off).
 
-    Parameters
-    ----------
-    t : (T,)
-        Time of each report, Unix s.
-    honest
-        Reports without this attack; not modified.
-    past
-        Unmanipulated voltage reports at earlier times, pu. Called for `Stuck` and `Replay` only, never for a
-        time after the newest of `t`.
-
-    Returns
-    -------
-    Reports
-        The same reports with those of `attack.meters` inside [t_on, t_off) replaced.
+    `past` gives unmanipulated voltage reports at earlier times, pu. It is called for `Stuck` and `Replay`
+    only, never for a time after the newest of `t`.
     """
     rows = np.flatnonzero(active(attack, t))
     if rows.size == 0:
@@ -307,20 +190,7 @@ def active(attack: Attack, t: Floats) -> Bools:
 
 
 def manipulated(attacks: Sequence[Attack], t: Floats, meters: int) -> Bools:
-    """Mask of the manipulated meters at each time.
-
-    Parameters
-    ----------
-    t : (T,)
-        Times, Unix s.
-    meters
-        Number of meters p.
-
-    Returns
-    -------
-    (T, p)
-        True where a meter is manipulated, displaced or not: a meter stuck at the true voltage counts too.
-    """
+    """Mask (T, p) of the manipulated meters at times t (T,), Unix s, displaced or not."""
     out = np.zeros((t.size, meters), dtype=np.bool_)
     for attack in attacks:
         out[np.ix_(active(attack, t), attack.meters)] = True
@@ -339,69 +209,32 @@ def reach(attack: Attack, t: float) -> float:
 
 
 def load_pattern(R: Floats, X: Floats, target: int, ratio: float, v: Floats) -> Floats:
-    """Voltage change at every customer per unit of extra load at one customer, to first order.
+    """Voltage change (N,) at every customer per pu of extra load at customer `target`, to first order.
 
-    From v^2 = v0^2 + 2 R p + 2 X q with a load P + j ratio P at customer k:
-    dv_i / dP = -(R_ik + ratio X_ik) / v_i.
-
-    Parameters
-    ----------
-    R, X : (N, N)
-        Shared path resistance and reactance of LinDistFlow, pu.
-    target
-        Customer k with the extra load.
-    ratio
-        Reactive over active power of that load, 1.
-    v : (N,)
-        Present voltage magnitudes, pu.
-
-    Returns
-    -------
-    (N,)
-        Change of the voltage magnitude per pu of load; never positive on an inductive feeder.
+    From v^2 = v0^2 + 2 R p + 2 X q with a load P + j ratio P at customer k: dv_i / dP = -(R_ik + ratio X_ik)
+    / v_i. R and X (N, N) are the shared path resistance and reactance of LinDistFlow, v (N,) the present
+    voltage, pu.
     """
     return -(R[:, target] + ratio * X[:, target]) / v
 
 
 def most_affected(pattern: Floats, count: int) -> Ints:
-    """The `count` entries of largest magnitude, in ascending order of index; ties go to the lower index.
-
-    Raises
-    ------
-    ValueError
-        If `count` exceeds the number of entries or is not positive.
-    """
-    if not 0 < count <= pattern.size:
-        raise InputInvalid([Problem("out-of-range", f"cannot choose {count} of {pattern.size} meters")])
+    """The `count` entries of largest magnitude, ascending by index; ties go to the lower index."""
+    require(
+        0 < count <= pattern.size, Problem("out-of-range", f"cannot choose {count} of {pattern.size} meters")
+    )
     order = np.argsort(-np.abs(pattern), kind="stable")
     return np.sort(order[:count])
 
 
 def coordinate(pattern: Floats, meters: Ints, size: float) -> float:
-    """Scale at which a pattern displaces every chosen meter by at least `size`.
+    """Scale ``size / min_j |pattern_j|`` that displaces the least affected chosen meter by `size` pu.
 
-    Parameters
-    ----------
-    pattern : (p,)
-        Voltage change at each meter per unit of the fake quantity, pu.
-    meters : (k,)
-        The meters to manipulate.
-    size
-        Smallest displacement required, pu, > 0.
-
-    Returns
-    -------
-    float
-        ``size / min_j |pattern_j|``; the least affected meter is displaced by exactly `size`.
-
-    Raises
-    ------
-    ValueError
-        If a chosen meter is not affected by any load size.
+    `pattern` (p,) is the voltage change at each meter per unit of the fake quantity, pu. A chosen meter
+    without any effect is a ValueError.
     """
     weakest = float(np.min(np.abs(pattern[meters])))
-    if not weakest > 0.0:
-        raise InputInvalid([Problem("no-effect", "a chosen meter is not affected by the fake load at all")])
+    require(weakest > 0.0, Problem("no-effect", "a chosen meter is not affected by the fake load at all"))
     return size / weakest
 
 
@@ -455,30 +288,23 @@ def _scramble(bits: _Bits) -> _Bits:
 
 
 def _check_meters(meters: Ints, t_on: float, t_off: float, *, what: str = "meters") -> None:
-    if meters.ndim != 1 or meters.size == 0:
-        raise InputInvalid(
-            [Problem("shape", f"an attack needs a one-dimensional, non-empty array of {what}")]
-        )
-    if np.unique(meters).size != meters.size or np.any(meters < 0):
-        raise InputInvalid(
-            [
-                Problem(
-                    "duplicate" if np.all(meters >= 0) else "unknown-index",
-                    f"{what} of an attack must be different indices from 0, got {meters.tolist()}",
-                )
-            ]
-        )
-    if not t_on < t_off:
-        raise InputInvalid(
-            [Problem("order", f"an attack must begin before it ends, got t_on={t_on} and t_off={t_off}")]
-        )
+    one_each = meters.ndim == 1 and meters.size > 0
+    require(one_each, Problem("shape", f"an attack needs a one-dimensional, non-empty array of {what}"))
+    known = np.all(meters >= 0)
+    require(
+        known and np.unique(meters).size == meters.size,
+        Problem(
+            "duplicate" if known else "unknown-index",
+            f"{what} of an attack must be different indices from 0, got {meters.tolist()}",
+        ),
+    )
+    require(
+        t_on < t_off,
+        Problem("order", f"an attack must begin before it ends, got t_on={t_on} and t_off={t_off}"),
+    )
 
 
-def _check_per_meter(meters: Ints, **values: Floats) -> None:
-    for name, value in values.items():
-        if value.shape != meters.shape:
-            raise InputInvalid(
-                [Problem("shape", f"{name} has shape {value.shape}, but there are {meters.size} meters")]
-            )
-        if not np.all(np.isfinite(value)):
-            raise InputInvalid([Problem("not-finite", f"{name} must be finite")])
+def _check_per_meter(meters: Ints, name: str, value: Floats) -> None:
+    same = value.shape == meters.shape
+    require(same, Problem("shape", f"{name} has shape {value.shape}, but there are {meters.size} meters"))
+    require(np.all(np.isfinite(value)), Problem("not-finite", f"{name} must be finite"))

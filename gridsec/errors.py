@@ -129,6 +129,11 @@ class InputInvalid(Problems, ValueError):
         self.problems = tuple(problems)
         super().__init__("; ".join(self.problems))
 
+    @classmethod
+    def of(cls, code: str, text: str) -> Self:
+        """Return the error of a single problem."""
+        return cls((Problem(code, text),))
+
 
 class NotObservable(GridsecError):
     """A set of meters is too small for the purpose.
@@ -192,6 +197,11 @@ def raise_if_any(problems: Iterable[str]) -> None:
     found = tuple(problems)
     if found:
         raise InputInvalid(found)
+
+
+def require(holds: object, problem: Problem) -> None:
+    """Raise one error with a problem of an input, unless the condition holds."""
+    raise_if_any([] if holds else [problem])
 
 
 Choice = TypeVar("Choice", bound=StrEnum)

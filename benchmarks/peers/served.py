@@ -15,7 +15,7 @@ from gridsec.estimators import sequential
 from gridsec.estimators.plant import Plant
 from gridsec.grid.droop import Droop
 from gridsec.grid.meter import MeterAccuracy
-from gridsec.interface import Frame
+from gridsec.interface import Decision, Frame
 
 # The powers' error is the same in all readings: it lasts much longer than they do.
 _LASTS_S = 3600.0
@@ -49,11 +49,11 @@ def frame(told: Snapshot, t: int) -> Frame:
 
 
 def suspects(here: Scene, told: Snapshot) -> Bools:
-    """Who is named after the last of the readings."""
+    """Who is named after the last of the readings; nobody where the monitor is undecided."""
     design = watch(here, told)
     state = sequential.init(design, 0.0)
     named = np.zeros(told.liars.size, dtype=np.bool_)
     for t in range(len(told.v)):
         state, _, verdict = sequential.step(design, state, frame(told, t))
-        named = verdict.suspects
+        named = verdict.suspects & (verdict.decision is Decision.ATTACKED)
     return named

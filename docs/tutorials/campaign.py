@@ -8,18 +8,18 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from feeders.model.profiles import Season
 from feeders.model.site import load
-from feeders.simulation.attacks import Trick
-from feeders.studies.campaign.plan import Kind, Place, Plan
+from feeders.profiles import Season
+from feeders.simulation.attacks import AttackKind
+from feeders.studies.campaign.plan import AttackClass, CampaignPlan, Place
 from feeders.studies.campaign.study import campaign
 
 site = load("cigre-lv")
-plan = Plan(
+plan = CampaignPlan(
     scenes=2,  # a real campaign has hundreds, of ten minutes each
     together=7,
     seed=1,
-    kinds=(Kind("bias", Trick.BIAS, (0.5, 3.0)), Kind("drift", Trick.DRIFT, (3.0,))),
+    kinds=(AttackClass("bias", AttackKind.BIAS, (0.5, 3.0)), AttackClass("drift", AttackKind.DRIFT, (3.0,))),
     liars=(1, 2),
     places=(Place.RANDOM, Place.COLLUDING),
     seasons=(Season.SUMMER, Season.WINTER),

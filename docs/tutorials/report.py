@@ -10,15 +10,15 @@ from pathlib import Path
 
 from feeders.model.site import load
 from feeders.report.build import report
-from feeders.report.html import About, Outcome
+from feeders.report.html import About, StudyOutcome
 from feeders.studies.protect import Goal, protect
 from feeders.studies.redundancy import redundancy
 
 site = load("cigre-lv")
 outcomes = [
-    Outcome("protect", protect(site, max_attacked=2, goal=Goal.BOUND, lie_volt=4.6)),
-    Outcome("redundancy", redundancy(site, silent=["m02"]), command="gridsec study redundancy cigre-lv"),
-    Outcome("droop", None, problem="left out of this tutorial"),
+    StudyOutcome("protect", protect(site, max_attacked=2, goal=Goal.BOUND, lie_volt=4.6)),
+    StudyOutcome("redundancy", redundancy(site, silent=["m02"]), command="gridsec study redundancy cigre-lv"),
+    StudyOutcome("droop", None, problem="left out of this tutorial"),
 ]
 about = About(
     made="2026-11-21 12:00 UTC",  # time is an argument: the same arguments give the same bytes

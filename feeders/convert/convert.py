@@ -19,13 +19,15 @@ from pathlib import Path
 from typing import Any, Final
 
 from feeders.convert import from_simbench
+from feeders.convert.customers import Fleet
 from feeders.convert.from_opendss import read_opendss
-from feeders.convert.from_pandapower import Fleet, from_pandapower
+from feeders.convert.from_pandapower import read_pandapower
 from feeders.convert.from_power_grid_model import read_pgm
 from feeders.convert.network import Converted, feeder_of, opened_rows
 from feeders.convert.provenance import (
     CHANGES_FILE,
     SOURCE_FILE,
+    Changes,
     ConversionChange,
     Origin,
     SourceUnreadable,
@@ -36,31 +38,15 @@ from feeders.convert.provenance import (
     sentences,
     versioned,
 )
-from feeders.convert.provenance import origin as origin_of
 from feeders.convert.round_trip import SourceCheck, compare
+from feeders.convert.source import SourceNetwork
 from feeders.convert.transformers import EVERYTHING, Extent
 from feeders.format.reader import CUSTOMERS_FILE, LINES_FILE, META_FILE
 from feeders.format.tables import FeederTables, read, write
-from feeders.model.profiles import ENVELOPES, Season
 from feeders.model.site import from_tables
+from feeders.profiles import ENVELOPES, Season
 from feeders.util import command_line, extra
 from gridsec.errors import FeederInvalid, GridsecError, Problem
-
-__all__ = [
-    "KERBER",
-    "PROFILES",
-    "RECIPES",
-    "SEED",
-    "SIMBENCH_CODE",
-    "WRITTEN",
-    "Conversion",
-    "Recipe",
-    "check_against_source",
-    "convert",
-    "from_folder",
-    "source_again",
-]
-
 
 UNCHECKED: Final = "it was a feeder's folder already"
 AGAIN: Final = "Before the folder was written again: "
@@ -73,23 +59,12 @@ def from_folder(
     root: str | None = None,
     opened: Sequence[str] = (),
     droop: str | None = None,
-    one_voltage: bool = False,
-    meshed: bool = False,
+    extent: Extent = EVERYTHING,
 ) -> Converted:
     """Copy a feeder in the project's own format, with the changes of its earlier conversion.
 
-    Parameters
-    ----------
-    folder
-        Folder of the feeder.
-    name
-        New name; empty: the old one.
-    opened
-        Lines to open.
-    root, droop, one_voltage
-        As in `feeders.convert.convert.convert`; only for networks of other tools.
-    meshed
-        True: loops stay closed, with any `meshed` of the file.
+    An empty `name` keeps the old one; `root`, `droop` and `extent.one_voltage` are only for networks of other
+    tools. `extent.meshed` keeps loops closed, with any `meshed` of the file.
 
     Raises
     ------
@@ -99,7 +74,7 @@ def from_folder(
         For an invalid conversion.csv.
     """
     tables = read(folder)
-    given = {"root": root is not None, "droop": droop is not None, "one_voltage": one_voltage}
+    given = {"root": root is not None, "droop": droop is not None, "one_voltage": extent.one_voltage}
     problems: list[str] = [
         Problem(
             "inconsistent", f"{option} is for networks of other tools; {folder} is a feeder's folder already"
@@ -107,7 +82,7 @@ def from_folder(
         for option, value in given.items()
         if value
     ]
-    changes: list[ConversionChange] = []
+    changes = Changes()
     try:
         lines = opened_rows(tables.lines, opened, changes)
     except FeederInvalid as error:
@@ -115,13 +90,11 @@ def from_folder(
     if problems:
         raise FeederInvalid(problems)
     before = origin(folder)
-    earlier = (
-        [] if before is None else [ConversionChange(*row) for row in before.changes.itertuples(index=False)]
-    )
+    earlier = [] if before is None else [ConversionChange(*row) for row in before.changes.to_numpy()]
     meta = tables.meta
     if name:
         meta = replace(meta, name=name, title=name if meta.title == meta.name else meta.title)
-    meta = replace(meta, meshed=meshed or meta.meshed)
+    meta = replace(meta, meshed=extent.meshed or meta.meshed)
     tables = replace(tables, meta=meta, lines=tuple(lines))
     return Converted(tables, (*earlier, *changes), None, UNCHECKED)
 
@@ -129,19 +102,7 @@ def from_folder(
 def source_again(
     before: Origin | None, tables: FeederTables, folder: Path, command: str, notes: tuple[str, ...]
 ) -> str:
-    """Content of the SOURCE.md of a folder that is written again.
-
-    Parameters
-    ----------
-    before
-        Origin of the folder before.
-    tables
-        The feeder.
-    folder, command
-        The folder, and the command line of the new conversion.
-    notes
-        Omissions, additions and changes, earlier and now.
-    """
+    """Content of the SOURCE.md of a folder that is written again; `before` is its origin until now."""
     if before is None or not before.source:
         about, source, package = "A feeder in the project's own form.", str(folder), versioned("gridsec")
         check = f"Not checked: {UNCHECKED}"
@@ -167,11 +128,11 @@ KERBER = "(G. Kerber, dissertation, TU Munich 2011)"
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """Options of the conversion to a bundled feeder."""
+    """Options of the conversion to a bundled feeder; the defaults are those of any other source."""
 
     source: str
-    title: str
-    about: str
+    title: str = ""
+    about: str = "A converted network."
     root: str | None = None
     fleet: Fleet | None = None
     max_attacked: int = 1
@@ -252,21 +213,12 @@ RECIPES: dict[str, Recipe] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Conversion:
-    """Result of a conversion.
+    """Result of a conversion."""
 
-    Attributes
-    ----------
-    changes
-        Omissions, approximations, additions and changes; also in conversion.csv beside the feeder.
-    check
-        Comparison of the AC power flows of feeder and source; None without one.
-    unchecked
-        Reason for a missing comparison.
-    """
-
+    # Omissions, approximations, additions and changes; also in conversion.csv beside the feeder
     changes: tuple[ConversionChange, ...]
-    check: SourceCheck | None
-    unchecked: str = ""
+    check: SourceCheck | None  # Comparison of the AC power flows of feeder and source; None without one
+    unchecked: str = ""  # Reason for a missing comparison
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -291,13 +243,10 @@ def convert(
     ----------
     source
         Source, see the module.
-    out
-        Output folder; created if it does not exist.
     root
         Bus that becomes the metered busbar, if the source has several candidates.
     name
-        Name of the feeder; default: that of the source if it is a feeder's folder, else that of the output
-        folder.
+        Default: that of the source if it is a feeder's folder, else that of the output folder.
     droop
         Preset of the source's generators.
     opened
@@ -327,34 +276,34 @@ def convert(
         raise FileExistsError(
             f"{folder}: holds a feeder that is not from a conversion; expected another folder"
         )
-    recipe = RECIPES.get(source)
-    again = recipe is None and Path(source).is_dir()  # a feeder's folder has a name and an origin
-    before = origin_of(source) if again else None
+    again = source not in RECIPES and Path(source).is_dir()  # a feeder's folder has a name and an origin
+    before = origin(source) if again else None
     usual = "" if again else re.sub(r"[^A-Za-z0-9_-]+", "-", folder.resolve().name)
-    chosen = name or (source if recipe is not None else usual)
+    chosen = name or (source if source in RECIPES else usual)
     extent = Extent(one_voltage, meshed)
     converted, package = _converted(source, chosen[:64], root=root, droop=droop, opened=opened, extent=extent)
-    problems = _problems(converted.tables)
-    if problems:
-        raise FeederInvalid(
-            [
-                *problems,
-                *(Problem("note", f"while converting: {note}") for note in sentences(converted.changes)),
-            ]
-        )
+    try:  # some valid tables cannot be loaded, and the result must be
+        from_tables(converted.tables)
+    except FeederInvalid as error:
+        notes = (Problem("note", f"while converting: {note}") for note in sentences(converted.changes))
+        raise FeederInvalid([*error.problems, *notes]) from error
     write(converted.tables, folder)
     done = _checked(converted, folder)
     (folder / CHANGES_FILE).write_text(changes_csv(done.changes), encoding="utf-8", newline="\n")
-    target = f"data/feeders/{chosen}" if recipe else str(out)
-    options = [*_options(root, name, droop, opened), *_flags(extent)]
+    target = f"data/feeders/{chosen}" if source in RECIPES else str(out)
+    given = {"--root": root, "--name": name, "--droop": droop}
+    options = [word for option, value in given.items() if value for word in (option, value)]
+    options += [word for line in opened for word in ("--open", line)]
+    options += [flag for flag, value in (("--meshed", meshed), ("--one-voltage", one_voltage)) if value]
     command = command_line(["gridsec", "feeders", "convert", source, target, *options])
     if again:
         text = source_again(before, converted.tables, Path(source), command, done.notes)
     else:
+        recipe = RECIPES.get(source, Recipe(source))
         text = feeder_source(
             converted.tables,
-            about=recipe.about if recipe else "A converted network.",
-            origin=recipe.source if recipe else source,
+            about=recipe.about,
+            origin=recipe.source,
             package=versioned(package),
             command=command,
             notes=done.notes,
@@ -362,15 +311,6 @@ def convert(
         )
     (folder / SOURCE_FILE).write_text(text, encoding="utf-8", newline="\n")
     return done
-
-
-def _problems(tables: FeederTables) -> tuple[str, ...]:
-    """All problems of a feeder: some valid tables cannot be loaded, and the result must be."""
-    try:
-        from_tables(tables)
-    except FeederInvalid as error:
-        return error.problems
-    return ()
 
 
 def check_against_source(
@@ -381,16 +321,7 @@ def check_against_source(
     opened: Sequence[str] = (),
     one_voltage: bool = False,
 ) -> SourceCheck:
-    """Compare a folder's AC power flow with that of its source, at the source's loads.
-
-    Parameters
-    ----------
-    source
-        As in `convert`.
-    folder
-        The feeder.
-    root, opened, one_voltage
-        As in the conversion.
+    """Compare a folder's AC power flow with that of its source, at the source's loads; as of `convert`.
 
     Raises
     ------
@@ -429,36 +360,33 @@ def _converted(
     extent: Extent = EVERYTHING,
 ) -> tuple[Converted, str]:
     """Source as a feeder, and the package that has its data or reads its file."""
-    recipe = RECIPES.get(source)
-    origin = recipe.source if recipe else source
-    path = Path(origin)
-    if recipe is None and path.is_dir():
-        one_voltage, meshed = extent.one_voltage, extent.meshed
-        again = from_folder(
-            path, name, root=root, opened=opened, droop=droop, one_voltage=one_voltage, meshed=meshed
-        )
-        return again, "gridsec"
+    recipe = RECIPES.get(source, Recipe(source))
+    path = Path(recipe.source)
+    if source not in RECIPES and path.is_dir():
+        return from_folder(path, name, root=root, opened=opened, droop=droop, extent=extent), "gridsec"
     kind = _kind(path) if path.is_file() else ""
+    network: SourceNetwork
     if kind == OPENDSS:
         network, package = read_opendss(path), "opendssdirect.py"
-        return feeder_of(network, name, root=root, opened=opened, droop=droop, extent=extent), package
-    if kind == PGM:
+    elif kind == PGM:
         network, package = read_pgm(path), "power-grid-model"
-        return feeder_of(network, name, root=root, opened=opened, droop=droop, extent=extent), package
-    net, package = _open(origin)
-    mended = (recipe.mend(net),) if recipe and recipe.mend else ()
-    found = from_pandapower(
-        net,
+    else:
+        net, package = _open(recipe.source)
+        mended = [recipe.mend(net)] if recipe.mend else []
+        network = read_pandapower(net)
+        network.changes[:0] = mended
+    converted = feeder_of(
+        network,
         name,
-        title=recipe.title if recipe else "",
-        root=root or (recipe.root if recipe else None),
+        title=recipe.title,
+        root=root or recipe.root,
         opened=opened,
         droop=droop,
         extent=extent,
-        fleet=recipe.fleet if recipe else None,
-        max_attacked=recipe.max_attacked if recipe else 1,
+        fleet=recipe.fleet,
+        max_attacked=recipe.max_attacked,
     )
-    return replace(found, changes=(*mended, *found.changes)), package
+    return converted, package
 
 
 def _kind(path: Path) -> str:
@@ -487,17 +415,6 @@ def _kind(path: Path) -> str:
         f"{path}: JSON, but neither a pandapower net (with _class pandapowerNet) nor input data of "
         "power-grid-model (with version, type and data)"
     )
-
-
-def _options(root: str | None, name: str | None, droop: str | None, opened: Sequence[str]) -> list[str]:
-    """Given options as words of the command line."""
-    given = (("--root", root), ("--name", name), ("--droop", droop), *(("--open", line) for line in opened))
-    return [word for option, value in given if value for word in (option, value)]
-
-
-def _flags(extent: Extent) -> list[str]:
-    given = (("--meshed", extent.meshed), ("--one-voltage", extent.one_voltage))
-    return [text for text, value in given if value]
 
 
 def _seeded(make: Callable[[], Any]) -> Any:

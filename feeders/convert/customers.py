@@ -9,9 +9,9 @@ from typing import Final
 
 import numpy as np
 
-from feeders.convert.provenance import WHOLE, ConversionChange
+from feeders.convert.provenance import WHOLE, Changes
 from feeders.format.tables import CustomerRow
-from feeders.model.profiles import envelopes
+from feeders.profiles import envelopes
 from gridsec.arrays import Phasors
 
 HOUSEHOLDS: Final = ("H0-A", "H0-B", "H0-C", "H0-G", "H0-L")
@@ -39,12 +39,7 @@ def usual_profile(number: int, *, household: bool) -> str:
 def reactive(customer: CustomerRow, power_factor: float | None) -> CustomerRow:
     """Set power factors and reactive floor from the history of the load's profile.
 
-    Parameters
-    ----------
-    customer
-        Customer with a load and its profile.
-    power_factor
-        At the peak, lagging; None: the usual one.
+    `power_factor` is that at the peak, lagging; None: the usual one.
     """
     factor = USUAL_POWER_FACTOR if power_factor is None else max(round(power_factor, 4), LEAST_POWER_FACTOR)
     tan = math.tan(math.acos(factor))
@@ -71,6 +66,31 @@ def with_meters(rows: list[CustomerRow]) -> list[CustomerRow]:
     """Give every customer a meter: m01, m02, ... in order."""
     digits = max(2, len(str(len(rows))))
     return [replace(row, meter=f"m{k:0{digits}d}") for k, row in enumerate(rows, start=1)]
+
+
+@dataclass(frozen=True, slots=True)
+class Fleet:
+    """Synthetic PV inverters for a source without any."""
+
+    every: int
+    """Interval among the customers without generation, from the first one on."""
+    kva: float
+    """Rating, kVA; 0: half of the customer's load_kw."""
+    droop: str = "ieee1547-b"
+
+
+def with_fleet(customers: list[CustomerRow], fleet: Fleet, changes: Changes) -> list[CustomerRow]:
+    """Add synthetic inverters to customers without one."""
+    rows = list(customers)
+    bare = [k for k, row in enumerate(rows) if row.inverter_kva == 0.0]
+    for k in bare[:: fleet.every]:
+        kva = fleet.kva or rounded(0.5 * rows[k].load_kw)
+        if kva > 0:
+            row = replace(rows[k], pv_kw=rounded(0.9 * kva), pv_profile=f"PV{k % 8 + 1}")
+            rows[k] = replace(row, inverter_kva=kva, droop=fleet.droop)
+            effect = f"synthetic, with droop curve {fleet.droop}; not in the source"
+            changes.note(rows[k].customer, f"PV inverter of {kva:g} kVA", "added", effect)
+    return rows
 
 
 def base_kva(volt: float, load_kw: float) -> float:
@@ -112,37 +132,19 @@ EVEN: Final = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Draw:
-    """Load or generator at a bus.
+    """Load or generator at a bus."""
 
-    Attributes
-    ----------
-    name, bus
-        Name and bus.
-    power_kva : (3,)
-        Power from each phase at the source's operating point, P + jQ, kVA.
-    even
-        True for one connection of all three phases.
-    rating_kva
-        Rating of a generator's inverter, kVA; 0: without inverter; None: not a generator.
-    idle
-        True for a transformer's no-load power, which is unmetered.
-    peak_kw
-        Rated peak of a generator, kW; the present power may be less.
-    phases
-        Connected phases, with or without power.
-    noun
-        Noun for messages; empty: load or generator.
-    """
-
+    # Name and bus
     name: str
     bus: str
-    power_kva: Phasors
-    even: bool = True
+    power_kva: Phasors  # (3,), power from each phase at the source's operating point, P + jQ, kVA
+    even: bool = True  # True for one connection of all three phases
+    # Rating of a generator's inverter, kVA; 0: without inverter; None: not a generator
     rating_kva: float | None = None
-    idle: bool = False
-    peak_kw: float = 0.0
-    phases: str = "abc"
-    noun: str = ""
+    idle: bool = False  # True for a transformer's no-load power, which is unmetered
+    peak_kw: float = 0.0  # Rated peak of a generator, kW; the present power may be less
+    phases: str = "abc"  # Connected phases, with or without power
+    noun: str = ""  # Noun for messages; empty: load or generator
 
     @property
     def label(self) -> str:
@@ -157,13 +159,7 @@ def is_even(power: Phasors) -> bool:
 
 
 def as_it_stands(power: Phasors) -> str:
-    """Effect on a load or generator with a control of its own, for a change.
-
-    Parameters
-    ----------
-    power : (3,)
-        Power from each phase at the source's operating point, kVA.
-    """
+    """Effect on a load or generator with a control of its own, from its power (3,) in the source, kVA."""
     p, q = (round(float(part), 6) + 0.0 for part in (power.sum().real, power.sum().imag))
     if p < 0:
         return f"a customer that feeds in {-p:.4g} kW and draws {q:.4g} kvar in the check"
@@ -174,23 +170,13 @@ def customers_of(
     draws: Iterable[Draw],
     nominal: Mapping[str, float],
     droop: str | None,
-    changes: list[ConversionChange],
+    changes: Changes,
     taken: Collection[str] = (),
 ) -> tuple[list[CustomerRow], dict[str, complex]]:
     """Rows of customers.csv, and the power of each at the source's operating point, kVA.
 
-    Parameters
-    ----------
-    draws
-        Loads and generators.
-    nominal
-        Nominal voltages of the buses, V.
-    droop
-        Preset of the generators' inverters; None: by their size.
-    changes
-        Receives inexact conversions.
-    taken
-        Names of other customers.
+    `nominal` are the buses' voltages, V; `droop` is the generators' preset, None: by their size; `taken` are
+    names of other customers.
     """
     rows: list[CustomerRow] = []
     power: dict[str, complex] = {}
@@ -199,9 +185,9 @@ def customers_of(
         connections = _connections(draw)
         if not connections:
             effect = "draws nothing in the source's power flow"
-            changes.append(ConversionChange(draw.label, WHOLE, "left out", effect))
+            changes.note(draw.label, WHOLE, "left out", effect)
         for phases, kva in connections:
-            row = CustomerRow(_unique(draw, phases, {*taken, *power}), draw.bus, 0.0, phases=phases)
+            row = CustomerRow(_unique(draw, phases, {*taken, *power}), draw.bus, load_kw=0.0, phases=phases)
             power[row.customer] = kva
             takes = kva.real > EVEN * max(abs(kva), draw.peak_kw)
             if draw.rating_kva is None or takes:
@@ -220,7 +206,7 @@ def _generator(
     number: int,
     *,
     droop: str | None,
-    changes: list[ConversionChange],
+    changes: Changes,
 ) -> CustomerRow:
     """Give a customer a generator's peak, and its inverter."""
     parts = len(_connections(draw))
@@ -229,32 +215,26 @@ def _generator(
     row = replace(row, pv_kw=peak, pv_profile=f"PV{number % 8 + 1}")
     if not rating > 0:
         effect = f"{row.pv_profile}, not in the source: a feeder's generation follows the sun"
-        changes.append(ConversionChange(draw.label, "profile", "added", effect))
+        changes.note(draw.label, "profile", "added", effect)
         return row
     row = replace(row, inverter_kva=rounded(rating), droop=droop or droop_preset(rating))
-    changes.append(ConversionChange(draw.label, "droop curve", "added", f"{row.droop}, not in the source"))
+    changes.note(draw.label, "droop curve", "added", f"{row.droop}, not in the source")
     if abs(kva.imag) > EVEN * rating:
-        changes.append(ConversionChange(draw.label, *BY_DROOP))
+        changes.note(draw.label, *BY_DROOP)
     return row
 
 
 def idle_customers(
     draws: Iterable[Draw], taken: Collection[str]
 ) -> tuple[list[CustomerRow], dict[str, complex]]:
-    """No-load powers of transformers as customers without meters, and their powers, kVA.
-
-    Parameters
-    ----------
-    draws
-        Loads and generators; only those with `idle` count.
-    taken
-        Names of customers.
-    """
+    """No-load powers of transformers as customers without meters, and their powers, kVA."""
     rows: list[CustomerRow] = []
     power: dict[str, complex] = {}
     for draw in draws:
         for phases, kva in _connections(draw) if draw.idle else ():
-            row = CustomerRow(_unique(draw, phases, {*taken, *power}), draw.bus, rounded(max(kva.real, 0.0)))
+            row = CustomerRow(
+                _unique(draw, phases, {*taken, *power}), draw.bus, load_kw=rounded(max(kva.real, 0.0))
+            )
             factor = max(kva.real / abs(kva), LEAST_POWER_FACTOR)
             # Reactive power beyond the power factor: all of it without active power.
             beside = abs(kva.imag) - row.load_kw * math.tan(math.acos(factor))
@@ -279,17 +259,10 @@ def _connections(draw: Draw) -> list[tuple[str, complex]]:
 
 
 def in_star(pairs: Phasors, volts: Phasors) -> Phasors:
-    """Powers of a load between phases, from each phase, kVA.
+    """Powers of a load between phases, from each phase, (3,), kVA.
 
     The current between the phases k and k + 1 is ``conj(S_k / (V_k - V_k+1))``; the current of a phase is the
-    difference of two of these.
-
-    Parameters
-    ----------
-    pairs : (3,)
-        Powers between a and b, b and c, c and a, kVA.
-    volts : (3,)
-        Voltages of the phases, V.
+    difference of two of these. `pairs` (3,) are the powers between a and b, b and c, c and a, kVA.
     """
     between = np.conj(pairs / (volts - np.roll(volts, -1)))
     return np.asarray(volts * np.conj(between - np.roll(between, 1)), dtype=np.complex128)
@@ -303,24 +276,24 @@ def _unique(draw: Draw, phases: str, taken: Collection[str]) -> str:
     return name
 
 
-def _load(
-    row: CustomerRow, kva: complex, number: int, *, volt: float, changes: list[ConversionChange], noun: str
-) -> CustomerRow:
+def expected_load(row: CustomerRow, kva: complex, label: str, prop: str, changes: Changes) -> CustomerRow:
+    """Set the power factors of a load of this power; reports parts of it that the format lacks."""
     p, q = kva.real, kva.imag
     if p < 0:
-        changes.append(
-            ConversionChange(
-                f"{noun} {row.customer}", "p_kw", "changed", "feeds in; its expected load is taken as 0"
-            )
-        )
+        effect = "feeds in; its expected load is taken as 0"
+        changes.note(label, prop, "changed", effect)
     if q < -NO_POWER * abs(kva):
-        changes.append(
-            ConversionChange(
-                f"{noun} {row.customer}", "power factor", "approximated", "leading; expected to be 1"
-            )
-        )
+        effect = "leading; expected to be 1"
+        changes.note(label, "power factor", "approximated", effect)
     if p <= 0.0 and q > NO_POWER:
-        changes.append(ConversionChange(f"{noun} {row.customer}", *ONLY_REACTIVE))
+        changes.note(label, *ONLY_REACTIVE)
+    return reactive(row, p / math.hypot(p, q) if p > 0 and q > 0 else None)
+
+
+def _load(
+    row: CustomerRow, kva: complex, number: int, *, volt: float, changes: Changes, noun: str
+) -> CustomerRow:
+    p = kva.real
     household = volt < 1000.0 and p <= HOUSEHOLD_KW
     row = replace(row, load_kw=rounded(max(p, 0.0)), load_profile=usual_profile(number, household=household))
-    return reactive(row, p / math.hypot(p, q) if p > 0 and q > 0 else None)
+    return expected_load(row, kva, f"{noun} {row.customer}", "p_kw", changes)

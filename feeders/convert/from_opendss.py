@@ -20,9 +20,10 @@ from typing import Any, Final
 import numpy as np
 
 from feeders.convert.customers import Draw, as_it_stands, is_even, rounded
-from feeders.convert.lines import Coupling, capacitor, line_row, open_end, with_taps
-from feeders.convert.network import SourceNetwork
-from feeders.convert.provenance import WHOLE, ConversionChange, SourceUnreadable
+from feeders.convert.lines import Coupling, line_row, with_taps
+from feeders.convert.provenance import Changes, ConversionChange, SourceUnreadable
+from feeders.convert.source import CONSTANT, IN_STAR, MEASURE, OFF, UNLIKE, SourceNetwork
+from feeders.format.reader import CheckReport
 from feeders.format.tables import LineRow
 from feeders.util import extra
 from gridsec.arrays import Floats, Phasors
@@ -76,14 +77,7 @@ class Element:
 
 
 def voltage_dependence(dss: Any) -> list[tuple[str, ConversionChange]]:
-    """Loads that are not of constant power, each with its bus.
-
-    Parameters
-    ----------
-    dss
-        The engine, with the circuit of the file.
-    """
-    effect = "depends on the voltage in the source; taken as constant power"
+    """Loads that are not of constant power, each with its bus."""
     changes = []
     for name in dss.Loads.AllNames():
         if name.lower() == "none":
@@ -91,10 +85,8 @@ def voltage_dependence(dss: Any) -> list[tuple[str, ConversionChange]]:
         dss.Loads.Name(name)
         bus = str(dss.CktElement.BusNames()[0]).partition(".")[0].lower()
         if int(dss.Loads.Model()) != 1:
-            change = ConversionChange(
-                f"load {name}", f"model {int(dss.Loads.Model())}", "approximated", effect
-            )
-            changes.append((bus, change))
+            model = f"model {int(dss.Loads.Model())}"
+            changes.append((bus, ConversionChange(f"load {name}", model, "approximated", CONSTANT)))
     return changes
 
 
@@ -103,12 +95,8 @@ def beyond_limits(
 ) -> list[tuple[str, ConversionChange]]:
     """Loads and generators of constant power that become impedances at their voltages.
 
-    Parameters
-    ----------
-    found, constant
-        All elements as the source solves them, and with loads of constant power.
-    known
-        Labels of elements that are reported already.
+    `found` are the elements as the source solves them, `constant` those with loads of constant power, `known`
+    the labels of elements that are reported already.
     """
     out = []
     for one, other in zip(found, constant, strict=True):
@@ -122,24 +110,13 @@ def beyond_limits(
 
 
 def add_draw(dss: Any, each: Element, network: SourceNetwork) -> None:
-    """Add a load, a generator or a battery to a network, and report properties that a customer lacks.
-
-    Parameters
-    ----------
-    dss
-        The engine.
-    each
-        The element.
-    network
-        Receives the element.
-    """
+    """Add a load, a generator or a battery to a network, and report properties that a customer lacks."""
     power, bus = each.power_kva[0], each.buses[0]
     used = [node for node in each.nodes[0] if 1 <= node <= PHASES]
     even = len(used) == PHASES and (is_even(power) or not power.any())
     told = list(_curves(dss, each))
     if len(used) > 1 and not even:
-        effect = "in star, with its phases' powers of the source's power flow; exact at these loads only"
-        told.append(ConversionChange(each.label, "delta", "approximated", effect))
+        told.append(ConversionChange(each.label, "delta", "approximated", IN_STAR))
     rating: float | None = None
     peak = 0.0
     if each.kind == "pvsystem":
@@ -208,7 +185,6 @@ NO_LOAD: Final = 1e-5
 
 SERIES: Final = {"line", "reactor"}
 COUPLINGS: Final = {"transformer", "autotrans"}
-MEASURE: Final = "every customer has a meter of the feeder's own kind instead"
 DROOP: Final = "inverters of solar plants follow the droop curve of the customer"
 TOLD: Final = {
     "monitor": MEASURE,
@@ -229,7 +205,6 @@ TOLD: Final = {
 }
 """Classes without current, and their replacement in a feeder."""
 
-UNLIKE: Final = "has no place in a feeder; the check shows the effect"
 NO_PLACE: Final = {
     *("isource", "vccs", "fault", "upfc", "vsconverter"),
     *("gicsource", "gicline", "gictransformer"),
@@ -268,12 +243,7 @@ def _engine() -> Iterator[Any]:
 
 
 def read_opendss(path: Path) -> SourceNetwork:
-    """Read and solve a master file.
-
-    Parameters
-    ----------
-    path
-        The file that defines the circuit and its voltage bases.
+    """Read and solve a master file, which defines the circuit and its voltage bases.
 
     Raises
     ------
@@ -297,20 +267,27 @@ def _read(dss: Any, path: Path) -> SourceNetwork:
     dss.Text.Command(f'redirect "{path.resolve()}"')
     if not dss.Basic.NumCircuits():
         raise SourceUnreadable(f"{path}: OpenDSS finds no circuit in it; expected 'new circuit...'")
-    problems: list[Problem] = []
+    report = CheckReport()
     _run(dss, (*_voltage_bases(dss), *SOLVER))
     found = _solved(dss)
     if not found:
         raise GridsecError(f"{path}: OpenDSS's own power flow does not converge", code="not-converged")
-    elements = [_element(dss, name, problems) for name in dss.Circuit.AllElementNames()]
+    elements = [_element(dss, name, report) for name in dss.Circuit.AllElementNames()]
     changes = voltage_dependence(dss)
     _run(dss, CONSTANT_POWER)
     volts = _solved(dss)
     if volts:
         before = elements
-        elements = [_element(dss, name, problems) for name in dss.Circuit.AllElementNames()]
+        elements = [_element(dss, name, report) for name in dss.Circuit.AllElementNames()]
         changes += beyond_limits(before, elements, {change.element for _, change in changes})
-    nominal = _nominal(dss, problems)
+    nominal = _nominal(dss)
+    bare = [bus for bus, volt in nominal.items() if volt <= 0]
+    if bare:
+        report.problem(
+            "missing",
+            f"{len(bare)} bus(es) have no nominal voltage, among them {', '.join(bare[:5])}; "
+            "expected 'set voltagebases=[...]' and 'calcvoltagebases' in the file",
+        )
     network = SourceNetwork(
         tool=f"OpenDSS {version('dss_python_backend')}",
         sources=[each.buses[0] for each in elements if each.kind == "vsource" and each.enabled],
@@ -323,11 +300,10 @@ def _read(dss: Any, path: Path) -> SourceNetwork:
     network.of_bus.extend(changes)
     _build_everything(dss, elements)
     for each in elements:
-        _take(dss, each, network, problems)
-    if problems:
-        raise FeederInvalid(
-            Problem(problem.code, f"{path.name}: {problem}") for problem in dict.fromkeys(problems)
-        )
+        _take(dss, each, network, report)
+    if report.problems:
+        once = dict.fromkeys(report.problems)
+        raise FeederInvalid(Problem(problem.code, f"{path.name}: {problem}") for problem in once)
     return network
 
 
@@ -342,8 +318,7 @@ def _solved(dss: Any) -> dict[str, Phasors]:
     if not dss.Solution.Converged():
         return {}
     volts: dict[str, Phasors] = {}
-    for bus in dss.Circuit.AllBusNames():
-        dss.Circuit.SetActiveBus(bus)
+    for bus in _buses(dss):
         parts = np.array(dss.Bus.Voltages()).reshape(-1, 2)
         v = np.full(PHASES, np.nan, dtype=np.complex128)
         for node, (real, imaginary) in zip(dss.Bus.Nodes(), parts, strict=True):
@@ -357,37 +332,30 @@ def _solved(dss: Any) -> dict[str, Phasors]:
 def _voltage_bases(dss: Any) -> tuple[str, ...]:
     """Missing commands for a file with voltage bases that it does not apply, such as a saved one."""
     named = set(dss.Settings.VoltageBases()) != set(UNNAMED_KV)
-    bare = any(not volt > 0 for volt in _nominal(dss, []).values())
+    bare = any(not volt > 0 for volt in _nominal(dss).values())
     return ("calcvoltagebases",) if named and bare else ()
 
 
-def _nominal(dss: Any, problems: list[Problem]) -> dict[str, float]:
-    nominal = {}
-    for bus in dss.Circuit.AllBusNames():
-        dss.Circuit.SetActiveBus(bus)
-        nominal[bus] = 1000.0 * float(dss.Bus.kVBase())
-    bare = [bus for bus, volt in nominal.items() if volt <= 0]
-    if bare:
-        problems.append(
-            Problem(
-                "missing",
-                f"{len(bare)} bus(es) have no nominal voltage, among them {', '.join(bare[:5])}; "
-                "expected 'set voltagebases=[...]' and 'calcvoltagebases' in the file",
-            )
-        )
-    return nominal
+def _nominal(dss: Any) -> dict[str, float]:
+    return {bus: 1000.0 * float(dss.Bus.kVBase()) for bus in _buses(dss)}
 
 
 def _positions(dss: Any) -> dict[str, tuple[float, float]]:
-    places = {}
+    return {
+        bus: (round(float(dss.Bus.X()), 6), round(float(dss.Bus.Y()), 6))
+        for bus in _buses(dss)
+        if dss.Bus.Coorddefined()
+    }
+
+
+def _buses(dss: Any) -> Iterator[str]:
+    """Yield every bus while it is the active one."""
     for bus in dss.Circuit.AllBusNames():
         dss.Circuit.SetActiveBus(bus)
-        if dss.Bus.Coorddefined():
-            places[bus] = (round(float(dss.Bus.X()), 6), round(float(dss.Bus.Y()), 6))
-    return places
+        yield bus
 
 
-def _element(dss: Any, full: str, problems: list[Problem]) -> Element:
+def _element(dss: Any, full: str, report: CheckReport) -> Element:
     dss.Circuit.SetActiveElement(full)
     kind, _, name = full.partition(".")
     kind = kind.lower()
@@ -410,12 +378,10 @@ def _element(dss: Any, full: str, problems: list[Problem]) -> Element:
                 power[node - 1] += kva
         powers.append(power)
     if enabled and kind not in COUPLINGS and any(node > PHASES for here in nodes for node in here):
-        problems.append(
-            Problem(
-                "unsupported",
-                f"{kind} {name} has a conductor besides the phases 1, 2, 3 and the grounded neutral 0; "
-                "expected none",
-            )
+        report.problem(
+            "unsupported",
+            f"{kind} {name} has a conductor besides the phases 1, 2, 3 and the grounded neutral 0; "
+            "expected none",
         )
     on = tuple(k for k in range(len(buses)) if enabled and not element.IsOpen(k + 1, 0))
     return Element(name, kind, buses, nodes, tuple(powers), enabled, on)
@@ -431,32 +397,26 @@ def _build_everything(dss: Any, elements: list[Element]) -> None:
     dss.Solution.BuildYMatrix(1, 0)
 
 
-def _take(dss: Any, each: Element, network: SourceNetwork, problems: list[Problem]) -> None:
+def _take(dss: Any, each: Element, network: SourceNetwork, report: CheckReport) -> None:
     """Add an element to the network, or report its omission."""
     label = f"{each.kind} {each.name}"
     if not each.enabled:
-        network.changes.append(ConversionChange(label, WHOLE, "left out", "disabled in the source"))
+        network.leave_out(label, "disabled in the source")
     elif each.kind in {"capacitor", "reactor"} and _is_shunt(each):
         _shunt(dss, each, network)
     elif each.kind in SERIES:
-        _line(dss, each, network, problems)
+        _line(dss, each, network, report)
     elif each.kind == "capacitor":
-        problems.append(
-            Problem(
-                "unsupported",
-                f"{label} is in series between {each.buses[0]} and {each.buses[1]}; expected a shunt",
-            )
-        )
+        text = f"{label} is in series between {each.buses[0]} and {each.buses[1]}; expected a shunt"
+        report.problem("unsupported", text)
     elif each.kind in COUPLINGS:
         line, idle = _regulator(dss, each, network)
         network.couplings.append(Coupling(label, each.buses, each.power_kva, line, idle))
     elif each.kind in LOADS | GENERATORS | STORAGE:
         add_draw(dss, each, network)
     elif each.kind != "vsource":
-        change = ConversionChange(label, WHOLE, "left out", TOLD.get(each.kind, UNLIKE))
-        at = [bus for bus in each.buses if bus in network.nominal]
-        network.of_bus.extend((bus, change) for bus in at)
-        network.changes += [] if at else [change]  # without a bus, as controllers of several elements
+        at = [bus for bus in each.buses if bus in network.nominal]  # none for controllers of several elements
+        network.leave_out(label, TOLD.get(each.kind, UNLIKE), *at)
 
 
 def _regulator(dss: Any, each: Element, network: SourceNetwork) -> tuple[LineRow | None, Draw | None]:
@@ -495,7 +455,7 @@ def _regulator(dss: Any, each: Element, network: SourceNetwork) -> tuple[LineRow
         phases,
         series=np.diag(series),
         shunt=np.zeros((count, count)),
-        changes=[],
+        changes=Changes(),
     )
     taps = np.ones(PHASES)
     here, there = (network.nominal[bus] for bus in each.buses)
@@ -529,23 +489,19 @@ def _yprim(dss: Any, each: Element) -> Phasors:
     return matrix
 
 
-def _line(dss: Any, each: Element, network: SourceNetwork, problems: list[Problem]) -> None:
+def _line(dss: Any, each: Element, network: SourceNetwork, report: CheckReport) -> None:
     """Line or series reactor: series impedance and charging from its primitive admittances."""
     label = each.name if each.kind == "line" else f"{each.kind}.{each.name}"
     here, there = each.nodes
     if here != there or len(set(here)) != len(here) or not all(1 <= node <= PHASES for node in here):
         if all(1 <= node <= PHASES for node in (*here, *there)):
-            problems.append(
-                Problem(
-                    "unsupported",
-                    f"line {label} joins the phases {'.'.join(map(str, here))} of {each.buses[0]} to "
-                    f"{'.'.join(map(str, there))} of {each.buses[1]}; expected the same phases at both ends",
-                )
+            report.problem(
+                "unsupported",
+                f"line {label} joins the phases {'.'.join(map(str, here))} of {each.buses[0]} to "
+                f"{'.'.join(map(str, there))} of {each.buses[1]}; expected the same phases at both ends",
             )
         elif 0 in (*here, *there):
-            problems.append(
-                Problem("unsupported", f"line {label} has a conductor to ground; expected phases 1, 2, 3")
-            )
+            report.problem("unsupported", f"line {label} has a conductor to ground; expected phases 1, 2, 3")
         return
     matrix, count = _yprim(dss, each), len(here)
     series = np.asarray(
@@ -557,11 +513,9 @@ def _line(dss: Any, each: Element, network: SourceNetwork, problems: list[Proble
     order = np.argsort(here)
     phases = np.array(here)[order] - 1
     if min(series.real.diagonal().min(), series.imag.diagonal().min()) < 0:
-        problems.append(
-            Problem("negative", f"line {label} has a negative resistance or reactance; expected none")
-        )
+        report.problem("negative", f"line {label} has a negative resistance or reactance; expected none")
         return
-    changes: list[ConversionChange] = []
+    changes = Changes()
     row = line_row(
         label,
         (each.buses[0], each.buses[1]),
@@ -571,12 +525,7 @@ def _line(dss: Any, each: Element, network: SourceNetwork, problems: list[Proble
         changes=changes,
     )
     network.of_bus.extend((each.buses[0], change) for change in changes)
-    row = _rated(dss, each, row)
-    network.lines.append(row)
-    if len(each.on) == 1:
-        bus = each.buses[each.on[0]]
-        stub = open_end(row, bus, network.nominal[bus])
-        network.lines += [stub] if stub else []
+    network.add_line(_rated(dss, each, row), [each.buses[k] for k in each.on])
 
 
 def _rated(dss: Any, each: Element, row: LineRow) -> LineRow:
@@ -592,14 +541,12 @@ def _shunt(dss: Any, each: Element, network: SourceNetwork) -> None:
     label, bus = f"{each.kind} {each.name}", each.buses[0]
     kvar = -sum(power.sum() for power in each.power_kva).imag
     if not each.closed or each.kind == "reactor" or kvar <= 0:
-        effect = f"{-kvar:.4g} kvar" if each.closed else "switched off in the source"
-        network.of_bus.append((bus, ConversionChange(label, WHOLE, "left out", effect)))
+        effect = f"{-kvar:.4g} kvar" if each.closed else OFF
+        network.leave_out(label, effect, bus)
         return
     # Both terminals may be at phases of the bus: entries between phases are where their conductors meet.
     meet = np.equal.outer(np.arange(1, PHASES + 1), np.concatenate(each.nodes)).astype(np.float64)
     here = np.flatnonzero(meet.any(axis=1))
     block = (meet @ _yprim(dss, each).imag @ meet.T)[np.ix_(here, here)]
     phases = "".join("abc"[k] for k in here)
-    effect = f"{kvar:.4g} kvar as the charging of a line to nowhere"
-    network.of_bus.append((bus, ConversionChange(label, "connection", "changed", effect)))
-    network.lines.append(capacitor(f"capacitor.{each.name}", bus, block, phases))
+    network.add_capacitor(f"capacitor.{each.name}", bus, block, kvar, phases=phases, label=label)

@@ -21,15 +21,16 @@ from power_grid_model.utils import json_deserialize  # type: ignore[attr-defined
 from power_grid_model.validation import validate_input_data
 
 from feeders.convert.customers import SWITCHED_OFF, Draw, rounded
-from feeders.convert.lines import ALL, Coupling, by_sequence, capacitor, charging_cells, line_row, open_end
-from feeders.convert.network import SourceNetwork
-from feeders.convert.provenance import WHOLE, ConversionChange, SourceUnreadable
+from feeders.convert.lines import ALL, Coupling, by_sequence, charging_cells, line_row
+from feeders.convert.provenance import Changes, SourceUnreadable
+from feeders.convert.source import CONSTANT, MEASURE, OFF, UNLIKE, SourceNetwork
 from feeders.convert.transformers import TwoPort, coupling_of
 from feeders.format.reader import some
 from feeders.format.tables import LineRow
 from feeders.format.validation import same_level
 from gridsec.arrays import Floats, Phasors
 from gridsec.errors import FeederInvalid, GridsecError, Problem
+from gridsec.grid.three_phase import ROTATION
 
 OMEGA: Final = 2.0 * np.pi * 50.0
 """Angular frequency of power-grid-model; its files state none."""
@@ -47,8 +48,6 @@ CARRIED: Final = {
 }
 """Tables that are reported row by row."""
 
-MEASURE: Final = "every customer has a meter of the feeder's own kind instead"
-UNLIKE: Final = "has no place in a feeder; the check shows the effect"
 NOTED: Final = {
     "transformer_tap_regulator": "taps as in the file",
     "fault": "not part of a power flow",
@@ -61,18 +60,11 @@ TOLERANCES: Final = (1e-11, 1e-9, 1e-7)
 STIFF_VA: Final = 1e20
 """Short-circuit power of a source in front of one transformer, VA."""
 
-TURN: Final = np.exp(-2j * np.pi / 3.0 * np.arange(3))
-
 Tables = dict[str, Any]
 
 
 def read_pgm(path: Path) -> SourceNetwork:
-    """Read and solve a file of input data.
-
-    Parameters
-    ----------
-    path
-        JSON as power-grid-model serialises a dataset of the type `input`.
+    """Read and solve a file of input data: JSON as power-grid-model serialises a dataset of type `input`.
 
     Raises
     ------
@@ -99,13 +91,8 @@ def read_pgm(path: Path) -> SourceNetwork:
     for kind in dependent:
         for row in tables[kind][tables[kind]["type"] != 0]:
             law = "impedance" if row["type"] == 1 else "current"
-            change = ConversionChange(
-                f"{kind} {row['id']}",
-                f"constant {law}",
-                "approximated",
-                "depends on the voltage in the source; taken as constant power",
-            )
-            network.of_bus.append((str(row["node"]), change))
+            label = f"{kind} {row['id']}"
+            network.note_at(str(row["node"]), label, f"constant {law}", "approximated", CONSTANT)
         tables[kind]["type"] = 0
     solved = _solve(path, tables, symmetric)
     network.volts = _volts(tables, solved)
@@ -182,7 +169,7 @@ def _volts(tables: Tables, solved: Tables) -> dict[str, Phasors]:
     nodes = solved["node"]
     v: Phasors = nodes["u_pu"] * np.exp(1j * nodes["u_angle"])
     if v.ndim == 1:
-        v = v[:, None] * TURN
+        v = v[:, None] * ROTATION
     v = v * (tables["node"]["u_rated"] / 3.0**0.5)[:, None]
     fed = nodes["energized"].astype(bool)
     return {
@@ -209,9 +196,7 @@ def _lines(tables: Tables, network: SourceNetwork) -> None:
             b1, b0 = OMEGA * float(row["c1"]), OMEGA * float(row["c0"])
             if row["tan1"] > 0 and b1 > 0:
                 effect = f"{1e6 * b1 * float(row['tan1']):.3g} microsiemens"
-                network.of_bus.append(
-                    (ends[0], ConversionChange(name, "shunt conductance", "left out", effect))
-                )
+                network.note_at(ends[0], name, "shunt conductance", "left out", effect)
             limit = _finite(row["i_n"])
             made = LineRow(
                 name,
@@ -228,11 +213,8 @@ def _lines(tables: Tables, network: SourceNetwork) -> None:
 
 
 def _add_line(row: Any, made: LineRow, network: SourceNetwork) -> None:
-    network.lines.append(made)
-    if bool(row["from_status"]) != bool(row["to_status"]):
-        bus = made.from_bus if row["from_status"] else made.to_bus
-        stub = open_end(made, bus, network.nominal[bus])
-        network.lines += [stub] if stub else []
+    ends = (("from_status", made.from_bus), ("to_status", made.to_bus))
+    network.add_line(made, [bus for status, bus in ends if row[status]])
 
 
 def _asymmetric_lines(tables: Tables, network: SourceNetwork) -> None:
@@ -246,7 +228,7 @@ def _asymmetric_lines(tables: Tables, network: SourceNetwork) -> None:
                 z[i, j] = z[j, i] = complex(row[f"r_{one}{other}"], row[f"x_{one}{other}"])
         if len(letters) > 3:
             z = z[:3, :3] - np.outer(z[:3, 3], z[3, :3]) / z[3, 3]
-        changes: list[ConversionChange] = []
+        changes = Changes()
         made = line_row(name, ends, np.arange(3), series=z, shunt=_capacitances(row), changes=changes)
         network.of_bus.extend((ends[0], change) for change in changes)
         limit = _finite(row["i_n"])
@@ -276,9 +258,7 @@ def _couplings(tables: Tables, solved: Tables, network: SourceNetwork, *, symmet
             ]
             joined = [k for k, ok in enumerate(on) if ok]
             if len(joined) < 2:
-                network.changes.append(
-                    ConversionChange(label, WHOLE, "left out", "switched off in the source")
-                )
+                network.leave_out(label, OFF)
                 continue
             ends = tuple(str(row[sides[k][0]]) for k in joined)
             flows = tuple(_by_phase(flow[sides[k][1]], flow[sides[k][2]]) for k in joined)
@@ -336,12 +316,8 @@ def _two_ports(tables: Tables, symmetric: bool) -> dict[int, TwoPort]:
         nodes = solved[ComponentType.node]
         v = (nodes["u_pu"] * np.exp(1j * nodes["u_angle"]) * node["u_rated"] / 3.0**0.5).reshape(-1, 2)
         power = solved[ComponentType.sym_load]
-        current = np.conj((power["p"] + 1j * power["q"]) / 3.0 / v[:, 1])
-        found.append([(complex(a), complex(b), complex(i)) for (a, b), i in zip(v, current, strict=True)])
-    return {
-        int(row["id"]): TwoPort.measured(idle[:2], loaded)
-        for row, idle, loaded in zip(rows, *found, strict=True)
-    }
+        found.append((v, np.conj((power["p"] + 1j * power["q"]) / 3.0 / v[:, 1])))
+    return TwoPort.measured([row["id"] for row in rows], *found)
 
 
 def _passing(row: Any) -> bool:
@@ -387,8 +363,7 @@ def _draws(tables: Tables, network: SourceNetwork) -> None:
             power = sign * float(row["status"]) * _by_phase(row["p_specified"], row["q_specified"])
             even = bool((power == power[0]).all())
             if not row["status"]:
-                off = ConversionChange(f"{kind} {row['id']}", *SWITCHED_OFF)
-                network.of_bus.append((str(row["node"]), off))
+                network.note_at(str(row["node"]), f"{kind} {row['id']}", *SWITCHED_OFF)
             rating = float(np.abs(power.sum())) if kind in GENERATORS else None
             network.draws.append(Draw(f"{kind} {row['id']}", str(row["node"]), power, even, rating))
 
@@ -398,29 +373,23 @@ def _shunts(tables: Tables, solved: Tables, network: SourceNetwork) -> None:
         label, bus = f"shunt {row['id']}", str(row["node"])
         p, q = (1e-3 * float(np.sum(flow[name])) for name in ("p", "q"))
         if not row["status"]:
-            network.of_bus.append(
-                (bus, ConversionChange(label, WHOLE, "left out", "switched off in the source"))
-            )
+            network.leave_out(label, OFF, bus)
             continue
         if row["g1"] != 0:
-            network.of_bus.append((bus, ConversionChange(label, "conductance", "left out", f"{p:.4g} kW")))
+            network.note_at(bus, label, "conductance", "left out", f"{p:.4g} kW")
         if row["b1"] > 0:
-            block = by_sequence(float(row["b1"]), float(row["b0"]))
-            network.lines.append(capacitor(f"{label}", bus, block))
-            effect = f"{-q:.4g} kvar as the charging of a line to nowhere"
-            network.of_bus.append((bus, ConversionChange(label, "connection", "changed", effect)))
+            network.add_capacitor(label, bus, by_sequence(float(row["b1"]), float(row["b0"])), -q)
         elif row["b1"] < 0:
-            network.of_bus.append((bus, ConversionChange(label, "inductance", "left out", f"{q:.4g} kvar")))
+            network.note_at(bus, label, "inductance", "left out", f"{q:.4g} kvar")
 
 
 def _rest(tables: Tables, network: SourceNetwork) -> None:
     """Report sources out of service, and tables without network elements."""
     for row in _rows(tables, "source"):
         if not row["status"]:
-            off = ConversionChange(f"source {row['id']}", WHOLE, "left out", "switched off in the source")
-            network.of_bus.append((str(row["node"]), off))
+            network.leave_out(f"source {row['id']}", OFF, str(row["node"]))
     for kind, rows in tables.items():
         if not len(rows) or kind in CARRIED:
             continue
         effect = MEASURE if kind.endswith("_sensor") else NOTED.get(kind, UNLIKE)
-        network.changes.append(ConversionChange(f"{len(rows)} {kind}(s)", WHOLE, "left out", effect))
+        network.leave_out(f"{len(rows)} {kind}(s)", effect)

@@ -19,7 +19,7 @@ from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, QhullError
 
 from feeders.convert.provenance import SourceUnreadable
-from feeders.model.profiles import ReactiveEnvelope, Season
+from feeders.profiles import ReactiveEnvelope, Season
 from feeders.util import extra
 from gridsec.arrays import Floats
 from gridsec.errors import GridsecError
@@ -38,18 +38,10 @@ SUMMER_TIME = (date(2016, 3, 27), date(2016, 10, 30))
 
 @dataclass(frozen=True, slots=True)
 class Stretch:
-    """Consecutive days of the year.
+    """Consecutive days of the year."""
 
-    Attributes
-    ----------
-    monday
-        First day, from 00:00 local time.
-    days
-        Number of days.
-    """
-
-    monday: date
-    days: int
+    monday: date  # First day, from 00:00 local time
+    days: int  # Number of days
 
     @property
     def rows(self) -> slice:
@@ -86,13 +78,6 @@ def grid(code: str) -> Any:
     return simbench.get_simbench_net(code)
 
 
-def version() -> str:
-    """Installed version of simbench."""
-    from importlib.metadata import version as installed
-
-    return installed("simbench")
-
-
 def year() -> dict[str, Floats]:
     """Every low-voltage profile of the year: load profiles as `_pload`, `_qload`, and PV.
 
@@ -122,15 +107,7 @@ def _simbench() -> Any:
 
 
 def library_csv(columns: Mapping[str, Floats], season: Season) -> bytes:
-    """Season of the library as gzipped CSV: t_s, then `<load>_p`, `<load>_q`, `<pv>`.
-
-    Parameters
-    ----------
-    columns
-        Profiles of `year`.
-    season
-        Season of the slice.
-    """
+    """Season of the library as gzipped CSV: t_s, then `<load>_p`, `<load>_q`, `<pv>`."""
     rows = STRETCHES[season].rows
     names: list[tuple[str, str]] = []
     for load in load_profiles(columns):
@@ -151,16 +128,12 @@ def load_profiles(columns: Mapping[str, Floats]) -> list[str]:
 
 
 def envelope(p: Floats, q: Floats) -> ReactiveEnvelope:
-    """Smallest wedge with a floor that contains every point of a load profile.
+    """Smallest wedge with a floor that contains every point (T,) of a load profile.
 
     Minimises the mean width ``(high - low) w + 2 floor`` subject to ``low p - floor <= q <= high p + floor``
     for all points, ``0 <= low <= 1 <= high``, at ``w = max(mean p, 0.3)``: at a weight as small as a
     household's mean, the upper slope would be several times the nominal one, and useless for an unknown load.
-
-    Parameters
-    ----------
-    p, q : (T,)
-        Active and reactive power, fractions of their nominal values.
+    Powers are fractions of their nominal values.
 
     Raises
     ------

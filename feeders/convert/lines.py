@@ -11,52 +11,30 @@ from typing import Any, Final
 import numpy as np
 
 from feeders.convert.customers import Draw, rounded
-from feeders.convert.provenance import WHOLE, ConversionChange
-from feeders.format.matrices import SERIES_NAMES, SHUNT_NAMES, cells_of, columns_of, passive, shunt_us
-from feeders.format.tables import LineRow
+from feeders.convert.provenance import WHOLE, Changes, ConversionChange
+from feeders.format.columns import SERIES_NAMES, SHUNT_NAMES, LineRow
+from feeders.format.matrices import cells_of, columns_of, passive, shunt_us
 from feeders.model.three_phase import series_of, shunt_of
 from gridsec.arrays import Floats, Ints, Phasors
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Coupling:
-    """Transformer, or another element that joins buses and is not a line.
+    """Transformer, or another element that joins buses and is not a line."""
 
-    Attributes
-    ----------
-    name, buses
-        Kind and name, and the buses that it joins.
-    power_kva
-        Power into it from each bus, by phase, kVA.
-    line
-        Equivalent line from the first of its two buses to the second, with its tap relative to their nominal
-        voltages, without `to_volt`; None without an equivalent.
-    idle
-        No-load power beside that line.
-    turn
-        Phase shift from the first bus to the second, degrees.
-    """
-
+    # Kind and name, and the buses that it joins
     name: str
     buses: tuple[str, ...]
-    power_kva: tuple[Phasors, ...]
+    power_kva: tuple[Phasors, ...]  # Power into it from each bus, by phase, kVA
+    # Equivalent line from the first of its two buses to the second, with its tap relative to their nominal
+    # voltages, without `to_volt`; None without an equivalent
     line: LineRow | None = None
-    idle: Draw | None = None
-    turn: float = 0.0
+    idle: Draw | None = None  # No-load power beside that line
+    turn: float = 0.0  # Phase shift from the first bus to the second, degrees
 
 
 def reached(start: str, rows: Iterable[LineRow], without: Collection[str] = ()) -> dict[str, int]:
-    """Buses that closed lines connect, with their distances in lines; ways end at `without`.
-
-    Parameters
-    ----------
-    start
-        First bus.
-    rows
-        Lines.
-    without
-        Buses at which a way ends.
-    """
+    """Buses that closed lines connect to `start`, with their distances in lines; ways end at `without`."""
     near: dict[str, list[str]] = defaultdict(list)
     for row in rows:
         if row.closed:
@@ -74,7 +52,7 @@ def reached(start: str, rows: Iterable[LineRow], without: Collection[str] = ()) 
 
 def fused_with(bus: str, rows: Iterable[LineRow]) -> dict[str, int]:
     """Buses that closed switches fuse with a bus."""
-    return reached(bus, (row for row in rows if row.r_ohm == row.x_ohm == 0.0))
+    return reached(bus, (row for row in rows if row.fuses))
 
 
 def as_rows(couplings: Iterable[Coupling]) -> list[LineRow]:
@@ -87,15 +65,7 @@ def as_rows(couplings: Iterable[Coupling]) -> list[LineRow]:
 def above_busbar(
     busbar: str, sources: Iterable[str], rows: list[LineRow], couplings: Iterable[Coupling]
 ) -> set[str]:
-    """Buses that are connected to the sources without passing the busbar.
-
-    Parameters
-    ----------
-    busbar, sources
-        The busbar, and the buses with a voltage source.
-    rows, couplings
-        Everything that joins buses.
-    """
+    """Buses that are connected to the sources without passing the busbar."""
     fused = fused_with(busbar, rows)
     everything = [*rows, *as_rows(couplings)]
     return {bus for source in sources for bus in reached(source, everything, without=fused)}
@@ -115,25 +85,12 @@ def line_row(
     *,
     series: Phasors,
     shunt: Floats,
-    changes: list[ConversionChange],
+    changes: Changes,
 ) -> LineRow:
-    """Row of a line with matrices.
+    """Row of a line with matrices: series impedances (k, k), ohm, and total shunt susceptances (k, k), S.
 
     Cyclically symmetric series impedances become sequence values. Charging that is equal in every phase and
-    goes to earth only becomes one number.
-
-    Parameters
-    ----------
-    name, ends
-        Name and buses of the line.
-    phases : (k,)
-        Phases of the line, ascending, 0 for a.
-    series : (k, k)
-        Series impedances, ohm.
-    shunt : (k, k)
-        Total shunt susceptances, S.
-    changes
-        Receives inexact conversions.
+    goes to earth only becomes one number. `phases` (k,) are ascending, 0 for a.
     """
     own, mutual = _means(series)
     row = LineRow(
@@ -141,7 +98,7 @@ def line_row(
         *ends,
         rounded((own - mutual).real),
         rounded((own - mutual).imag),
-        _NAMES[tuple(phases.tolist())],
+        phases=_NAMES[tuple(phases.tolist())],
         **charging_cells(name, phases, shunt, changes),
     )
     if len(phases) == 1:
@@ -149,7 +106,7 @@ def line_row(
     like_each_other = cyclic(series)
     if not like_each_other and not passive(series.real):
         effect = "its resistances generate power; taken as transposed"
-        changes.append(ConversionChange(f"line {name}", "impedance matrix", "approximated", effect))
+        changes.note(f"line {name}", "impedance matrix", "approximated", effect)
         like_each_other = True
     if like_each_other:
         zero = own + 2.0 * mutual
@@ -185,34 +142,20 @@ def _cells(symbol: str, unit: str, matrix: Floats, phases: Ints) -> dict[str, An
     return {name: rounded(value) for name, value in found.items()}
 
 
-def charging_cells(name: str, phases: Ints, shunt: Floats, changes: list[ConversionChange]) -> dict[str, Any]:
-    """Cells of a line's charging: one number, or a matrix beside its positive sequence.
-
-    Parameters
-    ----------
-    name, phases, shunt, changes
-        As in `line_row`.
-    """
+def charging_cells(name: str, phases: Ints, shunt: Floats, changes: Changes) -> dict[str, Any]:
+    """Cells of a line's charging: one number, or a matrix beside its positive sequence; as of `line_row`."""
     own, mutual = (part.real for part in _means(shunt))
     one = {"b_us": rounded(max(own - mutual, 0.0) * 1e6)}
     if len(phases) == 1 or (cyclic(shunt) and abs(mutual) <= CYCLIC * abs(own)):
         return one
     if not passive(shunt):
-        changes.append(
-            ConversionChange(f"line {name}", CHARGING, "approximated", "no capacitances; " + IN_EVERY_PHASE)
-        )
+        changes.note(f"line {name}", CHARGING, "approximated", "no capacitances; " + IN_EVERY_PHASE)
         return one
     return one | _cells("b", "us", 1e6 * shunt, phases)
 
 
 def by_sequence(one: float, zero: float) -> Floats:
-    """Susceptances of three equal phases; without a zero sequence the phases are not coupled.
-
-    Parameters
-    ----------
-    one, zero
-        Positive and zero sequence, S; NaN for an unknown zero sequence.
-    """
+    """Susceptances (3, 3) of equal phases from sequence values, S; not coupled if the zero one is NaN."""
     apart = zero if np.isfinite(zero) else one
     return np.asarray(one * np.eye(3) + (apart - one) / 3.0)
 
@@ -221,16 +164,8 @@ CHARGING: Final = "charging between phases"
 IN_EVERY_PHASE: Final = "the positive-sequence charging in every phase; exact where the voltages are balanced"
 
 
-def balanced_charging(lines: Sequence[LineRow], changes: list[ConversionChange]) -> list[LineRow]:
-    """Reduce charging to its positive sequence, if nothing else needs three phases.
-
-    Parameters
-    ----------
-    lines
-        Rows of a feeder on which all customers have three phases.
-    changes
-        Receives the omissions.
-    """
+def balanced_charging(lines: Sequence[LineRow], changes: Changes) -> list[LineRow]:
+    """Reduce charging to its positive sequence, if nothing needs three phases; all customers have them."""
     matrices = [shunt_us(cells_of(row)) for row in lines]
     if any(
         row.phases != "abc" or row.r_aa_ohm is not None or row.tap_a is not None for row in lines
@@ -247,50 +182,28 @@ def balanced_charging(lines: Sequence[LineRow], changes: list[ConversionChange])
 def capacitor(name: str, bus: str, siemens: float | Floats, phases: str = "abc") -> LineRow:
     """Capacitor as the charging of a line to nowhere, so short that its voltage is that of its bus.
 
-    Parameters
-    ----------
-    name, bus
-        Name and bus of the capacitor.
-    siemens : scalar or (k, k)
-        Susceptance per phase, S, or matrix of its phases.
-    phases
-        Connected phases.
+    `siemens` is the susceptance per phase, S, or the matrix (k, k) of its phases.
     """
     here = np.array(["abc".index(phase) for phase in sorted(phases)])
     shunt = siemens * np.eye(here.size) if isinstance(siemens, float) else siemens
     ohm = (1.0 + 1j) * 1e-7 / float(shunt.diagonal().max())
     series = np.diag(np.full(here.size, ohm, dtype=np.complex128))
-    return line_row(name, (bus, f"{bus} {name}"), here, series=series, shunt=shunt, changes=[])
+    return line_row(name, (bus, f"{bus} {name}"), here, series=series, shunt=shunt, changes=Changes())
 
 
 def open_end(row: LineRow, bus: str, volt: float) -> LineRow | None:
-    """Line that is open at one end only, as a line to nowhere with its charging; None if negligible.
+    """Line that is closed at `bus` only, as a line to nowhere with its charging; None if negligible.
 
-    Parameters
-    ----------
-    row
-        The line.
-    bus
-        Its closed end.
-    volt
-        Nominal voltage, V; below 1000 the charging is negligible.
+    Below a nominal voltage of 1000 V charging is negligible.
     """
-    if row.b_us == 0 or volt < 1000.0 or not (row.r_ohm or row.x_ohm):
+    if row.b_us == 0 or volt < 1000.0 or row.fuses:
         return None
     name = f"{row.line} open end"
     return replace(row, line=name, from_bus=bus, to_bus=f"{bus} {name}", closed=True)
 
 
 def turned(row: LineRow, nominal: Mapping[str, float]) -> LineRow:
-    """Line in the reverse direction; a tap t becomes 1/t, with the impedance on its other side.
-
-    Parameters
-    ----------
-    row
-        The line.
-    nominal
-        Nominal voltages of the buses, V; used only if they differ at the two ends.
-    """
+    """Line in the reverse direction; a tap t becomes 1/t, with the impedance on its other side."""
     away = replace(row, from_bus=row.to_bus, to_bus=row.from_bus)
     level = 1.0
     if row.to_volt is not None:
@@ -317,22 +230,14 @@ def turned(row: LineRow, nominal: Mapping[str, float]) -> LineRow:
         phases,
         series=series_of(row)[here] * side,
         shunt=1e-6 * shunt_of(row)[here] / side,
-        changes=[],
+        changes=Changes(),
     )
     scaled = replace(scaled, closed=row.closed, rating_a=away.rating_a, to_volt=away.to_volt)
     return with_taps(scaled, 1.0 / np.array(row.taps))
 
 
 def with_taps(row: LineRow, taps: Floats) -> LineRow:
-    """Line with a transformer at its first end: one ratio, or if they differ one for each phase.
-
-    Parameters
-    ----------
-    row
-        The line.
-    taps : (3,)
-        Ratios; only those of its phases count.
-    """
+    """Line with a transformer at its first end: one ratio, or if they differ one for each phase."""
     own = [rounded(float(tap)) for tap in taps]
     phases = phases_of(row)
     if len({own[phase] for phase in phases}) == 1:
@@ -347,21 +252,9 @@ def phases_of(row: LineRow) -> Ints:
 
 
 def merged(
-    lines: Sequence[LineRow], busbar: str, changes: list[ConversionChange], nominal: Mapping[str, float]
+    lines: Sequence[LineRow], busbar: str, changes: Changes, nominal: Mapping[str, float]
 ) -> list[LineRow]:
-    """Merge parallel lines to one, and open lines that switches short-circuit.
-
-    Parameters
-    ----------
-    lines
-        Rows of a feeder.
-    busbar
-        Its busbar.
-    changes
-        Receives the merged lines.
-    nominal
-        Nominal voltages of the buses, V.
-    """
+    """Merge parallel lines to one, and open lines that switches short-circuit; `changes` receives both."""
     above: dict[str, str] = {busbar: busbar}
 
     def fused(bus: str) -> str:
@@ -371,32 +264,24 @@ def merged(
 
     rows: list[LineRow] = []
     for row in lines:
-        solid = row.closed and row.r_ohm == row.x_ohm == 0.0
+        solid = row.closed and row.fuses
         one, other = fused(row.from_bus), fused(row.to_bus)
         if solid and one == other:
-            changes.append(
-                ConversionChange(
-                    f"switch {row.line}", "closed", "changed", "open; others join the same buses"
-                )
-            )
+            changes.note(f"switch {row.line}", "closed", "changed", "open; others join the same buses")
             row = replace(row, closed=False)  # noqa: PLW2901
         elif solid:
             above[other] = one
         rows.append(row)
     beside: dict[frozenset[str], list[int]] = defaultdict(list)
     for k, row in enumerate(rows):
-        if row.closed and (row.r_ohm or row.x_ohm):
+        if row.closed and not row.fuses:
             beside[frozenset((fused(row.from_bus), fused(row.to_bus)))].append(k)
     gone: set[int] = set()
     for ends, members in beside.items():
         if len(ends) == 1:
             for k in members:
                 rows[k] = replace(rows[k], closed=False)
-                changes.append(
-                    ConversionChange(
-                        f"line {rows[k].line}", "closed", "changed", "open; switches join its two ends"
-                    )
-                )
+                changes.note(f"line {rows[k].line}", "closed", "changed", "open; switches join its two ends")
         elif len(members) > 1:
             start = fused(rows[members[0]].from_bus)
             alike = [
@@ -407,7 +292,7 @@ def merged(
     return [row for k, row in enumerate(rows) if k not in gone]
 
 
-def _parallel(rows: list[LineRow], changes: list[ConversionChange]) -> LineRow:
+def _parallel(rows: list[LineRow], changes: Changes) -> LineRow:
     """Merge lines between the same buses."""
     names = " + ".join(row.line for row in rows)
     first = rows[0]
@@ -415,9 +300,7 @@ def _parallel(rows: list[LineRow], changes: list[ConversionChange]) -> LineRow:
     tapped = len({row.taps for row in rows}) > 1
     if not alike or any((row.in_phases and len(row.phases) > 1) or tapped for row in rows):
         return _side_by_side(rows, names, changes)
-    changes.append(
-        ConversionChange(f"lines {names}", WHOLE, "changed", f"in parallel; one line {first.line}")
-    )
+    changes.note(f"lines {names}", WHOLE, "changed", f"in parallel; one line {first.line}")
     positive = [complex(row.r_ohm, row.x_ohm) for row in rows]
     total = 1.0 / sum(1.0 / z for z in positive)
     limit = _shared(rows, [abs(total) / abs(z) for z in positive])
@@ -437,7 +320,7 @@ def _parallel(rows: list[LineRow], changes: list[ConversionChange]) -> LineRow:
     return replace(joined, r0_ohm=rounded(zero.real), x0_ohm=rounded(zero.imag))
 
 
-def _side_by_side(rows: list[LineRow], names: str, changes: list[ConversionChange]) -> LineRow:
+def _side_by_side(rows: list[LineRow], names: str, changes: Changes) -> LineRow:
     """Merge lines of any phases and matrices between the same buses: their admittances add up."""
     first = rows[0]
     each: list[Phasors] = []
@@ -452,14 +335,12 @@ def _side_by_side(rows: list[LineRow], names: str, changes: list[ConversionChang
         taps[own] = np.where(np.isnan(taps[own]), np.array(row.taps)[own], taps[own])
         if np.abs(taps[own] - np.array(row.taps)[own]).max() > CYCLIC:
             effect = f"that of {first.line} beside it; the current that their difference drives is left out"
-            changes.append(ConversionChange(f"line {row.line}", "tap", "approximated", effect))
+            changes.note(f"line {row.line}", "tap", "approximated", effect)
     admittance = np.sum(each, axis=0)
     phases = np.flatnonzero(admittance.diagonal())
     there = np.ix_(phases, phases)
     series = np.asarray(np.linalg.inv(admittance[there]))
-    changes.append(
-        ConversionChange(f"lines {names}", WHOLE, "changed", f"side by side; one line {first.line}")
-    )
+    changes.note(f"lines {names}", WHOLE, "changed", f"side by side; one line {first.line}")
     joined = line_row(
         first.line,
         (first.from_bus, first.to_bus),
@@ -476,7 +357,7 @@ def _side_by_side(rows: list[LineRow], names: str, changes: list[ConversionChang
     even = all(np.abs(part - np.diag(part.diagonal())).max() <= CYCLIC for part in parts)
     if limit is not None and not (even and np.ptp(limits) <= CYCLIC * limit):
         effect = f"{limit:g} A, the least of its conductors' in balanced currents"
-        changes.append(ConversionChange(f"lines {names}", "rating", "approximated", effect))
+        changes.note(f"lines {names}", "rating", "approximated", effect)
     joined = replace(joined, rating_a=limit, to_x=first.to_x, to_y=first.to_y, to_volt=first.to_volt)
     return with_taps(joined, taps)
 

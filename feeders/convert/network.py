@@ -7,23 +7,24 @@ the busbar by customers with their power.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Final, TypeVar
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 
 from feeders.convert.customers import (
     USUAL_POWER_FACTOR,
     Draw,
+    Fleet,
     base_kva,
     customers_of,
     idle_customers,
     is_even,
+    with_fleet,
     with_meters,
 )
 from feeders.convert.lines import (
-    Coupling,
     above_busbar,
     as_rows,
     balanced_charging,
@@ -32,63 +33,31 @@ from feeders.convert.lines import (
     reached,
     turned,
 )
-from feeders.convert.provenance import WHOLE, BusbarUnclear, ConversionChange
+from feeders.convert.provenance import WHOLE, BusbarUnclear, Changes, ConversionChange
 from feeders.convert.round_trip import SourceState
+from feeders.convert.source import SourceNetwork, named_bus
 from feeders.convert.transformers import EVERYTHING, Extent, levels_of, transformed
 from feeders.format.columns import SUSPICIONS
-from feeders.format.tables import FeederMeta, FeederTables, LineRow, LoadDefaults, validate
+from feeders.format.tables import FeederMeta, FeederTables, LineRow, LoadDefaults, MonitorDefaults, validate
 from feeders.format.validation import loops
 from gridsec.arrays import Phasors
 from gridsec.errors import FeederInvalid, GridsecError, Problem
 from gridsec.grid.droop import preset
 from gridsec.grid.three_phase import ROTATION
 
-__all__ = [
-    "BEYOND",
-    "UNFED",
-    "Converted",
-    "SourceNetwork",
-    "SuppliedArea",
-    "accepting",
-    "angles_of",
-    "below",
-    "below_source",
-    "busbar_of",
-    "chosen",
-    "feeder_of",
-    "finished",
-    "named_bus",
-    "one_busbar",
-    "opened_rows",
-]
-
-
-Busbar = TypeVar("Busbar")
-
 TURNED: Final = 1.0
 """Largest deviation of the angles between a busbar's phases from those of a feeder, degrees."""
 
 
-def chosen(
-    network: SourceNetwork, find: Callable[[], Busbar], opened: Sequence[str], droop: str | None
-) -> Busbar:
+def chosen(network: SourceNetwork, root: str | None, opened: Sequence[str], droop: str | None) -> str | None:
     """Busbar of the conversion; reports all other unknown choices together with an unknown busbar.
-
-    Parameters
-    ----------
-    network
-        The network.
-    find
-        Finds the busbar, or raises a GridsecError.
-    opened, droop
-        As in `feeder_of`.
 
     Raises
     ------
     FeederInvalid
         With all unknown names.
     GridsecError
-        As `find`, without further problems.
+        For the busbar, without further problems.
     """
     problems = _unknown(network.lines, opened)
     try:
@@ -97,7 +66,7 @@ def chosen(
     except FeederInvalid as error:
         problems += error.problems
     try:
-        busbar = find()
+        busbar = network.busbar(root)
     except GridsecError as error:
         if not problems:
             raise
@@ -107,48 +76,18 @@ def chosen(
     return busbar
 
 
-def opened_rows(
-    lines: Iterable[LineRow], opened: Sequence[str], changes: list[ConversionChange]
-) -> list[LineRow]:
-    """Open the requested lines.
-
-    Parameters
-    ----------
-    lines
-        Rows of lines.csv.
-    opened
-        Names of lines.
-    changes
-        Receives the opened lines.
-
-    Raises
-    ------
-    FeederInvalid
-        With every unknown line.
-    """
+def opened_rows(lines: Iterable[LineRow], opened: Sequence[str], changes: Changes) -> list[LineRow]:
+    """Open the requested lines; `FeederInvalid` names every unknown one."""
     rows = list(lines)
     if unknown := _unknown(rows, opened):
         raise FeederInvalid(unknown)
-    changes.extend(
-        ConversionChange(
-            f"line {line}", "closed", "changed", "open, as requested; the check shows the effect"
-        )
-        for line in opened
-    )
+    effect = "open, as requested; the check shows the effect"
+    changes.extend(ConversionChange(f"line {line}", "closed", "changed", effect) for line in opened)
     return [replace(row, closed=False) if row.line in opened else row for row in rows]
 
 
 def busbar_of(network: SourceNetwork, rows: list[LineRow], root: str | None) -> str:
-    """Requested bus, or the first bus with lines below the source.
-
-    Parameters
-    ----------
-    network
-        The network.
-    rows
-        Its lines, after opening.
-    root
-        Requested bus, or None.
+    """Requested bus, or the first bus with lines below the source; `rows` are the lines after opening.
 
     Raises
     ------
@@ -158,7 +97,7 @@ def busbar_of(network: SourceNetwork, rows: list[LineRow], root: str | None) -> 
         Without a request, if several buses are possible.
     """
     if root is not None:
-        return named_bus(network, root)
+        return named_bus(network.nominal, root)
     if len(network.sources) != 1:
         names = ", ".join(network.sources) or "none"
         raise BusbarUnclear(f"the busbar is not clear, voltage sources at: {names}; name it with root")
@@ -167,27 +106,6 @@ def busbar_of(network: SourceNetwork, rows: list[LineRow], root: str | None) -> 
         beyond = ", ".join(sorted(_beyond(network, way))) or "none"
         raise BusbarUnclear(f"the busbar is not clear, candidates: {beyond}; name it with root")
     return way[-1]
-
-
-def named_bus(network: SourceNetwork, root: str) -> str:
-    """Requested bus.
-
-    Parameters
-    ----------
-    network, root
-        The network, and the bus's name.
-
-    Raises
-    ------
-    GridsecError
-        For an unknown or ambiguous bus.
-    """
-    hits = [bus for bus in network.nominal if bus == root] or [
-        bus for bus in network.nominal if bus.lower() == root.lower()
-    ]
-    if len(hits) != 1:
-        raise GridsecError(f"bus {root!r} does not exist", code="unknown-name")
-    return hits[0]
 
 
 def _unknown(lines: Iterable[LineRow], opened: Sequence[str]) -> list[str]:
@@ -203,24 +121,11 @@ def below_source(network: SourceNetwork) -> str | None:
     return way[-1] if len(way) > 1 and _has_lines(way[-1], network.lines) else None
 
 
-def angles_of(volts: Phasors, busbar: str, changes: list[ConversionChange]) -> Phasors:
+def angles_of(volts: Phasors, busbar: str, changes: Changes) -> Phasors:
     """Busbar voltages with the angles of a feeder.
 
     The busbar meter reads magnitudes; simulations and monitors assume angles of 0, -120 and 120 degrees.
-
-    Parameters
-    ----------
-    volts : (3,)
-        Voltages of the source, V; NaN where a phase is absent.
-    busbar
-        The bus.
-    changes
-        Receives a row for other angles between phases.
-
-    Returns
-    -------
-    (3,)
-        The voltages, with other angles if necessary.
+    `volts` (3,) are those of the source, NaN where a phase is absent; `changes` receives other angles.
     """
     there = np.isfinite(volts)
     if not there.any():
@@ -231,7 +136,7 @@ def angles_of(volts: Phasors, busbar: str, changes: list[ConversionChange]) -> P
         return volts
     theirs, ours = (_degrees(each[there]) for each in (volts / first, of_feeder))
     effect = f"{ours} degrees, in the source {theirs}; the check shows the effect"
-    changes.append(ConversionChange(f"bus {busbar}", "angles between its phases", "approximated", effect))
+    changes.note(f"bus {busbar}", "angles between its phases", "approximated", effect)
     return np.asarray(np.abs(volts) * of_feeder)
 
 
@@ -269,164 +174,94 @@ BEYOND: Final = "supplied in the source, but not through the feeder: see the ele
 """Reasons for loads below the busbar that are not customers."""
 
 
-@dataclass(slots=True)
-class SourceNetwork:
-    """Network in SI, with the state by its own tool.
-
-    Attributes
-    ----------
-    tool
-        The source's tool and its version.
-    sources
-        Buses with a voltage source.
-    nominal
-        Nominal voltage of each bus, phase to neutral, V.
-    lines
-        Rows of lines.csv, in any direction.
-    draws, couplings
-        Loads, generators and transformers.
-    xy
-        Positions.
-    volts : (3,)
-        Complex voltages of the buses, V; NaN where a phase is absent. Loads of constant power.
-    as_found : (3,)
-        The same with the loads' dependence on the voltage; empty without one.
-    changes
-        Inexact conversions so far.
-    of_bus
-        Changes that count if their bus is in the feeder.
-    connected
-        Buses and labels of loads and generators that the reader itself converts to customers.
-    unsolved
-        Reason for missing voltages of the source's own power flow.
-    """
-
-    tool: str
-    sources: list[str]
-    nominal: dict[str, float]
-    lines: list[LineRow] = field(default_factory=list)
-    draws: list[Draw] = field(default_factory=list)
-    couplings: list[Coupling] = field(default_factory=list)
-    xy: dict[str, tuple[float, float]] = field(default_factory=dict)
-    volts: dict[str, Phasors] = field(default_factory=dict)
-    as_found: dict[str, Phasors] = field(default_factory=dict)
-    changes: list[ConversionChange] = field(default_factory=list)
-    of_bus: list[tuple[str, ConversionChange]] = field(default_factory=list)
-    connected: list[tuple[str, str]] = field(default_factory=list)
-    unsolved: str = ""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Converted:
-    """Feeder from another tool's network.
+    """Feeder from another tool's network."""
 
-    Attributes
-    ----------
-    tables
-        The feeder.
-    changes
-        Inexact conversions.
-    state
-        State by the source's tool at its own loads.
-    unchecked
-        Reason for a missing state.
-    """
-
-    tables: FeederTables
-    changes: tuple[ConversionChange, ...]
-    state: SourceState | None
-    unchecked: str = ""
+    tables: FeederTables  # The feeder
+    changes: tuple[ConversionChange, ...]  # Inexact conversions
+    state: SourceState | None  # State by the source's tool at its own loads
+    unchecked: str = ""  # Reason for a missing state
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SuppliedArea:
-    """Part of a network below a busbar.
+    """Part of a network below a busbar."""
 
-    Attributes
-    ----------
-    busbar
-        Bus of the busbar.
-    inside
-        The buses, nearest first, with their distances in lines.
-    lines
-        Rows of lines.csv, pointing away from the busbar.
-    draws
-        Loads and generators, and powers into transformers.
-    changes
-        Inexact conversions.
-    """
-
-    busbar: str
-    inside: dict[str, int]
-    lines: list[LineRow]
-    draws: list[Draw]
-    changes: list[ConversionChange]
+    busbar: str  # Bus of the busbar
+    inside: dict[str, int]  # The buses, nearest first, with their distances in lines
+    lines: list[LineRow]  # Rows of lines.csv, pointing away from the busbar
+    draws: list[Draw]  # Loads and generators, and powers into transformers
+    changes: Changes  # Inexact conversions
 
 
 def feeder_of(
     network: SourceNetwork,
     name: str,
     *,
+    title: str = "",
     root: str | None = None,
     opened: Sequence[str] = (),
     droop: str | None = None,
     extent: Extent = EVERYTHING,
+    fleet: Fleet | None = None,
+    max_attacked: int = 1,
 ) -> Converted:
     """Convert the part of a network below a bus to a feeder.
 
     Parameters
     ----------
-    network
-        The network.
-    name
-        Name of the feeder.
     root
-        Bus that becomes the metered busbar; None: the first with lines below the source.
+        Bus that becomes the metered busbar; None: that of `SourceNetwork.busbar`.
     opened
         Lines to open, so that the feeder is radial.
     droop
         Preset of the generators' inverters; None: by their size.
-    extent
-        Extent of the feeder.
+    fleet
+        Synthetic inverters to add.
+    max_attacked
+        `max_attacked` of the monitor.
 
     Raises
     ------
     FeederInvalid
         With every problem of the feeder.
+    GridsecError
+        For an unknown or ambiguous bus.
     """
-    busbar = chosen(network, lambda: None if root is None else named_bus(network, root), opened, droop)
+    busbar = chosen(network, root, opened, droop)
     part = below(network, busbar, opened, extent)
     volt = network.nominal[part.busbar]
-    rows, power = customers_of(part.draws, network.nominal, droop, part.changes)
-    idle, taken = idle_customers(part.draws, power)
-    rows, power = [*with_meters(rows), *idle], power | taken
+    own, power = network.customers(part.inside, droop, part.changes)
+    more, drawn = customers_of(part.draws, network.nominal, droop, part.changes, set(power))
+    rows = with_meters([*own, *more])
+    if fleet is not None:
+        rows = with_fleet(rows, fleet, part.changes)
+    idle, taken = idle_customers(part.draws, {row.customer for row in rows})
+    rows += idle
     lines = part.lines
     if all(row.phases == "abc" for row in rows):
         lines = balanced_charging(lines, part.changes)
     meta = FeederMeta(
         format=1,
         name=name,
-        title=name,
+        title=title or name,
         voltage_volt=round(volt, 6),
         base_kva=base_kva(volt, sum(row.load_kw for row in rows)),
         busbar=part.busbar,
         busbar_xy=network.xy.get(part.busbar),
         meshed=extent.meshed,
         load=LoadDefaults(power_factor=USUAL_POWER_FACTOR, power_factor_min=0.85),
+        monitor=MonitorDefaults(max_attacked=max_attacked),
     )
     tables = FeederTables(meta, tuple(lines), tuple(rows))
-    return finished(network, part, tables, power)
+    return finished(network, part, tables, power | drawn | taken)
 
 
 def below(
     network: SourceNetwork, root: str | None, opened: Sequence[str], extent: Extent = EVERYTHING
 ) -> SuppliedArea:
-    """Cut the part below a bus out of a network.
-
-    Parameters
-    ----------
-    network, root, opened, extent
-        As in `feeder_of`.
+    """Cut the part below a bus out of a network; arguments as of `feeder_of`.
 
     Raises
     ------
@@ -435,7 +270,7 @@ def below(
     GridsecError
         For an unknown or ambiguous bus.
     """
-    changes = list(network.changes)
+    changes = Changes(network.changes)
     rows = opened_rows(network.lines, opened, changes)
     busbar = busbar_of(network, rows, root)
     network, rows = transformed(network, rows, busbar, extent, changes)
@@ -444,7 +279,7 @@ def below(
     kept = _kept(network, rows, inside, changes)
     problems += levels_of(kept, network.nominal)
     if problems:
-        lines = merged(kept, busbar, [], network.nominal)
+        lines = merged(kept, busbar, Changes(), network.nominal)
         raise FeederInvalid([*problems, *(() if extent.meshed else loops(busbar, lines))])
     draws = [draw for draw in network.draws if draw.bus in inside]
     sums, summed = _behind(network, rows, inside, changes)
@@ -458,16 +293,7 @@ def below(
 def finished(
     network: SourceNetwork, part: SuppliedArea, tables: FeederTables, power: Mapping[str, complex]
 ) -> Converted:
-    """Assemble the result of a conversion.
-
-    Parameters
-    ----------
-    network, part
-        Source network, and its part below the busbar.
-    tables
-        The feeder.
-    power
-        Power of each customer in the source's power flow, kVA.
+    """Assemble the result of a conversion; `power` is that of each customer in the source, kVA.
 
     Raises
     ------
@@ -497,18 +323,11 @@ def finished(
     return Converted(accepted, changes, state)
 
 
-def accepting(tables: FeederTables, changes: list[ConversionChange], unchecked: str) -> FeederTables:
+def accepting(tables: FeederTables, changes: Changes, unchecked: str) -> FeederTables:
     """Accept values that are doubtful only for their unit: the source's tool knows its units.
 
-    Parameters
-    ----------
-    tables
-        A feeder.
-    changes
-        Receives every doubtful value.
-    unchecked
-        Reason for a missing power flow of the source; empty with one. Without one, the source itself may have
-        a wrong unit.
+    `changes` receives every doubtful value. `unchecked` is the reason for a missing power flow of the source,
+    empty with one; without one, the source itself may have a wrong unit.
 
     Raises
     ------
@@ -522,7 +341,7 @@ def accepting(tables: FeederTables, changes: list[ConversionChange], unchecked: 
         problems.append(Problem(problem.code, sentence))
         if found:
             doubts.add(doubt.partition('"')[0])
-            changes.append(ConversionChange("feeder", sentence, "accepted", "as in the source"))
+            changes.note("feeder", sentence, "accepted", "as in the source")
     if doubts and unchecked:
         raise FeederInvalid(
             [*problems, Problem("doubtful", f"{unchecked}; doubtful values cannot be confirmed")]
@@ -540,30 +359,24 @@ def _infeeds(
     fused = fused_with(busbar, rows)
     for source in network.sources:
         if source in inside and source != busbar:
-            problems.append(
-                Problem(
-                    "several-sources",
-                    f"bus {source!r} has another voltage source; expected the "
-                    f"busbar {busbar!r} as the only one",
-                )
-            )
+            expected = f"expected the busbar {busbar!r} as the only one"
+            text = f"bus {source!r} has another voltage source; {expected}"
+            problems.append(Problem("several-sources", text))
         elif source != busbar:
             above = reached(source, everything, without=fused)
             ways = [bus for bus in inside if bus not in fused and bus in above]
             if ways:
-                problems.append(
-                    Problem(
-                        "several-sources",
-                        f"{len(ways)} of the feeder's buses can be reached from the source {source!r} "
-                        f"not only through the busbar {busbar!r}, among them {', '.join(ways[:5])}: a mesh; "
-                        "open a line of it, or name another busbar with root",
-                    )
+                text = (
+                    f"{len(ways)} of the feeder's buses can be reached from the source {source!r} "
+                    f"not only through the busbar {busbar!r}, among them {', '.join(ways[:5])}: a mesh; "
+                    "open a line of it, or name another busbar with root"
                 )
+                problems.append(Problem("several-sources", text))
     return problems
 
 
 def _kept(
-    network: SourceNetwork, rows: list[LineRow], inside: Mapping[str, int], changes: list[ConversionChange]
+    network: SourceNetwork, rows: list[LineRow], inside: Mapping[str, int], changes: Changes
 ) -> list[LineRow]:
     """Lines of the feeder, each pointing away from the busbar, with positions."""
     kept = []
@@ -575,21 +388,12 @@ def _kept(
             place = network.xy.get(away.to_bus)
             kept.append(replace(away, to_x=place[0], to_y=place[1]) if place else away)
         elif a or b:
-            changes.append(
-                ConversionChange(
-                    f"line {row.line}", WHOLE, "left out", "open, towards buses that the busbar does not feed"
-                )
-            )
+            effect = "open, towards buses that the busbar does not feed"
+            changes.note(f"line {row.line}", WHOLE, "left out", effect)
     outside = len(network.nominal.keys() - inside.keys())
     if outside:
-        changes.append(
-            ConversionChange(
-                _buses(outside),
-                WHOLE,
-                "left out",
-                "above the busbar, behind a transformer or without supply",
-            )
-        )
+        effect = "above the busbar, behind a transformer or without supply"
+        changes.note(_buses(outside), WHOLE, "left out", effect)
     return kept
 
 
@@ -607,7 +411,7 @@ def _buses(count: int) -> str:
 
 
 def _behind(
-    network: SourceNetwork, rows: list[LineRow], inside: Mapping[str, int], changes: list[ConversionChange]
+    network: SourceNetwork, rows: list[LineRow], inside: Mapping[str, int], changes: Changes
 ) -> tuple[list[Draw], set[str]]:
     """Couplings below the busbar as powers into them, and the buses behind them."""
     everything = [*rows, *as_rows(network.couplings)]
@@ -628,7 +432,7 @@ def _behind(
         }
         if not np.isfinite(np.array([each.power_kva[k] for k in ends])).all():
             effect = f"{_buses(len(far))}; the power into it is not known"
-            changes.append(ConversionChange(each.name, "load side", "left out", effect))
+            changes.note(each.name, "load side", "left out", effect)
             continue
         summed |= far
         for k in ends:
@@ -637,13 +441,7 @@ def _behind(
             draws.append(Draw(name, each.buses[k], power, even=is_even(power)))
         total = sum((each.power_kva[k].sum() for k in ends), start=0j)
         what = f"{_buses(len(far))} became a customer with" if far else "in a loop; customers with"
-        changes.append(
-            ConversionChange(
-                each.name,
-                "load side",
-                "changed",
-                f"{what} the power into it, "
-                f"{total.real:.4g} kW and {total.imag:.4g} kvar; exact at these loads only",
-            )
-        )
+        effect = f"{total.real:.4g} kW and {total.imag:.4g} kvar; exact at these loads only"
+        effect = f"{what} the power into it, {effect}"
+        changes.note(each.name, "load side", "changed", effect)
     return draws, summed

@@ -16,44 +16,15 @@ from typing import Any, Final
 import numpy as np
 
 from feeders.convert.customers import Draw, as_it_stands, in_star, rounded
-from feeders.convert.lines import ALL, by_sequence, capacitor, charging_cells, open_end
-from feeders.convert.network import SourceNetwork
-from feeders.convert.provenance import WHOLE, ConversionChange
+from feeders.convert.lines import ALL, by_sequence, charging_cells
+from feeders.convert.provenance import ConversionChange
+from feeders.convert.source import IN_STAR, MEASURE, OFF, SourceNetwork
 from feeders.convert.transformers import TwoPort, coupling_of
 from feeders.format.tables import LineRow
 from feeders.format.validation import same_level
 from gridsec.arrays import Phasors
 from gridsec.errors import FeederInvalid, Problem
-
-__all__ = [
-    "BASE_MVA",
-    "CARRIED",
-    "COLUMNS",
-    "CONNECTED",
-    "CONNECTIONS",
-    "CURVES",
-    "DIRECT",
-    "FIXED",
-    "MEASURE",
-    "MONEY",
-    "NOTED",
-    "SHUNTS",
-    "SIDES",
-    "SWITCH_RX",
-    "TURN",
-    "UNLIMITED_KA",
-    "between_phases",
-    "flow_into",
-    "ids",
-    "network_of",
-    "number",
-    "phase_powers",
-    "problems_of",
-    "solve",
-    "unbalanced",
-    "with_truths",
-]
-
+from gridsec.grid.three_phase import ROTATION
 
 # Tables that are carried over, or reported one by one; every row of another table in the feeder is reported.
 CARRIED: Final = {
@@ -108,16 +79,9 @@ TRUTHS: Final = ("in_service", "closed")
 
 
 def ids(table: Any, noun: str, taken: Iterable[str] = ()) -> dict[int, str]:
-    """Id of each row: the source's name if unique, otherwise with its index.
+    """Id of each row: the source's name if unique, otherwise the name or noun with its index.
 
-    Parameters
-    ----------
-    table
-        A table of a net.
-    noun
-        Noun for a row without a name.
-    taken
-        Names in use elsewhere.
+    `taken` are names in use elsewhere.
     """
     given = {int(i): _clean(name) for i, name in zip(table.index, table["name"], strict=True)}
     count = Counter([*given.values(), *taken])
@@ -137,13 +101,7 @@ def _clean(name: object) -> str:
 
 
 def problems_of(net: Any) -> list[Problem]:
-    """All problems of a net's tables.
-
-    Parameters
-    ----------
-    net
-        Content of a file.
-    """
+    """All problems of a net's tables."""
     missing = [
         Problem("missing", f"the table {table!r} is missing")
         for table in COLUMNS
@@ -196,13 +154,7 @@ def _numbers(net: Any) -> Iterator[Problem]:
 
 
 def with_truths(net: Any) -> Any:
-    """Convert columns of 0 and 1 to truth values, as pandapower itself does.
-
-    Parameters
-    ----------
-    net
-        A pandapower net; not changed.
-    """
+    """Net with truth values in place of 0 and 1, as pandapower itself reads them; the net is not changed."""
     numeric = [
         (table, column)
         for table, column in _truths(net)
@@ -238,8 +190,6 @@ CONNECTIONS: Final = ("wye", "delta")
 BASE_MVA: Final = 0.1
 """Base power of three-phase power flows, MVA: pandapower ends them at a mismatch of 3e-8 pu of it."""
 
-TURN: Final = np.exp(-2j * np.pi / 3.0 * np.arange(3))
-
 
 def unbalanced(net: Any) -> bool:
     """True for a net with loads or generators of single phases."""
@@ -251,14 +201,7 @@ def unbalanced(net: Any) -> bool:
 def solve(net: Any, buses: dict[int, str], network: SourceNetwork) -> Any:
     """Run the net's own power flow; the solved copy, or None with the reason in the network.
 
-    Parameters
-    ----------
-    net
-        The net; not changed.
-    buses
-        Ids of its buses.
-    network
-        Receives the voltages.
+    The network receives the voltages; `buses` are the ids of its buses.
     """
     import pandapower
 
@@ -309,7 +252,7 @@ def _named_connections(solved: Any, network: SourceNetwork) -> None:
         if others.any():
             solved[table].loc[others, "type"] = "wye"
             effect = "in star; pandapower's own three-phase power flow ignores other types"
-            network.changes.append(ConversionChange(f"{others.sum()} {table}(s)", "type", "changed", effect))
+            network.changes.note(f"{others.sum()} {table}(s)", "type", "changed", effect)
 
 
 def _volts(net: Any, buses: dict[int, str]) -> dict[str, Phasors]:
@@ -322,7 +265,7 @@ def _volts(net: Any, buses: dict[int, str]) -> dict[str, Phasors]:
     else:
         found = net.res_bus.loc[net.bus.index]
         one = found.vm_pu.to_numpy() * np.exp(1j * np.deg2rad(found.va_degree.to_numpy()))
-        v = base * one[:, None] * TURN
+        v = base * one[:, None] * ROTATION
     return {buses[int(i)]: row for i, row in zip(net.bus.index, v, strict=True)}
 
 
@@ -340,14 +283,7 @@ def _flow(solved: Any, table: str, index: int, side: str) -> Phasors:
 def flow_into(solved: Any, table: str, index: int, side: str) -> Phasors:
     """Power into an element, by phase, kVA; NaN if unknown.
 
-    Parameters
-    ----------
-    solved
-        The solved net, or None.
-    table, index
-        The element.
-    side
-        Its end, as in the names of result columns; empty for a single end.
+    `solved` is the solved net or None; `side` is the end, as in result columns, empty for a single end.
     """
     unknown: Phasors = np.full(3, np.nan, dtype=np.complex128)
     if solved is None:
@@ -366,18 +302,10 @@ def between_phases(net: Any, row: Any) -> bool:
 def phase_powers(
     net: Any, row: Any, label: str, volts: Phasors | None
 ) -> tuple[Phasors, list[ConversionChange]]:
-    """Powers of a load from each phase, or of a generator into it, kVA, and approximations.
+    """Powers of a load from each phase, or of a generator into it, (3,), kVA, and approximations.
 
-    Parameters
-    ----------
-    net
-        Its net.
-    row
-        Its row; one of all three phases has a third in each.
-    label
-        Noun and name for messages.
-    volts : (3,)
-        Voltages at its bus by pandapower's power flow, V; None without one.
+    A row of all three phases has a third in each. `volts` (3,) are those at its bus by pandapower's power
+    flow, V; None without one.
     """
     scale = 1e3 * float(row.scaling) * float(row.in_service)
     if "p_mw" in row:
@@ -387,17 +315,14 @@ def phase_powers(
     power: Phasors = scale * np.array(given, dtype=np.complex128)
     if not between_phases(net, row):
         return power, []
-    effect = "in star, with its phases' powers of the source's power flow; exact at these loads only"
     known = volts is not None and bool(np.isfinite(volts).all())
-    return in_star(power, volts if known and volts is not None else TURN), [
-        ConversionChange(label, "delta", "approximated", effect)
-    ]
+    change = ConversionChange(label, "delta", "approximated", IN_STAR)
+    return in_star(power, volts if known and volts is not None else ROTATION), [change]
 
 
 FIXED: Final = {"gen": -1.0, "storage": 1.0, "motor": 1.0, "ward": 1.0, "xward": 1.0}
 """Tables of elements that become customers with the source's power, and the sign of their results."""
 
-MEASURE: Final = "every customer has a meter of the feeder's own kind instead"
 MONEY: Final = "prices change no voltage"
 DIRECT: Final = "direct current; left out with its converters"
 NOTED: Final = {
@@ -427,13 +352,8 @@ SHUNTS: Final = ("gf_pu", "bf_pu", "gt_pu", "bt_pu")
 SIDES: Final = {"trafo": ("hv", "lv"), "trafo3w": ("hv", "mv", "lv")}
 
 
-def network_of(net: Any) -> SourceNetwork:
-    """Convert a net to a network; `convert.from_pandapower` converts its loads and static generators.
-
-    Parameters
-    ----------
-    net
-        A pandapower net; not changed.
+def read_net(net: Any, network: SourceNetwork) -> None:
+    """Fill a network from a net, without loads and static generators; the net is not changed.
 
     Raises
     ------
@@ -444,20 +364,16 @@ def network_of(net: Any) -> SourceNetwork:
     if problems:
         raise FeederInvalid(problems)
     buses = ids(net.bus, "bus")
-    nominal = {buses[int(i)]: float(kv) * 1000.0 / math.sqrt(3.0) for i, kv in net.bus.vn_kv.items()}
     dead = _dead(net)
     feeds = net.ext_grid.bus[net.ext_grid.in_service.astype(bool) & ~net.ext_grid.bus.isin(dead)]
-    network = SourceNetwork(
-        f"pandapower {version('pandapower')}",
-        list(dict.fromkeys(buses[int(bus)] for bus in feeds)),
-        nominal,
-    )
+    network.tool = f"pandapower {version('pandapower')}"
+    network.sources = list(dict.fromkeys(buses[int(bus)] for bus in feeds))
+    network.nominal = {buses[int(i)]: float(kv) * 1000.0 / math.sqrt(3.0) for i, kv in net.bus.vn_kv.items()}
     network.xy = {buses[int(i)]: place for i in net.bus.index if (place := _place(net, int(i))) is not None}
-    off = "out of service in the source"
-    network.changes.extend(
-        ConversionChange(f"bus {buses[bus]}", WHOLE, "left out", off) for bus in sorted(dead)
-    )
-    network.lines = [*_line_rows(net, buses, network), *_switch_rows(net, buses, network)]
+    for bus in sorted(dead):
+        network.leave_out(f"bus {buses[bus]}", "out of service in the source")
+    _lines(net, buses, network)
+    _switches(net, buses, network)
     _impedances(net, buses, network)
     solved = solve(net, buses, network)
     _transformers(net, solved, buses, network)
@@ -465,7 +381,6 @@ def network_of(net: Any) -> SourceNetwork:
     _shunts(net, buses, network)
     _rest(net, buses, network)
     _connections(net, buses, network)
-    return network
 
 
 def _dead(net: Any) -> set[int]:
@@ -487,7 +402,7 @@ def _place(net: Any, bus: int) -> tuple[float, float] | None:
 # --- lines and switches -------------------------------------------------------------------------
 
 
-def _line_rows(net: Any, buses: dict[int, str], network: SourceNetwork) -> Iterator[LineRow]:
+def _lines(net: Any, buses: dict[int, str], network: SourceNetwork) -> None:
     names = ids(net.line, "line")
     opened = _opened(net, "l")
     dead = _dead(net)
@@ -501,7 +416,9 @@ def _line_rows(net: Any, buses: dict[int, str], network: SourceNetwork) -> Itera
         ]
         on = [bus for bus in ends if (i, bus) not in opened and bus not in dead and row["in_service"]]
         closed = len(on) == 2
-        _side_effects(row, f"line {names[i]}", buses[ends[0]], closed, network)
+        if row["g_us_per_km"] > 0 and closed:
+            effect = f"{row['g_us_per_km'] * length * parallel:.3g} microsiemens"
+            network.note_at(buses[ends[0]], f"line {names[i]}", "shunt conductance", "left out", effect)
         made = LineRow(
             line=names[i],
             from_bus=buses[ends[0]],
@@ -514,10 +431,7 @@ def _line_rows(net: Any, buses: dict[int, str], network: SourceNetwork) -> Itera
             closed=closed,
             rating_a=rounded(limit * 1000.0) if 0.0 < limit < UNLIMITED_KA else None,
         )
-        yield made
-        stub = open_end(made, buses[on[0]], network.nominal[buses[on[0]]]) if len(on) == 1 else None
-        if stub is not None:
-            yield stub
+        network.add_line(made, [buses[bus] for bus in on])
 
 
 def _opened(net: Any, kind: str) -> set[tuple[int, int]]:
@@ -526,20 +440,12 @@ def _opened(net: Any, kind: str) -> set[tuple[int, int]]:
     return {(int(element), int(bus)) for element, bus in zip(switches.element, switches.bus, strict=True)}
 
 
-def _side_effects(row: dict[str, Any], label: str, bus: str, closed: bool, network: SourceNetwork) -> None:
-    """Report properties that a row of lines.csv lacks."""
-    length, parallel = float(row["length_km"]), float(row["parallel"])
-    if row["g_us_per_km"] > 0 and closed:
-        effect = f"{row['g_us_per_km'] * length * parallel:.3g} microsiemens"
-        network.of_bus.append((bus, ConversionChange(label, "shunt conductance", "left out", effect)))
-
-
 def _zero_sequence(row: dict[str, Any], column: str, factor: float) -> float | None:
     value = float(row.get(column, math.nan))
     return rounded(value * factor) if math.isfinite(value) else None
 
 
-def _switch_rows(net: Any, buses: dict[int, str], network: SourceNetwork) -> Iterator[LineRow]:
+def _switches(net: Any, buses: dict[int, str], network: SourceNetwork) -> None:
     names, dead = _switch_names(net), _dead(net)
     for i in map(int, net.switch.index):
         row = net.switch.loc[i]
@@ -552,9 +458,8 @@ def _switch_rows(net: Any, buses: dict[int, str], network: SourceNetwork) -> Ite
             closed = bool(row.closed) and dead.isdisjoint(ends)
             if ohm and closed and unbalanced(net):
                 effect = "as in the table; pandapower's own three-phase power flow takes a third of it"
-                change = ConversionChange(f"switch {names[i]}", "impedance", "changed", effect)
-                network.of_bus.append((buses[ends[0]], change))
-            yield replace(made, r0_ohm=zero[0], x0_ohm=zero[1], closed=closed)
+                network.note_at(buses[ends[0]], f"switch {names[i]}", "impedance", "changed", effect)
+            network.lines.append(replace(made, r0_ohm=zero[0], x0_ohm=zero[1], closed=closed))
 
 
 def _switch_names(net: Any) -> dict[int, str]:
@@ -575,8 +480,7 @@ def _impedances(net: Any, buses: dict[int, str], network: SourceNetwork) -> None
         plain = (r, x) == back and min(r, x) >= 0 and not any(row.get(name) for name in SHUNTS)
         if not (plain and same_level(network.nominal[a], network.nominal[b])):
             effect = "asymmetric, or with shunts; has no place in a feeder"
-            change = ConversionChange(f"impedance {names[i]}", WHOLE, "left out", effect)
-            network.of_bus.extend((bus, change) for bus in (a, b))
+            network.leave_out(f"impedance {names[i]}", effect, a, b)
             continue
         ohm = float(net.bus.at[ends[0], "vn_kv"]) ** 2 / float(row["sn_mva"])
         r, x, r0, x0 = (ohm * value for value in (r, x, *_series(row, "ft0")))
@@ -605,9 +509,7 @@ def _transformers(net: Any, solved: Any, buses: dict[int, str], network: SourceN
             ends = [(side, bus) for side, bus in ends if (int(i), bus) not in opened and bus not in dead]
             label = f"{'transformer' if table == 'trafo' else 'three-winding transformer'} {names[int(i)]}"
             if not row.in_service or len(ends) < 2:
-                network.changes.append(
-                    ConversionChange(label, WHOLE, "left out", "switched off in the source")
-                )
+                network.leave_out(label, OFF)
                 continue
             joined = tuple(buses[bus] for _, bus in ends)
             flows = tuple(flow_into(solved, table, int(i), side) for side, _ in ends)
@@ -644,13 +546,11 @@ def _two_ports(net: Any) -> dict[int, TwoPort]:
         found = [_alone(bench, loaded=loaded) for loaded in (False, True)]
     except Exception:  # noqa: BLE001  # external solvers may raise anything
         return {}
-    return {
-        int(i): TwoPort.measured(idle[:2], loaded) for i, idle, loaded in zip(own.index, *found, strict=True)
-    }
+    return TwoPort.measured(own.index, *found)
 
 
-def _alone(bench: Any, *, loaded: bool) -> list[tuple[complex, complex, complex]]:
-    """Voltages at both ends of each transformer, V, and the current out of it, A."""
+def _alone(bench: Any, *, loaded: bool) -> tuple[Phasors, Phasors]:
+    """Voltages at both ends of each transformer, (n, 2), V, and the current out of it, (n,), A."""
     import pandapower
 
     bench.shunt["in_service"] = loaded
@@ -661,8 +561,7 @@ def _alone(bench: Any, *, loaded: bool) -> list[tuple[complex, complex, complex]
     angle = np.deg2rad(bench.res_bus.va_degree.to_numpy())
     v = (rated * bench.res_bus.vm_pu.to_numpy() * np.exp(1j * angle)).reshape(-1, 2)
     power = 1e6 * (bench.res_trafo.p_lv_mw + 1j * bench.res_trafo.q_lv_mvar).to_numpy()
-    current = -np.conj(power / 3.0 / v[:, 1])
-    return [(complex(a), complex(b), complex(i)) for (a, b), i in zip(v, current, strict=True)]
+    return v, -np.conj(power / 3.0 / v[:, 1])
 
 
 def _fixed(net: Any, solved: Any, buses: dict[int, str], network: SourceNetwork) -> None:
@@ -676,12 +575,12 @@ def _fixed(net: Any, solved: Any, buses: dict[int, str], network: SourceNetwork)
                 effect = (
                     "its power is not known; the check shows the effect" if solved is not None else "unknown"
                 )
-                network.of_bus.append((bus, ConversionChange(label, WHOLE, "left out", effect)))
+                network.leave_out(label, effect, bus)
                 network.connected.append((bus, label))
                 continue
             plant = table == "gen" and power.real.sum() < 0
             network.draws.append(Draw(label, bus, power, rating_kva=0.0 if plant else None, noun="customer"))
-            network.of_bus.append((bus, ConversionChange(label, "control", "changed", as_it_stands(power))))
+            network.note_at(bus, label, "control", "changed", as_it_stands(power))
     for table in ("asymmetric_sgen", "sgen"):
         names = ids(net[table], table)
         for i, row in net[table].iterrows():
@@ -714,27 +613,17 @@ def _shunts(net: Any, buses: dict[int, str], network: SourceNetwork) -> None:
         row = net.shunt.loc[i]
         bus, label = buses[int(row.bus)], f"shunt {names[i]}"
         if not row.in_service:
-            network.of_bus.append(
-                (bus, ConversionChange(label, WHOLE, "left out", "switched off in the source"))
-            )
+            network.leave_out(label, OFF, bus)
             continue
         p, q = _at_its_step(net, row)
         if p == q == 0.0:
-            network.of_bus.append(
-                (bus, ConversionChange(label, WHOLE, "left out", "draws nothing at its step"))
-            )
+            network.leave_out(label, "draws nothing at its step", bus)
         if p != 0:
-            network.of_bus.append(
-                (bus, ConversionChange(label, "conductance", "left out", f"{1e3 * p:.4g} kW"))
-            )
+            network.note_at(bus, label, "conductance", "left out", f"{1e3 * p:.4g} kW")
         if q > 0:
-            network.of_bus.append(
-                (bus, ConversionChange(label, "inductance", "left out", f"{1e3 * q:.4g} kvar"))
-            )
+            network.note_at(bus, label, "inductance", "left out", f"{1e3 * q:.4g} kvar")
         elif q < 0:
-            network.lines.append(capacitor(label, bus, -q / float(row.vn_kv) ** 2))
-            effect = f"{-1e3 * q:.4g} kvar as the charging of a line to nowhere"
-            network.of_bus.append((bus, ConversionChange(label, "connection", "changed", effect)))
+            network.add_capacitor(label, bus, -q / float(row.vn_kv) ** 2, -1e3 * q)
 
 
 def _at_its_step(net: Any, row: Any) -> tuple[float, float]:
@@ -750,8 +639,7 @@ def _at_its_step(net: Any, row: Any) -> tuple[float, float]:
 def _rest(net: Any, buses: dict[int, str], network: SourceNetwork) -> None:
     """Report every other table with rows: the format has no place for it."""
     for i, row in net.ext_grid[~net.ext_grid.in_service.astype(bool)].iterrows():
-        off = ConversionChange(f"ext_grid {i}", WHOLE, "left out", "switched off in the source")
-        network.of_bus.append((buses[int(row.bus)], off))
+        network.leave_out(f"ext_grid {i}", OFF, buses[int(row.bus)])
     for table in sorted(net.keys()):
         content = net[table]
         if table in CARRIED or not hasattr(content, "columns") or table.startswith(("res_", "_")):
@@ -761,9 +649,9 @@ def _rest(net: Any, buses: dict[int, str], network: SourceNetwork) -> None:
             effect = NOTED.get(table, "has no place in a feeder")
             if len(content) and not any(part in table for part in CURVES):
                 label = f"table {table}, {len(content)} row{'s' if len(content) > 1 else ''}"
-                network.changes.append(ConversionChange(label, WHOLE, "left out", effect))
+                network.leave_out(label, effect)
             continue
         for i, row in content.iterrows():
             known = [buses[int(row[end])] for end in ends if row[end] in buses]
-            change = ConversionChange(f"{table} {i}", WHOLE, "left out", "has no place in a feeder")
-            network.of_bus.extend((bus, change) for bus in known)
+            for bus in known:
+                network.leave_out(f"{table} {i}", "has no place in a feeder", bus)

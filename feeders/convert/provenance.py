@@ -19,32 +19,6 @@ from feeders.format.tables import FeederTables
 from feeders.model.equipment import folder_of
 from gridsec.errors import GridsecError
 
-__all__ = [
-    "ASSUMED",
-    "CHANGES_FILE",
-    "COLUMNS",
-    "LICENCES",
-    "NAMED",
-    "ODBL",
-    "OWN_FILE",
-    "PANDAPOWER",
-    "RANDOM",
-    "SOURCE_FILE",
-    "WHOLE",
-    "BusbarUnclear",
-    "ConversionChange",
-    "Done",
-    "Origin",
-    "SourceUnreadable",
-    "changes_csv",
-    "feeder_source",
-    "origin",
-    "profiles_source",
-    "sentences",
-    "versioned",
-]
-
-
 CHANGES_FILE: Final = "conversion.csv"
 COLUMNS: Final = ("element", "property", "done", "effect")
 WHOLE: Final = "all of it"
@@ -70,34 +44,24 @@ class SourceUnreadable(GridsecError):
 
 @dataclass(frozen=True, slots=True)
 class ConversionChange:
-    """Element of the source that is not, or not exactly, in the feeder.
+    """Element of the source that is not, or not exactly, in the feeder."""
 
-    Attributes
-    ----------
-    element
-        Kind and name.
-    prop
-        Property of the element; WHOLE for all of it.
-    done
-        Kind of the change.
-    effect
-        Replacement in the feeder, and its effect on the voltages.
-    """
+    element: str  # Kind and name
+    prop: str  # Property of the element; WHOLE for all of it
+    done: Done  # Kind of the change
+    effect: str  # Replacement in the feeder, and its effect on the voltages
 
-    element: str
-    prop: str
-    done: Done
-    effect: str
+
+class Changes(list[ConversionChange]):
+    """Changes of a conversion in the order of their detection."""
+
+    def note(self, element: str, prop: str, done: Done, effect: str) -> None:
+        """Add a change; arguments as of `ConversionChange`."""
+        self.append(ConversionChange(element, prop, done, effect))
 
 
 def sentences(changes: Iterable[ConversionChange]) -> tuple[str, ...]:
-    """Changes as sentences, with equal changes of several elements together.
-
-    Parameters
-    ----------
-    changes
-        Changes in the order of the sentences.
-    """
+    """Changes as sentences, with equal changes of several elements together."""
     fates: dict[tuple[str, str, str], list[str]] = {}
     for change in changes:
         fates.setdefault((change.done, change.prop, change.effect), []).append(change.element)
@@ -211,22 +175,8 @@ def feeder_source(
 ) -> str:
     """Content of the SOURCE.md of a converted feeder.
 
-    Parameters
-    ----------
-    tables
-        The feeder.
-    about
-        One sentence on the network.
-    origin
-        The source, as in `convert`.
-    package
-        Package with the data, or that reads the file, and its version.
-    command
-        Command line of the conversion.
-    notes
-        Omissions, additions and changes.
-    check
-        Comparison of the AC power flow with the source's.
+    `package` has the data, or reads the file; `notes` are omissions, additions and changes; `check` compares
+    the AC power flow with the source's.
     """
     licence = LICENCES.get(origin.partition(":")[0], OWN_FILE)
     return f"""# {tables.meta.title}
@@ -254,15 +204,7 @@ def feeder_source(
 
 
 def profiles_source(stretches: Iterable[tuple[str, date, int]], loads: int, generators: int) -> str:
-    """Content of the SOURCE.md of the profile library.
-
-    Parameters
-    ----------
-    stretches
-        Name, first day and number of days of each file.
-    loads, generators
-        Numbers of profiles.
-    """
+    """Content of the SOURCE.md of the profile library; `stretches` are file, first day and days."""
     table = "\n".join(f"| `{file}` | {first:%Y-%m-%d} | {days} |" for file, first, days in stretches)
     return f"""# Load and generation profiles
 
@@ -290,35 +232,21 @@ seconds from the first sample, which is at 00:00 local time.
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Origin:
-    """Origin of a converted feeder.
+    """Origin of a converted feeder."""
 
-    Attributes
-    ----------
-    source
-        The source, with the package that has or reads it; empty if unknown.
-    check
-        Comparison of the feeder's AC power flow with the source's, or the reason for a missing one; empty if
-        unknown.
-    changes
-        Omissions, approximations, additions and changes; one row each, as in conversion.csv.
-    about, command
-        Description of the network, and the command line of the conversion; empty if unknown.
-    """
-
-    source: str
+    source: str  # The source, with the package that has or reads it; empty if unknown
+    # Comparison of the feeder's AC power flow with the source's, or the reason for a missing one; empty if
+    # unknown
     check: str
+    # Omissions, approximations, additions and changes; one row each, as in conversion.csv
     changes: pd.DataFrame
+    # Description of the network, and the command line of the conversion; empty if unknown
     about: str = ""
     command: str = ""
 
 
 def origin(path_or_name: Path | str) -> Origin | None:
-    """Origin of a feeder; None if it was not converted.
-
-    Parameters
-    ----------
-    path_or_name
-        Its folder, or the name of a bundled feeder.
+    """Origin of a feeder, given by its folder or as a bundled feeder; None if it was not converted.
 
     Raises
     ------

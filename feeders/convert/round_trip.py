@@ -31,57 +31,28 @@ UNIFORM: Final = 1e-8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SourceState:
-    """Power flow by the source's tool at the source's own loads.
+    """Power flow by the source's tool at the source's own loads."""
 
-    Attributes
-    ----------
-    tool
-        Name and version.
-    power_kva
-        Net import P + jQ of each customer, kVA; 0 for the others.
-    busbar_volt : (3,)
-        Voltages of the busbar, phase to neutral, V; NaN where a phase is absent.
-    volts
-        Voltage magnitudes (3,) of each bus, V, all loads of constant power; NaN where a phase is absent.
-    as_found
-        The same with the loads' dependence on the voltage; empty without one.
-    """
-
-    tool: str
-    power_kva: Mapping[str, complex]
-    busbar_volt: Phasors
+    tool: str  # Name and version
+    power_kva: Mapping[str, complex]  # Net import P + jQ of each customer, kVA; 0 for the others
+    busbar_volt: Phasors  # (3,), voltages of the busbar, phase to neutral, V; NaN where a phase is absent
+    # Voltage magnitudes (3,) of each bus, V, all loads of constant power; NaN where a phase is absent
     volts: Mapping[str, Floats]
-    as_found: Mapping[str, Floats]
+    as_found: Mapping[str, Floats]  # The same with the loads' dependence on the voltage; empty without one
 
 
 @dataclass(frozen=True, slots=True)
 class SourceCheck:
-    """Differences between a feeder's AC voltages and those of its source.
+    """Differences between a feeder's AC voltages and those of its source."""
 
-    Attributes
-    ----------
-    tool
-        The source's tool and its version.
-    buses
-        Number of compared buses.
-    three_phase
-        True for a comparison phase by phase.
-    largest_pu
-        Largest difference of a voltage's magnitude, all loads of constant power, pu.
-    at
-        Bus of the largest difference.
-    as_found_pu
-        Largest difference from the source with its loads' dependence on the voltage, pu; None without one.
-    unmatched
-        Buses at which, in at least one phase, only one of the two has a voltage.
-    """
-
-    tool: str
-    buses: int
-    three_phase: bool
-    largest_pu: float
-    at: str
+    tool: str  # The source's tool and its version
+    buses: int  # Number of compared buses
+    three_phase: bool  # True for a comparison phase by phase
+    largest_pu: float  # Largest difference of a voltage's magnitude, all loads of constant power, pu
+    at: str  # Bus of the largest difference
+    # Largest difference from the source with its loads' dependence on the voltage, pu; None without one
     as_found_pu: float | None
+    # Buses at which, in at least one phase, only one of the two has a voltage
     unmatched: tuple[str, ...] = ()
 
     @property
@@ -114,13 +85,6 @@ def _above(value: float) -> str:
 
 def compare(state: SourceState, tables: FeederTables) -> SourceCheck:
     """Solve a converted feeder at its source's loads and compare the voltages of all buses.
-
-    Parameters
-    ----------
-    state
-        State by the source's tool.
-    tables
-        The feeder.
 
     Raises
     ------

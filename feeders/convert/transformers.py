@@ -23,21 +23,18 @@ import cmath
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
 from feeders.convert.customers import Draw, is_even, rounded
 from feeders.convert.lines import VOLT_DIGITS, Coupling, above_busbar, as_rows, fused_with, reached, turned
-from feeders.convert.provenance import WHOLE, ConversionChange
+from feeders.convert.provenance import WHOLE, Changes, ConversionChange
+from feeders.convert.source import SourceNetwork
 from feeders.format.tables import LineRow
 from feeders.format.validation import same_level
 from gridsec.arrays import Phasors
 from gridsec.errors import Problem
-
-if TYPE_CHECKING:
-    from feeders.convert.network import SourceNetwork
-
 
 TAP_DIGITS: Final = 9
 """Decimals of a ratio, the same for equal transformers."""
@@ -51,32 +48,24 @@ NO_LOAD_KVA: Final = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class TwoPort:
-    """Balanced transformer.
+    """Balanced transformer."""
 
-    Attributes
-    ----------
-    ratio
-        Complex ratio t of the voltage at its first end to that behind it, without load.
-    series
-        Impedance z behind it, ohm.
-    """
-
-    ratio: complex
-    series: complex
+    ratio: complex  # Complex ratio t of the voltage at its first end to that behind it, without load
+    series: complex  # Impedance z behind it, ohm
 
     @classmethod
-    def measured(cls, idle: tuple[complex, complex], loaded: tuple[complex, complex, complex]) -> TwoPort:
-        """Identify a transformer from two power flows.
+    def measured(
+        cls, names: Iterable[int], idle: tuple[Phasors, Phasors], loaded: tuple[Phasors, Phasors]
+    ) -> dict[int, TwoPort]:
+        """Identify transformers from two power flows, without load and loaded.
 
-        Parameters
-        ----------
-        idle
-            Voltages at both ends, V, without load.
-        loaded
-            Voltages at both ends, V, and current out of the second one, A.
+        Each has the voltages at both ends, (n, 2), V, and the currents out of the second end, (n,), A.
         """
-        ratio = idle[0] / idle[1]
-        return cls(ratio, (loaded[0] / ratio - loaded[1]) / loaded[2])
+        ports = {}
+        for name, (a, b), (u, v), current in zip(names, idle[0], *loaded, strict=True):
+            ratio = complex(a) / complex(b)
+            ports[int(name)] = cls(ratio, (complex(u) / ratio - complex(v)) / complex(current))
+        return ports
 
     @property
     def turn(self) -> float:
@@ -84,15 +73,7 @@ class TwoPort:
         return round(math.degrees(cmath.phase(self.ratio)), TURN_DIGITS)
 
     def line(self, name: str, ends: tuple[str, str], nominal: tuple[float, float]) -> LineRow | None:
-        """Equivalent line, with its tap relative to the nominal voltages of its ends; None without one.
-
-        Parameters
-        ----------
-        name, ends
-            Name and buses of the transformer.
-        nominal
-            Nominal voltages at its ends, V.
-        """
+        """Equivalent line, with its tap relative to the nominal voltages of its ends, V; None without one."""
         r, x = rounded(self.series.real), rounded(self.series.imag)
         if not (math.isfinite(r) and math.isfinite(x)) or min(r, x) < 0 or r == x == 0:
             return None
@@ -100,16 +81,9 @@ class TwoPort:
         return LineRow(name, *ends, r, x, tap=tap)
 
     def idle(self, name: str, bus: str, flows: tuple[Phasors, Phasors], volts: Phasors) -> Draw | None:
-        """Power beyond the losses in z, as a draw at its first end; None if negligible.
+        """Power beyond the losses in z, as a draw at its first end `bus`; None if negligible.
 
-        Parameters
-        ----------
-        name, bus
-            Name of the transformer, and its first bus.
-        flows : (3,)
-            Power into it from each end, by phase, kVA.
-        volts : (3,)
-            Voltages behind it, V.
+        `flows` (3,) are the powers into it from each end, kVA; `volts` (3,) the voltages behind it, V.
         """
         into, back = flows
         power: Phasors = into + back - np.abs(back) ** 2 / np.abs(volts) ** 2 * self.series * 1e3
@@ -127,18 +101,9 @@ def coupling_of(
     rating_a: float,
     network: SourceNetwork,
 ) -> Coupling:
-    """Transformer with its equivalent line, if there is one.
+    """Transformer with its equivalent line, if there is one; `rating_a` is that at the second bus, A.
 
-    Parameters
-    ----------
-    name, buses, power_kva
-        As in `Coupling`.
-    port
-        Two-port between its first two buses; None if unknown.
-    rating_a
-        Rated current at the second bus, A.
-    network
-        Network with nominal voltages, and voltages if known.
+    `port` is the two-port between its first two buses; None if unknown.
     """
     if port is None:
         return Coupling(name, buses, power_kva)
@@ -154,18 +119,11 @@ def coupling_of(
 
 @dataclass(frozen=True, slots=True)
 class Extent:
-    """Extent of a feeder.
+    """Extent of a feeder."""
 
-    Attributes
-    ----------
-    one_voltage
-        True: only the busbar's nominal voltage; a transformer to another one is a customer.
-    meshed
-        True: transformers may close loops.
-    """
-
+    # True: only the busbar's nominal voltage; a transformer to another one is a customer
     one_voltage: bool = False
-    meshed: bool = False
+    meshed: bool = False  # True: transformers may close loops
 
 
 EVERYTHING: Final = Extent()
@@ -178,21 +136,9 @@ THERE: Final = "a line to {:.6g} V, its ratio {} of the nominal one as in the so
 
 
 def transformed(
-    network: SourceNetwork, rows: list[LineRow], busbar: str, extent: Extent, changes: list[ConversionChange]
+    network: SourceNetwork, rows: list[LineRow], busbar: str, extent: Extent, changes: Changes
 ) -> tuple[SourceNetwork, list[LineRow]]:
-    """Replace transformers below the busbar by their equivalent lines, where possible.
-
-    Parameters
-    ----------
-    network, rows
-        The network, and its lines after opening.
-    busbar
-        The busbar.
-    extent
-        Extent of the feeder.
-    changes
-        Receives the changes.
-    """
+    """Replace transformers below the busbar by their equivalent lines, where possible."""
     fused = fused_with(busbar, rows)
     above = above_busbar(busbar, network.sources, rows, network.couplings)
     left: list[Coupling] = []
@@ -218,7 +164,7 @@ def transformed(
         changes.append(_told(each, turned(line, network.nominal) if backwards else line))
         if each.idle is None and not network.volts:
             effect = "not known without the source's power flow"
-            changes.append(ConversionChange(each.name, "no-load current", "left out", effect))
+            changes.note(each.name, "no-load current", "left out", effect)
     return replace(network, couplings=left, draws=[*network.draws, *draws]), [*rows, *lines]
 
 
@@ -236,19 +182,11 @@ def _leads_on(network: SourceNetwork, rows: Iterable[LineRow], each: Coupling, b
     behind = next((way for way in ways if busbar not in way), None)
     if behind is None:  # the transformer closes a loop
         return True
-    return any(row.closed and (row.r_ohm or row.x_ohm) and row.from_bus in behind for row in rows)
+    return any(row.closed and not row.fuses and row.from_bus in behind for row in rows)
 
 
 class _Joined:
-    """Joined buses, and the complex ratios of their voltages.
-
-    Parameters
-    ----------
-    rows
-        Lines, with no ratio other than their taps.
-    loops
-        True: a transformer may close a loop.
-    """
+    """Joined buses, and the complex ratios of their voltages; rows have no ratio other than their taps."""
 
     def __init__(self, rows: Iterable[LineRow], *, loops: bool) -> None:
         self._loops = loops
@@ -257,7 +195,7 @@ class _Joined:
         for row in rows:
             if row.closed:
                 self._all.join(row.from_bus, row.to_bus, 1.0 / row.tap + 0j)
-            if row.closed and row.r_ohm == row.x_ohm == 0.0:
+            if row.closed and row.fuses:
                 self._solid.join(row.from_bus, row.to_bus, 1.0 + 0j)
 
     def takes(self, line: LineRow, ratio: complex) -> bool:
@@ -298,15 +236,7 @@ class _Groups:
 
 
 def levels_of(rows: Iterable[LineRow], nominal: Mapping[str, float]) -> list[Problem]:
-    """Problems of the nominal voltages that lines join.
-
-    Parameters
-    ----------
-    rows
-        Lines of the feeder.
-    nominal
-        Nominal voltages of the buses, V.
-    """
+    """Problems of the nominal voltages, V, that lines join."""
     return [
         Problem(
             "inconsistent",

@@ -1,249 +1,236 @@
-"""Columns of lines.csv and customers.csv and keys of feeder.toml: types, limits, defaults.
+"""Rows of lines.csv and customers.csv and keys of feeder.toml: one declaration per column.
 
-One table of columns serves the files, the JSON form of the REST interface, the reader, the writer and the
-documentation. A cell arrives as text (CSV) or as a JSON or TOML value. `parse` converts it to the column's
-type, or returns a problem.
+An annotated field declares name, type, meaning, limits and default of its column. Files, the JSON form of
+the REST interface, reader, writer and documentation use these declarations. A cell arrives as text (CSV) or
+as a JSON or TOML value; `Column.parse` converts it to the column's type, or raises `CellInvalid`.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from enum import Enum
-from typing import Any, Final
+from collections.abc import Collection
+from dataclasses import KW_ONLY, MISSING, dataclass, field, fields, replace
+from importlib.metadata import entry_points
+from typing import Annotated, Any, ClassVar, Final, get_type_hints
 
-from feeders.registry import plugins
 from gridsec.errors import Problem
 
-NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
-WORDS_NO_NUMBER = {"nan", "inf", "+inf", "-inf", "infinity", "-infinity", "null", "none", "na", "n/a", "-"}
-NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
-LONGEST_ID = 128
-LONGEST_TEXT = 200
-SHOWN = 60
+NUMBER: Final = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+NO_NUMBER: Final = {"nan", "inf", "+inf", "-inf", "infinity", "-infinity", "null", "none", "na", "n/a", "-"}
+NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,64}")
+SHOWN: Final = 60
+REQUIRED: Final = object()
+"""Default of a column without a default."""
 
 
-class CellType(Enum):
-    """Type of a cell."""
+class CellInvalid(Exception):
+    """A cell has no valid value."""
 
-    TEXT = "text of at most 200 characters"
-    ID = "an id: printable text of at most 128 characters"
-    NAME = "a name of 1 to 64 of the characters A-Z a-z 0-9 _ -"
-    NUMBER = "a number"
-    WHOLE = "a whole number"
-    TRUTH = "true or false"
-    PAIR = "a pair of numbers"
-    NAMES = "a list of names"
+    def __init__(self, code: str, text: str) -> None:
+        super().__init__(text)
+        self.problem = Problem(code, text)
 
 
-class _Missing(Enum):
-    REQUIRED = "required"
-    BAD = "bad"
+def shown(cell: object) -> str:
+    """Value of a cell for a message: quoted, and shortened to SHOWN characters."""
+    try:
+        text = repr(cell)
+    except (ValueError, RecursionError):  # integers of thousands of digits, nested JSON
+        text = f"a {type(cell).__name__} that is too large to show"
+    return text if len(text) <= SHOWN else text[: SHOWN - 1] + "…"
 
 
-REQUIRED: Final = _Missing.REQUIRED
-BAD: Final = _Missing.BAD
+# --- types of cells -----------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Column:
-    """One column, or one key of feeder.toml.
+    """One column, or one key of feeder.toml."""
 
-    Attributes
-    ----------
-    name
-        As in the file's header; the unit is part of the name.
-    kind
-        Type of the cell.
-    meaning
-        Meaning of the cell, with its unit; used in messages and in the documentation.
-    default
-        Value of an empty or absent cell; REQUIRED without a default.
-    low, high
-        Inclusive limits of a number.
-    above
-        Exclusive lower limit of a number.
-    choices
-        The only valid values, if not None.
-    """
-
-    name: str
-    kind: CellType
     meaning: str
-    default: Any = REQUIRED
-    low: float | None = None
-    high: float | None = None
-    above: float | None = None
+    """Meaning with its unit, for messages and the documentation."""
+    _: KW_ONLY
     choices: tuple[str, ...] | None = None
+    """The only valid values, if not None."""
+    name: str = ""
+    """As in the file's header; the unit is part of the name."""
+    default: Any = REQUIRED
+    """Value of an empty or absent cell."""
+
+    valid: ClassVar[str] = ""
 
     @property
     def right(self) -> str:
         """Description of a valid value."""
-        if self.choices is not None:
-            return "one of " + ", ".join(self.choices)
+        return self.valid if self.choices is None else "one of " + ", ".join(self.choices)
+
+    def parse(self, cell: object) -> Any:
+        """Value of a cell; `CellInvalid` names the given and the expected value."""
+        given = cell.strip() or None if isinstance(cell, str) else cell
+        if given is None and self.default is REQUIRED:
+            raise self._complaint("missing", "is missing")
+        try:
+            return self.default if given is None else self._value(given)
+        except CellInvalid as wrong:
+            raise self._complaint(wrong.problem.code, wrong.problem) from None
+
+    def _complaint(self, code: str, text: str) -> CellInvalid:
+        return CellInvalid(code, f"{text}; expected {self.right} ({self.meaning})")
+
+    def _value(self, cell: object) -> Any:
+        raise NotImplementedError
+
+    def _check_choices(self, values: Collection[str]) -> None:
+        for value in values:
+            if self.choices is not None and value not in self.choices:
+                raise CellInvalid("unknown-name", f"{shown(value)} is not known")
+
+
+class Text(Column):
+    """Printable text."""
+
+    valid = "text of at most 200 characters"
+    longest = 200
+
+    def _value(self, cell: object) -> str:
+        if not isinstance(cell, str):
+            raise CellInvalid("wrong-type", f"{shown(cell)} is not text")
+        if not cell.isprintable():
+            raise CellInvalid("wrong-text", f"{shown(cell)} holds characters that cannot be printed")
+        if len(cell) > self.longest:
+            raise CellInvalid("wrong-text", f"{shown(cell)} is longer than {self.longest} characters")
+        self._check_choices([cell])
+        return cell
+
+
+class Id(Text):
+    """Id of a bus, line or customer."""
+
+    valid = "an id: printable text of at most 128 characters"
+    longest = 128
+
+
+class Name(Column):
+    """Name that is valid in paths and keys."""
+
+    valid = "a name of 1 to 64 of the characters A-Z a-z 0-9 _ -"
+
+    def _value(self, cell: object) -> str:
+        if not isinstance(cell, str) or NAME.fullmatch(cell) is None:
+            raise CellInvalid("wrong-text", f"{shown(cell)} is not a valid name")
+        return cell
+
+
+class Names(Column):
+    """List of names."""
+
+    valid = "a list of names"
+
+    def _value(self, cell: object) -> tuple[str, ...]:
+        if not isinstance(cell, (list, tuple)) or not all(isinstance(item, str) for item in cell):
+            raise CellInvalid("wrong-type", f"{shown(cell)} is not a list of names")
+        self._check_choices(cell)
+        return tuple(cell)
+
+
+class Truth(Column):
+    """Truth value."""
+
+    valid = "true or false"
+
+    def _value(self, cell: object) -> bool:
+        if isinstance(cell, bool):
+            return cell
+        if isinstance(cell, str) and cell.lower() in ("true", "1", "false", "0"):
+            return cell.lower() in ("true", "1")
+        raise CellInvalid("wrong-type", f"{shown(cell)} is neither true nor false")
+
+
+class Pair(Column):
+    """Pair of numbers."""
+
+    valid = "a pair of numbers"
+
+    def _value(self, cell: object) -> tuple[float, float]:
+        if not isinstance(cell, (list, tuple)) or len(cell) != 2:
+            raise CellInvalid("wrong-type", f"{shown(cell)} is not a pair")
+        return _number(cell[0]), _number(cell[1])
+
+
+@dataclass(frozen=True)
+class Number(Column):
+    """Number between inclusive limits, or above an exclusive one."""
+
+    low: float | None = field(default=None, kw_only=False)
+    high: float | None = field(default=None, kw_only=False)
+    above: float | None = None
+
+    valid = "a number"
+
+    @property
+    def right(self) -> str:
+        """Description of a valid value."""
         if self.low is not None and self.low == self.high:
             return f"{self.low:g}"
         if self.low is not None and self.high is not None:
-            limits = f"from {self.low:.10g} to {self.high:.10g}"
-        else:
-            parts = [("above", self.above), ("at least", self.low), ("at most", self.high)]
-            limits = " and ".join(f"{word} {value:.10g}" for word, value in parts if value is not None)
-        return f"{self.kind.value} {limits}".strip()
+            return f"{self.valid} from {self.low:.10g} to {self.high:.10g}"
+        parts = [("above", self.above), ("at least", self.low), ("at most", self.high)]
+        limits = " and ".join(f"{word} {value:.10g}" for word, value in parts if value is not None)
+        return f"{self.valid} {limits}".strip()
 
-    def complaint(self, what: Problem) -> Problem:
-        """Problem of this column's cell as a sentence, with the expected value."""
-        return Problem(what.code, f"{what}; expected {self.right} ({self.meaning})")
+    def _value(self, cell: object) -> float:
+        value = _number(cell)
+        low, above = (-math.inf if limit is None else limit for limit in (self.low, self.above))
+        if value < low or (value <= above and self.above is not None):
+            negative = value < 0
+            raise CellInvalid(
+                "negative" if negative else "out-of-range",
+                f"{value:g} is {'negative' if negative else 'too small'}",
+            )
+        if self.high is not None and value > self.high:
+            raise CellInvalid("out-of-range", f"{value:g} is too large")
+        return value
 
 
-PHASES = ("abc", "a", "b", "c")
-LINE_PHASES = (*PHASES, "ab", "bc", "ca")
-PAIRS = ("aa", "ab", "ac", "bb", "bc", "cc")
-"""Upper triangle of a symmetric matrix in phases, row by row."""
+class Whole(Number):
+    """Whole number between inclusive limits."""
+
+    valid = "a whole number"
+
+    def _value(self, cell: object) -> int:
+        value = _number(cell)
+        if value != int(value):
+            raise CellInvalid("not-integer", f"{shown(cell)} is not a whole number")
+        return int(super()._value(cell))
 
 
-def _matrix(symbol: str, unit: str, what: tuple[str, str], high: float) -> tuple[Column, ...]:
-    """Columns of a symmetric matrix in phases; entries of the diagonal are never negative."""
-    return tuple(
-        Column(
-            f"{symbol}_{pair}_{unit}",
-            CellType.NUMBER,
-            what[0 if own else 1].format(*pair),
-            None,
-            low=0.0 if own else -high,
-            high=high,
+def _number(cell: object) -> float:
+    if isinstance(cell, bool) or not isinstance(cell, (int, float, str)):
+        raise CellInvalid("wrong-type", f"{shown(cell)} is not a number")
+    if isinstance(cell, str) and cell.lower() in NO_NUMBER:
+        raise CellInvalid(
+            "not-finite", f"{shown(cell)} is not a finite number (leave the cell empty if there is none)"
         )
-        for pair, own in ((pair, pair[0] == pair[1]) for pair in PAIRS)
-    )
+    if isinstance(cell, str) and NUMBER.fullmatch(cell) is None:
+        comma = NUMBER.fullmatch(cell.replace(",", ".")) is not None
+        hint = " (decimal point, not comma)" if comma else ""
+        raise CellInvalid("wrong-type", f"{shown(cell)} is not a number{hint}")
+    try:
+        value = float(cell)
+    except OverflowError:
+        raise CellInvalid("out-of-range", f"{shown(cell)} is too large for a number") from None
+    if not math.isfinite(value):
+        raise CellInvalid("not-finite", f"{shown(cell)} is not a finite number")
+    return value
 
 
-SERIES_COLUMNS = (
-    *_matrix("r", "ohm", ("self-resistance of phase {}, ohm", "mutual resistance of {} and {}, ohm"), 1e6),
-    *_matrix("x", "ohm", ("self-reactance of phase {}, ohm", "mutual reactance of {} and {}, ohm"), 1e6),
-)
-SHUNT_COLUMNS = _matrix(
-    "b",
-    "us",
-    ("shunt susceptance of phase {}, microsiemens", "its entry of {} and {}, seldom above 0, microsiemens"),
-    1e9,
-)
-TAP_COLUMNS = tuple(
-    Column(f"tap_{phase}", CellType.NUMBER, f"the same of phase {phase} alone", None, low=0.001, high=1e3)
-    for phase in "abc"
-)
-MATRIX_NAMES = frozenset(column.name for column in (*SERIES_COLUMNS, *SHUNT_COLUMNS))
-PHASE_NAMES = MATRIX_NAMES | {column.name for column in TAP_COLUMNS}
-"""Columns of feeders in three phases only."""
+# --- names --------------------------------------------------------------------------------------
 
-LINE_COLUMNS: tuple[Column, ...] = (
-    Column("line", CellType.ID, "id of the line or switch"),
-    Column("from_bus", CellType.ID, "bus at one end"),
-    Column("to_bus", CellType.ID, "bus at the other end"),
-    Column("phases", CellType.TEXT, "conductors", "abc", choices=LINE_PHASES),
-    Column(
-        "r_ohm", CellType.NUMBER, "series resistance of the whole line, per phase, ohm", low=0.0, high=1e6
-    ),
-    Column("x_ohm", CellType.NUMBER, "series reactance of the whole line, per phase, ohm", low=0.0, high=1e6),
-    Column("r0_ohm", CellType.NUMBER, "zero-sequence resistance, ohm", None, low=0.0, high=1e6),
-    Column("x0_ohm", CellType.NUMBER, "zero-sequence reactance, ohm", None, low=0.0, high=1e6),
-    *SERIES_COLUMNS,
-    Column(
-        "b_us", CellType.NUMBER, "total shunt susceptance, microsiemens per phase", 0.0, low=0.0, high=1e9
-    ),
-    *SHUNT_COLUMNS,
-    Column("tap", CellType.NUMBER, "ratio of an ideal transformer at from_bus", 1.0, low=0.001, high=1e3),
-    *TAP_COLUMNS,
-    Column(
-        "to_volt",
-        CellType.NUMBER,
-        "nominal voltage of to_bus where another than from_bus's: a transformer; phase to neutral, V",
-        None,
-        low=0.001,
-        high=1e6,
-    ),
-    Column("closed", CellType.TRUTH, "whether the line carries current", True),
-    Column("rating_a", CellType.NUMBER, "thermal limit, ampere", None, above=0.0, high=1e9),
-    Column("to_x", CellType.NUMBER, "horizontal position of to_bus, any unit", None, low=-1e12, high=1e12),
-    Column("to_y", CellType.NUMBER, "vertical position of to_bus, any unit", None, low=-1e12, high=1e12),
-)
-
-CUSTOMER_COLUMNS: tuple[Column, ...] = (
-    Column("customer", CellType.ID, "id of the customer"),
-    Column("bus", CellType.ID, "bus of the connection point"),
-    Column("phases", CellType.TEXT, "connected phases", "abc", choices=PHASES),
-    Column("meter", CellType.NAME, "id of the meter; empty: no meter", ""),
-    Column(
-        "class_percent",
-        CellType.NUMBER,
-        "accuracy class of the voltage register, %",
-        None,
-        above=0.0,
-        high=100.0,
-    ),
-    Column(
-        "resolution_volt", CellType.NUMBER, "resolution of the voltage register, V", None, low=0.0, high=1e6
-    ),
-    Column(
-        "jitter_percent",
-        CellType.NUMBER,
-        "1 sigma noise of the voltage, % of nominal",
-        None,
-        low=0.0,
-        high=100.0,
-    ),
-    Column(
-        "p_error_percent", CellType.NUMBER, "error of the active power, % of it", None, low=0.0, high=50.0
-    ),
-    Column(
-        "q_error_percent",
-        CellType.NUMBER,
-        "error of the reactive power, % of range",
-        None,
-        low=0.0,
-        high=100.0,
-    ),
-    Column("load_kw", CellType.NUMBER, "expected peak of the load, kW", low=0.0, high=1e9),
-    Column("load_profile", CellType.TEXT, "load profile of the library", ""),
-    Column("power_factor", CellType.NUMBER, "expected power factor of the load", None, low=0.01, high=1.0),
-    Column("power_factor_min", CellType.NUMBER, "its smallest value", None, low=0.01, high=1.0),
-    Column("power_factor_max", CellType.NUMBER, "its largest value", None, low=0.01, high=1.0),
-    Column(
-        "q_floor_kvar",
-        CellType.NUMBER,
-        "load's reactive power that does not follow p, kvar",
-        None,
-        low=0.0,
-        high=1e9,
-    ),
-    Column(
-        "p_std_kw", CellType.NUMBER, "1 sigma error of the active power known, kW", None, low=0.0, high=1e9
-    ),
-    Column(
-        "q_std_kvar",
-        CellType.NUMBER,
-        "1 sigma error of the load's reactive power known, kvar",
-        None,
-        low=0.0,
-        high=1e9,
-    ),
-    Column("pv_kw", CellType.NUMBER, "peak of the generation, kW", 0.0, low=0.0, high=1e9),
-    Column("pv_profile", CellType.TEXT, "generation profile of the library", ""),
-    Column(
-        "inverter_kva", CellType.NUMBER, "rating of the droop inverter, kVA; 0: none", 0.0, low=0.0, high=1e9
-    ),
-    Column("droop", CellType.TEXT, "droop preset of the inverter", ""),
-    Column(
-        "tau_s",
-        CellType.NUMBER,
-        "time constant of the inverter, s; empty: the preset's",
-        None,
-        low=0.001,
-        high=1e6,
-    ),
-)
-
-OWN_ESTIMATORS = (
+PHASES: Final = ("abc", "a", "b", "c")
+LINE_PHASES: Final = (*PHASES, "ab", "bc", "ca")
+SUSPICIONS: Final = ("voltage", "impedance", "ratio", "rating", "load", "class")
+OWN_ESTIMATORS: Final = (
     "sequential",
     "exact-bank",
     "exact-bank-lmi",
@@ -256,324 +243,274 @@ OWN_ESTIMATORS = (
     "set-search",
     "unknown-input",
 )
-ESTIMATORS = (*OWN_ESTIMATORS, *plugins.names(OWN_ESTIMATORS))
-SUSPICIONS = ("voltage", "impedance", "ratio", "rating", "load", "class")
+GROUP: Final = "gridsec.estimators"
+"""Entry points of estimators of other packages."""
 
-META_COLUMNS: dict[str, tuple[Column, ...]] = {
-    "": (
-        Column("format", CellType.WHOLE, "version of this format", low=1, high=1),
-        Column("name", CellType.NAME, "name of the feeder"),
-        Column("title", CellType.TEXT, "title for people", ""),
-        Column(
-            "voltage_volt",
-            CellType.NUMBER,
-            "nominal voltage of the busbar, phase to neutral, V",
-            low=0.001,
-            high=1e6,
-        ),
-        Column(
-            "base_kva",
-            CellType.NUMBER,
-            "three-phase base power of the per-unit system, kVA",
-            100.0,
-            low=0.001,
-            high=1e9,
-        ),
-        Column("busbar", CellType.ID, "bus of the busbar meter; root of the feeder"),
-        Column("busbar_xy", CellType.PAIR, "position of the busbar", None),
-        Column("meshed", CellType.TRUTH, "whether closed lines may form loops", False),
-        Column(
-            "busbar_class_percent",
-            CellType.NUMBER,
-            "accuracy class of the busbar meter, %",
-            0.1,
-            above=0.0,
-            high=100.0,
-        ),
-        Column("busbar_resolution_volt", CellType.NUMBER, "its resolution, V", 0.1, low=0.0, high=1e6),
-        Column(
-            "busbar_jitter_percent",
-            CellType.NUMBER,
-            "its 1 sigma noise, % of nominal",
-            0.02,
-            low=0.0,
-            high=100.0,
-        ),
-        Column(
-            "accept", CellType.NAMES, "suspicions that were checked and are right", (), choices=SUSPICIONS
-        ),
-    ),
-    "limits": (
-        Column("v_min_pu", CellType.NUMBER, "lowest allowed voltage, pu", 0.9, above=0.0, high=2.0),
-        Column("v_max_pu", CellType.NUMBER, "highest allowed voltage, pu", 1.1, above=0.0, high=2.0),
-    ),
-    "meters": (
-        Column(
-            "class_percent",
-            CellType.NUMBER,
-            "accuracy class of the voltage registers, %",
-            0.5,
-            above=0.0,
-            high=100.0,
-        ),
-        Column(
-            "resolution_volt",
-            CellType.NUMBER,
-            "resolution of the voltage registers, V",
-            0.1,
-            low=0.0,
-            high=1e6,
-        ),
-        Column(
-            "jitter_percent",
-            CellType.NUMBER,
-            "1 sigma noise of the voltage, % of nominal",
-            0.05,
-            low=0.0,
-            high=100.0,
-        ),
-        Column(
-            "p_error_percent", CellType.NUMBER, "error of the active power, % of it", 1.0, low=0.0, high=50.0
-        ),
-        Column(
-            "q_error_percent",
-            CellType.NUMBER,
-            "error of the reactive power, % of range",
-            2.0,
-            low=0.0,
-            high=100.0,
-        ),
-        Column(
-            "p_resolution_kw", CellType.NUMBER, "resolution of the active power, kW", 0.01, low=0.0, high=1e6
-        ),
-        Column(
-            "p_interval_s",
-            CellType.NUMBER,
-            "largest age of a power at its voltage reading, s; 0: of the same moment",
-            0.0,
-            low=0.0,
-            high=1e6,
-        ),
-    ),
-    "load": (
-        Column("power_factor", CellType.NUMBER, "expected power factor, lagging", 0.95, low=0.01, high=1.0),
-        Column("power_factor_min", CellType.NUMBER, "its smallest value", 0.9, low=0.01, high=1.0),
-        Column("power_factor_max", CellType.NUMBER, "its largest value", 1.0, low=0.01, high=1.0),
-        Column(
-            "q_floor_percent",
-            CellType.NUMBER,
-            "reactive power that does not follow p, % of load_kw",
-            2.0,
-            low=0.0,
-            high=100.0,
-        ),
-        Column(
-            "correlation_s",
-            CellType.NUMBER,
-            "correlation time of the load errors, s",
-            600.0,
-            above=0.0,
-            high=1e7,
-        ),
-        Column(
-            "forecast", CellType.TEXT, "where unread powers are from", "none", choices=("none", "profiles")
-        ),
-        Column("utc_offset_h", CellType.NUMBER, "local time less UTC, h", 0.0, low=-14.0, high=14.0),
-    ),
-    "monitor": (
-        Column("estimator", CellType.TEXT, "estimator family", "sequential", choices=ESTIMATORS),
-        Column(
-            "max_attacked",
-            CellType.WHOLE,
-            "manipulated meters to withstand; `sequential`: a third",
-            1,
-            low=0,
-            high=1000,
-        ),
-        Column("tick_s", CellType.NUMBER, "period of the frames, s", 1.0, low=0.01, high=1e5),
-        Column(
-            "on_delay_s",
-            CellType.NUMBER,
-            "how long a condition must last to raise an alarm, s",
-            2.0,
-            low=0.0,
-            high=1e6,
-        ),
-        Column(
-            "off_delay_s", CellType.NUMBER, "how long it must be gone to clear it, s", 5.0, low=0.0, high=1e6
-        ),
-        Column(
-            "silence_s",
-            CellType.NUMBER,
-            "silence after which a meter counts as lost, s",
-            10.0,
-            above=0.0,
-            high=1e6,
-        ),
-        Column(
-            "alarms_per_year",
-            CellType.NUMBER,
-            "false alarms allowed by chance, per feeder and year",
-            1.0,
-            above=0.0,
-            high=1e6,
-        ),
-        Column(
-            "commission_s",
-            CellType.NUMBER,
-            "time over which the meters' fixed errors are learned, s; 0: never",
-            86400.0,
-            low=0.0,
-            high=1e8,
-        ),
-        Column(
-            "unread_std_percent",
-            CellType.NUMBER,
-            "largest standard deviation of a voltage beside a withheld power at CLEAN, %",
-            0.5,
-            low=0.0,
-            high=100.0,
-        ),
-    ),
-}
+_ESTIMATOR: Final = re.compile(r"[a-z0-9][a-z0-9-]{0,63}")
 
 
-def shown(cell: object) -> str:
-    """Value of a cell for a message: quoted, and shortened to SHOWN characters."""
-    try:
-        text = repr(cell)
-    except (ValueError, RecursionError):  # integers of thousands of digits, nested JSON
-        text = f"a {type(cell).__name__} that is too large to show"
-    return text if len(text) <= SHOWN else text[: SHOWN - 1] + "…"
+def foreign_estimators() -> tuple[str, ...]:
+    """Names of the estimators of other packages, in alphabetic order; their code is not run.
 
-
-def parse(column: Column, cell: object) -> tuple[Any, Problem | None]:
-    """Convert one cell to the column's type.
-
-    Parameters
-    ----------
-    column
-        Column of the cell.
-    cell
-        Text of a CSV file, a TOML or JSON value, or None for an absent cell.
-
-    Returns
-    -------
-    value, problem
-        The value, or BAD and a problem with the value and the expected one.
+    Own names, and names with characters other than lower-case letters, digits and hyphens, are ignored.
     """
-    if isinstance(cell, str):
-        cell = cell.strip()
-    if cell is None or (isinstance(cell, str) and cell == ""):
-        if column.default is REQUIRED:
-            return BAD, column.complaint(Problem("missing", "is missing"))
-        return column.default, None
-    value, what = _PARSERS[column.kind](cell)
-    if what is not None:
-        return BAD, column.complaint(what)
-    what = _outside(column, value)
-    return (BAD, column.complaint(what)) if what is not None else (value, None)
+    found = {point.name for point in entry_points(group=GROUP)}
+    return tuple(sorted(name for name in found - set(OWN_ESTIMATORS) if _ESTIMATOR.fullmatch(name)))
 
 
-def _outside(column: Column, value: Any) -> Problem | None:
-    """Problem of a value of the right type, None without one."""
-    if column.choices is not None:
-        given: Iterable[Any] = value if isinstance(value, tuple) else (value,)
-        strange = (item for item in given if item not in column.choices)
-        return next((Problem("unknown-name", f"{shown(item)} is not known") for item in strange), None)
-    if not isinstance(value, (int, float)) or isinstance(value, bool):
-        return None
-    low, above = (-math.inf if limit is None else limit for limit in (column.low, column.above))
-    if value < low or (value <= above and column.above is not None):
-        return (
-            Problem("negative", f"{value:g} is negative")
-            if value < 0
-            else Problem("out-of-range", f"{value:g} is too small")
-        )
-    if column.high is not None and value > column.high:
-        return Problem("out-of-range", f"{value:g} is too large")
-    return None
+ESTIMATORS: Final = (*OWN_ESTIMATORS, *foreign_estimators())
 
 
-def _text(cell: object, longest: int = LONGEST_TEXT) -> tuple[Any, Problem | None]:
-    if not isinstance(cell, str):
-        return BAD, Problem("wrong-type", f"{shown(cell)} is not text")
-    if not cell.isprintable():
-        return BAD, Problem("wrong-text", f"{shown(cell)} holds characters that cannot be printed")
-    if len(cell) > longest:
-        return BAD, Problem("wrong-text", f"{shown(cell)} is longer than {longest} characters")
-    return cell, None
+# --- rows ---------------------------------------------------------------------------------------
 
 
-def _id(cell: object) -> tuple[Any, Problem | None]:
-    return _text(cell, LONGEST_ID)
+@dataclass(frozen=True, slots=True)
+class LineRow:
+    """One row of lines.csv."""
+
+    line: Annotated[str, Id("id of the line or switch")]
+    from_bus: Annotated[str, Id("bus at one end")]
+    to_bus: Annotated[str, Id("bus at the other end")]
+    phases: Annotated[str, Text("conductors", choices=LINE_PHASES)] = field(default="abc", kw_only=True)
+    r_ohm: Annotated[float, Number("series resistance of the whole line, per phase, ohm", 0, 1e6)]
+    x_ohm: Annotated[float, Number("series reactance of the whole line, per phase, ohm", 0, 1e6)]
+    r0_ohm: Annotated[float | None, Number("zero-sequence resistance, ohm", 0, 1e6)] = None
+    x0_ohm: Annotated[float | None, Number("zero-sequence reactance, ohm", 0, 1e6)] = None
+    r_aa_ohm: Annotated[float | None, Number("self-resistance of phase a, ohm", 0, 1e6)] = None
+    r_ab_ohm: Annotated[float | None, Number("mutual resistance of a and b, ohm", -1e6, 1e6)] = None
+    r_ac_ohm: Annotated[float | None, Number("mutual resistance of a and c, ohm", -1e6, 1e6)] = None
+    r_bb_ohm: Annotated[float | None, Number("self-resistance of phase b, ohm", 0, 1e6)] = None
+    r_bc_ohm: Annotated[float | None, Number("mutual resistance of b and c, ohm", -1e6, 1e6)] = None
+    r_cc_ohm: Annotated[float | None, Number("self-resistance of phase c, ohm", 0, 1e6)] = None
+    x_aa_ohm: Annotated[float | None, Number("self-reactance of phase a, ohm", 0, 1e6)] = None
+    x_ab_ohm: Annotated[float | None, Number("mutual reactance of a and b, ohm", -1e6, 1e6)] = None
+    x_ac_ohm: Annotated[float | None, Number("mutual reactance of a and c, ohm", -1e6, 1e6)] = None
+    x_bb_ohm: Annotated[float | None, Number("self-reactance of phase b, ohm", 0, 1e6)] = None
+    x_bc_ohm: Annotated[float | None, Number("mutual reactance of b and c, ohm", -1e6, 1e6)] = None
+    x_cc_ohm: Annotated[float | None, Number("self-reactance of phase c, ohm", 0, 1e6)] = None
+    b_us: Annotated[float, Number("total shunt susceptance, microsiemens per phase", 0, 1e9)] = 0.0
+    b_aa_us: Annotated[float | None, Number("shunt susceptance of phase a, microsiemens", 0, 1e9)] = None
+    b_ab_us: Annotated[
+        float | None, Number("its entry of a and b, seldom above 0, microsiemens", -1e9, 1e9)
+    ] = None
+    b_ac_us: Annotated[
+        float | None, Number("its entry of a and c, seldom above 0, microsiemens", -1e9, 1e9)
+    ] = None
+    b_bb_us: Annotated[float | None, Number("shunt susceptance of phase b, microsiemens", 0, 1e9)] = None
+    b_bc_us: Annotated[
+        float | None, Number("its entry of b and c, seldom above 0, microsiemens", -1e9, 1e9)
+    ] = None
+    b_cc_us: Annotated[float | None, Number("shunt susceptance of phase c, microsiemens", 0, 1e9)] = None
+    tap: Annotated[float, Number("ratio of an ideal transformer at from_bus", 0.001, 1e3)] = 1.0
+    tap_a: Annotated[float | None, Number("the same of phase a alone", 0.001, 1e3)] = None
+    tap_b: Annotated[float | None, Number("the same of phase b alone", 0.001, 1e3)] = None
+    tap_c: Annotated[float | None, Number("the same of phase c alone", 0.001, 1e3)] = None
+    to_volt: Annotated[
+        float | None,
+        Number(
+            "nominal voltage of to_bus where another than from_bus's: a transformer; phase to neutral, V",
+            0.001,
+            1e6,
+        ),
+    ] = None
+    closed: Annotated[bool, Truth("whether the line carries current")] = True
+    rating_a: Annotated[float | None, Number("thermal limit, ampere", above=0, high=1e9)] = None
+    to_x: Annotated[float | None, Number("horizontal position of to_bus, any unit", -1e12, 1e12)] = None
+    to_y: Annotated[float | None, Number("vertical position of to_bus, any unit", -1e12, 1e12)] = None
+
+    @property
+    def fuses(self) -> bool:
+        """True without impedance: a closed line joins its buses to one."""
+        return self.r_ohm == self.x_ohm == 0.0
+
+    @property
+    def taps(self) -> tuple[float, float, float]:
+        """Ratio of the ideal transformer in each phase."""
+        a, b, c = (self.tap if own is None else own for own in (self.tap_a, self.tap_b, self.tap_c))
+        return a, b, c
+
+    @property
+    def in_phases(self) -> bool:
+        """True if the line requires a model in three phases: missing phases, a matrix, or taps by phase."""
+        own = (self.r_aa_ohm, self.b_aa_us, self.tap_a)
+        return self.phases != "abc" or any(value is not None for value in own)
 
 
-def _name(cell: object) -> tuple[Any, Problem | None]:
-    if not isinstance(cell, str) or NAME.fullmatch(cell) is None:
-        return BAD, Problem("wrong-text", f"{shown(cell)} is not a valid name")
-    return cell, None
+@dataclass(frozen=True, slots=True)
+class CustomerRow:
+    """One row of customers.csv; None for the default of feeder.toml."""
+
+    customer: Annotated[str, Id("id of the customer")]
+    bus: Annotated[str, Id("bus of the connection point")]
+    _: KW_ONLY
+    phases: Annotated[str, Text("connected phases", choices=PHASES)] = "abc"
+    meter: Annotated[str, Name("id of the meter; empty: no meter")] = ""
+    class_percent: Annotated[
+        float | None, Number("accuracy class of the voltage register, %", above=0, high=100)
+    ] = None
+    resolution_volt: Annotated[float | None, Number("resolution of the voltage register, V", 0, 1e6)] = None
+    jitter_percent: Annotated[float | None, Number("1 sigma noise of the voltage, % of nominal", 0, 100)] = (
+        None
+    )
+    p_error_percent: Annotated[float | None, Number("error of the active power, % of it", 0, 50)] = None
+    q_error_percent: Annotated[float | None, Number("error of the reactive power, % of range", 0, 100)] = None
+    load_kw: Annotated[float, Number("expected peak of the load, kW", 0, 1e9)]
+    load_profile: Annotated[str, Text("load profile of the library")] = ""
+    power_factor: Annotated[float | None, Number("expected power factor of the load", 0.01, 1)] = None
+    power_factor_min: Annotated[float | None, Number("its smallest value", 0.01, 1)] = None
+    power_factor_max: Annotated[float | None, Number("its largest value", 0.01, 1)] = None
+    q_floor_kvar: Annotated[
+        float | None, Number("load's reactive power that does not follow p, kvar", 0, 1e9)
+    ] = None
+    p_std_kw: Annotated[float | None, Number("1 sigma error of the active power known, kW", 0, 1e9)] = None
+    q_std_kvar: Annotated[
+        float | None, Number("1 sigma error of the load's reactive power known, kvar", 0, 1e9)
+    ] = None
+    pv_kw: Annotated[float, Number("peak of the generation, kW", 0, 1e9)] = 0.0
+    pv_profile: Annotated[str, Text("generation profile of the library")] = ""
+    inverter_kva: Annotated[float, Number("rating of the droop inverter, kVA; 0: none", 0, 1e9)] = 0.0
+    droop: Annotated[str, Text("droop preset of the inverter")] = ""
+    tau_s: Annotated[
+        float | None, Number("time constant of the inverter, s; empty: the preset's", 0.001, 1e6)
+    ] = None
 
 
-def _number(cell: object) -> tuple[Any, Problem | None]:
-    if isinstance(cell, bool) or not isinstance(cell, (int, float, str)):
-        return BAD, Problem("wrong-type", f"{shown(cell)} is not a number")
-    if isinstance(cell, str) and cell.lower() in WORDS_NO_NUMBER:
-        return BAD, Problem(
-            "not-finite", f"{shown(cell)} is not a finite number (leave the cell empty if there is none)"
-        )
-    if isinstance(cell, str) and NUMBER.fullmatch(cell) is None:
-        comma = NUMBER.fullmatch(cell.replace(",", ".")) is not None
-        return BAD, Problem(
-            "wrong-type", f"{shown(cell)} is not a number" + (" (decimal point, not comma)" if comma else "")
-        )
-    try:
-        value = float(cell)
-    except OverflowError:
-        return BAD, Problem("out-of-range", f"{shown(cell)} is too large for a number")
-    if not math.isfinite(value):
-        return BAD, Problem("not-finite", f"{shown(cell)} is not a finite number")
-    return value, None
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Allowed voltages."""
+
+    v_min_pu: Annotated[float, Number("lowest allowed voltage, pu", above=0, high=2)] = 0.9
+    v_max_pu: Annotated[float, Number("highest allowed voltage, pu", above=0, high=2)] = 1.1
 
 
-def _whole(cell: object) -> tuple[Any, Problem | None]:
-    value, what = _number(cell)
-    if what is not None:
-        return value, what
-    if value != int(value):
-        return BAD, Problem("not-integer", f"{shown(cell)} is not a whole number")
-    return int(value), None
+@dataclass(frozen=True, slots=True)
+class MeterDefaults:
+    """Properties of the customers' meters, for empty cells of customers.csv."""
+
+    class_percent: Annotated[
+        float, Number("accuracy class of the voltage registers, %", above=0, high=100)
+    ] = 0.5
+    resolution_volt: Annotated[float, Number("resolution of the voltage registers, V", 0, 1e6)] = 0.1
+    jitter_percent: Annotated[float, Number("1 sigma noise of the voltage, % of nominal", 0, 100)] = 0.05
+    p_error_percent: Annotated[float, Number("error of the active power, % of it", 0, 50)] = 1.0
+    q_error_percent: Annotated[float, Number("error of the reactive power, % of range", 0, 100)] = 2.0
+    p_resolution_kw: Annotated[float, Number("resolution of the active power, kW", 0, 1e6)] = 0.01
+    p_interval_s: Annotated[
+        float, Number("largest age of a power at its voltage reading, s; 0: of the same moment", 0, 1e6)
+    ] = 0.0
 
 
-def _truth(cell: object) -> tuple[Any, Problem | None]:
-    if isinstance(cell, bool):
-        return cell, None
-    if isinstance(cell, str) and cell.lower() in ("true", "1", "false", "0"):
-        return cell.lower() in ("true", "1"), None
-    return BAD, Problem("wrong-type", f"{shown(cell)} is neither true nor false")
+@dataclass(frozen=True, slots=True)
+class LoadDefaults:
+    """Reactive power, correlation time and forecast of the loads, for empty cells of customers.csv."""
+
+    power_factor: Annotated[float, Number("expected power factor, lagging", 0.01, 1)] = 0.95
+    power_factor_min: Annotated[float, Number("its smallest value", 0.01, 1)] = 0.9
+    power_factor_max: Annotated[float, Number("its largest value", 0.01, 1)] = 1.0
+    q_floor_percent: Annotated[
+        float, Number("reactive power that does not follow p, % of load_kw", 0, 100)
+    ] = 2.0
+    correlation_s: Annotated[float, Number("correlation time of the load errors, s", above=0, high=1e7)] = (
+        600.0
+    )
+    forecast: Annotated[str, Text("where unread powers are from", choices=("none", "profiles"))] = "none"
+    utc_offset_h: Annotated[float, Number("local time less UTC, h", -14, 14)] = 0.0
 
 
-def _pair(cell: object) -> tuple[Any, Problem | None]:
-    if not isinstance(cell, (list, tuple)) or len(cell) != 2:
-        return BAD, Problem("wrong-type", f"{shown(cell)} is not a pair")
-    parsed = [_number(item) for item in cell]
-    bad = next((what for _, what in parsed if what is not None), None)
-    return (BAD, bad) if bad is not None else (tuple(value for value, _ in parsed), None)
+@dataclass(frozen=True, slots=True)
+class MonitorDefaults:
+    """Settings of the monitor."""
+
+    estimator: Annotated[str, Text("estimator family", choices=ESTIMATORS)] = "sequential"
+    max_attacked: Annotated[int, Whole("manipulated meters to withstand; `sequential`: a third", 0, 1000)] = 1
+    tick_s: Annotated[float, Number("period of the frames, s", 0.01, 1e5)] = 1.0
+    on_delay_s: Annotated[float, Number("how long a condition must last to raise an alarm, s", 0, 1e6)] = 2.0
+    off_delay_s: Annotated[float, Number("how long it must be gone to clear it, s", 0, 1e6)] = 5.0
+    silence_s: Annotated[
+        float, Number("silence after which a meter counts as lost, s", above=0, high=1e6)
+    ] = 10.0
+    alarms_per_year: Annotated[
+        float, Number("false alarms allowed by chance, per feeder and year", above=0, high=1e6)
+    ] = 1.0
+    commission_s: Annotated[
+        float, Number("time over which the meters' fixed errors are learned, s; 0: never", 0, 1e8)
+    ] = 86400.0
+    unread_std_percent: Annotated[
+        float, Number("largest standard deviation of a voltage beside a withheld power at CLEAN, %", 0, 100)
+    ] = 0.5
 
 
-def _names(cell: object) -> tuple[Any, Problem | None]:
-    if not isinstance(cell, (list, tuple)) or not all(isinstance(item, str) for item in cell):
-        return BAD, Problem("wrong-type", f"{shown(cell)} is not a list of names")
-    return tuple(cell), None
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FeederMeta:
+    """Content of feeder.toml."""
+
+    format: Annotated[int, Whole("version of this format", 1, 1)]
+    name: Annotated[str, Name("name of the feeder")]
+    title: Annotated[str, Text("title for people")] = ""
+    voltage_volt: Annotated[float, Number("nominal voltage of the busbar, phase to neutral, V", 0.001, 1e6)]
+    base_kva: Annotated[float, Number("three-phase base power of the per-unit system, kVA", 0.001, 1e9)] = (
+        100.0
+    )
+    busbar: Annotated[str, Id("bus of the busbar meter; root of the feeder")]
+    busbar_xy: Annotated[tuple[float, float] | None, Pair("position of the busbar")] = None
+    meshed: Annotated[bool, Truth("whether closed lines may form loops")] = False
+    busbar_class_percent: Annotated[
+        float, Number("accuracy class of the busbar meter, %", above=0, high=100)
+    ] = 0.1
+    busbar_resolution_volt: Annotated[float, Number("its resolution, V", 0, 1e6)] = 0.1
+    busbar_jitter_percent: Annotated[float, Number("its 1 sigma noise, % of nominal", 0, 100)] = 0.02
+    accept: Annotated[
+        tuple[str, ...], Names("suspicions that were checked and are right", choices=SUSPICIONS)
+    ] = ()
+    limits: Limits = Limits()
+    meters: MeterDefaults = MeterDefaults()
+    load: LoadDefaults = LoadDefaults()
+    monitor: MonitorDefaults = MonitorDefaults()
 
 
-_PARSERS: dict[CellType, Callable[[object], tuple[Any, Problem | None]]] = {
-    CellType.TEXT: _text,
-    CellType.ID: _id,
-    CellType.NAME: _name,
-    CellType.NUMBER: _number,
-    CellType.WHOLE: _whole,
-    CellType.TRUTH: _truth,
-    CellType.PAIR: _pair,
-    CellType.NAMES: _names,
+@dataclass(frozen=True, slots=True)
+class FeederTables:
+    """Content of a feeder's files: SI units, the source's ids."""
+
+    meta: FeederMeta
+    lines: tuple[LineRow, ...]
+    customers: tuple[CustomerRow, ...]
+    valid: bool = field(default=False, init=False, compare=False, repr=False)
+    """True once `feeders.format.tables.validate` has found no problem; False in a copy by `replace`."""
+
+    @property
+    def in_phases(self) -> bool:
+        """True if the model is in three phases; open lines do not count."""
+        lines = any(row.in_phases for row in self.lines if row.closed)
+        return lines or any(row.phases != "abc" for row in self.customers)
+
+
+def _columns(row: type) -> tuple[Column, ...]:
+    """Columns of a class of rows or keys, in the order of its fields."""
+    hints = get_type_hints(row, include_extras=True)
+    declared = [(each, getattr(hints[each.name], "__metadata__", (None,))[0]) for each in fields(row)]
+    return tuple(
+        replace(column, name=each.name, default=REQUIRED if each.default is MISSING else each.default)
+        for each, column in declared
+        if isinstance(column, Column)
+    )
+
+
+LINE_COLUMNS: Final = _columns(LineRow)
+CUSTOMER_COLUMNS: Final = _columns(CustomerRow)
+SECTIONS: Final[dict[str, type]] = {
+    "limits": Limits,
+    "meters": MeterDefaults,
+    "load": LoadDefaults,
+    "monitor": MonitorDefaults,
 }
+META_COLUMNS: Final = {"": _columns(FeederMeta)} | {name: _columns(made) for name, made in SECTIONS.items()}
+
+PAIRS: Final = ("aa", "ab", "ac", "bb", "bc", "cc")
+"""Upper triangle of a symmetric matrix in phases, row by row."""
+
+SERIES_NAMES: Final = tuple(f"{symbol}_{pair}_ohm" for symbol in "rx" for pair in PAIRS)
+SHUNT_NAMES: Final = tuple(f"b_{pair}_us" for pair in PAIRS)
+MATRIX_NAMES: Final = (*SERIES_NAMES, *SHUNT_NAMES)
+PHASE_NAMES: Final = frozenset({*MATRIX_NAMES, "tap_a", "tap_b", "tap_c"})
+"""Columns of feeders in three phases only."""

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from operator import attrgetter
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Mapping
+from typing import Any, Final
 
 import numpy as np
 
-from feeders.format.columns import PAIRS, SERIES_COLUMNS, SHUNT_COLUMNS, Column
+from feeders.format.columns import MATRIX_NAMES, PAIRS, SERIES_NAMES, SHUNT_NAMES, LineRow
 from feeders.format.reader import CheckReport, Parsed, rows
 from gridsec.arrays import Bools, Floats, Phasors
-from gridsec.errors import Problem
-
-if TYPE_CHECKING:
-    from feeders.format.tables import LineRow
 
 PHASES: Final = "abc"
 
@@ -26,15 +21,10 @@ AGREEMENT: Final = 1e-3
 
 UPPER: Final = np.triu_indices(3)
 
-NAMES: Final = tuple(column.name for column in (*SERIES_COLUMNS, *SHUNT_COLUMNS))
-SERIES_NAMES: Final = tuple(column.name for column in SERIES_COLUMNS)
-SHUNT_NAMES: Final = tuple(column.name for column in SHUNT_COLUMNS)
-_cells = attrgetter(*NAMES)
-
 
 def cells_of(line: LineRow) -> dict[str, float | None]:
     """Matrix cells of a row by column name."""
-    return dict(zip(NAMES, _cells(line), strict=True))
+    return {name: getattr(line, name) for name in MATRIX_NAMES}
 
 
 def series_ohm(cells: Mapping[str, Any]) -> Phasors | None:
@@ -58,16 +48,9 @@ def _symmetric(cells: Mapping[str, Any], symbol: str, unit: str) -> Floats | Non
 
 
 def columns_of(symbol: str, unit: str, matrix: Floats, present: Bools) -> dict[str, float]:
-    """Cells of a symmetric matrix by column name, without those of absent phases.
+    """Cells of a symmetric matrix (3, 3) by column name, without those of absent phases.
 
-    Parameters
-    ----------
-    symbol, unit
-        "r" and "ohm", "x" and "ohm", or "b" and "us".
-    matrix : (3, 3)
-        Matrix in this unit.
-    present : (3,)
-        Mask of the phases.
+    `symbol` and `unit` are "r" and "ohm", "x" and "ohm", or "b" and "us"; `present` (3,) is a mask.
     """
     return {
         f"{symbol}_{pair}_{unit}": float(matrix[i, j])
@@ -77,13 +60,7 @@ def columns_of(symbol: str, unit: str, matrix: Floats, present: Bools) -> dict[s
 
 
 def positive_sequence(matrix: Phasors | Floats) -> complex:
-    """Mean of the diagonal less the mean of the other entries: the value for balanced currents.
-
-    Parameters
-    ----------
-    matrix : (k, k)
-        Matrix of the present phases.
-    """
+    """Mean of the diagonal less the mean of the other entries: the value for balanced currents."""
     count = len(matrix)
     own = complex(np.trace(matrix))
     return own / count - (complex(matrix.sum()) - own) / max(count * (count - 1), 1)
@@ -96,41 +73,37 @@ def passive(matrix: Floats) -> bool:
 
 def check(parsed: Parsed, report: CheckReport) -> None:
     """Report every matrix that is incomplete, inconsistent or physically impossible."""
-    needed = ("phases", "r_ohm", "x_ohm", "r0_ohm", "x0_ohm", "b_us", *NAMES)
+    needed = ("phases", "r_ohm", "x_ohm", "r0_ohm", "x0_ohm", "b_us", *MATRIX_NAMES)
     for where, cells in rows(parsed.lines, *needed):
-        for columns, matrix in ((SERIES_COLUMNS, series_ohm(cells)), (SHUNT_COLUMNS, shunt_us(cells))):
-            if any(cells[column.name] is not None for column in columns):
-                wrong = [*_layout(cells, columns)] or [*_content(cells, matrix)]
-                report.problems.extend(Problem(problem.code, f"{where}{problem}") for problem in wrong)
+        for names, matrix in ((SERIES_NAMES, series_ohm(cells)), (SHUNT_NAMES, shunt_us(cells))):
+            given = [name for name in names if cells[name] is not None]
+            if given and _complete(where, cells, names, given, report) and matrix is not None:
+                _content(where, cells, matrix, report)
 
 
-def _layout(cells: Mapping[str, Any], columns: tuple[Column, ...]) -> Iterator[Problem]:
-    """Missing and surplus cells of a matrix."""
+def _complete(
+    where: str, cells: Mapping[str, Any], names: tuple[str, ...], given: list[str], report: CheckReport
+) -> bool:
+    """True for a matrix without missing and surplus cells."""
     phases = cells["phases"]
     if len(phases) == 1:
-        first = next(column.name for column in columns if cells[column.name] is not None)
-        yield Problem("inconsistent", f", column {first}: a matrix, but phases is {phases!r}; expected none")
-        return
-    wanted = {column.name for column in columns if set(column.name.split("_")[1]) <= set(phases)}
-    missing = [column.name for column in columns if column.name in wanted and cells[column.name] is None]
-    extra = [
-        column.name for column in columns if column.name not in wanted and cells[column.name] is not None
-    ]
+        text = f"{where}, column {given[0]}: a matrix, but phases is {phases!r}; expected none"
+        report.problem("inconsistent", text)
+        return False
+    wanted = [name for name in names if set(name.split("_")[1]) <= set(phases)]
+    missing = [name for name in wanted if name not in given]
+    extra = [name for name in given if name not in wanted]
     if missing:
-        yield Problem(
-            "missing", f", columns {', '.join(missing)}: missing; expected the whole matrix or nothing of it"
-        )
+        expected = "expected the whole matrix or nothing of it"
+        report.problem("missing", f"{where}, columns {', '.join(missing)}: missing; {expected}")
     if extra:
-        yield Problem(
-            "absent-phase",
-            f", columns {', '.join(extra)}: of a conductor that is not in phases {phases!r}; expected none",
-        )
+        text = f"of a conductor that is not in phases {phases!r}; expected none"
+        report.problem("absent-phase", f"{where}, columns {', '.join(extra)}: {text}")
+    return not missing and not extra
 
 
-def _content(cells: Mapping[str, Any], whole: Phasors | Floats | None) -> Iterator[Problem]:
-    """Entries that no passive line has, and contradictions to the row's other cells."""
-    if whole is None:
-        return
+def _content(where: str, cells: Mapping[str, Any], whole: Phasors | Floats, report: CheckReport) -> None:
+    """Report entries that no passive line has, and contradictions to the row's other cells."""
     here = [PHASES.index(phase) for phase in sorted(cells["phases"])]
     matrix = whole[np.ix_(here, here)]
     one, largest = positive_sequence(matrix), float(np.abs(matrix).max())
@@ -138,30 +111,18 @@ def _content(cells: Mapping[str, Any], whole: Phasors | Floats | None) -> Iterat
     parts = [("r_ohm", one.real), ("x_ohm", one.imag)] if series else [("b_us", one.real)]
     for name, value in parts:
         if abs(cells[name] - value) > AGREEMENT * largest:
-            yield (
-                Problem(
-                    "inconsistent",
-                    f", column {name}: {cells[name]:g} is not the positive sequence of the line's matrix; "
-                    f"expected {value:.6g}, the mean of its diagonal less that of the rest",
-                )
+            report.problem(
+                "inconsistent",
+                f"{where}, column {name}: {cells[name]:g} is not the positive sequence of the line's matrix; "
+                f"expected {value:.6g}, the mean of its diagonal less that of the rest",
             )
-    if not series and not passive(matrix.real):
-        yield Problem(
-            "not-definite",
-            ", columns b_aa_us to b_cc_us: no capacitances; expected a positive semidefinite matrix",
-        )
-    if series and not passive(matrix.real):
-        yield Problem(
-            "not-definite",
-            ", columns r_aa_ohm to r_cc_ohm: generate power; expected a positive semidefinite matrix",
-        )
+    if not passive(matrix.real):
+        fault = "r_aa_ohm to r_cc_ohm: generate power" if series else "b_aa_us to b_cc_us: no capacitances"
+        report.problem("not-definite", f"{where}, columns {fault}; expected a positive semidefinite matrix")
     if series and (cells["r0_ohm"] is not None or cells["x0_ohm"] is not None):
-        yield Problem(
-            "inconsistent",
-            ", columns r0_ohm and x0_ohm: beside a matrix; expected one of the two",
+        report.problem(
+            "inconsistent", f"{where}, columns r0_ohm and x0_ohm: beside a matrix; expected one of the two"
         )
     if series and min(np.linalg.svd(matrix, compute_uv=False)[-1], abs(one)) <= ROUNDING * largest:
-        yield Problem(
-            "singular",
-            ", columns r_aa_ohm to x_cc_ohm: are singular; expected conductors with impedances of their own",
-        )
+        expected = "expected conductors with impedances of their own"
+        report.problem("singular", f"{where}, columns r_aa_ohm to x_cc_ohm: are singular; {expected}")

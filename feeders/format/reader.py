@@ -15,6 +15,38 @@ from feeders.format.columns import shown
 from gridsec.errors import Problem
 
 SHOWN = 10
+META_FILE, LINES_FILE, CUSTOMERS_FILE = "feeder.toml", "lines.csv", "customers.csv"
+FOREIGN = re.compile(r".+\.(json|dss)|(pandapower|simbench):.+|.+--[0-9]-(no_)?sw", re.IGNORECASE)
+"""Sources with a network of another tool."""
+MAX_BYTES = 64 * 1024 * 1024
+
+# Rows with their line numbers, from 1.
+Rows = list[tuple[int, Mapping[str, Any]]]
+
+
+@dataclass(slots=True)
+class CheckReport:
+    """Problems and notes of reading and of the checks."""
+
+    problems: list[Problem] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    def problem(self, code: str, text: str) -> None:
+        """Add a problem."""
+        self.problems.append(Problem(code, text))
+
+
+@dataclass(slots=True)
+class RawTables:
+    """Cells before parsing; unreadable tables are None."""
+
+    meta_name: str
+    lines_name: str
+    customers_name: str
+    meta: Mapping[str, Any] | None = None
+    lines: Rows | None = None
+    customers: Rows | None = None
+    report: CheckReport = field(default_factory=CheckReport)
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,38 +59,21 @@ class ParsedRow:
 
 @dataclass(frozen=True, slots=True)
 class Parsed:
-    """Input after parsing; unreadable parts are None.
-
-    Attributes
-    ----------
-    place
-        Name of the file or object with the feeder's own keys.
-    meta
-        Cells of each section of feeder.toml; "" is the top.
-    lines, customers
-        The tables' rows.
-    """
+    """Input after parsing, with the cells of each section of feeder.toml; unreadable parts are None."""
 
     place: str
+    """Name of the file or object with the feeder's own keys."""
     meta: dict[str, dict[str, Any]] | None
     lines: list[ParsedRow] | None
     customers: list[ParsedRow] | None
 
+    def section(self, name: str) -> dict[str, Any]:
+        """Valid keys of a section of feeder.toml; "" is the top."""
+        return {} if self.meta is None else self.meta[name]
+
     def top(self, key: str) -> Any:
         """Value of a key at the top of feeder.toml, None if invalid or absent."""
-        return None if self.meta is None else self.meta[""].get(key)
-
-    def accepted(self, suspicion: str) -> bool:
-        """True if `accept` in feeder.toml lists this suspicion."""
-        return suspicion in (self.top("accept") or ())
-
-
-@dataclass(slots=True)
-class CheckReport:
-    """Problems and notes of the checks."""
-
-    problems: list[Problem] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
+        return self.section("").get(key)
 
 
 def rows(records: list[ParsedRow] | None, *columns: str) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -74,28 +89,6 @@ def some(items: list[str]) -> str:
     return ", ".join(items[:SHOWN]) + tail
 
 
-META_FILE, LINES_FILE, CUSTOMERS_FILE = "feeder.toml", "lines.csv", "customers.csv"
-FOREIGN = re.compile(r".+\.(json|dss)|(pandapower|simbench):.+|.+--[0-9]-(no_)?sw", re.IGNORECASE)
-"""Sources with a network of another tool."""
-MAX_BYTES = 64 * 1024 * 1024
-
-# Rows with their line numbers, from 1.
-Rows = list[tuple[int, Mapping[str, Any]]]
-
-
-@dataclass(slots=True)
-class RawTables:
-    """Cells before parsing; unreadable tables are None."""
-
-    meta_name: str
-    meta: Mapping[str, Any] | None
-    lines_name: str
-    lines: Rows | None
-    customers_name: str
-    customers: Rows | None
-    problems: list[Problem]
-
-
 def advice(source: object) -> str:
     """Command that converts a network of another tool to a feeder; empty for any other source."""
     name = str(source)
@@ -104,162 +97,138 @@ def advice(source: object) -> str:
 
 def from_folder(folder: Path) -> RawTables:
     """Read the files of a feeder; an unreadable file is a problem, never an exception."""
-    raw = RawTables(META_FILE, None, LINES_FILE, None, CUSTOMERS_FILE, None, [])
+    raw = RawTables(META_FILE, LINES_FILE, CUSTOMERS_FILE)
     if not folder.is_dir():
         there = folder.exists()
         what = "is a file, not a folder" if there else "does not exist"
-        raw.problems.append(
-            Problem(
-                "wrong-type" if there else "missing",
-                f"{folder} {what}; expected a folder with {META_FILE}, {LINES_FILE}, {CUSTOMERS_FILE}"
-                f"{advice(folder)}",
-            )
+        files = f"{META_FILE}, {LINES_FILE}, {CUSTOMERS_FILE}"
+        raw.report.problem(
+            "wrong-type" if there else "missing",
+            f"{folder} {what}; expected a folder with {files}{advice(folder)}",
         )
         return raw
-    text = _file_text(folder / META_FILE, raw.problems)
-    if text is not None:
-        try:
-            raw.meta = tomllib.loads(text)
-        except (tomllib.TOMLDecodeError, RecursionError) as error:
-            raw.problems.append(Problem("unreadable", f"{META_FILE}: invalid TOML: {error}"))
-    text = _file_text(folder / LINES_FILE, raw.problems)
-    if text is not None:
-        raw.lines = _csv_rows(LINES_FILE, text, raw.problems)
-    text = _file_text(folder / CUSTOMERS_FILE, raw.problems)
-    if text is not None:
-        raw.customers = _csv_rows(CUSTOMERS_FILE, text, raw.problems)
+    text = _file_text(folder / META_FILE, raw.report)
+    try:
+        raw.meta = None if text is None else tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raw.report.problem("unreadable", f"{META_FILE}: invalid TOML: {error}")
+    raw.lines = _csv_rows(folder / LINES_FILE, raw.report)
+    raw.customers = _csv_rows(folder / CUSTOMERS_FILE, raw.report)
     return raw
 
 
-def _file_text(path: Path, problems: list[Problem]) -> str | None:
+def _file_text(path: Path, report: CheckReport) -> str | None:
     try:
         if path.stat().st_size > MAX_BYTES:
-            problems.append(
-                Problem(
-                    "too-many", f"{path.name}: larger than {MAX_BYTES // 1024**2} MiB; is it the right file?"
-                )
+            report.problem(
+                "too-many", f"{path.name}: larger than {MAX_BYTES // 1024**2} MiB; is it the right file?"
             )
             return None
         data = path.read_bytes()
     except FileNotFoundError:
-        problems.append(Problem("missing", f"{path.name}: the file is missing"))
+        report.problem("missing", f"{path.name}: the file is missing")
         return None
     except OSError as error:
-        problems.append(Problem("unreadable", f"{path.name}: cannot be read: {error.strerror}"))
+        report.problem("unreadable", f"{path.name}: cannot be read: {error.strerror}")
         return None
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         row = data[: error.start].count(b"\n") + 1
-        problems.append(
-            Problem(
-                "unreadable",
-                f"{path.name}, row {row}: byte 0x{data[error.start]:02x} is not UTF-8; save it as UTF-8",
-            )
+        report.problem(
+            "unreadable",
+            f"{path.name}, row {row}: byte 0x{data[error.start]:02x} is not UTF-8; save it as UTF-8",
         )
         return None
     if not text.strip():
-        problems.append(Problem("missing", f"{path.name}: the file is empty"))
+        report.problem("missing", f"{path.name}: the file is empty")
         return None
     return text
 
 
-def _csv_rows(name: str, text: str, problems: list[Problem]) -> Rows | None:
+def _csv_rows(path: Path, report: CheckReport) -> Rows | None:
+    name, text = path.name, _file_text(path, report)
+    if text is None:
+        return None
     reader = csv.reader(io.StringIO(text, newline=""), strict=True)
     rows: Rows = []
     try:
         header = [cell.strip() for cell in next(reader)]
         twice = sorted({cell for cell in header if header.count(cell) > 1})
         if twice:
-            problems.append(
-                Problem(
-                    "duplicate",
-                    f"{name}, row 1: column {', '.join(map(shown, twice))} is there more than once",
-                )
+            report.problem(
+                "duplicate", f"{name}, row 1: column {', '.join(map(shown, twice))} is there more than once"
             )
             return None
         if len(header) == 1 and (";" in header[0] or "\t" in header[0]):
-            problems.append(
-                Problem(
-                    "shape",
-                    f"{name}, row 1: one single column {shown(header[0])}; separate columns by commas",
-                )
+            report.problem(
+                "shape", f"{name}, row 1: one single column {shown(header[0])}; separate columns by commas"
             )
             return None
         for cells in reader:
             if not any(cell.strip() for cell in cells):
                 continue
             if len(cells) != len(header):
-                problems.append(
-                    Problem(
-                        "shape",
-                        f"{name}, row {reader.line_num}: {len(cells)} cells under {len(header)} columns",
-                    )
+                report.problem(
+                    "shape", f"{name}, row {reader.line_num}: {len(cells)} cells under {len(header)} columns"
                 )
                 continue
             rows.append((reader.line_num, dict(zip(header, cells, strict=True))))
     except csv.Error as error:
-        problems.append(Problem("unreadable", f"{name}, row {reader.line_num}: invalid CSV: {error}"))
+        report.problem("unreadable", f"{name}, row {reader.line_num}: invalid CSV: {error}")
         return None
     if not rows:
-        problems.append(Problem("missing", f"{name}: there is no row below the header"))
+        report.problem("missing", f"{name}: there is no row below the header")
         return None
     return rows
 
 
 def from_object(obj: object) -> RawTables:
     """Split the decoded JSON form; a table is a list of rows or an object of columns."""
-    raw = RawTables("feeder", None, "lines", None, "customers", None, [])
+    raw = RawTables("feeder", "lines", "customers")
     if not isinstance(obj, Mapping):
-        raw.problems.append(
-            Problem(
-                "wrong-type",
-                f"{shown(obj)} is not a feeder; expected an object with feeder, lines and customers",
-            )
+        raw.report.problem(
+            "wrong-type", f"{shown(obj)} is not a feeder; expected an object with feeder, lines and customers"
         )
         return raw
-    raw.problems.extend(
-        Problem("missing", f"{name}: is missing; expected feeder, lines and customers")
-        for name in ("feeder", "lines", "customers")
-        if obj.get(name) is None
-    )
+    for name in ("feeder", "lines", "customers"):
+        if obj.get(name) is None:
+            raw.report.problem("missing", f"{name}: is missing; expected feeder, lines and customers")
     meta = obj.get("feeder")
     if isinstance(meta, Mapping):
         raw.meta = meta
     elif meta is not None:
-        raw.problems.append(Problem("wrong-type", f"feeder: {shown(meta)} is not an object"))
-    raw.lines = _json_rows("lines", obj.get("lines"), raw.problems)
-    raw.customers = _json_rows("customers", obj.get("customers"), raw.problems)
+        raw.report.problem("wrong-type", f"feeder: {shown(meta)} is not an object")
+    raw.lines = _json_rows("lines", obj.get("lines"), raw.report)
+    raw.customers = _json_rows("customers", obj.get("customers"), raw.report)
     return raw
 
 
-def _json_rows(name: str, table: object, problems: list[Problem]) -> Rows | None:
+def _json_rows(name: str, table: object, report: CheckReport) -> Rows | None:
     if table is None:
         return None
     if isinstance(table, Mapping):
         if not all(isinstance(cells, (list, tuple)) for cells in table.values()):
-            problems.append(
-                Problem("wrong-type", f"{name}: expected a list of rows, or an object with lists as columns")
+            report.problem(
+                "wrong-type", f"{name}: expected a list of rows, or an object with lists as columns"
             )
             return None
         lengths = {column: len(cells) for column, cells in table.items()}
         if len(set(lengths.values())) > 1:
-            problems.append(Problem("shape", f"{name}: columns of different length: {shown(lengths)}"))
+            report.problem("shape", f"{name}: columns of different length: {shown(lengths)}")
             return None
         count = next(iter(lengths.values()), 0)
         table = [{column: cells[k] for column, cells in table.items()} for k in range(count)]
     if not isinstance(table, (list, tuple)):
-        problems.append(
-            Problem("wrong-type", f"{name}: {shown(table)} is not a table; expected a list of rows")
-        )
+        report.problem("wrong-type", f"{name}: {shown(table)} is not a table; expected a list of rows")
         return None
     if not table:
-        problems.append(Problem("missing", f"{name}: there is no row"))
+        report.problem("missing", f"{name}: there is no row")
         return None
     rows: Rows = []
     for number, row in enumerate(table, start=1):
         if isinstance(row, Mapping):
             rows.append((number, row))
         else:
-            problems.append(Problem("wrong-type", f"{name}, row {number}: {shown(row)} is not an object"))
+            report.problem("wrong-type", f"{name}, row {number}: {shown(row)} is not an object")
     return rows

@@ -1,12 +1,14 @@
 """Graph of the feeder: fused buses, a tree below the busbar, loops, islands.
 
-Works on ids alone: the checks and the loader use the same graph.
+The checks and the loader use the same graph.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+
+from feeders.format.columns import LineRow
 
 LOOPS_SHOWN = 20
 
@@ -25,34 +27,18 @@ class Edge:
 
 @dataclass(frozen=True, slots=True)
 class Tree:
-    """Part of the feeder that is connected to the busbar, in topological order.
+    """Part of the feeder that is connected to the busbar, in topological order."""
 
-    Attributes
-    ----------
-    group
-        Fused bus index of every connected bus; 0 is the busbar.
-    buses
-        One id per fused bus: the first of its members in the order of the input.
-    parent
-        Fused bus that feeds bus k + 1; always at most k.
-    branch
-        Index (into the edges given) of the line that feeds bus k + 1.
-    ties
-        Indices of the edges that close loops: each joins two buses that are connected without it.
-    loops
-        Indices of the edges of each loop: of every tie that joins a bus to itself, and of at most LOOPS_SHOWN
-        others. A radial feeder has none.
-    islands
-        Unconnected buses, one tuple for each connected piece.
-    """
-
-    group: dict[str, int]
-    buses: tuple[str, ...]
-    parent: tuple[int, ...]
-    branch: tuple[int, ...]
+    group: dict[str, int]  # Fused bus index of every connected bus; 0 is the busbar
+    buses: tuple[str, ...]  # One id per fused bus: the first of its members in the order of the input
+    parent: tuple[int, ...]  # Fused bus that feeds bus k + 1; always at most k
+    branch: tuple[int, ...]  # Index (into the edges given) of the line that feeds bus k + 1
+    # Indices of the edges that close loops: each joins two buses that are connected without it
     ties: tuple[int, ...]
+    # Indices of the edges of each loop: of every tie that joins a bus to itself, and of at most LOOPS_SHOWN
+    # others. A radial feeder has none
     loops: tuple[tuple[int, ...], ...]
-    islands: tuple[tuple[str, ...], ...]
+    islands: tuple[tuple[str, ...], ...]  # Unconnected buses, one tuple for each connected piece
 
 
 class _Sets:
@@ -80,17 +66,17 @@ class _Sets:
         return True
 
 
-def tree(busbar: str, edges: Sequence[Edge], others: Iterable[str] = ()) -> Tree:
-    """Fuse the buses at both ends of lines without impedance and walk the others from the busbar.
+def closed_tree(busbar: str, lines: Iterable[LineRow]) -> tuple[list[LineRow], Tree]:
+    """Closed lines of a feeder, and their tree."""
+    closed = [row for row in lines if row.closed]
+    edges = [Edge(row.line, row.from_bus, row.to_bus, row.fuses, phases=len(row.phases)) for row in closed]
+    return closed, tree(busbar, edges)
 
-    Parameters
-    ----------
-    busbar
-        Root of the tree.
-    edges
-        The closed lines.
-    others
-        Further buses that need a connection (ends of open lines).
+
+def tree(busbar: str, edges: Sequence[Edge], others: Iterable[str] = ()) -> Tree:
+    """Fuse the buses at both ends of closed lines without impedance and walk the others from the busbar.
+
+    `others` are further buses that need a connection, such as ends of open lines.
     """
     order = [busbar, *(bus for edge in edges for bus in (edge.from_bus, edge.to_bus)), *others]
     fused, connected = _Sets(order), _Sets(order)

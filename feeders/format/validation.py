@@ -13,19 +13,16 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from feeders.format import matrices
+from feeders.format.columns import LineRow
 from feeders.format.reader import CheckReport, Parsed, rows, some
-from feeders.format.topology import Edge, Tree, tree
-from feeders.model import profiles
+from feeders.format.topology import Edge, Tree, closed_tree, tree
+from feeders.profiles import load_names, pv_names
+from gridsec.arrays import Floats
 from gridsec.errors import Problem
 from gridsec.grid.droop import PRESETS
-
-if TYPE_CHECKING:
-    from feeders.format.tables import LineRow
-    from gridsec.arrays import Floats
-
 
 SAME_LEVEL: Final = 1e-6
 """Relative difference of two nominal voltages that count as equal: 230.94 and 400 / sqrt(3)."""
@@ -37,31 +34,15 @@ def same_level(one: float, other: float) -> bool:
 
 
 def told(nominal_volt: Floats, form: str = ".1f") -> str:
-    """Nominal voltages of a feeder for messages: "11547.0 V and 230.9 V".
-
-    Parameters
-    ----------
-    nominal_volt : (n,)
-        Nominal voltages of the places, V, the busbar first.
-    form
-        Format of the numbers.
-    """
+    """Nominal voltages of a feeder for messages: "11547.0 V and 230.9 V"; the busbar's is first."""
     several = dict.fromkeys(f"{volt:{form}} V" for volt in nominal_volt.tolist())
     return " and ".join(several)
 
 
 def nominal_volts(found: Tree, edges: Sequence[Edge | LineRow], volt: float) -> list[float]:
-    """Nominal voltage of every bus, V, phase to neutral.
-
-    Parameters
-    ----------
-    found, edges
-        The tree, and its closed lines.
-    volt
-        Nominal voltage of the busbar, V.
-    """
+    """Nominal voltage of every bus of a tree of closed lines, V, phase to neutral; `volt` of the busbar."""
     nominal = _found(found, edges, volt)
-    for k, above in enumerate(found.parent):  # missing only where `problems` reports a line
+    for k, above in enumerate(found.parent):  # missing only where `_levels` reports a line
         nominal.setdefault(k + 1, nominal[above])
     return [nominal[k] for k in range(len(found.buses))]
 
@@ -84,45 +65,6 @@ def _found(found: Tree, edges: Sequence[Edge | LineRow], volt: float) -> dict[in
     return nominal
 
 
-def problems(found: Tree, edges: Sequence[Edge | LineRow], volt: float) -> Iterator[tuple[int, Problem]]:
-    """Yield every line with an inconsistent `to_volt`, and its problem; arguments as of `nominal_volts`."""
-    nominal, known = nominal_volts(found, edges, volt), _found(found, edges, volt).keys()
-    above = dict(zip(found.branch, found.parent, strict=True))
-    for k, line in enumerate(edges):
-        if line.from_bus not in found.group:
-            continue
-        here, there = found.group[line.from_bus], found.group[line.to_bus]
-        told = nominal[here] if line.to_volt is None else line.to_volt
-        backwards = line.to_volt is not None and above.get(k) == there
-        if here == there and not same_level(told, nominal[here]):
-            yield (
-                k,
-                Problem(
-                    "zero-impedance",
-                    f"{told:g} on a line without impedance; expected the transformer's r_ohm and x_ohm",
-                ),
-            )
-        elif backwards and (here not in known or not same_level(told, nominal[there])):
-            yield (
-                k,
-                Problem("backwards", f"{told:g}, but {line.to_bus!r} is on the side of the busbar; {_TURN}"),
-            )
-        elif not same_level(told, nominal[there]):
-            yield (
-                k,
-                Problem(
-                    "inconsistent",
-                    f"{told:g} V at {line.to_bus!r}, {nominal[there]:g} V around the loop; expected the same",
-                ),
-            )
-
-
-_TURN: Final = (
-    "expected from_bus and to_bus exchanged, with the impedances of the other side: a transformer leads away "
-    "from the busbar"
-)
-
-
 LOW_VOLTAGE = 1000.0
 # Nominal voltages between phases; none is a usual voltage to neutral.
 PHASE_TO_PHASE = (
@@ -143,18 +85,8 @@ LINE_XR, TRANSFORMER_XR = 20.0, 100.0
 Doubts = Iterator[tuple[str, str]]
 
 
-def check_units(parsed: Parsed, edges: Sequence[Edge], found: Tree | None, report: CheckReport) -> None:
-    """Report every doubtful value, as a problem or, if feeder.toml accepts it, as a note.
-
-    Parameters
-    ----------
-    parsed
-        The tables.
-    edges, found
-        The closed lines and their tree, or None without a graph.
-    report
-        Receives the sentences.
-    """
+def _units(parsed: Parsed, edges: Sequence[Edge], found: Tree | None, report: CheckReport) -> None:
+    """Report every doubtful value, as a problem or, if feeder.toml accepts it, as a note."""
     volt = parsed.top("voltage_volt")
     level: dict[str, float] = {}
     if found is not None and volt is not None:
@@ -170,17 +102,13 @@ def check_units(parsed: Parsed, edges: Sequence[Edge], found: Tree | None, repor
     ]
     if found is not None:
         doubts += _drop(parsed, edges, found, level)
+    accepted = parsed.top("accept") or ()
     for name, sentence in doubts:
-        _doubt(parsed, report, name, sentence)
-
-
-def _doubt(parsed: Parsed, report: CheckReport, name: str, sentence: str) -> None:
-    if parsed.accepted(name):
-        report.notes.append(f"accepted: {sentence}")
-    else:
-        report.problems.append(
-            Problem("doubtful", f'{sentence} (if it is right: accept = ["{name}"] in feeder.toml)')
-        )
+        if name in accepted:
+            report.notes.append(f"accepted: {sentence}")
+        else:
+            hint = f'(if it is right: accept = ["{name}"] in feeder.toml)'
+            report.problem("doubtful", f"{sentence} {hint}")
 
 
 def _voltage(parsed: Parsed) -> Doubts:
@@ -266,7 +194,7 @@ def _powers(parsed: Parsed, level: Mapping[str, float], volt: float) -> Doubts:
 
 
 def _classes(parsed: Parsed) -> Doubts:
-    meters = {} if parsed.meta is None else parsed.meta["meters"]
+    meters = parsed.section("meters")
     places = [
         (f"{parsed.place}, [meters], key class_percent", meters.get("class_percent")),
         (f"{parsed.place}, key busbar_class_percent", parsed.top("busbar_class_percent")),
@@ -309,15 +237,13 @@ RESERVED_METER = "substation"
 """Name of the busbar meter on the wire and in alarms."""
 
 
-def feeder(parsed: Parsed) -> tuple[list[Problem], list[str]]:
-    """Every problem between cells, and notes on notable content."""
-    report = CheckReport()
-    for check in (_duplicates, _reserved, _limits, _power_factors, _presets, _profiles, _positions, _taps):
-        check(parsed, report)
+def check(parsed: Parsed, report: CheckReport) -> None:
+    """Report every problem between cells, and notable content."""
+    for each in (_duplicates, _reserved, _limits, _power_factors, _presets, _profiles, _positions, _taps):
+        each(parsed, report)
     matrices.check(parsed, report)
     edges, found = _graph(parsed, report)
-    check_units(parsed, edges, found, report)
-    return report.problems, report.notes
+    _units(parsed, edges, found, report)
 
 
 # --- ids and references -------------------------------------------------------------------------
@@ -335,12 +261,10 @@ def _duplicates(parsed: Parsed, report: CheckReport) -> None:
             if key == "":
                 continue
             if key in first:
-                report.problems.append(
-                    Problem(
-                        "duplicate",
-                        f"{where}, column {column}: {key!r} is already the id of {first[key]}; "
-                        "every id must be unique",
-                    )
+                report.problem(
+                    "duplicate",
+                    f"{where}, column {column}: {key!r} is already the id of {first[key]}; "
+                    "every id must be unique",
                 )
             else:
                 first[key] = where
@@ -354,30 +278,26 @@ def _duplicates(parsed: Parsed, report: CheckReport) -> None:
 def _reserved(parsed: Parsed, report: CheckReport) -> None:
     for where, cells in rows(parsed.customers, "meter"):
         if cells["meter"] == RESERVED_METER:
-            report.problems.append(
-                Problem(
-                    "duplicate",
-                    f"{where}, column meter: {RESERVED_METER!r} is the name of the busbar meter; "
-                    "expected another id",
-                )
+            report.problem(
+                "duplicate",
+                f"{where}, column meter: {RESERVED_METER!r} is the name of the busbar meter; "
+                "expected another id",
             )
 
 
 def _limits(parsed: Parsed, report: CheckReport) -> None:
-    limits = {} if parsed.meta is None else parsed.meta["limits"]
+    limits = parsed.section("limits")
     low, high = limits.get("v_min_pu"), limits.get("v_max_pu")
     if low is not None and high is not None and low >= high:
-        report.problems.append(
-            Problem(
-                "order",
-                f"{parsed.place}, [limits]: v_min_pu {low:g} is not below v_max_pu {high:g}; "
-                "expected for example 0.9 and 1.1",
-            )
+        report.problem(
+            "order",
+            f"{parsed.place}, [limits]: v_min_pu {low:g} is not below v_max_pu {high:g}; "
+            "expected for example 0.9 and 1.1",
         )
 
 
 def _power_factors(parsed: Parsed, report: CheckReport) -> None:
-    load = {} if parsed.meta is None else parsed.meta["load"]
+    load = parsed.section("load")
     names = ("power_factor_min", "power_factor", "power_factor_max")
     places: list[tuple[str, dict[str, Any], dict[str, Any]]]
     places = [(f"{parsed.place}, [load]", load, {})] if parsed.meta is not None else []
@@ -387,12 +307,10 @@ def _power_factors(parsed: Parsed, report: CheckReport) -> None:
             continue
         low, mid, high = (cells[n] if cells.get(n) is not None else defaults.get(n) for n in names)
         if low is not None and mid is not None and high is not None and not low <= mid <= high:
-            report.problems.append(
-                Problem(
-                    "order",
-                    f"{where}: power_factor {mid:g} is not between power_factor_min {low:g} "
-                    f"and power_factor_max {high:g}",
-                )
+            report.problem(
+                "order",
+                f"{where}: power_factor {mid:g} is not between power_factor_min {low:g} "
+                f"and power_factor_max {high:g}",
             )
 
 
@@ -400,35 +318,29 @@ def _presets(parsed: Parsed, report: CheckReport) -> None:
     for where, cells in rows(parsed.customers, "droop"):
         preset, rating = cells["droop"], cells.get("inverter_kva")
         if preset and preset not in PRESETS:
-            report.problems.append(
-                Problem(
-                    "unknown-name",
-                    f"{where}, column droop: {preset!r} is not known; expected one of {', '.join(PRESETS)}",
-                )
+            report.problem(
+                "unknown-name",
+                f"{where}, column droop: {preset!r} is not known; expected one of {', '.join(PRESETS)}",
             )
         if rating and not preset:
-            report.problems.append(
-                Problem(
-                    "missing",
-                    f"{where}, column droop: is missing although inverter_kva is {rating:g}; "
-                    f"expected one of {', '.join(PRESETS)}",
-                )
+            report.problem(
+                "missing",
+                f"{where}, column droop: is missing although inverter_kva is {rating:g}; "
+                f"expected one of {', '.join(PRESETS)}",
             )
         if preset and rating == 0:
             report.notes.append(f"{where}: droop {preset!r} has no effect, inverter_kva is 0")
 
 
 def _profiles(parsed: Parsed, report: CheckReport) -> None:
-    known = {"load_profile": profiles.load_names(), "pv_profile": profiles.pv_names()}
+    known = {"load_profile": load_names(), "pv_profile": pv_names()}
     for column, names in known.items():
         for where, cells in rows(parsed.customers, column):
             if cells[column] and cells[column] not in names:
-                report.problems.append(
-                    Problem(
-                        "unknown-name",
-                        f"{where}, column {column}: {cells[column]!r} is not known; "
-                        f"expected one of {', '.join(names)}, or nothing",
-                    )
+                report.problem(
+                    "unknown-name",
+                    f"{where}, column {column}: {cells[column]!r} is not known; "
+                    f"expected one of {', '.join(names)}, or nothing",
                 )
 
 
@@ -437,13 +349,9 @@ def _profiles(parsed: Parsed, report: CheckReport) -> None:
 
 def loops(busbar: str, lines: Iterable[LineRow]) -> list[Problem]:
     """Problems of the loops of a radial feeder's lines."""
-    edges = [
-        Edge(row.line, row.from_bus, row.to_bus, row.r_ohm == row.x_ohm == 0.0, phases=len(row.phases))
-        for row in lines
-        if row.closed
-    ]
     report = CheckReport()
-    _loops(tree(busbar, edges), edges, meshed=False, report=report)
+    closed, found = closed_tree(busbar, lines)
+    _loops(found, closed, meshed=False, report=report)
     return report.problems
 
 
@@ -456,8 +364,8 @@ def _graph(parsed: Parsed, report: CheckReport) -> tuple[list[Edge], Tree | None
         one, other = cells["from_bus"], cells["to_bus"]
         known.update({one: None, other: None})
         if one == other:
-            report.problems.append(
-                Problem("self-loop", f"{where}: from_bus and to_bus are both {one!r}; a line needs two buses")
+            report.problem(
+                "self-loop", f"{where}: from_bus and to_bus are both {one!r}; a line needs two buses"
             )
         elif cells.get("closed", False):
             zero = cells.get("r_ohm") == 0 and cells.get("x_ohm") == 0
@@ -470,18 +378,16 @@ def _graph(parsed: Parsed, report: CheckReport) -> tuple[list[Edge], Tree | None
         return edges, None
     for where, cells in rows(parsed.customers, "bus"):
         if cells["bus"] not in known:
-            report.problems.append(
-                Problem(
-                    "unknown-name",
-                    f"{where}, column bus: {cells['bus']!r} is not known; no line leads there, "
-                    f"and it is not the busbar {busbar!r}",
-                )
+            report.problem(
+                "unknown-name",
+                f"{where}, column bus: {cells['bus']!r} is not known; no line leads there, "
+                f"and it is not the busbar {busbar!r}",
             )
     if any(busbar in (edge.from_bus, edge.to_bus) for edge in edges):
         _islands(found, parsed, report)
     else:
-        report.problems.append(
-            Problem("not-connected", f"{parsed.place}, key busbar: no closed line is connected to {busbar!r}")
+        report.problem(
+            "not-connected", f"{parsed.place}, key busbar: no closed line is connected to {busbar!r}"
         )
     _fused(found, report)
     _levels(found, edges, parsed, report)
@@ -489,34 +395,52 @@ def _graph(parsed: Parsed, report: CheckReport) -> tuple[list[Edge], Tree | None
 
 
 def _levels(found: Tree, edges: list[Edge], parsed: Parsed, report: CheckReport) -> None:
+    """Lines with a `to_volt` that contradicts the tree."""
     volt = parsed.top("voltage_volt")
+    if volt is None:
+        return
+    nominal, known = nominal_volts(found, edges, volt), _found(found, edges, volt).keys()
+    above = dict(zip(found.branch, found.parent, strict=True))
     places = {cells["line"]: where for where, cells in rows(parsed.lines, "line")}
-    for k, problem in problems(found, edges, volt) if volt is not None else ():
-        where = places.get(edges[k].line, "lines")
-        report.problems.append(Problem(problem.code, f"{where}, column to_volt: {problem}"))
+    for k, line in enumerate(edges):
+        if line.from_bus not in found.group:
+            continue
+        where = f"{places.get(line.line, 'lines')}, column to_volt"
+        here, there = found.group[line.from_bus], found.group[line.to_bus]
+        told = nominal[here] if line.to_volt is None else line.to_volt
+        backwards = line.to_volt is not None and above.get(k) == there
+        if here == there and not same_level(told, nominal[here]):
+            expected = "expected the transformer's r_ohm and x_ohm"
+            report.problem("zero-impedance", f"{where}: {told:g} on a line without impedance; {expected}")
+        elif backwards and (here not in known or not same_level(told, nominal[there])):
+            report.problem(
+                "backwards",
+                f"{where}: {told:g}, but {line.to_bus!r} is on the side of the busbar; expected from_bus and "
+                "to_bus exchanged, with the impedances of the other side: a transformer leads away from the "
+                "busbar",
+            )
+        elif not same_level(told, nominal[there]):
+            around = f"{nominal[there]:g} V around the loop; expected the same"
+            report.problem("inconsistent", f"{where}: {told:g} V at {line.to_bus!r}, {around}")
 
 
-def _loops(found: Tree, edges: list[Edge], meshed: bool, report: CheckReport) -> None:
+def _loops(found: Tree, edges: Sequence[Edge | LineRow], meshed: bool, report: CheckReport) -> None:
     for loop in found.loops:
         names = some([edges[k].line for k in loop])
         if len(loop) == 1:
-            report.problems.append(
-                Problem(
-                    "self-loop",
-                    f"lines: {names} is short-circuited, lines without impedance join its two buses; "
-                    "set closed to false on one of them",
-                )
+            report.problem(
+                "self-loop",
+                f"lines: {names} is short-circuited, lines without impedance join its two buses; "
+                "set closed to false on one of them",
             )
         elif meshed:
             report.notes.append(f"lines: {names} form a loop; {edges[loop[0]].line!r} is drawn as a tie")
         else:
-            report.problems.append(
-                Problem(
-                    "not-radial",
-                    f"lines: {names} form a loop; the feeder must be radial: set closed to false on "
-                    "one of them (or merge parallel lines into one row), or meshed to true in feeder.toml "
-                    "(converters: --meshed) if the loop is really closed",
-                )
+            report.problem(
+                "not-radial",
+                f"lines: {names} form a loop; the feeder must be radial: set closed to false on "
+                "one of them (or merge parallel lines into one row), or meshed to true in feeder.toml "
+                "(converters: --meshed) if the loop is really closed",
             )
 
 
@@ -536,7 +460,7 @@ def _islands(found: Tree, parsed: Parsed, report: CheckReport) -> None:
         text += f" (with {some(customers)})" if customers else ""
         text += f" to the busbar {parsed.top('busbar')!r}"
         text += f"; open here: {some(ties)}" if ties else ""
-        report.problems.append(Problem("not-connected", text))
+        report.problem("not-connected", text)
 
 
 def _fused(found: Tree, report: CheckReport) -> None:
@@ -551,11 +475,8 @@ def _fused(found: Tree, report: CheckReport) -> None:
 def _positions(parsed: Parsed, report: CheckReport) -> None:
     for where, cells in rows(parsed.lines, "to_x", "to_y"):
         if (cells["to_x"] is None) != (cells["to_y"] is None):
-            report.problems.append(
-                Problem(
-                    "missing",
-                    f"{where}, columns to_x and to_y: one of them is missing; expected both or none",
-                )
+            report.problem(
+                "missing", f"{where}, columns to_x and to_y: one of them is missing; expected both or none"
             )
 
 
@@ -565,10 +486,8 @@ def _taps(parsed: Parsed, report: CheckReport) -> None:
         given = [name for name in names.values() if cells[name] is not None]
         wanted = [name for phase, name in names.items() if phase in cells["phases"]]
         if given and (given != wanted or cells["tap"] != 1.0):
-            report.problems.append(
-                Problem(
-                    "inconsistent",
-                    f"{where}, columns {', '.join(given)}: expected {', '.join(wanted)}, those of phases "
-                    f"{cells['phases']!r}, and no tap beside them; or tap alone, of all of them",
-                )
+            report.problem(
+                "inconsistent",
+                f"{where}, columns {', '.join(given)}: expected {', '.join(wanted)}, those of phases "
+                f"{cells['phases']!r}, and no tap beside them; or tap alone, of all of them",
             )

@@ -14,19 +14,20 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.resources.abc import Traversable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from feeders.format.columns import PHASE_NAMES
 from feeders.format.reader import CUSTOMERS_FILE, LINES_FILE, META_FILE, advice
 from feeders.format.tables import CustomerRow, FeederTables, LineRow, read, to_json
-from feeders.format.topology import Tree
+from feeders.format.topology import Tree, closed_tree
 from feeders.format.validation import nominal_volts
-from feeders.model.profiles import data_root
+from feeders.profiles import data_root
 from gridsec.arrays import Bools, Floats, Ints, frozen, frozen_ints
 from gridsec.errors import FeederInvalid, Problem
 from gridsec.grid.droop import Droop, fleet
@@ -39,51 +40,29 @@ CREDIBLE_KW = 50.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadModel:
-    """Limits of the customers' powers without and with a reading, pu. N customers.
+    """Limits of the customers' powers without and with a reading, pu. N customers."""
 
-    Attributes
-    ----------
-    load_peak, pv_peak : (N,)
-        Largest load and largest generation.
-    tan_min, tan_max : (N,)
-        Limits of the load's q / p (lagging).
-    q_floor : (N,)
-        Reactive power of the load that does not follow p.
-    p_fraction, p_floor : (N,)
-        Error limit of a metered p: ``p_fraction |reading| + p_floor``.
-    q_error : (N,)
-        Error limit of a metered q: a fraction of the customer's range.
-    q_fraction : (N,)
-        The same fraction, for readings beyond that range.
-    credible : (N,)
-        Largest plausible |p| of a reading.
-    p_unread, q_unread : (N,)
-        Half-width of p without a reading, and upper limit of that of q: the range, or the standard deviation
-        of the files for a customer without a meter.
-    """
-
+    # (N,), largest load and largest generation
     load_peak: Floats
     pv_peak: Floats
+    # (N,), limits of the load's q / p (lagging)
     tan_min: Floats
     tan_max: Floats
-    q_floor: Floats
+    q_floor: Floats  # (N,), reactive power of the load that does not follow p
+    # (N,), error limit of a metered p: ``p_fraction |reading| + p_floor``
     p_fraction: Floats
     p_floor: Floats
-    q_error: Floats
-    q_fraction: Floats
-    credible: Floats
+    q_error: Floats  # (N,), error limit of a metered q: a fraction of the customer's range
+    q_fraction: Floats  # (N,), the same fraction, for readings beyond that range
+    credible: Floats  # (N,), largest plausible |p| of a reading
+    # (N,), Half-width of p without a reading, and upper limit of that of q: the range, or the standard
+    # deviation of the files for a customer without a meter
     p_unread: Floats
     q_unread: Floats
 
 
 def names(*, balanced: bool = True) -> list[str]:
-    """Names of the bundled feeders.
-
-    Parameters
-    ----------
-    balanced
-        Leave out feeders in three phases.
-    """
+    """Names of the bundled feeders; `balanced`: without feeders in three phases."""
     folder = data_root() / "feeders"
     found = (entry for entry in folder.iterdir() if (entry / META_FILE).is_file())
     return sorted(entry.name for entry in found if not (balanced and _names_phases(entry)))
@@ -108,13 +87,7 @@ def folder_of(path_or_name: Path | str) -> Path | None:
 
 
 def find(path_or_name: Path | str) -> FeederTables:
-    """Read the tables of a feeder's folder, or of a bundled feeder.
-
-    Raises
-    ------
-    FeederInvalid
-        As `load`.
-    """
+    """Read the tables of a feeder's folder, or of a bundled feeder; `FeederInvalid` as `load`."""
     folder = folder_of(path_or_name)
     if folder is not None:
         return read(folder)
@@ -150,12 +123,8 @@ def metered_customers(tables: FeederTables) -> Ints:
 def inverters(tables: FeederTables, ratio: Floats) -> Droop:
     """Inverters with a droop curve, in the order of the customers.
 
-    Parameters
-    ----------
-    tables
-        The feeder's tables.
-    ratio : (N,)
-        Voltage base by nominal voltage of each customer; curves are standardised in the latter.
+    `ratio` (N,) is the voltage base by the nominal voltage of each customer; curves are standardised in the
+    latter.
     """
     own = [k for k, row in enumerate(tables.customers) if row.inverter_kva > 0]
     rows = [tables.customers[k] for k in own]
@@ -171,15 +140,7 @@ def inverters(tables: FeederTables, ratio: Floats) -> Droop:
 
 
 def accuracy(tables: FeederTables, base_volt: Floats, nominal_volt: Floats) -> MeterAccuracy:
-    """Accuracies of the meters, each in its voltage base.
-
-    Parameters
-    ----------
-    tables
-        The feeder's tables.
-    base_volt, nominal_volt : (N,)
-        1 pu and nominal voltage at each customer, V.
-    """
+    """Accuracies of the meters, from 1 pu and the nominal voltage at each customer (N,), V."""
     meta = tables.meta
     metered = metered_customers(tables)
     rows, base = [tables.customers[k] for k in metered], base_volt[metered]
@@ -253,51 +214,30 @@ def positions(tables: FeederTables, found: Tree) -> Floats | None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Referred:
-    """Tree of a feeder with its voltage bases. N customers, b + 1 buses.
+    """Tree of a feeder with its voltage bases. N customers, b + 1 buses."""
 
-    Attributes
-    ----------
-    lines
-        Lines; line k feeds bus k + 1.
-    ties
-        The t lines that close loops.
-    nominal : (b + 1,)
-        Nominal voltage of every bus, V.
-    bus : (b + 1, 3)
-        Voltage base of every phase of every bus, V.
-    branch : (b, 3)
-        Voltage base of each line's impedance and charging, which are behind its tap as seen from `from_bus`.
-    tie : (t, 3)
-        The same of each tie.
-    customer, customer_nominal : (N,)
-        Voltage base of every customer, the mean of its phases, and its nominal voltage, V.
-    """
-
-    lines: list[LineRow]
-    ties: list[LineRow]
-    nominal: Floats
-    bus: Floats
+    lines: list[LineRow]  # Lines; line k feeds bus k + 1
+    ties: list[LineRow]  # The t lines that close loops
+    nominal: Floats  # (b + 1,), nominal voltage of every bus, V
+    bus: Floats  # (b + 1, 3), voltage base of every phase of every bus, V
+    # (b, 3), voltage base of each line's impedance and charging, which are behind its tap as seen from
+    # `from_bus`
     branch: Floats
-    tie: Floats
+    tie: Floats  # (t, 3), the same of each tie
+    # (N,), voltage base of every customer, the mean of its phases, and its nominal voltage, V
     customer: Floats
     customer_nominal: Floats
 
 
-def refer(tables: FeederTables, closed: Sequence[LineRow], found: Tree) -> Referred:
-    """Refer voltages and impedances of a feeder to its busbar.
-
-    Parameters
-    ----------
-    tables
-        The feeder.
-    closed, found
-        Its closed lines, and their tree.
+def refer(tables: FeederTables) -> tuple[Referred, Tree]:
+    """Refer voltages and impedances of a feeder to its busbar; with the tree of its closed lines.
 
     Raises
     ------
     FeederInvalid
         For a tap on a line without impedance, or taps around a loop with a product other than 1.
     """
+    closed, found = closed_tree(tables.meta.busbar, tables.lines)
     lines, ties = [closed[k] for k in found.branch], [closed[k] for k in found.ties]
     nominal = np.array(nominal_volts(found, closed, tables.meta.voltage_volt))
     bus, branch = _factors(lines, found)
@@ -314,18 +254,63 @@ def refer(tables: FeederTables, closed: Sequence[LineRow], found: Tree) -> Refer
 
     base = bus * nominal[:, None]
     customer = of_customers(base[at], np.array(own_phases, dtype=np.bool_).reshape(-1, 3))
-    return Referred(lines, ties, nominal, base, branch * own(lines), tie * own(ties), customer, nominal[at])
+    referred = Referred(
+        lines, ties, nominal, base, branch * own(lines), tie * own(ties), customer, nominal[at]
+    )
+    return referred, found
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Equipment:
+    """Fields of a site that do not depend on the kind of its model. N customers, p meters, b + 1 buses."""
+
+    tables: FeederTables  # Content of the files in SI
+    droop: Droop  # The inverters with a droop curve, in the order of the customers
+    meters: Ints  # (p,), index of each meter's customer, ascending
+    meter_ids: tuple[str, ...]  # (p,), ids of the meters
+    accuracy: MeterAccuracy  # Accuracies of the meters, pu
+    bus_of_file: Mapping[str, int]  # Fused bus index of every bus id of the files
+    xy: Floats | None  # (b + 1, 2), positions of the buses, None unless the files have all of them
+    loads: LoadModel  # Limits of the customers' powers, in units of `base_kva`
+    # SHA-256 of the content: key of design caches. It changes with every value and with the order of the rows
+    # (which is the order of all arrays), not with layout, comments or unknown columns
+    digest: str
+
+
+def equipment(tables: FeederTables, base: Referred, found: Tree) -> dict[str, Any]:
+    """Values of the fields of `Equipment`."""
+    metered = metered_customers(tables)
+    return {
+        "tables": tables,
+        "droop": inverters(tables, base.customer / base.customer_nominal),
+        "meters": metered,
+        "meter_ids": tuple(tables.customers[k].meter for k in metered),
+        "accuracy": accuracy(tables, base.customer, base.customer_nominal),
+        "bus_of_file": found.group,
+        "xy": positions(tables, found),
+        "loads": load_model(tables),
+        "digest": digest(tables),
+    }
+
+
+def without_impedance(tables: FeederTables) -> list[Problem]:
+    """Problem of a feeder that its switches join to one bus."""
+    if not all(row.fuses for row in tables.lines if row.closed):
+        return []
+    text = "lines: no closed line has an impedance; there is nothing to monitor below the busbar"
+    return [Problem("nothing-to-design", text)]
+
+
+def not_radial() -> FeederInvalid:
+    """Error of a method for radial feeders."""
+    text = "lines: closed lines form loops; a radial feeder is required"
+    return FeederInvalid([Problem("not-radial", text)])
 
 
 def of_customers(base: Floats, connected: Bools) -> Floats:
     """Voltage base of each customer, V, (N,): the mean of its phases, as its meter reads.
 
-    Parameters
-    ----------
-    base : (N, 3)
-        Voltage bases of the phases of their buses, V.
-    connected : (N, 3)
-        Mask of the customers' phases.
+    `base` (N, 3) has the voltage bases of the phases of their buses, V; `connected` (N, 3) is their mask.
     """
     first = np.take_along_axis(base, connected.argmax(axis=1)[:, None], axis=1)
     # For equal bases this form of the mean is exact to the last bit.
@@ -346,19 +331,15 @@ def _factors(lines: Sequence[LineRow], found: Tree) -> tuple[Floats, Floats]:
 
 
 def _problems(closed: Sequence[LineRow]) -> list[Problem]:
-    out = []
-    for line in (line for line in closed if set(line.taps) != {1.0}):
-        where = (
-            f"lines, line {line.line!r}, column tap: {' '.join(f'{tap:g}' for tap in sorted({*line.taps}))}"
+    return [
+        Problem(
+            "zero-impedance",
+            f"lines, line {line.line!r}, column tap: {' '.join(f'{tap:g}' for tap in sorted({*line.taps}))} "
+            "on a line without impedance; expected the transformer's r_ohm and x_ohm",
         )
-        if line.r_ohm == line.x_ohm == 0.0:
-            out.append(
-                Problem(
-                    "zero-impedance",
-                    f"{where} on a line without impedance; expected the transformer's r_ohm and x_ohm",
-                )
-            )
-    return out
+        for line in closed
+        if set(line.taps) != {1.0} and line.fuses
+    ]
 
 
 def _around(ties: Sequence[LineRow], ratio: Floats) -> list[Problem]:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from feeders.model.equipment import LoadModel, indices
-from feeders.model.profiles import PROFILE_STEP_S, Profiles, Season, library, profile
+from feeders.profiles import PROFILE_STEP_S, Profiles, Season, library, profile
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.interface import Frame
 
@@ -38,45 +38,23 @@ _LOAD_P, _LOAD_Q, _PV = "load_p", "load_q", "pv"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Forecast:
-    """Forecasts of the customers' powers. N customers, pu, net import positive.
+    """Forecasts of the customers' powers. N customers, pu, net import positive."""
 
-    Attributes
-    ----------
-    p_std, q_std : (N,)
-        Standard deviations of the forecast's errors: `p_std_kw` and `q_std_kvar` of a customer without a
-        meter where its row has them, else `spread` of its profiles times its peaks.
-    p_range, q_range : (2, N)
-        Least and largest power of the customers, of q the load alone.
-    peaks : (3, N)
-        Peak of the load, its reactive power, and peak of the generation.
-    which : (3, N)
-        Index of the curve of each of these.
-    weeks
-        By season: the K curves over a week, relative to the peak, (672, K).
-    origin
-        Unix time of the begin of a week, s: Monday 00:00 of local time.
-    season
-        Fixed season; None: that of the calendar.
-    """
-
+    # (N,), standard deviations of the forecast's errors: `p_std_kw` and `q_std_kvar` of a customer without a
+    # meter where its row has them, else `spread` of its profiles times its peaks
     p_std: Floats
     q_std: Floats
+    # (2, N), least and largest power of the customers, of q the load alone
     p_range: Floats
     q_range: Floats
-    peaks: Floats
-    which: Ints
-    weeks: Mapping[Season, Floats]
-    origin: float
-    season: Season | None = None
+    peaks: Floats  # (3, N), peak of the load, its reactive power, and peak of the generation
+    which: Ints  # (3, N), index of the curve of each of these
+    weeks: Mapping[Season, Floats]  # By season: the K curves over a week, relative to the peak, (672, K)
+    origin: float  # Unix time of the begin of a week, s: Monday 00:00 of local time
+    season: Season | None = None  # Fixed season; None: that of the calendar
 
     def at(self, t: float) -> tuple[Floats, Floats]:
-        """Active power and the load's reactive power at a time, linear between quarters of an hour, (N,).
-
-        Parameters
-        ----------
-        t
-            Unix time, s; NaN counts as 0.
-        """
+        """Active power and the load's reactive power (N,) at a Unix time, s; linear between samples."""
         local = float(np.clip(np.nan_to_num(t), -_LONGEST_S, _LONGEST_S)) - self.origin
         season = season_of(local + FIRST_MONDAY_S) if self.season is None else self.season
         week = self.weeks[season]
@@ -99,29 +77,14 @@ class Forecast:
         return np.clip(load - pv, *self.p_range), np.clip(q, *self.q_range)
 
     def played(self, origin: float, season: Season) -> Forecast:
-        """Forecast with the calendar of a simulation.
-
-        Parameters
-        ----------
-        origin
-            Unix time of the begin of the season's profiles, s.
-        season
-            Season of the profiles.
-        """
+        """Forecast with the calendar of a simulation: the season's profiles begin at a Unix time, s."""
         return replace(self, origin=origin, season=season)
 
     def fill(self, frame: Frame, unread: Bools) -> Frame:
-        """Frame with forecasts in place of unread powers.
+        """Frame with forecasts in place of unread powers (N,).
 
         Half-widths reach to the farther end of the range, so that intervals contain every possible power. The
         forecasts' standard deviations are separate fields.
-
-        Parameters
-        ----------
-        frame
-            Frame of the readings.
-        unread : (N,)
-            Mask of the unread powers.
         """
         p, q = self.at(frame.t)
         return replace(
@@ -136,20 +99,7 @@ class Forecast:
 
 
 def forecast(tables: FeederTables, loads: LoadModel) -> Forecast | None:
-    """Prepare the forecasts of a feeder.
-
-    Parameters
-    ----------
-    tables
-        The feeder's tables, with `[load] forecast` and `utc_offset_h`.
-    loads
-        Limits of the customers' powers.
-
-    Returns
-    -------
-    Forecast or None
-        None with "none": unread powers have their range only.
-    """
+    """Prepare the forecasts of a feeder; None with "none": unread powers have their range only."""
     meta, rows = tables.meta, tables.customers
     if meta.load.forecast == "none":
         return None
@@ -176,17 +126,7 @@ def forecast(tables: FeederTables, loads: LoadModel) -> Forecast | None:
 
 
 def always(given: Forecast | None, frame: Frame, unread: Bools) -> Frame:
-    """Frame with intervals of unread powers that hold at any time, for designs and studies.
-
-    Parameters
-    ----------
-    given
-        Forecast of the feeder.
-    frame
-        A frame of any time.
-    unread : (N,)
-        Mask of the unread powers.
-    """
+    """Frame with intervals of unread powers (N,) that hold at any time, for designs and studies."""
     if given is None:
         return frame
     p, q = given.farthest()
@@ -198,31 +138,18 @@ def always(given: Forecast | None, frame: Frame, unread: Bools) -> Frame:
 
 
 def season_of(local_s: float) -> Season:
-    """Season of the northern hemisphere by the calendar; winter is December to February.
-
-    Parameters
-    ----------
-    local_s
-        Local time as seconds since 1970-01-01 00:00.
-    """
+    """Season of the northern hemisphere at a local time, s since 1970-01-01; winter is from December."""
     month = int(np.datetime64(int(local_s), "s").astype("datetime64[M]").astype(np.int64)) % 12
     return tuple(Season)[(month + 1) % 12 // 3]
 
 
 @cache
 def spread(what: str, name: str) -> float:
-    """Standard deviation of a profile's forecast, relative to the peak.
+    """Standard deviation of the forecast by a profile of "load_p", "load_q" or "pv", relative to the peak.
 
     Root mean square error of all profiles of its class (first letter: households, trades, farms, roofs) on
     every day of a season, in the worst season; generation by day only. Without a name it is that of all
     classes.
-
-    Parameters
-    ----------
-    what
-        "load_p", "load_q" or "pv".
-    name
-        Profile of the forecast; empty: the mean of all.
     """
     worst = 0.0
     for season in Season:

@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from feeders.format.columns import META_COLUMNS
+from feeders.format.columns import META_COLUMNS, Number
 from feeders.format.tables import FeederTables
 from feeders.model.forecast import always
 from feeders.model.site import Site, Snapshot, expected, to_frame
@@ -26,7 +26,9 @@ Seasons, hours and habits move these together.
 """
 
 LONGEST_S: Final = next(
-    column.high for column in META_COLUMNS["load"] if column.name == "correlation_s" and column.high
+    column.high
+    for column in META_COLUMNS["load"]
+    if column.name == "correlation_s" and isinstance(column, Number) and column.high
 )
 """Longest correlation time of the format, s."""
 
@@ -82,16 +84,10 @@ def _usual(half_width: Floats, std: Floats | None) -> Floats:
 
 
 def forecast_errors(site: Site, t: Floats, p_kw: Floats, q_kvar: Floats) -> tuple[Floats, Floats]:
-    """Deviations of true powers from frames without readings, pu: a history for `from_history`.
+    """Deviations of true powers from frames without readings, pu, (T, N): a history for `from_history`.
 
-    Parameters
-    ----------
-    site
-        The feeder, with or without forecasts.
-    t : (T,)
-        Unix times, s.
-    p_kw, q_kvar : (T, N)
-        True net active import and reactive import of the loads, kW and kvar.
+    `t` (T,) are Unix times, s; `p_kw` and `q_kvar` (T, N) the true net active import and the loads' reactive
+    import.
     """
     none, base = np.full(site.meters.size, np.nan), site.feeder.base_kva
     frames = [to_frame(site, Snapshot(float(now), none, none, none, np.nan)) for now in t]
@@ -102,16 +98,7 @@ def forecast_errors(site: Site, t: Floats, p_kw: Floats, q_kvar: Floats) -> tupl
 def tell(tables: FeederTables, doubt: LoadDoubt, base_kva: float) -> FeederTables:
     """Write standard deviations to customers without a meter, and the correlation time to `[load]`.
 
-    The correlation time is at most LONGEST_S.
-
-    Parameters
-    ----------
-    tables
-        The feeder's tables.
-    doubt
-        Load uncertainty of all customers.
-    base_kva
-        1 pu, kVA.
+    The correlation time is at most LONGEST_S; `base_kva` is 1 pu of `doubt`.
     """
     told = zip(tables.customers, doubt.p * base_kva, doubt.q * base_kva, strict=True)
     rows = tuple(
@@ -122,18 +109,11 @@ def tell(tables: FeederTables, doubt: LoadDoubt, base_kva: float) -> FeederTable
 
 
 def from_history(error_p: Floats, error_q: Floats, step_s: float) -> LoadDoubt:
-    """Estimate the load uncertainty from a history of errors, true powers less the assumed ones.
+    """Estimate the load uncertainty from a history (T, N) of errors, pu: true powers less the assumed ones.
 
     The correlation time is that of a first-order process with the same correlation between successive
     samples: the median over the customers, at most the length of the history. The common share follows from
     the variance of the customers' mean beyond that of independent errors.
-
-    Parameters
-    ----------
-    error_p, error_q : (T, N)
-        Errors, pu, at equal intervals.
-    step_s
-        The interval, s.
 
     Raises
     ------

@@ -19,39 +19,35 @@ docs/theory-sequential.md, section 7.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from feeders.format.columns import CUSTOMER_COLUMNS, parse
-from feeders.format.tables import CustomerRow, FeederTables, validate
-from feeders.format.topology import Edge, Tree, tree
+from feeders.format.columns import CUSTOMER_COLUMNS, CellInvalid, Column, CustomerRow, FeederTables
+from feeders.format.tables import validate
+from feeders.format.topology import Tree
 from feeders.model.equipment import (
+    Equipment,
     LoadModel,
     Referred,
-    accuracy,
-    digest,
+    equipment,
     find,
     indices,
-    inverters,
-    load_model,
-    metered_customers,
     names,
-    positions,
+    not_radial,
     refer,
+    without_impedance,
 )
 from feeders.model.forecast import Forecast, forecast
-from feeders.model.three_phase import spanned, unsupported
+from feeders.model.three_phase import spanned_valid, unsupported
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, frozen
 from gridsec.errors import FeederInvalid, Problem
 from gridsec.estimators.plant import Plant
 from gridsec.grid import AnyNetwork
-from gridsec.grid.droop import Droop
 from gridsec.grid.meshed import MeshedFeeder, PhasedMesh
-from gridsec.grid.meter import MeterAccuracy
 from gridsec.grid.network import Power
 from gridsec.grid.phased import PhasedFeeder
 from gridsec.grid.radial import Feeder
@@ -96,39 +92,18 @@ RENEWAL_TICKS: Final = 2.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Late:
-    """Late powers of one tick. N customers.
+    """Late powers of one tick. N customers."""
 
-    Attributes
-    ----------
-    which : (N,)
-        Customers with a late power that is better than none.
-    useless : (N,)
-        Customers with a power that is too late to be better than none.
-    stated : (N,)
-        Customers with a power no older than `[meters] p_interval_s`.
-    std : (N,)
-        Standard deviation of the change of the active power, pu; 0 elsewhere.
-    reach : (N,)
-        Largest change, pu.
-    """
-
-    which: Bools
-    useless: Bools
-    stated: Bools
-    std: Floats
-    reach: Floats
+    which: Bools  # (N,), customers with a late power that is better than none
+    useless: Bools  # (N,), customers with a power that is too late to be better than none
+    stated: Bools  # (N,), customers with a power no older than `[meters] p_interval_s`
+    std: Floats  # (N,), standard deviation of the change of the active power, pu; 0 elsewhere
+    reach: Floats  # (N,), largest change, pu
 
     def widen(self, site: Site, frame: Frame) -> Frame:
-        """Frame with the uncertainty of the late powers.
+        """Frame of the readings with the uncertainty of the late powers.
 
         Intervals reach to the ends of the range. Metered reactive powers of the same age are not used.
-
-        Parameters
-        ----------
-        site
-            The feeder.
-        frame
-            Frame of the readings, before widening.
         """
         loads, which, none = site.loads, self.which, np.full(self.std.size, np.nan)
         root, tan = np.sqrt(3.0), np.maximum(np.abs(loads.tan_min), np.abs(loads.tan_max))
@@ -153,12 +128,7 @@ class Late:
 def late(site: Site, snapshot: Snapshot) -> Late | None:
     """Late powers of a tick; None if all have the time of their voltage.
 
-    Parameters
-    ----------
-    site
-        The feeder; `[meters] p_interval_s` of its file is the age of powers without a time of their own.
-    snapshot
-        The readings.
+    `[meters] p_interval_s` of the feeder's file is the age of powers without a time of their own.
     """
     interval = site.tables.meta.meters.p_interval_s
     if snapshot.p_age_s is None and interval == 0.0:
@@ -214,16 +184,9 @@ class PowerAges:
 
 
 def change(site: Site, age_s: Floats | float, reach: Floats) -> Floats:
-    """Standard deviation of the change of each customer's active power, (N,), pu; 0 at age 0.
+    """Standard deviation of the change of each customer's active power over an age, s, (N,), pu; 0 at age 0.
 
-    Parameters
-    ----------
-    site
-        The feeder.
-    age_s : (N,)
-        Age, s.
-    reach : (N,)
-        Distance to the farther end of the range, pu.
+    `reach` (N,) is the distance to the farther end of the range, pu.
     """
     slow = -2.0 * np.expm1(-np.asarray(age_s) / site.tables.meta.load.correlation_s)
     moved = np.hypot(np.sqrt(slow) * spread(site), reach / SWITCHED)
@@ -247,45 +210,26 @@ def expected(site: Site) -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Registered:
-    """Load powers of one tick, consumption positive, pu. N customers.
+    """Load powers of one tick, consumption positive, pu. N customers."""
 
-    Attributes
-    ----------
-    p, p_error : (N,)
-        Centre and half-width of the interval of the net active power.
-    q, q_error : (N,)
-        The same of the load's reactive power.
-    known : (N,)
-        The interval rests on a reading.
-    origin : (N,)
-        `PowerOrigin` of `p`.
-    excess : (N,)
-        Part of the reading beyond the declared load or generation.
-    """
-
+    # (N,), centre and half-width of the interval of the net active power
     p: Floats
     p_error: Floats
+    # (N,), the same of the load's reactive power
     q: Floats
     q_error: Floats
-    known: Bools
-    origin: Ints
-    excess: Floats
+    known: Bools  # (N,), the interval rests on a reading
+    origin: Ints  # (N,), `PowerOrigin` of `p`
+    excess: Floats  # (N,), part of the reading beyond the declared load or generation
 
 
 def registered(site: Site, metered: Floats) -> Registered:
-    """Power intervals of the frame.
+    """Power intervals of the frame; `metered` (N,) is each register's net active power, pu, NaN without one.
 
     A reading is used up to ``LoadModel.credible``. Readings beyond the declared range are used only while the
     model error has a finite bound with all of them. Otherwise those with the largest voltage effect ``R_ii
     excess_i`` are replaced by the declared range, the fewest that restore the bound. The bound is at nominal
     busbar voltage, so that a busbar meter cannot affect it.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    metered : (N,)
-        Net active power by each register, pu; NaN: no usable reading.
     """
     known = np.abs(metered) <= site.loads.credible  # False for NaN
     found = _intervals(site.loads, metered, known)
@@ -343,57 +287,29 @@ def _intervals(model: LoadModel, metered: Floats, known: Bools) -> Registered:
 ABSURD_PU = 100.0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Site:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Site(Equipment):
     """Feeder for monitoring and simulation. N customers, p meters, b + 1 buses.
 
     With single-phase lines or customers, or lines that are not transposed, it is in three phases, and each
-    customer has one phase. A customer of three phases becomes three, see `one_phase_each`.
+    customer of `tables` has one phase. A customer of three phases becomes three, see `one_phase_each`.
 
     Attributes
     ----------
-    tables
-        Content of the files in SI; in three phases with customers of one phase.
     feeder
         The radial tree, pu; or with closed ties, or in three phases.
-    droop
-        The inverters with a droop curve, in the order of the customers.
-    meters : (p,)
-        Index of each meter's customer, ascending.
-    meter_ids : (p,)
-        Ids of the meters.
-    accuracy
-        Accuracies of the meters, pu.
-    bus_of_file
-        Fused bus index of every bus id of the files.
-    xy : (b + 1, 2)
-        Positions of the buses, None unless the files have all of them.
-    loads
-        Limits of the customers' powers.
     base_volt : (n,)
         1 pu of every place, V: the nominal voltage, times the taps' ratio behind taps, see
         `feeders.model.equipment`.
     nominal_volt : (n,)
         Nominal voltage of every place, V; behind a transformer it differs from the busbar's.
-    digest
-        SHA-256 of the content: key of design caches. It changes with every value and with the order of
-        the rows (which is the order of all arrays), not with layout, comments or unknown columns.
     forecast
         Forecast of unread powers; None: they have their range only.
     """
 
-    tables: FeederTables
     feeder: AnyNetwork
-    droop: Droop
-    meters: Ints
-    meter_ids: tuple[str, ...]
-    accuracy: MeterAccuracy
-    bus_of_file: Mapping[str, int]
-    xy: Floats | None
-    loads: LoadModel
     base_volt: Floats
     nominal_volt: Floats
-    digest: str
     forecast: Forecast | None = None
 
     @property
@@ -430,9 +346,7 @@ class Site:
             If closed lines form loops.
         """
         if isinstance(self.feeder, MeshedFeeder | PhasedMesh):
-            raise FeederInvalid(
-                [Problem("not-radial", "lines: closed lines form loops; a radial feeder is required")]
-            )
+            raise not_radial()
         return self.spanning
 
     @property
@@ -486,12 +400,7 @@ class Snapshot:
 
 
 def load(path_or_name: Path | str) -> Site:
-    """Load a feeder.
-
-    Parameters
-    ----------
-    path_or_name
-        A folder, or the name of a bundled feeder (`names()`).
+    """Load a feeder: a folder, or the name of a bundled feeder (`names()`).
 
     Raises
     ------
@@ -513,40 +422,14 @@ def from_tables(tables: FeederTables) -> Site:
     FeederInvalid
         For invalid tables, or for content that the model does not support.
     """
-    if tables.in_phases:
-        try:
-            return _in_phases(one_phase_each(tables))
-        except FeederInvalid as error:
-            # Rows and ids are those of the files, not of the channels.
-            problems = validate(tables) or _channels(tables) or unsupported(tables) or error.problems
-            raise FeederInvalid(problems) from error
-    problems = validate(tables) or _unsupported(tables)
+    problems = validate(tables)
+    if not tables.in_phases:
+        problems = problems or tuple(without_impedance(tables))
+    else:  # rows and ids of the files, not of the channels
+        problems = problems or tuple(_channels(tables)) or unsupported(tables)
     if problems:
         raise FeederInvalid(problems)
-    meta = tables.meta
-    closed = [line for line in tables.lines if line.closed]
-    found = tree(
-        meta.busbar,
-        [Edge(row.line, row.from_bus, row.to_bus, row.r_ohm == row.x_ohm == 0.0) for row in closed],
-    )
-    base = refer(tables, closed, found)
-    feeder, loads = _feeder(tables, base, found), load_model(tables)
-    metered = metered_customers(tables)
-    return Site(
-        tables=tables,
-        feeder=_meshed(tables, feeder, base, found) if base.ties else feeder,
-        droop=inverters(tables, base.customer / base.customer_nominal),
-        meters=metered,
-        meter_ids=tuple(tables.customers[k].meter for k in metered),
-        accuracy=accuracy(tables, base.customer, base.customer_nominal),
-        bus_of_file=found.group,
-        xy=positions(tables, found),
-        loads=loads,
-        base_volt=frozen(base.bus[:, 0]),
-        nominal_volt=frozen(base.nominal),
-        digest=digest(tables),
-        forecast=forecast(tables, loads),
-    )
+    return _in_phases(one_phase_each(tables)) if tables.in_phases else _in_one_phase(tables)
 
 
 def one_phase_each(tables: FeederTables) -> FeederTables:
@@ -555,11 +438,6 @@ def one_phase_each(tables: FeederTables) -> FeederTables:
     A meter of three phases reads three voltages and three powers; they become the channels "X-a", "X-b" and
     "X-c". Standard deviations are split as those of independent phases. An inverter of three phases becomes
     three that follow the voltage of their own phase.
-
-    Parameters
-    ----------
-    tables
-        The feeder's tables.
     """
     rows = [part for row in tables.customers for part in (_parts(row) if row.phases == "abc" else [row])]
     return replace(tables, customers=tuple(rows))
@@ -594,7 +472,7 @@ def _channels(tables: FeederTables) -> list[Problem]:
         for number, row in enumerate(tables.customers, start=1):
             where = f"customers, row {number} ({row.customer})"
             ids = [getattr(part, column.name) for part in (_parts(row) if row.phases == "abc" else [row])]
-            wrong = [problem for problem in (parse(column, own)[1] for own in ids) if problem]
+            wrong = [problem for problem in map(partial(_wrong, column), ids) if problem]
             wrong += [
                 Problem(
                     "duplicate",
@@ -610,9 +488,17 @@ def _channels(tables: FeederTables) -> list[Problem]:
     return problems
 
 
+def _wrong(column: Column, cell: str) -> Problem | None:
+    try:
+        column.parse(cell)
+    except CellInvalid as wrong:
+        return wrong.problem
+    return None
+
+
 def _in_phases(tables: FeederTables) -> Site:
     """Site of a feeder with one phase per customer."""
-    found, ties = spanned(tables)
+    found, ties = spanned_valid(tables)
     parts = {f.name: getattr(found, f.name) for f in fields(found)}
     feeder = PhasedMesh(found.feeder, *ties) if ties.ends.size else PhasedFeeder(found.feeder)
     places = {
@@ -624,21 +510,26 @@ def _in_phases(tables: FeederTables) -> Site:
     return Site(**parts | places)
 
 
+def _in_one_phase(tables: FeederTables) -> Site:
+    """Site of a balanced feeder."""
+    base, found = refer(tables)
+    feeder, own = _feeder(tables, base, found), equipment(tables, base, found)
+    return Site(
+        feeder=_meshed(tables, feeder, base, found) if base.ties else feeder,
+        base_volt=frozen(base.bus[:, 0]),
+        nominal_volt=frozen(base.nominal),
+        forecast=forecast(tables, own["loads"]),
+        **own,
+    )
+
+
 def plant(site: Site) -> Plant:
     """Plant of the site, for the monitor's design."""
     return Plant(site.feeder, site.droop, site.meters, site.accuracy, 1)
 
 
 def volts(base_volt: Floats, v2_pu: Floats) -> Floats:
-    """Convert squared voltages to volts: ``v = base_volt sqrt(v2)``.
-
-    Parameters
-    ----------
-    base_volt : (n,)
-        1 pu of each, V: `Site.base_volt` or `Site.customer_volt`.
-    v2_pu : (…, n)
-        Squared voltages, pu; a negative one gives 0.
-    """
+    """Convert squared voltages (…, n), pu, to volts: ``v = base_volt sqrt(v2)``; a negative one gives 0."""
     return np.asarray(base_volt * np.sqrt(np.maximum(v2_pu, 0.0)), dtype=np.float64)
 
 
@@ -707,20 +598,6 @@ def _busbar(v0_volt: Floats | float, base_volt: float) -> tuple[float, Floats | 
 
 
 # --- building -----------------------------------------------------------------------------------
-
-
-def _unsupported(tables: FeederTables) -> tuple[Problem, ...]:
-    """Problems of valid tables that the model does not support."""
-    problems = []
-    closed = [line for line in tables.lines if line.closed]
-    if all(line.r_ohm == line.x_ohm == 0.0 for line in closed):
-        problems.append(
-            Problem(
-                "nothing-to-design",
-                "lines: no closed line has an impedance; there is nothing to monitor below the busbar",
-            )
-        )
-    return tuple(problems)
 
 
 def _feeder(tables: FeederTables, base: Referred, found: Tree) -> Feeder:

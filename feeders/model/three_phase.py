@@ -6,38 +6,31 @@ for each phase.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from feeders.format.columns import FeederTables, LineRow
 from feeders.format.matrices import cells_of, series_ohm, shunt_us
-from feeders.format.tables import FeederTables, LineRow, validate
-from feeders.format.topology import Edge, Tree, tree
+from feeders.format.tables import validate
+from feeders.format.topology import Tree
 from feeders.model.equipment import (
-    LoadModel,
+    Equipment,
     Referred,
-    accuracy,
-    digest,
+    equipment,
     find,
-    inverters,
-    load_model,
-    metered_customers,
     names,
+    not_radial,
     of_customers,
-    positions,
     refer,
+    without_impedance,
 )
-from gridsec.arrays import Floats, Ints, Phasors, frozen
+from gridsec.arrays import Bools, Floats, Ints, Phasors, frozen
 from gridsec.errors import FeederInvalid, Problem
-from gridsec.grid.droop import Droop
-from gridsec.grid.meter import MeterAccuracy
 from gridsec.grid.three_phase import PHASES, ThreePhaseFeeder, sequence_matrix
-
-if TYPE_CHECKING:
-    from gridsec.arrays import Bools
 
 
 class Ties(NamedTuple):
@@ -49,36 +42,13 @@ class Ties(NamedTuple):
     charging: Floats
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ThreePhaseSite:
-    """Feeder in three phases. N customers, p meters, b + 1 buses.
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class ThreePhaseSite(Equipment):
+    """Feeder in three phases, powers in units of `base_kva`: as `gridsec.grid.three_phase.per_customer`."""
 
-    Attributes
-    ----------
-    tables
-        Content of the files in SI.
-    feeder
-        The radial tree, pu; powers of single phases in thirds of `base_kva`.
-    base_volt : (b + 1, 3)
-        1 pu of every phase of every bus, V, see `feeders.model.equipment`.
-    nominal_volt : (b + 1,)
-        Nominal voltage of every bus, V.
-    droop, meters, meter_ids, accuracy, bus_of_file, xy, loads, digest
-        As in `feeders.model.site.Site`, in units of `base_kva`: as `gridsec.grid.three_phase.per_customer`.
-    """
-
-    tables: FeederTables
-    feeder: ThreePhaseFeeder
-    droop: Droop
-    meters: Ints
-    meter_ids: tuple[str, ...]
-    accuracy: MeterAccuracy
-    bus_of_file: Mapping[str, int]
-    xy: Floats | None
-    loads: LoadModel
-    base_volt: Floats
-    nominal_volt: Floats
-    digest: str
+    feeder: ThreePhaseFeeder  # The radial tree, pu; powers of single phases in thirds of `base_kva`
+    base_volt: Floats  # (b + 1, 3), 1 pu of every phase of every bus, V, see `feeders.model.equipment`
+    nominal_volt: Floats  # (b + 1,), nominal voltage of every bus, V
 
     @property
     def customer_volt(self) -> Floats:
@@ -92,18 +62,7 @@ class ThreePhaseSite:
 
 
 def load_three_phase(path_or_name: Path | str) -> ThreePhaseSite:
-    """Load a feeder in three phases.
-
-    Parameters
-    ----------
-    path_or_name
-        A folder, or the name of a bundled feeder (`feeders.model.site.names`).
-
-    Raises
-    ------
-    FeederInvalid
-        With every problem of the files, or for an unknown feeder.
-    """
+    """Load a feeder in three phases: a folder, or the name of a bundled feeder; errors as `three_phase`."""
     return three_phase(find(path_or_name))
 
 
@@ -123,11 +82,6 @@ def three_phase(tables: FeederTables) -> ThreePhaseSite:
     With ``z_base = 3 V^2 / (1000 S)`` ohm for V volts phase to neutral and S kVA of all three phases, as on
     a balanced feeder; a single-phase customer's kW divide by ``S / 3``.
 
-    Parameters
-    ----------
-    tables
-        The feeder's tables.
-
     Raises
     ------
     FeederInvalid
@@ -135,19 +89,12 @@ def three_phase(tables: FeederTables) -> ThreePhaseSite:
     """
     site, ties = spanned(tables)
     if ties.ends.size:
-        raise FeederInvalid(
-            [Problem("not-radial", "lines: closed lines form loops; a radial feeder is required")]
-        )
+        raise not_radial()
     return site
 
 
 def spanned(tables: FeederTables) -> tuple[ThreePhaseSite, Ties]:
     """`three_phase` of a tree with every phase of every bus, and the lines that close loops.
-
-    Parameters
-    ----------
-    tables
-        The feeder's tables.
 
     Raises
     ------
@@ -157,36 +104,29 @@ def spanned(tables: FeederTables) -> tuple[ThreePhaseSite, Ties]:
     problems = validate(tables) or unsupported(tables)
     if problems:
         raise FeederInvalid(problems)
-    meta = tables.meta
-    closed = [line for line in tables.lines if line.closed]
-    edges = [Edge(row.line, row.from_bus, row.to_bus, _fuses(row), phases=len(row.phases)) for row in closed]
-    found = tree(meta.busbar, edges)
-    base = refer(tables, closed, found)
+    return spanned_valid(tables)
+
+
+def spanned_valid(tables: FeederTables) -> tuple[ThreePhaseSite, Ties]:
+    """`spanned` of valid and supported tables."""
+    base, found = refer(tables)
     beyond = _beyond(base.lines, base.ties, found)
     if beyond:
         raise FeederInvalid(beyond)
-    metered = metered_customers(tables)
     site = ThreePhaseSite(
-        tables=tables,
         feeder=_feeder(tables, base, found),
-        droop=inverters(tables, base.customer / base.customer_nominal),
-        meters=metered,
-        meter_ids=tuple(tables.customers[k].meter for k in metered),
-        accuracy=accuracy(tables, base.customer, base.customer_nominal),
-        bus_of_file=found.group,
-        xy=positions(tables, found),
-        loads=load_model(tables),
         base_volt=frozen(base.bus),
         nominal_volt=frozen(base.nominal),
-        digest=digest(tables),
+        **equipment(tables, base, found),
     )
-    return site, _ties(tables, base, found)
+    ends = [(found.group[tie.from_bus], found.group[tie.to_bus]) for tie in base.ties]
+    blocks = _blocks(base.ties, base.tie, tables.meta.base_kva)
+    return site, Ties(np.array(ends, dtype=np.intp).reshape(-1, 2), *blocks)
 
 
 def _feeder(tables: FeederTables, base: Referred, found: Tree) -> ThreePhaseFeeder:
-    meta, lines = tables.meta, base.lines
-    side = base.branch
-    present, z, charging = _blocks(lines, side, meta.base_kva)
+    meta = tables.meta
+    present, z, charging = _blocks(base.lines, base.branch, meta.base_kva)
     return ThreePhaseFeeder(
         name=meta.name,
         parent=np.array(found.parent, dtype=np.intp),
@@ -200,13 +140,6 @@ def _feeder(tables: FeederTables, base: Referred, found: Tree) -> ThreePhaseFeed
         base_kva=meta.base_kva,
         charging=charging,
     )
-
-
-def _ties(tables: FeederTables, base: Referred, found: Tree) -> Ties:
-    ends = [(found.group[tie.from_bus], found.group[tie.to_bus]) for tie in base.ties]
-    side = base.tie
-    blocks = _blocks(base.ties, side, tables.meta.base_kva)
-    return Ties(np.array(ends, dtype=np.intp).reshape(-1, 2), *blocks)
 
 
 def _blocks(lines: Sequence[LineRow], side: Floats, base_kva: float) -> tuple[Bools, Phasors, Floats]:
@@ -225,9 +158,8 @@ def _beyond(lines: Sequence[LineRow], ties: Sequence[LineRow], found: Tree) -> l
     return [
         Problem(
             "absent-phase",
-            f"lines, line {tie.line!r} closes a loop and brings phase {phase!r} to {bus!r}, which no "
-            "line of the "
-            "tree has there; expected lines in parallel of single phases as one row with a matrix",
+            f"lines, line {tie.line!r} closes a loop and brings phase {phase!r} to {bus!r}, which no line of "
+            "the tree has there; expected lines in parallel of single phases as one row with a matrix",
         )
         for tie in ties
         for bus in (tie.from_bus, tie.to_bus)
@@ -237,13 +169,7 @@ def _beyond(lines: Sequence[LineRow], ties: Sequence[LineRow], found: Tree) -> l
 
 
 def series_of(line: LineRow) -> Phasors:
-    """Impedance matrix of a line in phases, ohm.
-
-    Parameters
-    ----------
-    line
-        Row of the line; only cells of its phases count.
-    """
+    """Impedance matrix of a line in phases, ohm; only entries of its phases count."""
     matrix = series_ohm(cells_of(line))
     if matrix is not None:
         return matrix
@@ -263,10 +189,6 @@ def _present(phases: str) -> Bools:
     return np.array([phase in phases for phase in PHASES])
 
 
-def _fuses(line: LineRow) -> bool:
-    return line.r_ohm == line.x_ohm == 0.0
-
-
 def _why(tables: FeederTables) -> str:
     """First cause of a model in three phases, as the end of a sentence."""
     causes = [f"customer {row.customer!r}" for row in tables.customers if row.phases != "abc"]
@@ -276,47 +198,26 @@ def _why(tables: FeederTables) -> str:
 
 def unsupported(tables: FeederTables) -> tuple[Problem, ...]:
     """Problems of valid tables that the three-phase model does not support, and missing cells."""
-    problems, why = [], _why(tables)
-    closed = [line for line in tables.lines if line.closed]
-    for line in closed:
-        where = f"lines, line {line.line!r}"
-        given = (line.r0_ohm is not None) + (line.x0_ohm is not None)
-        if _fuses(line):
-            if line.phases != "abc":
-                problems.append(
-                    Problem(
-                        "absent-phase",
-                        f"{where}: phases {line.phases!r} without impedance; a switch must join all three",
-                    )
-                )
-            if line.r0_ohm or line.x0_ohm:
-                problems.append(
-                    Problem(
-                        "inconsistent",
-                        f"{where}: has an impedance only in the zero sequence; expected both or none",
-                    )
-                )
-        elif given == 2 and line.phases == "abc" and line.r0_ohm == line.x0_ohm == 0.0:
-            problems.append(
-                Problem(
-                    "zero-impedance",
-                    f"{where}: has no impedance in the zero sequence; expected that of its return",
-                )
-            )
-        elif given == 1 or (given == 0 and len(line.phases) > 1 and series_ohm(cells_of(line)) is None):
-            missing = "r0_ohm" if line.r0_ohm is None else "x0_ohm"
-            problems.append(
-                Problem(
-                    "missing",
-                    f"{where}, column {missing}: is missing; several phases need the zero sequence or "
-                    "a matrix" + why,
-                )
-            )
-    if all(map(_fuses, closed)):
-        problems.append(
-            Problem(
-                "nothing-to-design",
-                "lines: no closed line has an impedance; there is nothing to monitor below the busbar",
-            )
-        )
-    return tuple(problems)
+    return (
+        *(problem for line in tables.lines if line.closed for problem in _line_problems(line, tables)),
+        *without_impedance(tables),
+    )
+
+
+def _line_problems(line: LineRow, tables: FeederTables) -> Iterator[Problem]:
+    where = f"lines, line {line.line!r}"
+    given = (line.r0_ohm is not None) + (line.x0_ohm is not None)
+    if line.fuses:
+        if line.phases != "abc":
+            text = f"phases {line.phases!r} without impedance; a switch must join all three"
+            yield Problem("absent-phase", f"{where}: {text}")
+        if line.r0_ohm or line.x0_ohm:
+            text = "has an impedance only in the zero sequence; expected both or none"
+            yield Problem("inconsistent", f"{where}: {text}")
+    elif given == 2 and line.phases == "abc" and line.r0_ohm == line.x0_ohm == 0.0:
+        text = "has no impedance in the zero sequence; expected that of its return"
+        yield Problem("zero-impedance", f"{where}: {text}")
+    elif given == 1 or (given == 0 and len(line.phases) > 1 and series_ohm(cells_of(line)) is None):
+        missing = "r0_ohm" if line.r0_ohm is None else "x0_ohm"
+        text = "is missing; several phases need the zero sequence or a matrix"
+        yield Problem("missing", f"{where}, column {missing}: {text}{_why(tables)}")

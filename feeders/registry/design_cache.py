@@ -31,37 +31,18 @@ _KEEP = 64
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BankGains:
-    """Gains of a whole bank and their origin.
+    """Gains of a whole bank and their origin."""
 
-    Attributes
-    ----------
-    gains
-        Stacked, in the order of `gridsec.secure.subsets.Subsets.masks`, for
-        `gridsec.estimators.exact_bank.bank.design`.
-    designs
-        The single designs with their proofs, in the same order.
-    origin
-        "stored", "new", or "redesigned: …" with the problem of the stored ones.
-    problem
-        Problem of reading or storing the designs; empty without one.
-    """
-
+    # Stacked, in the order of `gridsec.secure.subsets.Subsets.masks`, for
+    # `gridsec.estimators.exact_bank.bank.design`
     gains: Gains
-    designs: tuple[CircleGains, ...]
-    origin: str
-    problem: str
+    designs: tuple[CircleGains, ...]  # The single designs with their proofs, in the same order
+    origin: str  # "stored", "new", or "redesigned: …" with the problem of the stored ones
+    problem: str  # Problem of reading or storing the designs; empty without one
 
 
 def folder(environment: Mapping[str, str] = os.environ, platform: str = sys.platform) -> Path:
-    """Folder of the cache: `GRIDSEC_CACHE_DIR`, or the platform's place for caches.
-
-    Parameters
-    ----------
-    environment
-        Environment variables.
-    platform
-        As `sys.platform`.
-    """
+    """Folder of the cache: `GRIDSEC_CACHE_DIR`, or the platform's place for caches."""
     if chosen := environment.get("GRIDSEC_CACHE_DIR"):
         return Path(chosen)
     home = Path(environment.get("HOME") or environment.get("USERPROFILE") or tempfile.gettempdir())
@@ -75,26 +56,14 @@ def folder(environment: Mapping[str, str] = os.environ, platform: str = sys.plat
 
 
 class DesignCache:
-    """Bytes under keys in one folder; failures go to `problems` and are not raised.
-
-    Parameters
-    ----------
-    where
-        The folder; created by the first write.
-    """
+    """Bytes under keys in one folder; failures go to `problems` and are not raised."""
 
     def __init__(self, where: Path) -> None:
         self.where = where
         self.problems: list[str] = []
 
     def get(self, key: str) -> bytes | None:
-        """Bytes under a key, None if absent or unreadable.
-
-        Parameters
-        ----------
-        key
-            Hexadecimal digits.
-        """
+        """Bytes under a key of letters and digits, None if absent or unreadable."""
         path = self._path(key)
         try:
             blob = path.read_bytes()
@@ -110,15 +79,7 @@ class DesignCache:
         return blob
 
     def put(self, key: str, blob: bytes) -> None:
-        """Store bytes under a key atomically, and remove the least recently used entries.
-
-        Parameters
-        ----------
-        key
-            Hexadecimal digits.
-        blob
-            The bytes.
-        """
+        """Store bytes under a key atomically, and remove the least recently used entries."""
         path = self._path(key)
         try:
             self.where.mkdir(parents=True, exist_ok=True)
@@ -155,22 +116,9 @@ def bank_gains(
     where: Path | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> BankGains:
-    """Gains by LMI for both banks of chong2020, from the cache if a valid entry exists.
+    """Gains by LMI for both banks of chong2020, from the cache `where` if a valid entry exists; p > 2M.
 
-    Parameters
-    ----------
-    lure
-        Plant with p meters.
-    max_attacked
-        M; p > 2M.
-    options
-        From `gridsec.observers.gains.options_for`.
-    workers
-        Number of processes, see `gridsec.observers.lmi.solve_many`.
-    where
-        Folder of the cache; by default `folder()`.
-    progress
-        Called with (done, total) during the design.
+    `progress` is called with (done, total) during the design.
 
     Raises
     ------

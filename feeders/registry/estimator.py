@@ -122,21 +122,11 @@ class Estimator:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DesignedEstimator:
-    """Finished design of one feeder, with its estimator.
+    """Finished design of one feeder, with its estimator."""
 
-    Attributes
-    ----------
-    family
-        The estimator.
-    design
-        Design by the estimator.
-    asked
-        M of the feeder's file.
-    """
-
-    family: Estimator
-    design: Any
-    asked: int = 0
+    family: Estimator  # The estimator
+    design: Any  # Design by the estimator
+    asked: int = 0  # M of the feeder's file
 
     @property
     def max_attacked(self) -> int:
@@ -160,15 +150,7 @@ class DesignedEstimator:
         return learner if learner is not None and learner.needed_s(self.design) > 0 else None
 
     def init(self, t: float, commission: Commission | None = None) -> Any:
-        """Initial state.
-
-        Parameters
-        ----------
-        t
-            Unix time, s.
-        commission
-            Earlier knowledge of the meters' fixed errors, for estimators that learn them.
-        """
+        """Initial state at a Unix time, s, with earlier knowledge of the meters' fixed errors."""
         if self.bias_learning is None or commission is None:
             return self.family.init(self.design, t)
         return self.bias_learning.init(self.design, t, commission)

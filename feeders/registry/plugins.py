@@ -6,18 +6,16 @@ that name. Names are read without running external code; an estimator is loaded 
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from importlib.metadata import EntryPoint, entry_points
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
+from feeders.format.columns import GROUP
 from gridsec.errors import DesignInfeasible, GridsecError, NotObservable
 
 if TYPE_CHECKING:
     from feeders.model.site import Site
     from feeders.registry.estimator import DesignOptions
-
-GROUP: Final = "gridsec.estimators"
 
 
 class EstimatorUnusable(GridsecError):
@@ -26,36 +24,13 @@ class EstimatorUnusable(GridsecError):
     code = "estimator-unusable"
 
 
-_NAME: Final = re.compile(r"[a-z0-9][a-z0-9-]{0,63}")
-
-
-def names(own: Collection[str]) -> tuple[str, ...]:
-    """Names of all estimators of other packages, in alphabetic order.
-
-    Parameters
-    ----------
-    own
-        Reserved names. Entry points with such a name, or with characters other than lower-case letters,
-        digits and hyphens, are ignored.
-    """
-    found = {point.name for point in entry_points(group=GROUP)}
-    return tuple(sorted(name for name in found - set(own) if _NAME.fullmatch(name)))
-
-
 def load(name: str, kind: type) -> Any:
-    """Load the estimator of that name.
-
-    Parameters
-    ----------
-    name
-        One of `names`.
-    kind
-        Required type.
+    """Load the estimator of that name, of `feeders.format.columns.foreign_estimators`.
 
     Raises
     ------
     EstimatorUnusable
-        If there is none or more than one, if its code fails, or if its type or name is wrong.
+        If there is none or more than one, if its code fails, or if its type is not `kind` or its name wrong.
     """
     points = tuple(entry_points(group=GROUP, name=name))
     if len(points) != 1:
@@ -74,16 +49,7 @@ def load(name: str, kind: type) -> Any:
 
 
 def design(name: str, make: Callable[[Site, DesignOptions], Any], site: Site, job: DesignOptions) -> Any:
-    """Design by an estimator of another package.
-
-    Parameters
-    ----------
-    name
-        The estimator's name.
-    make
-        Its design function.
-    site, job
-        Arguments of the function.
+    """Design by the function `make` of another package.
 
     Raises
     ------

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -69,14 +69,7 @@ def design(
     where: Path | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> DesignedEstimator:
-    """Design the estimator of the feeder's file.
-
-    Parameters
-    ----------
-    site
-        The feeder, with `[monitor] estimator`, `max_attacked` and `tick_s` of its file.
-    workers, where, progress
-        As in `DesignOptions`.
+    """Design the estimator of the feeder's file; options as of `DesignOptions`.
 
     Raises
     ------
@@ -104,11 +97,6 @@ def _sequential(site: Site, _: DesignOptions) -> sequential.SequentialDesign:
     return sequential.design(plant(site), doubt=load_doubt(site), step_s=settings.tick_s, options=options)
 
 
-def _direct_bank(site: Site, _: DesignOptions) -> exact_bank.MonitorDesign:
-    settings = site.tables.meta.monitor
-    return exact_bank.design(plant(site), max_attacked=settings.max_attacked, step_s=settings.tick_s)
-
-
 def _lmi_bank(site: Site, job: DesignOptions) -> exact_bank.MonitorDesign:
     settings = site.tables.meta.monitor
     lure = close_loop(site.feeder, site.droop, site.meters)
@@ -132,25 +120,29 @@ def _certificate(
     return f"{proof.kind} certificate, margin {proof.margin:.3g}, decay at least {proof.rate:.3g} 1/s"
 
 
-def _bank(
-    name: str, summary: str, make: Callable[[Site, DesignOptions], exact_bank.MonitorDesign]
+def _observers(design: Any) -> int:
+    return int(design.observers)
+
+
+def _of(
+    family: Any,
+    name: str,
+    summary: str,
+    *,
+    design: Callable[[Site, DesignOptions], Any] | None = None,
+    proof: Callable[[Any], str] = _certificate,
 ) -> Estimator:
-    return Estimator(
-        name, summary, make, exact_bank.init, exact_bank.step, lambda d: int(d.observers), _certificate
-    )
+    """Estimator of a module with `design`, `init` and `step`."""
+
+    def usual(site: Site, _: DesignOptions) -> Any:
+        settings = site.tables.meta.monitor
+        return family.design(plant(site), max_attacked=settings.max_attacked, step_s=settings.tick_s)
+
+    return Estimator(name, summary, design or usual, family.init, family.step, _observers, proof)
 
 
 def choose(site: Site, *, estimator: str | None = None, max_attacked: int | None = None) -> Site:
-    """Copy a feeder with other settings of the monitor.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    estimator
-        Name of the estimator; None: as in the file.
-    max_attacked
-        M; None: as in the file.
+    """Copy a feeder with other settings of the monitor; None: as in the file.
 
     Raises
     ------
@@ -160,11 +152,8 @@ def choose(site: Site, *, estimator: str | None = None, max_attacked: int | None
     meta = site.tables.meta
     problems = []
     if estimator is not None and estimator not in ESTIMATORS:
-        problems.append(
-            Problem(
-                "unknown-name", f"estimator {estimator!r} does not exist; there are {', '.join(ESTIMATORS)}"
-            )
-        )
+        text = f"estimator {estimator!r} does not exist; there are {', '.join(ESTIMATORS)}"
+        problems.append(Problem("unknown-name", text))
     if max_attacked is not None and max_attacked < 0:
         problems.append(Problem("negative", f"max_attacked is {max_attacked}; it must not be negative"))
     if problems:
@@ -186,13 +175,6 @@ def lmi_options(site: Site, lure: Lure) -> CircleOptions:
     part of the thresholds instead. The load error has one column for every customer's p and one for its q.
     Each is the largest error of the file at the customer's peak, or that without a reading for a customer
     without a meter.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    lure
-        Its Lur'e system.
 
     References
     ----------
@@ -220,21 +202,6 @@ def _load_columns(site: Site) -> Floats:
     return np.hstack([2.0 * model.R * dp, 2.0 * model.X * dq])
 
 
-def _windowed(site: Site, _: DesignOptions) -> windowed.WindowedDesign:
-    settings = site.tables.meta.monitor
-    return windowed.design(plant(site), max_attacked=settings.max_attacked, step_s=settings.tick_s)
-
-
-def _set_search(site: Site, _: DesignOptions) -> set_search.SetSearchDesign:
-    settings = site.tables.meta.monitor
-    return set_search.design(plant(site), max_attacked=settings.max_attacked, step_s=settings.tick_s)
-
-
-def _partial(site: Site, _: DesignOptions) -> partial.PartialDesign:
-    settings = site.tables.meta.monitor
-    return partial.design(plant(site), max_attacked=settings.max_attacked, step_s=settings.tick_s)
-
-
 def _ticks(name: str, summary: str, decoder: Decoder) -> Estimator:
     """Estimator that tests every tick by itself."""
 
@@ -249,24 +216,11 @@ def _ticks(name: str, summary: str, decoder: Decoder) -> Estimator:
             alarms_per_year=settings.alarms_per_year,
         )
 
-    return Estimator(
-        name, summary, make, sequential.init, sequential.step, lambda d: int(d.observers), _certificate
-    )
-
-
-def _unknown_input(site: Site, _: DesignOptions) -> unknown_input.UnknownInputDesign:
-    settings = site.tables.meta.monitor
-    return unknown_input.design(plant(site), max_attacked=settings.max_attacked, step_s=settings.tick_s)
+    return _of(sequential, name, summary, design=make)
 
 
 class Families(Mapping[str, Estimator]):
-    """Bundled estimators and those of other packages, which are loaded on first use.
-
-    Parameters
-    ----------
-    own
-        Bundled estimators.
-    """
+    """Bundled estimators and those of other packages, which are loaded on first use."""
 
     def __init__(self, own: Iterable[Estimator]) -> None:
         self._known = {family.name: family for family in own}
@@ -285,16 +239,15 @@ class Families(Mapping[str, Estimator]):
 
 FAMILIES: Final = Families(
     (
-        Estimator(
-            SEQUENTIAL,
-            "one switched observer, correlated loads, evidence on several time scales",
-            _sequential,
-            sequential.init,
-            sequential.step,
-            lambda d: int(d.observers),
-            _certificate,
-            lambda d: int(d.most),
-            BiasLearning(
+        replace(
+            _of(
+                sequential,
+                SEQUENTIAL,
+                "one switched observer, correlated loads, evidence on several time scales",
+                design=_sequential,
+            ),
+            withstands=lambda d: int(d.most),
+            bias_learning=BiasLearning(
                 needed_s=lambda d: float(d.options.commission_s),
                 init=lambda d, t, known: sequential.init(d, t, known.learned, known.learning),
                 commission=lambda state: state.commission,
@@ -302,18 +255,15 @@ FAMILIES: Final = Families(
                 read=sequential.from_arrays,
                 progress=sequential.progress,
             ),
-            WarmStart(sequential.distrusted, sequential.warm_start),
+            warm_start=WarmStart(sequential.distrusted, sequential.warm_start),
         ),
-        _bank(DIRECT, "banks of circle-criterion observers, direct injection (chong2020)", _direct_bank),
-        _bank(LMI, "the same banks, gains by matrix inequality (chong2020)", _lmi_bank),
-        Estimator(
+        _of(exact_bank, DIRECT, "banks of circle-criterion observers, direct injection (chong2020)"),
+        _of(exact_bank, LMI, "the same banks, gains by matrix inequality (chong2020)", design=_lmi_bank),
+        _of(
+            windowed,
             "windowed-bank",
             "windows of consistency of discrete-time observers (yang2019)",
-            _windowed,
-            windowed.init,
-            windowed.step,
-            lambda d: int(d.observers),
-            lambda d: _certificate(d.chain),
+            proof=lambda d: _certificate(d.chain),
         ),
         _ticks(
             "weighted-least-squares",
@@ -323,32 +273,22 @@ FAMILIES: Final = Families(
         _ticks("l0-decoder", "the smallest set that explains a tick (lee2018, 2)", single_tick.fewest),
         _ticks("basis-pursuit", "the attack of smallest l1 norm (lee2018, 2)", single_tick.pursue),
         _ticks("matching-pursuit", "orthogonal matching pursuit (lee2018, 2)", single_tick.match),
-        Estimator(
+        _of(
+            partial,
             "partial-observers",
             "one observer per meter, l0 decoding of their stack (lee2018, 4)",
-            _partial,
-            partial.init,
-            partial.step,
-            lambda d: int(d.observers),
-            lambda d: _certificate(d.model),
+            proof=lambda d: _certificate(d.model),
         ),
-        Estimator(
+        _of(
+            set_search,
             "set-search",
             "one switched observer, a new set when its test fails (kim2018, lee2018, 5)",
-            _set_search,
-            set_search.init,
-            set_search.step,
-            lambda d: int(d.observers),
-            _certificate,
         ),
-        Estimator(
+        _of(
+            unknown_input,
             "unknown-input",
             "meters and inverters at once; suspected injections are unknown inputs (yang2021)",
-            _unknown_input,
-            unknown_input.init,
-            unknown_input.step,
-            lambda d: int(d.observers),
-            lambda d: f"intervals of honest inverters; {len(d.missing)} pairs need reported q",
+            proof=lambda d: f"intervals of honest inverters; {len(d.missing)} pairs need reported q",
         ),
     )
 )

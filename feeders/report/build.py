@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from feeders.format.validation import told
-from feeders.report import drawing as drawings
-from feeders.report.drawing import WIDE, Drawing, Figure, svg
+from feeders.report.drawing import WIDE, Drawing, Figure, png, svg
 from feeders.report.html import CONVERSION, FEEDER, About, Chapter, StudyOutcome, page, section
-from feeders.report.maps import Shape, Spot, draw_map, legend_of
+from feeders.report.maps import Shape, Spot, draw_map, has_places, legend_of
+from gridsec.papers import draw
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -22,44 +22,20 @@ if TYPE_CHECKING:
     from feeders.convert.provenance import Origin
     from feeders.model.site import Site
 
-__all__ = ["Report", "report"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Report:
-    """Report of a feeder.
+    """Report of a feeder."""
 
-    Attributes
-    ----------
-    html
-        The page.
-    pictures
-        Figure files by name: SVG, and PNG with matplotlib.
-    tables
-        Tables by file name.
-    """
-
-    html: str
-    pictures: dict[str, bytes]
-    tables: dict[str, pd.DataFrame]
+    html: str  # the page
+    pictures: dict[str, bytes]  # figure files by name: SVG, and PNG with matplotlib
+    tables: dict[str, pd.DataFrame]  # tables by file name
 
 
 def report(
     site: Site, outcomes: Sequence[StudyOutcome], about: About, origin: Origin | None = None
 ) -> Report:
-    """Build the report; equal arguments give equal bytes.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    outcomes
-        Outcomes of its studies, in the order of the sections.
-    about
-        Data on the report itself.
-    origin
-        Origin of the feeder, if it was converted.
-    """
+    """Build the report, with sections in the order of `outcomes`; equal arguments give equal bytes."""
     chapters = [Chapter(outcome, section(site, outcome)) for outcome in outcomes]
     chart = _chart(site)
     title = site.tables.meta.title or site.feeder.name
@@ -79,8 +55,8 @@ def _files(figure: Figure) -> list[tuple[str, bytes]]:
     drawing = figure.draw(WIDE)
     text = svg(drawing, title=figure.title, text=figure.text, key=figure.name, alone=True)
     out = [(f"{figure.name}.svg", text.encode())]
-    if drawings.available():
-        out.append((f"{figure.name}.png", drawings.png(drawing, title=figure.title, text=figure.text)))
+    if draw.available():
+        out.append((f"{figure.name}.png", png(drawing, title=figure.title, text=figure.text)))
     return out
 
 
@@ -106,7 +82,7 @@ def _facts(site: Site) -> dict[str, str]:
 
 
 def _chart(site: Site) -> Figure:
-    real = "at their positions" if site.xy is not None else "as a tree"
+    real = "at their positions" if has_places(site) else "as a tree"
     return Figure(
         "feeder-map",
         "Map",

@@ -9,8 +9,6 @@ from typing import Final
 
 from feeders.report.drawing import Area, Disc, Drawing, Mark, Polyline, Text, regular, width_of
 
-__all__ = ["LINES", "Bar", "ChartRow", "Curve", "curves", "rows", "ticks"]
-
 LINES: Final = ("line-a", "line-b", "line-c", "line-d", "line-ink", "line-bad", "line-wire", "line-s")
 """Looks of curves, different in colour and dashes."""
 
@@ -20,28 +18,15 @@ _ROW: Final = 19.0
 
 @dataclass(frozen=True, slots=True)
 class Bar:
-    """Part of a row, from one value to another.
+    """Part of a row, from one value to another."""
 
-    Attributes
-    ----------
-    low, high
-        The values.
-    look
-        One of the looks of drawings.
-    meaning
-        Text in the legend.
-    tip
-        Text of the tooltip.
-    inset
-        Distance of the bar from the row's edges, px.
-    """
-
+    # The values.
     low: float
     high: float
-    look: str
-    meaning: str
-    tip: str = ""
-    inset: float = 3.0
+    look: str  # one of the looks of drawings
+    meaning: str  # text in the legend
+    tip: str = ""  # text of the tooltip
+    inset: float = 3.0  # distance of the bar from the row's edges, px
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,20 +47,9 @@ def rows(
     start: float = 0.0,
     limits: Mapping[str, Sequence[float]] | None = None,
 ) -> Drawing:
-    """Draw rows of bars over one axis.
+    """Draw rows of bars, finite values from `start` on, over one axis on a sheet `width` px wide.
 
-    Parameters
-    ----------
-    data
-        The rows, from above. Values are finite.
-    width
-        Width of the sheet, px.
-    axis
-        Label of the axis, with its unit.
-    start
-        Begin of the axis.
-    limits
-        Values with a line through all rows, by meaning; values beyond the axis are left out.
+    `limits` are values with a line through all rows, by meaning; values beyond the axis are left out.
     """
     left = min(max((width_of(row.label, _LETTERS) for row in data), default=0.0), 0.36 * width) + 12.0
     right = max((width_of(row.shown, _LETTERS) for row in data), default=0.0) + 14.0
@@ -130,20 +104,10 @@ def curves(
     high: float | None = None,
     decades: bool = False,
 ) -> Drawing:
-    """Draw curves.
+    """Draw curves on a sheet `width` px wide; a value that is not finite makes a gap.
 
-    Parameters
-    ----------
-    data
-        The curves; a value that is not finite makes a gap.
-    width
-        Width of the sheet, px.
-    x, y
-        Labels of the axes, with their units.
-    low, high
-        Values within the range of the ordinate.
-    decades
-        Abscissas are decimal logarithms.
+    `low` and `high` are values within the range of the ordinate. With `decades` abscissas are decimal
+    logarithms.
     """
     xs = [v for c in data for v in c.x if math.isfinite(v)] or [0.0, 1.0]
     ys = [v for c in data for v in c.y if math.isfinite(v)] or [0.0, 1.0]

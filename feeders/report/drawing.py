@@ -7,36 +7,14 @@ independent of feeders.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
+from itertools import groupby
 from typing import Any, Final
 
 from gridsec.papers import draw
-
-__all__ = [
-    "DARK",
-    "LIGHT",
-    "LOOKS",
-    "NARROW",
-    "STEPS",
-    "WIDE",
-    "Area",
-    "Disc",
-    "Drawing",
-    "Figure",
-    "Look",
-    "Mark",
-    "Polyline",
-    "Text",
-    "available",
-    "png",
-    "regular",
-    "style",
-    "svg",
-    "width_of",
-]
-
 
 Point = tuple[float, float]
 
@@ -91,7 +69,6 @@ class Look:
     stroke: str = ""
     width: float = 1.0
     dash: str = ""
-    bold: bool = False
     halo: bool = False
 
 
@@ -201,13 +178,7 @@ def width_of(text: str, size: float = 12.0) -> float:
 
 
 def style(scope: str = "") -> str:
-    """Style sheet of all looks, light and dark.
-
-    Parameters
-    ----------
-    scope
-        Selector of the drawings' container; empty: the whole document is one drawing.
-    """
+    """Style sheet of all looks, light and dark, below a selector, or for a whole document."""
     root = scope or ":root"
     before = f"{scope} " if scope else ""
     lines = [f"{root} {{ {_variables(LIGHT)} }}"]
@@ -230,26 +201,16 @@ def _rule(look: Look) -> str:
         parts.append("stroke-linecap: round;")
     if look.dash:
         parts.append(f"stroke-dasharray: {look.dash};")
-    if look.bold:
-        parts.append("font-weight: 650;")
     if look.halo:
         parts.append("paint-order: stroke; stroke: var(--g-card); stroke-width: 3px; stroke-linejoin: round;")
     return " ".join(parts)
 
 
 def svg(drawing: Drawing, *, title: str, text: str, key: str, alone: bool = False) -> str:
-    """Write a drawing as SVG.
+    """Write a drawing as SVG with a title, and a text for screen readers.
 
-    Parameters
-    ----------
-    drawing
-        The drawing.
-    title, text
-        Title, and description for screen readers.
-    key
-        Prefix of ids, unique in the document: letters, digits and hyphens.
-    alone
-        True: a file of its own, with style sheet and background.
+    `key` is a prefix of ids, unique in the document: letters, digits and hyphens. With `alone` the drawing is
+    a file of its own, with style sheet and background.
     """
     width, height = _number(drawing.width), _number(drawing.height)
     head = [
@@ -266,26 +227,16 @@ def svg(drawing: Drawing, *, title: str, text: str, key: str, alone: bool = Fals
 
 def _merged(marks: Sequence[Mark]) -> Iterable[str]:
     """Write marks; successive ones of equal look without a tip share one path."""
-    held: tuple[str, list[str]] | None = None
-    for mark in marks:
-        if isinstance(mark, Polyline | Area) and not mark.tip:
-            if held is not None and held[0] == mark.look:
-                held[1].append(_path(mark))
-                continue
-            if held is not None:
-                yield _one_path(*held)
-            held = (mark.look, [_path(mark)])
-            continue
-        if held is not None:
-            yield _one_path(*held)
-            held = None
-        yield _element(mark)
-    if held is not None:
-        yield _one_path(*held)
+    for look, some in groupby(marks, _shared_look):
+        if look:
+            parts = [_path(mark) for mark in some if isinstance(mark, Polyline | Area)]
+            yield f'<path class="g-{look}" d="{"".join(parts)}"/>'
+        else:
+            yield from map(_element, some)
 
 
-def _one_path(look: str, parts: list[str]) -> str:
-    return f'<path class="g-{look}" d="{"".join(parts)}"/>'
+def _shared_look(mark: Mark) -> str:
+    return mark.look if isinstance(mark, Polyline | Area) and not mark.tip else ""
 
 
 def _element(mark: Mark) -> str:
@@ -316,7 +267,7 @@ def _number(value: float) -> str:
 
 def _plain(text: str) -> str:
     """Text for XML: escaped, and without characters that are invalid in XML."""
-    return escape("".join(c if c >= " " and c not in "\ufffe\uffff" else "\ufffd" for c in text))
+    return escape(re.sub("[\x00-\x1f\ufffe\uffff]", "\ufffd", text))
 
 
 WIDE: Final = 720.0
@@ -327,24 +278,12 @@ NARROW: Final = 350.0
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """Figure of the report.
+    """Figure of the report."""
 
-    Attributes
-    ----------
-    name
-        Name of its files: letters, digits and hyphens.
-    title
-        Title in a few words.
-    text
-        Description, for screen readers; also printed below it.
-    draw
-        Draws it for a width, px.
-    """
-
-    name: str
-    title: str
-    text: str
-    draw: Callable[[float], Drawing]
+    name: str  # name of its files: letters, digits and hyphens
+    title: str  # title in a few words
+    text: str  # description, for screen readers; also printed below it
+    draw: Callable[[float], Drawing]  # draws it for a width, px
 
 
 SCALE: Final = 2.0
@@ -352,26 +291,8 @@ _POINTS: Final = 0.72  # points per px on a sheet of 100 px per inch
 _SIDES: Final = 48
 
 
-def available() -> bool:
-    """True if PNG is available: matplotlib is installed."""
-    return draw.available()
-
-
 def png(drawing: Drawing, *, title: str, text: str) -> bytes:
-    """Draw a PNG; equal drawings give equal bytes.
-
-    Parameters
-    ----------
-    drawing
-        The drawing.
-    title, text
-        Metadata of the file.
-
-    Raises
-    ------
-    ModuleNotFoundError
-        Without matplotlib; see `available`.
-    """
+    """Draw a PNG with a title and a text as metadata; equal drawings give equal bytes. Needs matplotlib."""
 
     def marks(axes: Any) -> None:
         for k, mark in enumerate(drawing.marks):
@@ -407,7 +328,6 @@ def _draw(axes: Any, mark: Mark, order: float) -> None:
             fontsize=_POINTS * mark.size * 0.94,  # DejaVu is wider than the fonts of screens
             ha=side,
             va="baseline",
-            weight="bold" if look.bold else "normal",
             zorder=order,
             parse_math=False,
             bbox=halo if look.halo else None,

@@ -29,23 +29,6 @@ if TYPE_CHECKING:
     from feeders.model.site import Site
     from gridsec.arrays import Floats
 
-__all__ = [
-    "ColorScale",
-    "Placed",
-    "Shape",
-    "Spot",
-    "comparable",
-    "draw_map",
-    "has_places",
-    "legend_of",
-    "names_of",
-    "place",
-    "single_phase",
-    "size_map",
-    "spots_by_size",
-    "steps_of",
-]
-
 
 Point = tuple[float, float]
 
@@ -56,35 +39,19 @@ HALF_PAGE: Final = 400.0
 
 @dataclass(frozen=True, slots=True)
 class Placed:
-    """Layout of a feeder on a sheet, px.
+    """Layout of a feeder on a sheet, px."""
 
-    Attributes
-    ----------
-    width, height
-        Size of the sheet.
-    wires, drops
-        Polylines of lines, and of the connections of customers.
-    ties
-        Polylines of the lines that close loops.
-    busbar
-        Both ends of the busbar.
-    customers
-        Position of each customer.
-    room
-        Available room of a customer.
-    real
-        True: positions of the files.
-    """
-
+    # Size of the sheet.
     width: float
     height: float
+    # Polylines of lines, and of the connections of customers.
     wires: tuple[tuple[Point, ...], ...]
     drops: tuple[tuple[Point, ...], ...]
-    ties: tuple[tuple[Point, ...], ...]
-    busbar: tuple[Point, Point]
-    customers: tuple[Point, ...]
-    room: float
-    real: bool
+    ties: tuple[tuple[Point, ...], ...]  # polylines of the lines that close loops
+    busbar: tuple[Point, Point]  # both ends of the busbar
+    customers: tuple[Point, ...]  # position of each customer
+    room: float  # available room of a customer
+    real: bool  # True: positions of the files
 
 
 def has_places(site: Site) -> bool:
@@ -93,15 +60,7 @@ def has_places(site: Site) -> bool:
 
 
 def place(site: Site, width: float) -> Placed:
-    """Lay out a feeder on a sheet of a given width.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    width
-        Width of the sheet, px; on narrow sheets trees grow downwards.
-    """
+    """Lay out a feeder on a sheet `width` px wide; on narrow sheets trees grow downwards."""
     return _real(site, width) if has_places(site) else _tree(site, width)
 
 
@@ -331,30 +290,14 @@ class Shape(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Spot:
-    """Mark of a customer on a map.
+    """Mark of a customer on a map."""
 
-    Attributes
-    ----------
-    shape
-        Kind of mark.
-    label
-        Text beside it, or empty.
-    tip
-        Text of the tooltip.
-    step
-        Step of a size on a scale.
-    weight
-        Priority of the label's position.
-    phase
-        Phase a, b or c on a feeder of several phases; empty: none shown.
-    """
-
-    shape: Shape
-    label: str = ""
-    tip: str = ""
-    step: int = 0
-    weight: float = 0.0
-    phase: str = ""
+    shape: Shape  # kind of mark
+    label: str = ""  # text beside it, or empty
+    tip: str = ""  # text of the tooltip
+    step: int = 0  # step of a size on a scale
+    weight: float = 0.0  # priority of the label's position
+    phase: str = ""  # phase a, b or c on a feeder of several phases; empty: none shown
 
 
 LEGS: Final = {"a": 60.0, "b": 180.0, "c": 300.0}
@@ -382,13 +325,7 @@ class ColorScale:
 
 
 def steps_of(values: Sequence[float], unit: str) -> ColorScale:
-    """Scale of equal steps of a round size over finite values.
-
-    Parameters
-    ----------
-    values, unit
-        Values, at least one of them finite, and their unit.
-    """
+    """Scale of equal steps of a round size over values, at least one of them finite."""
     finite = [value for value in values if math.isfinite(value)]
     least, most = min(finite), max(finite)
     same = most - least < 0.05 * max(abs(most), abs(least))
@@ -412,48 +349,15 @@ def _digits(step: float) -> int:
 
 
 def legend_of(meanings: Mapping[str, Shape], spots: Sequence[Spot]) -> dict[str, Spot]:
-    """Legend of the shapes on a map.
-
-    Parameters
-    ----------
-    meanings
-        Shapes by meaning.
-    spots
-        Marks of the map.
-    """
+    """Those of the shapes, by meaning, that are on a map."""
     there = {spot.shape for spot in spots}
     return {name: Spot(shape) for name, shape in meanings.items() if shape in there}
 
 
-def draw_map(
-    site: Site, spots: Sequence[Spot], width: float, *, legend: Mapping[str, Spot], note: str = ""
-) -> Drawing:
-    """Draw a feeder.
-
-    Parameters
-    ----------
-    site, spots
-        The feeder, and the mark of each customer.
-    width
-        Width of the sheet, px.
-    legend
-        Marks of the legend by meaning.
-    note
-        Text above the drawing.
-    """
+def draw_map(site: Site, spots: Sequence[Spot], width: float, *, legend: Mapping[str, Spot]) -> Drawing:
+    """Draw a feeder on a sheet `width` px wide, with the mark of each customer, and a legend by meaning."""
     at = place(site, width)
-    top = 22.0 if note else 0.0
-    at = replace(
-        at,
-        height=at.height + top,
-        wires=tuple(_down(points, top) for points in at.wires),
-        drops=tuple(_down(points, top) for points in at.drops),
-        ties=tuple(_down(points, top) for points in at.ties),
-        busbar=(_moved(at.busbar[0], top), _moved(at.busbar[1], top)),
-        customers=tuple(_moved(point, top) for point in at.customers),
-    )
-    marks: list[Mark] = [Text(8.0, 15.0, note, "quiet", size=12.0)] if note else []
-    marks += [Polyline(points, "drop") for points in at.drops]
+    marks: list[Mark] = [Polyline(points, "drop") for points in at.drops]
     marks += [Polyline(points, "wire") for points in at.wires]
     marks += [Polyline(points, "line-wire") for points in at.ties]
     marks.append(Polyline(at.busbar, "busbar", tip=f"busbar: {site.feeder.buses[0]}"))
@@ -462,7 +366,7 @@ def draw_map(
     order = sorted(range(len(spots)), key=lambda k: (spots[k].step, spots[k].weight))
     for k in order:
         marks += _glyph(spots[k], *at.customers[k], size)
-    marks += _labels(spots, at, size, top)
+    marks += _labels(spots, at, size)
     lines, height = _legend(legend, at.height, width)
     return Drawing(width, height, (*marks, *lines))
 
@@ -482,14 +386,6 @@ def _with_phases(
         **legend,
         **{f"phase {phase}": Spot(Shape.NONE, phase=phase) for phase in sorted(set(phases))},
     }
-
-
-def _moved(point: tuple[float, float], down: float) -> tuple[float, float]:
-    return (point[0], point[1] + down)
-
-
-def _down(points: Sequence[tuple[float, float]], down: float) -> tuple[tuple[float, float], ...]:
-    return tuple(_moved(point, down) for point in points)
 
 
 def _glyph(spot: Spot, x: float, y: float, size: float) -> list[Mark]:
@@ -527,13 +423,13 @@ def _leg(spot: Spot, x: float, y: float, size: float) -> list[Mark]:
 Box = tuple[float, float, float, float]
 
 
-def _labels(spots: Sequence[Spot], at: Placed, size: float, top: float) -> list[Mark]:
+def _labels(spots: Sequence[Spot], at: Placed, size: float) -> list[Mark]:
     """Labels with enough room, off the lines if possible: right, left, below, above, in this order.
 
     Labels of trees are below first.
     """
     lit = np.array([(*a, *b) for wire in (*at.wires, *at.ties, *at.drops) for a, b in pairwise(wire)])
-    taken: list[Box] = [_around(x, y, size) for x, y in at.customers]
+    taken: list[Box] = [(x - size, y - size, x + size, y + size) for x, y in at.customers]
     marks: list[Mark] = []
     letters = 11.0
     order = sorted((k for k, spot in enumerate(spots) if spot.label), key=lambda k: -spots[k].weight)
@@ -553,7 +449,7 @@ def _labels(spots: Sequence[Spot], at: Placed, size: float, top: float) -> list[
             tx, ty, anchor, left = places[name]
             box = (left, ty - 9.0, left + long, ty + 2.0)
             inside = (
-                box[0] >= 1.0 and box[2] <= at.width - 1.0 and box[1] >= top and box[3] <= at.height + 6.0
+                box[0] >= 1.0 and box[2] <= at.width - 1.0 and box[1] >= 0.0 and box[3] <= at.height + 6.0
             )
             if inside and not any(_overlap(box, other) for other in taken):
                 free.append((Text(tx, ty, spots[k].label, "label", anchor, letters), box))
@@ -562,10 +458,6 @@ def _labels(spots: Sequence[Spot], at: Placed, size: float, top: float) -> list[
             taken.append(box)
             marks.append(mark)
     return marks
-
-
-def _around(x: float, y: float, r: float) -> Box:
-    return (x - r, y - r, x + r, y + r)
 
 
 def _crossed(box: Box, lines: Floats) -> bool:
@@ -604,17 +496,7 @@ FEW_LABELS: Final = 40
 def size_map(
     site: Site, table: pd.DataFrame, width: float, *, who: str, column: str, unit: str = "V"
 ) -> Drawing:
-    """Map of the feeder with a number for each customer or meter.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    width
-        Width of the sheet, px.
-    table, column, unit
-        As in `spots_by_size`, with `who`.
-    """
+    """Map of the feeder with a number for each customer or meter, as in `spots_by_size`."""
     spots, legend = spots_by_size(site, table, who, column, unit)
     return draw_map(site, spots, width, legend=legend)
 
@@ -624,12 +506,7 @@ def spots_by_size(
 ) -> tuple[list[Spot], dict[str, Spot]]:
     """Marks of a map with sizes from a column of a table, and their legend.
 
-    Parameters
-    ----------
-    site
-        The feeder.
-    table, column, unit
-        Table, its column of numbers, and their unit. `who` is its column of ids, "meter" or "customer".
+    The column `who` of the table, "meter" or "customer", has the ids.
     """
     names = names_of(site, who)
     sizes = dict(zip(table[who].astype(str), table[column].astype(float), strict=True))
@@ -657,14 +534,9 @@ def spots_by_size(
 
 
 def comparable(site: Site, table: pd.DataFrame) -> tuple[pd.DataFrame, str]:
-    """Table of volts and its unit; with several nominal voltages relative to these.
+    """Table of volts and its unit; with several nominal voltages relative to that of the column `customer`.
 
-    Parameters
-    ----------
-    site
-        The feeder.
-    table
-        Table with a column `customer`; columns of numbers with a name in `_s` are not changed.
+    Columns of numbers with a name in `_s` are not changed.
     """
     if bool((site.nominal_volt == site.nominal_volt[0]).all()):
         return table, "V"

@@ -9,7 +9,18 @@ from typing import TYPE_CHECKING
 from feeders.report.charts import Bar, ChartRow, rows
 from feeders.report.drawing import Drawing, Figure
 from feeders.report.maps import Shape, Spot, draw_map, legend_of
-from feeders.report.text import Finding, Question, Section, Sentence, Standing, Value, listed, number, plural
+from feeders.report.text import (
+    Finding,
+    Question,
+    Section,
+    Sentence,
+    Standing,
+    Value,
+    counted,
+    listed,
+    number,
+    plural,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -17,7 +28,6 @@ if TYPE_CHECKING:
     from feeders.model.site import Site
     from feeders.studies.calibrate.study import Calibrate
 
-__all__ = ["calibrate"]
 
 ROWS = 40
 """Largest number of meters in a chart: those with the largest errors."""
@@ -28,6 +38,7 @@ UNTOLD, PROPOSED, EXCLUDED, AS_FILED = "cannot be told", "proposed", "excluded",
 
 def calibrate(site: Site, found: Calibrate) -> Section:
     """Section of the calibration."""
+    unread = listed(found.unread)
     known = found.meters[[math.isfinite(v) for v in found.meters["std_percent"]]]
     figures = [
         Figure(
@@ -49,7 +60,6 @@ def calibrate(site: Site, found: Calibrate) -> Section:
             )
         )
     return Section(
-        title="Readings against the files",
         answers={Question.RECORDS: _said(found)},
         figures=tuple(figures),
         tables=found.tables,
@@ -65,62 +75,55 @@ def calibrate(site: Site, found: Calibrate) -> Section:
             f"{found.frames} frames over {number(found.span_h, 1)} h were compared; for correct files "
             f"the probability of any proposal is {100.0 * found.risk:g} %.",
             "The files were not changed.",
-            *_left_out(found),
+            *(
+                [f"The busbar has no voltages of phase {unread}: the meters on it are left out."]
+                * bool(unread)
+            ),
         ),
     )
 
 
-def _left_out(found: Calibrate) -> list[str]:
-    if not found.unread:
-        return []
-    return [f"The busbar has no voltages of phase {listed(found.unread)}: the meters on it are left out."]
-
-
 def _said(found: Calibrate) -> Finding:
-    sure = found.proposals[found.proposals["verdict"] == PROPOSED]
-    vague = found.proposals[found.proposals["verdict"] == UNTOLD]
-    sentences: list[Sentence] = []
+    def having(verdict: str, name: str = "proposals") -> tuple[pd.DataFrame, Value]:
+        """Rows of a table with a verdict, and their number."""
+        table = found.tables[name]
+        some = table[table["verdict"] == verdict]
+        return some, counted(len(some), f"calibrate-{name}:verdict:count {verdict}")
+
+    sentences: list[Sentence] = [("No correction of the files is decided.",)]
+    sure, count = having(PROPOSED)
     if len(sure):
-        what = [f"{row['what']}: {row['proposed']}" for row in sure.to_dict("records")]
-        count = Value(len(sure), str(len(sure)), f"calibrate-proposals:verdict:count {PROPOSED}")
         verb = plural(len(sure), "correction of the files is", "corrections of the files are")
-        sentences.append((count, f" {verb} proposed: {listed(what)}."))
-    else:
-        sentences.append(("No correction of the files is decided.",))
+        sentences = [(count, f" {verb} proposed: {_proposals(sure)}.")]
+    vague, count = having(UNTOLD)
     if len(vague):
-        count = Value(len(vague), str(len(vague)), f"calibrate-proposals:verdict:count {UNTOLD}")
         noun = plural(len(vague), "error")
         sentences.append((count, f" {noun} in the readings could be one of several."))
-    changing = found.proposals[found.proposals["verdict"] == EXCLUDED]
+    changing, count = having(EXCLUDED)
     if len(changing):
-        count = Value(len(changing), str(len(changing)), f"calibrate-proposals:verdict:count {EXCLUDED}")
-        what = [f"{row['what']}: {row['proposed']}" for row in changing.to_dict("records")]
-        verb = plural(len(changing), "meter is", "meters are")
-        sentences.append(
-            (
-                count,
-                f" {verb} inconsistent, and errors of the files explain it less well: {listed(what)}. "
-                "An attack has this effect. The voltages were not used.",
-            )
+        words = (
+            f" {plural(len(changing), 'meter is', 'meters are')} inconsistent, and errors of the files "
+            f"explain it less well: {_proposals(changing)}. An attack has this effect. The voltages were not "
+            "used."
         )
-    outside = found.meters[found.meters["verdict"] == "outside its class"]["meter"].tolist()
-    if outside:
-        count = Value(len(outside), str(len(outside)), "calibrate-meters:verdict:count outside its class")
+        sentences.append((count, words))
+    outside, count = having("outside its class", "meters")
+    if len(outside):
         verb = plural(len(outside), "meter is", "meters are")
-        sentences.append((count, f" {verb} outside the accuracy class: {listed(outside)}."))
+        sentences.append((count, f" {verb} outside the accuracy class: {listed(outside['meter'].tolist())}."))
     silent: list[str | Value] = []
     for name in ("lines", "customers", "meters"):
-        table = found.tables[name]
-        untold = int((table["verdict"] == UNTOLD).sum())
-        if untold:
-            silent += [
-                ", " if silent else "Not determined by the readings: ",
-                Value(untold, str(untold), f"calibrate-{name}:verdict:count {UNTOLD}"),
-                f" of {len(table)} {name}",
-            ]
+        untold, count = having(UNTOLD, name)
+        if len(untold):
+            lead = ", " if silent else "Not determined by the readings: "
+            silent += [lead, count, f" of {len(found.tables[name])} {name}"]
     if silent:
         sentences.append((*silent, ". These may be right or wrong."))
     return Finding(Standing.MEASURED, tuple(sentences))
+
+
+def _proposals(table: pd.DataFrame) -> str:
+    return listed([f"{row['what']}: {row['proposed']}" for row in table.to_dict("records")])
 
 
 def _doubt_map(site: Site, customers: pd.DataFrame, width: float) -> Drawing:

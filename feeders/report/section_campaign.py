@@ -10,7 +10,20 @@ import numpy as np
 
 from feeders.report.charts import LINES, Bar, ChartRow, Curve, curves, rows
 from feeders.report.drawing import Drawing, Figure
-from feeders.report.text import Finding, Question, Section, Sentence, Standing, Value, listed, number, plural
+from feeders.report.text import (
+    Finding,
+    Question,
+    Section,
+    Sentence,
+    Standing,
+    Value,
+    counted,
+    listed,
+    number,
+    plural,
+    quantity,
+    sentence,
+)
 from feeders.simulation.attacks import AttackKind
 from feeders.simulation.trial import TrialMeterErrors
 
@@ -22,7 +35,6 @@ if TYPE_CHECKING:
     from feeders.studies.campaign.plan import CampaignPlan
     from feeders.studies.campaign.study import Campaign
 
-__all__ = ["campaign"]
 
 # Columns on the page; the files have all.
 _BY = {"by_kind": "kind", "by_size": "size", "by_place": "place", "by_liars": "liars"}
@@ -30,15 +42,7 @@ _SIZES = (
     "bias, scaling: % of nominal; drift: % of nominal per minute; replay: age of the reports, s; "
     "coordinated: displacement of the least affected meter by a false load, % of nominal; stuck: none"
 )
-_UNITS = {
-    **dict.fromkeys((AttackKind.BIAS, AttackKind.TOGETHER, AttackKind.SCALING, AttackKind.COORDINATED), " %"),
-    **{
-        AttackKind.DRIFT: " %/min",
-        AttackKind.REPLAY: " s",
-        AttackKind.CLOCK_SHIFT: " s",
-        AttackKind.INVERTER: " %",
-    },
-}
+_UNITS = {AttackKind.DRIFT: " %/min", AttackKind.REPLAY: " s", AttackKind.CLOCK_SHIFT: " s"}
 _ERRORS = {
     TrialMeterErrors.SITE: "those of the feeder's files",
     TrialMeterErrors.WHITE: "white noise of 0.2 %, no fixed error",
@@ -59,7 +63,6 @@ def campaign(_: Site, found: Campaign) -> Section:
     plan = found.plan
     rate = min(plan.alarms_per_year)
     return Section(
-        title="Simulated attacks",
         answers={Question.MONITOR: _behaved(found, rate)},
         figures=_figures(found, rate) if len(found.liars) else (),
         tables=found.tables,
@@ -134,14 +137,14 @@ def _behaved(found: Campaign, rate: float) -> Finding:
     if len(liars):
         share, low, high = (float(row[name].iloc[0]) for name in ("named", "named_low", "named_high"))
         sentences.append(
-            (
-                "Of ",
-                Value(len(liars), str(len(liars)), "campaign-liars:rows"),
-                " manipulated devices in ",
-                Value(len(played), str(len(played)), "campaign-scenarios:reason:empty"),
-                " simulated scenarios, the monitor named ",
-                Value(share, _percent(share), "campaign-false_names:named:row 0"),
-                f" (true share with 95 % confidence: {_percent(low)} to {_percent(high)}).",
+            sentence(
+                "Of {liars} manipulated devices in {played} simulated scenarios, the monitor named {share} "
+                "(true share with 95 % confidence: {low} to {high}).",
+                liars=counted(len(liars), "campaign-liars:rows"),
+                played=counted(len(played), "campaign-scenarios:reason:empty"),
+                share=Value(share, _percent(share), "campaign-false_names:named:row 0"),
+                low=_percent(low),
+                high=_percent(high),
             )
         )
         sentences += _missed(found, rate)
@@ -151,7 +154,7 @@ def _behaved(found: Campaign, rate: float) -> Finding:
     sentences.append(
         (
             "False accusations: ",
-            Value(wronged, str(wronged), "campaign-scenarios:falsely_named:filled"),
+            counted(wronged, "campaign-scenarios:falsely_named:filled"),
             f" of {len(played)} {plural(len(played), 'scenario')}.",
             *_worst(played),
         )
@@ -170,7 +173,7 @@ def _missed(found: Campaign, rate: float) -> list[Sentence]:
         return [(f"None was missed.{soon.replace('Median delay of the others', 'Median delay')}",)]
     total = liars.groupby("kind").size()
     kinds = [f"{kind} ({count} of {total[kind]})" for kind, count in never.groupby("kind").size().items()]
-    missed = Value(len(never), str(len(never)), "campaign-liars:delay_s:infinite")
+    missed = counted(len(never), "campaign-liars:delay_s:infinite")
     return [(missed, f" {plural(len(never), 'was', 'were')} missed: {listed(kinds)}.{soon}")]
 
 
@@ -191,30 +194,22 @@ def _worst(played: pd.DataFrame) -> Sentence:
 
 def _open(played: pd.DataFrame, impossible: int) -> list[Sentence]:
     """Undecided time, undetected time, and scenarios without a simulation."""
-    out: list[Sentence] = []
-    total, clean = float(played["undecided_s"].sum()), float(played["clean_lying_s"].sum())
-    watched = float(played["watched_s"].sum())
-    out.append(
-        (
-            "Of ",
-            Value(watched, f"{number(watched, 0)} s", "campaign-scenarios:watched_s:sum"),
-            " monitored, the verdict was UNDECIDED for ",
-            Value(total, f"{number(total, 0)} s", "campaign-scenarios:undecided_s:sum"),
-            ", and CLEAN for ",
-            Value(clean, f"{number(clean, 0)} s", "campaign-scenarios:clean_lying_s:sum"),
-            " with an attack that was not noticed yet, or never.",
-        )
+    watched, undecided, clean = (
+        quantity(float(played[name].sum()), "s", f"campaign-scenarios:{name}:sum", digits=0)
+        for name in ("watched_s", "undecided_s", "clean_lying_s")
     )
-    if impossible:
-        count = Value(impossible, str(impossible), "campaign-scenarios:reason:filled")
-        noun = plural(impossible, "scenario", "scenarios")
-        out.append(
-            (
-                count,
-                f" {noun} could not be simulated: no result for these.",
-            )
-        )
-    return out
+    times = sentence(
+        "Of {watched} monitored, the verdict was UNDECIDED for {undecided}, and CLEAN for {clean} with an "
+        "attack that was not noticed yet, or never.",
+        watched=watched,
+        undecided=undecided,
+        clean=clean,
+    )
+    if not impossible:
+        return [times]
+    count = counted(impossible, "campaign-scenarios:reason:filled")
+    noun = plural(impossible, "scenario")
+    return [times, (count, f" {noun} could not be simulated: no result for these.")]
 
 
 def _percent(share: float) -> str:
@@ -238,7 +233,7 @@ def _named_chart(plan: CampaignPlan, table: pd.DataFrame, width: float) -> Drawi
         told = int(row["liars_told"])
         kind = tricks.get(row["kind"])
         # Sizes of kinds in volts are factors.
-        unit = "" if kind is None or kind.volts or kind.together else _UNITS.get(kind.trick, "")
+        unit = "" if kind is None or kind.volts or kind.together else _UNITS.get(kind.trick, " %")
         size = "" if kind is not None and kind.trick is AttackKind.STUCK else f" {row['size']:g}{unit}"
         data.append(ChartRow(f"{row['kind']}{size}", bars, f"{round(share * told / 100.0)} of {told}"))
     return rows(data, width, axis="manipulated devices named, %")

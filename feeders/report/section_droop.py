@@ -18,9 +18,11 @@ from feeders.report.text import (
     Side,
     Standing,
     Value,
+    counted,
     least,
     listed,
     number,
+    quantity,
 )
 
 if TYPE_CHECKING:
@@ -29,7 +31,6 @@ if TYPE_CHECKING:
     from feeders.model.site import Site
     from feeders.studies.droop.study import DroopOptions, DroopStudy
 
-__all__ = ["droop"]
 
 ROWS = 30
 """Largest number of customers in a chart: those with the widest voltage limits."""
@@ -54,7 +55,6 @@ def droop(site: Site, found: DroopStudy) -> Section:
     delay = f", with a dead time of {given.dead} intervals" if given.dead else ""
     hosts = "hosting" in found.tables
     return Section(
-        title="The inverters",
         answers={Question.FLEET: _fleet(site, found, band, busbar)},
         figures=_figures(site, found, (low, high), band),
         tables=found.tables,
@@ -126,7 +126,7 @@ def _stability(stability: pd.DataFrame, verdict: str, busbar: str) -> Sentence:
         lead = f"Stable: proved for constant loads anywhere within their limits, the busbar {busbar}."
         return (lead, *margin)
     which = [str(p) for p, v in zip(stability["point"], stability["verdict"], strict=True) if v == verdict]
-    count = Value(len(which), str(len(which)), f"{name}:verdict:count {verdict}")
+    count = counted(len(which), f"{name}:verdict:count {verdict}")
     where: Sentence = (" (", count, f" of {len(stability)} cases: {listed(which)})")
     if verdict == UNSTABLE:
         return ("Unstable: the fleet leaves its equilibrium, in the proof and in AC simulation", *where, ".")
@@ -162,8 +162,7 @@ def _witness(site: Site, table: pd.DataFrame | None) -> Sentence:
     away = (table["v_volt"] / table["customer"].map(nominal) - 1.0).abs()
     k = int(away.where(table["beyond"]).fillna(-1.0).to_numpy().argmax())
     row = table.iloc[k]
-    size = float(row["v_volt"])
-    volt = Value(size, f"{number(size, 1)} V", f"droop-witness:v_volt:row {k}")
+    volt = quantity(float(row["v_volt"]), "V", f"droop-witness:v_volt:row {k}", digits=1)
     return ("; the loads of table witness give ", volt, f" at {row['customer']}, by AC power flow")
 
 
@@ -177,9 +176,9 @@ def _limits(site: Site, fleet: dict[str, object], always: str) -> Sentence:
     there = f" at the places nearest to the band's ends (nominal: {told(site.nominal_volt)}):"
     return (
         f"; proved limits{there if several else ''} ",
-        Value(low, f"{number(low, 1, Side.BELOW)} V", f"droop-band:low{which}_volt:row 0"),
+        quantity(low, "V", f"droop-band:low{which}_volt:row 0", digits=1, side=Side.BELOW),
         " and ",
-        Value(high, f"{number(high, 1, Side.ABOVE)} V", f"droop-band:high{which}_volt:row 0"),
+        quantity(high, "V", f"droop-band:high{which}_volt:row 0", digits=1, side=Side.ABOVE),
     )
 
 
@@ -191,9 +190,9 @@ def _hosting(found: DroopStudy) -> list[Sentence]:
         "Hosting capacity, with generation distributed as in the files, up to the first violated limit: "
     ]
     for k, row in enumerate(table.to_dict("records")):
-        kw = float(row["capacity_kw"])
         name = "without reactive power" if row["preset"] == "none" else f"with {row['preset']}"
-        size = Value(kw, f"{number(kw, 0, Side.BELOW)} kW", f"droop-hosting:capacity_kw:row {k}")
+        source = f"droop-hosting:capacity_kw:row {k}"
+        size = quantity(float(row["capacity_kw"]), "kW", source, digits=0, side=Side.BELOW)
         words += ["; " if k else "", size]
         unsure = {UNDECIDED: "; stability of the fleet there not proved", UNSTABLE: "; unstable there"}
         limit = row["limit"] or "no limit found"

@@ -18,11 +18,13 @@ from feeders.report.text import (
     Side,
     Standing,
     Value,
+    counted,
     least,
     listed,
     most,
     number,
     plural,
+    sentence,
 )
 from feeders.report.text import rows as how_many
 from feeders.studies.protect import Goal
@@ -35,14 +37,11 @@ if TYPE_CHECKING:
     from feeders.studies.protect import Protect
     from feeders.studies.redundancy import Redundancy
 
-__all__ = ["detectable", "protect", "redundancy"]
-
 
 def redundancy(site: Site, found: Redundancy) -> Section:
     """Section of the study redundancy."""
     first = found.meters[found.meters["case"] == "all live"]
     return Section(
-        title="Attacks that stay invisible",
         answers={Question.INVISIBLE: _invisible(found)},
         figures=(
             Figure(
@@ -96,13 +95,8 @@ def _invisible(found: Redundancy) -> Finding:
         else:
             meters = f": {listed(str(row['liars']).split(' '))}" if row["liars"] else ""
             verb = "manipulated meter can" if index == 1 else "manipulated meters together can"
-            sentences.append(
-                (
-                    prefix,
-                    value,
-                    f" {verb} stay invisible {kind}{meters}{'' if index == 1 else '; fewer cannot'}.",
-                )
-            )
+            end = "" if index == 1 else "; fewer cannot"
+            sentences.append((prefix, value, f" {verb} stay invisible {kind}{meters}{end}."))
         if row["blind"]:
             sentences.append((f"{prefix}No meter determines the voltage of {row['blind']}.",))
     return Finding(Standing.OPEN if open_ else Standing.PROVED, tuple(dict.fromkeys(sentences)))
@@ -142,7 +136,6 @@ def detectable(site: Site, found: Detectable) -> Section:
     """Section of the study detectable."""
     once, twice = _sure(found.risk), _sure(2.0 * found.risk)
     return Section(
-        title="Sizes of attacks",
         answers={
             Question.LIES: _sizes(site, found.meters, found.max_attacked, (once, twice)),
             Question.PICTURE: _picture(site, found.customers, found.max_attacked, twice),
@@ -222,67 +215,69 @@ def _sure(risk: float) -> str:
     return f"{100.0 * (1.0 - risk):.6g} %"
 
 
+def _span(
+    table: pd.DataFrame, name: str, column: str, who: str = "", *, digits: int = 2, side: Side = Side.ABOVE
+) -> Sentence:
+    """Smallest and largest value of a column, V, with the ids of both."""
+    low, high = (end(table, name, column, "V", digits=digits, side=side) for end in (least, most))
+    if not who:
+        return (low, " to ", high)
+    at = "at " if who == "customer" else ""
+    first, last = _extreme(table, who, column, smallest=True), _extreme(table, who, column)
+    return (low, f" ({at}{first}) to ", high, f" ({at}{last})")
+
+
 def _sizes(site: Site, meters: pd.DataFrame, liars: int, sure: tuple[str, str]) -> Finding:
     name = "detectable-meters"
     levels = f" Volts are those of each meter's own level{_percent(site)}." if _percent(site) else ""
-    together = "alone" if liars == 1 else f"with up to {liars} manipulated together"
-    never = meters[[math.isinf(v) or math.isnan(v) for v in meters["noticed"]]]
-    lead: Sentence = (
-        "All ",
-        how_many(meters, name),
-        f" meters, {together}, can hide a small attack: up to ",
-        least(meters, name, "hidden", "V", digits=3, side=Side.BELOW),
-        f" ({_extreme(meters, 'meter', 'hidden', smallest=True)}) to ",
-        most(meters, name, "hidden", "V", digits=3, side=Side.BELOW),
-        f" ({_extreme(meters, 'meter', 'hidden')}) no meter is named, with {sure[0]} at any one moment.",
-        levels,
+    lead = sentence(
+        "All {meters} meters, {together}, can hide a small attack: up to {span} no meter is named, with "
+        "{sure} at any one moment.{levels}",
+        meters=how_many(meters, name),
+        together="alone" if liars == 1 else f"with up to {liars} manipulated together",
+        span=_span(meters, name, "hidden", "meter", digits=3, side=Side.BELOW),
+        sure=sure[0],
+        levels=levels,
     )
+    never = meters[[math.isinf(v) or math.isnan(v) for v in meters["noticed"]]]
     if len(never):
-        noticed: Sentence = (
+        unnoticed: Sentence = (
             f"For {listed(never['meter'].tolist())} no size is proved to be noticed. "
             "This is no proof that attacks there are harmless.",
         )
-        return Finding(Standing.PART, (lead, noticed))
-    noticed = (
+        return Finding(Standing.PART, (lead, unnoticed))
+    noticed = sentence(
         "Larger attacks may stay unnoticed too, depending on the honest errors of the moment. A meter "
-        "exceeds a limit of the monitor, with the same probability, from ",
-        least(meters, name, "noticed", "V", side=Side.ABOVE),
-        f" ({_extreme(meters, 'meter', 'noticed', smallest=True)}) to ",
-        most(meters, name, "noticed", "V", side=Side.ABOVE),
-        f" ({_extreme(meters, 'meter', 'noticed')}) on.",
+        "exceeds a limit of the monitor, with the same probability, from {span} on.",
+        span=_span(meters, name, "noticed", "meter"),
     )
-    if not all(math.isfinite(v) for v in meters["named"]):
-        named: Sentence = ("Not every manipulated meter is proved to be named, for any size of the attack.",)
-        return Finding(Standing.PART, (lead, noticed, named))
-    named = (
-        "No explanation without the manipulated meter remains from ",
-        least(meters, name, "named", "V", side=Side.ABOVE),
-        " to ",
-        most(meters, name, "named", "V", side=Side.ABOVE),
-        f" on, with {sure[1]}. This is proved; the identification by the monitor's search is "
-        "not, but was checked by simulation.",
-    )
+    named: Sentence = ("Not every manipulated meter is proved to be named, for any size of the attack.",)
+    if all(math.isfinite(v) for v in meters["named"]):
+        named = sentence(
+            "No explanation without the manipulated meter remains from {span} on, with {sure}. This is "
+            "proved; the identification by the monitor's search is not, but was checked by simulation.",
+            span=_span(meters, name, "named"),
+            sure=sure[1],
+        )
     return Finding(Standing.PART, (lead, noticed, named))
 
 
 def _picture(site: Site, customers: pd.DataFrame, liars: int, sure: str) -> Finding:
-    name = "detectable-customers"
-    attacked = "a single manipulated meter" if liars == 1 else f"{liars} meters manipulated together"
-    lead: Sentence = (
-        f"Largest error of the shown voltage by {attacked} without notice: ",
-        least(customers, name, "error", "V", side=Side.ABOVE),
-        f" (at {_extreme(customers, 'customer', 'error', smallest=True)}) to ",
-        most(customers, name, "error", "V", side=Side.ABOVE),
-        f" (at {_extreme(customers, 'customer', 'error')}), honest errors included, with {sure} for each "
-        "customer at any one moment. "
-        f"Nominal voltage is {told(site.nominal_volt)}{_percent(site)}.",
-    )
     if not all(math.isfinite(v) for v in customers["error"]):
         return Finding(Standing.OPEN, (("No bound of the error is proved for every customer.",),))
-    arbitrary: Sentence = (
-        "For any method, two voltages up to ",
-        most(customers, name, "error_fits", "V", side=Side.ABOVE),
-        " apart apart can fit the same readings.",
+    name = "detectable-customers"
+    lead = sentence(
+        "Largest error of the shown voltage by {attacked} without notice: {span}, honest errors included, "
+        "with {sure} for each customer at any one moment. Nominal voltage is {nominal}{percent}.",
+        attacked="a single manipulated meter" if liars == 1 else f"{liars} meters manipulated together",
+        span=_span(customers, name, "error", "customer"),
+        sure=sure,
+        nominal=told(site.nominal_volt),
+        percent=_percent(site),
+    )
+    arbitrary = sentence(
+        "For any method, two voltages up to {apart} apart can fit the same readings.",
+        apart=most(customers, name, "error_fits", "V", side=Side.ABOVE),
     )
     how: Sentence = ("Proved for the linear effect of load errors, and checked by AC power flow.",)
     return Finding(Standing.PART, (lead, arbitrary, how))
@@ -345,7 +340,6 @@ def protect(site: Site, found: Protect) -> Section:
     """Section of the study protect."""
     chosen = set(found.meters["meter"]) if len(found.meters) else set()
     return Section(
-        title="Meters to protect",
         answers={Question.PROTECT: _protection(site, found)},
         figures=(
             Figure(
@@ -421,12 +415,11 @@ def _protection(site: Site, found: Protect) -> Finding:
     if not count:
         lead: Sentence = (f"None for this purpose: even without protection, {purpose}{scope}.",)
     else:
-        who = how_many(found.meters, "protect-meters")
+        names = listed(found.meters["meter"].tolist())
         lead = (
             "Protect ",
-            who,
-            f" of {site.meters.size} meters: {listed(found.meters['meter'].tolist())}. "
-            f"Then {purpose}{scope}.",
+            how_many(found.meters, "protect-meters"),
+            f" of {site.meters.size} meters: {names}. Then {purpose}{scope}.",
         )
     effect = _effect(found)
     proof: Sentence = ("No fewer suffice; other sets of this size may be as good.",)
@@ -435,11 +428,9 @@ def _protection(site: Site, found: Protect) -> Finding:
     if not count and not math.isnan(found.before):
         return Finding(sure, (lead, effect))
     if found.gap:
-        needed = Value(found.least, str(found.least), "protect-summary:least:row 0")
-        proof = (
-            "These suffice; their number is not proved to be the smallest; at least ",
-            needed,
-            " are needed.",
+        proof = sentence(
+            "These suffice; their number is not proved to be the smallest; at least {needed} are needed.",
+            needed=counted(found.least, "protect-summary:least:row 0"),
         )
     return Finding(sure, (lead, effect, proof))
 
@@ -450,19 +441,14 @@ def _effect(found: Protect) -> Sentence:
         Value(value, _cell(value, found.goal), f"protect-summary:{name}:row 0")
         for name, value in (("before", found.before), ("after", found.after), ("alone", found.alone))
     )
-    if found.goal.in_volts:
-        lead: Sentence = ("Largest hidden attack: ", before, " without protection, ", after, " with it.")
-        if math.isnan(found.alone):
-            return lead
-        return (*lead, " Unprotected, one meter hides up to ", alone, " by itself, with true powers.")
-    lead = (
-        "Fewest manipulated meters that stay invisible: ",
-        before,
-        " without protection, ",
-        after,
-        " with it",
-    )
-    return (*lead, ", for any number of meters." if math.isinf(found.after) else ".")
+    if not found.goal.in_volts:
+        words = "Fewest manipulated meters that stay invisible: {before} without protection, {after} with it"
+        words += ", for any number of meters." if math.isinf(found.after) else "."
+    else:
+        words = "Largest hidden attack: {before} without protection, {after} with it."
+        if not math.isnan(found.alone):
+            words += " Unprotected, one meter hides up to {alone} by itself, with true powers."
+    return sentence(words, before=before, after=after, alone=alone)
 
 
 def _cell(value: float, goal: Goal) -> str:

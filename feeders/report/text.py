@@ -9,30 +9,13 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
+from string import Formatter
 from typing import TYPE_CHECKING, Any, Final
 
 from feeders.report.drawing import Figure
 
 if TYPE_CHECKING:
     import pandas as pd
-
-__all__ = [
-    "MANY",
-    "Finding",
-    "Question",
-    "Section",
-    "Sentence",
-    "Side",
-    "Standing",
-    "Value",
-    "least",
-    "listed",
-    "most",
-    "number",
-    "plural",
-    "rows",
-    "said",
-]
 
 
 MANY: Final = 12
@@ -52,21 +35,11 @@ class Standing(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Value:
-    """Number in a sentence.
+    """Number in a sentence."""
 
-    Attributes
-    ----------
-    value
-        The number.
-    shown
-        Text of the number, with its unit.
-    source
-        Table, column, and operation: `detectable-meters:noticed:max`.
-    """
-
-    value: float
-    shown: str
-    source: str
+    value: float  # the number
+    shown: str  # text of the number, with its unit
+    source: str  # table, column, and operation: `detectable-meters:noticed:max`
 
 
 Sentence = tuple[str | Value, ...]
@@ -74,18 +47,19 @@ Sentence = tuple[str | Value, ...]
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Answer of a study.
+    """Answer of a study."""
 
-    Attributes
-    ----------
-    standing
-        Certainty of the answer.
-    sentences
-        The answer, the most important first.
-    """
+    standing: Standing  # certainty of the answer
+    sentences: tuple[Sentence, ...]  # the answer, the most important first
 
-    standing: Standing
-    sentences: tuple[Sentence, ...]
+
+def sentence(text: str, **parts: str | Value | Sentence) -> Sentence:
+    """Sentence with texts and numbers in place of `{name}`."""
+    out: list[str | Value] = []
+    for words, name, _, _ in Formatter().parse(text):
+        part = parts[name] if name else ()
+        out += [words, *(part if isinstance(part, tuple) else [part])]
+    return tuple(each for each in out if each)
 
 
 def said(sentence: Sentence) -> str:
@@ -133,25 +107,33 @@ def listed(names: Sequence[str]) -> str:
     return " and ".join([", ".join(some[:-1]), some[-1]] if len(some) > 1 else some)
 
 
+def counted(count: int, source: str) -> Value:
+    """Number of things."""
+    return Value(count, str(count), source)
+
+
 def rows(table: pd.DataFrame, name: str) -> Value:
     """Number of rows of a table."""
-    return Value(len(table), str(len(table)), f"{name}:rows")
+    return counted(len(table), f"{name}:rows")
+
+
+def quantity(value: float, unit: str, source: str, *, digits: int = 2, side: Side = Side.NEAR) -> Value:
+    """Rounded number with its unit."""
+    return Value(value, f"{number(value, digits, side)} {unit}".strip(), source)
 
 
 def most(
     table: pd.DataFrame, name: str, column: str, unit: str = "", *, digits: int = 2, side: Side = Side.NEAR
 ) -> Value:
     """Largest value of a column."""
-    value = float(table[column].max())
-    return Value(value, f"{number(value, digits, side)} {unit}".strip(), f"{name}:{column}:max")
+    return quantity(float(table[column].max()), unit, f"{name}:{column}:max", digits=digits, side=side)
 
 
 def least(
     table: pd.DataFrame, name: str, column: str, unit: str = "", *, digits: int = 2, side: Side = Side.NEAR
 ) -> Value:
     """Smallest value of a column."""
-    value = float(table[column].min())
-    return Value(value, f"{number(value, digits, side)} {unit}".strip(), f"{name}:{column}:min")
+    return quantity(float(table[column].min()), unit, f"{name}:{column}:min", digits=digits, side=side)
 
 
 class Question(Enum):
@@ -169,30 +151,13 @@ class Question(Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Section:
-    """Section of the report.
+    """Section of the report."""
 
-    Attributes
-    ----------
-    title
-        Heading.
-    answers
-        Answers by question.
-    figures
-        Figures; their names begin with the study's.
-    tables
-        Tables by name.
-    shown
-        Columns of a table on the page, if not the first ones; files have all.
-    columns
-        Meanings of the tables' columns, in the order of the page.
-    assumptions
-        Assumptions, as sentences.
-    """
-
-    title: str
-    answers: Mapping[Question, Finding]
-    figures: tuple[Figure, ...] = ()
-    tables: Mapping[str, pd.DataFrame] = field(default_factory=dict)
+    answers: Mapping[Question, Finding]  # answers by question
+    figures: tuple[Figure, ...] = ()  # figures; their names begin with the study's
+    tables: Mapping[str, pd.DataFrame] = field(default_factory=dict)  # tables by name
+    # Columns of a table on the page, if not the first ones; files have all.
     shown: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    # Meanings of the tables' columns, in the order of the page.
     columns: Mapping[str, str] = field(default_factory=dict)
-    assumptions: tuple[str, ...] = ()
+    assumptions: tuple[str, ...] = ()  # assumptions, as sentences

@@ -1,15 +1,14 @@
-"""Attacks on a given feeder: random and coordinated campaigns, and attacks stated in one line.
+"""Attacks on a given feeder, independent of any estimator.
 
-The attacks depend on the feeder and on no estimator. The trace of a coordinated attack is that of an extra
-load in the AC power flow of the simulation, droop inverters included. It is the strongest attack, as it has
-the shape of a real event.
+The trace of a coordinated attack is that of an extra load in the AC power flow of the simulation, droop
+inverters included. It is the strongest attack, as it has the shape of a real event.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 import numpy as np
 
@@ -52,36 +51,59 @@ LARGEST_SHIFT_PU: Final = 0.2
 TYPICAL_LOAD: Final = 0.3
 """Load relative to `load_kw` without a scenario, 1."""
 
+REPLAY_S: Final = 3600.0
+"""Age of the reports of a random replay, s."""
+
 SIZING_TOLERANCE: Final = 1e-4
 SIZING_ROUNDS: Final = 30
 
 
-class RandomAttackKind(StrEnum):
-    """Kinds of attack of `random_attacks`."""
+class AttackKind(StrEnum):
+    """Manipulation of the devices; `AttackSpec.size` states the size of each."""
 
     BIAS = "bias"
+    TOGETHER = "together"
     SCALING = "scaling"
     DRIFT = "drift"
     STUCK = "stuck"
     REPLAY = "replay"
+    CLOCK_SHIFT = "clock-shift"
     RANDOM = "random"
     COORDINATED = "coordinated"
     COORDINATED_POWER = "coordinated-power"
+    POWER = "power"
+    INVERTER = "inverter"
 
 
-def no_size(size: float) -> list[Problem]:
-    """Problem of a size that is probably given in per cent.
+LOAD_TRACES: Final = (AttackKind.COORDINATED, AttackKind.COORDINATED_POWER, AttackKind.POWER)
+"""Kinds with the trace of a fake load, or with the power of one."""
 
-    Parameters
-    ----------
-    size
-        Size relative to nominal, 1.
-    """
-    if abs(size) <= LARGEST_SIZE_PU:
-        return []
-    return [
-        Problem("out-of-range", f"{size:g} is {100.0 * size:g} % of nominal; {size / 100.0:g} is {size:g} %")
-    ]
+_NOT_RANDOM = (AttackKind.TOGETHER, AttackKind.CLOCK_SHIFT, AttackKind.POWER, AttackKind.INVERTER)
+RANDOM_KINDS: Final = tuple(kind for kind in AttackKind if kind not in _NOT_RANDOM)
+"""Kinds of `random_attacks`."""
+
+Attacks: TypeAlias = tuple[tuple[Attack, ...], tuple[InverterAttack, ...]]
+
+
+@dataclass(frozen=True, slots=True)
+class AttackSpec:
+    """Attack stated in one line: manipulation, count, size and time; the seed chooses the devices."""
+
+    trick: AttackKind  # the manipulation
+    count: int = 1  # number of meters, or inverters
+    # Size. Bias (random signs), together (the sign of `size` for all) and scaling: % of nominal. Drift: % of
+    # nominal per minute, random signs. Random: smallest displacement, % of nominal, redrawn each second.
+    # Coordinated: displacement of the least affected manipulated meter by the trace of a false load, % of
+    # nominal. The load is at a customer with a plausible reading of it, if there is one. Power: the same
+    # load, with only the power of that meter falsified. Replay and clock shift: age of the reports, s.
+    # Inverter: % of its rating, random signs. Stuck: unused.
+    size: float = 3.0
+    # Seconds after the start of the scenario.
+    onset_s: float = 30.0
+    end_s: float = np.inf
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "trick", choice("trick", AttackKind, self.trick))
 
 
 class NoSuchAttack(GridsecError):
@@ -92,17 +114,7 @@ class NoSuchAttack(GridsecError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FakeLoad:
-    """A load that does not exist, and its trace. p meters.
-
-    Attributes
-    ----------
-    customer
-        Index of the customer with the load.
-    p_kw, q_kvar
-        The load.
-    shift : (p,)
-        Change of the voltage at each meter, pu.
-    """
+    """A load that does not exist, and its change of the voltage at p meters: `shift` (p,), pu."""
 
     customer: int
     p_kw: float
@@ -110,10 +122,19 @@ class FakeLoad:
     shift: Floats
 
 
+def no_size(size: float) -> list[Problem]:
+    """Problem of a size relative to nominal that is probably given in per cent."""
+    if abs(size) <= LARGEST_SIZE_PU:
+        return []
+    return [
+        Problem("out-of-range", f"{size:g} is {100.0 * size:g} % of nominal; {size / 100.0:g} is {size:g} %")
+    ]
+
+
 def random_attacks(
     site: Site,
     seed: int,
-    kind: RandomAttackKind | str,
+    kind: AttackKind | str,
     count: int,
     size: float,
     *,
@@ -121,22 +142,15 @@ def random_attacks(
     t_off: float,
     scenario: Scenario | None = None,
 ) -> tuple[Attack, ...]:
-    """Choose random meters of a feeder and their attack.
+    """Choose random meters of a feeder and their attack; the seed determines both.
 
     Parameters
     ----------
-    site
-        The feeder.
-    seed
-        Chooses the meters, their displacements and the place of a fake load.
     kind
-        Kind of the attack. Bias, scaling and random displacements have random signs and sizes between `size`
+        One of RANDOM_KINDS. Bias, scaling and random displacements have random signs and sizes between `size`
         and 1.5 `size`. A drift reaches such a size after a third of the attack. A replay repeats the hour
         before. A fake load moves the least affected of its meters by `size`. Scaling moves a meter by at
-        least `size` while its voltage is within the feeder's limits. The displacement of stuck and replayed
-        meters is the change of the voltage since, independent of `size`.
-    count
-        Number of manipulated meters.
+        least `size` while its voltage is within the feeder's limits. Stuck meters have no size.
     size
         Smallest displacement of a manipulated meter, pu of nominal, > 0.
     t_on, t_off
@@ -147,79 +161,133 @@ def random_attacks(
     Raises
     ------
     NoSuchAttack
-        For fewer meters than `count`, or without a place for a fake load of this size.
+        For fewer meters than `count`, another kind, or without a place for a fake load of this size.
     """
-    kind = RandomAttackKind(kind)
-    if not 0 < count <= site.meters.size:
-        raise NoSuchAttack(
-            f"{site.feeder.name} has {site.meters.size} meters; cannot attack {count}", code="too-few-meters"
-        )
+    kind = choice("kind", AttackKind, kind)
+    if kind not in RANDOM_KINDS:
+        raise NoSuchAttack(f"{kind} is not a kind of random attacks", code="unknown-name")
+    check_count(site, kind, count)
     random = generator(seed, Stream.ATTACK)
-    if kind in (RandomAttackKind.COORDINATED, RandomAttackKind.COORDINATED_POWER):
-        loads = _typical(site) if scenario is None else present_loads(site, scenario, t_on)
-        meters, fake = _somewhere(site, random, count, size, loads)
-        power = kind is RandomAttackKind.COORDINATED_POWER
-        return (coordinated(site, meters, fake, t_on=t_on, t_off=t_off, power=power),)
+    if kind in LOAD_TRACES:
+        loads = None if scenario is None else present_loads(site, scenario, t_on)
+        return (load_trace(site, kind, count, size, random, loads=loads, t_on=t_on, t_off=t_off),)
     meters = np.sort(random.choice(site.meters.size, count, replace=False)).astype(np.intp)
     amount = size * random.uniform(1.0, LARGEST, count)
     signed = amount * random.choice([-1.0, 1.0], count)
-    return (_plain(kind, meters, signed, site, t_on=t_on, t_off=t_off, seed=seed),)
+    if kind is AttackKind.SCALING:
+        signed /= site.tables.meta.limits.v_min_pu
+    return (_displaced(kind, meters, signed, t_on, t_off, seed=seed),)
 
 
-def busbar_attack(
-    site: Site, kind: RandomAttackKind | str, size: float, *, t_on: float, t_off: float
-) -> Attack:
-    """Attack the busbar meter, in all of its phases.
+def busbar_attack(site: Site, kind: AttackKind | str, size: float, *, t_on: float, t_off: float) -> Attack:
+    """Attack the busbar meter, in all of its phases, by bias, scaling or drift; times are Unix s.
 
-    Parameters
-    ----------
-    site
-        The feeder.
-    kind
-        Bias, scaling or drift: the reading is too high by `size`, or by this part of itself, or by `size`
-        from a third of the attack on.
-    size
-        Displacement, pu of nominal; negative for a low reading.
-    t_on, t_off
-        Begin and end, Unix s.
-
-    Raises
-    ------
-    NoSuchAttack
-        For another kind.
+    By bias the reading is too high by `size`, pu; by scaling by this part of itself; by drift by `size` from
+    a third of the attack on. A negative size gives low readings. Raises NoSuchAttack for another kind.
     """
+    kind = choice("kind", AttackKind, kind)
+    if kind not in (AttackKind.BIAS, AttackKind.SCALING, AttackKind.DRIFT):
+        raise NoSuchAttack(
+            f"the busbar meter is manipulated by bias, scaling or drift, not by {kind}", code="unknown-name"
+        )
     phases = np.arange(site.feeder.busbar_places().stop)
-    signed = np.full(phases.size, size)
-    match RandomAttackKind(kind):
-        case RandomAttackKind.SCALING:
-            return Scaling(phases, t_on, t_off, factor=signed)
-        case RandomAttackKind.BIAS | RandomAttackKind.DRIFT as plain:
-            return _plain(plain, phases, signed, site, t_on=t_on, t_off=t_off, seed=0)
-        case other:
-            raise NoSuchAttack(
-                f"the busbar meter is manipulated by bias, scaling or drift, not by {other}",
-                code="unknown-name",
-            )
+    return _displaced(kind, phases, np.full(phases.size, size), t_on, t_off)
+
+
+def manipulations(site: Site, lie: AttackSpec | None, scenario: Scenario) -> Attacks:
+    """Build the attacks of one statement; none for None.
+
+    The seed of `scenario` (without attacks) chooses the devices; a false load adds to its loads. Raises
+    NoSuchAttack for too few devices, or without a place for such a load.
+    """
+    if lie is None:
+        return (), ()
+    t_on, t_off = scenario.start + lie.onset_s, scenario.start + min(lie.end_s, scenario.duration_s)
+    there = check_count(site, lie.trick, lie.count)
+    random = generator(scenario.seed, Stream.ATTACK)
+    if lie.trick in LOAD_TRACES:
+        loads = present_loads(site, scenario, t_on)
+        share = lie.size / 100.0
+        attack = load_trace(
+            site, lie.trick, lie.count, share, random, loads=loads, t_on=t_on, t_off=t_off, plausible=True
+        )
+        return (attack,), ()
+    devices = np.sort(random.choice(there, lie.count, replace=False)).astype(np.intp)
+    signs = random.choice([-1.0, 1.0], lie.count)
+    return on_devices(site, lie, devices, signs, t_on=t_on, t_off=t_off, seed=scenario.seed)
+
+
+def check_count(site: Site, kind: AttackKind, count: int) -> int:
+    """Number of meters, or inverters, of a feeder; NoSuchAttack if `count` of them do not exist."""
+    inverters = kind is AttackKind.INVERTER
+    there = site.droop.tau.size if inverters else site.meters.size
+    if not 0 < count <= there:
+        devices = "inverters" if inverters else "meters"
+        raise NoSuchAttack(
+            f"{site.feeder.name} has {there} {devices}; cannot attack {count}", code="too-few-meters"
+        )
+    return int(there)
+
+
+def on_devices(
+    site: Site, lie: AttackSpec, devices: Ints, signs: Floats, *, t_on: float, t_off: float, seed: int = 0
+) -> Attacks:
+    """Attack given meters or inverters (k,) independently, each by its sign (k,) of the size."""
+    amount = lie.size / 100.0 * (np.abs(signs) if lie.trick is AttackKind.TOGETHER else signs)
+    if lie.trick is AttackKind.INVERTER:
+        rating = np.array([row.inverter_kva for row in site.tables.customers])[site.droop.customer]
+        return (), (InverterAttack(devices, amount * rating[devices] / site.feeder.base_kva, t_on, t_off),)
+    if lie.trick is AttackKind.DRIFT:
+        amount /= 60.0
+    limit = np.abs(amount) * (t_off - t_on)
+    return (_on_meters(lie.trick, devices, t_on, t_off, amount, limit, delay_s=lie.size, seed=seed),), ()
+
+
+def _displaced(
+    kind: AttackKind, meters: Ints, signed: Floats, t_on: float, t_off: float, *, seed: int = 0
+) -> Attack:
+    """Attack with given displacements, pu; a drift reaches them after a third of the attack."""
+    amount = 3.0 * signed / (t_off - t_on) if kind is AttackKind.DRIFT else signed
+    return _on_meters(kind, meters, t_on, t_off, amount, np.abs(signed), delay_s=REPLAY_S, seed=seed)
+
+
+def _on_meters(  # noqa: PLR0917  # the fields of an attack
+    kind: AttackKind,
+    meters: Ints,
+    t_on: float,
+    t_off: float,
+    amount: Floats,
+    limit: Floats,
+    *,
+    delay_s: float,
+    seed: int,
+) -> Attack:
+    """Attack on each meter by its `amount`, pu; of a drift in pu/s, up to `limit` pu."""
+    match kind:
+        case AttackKind.SCALING:
+            return Scaling(meters, t_on, t_off, amount)
+        case AttackKind.DRIFT:
+            return Drift(meters, t_on, t_off, amount, limit)
+        case AttackKind.STUCK:
+            return Stuck(meters, t_on, t_off)
+        case AttackKind.REPLAY | AttackKind.CLOCK_SHIFT:  # they differ only in the age of the reports
+            return Replay(meters, t_on, t_off, delay_s)
+        case AttackKind.RANDOM:
+            low = np.abs(amount)
+            return Random(meters, t_on, t_off, low=low, high=LARGEST * low, hold_s=1.0, seed=seed)
+        case AttackKind.BIAS | AttackKind.TOGETHER:
+            return Bias(meters, t_on, t_off, amount)
+        case _:
+            raise NoSuchAttack(f"{kind} is not a manipulation of single meters", code="unknown-name")
 
 
 def fake_load(
     site: Site, customer: int, meters: Ints | int, size: float, *, loads: Loads | None = None
 ) -> tuple[Ints, FakeLoad]:
-    """Size a load at one customer with a trace of at least `size` at every manipulated meter.
+    """Size a load at one customer with a trace of at least `size` pu at every manipulated meter.
 
-    Parameters
-    ----------
-    site
-        The feeder.
-    customer
-        Index of the customer.
-    meters : (k,) or k
-        The meters to manipulate, or their number. A number selects those that the load affects most, with the
-        customer's own meter if there is one.
-    size
-        Smallest displacement, pu, > 0.
-    loads
-        True loads at the time; typical loads by default.
+    `meters` are the manipulated ones, (k,), or their number. A number selects those that the load affects
+    most, with the customer's own meter if there is one. Without `loads` the true loads are typical ones.
 
     Returns
     -------
@@ -243,7 +311,9 @@ def fake_load(
     v = without.v_volt / site.customer_volt
     nominal = site.customer_nominal
     pattern = (load_pattern(R, X, 0, ratio, v) * (site.customer_volt / nominal))[site.meters]
-    chosen = _affected(site, customer, pattern, meters) if isinstance(meters, int) else meters
+    # The customer's own meter counts as affected most.
+    strength = np.where(site.meters == customer, np.inf, pattern)
+    chosen = most_affected(strength, meters) if isinstance(meters, int) else meters
     try:
         power = coordinate(pattern, chosen, size)  # pu, to first order; AC power flow corrects it below
     except InputInvalid as error:
@@ -277,79 +347,58 @@ def fake_load(
 
 
 def coordinated(
-    site: Site, meters: Ints, fake: FakeLoad, *, t_on: float, t_off: float, power: bool
+    site: Site, meters: Ints, fake: FakeLoad, *, t_on: float, t_off: float, kind: AttackKind
 ) -> Coordinated:
-    """Build the attack with the trace of a fake load.
+    """Build the attack on given meters (k,) with the trace of a fake load.
 
-    Parameters
-    ----------
-    site
-        The feeder.
-    meters : (k,)
-        The manipulated meters.
-    fake
-        The load; see `fake_load`.
-    t_on, t_off
-        Begin and end, Unix s.
-    power
-        True: the customer's own meter, if manipulated, also reports the load's p and q.
+    With COORDINATED_POWER the customer's own meter, if manipulated, also reports the load's p and q. With
+    POWER it reports these only, and the other meters are not manipulated.
     """
-    own = (site.meters[meters] == fake.customer) & power
-    return Coordinated(
-        meters=meters,
-        t_on=t_on,
-        t_off=t_off,
-        shift=fake.shift[meters],
-        p_shift=np.where(own, fake.p_kw, 0.0),
-        q_shift=np.where(own, fake.q_kvar, 0.0),
-    )
+    own = (site.meters[meters] == fake.customer) & (kind is not AttackKind.COORDINATED)
+    shift = fake.shift[meters]
+    p_shift, q_shift = np.where(own, fake.p_kw, 0.0), np.where(own, fake.q_kvar, 0.0)
+    if kind is not AttackKind.POWER:
+        return Coordinated(meters, t_on, t_off, shift, p_shift, q_shift)
+    own &= (p_shift != 0.0) | (q_shift != 0.0)
+    return Coordinated(meters[own], t_on, t_off, np.zeros_like(shift[own]), p_shift[own], q_shift[own])
 
 
-def _somewhere(
+def load_trace(
     site: Site,
-    random: np.random.Generator,
+    kind: AttackKind,
     count: int,
     size: float,
-    loads: Loads,
-) -> tuple[Ints, FakeLoad]:
-    """Fake load at the first possible customer, in random order."""
+    random: np.random.Generator,
+    *,
+    loads: Loads | None,
+    t_on: float,
+    t_off: float,
+    plausible: bool = False,
+) -> Coordinated:
+    """Attack with the trace of a load at the first possible customer, in random order.
+
+    The trace displaces `count` meters by at least `size` pu. `plausible` prefers a customer with a plausible
+    reading of its power with the load. Raises NoSuchAttack without such a customer.
+    """
+    loads = _typical(site) if loads is None else loads
+    first: Coordinated | None = None
     why: NoSuchAttack | None = None
     for customer in random.permutation(site.meters):
         try:
-            return fake_load(site, int(customer), count, size, loads=loads)
+            meters, fake = fake_load(site, int(customer), count, size, loads=loads)
         except NoSuchAttack as error:
             why = error
-    raise NoSuchAttack(f"{site.feeder.name} has no place for a fake load of this size; the last try: {why}")
-
-
-def _affected(site: Site, customer: int, pattern: Floats, count: int) -> Ints:
-    """The customer's own meter, and the meters with the strongest effect of its load."""
-    return most_affected(np.where(site.meters == customer, np.inf, pattern), count)
-
-
-def _plain(
-    kind: RandomAttackKind, meters: Ints, signed: Floats, site: Site, *, t_on: float, t_off: float, seed: int
-) -> Attack:
-    """One attack with independent manipulations of the meters."""
-    attack: Attack
-    match kind:
-        case RandomAttackKind.BIAS:
-            attack = Bias(meters, t_on, t_off, size=signed)
-        case RandomAttackKind.SCALING:
-            attack = Scaling(meters, t_on, t_off, factor=signed / site.tables.meta.limits.v_min_pu)
-        case RandomAttackKind.DRIFT:
-            rate = 3.0 * signed / (t_off - t_on)
-            attack = Drift(meters, t_on, t_off, rate=rate, limit=np.abs(signed))
-        case RandomAttackKind.STUCK:
-            attack = Stuck(meters, t_on, t_off)
-        case RandomAttackKind.REPLAY:
-            attack = Replay(meters, t_on, t_off, delay_s=3600.0)
-        case RandomAttackKind.RANDOM:
-            low = np.abs(signed)
-            attack = Random(meters, t_on, t_off, low=low, high=LARGEST * low, hold_s=1.0, seed=seed)
-        case _:
-            raise NoSuchAttack(f"{kind} is not an attack of single meters", code="unknown-name")
-    return attack
+            continue
+        attack = coordinated(site, meters, fake, t_on=t_on, t_off=t_off, kind=kind)
+        read_kw = loads.p_kw[customer] + fake.p_kw
+        if not plausible or abs(read_kw) <= site.loads.credible[customer] * site.feeder.base_kva:
+            return attack
+        first = first or attack
+    if first is None:
+        raise NoSuchAttack(
+            f"{site.feeder.name} has no place for a fake load of this size; the last try: {why}"
+        )
+    return first
 
 
 def _typical(site: Site) -> Loads:
@@ -360,164 +409,5 @@ def _typical(site: Site) -> Loads:
 
 def present_loads(site: Site, scenario: Scenario, t: float) -> Loads:
     """Loads at time t, Unix s, without hidden powers."""
-    customers = Customers(
-        site, scenario.variation, scenario.seed, scenario.start, scenario.profile_s, season=scenario.season
-    )
-    demand = customers.at(np.array([t]))
+    demand = Customers.of(site, scenario).at(np.array([t]))
     return Loads(demand.p_kw[0], demand.q_kvar[0], demand.v0_volt[0])
-
-
-class AttackKind(StrEnum):
-    """Manipulation of the devices."""
-
-    BIAS = "bias"
-    TOGETHER = "together"
-    SCALING = "scaling"
-    DRIFT = "drift"
-    STUCK = "stuck"
-    REPLAY = "replay"
-    CLOCK_SHIFT = "clock-shift"
-    COORDINATED = "coordinated"
-    COORDINATED_POWER = "coordinated-power"
-    POWER = "power"
-    INVERTER = "inverter"
-
-
-@dataclass(frozen=True, slots=True)
-class AttackSpec:
-    """Attack stated in one line: manipulation, count, size and time; the run's seed chooses the devices.
-
-    Attributes
-    ----------
-    trick
-        The manipulation.
-    count
-        Number of meters, or inverters.
-    size
-        Size. Bias (random signs), together (the sign of `size` for all) and scaling: % of nominal. Drift: %
-        of nominal per minute, random signs. Coordinated: displacement of the least affected manipulated meter
-        by the trace of a false load, % of nominal. The load is at a customer with a plausible reading of it,
-        if there is one. Power: the same load, with only the power of that meter falsified. Replay and clock
-        shift: age of the reports, s. Inverter: % of its rating, random signs. Stuck: unused.
-    onset_s, end_s
-        Seconds after the start of the run.
-    """
-
-    trick: AttackKind
-    count: int = 1
-    size: float = 3.0
-    onset_s: float = 30.0
-    end_s: float = np.inf
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "trick", choice("trick", AttackKind, self.trick))
-
-
-def manipulations(
-    site: Site, lie: AttackSpec | None, scenario: Scenario
-) -> tuple[tuple[Attack, ...], tuple[InverterAttack, ...]]:
-    """Build the attacks of one statement.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    lie
-        The attack; None without one.
-    scenario
-        The run without attacks: its seed chooses the devices, and a false load adds to its loads.
-
-    Raises
-    ------
-    NoSuchAttack
-        For too few meters or inverters, or without a place for such a load.
-    """
-    if lie is None:
-        return (), ()
-    t_on, t_off = scenario.start + lie.onset_s, scenario.start + min(lie.end_s, scenario.duration_s)
-    if lie.trick in (AttackKind.COORDINATED, AttackKind.COORDINATED_POWER, AttackKind.POWER):
-        return (_coordinated(site, lie, scenario, t_on, t_off),), ()
-    random = generator(scenario.seed, Stream.ATTACK)
-    there = site.droop.tau.size if lie.trick is AttackKind.INVERTER else site.meters.size
-    if not 0 < lie.count <= there:
-        raise NoSuchAttack(
-            f"{site.feeder.name} has {there} of these devices; cannot manipulate {lie.count}",
-            code="too-few-meters",
-        )
-    liars = np.sort(random.choice(there, lie.count, replace=False)).astype(np.intp)
-    signs = random.choice([-1.0, 1.0], lie.count)
-    if lie.trick is AttackKind.INVERTER:
-        rating = np.array([row.inverter_kva for row in site.tables.customers])[site.droop.customer]
-        q = lie.size / 100.0 * signs * rating[liars] / site.feeder.base_kva
-        return (), (InverterAttack(liars, q, t_on, t_off),)
-    return (each_alone(lie, liars, signs, t_on, t_off),), ()
-
-
-def _coordinated(site: Site, lie: AttackSpec, scenario: Scenario, t_on: float, t_off: float) -> Attack:
-    """Attack with the trace of a load at a random customer."""
-    if not 0 < lie.count <= site.meters.size:
-        raise NoSuchAttack(
-            f"{site.feeder.name} has {site.meters.size} meters; cannot manipulate {lie.count}",
-            code="too-few-meters",
-        )
-    loads = present_loads(site, scenario, t_on)
-    told: list[Attack] = []
-    for customer in generator(scenario.seed, Stream.ATTACK).permutation(site.meters):
-        try:
-            meters, fake = fake_load(site, int(customer), lie.count, lie.size / 100.0, loads=loads)
-        except NoSuchAttack:
-            continue
-        power = lie.trick is not AttackKind.COORDINATED
-        attack = coordinated(site, meters, fake, t_on=t_on, t_off=t_off, power=power)
-        if lie.trick is AttackKind.POWER:
-            attack = _powers_of(attack)
-        read_kw = loads.p_kw[customer] + fake.p_kw
-        if abs(read_kw) <= site.loads.credible[customer] * site.feeder.base_kva:
-            return attack
-        told.append(attack)
-    if not told:
-        raise NoSuchAttack(f"{site.feeder.name} has no place for the trace of a load of {lie.size:g} %")
-    return told[0]
-
-
-def _powers_of(told: Coordinated) -> Coordinated:
-    """Part of an attack that manipulates powers."""
-    own = (told.p_shift != 0.0) | (told.q_shift != 0.0)
-    return replace(
-        told,
-        meters=told.meters[own],
-        shift=np.zeros(np.count_nonzero(own)),
-        p_shift=told.p_shift[own],
-        q_shift=told.q_shift[own],
-    )
-
-
-def each_alone(lie: AttackSpec, liars: Ints, signs: Floats, t_on: float, t_off: float) -> Attack:
-    """Attack with independent manipulations of the meters.
-
-    Parameters
-    ----------
-    lie
-        Manipulation and size; neither of inverters nor coordinated.
-    liars, signs : (k,)
-        The meters, and the multiple of the size for each, usually a sign.
-    t_on, t_off
-        Begin and end, Unix s.
-    """
-    share = lie.size / 100.0
-    attack: Attack
-    match lie.trick:
-        case AttackKind.BIAS:
-            attack = Bias(liars, t_on, t_off, share * signs)
-        case AttackKind.TOGETHER:
-            attack = Bias(liars, t_on, t_off, share * np.abs(signs))
-        case AttackKind.SCALING:
-            attack = Scaling(liars, t_on, t_off, share * signs)
-        case AttackKind.DRIFT:
-            rate = share / 60.0 * signs
-            attack = Drift(liars, t_on, t_off, rate, np.abs(rate) * (t_off - t_on))
-        case AttackKind.STUCK:
-            attack = Stuck(liars, t_on, t_off)
-        case _:  # Replay and a late clock differ only in the age of the reports.
-            attack = Replay(liars, t_on, t_off, lie.size)
-    return attack

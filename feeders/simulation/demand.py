@@ -1,8 +1,8 @@
 """Loads, generation and busbar voltage as functions of time.
 
 Every quantity is a pure function of the seed and of Unix time: any stretch, in any order and any chunks, has
-the same numbers. The integrator may therefore take substeps of any length, and a run with an attack has
-exactly the loads of the run without it.
+the same numbers. The integrator may therefore take substeps of any length, and a scenario
+with an attack has exactly the loads of that without it.
 
 Profiles of 15 min are interpolated. A faster variation is added, an Ornstein-Uhlenbeck process for every
 customer, so that readings at intervals of 1 s change from one to the next.
@@ -12,17 +12,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Self
 
 import numpy as np
 from scipy.signal import lfilter
 
-from feeders.model.profiles import Season, library, profile
+from feeders.profiles import Season, library, profile
 from gridsec.arrays import Floats
 from gridsec.grid.network import InPhases
 
 if TYPE_CHECKING:
     from feeders.model.site import Site
+    from feeders.simulation.scenario import Scenario
 
 GRID_S: Final = 1.0
 """Spacing of the random processes, s; linear in between."""
@@ -64,46 +65,27 @@ def generator(seed: int, stream: Stream, index: int = 0) -> np.random.Generator:
 
 @dataclass(frozen=True, slots=True)
 class Variation:
-    """Variation of loads, generation and the busbar.
+    """Variation of loads, generation and the busbar."""
 
-    Attributes
-    ----------
-    load_scale, pv_scale
-        Factors on the profiles, 1.
-    load_spread
-        Standard deviation of the logarithm of each customer's fast variation, 1.
-    load_correlation_s
-        Its correlation time, s.
-    cloud_spread, cloud_correlation_s
-        The same for generation. Half of its variance is common to the feeder, half is each roof's own.
-    busbar_pu
-        Mean voltage of the busbar, pu of nominal.
-    busbar_spread_pu, busbar_correlation_s
-        Standard deviation and correlation time of its slow variation, pu and s.
-    busbar_unbalance_pu
-        In three phases: standard deviation of an equally slow variation of each phase, pu.
-    tap_step_pu
-        Height of one step of the transformer's tap changer upstream, pu; 0: none.
-    tap_interval_s
-        Length of the intervals with one tap event each, at a random time, s.
-    hidden_kw, hidden_kvar, hidden_correlation_s
-        Standard deviations and correlation time, s, of the power of every metered customer beyond its
-        readings, for readings that are forecasts. None: those of the feeder's files (`p_std_kw`,
-        `q_std_kvar`), 0 for empty cells.
-    """
-
+    # Factors on the profiles, 1.
     load_scale: float = 1.0
     pv_scale: float = 1.0
-    load_spread: float = 0.3
-    load_correlation_s: float = 600.0
+    load_spread: float = 0.3  # standard deviation of the logarithm of each customer's fast variation, 1
+    load_correlation_s: float = 600.0  # its correlation time, s
+    # The same for generation. Half of its variance is common to the feeder, half is each roof's own.
     cloud_spread: float = 0.2
     cloud_correlation_s: float = 300.0
-    busbar_pu: float = 1.0
+    busbar_pu: float = 1.0  # mean voltage of the busbar, pu of nominal
+    # Standard deviation and correlation time of its slow variation, pu and s.
     busbar_spread_pu: float = 0.003
     busbar_correlation_s: float = 1800.0
+    # In three phases: standard deviation of an equally slow variation of each phase, pu.
     busbar_unbalance_pu: float = 0.002
-    tap_step_pu: float = 0.0125
-    tap_interval_s: float = 7200.0
+    tap_step_pu: float = 0.0125  # height of one step of the transformer's tap changer upstream, pu; 0: none
+    tap_interval_s: float = 7200.0  # length of the intervals with one tap event each, at a random time, s
+    # Standard deviations and correlation time, s, of the power of every metered customer beyond its readings,
+    # for readings that are forecasts. None: those of the feeder's files (`p_std_kw`, `q_std_kvar`), 0 for
+    # empty cells.
     hidden_kw: float | None = 0.0
     hidden_kvar: float | None = 0.0
     hidden_correlation_s: float = 600.0
@@ -115,15 +97,6 @@ class Fluctuation:
     Sampled exactly every GRID_S, autocorrelation exp(-abs(dt) / correlation_s). It consists of chunks that
     are joined as bridges: the values at the chunks' ends are independent, and the path between them is
     conditioned on both.
-
-    Parameters
-    ----------
-    seed, stream
-        Seed and stream of the path.
-    count
-        Number of copies.
-    correlation_s
-        Correlation time, s.
     """
 
     def __init__(self, seed: int, stream: Stream, count: int, correlation_s: float) -> None:
@@ -177,21 +150,11 @@ class Fluctuation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Demand:
-    """Powers of all customers at T times, without the droop inverters' reactive power.
+    """Powers of all customers at T times, without the droop inverters' reactive power."""
 
-    Attributes
-    ----------
-    p_kw : (T, N)
-        Net active import: load minus generation, kW.
-    q_kvar : (T, N)
-        Reactive import of the loads, kvar.
-    v0_volt : (T,) or (T, 3)
-        Busbar voltage, V; in three phases that of each.
-    """
-
-    p_kw: Floats
-    q_kvar: Floats
-    v0_volt: Floats
+    p_kw: Floats  # (T, N): net active import: load minus generation, kW
+    q_kvar: Floats  # (T, N): reactive import of the loads, kvar
+    v0_volt: Floats  # (T,) or (T, 3): busbar voltage, V; in three phases that of each
 
 
 class Customers:
@@ -199,22 +162,8 @@ class Customers:
 
     Loads are between 0 and `load_kw`, generation between 0 and `pv_kw`. Each customer has a constant ratio q
     / p inside the interval of power factors of the feeder's files. It also has a constant reactive power
-    within plus or minus the floor of the files. The monitor knows neither.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    variation
-        Variation of loads, generation and the busbar.
-    seed
-        Seed of all random numbers.
-    start
-        Unix time of the profiles' position `profile_s`, s.
-    profile_s
-        Position within the season's profiles, s; they repeat.
-    season
-        Season of the profiles.
+    within plus or minus the floor of the files. The monitor knows neither. At Unix time `start` the season's
+    profiles, which repeat, are at `profile_s`, s.
     """
 
     def __init__(
@@ -254,6 +203,12 @@ class Customers:
         self._hidden_kvar = metered * _told(variation.hidden_kvar, [row.q_std_kvar for row in rows])
         self._hidden_p = Fluctuation(seed, Stream.HIDDEN_P, count, variation.hidden_correlation_s)
         self._hidden_q = Fluctuation(seed, Stream.HIDDEN_Q, count, variation.hidden_correlation_s)
+
+    @classmethod
+    def of(cls, site: Site, scenario: Scenario) -> Self:
+        """Customers of a scenario."""
+        start, season = scenario.start, scenario.season
+        return cls(site, scenario.variation, scenario.seed, start, scenario.profile_s, season=season)
 
     def at(self, t: Floats) -> Demand:
         """Powers and busbar voltage at times t (T,), Unix s."""

@@ -14,7 +14,7 @@ import numpy as np
 
 from feeders.simulation.demand import Stream, generator
 from gridsec.arrays import Floats, Ints
-from gridsec.errors import InputInvalid, Problem
+from gridsec.errors import InputInvalid, Problem, raise_if_any
 from gridsec.grid.network import InPhases
 
 if TYPE_CHECKING:
@@ -32,149 +32,81 @@ EARLIEST_TICK: Final = 2**40
 
 @dataclass(frozen=True, slots=True)
 class MeterErrors:
-    """Errors of the simulated meters relative to those of the feeder's files; 0: none.
+    """Errors of the simulated meters relative to those of the feeder's files; 0: none."""
 
-    Attributes
-    ----------
-    bias
-        Limit of the fixed biases relative to the class, 1; uniform.
-    jitter
-        Factor on the jitter, 1.
-    resolution
-        Factor on the registers' steps, 1.
-    power
-        Limit of the fixed gain errors of p and q relative to the stated error, 1; uniform.
-    report_q
-        True: meters report reactive power.
-    """
-
-    bias: float = 1.0
-    jitter: float = 1.0
-    resolution: float = 1.0
-    power: float = 1.0
-    report_q: bool = False
+    bias: float = 1.0  # limit of the fixed biases relative to the class, 1; uniform
+    jitter: float = 1.0  # factor on the jitter, 1
+    resolution: float = 1.0  # factor on the registers' steps, 1
+    power: float = 1.0  # limit of the fixed gain errors of p and q relative to the stated error, 1; uniform
+    report_q: bool = False  # True: meters report reactive power
 
 
 @dataclass(frozen=True, slots=True)
 class MeterOutage:
-    """Silence of a meter for t_on <= t < t_off.
+    """Silence of a meter for t_on <= t < t_off."""
 
-    Attributes
-    ----------
-    meter
-        Id of the meter; BUSBAR for the busbar's.
-    t_on, t_off
-        Unix time, s.
-    """
-
-    meter: str
+    meter: str  # id of the meter; BUSBAR for the busbar's
+    # Unix time, s.
     t_on: float
     t_off: float
 
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """Loss, delay and duplication of readings, clock offsets and silences.
+    """Loss, delay and duplication of readings, clock offsets and silences; ValueError for invalid numbers."""
 
-    Attributes
-    ----------
-    loss
-        Probability of the loss of a reading, 1.
-    delay_s
-        Shortest delay, s.
-    delay_mean_s
-        Mean of the exponentially distributed delay on top of it, s.
-    late, late_s
-        Probability (1) of an additional delay `late_s`; more than a tick reorders readings.
-    duplicate
-        Probability of a second arrival of a reading, 1; the copy has a delay of its own.
-    clock_s
-        Limit of the constant clock offset of each meter, s; uniform.
-    silences
-        Intervals without readings of a meter; its sequence numbers count on.
-
-    Raises
-    ------
-    ValueError
-        For a probability outside [0, 1], or a time that is negative or not finite.
-    """
-
-    loss: float = 0.0
-    delay_s: float = 0.0
-    delay_mean_s: float = 0.0
+    loss: float = 0.0  # probability of the loss of a reading, 1
+    delay_s: float = 0.0  # shortest delay, s
+    delay_mean_s: float = 0.0  # mean of the exponentially distributed delay on top of it, s
+    # Probability (1) of an additional delay `late_s`; more than a tick reorders readings.
     late: float = 0.0
     late_s: float = 0.0
-    duplicate: float = 0.0
-    clock_s: float = 0.0
+    duplicate: float = 0.0  # probability of a second arrival of a reading, 1; the copy has a delay of its own
+    clock_s: float = 0.0  # limit of the constant clock offset of each meter, s; uniform
+    # Intervals without readings of a meter; its sequence numbers count on.
     silences: tuple[MeterOutage, ...] = ()
 
     def __post_init__(self) -> None:
-        for name in ("loss", "late", "duplicate"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise InputInvalid(
-                    [Problem("out-of-range", f"{name} is a probability, got {getattr(self, name)}")]
-                )
-        for name in ("delay_s", "delay_mean_s", "late_s", "clock_s"):
-            if not 0.0 <= getattr(self, name) < np.inf:
-                raise InputInvalid(
-                    [
-                        Problem(
-                            "negative", f"{name} must be finite and not negative, got {getattr(self, name)}"
-                        )
-                    ]
-                )
+        chances = {name: getattr(self, name) for name in ("loss", "late", "duplicate")}
+        times = {name: getattr(self, name) for name in ("delay_s", "delay_mean_s", "late_s", "clock_s")}
+        raise_if_any(
+            [
+                Problem("out-of-range", f"{name} is a probability, got {value}")
+                for name, value in chances.items()
+                if not 0.0 <= value <= 1.0
+            ]
+            + [
+                Problem("negative", f"{name} must be finite and not negative, got {value}")
+                for name, value in times.items()
+                if not 0.0 <= value < np.inf
+            ]
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Registers:
-    """Readings of the meters at T ticks, before any manipulation. p meters.
+    """Readings of the meters at T ticks, before any manipulation. p meters."""
 
-    Attributes
-    ----------
-    v_volt : (T, p)
-        Voltage, V.
-    p_kw, q_kvar : (T, p)
-        Net import, kW and kvar; q is NaN unless reported.
-    v0_volt : (T,) or (T, 3)
-        Busbar voltage, V; in three phases that of each.
-    """
-
-    v_volt: Floats
+    v_volt: Floats  # (T, p): voltage, V
+    # (T, p): net import, kW and kvar; q is NaN unless reported.
     p_kw: Floats
     q_kvar: Floats
-    v0_volt: Floats
+    v0_volt: Floats  # (T,) or (T, 3): busbar voltage, V; in three phases that of each
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Delivery:
-    """Arrival times of readings. p meters and, as the last column, the busbar meter.
+    """Arrival times of readings. p meters and, as the last column, the busbar meter."""
 
-    Attributes
-    ----------
-    stamp : (T, p + 1)
-        Time by the meter's clock, Unix s.
-    arrival : (T, p + 1)
-        Unix time, s; infinite for a lost reading.
-    copy : (T, p + 1)
-        Arrival of a duplicate; infinite without one.
-    """
-
-    stamp: Floats
-    arrival: Floats
-    copy: Floats
+    stamp: Floats  # (T, p + 1): time by the meter's clock, Unix s
+    arrival: Floats  # (T, p + 1): Unix time, s; infinite for a lost reading
+    copy: Floats  # (T, p + 1): arrival of a duplicate; infinite without one
 
 
 class SimulatedMeters:
-    """All meters of a feeder and their channel.
+    """All meters of a feeder and their channel; ValueError for the silence of an unknown meter.
 
-    Parameters
-    ----------
-    site
-        The feeder, with the meters' accuracies.
-    errors, channel
-        Share of these errors, and effects of the channel.
-    seed
-        Seed of all random numbers. Those of one tick depend on its number alone.
+    Random numbers of a tick depend on the seed and its number alone.
 
     Attributes
     ----------
@@ -185,11 +117,6 @@ class SimulatedMeters:
     p_gain, q_gain : (p,)
         Fixed relative errors of the power registers, 1: the true power is the reading times 1 + gain. Data
         sheets state the error as a fraction of the reading.
-
-    Raises
-    ------
-    ValueError
-        For the silence of an unknown meter.
     """
 
     def __init__(self, site: Site, errors: MeterErrors, channel: Channel, seed: int) -> None:
@@ -215,28 +142,19 @@ class SimulatedMeters:
         self.busbar_bias = errors.bias * accuracy.busbar_class * random.uniform(-1.0, 1.0, self._busbars)
         self._clock = channel.clock_s * random.uniform(-1.0, 1.0, self.count + 1)
 
-        base = np.append(site.customer_volt[customer], [site.tables.meta.voltage_volt] * self._busbars)
-        self._jitter = (
-            errors.jitter * base * np.append(accuracy.jitter, [accuracy.busbar_jitter] * self._busbars)
-        )
-        self._step = (
-            errors.resolution
-            * base
-            * np.append(accuracy.resolution, [accuracy.busbar_resolution] * self._busbars)
-        )
+        def registers(customers: Floats, busbar: float) -> Floats:
+            """Values of all voltage registers, those of the busbar meter last."""
+            return np.append(customers, [busbar] * self._busbars)
+
+        base = registers(site.customer_volt[customer], site.tables.meta.voltage_volt)
+        self._jitter = errors.jitter * base * registers(accuracy.jitter, accuracy.busbar_jitter)
+        self._step = errors.resolution * base * registers(accuracy.resolution, accuracy.busbar_resolution)
         self._p_step = errors.resolution * site.tables.meta.meters.p_resolution_kw
 
     def read(self, ticks: Ints, v_volt: Floats, p_kw: Floats, q_kvar: Floats, v0_volt: Floats) -> Registers:
-        """Read all registers.
+        """Read all registers at consecutive ticks (T,), from true values in V, kW and kvar (net imports).
 
-        Parameters
-        ----------
-        ticks : (T,)
-            Numbers of the ticks, consecutive.
-        v_volt, p_kw, q_kvar : (T, N)
-            True values at every customer, V, kW, kvar (net imports).
-        v0_volt : (T,) or (T, 3)
-            True voltage of the busbar, V.
+        True values are (T, N) of the customers, and (T,) or (T, 3) of the busbar.
         """
         true = np.column_stack(
             [
@@ -244,7 +162,8 @@ class SimulatedMeters:
                 v0_volt.reshape(-1, self._busbars) * (1.0 + self.busbar_bias),
             ]
         )
-        shown = _round(true + self._jitter * self._normal(ticks), self._step)
+        normal = self._draws(Stream.JITTER, ticks, self.count + self._busbars)
+        shown = _round(true + self._jitter * normal, self._step)
         p = _round(p_kw[:, self._customer] / (1.0 + self.p_gain), np.full(self.count, self._p_step))
         if self._errors.report_q:
             q = _round(q_kvar[:, self._customer] / (1.0 + self.q_gain), np.full(self.count, self._p_step))
@@ -253,15 +172,7 @@ class SimulatedMeters:
         return Registers(shown[:, : self.count], p, q, shown[:, self.count :].reshape(v0_volt.shape))
 
     def deliver(self, ticks: Ints, t: Floats) -> Delivery:
-        """Arrival times of the readings of some ticks.
-
-        Parameters
-        ----------
-        ticks : (T,)
-            Numbers of the ticks, consecutive.
-        t : (T,)
-            Times of the ticks, Unix s.
-        """
+        """Arrival times of the readings of consecutive ticks (T,) at times t (T,), Unix s."""
         channel, width = self._channel, self.count + 1
         uniform = self._draws(Stream.CHANNEL, ticks, 5 * width).reshape(ticks.size, 5, width)
         lost = uniform[:, 0] < channel.loss
@@ -276,10 +187,6 @@ class SimulatedMeters:
             arrival=np.where(lost, np.inf, arrival),
             copy=np.where(lost | (uniform[:, 4] >= channel.duplicate), np.inf, copy),
         )
-
-    def _normal(self, ticks: Ints) -> Floats:
-        """Standard normal numbers of each tick, one for each voltage register."""
-        return self._draws(Stream.JITTER, ticks, self.count + self._busbars)
 
     def _draws(self, stream: Stream, ticks: Ints, width: int) -> Floats:
         """Random numbers of each tick: normal for JITTER, uniform on [0, 1) otherwise."""

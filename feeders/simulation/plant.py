@@ -57,43 +57,21 @@ class NoEquilibrium(GridsecError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Loads:
-    """Powers of the customers without their inverters' reactive power. N customers.
+    """Powers of the customers without their inverters' reactive power. N customers."""
 
-    Attributes
-    ----------
-    p_kw : (N,)
-        Net active import, kW.
-    q_kvar : (N,)
-        Reactive import, kvar.
-    v0_volt
-        Busbar voltage, V; in three phases (3,).
-    """
-
-    p_kw: Floats
-    q_kvar: Floats
-    v0_volt: Floats | float
+    p_kw: Floats  # (N,): net active import, kW
+    q_kvar: Floats  # (N,): reactive import, kvar
+    v0_volt: Floats | float  # busbar voltage, V; in three phases (3,)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Point:
-    """State of the feeder at one instant. N customers, b + 1 buses, m inverters.
+    """State of the feeder at one instant. N customers, b + 1 buses, m inverters."""
 
-    Attributes
-    ----------
-    x : (m,)
-        Reactive injection of each inverter, pu.
-    setpoint : (m,)
-        Set-point of each inverter at this voltage, K(v), pu.
-    v_volt : (N,)
-        Voltage at each customer, V.
-    v_bus_volt : (b + 1,)
-        Voltage at each bus, V.
-    """
-
-    x: Floats
-    setpoint: Floats
-    v_volt: Floats
-    v_bus_volt: Floats
+    x: Floats  # (m,): reactive injection of each inverter, pu
+    setpoint: Floats  # (m,): set-point of each inverter at this voltage, K(v), pu
+    v_volt: Floats  # (N,): voltage at each customer, V
+    v_bus_volt: Floats  # (b + 1,): voltage at each bus, V
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,16 +84,10 @@ class _Trial:
 
 
 class ClosedLoop:
-    """A feeder with its droop inverters.
+    """A feeder with its droop inverters; their curves are piecewise linear functions of the voltage.
 
-    Parameters
-    ----------
-    flow
-        AC power flow of the feeder.
-    droop
-        The inverters; their curves are evaluated here as piecewise linear functions of the voltage.
-    base_kva, base_volt
-        Base values of `droop`; the voltage as one number, or for each customer, (N,).
+    `base_kva` and `base_volt` are the base values of `droop`; the voltage is one number, or that of each
+    customer, (N,).
     """
 
     def __init__(
@@ -151,45 +123,20 @@ class ClosedLoop:
         return Point(x, self.setpoint(v_volt), v_volt, v_bus_volt)
 
     def held(self, demand: Demand, rows: slice, x: Floats) -> tuple[Floats, Floats, Floats]:
-        """Points at many instants with given injections x (T, m), pu.
-
-        Returns
-        -------
-        v_volt (T, N), v_bus_volt (T, b + 1)
-            Voltages, V.
-        setpoint (T, m)
-            K(v), pu.
-        """
+        """Voltages (T, N), (T, b + 1), V, and set-points (T, m), pu, for injections x (T, m), pu."""
         q = self.reactive(demand.q_kvar[rows], x)
         v_volt, v_bus_volt = self.flow.solve_batch(demand.p_kw[rows], q, demand.v0_volt[rows])
         return v_volt, v_bus_volt, self.setpoint(v_volt)
 
     def equilibrium(self, loads: Loads, start: Floats | None = None) -> Point:
-        """Equilibrium of inverters and feeder: x = K(v(x)).
-
-        Parameters
-        ----------
-        loads
-            Powers of the customers.
-        start : (m,)
-            Start of the iteration, pu; zero by default.
-        """
+        """Equilibrium of inverters and feeder, x = K(v(x)); the iteration begins at `start` (m,) or zero."""
         zero, one = np.zeros(self.count), np.ones(self.count)
         return self.settle(loads, zero, one, zero if start is None else start)
 
     def advance(self, loads: Loads, now: Point, before: Point | None, h: float) -> Point:
-        """Point one step later.
+        """Point h > 0 seconds after `now`, with the loads at the end of the step.
 
-        Parameters
-        ----------
-        loads
-            Powers of the customers at the end of the step.
-        now
-            Point at the begin of the step.
-        before
-            Point one equal step earlier, if known; only improves the first guess.
-        h
-            Length of the step, s, > 0.
+        The point one equal step earlier, `before`, only improves the first guess.
         """
         decay, old, new = self.weights(h)
         kept = decay * now.x + old * now.setpoint
@@ -203,16 +150,7 @@ class ClosedLoop:
         return decay, 1.0 - decay - new, new
 
     def settle(self, loads: Loads, kept: Floats, new: Floats, guess: Floats) -> Point:
-        """Solve x = kept + new K(v(x)).
-
-        Parameters
-        ----------
-        loads
-            Powers of the customers.
-        kept, new : (m,)
-            The coefficients: pu, and 1 between 0 and 1.
-        guess : (m,)
-            First x, pu.
+        """Solve x = kept + new K(v(x)) from a first guess; kept and guess (m,) in pu, new (m,) from 0 to 1.
 
         Raises
         ------
@@ -297,40 +235,20 @@ QUASI_STATIC_TAUS: Final = 10.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlantTrajectory:
-    """True state at T consecutive ticks. N customers, m inverters, b + 1 buses.
+    """True state at T consecutive ticks. N customers, m inverters, b + 1 buses."""
 
-    Attributes
-    ----------
-    ticks : (T,)
-        Numbers of the ticks.
-    t : (T,)
-        Times of the ticks, Unix s.
-    v_volt : (T, N)
-        Voltage at each customer, V.
-    v_bus_volt : (T, b + 1)
-        Voltage of each bus, V; in three phases of each phase of each bus.
-    x : (T, m)
-        Reactive injection of each inverter by its droop curve, pu.
-    demand
-        Powers without the inverters' reactive power, and the busbar voltage.
-    shown_kw : (T, N)
-        Active power without hidden powers: the basis of the readings.
-    """
-
-    ticks: Ints
-    t: Floats
-    v_volt: Floats
-    v_bus_volt: Floats
-    x: Floats
-    demand: Demand
-    shown_kw: Floats
+    ticks: Ints  # (T,): numbers of the ticks
+    t: Floats  # (T,): times of the ticks, Unix s
+    v_volt: Floats  # (T, N): voltage at each customer, V
+    v_bus_volt: Floats  # (T, b + 1): voltage of each bus, V; in three phases of each phase of each bus
+    x: Floats  # (T, m): reactive injection of each inverter by its droop curve, pu
+    demand: Demand  # powers without the inverters' reactive power, and the busbar voltage
+    shown_kw: Floats  # (T, N): active power without hidden powers: the basis of the readings
 
 
 def truth(site: Site, scenario: Scenario, first: int, end: float) -> Iterator[PlantTrajectory]:
     """True state from tick `first` up to tick `end`, which may be infinite; begins in equilibrium."""
-    customers = Customers(
-        site, scenario.variation, scenario.seed, scenario.start, scenario.profile_s, season=scenario.season
-    )
+    customers = Customers.of(site, scenario)
     loop = ClosedLoop(power_flow(site), site.droop, site.feeder.base_kva, site.customer_volt)
     steps = substeps(site, scenario)
     course = _Course(loop, scenario.dt_s / steps)
@@ -384,15 +302,7 @@ class _Course:
         self._single = 0
 
     def run(self, demand: Demand) -> tuple[Floats, Floats, Floats]:
-        """Advance one step per row of `demand`.
-
-        Returns
-        -------
-        v_volt (T, N), v_bus_volt (T, b + 1)
-            Voltages after each step, V.
-        x (T, m)
-            Injections of the inverters, pu.
-        """
+        """Advance one step per row: voltages (T, N) and (T, b + 1), V, and injections x (T, m), pu."""
         steps = len(demand.v0_volt)
         parts: list[tuple[Floats, Floats, Floats]] = []
         k = 0

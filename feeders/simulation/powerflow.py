@@ -44,52 +44,27 @@ class PowerFlowDiverged(GridsecError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Grid:
-    """Feeder for AC power flow, in SI. L lines, B buses, N customers.
+    """Feeder for AC power flow, in SI. L lines, B buses, N customers."""
 
-    Attributes
-    ----------
-    ends : (L, 2)
-        The buses at both ends of each line, 0 .. B-1.
-    r_ohm, x_ohm : (L,)
-        Series resistance and reactance per phase, ohm; not both zero.
-    b_siemens : (L,)
-        Total shunt susceptance per phase, S.
-    busbar
-        Bus of the given voltage.
-    customer_bus : (N,)
-        Bus of each customer.
-    bus_count
-        Number of buses B.
-    nominal_volt : scalar or (B,)
-        Nominal phase-to-neutral voltage, V; or that of each bus.
-    tap : (L,), optional
-        Ratio of an ideal transformer at the first end of each line: the voltage there by that behind it, each
-        relative to its nominal voltage.
-    """
-
-    ends: Ints
+    ends: Ints  # (L, 2): the buses at both ends of each line, 0 .. B-1.
+    # (L,): series resistance and reactance per phase, ohm; not both zero.
     r_ohm: Floats
     x_ohm: Floats
-    b_siemens: Floats
-    busbar: int
-    customer_bus: Ints
-    bus_count: int
-    nominal_volt: Floats | float
+    b_siemens: Floats  # (L,): total shunt susceptance per phase, S
+    busbar: int  # bus of the given voltage
+    customer_bus: Ints  # (N,): bus of each customer
+    bus_count: int  # number of buses B
+    nominal_volt: Floats | float  # scalar or (B,): nominal phase-to-neutral voltage, V; or that of each bus
+    # (L,): ratio of an ideal transformer at the first end of each line: the voltage there by that behind it,
+    # each relative to its nominal voltage.
     tap: Floats | None = None
 
 
 class PowerFlow:
     """AC power flow of one feeder, for repeated solutions.
 
-    Parameters
-    ----------
-    site
-        The feeder. Voltages are in the order of its customers and of `site.feeder.buses`.
-
-    Notes
-    -----
-    A solve starts flat every time, so that its result depends on its arguments alone. An object is not
-    thread-safe: its input arrays are reused.
+    Voltages are in the order of the feeder's customers and buses. A solve starts flat every time, so that its
+    result depends on its arguments alone. An object is not thread-safe: its input arrays are reused.
     """
 
     def __init__(self, site: Site) -> None:
@@ -108,30 +83,13 @@ class PowerFlow:
         self._order = order
         self._scale = np.broadcast_to(grid.nominal_volt, (grid.bus_count,))
         self._model = PowerGridModel(_components(grid))
-        self._loads = _load_update(grid, (grid.customer_bus.size,))
-        self._source = _source_update(grid, (1,))
+        self._loads, self._source = _updates(grid)
 
     def solve(self, p_kw: Floats, q_kvar: Floats, v0_volt: Floats | float) -> tuple[Floats, Floats]:
-        """Voltages for one set of loads.
+        """Voltages of customers (N,) and buses (b + 1,), phase to neutral, V, for one set of loads.
 
-        Parameters
-        ----------
-        p_kw, q_kvar : (N,)
-            Net import of each customer, three-phase total, kW and kvar.
-        v0_volt
-            Voltage of the busbar, phase to neutral, V.
-
-        Returns
-        -------
-        customers : (N,)
-            Voltage at each customer, phase to neutral, V.
-        buses : (b + 1,)
-            Voltage at each bus, V.
-
-        Raises
-        ------
-        PowerFlowDiverged
-            Without a solution, or if Newton's method does not find it.
+        Loads are three-phase net imports (N,), kW and kvar, `v0_volt` is the busbar's voltage, phase to
+        neutral, V. PowerFlowDiverged is raised without a solution, or if Newton's method does not find it.
         """
         by_node = self._solve(p_kw, q_kvar, v0_volt, "u_pu") * self._scale
         return by_node[self.grid.customer_bus], by_node[self._order]
@@ -143,44 +101,23 @@ class PowerFlow:
         phasors: Phasors = magnitude * np.exp(1j * (angle - angle[self.grid.busbar]))
         return phasors
 
-    def solve_batch(
-        self, p_kw: Floats, q_kvar: Floats, v0_volt: Floats, *, threads: int = 1
-    ) -> tuple[Floats, Floats]:
-        """Voltages for T sets of loads: the numbers of T calls of `solve`, many times faster.
+    def solve_batch(self, p_kw: Floats, q_kvar: Floats, v0_volt: Floats) -> tuple[Floats, Floats]:
+        """Voltages (T, N) and (T, b + 1), V, for T sets of loads (T, N) and busbar voltages (T,).
 
-        Parameters
-        ----------
-        p_kw, q_kvar : (T, N)
-            Net imports, kW and kvar.
-        v0_volt : (T,)
-            Voltages of the busbar, V.
-        threads
-            Number of threads.
-
-        Returns
-        -------
-        customers : (T, N)
-            Voltage at each customer, V.
-        buses : (T, b + 1)
-            Voltage at each bus, V.
-
-        Raises
-        ------
-        PowerFlowDiverged
-            If any set has no solution; names the first of them.
+        The numbers are those of T calls of `solve`, many times faster. PowerFlowDiverged names the first set
+        without a solution.
         """
         count = p_kw.shape[0]
         if count == 0:
             return np.empty((0, p_kw.shape[1])), np.empty((0, self._order.size))
-        loads = _load_update(self.grid, (count, p_kw.shape[1]))
+        loads, source = _updates(self.grid, count)
         loads["p_specified"] = p_kw * 1e3
         loads["q_specified"] = q_kvar * 1e3
-        source = _source_update(self.grid, (count, 1))
         source["u_ref"][:, 0] = v0_volt / self._scale[self.grid.busbar]
         by_node = self._calculate(
             "u_pu",
             update_data={ComponentType.sym_load: loads, ComponentType.source: source},
-            threading=threads if threads > 1 else -1,
+            threading=-1,
         )
         by_node = by_node * self._scale
         return by_node[:, self.grid.customer_bus], by_node[:, self._order]
@@ -247,16 +184,8 @@ def _grid(site: Site) -> tuple[Grid, Ints]:
 def levels(ends: Ints, to_volt: Floats, busbar: int, volt: float, count: int) -> Floats:
     """Nominal voltage of every bus, V: from the busbar on, until a transformer changes it.
 
-    Parameters
-    ----------
-    ends : (L, 2)
-        The buses at both ends of each line.
-    to_volt : (L,)
-        Nominal voltage of the second bus, V; NaN where it is that of the first.
-    busbar, volt
-        The busbar, and its nominal voltage, V.
-    count
-        Number of buses.
+    `ends` (L, 2) are the buses of each line, `to_volt` (L,) the nominal voltage of the second one, V, NaN
+    where it is that of the first.
     """
     if np.isnan(to_volt).all():
         return np.full(count, volt)
@@ -331,13 +260,12 @@ def _first_load(grid: Grid) -> int:
     return grid.bus_count + len(grid.ends)
 
 
-def _load_update(grid: Grid, shape: tuple[int] | tuple[int, int]) -> Any:
-    update = initialize_array(DatasetType.update, ComponentType.sym_load, shape)
-    update["id"] = _first_load(grid) + np.arange(grid.customer_bus.size)
-    return update
-
-
-def _source_update(grid: Grid, shape: tuple[int] | tuple[int, int]) -> Any:
-    update = initialize_array(DatasetType.update, ComponentType.source, shape)
-    update["id"] = _first_load(grid) + grid.customer_bus.size
-    return update
+def _updates(grid: Grid, *shape: int) -> tuple[Any, Any]:
+    """Updates of all loads and of the source, one for each set of a batch of the given shape."""
+    customers = grid.customer_bus.size
+    sizes: Any = (*shape, customers), (*shape, 1)
+    load = initialize_array(DatasetType.update, ComponentType.sym_load, sizes[0])
+    source = initialize_array(DatasetType.update, ComponentType.source, sizes[1])
+    load["id"] = _first_load(grid) + np.arange(customers)
+    source["id"] = _first_load(grid) + customers
+    return load, source

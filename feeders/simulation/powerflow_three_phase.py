@@ -43,62 +43,31 @@ ITERATIONS: Final = 200
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UnbalancedGrid:
-    """Feeder for asymmetric AC power flow, in SI. L lines, B buses, N customers.
+    """Feeder for asymmetric AC power flow, in SI. L lines, B buses, N customers."""
 
-    Attributes
-    ----------
-    ends : (L, 2)
-        The buses at both ends of each line, 0 .. B-1.
-    present : (L, 3)
-        Phases a, b, c that a line has.
-    z_ohm : (L, 3, 3)
-        Series impedance of each line, ohm; only entries of its phases count.
-    b_siemens : (L, 3, 3)
-        Total shunt susceptance of each line, S, half at each end.
-    busbar
-        Bus of the given voltage.
-    customer_bus : (N,)
-        Bus of each customer.
-    connected : (N, 3)
-        Phases of each customer; its power is split evenly.
-    bus_count
-        Number of buses B.
-    nominal_volt : scalar or (B,)
-        Nominal phase-to-neutral voltage, V; or that of each bus.
-    tap : (L, 3), optional
-        Ratios of an ideal transformer at the first end of each line: the voltages there by those behind it.
-    source_ohm : (3, 3), optional
-        Impedance between the given voltage and the busbar, ohm. For a transformer Dyn, `sequence_ohm` of its
-        short-circuit impedance (with that of the grid above) and its zero-sequence impedance, both seen from
-        the low-voltage side: the delta blocks the zero sequence of the grid above.
-    """
-
-    ends: Ints
-    present: Bools
-    z_ohm: Phasors
-    b_siemens: Floats
-    busbar: int
-    customer_bus: Ints
-    connected: Bools
-    bus_count: int
-    nominal_volt: Floats | float
+    ends: Ints  # (L, 2): the buses at both ends of each line, 0 .. B-1.
+    present: Bools  # (L, 3): phases a, b, c that a line has
+    z_ohm: Phasors  # (L, 3, 3): series impedance of each line, ohm; only entries of its phases count
+    b_siemens: Floats  # (L, 3, 3): total shunt susceptance of each line, S, half at each end
+    busbar: int  # bus of the given voltage
+    customer_bus: Ints  # (N,): bus of each customer
+    connected: Bools  # (N, 3): phases of each customer; its power is split evenly
+    bus_count: int  # number of buses B
+    nominal_volt: Floats | float  # scalar or (B,): nominal phase-to-neutral voltage, V; or that of each bus
+    # (3, 3): impedance between the given voltage and the busbar, ohm. For a transformer Dyn, `sequence_ohm`
+    # of its short-circuit impedance (with that of the grid above) and its zero-sequence impedance, both seen
+    # from the low-voltage side: the delta blocks the zero sequence of the grid above.
     source_ohm: Phasors | None = None
+    # (L, 3): ratios of an ideal transformer at the first end of each line: the voltages there by those behind
+    # it.
     tap: Floats | None = None
 
 
 class UnbalancedPowerFlow:
-    """Asymmetric AC power flow of one feeder, for repeated solutions.
+    """Asymmetric AC power flow of one feeder, for repeated solutions; voltages are in the order of its buses.
 
-    Parameters
-    ----------
-    site
-        The feeder. Voltages are in the order of its buses.
-    source_ohm : (3, 3)
-        See `UnbalancedGrid`; without it the given voltage is that of the busbar.
-
-    Notes
-    -----
-    A solve starts flat every time, so that its result depends on its arguments alone.
+    A solve starts flat every time, so that its result depends on its arguments alone. Without `source_ohm`
+    (`UnbalancedGrid`) the given voltage is that of the busbar.
     """
 
     def __init__(self, site: ThreePhaseSite | Site, source_ohm: Phasors | None = None) -> None:
@@ -149,7 +118,7 @@ class UnbalancedPowerFlow:
             self._idle[busbar] = np.eye(3)
 
     def solve(self, p_kw: Floats, q_kvar: Floats, v0_volt: Floats | Phasors | float) -> tuple[Floats, Floats]:
-        """Voltages for one set of loads.
+        """Voltages for one set of loads; PowerFlowDiverged if the iteration finds no solution.
 
         Parameters
         ----------
@@ -165,37 +134,16 @@ class UnbalancedPowerFlow:
             Voltage of each connection, customer by customer, phase by phase, V.
         buses : (b + 1, 3)
             Voltage of each phase of each bus, V; NaN where it is absent.
-
-        Raises
-        ------
-        PowerFlowDiverged
-            Without a solution, or if the iteration does not find it.
         """
         all_of_them = self.phasors(p_kw[None], q_kvar[None], np.asarray(v0_volt)[None])
         connections, buses = self._magnitudes(all_of_them)
         return connections[0], buses[0]
 
     def solve_batch(self, p_kw: Floats, q_kvar: Floats, v0_volt: Floats | Phasors) -> tuple[Floats, Floats]:
-        """Voltages for T sets of loads at once, many times faster than T calls of `solve`.
+        """Voltages (T, C) and (T, b + 1, 3), V, for T sets of loads at once, many times faster than `solve`.
 
-        Parameters
-        ----------
-        p_kw, q_kvar : (T, N)
-            Net imports, kW and kvar.
-        v0_volt : (T,), (T, 3) or complex (T, 3)
-            Given voltages, V.
-
-        Returns
-        -------
-        connections : (T, C)
-            Voltage of each connection, V.
-        buses : (T, b + 1, 3)
-            Voltage of each phase of each bus, V.
-
-        Raises
-        ------
-        PowerFlowDiverged
-            If any set has no solution; names the first of them.
+        Net imports are (T, N), kW and kvar; `v0_volt` is (T,), (T, 3) or complex (T, 3), V. PowerFlowDiverged
+        names the first set without a solution.
         """
         return self._magnitudes(self.phasors(p_kw, q_kvar, v0_volt))
 
@@ -237,13 +185,7 @@ class UnbalancedPowerFlow:
 
 
 class PlacesFlow:
-    """Asymmetric power flow by places, with the methods of the balanced power flow.
-
-    Parameters
-    ----------
-    site
-        A feeder in three phases, with one phase per customer.
-    """
+    """Asymmetric power flow by places of a feeder with one phase per customer; methods as of `PowerFlow`."""
 
     def __init__(self, site: Site) -> None:
         self._flow = UnbalancedPowerFlow(site)

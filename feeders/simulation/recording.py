@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass, fields
 from importlib import metadata
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, get_args
 
 import numpy as np
 import pyarrow as pa
@@ -36,105 +36,44 @@ if TYPE_CHECKING:
 
     from feeders.model.site import Site
 
-__all__ = [
-    "CHUNK_TICKS",
-    "FORMAT",
-    "KEY",
-    "PACKAGES",
-    "PHASES",
-    "READINGS",
-    "REGISTERS",
-    "REQUIRED",
-    "T_POWER",
-    "RecordedTruth",
-    "Recording",
-    "RecordingInvalid",
-    "is_simulated",
-    "read_recording",
-    "record",
-    "scenario_from_json",
-    "scenario_to_json",
-    "truth_path",
-]
 
-
-_LISTS = ("attacks", "busbar_attacks")
+_LISTS: Final = ("attacks", "busbar_attacks")
+_KINDS: Final = {kind.__name__: kind for kind in get_args(attacks.Attack)}
 
 
 def scenario_to_json(scenario: Scenario) -> dict[str, Any]:
     """Convert a scenario to JSON types; infinite times become the text "inf"."""
-    told = {field.name: getattr(scenario, field.name) for field in fields(scenario)}
-    told["variation"] = asdict(scenario.variation)
-    told["errors"] = asdict(scenario.errors)
-    told["channel"] = asdict(scenario.channel)
+    told = asdict(scenario)
     for name in _LISTS:
-        told[name] = [
-            {"kind": type(attack).__name__}
-            | {field.name: getattr(attack, field.name) for field in fields(attack)}
-            for attack in getattr(scenario, name)
-        ]
-    told["inverter_attacks"] = [
-        {field.name: getattr(attack, field.name) for field in fields(attack)}
-        for attack in scenario.inverter_attacks
-    ]
+        for entry, attack in zip(told[name], getattr(scenario, name), strict=True):
+            entry["kind"] = type(attack).__name__
     out: dict[str, Any] = _told(plain(told))
     return out
 
 
 def scenario_from_json(obj: dict[str, Any]) -> Scenario:
-    """Convert the result of `scenario_to_json` back to a scenario.
-
-    Raises
-    ------
-    KeyError, TypeError, ValueError
-        For any other content.
-    """
-    given = {"busbar_attacks": ()} | _heard(obj)
-    channel = dict(given["channel"])
-    channel["silences"] = tuple(
-        MeterOutage(s["meter"], float(s["t_on"]), float(s["t_off"])) for s in channel["silences"]
-    )
-    given["channel"] = Channel(**channel)
+    """Inverse of `scenario_to_json`; KeyError, TypeError or ValueError for any other content."""
+    given = {"busbar_attacks": (), "inverter_attacks": (), "season": Season.SUMMER} | _heard(obj)
+    silences = tuple(MeterOutage(**silence) for silence in given["channel"]["silences"])
+    given["channel"] = Channel(**given["channel"] | {"silences": silences})
     given["variation"] = Variation(**given["variation"])
     given["errors"] = MeterErrors(**given["errors"])
     for name in _LISTS:
-        given[name] = tuple(_attack(entry) for entry in given[name])
-    given["inverter_attacks"] = tuple(
-        attacks.InverterAttack(
-            np.array(entry["inverters"], dtype=np.intp),
-            np.array(entry["q"], dtype=np.float64),
-            float(entry["t_on"]),
-            float(entry["t_off"]),
-        )
-        for entry in given.get("inverter_attacks", ())
-    )
-    given["duration_s"] = float(given["duration_s"])
-    given["season"] = Season(given.get("season", Season.SUMMER))
+        given[name] = tuple(_attack(_KINDS[entry.pop("kind")], entry) for entry in given[name])
+    wrong = (_attack(attacks.InverterAttack, entry) for entry in given["inverter_attacks"])
+    given["inverter_attacks"] = tuple(wrong)
     return Scenario(**given)
 
 
-_ATTACKS: Final = {
-    kind.__name__: kind
-    for kind in (
-        attacks.Bias,
-        attacks.Scaling,
-        attacks.Drift,
-        attacks.Stuck,
-        attacks.Replay,
-        attacks.Random,
-        attacks.Coordinated,
+def _attack(kind: Any, entry: dict[str, Any]) -> Any:
+    """Attack of a kind, with lists as arrays; lists of indices are integers."""
+    types = {"meters": np.intp, "inverters": np.intp}
+    return kind(
+        **{
+            name: np.array(value, dtype=types.get(name, np.float64)) if isinstance(value, list) else value
+            for name, value in entry.items()
+        }
     )
-}
-
-
-def _attack(entry: dict[str, Any]) -> attacks.Attack:
-    values = dict(entry)
-    kind: Any = _ATTACKS[values.pop("kind")]
-    for name, value in values.items():
-        if isinstance(value, list):
-            values[name] = np.array(value, dtype=np.intp if name == "meters" else np.float64)
-    made: attacks.Attack = kind(**values)
-    return made
 
 
 _INFINITE: Final = ("inf", "-inf")
@@ -180,20 +119,13 @@ PHASES: Final = pa.field("v_phases", pa.list_(pa.float64()))
 REQUIRED: Final = ("meter", "t", "v_volt")
 T_POWER: Final = pa.field("t_power", pa.float64())
 """Time of the powers, a column of external recordings with powers older than their voltages."""
+COLUMNS: Final = tuple(field.name for field in fields(SimulatedReading))
 REGISTERS: Final = ("seq", "p_kw", "q_kvar", "t_power")
 """Columns in which NaN means null, not reported: tables of floats have no null."""
 
 
 class RecordingInvalid(Problems, GridsecError):
-    """A file is not a recording, or has no truth.
-
-    Parameters
-    ----------
-    problems
-        One clause each, with the expected content.
-    where
-        Place of all problems, at the begin of the sentence.
-    """
+    """A file is not a recording, or has no truth; `where` begins the sentence of all problems."""
 
     def __init__(self, *problems: str, where: str = "") -> None:
         self.problems = problems
@@ -203,61 +135,31 @@ class RecordingInvalid(Problems, GridsecError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedTruth:
-    """Truth of a recording at its T ticks; columns as in `feeders.simulation.scenario.SimulatedTick`.
+    """Truth of a recording at its T ticks; columns as in `feeders.simulation.scenario.SimulatedTick`."""
 
-    Attributes
-    ----------
-    t : (T,)
-        Unix time, s.
-    v_volt, p_kw, q_kvar : (T, N)
-        Voltage and net import of each customer, V, kW, kvar.
-    v_bus_volt : (T, b + 1)
-        Voltage of each bus, V.
-    x_kvar : (T, m)
-        Injection of each inverter, kvar.
-    manipulated : (T, p)
-        Mask of the meters under attack.
-    shift_volt : (T, p)
-        Reported minus honest reading, V.
-    """
-
-    t: Floats
+    t: Floats  # (T,): Unix time, s
+    # (T, N): voltage and net import of each customer, V, kW, kvar.
     v_volt: Floats
     p_kw: Floats
     q_kvar: Floats
-    v_bus_volt: Floats
-    x_kvar: Floats
-    manipulated: Bools
-    shift_volt: Floats
+    v_bus_volt: Floats  # (T, b + 1): voltage of each bus, V
+    x_kvar: Floats  # (T, m): injection of each inverter, kvar
+    manipulated: Bools  # (T, p): mask of the meters under attack
+    shift_volt: Floats  # (T, p): reported minus honest reading, V
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recording:
-    """Recorded file, read lazily: only the metadata is in memory.
+    """Recorded file, read lazily: only the metadata is in memory."""
 
-    Attributes
-    ----------
-    path
-        The file with the readings.
-    count
-        Number of readings.
-    feeder, digest
-        Name and content digest of its feeder; None for an external file.
-    scenario
-        The simulated scenario; None for an external file.
-    versions
-        Versions of the packages at its writing.
-    timed
-        True with arrival times of the readings.
-    """
-
-    path: Path
-    count: int
+    path: Path  # the file with the readings
+    count: int  # number of readings
+    # Name and content digest of its feeder; None for an external file.
     feeder: str | None
     digest: str | None
-    scenario: Scenario | None
-    versions: dict[str, str]
-    timed: bool = False
+    scenario: Scenario | None  # the simulated scenario; None for an external file
+    versions: dict[str, str]  # versions of the packages at its writing
+    timed: bool = False  # true with arrival times of the readings
 
     def readings(self) -> Iterator[SimulatedReading]:
         """All readings in the order of the file, that of arrival."""
@@ -271,13 +173,7 @@ class Recording:
         return table
 
     def truth(self) -> RecordedTruth:
-        """Truth of a simulated recording.
-
-        Raises
-        ------
-        RecordingInvalid
-            Without a truth, or with that of another recording.
-        """
+        """Truth of a simulated recording; RecordingInvalid without one, or with that of another recording."""
         path = truth_path(self.path)
         try:
             table, own = pq.read_table(path), pq.read_schema(self.path)
@@ -299,26 +195,10 @@ def truth_path(path: Path) -> Path:
 
 
 def record(site: Site, scenario: Scenario, path: Path | str) -> Recording:
-    """Write the readings of a scenario to a file, and its truth to a second one beside it.
+    """Write the readings of a finite scenario to a file .parquet, and its truth to a second one beside it.
 
     Both have temporary names first, so that a file with the final name is complete. An old truth is removed
     first: it never accompanies new readings.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    scenario
-        The scenario, of finite length.
-    path
-        File of the readings, with the ending .parquet.
-
-    Raises
-    ------
-    ValueError
-        For a scenario of infinite length.
-    OSError
-        If the files cannot be written.
     """
     if not math.isfinite(scenario.duration_s):
         raise InputInvalid([Problem("not-finite", "a scenario without an end cannot be recorded")])
@@ -354,12 +234,7 @@ def read_recording(path: Path | str) -> Recording:
 
     An external file needs the columns `meter`, `t` and `v_volt`. Without `arrival` readings arrive at their
     own time. `seq`, `p_kw`, `q_kvar` and `t_power` may be absent, and null or NaN if not reported.
-
-    Raises
-    ------
-    RecordingInvalid
-        If the file is not Parquet, lacks a column or has one of another type, has fractional numbers of
-        readings, or has another format.
+    RecordingInvalid states wrong columns, fractional numbers of readings, and other formats.
     """
     path = Path(path)
     try:
@@ -388,18 +263,7 @@ def read_recording(path: Path | str) -> Recording:
 
 
 def is_simulated(path: Path) -> bool:
-    """True for a file of `record`, readings or truth.
-
-    Parameters
-    ----------
-    path
-        The file.
-
-    Raises
-    ------
-    OSError
-        If it cannot be read.
-    """
+    """True for a file of `record`, readings or truth; OSError if it cannot be read."""
     try:
         return KEY in (pq.read_schema(path).metadata or {})
     except pa.ArrowException:
@@ -410,7 +274,7 @@ def _wrong_columns(schema: Any) -> list[Problem]:
     """All problems of a file's columns."""
     missing = [name for name in REQUIRED if name not in schema.names]
     problems = [Problem("missing", f"columns {', '.join(missing)} are missing")] if missing else []
-    for name in (*READINGS.names, PHASES.name, T_POWER.name):
+    for name in COLUMNS:
         if name not in schema.names:
             continue
         given = schema.field(name).type
@@ -567,28 +431,12 @@ def _matrix(column: Any) -> Any:
 
 
 def _readings(batch: Any) -> Iterator[SimulatedReading]:
-    size = batch.num_rows
-    there = {
-        name: _column(batch, name).to_pylist()
-        for name in batch.schema.names
-        if name in (*READINGS.names, PHASES.name, T_POWER.name)
-    }
-    nothing = [None] * size
-    for meter, t, seq, arrival, v_volt, p_kw, q_kvar, phases, t_power in zip(
-        there["meter"],
-        there["t"],
-        there.get("seq", nothing),
-        there.get("arrival", there["t"]),
-        there["v_volt"],
-        there.get("p_kw", nothing),
-        there.get("q_kvar", nothing),
-        there.get(PHASES.name, nothing),
-        there.get(T_POWER.name, nothing),
-        strict=True,
-    ):
-        yield SimulatedReading(
-            meter, t, seq, arrival, v_volt, p_kw, q_kvar, phases and tuple(phases), t_power
-        )
+    there = {name: _column(batch, name).to_pylist() for name in batch.schema.names if name in COLUMNS}
+    there.setdefault("arrival", there["t"])
+    phases = there.get(PHASES.name, ())
+    there[PHASES.name] = [volts and tuple(volts) for volts in phases] or [None] * batch.num_rows
+    nothing = [None] * batch.num_rows
+    yield from map(SimulatedReading, *(there.get(name, nothing) for name in COLUMNS))
 
 
 def _column(batch: Any, name: str) -> Any:

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from feeders.model.profiles import Season
 from feeders.model.site import Snapshot
+from feeders.profiles import Season
 from feeders.simulation.attacks import random_attacks
 from feeders.simulation.demand import Variation
 from feeders.simulation.meters import BUSBAR, Channel, Delivery, MeterErrors, Registers, SimulatedMeters
@@ -24,7 +24,7 @@ from feeders.simulation.plant import PlantTrajectory, net_reactive, truth
 from feeders.util import own_numbers
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.attack import Attack, InverterAttack, Reports, apply_all, manipulated, reach
-from gridsec.errors import InputInvalid, Problem, choice, raise_if_any
+from gridsec.errors import Problem, choice, raise_if_any, require
 
 if TYPE_CHECKING:
     from feeders.model.site import Site
@@ -58,158 +58,84 @@ LONGEST_LOOK_BACK_S: Final = 7 * 86_400.0
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """Simulated run: length, profiles, variation, meter errors, channel and attacks.
+    """Simulated run: length, profiles, variation, meter errors, channel and attacks."""
 
-    Attributes
-    ----------
-    seed
-        Seed of all random numbers, >= 0.
-    start
-        Unix time of the first tick, s.
-    duration_s
-        Ticks are at start + k dt_s < start + duration_s; may be infinite.
-    dt_s
-        Interval between readings, s.
-    profile_s
-        Position within the season's profiles at `start`, s. They begin on a Monday at 00:00, have two weeks
-        in summer and one in the other seasons, and repeat. By default the noon of a Wednesday.
-    substep_s
-        Longest step of the integrator, s. None: half the smallest time constant of the inverters, or one
-        quasi-static step for a tick of more than QUASI_STATIC_TAUS of the largest.
-    variation, errors, channel
-        Variation of loads and busbar, errors of the meters, effects of the channel.
-    attacks
-        Attacks on meters, applied in this order. Meters are indices into `Site.meters`.
-    inverter_attacks
-        Wrong injections of inverters; they add up. Inverters are indices into `Site.droop`.
-    season
-        Season of loads and generation, independent of the date of `start`.
-    busbar_attacks
-        Attacks on the busbar meter, applied in this order; none may use earlier readings. Their meters are
-        its phases, 0 to 2, or 0 on a balanced feeder.
-
-    Raises
-    ------
-    ValueError
-        For an unknown season, or an invalid number.
-    """
-
-    seed: int = 0
-    start: float = START
-    duration_s: float = 600.0
-    dt_s: float = 1.0
+    seed: int = 0  # seed of all random numbers, >= 0
+    start: float = START  # Unix time of the first tick, s
+    duration_s: float = 600.0  # ticks are at start + k dt_s < start + duration_s; may be infinite
+    dt_s: float = 1.0  # interval between readings, s
+    # Position within the season's profiles at `start`, s. They begin on a Monday at 00:00, have two weeks in
+    # summer and one in the other seasons, and repeat. By default the noon of a Wednesday.
     profile_s: float = SUNNY_NOON_S
+    # Longest step of the integrator, s. None: half the smallest time constant of the inverters, or one quasi-
+    # static step for a tick of more than QUASI_STATIC_TAUS of the largest.
     substep_s: float | None = None
+    # Variation of loads and busbar, errors of the meters, effects of the channel.
     variation: Variation = field(default_factory=Variation)
     errors: MeterErrors = field(default_factory=MeterErrors)
     channel: Channel = field(default_factory=Channel)
+    # Attacks on meters, applied in this order. Meters are indices into `Site.meters`.
     attacks: tuple[Attack, ...] = ()
+    # Wrong injections of inverters; they add up. Inverters are indices into `Site.droop`.
     inverter_attacks: tuple[InverterAttack, ...] = ()
-    season: Season = Season.SUMMER
+    season: Season = Season.SUMMER  # season of loads and generation, independent of the date of `start`
+    # Attacks on the busbar meter, applied in this order; none may use earlier readings. Their meters are its
+    # phases, 0 to 2, or 0 on a balanced feeder.
     busbar_attacks: tuple[Attack, ...] = ()
 
     def __post_init__(self) -> None:
         own_numbers(self)
         object.__setattr__(self, "season", choice("season", Season, self.season))
-        if self.seed < 0:
-            raise InputInvalid([Problem("negative", f"seed must not be negative, got {self.seed}")])
-        if not np.isfinite(self.profile_s):
-            raise InputInvalid([Problem("not-finite", f"profile_s must be finite, got {self.profile_s}")])
-        if not 0.0 <= self.start < LATEST_S:
-            raise InputInvalid(
-                [Problem("out-of-range", f"start must be a Unix time in seconds, got {self.start}")]
-            )
-        if not self.duration_s > 0.0:
-            raise InputInvalid(
-                [Problem("not-positive", f"duration_s must be positive, got {self.duration_s}")]
-            )
-        if not 0.0 < self.dt_s < np.inf:
-            raise InputInvalid(
-                [Problem("not-positive", f"dt_s must be positive and finite, got {self.dt_s}")]
-            )
-        if self.substep_s is not None and not self.substep_s > 0.0:
-            raise InputInvalid([Problem("not-positive", f"substep_s must be positive, got {self.substep_s}")])
+        begin, length, step = self.start, self.duration_s, self.substep_s
+        require(self.seed >= 0, Problem("negative", f"seed must not be negative, got {self.seed}"))
+        finite = Problem("not-finite", f"profile_s must be finite, got {self.profile_s}")
+        require(np.isfinite(self.profile_s), finite)
+        unix = Problem("out-of-range", f"start must be a Unix time in seconds, got {begin}")
+        require(0.0 <= begin < LATEST_S, unix)
+        require(length > 0.0, Problem("not-positive", f"duration_s must be positive, got {length}"))
+        ticking = Problem("not-positive", f"dt_s must be positive and finite, got {self.dt_s}")
+        require(0.0 < self.dt_s < np.inf, ticking)
+        substep = Problem("not-positive", f"substep_s must be positive, got {step}")
+        require(step is None or step > 0.0, substep)
 
 
 @dataclass(frozen=True, slots=True)
 class SimulatedReading:
-    """One reading on its way to a service; net import positive.
+    """One reading on its way to a service; net import positive."""
 
-    Attributes
-    ----------
-    meter
-        Id of the meter; BUSBAR (the empty string) for the busbar meter.
-    t
-        Time by the meter's clock, Unix s.
-    seq
-        Number of the reading; rises by one with every tick, also without an arrival. None in external
-        recordings without numbers.
-    arrival
-        Arrival time, Unix s.
-    v_volt
-        Voltage, phase to neutral, V; for several phases their mean.
-    p_kw, q_kvar
-        Net import, kW and kvar; None where not reported.
-    v_phases
-        Busbar voltage of each phase, V; None on a balanced feeder.
-    t_power
-        Time of the powers by the meter's clock, Unix s; None for `t`.
-    """
-
-    meter: str
-    t: float
+    meter: str  # id of the meter; BUSBAR (the empty string) for the busbar meter
+    t: float  # time by the meter's clock, Unix s
+    # Number of the reading; rises by one with every tick, also without an arrival. None in external
+    # recordings without numbers.
     seq: int | None
-    arrival: float
-    v_volt: float
+    arrival: float  # arrival time, Unix s
+    v_volt: float  # voltage, phase to neutral, V; for several phases their mean
+    # Net import, kW and kvar; None where not reported.
     p_kw: float | None
     q_kvar: float | None
-    v_phases: tuple[float, ...] | None = None
-    t_power: float | None = None
+    v_phases: tuple[float, ...] | None = None  # busbar voltage of each phase, V; None on a balanced feeder
+    t_power: float | None = None  # time of the powers by the meter's clock, Unix s; None for `t`
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SimulatedTick:
-    """One tick: the truth, and the reports. N customers, m inverters, p meters, b + 1 buses.
+    """One tick: the truth, and the reports. N customers, m inverters, p meters, b + 1 buses."""
 
-    Attributes
-    ----------
-    t
-        Unix time, s.
-    seq
-        Number of the tick, from 0.
-    meter_ids : (p,)
-        Ids of the meters.
-    v_volt : (N,)
-        True voltage at each customer, V.
-    v_bus_volt : (b + 1,)
-        True voltage of each bus, the busbar first, V; in three phases (3 (b + 1),), the phases of a bus side
-        by side, NaN for an absent one.
-    x_kvar : (m,)
-        Reactive injection of each inverter by its droop curve, kvar, without attacks.
-    p_kw, q_kvar : (N,)
-        True net import of each customer, inverter included, kW and kvar.
-    manipulated : (p,)
-        Mask of the meters under attack.
-    shift_volt : (p,)
-        Reported minus honest reading, V; 0 for honest meters.
-    reported
-        Reports of the meters, manipulations included, as one row, with or without arrival.
-    delivery
-        Arrival times, as one row.
-    """
-
-    t: float
-    seq: int
-    meter_ids: tuple[str, ...]
-    v_volt: Floats
+    t: float  # Unix time, s
+    seq: int  # number of the tick, from 0
+    meter_ids: tuple[str, ...]  # (p,): ids of the meters
+    v_volt: Floats  # (N,): true voltage at each customer, V
+    # (b + 1,): true voltage of each bus, the busbar first, V; in three phases (3 (b + 1),), the phases of a
+    # bus side by side, NaN for an absent one.
     v_bus_volt: Floats
-    x_kvar: Floats
+    x_kvar: Floats  # (m,): reactive injection of each inverter by its droop curve, kvar, without attacks
+    # (N,): true net import of each customer, inverter included, kW and kvar.
     p_kw: Floats
     q_kvar: Floats
-    manipulated: Bools
-    shift_volt: Floats
-    reported: Registers
-    delivery: Delivery
+    manipulated: Bools  # (p,): mask of the meters under attack
+    shift_volt: Floats  # (p,): reported minus honest reading, V; 0 for honest meters
+    reported: Registers  # reports of the meters, manipulations included, as one row, with or without arrival
+    delivery: Delivery  # arrival times, as one row
 
     @property
     def readings(self) -> list[SimulatedReading]:
@@ -241,26 +167,12 @@ class SimulatedTick:
 
 
 def simulate(site: Site, scenario: Scenario) -> Iterator[SimulatedTick]:
-    """Simulate a scenario.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    scenario
-        The scenario.
-
-    Yields
-    ------
-    Sample
-        One per tick, in the order of time.
+    """Simulate a scenario, tick by tick.
 
     Raises
     ------
-    PowerFlowDiverged
-        If the power flow has no solution for the loads.
-    NoEquilibrium
-        Without a common solution of inverters and feeder.
+    PowerFlowDiverged, NoEquilibrium
+        Without a power flow solution, or without a common solution of inverters and feeder.
     ValueError
         For an attack on, or the silence of, an unknown meter, or an attack that uses too old readings.
     """
@@ -271,7 +183,8 @@ def simulate(site: Site, scenario: Scenario) -> Iterator[SimulatedTick]:
     if past.first < 0:
         for block in truth(site, scenario, past.first, 0):
             past.add(block.ticks, _honest(site, meters, block).v_volt / nominal)
-    for block in truth(site, scenario, 0, _tick_count(scenario)):
+    ticks = float(np.ceil(scenario.duration_s / scenario.dt_s - 1e-9))
+    for block in truth(site, scenario, 0, ticks):
         honest = _honest(site, meters, block)
         past.add(block.ticks, honest.v_volt / nominal)
         lies = manipulated(scenario.attacks, block.t, site.meters.size)
@@ -348,10 +261,8 @@ def by_arrival(samples: Iterable[SimulatedTick]) -> Iterator[SimulatedReading]:
 class _Past:
     """Honest voltage reports that attacks may still use, pu, in blocks of consecutive ticks.
 
-    Attributes
-    ----------
-    first
-        First tick that any attack uses; 0 or negative. Ticks before 0 are simulated before the scenario.
+    `first` is the first tick that any attack uses, 0 or negative. Ticks before 0 are simulated before the
+    scenario.
     """
 
     def __init__(self, meters: int, scenario: Scenario) -> None:
@@ -393,10 +304,6 @@ class _Past:
         return int(np.floor((t - self._scenario.start + 5e-7) / self._scenario.dt_s))
 
 
-def _tick_count(scenario: Scenario) -> float:
-    return float(np.ceil(scenario.duration_s / scenario.dt_s - 1e-9))
-
-
 def _honest(site: Site, meters: SimulatedMeters, block: PlantTrajectory) -> Registers:
     return meters.read(
         block.ticks, block.v_volt, block.shown_kw, net_reactive(site, block), block.demand.v0_volt
@@ -430,21 +337,15 @@ def _busbar_attacked(site: Site, scenario: Scenario, t: Floats, reported: Regist
 
 
 def check(site: Site, scenario: Scenario) -> None:
-    """Check the attacks of a scenario against the feeder.
-
-    Raises
-    ------
-    ValueError
-        With all problems.
-    """
+    """Check the attacks of a scenario against the feeder; ValueError with all problems."""
     name, phases = site.feeder.name, site.feeder.busbar_places().stop
     problems = [
-        Problem(
-            "unknown-index",
-            f"an attack names inverter {wrong.inverters.max()}, but {name} has {site.droop.tau.size}",
+        Problem("unknown-index", f"an attack names {what} {index}, but {name} has {count}")
+        for what, index, count in (
+            *(("inverter", each.inverters.max(), site.droop.tau.size) for each in scenario.inverter_attacks),
+            *(("meter", each.meters.max(), site.meters.size) for each in scenario.attacks),
         )
-        for wrong in scenario.inverter_attacks
-        if wrong.inverters.max() >= site.droop.tau.size
+        if index >= count
     ]
     if any(
         attack.meters.max() >= phases or reach(attack, attack.t_off) > 0.0
@@ -457,30 +358,22 @@ def check(site: Site, scenario: Scenario) -> None:
             )
         )
     for attack in scenario.attacks:
-        if attack.meters.max() >= site.meters.size:
-            problems.append(
-                Problem(
-                    "unknown-index",
-                    f"an attack names meter {attack.meters.max()}, but {name} has {site.meters.size}",
-                )
-            )
         then = max(attack.t_on, scenario.start)
-        if attack.t_off > then and reach(attack, then) > LONGEST_LOOK_BACK_S:
-            back = reach(attack, then)
+        back = reach(attack, then)
+        if attack.t_off > then and back > LONGEST_LOOK_BACK_S:
             problems.append(
                 Problem(
                     "out-of-range",
                     f"an attack uses readings {back:.0f} s old, more than the simulation supports",
                 )
             )
-    every = (*scenario.attacks, *scenario.busbar_attacks, *scenario.inverter_attacks)
     problems += [
         Problem(
             "out-of-range",
-            f"an attack begins {attack.t_on - scenario.start:g} s after the start, when the scenario of "
+            f"an attack begins {each.t_on - scenario.start:g} s after the start, when the scenario of "
             f"{scenario.duration_s:g} s is over",
         )
-        for attack in every
-        if attack.t_on >= scenario.start + scenario.duration_s
+        for each in (*scenario.attacks, *scenario.busbar_attacks, *scenario.inverter_attacks)
+        if each.t_on >= scenario.start + scenario.duration_s
     ]
     raise_if_any(problems)

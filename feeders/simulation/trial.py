@@ -1,4 +1,4 @@
-"""Trials: short simulated runs with known attacks, for the comparison of estimators.
+"""Trials: short scenarios with a known attack, for the comparison of estimators.
 
 A trial is a `feeders.simulation.scenario.Scenario` with one load situation that varies slowly. Its frames
 have the profiles' powers of all customers with an available meter. The true loads differ from these by an
@@ -66,60 +66,35 @@ class TrialMeterErrors(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class LoadError:
-    """Differences between true powers and those of the frames.
+    """Differences between true powers and those of the frames."""
 
-    Attributes
-    ----------
-    p_kw, q_kvar
-        Standard deviations at every customer with a meter, kW and kvar.
-    correlation_s
-        Correlation time, s.
-    half_width
-        Half-width of the frames' intervals, in standard deviations. The default is that of a uniform
-        distribution.
-    """
-
+    # Standard deviations at every customer with a meter, kW and kvar.
     p_kw: float = 0.6
     q_kvar: float = 0.2
-    correlation_s: float = 600.0
+    correlation_s: float = 600.0  # correlation time, s
+    # Half-width of the frames' intervals, in standard deviations. The default is that of a uniform
+    # distribution.
     half_width: float = float(np.sqrt(3.0))
 
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """Short simulated run.
+    """Short scenario on a feeder, with stated errors of loads and meters."""
 
-    Attributes
-    ----------
-    site
-        The feeder. Designs are for `stated`, with the errors of meters and loads.
-    seed
-        Seed of all random numbers.
-    duration_s, step_s
-        Length and interval of the frames, s.
-    load_error, meters
-        Load errors, and errors of the meters. Without `load_error`, registers, power factors and hidden
-        powers have the errors of the feeder's files, and frames are those of `to_frame`.
-    lie
-        The attack; None without one.
-    profile_s
-        Position within the 14 days of the summer profiles, s.
-    variation
-        Known variation of loads and busbar; its `hidden_*` are those of `load_error`.
-    report_q
-        True: meters report the net reactive power.
-    """
-
-    site: Site
-    seed: int = 0
+    site: Site  # The feeder. Designs are for `stated`, with the errors of meters and loads.
+    seed: int = 0  # seed of all random numbers
+    # Length and interval of the frames, s.
     duration_s: float = 120.0
     step_s: float = 1.0
+    # Load errors, and errors of the meters. Without `load_error`, registers, power factors and hidden powers
+    # have the errors of the feeder's files, and frames are those of `to_frame`.
     load_error: LoadError | None = field(default_factory=LoadError)
     meters: TrialMeterErrors = TrialMeterErrors.WHITE
-    lie: AttackSpec | None = None
-    profile_s: float = SUNNY_NOON_S
+    lie: AttackSpec | None = None  # the attack; None without one
+    profile_s: float = SUNNY_NOON_S  # position within the 14 days of the summer profiles, s
+    # Known variation of loads and busbar; its `hidden_*` are those of `load_error`.
     variation: Variation = STEADY
-    report_q: bool = False
+    report_q: bool = False  # True: meters report the net reactive power
 
     def __post_init__(self) -> None:
         own_numbers(self)
@@ -185,46 +160,22 @@ class Trial:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameTruth:
-    """The truth of one frame. N customers, p meters, m inverters.
+    """The truth of one frame. N customers, p meters, m inverters."""
 
-    Attributes
-    ----------
-    v2 : (N,)
-        Squared voltages, pu.
-    liars : (p,)
-        Mask of the manipulated meters.
-    attack : (p,)
-        Reported minus honest squared voltage, pu.
-    inverters : (m,)
-        Mask of the manipulated inverters.
-    """
-
-    v2: Floats
-    liars: Bools
-    attack: Floats
-    inverters: Bools
+    v2: Floats  # (N,): squared voltages, pu
+    liars: Bools  # (p,): mask of the manipulated meters
+    attack: Floats  # (p,): reported minus honest squared voltage, pu
+    inverters: Bools  # (m,): mask of the manipulated inverters
 
 
 def frames(
     trial: Trial, scenario: Scenario | None = None, *, stated: Site | None = None
 ) -> Iterator[tuple[Frame, FrameTruth]]:
-    """Simulate a trial.
+    """Simulate a trial, or another scenario on its feeder: frame and truth of each tick.
 
-    Parameters
-    ----------
-    trial
-        The trial.
-    scenario
-        Scenario in place of `trial.scenario`: another season, other attacks.
-    stated
-        `trial.stated`, if known already.
-
-    Yields
-    ------
-    Frame, Truth
-        One pair per tick. Customers with an available meter have the powers of the profiles, falsified by the
-        attack, and intervals of `LoadError.half_width`. The others, and all without `load_error`, have those
-        of `to_frame`.
+    Customers with an available meter have the powers of the profiles, falsified by the attack, and intervals
+    of `LoadError.half_width`. The others, and all without `load_error`, have those of `to_frame`. `stated` is
+    `trial.stated`, if known already.
 
     Raises
     ------
@@ -233,9 +184,7 @@ def frames(
     """
     site = trial.stated if stated is None else stated
     scenario = trial.scenario if scenario is None else scenario
-    known = Customers(
-        site, scenario.variation, scenario.seed, scenario.start, scenario.profile_s, season=scenario.season
-    )
+    known = Customers.of(site, scenario)
     if site.forecast is not None:
         origin = scenario.start - scenario.profile_s
         site = replace(site, forecast=site.forecast.played(origin, scenario.season))
@@ -302,49 +251,26 @@ def _truth(site: Site, scenario: Scenario, sample: SimulatedTick) -> FrameTruth:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrialResult:
-    """Result of an estimator in one trial. T ticks, p meters, k manipulated meters, l manipulated inverters.
+    """Result of an estimator in one trial. T ticks, p meters, k, l manipulated meters and inverters."""
 
-    Attributes
-    ----------
-    liars : (k,)
-        Meters manipulated at some time.
-    delay_s : (k,)
-        Time from the onset of each attack to the first naming of the meter during it, s; infinite without
-        one.
-    inverters, inverter_delay_s : (l,)
-        The same for inverters.
-    accused : (p,)
-        Meters named before their manipulation, or without one.
-    accused_inverters : (m,)
-        The same for inverters.
-    false_names : (T,)
-        Number of falsely named meters at each tick.
-    error_liars, error_all
-        Reconstruction errors of the voltage at manipulated meters and at all customers, % of nominal, one per
-        tick and place after settling; infinite if the estimate is not finite.
-    step_ms : (T,)
-        Processor time of each step, ms.
-    clean_while_lying : (T,)
-        Ticks with an attack and the verdict CLEAN without named devices.
-    lying : (T,)
-        Ticks with an attack.
-    undecided : (T,)
-        Ticks with the verdict UNDECIDED.
-    """
-
-    liars: Ints
+    liars: Ints  # (k,): meters manipulated at some time
+    # (k,): time from the onset of each attack to the first naming of the meter during it, s; infinite without
+    # one.
     delay_s: Floats
+    # (l,): the same for inverters.
     inverters: Ints
     inverter_delay_s: Floats
-    accused: Bools
-    accused_inverters: Bools
-    false_names: Ints
+    accused: Bools  # (p,): meters named before their manipulation, or without one
+    accused_inverters: Bools  # (m,): the same for inverters
+    false_names: Ints  # (T,): number of falsely named meters at each tick
+    # Reconstruction errors of the voltage at manipulated meters and at all customers, % of nominal, one per
+    # tick and place after settling; infinite if the estimate is not finite.
     error_liars: Floats
     error_all: Floats
-    step_ms: Floats
-    clean_while_lying: Bools
-    lying: Bools
-    undecided: Bools
+    step_ms: Floats  # (T,): processor time of each step, ms
+    clean_while_lying: Bools  # (T,): ticks with an attack and the verdict CLEAN without named devices
+    lying: Bools  # (T,): ticks with an attack
+    undecided: Bools  # (T,): ticks with the verdict UNDECIDED
 
     @property
     def missed(self) -> int:
@@ -364,18 +290,9 @@ def judge(
     settling_s: float = SETTLING_S,
     played: Iterable[tuple[Frame, FrameTruth]] | None = None,
 ) -> TrialResult:
-    """Run an estimator on a trial.
+    """Run a design for `trial.stated` on a trial, or on its frames if known already (`played`).
 
-    Parameters
-    ----------
-    watcher
-        The design, made for `trial.stated`.
-    trial
-        The trial.
-    settling_s
-        Settling time after the start and after each onset, without reconstruction errors, s.
-    played
-        Frames of this trial, if known already.
+    Reconstruction errors count from `settling_s` after the start and after each onset.
     """
     state = watcher.init(START)
     ticks: list[tuple[float, Verdict, FrameTruth]] = []

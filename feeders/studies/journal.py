@@ -20,7 +20,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Protocol, Self
 
-from feeders.registry.plugins import GROUP
+from feeders.format.columns import GROUP
 from feeders.util import plain
 from gridsec.errors import GridsecError, Problem
 

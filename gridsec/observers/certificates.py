@@ -9,9 +9,7 @@ projection on the other inverters, and Delta(t) the unknown slopes, `0 <= Delta_
 The set of trusted meters may change at any moment; every statement here holds for all of it. Proofs:
 docs/theory-certificates.md.
 
-References
-----------
-.. [1] chong2020, Proposition 1 and equation (12), as corrected there.
+Source: chong2020, Proposition 1 and equation (12), as corrected there.
 """
 
 from __future__ import annotations
@@ -24,7 +22,7 @@ import numpy as np
 from gridsec.arrays import Bools, Floats, frozen
 from gridsec.errors import DesignInfeasible
 from gridsec.grid.droop import Droop
-from gridsec.observers.lure import Lure, Readout
+from gridsec.observers.lure import Lure, Matrices
 
 # Shares of 1 / slope on the diagonal of P that `reactance` tries, see Theorem 1.
 SHARES = (0.01, 0.03, 0.1, 0.3, 0.6, 1.0)
@@ -36,40 +34,22 @@ WEIGHT_BACKOFF = 0.1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Certificate:
-    """Decay of the direct-injection observer's error and its steady level under disturbances.
+    """Decay of the direct-injection observer's error and its steady level under disturbances."""
 
-    Attributes
-    ----------
-    kind
-        `reactance` and `lmi`: the norm is `sqrt(e^T P e)`. `small-gain`: it is `max_i |e_i| / P_i`.
-    P : (n, n) or (n,)
-        Matrix or weights of the norm.
-    rate
-        Without disturbances the error decays in that norm at least like `exp(-rate t)`, 1/s.
-    noise, load, attack
-        Steady error in that norm per pu of the largest entry of the meter noise, of the error of the known
-        input w, and of the attack.
-    margin
-        Slack of the condition at the claimed rate, as recomputed by `verify`, relative to the rate of the
-        slowest inverter; a positive margin proves the claim.
-    status
-        Origin of the certificate, one sentence.
-    saturation
-        Steady error in that norm under any attack, by saturation of the droop curves; infinite without
-        saturation.
-    multiplier : (m,) or (0,)
-        The multipliers Lambda of the quadratic kinds.
-    """
-
-    kind: str
-    P: Floats
-    rate: float
-    noise: float
-    load: float
-    attack: float
+    kind: str  # `reactance` and `lmi`: the norm is `sqrt(e^T P e)`. `small-gain`: it is `max_i |e_i| / P_i`
+    P: Floats  # (n, n) or (n,) matrix or weights of the norm
+    rate: float  # without disturbances the error decays in that norm at least like `exp(-rate t)`, 1/s
+    noise: float  # steady error in that norm per pu of the largest entry of the meter noise
+    load: float  # the same for the error of the known input w
+    attack: float  # the same for the attack
+    # slack of the condition at the claimed rate, as recomputed by `verify`, relative to the rate of the
+    # slowest inverter; a positive margin proves the claim
     margin: float
-    status: str
+    status: str  # origin of the certificate, one sentence
+    # steady error in that norm under any attack, by saturation of the droop curves; infinite without
+    # saturation
     saturation: float = np.inf
+    # (m,) or (0,) the multipliers Lambda of the quadratic kinds
     multiplier: Floats = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
@@ -90,15 +70,7 @@ def reactance(lure: Lure) -> Certificate:
     makes P positive definite where S is singular (customers on one bus or on the busbar). Other
     systems are tried with the shares `SHARES`; asymmetry costs margin.
 
-    Parameters
-    ----------
-    lure
-        The closed loop, from `close_loop`.
-
-    Raises
-    ------
-    DesignInfeasible
-        If the condition fails for every share, or the system is not of this form.
+    Raises DesignInfeasible if the condition fails for every share, or the system is not of this form.
     """
     form = _droop_form(lure, "reactance certificate")
     if form.tau.size == 0:
@@ -135,15 +107,7 @@ def small_gain(lure: Lure) -> Certificate:
     Such c exists exactly if the spectral radius of `D |S|` is below 1; `max_i d_i sum_j |S_ij| < 1`
     is the case `c = 1`. S need not be symmetric, nor the time constants equal.
 
-    Parameters
-    ----------
-    lure
-        The closed loop, from `close_loop`.
-
-    Raises
-    ------
-    DesignInfeasible
-        If the loop gain is 1 or more, or the system is not of this form.
+    Raises DesignInfeasible if the loop gain is 1 or more, or the system is not of this form.
     """
     form = _droop_form(lure, "small-gain certificate")
     tau, slope = form.tau, form.slope
@@ -174,23 +138,11 @@ def quadratic(
     Turns a solution of the linear matrix inequality for *no* trusted meter into a certificate for all sets at
     once (docs/theory-certificates.md, Theorem 1).
 
-    Parameters
-    ----------
-    lure
-        The closed loop, from `close_loop`.
-    P : (n, n)
-        Matrix of the norm, symmetric positive definite.
-    multiplier : (m,)
-        Lambda, positive.
-    rate
-        Claimed decay rate, 1/s, positive.
-    kind, status
-        As in `Certificate`.
-
-    Raises
-    ------
-    DesignInfeasible
-        If the verification fails.
+    P (n, n): matrix of the norm, symmetric positive definite.
+    multiplier (m,): Lambda, positive.
+    rate: claimed decay rate, 1/s, positive.
+    kind, status: as in `Certificate`.
+    Raises DesignInfeasible if the verification fails.
     """
     form = _droop_form(lure, f"{kind} certificate")
     none, one = np.zeros(form.tau.size), np.ones(form.tau.size)
@@ -203,18 +155,7 @@ def quadratic(
 
 
 def certify(lure: Lure) -> Certificate:
-    """Closed-form certificate with the highest rate.
-
-    Parameters
-    ----------
-    lure
-        The closed loop, from `close_loop`.
-
-    Raises
-    ------
-    DesignInfeasible
-        If none holds; the message lists the reasons.
-    """
+    """Closed-form certificate with the highest rate; DesignInfeasible with the reasons if there is none."""
     found: list[Certificate] = []
     failed: list[DesignInfeasible] = []
     for attempt in (reactance, small_gain):
@@ -233,25 +174,12 @@ def certify(lure: Lure) -> Certificate:
 def verify(certificate: Certificate, lure: Lure, trusted: Bools | None = None) -> float:
     """Recompute the margin of a certificate from its numbers alone, in NumPy.
 
-    Parameters
-    ----------
-    lure
-        The closed loop of the claim.
-    trusted : (p,)
-        Verify for this set only; by default for all sets at once. That claim is stronger: a trusted meter
-        only removes terms from the condition.
-
-    Returns
-    -------
-    float
-        Slack of the condition at the claimed rate, relative to the rate of the slowest inverter and less the
-        rounding error of the computation. A positive slack proves the certificate. Minus infinity if the
-        claimed rate is not positive and finite.
-
-    Raises
-    ------
-    DesignInfeasible
-        If the kind is unknown, or the system does not have the form of the certificates.
+    lure: the closed loop of the claim.
+    trusted (p,): verify for this set only; by default for all sets at once. That claim is stronger: a trusted
+        meter only removes terms from the condition.
+    Returns the slack of the condition at the claimed rate, relative to the rate of the slowest inverter, less
+        the rounding of the computation; positive: proven. Minus infinity without a positive finite rate.
+    Raises DesignInfeasible if the kind is unknown, or the system does not have the form of the certificates.
     """
     form = _droop_form(lure, f"{certificate.kind} certificate")
     if trusted is not None:
@@ -269,14 +197,8 @@ def verify(certificate: Certificate, lure: Lure, trusted: Bools | None = None) -
     )
 
 
-def feeds(lure: Readout) -> Bools:
-    """Incidence of meters that can drive inverters of the observer, by equal voltages.
-
-    Returns
-    -------
-    (m, p)
-        True where the rows of `(H, F)` and `(C, D)` agree.
-    """
+def feeds(lure: Matrices) -> Bools:
+    """Meters that can drive inverters of the observer, (m, p): the rows of `(H, F)` and `(C, D)` agree."""
     inverters, meters = np.hstack([lure.H, lure.F]), np.hstack([lure.C, lure.D])
     same: Bools = np.all(inverters[:, None, :] == meters[None, :, :], axis=2)
     return same
@@ -301,29 +223,16 @@ def error_bound(
     valid after the transient. Without `certificate` the bound also holds for all times if it holds at the
     beginning. Under attack, `y_error` contains the size of the attack, infinity included.
 
-    Parameters
-    ----------
-    lure
-        The closed loop, from `close_loop`.
-    trusted : (…, p)
-        Meters that drive their inverters.
-    y_error : (…, p)
-        Largest error of each reading (noise and attack), squared pu.
-    u_error : (…, l)
-        Largest error of each entry of the known input w, squared pu.
-    z : (…, m)
-        The observer's own outputs. If given, `k_i(r)` is the variation of the curve within r of `z_i`, zero
-        inside the deadband. The bound then holds for observer and plant at rest, or moving slowly against the
-        time constants, provided that a certificate holds.
-    certificate
-        A certificate of the system. The norm of a quadratic one with its multiplier gives a start of the
-        iteration that may be tighter than saturation; other kinds are not used. That start is the box around
-        an ellipsoid: an error in a corner of the box can leave it temporarily.
-
-    Returns
-    -------
-    (…, n)
-        Bound of `|x - xhat|`, pu.
+    trusted (…, p): meters that drive their inverters.
+    y_error (…, p): largest error of each reading (noise and attack), squared pu.
+    u_error (…, l): largest error of each entry of the known input w, squared pu.
+    z (…, m): the observer's own outputs. If given, `k_i(r)` is the variation of the curve within r of `z_i`,
+        zero inside the deadband. The bound then holds for observer and plant at rest, or moving slowly
+        against the time constants, provided that a certificate holds.
+    certificate: a certificate of the system. The norm of a quadratic one with its multiplier gives a start of
+        the iteration that may be tighter than saturation; other kinds are not used. That start is the box
+        around an ellipsoid: an error in a corner of the box can leave it temporarily.
+    Returns (…, n): bound of `|x - xhat|`, pu.
     """
     form = _droop_form(lure, "error bound")
     driven = feeds(lure) & trusted[..., None, :]
@@ -424,10 +333,7 @@ def _span(lure: Lure) -> Floats:
 
 
 def _quadratic_form(P: Floats, multiplier: Floats, form: _Form) -> Floats:
-    """`P T^-1 + T^-1 P - b D Lambda^-1 b^T` with `b = P T^-1 - S^T Lambda`.
-
-    Twice the term of the circle criterion, so that half of it is left for the load error.
-    """
+    """`P T^-1 + T^-1 P - b D Lambda^-1 b^T` with `b = P T^-1 - S^T Lambda`; half is left for load errors."""
     scaled = P / form.tau
     b = scaled - form.S.T * multiplier
     return np.asarray(scaled + scaled.T - (b * (form.slope / multiplier)) @ b.T)
@@ -469,14 +375,10 @@ def _level(certificate: Certificate, form: _Form, kick: Floats, load: Floats) ->
 
     From `(W^2)' <= -2 alpha W^2 + 2 N W + L^2`: `W <= (N + sqrt(N^2 + 2 alpha L^2)) / (2 alpha)`.
 
-    Parameters
-    ----------
-    certificate
-        A quadratic certificate: P, Lambda and alpha.
-    kick : (…, n)
-        Largest entries of the direct terms of `e'`, pu/s: `N^2 = kick^T |P| kick`.
-    load : (…, m)
-        Largest load errors at the inverters without a trusted meter: `L^2 = sum d_i lambda_i load_i^2`.
+    certificate: a quadratic certificate: P, Lambda and alpha.
+    kick (…, n): largest entries of the direct terms of `e'`, pu/s: `N^2 = kick^T |P| kick`.
+    load (…, m): largest load errors at the inverters without a trusted meter: `L^2 = sum d_i lambda_i
+        load_i^2`.
     """
     rate = certificate.rate
     known = np.isfinite(kick)

@@ -6,9 +6,7 @@ Readings are held over a step. For any gains, the observer between two readings 
 `A - L C` and `H - K C` in the place of A and H. So one exponential integrator (and one equilibrium, for steps
 far above every time constant) serves plant and observers. Everything is in z coordinates: `y = vbar^2 - v^2`.
 
-References
-----------
-chong2020 (11), with G, B and the decay rate made explicit; docs/theory-observers.md.
+Source: chong2020 (11), with G, B and the decay rate made explicit; docs/theory-observers.md.
 """
 
 from __future__ import annotations
@@ -19,75 +17,43 @@ from typing import Literal
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, frozen
-from gridsec.errors import DesignInfeasible, InputInvalid, Problem, no_choice, raise_if_any
+from gridsec.errors import DesignInfeasible, InputInvalid, no_choice, raise_if_any
 from gridsec.observers.certificates import Certificate, certify, error_bound, feeds
 from gridsec.observers.gains import CircleGains, CircleOptions, margin, sensitivity, state_bound
-from gridsec.observers.lmi import circle, contraction
-from gridsec.observers.lure import POLICY, Lure, Readout, StepPolicy, advance
+from gridsec.observers.lmi import contraction, solve_many
+from gridsec.observers.lure import POLICY, Lure, Matrices, StepPolicy, advance
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CircleDesign:
-    """One observer. n states, m nonlinearities, p meters.
+    """One observer. n states, m nonlinearities, p meters."""
 
-    Attributes
-    ----------
-    lure
-        Plant.
-    trusted : (p,)
-        J as a mask.
-    L, K : (n, p), (m, p)
-        Gains; the columns of meters outside J are zero.
-    rate
-        Certified decay rate of the error without disturbances, 1/s, in `error_norm`.
-    sensitivity : (p,)
-        Influence of each meter on the estimate, see `gains.sensitivity`. A trusted meter without an inverter
-        has 0 under direct injection: attacks on it appear in its output residual only.
-    certificate
-        The proof: for direct injection a `Certificate` of all trusted sets at once, otherwise the
-        design by LMI itself.
-    """
-
-    lure: Lure
-    trusted: Bools
-    L: Floats
-    K: Floats
-    rate: float
+    lure: Lure  # plant
+    trusted: Bools  # (p,) J as a mask
+    L: Floats  # (n, p) gain into the state; zero columns for meters outside J
+    K: Floats  # (m, p) gain into the arguments of the nonlinearities; zero columns likewise
+    rate: float  # certified decay rate of the error without disturbances, 1/s, in `error_norm`
+    # (p,) influence of each meter on the estimate, see `gains.sensitivity`. A trusted meter without an
+    # inverter has 0 under direct injection: attacks on it appear in its output residual only
     sensitivity: Floats
+    # the proof: for direct injection a `Certificate` of all trusted sets at once, otherwise the design by LMI
+    # itself
     certificate: Certificate | CircleGains
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CircleState:
-    """State of an observer.
+    """State of an observer."""
 
-    Attributes
-    ----------
-    t
-        Time, s.
-    x : (n,)
-        Estimated state.
-    """
-
-    t: float
-    x: Floats
+    t: float  # time, s
+    x: Floats  # (n,) estimated state
 
 
-def direct_gain(lure: Readout, trusted: Bools) -> Floats:
-    """K of direct injection: the inverter of a trusted meter is driven by that meter.
+def direct_gain(lure: Matrices, trusted: Bools) -> Floats:
+    """K of direct injection, (m, p): the inverter of a trusted meter is driven by that meter.
 
     `K = E_J`: `K_ij = 1` where the argument of nonlinearity i is the output of the trusted meter j;
-    the first such meter where a customer has several. L is zero.
-
-    Parameters
-    ----------
-    trusted : (p,)
-        J as a mask.
-
-    Returns
-    -------
-    Floats
-        (m, p).
+    the first such meter where a customer has several. L is zero. `trusted` is (p,).
     """
     match = feeds(lure) & trusted
     K = np.zeros(match.shape)
@@ -105,28 +71,14 @@ def design(
 ) -> CircleDesign:
     """Design one observer, with a verified proof.
 
-    Parameters
-    ----------
-    trusted : (p,)
-        J as a mask.
-    gains
-        "direct": K = E_J, L = 0, proven for every J at once, in closed form or by `lmi.contraction`.
+    trusted (p,).
+    gains: "direct": K = E_J, L = 0, proven for every J at once, in closed form or by `lmi.contraction`.
         "lmi": gains and proof by `lmi.circle`. Or an existing design; it is verified again.
-    options
-        Specification of an LMI design; required by "lmi".
-
-    Raises
-    ------
-    DesignInfeasible
-        If there is no certificate, or if the design uses no meter.
-    ValueError
-        If `trusted` has the wrong length, or contradicts the given design, or `gains` is another text.
+    options: specification of an LMI design; required by "lmi".
+    Raises DesignInfeasible if there is no certificate, or if the design uses no meter. ValueError if
+        `trusted` has the wrong length, or contradicts the given design, or `gains` is another text.
     """
-    trusted = np.asarray(trusted, dtype=np.bool_)
-    if trusted.shape != (len(lure.C),):
-        raise InputInvalid(
-            [Problem("shape", f"trusted has shape {trusted.shape}; the plant has {len(lure.C)} meters")]
-        )
+    trusted = meter_mask(trusted, len(lure.C))
     if isinstance(gains, str):
         raise_if_any(no_choice("gains", ("direct", "lmi"), gains))
     if gains == "direct":
@@ -134,15 +86,7 @@ def design(
     meters = np.flatnonzero(trusted)
     if isinstance(gains, CircleGains):
         made = gains
-        if sorted(made.J.tolist()) != meters.tolist():
-            raise InputInvalid(
-                [
-                    Problem(
-                        "wrong-design",
-                        f"the design is for the meters {made.J.tolist()}, not {meters.tolist()}",
-                    )
-                ]
-            )
+        require_meters(made.J, meters)
         held = margin(lure, made.J, made)
         if not held > 0.0:
             raise DesignInfeasible(
@@ -150,20 +94,30 @@ def design(
             )
         made = replace(made, margin=held)
     elif options is None:
-        raise InputInvalid(
-            [Problem("missing", 'gains="lmi" needs options: gridsec.observers.lmi.options_for')]
-        )
+        raise InputInvalid.of("missing", 'gains="lmi" needs options: gridsec.observers.lmi.options_for')
     else:
-        made = circle(
-            lure,
-            meters,
-            rate=options.rate,
-            noise=options.noise,
-            load=options.load,
-            weight=options.weight,
-            floor=options.floor,
+        made = solve_many(lure, [meters.tolist()], options, workers=1)[0]
+    L, K = np.zeros((len(lure.A), len(trusted))), np.zeros((len(lure.slope), len(trusted)))
+    L[:, made.J], K[:, made.J] = made.L, made.K
+    heard = frozen(sensitivity(lure, L, K))
+    return CircleDesign(lure, trusted, frozen(L), frozen(K), made.alpha, heard, made)
+
+
+def meter_mask(trusted: Bools, meters: int) -> Bools:
+    """Copy of `trusted` that is read-only; refused unless it is (p,) for p `meters`."""
+    mask = np.array(trusted, dtype=np.bool_)
+    if mask.shape != (meters,):
+        raise InputInvalid.of("shape", f"trusted has shape {mask.shape}; the plant has {meters} meters")
+    mask.flags.writeable = False
+    return mask
+
+
+def require_meters(J: Ints, meters: Ints) -> None:
+    """Refuse a design for the meters J unless these are `meters`."""
+    if sorted(J.tolist()) != meters.tolist():
+        raise InputInvalid.of(
+            "wrong-design", f"the design is for the meters {J.tolist()}, not {meters.tolist()}"
         )
-    return _from_gains(lure, trusted, made)
 
 
 def _direct(lure: Lure, trusted: Bools, options: CircleOptions | None) -> CircleDesign:
@@ -176,7 +130,7 @@ def _direct(lure: Lure, trusted: Bools, options: CircleOptions | None) -> Circle
             raise
         proof = contraction(lure, rate=rate)
     heard = sensitivity(lure, L, K)
-    return CircleDesign(lure, _mask(trusted), frozen(L), frozen(K), proof.rate, frozen(heard), proof)
+    return CircleDesign(lure, trusted, frozen(L), frozen(K), proof.rate, frozen(heard), proof)
 
 
 def _fallback_rate(lure: Lure, options: CircleOptions | None) -> float:
@@ -190,32 +144,8 @@ def _fallback_rate(lure: Lure, options: CircleOptions | None) -> float:
 _MODEST = 0.1
 
 
-def _from_gains(lure: Lure, trusted: Bools, made: CircleGains) -> CircleDesign:
-    L, K = np.zeros((len(lure.A), len(trusted))), np.zeros((len(lure.slope), len(trusted)))
-    L[:, made.J], K[:, made.J] = made.L, made.K
-    heard = frozen(sensitivity(lure, L, K))
-    return CircleDesign(lure, _mask(trusted), frozen(L), frozen(K), made.alpha, heard, made)
-
-
-def _mask(trusted: Bools) -> Bools:
-    out = np.array(trusted, dtype=np.bool_)
-    out.flags.writeable = False
-    return out
-
-
 def error_norm(design: CircleDesign, e: Floats) -> Floats:
-    """Norm in which the proof guarantees a decay of the error at least like `exp(-rate t)`.
-
-    Parameters
-    ----------
-    e : (…, n)
-        Errors `x - x_hat`.
-
-    Returns
-    -------
-    Floats
-        (…): `sqrt(e^T P e)`, or `max |e_i| / P_i` for a small-gain certificate.
-    """
+    """Norm of errors e (…, n) of the certified decay: `sqrt(e^T P e)`, or `max |e_i| / P_i` (small gain)."""
     P = design.certificate.P
     if P.ndim == 1:
         return np.asarray(np.max(np.abs(e) / P, axis=-1, initial=0.0))
@@ -234,19 +164,9 @@ def between_readings(design: CircleDesign, y: Floats, u: Floats, seen: Bools) ->
     `A - L C` and `H - K C` with the columns of unseen meters removed; the input is
     `(c, b) = (F u + K (y - D u), B u + L (y - D u))`.
 
-    Parameters
-    ----------
-    y : (p,)
-        Readings; arbitrary where unseen, also NaN.
-    u : (l,)
-        Known input.
-    seen : (p,)
-        True for existing readings.
-
-    Returns
-    -------
-    system, held
-        `system` with input (c, b) of length m + n, and that input.
+    y (p,): readings; arbitrary where unseen, also NaN.
+    u (l,), seen (p,).
+    Returns system, held: `system` with input (c, b) of length m + n, and that input.
     """
     lure = design.lure
     heard = np.asarray(seen, dtype=np.bool_) & design.trusted & np.isfinite(y)
@@ -281,21 +201,11 @@ def step(  # noqa: PLR0917  # the border that all observer families share
 ) -> CircleState:
     """Advance an observer over one step of any length.
 
-    Parameters
-    ----------
-    y : (p,)
-        Readings `vbar^2 - v^2`, held over the step; ignored where unseen or not finite.
-    u : (l,)
-        Known input w, held over the step; finite.
-    seen : (p,)
-        True for existing readings. The others have no influence: the observer runs on its model there.
-    h
-        Length of the step, s.
-
-    Returns
-    -------
-    CircleState
-        At `t + h`. Never raises on data.
+    y (p,): readings `vbar^2 - v^2`, held over the step; ignored where unseen or not finite.
+    u (l,): known input w, held over the step; finite.
+    seen (p,): True for existing readings. The others have no influence: the observer runs on its model there.
+    h: length of the step, s.
+    Returns the state at `t + h`; never raises on data.
     """
     system, held = between_readings(design, y, u, seen)
     try:
@@ -308,18 +218,7 @@ def step(  # noqa: PLR0917  # the border that all observer families share
 
 
 def outputs(design: CircleDesign, state: CircleState, u: Floats) -> Floats:
-    """Expected reading of every meter of the plant, trusted or not: `C x_hat + D u`.
-
-    Parameters
-    ----------
-    u : (l,)
-        Known input.
-
-    Returns
-    -------
-    Floats
-        (p,), in z coordinates.
-    """
+    """Expected reading of every meter of the plant, trusted or not: `C x_hat + D u`, (p,)."""
     return np.asarray(design.lure.C @ state.x + design.lure.D @ u)
 
 
@@ -328,10 +227,7 @@ def margin_without(design: CircleDesign, silent: Ints) -> float:
 
     Direct injection is proven for every set of meters, so its margin does not depend on them.
 
-    Parameters
-    ----------
-    silent : (s,)
-        Meters without readings.
+    silent (s,): meters without readings.
     """
     proof = design.certificate
     if isinstance(proof, CircleGains):
@@ -345,17 +241,9 @@ def residual_bound(design: CircleDesign, y_error: Floats, u_error: Floats) -> Fl
     `|y - y_hat| <= |C e| + |D| |u - u_hat| + |n|`, with the ultimate bound on C e from the proof:
     the ellipsoid of the LMI, or the componentwise bounds of direct injection.
 
-    Parameters
-    ----------
-    y_error : (p,)
-        Largest error of each meter, squared pu.
-    u_error : (l,)
-        Largest error of each entry of the known input.
-
-    Returns
-    -------
-    Floats
-        (p,); infinite where the design gives no bound for such errors.
+    y_error (p,): largest error of each meter, squared pu.
+    u_error (l,): largest error of each entry of the known input.
+    Returns (p,): infinite where the design gives no bound for such errors.
     """
     lure, proof = design.lure, design.certificate
     rest = np.abs(lure.D) @ u_error + y_error

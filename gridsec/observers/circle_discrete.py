@@ -8,9 +8,7 @@ with zero columns of L and K for meters outside the trusted set J. Every design 
 
 `monte_carlo` simulates them as the paper does, with a statement on the validity of such numbers.
 
-References
-----------
-yang2019, section II; docs/theory-discrete.md.
+Source: yang2019, section II; docs/theory-discrete.md.
 """
 
 from __future__ import annotations
@@ -23,9 +21,8 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, frozen
 from gridsec.errors import DesignInfeasible, InputInvalid, Problem, no_choice, raise_if_any
-from gridsec.observers.circle import direct_gain
+from gridsec.observers.circle import CircleState, direct_gain, meter_mask, require_meters
 from gridsec.observers.lmi.discrete import (
-    DirectProof,
     DiscreteGains,
     DiscreteOptions,
     direct_gain_bound,
@@ -33,7 +30,6 @@ from gridsec.observers.lmi.discrete import (
     discrete_margin,
     growth,
     noise_gain,
-    nothing_unknown,
     unknown_gain,
 )
 from gridsec.observers.lmi.sampled import DiscreteLure, measure
@@ -42,185 +38,87 @@ from gridsec.observers.lmi.sampled import advance as advance_plant
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DiscreteDesign:
-    """One observer. n states, m nonlinearities, p meters.
+    """One observer. n states, m nonlinearities, p meters."""
 
-    Attributes
-    ----------
-    system
-        Plant.
-    trusted : (p,)
-        J as a mask.
-    L, K : (n, p), (m, p)
-        Gains; the columns of meters outside J are zero.
-    decay
-        lambda, per step.
-    growth
-        c.
-    noise_gain
-        gamma, with respect to the Euclidean norm of the trusted meters' errors.
-    unknown_gain
-        gamma_delta; for direct injection with respect to the error of the arguments z.
-    certificate
-        The proof.
-    """
-
-    system: DiscreteLure
-    trusted: Bools
-    L: Floats
-    K: Floats
-    decay: float
-    growth: float
-    noise_gain: float
-    unknown_gain: float
-    certificate: DiscreteGains | DirectProof
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class DiscreteState:
-    """State of an observer.
-
-    Attributes
-    ----------
-    t
-        Time, s.
-    x : (n,)
-        Estimated state.
-    """
-
-    t: float
-    x: Floats
+    system: DiscreteLure  # plant
+    trusted: Bools  # (p,) J as a mask
+    L: Floats  # (n, p) gain into the state; zero columns for meters outside J
+    K: Floats  # (m, p) gain into the arguments of the nonlinearities; zero columns likewise
+    decay: float  # lambda, per step
+    growth: float  # c
+    noise_gain: float  # gamma, with respect to the Euclidean norm of the trusted meters' errors
+    unknown_gain: float  # gamma_delta; for direct injection with respect to the error of the arguments z
+    certificate: DiscreteGains  # the proof
 
 
 def design(
     system: DiscreteLure,
     trusted: Bools,
     *,
-    gains: Literal["lmi"] | DiscreteGains | DirectProof = "lmi",
+    gains: Literal["lmi"] | DiscreteGains = "lmi",
     options: DiscreteOptions | None = None,
 ) -> DiscreteDesign:
     """Design one observer, with a verified proof.
 
-    Parameters
-    ----------
-    trusted : (p,)
-        J as a mask.
-    gains
-        "lmi": by `discrete_circle`. `DiscreteGains`: an existing design, verified again. `DirectProof` from
-        `discrete_contraction`: direct injection, with one proof for every set.
-    options
-        Specification of an LMI design; required by "lmi".
-
-    Raises
-    ------
-    DesignInfeasible
-        If there is no proof, or the given one does not hold here.
-    ValueError
-        If `trusted` has the wrong length, or contradicts the given design, or `gains` is another text.
+    trusted (p,).
+    gains: "lmi": by `discrete_circle`. Or an existing design, verified again; that of `discrete_contraction`,
+        without meters, is the proof of direct injection for every set.
+    options: specification of an LMI design; required by "lmi".
+    Raises DesignInfeasible if there is no proof, or the given one does not hold here. ValueError if `trusted`
+        has the wrong length, or contradicts the given design, or `gains` is another text.
     """
-    trusted = np.array(trusted, dtype=np.bool_)
-    trusted.flags.writeable = False
-    if trusted.shape != (len(system.C),):
-        raise InputInvalid(
-            [Problem("shape", f"trusted has shape {trusted.shape}; the plant has {len(system.C)} meters")]
-        )
+    trusted = meter_mask(trusted, len(system.C))
     if isinstance(gains, str):
         raise_if_any(no_choice("gains", ("lmi",), gains))
-    if isinstance(gains, DirectProof):
-        return _direct(system, trusted, gains)
     meters = np.flatnonzero(trusted)
     if isinstance(gains, DiscreteGains):
         made = gains
-        if sorted(made.J.tolist()) != meters.tolist():
-            raise InputInvalid(
-                [
-                    Problem(
-                        "wrong-design",
-                        f"the design is for the meters {made.J.tolist()}, not {meters.tolist()}",
-                    )
-                ]
-            )
+        if made.J.size:
+            require_meters(made.J, meters)
         held = discrete_margin(system, made.J, made)
         if not held > 0.0:
             what = f"discrete observer of the meters {meters.tolist()}"
             raise DesignInfeasible(what, "does not hold here", held, code="not-verified")
     elif options is None:
-        raise InputInvalid(
-            [Problem("missing", 'gains="lmi" needs options: gridsec.observers.lmi.discrete.discrete_options')]
+        raise InputInvalid.of(
+            "missing", 'gains="lmi" needs options: gridsec.observers.lmi.discrete.discrete_options'
         )
     else:
         made = discrete_circle(system, meters, options)
+    if not made.J.size:
+        return _direct(system, trusted, made)
     L, K = np.zeros((len(system.A), trusted.size)), np.zeros((len(system.lower), trusted.size))
     L[:, made.J], K[:, made.J] = made.L, made.K
-    return DiscreteDesign(
-        system,
-        trusted,
-        frozen(L),
-        frozen(K),
-        made.decay,
-        growth(made),
-        noise_gain(made),
-        unknown_gain(made),
-        made,
-    )
+    bounds = (made.decay, growth(made), noise_gain(made), unknown_gain(made))
+    return DiscreteDesign(system, trusted, frozen(L), frozen(K), *bounds, made)
 
 
-def _direct(system: DiscreteLure, trusted: Bools, proof: DirectProof) -> DiscreteDesign:
+def _direct(system: DiscreteLure, trusted: Bools, proof: DiscreteGains) -> DiscreteDesign:
     n, m = len(system.A), len(system.lower)
-    silent = DiscreteGains(
-        J=np.zeros(0, dtype=np.intp),
-        L=np.zeros((n, 0)),
-        K=np.zeros((m, 0)),
-        P=proof.P,
-        Lambda=proof.Lambda,
-        decay=proof.decay,
-        mu=0.0,
-        mu_delta=0.0,
-        noise=np.zeros(0),
-        unknown=nothing_unknown(system),
-        margin=proof.margin,
-        backoff=0.0,
-        status=proof.status,
-    )
-    held = discrete_margin(system, [], silent)
-    if not held > 0.0:
-        raise DesignInfeasible("direct injection", "the proof does not hold here", held, code="not-verified")
-    K = direct_gain(system, trusted)
-    return DiscreteDesign(
-        system,
-        trusted,
-        frozen(np.zeros((n, trusted.size))),
-        frozen(K),
-        proof.decay,
-        growth(silent),
-        direct_gain_bound(system, proof, K),
-        direct_gain_bound(system, proof, np.eye(m)),
-        proof,
-    )
+    L, K = np.zeros((n, trusted.size)), direct_gain(system, trusted)
+    noise, unknown = (direct_gain_bound(system, proof, rows) for rows in (K, np.eye(m)))
+    bounds = (proof.decay, growth(proof), noise, unknown)
+    return DiscreteDesign(system, trusted, frozen(L), frozen(K), *bounds, proof)
 
 
-def init(design: DiscreteDesign, t: float, x: Floats | None = None) -> DiscreteState:
+def init(design: DiscreteDesign, t: float, x: Floats | None = None) -> CircleState:
     """Initial state at t, s; the estimate starts at x (n,), by default at zero."""
     start = np.zeros(len(design.system.A)) if x is None else np.array(x, dtype=np.float64)
-    return DiscreteState(float(t), start)
+    return CircleState(float(t), start)
 
 
-def step(design: DiscreteDesign, state: DiscreteState, y: Floats, u: Floats, seen: Bools) -> DiscreteState:
+def step(design: DiscreteDesign, state: CircleState, y: Floats, u: Floats, seen: Bools) -> CircleState:
     """One step of one observer.
 
-    Parameters
-    ----------
-    y : (p,)
-        Readings at the beginning of the step; ignored where unseen or not finite.
-    u : (l,)
-        Known input during the step.
-    seen : (p,)
-        True for existing readings. The others have no influence.
+    y (p,): readings at the beginning of the step; ignored where unseen or not finite.
+    u (l,): known input during the step.
+    seen (p,): True for existing readings. The others have no influence.
     """
     x = _ahead(design.system, design.L, design.K, state.x, y=y, u=u, seen=seen)
-    return DiscreteState(state.t + design.system.h, x)
+    return CircleState(state.t + design.system.h, x)
 
 
-def outputs(design: DiscreteDesign, state: DiscreteState, u: Floats) -> Floats:
+def outputs(design: DiscreteDesign, state: CircleState, u: Floats) -> Floats:
     """Expected reading of every meter of the plant, trusted or not: `C x_hat + D u`, (p,)."""
     return measure(design.system, state.x, u)
 
@@ -228,14 +126,9 @@ def outputs(design: DiscreteDesign, state: DiscreteState, u: Floats) -> Floats:
 def error_bound(design: DiscreteDesign, k: int, *, start: float, noise: float, unknown: float = 0.0) -> float:
     """Right side of yang2019 (5) after k steps.
 
-    Parameters
-    ----------
-    start
-        |e(0)|.
-    noise
-        Supremum of the Euclidean norm of the trusted meters' errors (attacks included).
-    unknown
-        Supremum of the Euclidean norm of delta, or of the arguments' errors for direct injection.
+    start: |e(0)|.
+    noise: supremum of the Euclidean norm of the trusted meters' errors (attacks included).
+    unknown: supremum of the Euclidean norm of delta, or of the arguments' errors for direct injection.
     """
     first = design.growth * design.decay**k * start
     return first + design.noise_gain * noise + design.unknown_gain * unknown
@@ -244,62 +137,33 @@ def error_bound(design: DiscreteDesign, k: int, *, start: float, noise: float, u
 def settling_steps(design: DiscreteDesign, *, start: float, epsilon: float) -> int:
     """Smallest k with `c lambda^k |e(0)| <= epsilon`: k* of yang2019.
 
-    Parameters
-    ----------
-    start
-        Bound on |e(0)|; 0 for a start in the true state.
-    epsilon
-        Its largest remainder.
-
-    Raises
-    ------
-    ValueError
-        If `epsilon` is not positive and the start is not the true state.
+    start: bound on |e(0)|; 0 for a start in the true state.
+    epsilon: its largest remainder.
+    Raises ValueError if `epsilon` is not positive and the start is not the true state.
     """
     if design.growth * start <= epsilon:
         return 0
     if epsilon <= 0.0:
-        raise InputInvalid(
-            [Problem("not-positive", "epsilon must be positive unless the observers start in the true state")]
+        raise InputInvalid.of(
+            "not-positive", "epsilon must be positive unless the observers start in the true state"
         )
     return int(np.ceil(np.log(epsilon / (design.growth * start)) / np.log(design.decay)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StackedObservers:
-    """Several observers of one plant, on a leading axis. o observers.
+    """Several observers of one plant, on a leading axis. o observers."""
 
-    Attributes
-    ----------
-    system
-        Plant.
-    masks : (o, p)
-        Trusted sets.
-    L, K : (o, n, p), (o, m, p)
-        Gains.
-    """
-
-    system: DiscreteLure
-    masks: Bools
-    L: Floats
-    K: Floats
+    system: DiscreteLure  # plant
+    masks: Bools  # (o, p) trusted sets
+    L: Floats  # (o, n, p) gains
+    K: Floats  # (o, m, p)
 
 
 def stack(designs: Sequence[DiscreteDesign]) -> StackedObservers:
-    """Observers of one plant as stacked arrays.
-
-    Parameters
-    ----------
-    designs
-        At least one; all of the same plant.
-
-    Raises
-    ------
-    ValueError
-        If the observers belong to different plants.
-    """
+    """Observers of one plant as stacked arrays; ValueError if they belong to different plants."""
     if any(one.system is not designs[0].system for one in designs):
-        raise InputInvalid([Problem("wrong-design", "the observers belong to different plants")])
+        raise InputInvalid.of("wrong-design", "the observers belong to different plants")
     return StackedObservers(
         designs[0].system,
         np.stack([one.trusted for one in designs]),
@@ -311,21 +175,10 @@ def stack(designs: Sequence[DiscreteDesign]) -> StackedObservers:
 def advance(stack: StackedObservers, x: Floats, y: Floats, u: Floats, seen: Bools) -> Floats:
     """One step of all observers.
 
-    Parameters
-    ----------
-    x : (…, o, n)
-        Their estimates.
-    y : (…, p)
-        Readings; ignored where unseen or not finite.
-    u : (…, l)
-        Known input.
-    seen : (p,)
-        True for existing readings.
-
-    Returns
-    -------
-    (…, o, n)
-        Estimates one step later.
+    x (…, o, n): their estimates.
+    y (…, p): readings; ignored where unseen or not finite.
+    u (…, l), seen (p,).
+    Returns (…, o, n): estimates one step later.
     """
     y, u = np.asarray(y)[..., None, :], np.asarray(u)[..., None, :]
     return _ahead(stack.system, stack.L, stack.K, x, y=y, u=u, seen=seen)
@@ -343,26 +196,16 @@ def _ahead(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MonteCarlo:
-    """Gains by simulation: the largest observed ones, lower bounds of the true gains.
+    """Gains by simulation: the largest observed ones, lower bounds of the true gains."""
 
-    Attributes
-    ----------
-    gains : (o,)
-        `max |e_J(k)| / sup_{j < k} |n_J(j)|` over all runs and steps, starting from e(0) = 0.
-    runs
-        Number of independent runs.
-    exceedance
-        With the stated confidence, one more run of the same kind exceeds a given entry of `gains` with at
-        most this probability: `1 - (1 - confidence)^(1 / runs)`. It does not cover noise of another kind; see
-        docs/theory-discrete.md, section 4.
-    confidence
-        Requested confidence.
-    """
-
+    # (o,) `max |e_J(k)| / sup_{j < k} |n_J(j)|` over all runs and steps, starting from e(0) = 0
     gains: Floats
-    runs: int
+    runs: int  # number of independent runs
+    # with the stated confidence, one more run of the same kind exceeds a given entry of `gains` with at most
+    # this probability: `1 - (1 - confidence)^(1 / runs)`. It does not cover noise of another kind; see
+    # docs/theory-discrete.md, section 4
     exceedance: float
-    confidence: float
+    confidence: float  # requested confidence
 
 
 def monte_carlo(
@@ -379,21 +222,11 @@ def monte_carlo(
     Noise is independent and uniform between plus and minus `half_width`; every observer starts in the
     plant's state.
 
-    Parameters
-    ----------
-    half_width : (p,) or scalar
-        Half-width of each meter's noise.
-    start : (R, n)
-        Initial states, one for each run.
-    u : (T, l)
-        Known input of the T steps.
-    confidence
-        Confidence of `exceedance`.
-
-    Raises
-    ------
-    ValueError
-        With every number out of range; an observer without noisy meters has no gain.
+    half_width (p,) or scalar: half-width of each meter's noise.
+    start (R, n): initial states, one for each run.
+    u (T, l): known input of the T steps.
+    confidence: confidence of `exceedance`.
+    Raises ValueError with every number out of range; an observer without noisy meters has no gain.
     """
     system, rng = stack.system, np.random.default_rng(seed)
     runs, p = len(start), len(system.C)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridsec.arrays import frozen, frozen_ints
-from gridsec.errors import DesignInfeasible, InputInvalid, Problem
+from gridsec.errors import DesignInfeasible, InputInvalid
 from gridsec.observers.gains import CircleGains, CircleOptions, margin, refuse_blind, sensitivity
 from gridsec.observers.lmi import BACKOFF, solve_many
 from gridsec.observers.lure import Lure
@@ -69,10 +69,7 @@ def to_bytes(gains: Sequence[CircleGains], options: CircleOptions) -> bytes:
 def from_bytes(blob: bytes) -> tuple[CircleGains, ...]:
     """Read the bytes of `to_bytes`. The margins are the stored ones: recompute before trusting them.
 
-    Raises
-    ------
-    DesignInfeasible
-        If the bytes are damaged or not such an archive.
+    Raises DesignInfeasible if the bytes are damaged or not such an archive.
     """
     digest, content = blob[:_DIGEST], blob[_DIGEST:]
     if hashlib.sha256(content).digest() != digest:
@@ -89,35 +86,23 @@ def from_bytes(blob: bytes) -> tuple[CircleGains, ...]:
 
 def _unpack(arrays: _Arrays) -> tuple[CircleGains, ...]:
     if str(arrays["format"]) != _FORMAT:
-        raise InputInvalid([Problem("unreadable", f"unknown format {arrays['format']!s}")])
+        raise InputInvalid.of("unreadable", f"unknown format {arrays['format']!s}")
     load, weight = frozen(arrays["load"]), frozen(arrays["weight"])
     taken = dict.fromkeys(np.unique(arrays["sizes"]).tolist(), 0)
     out = []
     for size in arrays["sizes"].tolist():
         index = taken[size]
         taken[size] += 1
-        values = {name: arrays[f"{size}/{name}"][index] for name in _STORED}
-        out.append(
-            CircleGains(
-                J=frozen_ints(values["J"]),
-                L=frozen(values["L"]),
-                K=frozen(values["K"]),
-                P=frozen(values["P"]),
-                Lambda=frozen(values["Lambda"]),
-                nu=float(values["nu"]),
-                mu=float(values["mu"]),
-                mu_delta=float(values["mu_delta"]),
-                alpha=float(values["alpha"]),
-                noise=frozen(values["noise"]),
-                load=load,
-                weight=weight,
-                margin=float(values["margin"]),
-                sensitivity=frozen(values["sensitivity"]),
-                backoff=float(values["backoff"]),
-                status=str(values["status"]),
-            )
-        )
+        values = {name: _restored(arrays[f"{size}/{name}"][index]) for name in _STORED}
+        out.append(CircleGains(load=load, weight=weight, **values))
     return tuple(out)
+
+
+def _restored(value: Any) -> Any:
+    """Stored value as a read-only array, a number or a text."""
+    if value.ndim:
+        return frozen_ints(value) if value.dtype.kind == "i" else frozen(value)
+    return value.item()
 
 
 def cached(
@@ -135,24 +120,12 @@ def cached(
     Stored designs are verified again: readable, the right sets, every margin recomputed and positive, no
     blind design. Otherwise the bank is redesigned and put into the store.
 
-    Parameters
-    ----------
-    lure, subsets, options, workers, progress
-        As in `solve_many`.
-    get
-        Returns the bytes stored under a key, or None.
-    put
-        Stores bytes under a key.
-
-    Returns
-    -------
-    designs, origin
-        `origin` is "stored", "new", or "redesigned: " with the fault of the stored designs.
-
-    Raises
-    ------
-    DesignInfeasible
-        As `solve_many`.
+    lure, subsets, options, workers, progress: as in `solve_many`.
+    get: returns the bytes stored under a key, or None.
+    put: stores bytes under a key.
+    Returns designs, origin: `origin` is "stored", "new", or "redesigned: " with the fault of the stored
+        designs.
+    Raises DesignInfeasible as `solve_many`.
     """
     key = design_key(lure, subsets, options)
     blob = get(key)

@@ -3,9 +3,7 @@
 The parts of a design that need no solver: the corrected inequality (12) of chong2020 rebuilt as a plain
 matrix, its margin, the error bounds that follow from it, and the sensitivity of the observer to its meters.
 
-References
-----------
-chong2020, section VI; the correction and all proofs are in docs/theory-observers.md.
+Source: chong2020, section VI; the correction and all proofs are in docs/theory-observers.md.
 """
 
 from __future__ import annotations
@@ -27,56 +25,34 @@ _BLIND = 1e-3
 class CircleOptions:
     """Specification of a design. n states, p meters, l inputs, r directions of uncertainty.
 
-    Attributes
-    ----------
-    rate
-        alpha, certified decay rate of the error, 1/s.
-    noise : (p,)
-        Scale of each meter's error n_j, squared pu. The attack enters like the noise.
-    load : (l, r)
-        Shape of the error of the known input, u - u_hat = load @ delta with |delta_i| about 1. It contains
-        correlations between customers; a diagonal matrix has none.
-    weight : (n, n)
-        Q, weight of an error: e^T Q e.
-    floor
-        Smallest gain, 0 … 1, from a trusted meter to the curve of an inverter at the same place.
-
-    Raises
-    ------
-    ValueError
-        If a number is NaN, negative or out of its range, or no meter has noise; lists every problem.
+    Raises ValueError if a number is NaN, negative or out of its range, or no meter has noise; lists every
+        problem.
     """
 
-    rate: float
-    noise: Floats
+    rate: float  # alpha, certified decay rate of the error, 1/s
+    noise: Floats  # (p,) scale of each meter's error n_j, squared pu. The attack enters like the noise
+    # (l, r) shape of the error of the known input, u - u_hat = load @ delta with |delta_i| about 1. It
+    # contains correlations between customers; a diagonal matrix has none
     load: Floats
-    weight: Floats
-    floor: float
+    weight: Floats  # (n, n) Q, weight of an error: e^T Q e
+    floor: float  # smallest gain, 0 … 1, from a trusted meter to the curve of an inverter at the same place
 
     def __post_init__(self) -> None:
-        """Freeze the arrays and refuse invalid values."""
         for name in ("noise", "load", "weight"):
             object.__setattr__(self, name, frozen(getattr(self, name)))
-        problems = [
-            text
-            for bad, text in (
-                (
-                    not (np.isfinite(self.rate) and self.rate > 0.0),
-                    Problem("not-positive", "the rate must be positive"),
-                ),
-                (
-                    self.noise.ndim != 1 or not _within(self.noise),
-                    Problem("negative", "noise must be finite, >= 0, of shape (p,)"),
-                ),
-                (
-                    self.load.ndim != 2 or not np.isfinite(self.load).all(),
-                    Problem("not-finite", "load must be finite, of shape (l, r)"),
-                ),
-                (not _is_square(self.weight), Problem("shape", "the weight must be a finite square matrix")),
-                (not 0.0 <= self.floor < 1.0, Problem("out-of-range", "the floor must lie in [0, 1)")),
-            )
-            if bad
-        ]
+        noise, load, weight = self.noise, self.load, self.weight
+        held = {
+            Problem("not-positive", "the rate must be positive"): np.isfinite(self.rate) and self.rate > 0.0,
+            Problem("negative", "noise must be finite, >= 0, of shape (p,)"): noise.ndim == 1
+            and bool(np.all(np.isfinite(noise) & (noise >= 0.0))),
+            Problem("not-finite", "load must be finite, of shape (l, r)"): load.ndim == 2
+            and bool(np.isfinite(load).all()),
+            Problem("shape", "the weight must be a finite square matrix"): weight.ndim == 2
+            and weight.shape[0] == weight.shape[1]
+            and bool(np.isfinite(weight).all()),
+            Problem("out-of-range", "the floor must lie in [0, 1)"): 0.0 <= self.floor < 1.0,
+        }
+        problems = [text for text, holds in held.items() if not holds]
         if not np.any(self.noise > 0.0):
             problems.append(Problem("not-positive", "at least one meter must have a noise scale above zero"))
         raise_if_any(problems)
@@ -84,52 +60,24 @@ class CircleOptions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CircleGains:
-    """One designed observer with its proof. k trusted meters, n states, m nonlinearities.
+    """One designed observer with its proof. k trusted meters, n states, m nonlinearities."""
 
-    Attributes
-    ----------
-    J : (k,)
-        The trusted meters.
-    L, K : (n, k), (m, k)
-        Injection into the state, and into the argument of the nonlinearities.
-    P : (n, n)
-        V = e^T P e is the certificate.
-    Lambda : (m,)
-        Diagonal multiplier of the slope restriction.
-    nu, mu, mu_delta : float
-        V' <= -2 alpha V - nu e^T Q e + mu |n / noise|^2 + mu_delta |delta|^2.
-    alpha
-        Certified decay rate, 1/s.
-    noise : (k,)
-        Scale of each trusted meter's error, squared pu.
-    load, weight : (l, r), (n, n)
-        As in `CircleOptions`.
-    margin
-        Margin of the rebuilt inequality, see `margin`; positive if it holds.
-    sensitivity : (k,)
-        Influence of each trusted meter on the observer, see `sensitivity`.
-    backoff
-        Fraction by which alpha, nu, mu and mu_delta were relaxed after the solver.
-    status
-        Status of the solver; not a proof.
-    """
-
-    J: Ints
-    L: Floats
-    K: Floats
-    P: Floats
-    Lambda: Floats
-    nu: float
+    J: Ints  # (k,) the trusted meters
+    L: Floats  # (n, k) injection into the state
+    K: Floats  # (m, k) injection into the arguments of the nonlinearities
+    P: Floats  # (n, n) V = e^T P e is the certificate
+    Lambda: Floats  # (m,) diagonal multiplier of the slope restriction
+    nu: float  # V' <= -2 alpha V - nu e^T Q e + mu |n / noise|^2 + mu_delta |delta|^2
     mu: float
     mu_delta: float
-    alpha: float
-    noise: Floats
-    load: Floats
-    weight: Floats
-    margin: float
-    sensitivity: Floats
-    backoff: float
-    status: str
+    alpha: float  # certified decay rate, 1/s
+    noise: Floats  # (k,) scale of each trusted meter's error, squared pu
+    load: Floats  # (l, r) as in `CircleOptions`
+    weight: Floats  # (n, n) as in `CircleOptions`
+    margin: float  # margin of the rebuilt inequality, see `margin`; positive if it holds
+    sensitivity: Floats  # (k,) influence of each trusted meter on the observer, see `sensitivity`
+    backoff: float  # fraction by which alpha, nu, mu and mu_delta were relaxed after the solver
+    status: str  # status of the solver; not a proof
 
 
 def options_for(
@@ -143,25 +91,13 @@ def options_for(
 ) -> CircleOptions:
     """Options of a design, with short forms filled in for a plant.
 
-    Parameters
-    ----------
-    lure
-        Plant; p meters, l inputs, n states.
-    rate
-        alpha, 1/s.
-    noise : (p,) or scalar
-        Scale of the meters' errors, squared pu.
-    load : (l, r) or (l,)
-        Error of the known input; a vector means independent entries.
-    weight : (n, n)
-        Q; by default H^T H, the squared error of z at the inverters.
-    floor
-        Smallest gain from a trusted meter to the curve at the same place.
-
-    Raises
-    ------
-    ValueError
-        As `CircleOptions`, or if shapes are inconsistent with the plant.
+    lure: plant; p meters, l inputs, n states.
+    rate: alpha, 1/s.
+    noise (p,) or scalar: scale of the meters' errors, squared pu.
+    load (l, r) or (l,): error of the known input; a vector means independent entries.
+    weight (n, n): Q; by default H^T H, the squared error of z at the inverters.
+    floor: smallest gain from a trusted meter to the curve at the same place.
+    Raises ValueError as `CircleOptions`, or if shapes are inconsistent with the plant.
     """
     load = np.asarray(load, dtype=np.float64)
     options = CircleOptions(
@@ -172,13 +108,8 @@ def options_for(
         floor=float(floor),
     )
     if len(options.load) != lure.F.shape[1] or len(options.weight) != len(lure.A):
-        raise InputInvalid(
-            [
-                Problem(
-                    "shape",
-                    f"load {options.load.shape} or weight {options.weight.shape} do not fit the plant",
-                )
-            ]
+        raise InputInvalid.of(
+            "shape", f"load {options.load.shape} or weight {options.weight.shape} do not fit the plant"
         )
     return options
 
@@ -198,32 +129,16 @@ def circle_matrix(lure: Lure, J: Ints | Sequence[int], gains: CircleGains) -> Fl
 
     Nonlinearities of slope bound 0 are constant and have no column.
 
-    Parameters
-    ----------
-    lure
-        Plant; n states, m nonlinearities, p meters, l inputs.
-    J : (k',)
-        Meters with injection, a subset of `gains.J`. A smaller set gives the matrix of the same observer
+    lure: plant; n states, m nonlinearities, p meters, l inputs.
+    J (k',): meters with injection, a subset of `gains.J`. A smaller set gives the matrix of the same observer
         while the other meters are unavailable.
-
-    Returns
-    -------
-    Floats
-        Symmetric, square.
-
-    Raises
-    ------
-    ValueError
-        If `J` is not a subset of the design's meters.
-
-    References
-    ----------
-    chong2020 (12), corrected: docs/theory-observers.md, section 2.
+    Raises ValueError if `J` is not a subset of the design's meters.
+    Source: chong2020 (12), corrected: docs/theory-observers.md, section 2.
     """
     keep = np.isin(gains.J, np.asarray(J, dtype=np.intp))
     if np.count_nonzero(keep) != len(J):
-        raise InputInvalid(
-            [Problem("wrong-design", f"{list(J)} is not a subset of the design's meters {gains.J.tolist()}")]
+        raise InputInvalid.of(
+            "wrong-design", f"{list(J)} is not a subset of the design's meters {gains.J.tolist()}"
         )
     rows, L, K, N = gains.J[keep], gains.L[:, keep], gains.K[:, keep], gains.noise[keep]
     live = lure.slope > 0.0
@@ -252,10 +167,7 @@ def negativity(matrix: Floats) -> float:
     order one, so that the result stays accurate when the blocks of `M` differ by many orders of magnitude. A
     diagonal entry that is not negative disproves definiteness.
 
-    Parameters
-    ----------
-    matrix : (s, s)
-        Symmetric.
+    matrix (s, s): symmetric.
     """
     if not np.isfinite(matrix).all():
         return -np.inf
@@ -281,10 +193,7 @@ def margin(lure: Lure, J: Ints | Sequence[int], gains: CircleGains) -> float:
     The smallest of: the negativity of `circle_matrix`, the positivity of P, and the signs of
     Lambda, mu, mu_delta, nu and alpha.
 
-    Parameters
-    ----------
-    lure, J, gains
-        As in `circle_matrix`.
+    lure, J, gains: as in `circle_matrix`.
     """
     live = lure.slope > 0.0
     signs = np.array([*gains.Lambda[live], gains.mu, gains.mu_delta, gains.nu, gains.alpha])
@@ -299,15 +208,7 @@ def sensitivity(lure: Lure, L: Floats, K: Floats) -> Floats:
     `s_j = max(max_i |K_ij|, max_i |L_ij| / (|G| d)_i)`: the part of a meter's error that reaches the argument
     of some curve, or its effect on some state relative to the largest effect of the curves.
 
-    Parameters
-    ----------
-    L, K : (n, k), (m, k)
-        Gains.
-
-    Returns
-    -------
-    Floats
-        (k,), dimensionless.
+    L (n, k), K (m, k). Returns (k,), dimensionless.
     """
     drive = np.abs(lure.G) @ lure.slope
     live = lure.slope > 0.0
@@ -322,17 +223,8 @@ def sensitivity(lure: Lure, L: Floats, K: Floats) -> Floats:
 def refuse_blind(J: Ints, heard: Floats) -> None:
     """Refuse a design that ignores every one of its meters.
 
-    Parameters
-    ----------
-    J : (k,)
-        The trusted meters.
-    heard : (k,)
-        Their `sensitivity`.
-
-    Raises
-    ------
-    DesignInfeasible
-        If every sensitivity is below `_BLIND`; the message states reason and remedies.
+    J (k,). heard (k,): their `sensitivity`.
+    Raises DesignInfeasible if every sensitivity is below `_BLIND`; the message states reason and remedies.
     """
     if np.max(heard, initial=0.0) < _BLIND:
         raise DesignInfeasible(
@@ -353,21 +245,11 @@ def state_bound(gains: CircleGains, rows: Floats, noise: float, delta: float) ->
     `|c^T e| <= sqrt(c^T P^{-1} c) sqrt((mu s_n^2 + mu_delta s_d^2) / (2 alpha))`, after the initial
     error has decayed with `exp(-alpha t)`.
 
-    Parameters
-    ----------
-    gains
-        A design with a positive margin.
-    rows : (k, n)
-        Functions c^T of the error, for example the rows of H.
-    noise
-        s_n, supremum over time of the Euclidean norm of (n + a)_J / noise.
-    delta
-        s_d, supremum over time of the Euclidean norm of delta.
-
-    Returns
-    -------
-    Floats
-        (k,), in the units of `rows @ e`.
+    gains: a design with a positive margin.
+    rows (k, n): functions c^T of the error, for example the rows of H.
+    noise: s_n, supremum over time of the Euclidean norm of (n + a)_J / noise.
+    delta: s_d, supremum over time of the Euclidean norm of delta.
+    Returns (k,): in the units of `rows @ e`.
     """
     level = (gains.mu * noise**2 + gains.mu_delta * delta**2) / (2.0 * gains.alpha)
     spread = np.sum(rows * np.linalg.solve(gains.P, rows.T).T, axis=1)
@@ -377,17 +259,9 @@ def state_bound(gains: CircleGains, rows: Floats, noise: float, delta: float) ->
 def stacked(gains: Sequence[CircleGains], meters: int) -> tuple[Floats, Floats]:
     """Gains of several observers on a leading axis, with zero columns for the meters that each one ignores.
 
-    Parameters
-    ----------
-    gains
-        B designs of one plant.
-    meters
-        p, number of meters of the plant.
-
-    Returns
-    -------
-    L, K : (B, n, p), (B, m, p)
-        Every observer of the bank injects `L @ r` and `K @ r` with the same r.
+    gains: B designs of one plant.
+    meters: p, number of meters of the plant.
+    Returns L (B, n, p), K (B, m, p): every observer of the bank injects `L @ r` and `K @ r` with the same r.
     """
     first = gains[0]
     L = np.zeros((len(gains), len(first.L), meters))
@@ -396,11 +270,3 @@ def stacked(gains: Sequence[CircleGains], meters: int) -> tuple[Floats, Floats]:
         L[index][:, one.J] = one.L
         K[index][:, one.J] = one.K
     return L, K
-
-
-def _within(values: Floats) -> bool:
-    return bool(np.isfinite(values).all() and np.all(values >= 0.0))
-
-
-def _is_square(matrix: Floats) -> bool:
-    return matrix.ndim == 2 and matrix.shape[0] == matrix.shape[1] and bool(np.isfinite(matrix).all())

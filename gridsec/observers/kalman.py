@@ -12,9 +12,7 @@ with all blocks P_ij. One recursion gives all blocks at once: with S, T and K bl
 
 with the usual covariances as diagonal blocks, because each K_i is optimal for its own sensor.
 
-References
-----------
-lee2018, section 4.3.2; docs/theory-partial-observers.md.
+Source: lee2018, section 4.3.2; docs/theory-partial-observers.md.
 """
 
 from __future__ import annotations
@@ -24,9 +22,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import block_diag, solve_discrete_lyapunov
 
-from gridsec.arrays import Bools, Floats, frozen, spectral_radius, symmetry_defect
-from gridsec.errors import DesignInfeasible, Problem, raise_if_any
-from gridsec.observers.parts import StackedDecompositions, decompose, heard, riccati, stack
+from gridsec.arrays import Bools, Floats, frozen, symmetry_defect
+from gridsec.errors import Problem, raise_if_any
+from gridsec.observers.parts import StackedDecompositions, decompose, heard, require_stable, riccati, stack
 
 RESIDUAL = 1e-8
 """Largest accepted relative residual of a Riccati equation."""
@@ -34,68 +32,32 @@ RESIDUAL = 1e-8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KalmanDesign:
-    """p partial filters, stacked. mu stacked states, p sensors, m inputs.
+    """p partial filters, stacked. mu stacked states, p sensors, m inputs."""
 
-    Attributes
-    ----------
-    stack
-        The decomposition.
-    process : (mu, mu)
-        Phi Q Phi^T, covariance of the disturbance of the filters.
-    noise : (p, p)
-        R, covariance of the sensors' noise; need not be diagonal.
-    own : (mu, p)
-        1 where a row belongs to a sensor, else 0.
-    period
-        Sampling time, s.
-    """
-
-    stack: StackedDecompositions
-    process: Floats
-    noise: Floats
-    own: Floats
-    period: float
+    stack: StackedDecompositions  # the decomposition
+    process: Floats  # (mu, mu) Phi Q Phi^T, covariance of the disturbance of the filters
+    noise: Floats  # (p, p) R, covariance of the sensors' noise; need not be diagonal
+    own: Floats  # (mu, p) 1 where a row belongs to a sensor, else 0
+    period: float  # sampling time, s
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KalmanState:
-    """State of the filters.
+    """State of the filters."""
 
-    Attributes
-    ----------
-    t
-        Time of the state that `z` estimates, s.
-    z : (…, mu)
-        Stacked estimates; leading axes are independent runs with the same covariance.
-    P : (mu, mu)
-        Joint covariance of their errors without attack.
-    K : (mu, p)
-        Gain of the last correction; zero for sensors without a reading.
-    """
-
-    t: float
-    z: Floats
-    P: Floats
-    K: Floats
+    t: float  # time of the state that `z` estimates, s
+    z: Floats  # (…, mu) stacked estimates; leading axes are independent runs with the same covariance
+    P: Floats  # (mu, mu) joint covariance of their errors without attack
+    K: Floats  # (mu, p) gain of the last correction; zero for sensors without a reading
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Steady:
-    """Stationary covariance and gain with every reading available.
+    """Stationary covariance and gain with every reading available."""
 
-    Attributes
-    ----------
-    P : (mu, mu)
-        P(k|k) for k to infinity.
-    K : (mu, p)
-        Gain, block diagonal.
-    F : (mu, mu)
-        (I - K T) S, Schur stable: motion of the errors.
-    """
-
-    P: Floats
-    K: Floats
-    F: Floats
+    P: Floats  # (mu, mu) P(k|k) for k to infinity
+    K: Floats  # (mu, p) gain, block diagonal
+    F: Floats  # (mu, mu) (I - K T) S, Schur stable: motion of the errors
 
 
 def design(
@@ -111,25 +73,12 @@ def design(
 ) -> KalmanDesign:
     """Design one filter for each sensor.
 
-    Parameters
-    ----------
-    A, B, C : (n, n), (n, m), (p, n)
-        Plant, sampled.
-    Q, R : (n, n), (p, p)
-        Covariances of disturbance and noise, symmetric and positive semidefinite.
-    slowest, tol
-        As in `parts.decompose`.
-    period
-        Sampling time, s.
-
-    Raises
-    ------
-    ValueError
-        If Q or R has the wrong shape or is not a covariance.
-
-    References
-    ----------
-    lee2018, Assumption 4.3.3, (4.3.8), (4.3.9).
+    A (n, n), B (n, m), C (p, n).
+    Q (n, n), R (p, p): covariances of disturbance and noise, symmetric and positive semidefinite.
+    slowest, tol: as in `parts.decompose`.
+    period: sampling time, s.
+    Raises ValueError if Q or R has the wrong shape or is not a covariance.
+    Source: lee2018, Assumption 4.3.3, (4.3.8), (4.3.9).
     """
     Q, R = np.asarray(Q, dtype=np.float64), np.asarray(R, dtype=np.float64)
     problems: list[Problem] = []
@@ -156,18 +105,10 @@ def design(
 def init(design: KalmanDesign, t: float, mean: Floats, covariance: Floats) -> KalmanState:
     """State before the first reading: z(0|-1) = Phi x_0, P(0|-1) = Phi P_0 Phi^T.
 
-    Parameters
-    ----------
-    t
-        Time, s.
-    mean : (…, n)
-        Expected state; leading axes are independent runs.
-    covariance : (n, n)
-        P_0, covariance of the state.
-
-    References
-    ----------
-    lee2018, after (4.3.9).
+    t: time, s.
+    mean (…, n): expected state; leading axes are independent runs.
+    covariance (n, n): P_0, covariance of the state.
+    Source: lee2018, after (4.3.9).
     """
     phi = design.stack.phi
     P = phi @ np.asarray(covariance) @ phi.T
@@ -175,17 +116,7 @@ def init(design: KalmanDesign, t: float, mean: Floats, covariance: Floats) -> Ka
 
 
 def predict(design: KalmanDesign, state: KalmanState, u: Floats) -> KalmanState:
-    """Prediction from (k|k) to (k+1|k).
-
-    Parameters
-    ----------
-    u : (…, m)
-        Input during the step.
-
-    References
-    ----------
-    lee2018 (4.3.9b), (4.3.9d), (4.3.15).
-    """
+    """Prediction from (k|k) to (k+1|k), with the input u (…, m); lee2018 (4.3.9b), (4.3.9d), (4.3.15)."""
     S, G = design.stack.S, design.stack.G
     P = S @ state.P @ S.T + design.process
     return KalmanState(state.t + design.period, state.z @ S.T + u @ G.T, P, state.K)
@@ -194,17 +125,10 @@ def predict(design: KalmanDesign, state: KalmanState, u: Floats) -> KalmanState:
 def correct(design: KalmanDesign, state: KalmanState, y: Floats, seen: Bools | None = None) -> KalmanState:
     """Correction from (k|k-1) to (k|k): each filter uses its own sensor's reading.
 
-    Parameters
-    ----------
-    y : (…, p)
-        Readings; ignored where not seen or not finite. Runs share their covariance: a sensor without a
+    y (…, p): readings; ignored where not seen or not finite. Runs share their covariance: a sensor without a
         reading in one run is not used in any.
-    seen : (p,)
-        True for existing readings; all by default.
-
-    References
-    ----------
-    lee2018 (4.3.9a), (4.3.9c), (4.3.9e), (4.3.15), all blocks of P in Joseph's form.
+    seen (p,): True for existing readings; all by default.
+    Source: lee2018 (4.3.9a), (4.3.9c), (4.3.9e), (4.3.15), all blocks of P in Joseph's form.
     """
     T, R = design.stack.T, design.noise
     M = (state.P @ T.T) * design.own
@@ -222,18 +146,9 @@ def step(
 ) -> KalmanState:
     """Step from (k|k) to (k+1|k+1), with the input u(k) and the readings y(k+1).
 
-    Parameters
-    ----------
-    y : (…, p)
-        Readings at the end of the step; ignored where not seen or not finite.
-    u : (…, m)
-        Input during the step.
-    seen : (p,)
-        As in `correct`.
-
-    References
-    ----------
-    lee2018 (4.3.8).
+    y (…, p): readings at the end of the step; ignored where not seen or not finite.
+    u (…, m). seen (p,): as in `correct`.
+    Source: lee2018 (4.3.8).
     """
     return correct(design, predict(design, state, u), y, seen)
 
@@ -241,15 +156,7 @@ def step(
 def step_steady(
     design: KalmanDesign, steady: Steady, state: KalmanState, y: Floats, u: Floats
 ) -> KalmanState:
-    """`step` with the stationary gain and covariance of `steady`.
-
-    Parameters
-    ----------
-    design, state, y, u
-        As in `step`, with every reading available.
-    steady
-        From `steady`.
-    """
+    """`step` with the gain and covariance of `steady`; every reading must be available."""
     z = state.z @ design.stack.S.T + u @ design.stack.G.T
     z = z + (y - z @ design.stack.T.T) @ steady.K.T
     return KalmanState(state.t + design.period, z, steady.P, steady.K)
@@ -260,14 +167,9 @@ def steady(design: KalmanDesign) -> Steady:
 
     The gains solve one Riccati equation for each sensor, the joint covariance one Lyapunov equation.
 
-    Raises
-    ------
-    DesignInfeasible
-        If a filter has no stable stationary gain: a mode on the unit circle has no disturbance.
-
-    References
-    ----------
-    lee2018 (4.3.14), (4.3.15).
+    Raises DesignInfeasible if a filter has no stable stationary gain: a mode on the unit circle has no
+        disturbance.
+    Source: lee2018 (4.3.14), (4.3.15).
     """
     whole = design.stack
     gains = np.zeros(design.own.shape)
@@ -279,11 +181,7 @@ def steady(design: KalmanDesign) -> Steady:
         gains[at, i] = M @ part.t / (part.t @ M @ part.t + design.noise[i, i])
     J = np.eye(len(gains)) - gains @ whole.T
     F = J @ whole.S
-    radius = spectral_radius(F)
-    if not radius < 1.0:
-        raise DesignInfeasible(
-            "stationary filters", f"spectral radius {radius:.6g}", 1.0 - radius, code="unstable"
-        )
+    require_stable(F, "stationary filters")
     P = np.asarray(
         solve_discrete_lyapunov(F, J @ design.process @ J.T + gains @ design.noise @ gains.T),
         dtype=np.float64,

@@ -8,9 +8,7 @@ the others exact. The estimates of all sensors, stacked, are a code word of the 
 which `gridsec.secure.decode.partial_bounded` decodes. Sampled time: x(k+1) = A x(k) + B u(k) + d(k), y(k) = C
 x(k) + n(k).
 
-References
-----------
-lee2018, sections 4.2.1 and 4.3.1; docs/theory-partial-observers.md.
+Source: lee2018, sections 4.2.1 and 4.3.1; docs/theory-partial-observers.md.
 """
 
 from __future__ import annotations
@@ -22,12 +20,13 @@ from typing import Literal
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, frozen, spectral_radius
-from gridsec.errors import DesignInfeasible, InputInvalid, Problem, no_choice, raise_if_any
+from gridsec.errors import DesignInfeasible, InputInvalid, no_choice, raise_if_any
 from gridsec.observers.parts import (
     SensorDecomposition,
     StackedDecompositions,
     decompose,
     heard,
+    require_stable,
     riccati,
     stack,
 )
@@ -41,43 +40,23 @@ RESIDUAL = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bounds:
-    """Largest disturbances and noise (lee2018, Assumption 4.3.2).
+    """Largest disturbances and noise (lee2018, Assumption 4.3.2)."""
 
-    Attributes
-    ----------
-    process
-        d_max: `d(k) = E w(k)` with `|w(k)|_2 <= process`.
-    noise : (p,)
-        n_max of each sensor: `|n_i(k)| <= noise[i]`, in the sensor's unit.
-    E : (n, l)
-        Input matrix of disturbances; the identity in the paper.
-    """
-
-    process: float
-    noise: Floats
-    E: Floats
+    process: float  # d_max: `d(k) = E w(k)` with `|w(k)|_2 <= process`
+    noise: Floats  # (p,) n_max of each sensor: `|n_i(k)| <= noise[i]`, in the sensor's unit
+    E: Floats  # (n, l) input matrix of disturbances; the identity in the paper
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ErrorEnvelope:
-    """Bound of one observer's error without attack: |v(k)| <= |F^k| |v(0)| + limit.
+    """Bound of one observer's error without attack: |v(k)| <= |F^k| |v(0)| + limit; lee2018 (4.3.7)."""
 
-    Attributes
-    ----------
-    powers : (K + 1,)
-        |F^j|_2 for j = 0 … K, the last at most half of one over the largest. Beyond:
-        |F^(mK + r)| <= powers[K]^m powers[r].
-    limit
-        w_max: the sum over all j >= 0 of |F^j L| n_max + |F^j Z^T E| d_max, its tail bounded by a
-        geometric series: at most 1 / (1 - powers[K]) times the sum, and the sum is at most the paper's
-        (eta_L n_max + eta_Z d_max) / (1 - beta).
-
-    References
-    ----------
-    lee2018 (4.3.7).
-    """
-
+    # (K + 1,) |F^j|_2 for j = 0 … K, the last at most half of one over the largest. Beyond: |F^(mK + r)| <=
+    # powers[K]^m powers[r]
     powers: Floats
+    # w_max: the sum over all j >= 0 of |F^j L| n_max + |F^j Z^T E| d_max, its tail bounded by a geometric
+    # series: at most 1 / (1 - powers[K]) times the sum, and the sum is at most the paper's (eta_L n_max +
+    # eta_Z d_max) / (1 - beta)
     limit: float
 
     def growth(self, steps: int) -> float:
@@ -88,55 +67,25 @@ class ErrorEnvelope:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LuenbergerDesign:
-    """p partial observers, stacked. mu stacked states, p sensors, m inputs.
+    """p partial observers, stacked. mu stacked states, p sensors, m inputs."""
 
-    Attributes
-    ----------
-    stack
-        The decomposition.
-    L : (mu, p)
-        Injection gains, block diagonal.
-    F : (mu, mu)
-        S - L T, block diagonal and Schur stable.
-    bounds
-        Disturbances and noise of the envelopes.
-    envelopes
-        One for each sensor.
-    step_norm : (p,)
-        |S_i|_2: largest growth of an error in a step without a reading.
-    period
-        Sampling time, s.
-    """
-
-    stack: StackedDecompositions
-    L: Floats
-    F: Floats
-    bounds: Bounds
-    envelopes: tuple[ErrorEnvelope, ...]
-    step_norm: Floats
-    period: float
+    stack: StackedDecompositions  # the decomposition
+    L: Floats  # (mu, p) injection gains, block diagonal
+    F: Floats  # (mu, mu) S - L T, block diagonal and Schur stable
+    bounds: Bounds  # disturbances and noise of the envelopes
+    envelopes: tuple[ErrorEnvelope, ...]  # one for each sensor
+    step_norm: Floats  # (p,) |S_i|_2: largest growth of an error in a step without a reading
+    period: float  # sampling time, s
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LuenbergerState:
-    """State of the observers.
+    """State of the observers."""
 
-    Attributes
-    ----------
-    t
-        Time of the state that `z` estimates, s.
-    z : (…, mu)
-        Stacked estimates; leading axes are independent runs.
-    origin : (p,)
-        Bound of |z_i - Z_i^T x| at the last start of sensor i; infinite if unknown.
-    age : (p,)
-        Steps since then.
-    """
-
-    t: float
-    z: Floats
-    origin: Floats
-    age: Ints
+    t: float  # time of the state that `z` estimates, s
+    z: Floats  # (…, mu) stacked estimates; leading axes are independent runs
+    origin: Floats  # (p,) bound of |z_i - Z_i^T x| at the last start of sensor i; infinite if unknown
+    age: Ints  # (p,) steps since then
 
 
 def riccati_gain(part: SensorDecomposition, process: Floats, noise: float, *, rate: float) -> Floats:
@@ -145,31 +94,16 @@ def riccati_gain(part: SensorDecomposition, process: Floats, noise: float, *, ra
     With rate 1 the Riccati equation is that of (S, t). Below 1 it is that of the observable block over
     `rate`, with an error decay of at least rate^k; fading modes keep their own decay and get no gain.
 
-    Parameters
-    ----------
-    part
-        The sensor's part of the state.
-    process : (n, n)
-        Weight (covariance) of d.
-    noise
-        Weight (variance) of n_i, > 0.
-    rate
-        In (0, 1].
-
-    Raises
-    ------
-    DesignInfeasible
-        If there is no such gain: the process weight leaves a mode on or outside the circle of radius
-        `rate` without disturbance.
-    ValueError
-        If `rate` is not in (0, 1].
-
-    References
-    ----------
-    B. Anderson, J. Moore, "Optimal filtering", Prentice-Hall, 1979, sections 4.4 and 6.3 (prescribed decay).
+    process (n, n): weight (covariance) of d.
+    noise: weight (variance) of n_i, > 0.
+    rate: in (0, 1].
+    Raises DesignInfeasible if there is no such gain: the process weight leaves a mode on or outside the
+        circle of radius `rate` without disturbance. ValueError if `rate` is not in (0, 1].
+    Source: B. Anderson, J. Moore, "Optimal filtering", Prentice-Hall, 1979, sections 4.4 and 6.3 (prescribed
+        decay).
     """
     if not 0.0 < rate <= 1.0:
-        raise InputInvalid([Problem("out-of-range", f"rate is {rate}; it must lie in (0, 1]")])
+        raise InputInvalid.of("out-of-range", f"rate is {rate}; it must lie in (0, 1]")
     size = part.t.size if rate == 1.0 else part.observable.shape[1]
     gain = np.zeros(part.t.size)
     if not size:
@@ -178,14 +112,8 @@ def riccati_gain(part: SensorDecomposition, process: Floats, noise: float, *, ra
     S, t = part.S[:size, :size] / rate, part.t[:size] / np.sqrt(noise)
     P = riccati(S, t, basis.T @ process @ basis, 1.0, tol=RESIDUAL)
     gain[:size] = rate * S @ P @ t / (t @ P @ t + 1.0) / np.sqrt(noise)
-    radius = spectral_radius(part.S[:size, :size] - np.outer(gain[:size], part.t[:size]))
-    if not radius < rate:
-        raise DesignInfeasible(
-            f"observer gain for decay like {rate:g}^k",
-            f"spectral radius {radius:.6g}",
-            rate - radius,
-            code="unstable",
-        )
+    closed = part.S[:size, :size] - np.outer(gain[:size], part.t[:size])
+    require_stable(closed, f"observer gain for decay like {rate:g}^k", rate=rate)
     return gain
 
 
@@ -203,61 +131,34 @@ def design(
 ) -> LuenbergerDesign:
     """Design one partial observer for each sensor.
 
-    Parameters
-    ----------
-    A, B, C : (n, n), (n, m), (p, n)
-        Plant, sampled.
-    bounds
-        Bounds of disturbance and noise; also the weights of the Riccati gains.
-    slowest, tol
-        As in `decompose`.
-    gains
-        "riccati": `riccati_gain` with weights `process^2 E E^T` and `noise^2`. Or L_i (mu_i,) for each
+    A (n, n), B (n, m), C (p, n).
+    bounds: bounds of disturbance and noise; also the weights of the Riccati gains.
+    slowest, tol: as in `decompose`.
+    gains: "riccati": `riccati_gain` with weights `process^2 E E^T` and `noise^2`. Or L_i (mu_i,) for each
         sensor.
-    rate
-        As in `riccati_gain`.
-    period
-        Sampling time, s.
-
-    Raises
-    ------
-    DesignInfeasible
-        If some F_i = S_i - L_i t_i is not Schur stable, or errors may not have halved for good after
-        `LONGEST` steps.
-    ValueError
-        If shapes are inconsistent, a bound is negative or NaN, `gains` is another text, or "riccati" without
-        noise.
-
-    References
-    ----------
-    lee2018 (4.3.1), (4.3.3), (4.3.7).
+    rate: as in `riccati_gain`.
+    period: sampling time, s.
+    Raises DesignInfeasible if some F_i = S_i - L_i t_i is not Schur stable, or errors may not have halved for
+        good after `LONGEST` steps. ValueError if shapes are inconsistent, a bound is negative or NaN, `gains`
+        is another text, or "riccati" without noise.
+    Source: lee2018 (4.3.1), (4.3.3), (4.3.7).
     """
     parts = decompose(A, C, slowest=slowest, tol=tol)
     E, noise = np.asarray(bounds.E, dtype=np.float64), np.asarray(bounds.noise, dtype=np.float64)
     if E.ndim != 2 or E.shape[0] != len(A) or noise.shape != (len(parts),):
-        raise InputInvalid(
-            [
-                Problem(
-                    "shape",
-                    f"E has shape {E.shape} and noise {noise.shape} for n = {len(A)}, p = {len(parts)}",
-                )
-            ]
+        raise InputInvalid.of(
+            "shape", f"E has shape {E.shape} and noise {noise.shape} for n = {len(A)}, p = {len(parts)}"
         )
     if not (bounds.process >= 0.0 and np.all(noise >= 0.0)):
-        raise InputInvalid(
-            [Problem("negative", "bounds of disturbance and noise must be numbers and cannot be negative")]
+        raise InputInvalid.of(
+            "negative", "bounds of disturbance and noise must be numbers and cannot be negative"
         )
     if isinstance(gains, str):
         raise_if_any(no_choice("gains", ("riccati",), gains))
         weight = bounds.process**2 * E @ E.T
         if np.any(noise == 0.0):
-            raise InputInvalid(
-                [
-                    Problem(
-                        "not-positive",
-                        'gains="riccati" needs positive bounds of the noise; give the gains otherwise',
-                    )
-                ]
+            raise InputInvalid.of(
+                "not-positive", 'gains="riccati" needs positive bounds of the noise; give the gains otherwise'
             )
         chosen = [
             riccati_gain(part, weight, float(size) ** 2, rate=rate)
@@ -266,9 +167,7 @@ def design(
     else:
         chosen = [np.asarray(gain, dtype=np.float64) for gain in gains]
     if [gain.shape for gain in chosen] != [part.t.shape for part in parts]:
-        raise InputInvalid(
-            [Problem("shape", f"gains must have the lengths {[part.t.size for part in parts]}")]
-        )
+        raise InputInvalid.of("shape", f"gains must have the lengths {[part.t.size for part in parts]}")
     whole = stack(parts, B)
     L = np.zeros((whole.phi.shape[0], len(parts)))
     for i, gain in enumerate(chosen):
@@ -289,24 +188,12 @@ def envelope(
 ) -> ErrorEnvelope:
     """Bound of one partial observer's error without attack.
 
-    Parameters
-    ----------
-    part, gain
-        The sensor's part and L_i (mu_i,).
-    process, noise, E
-        As in `Bounds`, with the noise of this sensor.
-
-    Raises
-    ------
-    DesignInfeasible
-        As `design`.
+    part, gain: the sensor's part and L_i (mu_i,).
+    process, noise, E: as in `Bounds`, with the noise of this sensor.
+    Raises DesignInfeasible as `design`.
     """
     F = part.S - np.outer(gain, part.t)
-    radius = spectral_radius(F)
-    if not radius < 1.0:
-        raise DesignInfeasible(
-            "partial observer", f"spectral radius {radius:.6g} of S - L t", 1.0 - radius, code="unstable"
-        )
+    require_stable(F, "partial observer, S - L t")
     if not part.t.size:
         return ErrorEnvelope(frozen(np.array([1.0, 0.0])), 0.0)
     powers, sizes = _powers(F)
@@ -336,33 +223,17 @@ def geometric(
 ) -> ErrorEnvelope:
     """The paper's own bound, with the smallest constants eta_F, eta_L, eta_Z for a given beta.
 
-    Parameters
-    ----------
-    part, gain, process, noise, E
-        As in `envelope`.
-    beta
-        Between the spectral radius of F and 1.
-
-    Returns
-    -------
-    Envelope
-        With `growth(k) = eta_F beta^k` and limit = (eta_L n_max + eta_Z d_max) / (1 - beta).
-
-    Raises
-    ------
-    DesignInfeasible
-        If beta is too close to the spectral radius to find the constants in `LONGEST` steps.
-    ValueError
-        If beta is not between the spectral radius of F and 1.
-
-    References
-    ----------
-    lee2018 (4.3.7).
+    part, gain, process, noise, E: as in `envelope`.
+    beta: between the spectral radius of F and 1.
+    Returns `growth(k) = eta_F beta^k` and `limit = (eta_L n_max + eta_Z d_max) / (1 - beta)`.
+    Raises DesignInfeasible if beta is too close to the spectral radius to find the constants in `LONGEST`
+        steps. ValueError if beta is not between the spectral radius of F and 1.
+    Source: lee2018 (4.3.7).
     """
     F = part.S - np.outer(gain, part.t)
     if not spectral_radius(F) < beta < 1.0:
-        raise InputInvalid(
-            [Problem("out-of-range", f"beta is {beta}; it must lie between {spectral_radius(F):.6g} and 1")]
+        raise InputInvalid.of(
+            "out-of-range", f"beta is {beta}; it must lie between {spectral_radius(F):.6g} and 1"
         )
     # |F^j M| beta^-j is largest within the first K powers: later ones are shorter than those K before.
     powers, sizes = _powers(F / beta)
@@ -375,14 +246,9 @@ def geometric(
 def init(design: LuenbergerDesign, t: float, x: Floats, error: float = np.inf) -> LuenbergerState:
     """Initial state of all observers from a guess of the state.
 
-    Parameters
-    ----------
-    t
-        Time, s.
-    x : (…, n)
-        Guess; leading axes are independent runs.
-    error
-        Bound of |guess - x|_2. Without it all bounds stay infinite.
+    t: time, s.
+    x (…, n): guess; leading axes are independent runs.
+    error: bound of |guess - x|_2. Without it all bounds stay infinite.
     """
     p = len(design.stack.parts)
     # |Z_i^T| = 1 unless the part is empty.
@@ -397,20 +263,12 @@ def step(
 
         z_hat_i(k+1) = S_i z_hat_i(k) + Z_i^T B u(k) + L_i (y_i(k) - t_i z_hat_i(k))
 
-    Parameters
-    ----------
-    y : (…, p)
-        Readings; ignored where not seen or not finite. Runs share their bounds: a sensor without a
+    y (…, p): readings; ignored where not seen or not finite. Runs share their bounds: a sensor without a
         reading in one run is not used in any.
-    u : (…, m)
-        Inputs.
-    seen : (p,)
-        True for existing readings; all by default. An observer without a reading predicts, and the bound of
-        its error restarts from the enlarged one.
-
-    References
-    ----------
-    lee2018 (4.3.1).
+    u (…, m): inputs.
+    seen (p,): True for existing readings; all by default. An observer without a reading predicts, and the
+        bound of its error restarts from the enlarged one.
+    Source: lee2018 (4.3.1).
     """
     stack = design.stack
     live = heard(y, seen)
@@ -428,9 +286,7 @@ def step(
 def bound(design: LuenbergerDesign, state: LuenbergerState) -> Floats:
     """Bound of |z_hat_i - Z_i^T x|_2 for every sensor without attack, (p,); the largest is v_max(k).
 
-    References
-    ----------
-    lee2018 (4.3.7).
+    Source: lee2018 (4.3.7).
     """
     out = np.empty(state.origin.size)
     for i, (env, origin, age) in enumerate(zip(design.envelopes, state.origin, state.age, strict=True)):

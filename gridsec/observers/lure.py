@@ -2,100 +2,69 @@
 
     x' or x+ = A x + G phi(H x + F u) + B u,     y = C x + D u
 
-    x' = A x + G phi(H x + F u) + B u,     y = C x + D u
-
 phi acts entry by entry, and its slopes lie in `[0, slope]`. For a feeder, x is the reactive injection of the
 inverters, `z = H x + F u` and y are `vbar^2 - v^2` at inverters and meters, and u = w is the contribution of
 the rest of the feeder to z (`known_input`).
 
-References
-----------
-chong2020 (9), (10); yang2019 (1), (2).
-.. [1] chong2020, equations (9), (15) to (19).
+Source: chong2020 (9), (10), (15) to (19); yang2019 (1), (2).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
+from math import prod
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import expm
 
-from gridsec.arrays import Floats, Ints, exponential_integrals, frozen, perron_bound
-from gridsec.errors import FeederInvalid, InputInvalid, Problem, raise_if_any
+from gridsec.arrays import Bools, Floats, Ints, exponential_integrals, frozen, perron_bound
+from gridsec.errors import DesignInfeasible, FeederInvalid, InputInvalid, Problem, raise_if_any
 from gridsec.grid.droop import Droop
 from gridsec.grid.network import LinDistFlow, Network, Power
 from gridsec.grid.three_phase import CustomerFlow, ThreePhaseFeeder, lindist3flow, per_customer
-from gridsec.observers.newton import Nonlinearity, settle
 
-_MATRICES = ("A", "G", "H", "F", "B", "C", "D")
-
-
-class Readout(Protocol):
-    """Matrices of `z = H x + F u` and `y = C x + D u`, in continuous or discrete time."""
-
-    @property
-    def H(self) -> Floats: ...  # noqa: D102, N802
-    @property
-    def F(self) -> Floats: ...  # noqa: D102, N802
-    @property
-    def C(self) -> Floats: ...  # noqa: D102, N802
-    @property
-    def D(self) -> Floats: ...  # noqa: D102, N802
+Nonlinearity = Callable[[Floats], Floats]
 
 
-class Form(Readout, Protocol):
-    """Complete system in Lur'e form, in continuous or discrete time."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Matrices:
+    """The matrices of a Lur'e system. n states, m nonlinearities, l inputs, p meters."""
 
-    @property
-    def A(self) -> Floats: ...  # noqa: D102, N802
-    @property
-    def G(self) -> Floats: ...  # noqa: D102, N802
-    @property
-    def B(self) -> Floats: ...  # noqa: D102, N802
-    @property
-    def phi(self) -> Nonlinearity: ...  # noqa: D102
-
-
-def as_floats(*given: ArrayLike) -> tuple[Floats, ...]:
-    """Nested lists as arrays of floats."""
-    return tuple(np.asarray(one, dtype=np.float64) for one in given)
+    A: Floats  # (n, n)
+    G: Floats  # (n, m)
+    H: Floats  # (m, n)
+    F: Floats  # (m, l)
+    B: Floats  # (n, l)
+    C: Floats  # (p, n)
+    D: Floats  # (p, l)
 
 
-def input_matrices(
-    heights: tuple[int, int, int], F: ArrayLike | None, B: ArrayLike | None, D: ArrayLike | None
-) -> tuple[Floats, ...]:
-    """F, B and D as arrays, zero where not given; the given ones determine l.
+_Seven = tuple[Floats, Floats, Floats, Floats, Floats, Floats, Floats]
 
-    Parameters
-    ----------
-    heights
-        Their numbers of rows: nonlinearities, states and meters.
-    """
+
+def matrices_of(  # noqa: PLR0917  # all matrices
+    A: ArrayLike,
+    C: ArrayLike,
+    G: ArrayLike,
+    H: ArrayLike,
+    F: ArrayLike | None,
+    B: ArrayLike | None,
+    D: ArrayLike | None,
+) -> _Seven:
+    """Arrays A, G, H, F, B, C, D from nested lists; missing input matrices are zero, given ones state l."""
+    a, c, g, h = (np.asarray(one, dtype=np.float64) for one in (A, C, G, H))
     found = [None if one is None else np.asarray(one, dtype=np.float64) for one in (F, B, D)]
     inputs = max((one.shape[-1] for one in found if one is not None and one.ndim), default=0)
-    rows = zip(found, heights, strict=True)
-    return tuple(np.zeros((count, inputs)) if one is None else one for one, count in rows)
+    rows = zip(found, (h, a, c), strict=True)
+    f, b, d = (np.zeros((len(like), inputs)) if one is None else one for one, like in rows)
+    return a, g, h, f, b, c, d
 
 
-def freeze(system: object, *slopes: str) -> list[Problem]:
-    """Freeze the arrays of a new system and return their problems.
-
-    Parameters
-    ----------
-    system
-        Object with the seven matrices and the bounds of the slopes as attributes.
-    slopes
-        Attribute names of these bounds, (m,).
-
-    Returns
-    -------
-    list of str
-        One clause for every inconsistent shape, and one if an entry is not finite.
-    """
-    given: dict[str, Floats] = {name: frozen(getattr(system, name)) for name in (*_MATRICES, *slopes)}
+def freeze(system: Matrices, *slopes: str) -> list[Problem]:
+    """Freeze the seven matrices and the bounds `slopes` (m,) of a new system; return their problems."""
+    given: dict[str, Floats] = {name: frozen(getattr(system, name)) for name in (*"AGHFBCD", *slopes)}
     for name, array in given.items():
         object.__setattr__(system, name, array)
     if wrong := [
@@ -117,27 +86,17 @@ def freeze(system: object, *slopes: str) -> list[Problem]:
     return wrong
 
 
-def without_lower(system: Form, lower: Floats) -> tuple[Floats, Floats, Nonlinearity]:
+def without_lower(system: Matrices, phi: Nonlinearity, lower: Floats) -> tuple[Floats, Floats, Nonlinearity]:
     """Loop transform: the lower slopes of phi move into the linear part.
 
     `phi(z) = lower z + phi~(z)`, with slopes of phi~ in [0, upper - lower], and `A~ = A + G diag(lower) H`,
     `B~ = B + G diag(lower) F`. Trajectories do not change.
 
-    Parameters
-    ----------
-    system
-        System with slopes of phi from `lower` on.
-    lower : (m,)
-        The lower slopes.
-
-    Returns
-    -------
-    A~, B~, phi~
-        Of the same system; phi itself if `lower` is zero.
+    lower (m,): the lower slopes. Returns A~, B~, phi~; phi itself if `lower` is zero.
     """
     if not np.any(lower):
-        return system.A, system.B, system.phi
-    phi, pushed = system.phi, system.G * lower
+        return system.A, system.B, phi
+    pushed = system.G * lower
     return (
         system.A + pushed @ system.H,
         system.B + pushed @ system.F,
@@ -146,39 +105,15 @@ def without_lower(system: Form, lower: Floats) -> tuple[Floats, Floats, Nonlinea
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Lure:
+class Lure(Matrices):
     """`x' = A x + G phi(H x + F u) + B u`, `y = C x + D u`.
 
-    Attributes
-    ----------
-    A : (n, n)
-    G : (n, m)
-    H : (m, n)
-    F : (m, l)
-    B : (n, l)
-    C : (p, n)
-    D : (p, l)
-        The matrices of the system.
-    slope : (m,)
-        Upper bound of the slope of each entry of phi; the lower bound is 0.
-    phi
-        The nonlinearity, (…, m) -> (…, m), entry by entry. For a feeder: its `Droop`.
-
-    Raises
-    ------
-    ValueError
-        If shapes are inconsistent, an entry is not finite, or a slope is negative; lists every problem.
+    Raises ValueError if shapes are inconsistent, an entry is not finite, or a slope is negative; lists every
+        problem.
     """
 
-    A: Floats
-    G: Floats
-    H: Floats
-    F: Floats
-    B: Floats
-    C: Floats
-    D: Floats
-    slope: Floats
-    phi: Nonlinearity
+    slope: Floats  # (m,) upper bound of the slope of each entry of phi; the lower bound is 0
+    phi: Nonlinearity  # the nonlinearity, (…, m) -> (…, m), entry by entry. For a feeder: its `Droop`
 
     def __post_init__(self) -> None:
         wrong = freeze(self, "slope")
@@ -208,29 +143,17 @@ class Lure:
     ) -> Lure:
         """System from nested lists or arrays; a missing input matrix is zero.
 
-        Parameters
-        ----------
-        A, C, G, H, phi, F, B, D
-            As in the class. Without any of F, B and D there are no inputs, l = 0.
-        slope, lower
-            Bounds of the slopes of each entry of phi, or one number for all. A `lower` other than 0 moves
-            into the linear part: A, B, `slope` and phi of the result are those of `without_lower`.
-
-        Raises
-        ------
-        ValueError
-            If shapes are inconsistent, an entry is not finite, or a lower slope exceeds its upper one; lists
-            every problem.
-
-        References
-        ----------
-        chong2020 (9), (10).
+        A, C, G, H, phi, F, B, D: as in the class. Without any of F, B and D there are no inputs, l = 0.
+        slope, lower: bounds of the slopes of each entry of phi, or one number for all. A `lower` other than 0
+            moves into the linear part: A, B, `slope` and phi of the result are those of `without_lower`.
+        Raises ValueError if shapes are inconsistent, an entry is not finite, or a lower slope exceeds its
+            upper one; lists every problem.
+        Source: chong2020 (9), (10).
         """
-        a, c, g, h, high, low = as_floats(A, C, G, H, slope, lower)
-        f, b, d = input_matrices((len(h), len(a), len(c)), F, B, D)
-        high, low = (np.broadcast_to(bound, len(h)) for bound in (high, low))
-        given = cls(a, g, h, f, b, c, d, high - low, phi)
-        moved_a, moved_b, bent = without_lower(given, low)
+        found = matrices_of(A, C, G, H, F, B, D)
+        high, low = (np.broadcast_to(np.asarray(end, np.float64), len(found[2])) for end in (slope, lower))
+        given = cls(*found, high - low, phi)
+        moved_a, moved_b, bent = without_lower(given, phi, low)
         return replace(given, A=moved_a, B=moved_b, phi=bent)
 
 
@@ -242,21 +165,9 @@ def close_loop(feeder: Network | ThreePhaseFeeder, droop: Droop, meters: Ints) -
     pick the inverters' and the meters' customers, `B = 0`. The slopes are those of K (G carries 1/tau).
     On three phases X is that of `per_customer`, and neither symmetric nor nonnegative.
 
-    Parameters
-    ----------
-    feeder
-        The feeder, balanced or not.
-    meters : (p,)
-        Customer of each meter.
-
-    Raises
-    ------
-    FeederInvalid
-        If an inverter or a meter belongs to a customer that does not exist.
-
-    References
-    ----------
-    chong2020, section VII.
+    meters (p,): customer of each meter.
+    Raises FeederInvalid if an inverter or a meter belongs to a customer that does not exist.
+    Source: chong2020, section VII.
     """
     count = len(feeder.customers)
     problems = [
@@ -297,28 +208,17 @@ def known_input(  # noqa: PLR0917  # every argument is a term of chong2020 (19),
     v0_squared: Floats | float,
     correction: Floats | float = 0.0,
 ) -> Floats:
-    """Input w of the Lur'e system: z with all droop inverters at zero.
+    """Input w (…, N) of the Lur'e system, pu: z with all droop inverters at zero.
 
     `w = vbar^2 - v0^2 - 2 R p - 2 X q - correction`, chong2020 before (19), where q is the reactive
     injection without the inverters (`q = -q_c`).
 
-    Parameters
-    ----------
-    model
-        From `lindistflow`, or from `per_customer` on three phases.
-    vbar
-        Reference voltage of the droop, pu.
-    p, q : (…, N)
-        Active injection and reactive injection without the droop inverters, pu.
-    v0_squared : (…) or scalar
-        Squared busbar voltage, pu.
-    correction : (…, N) or scalar
-        Correction of the linear model's squared voltages: `loss_correction` at the customers.
-
-    Returns
-    -------
-    (…, N)
-        w, pu.
+    model: from `lindistflow`, or from `per_customer` on three phases.
+    vbar: reference voltage of the droop, pu.
+    p, q (…, N): active injection and reactive injection without the droop inverters, pu.
+    v0_squared (…) or scalar: squared busbar voltage, pu.
+    correction (…, N) or scalar: correction of the linear model's squared voltages: `loss_correction` at the
+        customers.
     """
     base = vbar**2 - np.asarray(v0_squared, dtype=np.float64)[..., None]
     return np.asarray(base - 2.0 * (p @ model.R.T + q @ model.X.T) - correction)
@@ -326,26 +226,16 @@ def known_input(  # noqa: PLR0917  # every argument is a term of chong2020 (19),
 
 @dataclass(frozen=True, slots=True)
 class StepPolicy:
-    """Substeps of `advance`, and its criterion for steps that end in the equilibrium.
+    """Substeps of `advance`, and its criterion for steps that end in the equilibrium."""
 
-    Attributes
-    ----------
-    substep
-        Longest substep times the fastest rate of the closed loop, dimensionless. The error of the
-        second-order scheme falls with its square.
-    settled
-        A step is long when every open-loop mode has decayed to this fraction; it then ends in the
-        equilibrium. If only some have, these are slowed down to exactly that decay (`rest`). 0 disables both.
-    tol
-        Residual of the equilibrium, relative to `unit`.
-    max_iter
-        Largest number of Newton steps for the equilibrium.
-    """
-
+    # longest substep times the fastest rate of the closed loop, dimensionless. The error of the second-order
+    # scheme falls with its square
     substep: float
+    # a step is long when every open-loop mode has decayed to this fraction; it then ends in the equilibrium.
+    # If only some have, these are slowed down to exactly that decay (`rest`). 0 disables both
     settled: float
-    tol: float
-    max_iter: int
+    tol: float  # residual of the equilibrium, relative to `unit`
+    max_iter: int  # largest number of Newton steps for the equilibrium
 
 
 POLICY = StepPolicy(substep=0.1, settled=1e-6, tol=1e-10, max_iter=200)
@@ -367,27 +257,16 @@ def rest(h: float, policy: StepPolicy) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LureTransition:
-    """Quantities of a step of length h that do not depend on x and u.
+    """Quantities of a step of length h that do not depend on x and u."""
 
-    Attributes
-    ----------
-    h
-        Length of the step, s.
-    substeps
-        Number of equal substeps; 0 for a long step that ends in the equilibrium.
-    decay, first, second : (n,) or (n, n)
-        `exp(A s)`, `s phi_1(A s)`, `s phi_2(A s)` for the substep s; diagonals where A is diagonal. `first`
-        and `second` include the slowed rows of G and B of slowed states.
-    policy
-        Policy of the step.
-    """
-
-    h: float
-    substeps: int
+    h: float  # length of the step, s
+    substeps: int  # number of equal substeps; 0 for a long step that ends in the equilibrium
+    # (n,) or (n, n) `exp(A s)`, `s phi_1(A s)`, `s phi_2(A s)` for the substep s; diagonals where A is
+    # diagonal. `first` and `second` include the slowed rows of G and B of slowed states
     decay: Floats
-    first: Floats
-    second: Floats
-    policy: StepPolicy
+    first: Floats  # (n,) or (n, n)
+    second: Floats  # (n,) or (n, n)
+    policy: StepPolicy  # policy of the step
 
 
 def transition(lure: Lure, h: float, policy: StepPolicy = POLICY) -> LureTransition:
@@ -398,24 +277,12 @@ def transition(lure: Lure, h: float, policy: StepPolicy = POLICY) -> LureTransit
     milliseconds with hours costs no more. Its effect on other states within the step is delayed by up to
     `h / ln(1 / settled)`, 7 % of the step.
 
-    Parameters
-    ----------
-    h
-        Length of the step, s, not negative.
-
-    Raises
-    ------
-    ValueError
-        If h is negative or not finite.
-
-    References
-    ----------
-    M. Hochbruck, A. Ostermann, "Exponential integrators", Acta Numerica 19, 2010, sections 2.1, 2.3.
+    h: length of the step, s, not negative.
+    Raises ValueError if h is negative or not finite.
+    Source: M. Hochbruck, A. Ostermann, "Exponential integrators", Acta Numerica 19, 2010, sections 2.1, 2.3.
     """
     if not (np.isfinite(h) and h >= 0):
-        raise InputInvalid(
-            [Problem("negative", f"h is {h} s; it must be a finite number that is not negative")]
-        )
+        raise InputInvalid.of("negative", f"h is {h} s; it must be a finite number that is not negative")
     own = np.diagonal(lure.A)
     diagonal = np.count_nonzero(lure.A) == np.count_nonzero(own)
     if diagonal:
@@ -452,22 +319,7 @@ _PERRON_ROUNDS = 8
 
 
 def step(prepared: LureTransition, lure: Lure, x: Floats, u: Floats) -> Floats:
-    """State after one prepared step, with u constant.
-
-    Parameters
-    ----------
-    prepared
-        From `transition`, for the same system.
-    x : (…, n)
-        State at the beginning.
-    u : (…, l)
-        Input during the step.
-
-    Returns
-    -------
-    (…, n)
-        State at the end.
-    """
+    """State after one step prepared for the same system, with u (…, l) constant and x (…, n)."""
     if prepared.substeps == 0:
         policy = prepared.policy
         return equilibrium(lure, u, x, tol=policy.tol * unit(lure.phi), max_iter=policy.max_iter)
@@ -501,24 +353,8 @@ def advance(lure: Lure, x: Floats, u: Floats, h: float, policy: StepPolicy = POL
     provided that it is attractive (proved for droop inverters in docs/theory-model.md). For many steps of one
     length, prepare them with `transition`.
 
-    Parameters
-    ----------
-    x : (…, n)
-        State at the beginning.
-    u : (…, l)
-        Input during the step.
-    h
-        Length of the step, s.
-
-    Returns
-    -------
-    (…, n)
-        State at the end.
-
-    Raises
-    ------
-    DesignInfeasible
-        If the equilibrium of a long step is not found.
+    x (…, n), u (…, l), h in s.
+    Raises DesignInfeasible if the equilibrium of a long step is not found.
     """
     return step(transition(lure, h, policy), lure, x, u)
 
@@ -526,23 +362,11 @@ def advance(lure: Lure, x: Floats, u: Floats, h: float, policy: StepPolicy = POL
 def equilibrium(lure: Lure, u: Floats, x0: Floats | None = None, *, tol: float, max_iter: int) -> Floats:
     """Equilibrium of the system, `A x + G phi(H x + F u) + B u = 0`.
 
-    Parameters
-    ----------
-    lure
-        The system; A must be invertible.
-    u : (…, l)
-        Input.
-    x0 : (…, n)
-        Initial value; 0 by default.
-    tol
-        Largest entry of the residual `x + A^-1 (G phi + B u)`, in the unit of x.
-    max_iter
-        Largest number of Newton steps.
-
-    Raises
-    ------
-    DesignInfeasible
-        If it is not found.
+    lure: the system; A must be invertible.
+    u (…, l).
+    x0 (…, n): initial value; 0 by default.
+    tol: largest entry of the residual `x + A^-1 (G phi + B u)`, in the unit of x.
+    Raises DesignInfeasible if it is not found.
     """
     gain = np.asarray(np.linalg.solve(-lure.A, lure.G), dtype=np.float64)
     bias = np.linalg.solve(-lure.A, lure.B)
@@ -550,3 +374,95 @@ def equilibrium(lure: Lure, u: Floats, x0: Floats | None = None, *, tol: float, 
     start = np.zeros(offset.shape) if x0 is None else np.broadcast_to(x0, offset.shape)
     drive = u @ lure.F.T
     return settle(lure.phi, gain, lure.H, drive=drive, bias=offset, x0=start, tol=tol, max_iter=max_iter)
+
+
+# Half-width of the difference quotients, relative: far above rounding, far below any deadband.
+_QUOTIENT = 1e-7
+_HALVINGS = 30
+
+
+def settle(
+    phi: Nonlinearity,
+    gain: Floats,
+    H: Floats,
+    *,
+    drive: Floats,
+    bias: Floats,
+    x0: Floats,
+    tol: float,
+    max_iter: int,
+) -> Floats:
+    """Solve `x = gain phi(H x + drive) + bias` by a damped semismooth Newton method.
+
+    The Jacobian `I - gain Delta H` takes Delta, the slopes of phi, from difference quotients, which are
+    elements of the generalised Jacobian except within rounding of a kink. The step is halved until the
+    residual falls. Plain iteration would need a loop gain below 1; this method does not.
+
+    phi: nonlinearity, entry by entry, non-decreasing.
+    gain (n, m): gain behind phi.
+    H (m, n) or (…, m, n): feedback, possibly one for every leading index (one observer each).
+    drive (…, m). bias (…, n): constant parts.
+    x0 (…, n): initial value.
+    tol: largest entry of the residual, in the unit of x.
+    Raises DesignInfeasible if the residual is still above `tol` after `max_iter` steps.
+    """
+    lead = np.broadcast_shapes(x0.shape[:-1], drive.shape[:-1], bias.shape[:-1], H.shape[:-2])
+    (n, m), count = gain.shape, prod(lead)
+    x = np.array(np.broadcast_to(x0, (*lead, n)), dtype=np.float64).reshape(count, n)
+    c = np.broadcast_to(drive, (*lead, m)).reshape(count, m)
+    e = np.broadcast_to(bias, (*lead, n)).reshape(count, n)
+    every = np.broadcast_to(H, (*lead, m, n)).reshape(count, m, n) if H.ndim > 2 else H[None]
+    rows, loop = np.arange(count), _Loop(phi, gain, every, c, e)
+    for _ in range(max_iter):
+        residual = loop.residual(x[rows])
+        rough = np.max(np.abs(residual), axis=-1, initial=0.0) > tol
+        if not rough.any():
+            return x.reshape(*lead, n)
+        rows, loop = rows[rough], loop.rows(rough)
+        x[rows] = loop.newton(x[rows], residual[rough])
+    raise DesignInfeasible(
+        "equilibrium of the droop loop",
+        f"residual above {tol:g} after {max_iter} Newton steps",
+        None,
+        code="not-converged",
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Loop:
+    """The equation `x - gain phi(H x + drive) - bias = 0` for k rows at once."""
+
+    phi: Nonlinearity
+    gain: Floats
+    H: Floats  # (1 or k, m, n)
+    drive: Floats
+    bias: Floats
+
+    def rows(self, keep: Bools) -> _Loop:
+        H = self.H if self.H.shape[0] == 1 else self.H[keep]
+        return _Loop(self.phi, self.gain, H, self.drive[keep], self.bias[keep])
+
+    def outputs(self, x: Floats) -> Floats:
+        if self.H.shape[0] == 1:
+            return np.asarray(x @ self.H[0].T + self.drive)
+        return np.asarray(np.einsum("kmn,kn->km", self.H, x) + self.drive)
+
+    def residual(self, x: Floats) -> Floats:
+        return np.asarray(x - self.phi(self.outputs(x)) @ self.gain.T - self.bias)
+
+    def newton(self, x: Floats, residual: Floats) -> Floats:
+        """One damped Newton step from `x` (k, n) with residual `residual`."""
+        z = self.outputs(x)
+        width = _QUOTIENT * np.maximum(1.0, np.abs(z))
+        slopes = (self.phi(z + width) - self.phi(z - width)) / (2.0 * width)
+        jacobian = np.eye(x.shape[1]) - (self.gain * slopes[:, None, :]) @ self.H
+        direction = -np.linalg.solve(jacobian, residual[..., None])[..., 0]
+        size = np.linalg.norm(residual, axis=-1)
+        length = np.ones(x.shape[0])
+        for _ in range(_HALVINGS):
+            trial = x + length[:, None] * direction
+            worse = np.linalg.norm(self.residual(trial), axis=-1) > (1.0 - 1e-4 * length) * size
+            if not worse.any():
+                break
+            length = np.where(worse, 0.5 * length, length)
+        return np.asarray(x + length[:, None] * direction)

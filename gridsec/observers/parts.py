@@ -4,9 +4,7 @@
 
 The partial observers of `luenberger` and `kalman` estimate z_i from y_i alone.
 
-References
-----------
-lee2018, section 4.2.1; docs/theory-partial-observers.md.
+Source: lee2018, section 4.2.1; docs/theory-partial-observers.md.
 """
 
 from __future__ import annotations
@@ -17,37 +15,20 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import LinAlgError, block_diag, schur, solve_discrete_are
 
-from gridsec.arrays import Bools, Floats, Ints, frozen, frozen_ints, unit_rows
-from gridsec.errors import DesignInfeasible, InputInvalid, Problem
+from gridsec.arrays import Bools, Floats, Ints, frozen, frozen_ints, spectral_radius, unit_rows
+from gridsec.errors import DesignInfeasible, InputInvalid
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorDecomposition:
-    """Decomposition of an n-dimensional state for one sensor: an orthonormal basis in three pieces.
+    """Orthonormal basis of the state for one sensor, in three pieces; lee2018 (4.2.3) to (4.2.5)."""
 
-    Attributes
-    ----------
-    observable : (n, nu)
-        Z^o, basis of the orthogonal complement of the unobservable subspace N(G_i).
-    fading : (n, mu - nu)
-        Z^d, basis of the unobservable part that a model predicts with decaying error.
-    hidden : (n, n - mu)
-        W, basis of the rest: unobservable and not predictable.
-    S : (mu, mu)
-        Motion of z = Z^T x with Z = [Z^o Z^d]; block lower triangular.
-    t : (mu,)
-        The sensor's row on z; zero beyond the first nu.
-
-    References
-    ----------
-    lee2018 (4.2.3)-(4.2.5).
-    """
-
-    observable: Floats
+    observable: Floats  # (n, nu) Z^o, basis of the orthogonal complement of the unobservable subspace N(G_i)
+    # (n, mu - nu) Z^d, basis of the unobservable part that a model predicts with decaying error
     fading: Floats
-    hidden: Floats
-    S: Floats
-    t: Floats
+    hidden: Floats  # (n, n - mu) W, basis of the rest: unobservable and not predictable
+    S: Floats  # (mu, mu) motion of z = Z^T x with Z = [Z^o Z^d]; block lower triangular
+    t: Floats  # (mu,) the sensor's row on z; zero beyond the first nu
 
     @property
     def basis(self) -> Floats:
@@ -62,50 +43,30 @@ def decompose(A: Floats, C: Floats, *, slowest: float, tol: float) -> tuple[Sens
     others into `hidden`. Hence `slowest=0` gives the Kalman observability decomposition (no unobservable mode
     is kept), and `slowest=1` the detectability decomposition.
 
-    Parameters
-    ----------
-    A, C : (n, n), (p, n)
-        The pair, sampled.
-    slowest
-        In [0, 1], preferably slightly below 1: a mode that decays in 1e6 steps is useless, and rounding moves
-        a repeated eigenvalue on the unit circle slightly inside.
-    tol
-        A row of the observability matrix, orthogonalised against those before it, counts as new if longer
+    A (n, n), C (p, n): the pair, sampled.
+    slowest: in [0, 1], preferably slightly below 1: a mode that decays in 1e6 steps is useless, and rounding
+        moves a repeated eigenvalue on the unit circle slightly inside.
+    tol: a row of the observability matrix, orthogonalised against those before it, counts as new if longer
         than this times |A|. A large value makes parts smaller; a small one keeps directions that only noise
         determines. A sensor with a row up to this fraction of the longest measures nothing.
-
-    Returns
-    -------
-    p times Part
-
-    Raises
-    ------
-    ValueError
-        If `slowest` is not in [0, 1].
-
-    References
-    ----------
-    lee2018, section 4.2.1.
+    Raises ValueError if `slowest` is not in [0, 1].
+    Source: lee2018, section 4.2.1.
     """
     A, C = np.asarray(A, dtype=np.float64), np.asarray(C, dtype=np.float64)
     if A.ndim != 2 or A.shape[0] != A.shape[1] or C.ndim != 2 or C.shape[1] != A.shape[0]:
-        raise InputInvalid(
-            [Problem("shape", f"A has shape {A.shape} and C {C.shape}; (n, n) and (p, n) are needed")]
-        )
+        raise InputInvalid.of("shape", f"A has shape {A.shape} and C {C.shape}; (n, n) and (p, n) are needed")
     if not 0.0 <= slowest <= 1.0:
-        raise InputInvalid(
-            [
-                Problem(
-                    "out-of-range", f"slowest is {slowest}; it is the modulus of a decaying mode, in [0, 1]"
-                )
-            ]
+        raise InputInvalid.of(
+            "out-of-range", f"slowest is {slowest}; it is the modulus of a decaying mode, in [0, 1]"
         )
     return tuple(_part(A, c, row, slowest, tol) for c, row in zip(C, unit_rows(C, tol=tol), strict=True))
 
 
 def _part(A: Floats, c: Floats, row: Floats, slowest: float, tol: float) -> SensorDecomposition:
     """Decomposition for the sensor with row c, of length one in `row`."""
-    seen, unseen = _krylov(A, row, tol)
+    seen = krylov(A, row, tol)
+    full = np.linalg.qr(seen, mode="complete")[0] if seen.shape[1] else np.eye(len(A))
+    unseen = full[:, seen.shape[1] :]
     hidden_count, turn = 0, np.zeros((0, 0))
     if unseen.shape[1]:
         # N(G) is invariant: the leading Schur vectors of its slow modes are invariant too, and the others
@@ -121,8 +82,8 @@ def _part(A: Floats, c: Floats, row: Floats, slowest: float, tol: float) -> Sens
     )
 
 
-def _krylov(A: Floats, row: Floats, tol: float) -> tuple[Floats, Floats]:
-    """Orthonormal bases of span{c, A^T c, …} and of its complement, without powers of A; c of length one."""
+def krylov(A: Floats, row: Floats, tol: float) -> Floats:
+    """Orthonormal basis of span{c, A^T c, …} in columns, without powers of A; c of length one."""
     n = A.shape[0]
     size = float(np.linalg.norm(A, 2)) or 1.0
     basis = np.zeros((n, 0))
@@ -132,38 +93,19 @@ def _krylov(A: Floats, row: Floats, tol: float) -> tuple[Floats, Floats]:
         # Twice, because later rows would inherit the rounding errors of a single pass.
         for _ in range(2):
             row = row - basis @ (basis.T @ row)
-    full, _ = np.linalg.qr(basis, mode="complete") if basis.shape[1] else (np.eye(n), None)
-    return basis, full[:, basis.shape[1] :]
+    return basis
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StackedDecompositions:
-    """All parts, stacked. mu is the sum of the parts' sizes.
+    """All parts, stacked; lee2018 (4.2.5), (4.2.9), (4.2.10). mu is the sum of the parts' sizes."""
 
-    Attributes
-    ----------
-    parts
-        One for each sensor.
-    first : (p + 1,)
-        Sensor i has the rows `first[i]:first[i + 1]` of the stacked arrays.
-    phi : (mu, n)
-        Phi = [Z_1 … Z_p]^T, without the zero rows of the paper.
-    S, T : (mu, mu), (p, mu)
-        Motion and outputs of the stacked z; block diagonal.
-    G : (mu, m)
-        Phi B.
-
-    References
-    ----------
-    lee2018 (4.2.9), (4.2.10), (4.2.5).
-    """
-
-    parts: tuple[SensorDecomposition, ...]
-    first: Ints
-    phi: Floats
-    S: Floats
-    T: Floats
-    G: Floats
+    parts: tuple[SensorDecomposition, ...]  # one for each sensor
+    first: Ints  # (p + 1,) sensor i has the rows `first[i]:first[i + 1]` of the stacked arrays
+    phi: Floats  # (mu, n) Phi = [Z_1 … Z_p]^T, without the zero rows of the paper
+    S: Floats  # (mu, mu) motion of the stacked z; block diagonal
+    T: Floats  # (p, mu) outputs of the stacked z; block diagonal
+    G: Floats  # (mu, m) Phi B
 
     def rows(self, sensor: int) -> slice:
         """Rows of one sensor."""
@@ -176,15 +118,7 @@ class StackedDecompositions:
 
 
 def stack(parts: Sequence[SensorDecomposition], B: Floats) -> StackedDecompositions:
-    """Stack the parts.
-
-    Parameters
-    ----------
-    parts
-        From `decompose`.
-    B : (n, m)
-        Input matrix.
-    """
+    """Stack the parts, for the input matrix B (n, m)."""
     phi = np.vstack([part.basis.T for part in parts])
     first = np.concatenate([[0], np.cumsum([part.t.size for part in parts])])
     T = np.zeros((len(parts), phi.shape[0]))
@@ -201,21 +135,11 @@ def riccati(S: Floats, t: Floats, Q: Floats, r: float, *, tol: float) -> Floats:
 
         M = S M S^T + Q - S M t t^T M S^T / (t^T M t + r)
 
-    Parameters
-    ----------
-    S, t : (mu, mu), (mu,)
-        The sensor's part.
-    Q : (mu, mu)
-        Covariance of the disturbance of z.
-    r
-        Variance of the sensor's noise, > 0.
-    tol
-        Largest residual of the equation, relative to its largest term.
-
-    Raises
-    ------
-    DesignInfeasible
-        If no stabilising solution within `tol` is found.
+    S (mu, mu), t (mu,): the sensor's part.
+    Q (mu, mu): covariance of the disturbance of z.
+    r: variance of the sensor's noise, > 0.
+    tol: largest residual of the equation, relative to its largest term.
+    Raises DesignInfeasible if no stabilising solution within `tol` is found.
     """
     best, worst, said = S, np.inf, "no stabilising solution"
     # SciPy's balancing fails by orders of magnitude for zeros in t, as with fading modes; without it badly
@@ -237,16 +161,15 @@ def riccati(S: Floats, t: Floats, Q: Floats, r: float, *, tol: float) -> Floats:
     return np.asarray(0.5 * (best + best.T))
 
 
-def heard(y: Floats, seen: Bools | None) -> Bools:
-    """Sensors with usable readings, (p,): seen, and finite in all runs.
+def require_stable(F: Floats, what: str, *, rate: float = 1.0) -> None:
+    """Raise DesignInfeasible unless the spectral radius of F is below `rate`."""
+    radius = spectral_radius(F)
+    if not radius < rate:
+        raise DesignInfeasible(what, f"spectral radius {radius:.6g}", rate - radius, code="unstable")
 
-    Parameters
-    ----------
-    y : (…, p)
-        Readings; leading axes are independent runs.
-    seen : (p,)
-        True for existing readings; all if None.
-    """
+
+def heard(y: Floats, seen: Bools | None) -> Bools:
+    """Sensors with usable readings y (…, p): `seen` (p,), if given, and finite in all runs; (p,)."""
     finite = np.isfinite(y)
     live = finite.all(axis=tuple(range(finite.ndim - 1)))
     return np.asarray(live if seen is None else live & np.asarray(seen, dtype=np.bool_))

@@ -3,9 +3,7 @@
     x+ = A x + G phi(H x + F u) + B u + B_a a_u + E d,      y = C x + D u + a_y + n
 
 The attack a_u is an unknown input of any size. An observer that trusts the sensors J_s and uses no knowledge
-of the inputs J_u needs `rank(C_Js b_Ju) = |J_u|`, and its zeros inside the unit circle.
-
-Observer i trusts the sensors J_s and uses no knowledge of the inputs J_u:
+of the inputs J_u needs `rank(C_Js b_Ju) = |J_u|`, and its zeros inside the unit circle:
 
     x_hat+ = Gbar (A x_hat + G phi(H x_hat + F u) + B u) + K (y - C x_hat - D u)_J + b H (y+ - D u+)_J
 
@@ -13,11 +11,8 @@ Besides its estimate every observer has two bounds of its error that hold while 
 attacked inputs and J_s no attacked sensor: `level`, of `sqrt(e^T P e)` by the design's certificate, and
 `box`, entry by entry, by comparison with a non-negative system. The smaller one is used.
 
-References
-----------
-yang2021 (2), (17), (33) to (36); docs/theory-unknown-input.md.
-yang2021 (1), (16), (18), (33); docs/theory-unknown-input.md.
-yang2021 (35), (36), with the injection of y+ in (35) corrected: docs/errata/yang2021.md.
+Source: yang2021 (1), (2), (16) to (18), (33) to (36), with the injection of y+ in (35) corrected:
+docs/errata/yang2021.md. Theory: docs/theory-unknown-input.md.
 """
 
 from __future__ import annotations
@@ -48,34 +43,17 @@ Pair = tuple[tuple[int, ...], tuple[int, ...]]
 class UnknownInputPlant:
     """A sampled plant with inputs and sensors that may be attacked. n states, r inputs, p sensors.
 
-    Attributes
-    ----------
-    system
-        The plant without attacks.
-    inputs : (n, r)
-        B_a, full column rank. For yang2021 (33) also the B of the known input.
-    noise : (p,)
-        Largest error of each unmanipulated reading; either all positive or all zero.
-    drift : (n, d)
-        E: deviation of the plant from its model, with |d_i| <= 1.
-    span : (n,)
-        Largest possible |x_i|, or infinity. The only knowledge at the start.
-
-    Raises
-    ------
-    ValueError
-        If shapes are inconsistent, the columns of `inputs` are dependent, or `noise` or `span` is invalid;
-        lists every problem.
+    Raises ValueError if shapes are inconsistent, the columns of `inputs` are dependent, or `noise` or `span`
+        is invalid; lists every problem.
     """
 
-    system: DiscreteLure
-    inputs: Floats
-    noise: Floats
-    drift: Floats
-    span: Floats
+    system: DiscreteLure  # the plant without attacks
+    inputs: Floats  # (n, r) B_a, full column rank. For yang2021 (33) also the B of the known input
+    noise: Floats  # (p,) largest error of each unmanipulated reading; either all positive or all zero
+    drift: Floats  # (n, d) E: deviation of the plant from its model, with |d_i| <= 1
+    span: Floats  # (n,) largest possible |x_i|, or infinity. The only knowledge at the start
 
     def __post_init__(self) -> None:
-        """Freeze the arrays and refuse invalid values."""
         for name in ("inputs", "noise", "drift", "span"):
             object.__setattr__(self, name, frozen(getattr(self, name)))
         n, p = len(self.system.A), len(self.system.C)
@@ -140,86 +118,47 @@ def inverters(
     of its reactive injection corresponds to some a_u. Sampled at h with `lmi.sampled.sample`. Sensors are the
     voltage meters, then the reported reactive injections of inverters.
 
-    Parameters
-    ----------
-    lure
-        Closed loop of a feeder, from `close_loop`.
-    h
-        Time between readings, s.
-    attackable : (r,)
-        Inverters with an attackable set point.
-    reading_error : (p',)
-        Largest error of each voltage meter, squared pu.
-    u_error : (l,)
-        Largest error of each entry of the known input, squared pu. It adds to the readings' errors
+    lure: closed loop of a feeder, from `close_loop`.
+    h: time between readings, s.
+    attackable (r,): inverters with an attackable set point.
+    reading_error (p',): largest error of each voltage meter, squared pu.
+    u_error (l,): largest error of each entry of the known input, squared pu. It adds to the readings' errors
         through D and to the set points' through the steepest slope of the curve.
-    curve_error : (m,)
-        Largest further error of each inverter's set point, pu: motion of z within a step, difference between
-        the curve and the model's.
-    span : (m,)
-        Largest reactive injection of each inverter, attacked or not, pu.
-    reports : (k,)
-        Inverters with a reported reactive injection.
-    report_error : (k,)
-        Largest error of each report, pu.
-
-    Raises
-    ------
-    ValueError
-        As `UnknownInputPlant`, or if reports and their errors differ in number.
+    curve_error (m,): largest further error of each inverter's set point, pu: motion of z within a step,
+        difference between the curve and the model's.
+    span (m,): largest reactive injection of each inverter, attacked or not, pu.
+    reports (k,): inverters with a reported reactive injection.
+    report_error (k,): largest error of each report, pu.
+    Raises ValueError as `UnknownInputPlant`, or if reports and their errors differ in number.
     """
     system = sample(lure, h)
     n, inputs = system.B.shape
     told = np.zeros(0, dtype=np.intp) if reports is None else np.asarray(reports, dtype=np.intp)
     error = np.zeros(0) if report_error is None else np.asarray(report_error, dtype=np.float64)
     if told.size != error.size:
-        raise InputInvalid(
-            [Problem("shape", f"{told.size} inverters report, but {error.size} errors of reports are given")]
+        raise InputInvalid.of(
+            "shape", f"{told.size} inverters report, but {error.size} errors of reports are given"
         )
-    whole = DiscreteLure(
-        A=system.A,
-        G=system.G,
-        H=system.H,
-        F=system.F,
-        B=system.B,
-        C=np.vstack([system.C, np.eye(n)[told]]),
-        D=np.vstack([system.D, np.zeros((told.size, inputs))]),
-        lower=system.lower,
-        upper=system.upper,
-        phi=system.phi,
-        h=h,
-    )
+    C, D = np.vstack([system.C, np.eye(n)[told]]), np.vstack([system.D, np.zeros((told.size, inputs))])
     off = curve_error + lure.slope * (np.abs(lure.F) @ u_error)
     drift = system.G * off
     noise = np.concatenate([reading_error + np.abs(lure.D) @ u_error, error])
+    whole = replace(system, C=C, D=D)
     return UnknownInputPlant(whole, system.G[:, attackable], noise, drift[:, off > 0.0], span)
 
 
 @dataclass(frozen=True, slots=True)
 class Missing:
-    """An observer missing from a bank.
+    """An observer missing from a bank."""
 
-    Attributes
-    ----------
-    pair
-        (J_u, J_s).
-    reason
-        "rank": the sensors do not observe every unknown input. "zero": a zero outside the unit circle. Either
-        proves that no observer satisfies (3) or (21) of yang2021. "design": no gain was found; others may
-        exist.
-    rank
-        Rank of `C_Js b_Ju`.
-    value
-        Smallest singular value relative to the largest; modulus of the zero; or the design's margin.
-    why
-        One sentence.
-    """
-
-    pair: Pair
+    pair: Pair  # (J_u, J_s)
+    # "rank": the sensors do not observe every unknown input. "zero": a zero outside the unit circle. Either
+    # proves that no observer satisfies (3) or (21) of yang2021. "design": no gain was found; others may exist
     reason: Literal["rank", "zero", "design"]
-    rank: int
+    rank: int  # rank of `C_Js b_Ju`
+    # smallest singular value relative to the largest; modulus of the zero; or the design's margin
     value: float
-    why: str
+    why: str  # one sentence
 
 
 def obstruction(plant: UnknownInputPlant, pair: Pair, *, tolerance: float) -> Missing | None:
@@ -230,17 +169,9 @@ def obstruction(plant: UnknownInputPlant, pair: Pair, *, tolerance: float) -> Mi
     plant a zero of modulus above 1. (Proofs: docs/theory-unknown-input.md, sections 2 and 3; the latter
     presumes that the known input can hold the plant where its slopes are these.)
 
-    Parameters
-    ----------
-    pair
-        (J_u, J_s).
-    tolerance
-        Singular values below this part of the largest count as zero.
-
-    Returns
-    -------
-    Missing or None
-        None if both conditions hold; a design may still not exist.
+    pair: (J_u, J_s).
+    tolerance: singular values below this part of the largest count as zero.
+    Returns None if both conditions hold; a design may still not exist.
     """
     unknown, sensors = list(pair[0]), list(pair[1])
     seen = plant.system.C[sensors] / plant.scale[sensors, None] @ plant.inputs[:, unknown]
@@ -266,15 +197,8 @@ def worst_zero(plant: UnknownInputPlant, pair: Pair) -> float:
     Only for as many sensors as unknown inputs: then the error invisible to the sensors moves inside
     `ker C_Js` by `Gbar (A + G diag(d) H)`, and its eigenvalues there are the zeros.
 
-    Parameters
-    ----------
-    pair
-        (J_u, J_s), with `C_Js b_Ju` square and regular.
-
-    Raises
-    ------
-    DesignInfeasible
-        If there are too many nonlinearities to visit all corners.
+    pair: (J_u, J_s), with `C_Js b_Ju` square and regular.
+    Raises DesignInfeasible if there are too many nonlinearities to visit all corners.
     """
     system, sensors = plant.system, list(pair[1])
     blind, _ = projection(plant, pair)
@@ -305,15 +229,8 @@ def projection(plant: UnknownInputPlant, pair: Pair) -> tuple[Floats, Floats]:
     H is the left inverse of `C_J b` that is least squares in units of the sensors' errors; with equal
     errors this is the Moore-Penrose inverse of the paper.
 
-    Parameters
-    ----------
-    plant, pair
-        As in `obstruction`, which must return None.
-
-    Returns
-    -------
-    blind, inject : (n, n), (n, |J_s|)
-        `blind @ b = 0`.
+    plant, pair: as in `obstruction`, which must return None.
+    Returns blind (n, n), inject (n, |J_s|): `blind @ b = 0`.
     """
     unknown, sensors = list(pair[0]), list(pair[1])
     n = len(plant.system.A)
@@ -329,10 +246,7 @@ def error_system(plant: UnknownInputPlant, pair: Pair) -> ErrorSystem:
 
     `e+ = (Gbar (A + G mid H) - K C_J) e + Gbar G psi + [b H N, Gbar E] w + K N n` with `e = x_hat - x`.
 
-    Parameters
-    ----------
-    plant, pair
-        As in `projection`.
+    plant, pair: as in `projection`.
     """
     system, sensors = plant.system, list(pair[1])
     blind, inject = projection(plant, pair)
@@ -358,72 +272,36 @@ def pairs_text(pairs: Sequence[Pair]) -> str:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UnknownInputObserver:
-    """Stacked observers. c observers, n states, r inputs, p sensors.
-
-    Attributes
-    ----------
-    pairs
-        (J_u, J_s) of each observer.
-    missing
-        Requested observers that do not exist or were not found.
-    sensors : (c, p)
-        J_s as masks.
-    blind : (c, n, n)
-        Gbar.
-    inject, K : (c, n, p)
-        `b H` and the gain, zero in the columns of sensors outside J_s.
-    gains
-        Gain and proof of each observer, as designed.
-    rate, push, slip : (c,)
-        `level+ <= sqrt((rate level)^2 + push^2) + slip`.
-    reach : (c, n)
-        `|e_i| <= reach_i level`.
-    shrink, floor : (c, n, n), (c, n)
-        `box+ <= shrink box + floor`.
-    """
+    """Stacked observers. c observers, n states, r inputs, p sensors."""
 
     plant: UnknownInputPlant
-    pairs: tuple[Pair, ...]
-    missing: tuple[Missing, ...]
-    sensors: Bools
-    blind: Floats
-    inject: Floats
-    K: Floats
-    gains: tuple[UnknownInputGains, ...]
-    rate: Floats
-    push: Floats
-    slip: Floats
-    reach: Floats
-    shrink: Floats
-    floor: Floats
+    pairs: tuple[Pair, ...]  # (J_u, J_s) of each observer
+    missing: tuple[Missing, ...]  # requested observers that do not exist or were not found
+    sensors: Bools  # (c, p) J_s as masks
+    blind: Floats  # (c, n, n) Gbar
+    inject: Floats  # (c, n, p) `b H`; zero columns for sensors outside J_s
+    K: Floats  # (c, n, p) gain; zero columns likewise
+    gains: tuple[UnknownInputGains, ...]  # gain and proof of each observer, as designed
+    rate: Floats  # (c,) `level+ <= sqrt((rate level)^2 + push^2) + slip`
+    push: Floats  # (c,)
+    slip: Floats  # (c,)
+    reach: Floats  # (c, n) `|e_i| <= reach_i level`
+    shrink: Floats  # (c, n, n) `box+ <= shrink box + floor`
+    floor: Floats  # (c, n)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UnknownInputObserverState:
-    """State of the observers. c observers, n states, p sensors, l inputs.
+    """State of the observers. c observers, n states, p sensors, l inputs."""
 
-    Attributes
-    ----------
-    t
-        Time, s.
-    x : (c, n)
-        Estimates.
-    level, box : (c,), (c, n)
-        Bounds of their errors.
-    y, u, seen : (p,), (l,), (p,) or None
-        The last readings; None before the first ones.
-    live : (c,)
-        True if the observer had all its readings in the last step.
-    """
-
-    t: float
-    x: Floats
-    level: Floats
-    box: Floats
-    y: Floats | None
-    u: Floats | None
-    seen: Bools | None
-    live: Bools
+    t: float  # time, s
+    x: Floats  # (c, n) estimates
+    level: Floats  # (c,) bound of each error in the norm `sqrt(e^T P e)`
+    box: Floats  # (c, n) bound of each entry of the errors
+    y: Floats | None  # (p,) the last readings; None before the first ones
+    u: Floats | None  # (l,) input of the same tick
+    seen: Bools | None  # (p,) mask of these readings
+    live: Bools  # (c,) True if the observer had all its readings in the last step
 
 
 def design(
@@ -437,27 +315,15 @@ def design(
 ) -> UnknownInputObserver:
     """Design the observers of several pairs; impossible ones are reported in `missing`.
 
-    Parameters
-    ----------
-    pairs
-        (J_u, J_s) of each observer, indices from 0.
-    rates
-        Contractions per step to try, ascending; the first one with a gain is used.
-    multiplier
-        "diagonal" uses a slope for every nonlinearity, "scalar" only the common Lipschitz constant, as (34)
-        does. The latter needs equal half-widths and `H = I`.
-    tolerance
-        For the conditions of existence, see `obstruction`.
-    rounding
-        Added to the bound of every entry at every step, in the unit of x: allowance for floating point and
-        the solver's accuracy.
-
-    Raises
-    ------
-    DesignInfeasible
-        If none of the observers exists.
-    ValueError
-        If `rates` is empty, or `multiplier` is unknown.
+    pairs: (J_u, J_s) of each observer, indices from 0.
+    rates: contractions per step to try, ascending; the first one with a gain is used.
+    multiplier: "diagonal" uses a slope for every nonlinearity, "scalar" only the common Lipschitz constant,
+        as (34) does. The latter needs equal half-widths and `H = I`.
+    tolerance: for the conditions of existence, see `obstruction`.
+    rounding: added to the bound of every entry at every step, in the unit of x: allowance for floating point
+        and the solver's accuracy.
+    Raises DesignInfeasible if none of the observers exists. ValueError if `rates` is empty, or `multiplier`
+        is unknown.
     """
     raise_if_any(
         [] if len(rates) else [Problem("missing", "rates are empty; at least one contraction is needed")]
@@ -556,14 +422,9 @@ def init(
 ) -> UnknownInputObserverState:
     """Initial state of all observers, at the same estimate.
 
-    Parameters
-    ----------
-    t
-        Time, s.
-    x : (n,)
-        Initial estimate; zero by default.
-    radius : (n,)
-        Bound of its error, entry by entry; by default |x| plus the plant's span.
+    t: time, s.
+    x (n,): initial estimate; zero by default.
+    radius (n,): bound of its error, entry by entry; by default |x| plus the plant's span.
     """
     count, n = len(design.pairs), len(design.plant.span)
     start = np.zeros(n) if x is None else np.asarray(x, dtype=np.float64)
@@ -594,21 +455,12 @@ def step(
 ) -> UnknownInputObserverState:
     """Process the readings of one tick. The first ones are only stored: an observer needs two.
 
-    Parameters
-    ----------
-    y : (p,)
-        Readings at this tick; arbitrary where unseen.
-    u : (l,)
-        Known input from this tick on, and of this tick's readings; finite.
-    seen : (p,)
-        True for existing readings. Unseen ones have no influence. An observer without a reading of one of its
-        sensors, now or at the last tick, runs on the model with all attacks at zero; its error bound is then
-        the plant's span.
-
-    Returns
-    -------
-    UnknownInputState
-        One tick later. Never raises on data.
+    y (p,): readings at this tick; arbitrary where unseen.
+    u (l,): known input from this tick on, and of this tick's readings; finite.
+    seen (p,): True for existing readings. Unseen ones have no influence. An observer without a reading of one
+        of its sensors, now or at the last tick, runs on the model with all attacks at zero; its error bound
+        is then the plant's span.
+    Never raises on data.
     """
     plant, system = design.plant, design.plant.system
     heard = np.asarray(seen, dtype=np.bool_) & np.isfinite(y)
@@ -646,12 +498,6 @@ def _grown(design: UnknownInputObserver, box: Floats) -> Floats:
 
 
 def outputs(design: UnknownInputObserver, state: UnknownInputObserverState, u: Floats) -> Floats:
-    """Expected reading of every sensor by every observer, `C x_hat + D u`; (c, p).
-
-    Parameters
-    ----------
-    u : (l,)
-        Known input of the tick.
-    """
+    """Expected reading of every sensor by every observer, `C x_hat + D u`, for the tick's u (l,); (c, p)."""
     system = design.plant.system
     return np.asarray(state.x @ system.C.T + system.D @ u)

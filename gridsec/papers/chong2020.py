@@ -4,9 +4,7 @@ The paper prints no numbers; feeder and attack are this project's. The corrected
 every set J of at least N - 2M meters and verified without the solver. (8) and (20), corrected, are evaluated
 twice: with the gains L_J, K_J of these solutions, and with direct injection L = 0, K = E_J.
 
-References
-----------
-chong2020, sections V to VII; docs/errata/chong2020.md.
+Source: chong2020, sections V to VII; docs/errata/chong2020.md.
 """
 
 from __future__ import annotations
@@ -21,7 +19,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from gridsec.arrays import Floats, Ints
-from gridsec.errors import InputInvalid, Problem
+from gridsec.errors import InputInvalid
 from gridsec.estimators.exact_bank import bank as banks
 from gridsec.grid.droop import Droop, fleet
 from gridsec.grid.radial import Feeder
@@ -50,24 +48,12 @@ GAINS = {"(12)": "L, K of (12)", "direct": "L = 0, K = E_J"}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chong2020Feeder:
-    """Feeder of the paper's Figure 2, per unit on 100 kVA and 230 V.
+    """Feeder of the paper's Figure 2, per unit on 100 kVA and 230 V."""
 
-    Attributes
-    ----------
-    feeder
-        Main line and service drops.
-    droop
-        One inverter at each customer, all with the same time constant.
-    lure
-        The closed loop (9), outputs and arguments in z.
-    w : (N,)
-        Known input, constant.
-    """
-
-    feeder: Feeder
-    droop: Droop
-    lure: Lure
-    w: Floats
+    feeder: Feeder  # main line and service drops
+    droop: Droop  # one inverter at each customer, all with the same time constant
+    lure: Lure  # the closed loop (9), outputs and arguments in z
+    w: Floats  # (N,) known input, constant
 
 
 @cache
@@ -100,18 +86,10 @@ def reported(z: Floats, vbar: float, alpha: Floats) -> Floats:
 
     `y = z + a`, `a = -2 v alpha - alpha^2`; the paper prints `2 v alpha - alpha^2`.
 
-    Parameters
-    ----------
-    z : (…, N)
-        True `vbar^2 - v^2`, pu.
-    vbar
-        Reference voltage, pu.
-    alpha : (…, N)
-        Attack on the voltage, pu.
-
-    References
-    ----------
-    chong2020 (14), and the attack signal of section VII.
+    z (…, N): True `vbar^2 - v^2`, pu.
+    vbar: reference voltage, pu.
+    alpha (…, N): attack on the voltage, pu.
+    Source: chong2020 (14), and the attack signal of section VII.
     """
     v = np.sqrt(vbar**2 - z)
     return np.asarray(vbar**2 - (v + alpha) ** 2)
@@ -126,32 +104,16 @@ def attack(t: float) -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chong2020Run:
-    """Plant and all observers over time. T times, N customers, o observers.
+    """Plant and all observers over time. T times, N customers, o observers."""
 
-    Attributes
-    ----------
-    t : (T,)
-        s.
-    x : (T, N)
-        True reactive injections, pu.
-    estimates : (T, o, N)
-        Those of every observer.
-    chosen : (T,)
-        sigma(t) of (7), as the number of the set.
-    pi : (T, s)
-        (6).
-    v2, v2_estimate, v2_reported : (T, N)
-        Squared voltages: true, by (19) corrected, and reported.
-    """
-
-    t: Floats
-    x: Floats
-    estimates: Floats
-    chosen: Ints
-    pi: Floats
-    v2: Floats
-    v2_estimate: Floats
-    v2_reported: Floats
+    t: Floats  # (T,) s
+    x: Floats  # (T, N) True reactive injections, pu
+    estimates: Floats  # (T, o, N) those of every observer
+    chosen: Ints  # (T,) sigma(t) of (7), as the number of the set
+    pi: Floats  # (T, s) (6)
+    v2: Floats  # (T, N) squared voltages
+    v2_estimate: Floats  # (T, N) by (19) corrected
+    v2_reported: Floats  # (T, N) as reported
 
     @property
     def error(self) -> Floats:
@@ -162,21 +124,12 @@ class Chong2020Run:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observers:
-    """Both banks with a proof for each observer. o observers, N customers.
+    """Both banks with a proof for each observer. o observers, N customers."""
 
-    Attributes
-    ----------
-    bank
-        Sets and gains.
-    P : (o, N, N)
-        `e_J^T P_J e_J` decays at least like `exp(-2 rate_J t)` while no meter of J is manipulated.
-    rate : (o,)
-        1/s.
-    """
-
-    bank: banks.Bank
+    bank: banks.Bank  # sets and gains
+    # (o, N, N) `e_J^T P_J e_J` decays at least like `exp(-2 rate_J t)` while no meter of J is manipulated
     P: Floats
-    rate: Floats
+    rate: Floats  # (o,) 1/s
 
 
 @cache
@@ -185,24 +138,10 @@ def solutions(customers: int = CUSTOMERS, liars: int = LIARS) -> dict[tuple[int,
 
     The solver's status is not used: `margin` rebuilds the inequality in NumPy.
 
-    Parameters
-    ----------
-    customers, liars
-        N and M.
-
-    Returns
-    -------
-    dict
-        Solutions with a positive margin, by the meters of J in rising order.
-
-    Raises
-    ------
-    DesignInfeasible
-        As `gridsec.observers.lmi.solve_many`.
-
-    References
-    ----------
-    chong2020 (12), corrected: docs/errata/chong2020.md.
+    customers, liars: N and M.
+    Returns the solutions with a positive margin, by the meters of J in rising order.
+    Raises DesignInfeasible as `gridsec.observers.lmi.solve_many`.
+    Source: chong2020 (12), corrected: docs/errata/chong2020.md.
     """
     lure = setting(customers).lure
     sizes = range(customers - 2 * liars, customers + 1)
@@ -216,12 +155,8 @@ def solutions(customers: int = CUSTOMERS, liars: int = LIARS) -> dict[tuple[int,
 def observers(of: Design, customers: int = CUSTOMERS, liars: int = LIARS) -> Observers:
     """Both banks of section V for the line feeder, by one of two designs.
 
-    Parameters
-    ----------
-    of
-        "(12)": gains and P_J of `solutions`. "direct": L = 0, K = E_J, P = -H with the reactance certificate.
-    customers, liars
-        N and M.
+    of: "(12)": gains and P_J of `solutions`. "direct": L = 0, K = E_J, P = -H with the reactance certificate.
+    customers, liars: N and M.
     """
     lure = setting(customers).lure
     masks = banks.subsets(customers, liars, most=10_000).masks()
@@ -248,22 +183,16 @@ def observe(
 ) -> Chong2020Run:
     """Integrate plant and both banks (11) together, in continuous time, and select by (6) and (7).
 
-    Parameters
-    ----------
-    alpha
-        Attack on the voltages at time t, (N,).
-    x : (N,)
-        Initial state of the plant.
-    start : (o, N)
-        Initial states of the observers, in the order of `bank.subsets(N, M).masks()`.
-    times : (T,)
-        Recorded times, s, from 0.
+    alpha: attack on the voltages at time t, (N,).
+    x (N,): initial state of the plant.
+    start (o, N): initial states of the observers, in the order of `bank.subsets(N, M).masks()`.
+    times (T,): recorded times, s, from 0.
     """
     lure, w, vbar = of.lure, of.w, of.droop.vbar
     count, bank = len(w), made.bank
     gains = bank.gains
     if gains is None:
-        raise InputInvalid([Problem("missing", "the bank needs explicit gains")])
+        raise InputInvalid.of("missing", "the bank needs explicit gains")
     L, K = gains.L, gains.K
 
     def field(t: float, flat: Floats) -> Floats:
@@ -317,12 +246,8 @@ def envelope(made: Observers, errors: Floats, t: Floats) -> Floats:
     An observer without manipulated meters stays within a third of it, the selected estimate within all of it:
     docs/theory-detection.md, claim 1. The maximum is over all observers; (8) as printed omits it.
 
-    Parameters
-    ----------
-    errors : (o, N)
-        Initial errors of all observers.
-    t : (T,)
-        s.
+    errors (o, N): initial errors of all observers.
+    t (T,): s.
     """
     values = np.linalg.eigvalsh(made.P)
     first = np.sqrt(values[:, -1] / values[:, 0]) * np.linalg.norm(errors, axis=1)
@@ -331,10 +256,9 @@ def envelope(made: Observers, errors: Floats, t: Floats) -> Floats:
 
 @cache
 def under_attack(of: Design = "(12)") -> tuple[Chong2020Run, Floats, Floats]:
-    """The paper's setting with two of five meters manipulated: run, and envelopes of (8) and (20).
+    """Setting of the paper with two of five meters manipulated: run, and envelopes of (8) and (20).
 
-    The plant starts near its equilibrium, every observer at random within the inverters' limits, equally for
-    both designs.
+    The plant starts near its equilibrium, every observer at random within the inverters' limits.
     """
     at, made = setting(), observers(of)
     rng = np.random.default_rng(2020)

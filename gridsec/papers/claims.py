@@ -11,40 +11,24 @@ from typing import Literal
 import numpy as np
 
 from gridsec.arrays import Floats
-from gridsec.errors import InputInvalid, Problem
+from gridsec.errors import InputInvalid
 
 Style = Literal["solid", "dashed", "dotted", "dashdot", "points", "steps"]
 
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """One statement of a paper beside the computed result.
+    """One statement of a paper beside the computed result."""
 
-    Attributes
-    ----------
-    what
-        The quantity or statement, in words.
-    where
-        Its place in the paper: equation, section, table, figure.
-    printed
-        The printed value or statement.
-    ours
-        The computed value or statement.
-    met
-        True if the two agree, numbers to the printed digits.
-    why
-        Known reason of a disagreement: an erratum, or a choice that the paper leaves open. A claim that is
-        not met and has no reason is a failure of this project.
-    relation
-        Required relation of `ours` to the printed number: equal to the digits, or at most it.
-    """
-
-    what: str
-    where: str
-    printed: float | str
-    ours: float | str
-    met: bool
+    what: str  # the quantity or statement, in words
+    where: str  # its place in the paper: equation, section, table, figure
+    printed: float | str  # the printed value or statement
+    ours: float | str  # the computed value or statement
+    met: bool  # True if the two agree, numbers to the printed digits
+    # known reason of a disagreement: an erratum, or a choice that the paper leaves open. A claim that is not
+    # met and has no reason is a failure of this project
     why: str = ""
+    # required relation of `ours` to the printed number: equal to the digits, or at most it
     relation: Literal["=", "<="] = "="
 
 
@@ -52,31 +36,19 @@ class Claim:
 class FigureCurve:
     """One curve.
 
-    Attributes
-    ----------
-    label
-        For the legend; empty for none.
-    x, y : (k,)
-        Its points; NaN in `y` interrupts it.
-    style
-        "points" has markers only, "steps" holds each value until the next point.
-
-    Raises
-    ------
-    ValueError
-        If x and y differ in their shapes.
+    Raises ValueError if x and y differ in their shapes.
     """
 
-    label: str
-    x: Floats
-    y: Floats
-    style: Style = "solid"
+    label: str  # for the legend; empty for none
+    x: Floats  # (k,) abscissas
+    y: Floats  # (k,) ordinates; NaN interrupts the curve
+    style: Style = "solid"  # "points" has markers only, "steps" holds each value until the next point
 
     def __post_init__(self) -> None:
         x, y = np.asarray(self.x, dtype=np.float64), np.asarray(self.y, dtype=np.float64)
         if x.ndim != 1 or x.shape != y.shape:
-            raise InputInvalid(
-                [Problem("shape", f"line {self.label!r}: x has shape {x.shape}, y has shape {y.shape}")]
+            raise InputInvalid.of(
+                "shape", f"line {self.label!r}: x has shape {x.shape}, y has shape {y.shape}"
             )
         object.__setattr__(self, "x", x)
         object.__setattr__(self, "y", y)
@@ -84,58 +56,30 @@ class FigureCurve:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Panel:
-    """One pair of axes with its curves.
+    """One pair of axes with its curves."""
 
-    Attributes
-    ----------
-    title, x_label, y_label
-        Texts, units included.
-    lines
-        The curves.
-    """
-
-    title: str
-    x_label: str
-    y_label: str
-    lines: tuple[FigureCurve, ...]
+    title: str  # text above the axes
+    x_label: str  # with the unit
+    y_label: str  # with the unit
+    lines: tuple[FigureCurve, ...]  # the curves
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PaperFigure:
-    """Panels of one figure, drawn one below the other.
+    """Panels of one figure, drawn one below the other."""
 
-    Attributes
-    ----------
-    name
-        File stem, for example "kim2018-figure-1"; letters, digits and hyphens.
-    caption
-        Content in one sentence.
-    panels
-        From top to bottom.
-    """
-
-    name: str
-    caption: str
-    panels: tuple[Panel, ...]
+    name: str  # file stem, for example "kim2018-figure-1"; letters, digits and hyphens
+    caption: str  # content in one sentence
+    panels: tuple[Panel, ...]  # from top to bottom
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reproduction:
-    """Results of one paper's examples.
+    """Results of one paper's examples."""
 
-    Attributes
-    ----------
-    paper
-        Short name, for example "kim2018".
-    claims
-        Its numbers and statements beside the computed ones.
-    figures
-        Data of its figures.
-    """
-
-    paper: str
-    claims: tuple[Claim, ...]
-    figures: tuple[PaperFigure, ...] = field(default=())
+    paper: str  # short name, for example "kim2018"
+    claims: tuple[Claim, ...]  # its numbers and statements beside the computed ones
+    figures: tuple[PaperFigure, ...] = field(default=())  # data of its figures
 
     @property
     def unmet(self) -> tuple[Claim, ...]:
@@ -151,55 +95,25 @@ class Reproduction:
 def number(what: str, where: str, printed: float, ours: float, *, unit: float) -> Claim:
     """Claim about a printed number, met if `ours` rounds to it.
 
-    Parameters
-    ----------
-    what, where
-        As in `Claim`.
-    printed
-        The number in the paper.
-    ours
-        The number computed here.
-    unit
-        Worth of one step in the last printed digit: 1.0 for "671", 1e-6 for "4.74e-4".
-
-    Returns
-    -------
-    Claim
-        Met when `|ours - printed| <= unit / 2`, with a part in 1e9 for rounding of the comparison.
+    printed: the number in the paper.
+    ours: the number computed here.
+    unit: worth of one step in the last printed digit: 1.0 for "671", 1e-6 for "4.74e-4".
+    Met when `|ours - printed| <= unit / 2`, with a part in 1e9 for rounding of the comparison.
     """
     half = 0.5 * unit * (1.0 + 1e-9)
     return Claim(what, where, printed, float(ours), bool(abs(ours - printed) <= half))
 
 
 def statement(what: str, where: str, printed: str, ours: str, why: str = "") -> Claim:
-    """Claim in words, met if both texts are the same.
-
-    Parameters
-    ----------
-    what, where
-        As in `Claim`.
-    printed, ours
-        The two texts, for example "1 -> 2 -> 3".
-    why
-        As in `Claim`.
-    """
+    """Claim in words, met if both texts are the same."""
     return Claim(what, where, printed, ours, printed == ours, why)
 
 
 def rounded_up(what: str, where: str, printed: float, ours: float, *, unit: float) -> Claim:
     """Claim about a printed upper bound, met if `ours`, rounded up, equals it.
 
-    Parameters
-    ----------
-    what, where, printed, ours
-        As in `Claim`.
-    unit
-        Worth of one step in the last printed digit.
-
-    Returns
-    -------
-    Claim
-        Met when `printed - unit < ours <= printed`, with a part in 1e9 for rounding.
+    unit: worth of one step in the last printed digit.
+    Met when `printed - unit < ours <= printed`, with a part in 1e9 for rounding.
     """
     slack = 1e-9 * unit
     met = bool(printed - unit < ours + slack <= printed + 2.0 * slack)

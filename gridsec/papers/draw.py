@@ -113,20 +113,8 @@ def draw(figure: PaperFigure) -> Canvas:
 
     A label has the same colour in every panel. Neighbouring panels over the same abscissa share it.
 
-    Parameters
-    ----------
-    figure
-        Data of the figure.
-
-    Returns
-    -------
-    Canvas
-        A matplotlib figure on an Agg canvas, of 150 dots per inch.
-
-    Raises
-    ------
-    ModuleNotFoundError
-        matplotlib is not installed; see `available`.
+    Returns a matplotlib figure on an Agg canvas, of 150 dots per inch.
+    Raises ModuleNotFoundError without matplotlib; see `available`.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure as Canvas
@@ -153,10 +141,7 @@ def draw(figure: PaperFigure) -> Canvas:
 def png(figure: PaperFigure) -> bytes:
     """Draw a figure as a PNG; the same data give the same bytes.
 
-    Raises
-    ------
-    ModuleNotFoundError
-        matplotlib is not installed; see `available`.
+    Raises ModuleNotFoundError without matplotlib; see `available`.
     """
     canvas = draw(figure)
     buffer = io.BytesIO()
@@ -176,21 +161,11 @@ def sheet(
 ) -> bytes:
     """Draw on an empty sheet as a PNG; the same marks give the same bytes.
 
-    Parameters
-    ----------
-    width, height
-        Size of the sheet, px; a px is a hundredth of an inch in `marks`.
-    marks
-        Draws on axes that cover the sheet, in px from its upper left corner.
-    scale
-        Dots per px.
-    about
-        Metadata of the file.
-
-    Raises
-    ------
-    ModuleNotFoundError
-        matplotlib is not installed; see `available`.
+    width, height: size of the sheet, px; a px is a hundredth of an inch in `marks`.
+    marks: draws on axes that cover the sheet, in px from its upper left corner.
+    scale: dots per px.
+    about: metadata of the file.
+    Raises ModuleNotFoundError without matplotlib; see `available`.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure as Canvas

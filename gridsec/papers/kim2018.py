@@ -240,10 +240,7 @@ def printed_inverses(model: System) -> tuple[Inverse, ...]:
 def printed_design(search: Literal["all", "one"] = "one") -> HighGainDesign:
     """The paper's estimator.
 
-    Parameters
-    ----------
-    search
-        "one" set per sampling time, as in its simulation, or "all" at once, as in its theorem.
+    search: "one" set per sampling time, as in its simulation, or "all" at once, as in its theorem.
     """
     model = system()
     return design(
@@ -264,10 +261,7 @@ def printed_design(search: Literal["all", "one"] = "one") -> HighGainDesign:
 def sharp_design(noise: float = NOISE) -> HighGainDesign:
     """The same example with nearest-point inverses and componentwise constants.
 
-    Parameters
-    ----------
-    noise
-        Measurement error that the thresholds allow for, interpolation between samples included.
+    noise: measurement error that the thresholds allow for, interpolation between samples included.
     """
     model = system()
     # Below every threshold of this design, so that it affects time only.
@@ -288,15 +282,7 @@ def sharp_design(noise: float = NOISE) -> HighGainDesign:
 
 
 def trajectory(t: Floats, start: Sequence[float] = START) -> Floats:
-    """The true state, in closed form; (…, 3).
-
-    Parameters
-    ----------
-    t : (…)
-        Times, s.
-    start
-        x(0).
-    """
+    """The true state at times t (…), s, in closed form; (…, 3)."""
     w = 0.2 * np.pi
     a0, b0, c0 = start[0] - start[1] ** 3, start[1], start[2] - np.sin(start[1])
 
@@ -312,12 +298,8 @@ def trajectory(t: Floats, start: Sequence[float] = START) -> Floats:
 def attacks(t: Floats, size: float = ATTACK) -> Floats:
     """Scenario of Figure 1(a): attack on sensor 3 in [6, 8], then on sensor 2 in [17, 20]; (…, 4).
 
-    Parameters
-    ----------
-    t : (…)
-        Times, s.
-    size
-        Height of the two pulses; the paper's is not in the text.
+    t (…): times, s.
+    size: height of the two pulses; the paper's is not in the text.
     """
     out = np.zeros((*t.shape, 4))
     out[..., 2] = size * ((t >= 6.0) & (t <= 8.0))
@@ -327,27 +309,13 @@ def attacks(t: Floats, size: float = ATTACK) -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Kim2018Run:
-    """A simulation. k instants, N entries of z.
+    """A simulation. k instants, N entries of z."""
 
-    Attributes
-    ----------
-    t : (k,)
-        Times, s.
-    x : (k, 3)
-        True states.
-    z : (k, 7)
-        Estimates of the partial observers.
-    attack : (k, 4)
-        Attack on the outputs.
-    outcomes
-        Results, one for each instant.
-    """
-
-    t: Floats
-    x: Floats
-    z: Floats
-    attack: Floats
-    outcomes: tuple[HighGainEstimate, ...]
+    t: Floats  # (k,) times, s
+    x: Floats  # (k, 3) True states
+    z: Floats  # (k, 7) estimates of the partial observers
+    attack: Floats  # (k, 4) attack on the outputs
+    outcomes: tuple[HighGainEstimate, ...]  # results, one for each instant
 
     @property
     def sigma(self) -> Floats:
@@ -370,12 +338,8 @@ def simulate(
 ) -> Kim2018Run:
     """The paper's simulation: 25 s in steps of 0.02 s, noise uniform within 1e-6.
 
-    Parameters
-    ----------
-    attack
-        Attacks (k, 4) as a function of the times (k,).
-    deviation
-        If given, the noise is Gaussian with this standard deviation (lee2018).
+    attack: attacks (k, 4) as a function of the times (k,).
+    deviation: if given, the noise is Gaussian with this standard deviation (lee2018).
     """
     t = np.asarray(STEP * np.arange(round(seconds / STEP) + 1), dtype=np.float64)
     x, added = trajectory(t), attack(t)
@@ -398,13 +362,7 @@ def simulate(
 
 
 def switching(run: Kim2018Run, start: float, stop: float) -> str:
-    """Sets in use between two times, as in "1 -> 2 -> 3".
-
-    Parameters
-    ----------
-    start, stop
-        Times, s.
-    """
+    """Sets in use from `start` to `stop`, s, as in "1 -> 2 -> 3"."""
     inside = run.sigma[(run.t >= start) & (run.t < stop)].astype(int)
     kept = [inside[0], *(b for a, b in pairwise(inside.tolist()) if a != b)]
     return " -> ".join(str(value) for value in kept)

@@ -72,38 +72,22 @@ RATE, SLOWEST, TOL = 0.998, 1.0 - 1e-6, 1e-9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SampledPlant:
-    """A sampled plant and its continuous origin.
+    """A sampled plant and its continuous origin."""
 
-    Attributes
-    ----------
-    A_c, B_c : (6, 6), (6, 1)
-        Continuous time.
-    A, B, C : (6, 6), (6, 1), (5, 6)
-        Sampled with zero-order hold.
-    E : (6, 6)
-        Input matrix of a disturbance w that is constant over a step: d = E w.
-    """
-
-    A_c: Floats
-    B_c: Floats
-    A: Floats
-    B: Floats
-    C: Floats
-    E: Floats
+    A_c: Floats  # (6, 6) continuous time
+    B_c: Floats  # (6, 1) continuous time
+    A: Floats  # (6, 6) sampled with zero-order hold
+    B: Floats  # (6, 1) sampled
+    C: Floats  # (5, 6) outputs
+    E: Floats  # (6, 6) input matrix of a disturbance w that is constant over a step: d = E w
 
 
 def plant(disturbance: Literal["continuous", "sampled"] = "continuous") -> SampledPlant:
     """The three-inertia system; states theta_1, its speed, theta_2, its speed, theta_3, its speed.
 
-    Parameters
-    ----------
-    disturbance
-        Quantity bounded by d_max. "continuous": d(t) of (4.5.1), constant over each step. "sampled": d(k) of
-        (4.1.1), a thousand times as large.
-
-    References
-    ----------
-    lee2018 (4.5.1), (4.5.2).
+    disturbance: quantity bounded by d_max. "continuous": d(t) of (4.5.1), constant over each step. "sampled":
+        d(k) of (4.1.1), a thousand times as large.
+    Source: lee2018 (4.5.1), (4.5.2).
     """
     k, b = STIFFNESS / INERTIA, FRICTION / INERTIA
     A_c = np.zeros((6, 6))
@@ -124,10 +108,7 @@ def plant(disturbance: Literal["continuous", "sampled"] = "continuous") -> Sampl
 def estimator(model: SampledPlant, *, slowest: float = SLOWEST) -> BoundedDesign:
     """Partial Luenberger observers and Algorithm 4.1 for one attacked sensor.
 
-    Parameters
-    ----------
-    slowest
-        0 for the observability decomposition; the detectability decomposition by default.
+    slowest: 0 for the observability decomposition; the detectability decomposition by default.
     """
     bounds = Bounds(D_MAX, np.full(len(model.C), N_MAX), model.E)
     observers = luenberger.design(
@@ -149,12 +130,7 @@ def gaussian_estimator(model: SampledPlant, *, false_alarm: float = 1e-4) -> Gau
 
 
 def conventional_gain(model: SampledPlant) -> Floats:
-    """L of one observer (4.2.1) on all sensors, the stationary Kalman predictor.
-
-    Returns
-    -------
-    (6, 5)
-    """
+    """L (6, 5) of one observer (4.2.1) on all sensors, the stationary Kalman predictor."""
     Q, R = model.E @ model.E.T * D_MAX**2, np.eye(len(model.C)) * N_MAX**2
     P = solve_discrete_are(model.A.T, model.C.T, Q, R)
     return np.asarray(model.A @ P @ model.C.T @ np.linalg.inv(model.C @ P @ model.C.T + R))
@@ -178,49 +154,24 @@ def closed_loop(model: SampledPlant) -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lee2018Run:
-    """One simulation of T steps.
+    """One simulation of T steps."""
 
-    Attributes
-    ----------
-    t : (T,)
-        Time, s.
-    x, x_hat, x_conventional : (T, 6)
-        State; estimate in the loop; estimate of the conventional observer beside it.
-    bound : (T,)
-        Bound of |x_hat - x|; infinite for Gaussian noise.
-    disagree : (T, 5)
-        Sensors that the estimate does not use (Gaussian) or explain (bounded).
-    searched : (T,)
-        Steps with a search (bounded) or an alarm (Gaussian).
-    attack, reference : (T,)
-        a_1 and theta_3,ref, rad.
-    u : (T,)
-        Torque, N m.
-    """
-
-    t: Floats
-    x: Floats
-    x_hat: Floats
-    x_conventional: Floats
-    bound: Floats
-    disagree: Floats
-    searched: Floats
-    attack: Floats
-    reference: Floats
-    u: Floats
+    t: Floats  # (T,) time, s
+    x: Floats  # (T, 6) state
+    x_hat: Floats  # (T, 6) estimate of the secure estimator
+    x_conventional: Floats  # (T, 6) estimate of the conventional observer
+    bound: Floats  # (T,) bound of |x_hat - x|; infinite for Gaussian noise
+    disagree: Floats  # (T, 5) sensors that the estimate does not use (Gaussian) or explain (bounded)
+    searched: Floats  # (T,) steps with a search (bounded) or an alarm (Gaussian)
+    attack: Floats  # (T,) a_1, rad
+    reference: Floats  # (T,) theta_3,ref, rad
+    u: Floats  # (T,) torque, N m
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _World:
-    """Random and prescribed signals, drawn before the loop."""
-
-    d: Floats
-    n: Floats
-    lie: Floats
-    wanted: Floats
-
-
-def _world(model: SampledPlant, t: Floats, seed: int, *, attacked: bool, normal: bool) -> _World:
+def _signals(
+    model: SampledPlant, t: Floats, seed: int, *, attacked: bool, normal: bool
+) -> tuple[Floats, Floats, Floats]:
+    """Disturbance, noise and attack, drawn before the loop."""
     rng = np.random.default_rng(seed)
     steps, p = t.size, len(model.C)
     w = rng.standard_normal((steps, 6))
@@ -233,7 +184,7 @@ def _world(model: SampledPlant, t: Floats, seed: int, *, attacked: bool, normal:
     lie = np.zeros((steps, p))
     if attacked:
         lie[:, 0] = attack(t)
-    return _World(w @ model.E.T, n, lie, reference(t))
+    return w @ model.E.T, n, lie
 
 
 def simulate(
@@ -247,26 +198,21 @@ def simulate(
 ) -> Lee2018Run:
     """The closed loop of Figures 4.1 and 4.8, with an estimator in it and a conventional observer beside it.
 
-    Parameters
-    ----------
-    design
-        From `estimator` or `gaussian_estimator`.
-    seed
-        Seed of disturbance and noise: uniform within their bounds, or Gaussian of the same variance.
-    attacked
-        Attack sensor 1 from 2 s on.
-    feedback
-        Estimate used by the controller.
+    design: from `estimator` or `gaussian_estimator`.
+    seed: seed of disturbance and noise: uniform within their bounds, or Gaussian of the same variance.
+    attacked: attack sensor 1 from 2 s on.
+    feedback: estimate used by the controller.
     """
     t: Floats = np.arange(round(seconds / PERIOD), dtype=np.float64) * PERIOD
-    world = _world(model, t, seed, attacked=attacked, normal=isinstance(design, GaussianDesign))
+    normal, wanted = isinstance(design, GaussianDesign), reference(t)
+    d, n, lie = _signals(model, t, seed, attacked=attacked, normal=normal)
     gain = conventional_gain(model)
     steps = t.size
     x, total, plain = X_START.copy(), 0.0, np.zeros(6)
     xs, hats, plains = np.empty((steps, 6)), np.empty((steps, 6)), np.empty((steps, 6))
     bounds, us = np.full(steps, np.inf), np.empty(steps)
     disagree, searched = np.zeros((steps, len(model.C))), np.zeros(steps)
-    y = model.C @ x + world.n[0] + world.lie[0]
+    y = model.C @ x + n[0] + lie[0]
     if isinstance(design, BoundedDesign):
         one, out = partial_bounded.init(design, 0.0, np.zeros(6), START_ERROR)
     else:
@@ -281,16 +227,16 @@ def simulate(
         u = FEEDBACK @ used + INTEGRAL * total
         us[k] = u[0]
         # The controller has estimates only and integrates the estimated theta_3.
-        total += world.wanted[k] - used[4]
+        total += wanted[k] - used[4]
         plain = model.A @ plain + model.B @ u + gain @ (y - model.C @ plain)
-        x = model.A @ x + model.B @ u + world.d[k]
+        x = model.A @ x + model.B @ u + d[k]
         if isinstance(design, BoundedDesign):
             one, out = partial_bounded.step(design, one, y, u)
         if k + 1 < steps:
-            y = model.C @ x + world.n[k + 1] + world.lie[k + 1]
+            y = model.C @ x + n[k + 1] + lie[k + 1]
             if isinstance(design, GaussianDesign):
                 two, seen = partial_gaussian.step(design, two, y, u)
-    return Lee2018Run(t, xs, hats, plains, bounds, disagree, searched, world.lie[:, 0], world.wanted, us)
+    return Lee2018Run(t, xs, hats, plains, bounds, disagree, searched, lie[:, 0], wanted, us)
 
 
 SECONDS = 6.0
@@ -310,25 +256,19 @@ def chapter4() -> Reproduction:
     made = estimator(model)
     run = simulate(model, made, seconds=SECONDS)
     gauss = simulate(model, gaussian_estimator(model), seconds=SECONDS)
-    claims = (
-        *_index_claims(model),
-        *_memory_claims(made),
-        *_run_claims(model, made, run),
-        *_gauss_claims(gauss),
-    )
-    return Reproduction("lee2018-4", claims, (_figure(run), _errors(run, gauss)))
+    claims = [*_index_claims(model), *_memory_claims(made), *_run_claims(model, made, run)]
+    claims += _gauss_claims(gauss)
+    return Reproduction("lee2018-4", tuple(claims), (_figure(run), _errors(run, gauss)))
 
 
 def _index_claims(model: SampledPlant) -> list[Claim]:
     place = "section 4.5"
     asymptotic = asymptotic_index(model.A, model.C, discrete=True, tol=TOL)
-    enough = redundant_detectable(model.A, model.C, 2, discrete=True, tol=TOL)
-    more = redundant_detectable(model.A, model.C, 3, discrete=True, tol=TOL)
+    lost = [q for q in (2, 3) if redundant_detectable(model.A, model.C, q, discrete=True, tol=TOL)]
+    redundancy = f"{max(lost)}-redundant detectable" if lost else "not 2-redundant detectable"
     printed = asymptotic_index(model.A, ROWS_PRINTED, discrete=True, tol=TOL)
     return [
-        statement(
-            "redundancy of (A, C)", place, "2-redundant detectable", _redundancy(enough=enough, more=more)
-        ),
+        statement("redundancy of (A, C)", place, "2-redundant detectable", redundancy),
         number("attacked sensors that can be corrected", place, 1.0, asymptotic.correctable, unit=1.0),
         number(
             "dynamic security index", place, 3.0, dynamic_index(model.A, model.C, tol=TOL).count, unit=1.0
@@ -343,12 +283,6 @@ def _index_claims(model: SampledPlant) -> list[Claim]:
             "the printed C_c has six rows for five outputs: the one of theta_2 is there twice",
         ),
     ]
-
-
-def _redundancy(*, enough: bool, more: bool) -> str:
-    if more:
-        return "3-redundant detectable"
-    return "2-redundant detectable" if enough else "not 2-redundant detectable"
 
 
 def _memory_claims(made: BoundedDesign) -> list[Claim]:

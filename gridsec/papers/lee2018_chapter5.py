@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -77,24 +76,6 @@ def estimator(search: Literal["all", "one"] = "one") -> HighGainDesign:
         search=search,
         reset=False,
     )
-
-
-def smallest_noticed(*, low: float = 1.0, high: float = 100.0, tolerance: float = 0.1) -> float:
-    """Smallest step on sensor 2 that the printed threshold detects, by bisection over simulations.
-
-    Parameters
-    ----------
-    low, high
-        An undetected and a detected size.
-    tolerance
-        Tolerance of the result.
-    """
-    made = estimator()
-    while high - low > tolerance:
-        size = 0.5 * (low + high)
-        run = simulate(made, partial(attack, size=size), seconds=6.0, deviation=DEVIATION)
-        low, high = (low, size) if run.sigma.max() > 1 else (size, high)
-    return high
 
 
 def reproduce() -> Reproduction:

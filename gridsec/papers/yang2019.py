@@ -5,10 +5,7 @@ smallest proven noise gain. With them the paper's own recipe, (10) and (19) with
 isolates no attack in the settings of Figures 1 to 4. `reproduce` prints its rates beside those of calibrated
 thresholds and of another voting rule, which are this project's.
 
-References
-----------
-yang2019, Algorithms 1 and 2; docs/theory-discrete.md, section 5.
-yang2019, Example 1, equations (25), (26), Figures 1 to 4.
+Source: yang2019, Algorithms 1 and 2, Example 1 with (25), (26), Figures 1 to 4; docs/theory-discrete.md.
 """
 
 from __future__ import annotations
@@ -44,13 +41,7 @@ JUMP = 3e-4
 
 
 def points(suspects: Bools) -> tuple[Floats, Floats]:
-    """Points (window, meter), both from 1; meter 0 for a window without named meters.
-
-    Parameters
-    ----------
-    suspects : (w, p)
-        Named meters of each window.
-    """
+    """Points (window, meter) of `suspects` (w, p), from 1; meter 0 for a window without named meters."""
     with_nobody = np.hstack([~suspects.any(axis=1, keepdims=True), suspects])
     window, meter = np.nonzero(with_nobody)
     return (window + 1).astype(np.float64), meter.astype(np.float64)
@@ -58,22 +49,12 @@ def points(suspects: Bools) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FeederStudy:
-    """Results of the two algorithms on a sampled feeder.
+    """Results of the two algorithms on a sampled feeder."""
 
-    Attributes
-    ----------
-    design
-        Bank and proven thresholds.
-    error, bound : (T, o), (o,)
-        Error of every observer, and its proven bound, pu of reactive power.
-    verdicts
-        One for each window.
-    """
-
-    design: WindowDesign
-    error: Floats
-    bound: Floats
-    verdicts: tuple[windows.WindowVerdict, ...]
+    design: WindowDesign  # bank and proven thresholds
+    error: Floats  # (T, o) error of every observer, pu of reactive power
+    bound: Floats  # (o,) its proven bound
+    verdicts: tuple[windows.WindowVerdict, ...]  # one for each window
 
 
 def on_feeder(
@@ -95,25 +76,15 @@ def on_feeder(
     The observers run on the exponential Euler step. The deviation of the continuous plant within a step is an
     error of the arguments of at most `held` and part of the thresholds, which thus cover the discretisation.
 
-    Parameters
-    ----------
-    lure
-        Closed loop from `close_loop`.
-    h
-        Time between readings, s.
-    u : (T, l)
-        Known input, constant between readings.
-    noise
-        Half-width of the meters' uniform noise, squared pu.
-    held : (m,)
-        Bound on the motion of each inverter's argument within a step, squared pu: `sampled.held_error`
+    lure: closed loop from `close_loop`.
+    h: time between readings, s.
+    u (T, l): known input, constant between readings.
+    noise: half-width of the meters' uniform noise, squared pu.
+    held (m,): bound on the motion of each inverter's argument within a step, squared pu: `sampled.held_error`
         or `sampled.drift_error`.
-    limit : (m,)
-        Largest injection of each inverter, pu.
-    lie : (T, p)
-        Attack, squared pu (in z).
-    max_attacked, length, rule
-        q, N, and the isolation rule of windows.
+    limit (m,): largest injection of each inverter, pu.
+    lie (T, p): attack, squared pu (in z).
+    max_attacked, length, rule: q, N, and the isolation rule of windows.
     """
     plant = sample(lure, h)
     slowest = spectral_radius(plant.A)
@@ -175,8 +146,7 @@ def feeder_figure() -> PaperFigure:
     score = np.stack([verdict.score for verdict in study.verdicts])
     named = np.stack([verdict.suspects for verdict in study.verdicts])
     window, meter = points(named)
-    masks = study.design.observers.masks[1 : 1 + study.design.sets.count_large]
-    labels = ["pi"] + ["pi_J, J without meter " + str(int(np.argmin(J)) + 1) for J in masks]
+    labels = ["pi"] + ["pi_J, J without meter " + str(int(np.argmin(J)) + 1) for J in study.design.large]
     lines = [FigureCurve(label, t, column) for label, column in zip(labels, score.T, strict=True)]
     lines.append(FigureCurve("threshold", t, np.full(t.size, study.design.detect_above), "dashed"))
     panels = (
@@ -215,17 +185,15 @@ RECIPE_FAILS = (
 def system() -> DiscreteLure:
     """The plant (25), (26) with delta = 0.1, alpha = 1; the sine's slopes lie in [-1, 1]."""
     delta, alpha = 0.1, 1.0
-    return DiscreteLure(
-        A=np.array([[1.0, delta], [0.0, 1.0]]),
+    return DiscreteLure.of(
+        [[1.0, delta], [0.0, 1.0]],
+        [[3.0, 0.3], [3.0, 0.6], [6.0, 0.9], [1.2, 12.0]],
         G=delta * alpha * np.array([[0.5], [1.0]]),
         H=np.ones((1, 2)),
-        F=np.zeros((1, 1)),
         B=np.full((2, 1), delta),
-        C=np.array([[3.0, 0.3], [3.0, 0.6], [6.0, 0.9], [1.2, 12.0]]),
-        D=np.zeros((4, 1)),
-        lower=-np.ones(1),
-        upper=np.ones(1),
         phi=np.sin,
+        lower=-1.0,
+        upper=1.0,
         h=delta,
     )
 
@@ -238,13 +206,7 @@ def every_observer() -> tuple[DiscreteGains, ...]:
 
 @cache
 def bank(decays: tuple[float, ...] = DECAYS) -> tuple[DiscreteDesign, ...]:
-    """The eleven observers for one attacked sensor: of all four, of three and of two sensors.
-
-    Parameters
-    ----------
-    decays
-        Candidates for the decay.
-    """
+    """The eleven observers for one attacked sensor: of all four, of three and of two sensors."""
     plant = system()
     return windows.bank(plant, 1, options=discrete_options(plant, decays=decays, noise=1.0))
 
@@ -252,13 +214,7 @@ def bank(decays: tuple[float, ...] = DECAYS) -> tuple[DiscreteDesign, ...]:
 def simulated_gains(
     observers: Sequence[DiscreteDesign], *, runs: int, seed: int
 ) -> circle_discrete.MonteCarlo:
-    """Gains by simulation, as in the paper: normal initial states, uniform noise, u = 0.
-
-    Parameters
-    ----------
-    runs, seed
-        Number of runs of 1000 steps, and seed of the random numbers.
-    """
+    """Gains by simulation, as in the paper: normal initial states, uniform noise, u = 0; 1000 steps."""
     start = np.random.default_rng(seed).standard_normal((runs, 2))
     return circle_discrete.monte_carlo(
         circle_discrete.stack(observers), half_width=HALF_WIDTH, start=start, u=_still(), seed=seed + 1
@@ -273,14 +229,9 @@ def _still() -> Floats:
 def trial(design: WindowDesign, *, sensor: int | None, size: float, runs: int, seed: int) -> windows.Trace:
     """Runs of 1000 steps: uniform noise, one sensor attacked by uniform values in plus and minus `size`.
 
-    Parameters
-    ----------
-    sensor
-        Attacked sensor, from 0; None for no attack.
-    size
-        Size of the attack.
-    runs, seed
-        Number of runs, and seed of the random numbers.
+    sensor: attacked sensor, from 0; None for no attack.
+    size: size of the attack.
+    runs, seed: number of runs, and seed of the random numbers.
     """
     rng = np.random.default_rng(seed)
     start = rng.standard_normal((runs, 2))
@@ -292,38 +243,19 @@ def trial(design: WindowDesign, *, sensor: int | None, size: float, runs: int, s
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Levels:
-    """Three kinds of thresholds for one bank.
+    """Three kinds of thresholds for one bank."""
 
-    Attributes
-    ----------
-    proven
-        (10) and (19) with the gains from the inequality: bounds.
-    simulated
-        (10) and (19) with simulated gains, as in the paper.
-    calibrated
-        The largest pi and pi_J of simulated runs without attack.
-    exceedance
-        Probability, at 99 % confidence, that one more run without attack of this kind exceeds a given
-        simulated gain or calibrated threshold.
-    """
-
-    proven: WindowDesign
-    simulated: WindowDesign
-    calibrated: WindowDesign
+    proven: WindowDesign  # (10) and (19) with the gains from the inequality: bounds
+    simulated: WindowDesign  # (10) and (19) with simulated gains, as in the paper
+    calibrated: WindowDesign  # the largest pi and pi_J of simulated runs without attack
+    # probability, at 99 % confidence, that one more run without attack of this kind exceeds a given simulated
+    # gain or calibrated threshold
     exceedance: float
 
 
 @cache
 def levels(decays: tuple[float, ...] = DECAYS, runs: int = RUNS) -> Levels:
-    """Thresholds for Example 1.
-
-    Parameters
-    ----------
-    decays
-        Candidates for the observers' decay.
-    runs
-        Number of simulated runs.
-    """
+    """Thresholds for Example 1, from simulated `runs`."""
     observers = bank(decays)
     proven = windows.design(observers, 1, noise=NOISE, length=LENGTHS[0])
     found = simulated_gains(observers, runs=runs, seed=2019)
@@ -332,48 +264,27 @@ def levels(decays: tuple[float, ...] = DECAYS, runs: int = RUNS) -> Levels:
     return Levels(proven, simulated, windows.calibrate(proven, honest), found.exceedance)
 
 
-def large_sets(design: WindowDesign) -> Bools:
-    """Masks (s, p) of the sets of p - q sensors, in the order of pi_J."""
-    return design.observers.masks[1 : 1 + design.sets.count_large]
-
-
 def detection_rates(design: WindowDesign, trace: windows.Trace) -> Floats:
     """Fraction of the windows found attacked by Algorithm 1, for N = 50, 100, 200."""
     return np.array([windows.detection(trace.pi, design.detect_above, N).mean() for N in LENGTHS])
 
 
 def isolation_rates(design: WindowDesign, trace: windows.Trace, sensor: int, rule: Rule) -> Floats:
-    """Fraction of the windows that name exactly the attacked sensor, for N = 50, 100, 200.
-
-    Parameters
-    ----------
-    sensor
-        The attacked sensor, from 0.
-    rule
-        "majority" (Algorithm 2) or "survivors".
-    """
+    """Fraction of the windows that name exactly the attacked `sensor`, from 0, for N = 50, 100, 200."""
     exact, rates = np.arange(4) == sensor, []
     for N in LENGTHS:
-        found = windows.isolation(trace.pi_sets, design.isolate_above, large_sets(design), N, rule)
+        found = windows.isolation(trace.pi_sets, design.isolate_above, design.large, N, rule)
         rates.append((found.suspects == exact).all(axis=-1).mean())
     return np.array(rates)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FigureSetting:
-    """Setting of one of the paper's four figures.
+    """Setting of one of the paper's four figures."""
 
-    Attributes
-    ----------
-    figure
-        Its number.
-    sensor, size
-        The attacked sensor, from 0, and the half width of its uniform attack.
-    """
-
-    figure: int
-    sensor: int
-    size: float
+    figure: int  # its number
+    sensor: int  # the attacked sensor, from 0
+    size: float  # half-width of its uniform attack
 
     @property
     def isolates(self) -> bool:
@@ -418,7 +329,7 @@ def figure(of: FigureSetting) -> PaperFigure:
         lines = []
         for label, design, rule in kinds:
             if of.isolates:
-                found = windows.isolation(trace.pi_sets[0], design.isolate_above, large_sets(design), N, rule)
+                found = windows.isolation(trace.pi_sets[0], design.isolate_above, design.large, N, rule)
                 x, y = points(found.suspects)
             else:
                 y = windows.detection(trace.pi[0], design.detect_above, N).astype(np.float64)
@@ -442,17 +353,9 @@ def deadbeat_bank() -> tuple[DiscreteDesign, ...]:
 
     `L_J` has the entries `1 / (2 |J|)`, so that `e_J(k+1) = -sum over J of (n_i + a_i) / (2 |J|)`.
     """
-    plant = DiscreteLure(
-        A=np.array([[0.5]]),
-        G=np.zeros((1, 1)),
-        H=np.zeros((1, 1)),
-        F=np.zeros((1, 1)),
-        B=np.zeros((1, 1)),
-        C=np.ones((5, 1)),
-        D=np.zeros((5, 1)),
-        lower=np.zeros(1),
-        upper=np.zeros(1),
-        phi=np.zeros_like,
+    none = np.zeros((1, 1))
+    plant = DiscreteLure.of(
+        [[0.5]], np.ones((5, 1)), G=none, H=none, B=none, phi=np.zeros_like, lower=0.0, upper=0.0
     )
     options = discrete_options(plant, decays=0.01, noise=1.0)
     made = []
@@ -542,14 +445,9 @@ def _shown(rates: Floats) -> str:
     return ", ".join(f"{rate:.2f}" for rate in rates)
 
 
-def fast_levels() -> Levels:
-    """Thresholds for observers with decay 0.6 throughout: faster and noisier than necessary."""
-    return levels((0.6,), OTHER_RUNS)
-
-
 def _remark_2() -> Claim:
-    """Longer windows degrade Algorithm 2 if most steps trust all sensors."""
-    at = fast_levels()
+    """Longer windows degrade Algorithm 2 if most steps trust all sensors; decay 0.6: fast and noisy."""
+    at = levels((0.6,), OTHER_RUNS)
     rates = isolation_rates(
         at.calibrated, trial(at.proven, sensor=ISOLATED, size=5.0, runs=60, seed=60), ISOLATED, "majority"
     )
@@ -562,7 +460,7 @@ def _remark_2() -> Claim:
 def _proposition_4() -> Claim:
     design, trace = alternating_attack()
     found = windows.isolation(
-        trace.pi_sets[1:], design.isolate_above, large_sets(design), design.length, "majority"
+        trace.pi_sets[1:], design.isolate_above, design.large, design.length, "majority"
     )
     named = ", ".join(str(i + 1) for i in np.flatnonzero(found.suspects[0]))
     what = "sensors isolated when every attacked set fails in half of the window, attackers 1 and 2 in turns"

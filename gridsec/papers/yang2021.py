@@ -15,7 +15,7 @@ from math import comb
 import numpy as np
 
 from gridsec.arrays import Floats
-from gridsec.errors import InputInvalid, Problem
+from gridsec.errors import InputInvalid
 from gridsec.observers.lmi.sampled import DiscreteLure, advance
 from gridsec.observers.unknown_input import Missing, UnknownInputPlant, exact, obstruction, pairs_text
 from gridsec.papers import yang2021_feeder
@@ -35,17 +35,9 @@ CORRECTION_2 = (1, 2, 0.4)
 def plant(example: int, *, corrected: bool = False) -> UnknownInputPlant:
     """The plants (37) and (38).
 
-    Parameters
-    ----------
-    example
-        1 (also of Example 3) or 2 (also of Example 4).
-    corrected
-        Change the one entry of C that makes all members of the bank exist.
-
-    Raises
-    ------
-    ValueError
-        If `example` is not 1 or 2.
+    example: 1 (also of Example 3) or 2 (also of Example 4).
+    corrected: change the one entry of C that makes all members of the bank exist.
+    Raises ValueError if `example` is not 1 or 2.
     """
     if example == 1:
         A, B = np.array([[0.2, 0.5], [0.2, 0.7]]), np.eye(2)
@@ -55,36 +47,21 @@ def plant(example: int, *, corrected: bool = False) -> UnknownInputPlant:
         B = np.array([[1.0, 0.0, 1.0], [1.0, 1.0, 0.0], [0.0, 1.0, 1.0]])
         C = np.array([[1.0, 1.0, 3.0, 4.0], [3.0, 1.0, 2.0, 1.0], [1.0, 1.0, 1.0, 1.0]]).T
     else:
-        raise InputInvalid([Problem("out-of-range", f"example {example}: only 1 and 2 have plants")])
+        raise InputInvalid.of("out-of-range", f"example {example}: only 1 and 2 have plants")
     if corrected:
         row, column, value = CORRECTION_1 if example == 1 else CORRECTION_2
         C = C.copy()
         C[row, column] = value
-    n, r = B.shape
-    system = DiscreteLure(
-        A=A,
-        G=np.eye(n),
-        H=np.eye(n),
-        F=np.zeros((n, r)),
-        B=B,
-        C=C,
-        D=np.zeros((len(C), r)),
-        lower=np.full(n, -0.5),
-        upper=np.full(n, 0.5),
-        phi=lambda z: np.asarray(0.5 * np.sin(z)),
+    one = np.eye(len(A))
+    system = DiscreteLure.of(
+        A, C, G=one, H=one, B=B, phi=lambda z: np.asarray(0.5 * np.sin(z)), lower=-0.5, upper=0.5
     )
     return exact(system, B)
 
 
 @lru_cache(maxsize=4)
 def bank(example: int, *, corrected: bool = False) -> IsolationDesign:
-    """The bank of an example: complete with q = 1, or partial with q_1 = q_2 = 1.
-
-    Parameters
-    ----------
-    example, corrected
-        As in `plant`.
-    """
+    """The bank of an example: complete with q = 1, or partial with q_1 = q_2 = 1."""
     max_inputs = 2 if example == 1 else 1
     made = plant(example, corrected=corrected)
     return design(made, max_inputs=max_inputs, max_sensors=1, measure="distance")
@@ -99,30 +76,16 @@ def missing_complete() -> tuple[Missing, ...]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Yang2021Run:
-    """One simulation. T steps, n states, r inputs, p sensors.
+    """One simulation. T steps, n states, r inputs, p sensors."""
 
-    Attributes
-    ----------
-    x, x_hat : (T, n)
-        Truth and estimate.
-    a_u, a_u_hat : (T, r)
-        Attack on the inputs; `a_u_hat[k]` is (42) of step k + 1, NaN at the last step.
-    a_y, a_y_hat : (T, p)
-        Attack on the sensors and (43).
-    bound : (T, n)
-        Bound of the estimate's error; proven only where no member is missing.
-    answers
-        Results of the bank.
-    """
-
-    x: Floats
-    x_hat: Floats
-    a_u: Floats
-    a_u_hat: Floats
-    a_y: Floats
-    a_y_hat: Floats
-    bound: Floats
-    answers: tuple[IsolationStep, ...]
+    x: Floats  # (T, n) state
+    x_hat: Floats  # (T, n) estimate
+    a_u: Floats  # (T, r) attack on the inputs
+    a_u_hat: Floats  # (T, r) (42) of the next step; NaN at the last step
+    a_y: Floats  # (T, p) attack on the sensors
+    a_y_hat: Floats  # (T, p) (43)
+    bound: Floats  # (T, n) bound of the estimate's error; proven only where no member is missing
+    answers: tuple[IsolationStep, ...]  # results of the bank
 
     def named(self, last: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """Inputs and sensors (from 1) with a reconstructed attack above `TOLERANCE` in the `last` steps."""
@@ -145,17 +108,11 @@ def simulate(
 ) -> Yang2021Run:
     """Run an example: known inputs and attacks uniform and white, `x(0)` standard normal.
 
-    Parameters
-    ----------
-    example, corrected
-        As in `plant`.
-    amplitude
-        Attacks are uniform in (-amplitude, amplitude).
-    inputs, sensors
-        Attacked inputs and sensors, from 0. By default both inputs (Example 1) or the third (Example 4's
-        text).
-    seed
-        Seed of the random numbers; the paper does not state its own.
+    example, corrected: as in `plant`.
+    amplitude: attacks are uniform in (-amplitude, amplitude).
+    inputs, sensors: attacked inputs and sensors, from 0. By default both inputs (Example 1) or the third
+        (Example 4's text).
+    seed: seed of the random numbers; the paper does not state its own.
     """
     made = bank(example, corrected=corrected)
     model = made.family.plant
@@ -188,23 +145,12 @@ def simulate(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class IndistinguishableHistories:
-    """Two histories with the same readings, each with no more attacks than assumed. T steps.
+    """Two histories with the same readings, each with no more attacks than assumed. T steps."""
 
-    Attributes
-    ----------
-    y : (T, p)
-        Reports of the sensors in both.
-    u : (T, r)
-        Known input of both.
-    x : (2, T, n)
-        The two states.
-    attacked
-        Inputs and sensors attacked in each, from 0.
-    """
-
-    y: Floats
-    u: Floats
-    x: Floats
+    y: Floats  # (T, p) reports of the sensors in both
+    u: Floats  # (T, r) known input of both
+    x: Floats  # (2, T, n) the two states
+    # inputs and sensors attacked in each, from 0
     attacked: tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
 
 
@@ -216,14 +162,9 @@ def doubt(example: int, size: float, steps: int = STEPS) -> IndistinguishableHis
     Example 2: `b_1 - b_2` moves neither sensor 1 nor sensor 2. Input 1 and sensor 3 are attacked in one
     history, input 2 and sensor 4 in the other, and the states differ by `size (b_1 - b_2)` at the end.
 
-    Parameters
-    ----------
-    example
-        1 or 2, as printed.
-    size
-        Distance of the states, in multiples of (1, -1) or b_1 - b_2.
-    steps
-        Length of the histories.
+    example: 1 or 2, as printed.
+    size: distance of the states, in multiples of (1, -1) or b_1 - b_2.
+    steps: length of the histories.
     """
     model = plant(example)
     n, r = len(model.system.A), model.inputs.shape[1]
@@ -330,31 +271,21 @@ def doubt_error(example: int, size: float = 2.0) -> float:
 
 
 def _figures(amplitude: float, numbers: tuple[int, ...]) -> list[PaperFigure]:
-    one, two = simulate(1, amplitude), simulate(2, amplitude)
+    # The captions of Figures 3 and 4 attack input 1, those of Figures 9 to 12 input 3.
+    one, two, other = (simulate(1, amplitude), simulate(2, amplitude), simulate(2, amplitude, inputs=(0,)))
     size = f"uniform in ±{amplitude:g}"
-    return [
-        _states(one, numbers[0], f"Example 1: estimate (dashed) and state, attacks {size}"),
-        # The captions of Figures 3 and 4 attack input 1, those of Figures 9 to 12 input 3.
-        _states(
-            simulate(2, amplitude, inputs=(0,)),
-            numbers[1],
-            f"Example 2: estimate (dashed) and state, attacks {size}",
-        ),
-        _attacks(one, numbers[2], "y", f"Example 3: attacks on the sensors, {size}, reconstructed by (43)"),
-        _attacks(one, numbers[3], "u", f"Example 3: attacks on the inputs, {size}, reconstructed by (42)"),
-        _attacks(two, numbers[4], "y", f"Example 4: attacks on the sensors, {size}, reconstructed by (43)"),
-        _attacks(two, numbers[5], "u", f"Example 4: attacks on the inputs, {size}, reconstructed by (42)"),
-    ]
-
-
-def _states(run: Yang2021Run, place: int, caption: str) -> PaperFigure:
-    return _figure(place, caption, run.x, run.x_hat, "x")
-
-
-def _attacks(run: Yang2021Run, place: int, which: str, caption: str) -> PaperFigure:
-    if which == "y":
-        return _figure(place, caption, run.a_y, run.a_y_hat, "a_y")
-    return _figure(place, caption, run.a_u, run.a_u_hat, "a_u")
+    states = f"estimate (dashed) and state, attacks {size}"
+    sensors = f"attacks on the sensors, {size}, reconstructed by (43)"
+    inputs = f"attacks on the inputs, {size}, reconstructed by (42)"
+    parts = (
+        (f"Example 1: {states}", one.x, one.x_hat, "x"),
+        (f"Example 2: {states}", other.x, other.x_hat, "x"),
+        (f"Example 3: {sensors}", one.a_y, one.a_y_hat, "a_y"),
+        (f"Example 3: {inputs}", one.a_u, one.a_u_hat, "a_u"),
+        (f"Example 4: {sensors}", two.a_y, two.a_y_hat, "a_y"),
+        (f"Example 4: {inputs}", two.a_u, two.a_u_hat, "a_u"),
+    )
+    return [_figure(place, *part) for place, part in zip(numbers, parts, strict=True)]
 
 
 def _figure(place: int, caption: str, truth: Floats, found: Floats, letter: str) -> PaperFigure:

@@ -29,9 +29,7 @@ ONSET_S = 40.0
 def feeder() -> Feeder:
     """Kerber's rural overhead line: 13 sections of 9.303 mohm + j 1.449 mohm at 400 V, base 100 kVA.
 
-    References
-    ----------
-    G. Kerber, dissertation, TU Muenchen 2011, as distributed with pandapower.
+    Source: G. Kerber, dissertation, TU Muenchen 2011, as distributed with pandapower.
     """
     ohm = 400.0**2 / 100e3
     return Feeder(
@@ -53,28 +51,12 @@ def _droop(at: tuple[int, ...]) -> Droop:
 
 
 def loop(at: tuple[int, ...], meters: tuple[int, ...]) -> Lure:
-    """The closed loop with inverters of 10 kVA and the curve of IEEE 1547, category B.
-
-    Parameters
-    ----------
-    at
-        Customers with an inverter, from 0.
-    meters
-        Customers with a meter, from 0.
-    """
+    """Closed loop with inverters of 10 kVA and the curve of IEEE 1547, category B; customers count from 0."""
     return close_loop(feeder(), _droop(at), np.array(meters))
 
 
 def plant(at: tuple[int, ...], meters: tuple[int, ...], reading_error: float) -> UnknownInputPlant:
-    """The sampled loop with attacks possible on every inverter.
-
-    Parameters
-    ----------
-    at, meters
-        As in `loop`.
-    reading_error
-        Largest error of every meter, squared pu.
-    """
+    """The sampled loop with attacks possible on every inverter; `reading_error` in squared pu."""
     return inverters(
         loop(at, meters),
         STEP_S,
@@ -99,22 +81,12 @@ def bank(reading_error: float = 1e-6) -> IsolationDesign:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Yang2021FeederRun:
-    """One simulation. T ticks, m inverters, p meters.
+    """One simulation. T ticks, m inverters, p meters."""
 
-    Attributes
-    ----------
-    x, a_u : (T, m)
-        Reactive injections and wrong parts of their set points, pu.
-    a_y : (T, p)
-        Attacks on the meters, squared pu.
-    answers
-        Results of the bank.
-    """
-
-    x: Floats
-    a_u: Floats
-    a_y: Floats
-    answers: tuple[IsolationStep, ...]
+    x: Floats  # (T, m) reactive injections, pu
+    a_u: Floats  # (T, m) wrong parts of their set points, pu
+    a_y: Floats  # (T, p) attacks on the meters, squared pu
+    answers: tuple[IsolationStep, ...]  # results of the bank
 
 
 def simulate(
@@ -122,12 +94,8 @@ def simulate(
 ) -> Yang2021FeederRun:
     """Simulate the loop under attack from `ONSET_S` on: the inverter absorbs, the meter is biased.
 
-    Parameters
-    ----------
-    inverter, meter
-        Attacked inverter and meter, from 0.
-    seed
-        Seed of the meters' errors, which are uniform inside their bounds.
+    inverter, meter: attacked inverter and meter, from 0.
+    seed: seed of the meters' errors, which are uniform inside their bounds.
     """
     model = made.family.plant
     m, p = model.inputs.shape[1], len(model.noise)

@@ -30,8 +30,17 @@ from gridsec.grid.network import Network, Power
 from gridsec.grid.radial import Feeder
 from gridsec.grid.three_phase import ThreePhaseFeeder
 from gridsec.observers.lure import Lure
-from gridsec.secure.index import Index, Sparsest, eigenspaces, fewest, kernel, linearise
-from gridsec.secure.index.blocks import MOST_NODES, Matrix, fewest_rows
+from gridsec.secure.index import (
+    MOST_NODES,
+    Index,
+    Matrix,
+    Sparsest,
+    eigenspaces,
+    fewest,
+    fewest_rows,
+    kernel,
+    linearise,
+)
 
 __all__ = [
     "FeederSection",

@@ -4,16 +4,7 @@ A bank compares every large observer, which distrusts q_1 inputs and q_2 sensors
 distrust twice as many of each. The observer in best agreement with its company is selected. The attacks
 follow from its estimate; inputs and sensors with an attack above the estimate's error are named.
 
-    design(plant, ...) -> IsolationDesign
-    init(design, t) -> IsolationState
-    step(design, state, y, u, seen) -> (IsolationState, Isolation)
-
-References
-----------
-yang2021 (5) to (7), (22) to (24), (42) to (47); docs/theory-unknown-input.md.
-yang2021 (4), (19), (20); docs/theory-unknown-input.md.
-yang2021 (5) to (7), (22) to (24); docs/theory-unknown-input.md.
-yang2021 (42) to (47); docs/theory-unknown-input.md.
+Source: yang2021 (4) to (7), (19), (20), (22) to (24), (42) to (47); docs/theory-unknown-input.md.
 """
 
 from __future__ import annotations
@@ -45,45 +36,24 @@ Measure = Literal["distance", "bounds"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class IsolationDesign:
-    """A bank with its comparisons. n states, r inputs, p sensors.
+    """A bank with its comparisons. n states, r inputs, p sensors."""
 
-    Attributes
-    ----------
-    family
-        All observers that exist.
-    large : (a,)
-        Indices of the large ones, J of (5) or (22).
-    company : (a, b)
-        For each large observer the small ones within it, padded by repetition.
-    alone : (a,)
-        Large observers without any existing company: they cannot be confirmed.
-    max_inputs, max_sensors
-        q_1 and q_2. A complete bank distrusts all inputs: max_inputs = r.
-    missing
-        Members missing from the bank. Unless empty, the theorems do not apply.
-    measure
-        Measure of disagreement. "distance": the Euclidean norm of (5) and (22), with the selection (6), (23).
-        "bounds": the largest difference of an entry relative to the sum of both observers' error bounds, in
-        which a poorly observed state does not mask others; the observer with the best certified estimate is
-        selected.
-    left : (r, n)
-        Left inverse of the inputs' matrix.
-    from_now, from_before, from_drift : (r, n), (r, n), (r,)
-        Gains from the bounds of the estimates to that of the reconstructed input attack.
-    """
-
-    family: UnknownInputObserver
-    large: Ints
-    company: Ints
-    alone: Bools
-    max_inputs: int
-    max_sensors: int
-    missing: tuple[Missing, ...]
+    family: UnknownInputObserver  # all observers that exist
+    large: Ints  # (a,) indices of the large ones, J of (5) or (22)
+    company: Ints  # (a, b) for each large observer the small ones within it, padded by repetition
+    alone: Bools  # (a,) large observers without any existing company: they cannot be confirmed
+    max_inputs: int  # q_1; a complete bank distrusts all inputs: max_inputs = r
+    max_sensors: int  # q_2
+    missing: tuple[Missing, ...]  # members missing from the bank. Unless empty, the theorems do not apply
+    # measure of disagreement. "distance": the Euclidean norm of (5) and (22), with the selection (6), (23).
+    # "bounds": the largest difference of an entry relative to the sum of both observers' error bounds, in
+    # which a poorly observed state does not mask others; the observer with the best certified estimate is
+    # selected
     measure: Measure
-    left: Floats
-    from_now: Floats
-    from_before: Floats
-    from_drift: Floats
+    left: Floats  # (r, n) left inverse of the inputs' matrix
+    from_now: Floats  # (r, n) gain from the bound of an estimate to that of the reconstructed input attack
+    from_before: Floats  # (r, n) gain from the bound of the estimate before
+    from_drift: Floats  # (r,) contribution of the drift
 
     @property
     def guaranteed(self) -> bool:
@@ -94,24 +64,12 @@ class IsolationDesign:
 def members(inputs: int, sensors: int, max_inputs: int, max_sensors: int) -> tuple[list[Pair], list[Pair]]:
     """The pairs (J_u, J_s) of both banks.
 
-    Parameters
-    ----------
-    inputs, sensors
-        r and p.
-    max_inputs, max_sensors
-        q_1 and q_2. `max_inputs = inputs` selects the complete bank, in which both distrust all inputs.
-
-    Returns
-    -------
-    large, small
-        (q_1, p - q_2) and (2 q_1, p - 2 q_2) inputs and sensors.
-
-    Raises
-    ------
-    NotObservable
-        Unless p > 2 q_2 and (except for the complete bank) r > 2 q_1, yang2021 (4), (19), (20).
-    ValueError
-        If a count is negative.
+    inputs, sensors: r and p.
+    max_inputs, max_sensors: q_1 and q_2. `max_inputs = inputs` selects the complete bank, in which both
+        distrust all inputs.
+    Returns large, small: (q_1, p - q_2) and (2 q_1, p - 2 q_2) inputs and sensors.
+    Raises NotObservable unless p > 2 q_2 and (except for the complete bank) r > 2 q_1, yang2021 (4), (19),
+        (20). ValueError if a count is negative.
     """
     counts = {"max_inputs": max_inputs, "max_sensors": max_sensors}
     raise_if_any(
@@ -155,24 +113,13 @@ def design(
 ) -> IsolationDesign:
     """Design a bank and list its missing members.
 
-    Parameters
-    ----------
-    max_inputs, max_sensors
-        Largest numbers of attacked inputs and sensors, q_1 and q_2; `max_inputs = r` is the complete
-        bank.
-    measure
-        See `IsolationDesign`. yang2021: "distance".
-    rates, multiplier, tolerance, rounding
-        See `observers.unknown_input.design`.
-
-    Raises
-    ------
-    NotObservable
-        If there are too few sensors or inputs for the counts.
-    DesignInfeasible
-        If no member exists at all.
-    ValueError
-        If a count is negative, `rates` is empty, or `measure` or `multiplier` is unknown.
+    max_inputs, max_sensors: largest numbers of attacked inputs and sensors, q_1 and q_2; `max_inputs = r` is
+        the complete bank.
+    measure: see `IsolationDesign`. yang2021: "distance".
+    rates, multiplier, tolerance, rounding: see `observers.unknown_input.design`.
+    Raises NotObservable if there are too few sensors or inputs for the counts. DesignInfeasible if no member
+        exists at all. ValueError if a count is negative, `rates` is empty, or `measure` or `multiplier` is
+        unknown.
     """
     raise_if_any(no_choice("measure", get_args(Measure), measure))
     r, p = plant.inputs.shape[1], plant.noise.size
@@ -221,13 +168,7 @@ def _within(small: Pair, large: Pair) -> bool:
 
 
 def disagreement(design: IsolationDesign, state: UnknownInputObserverState) -> Floats:
-    """Disagreement pi of every large observer, (5) and (22); infinite without a member to confirm it.
-
-    Returns
-    -------
-    Floats
-        (a,).
-    """
+    """Disagreement pi of every large observer (a,), (5) and (22); infinite without a member to confirm it."""
     if design.measure == "bounds":
         return contradiction(design, state)
     pi = np.linalg.norm(_gap(design, state), axis=2).max(axis=1)
@@ -237,11 +178,8 @@ def disagreement(design: IsolationDesign, state: UnknownInputObserverState) -> F
 def contradiction(design: IsolationDesign, state: UnknownInputObserverState) -> Floats:
     """Largest difference of an entry from that of the company, relative to the sum of both bounds.
 
-    Returns
-    -------
-    Floats
-        (a,); infinite without a member to confirm it. A finite value above 1 proves that an attack affects
-        the observer or one of its company.
+    Returns (a,): infinite without a member to confirm it. A finite value above 1 proves that an attack
+        affects the observer or one of its company.
     """
     gap = _gap(design, state)
     allowed = state.box[design.large][:, None, :] + state.box[design.company]
@@ -262,16 +200,11 @@ def _dead(design: IsolationDesign, state: UnknownInputObserverState) -> Bools:
 
 
 def bounds(design: IsolationDesign, state: UnknownInputObserverState) -> Floats:
-    """Bounds of the errors of all large observers, under any attack.
+    """Bounds of the errors of all large observers (a, n), under any attack.
 
     Some small observer S within J is free of attacks, by Lemmas 1 to 3, so
     `|e_J,i| <= max_S (|x_hat_J,i - x_hat_S,i| + box_S,i)`, for every J: the company also bounds observers
     with attacked sensors. The plant's span limits every error.
-
-    Returns
-    -------
-    Floats
-        (a, n).
     """
     x = state.x[design.large]
     gap = np.abs(x[:, None, :] - state.x[design.company]) + state.box[design.company]
@@ -286,17 +219,9 @@ def estimate(
     The true state is within the bounds of every large observer, so in the intersection of all these
     intervals.
 
-    Parameters
-    ----------
-    index
-        Index among the large observers.
-
-    Returns
-    -------
-    x, bound : (n,)
-    torn
-        True if intervals do not intersect: then more is attacked than assumed, and the bound is infinite
-        there.
+    index: index among the large observers.
+    Returns x (n,), bound (n,), and True if intervals do not intersect: then more is attacked than assumed,
+        and the bound is infinite there.
     """
     x, wide = state.x[design.large], bounds(design, state)
     low, high = np.max(x - wide, axis=0), np.min(x + wide, axis=0)
@@ -305,13 +230,7 @@ def estimate(
 
 
 def select(design: IsolationDesign, state: UnknownInputObserverState, pi: Floats) -> int:
-    """Index of the selected large observer: by (6), (23), or the one with the best certified estimate.
-
-    Parameters
-    ----------
-    pi : (a,)
-        Disagreement of the large observers.
-    """
+    """Index of the selected large observer: by (6), (23), or the one with the best certified estimate."""
     if design.measure == "distance":
         return int(np.argmin(pi))
     wide = bounds(design, state)
@@ -322,71 +241,38 @@ def select(design: IsolationDesign, state: UnknownInputObserverState, pi: Floats
 
 @dataclass(frozen=True, slots=True, eq=False)
 class IsolationState:
-    """State between ticks. n states, r inputs, p sensors, l known inputs.
+    """State between ticks. n states, r inputs, p sensors, l known inputs."""
 
-    Attributes
-    ----------
-    family
-        The observers.
-    x, bound : (n,) or None
-        Selected estimate and bound of its error at the last tick.
-    u : (l,) or None
-        Known input of the last tick.
-    inputs, sensors : (r,), (p,)
-        Named so far: by Assumption 1 the attacked sets do not change.
-    """
-
-    family: UnknownInputObserverState
-    x: Floats | None
-    bound: Floats | None
-    u: Floats | None
-    inputs: Bools
-    sensors: Bools
+    family: UnknownInputObserverState  # the observers
+    x: Floats | None  # (n,) selected estimate of the last tick
+    bound: Floats | None  # (n,) bound of its error
+    u: Floats | None  # (l,) known input of the last tick
+    inputs: Bools  # (r,) inputs named so far: by Assumption 1 the attacked sets do not change
+    sensors: Bools  # (p,) sensors named so far
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class IsolationStep:
-    """Result of one tick. n states, r inputs, p sensors, a large observers.
+    """Result of one tick. n states, r inputs, p sensors, a large observers."""
 
-    Attributes
-    ----------
-    t
-        Time of the tick, s.
-    decision, cause, reason
-        As in `gridsec.interface.Verdict`. UNDECIDED if members of the bank are missing.
-    x, bound : (n,)
-        Estimate (7), (24) and a bound of its error, valid under the theorems' assumptions.
-    selected
-        (J_u, J_s) of the selected observer.
-    disagreement : (a,)
-        pi of (5) or (22) for each large observer, infinite if it cannot be confirmed. With "bounds", a value
-        above 1 proves that an attack affects the observer or one of its company.
-    input_attack, input_threshold : (r,)
-        (42), of the *last* tick, and its largest value without attack. NaN and infinite at the first tick.
-    sensor_attack, sensor_threshold : (p,)
-        (43), NaN where unseen, and its largest value without attack.
-    inputs_now, sensors_now : (r,), (p,)
-        (46), (47) with these thresholds, for this tick alone.
-    inputs, sensors : (r,), (p,)
-        Named at this tick or before.
-    """
-
-    t: float
-    decision: Decision
+    t: float  # time of the tick, s
+    decision: Decision  # as in `gridsec.interface.Verdict`. UNDECIDED if members of the bank are missing
     cause: Cause
     reason: str
-    x: Floats
-    bound: Floats
-    selected: Pair
+    x: Floats  # (n,) estimate (7), (24)
+    bound: Floats  # (n,) bound of its error under the theorems' assumptions
+    selected: Pair  # (J_u, J_s) of the selected observer
+    # (a,) pi of (5) or (22) for each large observer, infinite if it cannot be confirmed. With "bounds", a
+    # value above 1 proves that an attack affects the observer or one of its company
     disagreement: Floats
-    input_attack: Floats
-    input_threshold: Floats
-    sensor_attack: Floats
-    sensor_threshold: Floats
-    inputs_now: Bools
-    sensors_now: Bools
-    inputs: Bools
-    sensors: Bools
+    input_attack: Floats  # (r,) (42), of the *last* tick; NaN at the first tick
+    input_threshold: Floats  # (r,) its largest value without attack; infinite at the first tick
+    sensor_attack: Floats  # (p,) (43); NaN where unseen
+    sensor_threshold: Floats  # (p,) its largest value without attack
+    inputs_now: Bools  # (r,) (46) with these thresholds, for this tick alone
+    sensors_now: Bools  # (p,) (47) likewise
+    inputs: Bools  # (r,) inputs named at this tick or before
+    sensors: Bools  # (p,) sensors named at this tick or before
 
 
 def init(
@@ -394,12 +280,9 @@ def init(
 ) -> IsolationState:
     """Initial state of a bank.
 
-    Parameters
-    ----------
-    t
-        Time of the first readings, s.
-    x, radius : (n,)
-        Initial estimate of all observers, and the bound of its error, see `observers.unknown_input.init`.
+    t: time of the first readings, s.
+    x, radius (n,): initial estimate of all observers, and the bound of its error, see
+        `observers.unknown_input.init`.
     """
     r, p = len(design.left), len(design.family.plant.noise)
     none_attacked = np.zeros(r, dtype=np.bool_), np.zeros(p, dtype=np.bool_)
@@ -409,17 +292,7 @@ def init(
 def input_attack(design: IsolationDesign, x: Floats, before: Floats, u: Floats) -> Floats:
     """Attack on the inputs at the last tick, (42): `B_a^+ (x_hat - A x_hat- - G phi(z_hat-) - B u-)`.
 
-    Parameters
-    ----------
-    x, before : (n,)
-        Estimates at this tick and at the last.
-    u : (l,)
-        Known input of the last tick.
-
-    Returns
-    -------
-    Floats
-        (r,).
+    x, before (n,): estimates at this tick and at the last. u (l,): known input of the last tick.
     """
     s = design.family.plant.system
     expected = s.A @ before + s.G @ s.phi(s.H @ before + s.F @ u) + s.B @ u
@@ -431,12 +304,8 @@ def support(attack: Floats, threshold: Floats | float) -> Bools:
 
     The printed `supp` requires exact zeros, which no estimate has after finitely many steps.
 
-    Parameters
-    ----------
-    attack : (…)
-        From (42) or (43); NaN counts as not attacked.
-    threshold : (…) or scalar
-        Largest value without attack.
+    attack (…): from (42) or (43); NaN counts as not attacked.
+    threshold (…) or scalar: largest value without attack.
     """
     return np.asarray(np.abs(np.nan_to_num(attack)) > threshold)
 
@@ -446,19 +315,9 @@ def step(
 ) -> tuple[IsolationState, IsolationStep]:
     """Process one tick and name attacked inputs and sensors.
 
-    Parameters
-    ----------
-    y : (p,)
-        Readings; arbitrary where unseen.
-    u : (l,)
-        Known input of this tick; finite.
-    seen : (p,)
-        True for existing readings.
-
-    Returns
-    -------
-    state, answer
-        Never raises on data.
+    y (p,): readings; arbitrary where unseen.
+    u (l,): known input of this tick; finite, seen (p,).
+    Never raises on data.
     """
     plant, s = design.family.plant, design.family.plant.system
     family = step_family(design.family, state.family, y, u, seen)
@@ -524,27 +383,13 @@ def _times(matrix: Floats, bound: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Evidence:
-    """Evidence for an answer besides the named inputs and sensors.
+    """Evidence for an answer besides the named inputs and sensors."""
 
-    Attributes
-    ----------
-    torn
-        True if the large observers' intervals do not intersect.
-    contradicted
-        True if an observer differs from its company by more than the sum of both bounds.
-    confirmed
-        True if an observer and its company have used readings.
-    settled
-        True if the estimate's bound is below the prior one.
-    silent : (p,)
-        Sensors without a reading.
-    """
-
-    torn: bool
-    contradicted: bool
-    confirmed: bool
-    settled: bool
-    silent: Bools
+    torn: bool  # True if the large observers' intervals do not intersect
+    contradicted: bool  # True if an observer differs from its company by more than the sum of both bounds
+    confirmed: bool  # True if an observer and its company have used readings
+    settled: bool  # True if the estimate's bound is below the prior one
+    silent: Bools  # (p,) sensors without a reading
 
 
 def _decide(

@@ -9,43 +9,28 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import chain, combinations
 from math import comb
 
 import numpy as np
 
 from gridsec.arrays import Bools, Ints
-from gridsec.errors import DesignInfeasible, InputInvalid, NotObservable, Problem
+from gridsec.errors import DesignInfeasible, InputInvalid, NotObservable
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Subsets:
-    """Sensor subsets of chong2020's two banks. p meters, at most M attacked.
+    """Sensor subsets of chong2020's two banks. p meters, at most M attacked."""
 
-    Attributes
-    ----------
-    meters
-        p.
-    max_attacked
-        M.
-    out_large : (C(p, M), M)
-        Meters that each large set S leaves out, ascending.
-    out_small : (C(p, 2M), 2M)
-        Meters that each small set P leaves out, ascending.
-    choices : (C(2M, M), M)
-        The choices of M of the 2M places of `out_small`.
-    parent : (C(2M, M), C(p, 2M))
-        `parent[c, P]`: the S that leaves out those of P's meters that choice c picks.
-    pairs : (C(p, M), C(p - M, M))
-        For each S, positions of its comparisons in an array of shape `parent.shape`, flattened.
-    """
-
-    meters: int
-    max_attacked: int
-    out_large: Ints
-    out_small: Ints
-    choices: Ints
+    meters: int  # p
+    max_attacked: int  # M
+    out_large: Ints  # (C(p, M), M) meters that each large set S leaves out, ascending
+    out_small: Ints  # (C(p, 2M), 2M) meters that each small set P leaves out, ascending
+    choices: Ints  # (C(2M, M), M) the choices of M of the 2M places of `out_small`
+    # (C(2M, M), C(p, 2M)) `parent[c, P]`: the S that leaves out those of P's meters that choice c picks
     parent: Ints
+    # (C(p, M), C(p - M, M)) for each S, positions of its comparisons in an array of shape `parent.shape`,
+    # flattened
     pairs: Ints
 
     @property
@@ -71,30 +56,14 @@ class Subsets:
 def subsets(meters: int, max_attacked: int, *, most: int) -> Subsets:
     """Tables for p meters with at most M manipulated.
 
-    Parameters
-    ----------
-    meters
-        p, number of meters.
-    max_attacked
-        M, largest number of simultaneously manipulated meters.
-    most
-        Largest acceptable number of observers.
-
-    Raises
-    ------
-    NotObservable
-        Unless p > 2M.
-    DesignInfeasible
-        If the banks need more than `most` observers.
-    ValueError
-        If M is negative.
-
-    References
-    ----------
-    chong2020, Theorem 1 (ii), equations (5) and (6).
+    meters: p, number of meters.
+    max_attacked: M, largest number of simultaneously manipulated meters.
+    Raises NotObservable unless p > 2M. DesignInfeasible if the banks need more than `most` observers.
+        ValueError if M is negative.
+    Source: chong2020, Theorem 1 (ii), equations (5) and (6).
     """
     if max_attacked < 0:
-        raise InputInvalid([Problem("negative", f"max_attacked is {max_attacked}; it cannot be negative")])
+        raise InputInvalid.of("negative", f"max_attacked is {max_attacked}; it cannot be negative")
     if meters <= 2 * max_attacked:
         raise NotObservable(
             range(meters),
@@ -111,9 +80,9 @@ def subsets(meters: int, max_attacked: int, *, most: int) -> Subsets:
             f"it needs {count} observers, and at most {most} are allowed; allow fewer manipulated meters",
             code="too-many",
         )
-    out_large = _combinations(meters, max_attacked)
-    out_small = _combinations(meters, 2 * max_attacked)
-    choices = _combinations(2 * max_attacked, max_attacked)
+    out_large = combinations_of(meters, max_attacked)
+    out_small = combinations_of(meters, 2 * max_attacked)
+    choices = combinations_of(2 * max_attacked, max_attacked)
     parent = np.stack([_rank(out_small[:, pick], meters) for pick in choices])
     pairs = np.argsort(parent, axis=None, kind="stable").reshape(out_large.shape[0], -1)
     return Subsets(meters, max_attacked, out_large, out_small, choices, parent, pairs)
@@ -125,37 +94,27 @@ def most_attacked(meters: int, works: Callable[[Ints], bool]) -> int:
     All sets are tried, the largest first, until one fails. If the criterion is observability of the pair (A,
     C_J), `index.dynamic_index(A, C).correctable` gives the same result without trials.
 
-    Parameters
-    ----------
-    meters
-        p, number of meters.
-    works
-        Criterion for the meters J, ascending: True if an observer exists or can be designed for them.
-
-    Returns
-    -------
-    int
-        M; -1 if not even all meters suffice.
-
-    References
-    ----------
-    yang2019, before (3); yang2021, before (4); chong2020, Theorem 1 (ii) and Corollary 1.
+    meters: p, number of meters.
+    works: criterion for the meters J, ascending: True if an observer exists or can be designed for them.
+    Returns -1 if not even all meters suffice.
+    Source: yang2019, before (3); yang2021, before (4); chong2020, Theorem 1 (ii) and Corollary 1.
     """
     everybody = np.arange(meters)
     lost = 0
-    while lost < meters and all(works(np.delete(everybody, out)) for out in _combinations(meters, lost)):
+    while lost < meters and all(works(np.delete(everybody, out)) for out in combinations_of(meters, lost)):
         lost += 1
     return (lost - 1) // 2
 
 
-def _combinations(n: int, k: int) -> Ints:
+def combinations_of(n: int, k: int) -> Ints:
     """All k-element subsets of range(n), each ascending, in lexicographic order; (C(n, k), k)."""
-    flat = [i for chosen in combinations(range(n), k) for i in chosen]
-    return np.array(flat, dtype=np.intp).reshape(comb(n, k), k)
+    count = comb(n, k)
+    flat = np.fromiter(chain.from_iterable(combinations(range(n), k)), dtype=np.intp, count=count * k)
+    return flat.reshape(count, k)
 
 
 def _rank(rows: Ints, n: int) -> Ints:
-    """Position of each ascending row among `_combinations(n, k)`; (r,).
+    """Position of each ascending row among `combinations_of(n, k)`; (r,).
 
     `C(n, k) - 1 - sum_i C(n - 1 - row_i, k - i)`: the rows after a row exceed it in the first place in which
     they differ.

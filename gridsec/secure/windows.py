@@ -9,11 +9,7 @@ meters all of them stay within a known distance of the true state, hence of each
 the latter for every J without a manipulated meter. A value above its bound is evidence; a window of N steps
 collects it.
 
-References
-----------
-yang2019, Algorithms 1 and 2; docs/theory-discrete.md, section 3.
-yang2019 (8), (10), (17), (19).
-yang2019, Example 1; docs/theory-discrete.md, section 4.
+Source: yang2019 (8), (10), (17), (19), Algorithms 1 and 2, Example 1; docs/theory-discrete.md, sections 3, 4.
 """
 
 from __future__ import annotations
@@ -29,7 +25,7 @@ from gridsec.errors import InputInvalid, Problem, no_choice, raise_if_any
 from gridsec.interface import Decision
 from gridsec.observers import circle_discrete
 from gridsec.observers.circle_discrete import DiscreteDesign, StackedObservers, advance, settling_steps, stack
-from gridsec.observers.lmi.discrete import DirectProof, DiscreteOptions, discrete_circles
+from gridsec.observers.lmi.discrete import DiscreteGains, DiscreteOptions, discrete_circles
 from gridsec.observers.lmi.sampled import DiscreteLure, measure
 from gridsec.observers.lmi.sampled import advance as advance_plant
 from gridsec.secure.subsets import Subsets, subsets
@@ -40,77 +36,37 @@ Rule = Literal["majority", "survivors"]
 def exceeds(measure: Floats, threshold: Floats | float) -> Bools:
     """True where measures are above their thresholds.
 
-    Parameters
-    ----------
-    measure : (…)
-        pi or pi_J; NaN, a measure that was not judged, exceeds no threshold.
-    threshold : (…) or scalar
-        A threshold of NaN is exceeded by every judged measure.
+    measure (…): pi or pi_J; NaN, a measure that was not judged, exceeds no threshold.
+    threshold (…) or scalar: a threshold of NaN is exceeded by every judged measure.
     """
     return np.asarray(~np.isnan(measure) & ~(measure <= threshold))
 
 
 def detection(pi: Floats, threshold: float, length: int) -> Bools:
-    """Algorithm 1: True for windows in which pi exceeds its threshold anywhere.
-
-    Parameters
-    ----------
-    pi : (…, T)
-        From step k* on; an incomplete last window is left out.
-    threshold
-        (10).
-    length
-        N.
-
-    Returns
-    -------
-    (…, T // N)
-        detection(i) as booleans.
-    """
+    """Algorithm 1: True for windows (…, T // N) in which pi (…, T), from step k* on, exceeds (10)."""
     count = pi.shape[-1] // length
     above = exceeds(pi[..., : count * length], threshold)
     return np.asarray(above.reshape(*pi.shape[:-1], count, length).any(axis=-1))
 
 
 def believed(passing: Bools, masks: Bools) -> Bools:
-    """W-bar(k): the union of all large sets that pass.
+    """W-bar(k): the union of all large sets that pass, the meters (…, p) regarded as unmanipulated.
 
-    Parameters
-    ----------
-    passing : (…, s)
-        True where pi_J is within its threshold.
-    masks : (s, p)
-        The large sets.
-
-    Returns
-    -------
-    (…, p)
-        Meters regarded as unmanipulated.
-
-    References
-    ----------
-    yang2019 (21).
+    passing (…, s): True where pi_J is within its threshold.
+    masks (s, p).
+    Source: yang2019 (21).
     """
     return np.asarray((passing[..., :, None] & masks).any(axis=-2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WindowIsolation:
-    """Result of windows. w windows, p meters.
+    """Result of windows. w windows, p meters."""
 
-    Attributes
-    ----------
-    suspects : (…, w, p)
-        Meters regarded as attacked; none where `decided` is False.
-    decided : (…, w)
-        True if the window has an answer.
-    share : (…, w)
-        Fraction of the window's steps with this answer (majority), or of the large sets that survived
-        (survivors).
-    """
-
-    suspects: Bools
-    decided: Bools
+    suspects: Bools  # (…, w, p) meters regarded as attacked; none where `decided` is False
+    decided: Bools  # (…, w) True if the window has an answer
+    # (…, w) fraction of the window's steps with this answer (majority), or of the large sets that survived
+    # (survivors)
     share: Floats
 
 
@@ -122,27 +78,12 @@ def isolation(pi_sets: Floats, thresholds: Floats, masks: Bools, length: int, ru
     at its first failure and trusts the union of the others; without any, the assumptions are wrong and the
     window is undecided.
 
-    Parameters
-    ----------
-    pi_sets : (…, T, s)
-        pi_J from step k* on; NaN where J cannot be judged, neither passed nor failed.
-    thresholds : (s,)
-        (19).
-    masks : (s, p)
-        The large sets.
-    length
-        N. An incomplete last window is left out.
-    rule
-        "majority" or "survivors".
-
-    Raises
-    ------
-    ValueError
-        If `rule` is unknown.
-
-    References
-    ----------
-    yang2019, Algorithm 2; docs/errata/yang2019.md on the two rules.
+    pi_sets (…, T, s): pi_J from step k* on; NaN where J cannot be judged, neither passed nor failed.
+    thresholds (s,), masks (s, p).
+    length: N. An incomplete last window is left out.
+    rule: "majority" or "survivors".
+    Raises ValueError if `rule` is unknown.
+    Source: yang2019, Algorithm 2; docs/errata/yang2019.md on the two rules.
     """
     raise_if_any(no_choice("rule", get_args(Rule), rule))
     count = pi_sets.shape[-2] // length
@@ -184,61 +125,29 @@ MOST_OBSERVERS = 20_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WindowDesign:
-    """Bank with its thresholds. p meters, at most q manipulated, s = C(p, q) large sets, o observers.
+    """Bank with its thresholds. p meters, at most q manipulated, s = C(p, q) large sets, o observers."""
 
-    Attributes
-    ----------
-    observers
-        All o = 1 + C(p, q) + C(p, 2q) observers: of all meters, of the large sets J, of the small sets S.
-    sets
-        J and S, and the compared pairs.
-    gains : (o,)
-        gamma of each observer.
-    noise
-        m, supremum over time of the Euclidean norm of all meters' noise.
-    epsilon
-        Largest remainder of the initial error when windows begin.
-    settling
-        k*, first step of the first window.
-    detect_above
-        Threshold of pi.
-    isolate_above : (s,)
-        Thresholds of pi_J.
-    length
-        N, steps in a window.
-    rule
-        Isolation rule of a window: "majority" is Algorithm 2; "survivors" keeps the J that never failed.
-    """
-
+    # all o = 1 + C(p, q) + C(p, 2q) observers: of all meters, of the large sets J, of the small sets S
     observers: StackedObservers
-    sets: Subsets
-    gains: Floats
-    noise: float
-    epsilon: float
-    settling: int
-    detect_above: float
-    isolate_above: Floats
-    length: int
+    sets: Subsets  # J and S, and the compared pairs
+    gains: Floats  # (o,) gamma of each observer
+    noise: float  # m, supremum over time of the Euclidean norm of all meters' noise
+    epsilon: float  # largest remainder of the initial error when windows begin
+    settling: int  # k*, first step of the first window
+    detect_above: float  # threshold of pi
+    isolate_above: Floats  # (s,) thresholds of pi_J
+    length: int  # N, steps in a window
+    # isolation rule of a window: "majority" is Algorithm 2; "survivors" keeps the J that never failed
     rule: Rule
+
+    @property
+    def large(self) -> Bools:
+        """Masks (s, p) of the large sets, in the order of pi_J."""
+        return self.observers.masks[1 : 1 + self.sets.count_large]
 
 
 def bank_masks(meters: int, max_attacked: int, *, most: int = MOST_OBSERVERS) -> Bools:
-    """Sets of meters of all observers of a bank, in their order: all meters, then J, then S.
-
-    Parameters
-    ----------
-    meters
-        p.
-    max_attacked
-        q.
-    most
-        Largest acceptable number of observers.
-
-    Returns
-    -------
-    (o, p)
-        Masks.
-    """
+    """Sets of meters of all observers of a bank as masks (o, p): all meters, then J, then S."""
     sets = subsets(meters, max_attacked, most=most)
     return np.vstack([np.ones((1, meters), dtype=np.bool_), sets.masks()])
 
@@ -248,50 +157,26 @@ def bank(
     max_attacked: int,
     *,
     options: DiscreteOptions | None = None,
-    proof: DirectProof | None = None,
+    proof: DiscreteGains | None = None,
     most: int = MOST_OBSERVERS,
 ) -> tuple[DiscreteDesign, ...]:
     """Design all observers: of all meters, of every p - q and of every p - 2q of them.
 
-    Parameters
-    ----------
-    system
-        Plant with p meters.
-    max_attacked
-        q, at least 1.
-    options
-        For gains by matrix inequality. Either `options` or `proof` is required.
-    proof
-        For direct injection.
-    most
-        Largest acceptable number of observers.
-
-    Raises
-    ------
-    NotObservable
-        Unless p > 2q.
-    DesignInfeasible
-        If there are more than `most` observers, or an observer cannot be designed.
-    ValueError
-        If `max_attacked` is below 1, or not exactly one of `options` and `proof` is given.
+    system: plant with p meters.
+    max_attacked: q, at least 1.
+    options: for gains by matrix inequality. Either `options` or `proof` is required.
+    proof: for direct injection.
+    Raises NotObservable unless p > 2q. DesignInfeasible if there are more than `most` observers, or an
+        observer cannot be designed. ValueError if `max_attacked` is below 1, or not exactly one of `options`
+        and `proof` is given.
     """
     if max_attacked < 1:
-        raise InputInvalid(
-            [
-                Problem(
-                    "out-of-range",
-                    "max_attacked must be at least 1: otherwise there is nothing to isolate",
-                )
-            ]
+        raise InputInvalid.of(
+            "out-of-range", "max_attacked must be at least 1: otherwise there is nothing to isolate"
         )
     if (options is None) == (proof is None):
-        raise InputInvalid(
-            [
-                Problem(
-                    "inconsistent",
-                    "give options for gains by matrix inequality, or a proof for direct injection",
-                )
-            ]
+        raise InputInvalid.of(
+            "inconsistent", "give options for gains by matrix inequality, or a proof for direct injection"
         )
     masks = bank_masks(len(system.C), max_attacked, most=most)
     if proof is not None:
@@ -317,50 +202,25 @@ def design(
 ) -> WindowDesign:
     """Thresholds of a bank, `2 (epsilon + gamma m)`.
 
-    Parameters
-    ----------
-    observers
-        From `bank`.
-    max_attacked
-        q, as there.
-    noise
-        m, supremum of the Euclidean norm of all meters' noise.
-    length
-        N.
-    start
-        Bound on every observer's initial error; 0 for starts in the true state.
-    epsilon
-        Its largest remainder when windows begin.
-    gains : (o,)
-        gamma of each observer; by default the proven ones. Simulated ones give smaller thresholds that are
-        not bounds.
-    unknown
-        Supremum of the norm of further unknowns; its share `gamma_delta unknown` is part of epsilon
-        in (10) and (19), observer by observer.
-    rule
-        Isolation rule of a window.
-
-    Raises
-    ------
-    ValueError
-        With every number that is not finite or is negative, if the rule is unknown, or if the observers are
-        not those of a bank.
-
-    References
-    ----------
-    yang2019 (10), (19).
+    noise: m, supremum of the Euclidean norm of all meters' noise.
+    start: bound on every observer's initial error; 0 for starts in the true state.
+    epsilon: its largest remainder when windows begin.
+    gains (o,): gamma of each observer; by default the proven ones. Simulated ones give smaller thresholds
+        that are not bounds.
+    unknown: supremum of the norm of further unknowns; its share `gamma_delta unknown` is part of epsilon in
+        (10) and (19), observer by observer.
+    rule: isolation rule of a window.
+    Raises ValueError with every number that is not finite or is negative, if the rule is unknown, or if the
+        observers are not those of a bank.
+    Source: yang2019 (10), (19).
     """
     p = len(observers[0].system.C)
     sets = subsets(p, max_attacked, most=MOST_OBSERVERS)
     wanted = bank_masks(p, max_attacked)
     if not np.array_equal(np.stack([one.trusted for one in observers]), wanted):
-        raise InputInvalid(
-            [
-                Problem(
-                    "wrong-design",
-                    f"no bank for {p} meters and max_attacked {max_attacked}, in the order of `bank_masks`",
-                )
-            ]
+        raise InputInvalid.of(
+            "wrong-design",
+            f"no bank for {p} meters and max_attacked {max_attacked}, in the order of `bank_masks`",
         )
     gamma = np.array([one.noise_gain for one in observers]) if gains is None else np.asarray(gains)
     sizes = {"noise": noise, "start": start, "epsilon": epsilon, "unknown": unknown}
@@ -370,13 +230,8 @@ def design(
     if unknown > 0.0:
         level = level + np.array([one.unknown_gain for one in observers]) * unknown
     if not np.all(np.isfinite(level)):
-        raise InputInvalid(
-            [
-                Problem(
-                    "not-finite",
-                    "an observer has no finite bound of its error: no value would ever exceed it",
-                )
-            ]
+        raise InputInvalid.of(
+            "not-finite", "an observer has no finite bound of its error: no value would ever exceed it"
         )
     large, small = level[1 : 1 + sets.count_large], level[1 + sets.count_large :]
     spread = np.broadcast_to(small, sets.parent.shape).ravel()[sets.pairs].max(axis=1)
@@ -414,19 +269,9 @@ def _problems(sizes: dict[str, float], gains: Floats, observers: int, length: in
 def consistency(design: WindowDesign, x: Floats) -> tuple[Floats, Floats]:
     """Both measures, pi and pi_J, of a set of estimates.
 
-    Parameters
-    ----------
-    x : (…, o, n)
-        All estimates.
-
-    Returns
-    -------
-    pi, pi_J : (…), (…, s)
-        Euclidean distances.
-
-    References
-    ----------
-    yang2019 (8), (17).
+    x (…, o, n): all estimates.
+    Returns pi (…), pi_J (…, s): Euclidean distances.
+    Source: yang2019 (8), (17).
     """
     sets, first = design.sets, 1 + design.sets.count_large
     whole, large, small = x[..., :1, :], x[..., 1:first, :], x[..., first:, :]
@@ -444,57 +289,28 @@ _NEVER = np.iinfo(np.intp).max
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WindowState:
-    """State of the bank within its window.
+    """State of the bank within its window."""
 
-    Attributes
-    ----------
-    t
-        Time, s.
-    x : (o, n)
-        All estimates.
-    k
-        Steps since the start.
-    stale : (o,)
-        Steps until each observer has settled.
-    pi : (i,)
-        pi of the window's steps so far; NaN where not judged.
-    pi_sets : (i, s)
-        Likewise pi_J.
-    """
-
-    t: float
-    x: Floats
-    k: int
-    stale: Ints
-    pi: Floats
-    pi_sets: Floats
+    t: float  # time, s
+    x: Floats  # (o, n) all estimates
+    k: int  # steps since the start
+    stale: Ints  # (o,) steps until each observer has settled
+    pi: Floats  # (i,) pi of the window's steps so far; NaN where not judged
+    pi_sets: Floats  # (i, s) likewise pi_J
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WindowVerdict:
-    """Result of one window.
+    """Result of one window."""
 
-    Attributes
-    ----------
-    t
-        Time of its last step, s.
-    detection
-        Algorithm 1: CLEAN, ATTACKED, or UNDECIDED if a step was not judged and none exceeded.
-    isolation
-        Algorithm 2: ATTACKED, CLEAN if no meter is suspect and every set was judged at every step, or
-        UNDECIDED.
-    suspects : (p,)
-        Meters named by Algorithm 2.
-    score, threshold : (1 + s,)
-        Largest pi and pi_J of the window beside their thresholds.
-    """
-
-    t: float
+    t: float  # time of its last step, s
+    # Algorithm 1: CLEAN, ATTACKED, or UNDECIDED if a step was not judged and none exceeded
     detection: Decision
+    # Algorithm 2: ATTACKED, CLEAN if no meter is suspect and every set was judged at every step, or UNDECIDED
     isolation: Decision
-    suspects: Bools
-    score: Floats
-    threshold: Floats
+    suspects: Bools  # (p,) meters named by Algorithm 2
+    score: Floats  # (1 + s,) largest pi and pi_J of the window
+    threshold: Floats  # (1 + s,) their thresholds
 
 
 def init(design: WindowDesign, t: float, x: Floats) -> WindowState:
@@ -510,21 +326,12 @@ def step(
 ) -> tuple[WindowState, WindowVerdict | None]:
     """Judge the estimates of this step, then advance them with its readings.
 
-    Parameters
-    ----------
-    y : (p,)
-        Readings; ignored where unseen or not finite.
-    u : (l,)
-        Known input.
-    seen : (p,)
-        True for existing readings. An observer with an unavailable meter continues without it and is not
-        judged until k* steps after the meter is back, provided that its error is then within `start` of
+    y (p,): readings; ignored where unseen or not finite.
+    u (l,).
+    seen (p,): True for existing readings. An observer with an unavailable meter continues without it and is
+        not judged until k* steps after the meter is back, provided that its error is then within `start` of
         `design`. Without such a bound (`start` = 0) it is not judged again at all.
-
-    Returns
-    -------
-    state, verdict
-        A verdict at the last step of every window, otherwise None.
+    Returns a verdict at the last step of every window, otherwise None.
     """
     here = np.asarray(seen, dtype=np.bool_) & np.isfinite(y)
     pi, pi_sets = state.pi, state.pi_sets
@@ -562,8 +369,7 @@ def _judged(design: WindowDesign, state: WindowState) -> tuple[float, Floats]:
 
 
 def _verdict(design: WindowDesign, t: float, pi: Floats, pi_sets: Floats) -> WindowVerdict:
-    masks = design.observers.masks[1 : 1 + design.sets.count_large]
-    found = isolation(pi_sets, design.isolate_above, masks, design.length, design.rule)
+    found = isolation(pi_sets, design.isolate_above, design.large, design.length, design.rule)
     seen = bool(np.isfinite(pi).all())
     exceeded = bool(exceeds(pi, design.detect_above).any())
     quiet = Decision.CLEAN if seen else Decision.UNDECIDED
@@ -590,20 +396,11 @@ def _top(values: Floats) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trace:
-    """One simulated run or several. T steps, R runs on a leading axis if there are several.
+    """One simulated run or several. T steps, R runs on a leading axis if there are several."""
 
-    Attributes
-    ----------
-    pi : (…, T)
-    pi_sets : (…, T, s)
-        The consistency measures.
-    error : (…, T, o)
-        `|x_hat - x|` of every observer.
-    """
-
-    pi: Floats
-    pi_sets: Floats
-    error: Floats
+    pi: Floats  # (…, T) consistency measure of all large sets
+    pi_sets: Floats  # (…, T, s) consistency measure of each
+    error: Floats  # (…, T, o) `|x_hat - x|` of every observer
 
 
 def simulate(
@@ -611,16 +408,9 @@ def simulate(
 ) -> Trace:
     """Simulate plant and bank together under given noise and attacks.
 
-    Parameters
-    ----------
-    x : (…, n)
-        Initial states of the plant.
-    u : (T, l)
-        Known input.
-    disturbance : (…, T, p)
-        Noise plus attack of every meter.
-    apart : (…, n) or scalar
-        Initial error of every observer.
+    x (…, n): initial states of the plant.
+    u (T, l). disturbance (…, T, p): noise plus attack of every meter.
+    apart (…, n) or scalar: initial error of every observer.
     """
     system, observers = design.observers.system, design.observers
     truth = np.asarray(x, dtype=np.float64)
@@ -645,15 +435,8 @@ def calibrate(design: WindowDesign, honest: Trace) -> WindowDesign:
     probability `1 - (1 - confidence)^(1/R)`, with that confidence. Noise of another kind may exceed them:
     these thresholds are statistics, not bounds.
 
-    Parameters
-    ----------
-    honest
-        From `simulate` without attack.
-
-    Raises
-    ------
-    ValueError
-        If the measures are not finite, or all runs end before windows begin.
+    honest: from `simulate` without attack.
+    Raises ValueError if the measures are not finite, or all runs end before windows begin.
     """
     first = design.settling
     measures = {"pi": honest.pi[..., first:], "pi_sets": honest.pi_sets[..., first:, :]}

@@ -62,7 +62,7 @@ class DemoPlan:
     size
         Smallest size of the manipulation, pu.
     kind
-        Attack kind (see `feeders.simulation.attacks.RandomAttackKind`).
+        Attack kind (see `feeders.simulation.attacks.RANDOM_KINDS`).
     seed
         Seed of meters, loads and errors.
     http

@@ -52,7 +52,7 @@ from service.cli.study_planning import as_usage_error
 
 if TYPE_CHECKING:
     from feeders.model.site import Site
-    from feeders.simulation.attacks import RandomAttackKind
+    from feeders.simulation.attacks import AttackKind
     from feeders.simulation.scenario import Scenario
     from gridsec.attack import Attack, InverterAttack
 
@@ -184,13 +184,13 @@ def demo(
 
 def _see_kind(kind: str, *, check: bool) -> None:
     """Refuse unknown kinds, and with `--check` those that may not become visible during the demo."""
-    from feeders.simulation.attacks import RandomAttackKind
+    from feeders.simulation.attacks import RANDOM_KINDS, AttackKind
 
-    if kind not in set(RandomAttackKind):
+    if kind not in RANDOM_KINDS:
         raise typer.BadParameter(
-            f"{kind!r} is not known; expected one of {', '.join(RandomAttackKind)}", param_hint="--kind"
+            f"{kind!r} is not known; expected one of {', '.join(RANDOM_KINDS)}", param_hint="--kind"
         )
-    if check and kind in {RandomAttackKind.STUCK, RandomAttackKind.REPLAY}:
+    if check and kind in {AttackKind.STUCK, AttackKind.REPLAY}:
         raise typer.BadParameter(
             f"{kind} is visible only after the voltage has left the repeated values, which may take longer "
             "than the demo; until then such meters are correctly not named. Leave out --check",
@@ -346,7 +346,7 @@ def _span(begin: float, end: float) -> tuple[float, float]:
 class _Lie:
     """Parsed value of --attack; without a count, an attack on the busbar meter."""
 
-    kind: RandomAttackKind
+    kind: AttackKind
     count: int | None
     size: float
     begin: float
@@ -355,28 +355,29 @@ class _Lie:
 
 def _lie(text: str) -> _Lie:
     """Parse `kind:count:size:from:to`."""
-    from feeders.simulation.attacks import RandomAttackKind, no_size
+    from feeders.simulation.attacks import RANDOM_KINDS, AttackKind, no_size
     from service.report.voltages import BUSBAR
 
     try:
         name, count, size, begin, end = text.split(":")
-        many, part, kind = None if count == BUSBAR else int(count), float(size), RandomAttackKind(name)
+        many, part = None if count == BUSBAR else int(count), float(size)
+        kind = RANDOM_KINDS[RANDOM_KINDS.index(name)]
         times = float(begin), float(end)
     except ValueError:
         raise ValueError(
-            f"expected kind:count:size:from:to with a kind of {', '.join(RandomAttackKind)}"
+            f"expected kind:count:size:from:to with a kind of {', '.join(RANDOM_KINDS)}"
         ) from None
     on, off = _span(*times)
     if many is not None and many < 1:
         raise ValueError(f"{many} is not a number of meters; expected 1 or more")
     # The size of a stuck or replayed reading follows from later changes, not from the option.
-    sized = many is not None and kind not in (RandomAttackKind.STUCK, RandomAttackKind.REPLAY)
+    sized = many is not None and kind not in (AttackKind.STUCK, AttackKind.REPLAY)
     if not math.isfinite(part) or (sized and part <= 0.0):
         what = "positive" if sized else "finite"
         raise ValueError(f"its size is {size}; expected a {what} part of nominal")
-    if kind not in (RandomAttackKind.STUCK, RandomAttackKind.REPLAY):
+    if kind not in (AttackKind.STUCK, AttackKind.REPLAY):
         raise_if_any(no_size(part))
-    if kind is RandomAttackKind.DRIFT and math.isinf(off):
+    if kind is AttackKind.DRIFT and math.isinf(off):
         raise ValueError("a drift needs an end, which determines its speed")
     return _Lie(kind, many, part, on, off)
 

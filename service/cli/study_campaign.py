@@ -276,8 +276,8 @@ def campaign(
     out: Out = None,
 ) -> None:
     """Simulate attacks over days of profiles: meters named correctly, missed or named falsely, and delays."""
-    from feeders.model.profiles import Season
     from feeders.model.site import load
+    from feeders.profiles import Season
     from feeders.simulation.trial import TrialMeterErrors
     from feeders.studies.campaign.plan import Design, Place
     from feeders.studies.campaign.study import campaign as study

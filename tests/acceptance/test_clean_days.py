@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 
 from benchmarks.clean_days import Run, main, plan, play
-from feeders.model.profiles import Season
 from feeders.model.site import Snapshot, from_tables, load, to_frame
+from feeders.profiles import Season
 from feeders.registry.registry import design
-from feeders.simulation.attacks import RandomAttackKind, random_attacks
+from feeders.simulation.attacks import AttackKind, random_attacks
 from feeders.simulation.demand import Variation
 from feeders.simulation.meters import MeterErrors
 from feeders.simulation.scenario import START, Scenario, SimulatedReading, simulate
@@ -127,9 +127,7 @@ def test_the_benchmark_counts_nothing_where_nothing_is() -> None:
 def test_the_benchmark_counts_alarms_and_tells_which_are_right() -> None:
     """As many alarms as liars, and those about voltages that truly are too low are no false ones."""
     run = plan("simbench-lv-rural1", Season.WINTER, 3, 600.0, None)
-    lies = random_attacks(
-        run.site, 1, RandomAttackKind.BIAS, 2, 0.05, t_on=START + 300.0, t_off=START + 500.0
-    )
+    lies = random_attacks(run.site, 1, AttackKind.BIAS, 2, 0.05, t_on=START + 300.0, t_off=START + 500.0)
     seen = play(replace(run, scenario=replace(run.scenario, attacks=lies)))
     assert seen.false == {"meter-manipulated": 2}
     assert len(seen.suspects) == 2

@@ -208,7 +208,7 @@ def test_every_family_is_here_and_says_what_it_lacks() -> None:
     there = {path.stem for path in Path(observers.__path__[0]).iterdir() if not path.stem.startswith("_")}
     # What kinds of observers share is left out; circle has two kinds of gains.
     named = {"circle", *(name.replace("-", "_") for name in FAMILIES)} - {"circle_direct", "circle_lmi"}
-    assert there - {"parts", "lure", "newton", "gains", "certificates", "lmi", "design_archive"} == named
+    assert there - {"parts", "lure", "gains", "certificates", "lmi", "design_archive"} == named
     assert all(family.batches for family in FAMILIES.values())
     any_length = {name for name, family in FAMILIES.items() if not family.one_length}
     assert any_length == {"circle-direct", "circle-lmi"}

@@ -10,12 +10,12 @@ import numpy as np
 import pandapower as pp
 import pytest
 
+from feeders import profiles
 from feeders.convert.convert import RECIPES
 from feeders.format.tables import examine, read
-from feeders.model import profiles
-from feeders.model.profiles import Season
 from feeders.model.site import Site, Snapshot, load, names, to_frame
 from feeders.model.three_phase import three_phase_names
+from feeders.profiles import Season
 from gridsec.grid.radial import squared_voltages
 from gridsec.observers.certificates import certify, reactance, small_gain, verify
 from gridsec.observers.lure import close_loop

@@ -22,14 +22,15 @@ import pytest
 import feeders
 from feeders.convert.convert import convert
 from feeders.convert.from_simbench import envelope
-from feeders.convert.network import SourceNetwork, below, busbar_of
+from feeders.convert.network import below, busbar_of
+from feeders.convert.source import SourceNetwork
 from feeders.format.tables import CustomerRow, FeederTables, LineRow, from_json, read, to_json, write
 from feeders.model.load_uncertainty import from_history
 from feeders.model.site import from_tables, load
 from feeders.model.three_phase import three_phase
 from feeders.registry import plugins
 from feeders.registry.registry import Estimator, choose
-from feeders.simulation.attacks import RandomAttackKind, random_attacks
+from feeders.simulation.attacks import AttackKind, random_attacks
 from feeders.simulation.demand import Variation
 from feeders.simulation.meters import Channel
 from feeders.simulation.plant import ClosedLoop, Loads
@@ -52,7 +53,7 @@ from tests.sentences import golden, sentences, used
 
 PACKAGE = Path(feeders.__file__).parent
 GOLDEN = Path(__file__).parent / "golden" / "errors.txt"
-HOUSE = CustomerRow("house", "end", 5.0, meter="m1")
+HOUSE = CustomerRow("house", "end", load_kw=5.0, meter="m1")
 MAIN = LineRow("main", "bb", "end", 0.1, 0.04)
 START = 1.75e9
 
@@ -265,10 +266,10 @@ CALLS: dict[str, Callable[[], Any]] = {
     "a scenario without length": lambda: Scenario(duration_s=0.0),
     "an attack of a meter that is not there": elsewhere,
     "more attacked meters than there are": lambda: random_attacks(
-        village(), 0, RandomAttackKind.BIAS, 8, 0.02, t_on=START, t_off=START + 1.0
+        village(), 0, AttackKind.BIAS, 8, 0.02, t_on=START, t_off=START + 1.0
     ),
     "a fake load at all meters": lambda: random_attacks(
-        village(), 0, RandomAttackKind.COORDINATED, 7, 0.02, t_on=START, t_off=START + 1.0
+        village(), 0, AttackKind.COORDINATED, 7, 0.02, t_on=START, t_off=START + 1.0
     ),
     "a load beyond the feeder": lambda: PowerFlow(village()).solve(np.full(8, 1e5), np.zeros(8), 230.0),
     "inverters that do not settle": not_settled,

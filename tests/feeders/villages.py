@@ -26,7 +26,9 @@ def tables() -> FeederTables:
     def customer(
         name: str, bus: str, load: float, pv: float = 0.0, *, kva: float = 0.0, droop: str = ""
     ) -> CustomerRow:
-        return CustomerRow(name, bus, load, meter=f"m-{name}", pv_kw=pv, inverter_kva=kva, droop=droop)
+        return CustomerRow(
+            name, bus, load_kw=load, meter=f"m-{name}", pv_kw=pv, inverter_kva=kva, droop=droop
+        )
 
     customers = (
         customer("c1", "n1", 8.0),

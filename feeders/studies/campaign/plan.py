@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from feeders.format.columns import ESTIMATORS
-from feeders.model.profiles import Season, library
 from feeders.model.site import from_tables
-from feeders.simulation.attacks import AttackKind
+from feeders.profiles import Season, library
+from feeders.simulation.attacks import LOAD_TRACES, AttackKind
 from feeders.simulation.demand import Variation
 from feeders.simulation.trial import LoadError, Trial, TrialMeterErrors
 from feeders.util import own_numbers, plain
@@ -487,7 +487,7 @@ def wrong_settings(site: Site, settings: Iterable[tuple[str, float]]) -> list[Pr
 _MOMENT, _CASE, _ORDER, _LIARS = range(4)
 
 # The trace of a false load determines its meters, and inverters have no such places.
-_PLACED = (AttackKind.COORDINATED, AttackKind.COORDINATED_POWER, AttackKind.INVERTER)
+_PLACED = (*LOAD_TRACES, AttackKind.INVERTER)
 
 
 def _places(kind: AttackClass, places: Iterable[Place]) -> tuple[Place, ...]:

@@ -14,15 +14,17 @@ import numpy as np
 
 from feeders.registry.registry import DesignedEstimator, design
 from feeders.simulation.attacks import (
+    LOAD_TRACES,
     AttackKind,
+    Attacks,
     AttackSpec,
     NoSuchAttack,
-    coordinated,
-    each_alone,
-    fake_load,
+    check_count,
+    load_trace,
+    on_devices,
     present_loads,
 )
-from feeders.simulation.plant import Loads, NoEquilibrium
+from feeders.simulation.plant import NoEquilibrium
 from feeders.simulation.powerflow import PowerFlowDiverged
 from feeders.simulation.scenario import Scenario
 from feeders.simulation.trial import FrameTruth, Trial, frames
@@ -32,7 +34,6 @@ from gridsec.attack import (
     Attack,
     Bias,
     Coordinated,
-    InverterAttack,
     Reports,
     apply_all,
     load_pattern,
@@ -51,9 +52,7 @@ if TYPE_CHECKING:
 __all__ = ["Prepared", "attacks", "liars", "prepare", "risings", "watch"]
 
 
-def attacks(
-    site: Site, plan: CampaignPlan, case: CampaignCase, honest: Scenario
-) -> tuple[tuple[Attack, ...], tuple[InverterAttack, ...]]:
+def attacks(site: Site, plan: CampaignPlan, case: CampaignCase, honest: Scenario) -> Attacks:
     """Build the attacks of a scenario.
 
     Parameters
@@ -69,23 +68,17 @@ def attacks(
         For too few meters or inverters, or without a place for a false load.
     """
     kind, random = plan.kind(case.kind), np.random.default_rng(case.seed)
-    there = site.droop.tau.size if kind.trick is AttackKind.INVERTER else site.meters.size
-    if case.liars > there:
-        raise NoSuchAttack(
-            f"{site.feeder.name} has {there} of these devices; cannot manipulate {case.liars}",
-            code="too-few-meters",
-        )
+    there = check_count(site, kind.trick, case.liars)
     t_on = honest.start + case.onset_s
     t_off = honest.start + min(case.onset_s + plan.lying_s, plan.duration_s)
-    if kind.trick in (AttackKind.COORDINATED, AttackKind.COORDINATED_POWER):
-        power = kind.trick is AttackKind.COORDINATED_POWER
-        loads = present_loads(site, honest, t_on)
-        return (_story(site, case, loads, random, t_on=t_on, t_off=t_off, power=power),), ()
+    lie = AttackSpec(kind.trick, case.liars, case.size)
+    if kind.trick in LOAD_TRACES:
+        loads, share = present_loads(site, honest, t_on), case.size / 100.0
+        attack = load_trace(site, kind.trick, case.liars, share, random, loads=loads, t_on=t_on, t_off=t_off)
+        return (attack,), ()
     if kind.trick is AttackKind.INVERTER:
-        some = np.sort(random.choice(there, case.liars, replace=False))
-        rating = np.array([row.inverter_kva for row in site.tables.customers])[site.droop.customer[some]]
-        q = case.size / 100.0 * random.choice([-1.0, 1.0], some.size) * rating / site.feeder.base_kva
-        return (), (InverterAttack(some.astype(np.intp), q, t_on, t_off),)
+        some = np.sort(random.choice(there, case.liars, replace=False)).astype(np.intp)
+        return on_devices(site, lie, some, random.choice([-1.0, 1.0], some.size), t_on=t_on, t_off=t_off)
     for sizes in (kind.volts, *kind.together):
         if sizes and len(sizes) != there:
             raise NoSuchAttack(
@@ -100,8 +93,7 @@ def attacks(
     if told.size:
         nominal = site.customer_nominal[site.meters[some]]
         return (Bias(some, t_on, t_off, case.size * signs * told[some] / nominal),), ()
-    lie = AttackSpec(kind.trick, case.liars, case.size)
-    return (each_alone(lie, some, signs, t_on, t_off),), ()
+    return on_devices(site, lie, some, signs, t_on=t_on, t_off=t_off, seed=int(random.integers(2**63)))
 
 
 def liars(site: Site, case: CampaignCase, random: np.random.Generator) -> tuple[Ints, Floats]:
@@ -153,28 +145,6 @@ def _nearest(R: Floats, meters: Ints, one: int, count: int) -> Ints:
     apart = own[one] + own - 2.0 * R[meters[one], meters]
     apart[one] = -1.0
     return np.sort(np.argsort(apart, kind="stable")[:count]).astype(np.intp)
-
-
-def _story(
-    site: Site,
-    case: CampaignCase,
-    loads: Loads,
-    random: np.random.Generator,
-    *,
-    t_on: float,
-    t_off: float,
-    power: bool,
-) -> Attack:
-    """Trace of a load at the first possible customer, in random order."""
-    why: NoSuchAttack | None = None
-    for customer in random.permutation(site.meters):
-        try:
-            some, fake = fake_load(site, int(customer), case.liars, case.size / 100.0, loads=loads)
-        except NoSuchAttack as error:
-            why = error
-            continue
-        return coordinated(site, some, fake, t_on=t_on, t_off=t_off, power=power)
-    raise NoSuchAttack(f"{site.feeder.name} has no place for the trace of a load of {case.size:g} %: {why}")
 
 
 ERROR_PERCENTILE = 95.0

@@ -567,7 +567,7 @@ class _Loops:
         return np.asarray(x - self.curve(self.outputs(x)))
 
     def solve(self, x: Floats, policy: StepPolicy) -> Floats:
-        """Damped semismooth Newton, as in `newton.settle`; then, if necessary, plain integration."""
+        """Damped semismooth Newton, as in `lure.settle`; then, if necessary, plain integration."""
         x = x.copy()
         left = np.arange(x.shape[0])
         tol = policy.tol * unit(self.lay.droop)

@@ -236,8 +236,8 @@ def _without_busbar(
     lying = replace(each[best], cost=each[best].cost - search.relief(found.best, each[best]))
     worse = lying.cost - found.best.cost
     vouching = (here.enough & each[best].trusted) @ design.hangs_on[:, phases[best]]
-    if vouching < design.most:
-        # All meters that speak against it may be manipulated themselves.
+    # All meters that speak against it may be manipulated themselves, or are suspected for the most part.
+    if vouching < design.most or (worse < -like and suspects[0] > design.most):
         return replace(found, others=(*found.others, lying)), None
     if worse < -like:
         # A false power may look the same: it need not be as unlikely as to accuse somebody of it.

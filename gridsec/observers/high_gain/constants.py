@@ -22,16 +22,9 @@ from gridsec.arrays import Floats
 def riccati(n: int, theta: float) -> Floats:
     """P(theta) in closed form, (n, n): `(-1)^{i+j} C(i+j-2, i-1) / theta^{i+j-1}`.
 
-    Parameters
-    ----------
-    n
-        Dimension of the observable part.
-    theta
-        High-gain parameter, 1/s, positive.
-
-    References
-    ----------
-    kim2018, the equation after (5); lee2018 (5.2.7).
+    n: dimension of the observable part.
+    theta: high-gain parameter, 1/s, positive.
+    Source: kim2018, the equation after (5); lee2018 (5.2.7).
     """
     out = np.empty((n, n))
     for i, j in product(range(1, n + 1), repeat=2):
@@ -51,51 +44,23 @@ def gain(n: int, theta: float) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class Decay:
-    """`|zhat(t) - z(t)| <= max(eta e^{-rate t} |zhat(0) - z(0)|, epsilon)`, largest entries.
+    """`|zhat(t) - z(t)| <= max(eta e^{-rate t} |zhat(0) - z(0)|, epsilon)`, largest entries."""
 
-    Attributes
-    ----------
-    eta
-        Overshoot.
-    epsilon
-        Floor by noise.
-    rate
-        1/s.
-    origin
-        Derivation: "kim2018", "lee2018" or "componentwise".
-    """
-
-    eta: float
-    epsilon: float
-    rate: float
-    origin: str
+    eta: float  # overshoot
+    epsilon: float  # floor by noise
+    rate: float  # 1/s
+    origin: str  # derivation: "kim2018", "lee2018" or "componentwise"
 
     def bound(self, initial: Floats, age: Floats) -> Floats:
-        """Bound on the error, (…).
-
-        Parameters
-        ----------
-        initial : (…)
-            Bound on the error at the start.
-        age : (…)
-            Time since the start, s.
-        """
+        """Bound on the error (…) for its bound `initial` (…) at the start, after `age` (…), s."""
         return np.asarray(np.maximum(self.eta * initial * np.exp(-self.rate * age), self.epsilon))
 
 
 def decay_kim(n: int, theta: float, noise: float) -> Decay:
     """Constants of kim2018: `eta = sqrt(2 n l2 / l1) theta^{n-1}`, `eps = 4 sqrt(2) Mv theta^{n-1} / l1`.
 
-    Parameters
-    ----------
-    n, theta
-        As in `riccati`.
-    noise
-        M_v, largest absolute value of the measurement noise.
-
-    References
-    ----------
-    kim2018, Lemma 1 and its proof in the appendix.
+    noise: M_v, largest absolute value of the measurement noise.
+    Source: kim2018, Lemma 1 and its proof in the appendix.
     """
     low, high = _spectrum(n)
     peak = theta ** (n - 1)
@@ -108,19 +73,11 @@ def decay_lee(n: int, theta: float, noise: float, *, printed: bool = False) -> D
 
     The dissertation states that some eta(theta) exists, without a formula.
 
-    Parameters
-    ----------
-    n, theta
-        As in `riccati`.
-    noise
-        delta of Remark 5.4.1, the floor of the bound.
-    printed
-        False: `eta = sqrt(n l2 / l1) theta^{n-1}`, by the steps of kim2018's appendix without noise. True:
-        without the factor sqrt(n). This gives the printed 168; it has no derivation and is inferred here.
-
-    References
-    ----------
-    lee2018, Lemma 5.2.1 and Remark 5.4.1; docs/errata/kim2018.md.
+    noise: delta of Remark 5.4.1, the floor of the bound.
+    printed: False: `eta = sqrt(n l2 / l1) theta^{n-1}`, by the steps of kim2018's appendix without noise.
+        True: without the factor sqrt(n). This gives the printed 168; it has no derivation and is inferred
+        here.
+    Source: lee2018, Lemma 5.2.1 and Remark 5.4.1; docs/errata/kim2018.md.
     """
     low, high = _spectrum(n)
     factor = 1.0 if printed else float(n)
@@ -134,14 +91,8 @@ def decay_componentwise(n: int, theta: float, noise: float) -> Decay:
     V(0) at most the largest value of `xi^T Pt xi` over the corners of the box of initial errors.
     `sqrt(a + b) <= sqrt(2) max` brings it into the form of `Decay`. The rate is twice kim2018's.
 
-    Parameters
-    ----------
-    n, theta, noise
-        As in `decay_kim`; theta at least 1.
-
-    References
-    ----------
-    docs/theory-high-gain.md, Theorem 1.
+    n, theta, noise: as in `decay_kim`; theta at least 1.
+    Source: docs/theory-high-gain.md, Theorem 1.
     """
     base = riccati(n, 1.0)
     scale = theta ** np.arange(n, dtype=np.float64)
@@ -158,20 +109,13 @@ def _spectrum(n: int) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Slopes:
-    """Ranges of the partial derivatives of one sensor's alpha and beta u, over all arguments.
+    """Ranges of the partial derivatives of one sensor's alpha and beta u, over all arguments."""
 
-    Attributes
-    ----------
-    low, high : (n, n)
-        Entry (j, k): range of the derivative of row j with respect to z_k. Rows before the last are those of
-        `beta_j u`, the last one that of `alpha + beta_n u`; zero above the diagonal.
-    proven
-        True for rigorous ranges; False for samples.
-    """
-
+    # (n, n) entry (j, k): range of the derivative of row j with respect to z_k. Rows before the last are
+    # those of `beta_j u`, the last one that of `alpha + beta_n u`; zero above the diagonal
     low: Floats
-    high: Floats
-    proven: bool
+    high: Floats  # (n, n) upper ends
+    proven: bool  # True for rigorous ranges; False for samples
 
 
 def margin(slopes: Slopes, theta: float) -> float:
@@ -180,51 +124,37 @@ def margin(slopes: Slopes, theta: float) -> float:
     Largest mu with `Pt D + D^T Pt <= (theta/2 - mu) Pt` for every D with entries `D_jk = theta^{k-j} s_jk`
     and `s_jk` in its range. The inequality is affine in each s_jk, so that the corners decide.
 
-    Parameters
-    ----------
-    slopes
-        Ranges of the derivatives.
-    theta
-        High-gain parameter, 1/s.
-
-    References
-    ----------
-    docs/theory-high-gain.md, Theorem 1 (quantifies kim2018's "sufficiently large theta").
+    slopes: ranges of the derivatives.
+    theta: high-gain parameter, 1/s.
+    Source: docs/theory-high-gain.md, Theorem 1 (quantifies kim2018's "sufficiently large theta").
     """
     n = slopes.low.shape[0]
     base = riccati(n, 1.0)
     root = np.linalg.cholesky(base)
+    power = theta ** (np.arange(n)[None, :] - np.arange(n)[:, None]).astype(np.float64)
+
+    def growth(D: Floats) -> float:
+        form = np.linalg.solve(root, np.linalg.solve(root, base @ D + D.T @ base).T)
+        return float(np.linalg.eigvalsh(0.5 * (form + form.T))[-1])
+
     free = np.argwhere(slopes.low < slopes.high)
     if len(free) > _CORNERS:
-        return _margin_by_norm(slopes, theta)
-    power = theta ** (np.arange(n)[None, :] - np.arange(n)[:, None]).astype(np.float64)
+        # Conservative: `2 |Pt^{1/2} D Pt^{-1/2}|` by centre and radius.
+        centre, radius = 0.5 * (slopes.low + slopes.high) * power, 0.5 * (slopes.high - slopes.low) * power
+        spread = np.abs(root.T) @ radius @ np.abs(np.linalg.inv(root.T))
+        return 0.5 * theta - growth(centre) - 2.0 * float(np.linalg.norm(spread, 2))
     worst = -np.inf
     for pick in product((False, True), repeat=len(free)):
         chosen = slopes.low.copy()
         for (j, k), upper in zip(free, pick, strict=True):
             if upper:
                 chosen[j, k] = slopes.high[j, k]
-        D = chosen * power
-        form = np.linalg.solve(root, np.linalg.solve(root, base @ D + D.T @ base).T)
-        worst = max(worst, float(np.linalg.eigvalsh(0.5 * (form + form.T))[-1]))
+        worst = max(worst, growth(chosen * power))
     return 0.5 * theta - worst
 
 
 # Number of uncertain entries above which a norm bound replaces the corners.
 _CORNERS = 12
-
-
-def _margin_by_norm(slopes: Slopes, theta: float) -> float:
-    """`margin` with `2 |Pt^{1/2} D Pt^{-1/2}|` bounded by centre and radius; conservative."""
-    n = slopes.low.shape[0]
-    base = riccati(n, 1.0)
-    root = np.linalg.cholesky(base)
-    power = theta ** (np.arange(n)[None, :] - np.arange(n)[:, None]).astype(np.float64)
-    centre, radius = 0.5 * (slopes.low + slopes.high) * power, 0.5 * (slopes.high - slopes.low) * power
-    form = np.linalg.solve(root, np.linalg.solve(root, base @ centre + centre.T @ base).T)
-    spread = np.abs(root.T) @ radius @ np.abs(np.linalg.inv(root.T))
-    extra = 2.0 * float(np.linalg.norm(spread, 2))
-    return 0.5 * theta - float(np.linalg.eigvalsh(0.5 * (form + form.T))[-1]) - extra
 
 
 def smallest_theta(slopes: Slopes, *, most: float = 1e6, tolerance: float = 1e-6) -> float:
@@ -235,17 +165,10 @@ def smallest_theta(slopes: Slopes, *, most: float = 1e6, tolerance: float = 1e-6
 
     The number is sufficient for Lemma 1, not necessary: (6) can hold at a smaller theta.
 
-    Parameters
-    ----------
-    slopes
-        Ranges of the derivatives. An entry above the diagonal, which no uniformly observable system has,
+    slopes: ranges of the derivatives. An entry above the diagonal, which no uniformly observable system has,
         gives infinity.
-    most
-        Largest theta to consider, 1/s.
-
-    References
-    ----------
-    docs/theory-high-gain.md, section 2; kim2018, Lemma 1, states that some theta* exists.
+    most: largest theta to consider, 1/s.
+    Source: docs/theory-high-gain.md, section 2; kim2018, Lemma 1, states that some theta* exists.
     """
     if np.any(np.triu(slopes.low, 1)) or np.any(np.triu(slopes.high, 1)):
         return np.inf
@@ -269,16 +192,9 @@ def smallest_theta(slopes: Slopes, *, most: float = 1e6, tolerance: float = 1e-6
 def settling(decay: Decay, z_bound: float) -> tuple[float, float]:
     """Delta_1 and Delta_2, s: settling times of an observer after an attack, without and after a reset.
 
-    Parameters
-    ----------
-    decay
-        The observer's constants, epsilon > 0.
-    z_bound
-        M_z, largest entry of the observable part.
-
-    References
-    ----------
-    kim2018 (18a), (18b) with equality.
+    decay: the observer's constants, epsilon > 0.
+    z_bound: M_z, largest entry of the observable part.
+    Source: kim2018 (18a), (18b) with equality.
     """
     start = 2.0 * z_bound * decay.eta
     first = (max(start, decay.epsilon) + 2.0 * z_bound) * decay.eta

@@ -4,11 +4,9 @@
     z_i' = A z_i + e alpha_i(z_i) + beta_i(z_i) u,    beta_ij depends on z_i1, …, z_ij only
     y_i = z_i1 + a_i + v_i
 
-All functions are written over *components*: they take a sequence of n entries and use NumPy's operations on
-them, so that the same function serves numbers, arrays and intervals. `linear` computes the decomposition of a
-linear system, `form.decompose` that of a system in sympy.
-
-The only module that imports sympy, and only when called: sympy is optional.
+Functions are written over *components*: they take a sequence of n entries and use NumPy's operations on
+them, so that one function serves numbers, arrays and intervals. `linear` decomposes a linear system,
+`decompose` one in sympy, which is optional and imported only there.
 
 Lie derivatives are exact. The order n_i is the number of Lie derivatives with independent differentials;
 alpha_i and beta_ij are found by matching a polynomial in z_i against the exact expression, and accepted only
@@ -27,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints
-from gridsec.errors import InputInvalid, NotObservable, Problem
+from gridsec.errors import InputInvalid, NotObservable
 from gridsec.observers.high_gain.constants import Slopes
 from gridsec.observers.high_gain.intervals import Interval, interval, supremum
 
@@ -37,20 +35,7 @@ Matrix = Callable[[Sequence[Any]], Sequence[Sequence[Any]]]
 
 
 def at(function: Vector, points: Floats) -> Floats:
-    """Values of a function over components at points.
-
-    Parameters
-    ----------
-    function
-        From n components to k.
-    points : (…, n)
-        Points.
-
-    Returns
-    -------
-    Floats
-        (…, k).
-    """
+    """Values (…, k) of a function from n components to k at points (…, n)."""
     points = np.asarray(points, dtype=np.float64)
     values = function([points[..., i] for i in range(points.shape[-1])])
     # Assigned to one array: a stack of arrays after broadcasting takes several times as long.
@@ -61,15 +46,7 @@ def at(function: Vector, points: Floats) -> Floats:
 
 
 def jacobian_at(function: Matrix, points: Floats) -> Floats:
-    """Values of a matrix over components at points, (…, k, m).
-
-    Parameters
-    ----------
-    function
-        From n components to k rows of m entries.
-    points : (…, n)
-        Points.
-    """
+    """Values (…, k, m) of a function from n components to k rows of m entries, at points (…, n)."""
     points = np.asarray(points, dtype=np.float64)
     rows = function([points[..., i] for i in range(points.shape[-1])])
     columns = range(len(rows[0]))
@@ -83,34 +60,19 @@ def jacobian_at(function: Matrix, points: Floats) -> Floats:
 def sat(z: Floats, bound: Floats | float) -> Floats:
     """Componentwise saturation `min(max(z, -bound), bound)`; NaN becomes zero.
 
-    Parameters
-    ----------
-    z : (…)
-        Arbitrary values, also infinite.
-    bound
-        Saturation level, scalar or broadcastable.
-
-    References
-    ----------
-    kim2018, after (4); lee2018, after (5.2.5).
+    z (…): arbitrary values, also infinite.
+    bound: saturation level, scalar or broadcastable.
+    Source: kim2018, after (4); lee2018, after (5.2.5).
     """
     return np.clip(np.where(np.isnan(z), 0.0, z), -np.asarray(bound), np.asarray(bound))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Polynomial:
-    """Polynomial `sum_k c_k prod_j z_j^{e_kj}`; differentiable, and stackable over sensors.
+    """Polynomial `sum_k c_k prod_j z_j^{e_kj}`; differentiable, and stackable over sensors."""
 
-    Attributes
-    ----------
-    exponents : (k, n)
-        Non-negative integers.
-    coefficients : (k,)
-        Real.
-    """
-
-    exponents: Ints
-    coefficients: Floats
+    exponents: Ints  # (k, n) non-negative integers
+    coefficients: Floats  # (k,) real
 
     def __call__(self, z: Sequence[Any]) -> Any:
         """Value at n components."""
@@ -143,27 +105,15 @@ def affine(constant: float, slopes: Sequence[float]) -> Polynomial:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Partial:
-    """Uniformly observable part of one sensor.
+    """Uniformly observable part of one sensor."""
 
-    Attributes
-    ----------
-    phi
-        Phi_i, from the n components of x to the n_i of z_i.
-    jacobian
-        Its derivative, n_i rows of n entries.
-    alpha
-        alpha_i over the n_i components of z_i.
-    beta
-        beta_i: n_i rows with one function for each of the m inputs; row j must use z_1 … z_j only.
-    bound
-        M_z,i: `|Phi_i(x)| <= bound` on the whole box of states. alpha and beta are only evaluated
-        at saturated arguments, which makes them globally Lipschitz (kim2018 (4)).
-    """
-
-    phi: Vector
-    jacobian: Matrix
-    alpha: Scalar
+    phi: Vector  # Phi_i, from the n components of x to the n_i of z_i
+    jacobian: Matrix  # its derivative, n_i rows of n entries
+    alpha: Scalar  # alpha_i over the n_i components of z_i
+    # beta_i: n_i rows with one function for each of the m inputs; row j must use z_1 … z_j only
     beta: tuple[tuple[Scalar, ...], ...]
+    # M_z,i: `|Phi_i(x)| <= bound` on the whole box of states. alpha and beta are only evaluated at saturated
+    # arguments, which makes them globally Lipschitz (kim2018 (4))
     bound: float
 
     @property
@@ -181,23 +131,11 @@ class Partial:
 class System:
     """System with its sensors. n states, p sensors, N = n_1 + … + n_p.
 
-    Attributes
-    ----------
-    x_bound : (n,)
-        The states stay in the box `|x_k| <= x_bound_k`.
-    partials
-        The sensors' observable parts.
-
-    Raises
-    ------
-    NotObservable
-        If there is no sensor.
-    ValueError
-        If sensors differ in their numbers of inputs.
+    Raises NotObservable if there is no sensor. ValueError if sensors differ in their numbers of inputs.
     """
 
-    x_bound: Floats
-    partials: tuple[Partial, ...]
+    x_bound: Floats  # (n,) the states stay in the box `|x_k| <= x_bound_k`
+    partials: tuple[Partial, ...]  # the sensors' observable parts
     mask: Bools = field(init=False)
 
     def __post_init__(self) -> None:
@@ -207,9 +145,7 @@ class System:
             )
         widths = {partial.inputs for partial in self.partials}
         if len(widths) != 1:
-            raise InputInvalid(
-                [Problem("shape", f"all sensors share the inputs, but have {sorted(widths)} of them")]
-            )
+            raise InputInvalid.of("shape", f"all sensors share the inputs, but have {sorted(widths)} of them")
         object.__setattr__(self, "x_bound", np.atleast_1d(np.asarray(self.x_bound, dtype=np.float64)))
         sizes = np.array([partial.size for partial in self.partials])
         object.__setattr__(self, "mask", np.arange(sizes.max())[None, :] < sizes[:, None])
@@ -225,18 +161,9 @@ class System:
         return np.array([partial.bound for partial in self.partials], dtype=np.float64)
 
     def phi(self, x: Floats, sensors: Sequence[int] | None = None) -> Floats:
-        """Phi_I(x), (…, N_I); by default of all sensors.
+        """Phi_I(x), (…, N_I), for x (…, n); by default of all sensors.
 
-        Parameters
-        ----------
-        x : (…, n)
-            States.
-        sensors
-            I, ascending.
-
-        References
-        ----------
-        kim2018 (9); lee2018 (5.3.2), without the zeros for padding.
+        Source: kim2018 (9); lee2018 (5.3.2), without the zeros for padding.
         """
         return np.concatenate([at(self.partials[i].phi, x) for i in self._chosen(sensors)], axis=-1)
 
@@ -262,14 +189,9 @@ class System:
 def largest(phi: Vector, x_bound: Floats, *, gap: float = 1e-3) -> float:
     """A proven M_z: bound on `|Phi_i|` over the box of states, by interval bisection.
 
-    Parameters
-    ----------
-    phi
-        Phi_i over components.
-    x_bound : (n,)
-        Half-widths of the box.
-    gap
-        Acceptable relative overestimation.
+    phi: Phi_i over components.
+    x_bound (n,): half-widths of the box.
+    gap: acceptable relative overestimation.
     """
     count = len(phi(list(np.zeros(len(x_bound)))))
     return max(supremum(_size(phi, j), -x_bound, x_bound, gap=gap).upper for j in range(count))
@@ -286,12 +208,8 @@ def slopes(partial: Partial, u_low: Floats, u_high: Floats, *, samples: int = 40
     at random points, widened by a tenth, and marked as not proven. Zero is always inside, because the
     functions are constant beyond the saturation.
 
-    Parameters
-    ----------
-    u_low, u_high : (m,)
-        Range of the inputs.
-    samples, seed
-        Number and seed of the random points.
+    u_low, u_high (m,): range of the inputs.
+    samples, seed: number and seed of the random points.
     """
     n = partial.size
     low, high, proven = np.zeros((n, n)), np.zeros((n, n)), True
@@ -330,23 +248,11 @@ def defects(system: System, f: Vector, g: Matrix, h: Vector, points: Floats, *, 
     Central differences of Phi_i along f and the columns of g against `(z_2, …, alpha)` and `beta`, and
     Phi_i1 against h_i. The check uses no derivative of the decomposition itself.
 
-    Parameters
-    ----------
-    f, g, h
-        The system over components; g has n rows of m entries.
-    points : (k, n)
-        Points inside the box of states.
-    step
-        Length of the differences, relative to the length of the direction.
-
-    Returns
-    -------
-    Floats
-        (p,) largest absolute defect of every sensor; near `step^2` for a correct decomposition.
-
-    References
-    ----------
-    kim2018, Assumption 2 and (3).
+    f, g, h: the system over components; g has n rows of m entries.
+    points (k, n): points inside the box of states.
+    step: length of the differences, relative to the length of the direction.
+    Returns (p,): largest absolute defect of every sensor; near `step^2` for a correct decomposition.
+    Source: kim2018, Assumption 2 and (3).
     """
     drift, drive, read = at(f, points), jacobian_at(g, points), at(h, points)
     out = np.zeros(len(system.partials))
@@ -381,19 +287,10 @@ def linear(A: Floats, B: Floats, C: Floats, x_bound: Floats, *, tolerance: float
     Phi_i is the observability matrix of (A, c_i) up to its rank n_i, and alpha_i are the coefficients of
     `c_i A^{n_i}` in its rows.
 
-    Parameters
-    ----------
-    A, B, C : (n, n), (n, m), (p, n)
-        The system.
-    x_bound : (n,)
-        Half-widths of the box of states.
-    tolerance
-        Largest relative part of a row outside the span of the rows before that counts as zero.
-
-    Raises
-    ------
-    NotObservable
-        If a sensor's row is zero.
+    A (n, n), B (n, m), C (p, n).
+    x_bound (n,): half-widths of the box of states.
+    tolerance: largest relative part of a row outside the span of the rows before that counts as zero.
+    Raises NotObservable if a sensor's row is zero.
     """
     A, B, C = (np.asarray(matrix, dtype=np.float64) for matrix in (A, B, C))
     x_bound = np.broadcast_to(np.asarray(x_bound, dtype=np.float64), A.shape[:1])
@@ -444,47 +341,26 @@ def _sympy() -> Any:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorForm:
-    """Symbolic decomposition for one sensor.
+    """Symbolic decomposition for one sensor."""
 
-    Attributes
-    ----------
-    phi
-        `h, L_f h, …`; n_i expressions in x.
-    alpha, beta
-        `L_f^{n_i} h`, and for each row j the m expressions `L_g L_f^{j-1} h`, in x.
-    polynomials
-        For alpha and each entry of beta (in this order, row by row) the equal polynomial in z_i, or None if
-        there is none of the given degree.
-    """
-
-    phi: tuple[Expression, ...]
-    alpha: Expression
-    beta: tuple[tuple[Expression, ...], ...]
+    phi: tuple[Expression, ...]  # `h, L_f h, …`; n_i expressions in x
+    alpha: Expression  # `L_f^{n_i} h`, in x
+    beta: tuple[tuple[Expression, ...], ...]  # for each row j the m expressions `L_g L_f^{j-1} h`, in x
+    # for alpha and each entry of beta (in this order, row by row) the equal polynomial in z_i, or None if
+    # there is none of the given degree
     polynomials: tuple[Polynomial | None, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Symbolic:
-    """A decomposed system.
+    """A decomposed system."""
 
-    Attributes
-    ----------
-    x
-        The symbols of the state.
-    forms
-        One for each sensor.
-    f, g, h
-        The system over components, for `form.defects` and simulation.
-    system
-        The decomposition, ready for the observers.
-    """
-
-    x: tuple[Expression, ...]
-    forms: tuple[SensorForm, ...]
-    f: Vector
+    x: tuple[Expression, ...]  # the symbols of the state
+    forms: tuple[SensorForm, ...]  # one for each sensor
+    f: Vector  # the system over components, for `form.defects` and simulation
     g: Matrix
     h: Vector
-    system: System
+    system: System  # the decomposition, ready for the observers
 
 
 def lie(expression: Expression, field: Sequence[Expression], x: Sequence[Expression]) -> Expression:
@@ -492,9 +368,7 @@ def lie(expression: Expression, field: Sequence[Expression], x: Sequence[Express
 
     The field has n expressions for the n symbols x.
 
-    References
-    ----------
-    lee2018, Remark 5.2.1.
+    Source: lee2018, Remark 5.2.1.
     """
     sympy = _sympy()
     terms = (sympy.diff(expression, symbol) * part for symbol, part in zip(x, field, strict=True))
@@ -515,36 +389,18 @@ def decompose(
 ) -> Symbolic:
     """Decomposition of `x' = f + g u, y = h` for every sensor.
 
-    Parameters
-    ----------
-    f
-        n expressions.
-    g
-        n rows of m expressions; n expressions for one input.
-    h
-        p expressions.
-    x
-        n symbols.
-    x_bound
-        Half-widths of the box of states; scalar or (n,).
-    degree
-        Largest degree of the polynomials for alpha and beta.
-    samples, seed
-        Random points for ranks and for matching.
-    tolerance
-        Relative singular value that counts as zero.
-
-    Raises
-    ------
-    NotObservable
-        If a sensor has no uniformly observable part: the rank changes over the box, or beta_ij depends
-        on more than z_1 … z_j, so that observability depends on the input.
-    ImportError
-        If sympy is missing.
-
-    References
-    ----------
-    kim2018, Assumption 2 and (3); lee2018, Assumption 5.2.1.
+    f: n expressions.
+    g: n rows of m expressions; n expressions for one input.
+    h: p expressions.
+    x: n symbols.
+    x_bound: half-widths of the box of states; scalar or (n,).
+    degree: largest degree of the polynomials for alpha and beta.
+    samples, seed: random points for ranks and for matching.
+    tolerance: relative singular value that counts as zero.
+    Raises NotObservable if a sensor has no uniformly observable part: the rank changes over the box, or
+        beta_ij depends on more than z_1 … z_j, so that observability depends on the input. ImportError if
+        sympy is missing.
+    Source: kim2018, Assumption 2 and (3); lee2018, Assumption 5.2.1.
     """
     sympy = _sympy()
     symbols = tuple(x)
@@ -571,9 +427,9 @@ def decompose(
     return Symbolic(
         x=symbols,
         forms=tuple(forms),
-        f=_vector(drift, symbols),
-        g=_matrix(drive, symbols),
-        h=_vector([sympy.sympify(output) for output in h], symbols),
+        f=_numeric(drift, symbols),
+        g=_numeric(drive, symbols),
+        h=_numeric([sympy.sympify(output) for output in h], symbols),
         system=System(bound, parts),
     )
 
@@ -590,7 +446,7 @@ class _Probe:
         """Rank of the differentials of some functions, at each point."""
         sympy = _sympy()
         rows = [[sympy.diff(entry, symbol) for symbol in self.x] for entry in chain]
-        values = _evaluate_matrix(_matrix(rows, self.x), self.points)
+        values = jacobian_at(_numeric(rows, self.x), self.points)
         size = np.linalg.norm(values, axis=-1, keepdims=True)
         singular = np.linalg.svd(values / np.where(size > 0.0, size, 1.0), compute_uv=False)
         return np.sum(singular > self.tolerance, axis=-1)
@@ -610,15 +466,6 @@ def _chain(i: int, output: Expression, drift: list[Expression], probe: _Probe) -
         if high < len(chain):
             return chain
         chain.append(lie(chain[-1], drift, probe.x))
-
-
-def _evaluate_matrix(rows: Matrix, points: Floats) -> Floats:
-    count = len(rows(list(points[0])))
-    return np.stack([at(_row(rows, r), points) for r in range(count)], axis=-2)
-
-
-def _row(rows: Matrix, r: int) -> Vector:
-    return lambda x: rows(x)[r]
 
 
 def _check_triangular(
@@ -645,7 +492,7 @@ def _match(
         for d in range(degree + 1)
         for pick in combinations_with_replacement(range(n), d)
     ]
-    z, goal = at(_vector(phi, probe.x), probe.points), at(_vector([target], probe.x), probe.points)[:, 0]
+    z, goal = at(_numeric(phi, probe.x), probe.points), at(_numeric([target], probe.x), probe.points)[:, 0]
     table = np.stack([np.prod(z**power, axis=-1) for power in powers], axis=-1)
     scale = np.max(np.abs(table), axis=0)
     weights = np.linalg.lstsq(table / scale, goal, rcond=1e-12)[0] / scale
@@ -666,8 +513,8 @@ def _match(
 
 def _partial(form: SensorForm, x: tuple[Expression, ...], bound: Floats) -> Partial:
     sympy = _sympy()
-    phi = _vector(form.phi, x)
-    jacobian = _matrix([[sympy.diff(entry, symbol) for symbol in x] for entry in form.phi], x)
+    phi = _numeric(form.phi, x)
+    jacobian = _numeric([[sympy.diff(entry, symbol) for symbol in x] for entry in form.phi], x)
     section = _section(phi, jacobian, bound)
     size = largest(phi, bound)
     found = iter(form.polynomials)
@@ -682,7 +529,7 @@ def _section(phi: Vector, jacobian: Matrix, bound: Floats) -> Callable[[Floats],
     def state(z: Floats) -> Floats:
         x = np.zeros((len(z), len(bound)))
         for _ in range(_ROUNDS):
-            move = np.linalg.pinv(_evaluate_matrix(jacobian, x))
+            move = np.linalg.pinv(jacobian_at(jacobian, x))
             x = sat(x + np.einsum("kij,kj->ki", move, z - at(phi, x)), bound)
         return x
 
@@ -691,7 +538,7 @@ def _section(phi: Vector, jacobian: Matrix, bound: Floats) -> Callable[[Floats],
 
 def _through(target: Expression, x: tuple[Expression, ...], section: Callable[[Floats], Floats]) -> Scalar:
     """`target` at a state with this z: a function of z exactly if `target` is one."""
-    value = _vector([target], x)
+    value = _numeric([target], x)
 
     def function(z: Sequence[Any]) -> Any:
         parts = np.broadcast_arrays(*[np.asarray(part, dtype=np.float64) for part in z])
@@ -706,14 +553,8 @@ def _through(target: Expression, x: tuple[Expression, ...], section: Callable[[F
 _ROUNDS = 12
 
 
-def _vector(entries: Sequence[Expression], x: tuple[Expression, ...]) -> Vector:
-    return _callable(list(entries), x)
-
-
-def _matrix(rows: Sequence[Sequence[Expression]], x: tuple[Expression, ...]) -> Matrix:
-    return _callable([list(row) for row in rows], x)
-
-
-def _callable(entries: Any, x: tuple[Expression, ...]) -> Callable[[Sequence[Any]], Any]:
-    function = _sympy().lambdify(x, entries, modules="numpy", cse=True)
+def _numeric(entries: Sequence[Any], x: tuple[Expression, ...]) -> Callable[[Sequence[Any]], Any]:
+    """Expressions, or rows of them, as a function over components."""
+    listed = [list(entry) if isinstance(entry, Sequence) else entry for entry in entries]
+    function = _sympy().lambdify(x, listed, modules="numpy", cse=True)
     return lambda point: function(*point)

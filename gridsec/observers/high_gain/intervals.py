@@ -15,19 +15,13 @@ import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
 from gridsec.arrays import Floats
-from gridsec.errors import InputInvalid, Problem
+from gridsec.errors import InputInvalid
 
 _ULPS = 2
 
 
 class Interval(NDArrayOperatorsMixin):
-    """Arrays of closed intervals `[lo, hi]`, elementwise.
-
-    Parameters
-    ----------
-    lo, hi : (…)
-        Ends, `lo <= hi`, of the same shape.
-    """
+    """Arrays of closed intervals `[lo, hi]`, elementwise; ends of one shape, `lo <= hi`."""
 
     __slots__ = ("hi", "lo")
 
@@ -106,9 +100,7 @@ def _absolute(a: object) -> Interval:
 def _power(a: object, b: object) -> Interval:
     p, exponent = interval(a), float(np.asarray(b, dtype=np.float64))
     if exponent != int(exponent):
-        raise InputInvalid(
-            [Problem("not-integer", f"only integer powers of intervals are defined, not {exponent}")]
-        )
+        raise InputInvalid.of("not-integer", f"only integer powers of intervals are defined, not {exponent}")
     k = int(exponent)
     if k < 0:
         return _divide(1.0, _power(a, -k))
@@ -183,19 +175,12 @@ Boxed = Callable[[Sequence[Any]], Any]
 
 @dataclass(frozen=True, slots=True)
 class Bracket:
-    """Bracket of a constant.
+    """Bracket of a constant."""
 
-    Attributes
-    ----------
-    lower, upper
-        Ends of the bracket; an unknown end is infinite.
-    method
-        "interval bisection" is a proof (up to the correctness of the outward rounding); "sampling" shows only
-        that no tried point exceeds one side.
-    """
-
-    lower: float
-    upper: float
+    lower: float  # lower end; minus infinity or 0 if unknown
+    upper: float  # upper end; infinite if unknown
+    # "interval bisection" is a proof (up to the correctness of the outward rounding); "sampling" shows only
+    # that no tried point exceeds one side
     method: str
 
 
@@ -207,21 +192,10 @@ def supremum(
     Boxes are evaluated all at once; those without values above the best value at a centre are dropped, and
     the rest halved along their longest side.
 
-    Parameters
-    ----------
-    function
-        From n components (intervals or arrays) to one value per box or point.
-    lower, upper : (n,)
-        The box.
-    gap
-        Acceptable relative distance of `upper` and `lower`.
-    most
-        Largest number of boxes at a time; beyond it the bracket is wider, but still valid.
-
-    Returns
-    -------
-    Bracket
-        Around the supremum.
+    function: from n components (intervals or arrays) to one value per box or point.
+    lower, upper (n,).
+    gap: acceptable relative distance of `upper` and `lower`.
+    most: largest number of boxes at a time; beyond it the bracket is wider, but still valid.
     """
     lo, hi = (np.array(np.atleast_1d(end), dtype=np.float64)[:, None] for end in (lower, upper))
     width = np.where(hi > lo, hi - lo, 1.0)

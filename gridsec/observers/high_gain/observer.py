@@ -1,14 +1,10 @@
 """Partial high-gain observers, detection with a time-varying threshold, and the switching search.
 
-Sensor i occupies the first n_i of n_max places of its row; the rest stays zero.
+Each sensor has an observer of its own, so that an attack affects only one; sensor i occupies the first n_i of
+n_max places of its row, the rest is zero. A set of p - q sensors is trusted while its left inverse explains
+all its estimates; the search continues only if it does not.
 
-Each sensor has an observer of its own, so that an attack affects only one. A set of p - q sensors is
-trusted while its left inverse explains all its estimates; the search continues only if it does not.
-
-References
-----------
-kim2018, section III; docs/theory-high-gain.md.
-kim2018, section III; lee2018, sections 5.2 and 5.4; docs/theory-high-gain.md.
+Source: kim2018, section III; lee2018, sections 5.2 and 5.4; docs/theory-high-gain.md.
 """
 
 from __future__ import annotations
@@ -47,47 +43,25 @@ Search = Literal["all", "one"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HighGainEstimate:
-    """Result at one instant.
+    """Result at one instant."""
 
-    Attributes
-    ----------
-    t
-        Time, s.
-    x : (n,)
-        Estimate of the state; NaN if no set is complete.
-    bound
-        Bound on its largest error while at most q sensors are attacked; NaN if the design has no `lowest`,
-        infinite if no set passed.
-    sigma
-        Index of the set in use, from 0.
-    visited
-        The tested sets, in order; the last is `sigma`.
-    trusted : (p,)
-        The sensors of that set.
-    residual, threshold
-        Of that set; NaN if not tested.
-    decision, cause, reason
-        As in `gridsec.interface`; UNDECIDED is an answer of its own.
-    suspects : (p,)
-        Sensors named as manipulated. With a known `bound`: those that cannot be unmanipulated; otherwise,
-        after an alarm, those outside the trusted set.
-    reset : (p,)
-        Observers that were reset in this step.
-    """
-
-    t: float
-    x: Floats
+    t: float  # time, s
+    x: Floats  # (n,) estimate of the state; NaN if no set is complete
+    # bound on its largest error while at most q sensors are attacked; NaN if the design has no `lowest`,
+    # infinite if no set passed
     bound: float
-    sigma: int
-    visited: tuple[int, ...]
-    trusted: Bools
-    residual: float
-    threshold: float
-    decision: Decision
+    sigma: int  # index of the set in use, from 0
+    visited: tuple[int, ...]  # the tested sets, in order; the last is `sigma`
+    trusted: Bools  # (p,) the sensors of that set
+    residual: float  # of that set; NaN if not tested
+    threshold: float  # of that set; NaN if not tested
+    decision: Decision  # as in `gridsec.interface`; UNDECIDED is an answer of its own
     cause: Cause
     reason: str
+    # (p,) sensors named as manipulated. With a known `bound`: those that cannot be unmanipulated; otherwise,
+    # after an alarm, those outside the trusted set
     suspects: Bools
-    reset: Bools
+    reset: Bools  # (p,) observers that were reset in this step
 
 
 def verdict(
@@ -102,22 +76,12 @@ def verdict(
 ) -> tuple[Decision, Cause, str]:
     """Decision, cause, and one sentence.
 
-    Parameters
-    ----------
-    heard
-        Number of sensors with a reading.
-    needed
-        Number of sensors of a set.
-    passed
-        True if the last set passed its test; None if it was not complete, and not tested.
-    alarm
-        True if a test failed or a sensor is named.
-    settled
-        True if the bounds of all observers with readings have settled.
-    untested
-        Number of sensors with a reading but without a test.
-    search
-        As in the design: with "one", other sets may still pass later.
+    heard: number of sensors with a reading. needed: number of sensors of a set.
+    passed: True if the last set passed its test; None if it was not complete, and not tested.
+    alarm: True if a test failed or a sensor is named.
+    settled: True if the bounds of all observers with readings have settled.
+    untested: number of sensors with a reading but without a test.
+    search: with "one", other sets may still pass later.
     """
     if passed is None:
         reason = f"{heard} sensors are heard and no set of {needed} is complete"
@@ -141,32 +105,16 @@ Field = Callable[[Floats, Floats], Floats]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HighGainTransition:
-    """One step of the linear parts, exact for forcing that is linear in time.
+    """One step of the linear parts, exact for forcing that is linear in time."""
 
-    Attributes
-    ----------
-    h
-        Length of the step, s.
-    whole : (p, n_max, n_max)
-        `e^{M h}` with `M = A - K C`.
-    held, slope : (p, n_max, n_max)
-        `z(h) = whole z(0) + held g(0) + slope (g(h) - g(0))`.
-    """
-
-    h: float
-    whole: Floats
-    held: Floats
-    slope: Floats
+    h: float  # length of the step, s
+    whole: Floats  # (p, n_max, n_max) `e^{M h}` with `M = A - K C`
+    held: Floats  # (p, n_max, n_max) `z(h) = whole z(0) + held g(0) + slope (g(h) - g(0))`
+    slope: Floats  # (p, n_max, n_max)
 
 
 def gains(system: System, theta: Floats) -> Floats:
-    """K of every sensor, padded with zeros; (p, n_max).
-
-    Parameters
-    ----------
-    theta : (p,)
-        High-gain parameters, 1/s.
-    """
+    """K of every sensor for `theta` (p,), 1/s, padded with zeros; (p, n_max)."""
     out = np.zeros(system.mask.shape)
     for i, partial in enumerate(system.partials):
         out[i, : partial.size] = gain(partial.size, float(theta[i]))
@@ -263,29 +211,11 @@ def advance(
     Readings and inputs are interpolated linearly between the two instants. The stiff linear part is exact for
     every `theta h`.
 
-    Parameters
-    ----------
-    right
-        From `field`.
-    K : (p, n_max)
-        Gains.
-    move
-        From `transition`.
-    z : (p, n_max)
-        Estimates at the start.
-    y : pair of (p,)
-        Readings at the start and the end.
-    u : pair of (m,)
-        Inputs at the start and the end.
-
-    Returns
-    -------
-    Floats
-        (p, n_max), estimates at the end; not finite on overflow by extreme readings.
-
-    References
-    ----------
-    kim2018 (5); lee2018 (5.2.6).
+    K (p, n_max). z (p, n_max): estimates at the start.
+    y (pair of (p,)): readings at the start and the end.
+    u (pair of (m,)): inputs at the start and the end.
+    Returns (p, n_max): estimates at the end; not finite on overflow by extreme readings.
+    Source: kim2018 (5); lee2018 (5.2.6).
     """
     before = right(z, u[0])
     forced = before + K * y[0][:, None]
@@ -304,85 +234,41 @@ _DECAYS = {"componentwise": decay_componentwise, "kim2018": decay_kim, "lee2018"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HighGainDesign:
-    """Design of the observers. p sensors, s sets of p - q sensors.
+    """Design of the observers. p sensors, s sets of p - q sensors."""
 
-    Attributes
-    ----------
-    system
-        The system and its decomposition.
-    inverses
-        Psi of the sets Lambda(1), …, Lambda(s), in the order of the search.
-    whole
-        Psi of all sensors, for the test of Corollary 1; without it there is no such test, and no CLEAN unless
-        `lowest` is known.
-    theta : (p,)
-        High-gain parameters, 1/s.
-    decays
-        Constants of every sensor's observer.
-    margins : (p,)
-        Margin of every sensor's Lyapunov inequality; Lemma 1 holds at this theta if positive.
-    proven
-        True if the margins use proven ranges of derivatives only.
-    limit : (p,)
-        Size of an estimate at which it is reset (7).
-    lowest
-        Lower bound on Lip_(Phi_J) over all sets of p - 2q sensors; NaN if unknown, and so is the error bound.
-    steep : (p,)
-        Upper bounds on Lip^(Phi_i).
-    search
-        "all": sets are tried at once until one passes. "one": one change of set per step, for limited
-        computing time (the papers' simulations).
-    K : (p, n_max)
-        Gains.
-    field, move
-        Right-hand side, and matrices for the nominal step.
-    substeps
-        Number of substeps of a step.
-    """
-
-    system: System
-    inverses: tuple[Inverse, ...]
+    system: System  # the system and its decomposition
+    inverses: tuple[Inverse, ...]  # Psi of the sets Lambda(1), …, Lambda(s), in the order of the search
+    # Psi of all sensors, for the test of Corollary 1; without it there is no such test, and no CLEAN unless
+    # `lowest` is known
     whole: Inverse | None
-    theta: Floats
-    decays: tuple[Decay, ...]
+    theta: Floats  # (p,) high-gain parameters, 1/s
+    decays: tuple[Decay, ...]  # constants of every sensor's observer
+    # (p,) margin of every sensor's Lyapunov inequality; Lemma 1 holds at this theta if positive
     margins: Floats
-    proven: bool
-    limit: Floats
+    proven: bool  # True if the margins use proven ranges of derivatives only
+    limit: Floats  # (p,) size of an estimate at which it is reset (7)
+    # lower bound on Lip_(Phi_J) over all sets of p - 2q sensors; NaN if unknown, and so is the error bound
     lowest: float
-    steep: Floats
+    steep: Floats  # (p,) upper bounds on Lip^(Phi_i)
+    # "all": sets are tried at once until one passes. "one": one change of set per step, for limited computing
+    # time (the papers' simulations)
     search: Search
-    K: Floats
-    field: Field
-    move: HighGainTransition
-    substeps: int
+    K: Floats  # (p, n_max) gains
+    field: Field  # right-hand side of the observers
+    move: HighGainTransition  # matrices of the nominal substep
+    substeps: int  # number of substeps of a step
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HighGainState:
-    """State of the observers.
+    """State of the observers."""
 
-    Attributes
-    ----------
-    t
-        Time, s.
-    z : (p, n_max)
-        Estimates; zero where a sensor has no such entry or is unavailable.
-    y : (p,)
-        Readings at t; NaN where unavailable.
-    u : (m,)
-        Input at t.
-    age : (p,)
-        Time of each observer with readings without a gap, s.
-    sigma
-        Place of the set in use, from 0.
-    """
-
-    t: float
-    z: Floats
-    y: Floats
-    u: Floats
-    age: Floats
-    sigma: int
+    t: float  # time, s
+    z: Floats  # (p, n_max) estimates; zero where a sensor has no such entry or is unavailable
+    y: Floats  # (p,) readings at t; NaN where unavailable
+    u: Floats  # (m,) input at t
+    age: Floats  # (p,) time of each observer with readings without a gap, s
+    sigma: int  # place of the set in use, from 0
 
 
 def design(
@@ -405,45 +291,23 @@ def design(
 ) -> HighGainDesign:
     """Design observers, thresholds and search, and verify their conditions.
 
-    Parameters
-    ----------
-    inverses
-        A left inverse for each set of p - q sensors, in the order of the search. By default the nearest
+    inverses: a left inverse for each set of p - q sensors, in the order of the search. By default the nearest
         points, for these sets and for `whole`.
-    theta
-        High-gain parameters, 1/s, at least 1; scalar or (p,).
-    noise
-        M_v: largest measurement error of unmanipulated sensors, interpolation included; scalar or (p,).
-    max_attacked
-        q.
-    u_low, u_high
-        Range of the inputs; scalar or (m,).
-    step_s
-        Nominal time between readings, s.
-    whole
-        Left inverse of all sensors for the test of Corollary 1.
-    decay
-        Derivation of eta, epsilon and rate; or these constants, one for each sensor.
-    lowest
-        Lower bound on Lip_(Phi_J) for every set J of p - 2q sensors, at least 0; NaN if unknown. At 0 or NaN
-        the estimate has no error bound.
-    search
-        See `HighGainDesign`.
-    reset
-        Apply the reset rule (7); lee2018 has none. Estimates that are not finite are reset anyway.
-    substeps
-        Number of substeps of a step, for accuracy.
-    tolerance
-        Largest error of a left inverse at its check points.
-
-    Raises
-    ------
-    NotObservable
-        If p <= 2q, or the sets are not all sets of p - q sensors.
-    DesignInfeasible
-        If theta is too small for Lemma 1, or a left inverse fails its check.
-    ValueError
-        If `noise` or `lowest` is negative, or `decay` or `search` is unknown.
+    theta: high-gain parameters, 1/s, at least 1; scalar or (p,).
+    noise: M_v: largest measurement error of unmanipulated sensors, interpolation included; scalar or (p,).
+    u_low, u_high: range of the inputs; scalar or (m,).
+    step_s: nominal time between readings, s.
+    whole: left inverse of all sensors for the test of Corollary 1.
+    decay: derivation of eta, epsilon and rate; or these constants, one for each sensor.
+    lowest: lower bound on Lip_(Phi_J) for every set J of p - 2q sensors, at least 0; NaN if unknown. At 0 or
+        NaN the estimate has no error bound.
+    search: see `HighGainDesign`.
+    reset: apply the reset rule (7); lee2018 has none. Estimates that are not finite are reset anyway.
+    substeps: number of substeps of a step, for accuracy.
+    tolerance: largest error of a left inverse at its check points.
+    Raises NotObservable if p <= 2q, or the sets are not all sets of p - q sensors. DesignInfeasible if theta
+        is too small for Lemma 1, or a left inverse fails its check. ValueError if `noise` or `lowest` is
+        negative, or `decay` or `search` is unknown.
     """
     p, m = len(system.partials), system.partials[0].inputs
     if not p > 2 * max_attacked >= 0:
@@ -453,10 +317,18 @@ def design(
             f"{p} sensors, {max_attacked} attacked: more than twice are needed",
             code="too-few-meters",
         )
-    raise_if_any(_problems(lowest, search, decay))
+    problems = no_choice("search", get_args(Search), search)
+    problems += no_choice("decay", _DECAYS, decay) if isinstance(decay, str) else []
+    if lowest < 0.0:
+        problems.append(Problem("negative", f"lowest is {lowest}; a lower bound of gains is not negative"))
+    raise_if_any(problems)
     thetas = np.broadcast_to(np.asarray(theta, dtype=np.float64), (p,))
     noises = np.broadcast_to(not_negative("noise", noise), (p,))
-    decays = _constants(system, thetas, noises, decay)
+    if isinstance(decay, str):
+        parts = zip(system.partials, thetas, noises, strict=True)
+        decays = tuple(_DECAYS[decay](part.size, float(th), float(v)) for part, th, v in parts)
+    else:
+        decays = tuple(decay)
     inverses, whole = _inverses(system, inverses, whole, decays, max_attacked)
     low, high = (np.broadcast_to(np.asarray(end, dtype=np.float64), (m,)) for end in (u_low, u_high))
     margins, proven = _margins(system, thetas, low, high)
@@ -465,6 +337,8 @@ def design(
         check(system, inverse, points, tolerance=tolerance)
     eta, rest = (np.array([getattr(d, name) for d in decays]) for name in ("eta", "epsilon"))
     limit = np.maximum(2.0 * eta * system.z_bound, rest) + system.z_bound if reset else np.full(p, np.inf)
+    ends = (-system.x_bound, system.x_bound)
+    steep = np.array([upper_proven(part.jacobian, *ends, gap=1e-2).upper for part in system.partials])
     K = gains(system, thetas)
     return HighGainDesign(
         system=system,
@@ -476,26 +350,13 @@ def design(
         proven=proven,
         limit=frozen(limit),
         lowest=lowest,
-        steep=frozen(_steep(system)),
+        steep=frozen(steep),
         search=search,
         K=frozen(K),
         field=field(system),
         move=transition(system, K, step_s / substeps),
         substeps=substeps,
     )
-
-
-def _problems(lowest: float, search: str, decay: str | Sequence[Decay]) -> list[str]:
-    wrong = no_choice("search", get_args(Search), search)
-    wrong += no_choice("decay", _DECAYS, decay) if isinstance(decay, str) else []
-    return [
-        *wrong,
-        *(
-            [Problem("negative", f"lowest is {lowest}; a lower bound of gains is not negative")]
-            if lowest < 0.0
-            else []
-        ),
-    ]
 
 
 def _inverses(
@@ -521,21 +382,6 @@ def _inverses(
             code="missing",
         )
     return tuple(given), whole
-
-
-def _steep(system: System) -> Floats:
-    """Upper bounds on Lip^(Phi_i)."""
-    ends = (-system.x_bound, system.x_bound)
-    return np.array([upper_proven(part.jacobian, *ends, gap=1e-2).upper for part in system.partials])
-
-
-def _constants(
-    system: System, theta: Floats, noise: Floats, decay: str | Sequence[Decay]
-) -> tuple[Decay, ...]:
-    if not isinstance(decay, str):
-        return tuple(decay)
-    rule, parts = _DECAYS[decay], zip(system.partials, theta, noise, strict=True)
-    return tuple(rule(part.size, float(th), float(v)) for part, th, v in parts)
 
 
 def _margins(system: System, theta: Floats, low: Floats, high: Floats) -> tuple[Floats, bool]:
@@ -566,16 +412,10 @@ def init(
 ) -> HighGainState:
     """Initial state of all observers.
 
-    Parameters
-    ----------
-    t
-        Time, s.
-    y : (p,)
-        Readings at t, NaN where missing; without them every observer starts with its first reading.
-    u : (m,)
-        Input at t; zero by default.
-    z : (p, n_max)
-        Initial estimates of the sensors with a reading, at most M_z in size; zero by default.
+    t: time, s.
+    y (p,): readings at t, NaN where missing; without them every observer starts with its first reading.
+    u (m,): input at t; zero by default.
+    z (p, n_max): initial estimates of the sensors with a reading, at most M_z in size; zero by default.
     """
     system = design.system
     p, m = len(system.partials), system.partials[0].inputs
@@ -595,25 +435,12 @@ def step(  # noqa: PLR0917  # the border that all observer families share
 ) -> tuple[HighGainState, HighGainEstimate]:
     """Advance all observers to the next readings, and decide.
 
-    Parameters
-    ----------
-    y : (p,)
-        Readings at `t + h`; ignored where unseen or not finite.
-    u : (m,)
-        Input at `t + h`; finite.
-    seen : (p,)
-        True for existing readings. An unseen sensor drops out, and returns with a new observer.
-    h
-        Length of the step, s.
-
-    Returns
-    -------
-    HighGainState, Outcome
-        At `t + h`. Never raises on data.
-
-    References
-    ----------
-    kim2018 (5), (7), Theorem 2.
+    y (p,): readings at `t + h`; ignored where unseen or not finite.
+    u (m,): input at `t + h`; finite.
+    seen (p,): True for existing readings. An unseen sensor drops out, and returns with a new observer.
+    h: length of the step, s.
+    Returns state and estimate at `t + h`; never raises on data.
+    Source: kim2018 (5), (7), Theorem 2.
     """
     live = np.asarray(seen, dtype=np.bool_) & np.isfinite(y)
     going = live & np.isfinite(state.y)
@@ -647,16 +474,9 @@ def _advance(
 
 
 def error_bounds(design: HighGainDesign, age: Floats) -> Floats:
-    """Bound on the error of every observer without attack: `max(2 M_z eta e^{-rate age}, epsilon)`, (p,).
+    """Bounds `max(2 M_z eta e^{-rate age}, epsilon)` (p,) of the errors without attack, after `age` (p,), s.
 
-    Parameters
-    ----------
-    age : (p,)
-        Time of each observer with readings, s.
-
-    References
-    ----------
-    kim2018 (12), (14); lee2018 (5.4.2).
+    Source: kim2018 (12), (14); lee2018 (5.4.2).
     """
     pairs = zip(design.decays, design.system.z_bound, age, strict=True)
     return np.array([float(d.bound(2.0 * bound, a)) for d, bound, a in pairs])
@@ -702,7 +522,8 @@ def _judge(  # noqa: PLR0917  # the whole state
         tested = live if whole or np.isfinite(bound) else trusted
         if design.whole is not None and whole:
             alarm |= not _test(design, design.whole, z, delta).passed
-    settled = bool(np.all(delta[live] <= _rest(design)[live]))
+    rest = np.array([decay.epsilon for decay in design.decays])
+    settled = bool(np.all(delta[live] <= rest[live]))
     decision, cause, reason = verdict(
         heard=int(live.sum()),
         needed=len(design.inverses[0].sensors),
@@ -730,36 +551,26 @@ def _judge(  # noqa: PLR0917  # the whole state
     )
 
 
-def _rest(design: HighGainDesign) -> Floats:
-    return np.array([decay.epsilon for decay in design.decays])
-
-
 def _search(  # noqa: PLR0917  # the inputs of a test, and the first set
     design: HighGainDesign, sigma: int, z: Floats, delta: Floats, live: Bools, large: Bools
 ) -> tuple[int, tuple[int, ...], _Trial | None, bool]:
     """Update rule (20): next set whenever the present one fails or is incomplete."""
-    visited, alarm, count = [sigma], False, len(design.inverses)
-    changes = count - 1 if design.search == "all" else 1
-    trial = _try(design, sigma, z, delta, live, large)
-    while (trial is None or not trial.passed) and len(visited) <= changes:
+    count = len(design.inverses)
+    visited: list[int] = []
+    trial: _Trial | None = None
+    alarm = False
+    for change in range(count if design.search == "all" else 2):
+        place = (sigma + change) % count
+        visited.append(place)
+        members = list(design.inverses[place].sensors)
+        trial = _test(design, design.inverses[place], z, delta) if live[members].all() else None
+        if trial is not None and large[members].any():
+            # A sensor that has just been reset is attacked, for any new estimate.
+            trial = replace(trial, residual=np.inf)
+        if trial is not None and trial.passed:
+            break
         alarm |= trial is not None
-        sigma = (sigma + 1) % count
-        visited.append(sigma)
-        trial = _try(design, sigma, z, delta, live, large)
-    alarm |= trial is not None and not trial.passed
-    return sigma, tuple(visited), trial, alarm
-
-
-def _try(  # noqa: PLR0917  # the inputs of a test
-    design: HighGainDesign, sigma: int, z: Floats, delta: Floats, live: Bools, large: Bools
-) -> _Trial | None:
-    inverse = design.inverses[sigma]
-    members = list(inverse.sensors)
-    if not live[members].all():
-        return None
-    trial = _test(design, inverse, z, delta)
-    # A sensor that has just been reset is attacked, for any new estimate.
-    return replace(trial, residual=np.inf) if large[members].any() else trial
+    return visited[-1], tuple(visited), trial, alarm
 
 
 def _unhealthy(design: HighGainDesign, z: Floats, x: Floats, delta: Floats, bound: float) -> Bools:

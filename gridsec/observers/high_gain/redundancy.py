@@ -34,24 +34,12 @@ from gridsec.observers.high_gain.intervals import Bracket, Interval, interval, s
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Inverse:
-    """Left inverse of Phi_I, defined everywhere.
+    """Left inverse of Phi_I, defined everywhere."""
 
-    Attributes
-    ----------
-    sensors
-        I, ascending.
-    function
-        Psi^I: from z_I (…, N_I) to states (…, n) inside the box.
-    factor
-        A residual above `factor` times the observers' error bound proves an attack within I.
-    origin
-        "given" or "nearest".
-    """
-
-    sensors: tuple[int, ...]
-    function: Callable[[Floats], Floats]
-    factor: float
-    origin: str
+    sensors: tuple[int, ...]  # I, ascending
+    function: Callable[[Floats], Floats]  # Psi^I: from z_I (…, N_I) to states (…, n) inside the box
+    factor: float  # a residual above `factor` times the observers' error bound proves an attack within I
+    origin: str  # "given" or "nearest"
 
     def __call__(self, z: Floats) -> Floats:
         """Psi^I(z_I)."""
@@ -68,20 +56,10 @@ def given(
 ) -> Inverse:
     """Left inverse in closed form, extended by saturation: `sat(f(sat(z, M_z)), M_x)`.
 
-    Parameters
-    ----------
-    sensors
-        I, ascending.
-    function
-        A smooth map from (…, N_I) to (…, n) with `f(Phi_I(x)) = x` in the box of states.
-    factor
-        Bound on `Lip^(id - Phi_I Psi^I)`.
-    z_bound
-        M_z; by default the largest bound of the sensors.
-
-    References
-    ----------
-    kim2018 (10), (11); lee2018 (5.3.4), (5.3.5).
+    function: a smooth map from (…, N_I) to (…, n) with `f(Phi_I(x)) = x` in the box of states.
+    factor: bound on `Lip^(id - Phi_I Psi^I)`.
+    z_bound: M_z; by default the largest bound of the sensors.
+    Source: kim2018 (10), (11); lee2018 (5.3.4), (5.3.5).
     """
     chosen = tuple(int(i) for i in sensors)
     level = float(np.max(system.z_bound[list(chosen)])) if z_bound is None else z_bound
@@ -95,15 +73,9 @@ def nearest(system: System, sensors: Sequence[int], *, accept: float = 0.0, iter
     `accept` also from the middles of the orthants (up to eight states), with the best result. The factor
     sqrt(N_I) presumes a global minimum.
 
-    Parameters
-    ----------
-    system
-        The system; its Jacobians are used.
-    sensors
-        I, ascending.
-    accept
-        Residual (largest entry) without further starts. Values up to the threshold in use change no decision:
-        a set that passes with a local minimum would pass with the global one.
+    system: the system; its Jacobians are used.
+    accept: residual (largest entry) without further starts. Values up to the threshold in use change no
+        decision: a set that passes with a local minimum would pass with the global one.
     """
     chosen = tuple(int(i) for i in sensors)
     bound = system.x_bound
@@ -177,17 +149,9 @@ _SHORT = 1e-13
 def check(system: System, inverse: Inverse, points: Floats, *, tolerance: float) -> float:
     """Largest `|Psi^I(Phi_I(x)) - x|` over points of the box.
 
-    Parameters
-    ----------
-    points : (k, n)
-        States in the box.
-    tolerance
-        Largest acceptable error.
-
-    Raises
-    ------
-    DesignInfeasible
-        If the error exceeds `tolerance`.
+    points (k, n): states in the box.
+    tolerance: largest acceptable error.
+    Raises DesignInfeasible if the error exceeds `tolerance`.
     """
     worst = float(np.max(np.abs(inverse(system.phi(points, inverse.sensors)) - points)))
     if not worst <= tolerance:
@@ -216,18 +180,10 @@ def upper_proven(rows: Matrix, lower: Floats, upper: Floats, *, gap: float = 1e-
     A box is convex: the mean value theorem along the segment gives "at most", and a segment along the signs
     of the worst row "at least".
 
-    Parameters
-    ----------
-    rows
-        Jacobian over components.
-    lower, upper : (n,)
-        The box.
-    gap
-        Acceptable relative width of the bracket.
-
-    References
-    ----------
-    kim2018, section III.A.
+    rows: Jacobian over components.
+    lower, upper (n,).
+    gap: acceptable relative width of the bracket.
+    Source: kim2018, section III.A.
     """
     count = len(rows(list(np.asarray(lower, dtype=np.float64))))
     each = [supremum(_row_sum(rows, r), lower, upper, gap=gap) for r in range(count)]
@@ -251,14 +207,9 @@ def upper_sampled(
 
     Half of the pairs are far apart, half close together, near the steepest slopes of smooth maps.
 
-    Parameters
-    ----------
-    function
-        From points (k, n) to values (k, q).
-    lower, upper : (n,)
-        The box.
-    samples, seed
-        Number of pairs and seed.
+    function: from points (k, n) to values (k, q).
+    lower, upper (n,).
+    samples, seed: number of pairs and seed.
     """
     quotient = _quotients(function, lower, upper, samples, seed)
     return Bracket(float(np.max(quotient)), np.inf, "sampling")
@@ -290,10 +241,7 @@ def _quotients(function: Map, lower: Floats, upper: Floats, samples: int, seed: 
 def lower_from_inverse(inverse: Bracket) -> Bracket:
     """`Lip_(phi) >= 1 / Lip^(psi)` for every left inverse psi: `|x - x'| <= Lip^(psi) |phi(x) - phi(x')|`.
 
-    Parameters
-    ----------
-    inverse
-        Bracket of Lip^(psi) on a convex set that contains the image, or on a set with a global psi.
+    inverse: bracket of Lip^(psi) on a convex set that contains the image, or on a set with a global psi.
     """
     return Bracket(1.0 / inverse.upper, np.inf, inverse.method)
 
@@ -305,12 +253,8 @@ def lower_proven(rows: Matrix, lower: Floats, upper: Floats) -> Bracket:
     the middle of [J], `|B| |M d| >= |B M d| >= (1 - r) |d|` where r bounds |B M - I|. Useful for moderate
     curvature; otherwise the bound is 0, which is valid but empty.
 
-    Parameters
-    ----------
-    rows
-        Jacobian over components.
-    lower, upper : (n,)
-        The box.
+    rows: Jacobian over components.
+    lower, upper (n,).
     """
     box = [Interval(np.array(a), np.array(b)) for a, b in zip(lower, upper, strict=True)]
     entries = [[interval(entry) for entry in row] for row in rows(box)]
@@ -332,18 +276,9 @@ def extend(points: Floats, values: Floats, constants: Floats) -> Map:
     Every component keeps its constant on the whole space, in the largest-entry norm, and the given values
     that satisfy it (McShane's formula; in the papers Kirszbraun's).
 
-    Parameters
-    ----------
-    points : (k, N)
-        Points with known values.
-    values : (k, n)
-        Its values.
-    constants : (n,)
-        Lipschitz constant of each component.
-
-    References
-    ----------
-    kim2018, footnote 2; lee2018, Remark 5.2.3.
+    points (k, N) with known values (k, n).
+    constants (n,): Lipschitz constant of each component.
+    Source: kim2018, footnote 2; lee2018, Remark 5.2.3.
     """
     steep = np.broadcast_to(np.asarray(constants, dtype=np.float64), values.shape[1:])
 
@@ -357,16 +292,9 @@ def extend(points: Floats, values: Floats, constants: Floats) -> Map:
 def kappa_detect(factor: float, lowest: float) -> float:
     """`kappa^{n,d} = (Lip^(id - Phi Psi) + 1) / min Lip_(Phi_J)`: error of an estimate that passes its test.
 
-    Parameters
-    ----------
-    factor
-        Lip^(id - Phi Psi), or the largest one over the sets for kappa^{n,c}.
-    lowest
-        Smallest Lip_(Phi_J) over the sets J that can be free of attacks; 0 gives no bound.
-
-    References
-    ----------
-    kim2018, Theorems 1 and 2; lee2018, before Theorem 5.4.1 and before Theorem 5.4.3.
+    factor: Lip^(id - Phi Psi), or the largest one over the sets for kappa^{n,c}.
+    lowest: smallest Lip_(Phi_J) over the sets J that can be free of attacks; 0 gives no bound.
+    Source: kim2018, Theorems 1 and 2; lee2018, before Theorem 5.4.1 and before Theorem 5.4.3.
     """
     return (factor + 1.0) / lowest if lowest != 0.0 else np.inf
 
@@ -374,16 +302,9 @@ def kappa_detect(factor: float, lowest: float) -> float:
 def kappa_error(factor: float, lowest: float, steepest: float) -> float:
     """`kappa^{n,e} = (Lip^(id - Phi Psi) + 1) (1 + Lip^(Phi) / min Lip_(Phi_J))`: largest attack that passes.
 
-    Parameters
-    ----------
-    factor, lowest
-        As in `kappa_detect`.
-    steepest
-        Lip^(Phi) of the tested set.
-
-    References
-    ----------
-    lee2018, before Theorem 5.4.1; its part (ii).
+    factor, lowest: as in `kappa_detect`.
+    steepest: Lip^(Phi) of the tested set.
+    Source: lee2018, before Theorem 5.4.1; its part (ii).
     """
     return (factor + 1.0) * (1.0 + steepest / lowest) if lowest != 0.0 else np.inf
 
@@ -391,23 +312,11 @@ def kappa_error(factor: float, lowest: float, steepest: float) -> float:
 def block_distance(codes: Floats, mask: Bools | None = None, *, tolerance: float = 0.0) -> Floats:
     """Number of blocks in which codes differ, pairwise: `d_{0^n}(z, z')`.
 
-    Parameters
-    ----------
-    codes : (k, p, n)
-        k codes of p blocks.
-    mask : (p, n)
-        Entries that count; by default all.
-    tolerance
-        Largest difference that counts as zero.
-
-    Returns
-    -------
-    Floats
-        (k, k), symmetric, zero on the diagonal.
-
-    References
-    ----------
-    kim2018, section III.A; lee2018, Proposition 5.1.2 (iii).
+    codes (k, p, n): k codes of p blocks.
+    mask (p, n): entries that count; by default all.
+    tolerance: largest difference that counts as zero.
+    Returns (k, k): symmetric, zero on the diagonal.
+    Source: kim2018, section III.A; lee2018, Proposition 5.1.2 (iii).
     """
     apart = np.abs(codes[:, None] - codes[None, :])
     if mask is not None:
@@ -418,52 +327,28 @@ def block_distance(codes: Floats, mask: Bools | None = None, *, tolerance: float
 def detectable(codes: Floats, errors: int, *, tolerance: float = 0.0) -> bool:
     """True if any two of finitely many codes differ in more than `errors` blocks.
 
-    Parameters
-    ----------
-    codes : (k, p, n)
-        Codes of different states.
-    errors
-        q, largest number of wrong blocks.
-    tolerance
-        Largest difference that counts as zero.
-
-    References
-    ----------
-    lee2018, Definition 5.1.1 and Proposition 5.1.2.
+    codes (k, p, n): codes of different states.
+    tolerance: largest difference that counts as zero.
+    Source: lee2018, Definition 5.1.1 and Proposition 5.1.2.
     """
     far = block_distance(codes, tolerance=tolerance)
     return bool(np.all(far[~np.eye(len(codes), dtype=np.bool_)] > errors))
 
 
 def correctable(codes: Floats, errors: int, *, tolerance: float = 0.0) -> bool:
-    """True if `errors` wrong blocks are always correctable: detectable for twice as many.
-
-    References
-    ----------
-    lee2018, Definition 5.1.2 and Proposition 5.1.5.
-    """
+    """True if `errors` wrong blocks are always correctable: detectable for twice as many (5.1.2, 5.1.5)."""
     return detectable(codes, 2 * errors, tolerance=tolerance)
 
 
 @dataclass(frozen=True, slots=True)
 class SensorRedundancy:
-    """Redundancy without k sensors, at the sampled points.
+    """Redundancy without k sensors, at the sampled points."""
 
-    Attributes
-    ----------
-    missing
-        k.
-    weakest
-        The group of p - k sensors with the smallest `singular`.
-    singular
-        Smallest singular value of the Jacobian of any group at any point; zero for no immersion.
-    injective
-        Smallest `|Phi_I(x) - Phi_I(x')| / |x - x'|` of any group and any pair; zero if not injective.
-    """
-
-    missing: int
-    weakest: tuple[int, ...]
+    missing: int  # k
+    weakest: tuple[int, ...]  # the group of p - k sensors with the smallest `singular`
+    # smallest singular value of the Jacobian of any group at any point; zero for no immersion
     singular: float
+    # smallest `|Phi_I(x) - Phi_I(x')| / |x - x'|` of any group and any pair; zero if not injective
     injective: float
 
 
@@ -473,21 +358,10 @@ def redundancy(system: System, missing: int, *, samples: int = 2000, seed: int =
     A value of zero disproves it. Positive values are evidence, and a proof with a bound of
     `redundancy.lower_proven` or a left inverse for each group.
 
-    Parameters
-    ----------
-    missing
-        k.
-    samples, seed
-        Points and pairs for each group.
-
-    Raises
-    ------
-    NotObservable
-        If a group has too few entries to determine the state at all.
-
-    References
-    ----------
-    kim2018, Definition 1; lee2018, Definition 5.3.1 and Proposition 5.1.4.
+    missing: k.
+    samples, seed: points and pairs for each group.
+    Raises NotObservable if a group has too few entries to determine the state at all.
+    Source: kim2018, Definition 1; lee2018, Definition 5.3.1 and Proposition 5.1.4.
     """
     p = len(system.partials)
     points = corners_and_interior(system, samples=samples, seed=seed)
@@ -513,11 +387,6 @@ def redundancy(system: System, missing: int, *, samples: int = 2000, seed: int =
 
 
 def groups(sensors: int, attacked: int) -> list[tuple[int, ...]]:
-    """All sets of p - q sensors in the order of the papers' tables: the first leaves out sensor 0.
-
-    References
-    ----------
-    kim2018, Theorem 2: the bijection Lambda.
-    """
+    """All sets of p - q sensors in the order Lambda of the papers' tables: the first leaves out sensor 0."""
     everyone = range(sensors)
     return [tuple(i for i in everyone if i not in out) for out in combinations(everyone, attacked)]

@@ -8,9 +8,7 @@ and `circle` finds the L and K, with their proof, that keep the error small unde
 the known input and `noise * n` of the meters. The solver's result is not trusted: the inequality is
 rebuilt from the gains in NumPy, in the plant's own units, before a design leaves this module.
 
-References
-----------
-chong2020 (11), (12), corrected; arcak2001. Proofs: docs/theory-observers.md.
+Source: chong2020 (11), (12), corrected; arcak2001. Proofs: docs/theory-observers.md.
 """
 
 from __future__ import annotations
@@ -26,17 +24,13 @@ from gridsec.arrays import Floats, Ints, frozen, frozen_ints
 from gridsec.errors import DesignInfeasible
 from gridsec.observers.certificates import Certificate, feeds, quadratic
 from gridsec.observers.gains import CircleGains, CircleOptions, margin, options_for, refuse_blind, sensitivity
-from gridsec.observers.lmi.solver import cvxpy_late, solver_warnings_as_status
+from gridsec.observers.lmi.solver import BACKOFF, cvxpy_late, first_proven, solve
 from gridsec.observers.lure import Lure
 from gridsec.processes import deaf, listen, stop
-
-__all__ = ["BACKOFF", "circle", "contraction", "prove", "settle", "solve_many"]
 
 # Slack of the scaled inequality, with entries of order one: a hundred times the solver's tolerance, so that
 # its last digits cannot decide the sign of the margin.
 _SLACK = 1e-6
-# Relaxations tried, in order, if the rebuilt inequality is violated.
-BACKOFF = (0.0, 1e-4, 1e-3, 1e-2, 5e-2)
 # Subsets per task of `solve_many`: enough to share one canonicalisation, few enough for steady progress.
 _CHUNK = 5
 
@@ -56,22 +50,10 @@ def circle(
     Minimises `k mu + r mu_delta`, a bound on the mean of e^T Q e for signals of their stated sizes, over (P,
     P L, Lambda, Lambda K, mu, mu_delta) subject to the corrected (12) with nu = 1.
 
-    Parameters
-    ----------
-    J : (k,)
-        Trusted meters.
-    rate, noise, load, weight, floor
-        See `options_for`.
-
-    Raises
-    ------
-    DesignInfeasible
-        If there is no such observer, if the rebuilt inequality is violated, or if the optimum is the blind L
-        = K = 0.
-
-    References
-    ----------
-    chong2020 (12), corrected: docs/theory-observers.md, section 2.
+    J (k,). rate, noise, load, weight, floor: see `options_for`.
+    Raises DesignInfeasible if there is no such observer, if the rebuilt inequality is violated, or if the
+        optimum is the blind L = K = 0.
+    Source: chong2020 (12), corrected: docs/theory-observers.md, section 2.
     """
     options = options_for(lure, rate=rate, noise=noise, load=load, weight=weight, floor=floor)
     return _Template(lure, options, len(J)).solve(np.asarray(J, dtype=np.intp))
@@ -80,26 +62,11 @@ def circle(
 def prove(lure: Lure, J: Sequence[int] | Ints, L: Floats, K: Floats, options: CircleOptions) -> CircleGains:
     """Certificate for an observer with given gains: the corrected (12) in P and Lambda only.
 
-    Parameters
-    ----------
-    lure
-        Plant; n states, m nonlinearities.
-    J : (k,)
-        Trusted meters.
-    L, K : (n, k), (m, k)
-        Gains. Those of nonlinearities of slope bound 0 have no effect.
-    options
-        From `options_for`. Its `floor` is ignored.
-
-    Returns
-    -------
-    CircleGains
-        With exactly these gains and a positive margin. Blind gains are accepted.
-
-    Raises
-    ------
-    DesignInfeasible
-        If the inequality has no solution, or is violated when rebuilt.
+    lure: plant; n states, m nonlinearities.
+    J (k,). L (n, k), K (m, k): gains. Those of nonlinearities of slope bound 0 have no effect.
+    options: from `options_for`. Its `floor` is ignored.
+    Blind gains are accepted.
+    Raises DesignInfeasible if the inequality has no solution, or is violated when rebuilt.
     """
     given = (np.asarray(L, dtype=np.float64), np.asarray(K, dtype=np.float64))
     template = _Template(lure, replace(options, floor=0.0), len(J), given=given)
@@ -118,17 +85,9 @@ def contraction(lure: Lure, *, rate: float) -> Certificate:
     load. Trusted meters only remove columns of H in it, and by Theorem 1 of docs/theory-certificates.md this
     proves every set.
 
-    Parameters
-    ----------
-    lure
-        Closed loop of a feeder with droop, from `close_loop`.
-    rate
-        alpha, 1/s.
-
-    Raises
-    ------
-    DesignInfeasible
-        If there is no such P at this rate, or its verification in NumPy fails.
+    lure: closed loop of a feeder with droop, from `close_loop`.
+    rate: alpha, 1/s.
+    Raises DesignInfeasible if there is no such P at this rate, or its verification in NumPy fails.
     """
     cp = cvxpy_late()
     what = f"certificate of direct injection for all sets of meters at rate {rate:g}/s"
@@ -144,12 +103,8 @@ def contraction(lure: Lure, *, rate: float) -> Certificate:
     slack = cp.Variable()
     constraints = [whole << -slack * np.eye(2 * n), P >> slack * np.eye(n), cp.trace(P) == n]
     problem = cp.Problem(cp.Maximize(slack), constraints)
-    try:
-        with solver_warnings_as_status():
-            problem.solve(solver=cp.CLARABEL)
-    except cp.error.SolverError as failure:
-        raise DesignInfeasible(what, f"the solver failed: {failure}", code="solver-failed") from failure
-    if problem.status not in {cp.OPTIMAL, cp.OPTIMAL_INACCURATE} or not slack.value > 0.0:
+    solve(problem, what)
+    if not slack.value > 0.0:
         raise DesignInfeasible(
             what, f"the inequality has no solution ({problem.status})", slack.value, code="no-solution"
         )
@@ -173,24 +128,11 @@ def solve_many(
     Processes are spawned, so a calling script needs the `if __name__ == "__main__"` guard; each runs its
     linear algebra on one thread. One worker means this process.
 
-    Parameters
-    ----------
-    lure
-        Plant. Its matrices are sent to the workers; its nonlinearity, which no inequality needs, is not.
-    options
-        From `options_for`.
-    progress
-        Called in this process with (done, total) after finished designs.
-
-    Returns
-    -------
-    tuple of CircleGains
-        In the order of `subsets`.
-
-    Raises
-    ------
-    DesignInfeasible
-        For the first set with a failed design; pending work is dropped.
+    lure: plant. Its matrices are sent to the workers; its nonlinearity, which no inequality needs, is not.
+    options: from `options_for`.
+    progress: called in this process with (done, total) after finished designs.
+    Returns the designs in the order of `subsets`.
+    Raises DesignInfeasible for the first set with a failed design; pending work is dropped.
     """
     chunks = _chunks(subsets)
     results: dict[int, CircleGains] = {}
@@ -348,29 +290,14 @@ class _Template:
         self.variables = (P, Y, lam, Gamma, mu, mu_delta)
 
     def solve(self, J: Ints) -> CircleGains:
-        """Design for one set, verified.
-
-        Raises
-        ------
-        DesignInfeasible
-            As in `circle`.
-        """
-        cp = cvxpy_late()
+        """Design for one set, verified. Raises DesignInfeasible as in `circle`."""
         lure, options, live = self.lure, self.options, self.live
         what = f"circle-criterion observer of the meters {J.tolist()} at rate {options.rate:g}/s"
         self.C.value = lure.C[J] * self.x_unit / self.z_unit
         self.D.value = lure.D[J] @ options.load / self.z_unit
         self.N.value = (options.noise[J] / self.noise_unit)[None, :]
         self.at.value = feeds(lure)[np.ix_(live, J)].astype(np.float64)
-        try:
-            with solver_warnings_as_status():
-                self.problem.solve(solver=cp.CLARABEL)
-        except cp.error.SolverError as failure:
-            raise DesignInfeasible(what, f"the solver failed: {failure}", code="solver-failed") from failure
-        if self.problem.status not in {cp.OPTIMAL, cp.OPTIMAL_INACCURATE}:
-            raise DesignInfeasible(
-                what, f"the inequality has no solution ({self.problem.status})", code="no-solution"
-            )
+        solve(self.problem, what)
         return settle(lure, self._in_plant_units(J), what, blind=self.given is not None)
 
     def _in_plant_units(self, J: Ints) -> CircleGains:
@@ -414,21 +341,11 @@ def settle(lure: Lure, found: CircleGains, what: str, *, blind: bool = False) ->
     and mu, mu_delta grown together by the stated steps (at most 5 %), which makes every diagonal
     block but that of psi more negative; the gains stay. `backoff` stores the step.
 
-    Parameters
-    ----------
-    what
-        Name of the design in errors.
-    blind
-        Accept gains that use no meter.
-
-    Raises
-    ------
-    DesignInfeasible
-        If every step fails, or if the design uses no meter.
+    blind: accept gains that use no meter.
+    Raises DesignInfeasible if every step fails, or if the design uses no meter.
     """
-    best = -np.inf
-    for step in BACKOFF:
-        tried = replace(
+    tries = (
+        replace(
             found,
             alpha=found.alpha * (1.0 - step),
             nu=found.nu * (1.0 - step),
@@ -436,12 +353,9 @@ def settle(lure: Lure, found: CircleGains, what: str, *, blind: bool = False) ->
             mu_delta=found.mu_delta * (1.0 + step),
             backoff=step,
         )
-        reached = margin(lure, found.J, tried)
-        if reached > 0.0:
-            if not blind:
-                refuse_blind(found.J, found.sensitivity)
-            return replace(tried, margin=reached)
-        best = max(best, reached)
-    raise DesignInfeasible(
-        what, f"solver: {found.status}, but the rebuilt inequality is violated", best, code="not-verified"
+        for step in BACKOFF
     )
+    made, reached = first_proven(tries, lambda tried: margin(lure, found.J, tried), what, found.status)
+    if not blind:
+        refuse_blind(found.J, found.sensitivity)
+    return replace(made, margin=reached)

@@ -1,7 +1,5 @@
 """Discrete-time circle-criterion observers by linear matrix inequalities: design, margins, error bounds.
 
-The parts of a design that need no solver.
-
 The observer of the trusted meters J is
 
     x_hat+ = A x_hat + G phi(zeta) + B u + L r,   zeta = H x_hat + F u + K r,   r = (y - C x_hat - D u)_J
@@ -9,15 +7,12 @@ The observer of the trusted meters J is
 Slopes may lie anywhere in [lower, upper]; a loop transform moves them to [0, upper - lower]. The solver's
 result is rebuilt in NumPy, in the plant's own units, before it is used.
 
-References
-----------
-yang2019 (4), (5); docs/theory-discrete.md.
-yang2019 (4), Assumption 1. Proofs: docs/theory-discrete.md.
+Source: yang2019 (4), (5), Assumption 1. Proofs: docs/theory-discrete.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -27,7 +22,7 @@ from gridsec.arrays import Floats, Ints, frozen, frozen_ints
 from gridsec.errors import DesignInfeasible, InputInvalid, Problem, raise_if_any
 from gridsec.observers.gains import negativity
 from gridsec.observers.lmi.sampled import DiscreteLure, shift
-from gridsec.observers.lmi.solver import cvxpy_late, solver_warnings_as_status
+from gridsec.observers.lmi.solver import BACKOFF, cvxpy_late, first_proven, solve
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,29 +31,19 @@ class UncertaintyInputs:
 
     `x+ = … + state @ delta`, `z = H x + F u + argument @ delta`, `y = … + output @ delta`.
 
-    Attributes
-    ----------
-    state : (n, r)
-    argument : (m, r)
-    output : (p, r)
-        Scaled so that the entries of delta are about one.
-
-    Raises
-    ------
-    ValueError
-        If the numbers of columns differ.
+    Raises ValueError if the numbers of columns differ.
     """
 
-    state: Floats
-    argument: Floats
-    output: Floats
+    state: Floats  # (n, r)
+    argument: Floats  # (m, r)
+    output: Floats  # (p, r) scaled so that the entries of delta are about one
 
     def __post_init__(self) -> None:
         for name in ("state", "argument", "output"):
             object.__setattr__(self, name, frozen(getattr(self, name)))
         if not self.state.shape[1] == self.argument.shape[1] == self.output.shape[1]:
-            raise InputInvalid(
-                [Problem("shape", "state, argument and output must have one column for each entry of delta")]
+            raise InputInvalid.of(
+                "shape", "state, argument and output must have one column for each entry of delta"
             )
 
 
@@ -71,14 +56,9 @@ def nothing_unknown(system: DiscreteLure) -> UncertaintyInputs:
 def input_error(system: DiscreteLure, load: Floats, held: Floats | None = None) -> UncertaintyInputs:
     """Uncertainty of an input known up to `load @ delta`, with arguments that move by `held` within a step.
 
-    Parameters
-    ----------
-    system
-        The plant; l inputs, m nonlinearities.
-    load : (l, r) or (l,)
-        Shape of the error of the known input; a vector means independent entries.
-    held : (m,), optional
-        Error of each argument from `sampled.held_error`, independent of all others.
+    system: the plant; l inputs, m nonlinearities.
+    load (l, r) or (l,): shape of the error of the known input; a vector means independent entries.
+    held (m,), optional: error of each argument from `sampled.held_error`, independent of all others.
     """
     given = np.asarray(load, dtype=np.float64)
     W = np.diag(given) if given.ndim == 1 else given
@@ -94,46 +74,22 @@ class DiscreteGains:
     """One designed observer with its proof. k trusted meters, n states, m nonlinearities.
 
     With `V = e^T P e`, `e = x - x_hat`: `V+ <= decay^2 V + mu |n / noise|^2 + mu_delta |delta|^2`.
-
-    Attributes
-    ----------
-    J : (k,)
-        The trusted meters.
-    L, K : (n, k), (m, k)
-        Injection of `r = y - y_hat` into the state and into the arguments of the nonlinearities;
-        yang2019 (4) writes the same with the opposite sign of both.
-    P : (n, n)
-    Lambda : (m,)
-        Certificate and multiplier, for the loop-transformed system.
-    decay
-        lambda of yang2019 (5), per step.
-    mu, mu_delta : float
-        As above.
-    noise : (k,)
-        Scale of each trusted meter's error.
-    unknown
-        Further uncertainty.
-    margin
-        Margin of the rebuilt inequality; it holds if positive.
-    backoff
-        Fraction by which mu and mu_delta were enlarged after the solver.
-    status
-        Status of the solver; not a proof.
     """
 
-    J: Ints
+    J: Ints  # (k,) the trusted meters
+    # (n, k) injection of `r = y - y_hat` into the state; yang2019 (4) writes it with the opposite sign
     L: Floats
-    K: Floats
-    P: Floats
-    Lambda: Floats
-    decay: float
-    mu: float
+    K: Floats  # (m, k) injection into the arguments of the nonlinearities, likewise
+    P: Floats  # (n, n) certificate, for the loop-transformed system
+    Lambda: Floats  # (m,) multiplier, for the same system
+    decay: float  # lambda of yang2019 (5), per step
+    mu: float  # as above
     mu_delta: float
-    noise: Floats
-    unknown: UncertaintyInputs
-    margin: float
-    backoff: float
-    status: str
+    noise: Floats  # (k,) scale of each trusted meter's error
+    unknown: UncertaintyInputs  # further uncertainty
+    margin: float  # margin of the rebuilt inequality; it holds if positive
+    backoff: float  # fraction by which mu and mu_delta were enlarged after the solver
+    status: str  # status of the solver; not a proof
 
 
 def discrete_matrix(system: DiscreteLure, J: Ints | Sequence[int], gains: DiscreteGains) -> Floats:
@@ -149,24 +105,14 @@ def discrete_matrix(system: DiscreteLure, J: Ints | Sequence[int], gains: Discre
     and the loop transform `A~ = A + G diag(lower) H`, `E_x~ = E_x + G diag(lower) E_z`,
     `L~ = L + G diag(lower) K`. Nonlinearities of constant slope have no column.
 
-    Parameters
-    ----------
-    J : (k',)
-        Meters with injection, a subset of `gains.J`: the observer while others are unavailable.
-
-    Raises
-    ------
-    ValueError
-        If `J` is not a subset of the design's meters.
-
-    References
-    ----------
-    docs/theory-discrete.md, Theorem 1.
+    J (k',): meters with injection, a subset of `gains.J`: the observer while others are unavailable.
+    Raises ValueError if `J` is not a subset of the design's meters.
+    Source: docs/theory-discrete.md, Theorem 1.
     """
     keep = np.isin(gains.J, np.asarray(J, dtype=np.intp))
     if np.count_nonzero(keep) != len(J):
-        raise InputInvalid(
-            [Problem("wrong-design", f"{list(J)} is not a subset of the design's meters {gains.J.tolist()}")]
+        raise InputInvalid.of(
+            "wrong-design", f"{list(J)} is not a subset of the design's meters {gains.J.tolist()}"
         )
     rows, L, K, N = gains.J[keep], gains.L[:, keep], gains.K[:, keep], gains.noise[keep]
     moved, lower = shift(system), system.G * system.lower
@@ -196,10 +142,7 @@ def discrete_margin(system: DiscreteLure, J: Ints | Sequence[int], gains: Discre
     The smaller one of the negativity of `discrete_matrix` and the positivity of P; minus infinity if a
     sign is wrong.
 
-    Parameters
-    ----------
-    system, J, gains
-        As in `discrete_matrix`.
+    system, J, gains: as in `discrete_matrix`.
     """
     live = system.slope > 0.0
     signs = [*gains.Lambda[live], gains.decay, 1.0 - gains.decay]
@@ -211,13 +154,7 @@ def discrete_margin(system: DiscreteLure, J: Ints | Sequence[int], gains: Discre
 
 
 def growth(gains: DiscreteGains) -> float:
-    """C of yang2019 (5), `sqrt(lambda_max(P) / lambda_min(P))`: `|e(k)| <= c decay^k |e(0)| + …`.
-
-    Parameters
-    ----------
-    gains
-        A design with a positive margin.
-    """
+    """C of yang2019 (5), `sqrt(lambda_max(P) / lambda_min(P))`: `|e(k)| <= c decay^k |e(0)| + …`."""
     values = np.linalg.eigvalsh(gains.P)
     return float(np.sqrt(values[-1] / values[0]))
 
@@ -227,10 +164,7 @@ def noise_gain(gains: DiscreteGains) -> float:
 
     `sqrt(mu / ((1 - decay^2) lambda_min(P))) / min noise`.
 
-    Parameters
-    ----------
-    gains
-        A design with a positive margin.
+    gains: a design with a positive margin.
     """
     quietest = float(np.min(gains.noise))
     if quietest == 0.0:
@@ -240,62 +174,24 @@ def noise_gain(gains: DiscreteGains) -> float:
 
 
 def unknown_gain(gains: DiscreteGains) -> float:
-    """Gain of delta: `|e| <= … + gain sup |delta|`; 0 without delta.
-
-    Parameters
-    ----------
-    gains
-        A design with a positive margin.
-    """
+    """Gain of delta: `|e| <= … + gain sup |delta|`; 0 without delta."""
     if not gains.unknown.state.shape[1]:
         return 0.0
     lowest = float(np.linalg.eigvalsh(gains.P)[0])
     return float(np.sqrt(gains.mu_delta / ((1.0 - gains.decay**2) * lowest)))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class DirectProof:
-    """Proof that the errors of direct injection decay, for every set of trusted meters and every switching.
-
-    Attributes
-    ----------
-    P : (n, n)
-        `|e+|_P <= decay |e|_P` without disturbances, `|e|_P = sqrt(e^T P e)`.
-    Lambda : (m,)
-        Multiplier.
-    decay
-        Per step.
-    margin
-        Margin of the inequality without meters; it holds if positive.
-    status
-        Origin of the proof.
-    """
-
-    P: Floats
-    Lambda: Floats
-    decay: float
-    margin: float
-    status: str
-
-
-def direct_gain_bound(system: DiscreteLure, proof: DirectProof, rows: Floats) -> float:
+def direct_gain_bound(system: DiscreteLure, proof: DiscreteGains, rows: Floats) -> float:
     """Ultimate bound of direct injection: `|e| <= … + bound sup |s|` in Euclidean norms.
 
     `|P^(1/2) G diag(slope)|_2 |rows|_2 / ((1 - decay) sqrt(lambda_min(P)))`, over the nonlinearities
     that s reaches: besides the part covered by the proof, `|psi_i| <= slope_i |(rows s)_i|`.
 
-    Parameters
-    ----------
-    system
-        The plant; slopes from zero.
-    proof
-        From `discrete.discrete_contraction`.
-    rows : (m, s)
-        Matrix from the disturbance s to the arguments of the observer's or the plant's nonlinearities.
-
-    References
-    ----------
-    docs/theory-discrete.md, Theorem 2.
+    system: the plant; slopes from zero.
+    proof: from `discrete.discrete_contraction`.
+    rows (m, s): matrix from the disturbance s to the arguments of the observer's or the plant's
+        nonlinearities.
+    Source: docs/theory-discrete.md, Theorem 2.
     """
     used = np.any(rows != 0.0, axis=1)
     if not used.any():
@@ -308,8 +204,6 @@ def direct_gain_bound(system: DiscreteLure, proof: DirectProof, rows: Floats) ->
 
 # Slack of the scaled inequality, as in circle_criterion: far above the solver's tolerance.
 _SLACK = 1e-7
-# Enlargements of mu and mu_delta tried, in order, if the rebuilt inequality is violated.
-_BACKOFF = (0.0, 1e-4, 1e-3, 1e-2, 5e-2)
 # Relative influence on the observer below which a meter counts as ignored.
 _BLIND = 1e-3
 
@@ -318,28 +212,15 @@ _BLIND = 1e-3
 class DiscreteOptions:
     """Specification of a design. n states, p meters.
 
-    Attributes
-    ----------
-    decays
-        Candidates for lambda, each in (0, 1), per step. The one with the smallest bound is used.
-    noise : (p,)
-        Scale of each meter's error.
-    unknown
-        Further unknowns.
-    weight : (n, n)
-        Q > 0: the bound minimised is the one on `e^T Q e`.
-
-    Raises
-    ------
-    ValueError
-        If a candidate is not inside (0, 1), a scale of noise not positive, or the weight not positive
-        definite; lists every problem.
+    Raises ValueError if a candidate is not inside (0, 1), a scale of noise not positive, or the weight not
+        positive definite; lists every problem.
     """
 
+    # candidates for lambda, each in (0, 1), per step. The one with the smallest bound is used
     decays: tuple[float, ...]
-    noise: Floats
-    unknown: UncertaintyInputs
-    weight: Floats
+    noise: Floats  # (p,) scale of each meter's error
+    unknown: UncertaintyInputs  # further unknowns
+    weight: Floats  # (n, n) Q > 0: the bound minimised is the one on `e^T Q e`
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "noise", frozen(self.noise))
@@ -364,21 +245,11 @@ def discrete_options(
 ) -> DiscreteOptions:
     """Options with short forms filled in for a plant.
 
-    Parameters
-    ----------
-    decays
-        One candidate for lambda or several.
-    noise : (p,) or scalar
-        Scale of the meters' errors.
-    unknown
-        None by default. Required for a plant that settles by itself; otherwise the best design is blind.
-    weight : (n, n)
-        Identity by default.
-
-    Raises
-    ------
-    ValueError
-        As `DiscreteOptions`.
+    decays: one candidate for lambda or several.
+    noise (p,) or scalar: scale of the meters' errors.
+    unknown: None by default. Required for a plant that settles by itself; otherwise the best design is blind.
+    weight (n, n): identity by default.
+    Raises ValueError as `DiscreteOptions`.
     """
     several = tuple(float(decay) for decay in np.atleast_1d(np.asarray(decays, dtype=np.float64)))
     return DiscreteOptions(
@@ -395,17 +266,9 @@ def discrete_circle(system: DiscreteLure, J: Sequence[int] | Ints, options: Disc
     Minimises `(k mu + r mu_delta) / (1 - lambda^2)`, the bound on `e^T Q e` for entries of size one,
     over (P, P L~, Lambda, Lambda K, mu, mu_delta) with `P >= Q`, for each candidate lambda.
 
-    Parameters
-    ----------
-    J : (k,)
-        Trusted meters.
-    options
-        From `discrete_options`.
-
-    Raises
-    ------
-    DesignInfeasible
-        If there is no such observer for any candidate, or if the best one ignores its meters.
+    J (k,).
+    Raises DesignInfeasible if there is no such observer for any candidate, or if the best one ignores its
+        meters.
     """
     return discrete_circles(system, [J], options)[0]
 
@@ -415,15 +278,7 @@ def discrete_circles(
 ) -> tuple[DiscreteGains, ...]:
     """`discrete_circle` for several sets; sets of one size share one stated problem.
 
-    Parameters
-    ----------
-    system, options
-        As there.
-
-    Raises
-    ------
-    DesignInfeasible
-        If there is no such observer for one of the sets, or it ignores its meters.
+    Raises DesignInfeasible if there is no such observer for one of the sets, or it ignores its meters.
     """
     templates: dict[int, _Template] = {}
     made = []
@@ -448,41 +303,23 @@ def discrete_prove(
 ) -> DiscreteGains:
     """Best proof for given gains: the same inequality in P, Lambda, mu and mu_delta only.
 
-    Parameters
-    ----------
-    system, J, options
-        As in `discrete_circle`.
-    L, K : (n, k), (m, k)
-        Gains; blind ones are accepted.
-
-    Raises
-    ------
-    DesignInfeasible
-        If there is no proof.
+    system, J, options: as in `discrete_circle`.
+    L (n, k), K (m, k): gains; blind ones are accepted.
+    Raises DesignInfeasible if there is no proof.
     """
     given = (np.asarray(L, dtype=np.float64), np.asarray(K, dtype=np.float64))
     return _Template(system, options, len(J), given).best(np.asarray(J, dtype=np.intp))
 
 
-def discrete_contraction(system: DiscreteLure, *, decays: Sequence[float] | float) -> DirectProof:
-    """One proof of direct injection for all sets of meters: the inequality without meters.
+def discrete_contraction(system: DiscreteLure, *, decays: Sequence[float] | float) -> DiscreteGains:
+    """One proof of direct injection for all sets of meters: the inequality without meters, J empty.
 
-    A trusted meter replaces a slope of the loop by zero, which the proof covers. It needs
-    `lower <= 0 <= upper`.
+    `|e+|_P <= decay |e|_P` without disturbances, for every set and switching: a trusted meter replaces a
+    slope of the loop by zero, which the proof covers. It needs `lower <= 0 <= upper`.
 
-    Parameters
-    ----------
-    decays
-        Candidates for lambda. The one with the smallest `sqrt(cond P) / (1 - lambda)` is used.
-
-    Raises
-    ------
-    DesignInfeasible
-        If there is no proof.
-
-    References
-    ----------
-    docs/theory-discrete.md, Theorem 2.
+    decays: candidates for lambda. The one with the smallest `sqrt(cond P) / (1 - lambda)` is used.
+    Raises DesignInfeasible if there is no proof.
+    Source: docs/theory-discrete.md, Theorem 2.
     """
     what = "proof of direct injection for all sets of meters"
     if np.any(system.lower > 0.0) or np.any(system.upper < 0.0):
@@ -490,20 +327,14 @@ def discrete_contraction(system: DiscreteLure, *, decays: Sequence[float] | floa
     options = discrete_options(system, decays=decays, noise=1.0)
     n, m = len(system.A), len(system.lower)
     silent = _Template(system, options, 0, (np.zeros((n, 0)), np.zeros((m, 0))))
-    found, best = None, np.inf
-    for decay in options.decays:
-        try:
-            tried = silent.solve(np.zeros(0, dtype=np.intp), decay)
-        except DesignInfeasible:
-            continue
-        cost = np.sqrt(np.linalg.cond(tried.P)) / (1.0 - decay)
-        if cost < best:
-            found, best = tried, cost
-    if found is None:
+    try:
+        return silent.best(
+            np.zeros(0, dtype=np.intp), lambda one: float(np.sqrt(np.linalg.cond(one.P))) / (1.0 - one.decay)
+        )
+    except DesignInfeasible as failure:
         raise DesignInfeasible(
             what, f"the inequality has no solution for lambda in {options.decays}", code="no-solution"
-        )
-    return DirectProof(found.P, found.Lambda, found.decay, found.margin, found.status)
+        ) from failure
 
 
 def _refuse_blind(system: DiscreteLure, gains: DiscreteGains) -> None:
@@ -605,30 +436,25 @@ class _Template:
         self.problem = cp.Problem(cp.Minimize(cost), constraints)
         self.variables = (P, Y, lam, Gamma, mu, mu_delta)
 
-    def best(self, J: Ints) -> DiscreteGains:
-        """The candidate lambda with the smallest bound."""
-        failure, found, best = None, None, np.inf
+    def best(self, J: Ints, cost: Callable[[DiscreteGains], float] | None = None) -> DiscreteGains:
+        """The candidate lambda with the smallest cost, by default the bound of `e^T Q e`."""
+        found: list[DiscreteGains] = []
+        failed: DesignInfeasible | None = None
         for decay in self.options.decays:
             try:
-                tried = self.solve(J, decay)
+                found.append(self.solve(J, decay))
             except DesignInfeasible as reason:
-                failure = reason
-                continue
-            r = self.options.unknown.state.shape[1]
-            cost = (len(J) * tried.mu + r * tried.mu_delta) / (1.0 - decay**2)
-            if cost < best:
-                found, best = tried, cost
-        if found is None:
-            raise (
-                failure
-                if failure is not None
-                else DesignInfeasible("observer", "no candidate decay", code="no-solution")
-            )
-        return found
+                failed = reason
+        if failed is not None and not found:
+            raise failed
+        return min(found, key=self._bound if cost is None else cost)
+
+    def _bound(self, made: DiscreteGains) -> float:
+        r = self.options.unknown.state.shape[1]
+        return float((len(made.J) * made.mu + r * made.mu_delta) / (1.0 - made.decay**2))
 
     def solve(self, J: Ints, decay: float) -> DiscreteGains:
         """Design for one set at one decay, verified."""
-        cp = cvxpy_late()
         what = f"discrete circle-criterion observer of the meters {J.tolist()} at decay {decay:g} per step"
         if len(J):
             self.C.value = self.system.C[J] * self.x_unit / self.y_unit
@@ -637,16 +463,16 @@ class _Template:
         else:
             self.C.value = np.zeros((0, len(self.x_unit)))
         self.decay2.value = decay**2
-        try:
-            with solver_warnings_as_status():
-                self.problem.solve(solver=cp.CLARABEL)
-        except cp.error.SolverError as failure:
-            raise DesignInfeasible(what, f"the solver failed: {failure}", code="solver-failed") from failure
-        if self.problem.status not in {cp.OPTIMAL, cp.OPTIMAL_INACCURATE}:
-            raise DesignInfeasible(
-                what, f"the inequality has no solution ({self.problem.status})", code="no-solution"
-            )
-        return _settle(self.system, self._in_plant_units(J, decay), what)
+        solve(self.problem, what)
+        found = self._in_plant_units(J, decay)
+        tries = (
+            replace(found, mu=found.mu * (1.0 + part), mu_delta=found.mu_delta * (1.0 + part), backoff=part)
+            for part in BACKOFF
+        )
+        made, held = first_proven(
+            tries, lambda tried: discrete_margin(self.system, J, tried), what, found.status
+        )
+        return replace(made, margin=held)
 
     def _in_plant_units(self, J: Ints, decay: float) -> DiscreteGains:
         P, lam = (np.asarray(self.variables[i].value, dtype=np.float64) for i in (0, 2))
@@ -696,21 +522,3 @@ def _blocks(
     rows.append([*ahead, last])
     keep = [i for i in range(count + 1) if i == count or sizes[i] > 0]
     return [[rows[i][j] for j in keep] for i in keep]
-
-
-def _settle(system: DiscreteLure, found: DiscreteGains, what: str) -> DiscreteGains:
-    """Turn a solver's result into a proven design, or refuse it.
-
-    If the margin in plant units is not positive, mu and mu_delta are enlarged by the stated steps.
-    """
-    best = -np.inf
-    for step in _BACKOFF:
-        grown = 1.0 + step
-        tried = replace(found, mu=found.mu * grown, mu_delta=found.mu_delta * grown, backoff=step)
-        held = discrete_margin(system, tried.J, tried)
-        if held > 0.0:
-            return replace(tried, margin=held)
-        best = max(best, held)
-    raise DesignInfeasible(
-        what, f"the rebuilt inequality is violated ({found.status})", best, code="not-verified"
-    )

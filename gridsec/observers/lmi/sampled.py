@@ -4,9 +4,7 @@
 
 The module is in this package because the inequalities use these systems; no solver is used here.
 
-References
-----------
-yang2019 (1), (2), with the known vector rho written as B u; docs/theory-discrete.md.
+Source: yang2019 (1), (2), with the known vector rho written as B u; docs/theory-discrete.md.
 """
 
 from __future__ import annotations
@@ -19,49 +17,22 @@ from scipy.linalg import expm
 
 from gridsec.arrays import Floats, exponential_integrals, spectral_radius
 from gridsec.errors import Problem, raise_if_any
-from gridsec.observers.lure import Lure, as_floats, freeze, input_matrices, without_lower
-from gridsec.observers.newton import Nonlinearity
+from gridsec.observers.lure import Lure, Matrices, Nonlinearity, freeze, matrices_of, without_lower
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class DiscreteLure:
-    """`x+ = A x + G phi(H x + F u) + B u`, `y = C x + D u`. n states, m nonlinearities, l inputs, p meters.
+class DiscreteLure(Matrices):
+    """`x+ = A x + G phi(H x + F u) + B u`, `y = C x + D u`.
 
-    Attributes
-    ----------
-    A : (n, n)
-    G : (n, m)
-    H : (m, n)
-    F : (m, l)
-    B : (n, l)
-    C : (p, n)
-    D : (p, l)
-        The matrices. A known vector rho(u, y) as in yang2019 (1) is passed as further entries of u.
-    lower, upper : (m,)
-        Bounds of the slopes of each entry of phi, `lower <= upper`.
-    phi
-        The nonlinearity, (…, m) -> (…, m), entry by entry.
-    h
-        Time from one step to the next, s.
-
-    Raises
-    ------
-    ValueError
-        If shapes are inconsistent, an entry is not finite, a lower slope exceeds its upper one, or h is not
-        positive; lists every problem.
+    A known vector rho(u, y) as in yang2019 (1) is passed as further entries of u.
+    Raises ValueError if shapes are inconsistent, an entry is not finite, a lower slope exceeds its upper one,
+        or h is not positive; lists every problem.
     """
 
-    A: Floats
-    G: Floats
-    H: Floats
-    F: Floats
-    B: Floats
-    C: Floats
-    D: Floats
-    lower: Floats
-    upper: Floats
-    phi: Nonlinearity
-    h: float = 1.0
+    lower: Floats  # (m,) lower bound of the slope of each entry of phi
+    upper: Floats  # (m,) upper bound, `lower <= upper`
+    phi: Nonlinearity  # the nonlinearity, (…, m) -> (…, m), entry by entry
+    h: float = 1.0  # time from one step to the next, s
 
     def __post_init__(self) -> None:
         wrong = freeze(self, "lower", "upper")
@@ -89,22 +60,13 @@ class DiscreteLure:
     ) -> DiscreteLure:
         """System from nested lists or arrays; a missing input matrix is zero.
 
-        Parameters
-        ----------
-        A, C, G, H, phi, F, B, D, h
-            As in the class. Without any of F, B and D there are no inputs, l = 0.
-        lower, upper
-            Likewise; one number for all entries of phi.
-
-        Raises
-        ------
-        ValueError
-            As in the class.
+        A, C, G, H, phi, F, B, D, h: as in the class. Without any of F, B and D there are no inputs, l = 0.
+        lower, upper: likewise; one number for all entries of phi.
+        Raises ValueError as in the class.
         """
-        a, c, g, hh, low, high = as_floats(A, C, G, H, lower, upper)
-        f, b, d = input_matrices((len(hh), len(a), len(c)), F, B, D)
-        low, high = (np.broadcast_to(bound, len(hh)) for bound in (low, high))
-        return cls(a, g, hh, f, b, c, d, low, high, phi, h)
+        found = matrices_of(A, C, G, H, F, B, D)
+        low, high = (np.broadcast_to(np.asarray(end, np.float64), len(found[2])) for end in (lower, upper))
+        return cls(*found, low, high, phi, h)
 
     @property
     def slope(self) -> Floats:
@@ -114,20 +76,12 @@ class DiscreteLure:
 
 def shift(system: DiscreteLure) -> DiscreteLure:
     """The same system with slopes in [0, upper - lower]: `gridsec.observers.lure.without_lower`."""
-    A, B, phi = without_lower(system, system.lower)
+    A, B, phi = without_lower(system, system.phi, system.lower)
     return replace(system, A=A, B=B, lower=np.zeros(system.lower.shape), upper=system.slope, phi=phi)
 
 
 def advance(system: DiscreteLure, x: Floats, u: Floats) -> Floats:
-    """State one step later.
-
-    Parameters
-    ----------
-    x : (…, n)
-        State.
-    u : (…, l)
-        Input.
-    """
+    """State one step later, for x (…, n) and u (…, l)."""
     z = x @ system.H.T + u @ system.F.T
     return np.asarray(x @ system.A.T + system.phi(z) @ system.G.T + u @ system.B.T)
 
@@ -145,14 +99,8 @@ def sample(lure: Lure, h: float) -> DiscreteLure:
     some value of z_i *during* the step; `held_error` bounds the distance of that value from the one at its
     beginning.
 
-    Parameters
-    ----------
-    h
-        Length of a step, s, positive.
-
-    References
-    ----------
-    docs/theory-discrete.md, section 5.
+    h: length of a step, s, positive.
+    Source: docs/theory-discrete.md, section 5.
     """
     n = len(lure.A)
     own = np.diagonal(lure.A)
@@ -164,19 +112,9 @@ def sample(lure: Lure, h: float) -> DiscreteLure:
         block[:n, :n], block[:n, n:] = h * lure.A, h * np.eye(n)
         full = expm(block)
         A, hold = full[:n, :n], full[:n, n:]
-    return DiscreteLure(
-        A=A,
-        G=hold @ lure.G,
-        H=lure.H,
-        F=lure.F,
-        B=hold @ lure.B,
-        C=lure.C,
-        D=lure.D,
-        lower=np.zeros(lure.slope.shape),
-        upper=lure.slope,
-        phi=lure.phi,
-        h=h,
-    )
+    lower = np.zeros(lure.slope.shape)
+    G, B = hold @ lure.G, hold @ lure.B
+    return DiscreteLure(A, G, lure.H, lure.F, B, lure.C, lure.D, lower, lure.slope, lure.phi, h)
 
 
 def held_error(lure: Lure, h: float, away: Floats) -> Floats:
@@ -186,23 +124,11 @@ def held_error(lure: Lure, h: float, away: Floats) -> Floats:
     with `q_j = 1 - exp(-h / tau_j)`. With `away_j >= |K_j(z_j(0)) - x_j(0)|`, the motion m solves
     `m = q (away + d |H| m)`, if the spectral radius of `diag(q d) |H|` is below 1.
 
-    Parameters
-    ----------
-    lure
-        Closed loop of a feeder, A and G diagonal with G = -A.
-    h
-        Length of the step, s.
-    away : (m,)
-        Distance of each inverter from its set point at the beginning of the step, pu.
-
-    Returns
-    -------
-    (m,)
-        Bound on `|z_i(s) - z_i(0)|`, 0 <= s <= h, squared pu; infinite without a bound.
-
-    References
-    ----------
-    docs/theory-discrete.md, section 5.
+    lure: closed loop of a feeder, A and G diagonal with G = -A.
+    h: length of the step, s.
+    away (m,): distance of each inverter from its set point at the beginning of the step, pu.
+    Returns (m,): bound on `|z_i(s) - z_i(0)|`, 0 <= s <= h, squared pu; infinite without a bound.
+    Source: docs/theory-discrete.md, section 5.
     """
     q = -np.expm1(np.diagonal(lure.A) * h)
     reach = np.abs(lure.H)
@@ -219,21 +145,10 @@ def drift_error(lure: Lure, h: float, jump: Floats) -> Floats:
     With `|F (u(k+1) - u(k))| <= jump` the motion m of the inverters within any step obeys
     `m <= d ((1 + 2 q) |H| m + jump)`, if the spectral radius of `(1 + 2 q) diag(d) |H|` is below 1.
 
-    Parameters
-    ----------
-    lure, h
-        As in `held_error`.
-    jump : (m,)
-        Largest change of each argument's own input from one step to the next, squared pu.
-
-    Returns
-    -------
-    (m,)
-        Bound on `|z_i(s) - z_i(0)|`, 0 <= s <= h, squared pu; infinite without a bound.
-
-    References
-    ----------
-    docs/theory-discrete.md, section 5.
+    lure, h: as in `held_error`.
+    jump (m,): largest change of each argument's own input from one step to the next, squared pu.
+    Returns (m,): bound on `|z_i(s) - z_i(0)|`, 0 <= s <= h, squared pu; infinite without a bound.
+    Source: docs/theory-discrete.md, section 5.
     """
     q = -np.expm1(np.diagonal(lure.A) * h)
     reach = np.abs(lure.H)

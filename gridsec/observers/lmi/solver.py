@@ -1,29 +1,23 @@
 """Solver settings, and basis pursuit as a second-order cone program.
 
-References
-----------
-lee2018 (2.1.4), with the Euclidean norm of every block in place of the absolute value of every entry.
+Source: lee2018 (2.1.4), with the Euclidean norm of every block in place of the absolute value of every entry.
 """
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import Any
+from collections.abc import Callable, Iterable
+from typing import Any, TypeVar
 
 import numpy as np
 
 from gridsec.arrays import Floats, Ints
 from gridsec.errors import DesignInfeasible
 
+BACKOFF = (0.0, 1e-4, 1e-3, 1e-2, 5e-2)
+"""Relaxations tried, in order, if a rebuilt inequality is violated."""
 
-@contextmanager
-def solver_warnings_as_status() -> Iterator[None]:
-    """Suppress the warning about inaccurate solutions; the margin of a design decides."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Solution may be inaccurate", category=UserWarning)
-        yield
+Design = TypeVar("Design")
 
 
 def cvxpy_late() -> Any:
@@ -33,27 +27,49 @@ def cvxpy_late() -> Any:
     return cvxpy
 
 
+def solve(problem: Any, what: str, *, condition: str = "inequality") -> None:
+    """Solve a problem by Clarabel; the margin of the rebuilt condition decides, not the solver's status.
+
+    Raises DesignInfeasible if the solver fails or finds no solution.
+    """
+    cp = cvxpy_late()
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="Solution may be inaccurate", category=UserWarning)
+            problem.solve(solver=cp.CLARABEL)
+    except cp.error.SolverError as failure:
+        raise DesignInfeasible(what, f"the solver failed: {failure}", code="solver-failed") from failure
+    if problem.status not in {cp.OPTIMAL, cp.OPTIMAL_INACCURATE}:
+        raise DesignInfeasible(
+            what, f"the {condition} has no solution ({problem.status})", code="no-solution"
+        )
+
+
+def first_proven(
+    tries: Iterable[Design], margin: Callable[[Design], float], what: str, status: str
+) -> tuple[Design, float]:
+    """First design with a positive margin of the rebuilt inequality, and this margin.
+
+    Raises DesignInfeasible if there is none.
+    """
+    best = -np.inf
+    for tried in tries:
+        reached = margin(tried)
+        if reached > 0.0:
+            return tried, reached
+        best = max(best, reached)
+    raise DesignInfeasible(
+        what, f"solver: {status}, but the rebuilt inequality is violated", best, code="not-verified"
+    )
+
+
 def group_pursuit(F: Floats, y: Floats, heights: Ints) -> Floats:
-    """Minimise `sum_i |e_i|_2` subject to `F e = y`.
+    """Minimise `sum_i |e_i|_2` over e (N,) subject to `F e = y`.
 
-    Parameters
-    ----------
-    F : (m, N)
-        Sensing matrix.
-    y : (m,)
-        Observation.
-    heights : (p,)
-        Entries of each block of e; they sum to N.
-
-    Returns
-    -------
-    (N,)
-        e.
-
-    Raises
-    ------
-    DesignInfeasible
-        If the solver finds no solution, or its solution does not satisfy `F e = y` to 1e-6 of y.
+    F (m, N), y (m,).
+    heights (p,): entries of each block of e; they sum to N.
+    Raises DesignInfeasible if the solver finds no solution, or its solution does not satisfy `F e = y` to
+        1e-6 of y.
     """
     cp = cvxpy_late()
     size = float(np.max(np.abs(y), initial=0.0))
@@ -62,14 +78,7 @@ def group_pursuit(F: Floats, y: Floats, heights: Ints) -> Floats:
     e = cp.Variable(F.shape[1])
     parts = [part for part in np.split(np.arange(F.shape[1]), np.cumsum(heights)[:-1]) if part.size]
     problem = cp.Problem(cp.Minimize(sum(cp.norm(e[part], 2) for part in parts)), [F @ e == y / size])
-    try:
-        problem.solve(solver=cp.CLARABEL)
-    except cp.error.SolverError as failure:
-        raise DesignInfeasible(
-            "stacked basis pursuit", f"the solver failed: {failure}", code="solver-failed"
-        ) from failure
-    if e.value is None:
-        raise DesignInfeasible("stacked basis pursuit", f"no solution ({problem.status})", code="no-solution")
+    solve(problem, "stacked basis pursuit", condition="equation")
     found = size * np.asarray(e.value, dtype=np.float64)
     gap = float(np.max(np.abs(F @ found - y))) / size
     if not gap <= 1e-6:

@@ -12,11 +12,8 @@ quadratic `V = e^T P e` with
 
 The inequality is rebuilt in NumPy before a design leaves this module.
 
-References
-----------
-yang2021 (33) to (36), which leaves the design to Witczak, Korbicz, Puig, "An LMI approach to designing
-observers and unknown input observers for nonlinear systems", 2006. The inequality used here is derived
-in docs/theory-unknown-input.md.
+Source: yang2021 (33) to (36); Witczak, Korbicz, Puig, "An LMI approach to designing observers and unknown
+input observers for nonlinear systems", 2006. Derivation: docs/theory-unknown-input.md.
 """
 
 from __future__ import annotations
@@ -27,8 +24,8 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from gridsec.arrays import Floats, frozen
-from gridsec.errors import DesignInfeasible, InputInvalid, Problem, no_choice, raise_if_any
-from gridsec.observers.lmi.solver import cvxpy_late, solver_warnings_as_status
+from gridsec.errors import InputInvalid, Problem, no_choice, raise_if_any
+from gridsec.observers.lmi.solver import cvxpy_late, first_proven, solve
 
 Multiplier = Literal["diagonal", "scalar"]
 
@@ -42,40 +39,22 @@ _BACKOFF = (0.0, 1e-3, 1e-2, 1e-1)
 class ErrorSystem:
     """Error of an unknown-input observer without its gain. n states, m bounds, k sensors.
 
-    Attributes
-    ----------
-    M : (n, n)
-        Error map without gain, at the middle of the slopes.
-    S : (n, m)
-        Input matrix of psi, the rest of the nonlinearity.
-    H : (m, n)
-        Argument matrix of psi.
-    half : (m,)
-        Half-width of the slopes: `|psi_i| <= half_i |(H e)_i|`. With the "scalar" multiplier:
-        `|psi| <= |half * H e|`, which is yang2021 (34) for H = I and half = gamma.
-    C : (k, n)
-        The sensors' rows.
-    W : (n, d)
-        Input matrix of errors of size one that the gain does not weigh: next readings, drift of the plant.
-    N : (k,)
-        Size of the error of each sensor's reading, positive.
-
-    Raises
-    ------
-    ValueError
-        If shapes are inconsistent, an error scale is not positive, or a half-width negative.
+    Raises ValueError if shapes are inconsistent, an error scale is not positive, or a half-width negative.
     """
 
-    M: Floats
-    S: Floats
-    H: Floats
+    M: Floats  # (n, n) error map without gain, at the middle of the slopes
+    S: Floats  # (n, m) input matrix of psi, the rest of the nonlinearity
+    H: Floats  # (m, n) argument matrix of psi
+    # (m,) half-width of the slopes: `|psi_i| <= half_i |(H e)_i|`. With the "scalar" multiplier: `|psi| <=
+    # |half * H e|`, which is yang2021 (34) for H = I and half = gamma
     half: Floats
-    C: Floats
+    C: Floats  # (k, n) the sensors' rows
+    # (n, d) input matrix of errors of size one that the gain does not weigh: next readings, drift of the
+    # plant
     W: Floats
-    N: Floats
+    N: Floats  # (k,) size of the error of each sensor's reading, positive
 
     def __post_init__(self) -> None:
-        """Freeze the arrays and check that their shapes are consistent."""
         for name in ("M", "S", "H", "half", "C", "W", "N"):
             object.__setattr__(self, name, frozen(getattr(self, name)))
         n, m, k, d = len(self.M), self.half.size, self.N.size, self.W.shape[-1]
@@ -87,40 +66,23 @@ class ErrorSystem:
         ]
         raise_if_any(wrong)
         if not np.all(self.N > 0.0):
-            raise InputInvalid([Problem("not-positive", "every sensor must have a positive error scale N")])
+            raise InputInvalid.of("not-positive", "every sensor must have a positive error scale N")
         if np.any(self.half < 0.0):
-            raise InputInvalid([Problem("negative", "half-widths of slopes cannot be negative")])
+            raise InputInvalid.of("negative", "half-widths of slopes cannot be negative")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UnknownInputGains:
-    """A gain with its proof. n states, m bounds, k sensors.
+    """A gain with its proof. n states, m bounds, k sensors."""
 
-    Attributes
-    ----------
-    K : (n, k)
-        Gain from the sensors' residuals.
-    P : (n, n)
-        `V = e^T P e`.
-    Lambda : (m,)
-        Multiplier of the bounds on the nonlinearity; all entries equal for the "scalar" one.
-    mu
-        `V+ <= rate^2 V + mu (|w|^2 + |n|^2)`.
-    rate
-        Certified contraction of sqrt(V) per step.
-    margin
-        Margin of the rebuilt inequality, see `unknown_input_margin`; it holds if positive.
-    status
-        Status of the solver; not a proof.
-    """
-
-    K: Floats
-    P: Floats
+    K: Floats  # (n, k) gain from the sensors' residuals
+    P: Floats  # (n, n) `V = e^T P e`
+    # (m,) multiplier of the bounds on the nonlinearity; all entries equal for the "scalar" one
     Lambda: Floats
-    mu: float
-    rate: float
-    margin: float
-    status: str
+    mu: float  # `V+ <= rate^2 V + mu (|w|^2 + |n|^2)`
+    rate: float  # certified contraction of sqrt(V) per step
+    margin: float  # margin of the rebuilt inequality, see `unknown_input_margin`; it holds if positive
+    status: str  # status of the solver; not a proof
 
 
 def unknown_input_matrix(system: ErrorSystem, gains: UnknownInputGains) -> Floats:
@@ -133,10 +95,7 @@ def unknown_input_matrix(system: ErrorSystem, gains: UnknownInputGains) -> Float
     the increment of V minus its bound, plus the multiplier times `|half H e|^2 - |psi|^2 >= 0`. Without a
     Schur complement, this is the statement itself, not the form given to the solver.
 
-    Returns
-    -------
-    Floats
-        (n + m + d + k, n + m + d + k), symmetric.
+    Returns (n + m + d + k, n + m + d + k): symmetric.
     """
     s, g = system, gains
     n, m, d, k = len(s.M), s.half.size, s.W.shape[1], s.N.size
@@ -156,10 +115,7 @@ def unknown_input_margin(system: ErrorSystem, gains: UnknownInputGains) -> float
     (rate^2 P, Lambda, mu), so that units have no effect. Negative infinity if P is not positive definite or a
     multiplier is negative. Bounds of half-width zero do not count: their psi is zero.
 
-    Parameters
-    ----------
-    system, gains
-        As in `unknown_input_matrix`.
+    system, gains: as in `unknown_input_matrix`.
     """
     live = system.half > 0.0
     lowest = float(np.min(np.linalg.eigvalsh(gains.P)))
@@ -185,18 +141,10 @@ class UnknownInputTemplate:
     Units: readings in their error scales N, states in the change that moves the readings by one such unit,
     psi_i in its largest value for an error of one unit. All entries are then of order one.
 
-    Parameters
-    ----------
-    states, sensors, bounds
-        n, k, and the number of bounds with a half-width above zero.
-    multiplier
-        "diagonal": every nonlinearity has a bound of its own. "scalar": one bound of their norm, the
+    states, sensors, bounds: n, k, and the number of bounds with a half-width above zero.
+    multiplier: "diagonal": every nonlinearity has a bound of its own. "scalar": one bound of their norm, the
         Lipschitz condition (34) of yang2021; it proves less.
-
-    Raises
-    ------
-    ValueError
-        If `multiplier` is unknown.
+    Raises ValueError if `multiplier` is unknown.
     """
 
     def __init__(self, states: int, sensors: int, bounds: int, multiplier: Multiplier) -> None:
@@ -238,31 +186,15 @@ class UnknownInputTemplate:
     def solve(self, system: ErrorSystem, rate: float, what: str) -> UnknownInputGains:
         """Design for one error system, verified.
 
-        Parameters
-        ----------
-        system
-            The error system, of the shape of this template.
-        rate
-            Required contraction, in (0, 1).
-        what
-            Name of the design in errors.
-
-        Raises
-        ------
-        DesignInfeasible
-            If the inequality has no solution, or is violated when rebuilt.
-        ValueError
-            If the rate is not inside (0, 1).
+        system: the error system, of the shape of this template.
+        rate: required contraction, in (0, 1).
+        Raises DesignInfeasible if the inequality has no solution, or is violated when rebuilt. ValueError if
+            the rate is not inside (0, 1).
         """
         if not 0.0 < rate < 1.0:
-            raise InputInvalid(
-                [
-                    Problem(
-                        "out-of-range", f"the rate is {rate:g}; it is a contraction per step, between 0 and 1"
-                    )
-                ]
+            raise InputInvalid.of(
+                "out-of-range", f"the rate is {rate:g}; it is a contraction per step, between 0 and 1"
             )
-        cp = cvxpy_late()
         live = system.half > 0.0
         x = state_units(system)
         psi = system.half[live] * np.linalg.norm(system.H[live] * x, axis=1)
@@ -278,15 +210,7 @@ class UnknownInputTemplate:
             self.S.value = system.S[:, live] * psi / x[:, None]
             bound = system.half[live, None] * system.H[live] * x / psi[:, None]
             self.sector.value = np.einsum("ma,mb->abm", bound, bound).reshape(x.size**2, -1)
-        try:
-            with solver_warnings_as_status():
-                self.problem.solve(solver=cp.CLARABEL)
-        except cp.error.SolverError as failure:
-            raise DesignInfeasible(what, f"the solver failed: {failure}", code="solver-failed") from failure
-        if self.problem.status not in {cp.OPTIMAL, cp.OPTIMAL_INACCURATE}:
-            raise DesignInfeasible(
-                what, f"the inequality has no solution ({self.problem.status})", code="no-solution"
-            )
+        solve(self.problem, what)
         P, Y, mu = (np.asarray(v.value, dtype=np.float64) for v in self.variables[:3])
         Lambda = np.zeros(system.half.size)
         if self.variables[3] is not None:
@@ -300,7 +224,11 @@ class UnknownInputTemplate:
             margin=np.nan,
             status=str(self.problem.status),
         )
-        return _settle(system, found, what)
+        tries = (replace(found, mu=found.mu * (1.0 + part)) for part in _BACKOFF)
+        made, held = first_proven(
+            tries, lambda tried: unknown_input_margin(system, tried), what, found.status
+        )
+        return replace(made, margin=held)
 
 
 def state_units(system: ErrorSystem) -> Floats:
@@ -327,32 +255,9 @@ def unknown_input(
     Minimises mu over (P, P K, Lambda) with `P >= I` in scaled coordinates, subject to the inequality in
     the module's head.
 
-    Parameters
-    ----------
-    rate
-        Required contraction of sqrt(V) per step, in (0, 1).
-    multiplier
-        See `UnknownInputTemplate`.
-    what
-        Name of the design in errors.
-
-    Raises
-    ------
-    DesignInfeasible
-        If there is no such gain, or the rebuilt inequality is violated.
+    rate: required contraction of sqrt(V) per step, in (0, 1).
+    multiplier: see `UnknownInputTemplate`.
+    Raises DesignInfeasible if there is no such gain, or the rebuilt inequality is violated.
     """
     shape = (len(system.M), system.N.size, int(np.count_nonzero(system.half > 0.0)))
     return UnknownInputTemplate(*shape, multiplier).solve(system, rate, what)
-
-
-def _settle(system: ErrorSystem, found: UnknownInputGains, what: str) -> UnknownInputGains:
-    best = -np.inf
-    for part in _BACKOFF:
-        tried = replace(found, mu=found.mu * (1.0 + part))
-        reached = unknown_input_margin(system, tried)
-        if reached > 0.0:
-            return replace(tried, margin=reached)
-        best = max(best, reached)
-    raise DesignInfeasible(
-        what, f"solver: {found.status}, but the rebuilt inequality is violated", best, code="not-verified"
-    )

@@ -7,9 +7,7 @@ The residual of the minimum-variance estimate has the *singular* covariance
 N - n degrees of freedom. lee2018 prints N, which gives far fewer false alarms than specified and misses
 attacks: docs/errata/lee2018-chapter-2.md.
 
-References
-----------
-lee2018, section 2.2.3.2.
+Source: lee2018, section 2.2.3.2.
 """
 
 from __future__ import annotations
@@ -22,7 +20,7 @@ from scipy.linalg import solve_triangular
 from scipy.special import chdtr, chdtrc, chdtri, gammaln, xlogy
 
 from gridsec.arrays import Bools, Floats, Ints, frozen, frozen_ints
-from gridsec.errors import DesignInfeasible, InputInvalid, NotObservable, Problem, no_choice, raise_if_any
+from gridsec.errors import DesignInfeasible, InputInvalid, NotObservable, no_choice, raise_if_any
 from gridsec.secure.decode.stacks import MOST_SUBSETS, Stack, subsets
 
 # Terms of the continued fraction; for arguments beyond the largest double's logarithm two would suffice.
@@ -32,42 +30,20 @@ _MOST = 1e300
 
 
 def log_density(g: Floats, k: Floats) -> Floats:
-    """Logarithm of the density of a chi-square variable.
+    """Logarithm of the density of a chi-square variable at g >= 0 with k degrees of freedom.
 
-    Parameters
-    ----------
-    g : (…)
-        Argument, >= 0.
-    k : (…)
-        Degrees of freedom.
-
-    Returns
-    -------
-    (…)
-        ``(k / 2 - 1) ln g - g / 2 - (k / 2) ln 2 - ln Gamma(k / 2)``.
+    ``(k / 2 - 1) ln g - g / 2 - (k / 2) ln 2 - ln Gamma(k / 2)``
     """
     g, half = np.minimum(g, _MOST), 0.5 * k
     return np.asarray(xlogy(half - 1.0, g) - 0.5 * g - half * np.log(2.0) - gammaln(half))
 
 
 def log_tail(g: Floats, k: Floats) -> Floats:
-    """Logarithm of the probability that a chi-square variable exceeds g.
+    """Logarithm of the probability that a chi-square variable with k degrees of freedom exceeds g >= 0.
 
-    Parameters
-    ----------
-    g : (…)
-        The bound, >= 0.
-    k : (…)
-        Degrees of freedom.
+    Where the probability itself underflows, by the continued fraction of the incomplete gamma function.
 
-    Returns
-    -------
-    (…)
-        If the probability itself underflows, by the continued fraction of the incomplete gamma function.
-
-    References
-    ----------
-    NIST Digital Library of Mathematical Functions, 8.9.2.
+    Source: NIST Digital Library of Mathematical Functions, 8.9.2.
     """
     g = np.minimum(g, _MOST)
     above, below = chdtrc(k, g), chdtr(k, g)
@@ -90,22 +66,13 @@ Rule = Literal["density", "tail"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Test:
-    """Least squares and chi-square test on one set of sensors.
-
-    Attributes
-    ----------
-    estimator : (n, N)
-        Psi: the estimate is `Psi z`; zero in the columns of sensors left out.
-    covariance : (n, n)
-        Covariance of the estimate's error.
-    standardise : (N_kept - n, N)
-        `W z` are independent standard normal numbers if there is no error; `g = |W z|^2`.
-    """
+    """Least squares and chi-square test on one set of sensors."""
 
     __test__ = False
 
-    estimator: Floats
-    covariance: Floats
+    estimator: Floats  # (n, N) Psi: the estimate is `Psi z`; zero in the columns of sensors left out
+    covariance: Floats  # (n, n) covariance of the estimate's error
+    # (N_kept - n, N) `W z` are independent standard normal numbers if there is no error; `g = |W z|^2`
     standardise: Floats
 
     @property
@@ -116,80 +83,40 @@ class Test:
     def threshold(self, false_alarm: float) -> float:
         """Delta_TH: the value that g exceeds with this probability without an error.
 
-        Parameters
-        ----------
-        false_alarm
-            delta, strictly between 0 and 1.
-
-        Raises
-        ------
-        ValueError
-            If `false_alarm` is outside (0, 1).
+        false_alarm: delta, strictly between 0 and 1.
+        Raises ValueError if `false_alarm` is outside (0, 1).
         """
         if not 0.0 < false_alarm < 1.0:
-            raise InputInvalid(
-                [Problem("out-of-range", f"false_alarm is {false_alarm}; it must lie in (0, 1)")]
-            )
+            raise InputInvalid.of("out-of-range", f"false_alarm is {false_alarm}; it must lie in (0, 1)")
         return float(chdtri(self.freedom, false_alarm))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Verdicts:
-    """Result of the chi-square test for a batch of measurements.
+    """Result of the chi-square test for a batch of measurements."""
 
-    Attributes
-    ----------
-    x : (…, n)
-        Estimates.
-    g : (…)
-        Square sums of the standardised residuals.
-    alarm : (…)
-        True if g exceeds the threshold or is NaN.
-    """
-
-    x: Floats
-    g: Floats
-    alarm: Bools
+    x: Floats  # (…, n) estimates
+    g: Floats  # (…) square sums of the standardised residuals
+    alarm: Bools  # (…) True if g exceeds the threshold or is NaN
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hypotheses:
-    """The C(p, q) tests of Algorithm 2.3; in hypothesis i, only the sensors in `kept[i]` are free of error.
+    """The C(p, q) tests of Algorithm 2.3; hypothesis i: only the sensors in `kept[i]` are free of error."""
 
-    Attributes
-    ----------
-    kept : (S, p - q)
-        Sensors trusted in each hypothesis.
-    estimators : (S, n, N)
-    standardise : (S, largest freedom, N)
-        As in `Test`, filled up with zero rows.
-    freedom : (S,)
-        Degrees of freedom of each hypothesis.
-    """
-
-    kept: Ints
-    estimators: Floats
-    standardise: Floats
-    freedom: Ints
+    kept: Ints  # (S, p - q) sensors trusted in each hypothesis
+    estimators: Floats  # (S, n, N)
+    standardise: Floats  # (S, largest freedom, N) as in `Test`, filled up with zero rows
+    freedom: Ints  # (S,) degrees of freedom of each hypothesis
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chosen:
-    """Chosen hypothesis for each of a batch of measurements.
+    """Chosen hypothesis for each of a batch of measurements."""
 
-    Attributes
-    ----------
-    x : (…, n)
-        Its estimate.
-    hypothesis : (…)
-        Its index.
-    g : (…, S)
-        Square sums of all hypotheses.
-    """
-
-    x: Floats
-    hypothesis: Ints
-    g: Floats
+    x: Floats  # (…, n) its estimate
+    hypothesis: Ints  # (…) its index
+    g: Floats  # (…, S) square sums of all hypotheses
 
 
 def design_test(stack: Stack, P: Floats, kept: Ints | None = None) -> Test:
@@ -199,26 +126,11 @@ def design_test(stack: Stack, P: Floats, kept: Ints | None = None) -> Test:
 
     so that `g = |W z|^2 = r^T P^-1 r = r^T Sigma^+ r` for the residual r and its covariance Sigma.
 
-    Parameters
-    ----------
-    stack
-        Phi.
-    P : (N, N)
-        Covariance of the noise, positive definite.
-    kept
-        Sensors to use; all by default.
-
-    Raises
-    ------
-    NotObservable
-        If these sensors do not determine x, or determine it without redundancy, so that no reading could
-        contradict it.
-    DesignInfeasible
-        If P is not positive definite.
-
-    References
-    ----------
-    lee2018 (2.2.16) to (2.2.20), Algorithm 2.2 with N - n degrees of freedom.
+    P (N, N): covariance of the noise, positive definite.
+    kept: sensors to use; all by default.
+    Raises NotObservable if these sensors do not determine x, or determine it without redundancy, so that no
+        reading could contradict it. DesignInfeasible if P is not positive definite.
+    Source: lee2018 (2.2.16) to (2.2.20), Algorithm 2.2 with N - n degrees of freedom.
     """
     test = _least_squares(stack, P, kept)
     if test.freedom == 0:
@@ -264,14 +176,8 @@ def _least_squares(stack: Stack, P: Floats, kept: Ints | None = None) -> Test:
 def residual_covariance(stack: Stack, P: Floats) -> Floats:
     """Covariance of the residual, `P - Phi (Phi^T P^-1 Phi)^-1 Phi^T`, of rank N - n, so not invertible.
 
-    Parameters
-    ----------
-    stack, P
-        As in `design_test`.
-
-    References
-    ----------
-    lee2018 (2.2.20).
+    stack, P: as in `design_test`.
+    Source: lee2018 (2.2.20).
     """
     return np.asarray(P - stack.matrix @ _least_squares(stack, P).covariance @ stack.matrix.T)
 
@@ -279,23 +185,9 @@ def residual_covariance(stack: Stack, P: Floats) -> Floats:
 def detect(test: Test, z: Floats, *, false_alarm: float) -> Verdicts:
     """Chi-square test for the presence of an error.
 
-    Parameters
-    ----------
-    test
-        From `design_test`.
-    z : (…, N)
-        Measurements.
-    false_alarm
-        delta, probability of an alarm without an error, strictly between 0 and 1.
-
-    Returns
-    -------
-    Verdicts
-        Measurements that are not finite alarm.
-
-    References
-    ----------
-    lee2018, Algorithm 2.2, with the degrees of freedom corrected.
+    z (…, N). false_alarm: delta, probability of an alarm without an error, strictly between 0 and 1.
+    Measurements that are not finite alarm.
+    Source: lee2018, Algorithm 2.2, with the degrees of freedom corrected.
     """
     g = np.square(z @ test.standardise.T).sum(axis=-1)
     return Verdicts(np.asarray(z @ test.estimator.T), g, np.asarray(~(g <= test.threshold(false_alarm))))
@@ -304,20 +196,11 @@ def detect(test: Test, z: Floats, *, false_alarm: float) -> Verdicts:
 def design_hypotheses(stack: Stack, P: Floats, q: int, *, most: int = MOST_SUBSETS) -> Hypotheses:
     """Prepare Algorithm 2.3: a test for every set of p - q sensors.
 
-    Parameters
-    ----------
-    stack, P
-        As in `design_test`.
-    q
-        Largest number of sensors in error.
-
-    Raises
-    ------
-    NotObservable
-        If a set of p - q sensors does not determine x, or determines it without redundancy, so that no
-        reading could contradict it.
-    DesignInfeasible
-        If there are more than `most` sets, or P is not positive definite.
+    stack, P: as in `design_test`.
+    q: largest number of sensors in error.
+    Raises NotObservable if a set of p - q sensors does not determine x, or determines it without redundancy,
+        so that no reading could contradict it. DesignInfeasible if there are more than `most` sets, or P is
+        not positive definite.
     """
     kept = subsets(stack.count, stack.count - q, most)
     tests = [design_test(stack, P, k) for k in kept]
@@ -332,27 +215,13 @@ def design_hypotheses(stack: Stack, P: Floats, q: int, *, most: int = MOST_SUBSE
 def choose(hypotheses: Hypotheses, z: Floats, *, rule: Rule, freedom: Ints | None = None) -> Chosen:
     """Choose the set of sensors assumed free of error, and its estimate.
 
-    Parameters
-    ----------
-    hypotheses
-        From `design_hypotheses`.
-    z : (…, N)
-        Measurements.
-    rule
-        "density": the paper's, the largest chi-square density at g; it penalises residuals that are too small
-        (its Remark 2.2.3). "tail": the largest probability of a g at least this large; for equal degrees of
-        freedom the smallest g, the maximum likelihood of z itself over x, e and the hypothesis.
-    freedom : (S,)
-        Degrees of freedom in place of the correct ones; for comparisons with the paper's.
-
-    Raises
-    ------
-    ValueError
-        If `rule` is unknown.
-
-    References
-    ----------
-    lee2018, Algorithm 2.3 and (2.2.21), with the degrees of freedom corrected.
+    z (…, N).
+    rule: "density": the paper's, the largest chi-square density at g; it penalises residuals that are too
+        small (its Remark 2.2.3). "tail": the largest probability of a g at least this large; for equal
+        degrees of freedom the smallest g, the maximum likelihood of z itself over x, e and the hypothesis.
+    freedom (S,): degrees of freedom in place of the correct ones; for comparisons with the paper's.
+    Raises ValueError if `rule` is unknown.
+    Source: lee2018, Algorithm 2.3 and (2.2.21), with the degrees of freedom corrected.
     """
     raise_if_any(no_choice("rule", get_args(Rule), rule))
     S, width, N = hypotheses.standardise.shape

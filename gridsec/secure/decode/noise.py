@@ -1,17 +1,11 @@
 """Detection and correction under bounded noise, and the probability of these bounds for Gaussian noise.
 
-Every block of the noise has norm at most v_max. Then, for errors in at most q blocks:
+Every block of the noise has norm at most v_max. Then, for errors in at most q blocks, `detect` never alarms
+without an error, and without an alarm errors and estimate are within `kappa_e v_max` and `kappa_d v_max`;
+`correct` is within `kappa_c v_max` for any errors. Under Gaussian noise all this holds with at least the
+probability `bound_probability`.
 
-- `detect` never alarms without an error; without an alarm, errors and estimate are within
-  `kappa_e v_max` and `kappa_d v_max`;
-- `correct` is within `kappa_c v_max` for any errors.
-
-The guarantees for bounded noise hold with at least that probability.
-
-References
-----------
-lee2018, section 2.2.3.1. Proofs and corrections: docs/theory-decoding.md.
-lee2018 (2.2.15), Corollaries 2.2.13 to 2.2.15.
+Source: lee2018, section 2.2.3.1, (2.2.15). Proofs and corrections: docs/theory-decoding.md.
 """
 
 from __future__ import annotations
@@ -23,104 +17,54 @@ from scipy.optimize import brentq
 from scipy.special import chdtr
 
 from gridsec.arrays import Bools, Floats, Ints, not_negative
-from gridsec.errors import DesignInfeasible, InputInvalid, Problem
+from gridsec.errors import DesignInfeasible, InputInvalid
 from gridsec.secure.decode.search import Decoder, DecodeResult, bounded, cheapest
 from gridsec.secure.decode.stacks import MOST_SUBSETS, Stack, masked, require, residual, subsets
 
 
 @dataclass(frozen=True, slots=True)
 class DetectionConstants:
-    """Constants of Theorem 2.2.9, for p blocks with at most q in error.
+    """Constants of Theorem 2.2.9, for p blocks with at most q in error."""
 
-    Attributes
-    ----------
-    rho
-        `rho_(p,q)`: smallest singular value of any `Phi_Lambda`, |Lambda| = p - q.
-    eta
-        `eta_(p,q)`: largest `|Phi_i Phi_Lambda^+|` over i outside Lambda; 0 for q = 0.
-    threshold
-        `sqrt(p)`: an alarm is a block residual above `threshold v_max`.
-    kappa_d
-        `(sqrt(p) + 1) sqrt(p - q) / rho`: bound of the estimate's error, over v_max.
-    kappa_e
-        `(eta sqrt(p - q) + 1) (sqrt(p) + 1)`: bound of every block of e, over v_max.
-    """
-
-    rho: float
-    eta: float
-    threshold: float
-    kappa_d: float
-    kappa_e: float
+    rho: float  # `rho_(p,q)`: smallest singular value of any `Phi_Lambda`, |Lambda| = p - q
+    eta: float  # `eta_(p,q)`: largest `|Phi_i Phi_Lambda^+|` over i outside Lambda; 0 for q = 0
+    threshold: float  # `sqrt(p)`: an alarm is a block residual above `threshold v_max`
+    kappa_d: float  # `(sqrt(p) + 1) sqrt(p - q) / rho`: bound of the estimate's error, over v_max
+    kappa_e: float  # `(eta sqrt(p - q) + 1) (sqrt(p) + 1)`: bound of every block of e, over v_max
 
 
 @dataclass(frozen=True, slots=True)
 class CorrectionConstants:
-    """Constants of Theorems 2.2.11 and 2.2.12, for candidates that ignore r blocks.
+    """Constants of Theorems 2.2.11 and 2.2.12, for candidates that ignore r blocks."""
 
-    Attributes
-    ----------
-    rho
-        `rho_(p,2q)`.
-    eta
-        `eta'_(p,q,r)`: over the sets of p - q blocks, the worst prediction of the others by the best subset
-        of p - r blocks; 0 for r = q.
-    theta
-        `max(eta sqrt(p - r) + 1, sqrt(p - r))`: a block is explained up to `theta v_max`.
-    kappa_c
-        `(theta + 1) sqrt(p - 2q) / rho`: bound of the decoded estimate's error, over v_max.
-    kappa_far
-        `kappa^c'`, `(theta - 1) / max |Phi_i|`: smallest error of an estimate with more than q unexplained
-        blocks, over v_max.
-    """
-
-    rho: float
+    rho: float  # `rho_(p,2q)`
+    # `eta'_(p,q,r)`: over the sets of p - q blocks, the worst prediction of the others by the best subset of
+    # p - r blocks; 0 for r = q
     eta: float
-    theta: float
-    kappa_c: float
+    theta: float  # `max(eta sqrt(p - r) + 1, sqrt(p - r))`: a block is explained up to `theta v_max`
+    kappa_c: float  # `(theta + 1) sqrt(p - 2q) / rho`: bound of the decoded estimate's error, over v_max
+    # `kappa^c'`, `(theta - 1) / max |Phi_i|`: smallest error of an estimate with more than q unexplained
+    # blocks, over v_max
     kappa_far: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Detected:
-    """Result of the detection for a batch of measurements.
+    """Result of the detection for a batch of measurements."""
 
-    Attributes
-    ----------
-    x : (…, n)
-        Least-squares estimate.
-    residuals : (…, p)
-        Norms of the blocks of the residual.
-    alarm : (…)
-        True if there certainly is an error.
-    """
-
-    x: Floats
-    residuals: Floats
-    alarm: Bools
+    x: Floats  # (…, n) least-squares estimate
+    residuals: Floats  # (…, p) norms of the blocks of the residual
+    alarm: Bools  # (…) True if there certainly is an error
 
 
 def detection_constants(stack: Stack, q: int, *, tol: float, most: int = MOST_SUBSETS) -> DetectionConstants:
     """rho, eta, kappa^d and kappa^e.
 
-    Parameters
-    ----------
-    stack
-        Phi; must be q-error detectable.
-    q
-        Largest number of blocks in error.
-    tol
-        Tolerance of that test.
-
-    Raises
-    ------
-    NotObservable
-        If Phi is not q-error detectable.
-    DesignInfeasible
-        If there are more than `most` subsets.
-
-    References
-    ----------
-    lee2018, before Theorem 2.2.9.
+    stack: Phi; must be q-error detectable.
+    tol: tolerance of that test.
+    Raises NotObservable if Phi is not q-error detectable. DesignInfeasible if there are more than `most`
+        subsets.
+    Source: lee2018, before Theorem 2.2.9.
     """
     require(stack, q, tol, f"detecting {q} errors")
     p = stack.count
@@ -142,33 +86,18 @@ def correction_constants(
 ) -> CorrectionConstants:
     """rho, eta', theta, kappa^c and kappa^c'.
 
-    Parameters
-    ----------
-    stack
-        Phi; must be q-error correctable.
-    q, tol, most
-        As in `detection_constants`.
-    left_out
-        r; by default the cheapest, as in `search.design`.
-
-    Raises
-    ------
-    NotObservable
-        If Phi is not q-error correctable.
-    DesignInfeasible
-        If there are more than `most` subsets.
-    ValueError
-        Unless q <= r <= 2 q.
-
-    References
-    ----------
-    lee2018 (2.2.9), before Theorem 2.2.11, Theorem 2.2.12.
+    stack: Phi; must be q-error correctable.
+    q, tol, most: as in `detection_constants`.
+    left_out: r; by default the cheapest, as in `search.design`.
+    Raises NotObservable if Phi is not q-error correctable. DesignInfeasible if there are more than `most`
+        subsets. ValueError unless q <= r <= 2 q.
+    Source: lee2018 (2.2.9), before Theorem 2.2.11, Theorem 2.2.12.
     """
     require(stack, 2 * q, tol, f"undoing {q} errors")
     p = stack.count
     r = cheapest(p, q) if left_out is None else left_out
     if not q <= r <= 2 * q:
-        raise InputInvalid([Problem("out-of-range", f"r = {r} with q = {q}; expected q <= r <= 2 q")])
+        raise InputInvalid.of("out-of-range", f"r = {r} with q = {q}; expected q <= r <= 2 q")
     rho, _ = _subset_norms(stack, subsets(p, p - 2 * q, most))
     smallest = float(rho.min())
     eta = _best_prediction(stack, q, r, most)
@@ -186,23 +115,11 @@ def correction_constants(
 def detect(stack: Stack, z: Floats, *, v_max: Floats | float) -> Detected:
     """Alarm if a block of the least-squares residual exceeds `sqrt(p) v_max`.
 
-    Parameters
-    ----------
-    stack
-        Phi of full column rank.
-    z : (…, N)
-        Measurements.
-    v_max : scalar or (…)
-        Largest norm of a block of the noise, not negative.
-
-    Raises
-    ------
-    ValueError
-        If a `v_max` is negative or NaN.
-
-    References
-    ----------
-    lee2018, Theorem 2.2.9.
+    stack: Phi of full column rank.
+    z (…, N).
+    v_max (scalar or (…)): largest norm of a block of the noise, not negative.
+    Raises ValueError if a `v_max` is negative or NaN.
+    Source: lee2018, Theorem 2.2.9.
     """
     sizes = stack.norms(residual(stack, z))
     x = z @ np.linalg.pinv(stack.matrix).T
@@ -216,25 +133,11 @@ def correct(
 ) -> DecodeResult:
     """Decode with the limit `theta v_max`; the result is within `kappa_c v_max`.
 
-    Parameters
-    ----------
-    decoder
-        From `search.design`.
-    constants
-        From `correction_constants`, with the same q and r.
-    z : (…, N)
-        Measurements.
-    v_max : scalar or (…)
-        Largest norm of a block of the noise, not negative.
-
-    Raises
-    ------
-    ValueError
-        If a `v_max` is negative or NaN.
-
-    References
-    ----------
-    lee2018 (2.2.8'), Theorem 2.2.11.
+    constants: from `correction_constants`, with the same q and r.
+    z (…, N).
+    v_max (scalar or (…)): largest norm of a block of the noise, not negative.
+    Raises ValueError if a `v_max` is negative or NaN.
+    Source: lee2018 (2.2.8'), Theorem 2.2.11.
     """
     return bounded(decoder, z, limit=constants.theta * not_negative("v_max", v_max)[..., None])
 
@@ -290,28 +193,14 @@ def bound_probability(stack: Stack, P: Floats, v_max: float, *, tol: float) -> f
     The product of the blocks' own probabilities, which by the Gaussian correlation inequality (the
     events are symmetric and convex) never exceeds p_v, for any correlation between blocks.
 
-    Parameters
-    ----------
-    stack
-        Defines the blocks.
-    P : (N, N)
-        Covariance of the noise.
-    v_max
-        Bound, not negative.
-    tol
-        Largest error per block, downwards, of `quadratic_probability`.
-
-    Raises
-    ------
-    ValueError
-        If `v_max` is negative or NaN, or P is not a covariance.
-    DesignInfeasible
-        If the probability of a block cannot be computed within `tol`.
-
-    References
-    ----------
-    lee2018 (2.2.15); T. Royen, "A simple proof of the Gaussian correlation conjecture extended to some
-    multivariate gamma distributions", Far East Journal of Theoretical Statistics 48(2), 2014.
+    stack: defines the blocks.
+    P (N, N): covariance of the noise.
+    v_max: bound, not negative.
+    tol: largest error per block, downwards, of `quadratic_probability`.
+    Raises ValueError if `v_max` is negative or NaN, or P is not a covariance. DesignInfeasible if the
+        probability of a block cannot be computed within `tol`.
+    Source: lee2018 (2.2.15); T. Royen, "A simple proof of the Gaussian correlation conjecture extended to
+        some multivariate gamma distributions", Far East Journal of Theoretical Statistics 48(2), 2014.
     """
     not_negative("v_max", v_max)
     at = np.split(np.arange(P.shape[0]), np.cumsum(stack.heights)[:-1])
@@ -325,22 +214,13 @@ def bound_probability(stack: Stack, P: Floats, v_max: float, *, tol: float) -> f
 def bound_for(stack: Stack, P: Floats, probability: float, *, tol: float) -> float:
     """Smallest v_max for which `bound_probability` reaches a probability.
 
-    Parameters
-    ----------
-    stack, P, tol
-        As in `bound_probability`; `tol` should be well below `1 - probability`.
-    probability
-        Required p_v, strictly between 0 and 1.
-
-    Raises
-    ------
-    ValueError
-        If `probability` is outside (0, 1).
-    DesignInfeasible
-        If it is not reached, because `tol` is too coarse.
+    stack, P, tol: as in `bound_probability`; `tol` should be well below `1 - probability`.
+    probability: required p_v, strictly between 0 and 1.
+    Raises ValueError if `probability` is outside (0, 1). DesignInfeasible if it is not reached, because `tol`
+        is too coarse.
     """
     if not 0.0 < probability < 1.0:
-        raise InputInvalid([Problem("out-of-range", f"probability is {probability}; it must lie in (0, 1)")])
+        raise InputInvalid.of("out-of-range", f"probability is {probability}; it must lie in (0, 1)")
     size = float(np.sqrt(max(float(np.max(np.linalg.eigvalsh(P))), 0.0)))
     if size == 0.0:
         return 0.0
@@ -364,25 +244,15 @@ def quadratic_probability(values: Floats, limit: float, *, tol: float) -> float:
 
     By Ruben's series if it is short, else by the inverse of the Laplace transform.
 
-    Parameters
-    ----------
-    values : (k,)
-        Weights: the eigenvalues of a covariance. Zeros, up to rounding, have no effect.
-    limit
-        Not negative.
-    tol
-        Largest error, downwards.
-
-    Raises
-    ------
-    ValueError
-        If a weight is negative or not finite, or the limit is negative or NaN.
-    DesignInfeasible
-        If neither method reaches `tol`.
+    values (k,): weights: the eigenvalues of a covariance. Zeros, up to rounding, have no effect.
+    limit: not negative.
+    tol: largest error, downwards.
+    Raises ValueError if a weight is negative or not finite, or the limit is negative or NaN. DesignInfeasible
+        if neither method reaches `tol`.
     """
     top = float(np.max(values, initial=0.0))
     if not np.all(np.isfinite(values) & (values >= -_ROUNDING * top)):
-        raise InputInvalid([Problem("negative", "weights must be finite and not negative")])
+        raise InputInvalid.of("negative", "weights must be finite and not negative")
     not_negative("limit", limit)
     used = values[values > 0.0]
     if limit == 0.0 or used.size == 0:
@@ -399,10 +269,8 @@ def _series(values: Floats, limit: float, tol: float) -> float | None:
     Weights are positive and sum to one: a partial sum is a lower bound, with an error of at most the omitted
     weight times the next distribution's value.
 
-    References
-    ----------
-    H. Ruben, "Probability content of regions under spherical normal distributions, IV", Annals of
-    Mathematical Statistics 33(2), 1962.
+    Source: H. Ruben, "Probability content of regions under spherical normal distributions, IV", Annals of
+        Mathematical Statistics 33(2), 1962.
     """
     k, scale = values.size, float(values.min())
     ratio = 1.0 - scale / values
@@ -427,10 +295,8 @@ def _integral(values: Floats, limit: float, tol: float) -> float:
     All its singularities lie on the negative half axis. On a parabola around it the midpoint rule converges
     geometrically, for any spread of the weights; two successive rules estimate the error.
 
-    References
-    ----------
-    L. N. Trefethen, J. A. C. Weideman, T. Schmelzer, "Talbot quadratures and rational approximations",
-    BIT Numerical Mathematics 46, 2006.
+    Source: L. N. Trefethen, J. A. C. Weideman, T. Schmelzer, "Talbot quadratures and rational
+        approximations", BIT Numerical Mathematics 46, 2006.
     """
     before, error = np.inf, np.inf
     for nodes in _NODES:

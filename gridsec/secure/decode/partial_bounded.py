@@ -7,9 +7,7 @@ has passed the test, so its error is at most `kappa_c v_max(k)` under any attack
 The printed algorithm tests the estimate of the step before and returns another one, computed
 afterwards, to which the bound does not apply: docs/errata/lee2018-chapter-4.md.
 
-References
-----------
-lee2018, section 4.3.1, Theorem 4.3.2; docs/theory-partial-observers.md.
+Source: lee2018, section 4.3.1, Theorem 4.3.2; docs/theory-partial-observers.md.
 """
 
 from __future__ import annotations
@@ -19,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, frozen
-from gridsec.errors import InputInvalid, Problem
+from gridsec.errors import InputInvalid
 from gridsec.observers import luenberger
 from gridsec.observers.luenberger import LuenbergerDesign, LuenbergerState
 from gridsec.secure.decode import search
@@ -30,75 +28,37 @@ from gridsec.secure.decode.stacks import Stack
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoundedDesign:
-    """Observers and decoder.
+    """Observers and decoder."""
 
-    Attributes
-    ----------
-    observers
-        The partial observers.
-    decoder
-        l0 decoder for the stacked estimates, each block divided by its `scale`.
-    constants
-        theta, kappa_c and the others, of the scaled blocks.
-    scale : (p,)
-        Unit of each observer's error.
-    """
-
-    observers: LuenbergerDesign
-    decoder: Decoder
-    constants: CorrectionConstants
-    scale: Floats
+    observers: LuenbergerDesign  # the partial observers
+    decoder: Decoder  # l0 decoder for the stacked estimates, each block divided by its `scale`
+    constants: CorrectionConstants  # theta, kappa_c and the others, of the scaled blocks
+    scale: Floats  # (p,) unit of each observer's error
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoundedState:
-    """State of observers and decoder.
+    """State of observers and decoder."""
 
-    Attributes
-    ----------
-    observers
-        The observers' state.
-    trusted : (p,)
-        Lambda: sensors in agreement with the last estimate.
-    """
-
-    observers: LuenbergerState
-    trusted: Bools
+    observers: LuenbergerState  # the observers' state
+    trusted: Bools  # (p,) Lambda: sensors in agreement with the last estimate
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoundedOutcome:
-    """Result of one step.
+    """Result of one step."""
 
-    Attributes
-    ----------
-    t
-        Time of the estimated state, s.
-    x : (n,)
-        Estimate.
-    bound
-        `kappa_c v_max(k)`: bound of |estimate - state|_2 if at most q sensors are attacked.
-    disagree : (p,)
-        Sensors with observers that the estimate does not explain; all of them are attacked, or the bounds on
-        disturbance and noise do not hold.
-    searched
-        True if the estimate was searched for.
-    credible
-        True if at most q sensors disagree. Otherwise an assumption is violated and the bound is void.
-    residuals : (p,)
-        |z_hat_i - Z_i^T x_hat|_2.
-    limits : (p,)
-        Their limits, theta v_max(k), in the same unit.
-    """
-
-    t: float
-    x: Floats
-    bound: float
+    t: float  # time of the estimated state, s
+    x: Floats  # (n,) estimate
+    bound: float  # `kappa_c v_max(k)`: bound of |estimate - state|_2 if at most q sensors are attacked
+    # (p,) sensors with observers that the estimate does not explain; all of them are attacked, or the bounds
+    # on disturbance and noise do not hold
     disagree: Bools
-    searched: bool
+    searched: bool  # True if the estimate was searched for
+    # True if at most q sensors disagree. Otherwise an assumption is violated and the bound is void
     credible: bool
-    residuals: Floats
-    limits: Floats
+    residuals: Floats  # (p,) |z_hat_i - Z_i^T x_hat|_2
+    limits: Floats  # (p,) their limits, theta v_max(k), in the same unit
 
     @property
     def faults(self) -> int:
@@ -116,32 +76,19 @@ def design(
 ) -> BoundedDesign:
     """Prepare Algorithm 4.1.
 
-    Parameters
-    ----------
-    observers
-        From `luenberger.design`.
-    max_attacked
-        q.
-    tol
-        Tolerance of the test that the state is determined without any 2q sensors.
-    left_out
-        r, between q and 2q; the cheapest by default.
-    scale : (p,)
-        Positive; errors of observer i are measured in `scale[i]`, which gives accurate sensors more weight.
-        One for all by default, as in the paper; the limits of the envelopes suit sensors of different
+    tol: tolerance of the test that the state is determined without any 2q sensors.
+    left_out: r, between q and 2q; the cheapest by default.
+    scale (p,): positive; errors of observer i are measured in `scale[i]`, which gives accurate sensors more
+        weight. One for all by default, as in the paper; the limits of the envelopes suit sensors of different
         accuracy.
-
-    Raises
-    ------
-    NotObservable
-        Unless the pair is 2q-redundant detectable (lee2018, Proposition 4.3.1) by the parts of the observers.
-    ValueError
-        If `scale` is not one positive number for each sensor, or r is not from q to 2 q.
+    Raises NotObservable unless the pair is 2q-redundant detectable (lee2018, Proposition 4.3.1) by the parts
+        of the observers. ValueError if `scale` is not one positive number for each sensor, or r is not from q
+        to 2 q.
     """
     blocks = observers.stack.blocks
     size = np.ones(len(blocks)) if scale is None else np.asarray(scale, dtype=np.float64)
     if size.shape != (len(blocks),) or not np.all(np.isfinite(size) & (size > 0.0)):
-        raise InputInvalid([Problem("not-positive", "scale must have one positive number for each sensor")])
+        raise InputInvalid.of("not-positive", "scale must have one positive number for each sensor")
     stacked = Stack.of([block / s for block, s in zip(blocks, size, strict=True)])
     decoder = search.design(stacked, max_attacked, tol=tol, left_out=left_out)
     constants = correction_constants(stacked, max_attacked, tol=tol, left_out=decoder.left_out)
@@ -151,14 +98,9 @@ def design(
 def init(design: BoundedDesign, t: float, x: Floats, error: float) -> tuple[BoundedState, BoundedOutcome]:
     """Initial state from a guess of the state, with all sensors trusted.
 
-    Parameters
-    ----------
-    t
-        Time, s.
-    x : (n,)
-        Guess.
-    error
-        Bound of |guess - state|_2.
+    t: time, s.
+    x (n,): guess.
+    error: bound of |guess - state|_2.
     """
     observers = luenberger.init(design.observers, t, x, error)
     return decode(design, BoundedState(observers, np.ones(design.scale.size, dtype=np.bool_)))
@@ -167,13 +109,7 @@ def init(design: BoundedDesign, t: float, x: Floats, error: float) -> tuple[Boun
 def step(
     design: BoundedDesign, state: BoundedState, y: Floats, u: Floats, seen: Bools | None = None
 ) -> tuple[BoundedState, BoundedOutcome]:
-    """Step from the readings y(k) and the input u(k) to the estimate of x(k+1).
-
-    Parameters
-    ----------
-    y, u, seen : (p,), (m,), (p,)
-        As in `luenberger.step`.
-    """
+    """Step from the readings y(k) and the input u(k) to the estimate of x(k+1), as `luenberger.step`."""
     return decode(
         design, replace(state, observers=luenberger.step(design.observers, state.observers, y, u, seen))
     )
@@ -185,9 +121,7 @@ def decode(design: BoundedDesign, state: BoundedState) -> tuple[BoundedState, Bo
         x_hat = Phi_Lambda^+ z_hat_Lambda;  f = |{i : |z_hat_i - Z_i^T x_hat| > theta v_max(k)}|
         f <= q: keep x_hat.   f > q: x_hat = argmin f over F_(p,r)(z_hat).
 
-    References
-    ----------
-    lee2018, Algorithm 4.1 with the estimate made before the test; Theorems 2.2.11, 2.2.12 and 4.3.2.
+    Source: lee2018, Algorithm 4.1 with the estimate made before the test; Theorems 2.2.11, 2.2.12 and 4.3.2.
     """
     stacked = design.decoder.stack
     z = state.observers.z / (stacked.membership @ design.scale)

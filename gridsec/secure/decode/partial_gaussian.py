@@ -2,27 +2,22 @@
 
     z = Phi x + v + e,    v ~ N(0, P),  P >= 0
 
-The joint covariance of partial filters is usually singular: at the start all of them have the same initial
-error, and modes that several sensors cannot observe are predicted by all of them with exactly the same error.
-P^-1 then does not exist. Parity space avoids it: with N the annihilator of Phi, `N z` has covariance
-`V = N P N^T`, and
+The joint covariance of partial filters is usually singular: their initial errors are equal, and so are those
+of modes that several sensors cannot observe. In place of P^-1, with N the annihilator of Phi and
+`V = N P N^T`,
 
     g = (N z)^T V^+ (N z),     x_hat = Phi^+ (I - P N^T V^+ N) z
 
 are the test and the minimum-variance estimate of `gridsec.secure.decode.gaussian` wherever P > 0. A parity
 with variance zero is not random: it vanishes exactly unless there is an attack.
 
-The trusted sensors are fused and tested at every step. While the test passes, no other set is
-computed. After an alarm every set of p - q sensors is tested, and the most likely one is trusted from
-then on.
+The trusted sensors are fused and tested at every step. After an alarm every set of p - q sensors is tested,
+and the most likely one is trusted from then on.
 
 Corrected: degrees of freedom are the rank of the residual's covariance, that covariance may be singular,
 and the estimate of an alarming step is that of the newly chosen set: docs/errata/lee2018-chapter-4.md.
 
-References
-----------
-lee2018, section 4.3.2, with the corrections of its errata; docs/theory-partial-observers.md, section 5.
-lee2018, section 4.3.2; docs/theory-partial-observers.md.
+Source: lee2018, section 4.3.2; docs/theory-partial-observers.md, section 5.
 """
 
 from __future__ import annotations
@@ -33,7 +28,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from gridsec.arrays import Bools, Floats, Ints, frozen, frozen_ints
-from gridsec.errors import InputInvalid, NotObservable, Problem
+from gridsec.errors import InputInvalid, NotObservable
 from gridsec.observers import kalman
 from gridsec.observers.kalman import KalmanDesign, KalmanState, Steady
 from gridsec.observers.parts import heard
@@ -43,63 +38,31 @@ from gridsec.secure.decode.stacks import MOST_SUBSETS, Stack, annihilator, requi
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Parity:
-    """Part of the fusion of one set of sensors that does not depend on covariances. k rows are kept of N.
+    """Part of the fusion of one set of sensors that does not depend on covariances. k rows are kept of N."""
 
-    Attributes
-    ----------
-    kept
-        The sensors.
-    rows : (k,)
-        Their rows.
-    checks : (k - n, k)
-        Orthonormal N with N Phi = 0 on these rows.
-    inverse : (n, k)
-        Phi^+ on these rows.
-    """
-
-    kept: Ints
-    rows: Ints
-    checks: Floats
-    inverse: Floats
+    kept: Ints  # the sensors
+    rows: Ints  # (k,) their rows
+    checks: Floats  # (k - n, k) orthonormal N with N Phi = 0 on these rows
+    inverse: Floats  # (n, k) Phi^+ on these rows
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fused:
-    """Fusion of one set of sensors under one covariance. N stacked rows.
+    """Fusion of one set of sensors under one covariance. N stacked rows."""
 
-    Attributes
-    ----------
-    estimator : (n, N)
-        Psi: the estimate is `Psi z`.
-    covariance : (n, n)
-        Covariance of the estimate's error.
-    standardise : (k - n, N)
-        `g = |W z|^2`. Rows of exactly vanishing parities are divided by `sqrt(tol)` of their scale.
-    freedom
-        Degrees of freedom of g: rank of V.
-    """
-
-    estimator: Floats
-    covariance: Floats
+    estimator: Floats  # (n, N) Psi: the estimate is `Psi z`
+    covariance: Floats  # (n, n) covariance of the estimate's error
+    # (k - n, N) `g = |W z|^2`. Rows of exactly vanishing parities are divided by `sqrt(tol)` of their scale
     standardise: Floats
-    freedom: int
+    freedom: int  # degrees of freedom of g: rank of V
 
 
 def parity(stack: Stack, kept: Ints, *, tol: float) -> Parity:
     """Prepare the fusion of some sensors.
 
-    Parameters
-    ----------
-    stack
-        Phi.
-    tol
-        Singular values up to this, times the largest, count as zero.
-
-    Raises
-    ------
-    NotObservable
-        If these sensors do not determine x, or determine it without redundancy, so that no reading could
-        contradict it.
+    tol: singular values up to this, times the largest, count as zero.
+    Raises NotObservable if these sensors do not determine x, or determine it without redundancy, so that no
+        reading could contradict it.
     """
     rows = stack.rows(kept)
     phi = stack.matrix[rows]
@@ -119,18 +82,11 @@ def parity(stack: Stack, kept: Ints, *, tol: float) -> Parity:
 def fuse(prepared: Parity, P: Floats, *, tol: float) -> Fused:
     """Minimum-variance estimate and standardised residual under a covariance.
 
-    Parameters
-    ----------
-    P : (N, N)
-        Covariance of v; positive semidefinite.
-    tol
-        Largest variance of an exact parity, in units in which every row of z has variance one. Also the
+    P (N, N): covariance of v; positive semidefinite.
+    tol: largest variance of an exact parity, in units in which every row of z has variance one. Also the
         squared allowance for an exact parity, in the same units.
-
-    References
-    ----------
-    lee2018 (2.2.16) to (2.2.20), Algorithm 4.2 with the rank as degrees of freedom; C. R. Rao, "Linear
-    statistical inference and its applications", Wiley, 1973, section 4i (singular covariance).
+    Source: lee2018 (2.2.16) to (2.2.20), Algorithm 4.2 with the rank as degrees of freedom; C. R. Rao,
+        "Linear statistical inference and its applications", Wiley, 1973, section 4i (singular covariance).
     """
     at = prepared.rows
     part = P[np.ix_(at, at)]
@@ -158,111 +114,58 @@ def fuse(prepared: Parity, P: Floats, *, tol: float) -> Fused:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GaussianDesign:
-    """Filters and decoder.
+    """Filters and decoder."""
 
-    Attributes
-    ----------
-    filters
-        The partial filters.
-    steady
-        Their stationary gain and covariance, if used; None for time-varying ones.
-    sets
-        All sensors first, then every set of p - q.
-    thresholds : (N + 1,)
-        Delta_TH for every number of degrees of freedom. With none, the statistic is not random, and a
-        violation of size 1 alarms.
-    rule
-        Choice of the set after an alarm, see `gridsec.secure.decode.gaussian.choose`. "density" is the
-        paper's, which prefers sets with few rows if observable parts differ in size; "tail" does not.
-    readmit
-        Consecutive passed tests of all sensors together, after an alarm, until all of them are trusted again;
-        0 for never, as printed.
-    refresh
-        Change of an entry of the covariance, relative to the standard deviations of its row and column, above
-        which the fusion is recomputed; 0 for every step.
-    tol
-        As in `partial_gaussian.fuse`.
-    """
-
-    filters: KalmanDesign
-    steady: Steady | None
-    sets: tuple[Parity, ...]
+    filters: KalmanDesign  # the partial filters
+    steady: Steady | None  # their stationary gain and covariance, if used; None for time-varying ones
+    sets: tuple[Parity, ...]  # all sensors first, then every set of p - q
+    # (N + 1,) Delta_TH for every number of degrees of freedom. With none, the statistic is not random, and a
+    # violation of size 1 alarms
     thresholds: Floats
+    # choice of the set after an alarm, see `gridsec.secure.decode.gaussian.choose`. "density" is the paper's,
+    # which prefers sets with few rows if observable parts differ in size; "tail" does not
     rule: Rule
+    # consecutive passed tests of all sensors together, after an alarm, until all of them are trusted again; 0
+    # for never, as printed
     readmit: int
+    # change of an entry of the covariance, relative to the standard deviations of its row and column, above
+    # which the fusion is recomputed; 0 for every step
     refresh: float
-    tol: float
+    tol: float  # as in `partial_gaussian.fuse`
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tables:
-    """Fusions computed so far under one covariance.
+    """Fusions computed so far under one covariance."""
 
-    Attributes
-    ----------
-    P : (mu, mu)
-        The covariance.
-    fused
-        One entry for each set; None until needed.
-    """
-
-    P: Floats
-    fused: tuple[Fused | None, ...]
+    P: Floats  # (mu, mu) the covariance
+    fused: tuple[Fused | None, ...]  # one entry for each set; None until needed
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GaussianState:
-    """State of filters and decoder.
+    """State of filters and decoder."""
 
-    Attributes
-    ----------
-    filters
-        The filters' state.
-    current
-        Index of the trusted set among the design's sets.
-    passed
-        Consecutive tests passed by all sensors together since the last alarm.
-    tables
-        Fusion in use.
-    """
-
-    filters: KalmanState
-    current: int
-    passed: int
-    tables: Tables
+    filters: KalmanState  # the filters' state
+    current: int  # index of the trusted set among the design's sets
+    passed: int  # consecutive tests passed by all sensors together since the last alarm
+    tables: Tables  # fusion in use
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GaussianOutcome:
-    """Result of one step.
+    """Result of one step."""
 
-    Attributes
-    ----------
-    t
-        Time of the estimated state, s.
-    x : (n,)
-        Estimate.
-    covariance : (n, n)
-        Covariance of its error, if the trusted sensors are unmanipulated.
-    trusted : (p,)
-        The sensors in use.
-    alarm
-        f: True if the set trusted before failed its test in this step.
-    g, threshold, freedom
-        Statistic of the set trusted *before* this step, its threshold, its degrees of freedom.
-    credible
-        True if the set trusted now passes its own test. Otherwise more than q sensors are attacked, or this
-        step is one of the expected false alarms of all sets.
-    """
-
-    t: float
-    x: Floats
-    covariance: Floats
-    trusted: Bools
-    alarm: bool
-    g: float
-    threshold: float
-    freedom: int
+    t: float  # time of the estimated state, s
+    x: Floats  # (n,) estimate
+    covariance: Floats  # (n, n) covariance of its error, if the trusted sensors are unmanipulated
+    trusted: Bools  # (p,) the sensors in use
+    alarm: bool  # f: True if the set trusted before failed its test in this step
+    g: float  # statistic of the set trusted *before* this step
+    threshold: float  # its threshold
+    freedom: int  # its degrees of freedom
+    # True if the set trusted now passes its own test. Otherwise more than q sensors are attacked, or this
+    # step is one of the expected false alarms of all sets
     credible: bool
 
 
@@ -280,39 +183,18 @@ def design(
 ) -> GaussianDesign:
     """Prepare Algorithm 4.2.
 
-    Parameters
-    ----------
-    filters
-        From `kalman.design`.
-    max_attacked
-        q, at least 1.
-    false_alarm
-        delta, in (0, 1).
-    tol
-        As in `partial_gaussian.fuse`; its square root is the tolerance of observability.
-    steady
-        From `kalman.steady`, for filters in steady state.
-    rule, readmit, refresh
-        As in `GaussianDesign`.
-
-    Raises
-    ------
-    NotObservable
-        Unless the pair is 2q-redundant detectable (lee2018, Proposition 4.3.1) and every set of p - q
-        sensors is redundant by itself.
-    DesignInfeasible
-        If there are more than `most` sets.
-    ValueError
-        If `max_attacked` is below 1, or `false_alarm` not inside (0, 1).
+    max_attacked: q, at least 1.
+    false_alarm: delta, in (0, 1).
+    tol: as in `partial_gaussian.fuse`; its square root is the tolerance of observability.
+    steady: from `kalman.steady`, for filters in steady state.
+    rule, readmit, refresh: as in `GaussianDesign`.
+    Raises NotObservable unless the pair is 2q-redundant detectable (lee2018, Proposition 4.3.1) and every set
+        of p - q sensors is redundant by itself. DesignInfeasible if there are more than `most` sets.
+        ValueError if `max_attacked` is below 1, or `false_alarm` not inside (0, 1).
     """
     if max_attacked < 1 or not 0.0 < false_alarm < 1.0:
-        raise InputInvalid(
-            [
-                Problem(
-                    "out-of-range",
-                    f"max_attacked is {max_attacked} (>= 1), false_alarm {false_alarm} (in (0, 1))",
-                )
-            ]
+        raise InputInvalid.of(
+            "out-of-range", f"max_attacked is {max_attacked} (>= 1), false_alarm {false_alarm} (in (0, 1))"
         )
     stacked = Stack.of(filters.stack.blocks)
     zero = float(np.sqrt(tol))
@@ -336,19 +218,10 @@ def init(
 ) -> tuple[GaussianState, GaussianOutcome]:
     """Initial state from the prior of the state and the first readings, with all sensors trusted.
 
-    Parameters
-    ----------
-    t
-        Time of those readings, s.
-    mean, covariance : (n,), (n, n)
-        Prior of the state; the covariance is not used by stationary filters.
-    y, seen : (p,), (p,)
-        As in `kalman.correct`.
-
-    Raises
-    ------
-    ValueError
-        If a stationary filter has no reading, or one is not finite.
+    t: time of those readings, s.
+    mean (n,), covariance (n, n): prior of the state; the covariance is not used by stationary filters.
+    y (p,), seen (p,): as in `kalman.correct`.
+    Raises ValueError if a stationary filter has no reading, or one is not finite.
     """
     first = kalman.init(design.filters, t, mean, covariance)
     if design.steady is None:
@@ -365,15 +238,8 @@ def step(
 ) -> tuple[GaussianState, GaussianOutcome]:
     """Step from the input u(k) and the readings y(k+1) to the estimate of x(k+1).
 
-    Parameters
-    ----------
-    y, u, seen : (p,), (m,), (p,)
-        As in `kalman.step`. Stationary filters need every reading.
-
-    Raises
-    ------
-    ValueError
-        If a stationary filter has no reading, or one is not finite.
+    y (p,), u (m,), seen (p,): as in `kalman.step`. Stationary filters need every reading.
+    Raises ValueError if a stationary filter has no reading, or one is not finite.
     """
     if design.steady is not None:
         _require_all(y, seen)
@@ -387,12 +253,7 @@ def step(
 
 
 def decode(design: GaussianDesign, state: GaussianState) -> tuple[GaussianState, GaussianOutcome]:
-    """Test the trusted set, choose another if it fails, and estimate.
-
-    References
-    ----------
-    lee2018, Algorithm 4.2.
-    """
+    """Test the trusted set, choose another if it fails, and estimate; lee2018, Algorithm 4.2."""
     z, now = state.filters.z, state.current
     tables, tested = _fused(design, state.tables, now)
     g, threshold = _score(tested, z), float(design.thresholds[tested.freedom])
@@ -429,8 +290,8 @@ def decode(design: GaussianDesign, state: GaussianState) -> tuple[GaussianState,
 
 def _require_all(y: Floats, seen: Bools | None) -> None:
     if not np.all(heard(y, seen)):
-        raise InputInvalid(
-            [Problem("missing", "filters with stationary gains need every reading; design without `steady`")]
+        raise InputInvalid.of(
+            "missing", "filters with stationary gains need every reading; design without `steady`"
         )
 
 

@@ -1,31 +1,24 @@
-"""l0 decoding: exact search, rows with bounds of their own, and recovery without enumeration.
+"""l0 decoding by exact search, for balls and for boxes, and recovery without enumeration.
 
-    F_(p,r)(z) = {Phi_Lambda^+ z_Lambda : |Lambda| = p - r},   q <= r <= 2q
+`exact` and `bounded` choose among the candidates
 
-always contains a good answer, so C(p, r) candidates take the place of R^n. One pass serves the
-noiseless decoder and the one for bounded noise; they differ in the criterion for an explained block.
+    F_(p,r)(z) = {Phi_Lambda^+ z_Lambda : |Lambda| = p - r},   q <= r <= 2q,
 
-    s = B xi + v + e,     |xi_i| <= 1,     |v_k| <= 1,     e zero in all but q blocks
+which always contain a good answer; C(p, r) of them take the place of R^n.
 
-xi is the state in units of its prior intervals: rows of an identity that cannot be attacked, such as a
-model's own prediction and loads within their intervals. For every set of q blocks the least-squares fit to
-all others is made. With W = (I + B B^T)^-1, Lambda the rows that are kept, D the others and
-``g = W_DD^-1 W_D s``,
+`fits` decodes rows with bounds of their own, `s = B xi + v + e` with |xi_i| <= 1, |v_k| <= 1 and e zero in
+all but q blocks. xi is the state in units of its prior intervals, which cannot be attacked. With
+``W = (I + B B^T)^-1``, Lambda the rows kept by a fit, D the others and ``g = W_DD^-1 W_D s``,
 
     residual_Lambda = W_Lambda s - W_LambdaD g,     residual_D = g,
 
-and both are known matrices times (xi, v). The largest value of a row of blocks without attack is therefore
-the sum of absolute values of its coefficients, attained by some xi and v; no norm is estimated.
+known matrices times (xi, v): the largest values without attack are sums of absolute coefficients.
 
-Both recover the error from `F z = F e`, F an annihilator of Phi, fast, but under stronger conditions than
-correctability; otherwise they may fail. `gridsec.secure.decode.search` has no such conditions.
+`decode_by_pursuit` and `decode_by_matching` recover e from `F z = F e`, F an annihilator of Phi, fast, but
+under stronger conditions than correctability.
 
-References
-----------
-lee2018 (2.2.4) to (2.2.6), (2.2.8) to (2.2.8''), Theorems 2.2.7 and 2.2.11.
-lee2018 (2.2.8') and Theorem 2.2.11 with r = q, for boxes instead of balls; docs/theory-partial-observers.md,
-section 8.
-lee2018, section 2.1.
+Source: lee2018, section 2.1, (2.2.4) to (2.2.6), (2.2.8) to (2.2.8''), Theorems 2.2.7 and 2.2.11; for boxes:
+docs/theory-partial-observers.md, section 8.
 """
 
 from __future__ import annotations
@@ -37,65 +30,38 @@ import numpy as np
 from scipy.optimize import linprog
 
 from gridsec.arrays import Bools, Floats, Ints, frozen, not_negative
-from gridsec.errors import DesignInfeasible, InputInvalid, Problem
+from gridsec.errors import DesignInfeasible, InputInvalid
 from gridsec.observers.lmi.solver import group_pursuit
 from gridsec.secure.decode.stacks import MOST_SUBSETS, Stack, annihilator, masked, require, subsets
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Decoder:
-    """Part of l0 decoding that does not depend on the measurements.
+    """Part of l0 decoding that does not depend on the measurements."""
 
-    Attributes
-    ----------
-    stack
-        Phi.
-    max_attacked
-        q, number of blocks that may be in error.
-    left_out
-        r, number of blocks that each candidate ignores.
-    kept : (S, p - r)
-        The blocks used by each candidate.
-    inverses : (S, n, N)
-        Pseudo-inverses of `Phi_Lambda`; zero in the columns of ignored blocks.
-    """
-
-    stack: Stack
-    max_attacked: int
-    left_out: int
-    kept: Ints
-    inverses: Floats
+    stack: Stack  # Phi
+    max_attacked: int  # q, number of blocks that may be in error
+    left_out: int  # r, number of blocks that each candidate ignores
+    kept: Ints  # (S, p - r) the blocks used by each candidate
+    inverses: Floats  # (S, n, N) pseudo-inverses of `Phi_Lambda`; zero in the columns of ignored blocks
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DecodeResult:
-    """Result for a batch of measurements.
+    """Result for a batch of measurements."""
 
-    Attributes
-    ----------
-    x : (…, n)
-        Decoded unknowns.
-    in_error : (…, p)
-        Blocks that x does not explain.
-    credible : (…)
-        True if these are at most q, as assumed. Otherwise more than q blocks are in error or the noise
-        exceeds its bound, and x is invalid.
-    residuals : (…, p)
-        Norms of `z_i - Phi_i x`.
-    """
-
-    x: Floats
-    in_error: Bools
+    x: Floats  # (…, n) decoded unknowns
+    in_error: Bools  # (…, p) blocks that x does not explain
+    # (…) True if these are at most q, as assumed. Otherwise more than q blocks are in error or the noise
+    # exceeds its bound, and x is invalid
     credible: Bools
-    residuals: Floats
+    residuals: Floats  # (…, p) norms of `z_i - Phi_i x`
 
 
 def cheapest(p: int, q: int) -> int:
     """The r in q … 2q with the fewest candidates C(p, r); of several the smallest, with most averaging.
 
-    References
-    ----------
-    lee2018, Remark 2.2.2.
+    Source: lee2018, Remark 2.2.2.
     """
     return min(range(q, 2 * q + 1), key=lambda r: (comb(p, r), r))
 
@@ -105,36 +71,18 @@ def design(
 ) -> Decoder:
     """Prepare l0 decoding.
 
-    Parameters
-    ----------
-    stack
-        Phi; must be q-error correctable.
-    max_attacked
+    stack: Phi; must be q-error correctable.
+    tol: tolerance of that test, relative to blocks of norm one.
+    left_out: r between q and 2q; by default the cheapest.
+    Raises NotObservable if Phi is not q-error correctable; the message lists sensors with a loss that proves
+        it. DesignInfeasible if there would be more than `most` candidates. ValueError unless 0 <= q <= r <= 2
         q.
-    tol
-        Tolerance of that test, relative to blocks of norm one.
-    left_out
-        r between q and 2q; by default the cheapest.
-
-    Raises
-    ------
-    NotObservable
-        If Phi is not q-error correctable; the message lists sensors with a loss that proves it.
-    DesignInfeasible
-        If there would be more than `most` candidates.
-    ValueError
-        Unless 0 <= q <= r <= 2 q.
     """
     q = max_attacked
     r = cheapest(stack.count, q) if left_out is None else left_out
     if q < 0 or not q <= r <= 2 * q:
-        raise InputInvalid(
-            [
-                Problem(
-                    "out-of-range",
-                    f"r = {r} with q = {q}; expected 0 <= q <= r <= 2 q (lee2018, Theorem 2.2.7)",
-                )
-            ]
+        raise InputInvalid.of(
+            "out-of-range", f"r = {r} with q = {q}; expected 0 <= q <= r <= 2 q (lee2018, Theorem 2.2.7)"
         )
     require(stack, 2 * q, tol, f"undoing {q} errors")
     kept = subsets(stack.count, stack.count - r, most)
@@ -145,16 +93,9 @@ def design(
 def exact(decoder: Decoder, z: Floats, *, tol: float) -> DecodeResult:
     """Noiseless l0 decoding: recovers x exactly from any error in at most q blocks.
 
-    Parameters
-    ----------
-    z : (…, N)
-        Measurements, finite.
-    tol
-        A block counts as explained if its residual is at most this times `|z_i| + |Phi_i| |x|`.
-
-    References
-    ----------
-    lee2018 (2.2.6), Theorem 2.2.7.
+    z (…, N): measurements, finite.
+    tol: a block counts as explained if its residual is at most this times `|z_i| + |Phi_i| |x|`.
+    Source: lee2018 (2.2.6), Theorem 2.2.7.
     """
     size = np.linalg.norm(decoder.stack.blocks(), 2, axis=(1, 2)) if decoder.stack.matrix.size else 0.0
     x = _candidates(decoder, z)
@@ -165,26 +106,12 @@ def exact(decoder: Decoder, z: Floats, *, tol: float) -> DecodeResult:
 def bounded(decoder: Decoder, z: Floats, *, limit: Floats | float) -> DecodeResult:
     """l0 decoding with bounded noise: fewest blocks with a residual above a limit.
 
-    Parameters
-    ----------
-    z : (…, N)
-        Measurements, finite.
-    limit : scalar or (…, 1) or (…, p)
-        `v'_max = theta v_max`, for which `gridsec.secure.decode.noise` gives the error bound; not negative.
-
-    Returns
-    -------
-    Decoded
-        Of several minimisers the one with the best fit of the explained blocks; the bound holds for all.
-
-    Raises
-    ------
-    ValueError
-        If a limit is negative or NaN.
-
-    References
-    ----------
-    lee2018 (2.2.8'), Proposition 2.2.10, Theorem 2.2.11.
+    z (…, N): measurements, finite.
+    limit (scalar or (…, 1) or (…, p)): `v'_max = theta v_max`, for which `gridsec.secure.decode.noise` gives
+        the error bound; not negative.
+    Of several minimisers, returns the one with the best fit of the explained blocks; the bound holds for all.
+    Raises ValueError if a limit is negative or NaN.
+    Source: lee2018 (2.2.8'), Proposition 2.2.10, Theorem 2.2.11.
     """
     wide = not_negative("limit", limit)
     return _vote(decoder, z, _candidates(decoder, z), wide if wide.ndim == 0 else wide[..., None, :])
@@ -217,31 +144,19 @@ def _vote(decoder: Decoder, z: Floats, x: Floats, limit: Floats) -> DecodeResult
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fits:
-    """Fits that leave q blocks out, for all sets. S sets, p blocks, A rows, n unknowns, F functionals.
+    """Fits that leave q blocks out, for all sets. S sets, p blocks, A rows, n unknowns, F functionals."""
 
-    Attributes
-    ----------
-    left_out : (S, p)
-        The blocks left out by each fit.
-    residual, limit : (S, A)
-        ``s - B xi_hat`` and its largest value if all blocks outside the set are unmanipulated and, for rows
-        of the set, these as well.
-    reach : (A,)
-        Largest value of ``|s|`` of an unmanipulated row: the limit of the fit without blocks.
-    disagree : (S, p)
-        Blocks with a residual above its limit, or a value above `reach`.
-    xi : (S, n)
-        Fitted unknowns.
-    error : (S, F)
-        Bound of ``|f (xi - xi_hat)|`` for each functional, if all blocks outside the set are unmanipulated.
-    """
-
-    left_out: Bools
-    residual: Floats
+    left_out: Bools  # (S, p) the blocks left out by each fit
+    residual: Floats  # (S, A) `s - B xi_hat`
+    # (S, A) largest residual if all blocks outside the set, and for rows of the set these too, are
+    # unmanipulated
     limit: Floats
+    # (A,) largest value of ``|s|`` of an unmanipulated row: the limit of the fit without blocks
     reach: Floats
-    disagree: Bools
-    xi: Floats
+    disagree: Bools  # (S, p) blocks with a residual above its limit, or a value above `reach`
+    xi: Floats  # (S, n) fitted unknowns
+    # (S, F) bound of ``|f (xi - xi_hat)|`` for each functional, if all blocks outside the set are
+    # unmanipulated
     error: Floats
 
     @property
@@ -270,25 +185,12 @@ def fits(  # noqa: PLR0917  # the terms of s = B xi + v, then the requested boun
 ) -> Fits:
     """Fit the unknowns without every set of q blocks, with the limits of unmanipulated rows.
 
-    Parameters
-    ----------
-    B : (A, n)
-        Rows that can be attacked, in units of their own bounds.
-    s : (A,)
-        Their values.
-    block : (A,)
-        Block of each row. A block without rows can be left out too, and never disagrees.
-    blocks
-        p.
-    q
-        Number of blocks that each fit leaves out; all of them if fewer have rows.
-    functionals : (F, n)
-        Functionals to bound.
-
-    Raises
-    ------
-    DesignInfeasible
-        If there are more sets.
+    B (A, n): rows that can be attacked, in units of their own bounds.
+    s (A,): their values.
+    block (A,): block of each row. A block without rows can be left out too, and never disagrees.
+    q: number of blocks that each fit leaves out; all of them if fewer have rows.
+    functionals (F, n): functionals to bound.
+    Raises DesignInfeasible if there are more than `most` sets.
     """
     present = np.unique(block)
     chosen = present[subsets(present.size, min(q, present.size), most)]
@@ -348,18 +250,10 @@ def _without(whole: _Whole, out: Bools, functionals: Floats) -> tuple[Floats, Fl
 def restricted_isometry(F: Floats, k: int, *, most: int = MOST_SUBSETS) -> float:
     """Smallest delta_k with `(1 - delta) |e|^2 <= |F e|^2 <= (1 + delta) |e|^2` for all k-sparse e.
 
-    Parameters
-    ----------
-    F : (m, p)
-        Sensing matrix. Its scale matters.
-    k
-        Order.
-    most
-        Largest number of subsets of columns.
-
-    References
-    ----------
-    lee2018, Definition 2.1.1.
+    F (m, p): sensing matrix. Its scale matters.
+    k: order.
+    most: largest number of subsets of columns.
+    Source: lee2018, Definition 2.1.1.
     """
     columns = subsets(F.shape[1], min(k, F.shape[1]), most)
     gram = F.T @ F
@@ -368,28 +262,13 @@ def restricted_isometry(F: Floats, k: int, *, most: int = MOST_SUBSETS) -> float
 
 
 def basis_pursuit(F: Floats, y: Floats) -> Floats:
-    """Minimise `|e|_1` subject to `F e = y`, as a linear program.
+    """Minimise `|e|_1` over e (p,) subject to `F e = y`, as a linear program.
 
-    Parameters
-    ----------
-    F : (m, p)
-        Sensing matrix.
-    y : (m,)
-        Observation.
+    The result is the sparse one if `delta_2q < sqrt(2) - 1`.
 
-    Returns
-    -------
-    (p,)
-        e; the sparse one if `delta_2q < sqrt(2) - 1`.
-
-    Raises
-    ------
-    DesignInfeasible
-        If no e satisfies the constraint.
-
-    References
-    ----------
-    lee2018 (2.1.4), Theorem 2.1.1.
+    F (m, p), y (m,).
+    Raises DesignInfeasible if no e satisfies the constraint.
+    Source: lee2018 (2.1.4), Theorem 2.1.1.
     """
     p = F.shape[1]
     size = float(np.max(np.abs(y), initial=0.0))
@@ -405,28 +284,14 @@ def basis_pursuit(F: Floats, y: Floats) -> Floats:
 def matching_pursuit(F: Floats, y: Floats, q: int, *, heights: Ints | None = None) -> tuple[Floats, Ints]:
     """Orthogonal matching pursuit: q times the block of columns that explains the residual best.
 
-    Parameters
-    ----------
-    F : (m, N)
-        Sensing matrix.
-    y : (m,)
-        Observation.
-    q
-        Number of blocks to choose.
-    heights : (p,)
-        Columns per block; single columns by default, which is the paper's algorithm. A block's
+    F (m, N), y (m,).
+    q: number of blocks to choose.
+    heights (p,): columns per block; single columns by default, which is the paper's algorithm. A block's
         correlation is the norm of the projection of the residual on its columns.
-
-    Returns
-    -------
-    e : (N,)
-        Least squares on the chosen blocks, zero elsewhere.
-    chosen : (q,)
-        The blocks, in the order of their choice; fewer if the residual vanishes or all are chosen earlier.
-
-    References
-    ----------
-    lee2018, Algorithm 2.1, Theorem 2.1.2.
+    Returns e (N,): least squares on the chosen blocks, zero elsewhere.
+    Returns chosen (q,): the blocks, in the order of their choice; fewer if the residual vanishes or all are
+        chosen earlier.
+    Source: lee2018, Algorithm 2.1, Theorem 2.1.2.
     """
     sizes = np.ones(F.shape[1], dtype=np.intp) if heights is None else heights
     parts = np.split(np.arange(F.shape[1]), np.cumsum(sizes)[:-1])
@@ -451,23 +316,10 @@ def decode_by_pursuit(stack: Stack, z: Floats, *, tol: float) -> Floats:
     A stack of single rows is solved as a linear program; otherwise `sum_i |e_i|_2` is minimised, a
     second-order cone program, because an attack has no pattern within the block of its sensor.
 
-    Parameters
-    ----------
-    stack
-        Phi of full column rank.
-    z : (N,)
-        Measurements.
-    tol
-        As in `annihilator`.
-
-    Returns
-    -------
-    (n,)
-        `Phi^+ (z - e)`.
-
-    References
-    ----------
-    lee2018 (2.1.4); Remark 2.2.2.
+    stack: Phi of full column rank.
+    z (N,). tol: as in `annihilator`.
+    Returns (n,): `Phi^+ (z - e)`.
+    Source: lee2018 (2.1.4); Remark 2.2.2.
     """
     F = annihilator(stack.matrix, tol=tol)
     single = bool(np.all(stack.heights == 1))
@@ -476,15 +328,7 @@ def decode_by_pursuit(stack: Stack, z: Floats, *, tol: float) -> Floats:
 
 
 def decode_by_matching(stack: Stack, z: Floats, q: int, *, tol: float) -> tuple[Floats, Ints]:
-    """Decode by orthogonal matching pursuit; x and the blocks assumed in error.
-
-    Parameters
-    ----------
-    stack, z, tol
-        As in `decode_by_pursuit`.
-    q
-        Number of blocks in error.
-    """
+    """Decode by orthogonal matching pursuit; x, and the q blocks assumed in error."""
     F = annihilator(stack.matrix, tol=tol)
     e, chosen = matching_pursuit(F, F @ z, q, heights=stack.heights)
     return np.asarray(np.linalg.lstsq(stack.matrix, z - e, rcond=None)[0]), chosen

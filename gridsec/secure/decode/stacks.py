@@ -5,23 +5,21 @@
 Block i belongs to sensor i: one row of an output matrix, an observability matrix, the rows of a
 partial observer. Blocks may have different heights, and may be empty.
 
-References
-----------
-lee2018, sections 2.1, 2.2.1 and 2.2.2. Corrections: docs/errata/lee2018-chapter-2.md.
+Source: lee2018, sections 2.1, 2.2.1 and 2.2.2. Corrections: docs/errata/lee2018-chapter-2.md.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import chain, combinations
 from math import comb
 
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, frozen, frozen_ints, unit_rows
-from gridsec.errors import DesignInfeasible, InputInvalid, NotObservable, Problem
-from gridsec.secure.index import Sparsest, fewest, kernel, row_space
+from gridsec.errors import DesignInfeasible, InputInvalid, NotObservable
+from gridsec.secure.index import Sparsest, fewest, kernel, padded, row_space
+from gridsec.secure.subsets import combinations_of
 
 MOST_SUBSETS = 200_000
 """Default limit of enumerated subsets of sensors in a design."""
@@ -31,40 +29,23 @@ MOST_SUBSETS = 200_000
 class Stack:
     """A coding matrix in p blocks of rows.
 
-    Attributes
-    ----------
-    matrix : (N, n)
-        Phi.
-    heights : (p,)
-        Rows of each block; they sum to N.
-    membership : (N, p)
-        1 where a row belongs to a block, else 0. Derived.
-
-    Raises
-    ------
-    ValueError
-        If heights are negative, or do not sum to the rows of the matrix.
+    Raises ValueError if heights are negative, or do not sum to the rows of the matrix.
     """
 
-    matrix: Floats
-    heights: Ints
-    membership: Floats = field(init=False)
+    matrix: Floats  # (N, n) Phi
+    heights: Ints  # (p,) rows of each block; they sum to N
+    membership: Floats = field(init=False)  # (N, p) 1 where a row belongs to a block, else 0. Derived
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "matrix", frozen(self.matrix))
         object.__setattr__(self, "heights", frozen_ints(self.heights))
         if self.matrix.ndim != 2 or self.heights.ndim != 1 or np.any(self.heights < 0):
-            raise InputInvalid(
-                [Problem("shape", "a stack needs a matrix and one height, not negative, for every block")]
+            raise InputInvalid.of(
+                "shape", "a stack needs a matrix and one height, not negative, for every block"
             )
         if int(self.heights.sum()) != self.matrix.shape[0]:
-            raise InputInvalid(
-                [
-                    Problem(
-                        "shape",
-                        f"heights sum to {self.heights.sum()}; the matrix has {self.matrix.shape[0]} rows",
-                    )
-                ]
+            raise InputInvalid.of(
+                "shape", f"heights sum to {self.heights.sum()}; the matrix has {self.matrix.shape[0]} rows"
             )
         block = np.repeat(np.arange(self.heights.size), self.heights)
         object.__setattr__(self, "membership", frozen(np.eye(self.heights.size)[block]))
@@ -95,11 +76,8 @@ class Stack:
 
     def blocks(self) -> Floats:
         """The blocks as one array, short ones padded with zero rows; (p, largest height, n)."""
-        tall = int(np.max(self.heights, initial=0))
-        out = np.zeros((self.count, tall, self.unknowns))
-        for i, at in enumerate(np.split(self.matrix, np.cumsum(self.heights)[:-1])):
-            out[i, : len(at)] = at
-        return out
+        blocks = np.split(self.matrix, np.cumsum(self.heights)[:-1])
+        return np.asarray(padded(blocks, self.unknowns), dtype=np.float64)
 
     def norms(self, z: Floats) -> Floats:
         """Euclidean norm of every block of a stacked vector, (…, N) -> (…, p)."""
@@ -113,18 +91,10 @@ class Stack:
 def cospark(stack: Stack, *, tol: float, below: float = 0.0) -> Sparsest:
     """Fewest blocks in which `Phi x` is not zero, over all x != 0.
 
-    Parameters
-    ----------
-    stack
-        Phi. Every block is scaled to norm one first, which changes no support.
-    tol
-        Tolerance of zero after that; blocks shorter than this, relative to the longest, count as zero.
-    below
-        As in `gridsec.secure.index.fewest`.
-
-    References
-    ----------
-    lee2018, Notation and Symbols; Remark 2.2.1.
+    stack: Phi. Every block is scaled to norm one first, which changes no support.
+    tol: tolerance of zero after that; blocks shorter than this, relative to the longest, count as zero.
+    below: as in `gridsec.secure.index.fewest`.
+    Source: lee2018, Notation and Symbols; Remark 2.2.1.
     """
     blocks = np.split(stack.matrix, np.cumsum(stack.heights)[:-1])
     size = stack.norms(np.linalg.norm(stack.matrix, axis=1))
@@ -136,22 +106,11 @@ def cospark(stack: Stack, *, tol: float, below: float = 0.0) -> Sparsest:
 def spark(F: Floats, *, tol: float) -> Sparsest:
     """Fewest columns of F that are linearly dependent, with the coefficients of the dependence.
 
-    Parameters
-    ----------
-    F : (m, p)
-        Sensing matrix. Columns are scaled to norm one first.
-    tol
-        Tolerance of zero after that; columns shorter than this, relative to the longest, count as zero.
-
-    Returns
-    -------
-    Sparsest
-        `blocks` are the columns, `direction` (p,) is a vector with `F direction = 0`; the count is
-        infinite if the columns are independent.
-
-    References
-    ----------
-    lee2018 (2.1.2): `cospark(C) = spark(F)` whenever F annihilates C and nothing else.
+    F (m, p): sensing matrix. Columns are scaled to norm one first.
+    tol: tolerance of zero after that; columns shorter than this, relative to the longest, count as zero.
+    Returns the columns as `blocks`, and a `direction` (p,) with `F direction = 0`; the count is infinite if
+        the columns are independent.
+    Source: lee2018 (2.1.2): `cospark(C) = spark(F)` whenever F annihilates C and nothing else.
     """
     unit = unit_rows(F.T, tol=tol).T
     size = np.where(unit.any(axis=0), np.linalg.norm(F, axis=0), 1.0)
@@ -163,38 +122,20 @@ def spark(F: Floats, *, tol: float) -> Sparsest:
 def error_detectable(stack: Stack, q: int, *, tol: float) -> bool:
     """True if no error in q blocks equals the effect of a change of x: `cospark > q`.
 
-    Parameters
-    ----------
-    stack, tol
-        As in `cospark`.
-    q
-        Number of blocks in error.
-
-    References
-    ----------
-    lee2018, Definition 2.2.2 and Proposition 2.2.2.
+    stack, tol: as in `cospark`.
+    q: number of blocks in error.
+    Source: lee2018, Definition 2.2.2 and Proposition 2.2.2.
     """
     return cospark(stack, tol=tol, below=q + 1).count > q
 
 
 def error_correctable(stack: Stack, q: int, *, tol: float) -> bool:
-    """True if x is determined under any errors in q blocks: `cospark > 2 q`.
-
-    References
-    ----------
-    lee2018, Definition 2.2.3 and Proposition 2.2.3.
-    """
+    """True if x is determined under any errors in q blocks: `cospark > 2 q`; lee2018, Definition 2.2.3."""
     return error_detectable(stack, 2 * q, tol=tol)
 
 
 def require(stack: Stack, lost: int, tol: float, purpose: str) -> None:
-    """Raise NotObservable unless x stays determined after the loss of any `lost` blocks.
-
-    Raises
-    ------
-    NotObservable
-        If it is not; the message lists sensors with a loss that proves it.
-    """
+    """Raise NotObservable, with a proof, unless x stays determined after the loss of any `lost` blocks."""
     found = cospark(stack, tol=tol, below=lost + 1)
     if found.count > lost:
         return
@@ -212,10 +153,7 @@ def require(stack: Stack, lost: int, tol: float, purpose: str) -> None:
 def subsets(p: int, size: int, most: int) -> Ints:
     """All subsets of a size, each ascending, in lexicographic order; (C(p, size), size).
 
-    Raises
-    ------
-    DesignInfeasible
-        If there are more than `most`.
+    Raises DesignInfeasible if there are more than `most`.
     """
     count = comb(p, size)
     if count > most:
@@ -224,25 +162,11 @@ def subsets(p: int, size: int, most: int) -> Ints:
             f"{count} subsets; at most {most} allowed",
             code="too-many",
         )
-    flat = np.fromiter(chain.from_iterable(combinations(range(p), size)), dtype=np.intp, count=count * size)
-    return flat.reshape(count, size)
+    return combinations_of(p, size)
 
 
 def masked(stack: Stack, kept: Ints) -> Floats:
-    """Phi with all rows outside some blocks set to zero, for several sets at once.
-
-    Parameters
-    ----------
-    stack
-        Phi.
-    kept : (S, k)
-        Blocks that stay.
-
-    Returns
-    -------
-    (S, N, n)
-        The paper's `Phi_Lambda`; its pseudo-inverse has zero columns for all other rows.
-    """
+    """Phi with zero rows outside the blocks `kept` (S, k), the paper's `Phi_Lambda`; (S, N, n)."""
     keep = np.zeros((len(kept), stack.count))
     np.put_along_axis(keep, kept, 1.0, axis=1)
     return (keep @ stack.membership.T)[:, :, None] * stack.matrix
@@ -251,21 +175,11 @@ def masked(stack: Stack, kept: Ints) -> Floats:
 def annihilator(matrix: Floats, *, tol: float) -> Floats:
     """Orthonormal rows F with `F C = 0` and the range of C as kernel.
 
-    Parameters
-    ----------
-    matrix : (N, n)
-        C.
-    tol
-        Singular values up to this, times the largest, count as zero.
-
-    Returns
-    -------
-    (N - rank C, N)
-        N - n rows for C of full column rank: n (p - 1) for p blocks of n rows, not (n - 1) p.
-
-    References
-    ----------
-    lee2018 (2.1.2) and Corollary 2.2.5, with corrected dimensions: docs/errata/lee2018-chapter-2.md.
+    matrix (N, n): C.
+    tol: singular values up to this, times the largest, count as zero.
+    Returns (N - rank C, N): N - n rows for C of full column rank: n (p - 1) for p blocks of n rows, not (n -
+        1) p.
+    Source: lee2018 (2.1.2) and Corollary 2.2.5, with corrected dimensions: docs/errata/lee2018-chapter-2.md.
     """
     size = float(np.linalg.norm(matrix, 2)) if matrix.size else 0.0
     return np.ascontiguousarray(kernel(matrix.T / (size or 1.0), tol).T)
@@ -274,21 +188,10 @@ def annihilator(matrix: Floats, *, tol: float) -> Floats:
 def residual(stack: Stack, z: Floats) -> Floats:
     """Residual `z - Phi Phi^+ z`, not explained by any x.
 
-    Parameters
-    ----------
-    stack
-        Phi of full column rank.
-    z : (…, N)
-        Stacked measurements.
-
-    Returns
-    -------
-    (…, N)
-        Zero if and only if the error is undetectable.
-
-    References
-    ----------
-    lee2018 (2.2.3), Lemmas 2.2.1 and 2.2.4.
+    stack: Phi of full column rank.
+    z (…, N): stacked measurements.
+    Returns (…, N): zero if and only if the error is undetectable.
+    Source: lee2018 (2.2.3), Lemmas 2.2.1 and 2.2.4.
     """
     Q, _ = np.linalg.qr(stack.matrix)
     return np.asarray(z - (z @ Q) @ Q.T)
@@ -297,21 +200,10 @@ def residual(stack: Stack, z: Floats) -> Floats:
 def clean(stack: Stack, z: Floats, *, tol: float) -> Bools:
     """Test that noiseless measurements are free of error, for at most `cospark - 1` blocks in error.
 
-    Parameters
-    ----------
-    stack, z
-        As in `residual`.
-    tol
-        A residual up to this, relative to z, counts as zero.
-
-    Returns
-    -------
-    (…)
-        True without an error. `Phi^+ z` is then x.
-
-    References
-    ----------
-    lee2018, Lemma 2.2.4.
+    stack, z: as in `residual`.
+    tol: a residual up to this, relative to z, counts as zero.
+    Without an error, `Phi^+ z` is x.
+    Source: lee2018, Lemma 2.2.4.
     """
     r = np.linalg.norm(residual(stack, z), axis=-1)
     return np.asarray(r <= tol * np.linalg.norm(z, axis=-1))
@@ -323,18 +215,9 @@ def sensors_in_error(stack: Stack, z: Floats, x: Floats, limit: Floats | float) 
     With at most q blocks in error and a q-error correctable Phi, an x is correct if and only if this is at
     most q: exactly for noiseless z and limit 0, approximately for limit `theta v_max`.
 
-    Parameters
-    ----------
-    stack
-        Phi.
-    z, x : (…, N), (…, n)
-        Measurements and candidates.
-    limit : scalar or (…, p)
-        Largest norm of a residual that counts as explained.
-
-    References
-    ----------
-    lee2018, Lemma 2.2.8 and Theorem 2.2.12.
+    z (…, N), x (…, n): measurements and candidates.
+    limit (scalar or (…, p)): largest norm of a residual that counts as explained.
+    Source: lee2018, Lemma 2.2.8 and Theorem 2.2.12.
     """
     # Negated comparison: a residual of NaN counts.
     return np.asarray(np.count_nonzero(~(stack.norms(z - x @ stack.matrix.T) <= limit), axis=-1))

@@ -19,12 +19,14 @@ from pandapower import networks
 from pandapower.toolbox import drop_trafos, select_subnet
 
 from feeders.convert.convert import RECIPES, SEED, convert
-from feeders.convert.from_pandapower import Fleet, from_pandapower
+from feeders.convert.customers import Fleet
+from feeders.convert.from_pandapower import read_pandapower
 from feeders.convert.from_simbench import envelope, envelopes_csv, library_csv
+from feeders.convert.network import feeder_of
 from feeders.convert.provenance import SourceUnreadable, origin, sentences
 from feeders.format.tables import read, validate
-from feeders.model.profiles import Season, data_root, envelopes
 from feeders.model.site import from_tables, load, names
+from feeders.profiles import Season, data_root, envelopes
 from gridsec.errors import FeederInvalid, GridsecError
 from gridsec.grid.phased import PhasedFeeder
 from tests.codes import refused
@@ -171,7 +173,7 @@ def street() -> Any:
 
 
 def test_everything_is_carried_over_or_named() -> None:
-    converted = from_pandapower(street(), "street", title="A street")
+    converted = feeder_of(read_pandapower(street()), "street", title="A street")
     tables, notes = converted.tables, sentences(converted.changes)
     assert validate(tables) == ()
     lines = {line.line: line for line in tables.lines}
@@ -213,7 +215,7 @@ def test_everything_is_carried_over_or_named() -> None:
 
 
 def test_power_factor_interval_holds_the_profiles_history() -> None:
-    tables = from_pandapower(street(), "street").tables
+    tables = feeder_of(read_pandapower(street()), "street").tables
     for row in tables.customers:
         if row.load_kw == 0.0 or row.power_factor is None or row.q_floor_kvar is None:
             continue
@@ -229,7 +231,7 @@ def test_power_factor_interval_holds_the_profiles_history() -> None:
 
 def test_single_phase_loads_become_single_phase_customers() -> None:
     net = networks.ieee_european_lv_asymmetric("on_peak_566")
-    converted = from_pandapower(net, "european")
+    converted = feeder_of(read_pandapower(net), "european")
     tables, notes = converted.tables, sentences(converted.changes)
     assert validate(tables) == ()
     loads = net.asymmetric_load
@@ -246,7 +248,7 @@ def test_single_phase_loads_become_single_phase_customers() -> None:
 
 def test_synthetic_fleet() -> None:
     net = networks.create_kerber_landnetz_freileitung_1()
-    converted = from_pandapower(net, "fleet", fleet=Fleet(3, 0.0, "asnzs4777-a"))
+    converted = feeder_of(read_pandapower(net), "fleet", fleet=Fleet(3, 0.0, "asnzs4777-a"))
     tables, added = converted.tables, [each for each in converted.changes if each.done == "added"]
     with_inverter = [k for k, row in enumerate(tables.customers) if row.inverter_kva > 0]
     assert with_inverter == list(range(0, 13, 3))
@@ -258,13 +260,13 @@ def test_synthetic_fleet() -> None:
 def test_ambiguous_and_unknown_busbars() -> None:
     net = networks.create_cigre_network_lv()
     with refused(GridsecError, "busbar-unclear") as caught:
-        from_pandapower(net, "x")
+        feeder_of(read_pandapower(net), "x")
     assert "Bus R1, Bus I1, Bus C1" in str(caught.value)
     with refused(GridsecError, "unknown-name"):
-        from_pandapower(net, "x", root="Bus X")
-    commercial = from_pandapower(net, "x", root="Bus C1").tables
+        feeder_of(read_pandapower(net), "x", root="Bus X")
+    commercial = feeder_of(read_pandapower(net), "x", root="Bus C1").tables
     assert all(row.customer.startswith("Load C") for row in commercial.customers)
-    by_index = from_pandapower(net, "x", root=str(net.bus.index[net.bus.name == "Bus C1"][0]))
+    by_index = feeder_of(read_pandapower(net), "x", root=str(net.bus.index[net.bus.name == "Bus C1"][0]))
     assert by_index.tables == commercial
 
 
@@ -455,7 +457,7 @@ def test_other_infeeds_and_deeper_transformers_are_named() -> None:
     below = pp.create_bus(net, 0.23, name="below")
     pp.create_transformer_from_parameters(net, 2, below, 0.05, 0.4, 0.23, 1.0, 4.0, 0.1, 0.5)
     with refused(FeederInvalid, "several-sources"):
-        from_pandapower(net, "x", root="busbar")
+        feeder_of(read_pandapower(net), "x", root="busbar")
     net.ext_grid.loc[1, "in_service"] = False
-    said = "\n".join(sentences(from_pandapower(net, "x", root="busbar").changes))
+    said = "\n".join(sentences(feeder_of(read_pandapower(net), "x", root="busbar").changes))
     assert "load side of transformer trafo-1; 1 bus became a customer" in said

@@ -16,8 +16,8 @@ from power_grid_model import ComponentType
 from feeders.convert import from_opendss, from_power_grid_model
 from feeders.convert.convert import convert
 from feeders.convert.customers import in_star
-from feeders.convert.from_pandapower import from_pandapower
-from feeders.convert.network import Converted
+from feeders.convert.from_pandapower import read_pandapower
+from feeders.convert.network import Converted, feeder_of
 from feeders.convert.round_trip import UNBALANCED_PU, compare
 from feeders.format.tables import read, validate
 
@@ -137,7 +137,7 @@ def filled(tables: Iterable[str]) -> Converted:
         FILLED[table][0](net)
         assert len(net[table])
     net["wishes"] = net.load[["name"]].copy()
-    converted = from_pandapower(net, "x", root="root")
+    converted = feeder_of(read_pandapower(net), "x", root="root")
     said = fates(converted)
     wanted = {**{table: FILLED[table][1] for table in tables}, "wishes": "table wishes, "}
     assert [table for table, fate in wanted.items() if not any(fate in one for one in said)] == []
@@ -170,7 +170,7 @@ def test_between_phases_as_pandapower_solves_it() -> None:
     pp.create_sgen(net, 3, **three, type="delta", name="turbine")
     pp.create_sgen(net, 3, 0.006, type="WP", name="wind")
     pp.create_load(net, 2, 0.02, name="beside", type="delta", in_service=False)
-    converted = from_pandapower(net, "x", root="root")
+    converted = feeder_of(read_pandapower(net), "x", root="root")
     assert converted.state is not None
     check = compare(converted.state, converted.tables)
     assert (check.three_phase, check.largest_pu < UNBALANCED_PU) == (True, True)
@@ -198,7 +198,7 @@ def test_a_capacitor_takes_what_its_table_has_for_its_step() -> None:
     net["shunt_characteristic_table"] = pd.DataFrame(
         {"id_characteristic": [0, 0, 1], "step": [1, 2, 2], "q_mvar": [-0.004, -0.007, -9.0], "p_mw": 0.0}
     )
-    converted = from_pandapower(net, "x", root="root")
+    converted = feeder_of(read_pandapower(net), "x", root="root")
     assert converted.state is not None
     assert compare(converted.state, converted.tables).exact
     assert not [fate for fate in fates(converted) if "characteristic" in fate]
@@ -211,7 +211,7 @@ def test_batteries_and_plants_that_draw() -> None:
     pp.create_storage(net, 3, -0.004, 1.0, name="full")
     pp.create_storage(net, 3, 0.003, 1.0, name="empty")
     pp.create_sgen(net, 2, -0.001, name="standby")
-    converted = from_pandapower(net, "x", root="root")
+    converted = feeder_of(read_pandapower(net), "x", root="root")
     assert converted.state is not None
     assert compare(converted.state, converted.tables).exact
     assert converted.state.power_kva["storage full"] == pytest.approx(-4.0)

@@ -14,7 +14,8 @@ from power_grid_model.utils import json_serialize_to_file
 from typer.testing import CliRunner
 
 from feeders.convert.convert import Conversion, convert
-from feeders.convert.from_pandapower import from_pandapower
+from feeders.convert.from_pandapower import read_pandapower
+from feeders.convert.network import feeder_of
 from feeders.convert.provenance import BusbarUnclear
 from feeders.convert.round_trip import UNBALANCED_PU, compare
 from feeders.model.site import load
@@ -105,7 +106,7 @@ def test_a_switch_with_an_impedance_in_three_phases() -> None:
     beyond = pp.create_bus(net, 0.4, name="beyond")
     pp.create_switch(net, 3, beyond, "b", z_ohm=0.002)
     pp.create_asymmetric_load(net, beyond, p_a_mw=0.004, p_c_mw=0.001, name="flat")
-    done = from_pandapower(net, "x")
+    done = feeder_of(read_pandapower(net), "x")
     assert done.state is not None
     assert ("switch switch-0", "impedance") in {(each.element, each.prop) for each in done.changes}
     assert not compare(done.state, done.tables).exact
@@ -220,7 +221,7 @@ def test_the_check_does_not_depend_on_the_base_of_the_source() -> None:
         net = street(6, base_mva=base, **ZERO)
         for bus in (3, 5, 6):
             pp.create_asymmetric_load(net, bus, p_a_mw=0.006, p_c_mw=0.002, q_a_mvar=0.003)
-        done = from_pandapower(net, "x")
+        done = feeder_of(read_pandapower(net), "x")
         assert done.state is not None
         check = compare(done.state, done.tables)
         assert check.largest_pu < 1e-3 * UNBALANCED_PU
@@ -239,7 +240,7 @@ def test_a_source_without_voltages_is_named_as_such(tmp_path: Path) -> None:
 
 
 def test_a_voltage_without_the_other_is_no_agreement() -> None:
-    done = from_pandapower(street(4), "x")
+    done = feeder_of(read_pandapower(street(4)), "x")
     state = done.state
     assert state is not None
     assert compare(state, done.tables).exact
@@ -255,5 +256,5 @@ def test_without_a_source_the_busbar_has_to_be_named() -> None:
     net = street(3)
     net.ext_grid["in_service"] = False
     with refused(BusbarUnclear, "busbar-unclear"):
-        from_pandapower(net, "x")
-    assert from_pandapower(net, "x", root="b0").tables.meta.busbar == "b0"
+        feeder_of(read_pandapower(net), "x")
+    assert feeder_of(read_pandapower(net), "x", root="b0").tables.meta.busbar == "b0"

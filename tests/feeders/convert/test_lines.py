@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from feeders.convert.lines import merged
-from feeders.convert.provenance import ConversionChange
+from feeders.convert.provenance import Changes, ConversionChange
 from feeders.format.tables import LineRow
 from feeders.model.three_phase import series_of
 
@@ -25,7 +25,7 @@ LINE = LineRow("one", "s", "t", 0.08, 0.07, rating_a=200.0, **POLE)
 
 
 def joined(*rows: LineRow) -> tuple[LineRow, list[ConversionChange]]:
-    changes: list[ConversionChange] = []
+    changes = Changes()
     (row,) = merged(rows, "s", changes, {"s": 230.0, "t": 230.0})
     return row, [each for each in changes if each.prop == "rating"]
 

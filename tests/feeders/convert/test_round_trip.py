@@ -12,7 +12,7 @@ import pytest
 from pandapower import networks
 
 from feeders.convert.convert import check_against_source, convert
-from feeders.convert.from_pandapower import from_pandapower
+from feeders.convert.from_pandapower import read_pandapower
 from feeders.convert.from_power_grid_model import read_pgm
 from feeders.convert.network import feeder_of
 from feeders.convert.provenance import ConversionChange, changes_csv, sentences
@@ -69,7 +69,7 @@ def village(*, closed: bool = False) -> Any:
 
 
 def test_transformer_capacitor_and_open_cable_are_carried_over() -> None:
-    converted = from_pandapower(village(), "village", root="root", extent=Extent(one_voltage=True))
+    converted = feeder_of(read_pandapower(village()), "village", root="root", extent=Extent(one_voltage=True))
     assert converted.state is not None
     check = compare(converted.state, converted.tables)
     assert check.largest_pu < BALANCED_PU
@@ -96,16 +96,16 @@ def test_parallel_transformers_on_a_coupled_busbar_are_one_infeed() -> None:
     pp.create_line(net, second, far, 2.0, "NA2XS2Y 1x185 RM/25 12/20 kV", name="far")
     pp.create_load(net, far, 1.0, 0.2, name="farm")
     net.trafo.loc[1, "in_service"] = False  # that of the low voltage
-    converted = from_pandapower(net, "x")
+    converted = feeder_of(read_pandapower(net), "x")
     assert converted.tables.meta.busbar == "root"
     assert converted.state is not None
     check = compare(converted.state, converted.tables)
     assert (check.buses, check.largest_pu < BALANCED_PU) == (5, True)
     net.switch.loc[net.switch.name == "coupler", "closed"] = False
     with refused(GridsecError, "busbar-unclear") as caught:
-        from_pandapower(net, "x")
+        feeder_of(read_pandapower(net), "x")
     assert "root, root 2" in str(caught.value)
-    assert from_pandapower(net, "x", root="root 2").tables.customers[0].customer == "farm"
+    assert feeder_of(read_pandapower(net), "x", root="root 2").tables.customers[0].customer == "farm"
 
 
 def test_loop_is_named_and_opened_when_asked(tmp_path: Path) -> None:
@@ -171,11 +171,11 @@ def test_all_problems_of_a_net_at_once(tmp_path: Path) -> None:
     del net["trafo3w"], net["shunt"]
     net.line = net.line.drop(columns="df")
     with refused(FeederInvalid, "missing", "missing"):
-        from_pandapower(net, "x")
+        feeder_of(read_pandapower(net), "x")
     fresh = village()
     fresh.line = fresh.line.drop(columns=["df", "parallel"])
     with refused(FeederInvalid, "missing", "missing"):
-        from_pandapower(fresh, "x")
+        feeder_of(read_pandapower(fresh), "x")
 
 
 def test_unknown_numbers_and_truths_of_any_table_are_told() -> None:
@@ -189,7 +189,7 @@ def test_unknown_numbers_and_truths_of_any_table_are_told() -> None:
     net.switch["closed"] = net.switch["closed"].astype(object)
     net.switch.loc[0, "closed"] = None
     with refused(FeederInvalid, *["out-of-range"] * 4, *["wrong-type"] * 2) as caught:
-        from_pandapower(net, "x")
+        feeder_of(read_pandapower(net), "x")
     assert {problem.partition(" is ")[0] for problem in caught.value.problems} == {
         "asymmetric_load 0: p_b_mw",
         "asymmetric_sgen 0: q_c_mvar",
@@ -202,11 +202,11 @@ def test_unknown_numbers_and_truths_of_any_table_are_told() -> None:
 
 def test_truths_may_be_numbers_and_a_shunt_of_no_power_is_named() -> None:
     net = village()
-    expected = from_pandapower(net, "x").tables
+    expected = feeder_of(read_pandapower(net), "x").tables
     for table in ("load", "line", "trafo", "ext_grid", "bus"):
         net[table]["in_service"] = net[table]["in_service"].astype(float)
     pp.create_shunt(net, 2, q_mvar=0.0, name="none")
-    found = from_pandapower(net, "x")
+    found = feeder_of(read_pandapower(net), "x")
     assert found.tables == expected
     assert "shunt none" in [each.element for each in found.changes]
 
@@ -215,12 +215,12 @@ def test_another_source_hides_no_loop() -> None:
     net = village(closed=True)
     pp.create_ext_grid(net, 3)  # bus B
     with refused(FeederInvalid, "several-sources", "not-radial") as caught:
-        from_pandapower(net, "x", root="root")
+        feeder_of(read_pandapower(net), "x", root="root")
     source, loop = caught.value.problems
     assert source.startswith("bus 'B' ")
     assert loop.startswith("lines: ")
     with refused(FeederInvalid, "several-sources") as caught:
-        from_pandapower(net, "x", root="root", extent=Extent(meshed=True))
+        feeder_of(read_pandapower(net), "x", root="root", extent=Extent(meshed=True))
     assert caught.value.problems == (source,)
 
 
@@ -228,7 +228,7 @@ def test_a_wrong_busbar_hides_no_other_wrong_choice(tmp_path: Path) -> None:
     net = village()
     for wrong, count in (({"droop": "nosuch"}, 1), ({"opened": ["no", "none"]}, 2)):
         with refused(FeederInvalid, *["unknown-name"] * count):
-            from_pandapower(net, "x", **wrong)  # type: ignore[arg-type]
+            feeder_of(read_pandapower(net), "x", **wrong)  # type: ignore[arg-type]
     choices = {"root": "nowhere", "droop": "nosuch", "opened": ["no"]}
     source = str(pgm(tmp_path / "town.json", 6, balanced=True))
     pp.to_json(net, str(tmp_path / "village.json"))
@@ -249,7 +249,7 @@ def test_what_is_no_number_is_told_and_not_a_traceback() -> None:
     net.f_hz = None
     net.bus["geo"] = '{"x": 1}'
     with refused(FeederInvalid, "unknown-index", "not-positive", *["out-of-range"] * 3) as caught:
-        from_pandapower(net, "x")
+        feeder_of(read_pandapower(net), "x")
     assert {problem.partition(" is ")[0] for problem in caught.value.problems} == {
         "line 0: r_ohm_per_km",
         "line 1: parallel",
@@ -344,5 +344,5 @@ def test_switches_with_an_impedance_and_what_is_switched_off(tmp_path: Path) -> 
     # A generator that is switched off does not become an inverter that works.
     assert not any(row.inverter_kva for row in customers.values())
     pp.create_asymmetric_load(net, end, name="nobody")
-    later = [(each.element, each.prop, each.done) for each in from_pandapower(net, "x").changes]
+    later = [(each.element, each.prop, each.done) for each in feeder_of(read_pandapower(net), "x").changes]
     assert ("load nobody", "all of it", "left out") in later

@@ -6,6 +6,8 @@ import json
 import math
 import re
 import time
+from collections import Counter
+from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -16,13 +18,23 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from feeders.format import tables as tables_of
+from feeders.format import validation
 from feeders.format.columns import (
     CUSTOMER_COLUMNS,
     LINE_COLUMNS,
     META_COLUMNS,
     REQUIRED,
     SUSPICIONS,
-    CellType,
+    Column,
+    Id,
+    Name,
+    Names,
+    Number,
+    Pair,
+    Text,
+    Truth,
+    Whole,
 )
 from feeders.format.tables import (
     CustomerRow,
@@ -41,7 +53,8 @@ from feeders.format.tables import (
     write,
 )
 from feeders.format.topology import Edge, tree
-from feeders.model.profiles import load_names, pv_names
+from feeders.model.site import find, load
+from feeders.profiles import load_names, pv_names
 from gridsec.errors import FeederInvalid
 from gridsec.grid.droop import PRESETS
 from tests.codes import codes_of
@@ -163,7 +176,7 @@ def test_cells_arrive_as_written() -> None:
     assert tables.meta.meters == MeterDefaults(class_percent=1.0)
     assert tables.lines[0] == LineRow("L1", "station", "corner", 0.1, 0.02, b_us=100.0, to_x=1.0, to_y=0.0)
     assert tables.customers[1] == CustomerRow(
-        "smith", "east", 3.0, meter="m-smith", load_profile="H0-A", pv_kw=5.0, pv_profile="PV1",
+        "smith", "east", load_kw=3.0, meter="m-smith", load_profile="H0-A", pv_kw=5.0, pv_profile="PV1",
         inverter_kva=6.0, droop="ieee1547-b",
     )  # fmt: skip
     assert tables.customers[2].tau_s == 2.5
@@ -212,21 +225,38 @@ def test_numbers_of_numpy_are_written_as_numbers(tmp_path: Path) -> None:
     assert type(again.lines[0].x_ohm) is float
 
 
-def test_rows_and_columns_name_the_same_things() -> None:
-    sections = {"limits": Limits, "meters": MeterDefaults, "load": LoadDefaults, "monitor": MonitorDefaults}
+def test_every_field_of_a_row_declares_its_column() -> None:
     for made, columns in [
         (LineRow, LINE_COLUMNS),
         (CustomerRow, CUSTOMER_COLUMNS),
-        *((sections[key], META_COLUMNS[key]) for key in sections),
+        (FeederMeta, META_COLUMNS[""]),
     ]:
-        assert {field.name for field in fields(made)} == {column.name for column in columns}
-        example = {"line": "1", "from_bus": "0", "to_bus": "1", "r_ohm": 1.0, "x_ohm": 1.0}
-        example |= {"customer": "1", "bus": "0", "load_kw": 1.0}
-        known = {field.name for field in fields(made)}
-        instance = made(**{key: value for key, value in example.items() if key in known})
-        for column in columns:
-            if column.default is not REQUIRED:
-                assert getattr(instance, column.name) == column.default, column.name
+        declared = [each.name for each in fields(made) if each.name not in META_COLUMNS]
+        assert declared == [column.name for column in columns]
+
+
+@pytest.mark.parametrize("name", ["kerber-landnetz", "ieee-european-lv"])
+def test_a_feeder_is_parsed_and_checked_once_per_load(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tables from files are valid; a copy with other rows is not known to be valid."""
+    counts = Counter[str]()
+
+    def counted(what: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*args: Any) -> Any:
+            counts[what] += 1
+            return function(*args)
+
+        return call
+
+    monkeypatch.setattr(tables_of, "_parse_table", counted("parsed", tables_of._parse_table))
+    monkeypatch.setattr(validation, "check", counted("checked", validation.check))
+    site = load(name)
+    assert counts == {"parsed": 2, "checked": 1}  # lines.csv and customers.csv
+    copied = replace(find(name), customers=site.tables.customers)
+    assert not copied.valid
+    counts.clear()
+    assert validate(copied) == validate(copied) == ()
+    assert copied.valid
+    assert counts == {"parsed": 2, "checked": 1}
 
 
 # --- broken input -------------------------------------------------------------------------------
@@ -284,8 +314,8 @@ def test_accepted_doubts_become_notes(tmp_path: Path) -> None:
     assert read(tmp_path) == accepted
 
 
-GARBAGE: dict[CellType, tuple[Any, ...]] = {
-    CellType.NUMBER: (
+GARBAGE: dict[type[Column], tuple[Any, ...]] = {
+    Number: (
         "nan",
         "inf",
         "-1e400",
@@ -300,13 +330,13 @@ GARBAGE: dict[CellType, tuple[Any, ...]] = {
         10**400,
         "٣,٥",
     ),
-    CellType.WHOLE: ("1.5", 2.5, "x", False, math.nan),
-    CellType.TRUTH: ("yes", 2, 1.0, "TRUEE", []),
-    CellType.TEXT: (1, 2.5, True, [], "\x00", "x" * 201),
-    CellType.ID: (7, "a\nb", "\ud800", "\u200b", "x" * 129, ["1"]),
-    CellType.NAME: ("a b", "ä", "x" * 65, 5, "a/b", "*", "a\n"),
-    CellType.PAIR: (1, [1], [1, "x"], "1,2", [1, math.nan]),
-    CellType.NAMES: ("voltage", [1], ["nonsense"]),
+    Whole: ("1.5", 2.5, "x", False, math.nan),
+    Truth: ("yes", 2, 1.0, "TRUEE", []),
+    Text: (1, 2.5, True, [], "\x00", "x" * 201),
+    Id: (7, "a\nb", "\ud800", "\u200b", "x" * 129, ["1"]),
+    Name: ("a b", "ä", "x" * 65, 5, "a/b", "*", "a\n"),
+    Pair: (1, [1], [1, "x"], "1,2", [1, math.nan]),
+    Names: ("voltage", [1], ["nonsense"]),
 }
 
 
@@ -324,8 +354,10 @@ def test_every_corrupted_cell_is_named(data: st.DataObject) -> None:
     else:
         columns, cells, where = META_COLUMNS[place], obj["feeder"][place], f"feeder, [{place}]"
     column = data.draw(st.sampled_from(columns))
-    garbage = GARBAGE[column.kind] + ((None, "", "  ") if column.default is REQUIRED else ())
-    if (column.low is not None and column.low >= 0) or column.above is not None:
+    garbage = GARBAGE[type(column)] + ((None, "", "  ") if column.default is REQUIRED else ())
+    if isinstance(column, Number) and (
+        column.above is not None or (column.low is not None and column.low >= 0)
+    ):
         garbage += (-3, "-0.5")
     cells[column.name] = data.draw(st.sampled_from(garbage))
     problems = examine(obj).problems

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from feeders.format.tables import read, to_json, write
 from feeders.model.forecast import season_of
 from feeders.model.load_uncertainty import forecast_errors, from_history, load_doubt, tell, unread
-from feeders.model.profiles import Season, library
 from feeders.model.site import Site, Snapshot, from_tables, load, to_frame
+from feeders.profiles import Season, library
 from feeders.registry.registry import SEQUENTIAL, DesignedEstimator, choose, design
 from feeders.simulation.scenario import START, Scenario, simulate, snapshots
 from feeders.simulation.trial import Trial, frames

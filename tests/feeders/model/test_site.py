@@ -16,7 +16,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from feeders.format.columns import CUSTOMER_COLUMNS, LINE_COLUMNS, META_COLUMNS, SUSPICIONS, CellType
+from feeders.format.columns import CUSTOMER_COLUMNS, LINE_COLUMNS, META_COLUMNS, SUSPICIONS, Number
 from feeders.format.tables import CustomerRow, FeederTables, from_json, read, to_json, write
 from feeders.model.site import Site, Snapshot, from_tables, load, names, plant, to_frame, volts
 from gridsec.errors import FeederInvalid
@@ -112,7 +112,7 @@ def test_feeder_without_any_impedance_is_refused() -> None:
 
 
 def test_tables_made_in_memory_are_checked(three: Site) -> None:
-    broken = replace(three.tables, customers=(CustomerRow("x", "nowhere", -1.0),))
+    broken = replace(three.tables, customers=(CustomerRow("x", "nowhere", load_kw=-1.0),))
     with refused(FeederInvalid, "negative", "unknown-name"):
         from_tables(broken)
 
@@ -121,7 +121,7 @@ EXTREMES = [
     (table, column, value)
     for table, columns in [("lines", LINE_COLUMNS), ("customers", CUSTOMER_COLUMNS), *META_COLUMNS.items()]
     for column in columns
-    if column.kind is CellType.NUMBER
+    if type(column) is Number
     for value in (column.low, column.high, column.above and column.above + 1e-300, 1e-300, 1e300)
     if value is not None
 ]

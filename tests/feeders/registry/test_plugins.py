@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from feeders.format.columns import ESTIMATORS, OWN_ESTIMATORS
+from feeders.format.columns import ESTIMATORS, OWN_ESTIMATORS, foreign_estimators
 from feeders.model.site import Site, load
 from feeders.registry import plugins, registry
 from feeders.registry.plugins import EstimatorUnusable
@@ -48,7 +48,7 @@ def test_names_are_known_without_running_anything(place: Path, capsys: pytest.Ca
     install(
         place, "pkg_a", GOOD, "mine = pkg_a:FAMILY", "sequential = pkg_a:FAMILY", "Not a name = pkg_a:FAMILY"
     )
-    assert set(plugins.names(OWN_ESTIMATORS)) - set(ESTIMATORS) == {"mine"}
+    assert set(foreign_estimators()) - set(ESTIMATORS) == {"mine"}
     assert not capsys.readouterr().out
 
 

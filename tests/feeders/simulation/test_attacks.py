@@ -7,8 +7,9 @@ import pytest
 
 from feeders.simulation.attacks import (
     LARGEST,
+    RANDOM_KINDS,
+    AttackKind,
     NoSuchAttack,
-    RandomAttackKind,
     coordinated,
     fake_load,
     random_attacks,
@@ -18,23 +19,24 @@ from feeders.simulation.plant import ClosedLoop, Loads
 from feeders.simulation.powerflow import PowerFlow
 from feeders.simulation.scenario import START, Scenario, simulate
 from gridsec.attack import Coordinated
+from gridsec.errors import InputInvalid
 from tests.codes import refused
 from tests.feeders.villages import village, village_without_inverters
 
 ON, OFF = START + 20.0, START + 80.0
 SIZE = 0.03
 CONSTANT = (
-    RandomAttackKind.BIAS,
-    RandomAttackKind.SCALING,
-    RandomAttackKind.RANDOM,
-    RandomAttackKind.COORDINATED,
-    RandomAttackKind.COORDINATED_POWER,
+    AttackKind.BIAS,
+    AttackKind.SCALING,
+    AttackKind.RANDOM,
+    AttackKind.COORDINATED,
+    AttackKind.COORDINATED_POWER,
 )
 
 
 @pytest.mark.parametrize("kind", CONSTANT)
 @pytest.mark.parametrize("count", [1, 2, 3])
-def test_every_manipulated_meter_is_moved_by_at_least_the_size(kind: RandomAttackKind, count: int) -> None:
+def test_every_manipulated_meter_is_moved_by_at_least_the_size(kind: AttackKind, count: int) -> None:
     site = village()
     for seed in range(4):
         attacks = random_attacks(site, seed, kind, count, SIZE, t_on=ON, t_off=OFF)
@@ -61,7 +63,7 @@ def test_displacements_are_not_larger_than_stated() -> None:
 
 def test_a_drift_arrives_after_a_third_of_the_attack() -> None:
     site = village()
-    attacks = random_attacks(site, 1, RandomAttackKind.DRIFT, 2, SIZE, t_on=ON, t_off=OFF)
+    attacks = random_attacks(site, 1, AttackKind.DRIFT, 2, SIZE, t_on=ON, t_off=OFF)
     for sample in simulate(site, Scenario(duration_s=90.0, attacks=attacks)):
         shift = np.abs(sample.shift_volt[sample.manipulated]) / 230.0
         if sample.t >= ON + 20.0 and sample.manipulated.any():
@@ -72,7 +74,7 @@ def test_a_drift_arrives_after_a_third_of_the_attack() -> None:
 
 def test_every_kind_can_be_made_for_any_number_of_meters() -> None:
     site = village()
-    for kind in RandomAttackKind:
+    for kind in RANDOM_KINDS:
         for count in (1, 4):
             (attack,) = random_attacks(site, 3, kind, count, 0.01, t_on=ON, t_off=OFF)
             assert attack.meters.size == count
@@ -83,8 +85,8 @@ def test_a_seed_fixes_the_attack_and_another_changes_it() -> None:
     site = village()
     chosen = set()
     for seed in range(10):
-        (first,) = random_attacks(site, seed, RandomAttackKind.COORDINATED, 2, SIZE, t_on=ON, t_off=OFF)
-        (second,) = random_attacks(site, seed, RandomAttackKind.COORDINATED, 2, SIZE, t_on=ON, t_off=OFF)
+        (first,) = random_attacks(site, seed, AttackKind.COORDINATED, 2, SIZE, t_on=ON, t_off=OFF)
+        (second,) = random_attacks(site, seed, AttackKind.COORDINATED, 2, SIZE, t_on=ON, t_off=OFF)
         np.testing.assert_array_equal(first.meters, second.meters)
         assert isinstance(first, Coordinated)
         assert isinstance(second, Coordinated)
@@ -98,7 +100,7 @@ def test_the_lie_is_what_a_real_load_would_do(with_inverters: bool) -> None:
     site = village() if with_inverters else village_without_inverters()
     scenario = Scenario(seed=5)
     (attack,) = random_attacks(
-        site, 5, RandomAttackKind.COORDINATED_POWER, 3, SIZE, t_on=ON, t_off=OFF, scenario=scenario
+        site, 5, AttackKind.COORDINATED_POWER, 3, SIZE, t_on=ON, t_off=OFF, scenario=scenario
     )
     assert isinstance(attack, Coordinated)
     (own,) = np.flatnonzero(attack.p_shift)  # just one meter lies about power: the load's own
@@ -126,19 +128,21 @@ def test_chosen_meters_far_away_need_a_larger_load() -> None:
     assert large.p_kw > 2 * small.p_kw
     assert np.abs(large.shift[far]).min() == pytest.approx(0.01, rel=1e-12)
     assert np.abs(small.shift[near]).min() == pytest.approx(0.01, rel=1e-12)
-    lie = coordinated(site, far, large, t_on=0.0, t_off=1.0, power=False)
+    lie = coordinated(site, far, large, t_on=0.0, t_off=1.0, kind=AttackKind.COORDINATED)
     assert np.all(lie.p_shift == 0.0)
 
 
 def test_what_cannot_be_made_is_refused_with_its_reason() -> None:
     site = village()
     with refused(NoSuchAttack, "too-few-meters"):
-        random_attacks(site, 0, RandomAttackKind.BIAS, 8, SIZE, t_on=ON, t_off=OFF)
+        random_attacks(site, 0, AttackKind.BIAS, 8, SIZE, t_on=ON, t_off=OFF)
     with refused(NoSuchAttack, "no-effect"):
         fake_load(site, 2, np.array([5]), SIZE)  # c7 sits on the busbar
     with refused(NoSuchAttack, "no-such-attack"):
         fake_load(site, 2, np.array([0, 2]), 0.18)
     with refused(NoSuchAttack, "no-such-attack"):
-        random_attacks(site, 0, RandomAttackKind.COORDINATED, 7, SIZE, t_on=ON, t_off=OFF)
-    with pytest.raises(ValueError, match="'nonsense' is not a valid RandomAttackKind"):
+        random_attacks(site, 0, AttackKind.COORDINATED, 7, SIZE, t_on=ON, t_off=OFF)
+    with refused(InputInvalid, "unknown-name"):
         random_attacks(site, 0, "nonsense", 1, SIZE, t_on=ON, t_off=OFF)
+    with refused(NoSuchAttack, "unknown-name"):
+        random_attacks(site, 0, "inverter", 1, SIZE, t_on=ON, t_off=OFF)

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from feeders.model.profiles import Season, library
 from feeders.model.site import Site, from_tables, load
+from feeders.profiles import Season, library
 from feeders.simulation.demand import CHUNK_CORRELATIONS, STAGGER_S, Customers, Fluctuation, Stream, Variation
 from feeders.simulation.scenario import SUNNY_NOON_S
 from tests.feeders.villages import tables, village

@@ -127,13 +127,12 @@ def test_batch_equals_single() -> None:
     count = grid.customer_bus.size
     p, q = random.normal(2.0, 2.0, (7, count)), random.normal(0.5, 0.5, (7, count))
     v0 = random.uniform(220.0, 240.0, 7)
-    for threads in (1, 2):
-        customers, buses = flow.solve_batch(p, q, v0, threads=threads)
-        assert customers.shape == (7, count)
-        for k in range(7):
-            one_customers, one_buses = flow.solve(p[k], q[k], float(v0[k]))
-            np.testing.assert_allclose(customers[k], one_customers, rtol=1e-12)
-            np.testing.assert_allclose(buses[k], one_buses, rtol=1e-12)
+    customers, buses = flow.solve_batch(p, q, v0)
+    assert customers.shape == (7, count)
+    for k in range(7):
+        one_customers, one_buses = flow.solve(p[k], q[k], float(v0[k]))
+        np.testing.assert_allclose(customers[k], one_customers, rtol=1e-12)
+        np.testing.assert_allclose(buses[k], one_buses, rtol=1e-12)
 
 
 def test_a_solve_does_not_depend_on_the_one_before() -> None:

@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pandapower import networks
 
-from feeders.convert.from_pandapower import from_pandapower
+from feeders.convert.from_pandapower import read_pandapower
+from feeders.convert.network import feeder_of
 from feeders.format.tables import LineRow
 from feeders.model.site import find, load
 from feeders.model.three_phase import spanned, three_phase, three_phase_names
@@ -31,7 +32,7 @@ def test_agrees_with_pandapower(scenario: str) -> None:
     net = networks.ieee_european_lv_asymmetric(scenario)
     net.trafo["tap_dependency_table"] = False  # the file is older than this column
     pp.runpp_3ph(net, tolerance_mva=1e-10, numba=False)
-    tables = from_pandapower(net, "european").tables
+    tables = feeder_of(read_pandapower(net), "european").tables
     site = three_phase(tables)
     root = int(net.trafo.lv_bus.iloc[0])
     angle = {phase: np.deg2rad(net.res_bus_3ph.at[root, f"va_{phase}_degree"]) for phase in "abc"}

@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from feeders.simulation.attacks import RandomAttackKind, busbar_attack, random_attacks
+from feeders.simulation.attacks import RANDOM_KINDS, busbar_attack, random_attacks
 from feeders.simulation.demand import Variation
 from feeders.simulation.meters import BUSBAR, Channel, MeterErrors, MeterOutage
 from feeders.simulation.powerflow import PowerFlowDiverged
@@ -38,7 +38,7 @@ def busy() -> Scenario:
     site = village()
     attacks = tuple(
         attack
-        for seed, kind in enumerate(RandomAttackKind)
+        for seed, kind in enumerate(RANDOM_KINDS)
         for attack in random_attacks(site, seed, kind, 2, 0.02, t_on=START + 20.0, t_off=START + 60.0)
     )
     return Scenario(

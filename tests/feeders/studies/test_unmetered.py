@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from feeders.model.load_uncertainty import unread
-from feeders.model.profiles import Season
 from feeders.model.site import Site, load
+from feeders.profiles import Season
 from feeders.registry.registry import DesignedEstimator, design
 from feeders.simulation.scenario import START
 from feeders.simulation.trial import AttackKind, Trial, TrialMeterErrors, frames

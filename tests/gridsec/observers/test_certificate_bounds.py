@@ -10,8 +10,7 @@ from scipy.integrate import solve_ivp
 
 from gridsec.grid.droop import Droop
 from gridsec.observers.certificates import certify, error_bound, reactance, small_gain
-from gridsec.observers.lure import Lure
-from gridsec.observers.newton import settle
+from gridsec.observers.lure import Lure, settle
 from tests.gridsec.certified import norm, seeds
 from tests.gridsec.radial import random_loop
 

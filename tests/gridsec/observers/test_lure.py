@@ -23,10 +23,10 @@ from gridsec.observers.lure import (
     close_loop,
     equilibrium,
     known_input,
+    settle,
     step,
     transition,
 )
-from gridsec.observers.newton import settle
 from tests.codes import refused
 from tests.gridsec.radial import random_feeder, random_loop
 

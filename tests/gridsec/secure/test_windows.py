@@ -37,7 +37,7 @@ def five() -> WindowDesign:
 
 
 def masks(design: WindowDesign) -> np.ndarray:
-    return yang2019.large_sets(design)
+    return design.large
 
 
 def within(rng: np.random.Generator, shape: tuple[int, ...], size: float) -> np.ndarray:

@@ -11,8 +11,8 @@ import pandas as pd
 import pytest
 
 from feeders.format.tables import write
-from feeders.model.profiles import Season
 from feeders.model.site import load
+from feeders.profiles import Season
 from feeders.simulation.attacks import AttackKind
 from feeders.simulation.trial import LoadError
 from feeders.studies.campaign.plan import AttackClass, CampaignPlan, Place

@@ -202,7 +202,7 @@ def test_a_report_tells_what_was_not_carried_over(
     source = (folder / "feeder" / "SOURCE.md").read_text(encoding="utf-8")
     check = " ".join(source.partition("## Checked\n\n")[2].partition("\n\n")[0].split())
     assert check.startswith("AC power flow of power-grid-model")
-    assert check.replace("'", "&#x27;") in html
+    assert check.replace("'", "&#39;") in html
     assert f"gridsec study report {file}" in text_of(html)
 
 

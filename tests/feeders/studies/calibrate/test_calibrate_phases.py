@@ -38,7 +38,7 @@ def street() -> FeederTables:
     single = [LineRow(f"l-{bus}", at, bus, 0.02, 0.003, phases=phases[bus]) for bus, at in ends]
     loads = (6.0, 4.0, 5.0, 7.0, 4.5, 5.5, 3.0, 4.0, 3.5)
     rows = [
-        CustomerRow(f"c-{bus}", bus, load, phases=phase, meter=f"m-{bus}")
+        CustomerRow(f"c-{bus}", bus, load_kw=load, phases=phase, meter=f"m-{bus}")
         for (bus, phase), load in zip(phases.items(), loads, strict=True)
     ]
     meta = FeederMeta(format=1, name="street", voltage_volt=230.0, busbar="bb", base_kva=100.0)

@@ -19,8 +19,8 @@ import pytest
 import threadpoolctl
 from scipy.stats import beta
 
-from feeders.model.profiles import Season
 from feeders.model.site import Site, from_tables, load
+from feeders.profiles import Season
 from feeders.registry.registry import design
 from feeders.simulation.attacks import AttackKind
 from feeders.simulation.demand import Variation
@@ -30,6 +30,7 @@ from feeders.studies.campaign.scene import attacks, liars, risings
 from feeders.studies.campaign.study import Campaign, NothingPlayed, campaign, false_names, grouped, scenarios
 from feeders.studies.journal import OtherStudy, edition
 from feeders.studies.workers import ClusterUnusable, Dask, Here, Processes, WorkerLost, agree, versions
+from gridsec.attack import Coordinated, Random
 from gridsec.errors import InputInvalid
 from tests.codes import refused
 from tests.feeders import stations
@@ -155,6 +156,27 @@ def test_lies_behind_taps_are_those_of_the_full_play(site: Site) -> None:
     assert behind == {"bias", "told", "story"}
 
 
+def test_kinds_of_a_campaign_are_those_of_the_simulation() -> None:
+    kinds = (AttackClass("power", AttackKind.POWER, (2.0,)), AttackClass("random", AttackKind.RANDOM, (2.0,)))
+    plan = replace(PLAN, scenes=1, together=6, kinds=kinds, liars=(2,), places=(Place.RANDOM,))
+    honest = plan.trial(SITE, plan.moment(0)).scenario
+    seen = set()
+    for case in (case for case in plan.cases(0) if case.kind != CLEAN):
+        (attack,), _ = attacks(SITE, plan, case, honest)
+        seen.add(case.kind)
+        if case.kind == "power":
+            assert isinstance(attack, Coordinated)
+            assert np.all(attack.shift == 0.0)
+            assert np.count_nonzero(attack.p_shift) == attack.meters.size == 1
+        else:
+            assert isinstance(attack, Random)
+            assert np.all(attack.low == 0.02)
+            assert np.all(attack.high == 0.03)
+    assert seen == {"power", "random"}
+    found = campaign(SITE, plan)
+    assert (found.scenarios["reason"] == "").all()
+
+
 def test_cases_follow_from_their_numbers_alone() -> None:
     longer = replace(PLAN, scenes=9)
     assert longer.cases(2) == PLAN.cases(2)
@@ -200,7 +222,7 @@ def test_what_cannot_be_played_says_why() -> None:
     plan = replace(PLAN, scenes=1, kinds=(AttackClass("bias", AttackKind.BIAS, (1.0,)),), liars=(99,))
     found = campaign(SITE, plan)
     reasons = found.scenarios.loc[found.scenarios["kind"] == "bias", "reason"]
-    assert reasons.str.contains("6 of these devices; cannot manipulate 99").all()
+    assert reasons.str.contains("6 meters; cannot attack 99").all()
     assert found.by_kind["kind"].tolist() == [CLEAN, CLEAN]
     assert found.scenarios["exact"].dtype == np.bool_
     with refused(NothingPlayed, "nothing-played"):

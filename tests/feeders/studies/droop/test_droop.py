@@ -68,7 +68,7 @@ def random_site(seed: int, *, phased: bool = False) -> Site:
         r = rng.uniform(0.01, 0.08)
         lines.append(LineRow(f"l{k}", above, f"n{k}", r, ratio * r, b_us=10.0))
     customers = tuple(
-        CustomerRow(f"c{k}", f"n{k}", float(rng.uniform(2, 10)), pv_kw=float(rng.uniform(0, 12)))
+        CustomerRow(f"c{k}", f"n{k}", load_kw=float(rng.uniform(2, 10)), pv_kw=float(rng.uniform(0, 12)))
         for k in range(count)
     )
     meta = FeederMeta(format=1, name=f"street-{seed}", voltage_volt=230.0, busbar="bb", base_kva=100.0)
@@ -216,7 +216,7 @@ def test_collapse_is_an_outcome_and_not_an_error() -> None:
 def test_edges_and_margins_of_one_customer_are_those_of_the_formula() -> None:
     """One inverter that jumps to its set-point is stable up to a loop gain of 1."""
     meta = FeederMeta(format=1, name="one", voltage_volt=230.0, busbar="bb", base_kva=100.0)
-    row = CustomerRow("c", "n", 2.0, inverter_kva=10.0, droop="ieee1547-b")
+    row = CustomerRow("c", "n", load_kw=2.0, inverter_kva=10.0, droop="ieee1547-b")
     site = from_tables(FeederTables(meta, (LineRow("l", "bb", "n", 0.2, 0.16),), (row,)))
     subject, update, at = Subject.of(site), Update(100.0), point(site, 0.0, 0.0, 1.05)
     sure, over = edge(subject, site.droop, update, at, enlarged)

@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gridsec.arrays import Floats
-from gridsec.secure.index import fewest
-from gridsec.secure.index.blocks import fewest_rows
+from gridsec.secure.index import fewest, fewest_rows
 from tests.gridsec.planning.small import TOL
 
 

@@ -42,28 +42,19 @@ class Season(StrEnum):
 def data_root() -> Traversable:
     """Folder of the data: beside the packages in a checkout, inside them in a wheel."""
     packaged = resources.files("feeders") / "data"
-    return packaged if packaged.is_dir() else Path(__file__).resolve().parents[2] / "data"
+    return packaged if packaged.is_dir() else Path(__file__).resolve().parents[1] / "data"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Profiles:
-    """Profiles over time, for linear interpolation between samples.
+    """Profiles over time, for linear interpolation between samples."""
 
-    Attributes
-    ----------
-    t_s : (T,)
-        Time since the first sample, s; the first sample is at 00:00 of a Monday.
-    load_p, load_q : name -> (T,)
-        Active and reactive power of a load, as a fraction of its peak `load_kw` and of the reactive power of
-        `load_kw` at its expected power factor.
-    pv : name -> (T,)
-        Generation, fraction of its peak `pv_kw`.
-    """
-
-    t_s: Floats
+    t_s: Floats  # (T,), time since the first sample, s; the first sample is at 00:00 of a Monday
+    # name -> (T,), active and reactive power of a load, as a fraction of its peak `load_kw` and of the
+    # reactive power of `load_kw` at its expected power factor
     load_p: dict[str, Floats]
     load_q: dict[str, Floats]
-    pv: dict[str, Floats]
+    pv: dict[str, Floats]  # name -> (T,), generation, fraction of its peak `pv_kw`
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,12 +84,7 @@ def envelopes() -> dict[str, ReactiveEnvelope]:
 
 
 def library(season: Season = Season.SUMMER) -> Profiles:
-    """One season of the bundled library; see data/profiles/SOURCE.md.
-
-    Parameters
-    ----------
-    season
-        The season; summer has two weeks, the others have one.
+    """One season of the bundled library, see data/profiles/SOURCE.md; summer has two weeks, the others one.
 
     Raises
     ------
@@ -108,39 +94,38 @@ def library(season: Season = Season.SUMMER) -> Profiles:
     return _read(choice("season", Season, season))
 
 
+def _text(season: Season) -> str:
+    return gzip.decompress((data_root() / "profiles" / season.file).read_bytes()).decode("ascii")
+
+
+@cache
+def _header() -> tuple[str, ...]:
+    return tuple(next(csv.reader(io.StringIO(_text(Season.SUMMER)))))
+
+
 @cache
 def _read(season: Season) -> Profiles:
-    text = gzip.decompress((data_root() / "profiles" / season.file).read_bytes()).decode("ascii")
-    header = next(csv.reader(io.StringIO(text)))
-    table = np.loadtxt(io.StringIO(text), delimiter=",", skiprows=1, dtype=np.float64)
+    table = np.loadtxt(io.StringIO(_text(season)), delimiter=",", skiprows=1, dtype=np.float64)
     table.setflags(write=False)
-    columns = dict(zip(header, table.T, strict=True))
+    columns = dict(zip(_header(), table.T, strict=True))
     return Profiles(
         columns[TIME],
-        {name[:-2]: column for name, column in columns.items() if name.endswith("_p")},
-        {name[:-2]: column for name, column in columns.items() if name.endswith("_q")},
-        {name: column for name, column in columns.items() if name.startswith("PV")},
+        {name: columns[f"{name}_p"] for name in load_names()},
+        {name: columns[f"{name}_q"] for name in load_names()},
+        {name: columns[name] for name in pv_names()},
     )
 
 
 def profile(curves: dict[str, Floats], name: str) -> Floats:
-    """One profile, or without a name the mean of all.
-
-    Parameters
-    ----------
-    curves
-        `Profiles.load_p`, `load_q` or `pv`.
-    name
-        Name of the profile, or "".
-    """
+    """One profile of `Profiles.load_p`, `load_q` or `pv`; without a name the mean of all."""
     return curves[name] if name else np.asarray(np.mean(list(curves.values()), axis=0))
 
 
 def load_names() -> tuple[str, ...]:
     """Valid names of `load_profile`."""
-    return tuple(library().load_p)
+    return tuple(name.removesuffix("_p") for name in _header() if name.endswith("_p"))
 
 
 def pv_names() -> tuple[str, ...]:
     """Valid names of `pv_profile`."""
-    return tuple(library().pv)
+    return tuple(name for name in _header() if name.startswith("PV"))
