@@ -59,23 +59,9 @@ async def serve(
 ) -> None:
     """Run the service until SIGINT, SIGTERM or `Running.stop`.
 
-    Parameters
-    ----------
-    announce
-        Called once HTTP responds.
-    signals
-        Handle signals; only possible in the main thread.
-    settled
-        As in `Runtime`.
-    stopping
-        Called at the beginning of the end.
-    wall
-        Wall clock, Unix s.
-
-    Raises
-    ------
-    FeederInvalid, StoreUnavailable, BusUnavailable, AddressUnavailable
-        If the service cannot start.
+    `announce` is called once HTTP responds, `stopping` at the beginning of the end, `settled` as in
+    `Runtime`. Signals can be handled in the main thread only. Raises FeederInvalid, StoreUnavailable,
+    BusUnavailable, AddressUnavailable if the service cannot start.
     """
     shares = Shares.of(raise_limit())
     sites = {
@@ -218,15 +204,8 @@ def _listen(address: str) -> Iterator[socket.socket]:
 def load_sites(names: Iterable[str]) -> dict[str, Site]:
     """Load feeders, and report the problems of all of them at once.
 
-    Parameters
-    ----------
-    names
-        Folders, or names of feeders of the project.
-
-    Raises
-    ------
-    FeederInvalid
-        If any cannot be loaded, or two have the same name.
+    `names` are folders, or names of feeders of the project. Raises FeederInvalid if any cannot be loaded, or
+    two have the same name.
     """
     sites: dict[str, Site] = {}
     problems: list[Problem] = []

@@ -7,25 +7,9 @@ from __future__ import annotations
 
 from gridsec.errors import GridsecError, Problem
 
-__all__ = [
-    "FeederFixed",
-    "FeederNotLoaded",
-    "FeederUnknown",
-    "TooManyFeeders",
-    "prefixed",
-]
-
 
 def prefixed(start: str, problem: str) -> Problem:
-    """Return a problem with its place in front, once, and with its code.
-
-    Parameters
-    ----------
-    start
-        The place, with a separator.
-    problem
-        The sentence.
-    """
+    """Return a problem with its place in front, once, and with its code."""
     return Problem(getattr(problem, "code", ""), start + problem.removeprefix(start))
 
 

@@ -53,13 +53,7 @@ class Repeats:
         self._timer: threading.Timer | None = None
 
     def admit(self, kind: tuple[str, ...]) -> bool:
-        """True if a record is written.
-
-        Parameters
-        ----------
-        kind
-            Level, event and source: records with equal ones are of one kind.
-        """
+        """True if a record is written. Records with equal level, event and source are of one kind."""
         self.flush(over_only=True)
         with self._lock:
             begun, count = self._kinds.get(kind, (self._clock(), 0))
@@ -74,13 +68,7 @@ class Repeats:
         return count < self._first
 
     def flush(self, *, over_only: bool = False) -> None:
-        """Write the numbers of suppressed records.
-
-        Parameters
-        ----------
-        over_only
-            Restrict to windows that have ended.
-        """
+        """Write the numbers of suppressed records. With `over_only` only of windows that have ended."""
         now, ended = self._clock(), []
         with self._lock:
             # In the order of their starts.
@@ -144,13 +132,7 @@ class LineLogger:
         self._file = file
 
     def msg(self, message: str) -> None:
-        """Write a line.
-
-        Parameters
-        ----------
-        message
-            Text without a line end.
-        """
+        """Write a line."""
         with self._lock:
             try:
                 self._file.write(f"{message}\n")
@@ -162,15 +144,7 @@ class LineLogger:
 
 
 def set_up(level: str, form: str) -> None:
-    """Set up logging for the process.
-
-    Parameters
-    ----------
-    level
-        `debug`, `info`, `warning` or `error`.
-    form
-        `console` or `json`.
-    """
+    """Set up logging for the process."""
     stream = sys.stderr
 
     def logger(*_: Any) -> LineLogger:

@@ -94,13 +94,7 @@ class Metrics:
         unwritten.set_function(lambda: LineLogger.lost)
 
     def count_bus(self, counts: BusCounts) -> None:
-        """Update from the counters of the zenoh bus.
-
-        Parameters
-        ----------
-        counts
-            Totals since the start.
-        """
+        """Update from the counters of the zenoh bus."""
         now = asdict(counts)
         for what, total in now.items():
             self.bus.labels(what.replace("_", "-")).inc(total - self._bus_before[what])

@@ -150,15 +150,7 @@ class Settings(BaseSettings):
 def split_address(address: str) -> tuple[str, int]:
     """Return host and port of `host:port` or `[v6]:port`.
 
-    Parameters
-    ----------
-    address
-        `host:port` or `[v6]:port`.
-
-    Raises
-    ------
-    InputInvalid
-        If the text is not an address.
+    Raises InputInvalid if the text is not an address.
     """
     host, _, port = address.rpartition(":")
     host = host.removeprefix("[").removesuffix("]")
@@ -171,15 +163,7 @@ def split_address(address: str) -> tuple[str, int]:
 def settings(given: Mapping[str, Any]) -> Settings:
     """Return the settings: given values, then the environment, then the defaults.
 
-    Parameters
-    ----------
-    given
-        Values from the command line by field name; None for missing ones.
-
-    Raises
-    ------
-    SettingsInvalid
-        With every problem.
+    Raises SettingsInvalid with every problem.
     """
     try:
         return Settings(**{name: value for name, value in given.items() if value is not None})

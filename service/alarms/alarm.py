@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import Field, TypeAdapter
 
 from gridsec.errors import GridsecError
-from service.alarms.conditions import AlarmKind, ConditionEvidence, Severity
-from service.report.reasons import DataErrorReport
-from service.report.report import ExplanationReport, StalledMeter
+from service.alarms.conditions import AlarmEvidence, AlarmKind, Severity
 
 
 class AlarmState(StrEnum):
@@ -65,44 +65,29 @@ class RaisedAgain(GridsecError):
 
 @dataclass(frozen=True, slots=True)
 class Alarm:
-    """An alarm. Times are Unix seconds.
+    """An alarm. Times are Unix seconds."""
 
-    Attributes
-    ----------
-    id
-        26 characters, the first ten of which sort by time; the same data give the same id.
-    kind, feeder, meter, severity, reason, evidence, customer
-        As in the condition of the alarm.
-    state
-        Raised, acknowledged or cleared.
-    count
-        Number of occurrences; above 1 the alarm flaps.
-    t_event
-        Start of the condition of the present (or last) occurrence.
-    t_raised
-        End of the on-delay of that occurrence.
-    t_cleared
-        Time of clearing; None while active.
-    acknowledged_by, t_acknowledged, comment
-        Operator's acknowledgement of the present (or last) occurrence.
-    """
-
-    id: str
+    id: str  # 26 characters, the first ten sort by time; the same data give the same id
     kind: AlarmKind
     feeder: str
-    meter: str | None
+    meter: Annotated[
+        str | None,
+        Field(description="Null for an alarm of the whole feeder; `substation` is the busbar meter."),
+    ]
     severity: Severity
     state: AlarmState
-    count: int
-    t_event: float
-    t_raised: float
+    count: Annotated[int, Field(description="Number of occurrences; above 1 the alarm flaps.")]
+    t_event: Annotated[float, Field(description="Start of the condition.")]
+    t_raised: Annotated[float, Field(description="End of the on-delay.")]
     t_cleared: float | None
     reason: str
-    evidence: ConditionEvidence
-    acknowledged_by: str | None = None
-    t_acknowledged: float | None = None
-    comment: str | None = None
-    customer: str | None = None
+    evidence: AlarmEvidence
+    acknowledged_by: str | None
+    t_acknowledged: float | None
+    comment: str | None
+    customer: Annotated[
+        str | None, Field(description="Customer of the inverter, for an alarm of an inverter.")
+    ] = None
 
     @property
     def subject(self) -> str | None:
@@ -126,46 +111,15 @@ class AlarmTransition:
     comment: str | None = None
 
 
+_ALARM = TypeAdapter(Alarm)
+
+
 def to_json(alarm: Alarm) -> dict[str, Any]:
-    """Return the alarm as the JSON object of REST and zenoh."""
-    return {
-        **asdict(alarm),
-        "kind": str(alarm.kind),
-        "severity": str(alarm.severity),
-        "state": str(alarm.state),
-    }
+    """Return the alarm as the JSON object of REST, zenoh and the database."""
+    found: dict[str, Any] = _ALARM.dump_python(alarm, mode="json")
+    return found
 
 
 def from_json(data: Mapping[str, Any]) -> Alarm:
-    """Return the alarm that `to_json` wrote.
-
-    Parameters
-    ----------
-    data
-        The object; it may have more fields, and older ones lack newer fields.
-    """
-    fields = {name: data[name] for name in Alarm.__dataclass_fields__ if name in data}
-    fields["kind"] = AlarmKind(data["kind"])
-    fields["severity"] = Severity(data["severity"])
-    fields["state"] = AlarmState(data["state"])
-    evidence = dict(data["evidence"])
-    shown = evidence.pop("explanations", ())
-    explanations = tuple(
-        ExplanationReport(
-            tuple(e["meters"]), tuple(e["inverters"]), e["probability"], tuple(e.get("powers", ()))
-        )
-        for e in shown
-    )
-    learning = tuple(StalledMeter(**meter) for meter in evidence.pop("learning", ()))
-    error = evidence.pop("data_error", None)
-    fields["evidence"] = ConditionEvidence(
-        **evidence, explanations=explanations, learning=learning, data_error=_data_error(error)
-    )
-    return Alarm(**fields)
-
-
-def _data_error(data: Mapping[str, Any] | None) -> DataErrorReport | None:
-    if data is None:
-        return None
-    lists = {name: tuple(data[name]) for name in ("meters", "customers", "proposed")}
-    return DataErrorReport(kind=data["kind"], study=data["study"], text=data["text"], **lists)
+    """Return the alarm of `to_json`; further fields are ignored, absent newer ones have their defaults."""
+    return _ALARM.validate_python(data)

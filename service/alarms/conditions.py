@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import Annotated
+
+from pydantic import ConfigDict, Field, JsonValue, with_config
 
 from gridsec.interface import Cause, Decision
 from service.report.reasons import DataErrorReport
-from service.report.report import BUSBAR, ExplanationReport, FeederReport, MeterReport, StalledMeter, finite
+from service.report.report import ExplanationReport, FeederReport, MeterState, StalledMeter, finite
+from service.report.voltages import BUSBAR
 
 
 class AlarmKind(StrEnum):
@@ -33,67 +36,54 @@ class Severity(StrEnum):
     MINOR = "minor"
 
 
-@dataclass(frozen=True, slots=True)
-class ConditionEvidence:
-    """Numbers of an alarm at the tick that raised it; None without one.
+_ALWAYS: list[JsonValue] = [
+    "score",
+    "threshold",
+    "v_volt_reported",
+    "v_volt_estimated",
+    "attack_volt_estimated",
+]
 
-    Attributes
-    ----------
-    score, threshold
-        Residual of the meter and the largest one of an honest meter, squared pu.
-    v_volt_reported, v_volt_estimated, attack_volt_estimated
-        Reported and reconstructed voltage and their difference for suspects, V.
-    kind
-        Attack kind of a meter, see `gridsec.interface.ManipulationKind`.
-    attack_kvar_estimated
-        Injection of an inverter beyond its droop curve, kvar.
-    explanations
-        Possible explanations of the readings, if no device can be named as manipulated.
-    learning
-        Meters that are not learned after twice the expected time, with the reasons.
-    data_error
-        Error of the feeder's files that explains the accusation as well.
-    """
+
+@with_config(ConfigDict(json_schema_extra={"required": _ALWAYS}))
+@dataclass(frozen=True, slots=True)
+class AlarmEvidence:
+    """Numbers of an alarm when it was raised, or when `data_error` was found."""
 
     score: float | None = None
     threshold: float | None = None
     v_volt_reported: float | None = None
     v_volt_estimated: float | None = None
     attack_volt_estimated: float | None = None
-    kind: str | None = None
-    attack_kvar_estimated: float | None = None
+    kind: Annotated[str | None, Field(description="Attack kind of a meter.")] = None
+    attack_kvar_estimated: Annotated[
+        float | None, Field(description="Injection of an inverter beyond its droop curve, kvar.")
+    ] = None
     explanations: tuple[ExplanationReport, ...] = ()
-    learning: tuple[StalledMeter, ...] = ()
-    data_error: DataErrorReport | None = None
+    learning: Annotated[tuple[StalledMeter, ...], Field(description="Meters with stalled learning.")] = ()
+    data_error: Annotated[
+        DataErrorReport | None,
+        Field(description="Error of the feeder's files that explains the accusation as well."),
+    ] = None
 
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """One condition that is present at a tick or, with `known=False`, unknown.
+    """One condition that is present at a tick or, with `known=False`, unknown."""
 
-    Attributes
-    ----------
-    kind, feeder, meter
-        Kind and subject; the meter is None for a condition of the whole feeder.
-    customer
-        Customer of the inverter that the condition refers to, or None. `meter` is that customer's, if any.
-    severity, evidence, reason
-        Severity, numbers, and a sentence for the operator.
-    known
-        False: the tick gives no answer; an existing alarm is held.
-    unheard
-        The condition is present because readings are missing of meters that are not silent yet: it raises an
-        alarm only if it lasts for longer than `silence_s`.
-    """
-
+    # kind, feeder, meter: kind and subject; the meter is None for a condition of the whole feeder.
     kind: AlarmKind
     feeder: str
     meter: str | None
+    # severity, evidence, reason: severity, numbers, and a sentence for the operator.
     severity: Severity
-    evidence: ConditionEvidence = ConditionEvidence()
+    evidence: AlarmEvidence = AlarmEvidence()
     reason: str = ""
-    known: bool = True
+    known: bool = True  # false: the tick gives no answer; an existing alarm is held
+    # Customer of the inverter that the condition refers to, or None. `meter` is that customer's, if any.
     customer: str | None = None
+    # The condition is present because readings are missing of meters that are not silent yet: it raises an
+    # alarm only if it lasts for longer than `silence_s`.
     unheard: bool = False
 
     @property
@@ -122,10 +112,7 @@ def conditions(report: FeederReport) -> list[Condition]:
     - `clock-offset`: the clock of a meter, or of the busbar meter, is measurably ahead or behind, or its
       readings are late.
 
-    Returns
-    -------
-    list of Condition
-        A condition that is not in the list is absent.
+    A condition that is not in the list is absent.
     """
     manipulated = (*_manipulated(report), *_busbar(report), *_inverters(report))
     found = [*manipulated, *_data_loss(report), *_undecided(report), *_learning(report), *_clocks(report)]
@@ -134,11 +121,11 @@ def conditions(report: FeederReport) -> list[Condition]:
     return found
 
 
-def _evidence(meter: MeterReport) -> ConditionEvidence:
+def _evidence(meter: MeterState) -> AlarmEvidence:
     def number(value: float | None) -> float | None:
         return None if value is None else finite(value)
 
-    return ConditionEvidence(
+    return AlarmEvidence(
         number(meter.score),
         number(meter.threshold),
         number(meter.v_volt_reported),
@@ -196,7 +183,7 @@ def _busbar(report: FeederReport) -> Iterable[Condition]:
         report.feeder,
         BUSBAR,
         Severity.CRITICAL,
-        ConditionEvidence(
+        AlarmEvidence(
             v_volt_reported=busbar.v_volt_reported,
             v_volt_estimated=busbar.v_volt_estimated,
             attack_volt_estimated=busbar.attack_volt_estimated,
@@ -219,7 +206,7 @@ def _inverters(report: FeederReport) -> Iterable[Condition]:
             report.feeder,
             inverter.meter,
             Severity.CRITICAL,
-            ConditionEvidence(attack_kvar_estimated=kvar),
+            AlarmEvidence(attack_kvar_estimated=kvar),
             f"the inverter of {inverter.customer} injects {much} beyond its droop curve",
             known,
             inverter.customer,
@@ -239,16 +226,16 @@ _SOUND = frozenset(
 )
 
 
-def _voltage_limit(report: FeederReport, meter: MeterReport) -> Iterable[Condition]:
+def _voltage_limit(report: FeederReport, meter: MeterState) -> Iterable[Condition]:
     evidence = _evidence(meter)
     v = evidence.v_volt_estimated  # None if model only
     half_width = None if meter.v_volt_std is None else finite(3.0 * meter.v_volt_std)
-    if v is None or half_width is None or report.cause not in _SOUND:
+    low, high = meter.v_min_volt, meter.v_max_volt
+    if v is None or half_width is None or low is None or high is None or report.cause not in _SOUND:
         yield Condition(
             AlarmKind.VOLTAGE_LIMIT, report.feeder, meter.meter, Severity.MAJOR, evidence, known=False
         )
         return
-    low, high = meter.limits(report)
     if low <= v <= high:
         return
     surely = v + half_width < low or v - half_width > high
@@ -265,7 +252,7 @@ def _voltage_limit(report: FeederReport, meter: MeterReport) -> Iterable[Conditi
 
 
 def _data_loss(report: FeederReport) -> Iterable[Condition]:
-    silent = dict(report.silent)
+    silent = {one.meter: one.seconds for one in report.silent}
     unsure = [meter.meter for meter in report.meters if not meter.seen and meter.meter not in silent]
     busbar_seen = report.busbar.seen and report.cause is not Cause.NO_BUSBAR
     if not busbar_seen and BUSBAR not in silent:
@@ -273,7 +260,7 @@ def _data_loss(report: FeederReport) -> Iterable[Condition]:
     for meter, seconds in silent.items():
         # Without the busbar voltage the whole feeder is not monitored.
         severity = Severity.MAJOR if meter == BUSBAR else Severity.MINOR
-        length = "yet" if not math.isfinite(seconds) else f"for {seconds:.0f} s"
+        length = "yet" if seconds is None else f"for {seconds:.0f} s"
         yield Condition(
             AlarmKind.DATA_LOSS, report.feeder, meter, severity, reason=f"no usable reading {length}"
         )
@@ -289,7 +276,7 @@ def _undecided(report: FeederReport) -> Iterable[Condition]:
     if report.cause is Cause.NO_BUSBAR:
         gone = [BUSBAR]
     # A meter that is unavailable at every other tick is never silent; only this condition reports it.
-    told = bool(gone) and {*gone} <= {meter for meter, _ in report.silent}
+    told = bool(gone) and {*gone} <= {one.meter for one in report.silent}
     # Each of these meters has an alarm of kind `clock-offset`.
     told = told or report.cause is Cause.CLOCK_OFFSET
     yield Condition(
@@ -297,7 +284,7 @@ def _undecided(report: FeederReport) -> Iterable[Condition]:
         report.feeder,
         None,
         Severity.MAJOR,
-        ConditionEvidence(explanations=report.explanations, data_error=report.data_error),
+        AlarmEvidence(explanations=report.explanations, data_error=report.data_error),
         reason=report.reason,
         known=not told and report.cause is not Cause.SETTLING,
         unheard=unheard,
@@ -328,7 +315,7 @@ def _learning(report: FeederReport) -> Iterable[Condition]:
         report.feeder,
         None,
         Severity.MINOR,
-        ConditionEvidence(learning=stalled),
+        AlarmEvidence(learning=stalled),
         f"{len(stalled)} of {len(report.meters)} meters are not learned after twice the expected time{time}: "
         f"{why}",
         known=learning is not None,

@@ -34,11 +34,12 @@ from service.alarms.alarm import (
     from_json,
     to_json,
 )
-from service.alarms.conditions import AlarmKind, Condition, ConditionEvidence, Severity, conditions
+from service.alarms.conditions import AlarmEvidence, AlarmKind, Condition, Severity, conditions
 
 __all__ = [
     "Alarm",
     "AlarmBook",
+    "AlarmEvidence",
     "AlarmKind",
     "AlarmRules",
     "AlarmState",
@@ -47,13 +48,12 @@ __all__ = [
     "AlreadyAcknowledged",
     "Change",
     "Condition",
-    "ConditionEvidence",
     "RaisedAgain",
     "Severity",
-    "acknowledge",
     "acknowledged",
     "advance",
     "carried",
+    "carry",
     "close",
     "conditions",
     "from_json",
@@ -65,25 +65,18 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class AlarmRules:
-    """Delays of alarms.
+    """Delays of alarms."""
 
-    Attributes
-    ----------
-    on_delay_s, off_delay_s
-        Time that a condition must be present before its alarm is raised, and absent before it is cleared, s.
-    on_delays_s, off_delays_s
-        Other delays for single kinds, s.
-    memory_s
-        A condition that returns within this time after it cleared raises the same alarm again, s.
-    silence_s
-        A condition caused only by missing readings must be present for longer than this to raise an alarm, s.
-    """
-
+    # on_delay_s, off_delay_s: time that a condition must be present before its alarm is raised, and absent
+    # before it is cleared, s.
     on_delay_s: float = 2.0
     off_delay_s: float = 5.0
+    # on_delays_s, off_delays_s: other delays for single kinds, s.
     on_delays_s: Mapping[AlarmKind, float] = field(default_factory=dict)
     off_delays_s: Mapping[AlarmKind, float] = field(default_factory=dict)
+    # A condition that returns within this time after it cleared raises the same alarm again, s.
     memory_s: float = 600.0
+    # A condition caused only by missing readings must be present for longer than this to raise an alarm, s.
     silence_s: float = 0.0
 
     def __post_init__(self) -> None:
@@ -112,48 +105,25 @@ Key = tuple[AlarmKind, str | None]
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """State of one condition in the book.
+    """State of one condition in the book."""
 
-    Attributes
-    ----------
-    present
-        State at the last known tick.
-    onset
-        Start of the present run of equal states, s.
-    since
-        The same, moved forward by every hold, so that t - since is the time that counts, s.
-    t_known
-        End of the validity of the last known state: the last known tick, or the first unknown one after it,
-        s.
-    held
-        True if unknown ticks followed.
-    alarm
-        Its alarm: active, or cleared and remembered; None while the condition is only pending.
-    """
-
-    present: bool
-    onset: float
-    since: float
+    present: bool  # state at the last known tick
+    onset: float  # start of the present run of equal states, s
+    since: float  # the same, moved forward by every hold, so that t - since is the time that counts, s
+    # End of the validity of the last known state: the last known tick, or the first unknown one after it, s.
     t_known: float
-    held: bool
+    held: bool  # True if unknown ticks followed
+    # Its alarm: active, or cleared and remembered; None while the condition is only pending.
     alarm: Alarm | None
 
 
 @dataclass(frozen=True, slots=True)
 class AlarmBook:
-    """Alarm state of one feeder. A value: `advance` and `acknowledge` return a new one.
-
-    Attributes
-    ----------
-    t
-        Time of the last tick, s; None before the first one.
-    entries
-        By kind and subject.
-    """
+    """Alarm state of one feeder. A value: `advance` and `carry` return a new one."""
 
     feeder: str
-    t: float | None = None
-    entries: Mapping[Key, Entry] = field(default_factory=dict)
+    t: float | None = None  # time of the last tick, s; None before the first one
+    entries: Mapping[Key, Entry] = field(default_factory=dict)  # by kind and subject
 
     @property
     def alarms(self) -> tuple[Alarm, ...]:
@@ -172,22 +142,13 @@ def advance(
 ) -> tuple[AlarmBook, tuple[AlarmTransition, ...]]:
     """Update the book by one tick.
 
-    Parameters
-    ----------
-    conditions
-        Result of `conditions` for this tick; a condition that is not in it is absent.
-    t
-        Unix time of the tick, s. A tick before the last one holds every clock.
+    `conditions` are those of this tick: one that is not in it is absent. A tick before the last one holds
+    every clock. Raises ValueError if a condition belongs to another feeder.
 
     Returns
     -------
     book, transitions
         The new state, and the transitions, in a reproducible order.
-
-    Raises
-    ------
-    ValueError
-        If a condition belongs to another feeder.
     """
     seen: dict[Key, Condition] = {}
     for condition in conditions:
@@ -215,10 +176,7 @@ def advance(
 def hold(book: AlarmBook, t: float) -> AlarmBook:
     """Return the book after skipped ticks: every clock stops, as at an unknown tick.
 
-    Parameters
-    ----------
-    t
-        Unix time of the first skipped tick, s.
+    `t` is the time of the first skipped tick.
     """
     return replace(book, entries={key: _hold(entry, t) for key, entry in book.entries.items()})
 
@@ -277,7 +235,7 @@ def _present(
     return replace(entry, alarm=alarm), (AlarmTransition(alarm, change, t),)
 
 
-def _explains_more(now: ConditionEvidence, before: ConditionEvidence) -> bool:
+def _explains_more(now: AlarmEvidence, before: AlarmEvidence) -> bool:
     """True if an error of the feeder's files explains the condition and is new to the alarm."""
     error, told = now.data_error, before.data_error
     if error is None or told is None:
@@ -310,6 +268,9 @@ def _raise(old: Alarm | None, condition: Condition, rules: AlarmRules, onset: fl
         t_cleared=None,
         reason=condition.reason,
         evidence=condition.evidence,
+        acknowledged_by=None,
+        t_acknowledged=None,
+        comment=None,
         customer=condition.customer,
     )
 
@@ -322,13 +283,6 @@ def alarm_id(condition: Condition, onset: float) -> str:
 
     In the form of a ULID: ten characters of Crockford's base 32 for the milliseconds, then sixteen, which are
     a hash instead of random bits, so that a replay gives the same ids.
-
-    Parameters
-    ----------
-    condition
-        Kind, feeder and subject enter the hash.
-    onset
-        Unix time, s.
     """
     what = "\0".join((condition.kind, condition.feeder, condition.subject or "", repr(onset)))
     tail = int.from_bytes(hashlib.sha256(what.encode()).digest()[:10], "big")
@@ -343,21 +297,9 @@ def acknowledged(
 
     A cleared alarm without an acknowledgement can still be acknowledged; it stays cleared.
 
-    Parameters
-    ----------
-    who, comment
-        The operator, and the comment.
-    t
-        Unix time, s.
-    count
-        Occurrence that the operator refers to; None: the latest.
-
-    Raises
-    ------
-    RaisedAgain
-        If the alarm has been raised again: the acknowledgement refers to an earlier occurrence.
-    AlreadyAcknowledged
-        If the same occurrence is already acknowledged.
+    `count` is the occurrence that the operator refers to; None: the latest. Raises RaisedAgain if the alarm
+    has been raised again: the acknowledgement refers to an earlier occurrence. Raises AlreadyAcknowledged if
+    the same occurrence is already acknowledged.
     """
     if count is not None and count != alarm.count:
         raise RaisedAgain(alarm, count)
@@ -376,12 +318,7 @@ def acknowledged(
 def carried(alarm: Alarm, answered: Alarm) -> Alarm:
     """Return an alarm with the acknowledgement that was stored while it changed.
 
-    Parameters
-    ----------
-    alarm
-        The alarm after the change.
-    answered
-        The acknowledged alarm; ignored for another alarm or occurrence.
+    `answered` is ignored for another alarm or occurrence.
     """
     if (alarm.id, alarm.count) != (answered.id, answered.count):
         return alarm
@@ -394,45 +331,20 @@ def carried(alarm: Alarm, answered: Alarm) -> Alarm:
     )
 
 
-def acknowledge(
-    book: AlarmBook, alarm_id: str, who: str, comment: str, t: float, *, count: int | None = None
-) -> tuple[AlarmBook, tuple[AlarmTransition, ...]]:
-    """Acknowledge an alarm of the book.
-
-    Parameters
-    ----------
-    alarm_id, who, comment, t
-        Id of the alarm, operator, comment, and time (Unix s).
-    count
-        Occurrence; None: the latest.
-
-    Returns
-    -------
-    book, transitions
-        As from `advance`.
-
-    Raises
-    ------
-    AlarmUnknown
-        If the book has no such alarm: never raised, or cleared and dropped (the store may have it).
-    RaisedAgain, AlreadyAcknowledged
-        If the alarm has been raised again, or is already acknowledged.
-    """
+def carry(book: AlarmBook, answered: Alarm) -> AlarmBook | None:
+    """Return the book with a stored acknowledgement; None if its occurrence is over."""
     for key, entry in book.entries.items():
-        if entry.alarm is not None and entry.alarm.id == alarm_id:
-            transition = acknowledged(entry.alarm, who, comment, t, count=count)
-            entries = {**book.entries, key: replace(entry, alarm=transition.alarm)}
-            return replace(book, entries=entries), (transition,)
-    raise AlarmUnknown(alarm_id)
+        alarm = entry.alarm
+        if alarm is not None and (alarm.id, alarm.count) == (answered.id, answered.count):
+            entries = {**book.entries, key: replace(entry, alarm=carried(alarm, answered))}
+            return replace(book, entries=entries)
+    return None
 
 
 def close(alarms: Iterable[Alarm], t: float, why: str) -> tuple[AlarmTransition, ...]:
     """Return the transitions that clear alarms without a monitor.
 
-    Parameters
-    ----------
-    alarms, t, why
-        The alarms, of which the active ones are cleared; time (Unix s), and reason for the event.
+    `why` is the reason for the event; cleared alarms are left out.
     """
     cleared = (replace(alarm, state=AlarmState.CLEARED, t_cleared=t) for alarm in alarms if alarm.active)
     return tuple(AlarmTransition(alarm, Change.CLEARED, t, None, why) for alarm in cleared)
@@ -445,11 +357,9 @@ def restore(feeder: str, alarms: Iterable[Alarm]) -> AlarmBook:
     clock (a pending condition, an alarm about to clear) restarts from zero. A transition may therefore come
     later than without the restart, by less than its delay, and never earlier.
 
-    Parameters
-    ----------
-    alarms
-        Its active alarms and those that cleared within the memory of the rules, in any order. Of several with
-        the same kind and subject one counts: an active one before cleared ones, then the one raised last.
+    `alarms` are the active ones and those that cleared within the memory of the rules, in any order. Of
+    several with the same kind and subject one counts: an active one before cleared ones, then the one raised
+    last.
     """
     entries: dict[Key, Entry] = {}
     # Ids follow a clock that may have been set back since, so that they do not tell which alarm is active.

@@ -38,14 +38,7 @@ def problem(
 ) -> Response:
     """Return an error response.
 
-    Parameters
-    ----------
-    status, detail
-        HTTP status, and a sentence on the error.
-    headers
-        Additional headers.
-    **more
-        Additional members, such as the list of all problems of a feeder.
+    `more` are additional members, such as the list of all problems of a feeder.
     """
     body = {
         "type": "about:blank",

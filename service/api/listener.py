@@ -54,29 +54,16 @@ _log = structlog.get_logger("gridsec.http")
 
 @dataclass(frozen=True, slots=True)
 class Shares:
-    """Descriptors by use; their sum with `RESERVE` is at most the limit of the process.
+    """Descriptors by use; their sum with `RESERVE` is at most the limit of the process."""
 
-    Attributes
-    ----------
-    http
-        HTTP connections.
-    sessions, pending
-        zenoh sessions, and those that are being opened.
-    """
-
-    http: int
+    http: int  # HTTP connections
+    # sessions, pending: zenoh sessions, and those that are being opened.
     sessions: int
     pending: int
 
     @classmethod
     def of(cls, limit: int) -> Shares:
-        """Divide the descriptors of a process.
-
-        Parameters
-        ----------
-        limit
-            Soft limit of open descriptors.
-        """
+        """Divide the descriptors of a process. `limit` is the soft limit of open descriptors."""
         left = max(limit - RESERVE, 24)
         http = min(HTTP_MOST, left // 3)
         pending = min(PENDING_MOST, (left - http) // 8)

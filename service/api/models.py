@@ -1,28 +1,33 @@
-"""Pydantic models of REST: source of the OpenAPI description; NaN becomes null."""
+"""Models of requests and of responses that no other module declares.
+
+Reports, commissioning and alarms are dataclasses of the engine, declared once: pydantic derives their JSON
+and their OpenAPI description.
+"""
 
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Sequence
-from typing import Annotated, Any, Literal
+from dataclasses import dataclass, fields
+from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StringConstraints, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
-from gridsec.estimators.data_errors import DataErrorKind
-from gridsec.estimators.sequential import LearningReason, LearningState
 from gridsec.interface import Cause, Decision
-from service.alarms.state_machine import AlarmKind, AlarmState, Change, Severity
-from service.engine.commissioning import Stage
-from service.report.voltages import BUSBAR
-from service.store.schema import CommissioningChange
+from service.alarms.state_machine import Alarm
+from service.engine.commissioning import CommissioningProgress, MeterCommissioning
+from service.report.report import FeederReport, MeterState
+from service.report.voltages import ModelOnly
+from service.store import AlarmEvent
+from service.store.schema import CommissioningEvent
 
-
-def _finite(value: Any) -> Any:
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-Number = Annotated[float | None, BeforeValidator(_finite)]
+RENAMED = {
+    "Alarm": "AlarmModel",
+    "DataErrorReport": "DataErrorModel",
+    "ExplanationReport": "ExplanationModel",
+    "StalledMeter": "StalledMeterModel",
+}
+"""Names in OpenAPI of classes with another name in the code."""
 Line = Annotated[
     str,
     StringConstraints(
@@ -47,243 +52,39 @@ class Problem(BaseModel):
     instance: str = Field(description="Path of the request.")
 
 
-ModelOnly = Annotated[
-    bool,
-    Field(
-        description="The estimates use no voltage reading of this tick, only powers, the model and the state "
-        "of the estimator."
-    ),
-]
-
-
-class MeterState(BaseModel):
-    """One meter at the latest tick."""
-
-    meter: str
-    bus: str
-    seen: bool = Field(description="A usable reading belongs to this tick.")
-    suspect: bool = Field(description="The verdict names this meter as manipulated.")
-    score: Number = Field(description="Absolute residual of the squared voltage, squared pu.")
-    threshold: Number = Field(description="Largest score of an honest meter, squared pu.")
-    v_volt_reported: Number = Field(description="Reported voltage, phase to neutral, V.")
-    v_volt_estimated: Number = Field(description="Reconstructed voltage, V.")
-    v_volt_std: Number = Field(description="Its standard deviation, or a third of its hard bound, V.")
-    v2_pu_estimated: Number = Field(description="Reconstructed squared voltage, pu.")
-    attack_volt_estimated: Number = Field(description="Reported minus reconstructed, V; 0 if not suspect.")
-    kind: str | None = Field(default=None, description="Attack kind, if known.")
-    phase: str | None = Field(default=None, description="Measured phase; null if balanced.")
-    v_min_volt: Number = Field(default=None, description="Lowest permitted voltage at the meter, V.")
-    v_max_volt: Number = Field(default=None, description="Highest permitted voltage at the meter, V.")
-    learning_state: LearningState | None = Field(
-        default=None, description="Learning of its fixed error; null if the estimator does not learn."
-    )
-    learning_reason: LearningReason | None = Field(
-        default=None, description="Reason that took most of the time that did not count; null on schedule."
-    )
-    model_only: ModelOnly = False
-    clock_offset_s: Number = Field(
-        default=None,
-        description="Lead of its clock relative to the other meters, s; null if not measurable.",
-    )
-
-
-class BusbarMeterState(BaseModel):
-    """The busbar meter at the latest tick; in three phases the numbers belong to one phase."""
-
-    meter: str = Field(default=BUSBAR, description="Its name in alarms and explanations.")
-    judged: bool = Field(
-        default=False,
-        description="The estimator tests this meter, and this tick has the readings for the test: of this "
-        "meter and of a trusted meter in the same phase.",
-    )
-    seen: bool = Field(default=False, description="A usable reading belongs to this tick.")
-    suspect: bool = Field(default=False, description="The verdict names it as manipulated.")
-    phases: list[str] = Field(
-        default=[], description="Manipulated phases, a, b or c; empty on a balanced feeder."
-    )
-    phase: str | None = Field(
-        default=None,
-        description="Phase of the numbers, the one with the largest deviation; null if balanced.",
-    )
-    v_volt_reported: Number = Field(default=None, description="Reported voltage, phase to neutral, V.")
-    v_volt_estimated: Number = Field(default=None, description="Reconstructed voltage of the busbar, V.")
-    attack_volt_estimated: Number = Field(
-        default=None, description="Mean excess of its reading, V; 0 if not suspect."
-    )
-    model_only: ModelOnly = False
-    clock_offset_s: Number = Field(
-        default=None,
-        description="Lead of its clock relative to the other meters, s; null if not measurable.",
-    )
-
-
-class CustomerState(BaseModel):
-    """One customer at the latest tick, metered or not."""
-
-    customer: str
-    v_volt_estimated: Number = Field(description="Reconstructed voltage, V.")
-    v_volt_std: Number = Field(description="Its standard deviation, or a third of its hard bound, V.")
-    model_only: ModelOnly = False
-
-
-class InverterState(BaseModel):
-    """One droop inverter at the latest tick."""
-
-    customer: str
-    bus: str
-    meter: str | None = Field(description="The customer's meter, if there is one.")
-    judged: bool = Field(description="The inverter is monitored at this tick.")
-    suspect: bool = Field(description="The verdict names this inverter as manipulated.")
-    q_kvar_estimated: Number = Field(description="Injected reactive power, kvar.")
-    attack_kvar_estimated: Number = Field(description="Injection beyond its droop curve, kvar.")
-    model_only: ModelOnly = False
-
-
-class ExplanationModel(BaseModel):
-    """One of several explanations of the readings with similar probability."""
-
-    meters: list[str] = Field(description="Accused meters; `substation` is the busbar meter.")
-    inverters: list[str] = Field(description="Accused inverters, by customer.")
-    powers: list[str] = Field(default=[], description="False reported powers, by customer; accuses no meter.")
-    probability: float = Field(description="Share among the given explanations.")
-
-
-class DataErrorModel(BaseModel):
-    """An error of the feeder's files that explains accused meters as well as a manipulation does."""
-
-    kind: DataErrorKind
-    meters: list[str] = Field(description="The accused meters that the error explains.")
-    customers: list[str] = Field(description="The one customer, or the two that are exchanged.")
-    proposed: list[str] = Field(description="Bus and phase of each customer that agree with the readings.")
-    study: str = Field(description="Command that checks the error on a recording.")
-    text: str = Field(description="One sentence for the operator.")
-
-
-class BusState(BaseModel):
-    """One bus at the latest tick."""
-
-    bus: str
-    v_volt: Number = Field(
-        description="Reconstructed voltage to neutral, V; in three phases the one furthest from nominal."
-    )
-    v_phases: list[Number] | None = Field(
-        default=None, description="Reconstructed voltage of each phase, V; null on a balanced feeder."
-    )
-    model_only: ModelOnly = False
-
-
-class Silence(BaseModel):
-    """A meter without usable readings for longer than `silence_s` of the feeder."""
-
-    meter: str
-    seconds: Number
-
-
-class State(BaseModel):
+@dataclass(frozen=True, slots=True, kw_only=True)
+class State(FeederReport):
     """A feeder at its latest tick."""
 
-    feeder: str
-    revision: str = Field(default="", description="Revision of the feeder that the state belongs to.")
-    t: float = Field(description="Unix time of the tick, s.")
-    age_s: float = Field(description="Age of the tick at the response, by the service's clock, s.")
-    verdict: Decision
-    reason: str
-    cause: Cause
-    max_attacked: int
-    skipped: int = Field(default=0, description="Number of skipped ticks directly before this one.")
-    model_only: bool = Field(
-        default=False, description="No value of the feeder uses a voltage reading of this tick."
-    )
-    model_only_phases: list[str] = Field(
-        default=[], description="Phases without such a reading, of a, b and c; empty on a balanced feeder."
-    )
-    t_measured: Number = Field(
-        default=None,
-        description="Newest tick with a reading that a value uses, Unix s; null: none since the start.",
-    )
-    meters: list[MeterState]
-    buses: list[BusState]
-    silent: list[Silence]
-    v_min_volt: Number
-    v_max_volt: Number
-    busbar: BusbarMeterState = Field(default=BusbarMeterState(), description="The busbar meter.")
-    customers: list[CustomerState] = []
-    inverters: list[InverterState] = []
-    explanations: list[ExplanationModel] = []
-    data_error: DataErrorModel | None = Field(
-        default=None, description="Error of the feeder's files that explains the accused meters as well."
-    )
+    age_s: Annotated[float, Field(description="Age of the tick at the response, by the service's clock, s.")]
 
 
-class MeterCommissioning(BaseModel):
-    """Commissioning of one meter: its fixed error."""
-
-    meter: str
-    state: Stage
-    since: Number = Field(description="Start of the learning, Unix s; null for a learned meter.")
-    learned_at: Number = Field(description="Time at which it was learned, Unix s; null before.")
-    gathered_s: Number = Field(description="Time with usable readings of a trusted meter since the start, s.")
-    expected: Number = Field(description="Expected end of the learning if every tick counts, Unix s.")
-    error_volt: Number = Field(description="Fixed error at nominal voltage, V; 0 before it is learned.")
-    error_volt_std: Number = Field(description="Standard deviation of the error, ageing included, V.")
-    allowed_volt: Number = Field(description="Largest deviation of an honest meter from its error, V.")
-    learning_state: LearningState = Field(
-        description="`waiting`: no tick counted yet. `learning`. `stalled`: not learned after twice "
-        "`expected_s`. `learned`."
-    )
-    learning_reason: LearningReason | None = Field(
-        description="Reason that took most of the time that did not count; null on schedule."
-    )
-    watched_s: Number = Field(description="Time of all ticks since the start, s; null for a learned meter.")
-    lost_s: dict[LearningReason, float] = Field(description="Time that did not count, s, by reason.")
-
-
+@dataclass(frozen=True, slots=True, kw_only=True)
 class MeterNow(MeterState):
     """One meter at the latest tick, with its feeder and the verdict."""
 
     feeder: str
     t: float
     verdict: Decision
-    commissioning: MeterCommissioning | None = Field(
-        default=None, description="Commissioning of the meter; null if the estimator does not learn."
-    )
+    commissioning: Annotated[
+        MeterCommissioning | None,
+        Field(description="Commissioning of the meter; null if the estimator does not learn."),
+    ] = None
 
 
-class Commissioning(BaseModel):
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Commissioning(CommissioningProgress):
     """Commissioning of a feeder: learning of its meters' fixed errors."""
 
-    feeder: str
-    estimator: str
-    state: Stage = Field(
-        description="`off`: this monitor does not learn. `waiting`: no monitor or no tick yet. `learning`: "
-        "at least one meter is being learned. `learned`: all are."
-    )
-    t: Number = Field(description="Tick of the data, Unix s.")
-    tick_s: float = Field(description="Interval of the monitor's steps, s.")
-    needed_s: float = Field(description="`commission_s`: required time with usable readings, s.")
-    gathered_s: Number = Field(
-        description="Least time with usable readings of the meters that are being learned, s."
-    )
-    since: Number = Field(description="Earliest start of the learning, Unix s.")
-    expected: Number = Field(description="Expected end of the learning, Unix s; null if `held`.")
-    learned_at: Number = Field(description="Time of the latest learned meter, Unix s.")
-    held: bool = Field(description="Enough time has passed, but a suspect prevents learning.")
-    restored: bool = Field(description="The commissioning continues from stored state.")
-    note: str = Field(description="Reason why stored state is not used; empty otherwise.")
-    expected_s: Number = Field(description="Time of learning if every tick counts, s.")
-    stalled: int = Field(description="Meters that are not learned after twice that time.")
-    kept: Number = Field(description="Newest tick of the stored commissioning, Unix s.")
-    meters: list[MeterCommissioning]
+    kept: Annotated[float | None, Field(description="Newest tick of the stored commissioning, Unix s.")]
 
 
-class CommissioningEvent(BaseModel):
-    """One change of a commissioning."""
+Shown = TypeVar("Shown", State, MeterNow, Commissioning)
 
-    t: float
-    change: CommissioningChange
-    meters: list[str]
-    who: str | None
-    reason: str
+
+def extended(kind: type[Shown], base: Any, **more: Any) -> Shown:
+    """Return a dataclass of the engine as its REST form, with the fields that are known at the response."""
+    return kind(**{field.name: getattr(base, field.name) for field in fields(base)}, **more)
 
 
 class CommissioningEvents(BaseModel):
@@ -299,9 +100,9 @@ class FeederSummary(BaseModel):
 
     name: str
     title: str = ""
-    t: Number = Field(default=None, description="Latest tick; null before the first one.")
-    age_s: Number = Field(default=None, description="Age of that tick by the service's clock, s.")
-    patience_s: Number = Field(default=None, description="Age beyond which a tick is stale, s.")
+    t: float | None = Field(default=None, description="Latest tick; null before the first one.")
+    age_s: float | None = Field(default=None, description="Age of that tick by the service's clock, s.")
+    patience_s: float | None = Field(default=None, description="Age beyond which a tick is stale, s.")
     ticks_skipped: int | None = Field(
         default=None, description="Number of skipped ticks since the start; null if not monitored."
     )
@@ -350,7 +151,7 @@ class FeederDetail(BaseModel):
     v_min_volt: float
     v_max_volt: float
     tick_s: float = 1.0
-    patience_s: Number = Field(default=None, description="Age beyond which a state is stale, s.")
+    patience_s: float | None = Field(default=None, description="Age beyond which a state is stale, s.")
     revision: str = Field(
         description="Digest of all other fields; a state with another one does not belong to them."
     )
@@ -358,62 +159,10 @@ class FeederDetail(BaseModel):
     tables: dict[str, Any]
 
 
-class StalledMeterModel(BaseModel):
-    """A meter that is not learned after twice the expected time."""
-
-    meter: str
-    reason: LearningReason | None
-    gathered_s: float = Field(description="Time that counted, s.")
-
-
-class AlarmEvidence(BaseModel):
-    """Numbers of an alarm when it was raised, or when `data_error` was found."""
-
-    score: Number
-    threshold: Number
-    v_volt_reported: Number
-    v_volt_estimated: Number
-    attack_volt_estimated: Number
-    kind: str | None = Field(default=None, description="Attack kind of a meter.")
-    attack_kvar_estimated: Number = Field(
-        default=None, description="Injection of an inverter beyond its droop curve, kvar."
-    )
-    explanations: list[ExplanationModel] = []
-    learning: list[StalledMeterModel] = Field(default=[], description="Meters with stalled learning.")
-    data_error: DataErrorModel | None = Field(
-        default=None, description="Error of the feeder's files that explains the accusation as well."
-    )
-
-
-class AlarmModel(BaseModel):
-    """An alarm. Times are Unix seconds."""
-
-    id: str
-    kind: AlarmKind
-    feeder: str
-    meter: str | None = Field(
-        description="Null for an alarm of the whole feeder; `substation` is the busbar meter."
-    )
-    severity: Severity
-    state: AlarmState
-    count: int = Field(description="Number of occurrences; above 1 the alarm flaps.")
-    t_event: float = Field(description="Start of the condition.")
-    t_raised: float = Field(description="End of the on-delay.")
-    t_cleared: float | None
-    reason: str
-    evidence: AlarmEvidence
-    acknowledged_by: str | None
-    t_acknowledged: float | None
-    comment: str | None
-    customer: str | None = Field(
-        default=None, description="Customer of the inverter, for an alarm of an inverter."
-    )
-
-
 class Alarms(BaseModel):
     """A page of alarms, those with the latest onset first."""
 
-    alarms: list[AlarmModel]
+    alarms: list[Alarm]
     next: str | None = Field(description="Cursor of the next page; null on the last one.")
     last_event: int = Field(
         description="Newest event number: `after` of the stream that continues from here."
@@ -425,17 +174,6 @@ class Alarms(BaseModel):
         default=0, description="Number of alarm changes that wait for the database and are not included."
     )
     problem: str | None = Field(default=None, description="Problem of the database; null without one.")
-
-
-class AlarmEvent(BaseModel):
-    """One event of an alarm, and the alarm after it."""
-
-    seq: int
-    t: float
-    change: Change
-    who: str | None
-    comment: str | None
-    alarm: AlarmModel
 
 
 class AlarmEvents(BaseModel):
@@ -472,15 +210,7 @@ class Recommissioning(BaseModel):
 
     @classmethod
     def of(cls, body: bytes, known: Sequence[str]) -> Recommissioning | list[Any]:
-        """Return the request in a body, or all its problems.
-
-        Parameters
-        ----------
-        body
-            JSON.
-        known
-            Ids of the feeder's meters.
-        """
+        """Return the request in a body, or all its problems."""
         try:
             given = json.loads(body)
         except (ValueError, RecursionError) as error:
@@ -516,10 +246,10 @@ class HistoryPoint(BaseModel):
     cause: Cause
     seen: int = Field(description="Number of meters with a usable reading.")
     suspects: list[str]
-    v_volt_lowest: Number = Field(
+    v_volt_lowest: float | None = Field(
         description="Lowest reconstructed voltage at a meter that is not model only, V."
     )
-    v_volt_highest: Number = Field(description="Highest such voltage, V.")
+    v_volt_highest: float | None = Field(description="Highest such voltage, V.")
     model_only: bool = Field(default=False, description="As in the state.")
     meter: HistoryMeter | None = Field(default=None, description="The requested meter; null without one.")
 
@@ -530,10 +260,10 @@ class HistoryMeter(BaseModel):
     meter: str
     seen: bool
     suspect: bool
-    v_volt_reported: Number
-    v_volt_estimated: Number
-    score: Number
-    threshold: Number
+    v_volt_reported: float | None
+    v_volt_estimated: float | None
+    score: float | None
+    threshold: float | None
     model_only: ModelOnly = False
 
 

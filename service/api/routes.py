@@ -13,7 +13,6 @@ import hashlib
 import json
 import secrets
 from collections.abc import AsyncGenerator, AsyncIterator, Collection, Sequence
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path as FilePath
 from typing import Annotated, Any, Protocol, cast
@@ -24,16 +23,16 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from fastapi.staticfiles import StaticFiles
+from pydantic import TypeAdapter
 
 from gridsec.errors import FeederInvalid, Problem
-from service.alarms.state_machine import AlarmKind, AlarmState, AlarmUnknown, Severity
-from service.alarms.state_machine import to_json as alarm_json
+from service.alarms.state_machine import Alarm, AlarmKind, AlarmState, AlarmUnknown, Severity
 from service.api import models
 from service.api.errors import Guard, handlers, problem
+from service.engine.commissioning import CommissioningProgress
 from service.errors import FeederNotLoaded, FeederUnknown
 from service.report.report import FeederReport
-from service.report.report import to_json as report_json
-from service.store import Store, StoredTransition, StoreUnavailable
+from service.store import AlarmEvent, Store, StoreUnavailable
 
 
 class Backend(Protocol):
@@ -61,8 +60,8 @@ class Backend(Protocol):
     def age(self, report: FeederReport) -> float:
         """Return the age of a feeder's latest report by the service's clock, s."""
 
-    def commissioning(self, name: str) -> dict[str, Any] | None:
-        """Return the fields of `models.Commissioning` without `kept`, or None for an unknown feeder."""
+    def commissioning(self, name: str) -> CommissioningProgress | None:
+        """Return the progress of a feeder's commissioning, or None for an unknown feeder."""
 
     def unstored(self) -> tuple[int, str | None]:
         """Return the number of alarm changes that wait for the database, and its problem or None."""
@@ -82,12 +81,12 @@ class Backend(Protocol):
     async def delete_feeder(self, name: str) -> None:
         """Stop monitoring a feeder; raises FeederUnknown or FeederFixed."""
 
-    async def acknowledge(
-        self, alarm_id: str, who: str, comment: str, *, count: int | None = None
-    ) -> dict[str, Any]:
+    async def acknowledge(self, alarm_id: str, who: str, comment: str, *, count: int | None = None) -> Alarm:
         """Acknowledge an alarm and return it; raises AlarmUnknown, RaisedAgain or AlreadyAcknowledged."""
 
-    async def recommission(self, name: str, meters: Sequence[str], who: str, reason: str) -> dict[str, Any]:
+    async def recommission(
+        self, name: str, meters: Sequence[str], who: str, reason: str
+    ) -> CommissioningProgress:
         """Restart the learning of meters, empty for all; raises FeederUnknown or NothingToLearn."""
 
     def subscribe(self) -> AsyncGenerator[dict[str, Any], None]:
@@ -152,6 +151,7 @@ MAX_STREAMS = 100
 """Largest number of open event streams."""
 MAX_EVENT = (1 << 63) - 1
 """Largest number of an event."""
+_STATE, _EVENT = TypeAdapter(models.State), TypeAdapter(AlarmEvent)
 _WEB = FilePath(__file__).parent.with_name("web")
 _NAME = r"^[A-Za-z0-9_-]{1,64}$"
 
@@ -159,12 +159,7 @@ _NAME = r"^[A-Za-z0-9_-]{1,64}$"
 def create_api(backend: Backend, hosts: Collection[str] = (), *, max_streams: int = MAX_STREAMS) -> FastAPI:
     """Return the HTTP application.
 
-    Parameters
-    ----------
-    hosts
-        Host names for requests that change something, besides `localhost` and the machine's name.
-    max_streams
-        Largest number of open event streams.
+    `hosts` are host names for requests that change something, besides `localhost` and the machine's name.
     """
     app = FastAPI(
         title="gridsec",
@@ -208,8 +203,15 @@ def _describe(app: FastAPI) -> None:
         for operation in path.values():
             operation["responses"].pop("422", None)
             operation["responses"]["default"]["content"] = {"application/problem+json": {"schema": error}}
+    schemas = schema["components"]["schemas"]
     for unused in ("HTTPValidationError", "ValidationError"):
-        schema["components"]["schemas"].pop(unused, None)
+        schemas.pop(unused, None)
+    for name, shown in models.RENAMED.items():
+        schemas[shown] = {**schemas.pop(name), "title": shown}
+    text = json.dumps(schema)
+    for name, shown in models.RENAMED.items():
+        text = text.replace(f'"#/components/schemas/{name}"', f'"#/components/schemas/{shown}"')
+    app.openapi_schema = json.loads(text)
 
 
 def _backend(request: Request) -> Backend:
@@ -335,23 +337,29 @@ def get_state(backend: BackendHere, report: Latest, response: Response) -> model
 
 
 def _state(backend: Backend, report: FeederReport) -> models.State:
-    return models.State.model_validate({**report_json(report), "age_s": backend.age(report)})
+    return models.extended(models.State, report, age_s=backend.age(report))
 
 
 @_feeders.get("/{feeder}/meters/{meter}")
 def get_meter(backend: BackendHere, report: Latest, meter: str, response: Response) -> models.MeterNow:
     """One meter at the latest tick, and its commissioning."""
     response.headers["Cache-Control"] = "no-store"
-    known = backend.commissioning(report.feeder) or {"meters": ()}
-    for found in report_json(report)["meters"]:
-        if found["meter"] == meter:
-            own = next((one for one in known["meters"] if one["meter"] == meter), None)
-            whole = {"feeder": report.feeder, "t": report.t, "verdict": report.verdict, "commissioning": own}
-            return models.MeterNow.model_validate({**found, **whole})
-    raise HTTPException(404, f"feeder {report.feeder!r} has no meter {meter!r}")
+    found = next((one for one in report.meters if one.meter == meter), None)
+    if found is None:
+        raise HTTPException(404, f"feeder {report.feeder!r} has no meter {meter!r}")
+    progress = backend.commissioning(report.feeder)
+    learned = () if progress is None else progress.meters
+    return models.extended(
+        models.MeterNow,
+        found,
+        feeder=report.feeder,
+        t=report.t,
+        verdict=report.verdict,
+        commissioning=next((one for one in learned if one.meter == meter), None),
+    )
 
 
-@_feeders.get("/{feeder}/history")
+@_feeders.get("/{feeder}/history", response_model=models.History)
 def get_history(
     backend: BackendHere,
     feeder: KnownFeeder,
@@ -362,15 +370,14 @@ def get_history(
         str | None, Query(pattern=_NAME, description="Include the numbers of this meter.")
     ] = None,
     limit: Annotated[int, Query(ge=1, le=5000)] = 500,
-) -> models.History:
+) -> Any:
     """The newest kept ticks in [since, until), oldest first."""
     rows = backend.store.history(feeder, since=since, until=until, meter=meter, limit=limit)
-    points = [models.HistoryPoint.model_validate(row) for row in rows]
-    return models.History(feeder=feeder, points=points, more=len(rows) == limit)
+    return {"feeder": feeder, "points": rows, "more": len(rows) == limit}
 
 
-@_feeders.get("/{feeder}/commissioning", response_model=models.Commissioning)
-def get_commissioning(backend: BackendHere, feeder: KnownFeeder, response: Response) -> Any:
+@_feeders.get("/{feeder}/commissioning")
+def get_commissioning(backend: BackendHere, feeder: KnownFeeder, response: Response) -> models.Commissioning:
     """Commissioning of the meters: gathered time, learned errors, and times."""
     response.headers["Cache-Control"] = "no-store"
     return _commissioning(backend, feeder, backend.commissioning(feeder))
@@ -378,19 +385,18 @@ def get_commissioning(backend: BackendHere, feeder: KnownFeeder, response: Respo
 
 @_feeders.post(
     "/{feeder}/commissioning",
-    response_model=models.Commissioning,
     dependencies=[Depends(_json_only)],
     openapi_extra=models.Recommissioning.in_openapi(),
 )
-async def recommission(backend: BackendHere, feeder: KnownFeeder, request: Request) -> Any:
+async def recommission(backend: BackendHere, feeder: KnownFeeder, request: Request) -> models.Commissioning:
     """Restart the learning: of replaced meters, or without `meters` of the whole feeder."""
     layout = _detail(backend, feeder)["layout"]
     meters = [row["meter"] for row in layout["customers"] if row["meter"]]
     found = models.Recommissioning.of(await request.body(), meters)
     if isinstance(found, list):
         raise RequestValidationError(found)
-    fields = await backend.recommission(feeder, found.meters or (), found.who, found.reason)
-    return await to_thread.run_sync(_commissioning, backend, feeder, fields)
+    progress = await backend.recommission(feeder, found.meters or (), found.who, found.reason)
+    return await to_thread.run_sync(_commissioning, backend, feeder, progress)
 
 
 @_feeders.get("/{feeder}/commissioning/events")
@@ -398,15 +404,16 @@ def get_commissioning_events(
     backend: BackendHere, feeder: KnownFeeder, limit: Annotated[int, Query(ge=1, le=1000)] = 100
 ) -> models.CommissioningEvents:
     """The newest changes of the commissioning, with operator and reason, oldest first."""
-    found = [asdict(event) for event in backend.store.commission_events(feeder, limit)]
-    return models.CommissioningEvents.model_validate({"events": found})
+    return models.CommissioningEvents(events=backend.store.commission_events(feeder, limit))
 
 
-def _commissioning(backend: Backend, feeder: str, fields: dict[str, Any] | None) -> dict[str, Any]:
-    if fields is None:
+def _commissioning(
+    backend: Backend, feeder: str, progress: CommissioningProgress | None
+) -> models.Commissioning:
+    if progress is None:
         raise FeederUnknown(feeder)
     kept = backend.store.commission(feeder)
-    return {**fields, "kept": None if kept is None else kept.t}
+    return models.extended(models.Commissioning, progress, kept=None if kept is None else kept.t)
 
 
 @_feeders.get(
@@ -422,7 +429,8 @@ async def stream_states(backend: BackendHere, feeder: KnownFeeder) -> AsyncItera
         report = backend.report(feeder)
         if report is not None and report is not last:
             last = report
-            yield ServerSentEvent(event="state", data=_state(backend, report))
+            data = _STATE.dump_json(_state(backend, report)).decode()
+            yield ServerSentEvent(event="state", raw_data=data)
 
 
 # --------------------------------------------------------------------- alarms
@@ -466,15 +474,14 @@ def list_alarms(
         cursor=cursor,
         limit=limit,
     )
-    found = [alarm_json(alarm) for alarm in page]
-    return {
-        "alarms": found,
-        "next": following,
-        "last_event": last_event,
-        "raised": backend.store.raised(),
-        "unstored": unstored,
-        "problem": trouble,
-    }
+    return models.Alarms(
+        alarms=page,
+        next=following,
+        last_event=last_event,
+        raised=backend.store.raised(),
+        unstored=unstored,
+        problem=trouble,
+    )
 
 
 @_alarms.get("/stream", response_class=EventSourceResponse, dependencies=[Depends(_slot)], tags=["streams"])
@@ -500,19 +507,20 @@ async def stream_alarms(
             except StoreUnavailable:
                 return  # The client reconnects with the number of its last event.
             for event in events:
-                yield ServerSentEvent(event="alarm", id=str(event.seq), data=_event(event))
+                data = _EVENT.dump_json(event).decode()
+                yield ServerSentEvent(event="alarm", id=str(event.seq), raw_data=data)
                 seen = event.seq
             if not events:
                 seen = newest
 
 
-@_alarms.get("/{alarm_id}", response_model=models.AlarmModel)
-def get_alarm(backend: BackendHere, alarm_id: AlarmId) -> Any:
+@_alarms.get("/{alarm_id}")
+def get_alarm(backend: BackendHere, alarm_id: AlarmId) -> Alarm:
     """One alarm."""
     alarm = backend.store.alarm(alarm_id)
     if alarm is None:
         raise AlarmUnknown(alarm_id)
-    return alarm_json(alarm)
+    return alarm
 
 
 @_alarms.get("/{alarm_id}/events")
@@ -526,25 +534,14 @@ def get_events(
     found = backend.store.events(alarm_id, after=after, limit=limit + 1)
     if not found and backend.store.alarm(alarm_id) is None:
         raise AlarmUnknown(alarm_id)
-    page = [_event(event) for event in found[:limit]]
+    page = found[:limit]
     return models.AlarmEvents(events=page, next=page[-1].seq if len(found) > limit else None)
 
 
-@_alarms.post("/{alarm_id}/ack", response_model=models.AlarmModel, dependencies=[Depends(_json_only)])
-async def acknowledge(backend: BackendHere, alarm_id: AlarmId, answer: models.Acknowledgement) -> Any:
+@_alarms.post("/{alarm_id}/ack", dependencies=[Depends(_json_only)])
+async def acknowledge(backend: BackendHere, alarm_id: AlarmId, answer: models.Acknowledgement) -> Alarm:
     """Acknowledge an alarm, with the operator's name."""
     return await backend.acknowledge(alarm_id, answer.who, answer.comment, count=answer.count)
-
-
-def _event(event: StoredTransition) -> models.AlarmEvent:
-    return models.AlarmEvent(
-        seq=event.seq,
-        t=event.t,
-        change=event.change,
-        who=event.who,
-        comment=event.comment,
-        alarm=models.AlarmModel.model_validate(alarm_json(event.alarm)),
-    )
 
 
 # ----------------------------------------------------------------- operations

@@ -49,8 +49,9 @@ class DemoFailed(GridsecError):
 
 @dataclass(frozen=True, slots=True)
 class DemoPlan:
-    """Parameters of the demo.
+    """Parameters of the demo."""
 
+<<<<<<< HEAD
     Attributes
     ----------
     feeder
@@ -76,6 +77,15 @@ class DemoPlan:
     kind: str = "bias"
     seed: int = 1
     http: str = "127.0.0.1:8000"
+=======
+    feeder: str = FEEDER  # folder or name
+    duration_s: float = 120.0  # duration of the simulation, s
+    attacked: int = 2  # number of manipulated meters
+    size: float = 0.03  # smallest size of the manipulation, pu
+    kind: str = "bias"  # attack kind (see `feeders.simulation.attacks.RandomAttackKind`)
+    seed: int = 1  # seed of meters, loads and errors
+    http: str = "127.0.0.1:8000"  # address of the web page; if it is in use, another free port
+>>>>>>> lean-svc
 
     @property
     def attack(self) -> tuple[float, float]:
@@ -101,18 +111,7 @@ class Service:
         self.zenoh = zenoh
 
     def get(self, path: str) -> Any:
-        """Return the JSON of a path.
-
-        Parameters
-        ----------
-        path
-            Path from the root.
-
-        Raises
-        ------
-        DemoFailed
-            If the response is missing or has another status.
-        """
+        """Return the JSON of a path. Raises DemoFailed if the response is missing or has another status."""
         parts = urlsplit(self.url)
         connection = http.client.HTTPConnection(parts.hostname or "", parts.port, timeout=10.0)
         try:
@@ -146,17 +145,7 @@ def free_address(wanted: str) -> str:
 def started(feeder: str, address: str) -> Iterator[Service]:
     """Start a service with a separate database and end it in any case.
 
-    Parameters
-    ----------
-    feeder
-        Folder or name.
-    address
-        Address of HTTP.
-
-    Raises
-    ------
-    DemoFailed
-        If it does not start; with its output.
+    Raises DemoFailed if it does not start; with its output.
     """
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="gridsec-demo-")))
@@ -222,22 +211,8 @@ def _end(process: subprocess.Popen[str]) -> None:
 def run(plan: DemoPlan, console: Console, *, check: bool, keep: bool) -> DemoResult:
     """Run the demo.
 
-    Parameters
-    ----------
-    check
-        After the duration, wait until every alarm has cleared.
-    keep
-        Continue with honest meters until interrupted.
-
-    Returns
-    -------
-    Outcome
-        Meters named as manipulated, and all problems.
-
-    Raises
-    ------
-    DemoFailed, FeederInvalid, BusUnavailable
-        If it cannot run.
+    With `check` it lasts until every alarm has cleared, with `keep` until it is interrupted. Raises
+    DemoFailed, FeederInvalid, BusUnavailable if it cannot run.
     """
     site = load(plan.feeder)
     with started(plan.feeder, plan.http) as service:

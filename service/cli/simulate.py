@@ -23,18 +23,11 @@ _POLL_S = 0.0005
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """Speed of virtual time.
+    """Speed of virtual time."""
 
-    Attributes
-    ----------
-    speed
-        Virtual seconds per second; 1 is real time, infinity without limit.
-    ahead
-        In step with the service: largest lead over its published estimates, ticks (the feeder's ticks, or the
-        intervals of readings if longer). None: not in step.
-    """
-
-    speed: float = 1.0
+    speed: float = 1.0  # virtual seconds per second; 1 is real time, infinity without limit
+    # In step with the service: largest lead over its published estimates, ticks (the feeder's ticks, or the
+    # intervals of readings if longer). None: not in step.
     ahead: int | None = None
 
 
@@ -43,13 +36,7 @@ class OutOfStep(Exception):
 
 
 def key_of(feeder: str, meter: str) -> str:
-    """Return the zenoh key of a meter's readings, without the prefix.
-
-    Parameters
-    ----------
-    feeder, meter
-        Names; the meter `feeders.simulation.meters.BUSBAR` is the busbar meter.
-    """
+    """Return the zenoh key of a meter's readings, without the prefix."""
     source = "substation" if meter == BUSBAR else f"meter/{meter}"
     return f"{feeder}/{source}/reading"
 
@@ -79,24 +66,8 @@ def play(
 ) -> Iterator[SimulatedTick]:
     """Publish a scenario's readings, tick by tick, each at its time.
 
-    Parameters
-    ----------
-    meters
-        Open zenoh session of the meters.
-    clock, sleep
-        Clock and sleep function, s.
-
-    Yields
-    ------
-    Sample
-        Each tick after its readings have been published.
-
-    Raises
-    ------
-    OutOfStep
-        If the service does not keep up.
-    BusUnavailable
-        If zenoh is closed.
+    Yields each tick after its readings have been published. Raises OutOfStep if the service does not keep up.
+    Raises BusUnavailable if zenoh is closed.
     """
     name = site.feeder.name
     steps = _Steps(meters, site, pace.ahead, scenario.dt_s) if pace.ahead is not None else None

@@ -7,11 +7,12 @@ from the ticks, stored texts are passed as values. Readers on other threads only
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field
 
 from feeders.model.site import Site
 from feeders.registry.registry import BiasLearning, DesignedEstimator
@@ -52,91 +53,87 @@ class Stage(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class MeterStage:
-    """Commissioning of one meter.
-
-    Attributes
-    ----------
-    state
-        Learning or learned.
-    since, learned_at
-        Start of the learning, and time at which the meter was learned, Unix s.
-    gathered_s
-        Time with usable readings of a trusted meter since the start, s.
-    expected
-        Expected end of the learning, Unix s, if every tick from now on counts.
-    error_volt, error_volt_std
-        Fixed error at the nominal voltage, and its standard deviation, V.
-    allowed_volt
-        Largest deviation of an honest meter from that error, V.
-    learning_state, learning_reason
-        As in `gridsec.estimators.sequential.LearningProgress`.
-    watched_s
-        Time of all ticks since the start, s; None for a learned meter.
-    lost_s
-        Time that does not count, s, by reason; reasons with zero time are left out.
-    """
+class MeterCommissioning:
+    """Commissioning of one meter: its fixed error."""
 
     meter: str
     state: Stage
-    since: float | None
-    learned_at: float | None
-    gathered_s: float | None
-    expected: float | None
-    error_volt: float
-    error_volt_std: float
-    allowed_volt: float
-    learning_state: LearningState
-    learning_reason: LearningReason | None
-    watched_s: float | None
-    lost_s: dict[LearningReason, float]
+    since: Annotated[
+        float | None, Field(description="Start of the learning, Unix s; null for a learned meter.")
+    ]
+    learned_at: Annotated[
+        float | None, Field(description="Time at which it was learned, Unix s; null before.")
+    ]
+    gathered_s: Annotated[
+        float | None,
+        Field(description="Time with usable readings of a trusted meter since the start, s."),
+    ]
+    expected: Annotated[
+        float | None, Field(description="Expected end of the learning if every tick counts, Unix s.")
+    ]
+    error_volt: Annotated[
+        float | None, Field(description="Fixed error at nominal voltage, V; 0 before it is learned.")
+    ]
+    error_volt_std: Annotated[
+        float | None, Field(description="Standard deviation of the error, ageing included, V.")
+    ]
+    allowed_volt: Annotated[
+        float | None, Field(description="Largest deviation of an honest meter from its error, V.")
+    ]
+    learning_state: Annotated[
+        LearningState,
+        Field(
+            description="`waiting`: no tick counted yet. `learning`. `stalled`: not learned after twice "
+            "`expected_s`. `learned`."
+        ),
+    ]
+    learning_reason: Annotated[
+        LearningReason | None,
+        Field(
+            description="Reason that took most of the time that did not count; null on schedule.",
+        ),
+    ]
+    watched_s: Annotated[
+        float | None,
+        Field(description="Time of all ticks since the start, s; null for a learned meter."),
+    ]
+    lost_s: Annotated[
+        dict[LearningReason, float], Field(description="Time that did not count, s, by reason.")
+    ]
 
 
 @dataclass(frozen=True, slots=True)
-class Progress:
-    """Commissioning of a feeder.
-
-    Attributes
-    ----------
-    state
-        Learning while at least one meter is being learned.
-    t
-        Unix time of the tick, s.
-    tick_s
-        Interval of the monitor's steps, s.
-    needed_s, gathered_s
-        Required time with usable readings, and the least time that a meter has, s.
-    since, expected, learned_at
-        Earliest start, latest expected end, and latest time of a learned meter, Unix s.
-    held
-        Enough time has passed, but a device is suspect: a suspect meter is not learned, and until it is named
-        as manipulated no meter is.
-    restored
-        True if the commissioning continues from stored state.
-    note
-        Reason why stored state is not used; empty otherwise.
-    expected_s
-        Time of learning if every tick counts, s; None without a monitor that learns.
-    stalled
-        Number of meters that are not learned after twice that time.
-    """
+class CommissioningProgress:
+    """Commissioning of a feeder: learning of its meters' fixed errors."""
 
     feeder: str
     estimator: str
-    state: Stage
-    t: float | None
-    tick_s: float
-    needed_s: float
-    gathered_s: float | None
-    since: float | None
-    expected: float | None
-    learned_at: float | None
-    held: bool
-    restored: bool
-    note: str
-    expected_s: float | None
-    stalled: int
-    meters: tuple[MeterStage, ...]
+    state: Annotated[
+        Stage,
+        Field(
+            description="`off`: this monitor does not learn. `waiting`: no monitor or no tick yet. "
+            "`learning`: at least one meter is being learned. `learned`: all are."
+        ),
+    ]
+    t: Annotated[float | None, Field(description="Tick of the data, Unix s.")]
+    tick_s: Annotated[float, Field(description="Interval of the monitor's steps, s.")]
+    needed_s: Annotated[float, Field(description="`commission_s`: required time with usable readings, s.")]
+    gathered_s: Annotated[
+        float | None,
+        Field(description="Least time with usable readings of the meters that are being learned, s."),
+    ]
+    since: Annotated[float | None, Field(description="Earliest start of the learning, Unix s.")]
+    expected: Annotated[
+        float | None, Field(description="Expected end of the learning, Unix s; null if `held`.")
+    ]
+    learned_at: Annotated[float | None, Field(description="Time of the latest learned meter, Unix s.")]
+    # A suspect meter is not learned; until it is named as manipulated no meter is.
+    held: Annotated[bool, Field(description="Enough time has passed, but a suspect prevents learning.")]
+    restored: Annotated[bool, Field(description="The commissioning continues from stored state.")]
+    note: Annotated[str, Field(description="Reason why stored state is not used; empty otherwise.")]
+    expected_s: Annotated[float | None, Field(description="Time of learning if every tick counts, s.")]
+    stalled: Annotated[int, Field(description="Meters that are not learned after twice that time.")]
+    meters: tuple[MeterCommissioning, ...]
 
 
 class FeederCommissioning:
@@ -152,7 +149,7 @@ class FeederCommissioning:
     known
         Present state of the meters' errors; None before the first tick without stored state.
     restored, note
-        As in `Progress`.
+        As in `CommissioningProgress`.
     """
 
     def __init__(self, site: Site, kept: StateSnapshot | None = None) -> None:
@@ -187,15 +184,7 @@ class FeederCommissioning:
                 self.restored = True
 
     def follow(self, state: Any, t: float) -> None:
-        """Update from the result of a tick.
-
-        Parameters
-        ----------
-        state
-            State of the monitor after the tick.
-        t
-            Unix time of the tick, s.
-        """
+        """Update from the result of a tick."""
         if self.learner is None:
             return
         before, self.known, self._t = self.known, self.learner.commission(state), t
@@ -208,24 +197,8 @@ class FeederCommissioning:
     def renew(self, state: Any, meters: Sequence[str], t: float, who: str, reason: str) -> Any:
         """Restart the learning of meters.
 
-        Parameters
-        ----------
-        state
-            State of the monitor; None before the first tick.
-        meters
-            Their ids; empty for all.
-        t, who, reason
-            Time (Unix s), operator and reason.
-
-        Returns
-        -------
-        Any
-            New state of the monitor; None if it was None.
-
-        Raises
-        ------
-        NothingToLearn
-            If the monitor does not learn.
+        `meters` is empty for all; `state` is None before the first tick, as is then the result. Raises
+        NothingToLearn if the monitor does not learn.
         """
         learner, watcher = self.learner, self._watcher
         if learner is None or watcher is None:
@@ -269,10 +242,7 @@ class FeederCommissioning:
     ) -> tuple[tuple[StateSnapshot, ...], tuple[CommissioningEvent, ...]]:
         """Return the state that is due for the store; it counts as stored afterwards.
 
-        Parameters
-        ----------
-        at_once
-            Include state that is not due yet.
+        With `at_once` it includes state that is not due yet.
         """
         happened, self._happened = self._happened, ()
         if self.known is None or self._t is None:
@@ -308,7 +278,7 @@ class FeederCommissioning:
             return None
         return watcher.bias_learning.progress(watcher.design, known)
 
-    def progress(self) -> Progress:
+    def progress(self) -> CommissioningProgress:
         """Return the progress."""
         known, learner, monitor = self.known, self.learner, self._site.tables.meta.monitor
         found = self._found(known)
@@ -322,7 +292,7 @@ class FeederCommissioning:
             state = Stage.LEARNING if still else Stage.LEARNED
         needed = monitor.commission_s
         held = any(m.gathered_s is not None and m.gathered_s >= needed for m in still)
-        return Progress(
+        return CommissioningProgress(
             feeder=self._site.feeder.name,
             estimator=monitor.estimator,
             state=state,
@@ -341,7 +311,7 @@ class FeederCommissioning:
             meters=meters,
         )
 
-    def _meters(self, known: Commission, found: LearningProgress) -> tuple[MeterStage, ...]:
+    def _meters(self, known: Commission, found: LearningProgress) -> tuple[MeterCommissioning, ...]:
         learned, learning = known.learned, known.learning
         base = self._site.customer_volt[self._site.meters]
         needed, t = self._site.tables.meta.monitor.commission_s, self._t
@@ -350,7 +320,7 @@ class FeederCommissioning:
         error = base * (np.sqrt(1.0 + learned.bias) - 1.0)
         std, allowed = 0.5 * base * np.sqrt(learned.variance), 0.5 * base * learned.allowed
         return tuple(
-            MeterStage(
+            MeterCommissioning(
                 meter=meter,
                 state=Stage.LEARNING if np.isfinite(since[k]) else Stage.LEARNED,
                 since=_time(since, k),
@@ -369,11 +339,6 @@ class FeederCommissioning:
             )
             for k, meter in enumerate(self._site.meter_ids)
         )
-
-
-def to_json(progress: Progress) -> dict[str, Any]:
-    """Return the JSON object of REST."""
-    return asdict(progress)
 
 
 def _lost(learning: Learning | None, k: int) -> dict[LearningReason, float]:

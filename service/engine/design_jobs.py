@@ -26,10 +26,7 @@ _log = structlog.get_logger("gridsec.runtime")
 def begin(monitor: FeederMonitor, on_designed: Callable[[Callable[[], None]], None]) -> None:
     """Design in a daemon thread, which does not delay the end of the process.
 
-    Parameters
-    ----------
-    on_designed
-        Called from that thread with the remaining step, `install`, to run between two rounds.
+    `on_designed` is called from that thread with the remaining step, to run between two rounds.
     """
 
     def run() -> None:
@@ -59,16 +56,8 @@ def begin(monitor: FeederMonitor, on_designed: Callable[[Callable[[], None]], No
 def prepare(name: str, tables: dict[str, Any]) -> asyncio.Future[tuple[Site, DesignedEstimator]]:
     """Load and design a feeder as `begin` does; called from the event loop.
 
-    Parameters
-    ----------
-    name, tables
-        Name of the feeder, and the columns of its files as JSON.
-
-    Returns
-    -------
-    asyncio.Future
-        The feeder and its design, or FeederInvalid, NotObservable or DesignInfeasible. A caller that stops
-        waiting completes it in another way; the result of the thread is then discarded.
+    Returns the feeder and its design, or FeederInvalid, NotObservable or DesignInfeasible. A caller that
+    stops waiting completes it in another way; the result of the thread is then discarded.
     """
     loop = asyncio.get_running_loop()
     answer: asyncio.Future[tuple[Site, DesignedEstimator]] = loop.create_future()
@@ -105,13 +94,7 @@ def _apart(name: str, run: Callable[[], None]) -> None:
 
 
 def install(monitor: FeederMonitor, finished: DesignedEstimator | None, problem: str) -> None:
-    """Start monitoring with a finished design, or mark the feeder as failed.
-
-    Parameters
-    ----------
-    monitor, finished, problem
-        Monitor of the feeder, and its design, or None with the reason.
-    """
+    """Start monitoring with a finished design, or mark the feeder as failed."""
     if finished is None:
         monitor.fail(problem)
         return

@@ -30,15 +30,13 @@ from service.alarms.state_machine import (
     Alarm,
     AlarmRules,
     AlarmUnknown,
-    AlreadyAcknowledged,
-    RaisedAgain,
     acknowledged,
+    carry,
     close,
     restore,
 )
 from service.alarms.state_machine import to_json as alarm_json
-from service.engine.commissioning import FeederCommissioning
-from service.engine.commissioning import to_json as commissioning_json
+from service.engine.commissioning import CommissioningProgress, FeederCommissioning
 from service.engine.feeder_monitor import FeederMonitor, TickResult, align_rules, known_of
 from service.engine.suspicions import Suspicions
 from service.errors import FeederUnknown
@@ -66,11 +64,6 @@ def some_of_each(bad: Iterable[Rejected]) -> tuple[list[Rejected], int]:
     """Sample the rejected readings of a round fairly over their sources.
 
     Entries are taken by reason and key in turn, so that the largest source leaves room for the others.
-
-    Parameters
-    ----------
-    bad
-        Rejected readings of one round, in the order of arrival.
 
     Returns
     -------
@@ -142,12 +135,8 @@ class CatchUp:
     ) -> None:
         """Evaluate the pending ticks.
 
-        Parameters
-        ----------
-        judge
-            Evaluates the oldest pending tick of a feeder.
-        go_on
-            Checked before each tick; if False, the remaining ticks stay pending.
+        `judge` evaluates the oldest pending tick of a feeder. `go_on` is checked before each tick; if False,
+        the remaining ticks stay pending.
         """
         due = [monitor for monitor in monitors if monitor.pending]
         stale = [monitor for monitor in due if len(monitor.pending) > 1]
@@ -170,13 +159,7 @@ class CatchUp:
                 judge(monitor)
 
     def skipped(self, feeder: str, count: int) -> None:
-        """Log the first skipped ticks, and their number after `CALM_S` without one.
-
-        Parameters
-        ----------
-        feeder, count
-            Name of the feeder, and number of ticks.
-        """
+        """Log the first skipped ticks, and their number after `CALM_S` without one."""
         if self._calm_at is None:
             _log.warning("ticks are skipped: the service was behind by more than it can judge", feeder=feeder)
         self._skipped[feeder] += count
@@ -199,31 +182,16 @@ TOLD_TWICE = "duplicate of another alarm"
 
 @dataclass(frozen=True, slots=True)
 class RuntimeConfig:
-    """Configuration of the service, apart from its feeders.
+    """Configuration of the service, apart from its feeders."""
 
-    Attributes
-    ----------
-    prefix
-        First chunks of every zenoh key.
-    clock
-        Source of the present time.
-    max_skew_s, grace_s
-        As in `align.rules`; None for the values of the feeder's tick.
-    max_payload
-        Size of the largest accepted payload, bytes.
-    max_samples
-        Length of the queue before the runtime, samples.
-    max_feeders
-        Largest number of feeders added at run time, besides those given at the start.
-    """
-
-    prefix: str = "gridsec"
-    clock: Clock = Clock.WALL
+    prefix: str = "gridsec"  # first chunks of every zenoh key
+    clock: Clock = Clock.WALL  # source of the present time
+    # max_skew_s, grace_s: as in `align.rules`; None for the values of the feeder's tick.
     max_skew_s: float | None = None
     grace_s: float | None = None
-    max_payload: int = 256 * 1024
-    max_samples: int = 20_000
-    max_feeders: int = 100
+    max_payload: int = 256 * 1024  # size of the largest accepted payload, bytes
+    max_samples: int = 20_000  # length of the queue before the runtime, samples
+    max_feeders: int = 100  # largest number of feeders added at run time, besides those given at the start
 
 
 @dataclass(frozen=True, slots=True)
@@ -286,10 +254,7 @@ class Engine:
     def add(self, site: Site, past: PersistedState | None = None) -> FeederMonitor:
         """Start monitoring a feeder, or restart it with other tables; its alarms stay.
 
-        Parameters
-        ----------
-        past
-            State for the warm start; None: read from the database at once.
+        `past` is the state for the warm start; None: read from the database at once.
         """
         config, name = self.config, site.feeder.name
         past = past or self._past(name, self.store)
@@ -319,17 +284,7 @@ class Engine:
     ) -> Future[None]:
         """Store a feeder's tables and start monitoring it, or restart it with other tables.
 
-        Parameters
-        ----------
-        site, tables
-            The feeder, and the columns of its files as JSON.
-        installed
-            Called with its monitor.
-
-        Raises
-        ------
-        StoreUnavailable
-            If the tables cannot be stored; the feeder stays unchanged.
+        Raises StoreUnavailable if the tables cannot be stored; the feeder stays unchanged.
         """
         answer: Future[None] = Future()
         name = site.feeder.name
@@ -359,10 +314,8 @@ class Engine:
     def remove(self, name: str) -> Future[None]:
         """Stop monitoring a feeder: its alarms are cleared, its tables deleted, its history stays.
 
-        Raises
-        ------
-        FeederUnknown, StoreUnavailable
-            If it does not exist, or the change cannot be stored; monitoring then continues.
+        Raises FeederUnknown, StoreUnavailable if it does not exist, or the change cannot be stored;
+        monitoring then continues.
         """
         answer: Future[None] = Future()
         monitor = self.monitors.get(name)
@@ -418,17 +371,8 @@ class Engine:
     def cycle(self, samples: list[Sample], oldest: Callable[[], float | None] = lambda: None) -> bool:
         """Process samples and due ticks, store, publish.
 
-        Parameters
-        ----------
-        samples
-            In the order of arrival.
-        oldest
-            Returns the arrival time of the oldest waiting sample, Unix s; None if none waits.
-
-        Returns
-        -------
-        bool
-            True if there is a new report.
+        `oldest` returns the arrival time of the oldest waiting sample, Unix s; None if none waits. Returns
+        True if there is a new report.
         """
         started = time.perf_counter()
         bad = self._place(samples)
@@ -503,12 +447,7 @@ class Engine:
     def keep_states(self, monitors: Iterable[FeederMonitor] | None = None, *, at_once: bool = False) -> None:
         """Queue the commissioning and the suspicions of feeders for the database, if they are due.
 
-        Parameters
-        ----------
-        monitors
-            The feeders; None: all. Both states change with evaluated ticks only.
-        at_once
-            Include a commissioning that is not due yet.
+        `monitors` None: all. With `at_once` it includes a commissioning that is not due yet.
         """
         for monitor in self.monitors.values() if monitors is None else monitors:
             kept, happened = monitor.commissioning.due(at_once=at_once)
@@ -585,26 +524,16 @@ class Engine:
 
     def acknowledge(
         self, alarm_id: str, who: str, comment: str, *, count: int | None = None
-    ) -> Future[dict[str, Any]]:
+    ) -> Future[Alarm]:
         """Acknowledge an alarm. The result is the stored alarm; the book follows after the commit.
 
         Repeating the same acknowledgement of the same occurrence gives the same result.
 
-        Parameters
-        ----------
-        alarm_id, who, comment
-            Id of the alarm, operator, and comment.
-        count
-            Occurrence; None: the latest.
-
-        Raises
-        ------
-        AlarmUnknown, RaisedAgain, AlreadyAcknowledged, StoreUnavailable
-            If it cannot be acknowledged, at once or as the result; nothing is changed then.
-        OutcomeUnknown
-            As the result, if it is not known to be stored.
+        `count` is the occurrence; None: the latest. Raises AlarmUnknown, RaisedAgain, AlreadyAcknowledged,
+        StoreUnavailable if it cannot be acknowledged, at once or as the result; nothing is changed then.
+        Raises OutcomeUnknown: as the result, if it is not known to be stored.
         """
-        answer: Future[dict[str, Any]] = Future()
+        answer: Future[Alarm] = Future()
         t = self._wall()
 
         def store(alarm: Alarm | None) -> None:
@@ -612,13 +541,13 @@ class Engine:
                 raise AlarmUnknown(alarm_id)
             occurrence = alarm.count if count is None else count
             if (alarm.acknowledged_by, alarm.comment, alarm.count) == (who, comment, occurrence):
-                answer.set_result(alarm_json(alarm))
+                answer.set_result(alarm)
                 return
             transition = acknowledged(alarm, who, comment, t, count=count)
 
-            def landed() -> dict[str, Any]:
+            def landed() -> Alarm:
                 self._acknowledged(transition.alarm)
-                return alarm_json(transition.alarm)
+                return transition.alarm
 
             self.committer.store(Wish((transition,)), _landing(answer, landed), partial(_refuse, answer))
 
@@ -634,34 +563,23 @@ class Engine:
         """Copy a stored acknowledgement to the book, and to results since the start of the write."""
         self.committer.waiting.carry(alarm)
         monitor = self.monitors.get(alarm.feeder)
-        if monitor is not None and alarm.acknowledged_by is not None and alarm.t_acknowledged is not None:
-            try:
-                monitor.acknowledge(
-                    alarm.id,
-                    alarm.acknowledged_by,
-                    alarm.comment or "",
-                    alarm.t_acknowledged,
-                    count=alarm.count,
-                )
-            except (AlarmUnknown, AlreadyAcknowledged, RaisedAgain):
-                _log.info("the acknowledged occurrence is over", feeder=alarm.feeder, id=alarm.id)
+        if monitor is None:
+            return
+        if (book := carry(monitor.book, alarm)) is not None:
+            monitor.book = book
+        else:
+            _log.info("the acknowledged occurrence is over", feeder=alarm.feeder, id=alarm.id)
 
-    def recommission(self, name: str, meters: Sequence[str], who: str, reason: str) -> Future[dict[str, Any]]:
+    def recommission(
+        self, name: str, meters: Sequence[str], who: str, reason: str
+    ) -> Future[CommissioningProgress]:
         """Restart the learning of meters' errors. The result is the stored progress.
 
-        Parameters
-        ----------
-        name, meters, who, reason
-            The feeder, its meters (empty for all), operator, and reason.
-
-        Raises
-        ------
-        FeederUnknown, NothingToLearn, StoreUnavailable
-            If it is not possible, at once or as the result; nothing is changed then.
-        OutcomeUnknown
-            As in `acknowledge`.
+        `meters` is empty for all. Raises FeederUnknown, NothingToLearn, StoreUnavailable if it is not
+        possible, at once or as the result; nothing is changed then. Raises OutcomeUnknown: as in
+        `acknowledge`.
         """
-        answer: Future[dict[str, Any]] = Future()
+        answer: Future[CommissioningProgress] = Future()
         monitor = self.monitors.get(name)
         if monitor is None:
             raise FeederUnknown(name)
@@ -671,7 +589,7 @@ class Engine:
         kept, wanted = (*kept, *monitor.suspicions.due()), happened[-1:]
         take_back()
 
-        def landed() -> dict[str, Any]:
+        def landed() -> CommissioningProgress:
             # Ticks since then have changed the state: the restart is repeated from the present state, stored
             # with the next batch.
             monitor.recommission(meters, t, who, reason)
@@ -681,7 +599,7 @@ class Engine:
             for one in wanted:
                 _say(one)
             self._count_learned(monitor)
-            return commissioning_json(monitor.commissioning.progress())
+            return monitor.commissioning.progress()
 
         wish = Wish(kept=kept, happened=wanted)
         self.committer.store(wish, _landing(answer, landed), partial(_refuse, answer))

@@ -19,7 +19,7 @@ from feeders.model.site import PowerAges, Site, to_frame
 from feeders.registry import registry
 from gridsec.interface import Cause
 from service.alarms.conditions import conditions
-from service.alarms.state_machine import AlarmBook, AlarmRules, AlarmTransition, acknowledge, advance, hold
+from service.alarms.state_machine import AlarmBook, AlarmRules, AlarmTransition, advance, hold
 from service.engine.commissioning import FeederCommissioning
 from service.engine.suspicions import Suspicions
 from service.ingest.align import Aligner, AlignRules, Clock, ReadingOutcome, Tick, rules
@@ -68,13 +68,7 @@ def align_rules(
     grace_s: float | None = None,
     live: bool = False,
 ) -> AlignRules:
-    """Return the times of the alignment of a feeder's readings.
-
-    Parameters
-    ----------
-    clock, max_skew_s, grace_s, live
-        As in `align.rules`.
-    """
+    """Return the times of the alignment of a feeder's readings."""
     settings = site.tables.meta.monitor
     return rules(
         settings.tick_s, settings.silence_s, clock=clock, max_skew_s=max_skew_s, grace_s=grace_s, live=live
@@ -90,15 +84,8 @@ def alarm_rules(site: Site, times: AlignRules) -> AlarmRules:
 def design(site: Site, progress: Callable[[int, int], None] | None = None) -> registry.DesignedEstimator:
     """Return the design of a feeder's estimator; slow on large feeders.
 
-    Parameters
-    ----------
-    progress
-        Called with (done, total) if the design has many parts.
-
-    Raises
-    ------
-    NotObservable, DesignInfeasible
-        If the feeder does not satisfy the conditions of its estimator.
+    `progress` is called with (done, total) if the design has many parts. Raises NotObservable,
+    DesignInfeasible if the feeder does not satisfy the conditions of its estimator.
     """
     return registry.design(site, workers=os.cpu_count() or 1, progress=progress)
 
@@ -180,123 +167,48 @@ class FeederMonitor:
         self.phase, self.problem = Phase.WATCHING, ""
 
     def fail(self, problem: str) -> None:
-        """End monitoring; ticks continue and are undecided.
-
-        Parameters
-        ----------
-        problem
-            Reason for the operator.
-        """
+        """End monitoring; ticks continue and are undecided."""
         self._watcher = self._state = None
         self.phase, self.problem = Phase.FAILED, problem
 
     def break_down(self, defect: Exception) -> None:
-        """End monitoring because of a defect, and keep the defect until it is logged.
-
-        Parameters
-        ----------
-        defect
-            The exception.
-        """
+        """End monitoring because of a defect, and keep the defect until it is logged."""
         self.fail(f"{type(defect).__name__}: {defect}")
         self.defect = defect
 
     def place(self, reading: Reading, now: float) -> ReadingOutcome:
-        """Align one reading; ticks that become due are pending.
-
-        Parameters
-        ----------
-        reading, now
-            As in `Aligner.take`.
-        """
+        """Align one reading; ticks that become due are pending."""
         outcome, ticks = self.aligner.take(reading, now)
         self.pending.extend(ticks)
         return outcome
 
     def reach(self, now: float) -> None:
-        """Add the ticks that are due without a new reading to the pending ones.
-
-        Parameters
-        ----------
-        now
-            Wall time, Unix s.
-        """
+        """Add the ticks that are due without a new reading to the pending ones."""
         self.pending.extend(self.aligner.due(now))
 
     def skip(self, count: int) -> None:
         """Drop the oldest pending ticks without evaluation; the next one counts them.
 
-        Parameters
-        ----------
-        count
-            Number of dropped ticks, less than that of the pending ones.
+        `count` is less than the number of pending ticks.
         """
         gone = sum(self.pending.popleft().skipped + 1 for _ in range(count))
         following = self.pending[0]
         self.pending[0] = replace(following, skipped=following.skipped + gone)
 
     def judge(self) -> TickResult:
-        """Evaluate the oldest pending tick.
-
-        Raises
-        ------
-        IndexError
-            If no tick is pending.
-        """
+        """Evaluate the oldest pending tick. Raises IndexError if no tick is pending."""
         tick = self.pending.popleft()
         self.skipped += tick.skipped
         return self._result(tick)
-
-    def ingest(self, reading: Reading, now: float) -> tuple[ReadingOutcome, list[TickResult]]:
-        """Align one reading and evaluate the ticks that become due.
-
-        Parameters
-        ----------
-        reading, now
-            As in `Aligner.take`.
-        """
-        return self.place(reading, now), self._judged()
-
-    def advance(self, now: float) -> list[TickResult]:
-        """Evaluate the ticks that are due without a new reading.
-
-        Parameters
-        ----------
-        now
-            Wall time, Unix s.
-        """
-        self.reach(now)
-        return self._judged()
 
     def finish(self) -> None:
         """Add all ticks that the time has reached to the pending ones: the input has ended."""
         self.pending.extend(self.aligner.flush())
 
-    def acknowledge(
-        self, alarm_id: str, who: str, comment: str, t: float, *, count: int | None = None
-    ) -> tuple[AlarmTransition, ...]:
-        """Acknowledge an alarm of this feeder.
-
-        Parameters
-        ----------
-        alarm_id, who, comment, t, count
-            As in `state_machine.acknowledge`.
-        """
-        self.book, transitions = acknowledge(self.book, alarm_id, who, comment, t, count=count)
-        return transitions
-
     def recommission(self, meters: Sequence[str], t: float, who: str, reason: str) -> Callable[[], None]:
         """Restart the learning of meters' errors, after their replacement.
 
-        Parameters
-        ----------
-        meters, t, who, reason
-            As in `FeederCommissioning.renew`.
-
-        Returns
-        -------
-        callable
-            Undoes the restart, if nothing else has happened since.
+        Returns a function that undoes the restart, if nothing else has happened since.
         """
         state, before, believed = self._state, copy(self.commissioning), copy(self.suspicions)
         self._state = self.commissioning.renew(state, meters, t, who, reason)
@@ -307,9 +219,6 @@ class FeederMonitor:
             self._state, self.commissioning, self.suspicions = state, before, believed
 
         return take_back
-
-    def _judged(self) -> list[TickResult]:
-        return [self.judge() for _ in range(len(self.pending))]
 
     def _result(self, tick: Tick) -> TickResult:
         """Evaluate a tick; a defect costs its verdict, but no alarm of earlier ticks."""

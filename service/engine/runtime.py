@@ -22,8 +22,9 @@ import structlog
 from feeders.model.site import Site
 from feeders.registry.registry import DesignedEstimator
 from gridsec.errors import GridsecError
+from service.alarms.state_machine import Alarm
 from service.engine import design_jobs
-from service.engine.commissioning import to_json as commissioning_json
+from service.engine.commissioning import CommissioningProgress
 from service.engine.engine import Engine, RuntimeConfig
 from service.engine.feeder_monitor import FeederMonitor, Phase
 from service.errors import FeederFixed, TooManyFeeders
@@ -126,10 +127,7 @@ class Runtime:
     async def run(self) -> None:
         """Run rounds until `stop`.
 
-        Raises
-        ------
-        WriterLost
-            If another process may have written the database; nothing more is stored.
+        Raises WriterLost if another process may have written the database; nothing more is stored.
         """
         self._loop = asyncio.get_running_loop()
         try:
@@ -363,10 +361,10 @@ class Runtime:
         since = now - self._engine.reported.get(report.feeder, now)
         return since if self._engine.config.clock is Clock.EVENTS else max(since, self._wall() - report.t)
 
-    def commissioning(self, name: str) -> dict[str, Any] | None:
+    def commissioning(self, name: str) -> CommissioningProgress | None:
         """Return the progress of a feeder's commissioning, or None."""
         monitor = self._engine.monitors.get(name)
-        return None if monitor is None else commissioning_json(monitor.commissioning.progress())
+        return None if monitor is None else monitor.commissioning.progress()
 
     def unstored(self) -> tuple[int, str | None]:
         """Return the number of alarm changes that wait for the database, and its problem or None."""
@@ -412,15 +410,8 @@ class Runtime:
     async def put_feeder(self, name: str, tables: dict[str, Any]) -> None:
         """Take over a feeder's tables: check, design, store, start monitoring; all or nothing.
 
-        Parameters
-        ----------
-        name, tables
-            Name of the feeder, and the columns of its files as JSON.
-
-        Raises
-        ------
-        FeederInvalid, NotObservable, DesignInfeasible, TooManyFeeders, StoreUnavailable
-            If it cannot be taken over; the feeder stays unchanged.
+        Raises FeederInvalid, NotObservable, DesignInfeasible, TooManyFeeders, StoreUnavailable if it cannot
+        be taken over; the feeder stays unchanged.
         """
         self._go_on()
         self._make_room(name)
@@ -449,50 +440,22 @@ class Runtime:
     async def delete_feeder(self, name: str) -> None:
         """Stop monitoring a feeder that was added over REST; its alarms are cleared, its history stays.
 
-        Raises
-        ------
-        FeederUnknown, FeederFixed, StoreUnavailable
-            If it cannot be deleted; monitoring then continues.
+        Raises FeederUnknown, FeederFixed, StoreUnavailable if it cannot be deleted; monitoring then
+        continues.
         """
         if name in self._given:
             raise FeederFixed(name)
         await self._command(partial(self._engine.remove, name))
         self._notify("state")
 
-    async def acknowledge(
-        self, alarm_id: str, who: str, comment: str, *, count: int | None = None
-    ) -> dict[str, Any]:
-        """Acknowledge an alarm; it is stored when this returns.
-
-        Parameters
-        ----------
-        alarm_id, who, comment
-            Id of the alarm, operator, and comment.
-        count
-            Occurrence; None: the latest.
-
-        Raises
-        ------
-        AlarmUnknown, RaisedAgain, AlreadyAcknowledged, StoreUnavailable
-            If it cannot be acknowledged; nothing is changed then.
-        OutcomeUnknown
-            If it is not known to be stored; repeating the acknowledgement gives the answer.
-        """
+    async def acknowledge(self, alarm_id: str, who: str, comment: str, *, count: int | None = None) -> Alarm:
+        """Acknowledge an alarm as `Engine.acknowledge` does; it is stored when this returns."""
         return await self._command(partial(self._engine.acknowledge, alarm_id, who, comment, count=count))
 
-    async def recommission(self, name: str, meters: Sequence[str], who: str, reason: str) -> dict[str, Any]:
-        """Restart the learning of meters' errors; it is stored when this returns.
-
-        Parameters
-        ----------
-        name, meters, who, reason
-            The feeder, its meters (empty for all), operator, and reason.
-
-        Raises
-        ------
-        FeederUnknown, NothingToLearn, StoreUnavailable
-            If it is not possible; nothing is changed then.
-        """
+    async def recommission(
+        self, name: str, meters: Sequence[str], who: str, reason: str
+    ) -> CommissioningProgress:
+        """Restart the learning as `Engine.recommission` does; it is stored when this returns."""
         return await self._command(partial(self._engine.recommission, name, meters, who, reason))
 
     async def subscribe(self) -> AsyncGenerator[dict[str, Any], None]:

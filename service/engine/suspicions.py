@@ -56,40 +56,18 @@ class Suspicions:
         self._watcher = watcher
 
     def restore(self, state: Any) -> Any:
-        """Apply the record to a state, if the monitor supports a warm start.
-
-        Parameters
-        ----------
-        state
-            State of the monitor before its first tick.
-        """
+        """Apply the record to a state, if the monitor supports a warm start."""
         if self._watcher is None or self._memory is None:
             return state
         return self._memory.warm_start(self._watcher.design, state, self.known)
 
     def follow(self, state: Any, t: float) -> None:
-        """Update from the result of a tick.
-
-        Parameters
-        ----------
-        state
-            State of the monitor after the tick.
-        t
-            Unix time of the tick, s.
-        """
+        """Update from the result of a tick."""
         if self._watcher is not None and self._memory is not None:
             self.known, self._t = self._memory.distrusted(self._watcher.design, state), t
 
     def forget(self, meters: Sequence[str], t: float) -> None:
-        """Remove replaced meters from the record.
-
-        Parameters
-        ----------
-        meters
-            Their ids; empty for all.
-        t
-            Unix time, s.
-        """
+        """Remove replaced meters from the record. `meters` is empty for all."""
         chosen = set(meters)
         which = [not chosen or meter in chosen for meter in self._site.meter_ids]
         self.known, self._t = self.known.without(np.array(which, dtype=np.bool_)), t

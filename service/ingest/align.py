@@ -73,15 +73,7 @@ class ClockOffsets:
         self._reported: set[str | None] = set()
 
     def note(self, source: str | None, t: float, arrival: float) -> None:
-        """Add the delay of one reading.
-
-        Parameters
-        ----------
-        source
-            The meter, or None for the busbar meter.
-        t, arrival
-            Time stamp and wall time of its arrival, Unix s.
-        """
+        """Add the delay of one reading. `source` is the meter, None for the busbar meter; times in Unix s."""
         delays = self._delays[source]
         if self._arrived.get(source) == arrival:
             delays[-1] = min(delays[-1], arrival - t)
@@ -99,10 +91,7 @@ class ClockOffsets:
     def measured(self, now: float) -> Mapping[str | None, float]:
         """Return the measurable offsets, s; positive if the clock is ahead.
 
-        Parameters
-        ----------
-        now
-            Wall time, Unix s. Delays of silent sources are deleted.
+        Delays of sources that are silent at `now`, Unix s, are deleted.
         """
         for source in [each for each, last in self._arrived.items() if now - last > self._silence]:
             del self._arrived[source]
@@ -171,40 +160,20 @@ class ReadingOutcome(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class AlignRules:
-    """Times of the alignment of one feeder.
+    """Times of the alignment of one feeder."""
 
-    Attributes
-    ----------
-    tick_s
-        Interval between ticks, s.
-    max_age_s
-        Age of a reading at a tick, s, from which it is not usable.
-    grace_s
-        Longest wait after a tick for sources that have not reported, s.
-    lead_s
-        A reading up to this much after a tick still belongs to it, s: meters that read at the tick miss it
-        slightly in both directions.
-    max_skew_s
-        Largest difference of a reading's time from now, s; beyond it the reading is refused.
-    silence_s
-        Age of the last usable reading, s, beyond which a source is silent.
-    clock
-        Source of the present time.
-    backlog
-        Ticks formed after one step of the time; older ones are skipped and counted.
-    skips_empty
-        Skip all ticks after such a step if none of them has a usable reading.
-    """
-
-    tick_s: float
-    max_age_s: float
-    grace_s: float
+    tick_s: float  # interval between ticks, s
+    max_age_s: float  # age of a reading at a tick, s, from which it is not usable
+    grace_s: float  # longest wait after a tick for sources that have not reported, s
+    # A reading up to this much after a tick still belongs to it, s: meters that read at the tick miss it
+    # slightly in both directions.
     lead_s: float
-    max_skew_s: float
-    silence_s: float
-    clock: Clock = Clock.WALL
+    max_skew_s: float  # largest difference of a reading's time from now, s; beyond it the reading is refused
+    silence_s: float  # age of the last usable reading, s, beyond which a source is silent
+    clock: Clock = Clock.WALL  # source of the present time
+    # Ticks formed after one step of the time; older ones are skipped and counted.
     backlog: int = BACKLOG_TICKS
-    skips_empty: bool = False
+    skips_empty: bool = False  # skip all ticks after such a step if none of them has a usable reading
 
     def __post_init__(self) -> None:
         times = (self.tick_s, self.max_age_s, self.max_skew_s, self.silence_s)
@@ -261,34 +230,19 @@ def rules(
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """Readings that belong to one tick.
+    """Readings that belong to one tick."""
 
-    Attributes
-    ----------
-    t
-        Unix time, s.
-    readings
-        The usable reading of each meter, in the order of the feeder's meters; None if unavailable.
-    busbar
-        The usable reading of the busbar meter, or None.
-    silent
-        Silent sources as (meter, seconds since the last usable reading); None is the busbar meter, infinity a
-        source without any usable reading.
-    skipped
-        Number of skipped ticks directly before this one.
-    clock_offset : (p,) or ()
-        Lead of each meter's clock, s; None if not measurable, () if none is.
-    busbar_offset
-        Lead of the busbar meter's clock, s; None if not measurable.
-    """
-
-    t: float
+    t: float  # Unix time, s
+    # The usable reading of each meter, in the order of the feeder's meters; None if unavailable.
     readings: tuple[Reading | None, ...]
-    busbar: Reading | None
+    busbar: Reading | None  # the usable reading of the busbar meter, or None
+    # Silent sources as (meter, seconds since the last usable reading); None is the busbar meter, infinity a
+    # source without any usable reading.
     silent: tuple[tuple[str | None, float], ...]
-    skipped: int = 0
+    skipped: int = 0  # number of skipped ticks directly before this one
+    # (p,) or (): Lead of each meter's clock, s; None if not measurable, () if none is.
     clock_offset: tuple[float | None, ...] = ()
-    busbar_offset: float | None = None
+    busbar_offset: float | None = None  # lead of the busbar meter's clock, s; None if not measurable
 
 
 @dataclass(slots=True)
@@ -350,10 +304,7 @@ class Aligner:
     def take(self, reading: Reading, now: float) -> tuple[ReadingOutcome, list[Tick]]:
         """Align one reading, and emit the ticks that are due.
 
-        Parameters
-        ----------
-        now
-            Wall time of its arrival, Unix s; ignored for `Clock.EVENTS`.
+        `now` is the wall time of its arrival, Unix s; ignored for `Clock.EVENTS`.
 
         Returns
         -------
@@ -427,10 +378,7 @@ class Aligner:
     def now(self, wall: float) -> float | None:
         """Return the present time of the alignment, s; None until the readings determine it.
 
-        Parameters
-        ----------
-        wall
-            Wall time, Unix s.
+        `wall` is the wall time, Unix s.
         """
         return wall if self.rules.clock is Clock.WALL else self._now
 
@@ -485,10 +433,7 @@ class Aligner:
     def due(self, wall: float) -> Iterator[Tick]:
         """Emit the ticks that are due, in order.
 
-        Parameters
-        ----------
-        wall
-            Wall time up to which all arrivals are aligned, Unix s; ignored for `Clock.EVENTS`.
+        All arrivals up to the wall time `wall`, Unix s, are aligned; ignored for `Clock.EVENTS`.
         """
         if self.rules.clock is Clock.WALL and wall < self._latest - self.rules.silence_s:
             # The clock was set back: without a restart there would be no tick until it reaches its previous

@@ -79,18 +79,9 @@ class ArrowProblem(ValueError):
 def columns_of(payload: bytes, is_file: bool, names: tuple[str, ...]) -> dict[str, list[Any]]:
     """Return the named columns of an Arrow IPC stream or file as Python lists, nulls as None.
 
-    Parameters
-    ----------
-    is_file
-        File format (with a footer) instead of the stream format.
-    names
-        Requested columns; absent ones are left out of the result.
-
-    Raises
-    ------
-    ArrowProblem
-        If the payload is not Arrow IPC, is compressed, or a requested column is not a plain column of strings
-        (`meter`), integers (`seq`) or numbers (all others).
+    With `is_file` the payload has the file format (with a footer). Absent columns are left out of the result.
+    Raises ArrowProblem if the payload is not Arrow IPC, is compressed, or a requested column is not a plain
+    column of strings (`meter`), integers (`seq`) or numbers (all others).
     """
     try:
         reader = _open(payload, is_file)
@@ -213,40 +204,20 @@ class Source:
 
 @dataclass(frozen=True, slots=True)
 class Wire:
-    """The decoder of one service.
+    """The decoder of one service."""
 
-    Attributes
-    ----------
-    known
-        The monitored feeders, by name.
-    prefix
-        First chunks of every key, without a final slash.
-    max_bytes
-        Size of the largest accepted payload, bytes.
-    """
-
-    known: Mapping[str, Known]
-    prefix: str = "gridsec"
-    max_bytes: int = 256 * 1024
+    known: Mapping[str, Known]  # the monitored feeders, by name
+    prefix: str = "gridsec"  # first chunks of every key, without a final slash
+    max_bytes: int = 256 * 1024  # size of the largest accepted payload, bytes
 
     def decode(
         self, key: str, payload: bytes, encoding: str = "", *, size: int | None = None
     ) -> DecodedPayload:
         """Return the readings and the bad readings in one payload.
 
-        Parameters
-        ----------
-        key
-            Full zenoh key.
-        encoding
-            The zenoh encoding; a schema after `;` is ignored.
-        size
-            Length of the whole payload, bytes, if `payload` is only its beginning.
-
-        Returns
-        -------
-        Decoded
-            Never empty: a payload without readings is a bad reading.
+        `size` is the length of the whole payload, bytes, if `payload` is only its beginning. A schema after
+        `;` in the encoding is ignored. The result is never empty: a payload without readings is a
+        bad reading.
         """
         source = source_of(key, self.prefix, self.known)
         head = head_of(payload[:HEAD_BYTES])
@@ -280,15 +251,8 @@ def _decoder(
 def source_of(key: str, prefix: str, known: Mapping[str, Known]) -> Source | BadReading:
     """Return the source that a key denotes, or a bad reading with the reason.
 
-    Parameters
-    ----------
-    key
-        Full key: `<prefix>/<feeder>/meter/<meter>/reading`, `<prefix>/<feeder>/substation/reading` or
-        `<prefix>/<feeder>/concentrator/<id>/readings`.
-    prefix
-        The prefix, without a final slash.
-    known
-        The monitored feeders.
+    Keys are `<prefix>/<feeder>/meter/<meter>/reading`, `<prefix>/<feeder>/substation/reading` and
+    `<prefix>/<feeder>/concentrator/<id>/readings`.
     """
     if "*" in key or "$" in key:
         return _nowhere(key, BadReason.KEY, "is a pattern; a reading needs a key without wildcards")

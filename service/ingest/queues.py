@@ -22,28 +22,20 @@ class BusUnavailable(GridsecError):
 
 @dataclass(frozen=True, slots=True)
 class BusConfig:
-    """Configuration of a zenoh session.
+    """Configuration of a zenoh session."""
 
-    Attributes
-    ----------
-    mode
-        `router` for the service (it routes between clients and needs no separate router process), `client`
-        for meters and tools, `peer` if an existing network requires it. None: the mode of the file, or
-        `router` without a file.
-    listen, connect
-        Endpoints such as `tcp/127.0.0.1:7447`.
-    file
-        A zenoh configuration in json5 (TLS, users, access control, ...). Mode and endpoints given here
-        override it.
-    max_sessions, accept_pending
-        Largest number of sessions, and of sessions that are being opened; ignored with a file. Each session
-        takes a file descriptor.
-    """
-
+    # `router` for the service (it routes between clients and needs no separate router process), `client` for
+    # meters and tools, `peer` if an existing network requires it. None: the mode of the file, or `router`
+    # without a file.
     mode: str | None = None
+    # listen, connect: endpoints such as `tcp/127.0.0.1:7447`.
     listen: tuple[str, ...] = ()
     connect: tuple[str, ...] = ()
+    # A zenoh configuration in json5 (TLS, users, access control, ...). Mode and endpoints given here override
+    # it.
     file: Path | None = None
+    # max_sessions, accept_pending: largest number of sessions, and of sessions that are being opened; ignored
+    # with a file. Each session takes a file descriptor.
     max_sessions: int = 100_000
     accept_pending: int = 1_000
 
@@ -117,13 +109,7 @@ class Inbox:
             return self._waiting[0].arrival if self._waiting else None
 
     def put(self, batch: list[Sample]) -> int:
-        """Add samples; called from any thread.
-
-        Returns
-        -------
-        int
-            Number of dropped samples.
-        """
+        """Add samples; called from any thread. Returns the number of dropped samples."""
         dropped = 0
         for sample in batch:
             size = _size(sample)
@@ -232,13 +218,7 @@ class Outgoing:
                 self._wakeup.wait(pause if self._events else None)
 
     def put_back(self, event: Publication) -> None:
-        """Queue a refused event again; after `close`, discard all events.
-
-        Parameters
-        ----------
-        event
-            The result of `next`.
-        """
+        """Queue a refused event again; after `close`, discard all events."""
         with self._wakeup:
             if self._closing:
                 self._events.clear()

@@ -44,88 +44,45 @@ class BadReason(StrEnum):
 
 
 class Reading(msgspec.Struct, frozen=True, gc=False):
-    """One usable reading.
+    """One usable reading."""
 
-    Attributes
-    ----------
-    feeder
-        Its name.
-    meter
-        Its id; None for the busbar meter.
-    t
-        Unix time of the measurement by the meter's clock, s.
-    v_volt
-        RMS phase-to-neutral voltage, V.
-    p_kw, q_kvar
-        Net import at the connection point, kW and kvar; NaN where not reported.
-    seq
-        Sequence number of the reading, or None.
-    v_phases
-        Voltage of each phase at the busbar of a feeder in three phases, V, NaN if absent; None if the reading
-        has no separate phases.
-    t_power
-        Unix time of the powers by the meter's clock, s; NaN for the time `t`.
-    """
-
-    feeder: str
-    meter: str | None
-    t: float
-    v_volt: float
+    feeder: str  # its name
+    meter: str | None  # its id; None for the busbar meter
+    t: float  # Unix time of the measurement by the meter's clock, s
+    v_volt: float  # RMS phase-to-neutral voltage, V
+    # p_kw, q_kvar: net import at the connection point, kW and kvar; NaN where not reported.
     p_kw: float = NOT_REPORTED
     q_kvar: float = NOT_REPORTED
-    seq: int | None = None
+    seq: int | None = None  # sequence number of the reading, or None
+    # Voltage of each phase at the busbar of a feeder in three phases, V, NaN if absent; None if the reading
+    # has no separate phases.
     v_phases: tuple[float, ...] | None = None
-    t_power: float = NOT_REPORTED
+    t_power: float = NOT_REPORTED  # Unix time of the powers by the meter's clock, s; NaN for the time `t`
 
 
 @dataclass(frozen=True, slots=True)
 class BadReading:
-    """A payload, or an element of one, that was not used.
+    """A payload, or an element of one, that was not used."""
 
-    Attributes
-    ----------
-    reason
-        The kind of problem.
-    problems
-        All problems, one sentence each.
-    key
-        The zenoh key, printable; a long one is cut.
-    feeder, meter
-        Known ids only; None if the key denotes none.
-    head
-        The beginning of the payload or element, printable.
-    count
-        Number of readings that this entry stands for (more than one only for the tail of a bad batch).
-    """
-
-    reason: BadReason
-    problems: tuple[str, ...]
-    key: str
+    reason: BadReason  # the kind of problem
+    problems: tuple[str, ...]  # all problems, one sentence each
+    key: str  # the zenoh key, printable; a long one is cut
+    # feeder, meter: known ids only; None if the key denotes none.
     feeder: str | None = None
     meter: str | None = None
-    head: str = ""
+    head: str = ""  # the beginning of the payload or element, printable
+    # Number of readings that this entry stands for (more than one only for the tail of a bad batch).
     count: int = 1
 
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """Properties of a feeder that the validation of its readings uses.
+    """Properties of a feeder that the validation of its readings uses."""
 
-    Attributes
-    ----------
-    meters
-        Ids of its meters.
-    nominal_volt
-        Nominal phase-to-neutral voltage of the busbar, V.
-    power_max_kw
-        Largest plausible magnitude of a customer's active or reactive power, kW or kvar.
-    own_volt
-        Nominal voltage of each meter behind a transformer, V.
-    """
-
-    meters: frozenset[str]
-    nominal_volt: float
-    power_max_kw: float
+    meters: frozenset[str]  # ids of its meters
+    nominal_volt: float  # nominal phase-to-neutral voltage of the busbar, V
+    power_max_kw: float  # largest plausible magnitude of a customer's active or reactive power, kW or kvar
+    # Nominal voltage of each meter behind a transformer, V.
     own_volt: Mapping[str, float] = field(default_factory=dict)
 
     def volt(self, meter: object) -> float:
@@ -215,16 +172,7 @@ _GRAVITY = (BadReason.TYPE, BadReason.VALUE, BadReason.UNKNOWN_METER)
 def judge(value: Any, known: Known, meter: str | None = None, *, in_batch: bool) -> WireReading | Findings:
     """Return the reading in a parsed value, or all its problems.
 
-    Parameters
-    ----------
-    value
-        Any value of JSON, CBOR or a row of columns.
-    known
-        The feeder's limits.
-    meter
-        The meter of the reading outside of batches; None: the busbar meter.
-    in_batch
-        True if the reading must contain its meter.
+    `in_batch`: the reading must contain its meter. Otherwise it belongs to `meter`; None: the busbar meter.
     """
     findings = Findings()
     if not isinstance(value, dict):

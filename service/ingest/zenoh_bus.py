@@ -77,10 +77,7 @@ def _first_line(error: BaseException) -> str:
 def session(config: BusConfig) -> Iterator[zenoh.Session]:
     """Open a zenoh session and close it in any case.
 
-    Raises
-    ------
-    BusUnavailable
-        If an endpoint cannot be listened on or connected to, or the configuration is wrong.
+    Raises BusUnavailable if an endpoint cannot be listened on or connected to, or the configuration is wrong.
     """
     built = _config(config)
     try:
@@ -139,15 +136,14 @@ class Bus:
         """Open the session, subscribe, and declare the queryables."""
         with ExitStack() as stack:
             live = stack.enter_context(session(self._config))
-            # One subscription for all kinds of readings keeps their order. Its pattern also matches nearly
-            # correct keys: they are reported as bad readings.
-            key = f"{self._prefix}/*/**/reading$*"
             # A full ring drops the oldest samples; the gap shows in the sequence numbers.
-            subscriber = (
-                live.declare_subscriber(key, zenoh.handlers.FifoChannel(RING))
-                if self._lossless
-                else live.declare_subscriber(key, zenoh.handlers.RingChannel(RING))
+            ring: Any = (
+                zenoh.handlers.FifoChannel(RING) if self._lossless else zenoh.handlers.RingChannel(RING)
             )
+            # One subscription for all kinds of readings keeps their order. Its pattern also matches wrong
+            # keys: they are reported as bad readings.
+            remote = zenoh.Locality.REMOTE
+            subscriber = live.declare_subscriber(f"{self._prefix}/**", ring, allowed_origin=remote)
             stack.callback(subscriber.undeclare)
             self._start("zenoh readings", self._receive, subscriber.handler)
             for key in (f"{self._prefix}/*/estimate", f"{self._prefix}/*/alarm/*"):
@@ -183,32 +179,36 @@ class Bus:
                 return
             batch: list[Sample] = []
             while raw is not None:
-                if raw.kind == zenoh.SampleKind.DELETE:
+                key = str(raw.key_expr)
+                if self._published_by_others(key):
+                    pass
+                elif raw.kind == zenoh.SampleKind.DELETE:
                     self.counts.deleted += 1
                 else:
-                    batch.append(self._copy(raw))
+                    batch.append(self._copy(raw, key))
                 raw = _try_recv(handler) if len(batch) < BATCH else None
             self._deliver(batch)
 
-    def _copy(self, raw: zenoh.Sample) -> Sample:
+    def _published_by_others(self, key: str) -> bool:
+        """True for keys that another service with this prefix publishes."""
+        match key.removeprefix(f"{self._prefix}/").split("/"):
+            case [_, "estimate"] | [_, "alarm", _]:
+                return True
+        return False
+
+    def _copy(self, raw: zenoh.Sample, key: str) -> Sample:
         payload = raw.payload.to_bytes()
         size = len(payload)
         kept = payload if size <= self._max_payload else payload[:_HEAD]
         # A key that is cut here is longer than every valid key, and stays invalid.
-        key = str(raw.key_expr)[: len(self._prefix) + _HEAD]
-        return Sample(key, kept, str(raw.encoding), self._wall(), size)
+        return Sample(key[: len(self._prefix) + _HEAD], kept, str(raw.encoding), self._wall(), size)
 
     # ---------------------------------------------------------------- out
 
     def telemetry(self, key: str, payload: bytes) -> None:
         """Publish the newest value of a key, and store it for queries.
 
-        Parameters
-        ----------
-        key
-            Key without the prefix.
-        payload
-            JSON.
+        `key` has no prefix; the payload is JSON.
         """
         with self._answers_lock:
             self._answers[f"{self._prefix}/{key}"] = payload
@@ -217,21 +217,9 @@ class Bus:
     def event(self, key: str, payload: bytes, *, last: bool, done: Callable[[], None] | None = None) -> bool:
         """Publish an event that must not be lost; in order, with high priority.
 
-        Parameters
-        ----------
-        key
-            Key without the prefix.
-        payload
-            JSON.
-        last
-            Delete the key after the put; queries then return nothing.
-        done
-            Called from the publishing thread after the event is published.
-
-        Returns
-        -------
-        bool
-            False if too many events are waiting; the event is not queued.
+        `key` has no prefix; the payload is JSON. With `last` the key is deleted after the put. `done` is
+        called from the publishing thread. Returns False if too many events are waiting; the event is not
+        queued.
         """
         full = f"{self._prefix}/{key}"
         with self._answers_lock:
@@ -245,24 +233,13 @@ class Bus:
     def answer(self, key: str, payload: bytes) -> None:
         """Store the reply to queries for a key, without publishing it.
 
-        Parameters
-        ----------
-        key
-            Key without the prefix.
-        payload
-            JSON.
+        `key` has no prefix; the payload is JSON.
         """
         with self._answers_lock:
             self._answers[f"{self._prefix}/{key}"] = payload
 
     def withdraw(self, key: str) -> None:
-        """Remove the reply to queries for a key.
-
-        Parameters
-        ----------
-        key
-            Key without the prefix.
-        """
+        """Remove the reply to queries for a key."""
         with self._answers_lock:
             self._answers.pop(f"{self._prefix}/{key}", None)
 
@@ -398,17 +375,7 @@ class MeterClient:
     def query(self, key: str, timeout_s: float) -> dict[str, bytes]:
         """Query the values of a key.
 
-        Parameters
-        ----------
-        key
-            Key or pattern, without the prefix.
-        timeout_s
-            Time limit, s.
-
-        Returns
-        -------
-        dict
-            Payload by full key.
+        `key` is a key or pattern without the prefix. Returns the payload by full key.
         """
         replies = self._session().get(f"{self._prefix}/{key}", timeout=timeout_s)
         samples = (reply.ok for reply in replies)
@@ -420,13 +387,7 @@ class MeterClient:
         return self._live
 
     def put(self, key: str, payload: bytes, encoding: str = JSON) -> None:
-        """Put a payload on a key (without the prefix).
-
-        Raises
-        ------
-        BusUnavailable
-            If the session is closed.
-        """
+        """Put a payload on a key (without the prefix). Raises BusUnavailable if the session is closed."""
         try:
             # The default (drop when the network is congested) would lose readings of a simulation faster than
             # real time; a meter with one reading per second is not affected.

@@ -27,23 +27,14 @@ def summary(site: Site) -> dict[str, Any]:
 
 
 def revision(fields: Mapping[str, Any]) -> str:
-    """Return a digest of a feeder's published properties; it changes with any of them.
-
-    Parameters
-    ----------
-    fields
-        The properties, as JSON.
-    """
+    """Return a digest of a feeder's published properties; it changes with any of them."""
     return hashlib.sha256(json.dumps(fields, sort_keys=True, default=str).encode()).hexdigest()[:32]
 
 
 def detail(site: Site, patience_s: float) -> dict[str, Any]:
     """Return all properties of a feeder: limits, tree with positions, tables, and their `revision`.
 
-    Parameters
-    ----------
-    patience_s
-        Age beyond which its reports are stale, s.
+    Reports older than `patience_s`, s, are stale.
     """
     meta = site.tables.meta
     tree = site.spanning

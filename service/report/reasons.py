@@ -5,10 +5,11 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Annotated, Final
 
 import numpy as np
 import structlog
+from pydantic import Field
 
 from feeders.model.site import Site, plant
 from gridsec.arrays import Bools
@@ -19,43 +20,24 @@ from gridsec.interface import Cause, Estimate, Frame, Verdict
 from service.ingest.align import Tick
 from service.report.voltages import busbar_in_words, busbar_off
 
-__all__ = ["DataErrorReport", "DataErrors", "reason_of"]
-
-
 _log = structlog.get_logger("gridsec.data_errors")
 
 
 @dataclass(frozen=True, slots=True)
 class DataErrorReport:
-    """An error of the feeder's files that explains accused meters as well as a manipulation does.
+    """An error of the feeder's files that explains accused meters as well as a manipulation does."""
 
-    Attributes
-    ----------
-    kind
-        See `gridsec.estimators.data_errors.DataErrorKind`.
-    meters
-        The accused meters that the error explains.
-    customers
-        The customers at another phase or bus than in the files, or with exchanged meters.
-    proposed
-        Bus and phase of each of these customers that agree with the readings.
-    study
-        Command that checks the error on a recording.
-    text
-        One sentence for the operator.
-    """
-
-    kind: str
-    meters: tuple[str, ...]
-    customers: tuple[str, ...]
-    proposed: tuple[str, ...]
-    study: str
-    text: str
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the error as plain JSON types."""
-        lists = {name: list(getattr(self, name)) for name in ("meters", "customers", "proposed")}
-        return {"kind": self.kind, **lists, "study": self.study, "text": self.text}
+    kind: DataErrorKind
+    meters: Annotated[tuple[str, ...], Field(description="The accused meters that the error explains.")]
+    customers: Annotated[
+        tuple[str, ...], Field(description="The one customer, or the two that are exchanged.")
+    ]
+    proposed: Annotated[
+        tuple[str, ...],
+        Field(description="Bus and phase of each customer that agree with the readings."),
+    ]
+    study: Annotated[str, Field(description="Command that checks the error on a recording.")]
+    text: Annotated[str, Field(description="One sentence for the operator.")]
 
 
 class DataErrors:
@@ -72,13 +54,7 @@ class DataErrors:
         self._window = data_errors.begin()
 
     def follow(self, frame: Frame, estimate: Estimate, verdict: Verdict) -> DataErrorReport | None:
-        """Add one tick to the window; return the error that explains a meter accused at this tick.
-
-        Parameters
-        ----------
-        frame, estimate, verdict
-            Input and output of the estimator.
-        """
+        """Add one tick to the window; return the error that explains a meter accused at this tick."""
         accused = data_errors.accused(verdict)
         if not self._designed:
             if not accused.any():
@@ -132,7 +108,7 @@ def _in_words(site: Site, error: DataError) -> DataErrorReport:
     options = " ".join(f"--look-for {name}" for name in _LOOK_FOR[error.kind])
     study = f"gridsec study calibrate {site.feeder.name} --readings FILE {options}"
     return DataErrorReport(
-        kind=str(error.kind),
+        kind=error.kind,
         meters=tuple(site.meter_ids[j] for j in error.meters),
         customers=customers,
         proposed=proposed,
@@ -156,15 +132,7 @@ _SHOWN: Final = 5
 
 
 def reason_of(site: Site, tick: Tick, max_attacked: int, verdict: Verdict) -> str:
-    """Return the reason of a verdict, with the meters' ids as in alarms: the monitor uses customers only.
-
-    Parameters
-    ----------
-    site, tick
-        The feeder, and the readings.
-    max_attacked
-        M of the design.
-    """
+    """Return the reason of a verdict, with the meters' ids as in alarms: the monitor uses customers only."""
     suspects = np.flatnonzero(verdict.suspects).tolist()
     unseen = [k for k, reading in enumerate(tick.readings) if reading is None]
     named = _meters(site, suspects)

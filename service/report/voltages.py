@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
-from typing import Any, Literal, TypeAlias
+from dataclasses import dataclass
+from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
+from pydantic import Field
 
 from feeders.model.site import Site, Snapshot, volts
 from gridsec.arrays import Bools, Floats
@@ -59,17 +60,10 @@ class ReferenceVoltages:
 
     A value without such a reading in its phase is *model only*: it follows from powers, the model and the
     state of the estimator. All buses of a phase are connected, so that one reading counts for all of them.
-
-    Attributes
-    ----------
-    meters : (b,)
-        At least one meter of the phase reports and is trusted.
-    busbar : (b,)
-        The busbar's meter reports the phase and is not named as manipulated.
     """
 
-    meters: Bools
-    busbar: Bools
+    meters: Bools  # (b,): At least one meter of the phase reports and is trusted
+    busbar: Bools  # (b,): The busbar's meter reports the phase and is not named as manipulated
 
     @property
     def measured(self) -> Bools:
@@ -84,13 +78,7 @@ class ReferenceVoltages:
 def grounds(
     site: Site, tick: Tick, estimate: Estimate | None = None, verdict: Verdict | None = None
 ) -> ReferenceVoltages:
-    """Return the readings that the values of a tick use.
-
-    Parameters
-    ----------
-    estimate, verdict
-        None without a monitor: each reading then counts.
-    """
+    """Return the readings that the values of a tick use. Without a monitor each reading counts."""
     used = np.array([reading is not None for reading in tick.readings], dtype=np.bool_)
     busbar = np.isfinite(np.broadcast_to(busbar_volt(site, tick), len(busbar_phases(site))))
     if estimate is not None:
@@ -167,67 +155,64 @@ BUSBAR = "substation"
 """Name of the busbar meter in reports, as in its zenoh key; reserved for it."""
 
 
+ModelOnly: TypeAlias = Annotated[
+    bool,
+    Field(
+        description="The estimates use no voltage reading of this tick, only powers, the model and the state "
+        "of the estimator."
+    ),
+]
+"""See `ReferenceVoltages`."""
+ClockOffset: TypeAlias = Annotated[
+    float | None,
+    Field(description="Lead of its clock relative to the other meters, s; null if not measurable."),
+]
+
+
 @dataclass(frozen=True, slots=True)
-class BusbarReport:
-    """The busbar meter at one tick; in three phases the numbers belong to one phase.
+class BusbarMeterState:
+    """The busbar meter at the latest tick; in three phases the numbers belong to one phase."""
 
-    Attributes
-    ----------
-    judged
-        True if the estimator tests this meter, and this tick has readings for the test: of this meter and of
-        a trusted meter in the same phase. Estimators that trust this meter, or do not use it, never test it.
-    seen
-        True if a usable reading of it belongs to this tick.
-    suspect
-        True if the verdict names it as manipulated.
-    phases
-        The manipulated phases: of a, b and c; empty on a balanced feeder.
-    phase
-        Phase of the numbers: the one with the largest deviation, among the suspect ones if there are any;
-        None on a balanced feeder.
-    v_volt_reported
-        Reported RMS phase-to-neutral voltage, V; None if unavailable.
-    v_volt_estimated
-        Reconstructed voltage of the busbar, V: the reported one while the meter is trusted. None without an
-        estimate.
-    attack_volt_estimated
-        Reconstructed manipulation, V: the mean over the time scale of its detection; 0 if not suspect.
-    model_only
-        True if `v_volt_estimated` uses no reading of this tick, see `voltages.ReferenceVoltages`.
-    clock_offset_s
-        Lead of its clock relative to the other meters, s; None if not measurable.
-    """
-
-    judged: bool
-    seen: bool
-    suspect: bool
-    phases: tuple[str, ...] = ()
-    phase: str | None = None
-    v_volt_reported: float | None = None
-    v_volt_estimated: float | None = None
-    attack_volt_estimated: float | None = None
-    model_only: bool = False
-    clock_offset_s: float | None = None
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the JSON object of REST's `state`."""
-        return {"meter": BUSBAR} | asdict(self) | {"phases": list(self.phases)}
+    # Estimators that trust this meter, or do not use it, never test it.
+    judged: Annotated[
+        bool,
+        Field(
+            description="The estimator tests this meter, and this tick has the readings for the test: of "
+            "this meter and of a trusted meter in the same phase."
+        ),
+    ] = False
+    seen: Annotated[bool, Field(description="A usable reading belongs to this tick.")] = False
+    suspect: Annotated[bool, Field(description="The verdict names it as manipulated.")] = False
+    phases: Annotated[
+        tuple[str, ...], Field(description="Manipulated phases, a, b or c; empty on a balanced feeder.")
+    ] = ()
+    phase: Annotated[
+        str | None,
+        Field(description="Phase of the numbers, the one with the largest deviation; null if balanced."),
+    ] = None
+    v_volt_reported: Annotated[float | None, Field(description="Reported voltage, phase to neutral, V.")] = (
+        None
+    )
+    # The reported voltage while the meter is trusted.
+    v_volt_estimated: Annotated[
+        float | None, Field(description="Reconstructed voltage of the busbar, V.")
+    ] = None
+    attack_volt_estimated: Annotated[
+        float | None, Field(description="Mean excess of its reading, V; 0 if not suspect.")
+    ] = None
+    model_only: ModelOnly = False
+    clock_offset_s: ClockOffset = None
+    meter: Annotated[str, Field(description="Its name in alarms and explanations.")] = BUSBAR
 
 
-UNKNOWN_BUSBAR = BusbarReport(judged=False, seen=False, suspect=False)
+UNKNOWN_BUSBAR = BusbarMeterState()
 """Default without any data."""
 
 
 def busbar_report(
     site: Site, tick: Tick, estimate: Estimate | None = None, verdict: Verdict | None = None
-) -> BusbarReport:
-    """Return the report of the busbar meter.
-
-    Parameters
-    ----------
-    estimate, verdict
-        None without a monitor.
-    """
+) -> BusbarMeterState:
+    """Return the report of the busbar meter."""
     names, reported = busbar_phases(site), _reported(site, tick)
     nothing = np.full(reported.size, math.nan)
     judges = verdict is not None and verdict.busbar.size > 0
@@ -244,7 +229,7 @@ def busbar_report(
     def number(values: Floats) -> float | None:
         return float(values[k]) if math.isfinite(values[k]) else None
 
-    return BusbarReport(
+    return BusbarMeterState(
         judged=judges and bool((np.isfinite(reported) & rests_on.meters).any()),
         seen=math.isfinite(reported[k]),
         suspect=bool(suspect.any()),
@@ -259,13 +244,7 @@ def busbar_report(
 
 
 def busbar_in_words(site: Site, which: Bools) -> str:
-    """Return the name of the busbar meter for a sentence, with the phases if there are several.
-
-    Parameters
-    ----------
-    which : (b,)
-        Phases, one on a balanced feeder.
-    """
+    """Return the name of the busbar meter for a sentence, with the phases if there are several."""
     names = [name for name, one in zip(busbar_phases(site), which, strict=True) if one and name is not None]
     phases = f" (phase{'s' * (len(names) > 1)} {', '.join(names)})" if names else ""
     return f"the substation's meter{phases}"

@@ -15,16 +15,16 @@ same key again stores it, or finds it stored. After `WriterLost` a store writes 
 """
 
 from service.store.history import HistoryRules
-from service.store.schema import OutcomeUnknown, Rejected, StoredTransition, StoreUnavailable, WriterLost
+from service.store.schema import AlarmEvent, OutcomeUnknown, Rejected, StoreUnavailable, WriterLost
 from service.store.writes import BAD_READINGS_KEPT, Store
 
 __all__ = [
     "BAD_READINGS_KEPT",
+    "AlarmEvent",
     "HistoryRules",
     "OutcomeUnknown",
     "Rejected",
     "Store",
     "StoreUnavailable",
-    "StoredTransition",
     "WriterLost",
 ]

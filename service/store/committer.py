@@ -26,7 +26,7 @@ from service.alarms.state_machine import to_json as alarm_json
 from service.ingest.queues import BusCounts
 from service.metrics import Metrics
 from service.report.report import FeederReport
-from service.store import OutcomeUnknown, Store, StoredTransition, StoreUnavailable
+from service.store import AlarmEvent, OutcomeUnknown, Store, StoreUnavailable
 from service.store.schema import CommissioningEvent
 from service.store.state_codec import StateSnapshot
 from service.store.write_queue import Batch, WriteQueue
@@ -64,14 +64,9 @@ class Publisher(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Wish:
-    """Contents of a command's write: all of it is stored, or the command fails.
+    """Contents of a command's write: all of it is stored, or the command fails."""
 
-    Attributes
-    ----------
-    transitions, kept, happened, without, put
-        As in `Store.commit`.
-    """
-
+    # transitions, kept, happened, without, put: as in `Store.commit`.
     transitions: tuple[AlarmTransition, ...] = ()
     kept: tuple[StateSnapshot, ...] = ()
     happened: tuple[CommissioningEvent, ...] = ()
@@ -81,22 +76,13 @@ class Wish:
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """Command part of a job.
-
-    Attributes
-    ----------
-    read
-        Called after the commit, in the writing thread.
-    landed
-        Called between two rounds after it is stored, with the result of `read`.
-    refused
-        Called between two rounds if it is not stored, or its outcome is unknown; `landed` may follow the
-        latter.
-    """
+    """Command part of a job."""
 
     wish: Wish
-    read: Callable[[Store], Any]
-    landed: Callable[[Any], None]
+    read: Callable[[Store], Any]  # called after the commit, in the writing thread
+    landed: Callable[[Any], None]  # called between two rounds after it is stored, with the result of `read`
+    # Called between two rounds if it is not stored, or its outcome is unknown; `landed` may follow the
+    # latter.
     refused: Callable[[StoreUnavailable], None]
 
 
@@ -124,7 +110,7 @@ class WriteResult:
 
     numbers: tuple[int, ...] | None = None
     marked: bool = False
-    page: tuple[StoredTransition, ...] | None = None
+    page: tuple[AlarmEvent, ...] | None = None
     found: Any = None
     error: StoreUnavailable | None = None
 
@@ -133,13 +119,7 @@ Executor = Callable[[Callable[[], WriteResult], Callable[[WriteResult], None]], 
 
 
 def inline(write: Callable[[], WriteResult], then: Callable[[WriteResult], None]) -> None:
-    """Write, and process the result, before returning.
-
-    Parameters
-    ----------
-    write, then
-        The write, and the handler of its result.
-    """
+    """Write, and process the result, before returning."""
     then(write())
 
 
@@ -198,10 +178,7 @@ class Committer:
     def commit(self, *, at_once: bool = False) -> None:
         """Start storing the collected data; after a failure they are kept and stored later.
 
-        Parameters
-        ----------
-        at_once
-            Skip the wait after a failure.
+        With `at_once` it skips the wait after a failure.
         """
         self._publish_waiting()
         if self.storing or (time.monotonic() < self._retry_at and not at_once):
@@ -220,15 +197,7 @@ class Committer:
     ) -> None:
         """Start storing all collected data and a command's wish, all or nothing.
 
-        Parameters
-        ----------
-        wish, landed, refused
-            As in `Command`.
-
-        Raises
-        ------
-        StoreUnavailable
-            If the database is known to be unavailable; no call is made then.
+        Raises StoreUnavailable if the database is known to be unavailable; no call is made then.
         """
         self._command(Command(wish, lambda _: None, lambda _: landed(), refused))
 
@@ -238,18 +207,7 @@ class Committer:
         landed: Callable[[T], None],
         refused: Callable[[StoreUnavailable], None],
     ) -> None:
-        """Start a read after all collected data are stored.
-
-        Parameters
-        ----------
-        read, landed, refused
-            As in `Command`.
-
-        Raises
-        ------
-        StoreUnavailable
-            As in `store`.
-        """
+        """Start a read after all collected data are stored. Raises StoreUnavailable: as in `store`."""
         self._command(Command(Wish(), read, landed, refused))
 
     def _command(self, command: Command) -> None:
@@ -350,13 +308,7 @@ class Committer:
         return problems
 
     def publish(self, number: int, alarm: Alarm) -> None:
-        """Queue a stored event for publication, after earlier ones.
-
-        Parameters
-        ----------
-        number, alarm
-            Number of the event, and the alarm at that event.
-        """
+        """Queue a stored event for publication, after earlier ones."""
         if self._outbox_after is not None:
             return  # It is read from the outbox in its order.
         if len(self._unpublished) >= UNPUBLISHED_KEPT:

@@ -109,10 +109,7 @@ class WriterSession:
     def connect(self, _dialect: object, _record: object, arguments: Any, options: Any) -> Timed:
         """Connect and take the lock.
 
-        Raises
-        ------
-        WriterLost
-            If the server, still running, has ended the previous session.
+        Raises WriterLost if the server, still running, has ended the previous session.
         """
         made = Timed.connect(*arguments, **options)
         try:
@@ -149,13 +146,7 @@ class WriterSession:
 
 
 def code_of(cause: BaseException) -> str:
-    """Return the code of a failed call; empty without a specific one.
-
-    Parameters
-    ----------
-    cause
-        The driver's error.
-    """
+    """Return the code of a failed call; empty without a specific one."""
     if isinstance(cause, NoAnswer):
         return cause.code
     return _CODES.get(getattr(cause, "sqlstate", None) or "", "")
@@ -282,10 +273,7 @@ class Connections:
     def write(self, doing: str = "write") -> Iterator[sa.Connection]:
         """Begin a transaction of the writer; it is durable after the block.
 
-        Parameters
-        ----------
-        doing
-            The verb of the message after a failure.
+        `doing` is the verb of the message after a failure.
 
         Raises
         ------
@@ -308,13 +296,7 @@ class Connections:
             self._session.opened()
 
     def own(self, connection: sa.Connection) -> None:
-        """Register this store as the writer.
-
-        Parameters
-        ----------
-        connection
-            Transaction of the writer.
-        """
+        """Register this store as the writer."""
         connection.execute(WRITER.delete())
         connection.execute(WRITER.insert().values(owner=self._owner, commits=0, checks=0))
 

@@ -16,7 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from service.report.report import BUSBAR, FeederReport, MeterReport, finite
+from service.report.report import FeederReport, MeterState, finite
+from service.report.voltages import BUSBAR
 
 _COLUMNS = ("v_volt_reported", "v_volt_estimated", "score", "threshold")
 _SEEN, _SUSPECT, _MODEL_ONLY = 1, 2, 4
@@ -24,18 +25,10 @@ _SEEN, _SUSPECT, _MODEL_ONLY = 1, 2, 4
 
 @dataclass(frozen=True, slots=True)
 class HistoryRules:
-    """Grid and duration of the history.
+    """Grid and duration of the history."""
 
-    Attributes
-    ----------
-    step_s
-        Grid of the kept ticks, s; 0 keeps all.
-    keep_s
-        Time for which they are kept, s.
-    """
-
-    step_s: float = 10.0
-    keep_s: float = 14 * 86400.0
+    step_s: float = 10.0  # grid of the kept ticks, s; 0 keeps all
+    keep_s: float = 14 * 86400.0  # time for which they are kept, s
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,13 +47,7 @@ def mark(report: FeederReport) -> Mark:
 
 
 def worth_keeping(last: Mark | None, now: Mark, rules: HistoryRules) -> bool:
-    """True if a tick gets a row.
-
-    Parameters
-    ----------
-    last
-        Last kept tick of the feeder, or None.
-    """
+    """True if a tick gets a row."""
     if last is None or now.t < last.t:
         return True
     changed = (last.verdict, last.cause, last.suspects) != (now.verdict, now.cause, now.suspects)
@@ -68,12 +55,12 @@ def worth_keeping(last: Mark | None, now: Mark, rules: HistoryRules) -> bool:
     return changed or step <= 0.0 or math.floor(now.t / step) > math.floor(last.t / step)
 
 
-def rows(report: FeederReport) -> tuple[MeterReport, ...]:
+def rows(report: FeederReport) -> tuple[MeterState, ...]:
     """Return the meters of a row: those of the report, and the busbar meter as `BUSBAR`, without a score."""
     now = report.busbar
-    busbar = MeterReport(
+    busbar = MeterState(
         meter=BUSBAR,
-        bus=report.bus_v_volt[0][0] if report.bus_v_volt else "",
+        bus=report.buses[0].bus if report.buses else "",
         seen=now.seen,
         suspect=now.suspect,
         score=None,
@@ -88,7 +75,7 @@ def rows(report: FeederReport) -> tuple[MeterReport, ...]:
     return (*report.meters, busbar)
 
 
-def pack(meters: Sequence[MeterReport]) -> bytes:
+def pack(meters: Sequence[MeterState]) -> bytes:
     """Pack the meters of a report: four float32 columns (NaN for None), then one byte of flags each."""
     none = math.nan
     table = np.array(
@@ -101,21 +88,10 @@ def pack(meters: Sequence[MeterReport]) -> bytes:
 def unpack(data: bytes, meters: Sequence[str], only: str | None = None) -> dict[str, Any]:
     """Return the values of a kept row for the feeder and, on request, for one of its meters.
 
-    Parameters
-    ----------
-    data
-        The packed row.
-    meters
-        The ids of its meters, in order.
-    only
-        Include the numbers of this meter.
-
-    Returns
-    -------
-    dict
-        `seen` (number of meters), `suspects`, `v_volt_lowest`, `v_volt_highest`, `model_only`, and `meter`:
-        its fields as in REST's `state`, or None. The busbar meter may be among the suspects; `seen` and the
-        extremes leave it out. The extremes leave out model-only values; rows of earlier versions mark none.
+    `meters` are the ids of the row's meters, in order; `only` is the requested meter. Returns `seen` (number
+    of meters), `suspects`, `v_volt_lowest`, `v_volt_highest`, `model_only`, and `meter`: its fields as in
+    REST's `state`, or None. The busbar meter may be among the suspects; `seen` and the extremes leave it out.
+    The extremes leave out model-only values; rows of earlier versions mark none.
     """
     raw = zlib.decompress(data)
     size = len(meters)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from collections.abc import Collection
 from typing import Any
 
 import sqlalchemy as sa
@@ -23,10 +22,10 @@ from service.store.schema import (
     HISTORY,
     LAYOUT,
     OUTBOX,
+    AlarmEvent,
     CommissioningChange,
     CommissioningEvent,
     Rejected,
-    StoredTransition,
 )
 from service.store.state_codec import SnapshotKind, StateSnapshot
 
@@ -36,12 +35,8 @@ class Reader:
 
     def __init__(self, connections: Connections) -> None:
         self._connections = connections
+        self._read = connections.read
         self.name = connections.name
-
-    @contextmanager
-    def _read(self) -> Iterator[sa.Connection]:
-        with self._connections.read() as connection:
-            yield connection
 
     def alarm(self, alarm_id: str) -> Alarm | None:
         """Return an alarm by its id."""
@@ -110,12 +105,8 @@ class Reader:
     def active(self, feeder: str | None = None, *, cleared_since: float | None = None) -> list[Alarm]:
         """Return the alarms that `state_machine.restore` needs.
 
-        Parameters
-        ----------
-        feeder
-            Name; None for all feeders.
-        cleared_since
-            Include alarms that cleared at or after this time, Unix s.
+        `feeder` None: all feeders. With `cleared_since`, Unix s, it includes alarms that cleared at or after
+        this time.
         """
         a = ALARM.c
         stands: sa.ColumnElement[bool] = a.state != str(AlarmState.CLEARED)
@@ -127,51 +118,23 @@ class Reader:
         with self._read() as connection:
             return [from_json(json.loads(data)) for data in connection.scalars(query)]
 
-    def events(self, alarm_id: str, *, after: int = 0, limit: int = 1000) -> list[StoredTransition]:
-        """Return the events of an alarm, oldest first.
-
-        Parameters
-        ----------
-        after
-            Restrict to events with a higher number.
-        limit
-            Largest number of events.
-        """
+    def events(self, alarm_id: str, *, after: int = 0, limit: int = 1000) -> list[AlarmEvent]:
+        """Return the events of an alarm, oldest first. `after` restricts to events with a higher number."""
         query = sa.select(EVENT).where(EVENT.c.alarm_id == alarm_id, EVENT.c.seq > after)
         query = query.order_by(EVENT.c.seq).limit(limit)
         with self._read() as connection:
             return [_event(row) for row in connection.execute(query).mappings()]
 
-    def events_after(
-        self, number: int, *, feeder: str | None = None, limit: int = 100
-    ) -> list[StoredTransition]:
-        """Return the events after a number, oldest first.
-
-        Parameters
-        ----------
-        number
-            The last known event.
-        feeder
-            Restrict to this feeder; None for all.
-        limit
-            Largest number of events.
-        """
+    def events_after(self, number: int, *, feeder: str | None = None, limit: int = 100) -> list[AlarmEvent]:
+        """Return the events after a number, oldest first. `number` is the last known event."""
         query = sa.select(EVENT).where(EVENT.c.seq > number).order_by(EVENT.c.seq).limit(limit)
         if feeder is not None:
             query = query.where(EVENT.c.feeder == feeder)
         with self._read() as connection:
             return [_event(row) for row in connection.execute(query).mappings()]
 
-    def outbox_pending(self, limit: int = 1000, *, after: int = 0) -> list[StoredTransition]:
-        """Return the unpublished events, oldest first.
-
-        Parameters
-        ----------
-        limit
-            Largest number of events.
-        after
-            Restrict to events with a higher number.
-        """
+    def outbox_pending(self, limit: int = 1000, *, after: int = 0) -> list[AlarmEvent]:
+        """Return the unpublished events, oldest first. `after` restricts to events with a higher number."""
         query = sa.select(EVENT).join(OUTBOX, OUTBOX.c.seq == EVENT.c.seq).where(OUTBOX.c.seq > after)
         query = query.order_by(EVENT.c.seq)
         with self._read() as connection:
@@ -188,19 +151,8 @@ class Reader:
     ) -> list[dict[str, Any]]:
         """Return the newest kept ticks of a feeder in [since, until), oldest first.
 
-        Parameters
-        ----------
-        since, until
-            Unix s.
-        meter
-            Include this meter's numbers; None at ticks without such a meter.
-        limit
-            Largest number of ticks.
-
-        Returns
-        -------
-        list of dict
-            `t`, `verdict`, `cause`, and the result of `history.unpack`.
+        Numbers of `meter` are included; None at ticks without such a meter. Times are Unix s. Returns `t`,
+        `verdict`, `cause`, and the result of `history.unpack`.
         """
         h = HISTORY.c
         query = (
@@ -222,13 +174,7 @@ class Reader:
         ]
 
     def rejected(self, limit: int = 100) -> list[Rejected]:
-        """Return the newest rejected readings, newest first.
-
-        Parameters
-        ----------
-        limit
-            Largest number of readings.
-        """
+        """Return the newest rejected readings, newest first."""
         b = BAD.c
         query = sa.select(b.t, b.key, b.reason, b.payload).order_by(b.seq.desc()).limit(limit)
         with self._read() as connection:
@@ -255,13 +201,7 @@ class Reader:
             return None if row is None else StateSnapshot(*row, matter)
 
     def commission_events(self, feeder: str, limit: int = 100) -> list[CommissioningEvent]:
-        """Return the newest entries of a feeder's record of commissioning, oldest first.
-
-        Parameters
-        ----------
-        limit
-            Largest number of entries.
-        """
+        """Return the newest entries of a feeder's record of commissioning, oldest first."""
         c = COMMISSION_EVENT.c
         query = sa.select(COMMISSION_EVENT).where(c.feeder == feeder).order_by(c.seq.desc()).limit(limit)
         with self._read() as connection:
@@ -279,8 +219,8 @@ class Reader:
         ]
 
 
-def _event(row: sa.RowMapping) -> StoredTransition:
-    return StoredTransition(
+def _event(row: sa.RowMapping) -> AlarmEvent:
+    return AlarmEvent(
         row["seq"],
         row["t"],
         Change(row["change"]),

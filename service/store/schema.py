@@ -6,8 +6,10 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Annotated
 
 import sqlalchemy as sa
+from pydantic import Field
 
 from gridsec.errors import GridsecError
 from service.alarms.state_machine import Alarm, Change
@@ -23,26 +25,14 @@ class CommissioningChange(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class CommissioningEvent:
-    """One entry of a feeder's record of commissioning.
+    """One change of a commissioning."""
 
-    Attributes
-    ----------
-    t
-        Unix time, s.
-    change
-        Kind of the entry.
-    meters
-        Their ids.
-    who, reason
-        Operator or None, and reason.
-    """
-
-    feeder: str
+    feeder: Annotated[str, Field(exclude=True)]
     t: float
     change: CommissioningChange
     meters: tuple[str, ...]
-    who: str | None = None
-    reason: str = ""
+    who: str | None
+    reason: str
 
 
 class StoreUnavailable(GridsecError):
@@ -64,10 +54,10 @@ class WriterLost(StoreUnavailable):
 
 
 @dataclass(frozen=True, slots=True)
-class StoredTransition:
-    """One stored transition. `seq` increases in the order of commits and is never reused."""
+class AlarmEvent:
+    """One event of an alarm, and the alarm after it."""
 
-    seq: int
+    seq: int  # increases in the order of commits and is never reused
     t: float
     change: Change
     who: str | None
@@ -204,13 +194,7 @@ def _add_distrust(connection: sa.Connection) -> None:
 
 
 def digest(meters: str) -> str:
-    """Return the lookup key of a layout.
-
-    Parameters
-    ----------
-    meters
-        Text of the layout, of any length.
-    """
+    """Return the lookup key of a layout."""
     return hashlib.sha256(meters.encode()).hexdigest()
 
 
@@ -242,17 +226,7 @@ MIGRATIONS: tuple[Callable[[sa.Connection], None], ...] = (
 def migrate(connection: sa.Connection, name: str) -> None:
     """Create the tables, or migrate those of an older version.
 
-    Parameters
-    ----------
-    connection
-        Transaction of the writer.
-    name
-        Name of the database in messages.
-
-    Raises
-    ------
-    StoreUnavailable
-        If the database is newer than this program.
+    Raises StoreUnavailable if the database is newer than this program.
     """
     newest = 1 + len(MIGRATIONS)
     if not sa.inspect(connection).has_table(VERSION.name):

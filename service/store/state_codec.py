@@ -47,47 +47,24 @@ class KeptInvalid(GridsecError):
 
 @dataclass(frozen=True, slots=True)
 class StateSnapshot:
-    """An encoded text of the store.
-
-    Attributes
-    ----------
-    t
-        Unix time of its tick, s.
-    text
-        Result of `encode` or `encode_distrust`.
-    matter
-        Subject of the text.
-    """
+    """An encoded text of the store."""
 
     feeder: str
-    t: float
-    text: str
-    matter: SnapshotKind = SnapshotKind.COMMISSION
+    t: float  # Unix time of its tick, s
+    text: str  # result of `encode` or `encode_distrust`
+    matter: SnapshotKind = SnapshotKind.COMMISSION  # subject of the text
 
 
 class CommissionRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Contents of the text of a commissioning.
+    """Contents of the text of a commissioning."""
 
-    Attributes
-    ----------
-    format
-        Version of the text.
-    feeder, t
-        As in `StateSnapshot`.
-    fingerprint
-        Result of `fingerprint` at that time.
-    meters
-        Ids, in the order of the arrays.
-    arrays
-        One number per meter, by name; None for NaN.
-    """
-
-    format: int
+    format: int  # version of the text
+    # feeder, t: as in `StateSnapshot`.
     feeder: str
     t: _Finite
-    fingerprint: dict[str, str]
-    meters: list[str]
-    arrays: dict[str, list[_Finite | None]]
+    fingerprint: dict[str, str]  # result of `fingerprint` at that time
+    meters: list[str]  # ids, in the order of the arrays
+    arrays: dict[str, list[_Finite | None]]  # one number per meter, by name; None for NaN
 
 
 def fingerprint(site: Site) -> dict[str, str]:
@@ -109,17 +86,7 @@ def fingerprint(site: Site) -> dict[str, str]:
 
 
 def encode(site: Site, now: Mapping[str, str], t: float, arrays: Mapping[str, Floats]) -> StateSnapshot:
-    """Encode a commissioning.
-
-    Parameters
-    ----------
-    site, now
-        The feeder, and its fingerprint.
-    t
-        Unix time of the tick, s.
-    arrays : of (p,)
-        One array per name.
-    """
+    """Encode a commissioning. `now` is the feeder's fingerprint, `arrays` has shapes (p,)."""
     name = site.feeder.name
     numbers = {key: [None if math.isnan(x) else x for x in value.tolist()] for key, value in arrays.items()}
     record = CommissionRecord(FORMAT, name, t, dict(now), list(site.meter_ids), numbers)
@@ -129,20 +96,8 @@ def encode(site: Site, now: Mapping[str, str], t: float, arrays: Mapping[str, Fl
 def decode(site: Site, now: Mapping[str, str], kept: StateSnapshot) -> dict[str, Floats]:
     """Decode a commissioning for the present feeder.
 
-    Parameters
-    ----------
-    site, now, kept
-        The feeder, its fingerprint, and the text.
-
-    Returns
-    -------
-    dict of (p,) arrays
-        The arrays of `encode`.
-
-    Raises
-    ------
-    KeptInvalid
-        If the text is damaged, newer than this program, or of a feeder that has changed since.
+    `now` is the feeder's fingerprint. Returns the arrays of `encode`. Raises KeptInvalid if the text is
+    damaged, newer than this program, or of a feeder that has changed since.
     """
     record = _read(site, kept, CommissionRecord)
     changed = [name for name in now if record.fingerprint.get(name) != now[name]]
@@ -158,87 +113,49 @@ def decode(site: Site, now: Mapping[str, str], kept: StateSnapshot) -> dict[str,
 
 
 class Suspect(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A distrusted meter.
-
-    Attributes
-    ----------
-    scale_s
-        Time scale of its detection, s.
-    named
-        True if it was named as manipulated.
-    repeats_s
-        Lag of a replay of its readings, s; None without one. Older texts lack it.
-    """
+    """A distrusted meter."""
 
     meter: str
-    scale_s: _Time
-    named: bool
+    scale_s: _Time  # time scale of its detection, s
+    named: bool  # True if it was named as manipulated
+    # Lag of a replay of its readings, s; None without one. Older texts lack it.
     repeats_s: _Time | None = None
 
 
 class NamedInverter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """An inverter that was named as manipulated.
-
-    Attributes
-    ----------
-    number
-        Index among the inverters of this customer, in the order of the feeder's file.
-    """
+    """An inverter that was named as manipulated."""
 
     customer: str
+    # Index among the inverters of this customer, in the order of the feeder's file.
     number: Annotated[int, msgspec.Meta(ge=0)]
 
 
 class SuspectBusbarPhase(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A phase with a distrusted busbar meter.
+    """A phase with a distrusted busbar meter."""
 
-    Attributes
-    ----------
-    phase
-        Name of the phase; None on a balanced feeder.
-    scale_s, named
-        As in `Suspect`.
-    off
-        Excess of its reading, squared pu.
-    """
-
-    phase: Phase | None
+    phase: Phase | None  # name of the phase; None on a balanced feeder
+    # scale_s, named: as in `Suspect`.
     scale_s: _Time
     named: bool
-    off: _Finite
+    off: _Finite  # excess of its reading, squared pu
 
 
 class DistrustRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Contents of the text of suspicions.
+    """Contents of the text of suspicions."""
 
-    Attributes
-    ----------
-    format
-        Version of the text.
-    feeder, t
-        As in `StateSnapshot`.
-    meters, inverters
-        Distrusted devices.
-    busbar
-        Phases with a distrusted busbar meter; absent in texts of versions that did not test it.
-    """
-
-    format: int
+    format: int  # version of the text
+    # feeder, t: as in `StateSnapshot`.
     feeder: str
     t: _Finite
+    # meters, inverters: distrusted devices.
     meters: list[Suspect]
     inverters: list[NamedInverter]
+    # Phases with a distrusted busbar meter; absent in texts of versions that did not test it.
     busbar: list[SuspectBusbarPhase] = []
 
 
 def encode_distrust(site: Site, t: float, distrust: SuspicionRecord) -> StateSnapshot:
-    """Encode suspicions.
-
-    Parameters
-    ----------
-    t
-        Unix time of the tick, s.
-    """
+    """Encode suspicions."""
     name, owners = site.feeder.name, _owners(site)
     columns = (distrust.scale_s, distrust.named, distrust.repeats_s)
     meters = zip(*(column.tolist() for column in columns), strict=True)
@@ -263,15 +180,7 @@ def encode_distrust(site: Site, t: float, distrust: SuspicionRecord) -> StateSna
 def decode_distrust(site: Site, kept: StateSnapshot) -> SuspicionRecord:
     """Decode suspicions for the meters, inverters and phases of the present feeder.
 
-    Parameters
-    ----------
-    site, kept
-        The feeder, and the text.
-
-    Raises
-    ------
-    KeptInvalid
-        If the text is damaged, newer than this program, or of another feeder.
+    Raises KeptInvalid if the text is damaged, newer than this program, or of another feeder.
     """
     record, owners = _read(site, kept, DistrustRecord), _owners(site)
     who = {suspect.meter: suspect for suspect in record.meters}

@@ -84,13 +84,7 @@ class WriteQueue:
         kept: Iterable[StateSnapshot] = (),
         happened: Iterable[CommissioningEvent] = (),
     ) -> None:
-        """Add data.
-
-        Parameters
-        ----------
-        transitions, reports, rejected, kept, happened
-            As in `Store.commit`.
-        """
+        """Add data."""
         for item in transitions:
             if item.change is Change.RAISED and item.alarm.count == 1:
                 self._unheard.add(item.alarm.id)
@@ -126,13 +120,7 @@ class WriteQueue:
         self.given_up, self._thin_at = 0, TRANSITIONS_KEPT
 
     def give_back(self, batch: Batch) -> None:
-        """Put a batch that was not stored before all later data.
-
-        Parameters
-        ----------
-        batch
-            Result of `take`.
-        """
+        """Put a batch that was not stored before all later data."""
         self._unheard |= self._on_the_way
         self._on_the_way = set()
         self._taken = 0

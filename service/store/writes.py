@@ -229,23 +229,9 @@ class Store(Reader):
                 connection.execute(OUTBOX.delete().where(OUTBOX.c.seq == sa.bindparam("number")), rows)
 
     def check(self) -> None:
-        """Test a write.
-
-        Raises
-        ------
-        StoreUnavailable
-            If the database cannot be written.
-        """
+        """Test a write. Raises StoreUnavailable if the database cannot be written."""
         with self._write() as connection:
             connection.execute(WRITER.update().values(checks=WRITER.c.checks + 1))
-
-    def writable(self) -> bool:
-        """True if the database can be written now; `check` raises the reason otherwise."""
-        try:
-            self.check()
-        except StoreUnavailable:
-            return False
-        return True
 
     def _put_transition(self, connection: sa.Connection, transition: AlarmTransition) -> int:
         alarm = transition.alarm

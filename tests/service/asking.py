@@ -5,8 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import httpx
+from pydantic import TypeAdapter
 
 from service.api import models
+from service.store import AlarmEvent
 
 T0 = 1_795_212_000.0
 LIE = {"H3": 9.0}
@@ -68,7 +70,7 @@ class Stream:
         while len(found) < count:
             event = self.next()
             if "data" in event:
-                data = models.AlarmEvent.model_validate_json(event["data"])
+                data = TypeAdapter(AlarmEvent).validate_json(event["data"])
                 assert event["event"] == "alarm"
                 assert int(event["id"]) == data.seq
                 found.append((data.seq, str(data.change)))

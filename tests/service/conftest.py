@@ -18,27 +18,29 @@ from typing import Any
 import pytest
 import uvicorn
 from playwright.sync_api import Browser, sync_playwright
+from pydantic import TypeAdapter
 
 from gridsec.errors import FeederInvalid
 from gridsec.interface import Cause, Decision
 from service.alarms.state_machine import (
+    Alarm,
     AlarmBook,
     AlarmRules,
     AlarmUnknown,
-    acknowledge,
     advance,
     conditions,
-    to_json,
 )
 from service.api.routes import create_api
+from service.engine.commissioning import CommissioningProgress
 from service.errors import FeederFixed, FeederUnknown, TooManyFeeders
 from service.report.feeder_info import revision
-from service.report.report import FeederReport, MeterReport
+from service.report.report import BusState, FeederReport, MeterState, Silence
 from service.store import Store
 from service.store.schema import CommissioningChange, CommissioningEvent
 from tests.service.asking import T0, Setup
 from tests.service.databases import Cluster, find_postgresql
 from tests.service.looking import Site
+from tests.service.reports import acknowledge
 
 CHROMIUM = [
     *("--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"),
@@ -102,7 +104,7 @@ class Village:
             seen = name not in silent
             score = abs(2 * v * lie + lie * lie) / NOMINAL**2 + 1e-4
             meters.append(
-                MeterReport(
+                MeterState(
                     meter=name,
                     bus=c["bus"],
                     seen=seen,
@@ -114,6 +116,8 @@ class Village:
                     v_volt_std=0.15,
                     v2_pu_estimated=(v / NOMINAL) ** 2,
                     attack_volt_estimated=lie,
+                    v_min_volt=0.9 * NOMINAL,
+                    v_max_volt=1.1 * NOMINAL,
                 )
             )
         decision = {Cause.AGREEMENT: Decision.CLEAN, Cause.RESIDUALS: Decision.ATTACKED}
@@ -131,8 +135,8 @@ class Village:
             cause=cause,
             max_attacked=2,
             meters=tuple(meters),
-            bus_v_volt=tuple(at.items()),
-            silent=tuple((name, 12.0) for name in silent),
+            buses=tuple(BusState(bus, v) for bus, v in at.items()),
+            silent=tuple(Silence(name, 12.0) for name in silent),
             v_min_volt=0.9 * NOMINAL,
             v_max_volt=1.1 * NOMINAL,
         )
@@ -168,8 +172,8 @@ class SmallService:
             self.books[report.feeder], self.reports[report.feeder] = book, report
             self.heard[report.feeder] = time.monotonic()
         self.wake({"type": "state", "data": report})
-        for transition in transitions:
-            self.wake({"type": "alarm", "data": to_json(transition.alarm)})
+        for _ in transitions:
+            self.wake({"type": "alarm", "data": None})
 
     def wake(self, event: dict[str, Any] | None) -> None:
         def put() -> None:
@@ -200,13 +204,13 @@ class SmallService:
     def age(self, report: FeederReport) -> float:
         return self.delay_s + time.monotonic() - self.heard[report.feeder]
 
-    def commissioning(self, name: str) -> dict[str, Any] | None:
+    def commissioning(self, name: str) -> CommissioningProgress | None:
         village = self.villages.get(name)
         if village is None:
             return None
         open_ones = [m for m in village.meters if m in self.learning]
         now = self.reports[name].t if name in self.reports else None
-        return {
+        return TypeAdapter(CommissioningProgress).validate_python({
             "feeder": name, "estimator": "sequential", "state": "learning" if open_ones else "learned",
             "t": now, "tick_s": 1.0, "needed_s": 86400.0, "gathered_s": 18_000.0 if open_ones else None,
             "since": T0 - 18_000.0 if open_ones else None, "expected": T0 + 68_400.0 if open_ones else None,
@@ -231,14 +235,18 @@ class SmallService:
                 }
                 for m in village.meters
             ],
-        }  # fmt: skip
+        })  # fmt: skip
 
-    async def recommission(self, name: str, meters: Sequence[str], who: str, reason: str) -> dict[str, Any]:
+    async def recommission(
+        self, name: str, meters: Sequence[str], who: str, reason: str
+    ) -> CommissioningProgress:
         chosen = tuple(meters) or tuple(self.villages[name].meters)
         event = CommissioningEvent(name, T0, CommissioningChange.RECOMMISSIONED, chosen, who, reason)
         await asyncio.to_thread(partial(self.store.commit, happened=[event]))
         self.learning.update(chosen)
-        return self.commissioning(name) or {}
+        progress = self.commissioning(name)
+        assert progress is not None
+        return progress
 
     def unstored(self) -> tuple[int, str | None]:
         return self.waits
@@ -269,16 +277,14 @@ class SmallService:
         self.reports.pop(name, None)
         self.wake({"type": "state", "data": None})
 
-    async def acknowledge(
-        self, alarm_id: str, who: str, comment: str, *, count: int | None = None
-    ) -> dict[str, Any]:
+    async def acknowledge(self, alarm_id: str, who: str, comment: str, *, count: int | None = None) -> Alarm:
         for name, book in self.books.items():
             if any(alarm.id == alarm_id for alarm in book.alarms):
                 t = self.reports[name].t
-                self.books[name], transitions = acknowledge(book, alarm_id, who, comment, t, count=count)
-                await asyncio.to_thread(self.store.commit, transitions)
-                self.wake({"type": "alarm", "data": to_json(transitions[0].alarm)})
-                return to_json(transitions[0].alarm)
+                self.books[name], transition = acknowledge(book, alarm_id, who, comment, t, count=count)
+                await asyncio.to_thread(self.store.commit, [transition])
+                self.wake({"type": "alarm", "data": None})
+                return transition.alarm
         raise AlarmUnknown(alarm_id)
 
     async def subscribe(self) -> AsyncGenerator[dict[str, Any], None]:

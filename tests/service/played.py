@@ -10,7 +10,9 @@ from feeders.model.site import Site
 from feeders.simulation.recording import read_recording, record
 from feeders.simulation.scenario import Scenario, SimulatedTick
 from service.cli.simulate import Pace, play
+from service.engine.feeder_monitor import FeederMonitor, TickResult
 from service.engine.replay import ReplayCounts, replay
+from service.ingest.reading import Reading
 from service.report.report import FeederReport
 from tests.service.running import service, until
 
@@ -32,6 +34,12 @@ def served(
         samples = list(play(site, scenario, live.meters, Pace(float("inf"), ahead=3)))
         until(lambda: live.state(name).get("t", 0.0) >= samples[-1].t - 2.0, "the end")
         return samples, live.state(name)
+
+
+def ingest(monitor: FeederMonitor, reading: Reading, now: float) -> list[TickResult]:
+    """Align one reading and judge the ticks that become due."""
+    monitor.place(reading, now)
+    return [monitor.judge() for _ in range(len(monitor.pending))]
 
 
 def replayed(site: Site, scenario: Scenario, folder: Path) -> list[FeederReport]:

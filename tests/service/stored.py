@@ -7,14 +7,15 @@ from dataclasses import replace
 from gridsec.interface import Cause, Decision
 from service.alarms.state_machine import (
     Alarm,
+    AlarmEvidence,
     AlarmKind,
     AlarmState,
     AlarmTransition,
     Change,
-    ConditionEvidence,
     Severity,
 )
-from service.report.report import FeederReport, MeterReport
+from service.report.report import FeederReport, MeterState
+from service.store import Store, StoreUnavailable
 from tests.service.asking import T0
 
 
@@ -32,7 +33,10 @@ def an_alarm(number: int = 0, **changes: object) -> Alarm:
         t_raised=t,
         t_cleared=None,
         reason="reports 240.0 V – «quoted» ' \" \\ 雪",
-        evidence=ConditionEvidence(1e-3 / 3, None, 0.1 + 0.2, 230.0, -5e-324),
+        evidence=AlarmEvidence(1e-3 / 3, None, 0.1 + 0.2, 230.0, -5e-324),
+        acknowledged_by=None,
+        t_acknowledged=None,
+        comment=None,
     )
     return replace(made, **changes)  # type: ignore[arg-type]
 
@@ -45,8 +49,17 @@ def a_report(
     t: float, suspects: tuple[str, ...] = (), *, count: int = 3, volt: float = 230.0
 ) -> FeederReport:
     meters = tuple(
-        MeterReport(f"m{i}", "b1", i != 2, f"m{i}" in suspects, 1e-4, 2e-3, volt, volt - 0.5, 0.1, 1.0, 0.0)
+        MeterState(f"m{i}", "b1", i != 2, f"m{i}" in suspects, 1e-4, 2e-3, volt, volt - 0.5, 0.1, 1.0, 0.0)
         for i in range(count)
     )
     verdict = (Decision.ATTACKED, Cause.RESIDUALS) if suspects else (Decision.CLEAN, Cause.AGREEMENT)
     return FeederReport("village", t, verdict[0], "", verdict[1], 2, meters, (), (), 207.0, 253.0)
+
+
+def writable(store: Store) -> bool:
+    """True if the database can be written now."""
+    try:
+        store.check()
+    except StoreUnavailable:
+        return False
+    return True

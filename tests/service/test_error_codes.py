@@ -29,7 +29,7 @@ from feeders.model.site import load
 from gridsec.errors import FeederInvalid, GridsecError, InputInvalid, Problem
 from gridsec.estimators.sequential import SuspicionRecord
 from service import app
-from service.alarms.state_machine import AlarmBook, AlarmRules, acknowledge, acknowledged, restore
+from service.alarms.state_machine import AlarmRules, AlarmUnknown, acknowledged, restore
 from service.cli import demo
 from service.cli.paths import check_paths, write_tables
 from service.cli.replay import _site_of
@@ -426,7 +426,7 @@ RULES = {"tick_s": 1.0, "max_age_s": 1.0, "grace_s": 0.0, "lead_s": 0.0, "max_sk
 
 CALLS: dict[str, Call] = {
     "HTTP at an address of another machine": lambda _, __: app._listen("192.0.2.1:80").__enter__(),
-    "alarm that does not exist": lambda _, __: acknowledge(AlarmBook("village"), "nothing", "Ada", "", T0),
+    "alarm that does not exist": lambda _, __: refuse(AlarmUnknown("nothing")),
     "second answer to an alarm": lambda _, __: acknowledged(ANSWERED, "Grace", "", T0),
     "answer to an earlier occurrence": lambda _, __: acknowledged(AGAIN, "Ada", "", T0, count=1),
     "delay before an alarm": lambda _, __: AlarmRules(on_delay_s=-1.0),

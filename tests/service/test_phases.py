@@ -9,6 +9,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from pydantic import TypeAdapter
 
 from feeders.model.site import Site, from_tables, load, to_frame
 from feeders.simulation.recording import read_recording, record
@@ -126,7 +127,7 @@ def test_the_service_names_the_liars_with_their_phases(
     assert state["verdict"] == "attacked"
     assert {meter["meter"] for meter in state["meters"] if meter["suspect"]} == lying
     assert all(meter["phase"] == phase[meter["meter"]] for meter in state["meters"])
-    State.model_validate(state)
+    TypeAdapter(State).validate_python(state)
     # Estimated and true voltages of every phase of every bus, and the one furthest from nominal.
     found = np.array([bus["v_phases"] for bus in state["buses"]], dtype=float)
     np.testing.assert_allclose(found, samples[-1].v_bus_volt.reshape(-1, 3), rtol=0, atol=2.0)

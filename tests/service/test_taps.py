@@ -63,7 +63,7 @@ def test_the_liars_behind_a_tap_are_named_in_volts(name: str, tmp_path: Path) ->
     np.testing.assert_allclose(np.abs(sample.shift_volt[liars]), 0.03 * nominal, atol=0.1)
     squared = np.array([m.v2_pu_estimated for m in last.meters], dtype=float)
     np.testing.assert_allclose(squared, (told / nominal) ** 2, rtol=1e-12)
-    found = np.array([v for _, v in last.bus_v_volt], dtype=float)
+    found = np.array([bus.v_volt for bus in last.buses], dtype=float)
     buses = sample.v_bus_volt.reshape(found.size, -1)
     off = np.abs(found[:, None] - buses).min(axis=1) / nominal
     assert off.max() < 5e-3

@@ -9,20 +9,22 @@ from dataclasses import replace
 
 import pytest
 
+from gridsec.estimators.sequential import LearningReason
 from gridsec.interface import Cause
 from service.alarms.state_machine import (
     AlarmBook,
+    AlarmEvidence,
     AlarmKind,
     AlarmRules,
     Condition,
-    ConditionEvidence,
     Severity,
     advance,
     conditions,
 )
 from service.alarms.state_machine import from_json as alarm_from_json
 from service.alarms.state_machine import to_json as alarm_json
-from service.report.report import BUSBAR, LearningReport, StalledMeter, with_learning
+from service.report.report import LearningReport, StalledMeter, with_learning
+from service.report.voltages import BUSBAR
 from tests.service.reports import FEEDER, inverter, meter, report, with_inverters
 
 UNDECIDED_CAUSES = [cause for cause in Cause if cause not in (Cause.AGREEMENT, Cause.RESIDUALS)]
@@ -41,7 +43,7 @@ def test_a_suspect_is_a_condition_with_its_numbers() -> None:
     (found,) = conditions(report(meter("m1"), liar, cause=Cause.RESIDUALS))
     assert (found.kind, found.meter, found.known) == (AlarmKind.METER_MANIPULATED, "m2", True)
     assert found.severity is Severity.CRITICAL
-    assert found.evidence == ConditionEvidence(9e-3, 2e-3, 240.0, 230.0, 10.0)
+    assert found.evidence == AlarmEvidence(9e-3, 2e-3, 240.0, 230.0, 10.0)
     assert "240.0 V" in found.reason
     assert "230.0 V" in found.reason
 
@@ -58,7 +60,7 @@ def test_a_manipulated_inverter_is_a_condition_of_its_customer() -> None:
     (found,) = conditions(with_inverters(report(meter("m1"), cause=Cause.RESIDUALS), wrong, other))
     assert (found.kind, found.subject, found.meter) == (AlarmKind.INVERTER_MANIPULATED, "Miller", "m1")
     assert (found.severity, found.known) == (Severity.CRITICAL, True)
-    assert found.evidence == ConditionEvidence(attack_kvar_estimated=-6.25)
+    assert found.evidence == AlarmEvidence(attack_kvar_estimated=-6.25)
     assert "the inverter of Miller injects -6.2 kvar" in found.reason
 
 
@@ -199,7 +201,8 @@ def test_undecided_for_want_of_readings_is_told_unless_data_loss_tells_all_of_it
 
 # ------------------------------------------------------------------- learning
 
-STALLED = (StalledMeter("m2", "silent", 30.0), StalledMeter("m3", "no-busbar", 0.0))
+SILENT, NO_BUSBAR = LearningReason.SILENT, LearningReason.NO_BUSBAR
+STALLED = (StalledMeter("m2", SILENT, 30.0), StalledMeter("m3", NO_BUSBAR, 0.0))
 
 
 def test_stalled_meters_are_one_condition_of_the_feeder() -> None:
@@ -211,7 +214,7 @@ def test_stalled_meters_are_one_condition_of_the_feeder() -> None:
     (found,) = conditions(with_learning(now, learning))
     assert (found.kind, found.subject, found.known) == (AlarmKind.LEARNING_STALLED, None, True)
     assert found.severity is Severity.MINOR
-    assert found.evidence == ConditionEvidence(learning=STALLED)
+    assert found.evidence == AlarmEvidence(learning=STALLED)
     assert found.reason == (
         "2 of 3 meters are not learned after twice the expected time of 86401 s: no-busbar (1), silent (1)"
     )
@@ -236,7 +239,7 @@ def test_without_a_monitor_learning_is_unknown() -> None:
 
 
 def test_an_alarm_keeps_its_stalled_meters_in_its_text() -> None:
-    learning = LearningReport(("stalled",) * 2, ("silent", "no-busbar"), 61.0, STALLED)
+    learning = LearningReport(("stalled",) * 2, (SILENT, NO_BUSBAR), 61.0, STALLED)
     now = with_learning(report(meter("m2"), meter("m3")), learning)
     book, _ = advance(AlarmBook(FEEDER), AlarmRules(on_delay_s=0.0), conditions(now), now.t)
     (alarm,) = book.active

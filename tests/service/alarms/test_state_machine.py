@@ -17,6 +17,7 @@ from gridsec.interface import Cause
 from service.alarms.state_machine import (
     Alarm,
     AlarmBook,
+    AlarmEvidence,
     AlarmKind,
     AlarmRules,
     AlarmState,
@@ -25,9 +26,7 @@ from service.alarms.state_machine import (
     AlreadyAcknowledged,
     Change,
     Condition,
-    ConditionEvidence,
     Severity,
-    acknowledge,
     acknowledged,
     advance,
     conditions,
@@ -37,7 +36,7 @@ from service.alarms.state_machine import (
 )
 from service.report.report import ExplanationReport
 from tests.codes import refused
-from tests.service.reports import FEEDER, T0, inverter, meter, report, with_inverters
+from tests.service.reports import FEEDER, T0, acknowledge, inverter, meter, report, with_inverters
 
 
 def test_an_inverter_s_alarm_lives_like_any_other() -> None:
@@ -78,9 +77,7 @@ def tick(truth: str, name: str | None = "m1") -> list[Condition]:
     if truth == "A":
         return []
     kind = AlarmKind.METER_MANIPULATED
-    return [
-        Condition(kind, FEEDER, name, Severity.CRITICAL, ConditionEvidence(1.0), "why", known=truth == "P")
-    ]
+    return [Condition(kind, FEEDER, name, Severity.CRITICAL, AlarmEvidence(1.0), "why", known=truth == "P")]
 
 
 Tick = tuple[float, str]
@@ -349,7 +346,7 @@ def raised() -> tuple[AlarmBook, Alarm]:
 
 def test_acknowledging_keeps_the_alarm_and_says_who() -> None:
     book, alarm = raised()
-    book, (item,) = acknowledge(book, alarm.id, "Ada", "on my way", T0 + 10)
+    book, item = acknowledge(book, alarm.id, "Ada", "on my way", T0 + 10)
     assert item == AlarmTransition(book.active[0], Change.ACKNOWLEDGED, T0 + 10, "Ada", "on my way")
     assert item.alarm == replace(
         alarm,
@@ -391,7 +388,7 @@ def test_an_acknowledged_alarm_clears_and_remembers_who() -> None:
 def test_a_cleared_alarm_can_still_be_answered_and_stays_cleared() -> None:
     book, alarm = raised()
     book, _ = run([(T0 + 20 + k, "A") for k in range(6)], book=book)
-    book, (item,) = acknowledge(book, alarm.id, "Ada", "", T0 + 30)
+    book, item = acknowledge(book, alarm.id, "Ada", "", T0 + 30)
     assert (item.alarm.state, item.alarm.acknowledged_by) == (AlarmState.CLEARED, "Ada")
     with pytest.raises(AlreadyAcknowledged):
         acknowledged(book.alarms[0], "Grace", "", T0 + 31)
@@ -437,7 +434,7 @@ def test_json_and_back() -> None:
     assert type(data["state"]) is str
     assert from_json({**data, "unknown": 1}) == alarm
     shown = (ExplanationReport(("m1", "m2"), ("Miller",), 0.5, ("Smith",)),)
-    rich = replace(alarm, customer="Miller", evidence=ConditionEvidence(kind="stuck", explanations=shown))
+    rich = replace(alarm, customer="Miller", evidence=AlarmEvidence(kind="stuck", explanations=shown))
     assert from_json(json.loads(json.dumps(to_json(rich)))) == rich
 
 

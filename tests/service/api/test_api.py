@@ -12,10 +12,12 @@ from typing import Any
 
 import httpx
 import pytest
+from pydantic import TypeAdapter
 
 from gridsec.interface import Cause
+from service.alarms.state_machine import Alarm
 from service.api import models
-from service.report.report import CustomerReport, ExplanationReport, InverterReport
+from service.report.report import CustomerState, ExplanationReport, InverterState
 from service.report.report import to_json as report_json
 from service.store import Rejected, connect
 from tests.service.asking import T0, Setup, Stream, is_problem
@@ -73,7 +75,7 @@ def test_nan_never_leaves(setup: Setup) -> None:
 
 def test_one_meter(setup: Setup) -> None:
     setup.attack(ticks=1)
-    found = models.MeterNow.model_validate(setup.get("/feeders/village/meters/H3").json())
+    found = TypeAdapter(models.MeterNow).validate_python(setup.get("/feeders/village/meters/H3").json())
     assert (found.meter, found.feeder, found.verdict, found.suspect) == ("H3", "village", "attacked", True)
     is_problem(setup.get("/feeders/village/meters/nobody"), 404)
     is_problem(setup.get("/feeders/nowhere/meters/H3"), 404)
@@ -177,19 +179,19 @@ def test_an_alarm_and_its_fields(setup: Setup) -> None:
 
 
 def test_an_inverter_and_an_ambiguity_are_shown(setup: Setup) -> None:
-    inverter = InverterReport("H7", "drop-7", None, True, True, 4.5, -6.0)
+    inverter = InverterState("H7", "drop-7", None, True, True, 4.5, -6.0)
     explanations = (
         ExplanationReport(("H3",), (), 0.75),
         ExplanationReport((), ("H7",), 0.25, ("H5",)),
     )
     for k in range(4):
         report = setup.village.report(T0 + k, cause=Cause.RESIDUALS)
-        customers = (CustomerReport("H7", 229.0, 0.2), CustomerReport("H8", None, None))
+        customers = (CustomerState("H7", 229.0, 0.2), CustomerState("H8", None, None))
         setup.service.tick(replace(report, inverters=(inverter,), customers=customers))
-    state = models.State.model_validate(setup.get("/feeders/village/state").json())
+    state = TypeAdapter(models.State).validate_python(setup.get("/feeders/village/state").json())
     assert [(i.customer, i.suspect, i.attack_kvar_estimated) for i in state.inverters] == [("H7", True, -6.0)]
     assert [(c.customer, c.v_volt_std) for c in state.customers] == [("H7", 0.2), ("H8", None)]
-    alarm = models.AlarmModel.model_validate(setup.one())
+    alarm = TypeAdapter(Alarm).validate_python(setup.one())
     assert (alarm.kind, alarm.customer, alarm.meter) == ("inverter-manipulated", "H7", None)
     assert alarm.evidence.attack_kvar_estimated == -6.0
     assert setup.get("/alarms", params={"kind": "inverter-manipulated"}).json()["alarms"][0]["id"] == alarm.id

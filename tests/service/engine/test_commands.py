@@ -71,13 +71,13 @@ def test_an_alarm_clears_while_its_acknowledgement_is_stored(
         states = {alarm.id: (alarm.state, alarm.acknowledged_by) for alarm in slow.watch.book.alarms}
         assert states == {first: (AlarmState.CLEARED, None), second: (AlarmState.CLEARED, None)}
         slow.land()
-        assert answer.result()["acknowledged_by"] == "Ada"
+        assert answer.result().acknowledged_by == "Ada"
         assert [str(event.change) for event in store.events(first)] == ["raised", "acknowledged", "cleared"]
         assert set(slow.watch.book.alarms) == set(store.alarms()[0])
         stored = {alarm.id: (alarm.state, alarm.acknowledged_by) for alarm in slow.watch.book.alarms}
         assert stored == {first: (AlarmState.CLEARED, "Ada"), second: (AlarmState.CLEARED, None)}
         number = store.last_event
-        assert slow.live.acknowledge(first, "Ada", "on my way").result()["acknowledged_by"] == "Ada"
+        assert slow.live.acknowledge(first, "Ada", "on my way").result().acknowledged_by == "Ada"
         with pytest.raises(AlreadyAcknowledged):
             slow.live.acknowledge(first, "Ada", "something else")
         assert store.last_event == number
@@ -167,8 +167,8 @@ def test_learning_anew_begins_when_it_is_stored(site: Site, attacked: list[Sampl
         assert slow.watch.commissioning.known is not None
         gathered = slow.watch.commissioning.known.learning
         slow.land()
-        states = {one["meter"]: one for one in answer.result()["meters"]}
-        assert states["m01"]["state"] == "learning"
+        states = {one.meter: one for one in answer.result().meters}
+        assert states["m01"].state == "learning"
         assert gathered is not slow.watch.commissioning.known.learning
         changes = [event.change for event in store.commission_events(FEEDER)]
         assert changes == [CommissioningChange.BEGUN, CommissioningChange.RECOMMISSIONED]

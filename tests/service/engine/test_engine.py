@@ -158,7 +158,7 @@ def test_nobody_who_watches_waits_for_a_locked_database(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """With the wall clock, rounds go on while a write waits; commands wait for it, and nothing is lost."""
-    monkeypatch.setattr(connect, "BUSY_S", 15.0)
+    monkeypatch.setattr(connect, "BUSY_S", 60.0)
     some = [sample for sample in attacked if START + 4 <= sample.arrival < START + 20]
     wall = START + 3.5
 
@@ -174,9 +174,10 @@ def test_nobody_who_watches_waits_for_a_locked_database(
         for k in range(0, len(some), 28):
             wall = some[k : k + 28][-1].arrival
             runtime.deliver(some[k : k + 28])
-            await asyncio.sleep(0.02)
-        while len(outlet.estimates) < 8:  # noqa: ASYNC110
-            await asyncio.sleep(0.01)
+            # Ticks of several batches in one round would exceed its time budget on a busy machine.
+            while not outlet.estimates or outlet.estimates[-1]["t"] < int(wall):  # noqa: ASYNC110
+                await asyncio.sleep(0.01)
+        assert len(outlet.estimates) >= 8
         # The first write is still waiting: it has not been given up either.
         monkeypatch.setattr("service.store.committer.SLOW_S", 0.01)
         assert "gridsec_store_failures_total 0.0" in runtime.metrics().decode()
@@ -188,14 +189,14 @@ def test_nobody_who_watches_waits_for_a_locked_database(
         while len(store.alarms()[0]) < 2:  # noqa: ASYNC110
             await asyncio.sleep(0.01)
         name = store.alarms()[0][0].id
-        assert (await runtime.acknowledge(name, "Ada", ""))["acknowledged_by"] == "Ada"
+        assert (await runtime.acknowledge(name, "Ada", "")).acknowledged_by == "Ada"
         runtime.stop()
         await asyncio.wait_for(task, 20.0)
         assert [alarm["state"] for alarm, _ in outlet.events[:2]] == ["raised", "raised"]
         assert store.alarm(name).acknowledged_by == "Ada"  # type: ignore[union-attr]
 
     with Store(f"sqlite:///{path}") as store:
-        asyncio.run(asyncio.wait_for(scene(store), 60.0))
+        asyncio.run(asyncio.wait_for(scene(store), 120.0))
 
 
 def test_the_delay_of_a_report_ends_when_it_is_stored(
@@ -410,7 +411,7 @@ def test_acknowledgements(site: Site, attacked: list[Sample], path: Path) -> Non
         live = rounds(store, site, outlet)
         live.cycle(until(attacked, 15.0)[0])
         first, second = (a.id for a in store.active(FEEDER))
-        assert live.acknowledge(first, "Ada", "on my way").result()["acknowledged_by"] == "Ada"
+        assert live.acknowledge(first, "Ada", "on my way").result().acknowledged_by == "Ada"
         with pytest.raises(AlreadyAcknowledged):
             live.acknowledge(first, "Bob", "").result()
         with pytest.raises(RaisedAgain):
@@ -428,7 +429,7 @@ def test_acknowledgements(site: Site, attacked: list[Sample], path: Path) -> Non
         assert known.state is AlarmState.CLEARED
         with pytest.raises(RaisedAgain):
             live.acknowledge(second, "Bob", "", count=2).result()
-        assert live.acknowledge(second, "Bob", "", count=1).result()["acknowledged_by"] == "Bob"
+        assert live.acknowledge(second, "Bob", "", count=1).result().acknowledged_by == "Bob"
         assert outlet.events[-1][0]["acknowledged_by"] == "Bob"
 
 
@@ -436,12 +437,14 @@ def test_an_old_report_is_told_to_be_old(
     site: Site, attacked: list[Sample], path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A round hangs for a minute of the service's clock: the last report stays, and says how old it is."""
-    wall, goes_on, due = START + 3.5, threading.Event(), FeederMonitor.advance
+    wall, hangs_now, goes_on = START + 3.5, threading.Event(), threading.Event()
+    reach = FeederMonitor.reach
     some = [sample for sample in attacked if START + 4 <= sample.arrival < START + 6]
 
     def hangs(self: FeederMonitor, now: float) -> Any:
-        goes_on.wait(20.0)
-        return due(self, now)
+        hangs_now.set()
+        goes_on.wait(60.0)
+        return reach(self, now)
 
     async def scene(store: Store) -> None:
         nonlocal wall
@@ -451,7 +454,8 @@ def test_an_old_report_is_told_to_be_old(
         wall = START + 6.0
         while runtime.report(FEEDER) is None or not runtime.ready()[0]:  # noqa: ASYNC110
             await asyncio.sleep(0.01)
-        monkeypatch.setattr(FeederMonitor, "advance", hangs)
+        monkeypatch.setattr(FeederMonitor, "reach", hangs)
+        await asyncio.to_thread(hangs_now.wait, 20.0)
         report = runtime.report(FEEDER)
         assert report is not None
         assert runtime.age(report) < 5.0
@@ -462,7 +466,7 @@ def test_an_old_report_is_told_to_be_old(
         while not runtime.ready()[0]:  # noqa: ASYNC110
             await asyncio.sleep(0.01)
         runtime.stop()
-        await asyncio.wait_for(task, 5.0)
+        await asyncio.wait_for(task, 20.0)
 
     with Store(f"sqlite:///{path}") as store:
         asyncio.run(scene(store))

@@ -14,6 +14,7 @@ from service.ingest.align import Clock
 from service.ingest.reading import Reading
 from service.report.feeder_info import detail
 from service.report.report import to_json
+from tests.service.played import ingest
 
 FEEDER = "simbench-lv-rural1"
 T = 1_795_212_000.0
@@ -35,9 +36,9 @@ def ticking(site: Site, seconds: float) -> Site:
 def told(site: Site, grace_s: float | None = None) -> dict[str, Any]:
     """The first state of a feeder whose meters all read."""
     monitor = FeederMonitor(site, align_rules(site, Clock.WALL, grace_s=grace_s), AlarmBook(site.feeder.name))
-    monitor.advance(T)
+    monitor.reach(T)
     for meter in (*site.meter_ids, None):
-        monitor.ingest(Reading(FEEDER, meter, T, 230.0), T)
+        ingest(monitor, Reading(FEEDER, meter, T, 230.0), T)
     assert monitor.report is not None
     assert monitor.report.revision == detail(site, monitor.patience_s)["revision"]
     return to_json(monitor.report)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from service.engine.engine import Engine, RuntimeConfig
 from service.engine.feeder_monitor import design
 from service.ingest.align import Clock
 from service.ingest.queues import Sample
+from service.report.report import Silence
 from service.store import Store
 
 FEEDER = "simbench-lv-rural1"
@@ -78,7 +78,7 @@ def test_a_slow_clock_is_told_as_data_loss(site: Site, tmp_path: Path, who: str)
         source = who or "substation"
         assert street.standing() == {(AlarmKind.DATA_LOSS, source), (AlarmKind.CLOCK_OFFSET, source)}
         assert street.watch.report is not None
-        assert street.watch.report.silent == ((who or "substation", math.inf),)
+        assert street.watch.report.silent == (Silence(who or "substation", None),)
 
 
 def test_meters_that_are_missing_in_turn_leave_nobody_without_a_word(site: Site, tmp_path: Path) -> None:

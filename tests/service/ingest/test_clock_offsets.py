@@ -17,6 +17,7 @@ from service.ingest.align import FEWEST, KEPT, OFFSETS_TICKS, Aligner, Clock, Cl
 from service.ingest.reading import Reading
 from service.report.report import to_json
 from service.report.voltages import snapshot
+from tests.service.played import ingest
 from tests.service.reports import meter, report
 
 T0 = 1_795_212_000.0
@@ -160,7 +161,7 @@ def test_the_clock_of_the_busbar_meter_is_measured_and_shown() -> None:
         for one in (*site.meter_ids, None):
             stamp = T0 + k + (2.0 if one is None else 0.0)
             volt = site.tables.meta.voltage_volt
-            _, results = watch.ingest(Reading(site.feeder.name, one, stamp, volt, 0.0, 0.0), now)
+            results = ingest(watch, Reading(site.feeder.name, one, stamp, volt, 0.0, 0.0), now)
             raised += [t.alarm for result in results for t in result.transitions]
     assert ("substation", AlarmKind.CLOCK_OFFSET) in {(one.meter, one.kind) for one in raised}
     assert watch.report is not None
@@ -184,7 +185,7 @@ def test_a_watched_feeder_raises_the_alarm_and_shows_the_offset(offset: float, c
         for one in (*site.meter_ids, None):
             stamp = T0 + k + (offset if one == off else 0.0)
             volt = site.tables.meta.voltage_volt
-            _, results = watch.ingest(Reading(site.feeder.name, one, stamp, volt, 0.0, 0.0), now)
+            results = ingest(watch, Reading(site.feeder.name, one, stamp, volt, 0.0, 0.0), now)
             # Up to the first reading of the meter that serves a tick the meter is silent.
             kinds += [t.alarm.kind for result in results for t in result.transitions if k > 50]
             kinds += [

@@ -77,13 +77,17 @@ def test_patterns_and_wrong_keys_are_handed_over_and_deletions_are_counted() -> 
         foreign.put("gridsec/f/meter/*/reading", b"pattern")
         foreign.put("gridsec/f/meters/a/reading", b"typo")
         foreign.put("elsewhere/f/meter/a/reading", b"foreign")
+        foreign.put("gridsec/f/meter/a", b"unfinished")
+        foreign.put("gridsec/f/estimate", b"of another service")
+        foreign.put("gridsec/f/alarm/1", b"of another service")
+        bus.telemetry("f/estimate", b"own")
         foreign.delete("gridsec/f/meter/a/reading")
         foreign.put("gridsec/f/meter/a/reading", b"plain")
-        until(lambda: len(sink.samples) == 3)
+        until(lambda: len(sink.samples) == 4)
         assert bus.counts.deleted == 1
-    assert [s.payload for s in sink.samples] == [b"pattern", b"typo", b"plain"]
+    assert [s.payload for s in sink.samples] == [b"pattern", b"typo", b"unfinished", b"plain"]
     assert "*" in sink.samples[0].key
-    assert sink.samples[2].encoding == "zenoh/bytes"
+    assert sink.samples[3].encoding == "zenoh/bytes"
 
 
 def test_of_long_payloads_only_the_beginning_is_kept() -> None:

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from pydantic import TypeAdapter
 
 from benchmarks.calibrate_exchanges import truth_of
 from feeders.format.tables import FeederTables, write
@@ -16,23 +17,23 @@ from feeders.simulation.scenario import Scenario, simulate, snapshots
 from gridsec.estimators import data_errors
 from gridsec.interface import Cause
 from service.alarms.state_machine import (
+    Alarm,
     AlarmBook,
     AlarmKind,
     AlarmRules,
     Change,
-    acknowledge,
     advance,
     conditions,
 )
 from service.alarms.state_machine import from_json as alarm_from_json
 from service.alarms.state_machine import to_json as alarm_to_json
-from service.api.models import AlarmModel, State
+from service.api.models import State
 from service.cli.simulate import Pace, play
 from service.engine.feeder_monitor import TickResult
 from service.engine.replay import ReplayCounts, replay
 from service.report.reasons import DataErrorReport, DataErrors
 from service.report.report import to_json, with_data_error
-from tests.service.reports import FEEDER, T0, meter, report
+from tests.service.reports import FEEDER, T0, acknowledge, meter, report
 from tests.service.running import service, until
 
 NAME = "simbench-lv-rural1"
@@ -81,7 +82,7 @@ def test_the_hint_is_in_the_report_its_reason_and_the_evidence(results: list[Tic
         assert (error.kind, error.study) == ("exchanged-phases", STUDY)
         assert now.reason.endswith(error.text)
         assert STUDY in error.text
-    last = State.model_validate(to_json(named[-1]) | {"age_s": 0.0})
+    last = TypeAdapter(State).validate_python(to_json(named[-1]) | {"age_s": 0.0})
     assert last.data_error is not None
     assert last.data_error.study == STUDY
 
@@ -99,7 +100,7 @@ def test_the_alarm_that_stands_is_updated_once(results: list[TickResult]) -> Non
         assert t.alarm.meter in error.meters
         assert STUDY in t.alarm.reason
         assert alarm_from_json(alarm_to_json(t.alarm)) == t.alarm
-        AlarmModel.model_validate(alarm_to_json(t.alarm))
+        TypeAdapter(Alarm).validate_python(alarm_to_json(t.alarm))
 
 
 @pytest.mark.acceptance

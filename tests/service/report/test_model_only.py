@@ -17,7 +17,7 @@ from feeders.registry.registry import choose
 from feeders.simulation.meters import BUSBAR as BUSBAR_SOURCE
 from gridsec.interface import Cause
 from service.alarms.conditions import AlarmKind, conditions
-from service.api.models import HistoryPoint, State
+from service.api.models import HistoryPoint
 from service.engine.feeder_monitor import design
 from service.ingest.align import Tick
 from service.ingest.reading import Reading
@@ -57,7 +57,7 @@ def one_meter(_second: int, meter: str) -> tuple[float, float] | None:
 def marked(report: FeederReport | None) -> set[bool]:
     """Return every marker of a report, the feeder's included."""
     assert report is not None
-    state = State.model_validate({**to_json(report), "age_s": 0.0}).model_dump()
+    state = to_json(report)
     entries = [entry for name in LISTS for entry in state[name]]
     return {entry["model_only"] for entry in [*entries, state["busbar"], state]}
 
@@ -212,11 +212,10 @@ def test_in_three_phases_each_phase_needs_a_reading_of_its_own() -> None:
             of = {row.customer: row.phases for row in site.tables.customers}
             assert {of[c.customer] for c in report.customers if c.model_only} == set(alone)
             assert {m.phase for m in report.meters if m.model_only} == set(alone)
-            assert report.bus_model_only[0] == (len(alone) == 3)
+            assert report.buses[0].model_only == (len(alone) == 3)
             assert not report.busbar.judged or (phases == "a" and v_phases is not None)
         # A bus shows the voltage of a phase with a reading where it has one.
-        shown = dict(build(site, tick, 2, estimate, verdict).bus_v_volt)
-        assert all(v is not None for v in shown.values())
+        assert all(bus.v_volt is not None for bus in build(site, tick, 2, estimate, verdict).buses)
 
 
 def test_the_busbar_meter_is_judged_only_beside_a_meter_of_the_same_phase() -> None:

@@ -21,8 +21,8 @@ from service.alarms.conditions import AlarmKind, conditions
 from service.engine.feeder_monitor import design
 from service.ingest.align import Tick
 from service.ingest.reading import Reading
-from service.report.report import BUSBAR, ExplanationReport, FeederReport, blind, build, to_json
-from service.report.voltages import snapshot
+from service.report.report import ExplanationReport, FeederReport, Silence, blind, build, to_json
+from service.report.voltages import BUSBAR, snapshot
 
 T = 1_795_212_000.0
 
@@ -75,8 +75,8 @@ def test_volts_and_names(site: Site) -> None:
         None,
         0.0,
     )
-    assert report.silent == ((site.meter_ids[0], math.inf), (BUSBAR, 12.5))
-    assert report.bus_v_volt[0] == (site.feeder.buses[0], pytest.approx(base))
+    assert report.silent == (Silence(site.meter_ids[0], None), Silence(BUSBAR, 12.5))
+    assert (report.buses[0].bus, report.buses[0].v_volt) == (site.feeder.buses[0], pytest.approx(base))
     assert report.v_min_volt == pytest.approx(0.9 * base)
 
 

@@ -5,12 +5,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gridsec.interface import Cause, Decision
-from service.report.report import FeederReport, MeterReport
+from service.report.report import FeederReport, MeterState
 from service.store.history import HistoryRules, mark, pack, unpack, worth_keeping
 
 numbers = st.none() | st.floats(allow_nan=False, allow_infinity=False, width=32)
 meters = st.builds(
-    MeterReport,
+    MeterState,
     meter=st.text(max_size=5),
     bus=st.just("b"),
     seen=st.booleans(),
@@ -33,7 +33,7 @@ def near(kept: float | None, true: float | None) -> bool:
 
 
 @given(st.lists(meters, max_size=12, unique_by=lambda m: m.meter))
-def test_what_was_packed_comes_out(made: list[MeterReport]) -> None:
+def test_what_was_packed_comes_out(made: list[MeterState]) -> None:
     data, ids = pack(made), [m.meter for m in made]
     whole = unpack(data, ids)
     assert whole["meter"] is None
@@ -53,7 +53,7 @@ def test_what_was_packed_comes_out(made: list[MeterReport]) -> None:
 def test_a_row_of_146_meters_is_small() -> None:
     draw = np.random.default_rng(1)
     made = [
-        MeterReport(
+        MeterState(
             f"m{k}",
             "b",
             True,

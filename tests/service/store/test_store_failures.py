@@ -24,7 +24,7 @@ from service.store.state_codec import SnapshotKind, StateSnapshot
 from tests.codes import refused
 from tests.service.databases import Cluster, both
 from tests.service.reports import meter, report
-from tests.service.stored import T0, a_report, an_alarm, raised
+from tests.service.stored import T0, a_report, an_alarm, raised, writable
 
 
 @pytest.mark.parametrize(
@@ -118,7 +118,7 @@ def test_a_file_that_was_taken_away_is_missed_and_found_again(tmp_path: Path) ->
             store.commit([raised(an_alarm(2))])
         with refused(StoreUnavailable, "file-removed"):
             store.alarms()
-        assert not store.writable()
+        assert not writable(store)
         path.write_bytes(b"")
         with refused(StoreUnavailable, "file-replaced"):
             store.check()
@@ -298,6 +298,7 @@ FULL_DISK = """
     import resource, sys
     sys.path.insert(0, {tests!r})
     from service.store import Rejected, Store, StoreUnavailable
+    from tests.service.stored import writable
     store = Store({url!r})
     bad = [Rejected(0.0, "k" * 500, "r" * 500) for _ in range(100)]
     resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, resource.RLIM_INFINITY))
@@ -309,13 +310,13 @@ FULL_DISK = """
     except StoreUnavailable as error:
         print(error)
     # What was too large left room for something small.
-    assert done and store.writable()
+    assert done and writable(store)
     assert len(store.rejected(5000)) == 100 * done
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, resource.RLIM_INFINITY))
-    assert not store.writable()
+    assert not writable(store)
     assert len(store.rejected(5000)) == 100 * done
     resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
-    assert store.writable()
+    assert writable(store)
     assert len(store.rejected(5000)) == 100 * done
     store.commit(rejected=bad)
     assert len(store.rejected(5000)) == 100 * (done + 1)
@@ -338,7 +339,7 @@ def test_a_restart_of_postgresql_is_survived(cluster: Cluster) -> None:
         store.commit([raised(an_alarm(1))])
         cluster.stop()
         try:
-            assert not store.writable()
+            assert not writable(store)
             with refused(StoreUnavailable, "write-failed"):
                 store.commit([raised(an_alarm(2))])
             with refused(StoreUnavailable, "read-failed"):
@@ -360,7 +361,7 @@ WRITER = """
     while True:
         number += 1
         alarm = Alarm(uuid.uuid4().hex[:26], AlarmKind.DATA_LOSS, "village", None, Severity.MINOR,
-                      AlarmState.RAISED, 1, 0.0, 1.0, None, "", ConditionEvidence())
+                      AlarmState.RAISED, 1, 0.0, 1.0, None, "", AlarmEvidence(), None, None, None)
         over = replace(alarm, state=AlarmState.CLEARED, t_cleared=2.0)
         a = store.commit([AlarmTransition(alarm, Change.RAISED, 1.0)])
         print(alarm.id, a[0], "raised", flush=True)

@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from gridsec.interface import Cause, Decision
 from service.alarms.state_machine import (
     Alarm,
+    AlarmEvidence,
     AlarmKind,
     AlarmState,
     AlarmTransition,
     Change,
-    ConditionEvidence,
     Severity,
 )
 from service.report.report import FeederReport
@@ -24,7 +24,8 @@ from service.store import Rejected, write_queue
 from service.store.write_queue import WriteQueue
 
 KIND, LEVEL = AlarmKind.METER_MANIPULATED, Severity.CRITICAL
-RAISED = Alarm("", KIND, "f", "m", LEVEL, AlarmState.RAISED, 1, 0, 0, None, "", ConditionEvidence())
+RAISED = Alarm("", KIND, "f", "m", LEVEL, AlarmState.RAISED, 1, 0, 0, None, "", AlarmEvidence(),
+    None, None, None)  # fmt: skip
 
 
 def raised(name: str, count: int = 1, by: str | None = None) -> AlarmTransition:

@@ -19,7 +19,7 @@ from feeders.model.site import from_tables, load, names
 from gridsec.interface import Cause, Decision
 from service.ingest.align import Tick
 from service.report.feeder_info import detail
-from service.report.report import BusbarReport, blind
+from service.report.report import BusbarMeterState, BusState, blind
 from tests.feeders import stations
 from tests.service.asking import T0
 from tests.service.looking import DESKTOP, PHONE, Site, customer
@@ -146,7 +146,7 @@ def test_who_is_in_doubt_or_not_judged_is_not_honest(site: Site, size: dict[str,
     assert len(set(shapes.values())) == len(shapes)
     expect(page.locator("#legend")).to_contain_text("not monitored")
     # Without a verdict nothing tells who is honest, not even of those whose scores are small, or the busbar.
-    busbar = BusbarReport(True, True, False, (), None, 231.0, 231.0, 0.0)
+    busbar = BusbarMeterState(True, True, False, (), None, 231.0, 231.0, 0.0)
     states = [page.locator(f'#meters tr:has-text("{name}") .state') for name in ("H7", "substation")]
     texts = [(Cause.AMBIGUOUS, "not monitored"), (Cause.AGREEMENT, "consistent")]
     for k, (cause, word) in enumerate(texts, 1):
@@ -270,10 +270,10 @@ def test_the_diagram_works_by_keyboard(site: Site) -> None:
 
 def test_phases_of_meters_and_of_customers_without_one(site: Site) -> None:
     report = site.village.report(T0, lies={"H3": 9.0})
-    phases = tuple((None, None, 219.5 if bus == "drop-5" else None) for bus in site.village.buses)
+    buses = [replace(b, v_phases=(None, None, 219.5 if b.bus == "drop-5" else None)) for b in report.buses]
     site.village.customers[3]["phase"] = "b"
     site.village.customers.append({"customer": "X", "bus": "drop-5", "meter": None, "phase": "c"})
-    site.service.tick(replace(report, bus_phases=phases))
+    site.service.tick(replace(report, buses=tuple(buses)))
     page = site.open()
     liar = page.locator('#diagram .customer[aria-label^="H3, phase b:"]')
     liar.hover()
@@ -449,16 +449,17 @@ def test_two_nominal_voltages_have_one_scale(site_of: Callable[..., Site], villa
         )
         for meter, volt in zip(report.meters, nominal, strict=True)
     )
-    buses = tuple((bus, float(volt)) for bus, volt in zip(two.feeder.buses, two.nominal_volt, strict=True))
+    buses = tuple(
+        BusState(bus, float(volt)) for bus, volt in zip(two.feeder.buses, two.nominal_volt, strict=True)
+    )
     site = site_of(real(village, two))
     site.service.tick(
         replace(
             report,
             verdict=Decision.CLEAN,
             meters=meters,
-            bus_v_volt=buses,
+            buses=buses,
             model_only=False,
-            bus_model_only=(),
             t_measured=T0,
         )
     )
@@ -531,10 +532,8 @@ def test_values_of_the_model_alone_do_not_look_measured(site: Site, size: dict[s
     def silence(t: float, measured: float | None) -> None:
         report = site.village.report(t, silent=tuple(site.village.meters), cause=Cause.TOO_FEW_METERS)
         meters = tuple(replace(meter, model_only=True) for meter in report.meters)
-        alone = (True,) * len(report.bus_v_volt)
-        site.service.tick(
-            replace(report, meters=meters, model_only=True, bus_model_only=alone, t_measured=measured)
-        )
+        buses = tuple(replace(bus, model_only=True) for bus in report.buses)
+        site.service.tick(replace(report, meters=meters, model_only=True, buses=buses, t_measured=measured))
 
     silence(T0, None)
     page = site.open(size)

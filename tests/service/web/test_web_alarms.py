@@ -11,10 +11,10 @@ from playwright.sync_api import APIResponse, Route, expect
 from gridsec.interface import Cause
 from service.alarms.state_machine import AlarmState, AlarmTransition, Change
 from service.report.report import (
-    BusbarReport,
-    CustomerReport,
+    BusbarMeterState,
+    CustomerState,
     DataErrorReport,
-    InverterReport,
+    InverterState,
     LearningReport,
     StalledMeter,
     with_data_error,
@@ -31,8 +31,8 @@ LIST = re.compile(r"/api/v1/alarms\?")
 
 
 def test_a_manipulated_inverter_and_its_alarm(site: Site) -> None:
-    wrong = InverterReport("H7", "drop-7", "H7", True, True, 4.5, -6.0)
-    customers = tuple(CustomerReport(f"H{k}", 230.0, 0.25) for k in range(13))
+    wrong = InverterState("H7", "drop-7", "H7", True, True, 4.5, -6.0)
+    customers = tuple(CustomerState(f"H{k}", 230.0, 0.25) for k in range(13))
     for k in range(4):
         report = site.village.report(T0 + k, cause=Cause.RESIDUALS)
         liar = replace(report.meters[2], suspect=True, attack_volt_estimated=9.0, kind="drift")
@@ -75,7 +75,7 @@ def test_an_error_of_the_files_stands_beside_the_accusation(site: Site) -> None:
 @pytest.mark.parametrize("size", [DESKTOP, PHONE])
 def test_a_busbar_meter_that_lies_is_marked(site: Site, size: dict[str, int]) -> None:
     """In words and shapes, wherever a suspect meter is; and everything is as before once it is believed."""
-    honest = BusbarReport(True, True, False, (), None, 231.0, 231.0, 0.0)
+    honest = BusbarMeterState(True, True, False, (), None, 231.0, 231.0, 0.0)
     site.service.tick(replace(site.village.report(T0), busbar=honest))
     page = site.open(size)
     note, mark, name = (
@@ -87,7 +87,7 @@ def test_a_busbar_meter_that_lies_is_marked(site: Site, size: dict[str, int]) ->
     expect(note).to_be_hidden()
     expect(mark).to_be_hidden()
     expect(name).to_have_text("Busbar (busbar): 230.9 V")
-    liar = BusbarReport(True, True, True, ("b",), "b", 238.0, 231.0, 7.0)
+    liar = BusbarMeterState(True, True, True, ("b",), "b", 238.0, 231.0, 7.0)
     for k in range(1, 5):
         site.service.tick(replace(site.village.report(T0 + k, cause=Cause.RESIDUALS), busbar=liar))
     off = "Busbar meter suspect, phase b: reports 238.0 V, reconstructed 231.0 V (+7.0 V)"
