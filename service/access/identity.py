@@ -36,7 +36,6 @@ POLICY: Final[dict[str, Role | None]] = {
     "HEAD /healthz": PUBLIC,
     "GET /readyz": PUBLIC,
     "HEAD /readyz": PUBLIC,
-    "GET /api/v1/openapi.json": PUBLIC,
     "GET /api/v1/session": PUBLIC,
     "POST /api/v1/session": PUBLIC,
     "DELETE /api/v1/session": PUBLIC,

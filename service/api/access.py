@@ -87,7 +87,7 @@ class Authenticator:
         scheme, _, given = request.headers.get("authorization", "").partition(" ")
         cookie = request.cookies.get(COOKIE, "")
         if given and scheme.lower() == "bearer":
-            return self.of_credential(given.strip(), _client(request))
+            return self.of_credential(given.strip(), client_of(request))
         if cookie:
             record = self._cached(f"session {cookie}", lambda: self.store.session(cookie, self.wall()))
             if record is not None and record.ended(self.wall()) is None:
@@ -151,11 +151,9 @@ class Authenticator:
         self.store.close_session(cookie)
 
     def _key(self, text: str) -> KeyRecord:
-        parsed = keys.parse(text)
-        record = (
-            None if parsed is None else self._cached(f"key {parsed[0]}", lambda: self.store.key(parsed[0]))
-        )
-        if parsed is None or record is None or not keys.matches(record, parsed[1]):
+        key_id, secret = keys.parse(text) or ("", "")
+        record: KeyRecord | None = self._cached(f"key {key_id}", lambda: self.store.key(key_id))
+        if record is None or not keys.matches(record, secret):
             raise NotAuthenticated("the API key is not known")
         if (reason := record.ended(self.wall())) is not None:
             raise NotAuthenticated(reason)
@@ -175,7 +173,8 @@ class Authenticator:
         return value
 
 
-def _client(request: Request) -> str:
+def client_of(request: Request) -> str:
+    """Address of the client, for the limit of failures and the audit log."""
     return request.client.host if request.client is not None else "unknown"
 
 

@@ -17,6 +17,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from feeders.registry.plugins import EstimatorUnusable
 from gridsec.errors import DesignInfeasible, FeederInvalid, GridsecError, NotObservable
+from service.access.identity import NotAuthenticated, NotPermitted, TooManyFailures
 from service.alarms.state_machine import AlarmUnknown, AlreadyAcknowledged, RaisedAgain
 from service.engine.commissioning import NothingToLearn
 from service.errors import FeederFixed, FeederNotLoaded, FeederUnknown, TooManyFeeders
@@ -148,6 +149,9 @@ def _is_address(name: str) -> bool:
     return True
 
 
+_ADVICE = {503: {"Retry-After": "5"}, 401: {"WWW-Authenticate": "Bearer"}, 429: {"Retry-After": "60"}}
+"""Headers by status."""
+
 Handler = Callable[[Request, Exception], Awaitable[Response]]
 
 _STATUS: dict[type[GridsecError], int] = {
@@ -162,6 +166,9 @@ _STATUS: dict[type[GridsecError], int] = {
     FeederFixed: 409,
     NothingToLearn: 409,
     TooManyFeeders: 409,
+    NotAuthenticated: 401,
+    NotPermitted: 403,
+    TooManyFailures: 429,
     FeederNotLoaded: 503,
     StoreUnavailable: 503,
     GridsecError: 500,
@@ -181,7 +188,7 @@ def _gridsec_handler(status: int) -> Handler:
             more["problems"] = list(error.problems)
         if isinstance(error, OutcomeUnknown):
             more["outcome"] = "unknown"
-        headers = {"Retry-After": "5"} if status == 503 else None
+        headers = _ADVICE.get(status)
         return problem(request, status, str(error), headers=headers, **more)
 
     return handler

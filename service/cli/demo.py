@@ -51,41 +51,13 @@ class DemoFailed(GridsecError):
 class DemoPlan:
     """Parameters of the demo."""
 
-<<<<<<< HEAD
-    Attributes
-    ----------
-    feeder
-        Folder or name.
-    duration_s
-        Duration of the simulation, s.
-    attacked
-        Number of manipulated meters.
-    size
-        Smallest size of the manipulation, pu.
-    kind
-        Attack kind (see `feeders.simulation.attacks.RANDOM_KINDS`).
-    seed
-        Seed of meters, loads and errors.
-    http
-        Address of the web page; if it is in use, another free port.
-    """
-
-    feeder: str = FEEDER
-    duration_s: float = 120.0
-    attacked: int = 2
-    size: float = 0.03
-    kind: str = "bias"
-    seed: int = 1
-    http: str = "127.0.0.1:8000"
-=======
     feeder: str = FEEDER  # folder or name
     duration_s: float = 120.0  # duration of the simulation, s
     attacked: int = 2  # number of manipulated meters
     size: float = 0.03  # smallest size of the manipulation, pu
-    kind: str = "bias"  # attack kind (see `feeders.simulation.attacks.RandomAttackKind`)
+    kind: str = "bias"  # attack kind (see `feeders.simulation.attacks.RANDOM_KINDS`)
     seed: int = 1  # seed of meters, loads and errors
     http: str = "127.0.0.1:8000"  # address of the web page; if it is in use, another free port
->>>>>>> lean-svc
 
     @property
     def attack(self) -> tuple[float, float]:
