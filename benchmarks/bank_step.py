@@ -27,7 +27,7 @@ from gridsec.estimators.exact_bank import bank as banks
 from gridsec.estimators.plant import Plant
 from gridsec.grid.droop import fleet
 from gridsec.grid.meter import MeterAccuracy
-from gridsec.grid.radial import Feeder, squared_voltages
+from gridsec.grid.radial import Feeder
 from gridsec.interface import Frame
 from gridsec.observers.lure import Lure, close_loop, transition
 
@@ -171,7 +171,7 @@ def watched(plant: Plant, max_attacked: int) -> float:
     n = plant.meters.size
     design = exact_bank.design(plant, max_attacked=max_attacked, step_s=1.0)
     p, nothing = np.full(n, -0.3 / n), np.full(n, np.nan)
-    y = squared_voltages(plant.feeder.linear(), p, 0.3 * p, 1.0)
+    y = plant.feeder.bus_voltages(p, 0.3 * p, 1.0, steps=0)[plant.feeder.bus]
     state = exact_bank.init(design, 0.0)
 
     def frame(t: float) -> Frame:

@@ -29,7 +29,7 @@ from feeders.simulation.powerflow_three_phase import UnbalancedPowerFlow, sequen
 from gridsec.arrays import Floats, Phasors, spectral_radius
 from gridsec.errors import DesignInfeasible
 from gridsec.grid.droop import fleet
-from gridsec.grid.three_phase import bus_voltages, corrected, lindist3flow, model_error_bound, sensitivities
+from gridsec.grid.three_phase import bus_voltages, lindist3flow, model_error_bound, sensitivities
 from gridsec.observers.certificates import reactance, small_gain
 from gridsec.observers.lure import close_loop
 
@@ -141,7 +141,7 @@ def show_times(site: ThreePhaseSite, p_kw: Floats, tan: Floats) -> None:
     several = (np.tile(p, (many, 1)), np.tile(q, (many, 1)), np.full(many, BUSBAR_PU * feeder.base_volt))
     times = {
         "lindist3flow": milliseconds(lambda: lindist3flow(feeder), 3),
-        "corrected": milliseconds(lambda: corrected(feeder, base * p, base * q, v0), 20),
+        "bus_voltages": milliseconds(lambda: bus_voltages(feeder, base * p, base * q, v0), 20),
         "sensitivities": milliseconds(lambda: sensitivities(feeder, base * p, base * q, v0), 1),
         "AC power flow": milliseconds(lambda: flow.solve(p, q, BUSBAR_PU * feeder.base_volt), 20),
         f"AC, {many} at once, each": milliseconds(lambda: flow.solve_batch(*several), 1) / many,

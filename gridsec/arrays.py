@@ -26,6 +26,7 @@ __all__ = [
     "indices",
     "not_negative",
     "perron_bound",
+    "put",
     "spectral_radius",
     "submatrix",
     "symmetry_defect",
@@ -51,10 +52,7 @@ def frozen_ints(values: Ints) -> Ints:
 
     Doubles and booleans are refused, because a rounded index is a wrong index.
 
-    Raises
-    ------
-    TypeError
-        If `values` are not integers.
+    Raises TypeError if `values` are not integers.
     """
     given = np.asarray(values)
     if given.size and given.dtype.kind not in "iu":
@@ -64,20 +62,18 @@ def frozen_ints(values: Ints) -> Ints:
     return out
 
 
+def put(target: object, **values: object) -> None:
+    """Set fields of a frozen dataclass in its `__post_init__`; arrays become read-only."""
+    for name, value in values.items():
+        if isinstance(value, np.ndarray):
+            value.flags.writeable = False
+        object.__setattr__(target, name, value)
+
+
 def not_negative(name: str, values: Floats | float) -> Floats:
     """`values` as doubles; negative values and NaN are refused, infinity passes.
 
-    Parameters
-    ----------
-    name
-        Name of the quantity in the error message.
-    values : (…)
-        The numbers.
-
-    Raises
-    ------
-    ValueError
-        If one is negative or NaN.
+    Raises ValueError if one is negative or NaN.
     """
     out = np.asarray(values, dtype=np.float64)
     wrong = out[~(out >= 0.0)]
@@ -117,16 +113,8 @@ def submatrix(matrix: Floats, rows: Ints, columns: Ints) -> Floats:
 def unit_rows(matrix: Floats, *, tol: float) -> Floats:
     """Rows scaled to length one; rows at the level of rounding are set to zero.
 
-    Parameters
-    ----------
-    tol
-        Rows up to this fraction of the longest are zero. An exact zero row comes out of a decomposition at
+    tol: rows up to this fraction of the longest are zero. An exact zero row comes out of a decomposition at
         about 1e-17; scaled to length one it would have an arbitrary direction.
-
-    Returns
-    -------
-    (k, n)
-        Rows of length one or zero.
     """
     length = np.linalg.norm(matrix, axis=1, keepdims=True)
     nothing = length <= tol * np.max(length, initial=0.0)
@@ -153,14 +141,7 @@ def exponential_integrals(y: Floats) -> tuple[Floats, Floats, Floats]:
 
     The latter two use their power series near 0, where the formulas cancel.
 
-    Parameters
-    ----------
-    y : (…)
-        Any finite numbers.
-
-    References
-    ----------
-    M. Hochbruck, A. Ostermann, "Exponential integrators", Acta Numerica 19, 2010, equation (2.10).
+    Source: M. Hochbruck, A. Ostermann, "Exponential integrators", Acta Numerica 19, 2010, equation (2.10).
     """
     near = np.abs(y) < 1e-2
     small = np.where(near, y, 0.0)
@@ -181,11 +162,6 @@ def perron_bound(matrix: Floats, rounds: int) -> float:
 
     The quotient of Collatz and Wielandt, `max_i (|M| v)_i / v_i`, is a bound for every positive v; power
     iteration only tightens it.
-
-    Parameters
-    ----------
-    matrix : (n, n)
-        Any square matrix; signs are ignored.
     """
     if matrix.size == 0:
         return 0.0
@@ -217,10 +193,7 @@ else:
     def changed(value: Any, /, **new: Any) -> Any:
         """Copy of a frozen dataclass with other values in some fields.
 
-        Raises
-        ------
-        TypeError
-            If a field does not exist or is derived.
+        Raises TypeError if a field does not exist or is derived.
         """
         plan = _plan(type(value))
         if plan is None or not plan[1].keys() >= new.keys():

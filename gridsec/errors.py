@@ -21,18 +21,15 @@ __all__ = [
     "each_choice",
     "no_choice",
     "raise_if_any",
+    "wrong_shapes",
 ]
 
 
 class Problem(str):
     """Problem of an input: a sentence with a stable code.
 
-    Parameters
-    ----------
-    code
-        Violated rule, lower case words joined by hyphens, such as `shape` or `not-finite`.
-    text
-        Place, fault, and expected value.
+    code: violated rule, lower case words joined by hyphens, such as `shape` or `not-finite`.
+    text: place, fault, and expected value.
     """
 
     __slots__ = ("code",)
@@ -68,12 +65,7 @@ class _Pickled(BaseException):
 class GridsecError(_Pickled, Exception):
     """Base of every error that this project raises on purpose.
 
-    Parameters
-    ----------
-    args
-        The sentence.
-    code
-        Code of the reason: lower case words joined by hyphens; None: that of the class.
+    code: code of the reason: lower case words joined by hyphens; None: that of the class.
     """
 
     code: str = ""
@@ -103,10 +95,7 @@ class Problems(_Pickled):
 class FeederInvalid(Problems, GridsecError):
     """Invalid description of a feeder; `problems` lists every fault at once.
 
-    Parameters
-    ----------
-    problems
-        One complete sentence each: place, fault, and expected value.
+    problems: one complete sentence each: place, fault, and expected value.
     """
 
     def __init__(self, problems: Iterable[str]) -> None:
@@ -117,13 +106,7 @@ class FeederInvalid(Problems, GridsecError):
 
 
 class InputInvalid(Problems, ValueError):
-    """Invalid arguments; `problems` lists every fault at once.
-
-    Parameters
-    ----------
-    problems
-        One clause each: fault and expected value.
-    """
+    """Invalid arguments; `problems` lists every fault at once."""
 
     def __init__(self, problems: Iterable[str]) -> None:
         self.problems = tuple(problems)
@@ -138,16 +121,8 @@ class InputInvalid(Problems, ValueError):
 class NotObservable(GridsecError):
     """A set of meters is too small for the purpose.
 
-    Parameters
-    ----------
-    subset
-        Indices of the meters.
-    rank
-        Rank that they determine, or the number of meters if the number is too small.
-    why
-        The violated condition, in words.
-    code
-        Code of the condition: lower case words joined by hyphens.
+    rank: rank that they determine, or the number of meters if the number is too small.
+    why: the violated condition, in words.
     """
 
     def __init__(self, subset: Iterable[int], rank: int, why: str, *, code: str = "not-observable") -> None:
@@ -159,16 +134,10 @@ class NotObservable(GridsecError):
 class DesignInfeasible(GridsecError):
     """A design was not found, or its verification failed.
 
-    Parameters
-    ----------
-    what
-        The design and its condition.
-    status
-        Status of the solver, or the failed check. A solver's status is never a proof.
-    margin
-        The recomputed margin of the failed condition, if any; negative if violated.
-    code
-        Code of the reason: lower case words joined by hyphens.
+    what: the design and its condition.
+    status: status of the solver, or the failed check. A solver's status is never a proof.
+    margin: the recomputed margin of the failed condition, if any; negative if violated.
+    code: code of the reason: lower case words joined by hyphens.
     """
 
     def __init__(
@@ -184,15 +153,7 @@ class DesignInfeasible(GridsecError):
 def raise_if_any(problems: Iterable[str]) -> None:
     """Raise one error with all problems of an input; return if there are none.
 
-    Parameters
-    ----------
-    problems
-        One clause each: fault and expected value.
-
-    Raises
-    ------
-    InputInvalid
-        If `problems` is not empty.
+    Raises InputInvalid if `problems` is not empty.
     """
     found = tuple(problems)
     if found:
@@ -204,18 +165,22 @@ def require(holds: object, problem: Problem) -> None:
     raise_if_any([] if holds else [problem])
 
 
+def wrong_shapes(*expected: tuple[str, tuple[int, ...], tuple[int, ...]]) -> list[Problem]:
+    """Return one problem for each name with a shape (second) other than the expected one (third)."""
+    return [
+        Problem("shape", f"{what} has shape {has}; expected {wants}")
+        for what, has, wants in expected
+        if has != wants
+    ]
+
+
 Choice = TypeVar("Choice", bound=StrEnum)
 
 
 def no_choice(name: str, kind: Iterable[str], *values: str) -> list[str]:
     """Return one problem for each value that is not among the allowed ones.
 
-    Parameters
-    ----------
-    name
-        Name of the quantity in the message.
-    kind
-        Allowed values: an enumeration, or `typing.get_args` of a `Literal`.
+    kind: allowed values: an enumeration, or `typing.get_args` of a `Literal`.
     """
     known = tuple(kind)
     return [
@@ -228,10 +193,7 @@ def no_choice(name: str, kind: Iterable[str], *values: str) -> list[str]:
 def each_choice(name: str, kind: type[Choice], values: Iterable[str]) -> tuple[Choice, ...]:
     """Return the members for members or their texts.
 
-    Raises
-    ------
-    ValueError
-        If a value is not a member; the message contains `name`.
+    Raises ValueError if a value is not a member; the message contains `name`.
     """
     given = tuple(values)
     problems = no_choice(name, kind, *given)
@@ -242,9 +204,6 @@ def each_choice(name: str, kind: type[Choice], values: Iterable[str]) -> tuple[C
 def choice(name: str, kind: type[Choice], value: str) -> Choice:
     """Return the member for a member or its text.
 
-    Raises
-    ------
-    ValueError
-        If `value` is not a member; the message contains `name`.
+    Raises ValueError if `value` is not a member; the message contains `name`.
     """
     return each_choice(name, kind, (value,))[0]

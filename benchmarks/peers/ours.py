@@ -20,8 +20,8 @@ class Flow:
     """`Feeder.bus_voltages` at the customers, by matrices made once: on few buses that is faster."""
 
     def __init__(self, feeder: Feeder) -> None:
-        at = feeder.start
-        self.under = ((at[1:, None] <= at) & (at < feeder.stop[1:, None])).astype(np.float64)
+        at = feeder.walk.start
+        self.under = ((at[1:, None] <= at) & (at < feeder.walk.stop[1:, None])).astype(np.float64)
         self.loads = np.ascontiguousarray(self.under[:, feeder.bus])
         self.path = np.ascontiguousarray(self.under.T)
         self.behind = self.under[:, 1:] - np.eye(feeder.parent.size)

@@ -11,16 +11,14 @@ of H_a are used if they improve the fit by more than their price, ln T each. H_b
 explain the size of the deviation as well as its changes with the loads. A window with constant loads decides
 nothing.
 
-References
-----------
-docs/theory-sequential.md, Errors of the files.
+Source: docs/theory-sequential.md, Errors of the files.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 from typing import Final
 
@@ -104,95 +102,55 @@ class DataErrorKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class DataError:
-    """An error of the files that explains accused meters. p meters, N customers, n places.
+    """An error of the files that explains accused meters. p meters, N customers, n places."""
 
-    Attributes
-    ----------
-    kind
-        Kind.
-    customers
-        Indices of the one or two customers at other places than in the files.
-    places
-        Place of each of them that explains the readings, as in `gridsec.grid.network`.
-    meters
-        Indices of the accused meters that it explains.
-    """
-
-    kind: DataErrorKind
-    customers: tuple[int, ...]
-    places: tuple[int, ...]
-    meters: tuple[int, ...]
+    kind: DataErrorKind  # kind
+    customers: tuple[int, ...]  # indices of the one or two customers at other places than in the files
+    places: tuple[int, ...]  # place of each of them that explains the readings, as in `gridsec.grid.network`
+    meters: tuple[int, ...]  # indices of the accused meters that it explains
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DataErrorDesign:
-    """Sensitivities between all places that customers may have. N customers, C places.
+    """Sensitivities between all places that customers may have. N customers, C places."""
 
-    Attributes
-    ----------
-    plant
-        Feeder, inverters and meters.
-    anywhere
-        The same feeder with one customer at each of the places.
-    places : (C,)
-        Places, ascending.
-    at : (N,)
-        Index of each customer's place in `places`.
-    unit : (C,)
-        1 pu of each place, V; customers are exchanged only between equal ones.
-    active, reactive : (C, C)
-        From a power at one place to the squared voltage at another, pu.
-    block_s
-        Duration of a block, s.
-    """
-
-    plant: Plant
-    anywhere: Network
-    places: Ints
-    at: Ints
-    unit: Floats
+    plant: Plant  # feeder, inverters and meters
+    anywhere: Network  # the same feeder with one customer at each of the places
+    places: Ints  # (C,) places, ascending
+    at: Ints  # (N,) index of each customer's place in `places`
+    unit: Floats  # (C,) 1 pu of each place, V; customers are exchanged only between equal ones
+    # active, reactive (C, C): from a power at one place to the squared voltage at another, pu
     active: Floats
     reactive: Floats
-    block_s: float
+    block_s: float  # duration of a block, s
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rows:
-    """Means of blocks. T blocks, p meters, N customers, C places.
+    """Means of blocks. T blocks, p meters, N customers, C places."""
 
-    Attributes
-    ----------
-    t : (T,)
-        Time of each block, s.
-    y : (T, p)
-        Squared voltages read, pu; NaN without a reading.
-    p, q : (T, N)
-        Injections, pu.
-    p_var, q_var : (T, N)
-        Variances of their errors, squared pu.
-    read : (T, N)
-        Active power is a reading.
-    v0 : (T, b)
-        Squared busbar voltage, pu; one, or those of three phases.
-    model : (T, C)
-        Squared voltages of the files' model, pu.
-    count : (T,)
-        Number of frames.
-    accused : (T, p)
-        Meters accused within the block.
-    """
-
-    t: Floats
-    y: Floats
+    t: Floats  # (T,) time of each block, s
+    y: Floats  # (T, p) squared voltages read, pu; NaN without a reading
+    # p, q (T, N): injections, pu
     p: Floats
     q: Floats
+    # p_var, q_var (T, N): variances of their errors, squared pu
     p_var: Floats
     q_var: Floats
-    read: Bools
-    v0: Floats
-    model: Floats
-    count: Floats
-    accused: Bools
+    read: Bools  # (T, N) active power is a reading
+    v0: Floats  # (T, b) squared busbar voltage, pu; one, or those of three phases
+    model: Floats  # (T, C) squared voltages of the files' model, pu
+    count: Floats  # (T,) number of frames
+    accused: Bools  # (T, p) meters accused within the block
+
+    def joined(self, later: Rows) -> Rows:
+        """These and later blocks, at most `MOST_BLOCKS` of them."""
+        both = ((getattr(self, each.name), getattr(later, each.name)) for each in fields(self))
+        return Rows(*(np.concatenate(pair)[-MOST_BLOCKS:] for pair in both))
+
+    def where(self, which: Bools) -> Rows:
+        """The blocks of a mask (T,)."""
+        return Rows(*(getattr(self, each.name)[which] for each in fields(self)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -208,7 +166,7 @@ class _Mean:
         both = np.array([power, variance])
         return _Mean(np.where(told, both, 0.0), told.astype(np.float64), both)
 
-    def plus(self, other: _Mean) -> _Mean:
+    def __add__(self, other: _Mean) -> _Mean:
         return _Mean(self.told + other.told, self.told_count + other.told_count, self.every + other.every)
 
     def value(self, count: int) -> Floats:
@@ -233,21 +191,11 @@ class _Sums:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AccusationWindow:
-    """Readings since the first accusation, and their result. Empty while no meter is accused.
+    """Readings since the first accusation, and their result. Empty while no meter is accused."""
 
-    Attributes
-    ----------
-    rows
-        Complete blocks, at most `MOST_BLOCKS`; None before the first one.
-    error
-        Error of the files that explains accused meters; None if there is none.
-    t
-        Time of the last frame, s; None without one.
-    """
-
-    rows: Rows | None = None
-    error: DataError | None = None
-    t: float | None = None
+    rows: Rows | None = None  # complete blocks, at most `MOST_BLOCKS`; None before the first one
+    error: DataError | None = None  # error of the files that explains accused meters; None if there is none
+    t: float | None = None  # time of the last frame, s; None without one
     sums: _Sums | None = field(default=None, repr=False)
     since_accused: int = 0
 
@@ -260,12 +208,8 @@ def begin() -> AccusationWindow:
 def design(plant: Plant, base_volt: Floats, step_s: float) -> DataErrorDesign | None:
     """Prepare the comparison; None if the customers' buses have more than `MOST_PLACES` places.
 
-    Parameters
-    ----------
-    base_volt : (n,)
-        1 pu of every place, V.
-    step_s
-        Interval between frames, s.
+    base_volt (n,): 1 pu of every place, V.
+    step_s: interval between frames, s.
     """
     feeder = plant.feeder
     places = feeder.places(np.arange(len(feeder.buses) // feeder.busbar_phases))
@@ -300,17 +244,9 @@ def follow(
 ) -> AccusationWindow:
     """Add one frame to the window; compare at the end of each block.
 
-    Parameters
-    ----------
-    design, window
-        The preparation, and the window so far.
-    frame
-        Data of one tick. A frame that is not later than the last, or later by more than a window, restarts
+    frame: data of one tick. A frame that is not later than the last, or later by more than a window, restarts
         the window.
-    x : (m,)
-        Estimated injections of the inverters, pu.
-    accused : (p,)
-        From `accused`.
+    x (m,): estimated injections of the inverters, pu.
     """
     if window.t is not None and not window.t < frame.t <= window.t + MOST_BLOCKS * design.block_s:
         window = AccusationWindow()
@@ -356,16 +292,12 @@ def _added(
     )
     if sums is None:
         return now
-    return _Sums(
-        block,
-        sums.count + 1,
-        sums.y + now.y,
-        sums.heard + now.heard,
-        sums.p.plus(now.p),
-        sums.q.plus(now.q),
-        sums.v0 + v0,
-        sums.accused | accused,
-    )
+    total = {name: getattr(sums, name) + getattr(now, name) for name in _SUMMED}
+    return replace(now, **total, accused=sums.accused | accused)
+
+
+# Fields of `_Sums` that are added up.
+_SUMMED: Final = ("count", "y", "heard", "p", "q", "v0")
 
 
 def _variance(half_width: Floats, std: Floats | None) -> Floats:
@@ -380,21 +312,11 @@ def _closed(design: DataErrorDesign, window: AccusationWindow, sums: _Sums) -> A
     model = _solved(design, design.at, p[None], q[None], v0=v0[None])[0]
     with np.errstate(all="ignore"):
         y = sums.y / sums.heard  # NaN without a reading
-    t = np.array([(sums.block + 0.5) * design.block_s])
-    now = Rows(
-        t=t,
-        y=y[None],
-        p=p[None],
-        q=q[None],
-        p_var=p_var[None],
-        q_var=q_var[None],
-        read=(sums.p.told_count > 0.0)[None],
-        v0=v0[None],
-        model=model[None],
-        count=np.array([float(sums.count)]),
-        accused=sums.accused[None],
-    )
-    rows = now if window.rows is None else _joined(window.rows, now)
+    t = (sums.block + 0.5) * design.block_s
+    read, count = sums.p.told_count > 0.0, float(sums.count)
+    row = (t, y, p, q, p_var, q_var, read, v0, model, count, sums.accused)
+    now = Rows(*(np.asarray(each)[None] for each in row))
+    rows = now if window.rows is None else window.rows.joined(now)
     since = 0 if sums.accused.any() else window.since_accused + 1
     return AccusationWindow(rows, compare(design, rows, window.error), window.t, None, since)
 
@@ -417,44 +339,6 @@ def _solved(design: DataErrorDesign, at: Ints, p: Floats, q: Floats, *, v0: Floa
 
 _LOSS_STEPS: Final = 3
 """Corrections of the linear power flow: the third changes less than the resolution of a meter."""
-
-
-def _joined(rows: Rows, more: Rows) -> Rows:
-    """Rows and later ones, at most `MOST_BLOCKS` of them."""
-
-    def both(one: Floats, other: Floats) -> Floats:
-        return np.concatenate((one, other))[-MOST_BLOCKS:]
-
-    return Rows(
-        t=both(rows.t, more.t),
-        y=both(rows.y, more.y),
-        p=both(rows.p, more.p),
-        q=both(rows.q, more.q),
-        p_var=both(rows.p_var, more.p_var),
-        q_var=both(rows.q_var, more.q_var),
-        read=np.concatenate((rows.read, more.read))[-MOST_BLOCKS:],
-        v0=both(rows.v0, more.v0),
-        model=both(rows.model, more.model),
-        count=both(rows.count, more.count),
-        accused=np.concatenate((rows.accused, more.accused))[-MOST_BLOCKS:],
-    )
-
-
-def _some(rows: Rows, which: Bools) -> Rows:
-    """The chosen rows."""
-    return Rows(
-        rows.t[which],
-        rows.y[which],
-        rows.p[which],
-        rows.q[which],
-        rows.p_var[which],
-        rows.q_var[which],
-        rows.read[which],
-        rows.v0[which],
-        rows.model[which],
-        rows.count[which],
-        rows.accused[which],
-    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -488,12 +372,7 @@ class _Scene:
 def compare(design: DataErrorDesign, rows: Rows, held: DataError | None = None) -> DataError | None:
     """Return the error of the files that explains accused meters at least as well as a manipulation does.
 
-    Parameters
-    ----------
-    design, rows
-        The preparation, and the blocks of a window.
-    held
-        Error found before; it stays unless another one is likelier by more than `_STAYS`.
+    held: error found before; it stays unless another one is likelier by more than `_STAYS`.
     """
     scene = _scene(design, rows)
     if scene is None or not scene.accused.any():
@@ -524,7 +403,7 @@ def _scene(design: DataErrorDesign, rows: Rows) -> _Scene | None:
     whole = heard[:, k].all(axis=1) & rows.read[:, read].all(axis=1) & possible
     if np.count_nonzero(whole) < FEWEST_BLOCKS:
         return None
-    rows = _some(rows, np.asarray(whole))
+    rows = rows.where(np.asarray(whole))
     at = design.at[plant.meters[k]]
     e = rows.y[:, k] - rows.model[:, at]
     loads = _load_covariance(design, rows, at)

@@ -12,21 +12,17 @@ from gridsec.interface import Cause, Decision
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Counters:
-    """Counters of each meter's latest readings. p meters.
+    """Counters of each meter's latest readings. p meters."""
 
-    Attributes
-    ----------
-    above : (p,)
-        Readings above the threshold since the meter became suspect; 0 for meters not suspect.
-    below : (p,)
-        Consecutive readings not above the threshold.
-    named : (p,)
-        Meters named as manipulated.
-    """
+    above: Ints  # (p,) readings above the threshold since the meter became suspect; 0 for meters not suspect
+    below: Ints  # (p,) consecutive readings not above the threshold
+    named: Bools  # (p,) meters named as manipulated
 
-    above: Ints
-    below: Ints
-    named: Bools
+
+def no_counts(size: int) -> Counters:
+    """Counters before the first reading."""
+    zero = np.zeros(size, dtype=np.intp)
+    return Counters(zero, zero, np.zeros(size, dtype=np.bool_))
 
 
 def count(tally: Counters, over: Bools, live: Bools, *, confirm: int, release: int) -> Counters:
@@ -37,15 +33,8 @@ def count(tally: Counters, over: Bools, live: Bools, *, confirm: int, release: i
     every second reading does not avoid detection. An unavailable meter keeps its state: a named meter is not
     cleared by silence.
 
-    Parameters
-    ----------
-    over : (p,)
-        Meters with a residual above the threshold.
-    live : (p,)
-        Meters with a residual.
-    confirm, release
-        Readings above the threshold until a meter is named, and consecutive readings below it until it is
-        neither named nor suspect.
+    confirm, release: readings above the threshold until a meter is named, and consecutive readings below it
+        until it is neither named nor suspect.
     """
     below = np.where(live, np.where(over, 0, tally.below + 1), tally.below)
     above = np.where(below >= release, 0, tally.above + (live & over))
@@ -55,28 +44,17 @@ def count(tally: Counters, over: Bools, live: Bools, *, confirm: int, release: i
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DecisionInputs:
-    """Inputs of a verdict. p meters.
+    """Inputs of a verdict. p meters."""
 
-    Attributes
-    ----------
-    names : (p,)
-        Names of the meters in sentences.
-    max_attacked
-        M.
-    live, suspected, named : (p,)
-        Meters that are available, suspect, and named.
-    wide : (p,)
-        Meters with a threshold that is too wide for an answer or not finite.
-    valid, settled, busbar
-        True if the design holds, if the initial transient has decayed, and if the busbar voltage is known.
-    """
-
-    names: tuple[str, ...]
-    max_attacked: int
+    names: tuple[str, ...]  # (p,) names of the meters in sentences
+    max_attacked: int  # M
+    # live, suspected, named (p,): meters that are available, suspect, and named
     live: Bools
     suspected: Bools
     named: Bools
-    wide: Bools
+    wide: Bools  # (p,) meters with a threshold that is too wide for an answer or not finite
+    # valid, settled, busbar: True if the design holds, if the initial transient has decayed, and if the
+    # busbar voltage is known
     valid: bool
     settled: bool
     busbar: bool
@@ -164,12 +142,7 @@ def _list(now: DecisionInputs, which: Bools) -> str:
 def residual_excess(score: Floats, threshold: Floats, live: Bools) -> Floats:
     """Relative excess of residuals over their thresholds; 0 below them.
 
-    Parameters
-    ----------
-    score, threshold : (p,)
-        Residuals and thresholds, squared pu.
-    live : (p,)
-        Meters with a residual.
+    score, threshold (p,): residuals and thresholds, squared pu.
     """
     ratio = np.divide(score, threshold, out=np.zeros_like(threshold), where=live & (threshold > 0))
     return np.asarray(np.maximum(ratio - 1.0, 0.0))

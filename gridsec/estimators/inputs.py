@@ -33,38 +33,21 @@ class Inputs:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PreviousStep:
-    """State of the last step that prepares the next frame. m inverters, p meters.
+    """State of the last step that prepares the next frame. m inverters, p meters."""
 
-    Attributes
-    ----------
-    x : (m,)
-        Estimated injections, pu.
-    v0_squared
-        Squared busbar voltage, pu; in three phases one or (3,).
-    named : (p,)
-        Meters named as manipulated.
-    """
-
-    x: Floats
-    v0_squared: Floats | float
-    named: Bools
+    x: Floats  # (m,) estimated injections, pu
+    v0_squared: Floats | float  # squared busbar voltage, pu; in three phases one or (3,)
+    named: Bools  # (p,) meters named as manipulated
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reconstruction:
-    """Voltages reconstructed from a set of injections. N customers, n places.
+    """Voltages reconstructed from a set of injections. N customers, n places."""
 
-    Attributes
-    ----------
-    v2_bus, v2 : (n,), (N,)
-        Squared voltages of all places and of the customers, pu.
-    correction : (n,)
-        Part of the loss correction in them, squared pu.
-    """
-
+    # v2_bus, v2 (n,), (N,): squared voltages of all places and of the customers, pu
     v2_bus: Floats
     v2: Floats
-    correction: Floats
+    moved: Floats  # (N,) change of the loss correction since the last estimate, squared pu
 
 
 def nothing_new(  # noqa: PLR0917  # the last answer, and the values without one
@@ -77,14 +60,9 @@ def nothing_new(  # noqa: PLR0917  # the last answer, and the values without one
 ) -> tuple[Estimate, Verdict]:
     """Answer to a frame that is not later than the last one: the last answer, never CLEAN.
 
-    Parameters
-    ----------
-    t
-        Time of the last frame that was used, Unix s.
-    last
-        Last answer; None before the first.
-    v0_squared, x
-        Squared busbar voltage (or one for each phase) and injections, pu, for the answer without a last one.
+    t: time of the last frame that was used, Unix s.
+    v0_squared, x: squared busbar voltage (or one for each phase) and injections, pu, for the answer without a
+        last one.
     """
     reason = f"A frame of time {frame.t} is not later than the last one, {t}; it was not used."
     if last is not None:
@@ -134,13 +112,7 @@ def _power(power: Floats, error: Floats) -> tuple[Floats, Floats]:
 
 
 def reconstruct(setting: EstimatorContext, frame: Frame, inputs: Inputs, q: Floats) -> Reconstruction:
-    """Voltages for given injections, with the loss correction at these; chong2020 (19).
-
-    Parameters
-    ----------
-    q : (N,)
-        Net reactive injections, pu; see `injections`.
-    """
+    """Voltages for given injections, with the loss correction at these; chong2020 (19)."""
     plant, model, correction = setting.plant, setting.model, inputs.correction
     if plant.loss_correction:
         with np.errstate(all="ignore"):
@@ -150,7 +122,8 @@ def reconstruct(setting: EstimatorContext, frame: Frame, inputs: Inputs, q: Floa
         correction = np.where(np.isfinite(correction), correction, inputs.correction)
     base = plant.feeder.broadcast_busbar(inputs.v0_squared)
     v2_bus = base + 2.0 * (model.R_bus @ frame.p + model.X_bus @ q) + correction
-    return Reconstruction(v2_bus, v2_bus[plant.feeder.bus], correction)
+    at = plant.feeder.bus
+    return Reconstruction(v2_bus, v2_bus[at], np.abs(correction - inputs.correction)[at])
 
 
 def clean(setting: EstimatorContext, past: PreviousStep, frame: Frame) -> Inputs:
@@ -200,13 +173,7 @@ def _busbar(
 
 
 def busbar_errors(plant: Plant, v0_squared: Floats | float, sigmas: float) -> Floats | float:
-    """Largest error of the squared busbar voltage without manipulation; in three phases (3,) each.
-
-    Parameters
-    ----------
-    v0_squared, sigmas
-        As in `gridsec.grid.meter.busbar_error`.
-    """
+    """Largest error of the squared busbar voltage without manipulation; in three phases (3,) each."""
     if plant.feeder.busbar_phases == 1:
         return busbar_error(plant.accuracy, float(v0_squared), sigmas)
     each = np.broadcast_to(v0_squared, 3).tolist()
@@ -251,19 +218,11 @@ def losses(
 ) -> tuple[Floats, Floats]:
     """Loss correction and a bound of its error for powers within intervals.
 
-    Parameters
-    ----------
-    p, q : (N,)
-        Net injections, pu.
-    v0
-        Squared busbar voltage, pu; in three phases one or (3,).
-    p_error, q_error : (N,)
-        Largest errors of the injections, pu.
-
-    Returns
-    -------
-    (n,), (N,)
-        Correction of the linear model at every place, and the bound at every customer, squared pu.
+    p, q (N,): net injections, pu.
+    v0: squared busbar voltage, pu; in three phases one or (3,).
+    p_error, q_error (N,): largest errors of the injections, pu.
+    Returns (n,), (N,): correction of the linear model at every place, and the bound at every customer,
+        squared pu.
     """
     feeder, steps = plant.feeder, plant.loss_correction
     once, moved, rest = feeder.correction_bounds(

@@ -1,7 +1,5 @@
 """Partial observers on a feeder, stacked and decoded: lee2018, Algorithm 4.1.
 
-Part of `gridsec.estimators.partial`, which explains both.
-
 A single meter determines little. The part of the state x (the injections of the inverters) that belongs
 to meter j is
 
@@ -33,10 +31,8 @@ more fits can explain a small attack differently. Then the answer is UNDECIDED, 
 The paper's own constants (theta, kappa) are available from `constants`; on feeders they guarantee less than
 is known without any meter. docs/theory-partial-observers.md, section 8, has the proof and the numbers.
 
-References
-----------
-lee2018, sections 4.2.1 and 4.3.1, for droop inverters: docs/theory-partial-observers.md, section 8.
-lee2018, sections 4.2.1 and 4.3.1, Algorithm 4.1, Theorems 2.2.11 and 4.3.2.
+Source: lee2018, sections 4.2.1 and 4.3.1, Algorithm 4.1, Theorems 2.2.11 and 4.3.2; for droop inverters
+docs/theory-partial-observers.md, section 8.
 """
 
 from __future__ import annotations
@@ -49,7 +45,7 @@ import numpy as np
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import DesignInfeasible, NotObservable
 from gridsec.estimators import thresholds
-from gridsec.estimators.decision import Counters, DecisionInputs, count, decide
+from gridsec.estimators.decision import Counters, DecisionInputs, count, decide, no_counts
 from gridsec.estimators.inputs import (
     NO_VOLTAGE,
     Inputs,
@@ -62,14 +58,21 @@ from gridsec.estimators.inputs import (
     nothing_new,
     reconstruct,
 )
-from gridsec.estimators.plant import EstimatorContext, Options, Plant, check_plant, estimator_context
+from gridsec.estimators.plant import (
+    EstimatorContext,
+    Options,
+    Plant,
+    check_plant,
+    estimator_context,
+    usual_options,
+)
 from gridsec.estimators.thresholds import ErrorBound, Motion, TickUncertainty
 from gridsec.grid.meter import reading_error
 from gridsec.interface import Cause, Decision, Estimate, Explanation, Frame, Verdict
 from gridsec.observers import circle
 from gridsec.observers.certificates import Certificate, verify
 from gridsec.observers.circle import CircleDesign
-from gridsec.observers.lure import POLICY, close_loop, rest
+from gridsec.observers.lure import POLICY, close_loop
 from gridsec.secure.decode.noise import CorrectionConstants, correction_constants
 from gridsec.secure.decode.search import Fits, fits
 from gridsec.secure.decode.stacks import MOST_SUBSETS, Stack
@@ -100,55 +103,30 @@ _LARGEST, _FARTHEST = 1e4, 1e8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Parts:
-    """State of the observers. m inverters.
+    """State of the observers. m inverters."""
 
-    Attributes
-    ----------
-    x, z : (m,)
-        Injections of the observer without meters, and z at its inverters, pu.
-    driven : (m,)
-        Injections of the scalar observers; those of `x` without a driving meter.
-    bound
-        `free` bounds the error of x, `driven` that of the scalar observers of unmanipulated meters.
-    level
-        Upper level of the bounds during the last step.
-    """
-
+    # x, z (m,): injections of the observer without meters, and z at its inverters, pu
     x: Floats
     z: Floats
-    driven: Floats
+    driven: Floats  # (m,) injections of the scalar observers; those of `x` without a driving meter
+    # `free` bounds the error of x, `driven` that of the scalar observers of unmanipulated meters
     bound: ErrorBound
-    level: ErrorBound
+    level: ErrorBound  # upper level of the bounds during the last step
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CodeWord:
-    """One frame as a code word in units of its bounds. A rows, n unknowns.
+    """One frame as a code word in units of its bounds. A rows, n unknowns."""
 
-    Attributes
-    ----------
-    B, s, block : (A, n), (A,), (A,)
-        Rows, their values, and the meter of each.
-    unit : (A,)
-        Unit of each row, squared pu or pu.
-    scale : (n,)
-        Unit of each unknown, pu: x, p, q, squared busbar voltage.
-    reading : (A,)
-        True for rows that are readings.
-    voltage : (N, n)
-        Sensitivity of the customers' squared voltages to one unit of each unknown, pu.
-    rest : (N,)
-        Their remaining error, pu.
-    """
-
+    # B, s, block (A, n), (A,), (A,): rows, their values, and the meter of each
     B: Floats
     s: Floats
     block: Ints
-    unit: Floats
-    scale: Floats
-    reading: Bools
-    voltage: Floats
-    rest: Floats
+    unit: Floats  # (A,) unit of each row, squared pu or pu
+    scale: Floats  # (n,) unit of each unknown, pu: x, p, q, squared busbar voltage
+    reading: Bools  # (A,) True for rows that are readings
+    voltage: Floats  # (N, n) sensitivity of the customers' squared voltages to one unit of each unknown, pu
+    rest: Floats  # (N,) their remaining error, pu
 
 
 def start(setting: EstimatorContext) -> Parts:
@@ -162,20 +140,8 @@ def observe(  # noqa: PLR0917  # the observers, their state, and the inputs
 ) -> tuple[TickUncertainty, Reconstruction, Parts, bool]:
     """Advance all observers and their bounds to a frame.
 
-    Parameters
-    ----------
-    model
-        The observer without meters.
-    frame, inputs
-        The frame, received and prepared.
-    h
-        Time since the last frame, s; 0 for the first one.
-
-    Returns
-    -------
-    Uncertainty, Reconstruction, Parts, bool
-        Uncertainty without any meter, voltages by the observer without meters, new state of the observers,
-        and True once their initial transient is negligible.
+    Returns Uncertainty, Reconstruction, Parts, bool: uncertainty without any meter, voltages by the observer
+        without meters, new state of the observers, and True once their initial transient is negligible.
     """
     plant, errors = setting.plant, setting.errors
     own, no_meters = plant.droop.customer, np.zeros_like(inputs.live)
@@ -184,13 +150,10 @@ def observe(  # noqa: PLR0917  # the observers, their state, and the inputs
         model, circle.CircleState(0.0, before.x), inputs.z, inputs.w, no_meters, h if h > 0 else _LONG_S
     ).x
     seen = reconstruct(setting, frame, inputs, injections(plant, frame, x, no_meters))
-    moved = np.abs(seen.correction - inputs.correction)[plant.feeder.bus]
-    base = np.minimum(inputs.now.base + moved, NO_VOLTAGE)
+    base = np.minimum(inputs.now.base + seen.moved, NO_VOLTAGE)
     alone = replace(inputs.now, base=base, live=no_meters, told=no_meters)
     z = plant.droop.vbar**2 - seen.v2[own]
-    fast = plant.droop.tau * rest(h, POLICY) < 1.0
-    # If all are that fast, the step ends in the equilibrium.
-    lag = np.where(fast & ~fast.all(), np.abs(x - before.x), 0.0)
+    lag = np.where(thresholds.slowed(errors, h, POLICY), np.abs(x - before.x), 0.0)
     motion = Motion(before.z if h > 0 else z, z, np.zeros(x.shape), h, lag)
     bound, level = thresholds.advance(errors, alone, motion, before.bound, before.level)
     heard = np.zeros(x.shape, dtype=np.bool_)
@@ -208,10 +171,8 @@ def observe(  # noqa: PLR0917  # the observers, their state, and the inputs
 
 def _settled(setting: EstimatorContext, alone: TickUncertainty, motion: Motion, bound: ErrorBound) -> bool:
     errors = setting.errors
-    none = np.zeros(bound.free.shape)
-    top = thresholds.ceiling(errors, alone, motion, ErrorBound(none, none))
-    at_rest = thresholds.settled(errors, alone, motion, top)
-    excess = errors.inverters[errors.meters] @ np.maximum(bound.free - at_rest.free, 0.0)
+    transient = np.maximum(bound.free - thresholds.at_rest(errors, alone, motion).free, 0.0)
+    excess = errors.inverters[errors.meters] @ transient
     allowed = alone.reading + alone.base[errors.meters]
     return bool(np.all(excess <= setting.options.settled * allowed))
 
@@ -226,14 +187,10 @@ def code_word(  # noqa: PLR0917  # as _conclude
 ) -> CodeWord:
     """Rows of all meters, each in units of its own bound.
 
-    Parameters
-    ----------
-    setting, parts, frame, inputs
-        The feeder, its observers after this frame, and the frame, received and prepared.
-    alone
-        Uncertainty without any meter.
-    model
-        Voltages by the observer without meters.
+    setting, parts, frame, inputs: the feeder, its observers after this frame, and the frame, received and
+        prepared.
+    alone: uncertainty without any meter.
+    model: voltages by the observer without meters.
     """
     plant, errors, lines = setting.plant, setting.errors, setting.model
     own, n, m = plant.droop.customer, frame.p.size, parts.x.size
@@ -308,19 +265,9 @@ def _split(
 def constants(word: CodeWord, meters: int, max_attacked: int, *, tol: float) -> CorrectionConstants:
     """Theta and kappa_c of lee2018 for a frame: block j is the rows of meter j with the model.
 
-    Parameters
-    ----------
-    tol
-        As in `gridsec.secure.decode.noise.correction_constants`.
-
-    Returns
-    -------
-    CorrectionConstants
-        In units of the code word: v_max is the root of the number of unknowns and of rows of a meter.
-
-    References
-    ----------
-    lee2018, Theorem 2.2.11, with the fading part of section 4.2.1 in every block.
+    Returns CorrectionConstants: in units of the code word: v_max is the root of the number of unknowns and of
+        rows of a meter.
+    Source: lee2018, Theorem 2.2.11, with the fading part of section 4.2.1 in every block.
     """
     alone = np.eye(word.scale.size)
     blocks = [np.vstack([alone, word.B[word.block == j]]) for j in range(meters)]
@@ -336,19 +283,11 @@ _SHOWN = 8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PartialDesign:
-    """Design of the partial-observer estimator.
-
-    Attributes
-    ----------
-    model
-        The observer without meters.
-    step_s
-        Expected interval between frames, s.
-    """
+    """Design of the partial-observer estimator."""
 
     setting: EstimatorContext
-    model: CircleDesign
-    step_s: float
+    model: CircleDesign  # the observer without meters
+    step_s: float  # expected interval between frames, s
 
     @property
     def observers(self) -> int:
@@ -358,36 +297,16 @@ class PartialDesign:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PartialState:
-    """State between frames.
+    """State between frames."""
 
-    Attributes
-    ----------
-    t
-        Time of the last used frame, s; that of `init` before the first one.
-    valid
-        True if the certificate was verified.
-    started
-        True after the first frame.
-    parts
-        The observers.
-    settled
-        True once the initial transient has decayed.
-    tally
-        Counters of accusations, and the named meters.
-    v0_squared
-        Last squared busbar voltage, pu.
-    last
-        Last estimate and verdict; None before the first one.
-    """
-
-    t: float
-    valid: bool
-    started: bool
-    parts: Parts
-    settled: bool
-    tally: Counters
-    v0_squared: Floats | float
-    last: tuple[Estimate, Verdict] | None
+    t: float  # time of the last used frame, s; that of `init` before the first one
+    valid: bool  # True if the certificate was verified
+    started: bool  # True after the first frame
+    parts: Parts  # the observers
+    settled: bool  # True once the initial transient has decayed
+    tally: Counters  # counters of accusations, and the named meters
+    v0_squared: Floats | float  # last squared busbar voltage, pu
+    last: tuple[Estimate, Verdict] | None  # last estimate and verdict; None before the first one
 
 
 def design(
@@ -395,21 +314,10 @@ def design(
 ) -> PartialDesign:
     """Design the observers and fits for one feeder.
 
-    Parameters
-    ----------
-    max_attacked
-        M, largest number of simultaneously manipulated meters.
-    step_s
-        Expected interval between frames, s; others work, too.
-
-    Raises
-    ------
-    NotObservable
-        Unless there are more than 2M meters.
-    DesignInfeasible
-        If the initial transient does not decay, or there are too many sets of M meters.
-    ValueError
-        As `plant.check_plant`.
+    max_attacked: M, largest number of simultaneously manipulated meters.
+    step_s: expected interval between frames, s; others work, too.
+    Raises NotObservable unless there are more than 2M meters; DesignInfeasible if the initial transient does
+        not decay, or there are too many sets of M meters; ValueError as `plant.check_plant`.
     """
     meters, p = plant.meters, plant.meters.size
     check_plant(plant, max_attacked=max_attacked, step_s=step_s)
@@ -421,8 +329,7 @@ def design(
     if sets > MOST_SUBSETS or sets * rows * (rows + unknowns) > MOST_WORK * step_s:
         said = f"{sets} sets of up to {rows} rows every {step_s:g} s are too many"
         raise DesignInfeasible(f"fits without every {max_attacked} of {p} meters", said, code="too-many")
-    if options is None:
-        options = Options() if step_s <= 30.0 else Options(release=4)
+    options = usual_options(step_s) if options is None else options
     model = circle.design(close_loop(plant.feeder, plant.droop, meters), np.zeros(p, dtype=np.bool_))
     return PartialDesign(estimator_context(plant, max_attacked=max_attacked, options=options), model, step_s)
 
@@ -433,7 +340,6 @@ def init(design: PartialDesign, t: float) -> PartialState:
     The certificate of the design is verified again.
     """
     plant, proof = design.setting.plant, design.model.certificate
-    p = plant.meters.size
     try:
         valid = isinstance(proof, Certificate) and verify(proof, design.model.lure) > 0
     except DesignInfeasible:
@@ -444,27 +350,18 @@ def init(design: PartialDesign, t: float) -> PartialState:
         started=False,
         parts=start(design.setting),
         settled=False,
-        tally=Counters(np.zeros(p, dtype=np.intp), np.zeros(p, dtype=np.intp), np.zeros(p, dtype=np.bool_)),
+        tally=no_counts(plant.meters.size),
         v0_squared=plant.droop.vbar**2,
         last=None,
     )
 
 
 def step(design: PartialDesign, state: PartialState, frame: Frame) -> tuple[PartialState, Estimate, Verdict]:
-    """Process one frame.
+    """Process one frame; see `gridsec.interface`.
 
-    Parameters
-    ----------
-    frame
-        Data of one tick. A frame that is not later than the last one changes nothing: it returns the last
-        estimate and UNDECIDED.
-
-    Returns
-    -------
-    PartialState, Estimate, Verdict
-        As every estimator's step; see `gridsec.interface`. Score and threshold are those of the readings in
-        the fit of the estimate, or of the observer without meters where that is stricter. All fits and all
-        rows decide on named meters: a small attack may be named below this threshold.
+    Score and threshold are those of the readings in the fit of the estimate, or of the observer without
+        meters where that is stricter. All fits and all rows decide on named meters: a small attack may be
+        named below this threshold.
     """
     if (state.started and not frame.t > state.t) or not np.isfinite(frame.t):
         plant = design.setting.plant
@@ -513,7 +410,7 @@ def _conclude(  # noqa: PLR0917  # the chain's values, in the order in which the
     doubtful = contradicted if not found.certain.any() else np.zeros_like(live)
     decision, cause, reason = decide(
         DecisionInputs(
-            names=tuple(plant.feeder.customers[c] for c in plant.meters),
+            names=plant.meter_names,
             max_attacked=most,
             live=live,
             suspected=(tally.above > 0) | doubtful,

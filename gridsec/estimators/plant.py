@@ -19,30 +19,21 @@ from gridsec.grid.network import LinDistFlow, Network
 class Plant:
     """Physical feeder of an estimator. N customers, m inverters, p meters.
 
-    Attributes
-    ----------
-    feeder
-        The feeder with its customers: radial, meshed or in three phases.
-    droop
-        The customers' inverters and their curves.
-    meters : (p,)
-        Customer of each voltage meter; at most one meter per customer.
-    accuracy
-        Accuracy of the meters by their data sheets.
-    loss_correction
-        DistFlow fixed-point steps that correct LinDistFlow for branch losses; 0 leaves it linear.
-
-    Raises
-    ------
-    ValueError
-        With every problem found; `check_plant` checks that meters, feeder and accuracy are consistent.
+    Raises ValueError with every problem found; `check_plant` checks that meters, feeder and accuracy are
+        consistent.
     """
 
-    feeder: Network
-    droop: Droop
-    meters: Ints
-    accuracy: MeterAccuracy
+    feeder: Network  # the feeder with its customers: radial, meshed or in three phases
+    droop: Droop  # the customers' inverters and their curves
+    meters: Ints  # (p,) customer of each voltage meter; at most one meter per customer
+    accuracy: MeterAccuracy  # accuracy of the meters by their data sheets
+    # DistFlow fixed-point steps that correct LinDistFlow for branch losses; 0 leaves it linear
     loss_correction: int = 1
+
+    @property
+    def meter_names(self) -> tuple[str, ...]:
+        """Customer of each meter by name, (p,)."""
+        return tuple(self.feeder.customers[c] for c in self.meters)
 
     def __post_init__(self) -> None:
         meters, problems = np.asarray(self.meters), []
@@ -62,39 +53,24 @@ class Plant:
 class Options:
     """Tuning parameters.
 
-    Attributes
-    ----------
-    sigmas
-        Jitter allowance of an unmanipulated reading in standard deviations. At 4, one reading in 16 000
-        exceeds it, which matters only for a meter at the limit of its class.
-    confirm
-        Readings above the threshold until a meter is named.
-    release
-        Consecutive readings below it until a meter is neither named nor suspect. An attack on at least every
-        `release`-th reading is named; docs/theory-detection.md, section 5.
-    settled
-        The verdict is SETTLING until the remaining effect of the unknown initial state is below this fraction
-        of every threshold.
-    tie
-        Sets count as equal if their disagreements pi differ by at most this fraction of the largest
-        saturation limit; residuals decide between them.
-    widest
-        Largest threshold of a meter that is judged, squared pu: 0.1 is 5 % of the voltage.
-    v2_limits
-        Range of valid squared busbar voltages, pu; a reading outside it is not used.
-
-    Raises
-    ------
-    ValueError
-        With every problem found.
+    Raises ValueError with every problem found.
     """
 
+    # Jitter allowance of an unmanipulated reading in standard deviations. At 4, one reading in 16 000 exceeds
+    # it, which matters only for a meter at the limit of its class.
     sigmas: float = 4.0
-    confirm: int = 2
+    confirm: int = 2  # readings above the threshold until a meter is named
+    # Consecutive readings below it until a meter is neither named nor suspect. An attack on at least every
+    # `release`-th reading is named; docs/theory-detection.md, section 5.
     release: int = 6
+    # the verdict is SETTLING until the remaining effect of the unknown initial state is below this fraction
+    # of every threshold
     settled: float = 0.1
+    # sets count as equal if their disagreements pi differ by at most this fraction of the largest saturation
+    # limit; residuals decide between them
     tie: float = 1e-6
-    widest: float = 0.1
+    widest: float = 0.1  # largest threshold of a meter that is judged, squared pu: 0.1 is 5 % of the voltage
+    # range of valid squared busbar voltages, pu; a reading outside it is not used
     v2_limits: tuple[float, float] = (0.25, 2.25)
 
     def __post_init__(self) -> None:
@@ -118,6 +94,11 @@ class Options:
                 *judging_problems(self.settled, self.widest, self.v2_limits),
             ]
         )
+
+
+def usual_options(step_s: float) -> Options:
+    """Default options for an interval between frames, s: above 30 s, four readings clear a meter, not six."""
+    return Options() if step_s <= 30.0 else Options(release=4)
 
 
 def judging_problems(settled: float, widest: float, v2_limits: tuple[float, float]) -> list[Problem]:
@@ -148,19 +129,10 @@ def _whole(value: object, least: int) -> bool:
 def check_plant(plant: Plant, *, max_attacked: int, step_s: float, more: Iterable[Problem] = ()) -> None:
     """Refuse a plant that no estimator supports, before anything is computed.
 
-    Parameters
-    ----------
-    max_attacked
-        M, largest number of simultaneously manipulated meters.
-    step_s
-        Expected interval between frames, s.
-    more
-        Further problems, found by the caller.
-
-    Raises
-    ------
-    ValueError
-        With every problem: meters at no customer, two at one, accuracy of other meters, numbers out of range.
+    max_attacked: M, largest number of simultaneously manipulated meters.
+    step_s: expected interval between frames, s.
+    Raises ValueError with every problem: meters at no customer, two at one, accuracy of other meters, numbers
+        out of range.
     """
     meters, customers, problems = np.asarray(plant.meters), plant.feeder.bus.size, []
     nowhere = meters[(meters < 0) | (meters >= customers)]
@@ -189,26 +161,14 @@ def check_plant(plant: Plant, *, max_attacked: int, step_s: float, more: Iterabl
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EstimatorContext:
-    """Plant with its derived models, common to all estimators of a feeder.
-
-    Attributes
-    ----------
-    model
-        Linear power flow of the plant.
-    errors
-        Propagation of errors.
-    max_attacked
-        M.
-    uses_reported_q
-        True if metered net reactive power replaces that of load and inverter.
-    """
+    """Plant with its derived models, common to all estimators of a feeder."""
 
     plant: Plant
-    model: LinDistFlow
-    errors: ErrorModel
+    model: LinDistFlow  # linear power flow of the plant
+    errors: ErrorModel  # propagation of errors
     options: Options
-    max_attacked: int
-    uses_reported_q: bool
+    max_attacked: int  # M
+    uses_reported_q: bool  # True if metered net reactive power replaces that of load and inverter
 
 
 def estimator_context(

@@ -1,7 +1,5 @@
 """Switched observer that searches for another set of trusted meters when its own test fails.
 
-Part of `gridsec.estimators.set_search`, which selects the trusted meters.
-
 kim2018 and lee2018, chapter 5, do not run an observer for every set. They trust one set of meters while
 all of its readings agree with its estimate, and search for another one only if they do not:
 
@@ -25,10 +23,8 @@ The papers' sets have partial observers of their own, with estimates that can be
 candidate is judged by the injections that its members' readings alone imply, which needs no observer.
 Metered net reactive power is not used: that of a dropped meter would have to be removed, too.
 
-References
-----------
-docs/theory-high-gain.md, section 8; docs/theory-detection.md.
-kim2018, section III.D, Theorem 2; lee2018, section 5.4, Theorem 5.4.3; docs/theory-high-gain.md.
+Source: kim2018, section III.D, Theorem 2; lee2018, section 5.4, Theorem 5.4.3; docs/theory-high-gain.md,
+section 8.
 """
 
 from __future__ import annotations
@@ -42,16 +38,32 @@ import numpy as np
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import DesignInfeasible, NotObservable, Problem
 from gridsec.estimators import thresholds
-from gridsec.estimators.decision import Counters, DecisionInputs, count, decide
+from gridsec.estimators.decision import Counters, DecisionInputs, count, decide, no_counts
 from gridsec.estimators.exact_bank import bank as banks
-from gridsec.estimators.inputs import Inputs, PreviousStep, clean, injections, known, nothing_new, reconstruct
-from gridsec.estimators.plant import EstimatorContext, Options, Plant, check_plant, estimator_context
+from gridsec.estimators.inputs import (
+    Inputs,
+    PreviousStep,
+    Reconstruction,
+    clean,
+    injections,
+    known,
+    nothing_new,
+    reconstruct,
+)
+from gridsec.estimators.plant import (
+    EstimatorContext,
+    Options,
+    Plant,
+    check_plant,
+    estimator_context,
+    usual_options,
+)
 from gridsec.estimators.single_tick import MOST_SETS
 from gridsec.estimators.thresholds import ErrorBound, ErrorModel, Motion, TickUncertainty
 from gridsec.grid.meter import reading_error
 from gridsec.interface import Cause, Decision, Estimate, Explanation, Frame, Verdict
 from gridsec.observers.certificates import Certificate, certify
-from gridsec.observers.lure import close_loop, rest
+from gridsec.observers.lure import close_loop
 
 __all__ = [
     "SetSearchDesign",
@@ -69,28 +81,14 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SetSearchDesign:
-    """Design of the switched observer. p meters, c candidate sets.
-
-    Attributes
-    ----------
-    bank
-        The observer: a bank for M = 0, with the trusted meters as its available meters.
-    errors
-        Propagation of errors in an observer without manipulated meters.
-    certificate
-        Proof that the observer converges for every set and every switching.
-    dropped : (c, p)
-        Sets of dropped meters, the smallest first.
-    dwell_s
-        Delta, s.
-    """
+    """Design of the switched observer. p meters, c candidate sets."""
 
     setting: EstimatorContext
-    bank: banks.Bank
-    errors: ErrorModel
-    certificate: Certificate
-    dropped: Bools
-    dwell_s: float
+    bank: banks.Bank  # the observer: a bank for M = 0, with the trusted meters as its available meters
+    errors: ErrorModel  # propagation of errors in an observer without manipulated meters
+    certificate: Certificate  # proof that the observer converges for every set and every switching
+    dropped: Bools  # (c, p) sets of dropped meters, the smallest first
+    dwell_s: float  # Delta, s
 
     @property
     def observers(self) -> int:
@@ -100,55 +98,25 @@ class SetSearchDesign:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SetSearchState:
-    """State between frames. m inverters, p meters.
+    """State between frames. m inverters, p meters."""
 
-    Attributes
-    ----------
-    t
-        Time of the last used frame, s; that of `init` before the first one.
-    bank
-        The observer; None before the first frame.
-    x : (m,)
-        Its estimate, pu.
-    z : (m,)
-        Its z at the inverters, squared pu.
-    y : (p,)
-        Last readings as z, squared pu; NaN where missing.
-    bound, level
-        Bounds on its error if no trusted meter is manipulated, see `thresholds.advance`.
-    sure : (m,)
-        Bound on the error of inverters with an unmanipulated own meter, under any other attack, pu.
-    settled
-        True once the transient of the start, or of the last switch, has decayed.
-    dropped : (p,)
-        Meters that are not trusted.
-    innocent : (p,)
-        Time since which a dropped meter is within its limit, s; infinite where it is not.
-    readings : (p,)
-        Number of these readings.
-    tally
-        Counters of accusations, and the named meters.
-    v0_squared
-        Last squared busbar voltage, pu.
-    last
-        Last estimate and verdict; None before the first frame.
-    """
-
-    t: float
-    bank: banks.BankState | None
-    x: Floats
-    z: Floats
-    y: Floats
+    t: float  # time of the last used frame, s; that of `init` before the first one
+    bank: banks.BankState | None  # the observer; None before the first frame
+    x: Floats  # (m,) its estimate, pu
+    z: Floats  # (m,) its z at the inverters, squared pu
+    y: Floats  # (p,) last readings as z, squared pu; NaN where missing
+    # bound, level: bounds on its error if no trusted meter is manipulated, see `thresholds.advance`
     bound: ErrorBound
     level: ErrorBound
+    # (m,) bound on the error of inverters with an unmanipulated own meter, under any other attack, pu
     sure: Floats
-    settled: bool
-    dropped: Bools
-    innocent: Floats
-    readings: Ints
-    tally: Counters
-    v0_squared: Floats | float
-    last: tuple[Estimate, Verdict] | None
+    settled: bool  # True once the transient of the start, or of the last switch, has decayed
+    dropped: Bools  # (p,) meters that are not trusted
+    innocent: Floats  # (p,) time since which a dropped meter is within its limit, s; infinite where it is not
+    readings: Ints  # (p,) number of these readings
+    tally: Counters  # counters of accusations, and the named meters
+    v0_squared: Floats | float  # last squared busbar voltage, pu
+    last: tuple[Estimate, Verdict] | None  # last estimate and verdict; None before the first frame
 
 
 def design(
@@ -161,24 +129,13 @@ def design(
 ) -> SetSearchDesign:
     """Design the observer and the candidate sets for one feeder.
 
-    Parameters
-    ----------
-    max_attacked
-        M, largest number of simultaneously manipulated meters.
-    step_s
-        Expected interval between frames, s. Other intervals work, too.
-    dwell_s
-        Delta, s; by default the time in which the observer's transient decays to the fraction
+    max_attacked: M, largest number of simultaneously manipulated meters.
+    step_s: expected interval between frames, s. Other intervals work, too.
+    dwell_s: Delta, s; by default the time in which the observer's transient decays to the fraction
         `options.settled`.
-
-    Raises
-    ------
-    NotObservable
-        Unless there are more than 2M meters.
-    DesignInfeasible
-        If no closed-form certificate holds, or there are too many sets to search.
-    ValueError
-        As `plant.check_plant`, or if `dwell_s` is negative or not finite.
+    Raises NotObservable unless there are more than 2M meters; DesignInfeasible if no closed-form certificate
+        holds, or there are too many sets to search; ValueError as `plant.check_plant`, or if `dwell_s` is
+        negative or not finite.
     """
     p = plant.meters.size
     wrong = dwell_s is not None and not 0.0 <= dwell_s < np.inf
@@ -200,8 +157,7 @@ def design(
     chosen = (D for k in range(1, max_attacked + 1) for D in combinations(range(p), k))
     for row, D in zip(dropped, chosen, strict=True):
         row[list(D)] = True
-    if options is None:
-        options = Options() if step_s <= 30.0 else Options(release=4)
+    options = usual_options(step_s) if options is None else options
     lure = close_loop(plant.feeder, plant.droop, plant.meters)
     proof = certify(lure)
     watched = estimator_context(plant, max_attacked=max_attacked, options=options)
@@ -216,7 +172,6 @@ def init(design: SetSearchDesign, t: float) -> SetSearchState:
     """Initial state at Unix time t, s; the observer starts with the first frame and trusts all meters."""
     plant, widest = design.setting.plant, thresholds.widest(design.errors)
     m, p = plant.droop.tau.size, plant.meters.size
-    no_meters, zero = np.zeros(p, dtype=np.bool_), np.zeros(p, dtype=np.intp)
     return SetSearchState(
         t=t,
         bank=None,
@@ -227,10 +182,10 @@ def init(design: SetSearchDesign, t: float) -> SetSearchState:
         level=widest,
         sure=widest.free,
         settled=False,
-        dropped=no_meters,
+        dropped=np.zeros(p, dtype=np.bool_),
         innocent=np.full(p, np.inf),
-        readings=zero,
-        tally=Counters(zero, zero, no_meters),
+        readings=np.zeros(p, dtype=np.intp),
+        tally=no_counts(p),
         v0_squared=plant.droop.vbar**2,
         last=None,
     )
@@ -238,35 +193,16 @@ def init(design: SetSearchDesign, t: float) -> SetSearchState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrustedEstimate:
-    """Estimate of the feeder from the trusted set. N customers, p meters, m inverters.
+    """Estimate of the feeder from the trusted set. N customers, p meters, m inverters."""
 
-    Attributes
-    ----------
-    bank, x, z, bound, level, sure, settled
-        As in `SetSearchState`, at this frame.
-    v2, v2_bus : (N,), (b + 1,)
-        Reconstructed squared voltages, pu.
-    base : (N,)
-        Error of `v2` for known injections, squared pu.
-    score, threshold : (p,)
-        Residuals, NaN without a reading, and their limits if no trusted meter is manipulated.
-    over : (p,)
-        Meters with a residual above its limit.
-    """
-
-    bank: banks.BankState
-    x: Floats
-    z: Floats
-    bound: ErrorBound
-    level: ErrorBound
-    sure: Floats
-    settled: bool
-    v2: Floats
-    v2_bus: Floats
-    base: Floats
+    state: SetSearchState  # after the frame, with the trusted meters and the answer before it
+    seen: Reconstruction
+    base: Floats  # (N,) error of the voltages for known injections, squared pu
+    # score, threshold (p,): residuals, NaN without a reading, and their limits if no trusted meter is
+    # manipulated
     score: Floats
     threshold: Floats
-    over: Bools
+    over: Bools  # (p,) meters with a residual above its limit
 
 
 def advance(design: SetSearchDesign, state: SetSearchState, frame: Frame, inputs: Inputs) -> TrustedEstimate:
@@ -283,52 +219,38 @@ def advance(design: SetSearchDesign, state: SetSearchState, frame: Frame, inputs
     none = np.zeros(J.size, dtype=np.bool_)
     seen = reconstruct(watched, frame, inputs, injections(plant, frame, x, none))
     z = droop.vbar**2 - seen.v2[droop.customer]
-    moved = np.abs(seen.correction - inputs.correction)[plant.feeder.bus]
-    now = replace(inputs.now, base=inputs.now.base + moved, live=J)
-    lag = np.where(_slowed(design, h), np.abs(x - state.x), 0.0)
+    now = replace(inputs.now, base=inputs.now.base + seen.moved, live=J)
+    lag = np.where(thresholds.slowed(errors, h, design.bank.policy), np.abs(x - state.x), 0.0)
     before = z if state.bank is None else state.z
     motion = Motion(before=before, after=z, offset=np.zeros(x.shape), h=h, lag=lag)
-    handed = _handed_over(design, state, J)
+    handed = state.bound
+    if state.bank is not None:
+        handed = thresholds.handed_over(errors, handed, state.bank.seen, J)
     bound, level = thresholds.advance(errors, now, motion, handed, state.level)
     error = thresholds.gap(errors, now, bound)
     threshold = threshold_of(design, seen.v2[at], error[at])
     score = np.where(inputs.live, np.abs(inputs.y - seen.v2[at]), np.nan)
-    return TrustedEstimate(
+    after = replace(
+        state,
+        t=frame.t,
         bank=bank,
         x=x,
         z=z,
+        y=np.where(inputs.live, inputs.z, np.nan),
         bound=bound,
         level=level,
         sure=_sure(design, state, inputs, J, motion),
         settled=state.settled or _settled(design, now, motion, error, threshold),
-        v2=seen.v2,
-        v2_bus=seen.v2_bus,
-        base=now.base,
-        score=score,
-        threshold=threshold,
-        over=inputs.live & (np.nan_to_num(score) > threshold),
+        v0_squared=inputs.v0_squared,
     )
-
-
-def _slowed(design: SetSearchDesign, h: float) -> Bools:
-    """Mask (m,) of inverters that the step treats as slower than they are: `lure.transition`, `rest`."""
-    fast = design.setting.plant.droop.tau * rest(h, design.bank.policy) < 1.0
-    return fast & ~fast.all()
+    over = inputs.live & (np.nan_to_num(score) > threshold)
+    return TrustedEstimate(after, seen, now.base, score, threshold, over)
 
 
 def driven_by(design: SetSearchDesign, J: Bools) -> Bools:
     """Mask (m,) of inverters driven by a trusted meter, for the trusted meters J (p,)."""
     meter = design.errors.meter_of
     return (meter >= 0) & J[meter]
-
-
-def _handed_over(design: SetSearchDesign, state: SetSearchState, J: Bools) -> ErrorBound:
-    """The bounds when meters become unavailable or return: each inverter takes the other mode's error."""
-    if state.bank is None:
-        return state.bound
-    was, now = driven_by(design, state.bank.seen), driven_by(design, J)
-    free = np.where(was & ~now, np.maximum(state.bound.free, state.bound.driven), state.bound.free)
-    return ErrorBound(np.where(now & ~was, state.bound.free, state.bound.driven), free)
 
 
 def _sure(design: SetSearchDesign, state: SetSearchState, inputs: Inputs, J: Bools, motion: Motion) -> Floats:
@@ -349,12 +271,8 @@ def _sure(design: SetSearchDesign, state: SetSearchState, inputs: Inputs, J: Boo
 def threshold_of(design: SetSearchDesign, v2: Floats, error: Floats) -> Floats:
     """Largest residual of an unmanipulated meter for an estimate with an error of at most `error`.
 
-    Parameters
-    ----------
-    v2 : (p,)
-        Reconstructed squared voltages at the meters, pu.
-    error : (…, p)
-        Their error bounds, squared pu.
+    v2 (p,): reconstructed squared voltages at the meters, pu.
+    error (…, p): their error bounds, squared pu.
     """
     plant, sigmas = design.setting.plant, design.setting.options.sigmas
     return np.asarray(reading_error(plant.accuracy, v2 + error, sigmas) + error)
@@ -364,20 +282,13 @@ def _settled(
     design: SetSearchDesign, now: TickUncertainty, motion: Motion, error: Floats, threshold: Floats
 ) -> bool:
     """True once the remaining transient is negligible against every threshold."""
-    none, at = np.zeros(motion.after.shape), design.setting.plant.meters
-    top = thresholds.ceiling(design.errors, now, motion, ErrorBound(none, none))
-    rest_ = thresholds.gap(design.errors, now, thresholds.settled(design.errors, now, motion, top))
-    return bool(np.all((error - rest_)[at] <= design.setting.options.settled * threshold))
+    rest = thresholds.gap(design.errors, now, thresholds.at_rest(design.errors, now, motion))
+    transient = (error - rest)[design.setting.plant.meters]
+    return bool(np.all(transient <= design.setting.options.settled * threshold))
 
 
 def lost(errors: ErrorModel, sure: Floats) -> Floats:
-    """Additional error at every customer without one meter, (N, p): its inverter may inject anything.
-
-    Parameters
-    ----------
-    sure : (m,)
-        Error of each inverter that follows from its own meter, pu.
-    """
+    """Additional error at every customer without one meter, (N, p): its inverter may inject anything."""
     metered, p = errors.meter_of >= 0, errors.meters.size
     more = np.bincount(errors.meter_of[metered], weights=(errors.span - sure)[metered], minlength=p)
     return np.asarray(errors.reach * more)
@@ -386,19 +297,7 @@ def lost(errors: ErrorModel, sure: Floats) -> Floats:
 def step(
     design: SetSearchDesign, state: SetSearchState, frame: Frame
 ) -> tuple[SetSearchState, Estimate, Verdict]:
-    """Process one frame.
-
-    Parameters
-    ----------
-    frame
-        Data of one tick. A frame that is not later than the last one changes nothing: it returns the last
-        estimate and UNDECIDED.
-
-    Returns
-    -------
-    SetSearchState, Estimate, Verdict
-        As every estimator's step; see `gridsec.interface`.
-    """
+    """Process one frame; see `gridsec.interface`."""
     if not np.isfinite(frame.t) or (state.bank is not None and not frame.t > state.t):
         plant = design.setting.plant
         return state, *nothing_new(plant, frame, state.t, state.last, state.v0_squared, state.x)
@@ -426,8 +325,9 @@ def _search(design: SetSearchDesign, inputs: Inputs, view: TrustedEstimate, stat
     """Test all sets of at most M dropped meters by the injections that their own readings imply."""
     errors, at, live = design.errors, design.setting.plant.meters, inputs.live
     sets = design.dropped[~(design.dropped & ~live).any(axis=1)]
-    error = (view.base + errors.inverters @ view.sure)[at] + sets @ lost(errors, view.sure)[at].T
-    limit = threshold_of(design, view.v2[at], error)
+    sure = view.state.sure
+    error = (view.base + errors.inverters @ sure)[at] + sets @ lost(errors, sure)[at].T
+    limit = threshold_of(design, view.seen.v2[at], error)
     excess = np.where(live & ~sets, np.nan_to_num(view.score) / limit, 0.0).max(axis=1, initial=0.0)
     fine = np.flatnonzero(excess <= 1.0)
     if not fine.size:
@@ -464,61 +364,49 @@ def _conclude(  # noqa: PLR0917  # design, state and frame, then the results of 
     switched = bool((dropped & ~state.dropped).any())
     # Effect of an attack on the meter's own inverter and, through the model, on those without a trusted
     # meter.
-    driven = driven_by(design, live & ~dropped)
-    free = np.where(driven, view.bound.free, design.errors.span)
-    estimate = Estimate(
-        frame.t, view.v2, _error(design, view, found.torn), view.v2_bus, live & ~dropped, view.x
-    )
-    verdict = _verdict(design, inputs, view, found, tally, dropped, switched)
-    after = SetSearchState(
-        t=frame.t,
-        bank=view.bank,
-        x=view.x,
-        z=view.z,
-        y=np.where(live, inputs.z, np.nan),
-        bound=ErrorBound(view.sure, free) if switched else view.bound,
-        level=thresholds.widest(design.errors) if switched else view.level,
-        sure=view.sure,
-        settled=view.settled and not switched,
+    bound, level, settled = view.state.bound, view.state.level, view.state.settled
+    if switched:
+        free = np.where(driven_by(design, live & ~dropped), bound.free, design.errors.span)
+        bound, level, settled = ErrorBound(view.state.sure, free), thresholds.widest(design.errors), False
+    after = replace(
+        view.state,
+        bound=bound,
+        level=level,
+        settled=settled,
         dropped=dropped,
         innocent=np.where(dropped, innocent, np.inf),
         readings=np.where(dropped, readings, 0),
         tally=tally,
-        v0_squared=inputs.v0_squared,
-        last=(estimate, verdict),
     )
-    return after, estimate, verdict
+    error = _error(design, view, found.torn)
+    estimate = Estimate(frame.t, view.seen.v2, error, view.seen.v2_bus, live & ~dropped, after.x)
+    verdict = _verdict(design, after, inputs, view, found)
+    return replace(after, last=(estimate, verdict)), estimate, verdict
 
 
 def _error(design: SetSearchDesign, view: TrustedEstimate, torn: bool) -> Floats:
     """Half-width of the estimate for any M manipulated meters, detected or not; (N,)."""
-    errors = design.errors
+    errors, sure = design.errors, view.state.sure
     if torn:
         return np.asarray(view.base + errors.inverters @ errors.span)
-    most = thresholds.largest(lost(errors, view.sure), design.setting.max_attacked)
-    return np.asarray(view.base + errors.inverters @ view.sure + most)
+    most = thresholds.largest(lost(errors, sure), design.setting.max_attacked)
+    return np.asarray(view.base + errors.inverters @ sure + most)
 
 
-def _verdict(  # noqa: PLR0917  # all results of one tick
-    design: SetSearchDesign,
-    inputs: Inputs,
-    view: TrustedEstimate,
-    found: _Found,
-    tally: Counters,
-    dropped: Bools,
-    switched: bool,
+def _verdict(
+    design: SetSearchDesign, after: SetSearchState, inputs: Inputs, view: TrustedEstimate, found: _Found
 ) -> Verdict:
-    plant, live = design.setting.plant, inputs.live
+    plant, live, tally = design.setting.plant, inputs.live, after.tally
     decision, cause, reason = decide(
         DecisionInputs(
-            names=tuple(plant.feeder.customers[c] for c in plant.meters),
+            names=plant.meter_names,
             max_attacked=design.setting.max_attacked,
             live=live,
-            suspected=(tally.above > 0) | dropped,
+            suspected=(tally.above > 0) | after.dropped,
             named=tally.named,
             wide=live & ~(view.threshold <= design.setting.options.widest),
             valid=True,
-            settled=view.settled and not switched,
+            settled=after.settled,
             busbar=inputs.busbar,
         )
     )
@@ -528,7 +416,7 @@ def _verdict(  # noqa: PLR0917  # all results of one tick
             f"Without any {design.setting.max_attacked} meters, the others contradict each other: "
             "more are manipulated, or the busbar reading, a switch or a line in the model is wrong."
         )
-    attack = np.where(tally.named & live, inputs.y - view.v2[plant.meters], 0.0)
+    attack = np.where(tally.named & live, inputs.y - view.seen.v2[plant.meters], 0.0)
     none = np.zeros(plant.droop.tau.size, dtype=np.bool_)
     share = 1.0 / max(len(found.rivals), 1)
     return Verdict(

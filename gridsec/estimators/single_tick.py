@@ -11,10 +11,7 @@ They share the model ``m = w + e + a`` of `gridsec.estimators.sequential`: w is 
 errors on all voltages, known by its covariance S (pseudo-measurements of the loads, which cannot be
 attacked); e are the errors of unmanipulated meters; a is the attack, in as few entries as possible.
 
-References
-----------
-lee2018 (2.2.8'), Remark 2.2.1: least squares over all meters but those of a set.
-lee2018, chapter 2; docs/theory-snapshot.md.
+Source: lee2018, chapter 2, (2.2.8'), Remark 2.2.1; docs/theory-snapshot.md.
 """
 
 from __future__ import annotations
@@ -40,35 +37,17 @@ MOST_SETS = 20_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SetMisfits:
-    """Every set of one size. c sets of k meters.
+    """Every set of one size. c sets of k meters."""
 
-    Attributes
-    ----------
-    members : (c, k)
-        Meters of each set.
-    misfit : (c,)
-        Misfit without each set.
-    excess : (c,)
-        Largest offset of a remaining meter relative to its limit.
-    """
-
-    members: Ints
-    misfit: Floats
-    excess: Floats
+    members: Ints  # (c, k) meters of each set
+    misfit: Floats  # (c,) misfit without each set
+    excess: Floats  # (c,) largest offset of a remaining meter relative to its limit
 
 
 def check(candidates: int, most: int) -> None:
     """Refuse a search that would take too long.
 
-    Parameters
-    ----------
-    candidates, most
-        Number of meters, and largest size of a set.
-
-    Raises
-    ------
-    DesignInfeasible
-        If there would be more than `MOST_SETS` sets.
+    Raises DesignInfeasible if there would be more than `MOST_SETS` sets.
     """
     count = sum(comb(candidates, k) for k in range(most + 1))
     if count > MOST_SETS:
@@ -103,14 +82,9 @@ def outcomes(evidence: Evidence, size: int) -> SetMisfits:
 def least_squares(evidence: Evidence) -> tuple[Accused, ...]:
     """Weighted least squares with the chi-square test; remove the largest normalised residual and repeat.
 
-    Returns
-    -------
-    tuple of Accused
-        At most `most` meters, in the order of their residuals; a removed meter never returns.
-
-    References
-    ----------
-    lee2018, Algorithm 2.2 with the corrected degrees of freedom.
+    Returns tuple of Accused: at most `most` meters, in the order of their residuals; a removed meter never
+        returns.
+    Source: lee2018, Algorithm 2.2 with the corrected degrees of freedom.
     """
     now, live = evidence.whole.copy(), evidence.live
     accused = np.zeros(live.size, dtype=np.bool_)
@@ -130,15 +104,9 @@ def least_squares(evidence: Evidence) -> tuple[Accused, ...]:
 def fewest(evidence: Evidence) -> tuple[Accused, ...]:
     """The smallest set of meters without which every other one is within its limits.
 
-    Returns
-    -------
-    tuple of Accused
-        The set with the smallest misfit among those of the smallest size, and its rivals; the best set of the
-        largest size if no set leaves all others within the limits.
-
-    References
-    ----------
-    lee2018 (2.2.8'): l0 decoding with bounded noise, the sets tried in the order of their size.
+    Returns tuple of Accused: the set with the smallest misfit among those of the smallest size, and its
+        rivals; the best set of the largest size if no set leaves all others within the limits.
+    Source: lee2018 (2.2.8'): l0 decoding with bounded noise, the sets tried in the order of their size.
     """
     within = 2.0 * float(np.log(evidence.like))
     found: SetMisfits | None = None
@@ -160,9 +128,7 @@ def pursue(evidence: Evidence) -> tuple[Accused, ...]:
     ``min |a / sigma|_1 + |c|_1`` subject to ``a + V c = m`` with ``S = V V^T``: the stack of readings and
     pseudo-measurements, annihilated. Meters with a share beyond their limit are accused.
 
-    References
-    ----------
-    lee2018 (2.1.4); Theorem 2.1.1 for when it is exact.
+    Source: lee2018 (2.1.4); Theorem 2.1.1 for when it is exact.
     """
     at, F, y = _stack(evidence)
     attack = np.sqrt(evidence.whole.noise[at]) * basis_pursuit(F, y)[: at.size]
@@ -172,9 +138,7 @@ def pursue(evidence: Evidence) -> tuple[Accused, ...]:
 def match(evidence: Evidence) -> tuple[Accused, ...]:
     """Orthogonal matching pursuit on the whitened readings: column after column, without removal.
 
-    References
-    ----------
-    lee2018, Algorithm 2.1, Theorem 2.1.2.
+    Source: lee2018, Algorithm 2.1, Theorem 2.1.2.
     """
     at = np.flatnonzero(evidence.live)
     if not at.size:
@@ -220,25 +184,11 @@ def design(
 ) -> SequentialDesign:
     """Design with a decoder; `gridsec.estimators.sequential.init` and `step` run it.
 
-    Parameters
-    ----------
-    decoder
-        From `gridsec.estimators.single_tick`, or a custom one.
-    doubt
-        Uncertainty of the powers of the frames.
-    step_s
-        Expected interval between frames, s.
-    max_attacked
-        M, the largest number of accusations.
-    alarms_per_year
-        Expected false alarms per year.
-
-    Raises
-    ------
-    NotObservable, ValueError
-        As `gridsec.estimators.sequential.design`.
-    DesignInfeasible
-        If no certificate holds, or the decoder has too many sets to try.
+    step_s: expected interval between frames, s.
+    max_attacked: M, the largest number of accusations.
+    alarms_per_year: expected false alarms per year.
+    Raises NotObservable, ValueError as `gridsec.estimators.sequential.design`; DesignInfeasible if no
+        certificate holds, or the decoder has too many sets to try.
     """
     options = SequentialOptions(alarms_per_year=alarms_per_year, scales_s=(0.0,), commission_s=0.0)
     made = sequential_design(plant, doubt=doubt, step_s=step_s, options=options, max_attacked=max_attacked)

@@ -5,9 +5,7 @@ loads within stated intervals, the observers' own error and the model's error ca
 term comes from a stated accuracy. The sum is a worst case, because the errors of loads and meters may be
 systematic. docs/theory-detection.md has the derivation and the proof.
 
-References
-----------
-chong2020, section V and Theorem 2 (the estimate's error), equation (19) (the reconstructed voltage).
+Source: chong2020, section V and Theorem 2 (the estimate's error), equation (19) (the reconstructed voltage).
 """
 
 from __future__ import annotations
@@ -19,69 +17,40 @@ import numpy as np
 from gridsec.arrays import Bools, Floats, Ints, frozen
 from gridsec.grid.droop import Droop, voltage_curve
 from gridsec.grid.network import LinDistFlow
+from gridsec.observers.lure import StepPolicy, rest
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Majorant:
-    """Entrywise bounds for the observers of all sets, with any of their meters unavailable.
+    """Entrywise bounds for the observers of all sets, with any of their meters unavailable."""
 
-    Attributes
-    ----------
-    H : (m, m)
-        `|H - K_J C|`.
-    F : (m, N)
-        `|F - K_J D|`.
-    K, L : (m, p)
-        `|K_J|`, and `T |L_J|`: change of each state's target per pu of output error.
-    """
-
-    H: Floats
-    F: Floats
+    H: Floats  # (m, m) `|H - K_J C|`
+    F: Floats  # (m, N) `|F - K_J D|`
+    # K, L (m, p): `|K_J|`, and `T |L_J|`: change of each state's target per pu of output error
     K: Floats
     L: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ErrorModel:
-    """Propagation of errors through feeder and observers. N customers, m inverters, p meters.
+    """Propagation of errors through feeder and observers. N customers, m inverters, p meters."""
 
-    Attributes
-    ----------
-    droop
-        The inverters.
-    quota
-        2M: largest number of meters left out by an observer without manipulated meters.
-    R2, X2 : (N, N)
-        `2 |R|`, `2 |X|`.
-    inverters, reach : (N, m), (N, p)
-        Columns of X2 at the customers of inverters and of meters.
-    inverters_own, reach_own : (m, m), (m, p)
-        Rows of these at the inverters' customers.
-    meters : (p,)
-        Customer of each meter.
-    meter_of : (m,)
-        Meter that drives each inverter; -1 for none.
-    span : (m,)
-        Distance between the saturated values of each curve, pu.
-    mismatch : (m,)
-        Largest distance of a real inverter's curve, linear in v, from K, linear in z, pu.
-    majorant
-        For gains other than direct injection.
-    """
-
-    droop: Droop
-    quota: int
+    droop: Droop  # the inverters
+    quota: int  # 2M: largest number of meters left out by an observer without manipulated meters
+    # R2, X2 (N, N): `2 |R|`, `2 |X|`
     R2: Floats
     X2: Floats
+    # inverters, reach (N, m), (N, p): columns of X2 at the customers of inverters and of meters
     inverters: Floats
     reach: Floats
+    # inverters_own, reach_own (m, m), (m, p): rows of these at the inverters' customers
     inverters_own: Floats
     reach_own: Floats
-    meters: Ints
-    meter_of: Ints
-    span: Floats
-    mismatch: Floats
-    majorant: Majorant | None = None
+    meters: Ints  # (p,) customer of each meter
+    meter_of: Ints  # (m,) meter that drives each inverter; -1 for none
+    span: Floats  # (m,) distance between the saturated values of each curve, pu
+    mismatch: Floats  # (m,) largest distance of a real inverter's curve, linear in v, from K, linear in z, pu
+    majorant: Majorant | None = None  # for gains other than direct injection
 
 
 def error_model(droop: Droop, model: LinDistFlow, meters: Ints, max_attacked: int) -> ErrorModel:
@@ -122,55 +91,33 @@ def curve_mismatch(droop: Droop) -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TickUncertainty:
-    """Uncertainty at one tick.
+    """Uncertainty at one tick."""
 
-    Attributes
-    ----------
-    base : (N,)
-        Error of each customer's squared voltage for known injections of inverters: busbar, loads, model;
-        squared pu.
-    reading : (p,)
-        Error of each unmanipulated reading, squared pu.
-    live : (p,)
-        Meters with a usable reading.
-    told : (p,)
-        Available meters at customers with metered net reactive power in use.
-    extra : (p,)
-        Excess of the assumed load's uncertainty over that of the metered net at such a customer, pu.
-    """
-
+    # (N,) error of each customer's squared voltage for known injections of inverters: busbar, loads, model;
+    # squared pu
     base: Floats
-    reading: Floats
-    live: Bools
-    told: Bools
+    reading: Floats  # (p,) error of each unmanipulated reading, squared pu
+    live: Bools  # (p,) meters with a usable reading
+    told: Bools  # (p,) available meters at customers with metered net reactive power in use
+    # (p,) excess of the assumed load's uncertainty over that of the metered net at such a customer, pu
     extra: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ErrorBound:
-    """Bounds of the observers' error, inverter by inverter; valid at every time. m inverters.
+    """Bounds of the observers' error, inverter by inverter; valid at every time. m inverters."""
 
-    Attributes
-    ----------
-    driven : (m,)
-        For inverters driven by their own unmanipulated meter, pu.
-    free : (m,)
-        For inverters that run on the model, in every observer without manipulated meters that leaves out at
-        most 2M meters, pu.
-    """
-
-    driven: Floats
+    driven: Floats  # (m,) for inverters driven by their own unmanipulated meter, pu
+    # (m,) for inverters that run on the model, in every observer without manipulated meters that leaves out
+    # at most 2M meters, pu
     free: Floats
 
 
 def widest(model: ErrorModel, x: Floats | None = None) -> ErrorBound:
     """Bound without any knowledge: the true injections lie between the saturated values.
 
-    Parameters
-    ----------
-    x : (…, m), optional
-        The observers' states, needed where they can leave the range of the curves (gains L); by default they
-        lie in it.
+    x (…, m): the observers' states, needed where they can leave the range of the curves (gains L); by default
+        they lie in it.
     """
     if x is None:
         return ErrorBound(model.span.copy(), model.span.copy())
@@ -184,15 +131,7 @@ def gap(model: ErrorModel, now: TickUncertainty, bound: ErrorBound, *, own: bool
     `base_i + sum over undriven inverters 2 X_ik free_k + sum over meters 2 X_ij driven_j
     + the 2M largest of 2 X_ij (free_j - driven_j)`: the worst choice of 2M omitted meters.
 
-    Parameters
-    ----------
-    own
-        Restrict to the customers of the inverters.
-
-    Returns
-    -------
-    (N,) or (m,)
-        Bounds, squared pu.
+    Returns (N,) or (m,): bounds, squared pu.
     """
     inverters, column = (model.inverters_own, model.reach_own) if own else (model.inverters, model.reach)
     base = now.base[model.droop.customer] if own else now.base
@@ -217,27 +156,42 @@ def largest(values: Floats, count: int) -> Floats:
     return np.asarray(np.partition(values, p - count, axis=1)[:, p - count :].sum(axis=1))
 
 
+def handed_over(
+    model: ErrorModel, bound: ErrorBound, before: Bools, live: Bools, *, spread: Floats | float = 0.0
+) -> ErrorBound:
+    """The bounds when meters become unavailable or return: each inverter takes the other mode's error.
+
+    before, live (p,): meters that drive inverters before and after the change.
+    spread (m,): distance of the state that a returning inverter starts from to that of the observer, pu.
+    """
+    if not live.size:
+        return bound
+    metered = model.meter_of >= 0
+    was, now = metered & before[model.meter_of], metered & live[model.meter_of]
+    free = np.where(was & ~now, np.maximum(bound.free, bound.driven), bound.free)
+    return ErrorBound(np.where(now & ~was, bound.free + spread, bound.driven), free)
+
+
+def slowed(model: ErrorModel, h: float, policy: StepPolicy) -> Bools:
+    """Mask (m,) of inverters that a step treats as slower than they are: `lure.transition`, `lure.rest`."""
+    fast = model.droop.tau * rest(h, policy) < 1.0
+    # If all are that fast, the step ends in the equilibrium.
+    return np.asarray(fast & ~fast.all())
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """Estimate before and after one step.
+    """Estimate before and after one step."""
 
-    Attributes
-    ----------
-    before, after : (m,)
-        Estimated z at the inverters at the beginning and the end, pu.
-    offset : (m,)
-        Largest distance of the selected estimate's z from that of an observer without manipulated meters, pu.
-    h
-        Length of the step, s.
-    lag : (m,)
-        Motion of the inverters that the observers' step treats as slower than they are (`lure.transition`),
-        pu; 0 for the others.
-    """
-
+    # before, after (m,): estimated z at the inverters at the beginning and the end, pu
     before: Floats
     after: Floats
+    # (m,) largest distance of the selected estimate's z from that of an observer without manipulated meters,
+    # pu
     offset: Floats
-    h: float
+    h: float  # length of the step, s
+    # (m,) motion of the inverters that the observers' step treats as slower than they are
+    # (`lure.transition`), pu; 0 for the others
     lag: Floats | float = 0.0
 
 
@@ -247,10 +201,7 @@ def settled(model: ErrorModel, now: TickUncertainty, motion: Motion, start: Erro
     Iterates the monotone map of `docs/theory-detection.md` downwards from `start`. Every iterate is a bound;
     the iteration may stop at any time.
 
-    Parameters
-    ----------
-    start
-        An upper bound that the map does not exceed.
+    start: an upper bound that the map does not exceed.
     """
     level = start
     for _ in range(_ROUNDS):
@@ -261,6 +212,12 @@ def settled(model: ErrorModel, now: TickUncertainty, motion: Motion, start: Erro
         if done:
             break
     return level
+
+
+def at_rest(model: ErrorModel, now: TickUncertainty, motion: Motion) -> ErrorBound:
+    """Level to which the bounds converge from any initial state."""
+    none = np.zeros(model.span.size)
+    return settled(model, now, motion, ceiling(model, now, motion, ErrorBound(none, none)))
 
 
 def _image(model: ErrorModel, now: TickUncertainty, motion: Motion, bound: ErrorBound) -> ErrorBound:
@@ -306,17 +263,8 @@ def advance(
     monotone: with any G that is at least the present bound and at least its own image, the error stays
     below G during the step, and `bound+ = exp(-h/tau) bound + (1 - exp(-h/tau)) reach(G)`.
 
-    Parameters
-    ----------
-    bound
-        Bound at the beginning.
-    last
-        The G of the previous step, as first guess.
-
-    Returns
-    -------
-    ErrorBound, ErrorBound
-        Bound at the end, and this step's G.
+    last: the G of the previous step, as first guess.
+    Returns ErrorBound, ErrorBound: bound at the end, and this step's G.
     """
     keep = np.exp(-motion.h / model.droop.tau)
     top = ErrorBound(np.maximum(bound.driven, _ROOM * last.driven), np.maximum(bound.free, _ROOM * last.free))
@@ -348,13 +296,6 @@ def ceiling(model: ErrorModel, now: TickUncertainty, motion: Motion, floor: Erro
     Without output injection, the saturation of the curves. With it, the map is at most `r + A bound` with a
     matrix A of spectral radius below 1 (the certificate), and `(I - A)^-1 r` plus any multiple of
     `(I - A)^-1 1` is such a level.
-
-    Parameters
-    ----------
-    model, now, motion
-        As in `advance`.
-    floor
-        Lower limit of the level.
     """
     big = model.majorant
     if big is None or not big.L.any():

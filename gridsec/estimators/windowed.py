@@ -21,9 +21,7 @@ An attack inside the dead band of a curve, beyond its saturation, or on a meter 
 injection: windows cannot detect it, at any size. Output residuals can. If they contradict the windows, the
 answer is UNDECIDED. CLEAN needs both.
 
-References
-----------
-yang2019, Algorithms 1 and 2, (8), (10), (17), (19); docs/theory-discrete.md, sections 3 and 6.
+Source: yang2019, Algorithms 1 and 2, (8), (10), (17), (19); docs/theory-discrete.md, sections 3 and 6.
 """
 
 from __future__ import annotations
@@ -58,21 +56,12 @@ thresholds do not tighten with time.
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WindowedDesign:
-    """Design of the windowed estimator.
+    """Design of the windowed estimator."""
 
-    Attributes
-    ----------
-    chain
-        Design of the exact bank: observers, certificate, preparation of frames, reconstruction.
-    length
-        N, readings in a window.
-    rule
-        "survivors" or "majority", see `gridsec.secure.windows.isolation`.
-    """
-
+    # design of the exact bank: observers, certificate, preparation of frames, reconstruction
     chain: MonitorDesign
-    length: int
-    rule: Rule
+    length: int  # N, readings in a window
+    rule: Rule  # "survivors" or "majority", see `gridsec.secure.windows.isolation`
 
     @property
     def observers(self) -> int:
@@ -82,46 +71,22 @@ class WindowedDesign:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WindowResult:
-    """Result of one full window. p meters.
+    """Result of one full window. p meters."""
 
-    Attributes
-    ----------
-    judged
-        True if enough meters were available at every reading.
-    detected
-        Algorithm 1: True if pi exceeded its threshold.
-    decided
-        Algorithm 2: True if there is an answer.
-    suspects : (p,)
-        Algorithm 2: its answer.
-    """
-
-    judged: bool
-    detected: bool
-    decided: bool
-    suspects: Bools
+    judged: bool  # True if enough meters were available at every reading
+    detected: bool  # Algorithm 1: True if pi exceeded its threshold
+    decided: bool  # Algorithm 2: True if there is an answer
+    suspects: Bools  # (p,) Algorithm 2: its answer
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WindowedState:
-    """State between frames. s large sets.
+    """State between frames. s large sets."""
 
-    Attributes
-    ----------
-    chain
-        State of the exact bank.
-    pi : (i,)
-        pi of the window's readings so far, in thresholds; NaN where not judged.
-    pi_sets : (i, s)
-        Likewise pi_J.
-    said
-        Result of the last full window; None before the first one.
-    """
-
-    chain: MonitorState
-    pi: Floats
-    pi_sets: Floats
-    said: WindowResult | None
+    chain: MonitorState  # state of the exact bank
+    pi: Floats  # (i,) pi of the window's readings so far, in thresholds; NaN where not judged
+    pi_sets: Floats  # (i, s) likewise pi_J
+    said: WindowResult | None  # result of the last full window; None before the first one
 
 
 def design(
@@ -129,26 +94,14 @@ def design(
 ) -> WindowedDesign:
     """Design the observers and windows for one feeder.
 
-    Parameters
-    ----------
-    max_attacked
-        M, at least 1.
-    step_s
-        Expected interval between frames, s.
-    length
-        N, readings in a window; one of `LENGTHS`, or any other.
-    rule
-        Isolation rule of a window. The thresholds are bounds, so that one exceedance counts: "survivors". The
-        paper's vote, "majority", requires exceedances at more than half of the readings.
-
-    Raises
-    ------
-    NotObservable
-        Unless there are more than 2M meters.
-    DesignInfeasible
-        If no certificate holds, the bank would be too large, there is no droop inverter, or M is 0.
-    ValueError
-        If `length` is below 1, or `rule` is unknown.
+    max_attacked: M, at least 1.
+    step_s: expected interval between frames, s.
+    length: N, readings in a window; one of `LENGTHS`, or any other.
+    rule: isolation rule of a window. The thresholds are bounds, so that one exceedance counts: "survivors".
+        The paper's vote, "majority", requires exceedances at more than half of the readings.
+    Raises NotObservable unless there are more than 2M meters; DesignInfeasible if no certificate holds, the
+        bank would be too large, there is no droop inverter, or M is 0; ValueError if `length` is below 1, or
+        `rule` is unknown.
     """
     if not plant.droop.tau.size:
         raise DesignInfeasible(
@@ -179,18 +132,10 @@ def _empty(design: WindowedDesign) -> tuple[Floats, Floats]:
 def step(
     design: WindowedDesign, state: WindowedState, frame: Frame
 ) -> tuple[WindowedState, Estimate, Verdict]:
-    """Process one frame.
+    """Process one frame; see `gridsec.interface`.
 
-    Parameters
-    ----------
-    frame
-        Data of one tick. A frame that is not later than the last one changes nothing: it returns the last
-        estimate and UNDECIDED.
-
-    Returns
-    -------
-    WindowedState, Estimate, Verdict
-        As every estimator's step. The result of a window holds until the next one is full.
+    Returns WindowedState, Estimate, Verdict: as every estimator's step. The result of a window holds until
+        the next one is full.
     """
     before = state.chain
     if state.said is not None:
@@ -219,19 +164,8 @@ def consistency(
 ) -> tuple[float, Floats]:
     """Measures of disagreement, pi and pi_J, over their thresholds.
 
-    Parameters
-    ----------
-    bound
-        Error bounds of observers without manipulated meters.
-
-    Returns
-    -------
-    pi, pi_J : scalar, (s,)
-        Values above 1 are evidence. NaN while 2M or fewer meters are available.
-
-    References
-    ----------
-    yang2019 (8), (17), each entry over the sum of both observers' levels.
+    Returns pi, pi_J scalar, (s,): values above 1 are evidence. NaN while 2M or fewer meters are available.
+    Source: yang2019 (8), (17), each entry over the sum of both observers' levels.
     """
     sets, count = design.bank.sets, design.bank.sets.count_large
     if not isinstance(bank, SlotState) or bank.plan is None or design.bank.layout is None:
@@ -318,9 +252,7 @@ def _answer(
 
 def _combine(design: WindowedDesign, verdict: Verdict, said: WindowResult | None, off: Floats) -> Verdict:
     """Verdict of the windows; `off` is the signed distance of each reading from the reconstruction."""
-    plant = design.chain.plant
-    names = tuple(plant.feeder.customers[c] for c in plant.meters)
-    decision, cause, reason = _answer(verdict, said, names)
+    decision, cause, reason = _answer(verdict, said, design.chain.plant.meter_names)
     suspects = np.zeros_like(verdict.suspects) if said is None else said.suspects
     attack = np.where(suspects, np.nan_to_num(off), 0.0)
     return replace(verdict, decision=decision, cause=cause, reason=reason, suspects=suspects, attack=attack)

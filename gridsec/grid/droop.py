@@ -5,10 +5,8 @@ ends. Inverters measure v, so their curve is linear in v between the breakpoints
 runs on `z = vbar^2 - v^2`, where the curve K of chong2020 (17) is linear between the *mapped* breakpoints
 (`Droop.__call__`). The two agree at the breakpoints; docs/theory-model.md bounds the difference between them.
 
-References
-----------
-.. [1] chong2020, equations (16) to (18). In (18) the slope restriction needs the larger of the two
-   slopes, not the smaller one.
+Source: chong2020, equations (16) to (18). In (18) the slope restriction needs the larger of the two slopes,
+not the smaller one.
 """
 
 from __future__ import annotations
@@ -19,8 +17,8 @@ from math import log
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, Ints, frozen, frozen_ints
-from gridsec.errors import FeederInvalid, Problem
+from gridsec.arrays import Bools, Floats, Ints, frozen, frozen_ints, put
+from gridsec.errors import FeederInvalid, Problem, wrong_shapes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,51 +28,30 @@ class Droop:
     K_i is piecewise linear and non-decreasing in z, constant outside the outer breakpoints, with slope
     in `[0, slope_i]`. Calling the object evaluates K.
 
-    Attributes
-    ----------
-    customer : (m,)
-        Customer of each inverter.
-    v : (m, 4)
-        Breakpoints of the voltage, ascending, pu.
-    q : (m, 4)
-        Reactive injection at the breakpoints, non-increasing, pu of the feeder's base.
-    tau : (m,)
-        First-order time constant, s.
-    vbar
-        Reference voltage, pu; `z = vbar^2 - v^2`.
-    rating : (m,), or one number for all
-        Largest injection of an inverter that does not follow its curve: its rated apparent power, pu of the
-        feeder's base; infinite where not stated.
-    slope : (m,)
-        Derived. Largest slope of K, the d of chong2020 (18) as corrected.
-    limit : (m,)
-        Derived. Largest `|q|`, the saturation limit.
-
-    Raises
-    ------
-    FeederInvalid
-        With every problem found.
+    Raises FeederInvalid with every problem found.
     """
 
-    customer: Ints
-    v: Floats
-    q: Floats
-    tau: Floats
-    vbar: float = 1.0
+    customer: Ints  # (m,) customer of each inverter
+    v: Floats  # (m, 4) breakpoints of the voltage, ascending, pu
+    q: Floats  # (m, 4) reactive injection at the breakpoints, non-increasing, pu of the feeder's base
+    tau: Floats  # (m,) first-order time constant, s
+    vbar: float = 1.0  # reference voltage, pu; `z = vbar^2 - v^2`
+    # (m,), or one number for all: largest injection of an inverter that does not follow its curve: its rated
+    # apparent power, pu of the feeder's base; infinite where not stated
     rating: Floats = field(default_factory=lambda: np.array(np.inf))
+    # (m,) largest slope of K, the d of chong2020 (18) as corrected
     slope: Floats = field(init=False, repr=False)
-    limit: Floats = field(init=False, repr=False)
+    limit: Floats = field(init=False, repr=False)  # (m,) largest `|q|`, the saturation limit
     # Ramp k of z is slope[k] * (clip(z, low[k], high[k]) - low_or_high[k]); see `_ramps`.
     _ramps: tuple[_Ramp, ...] = field(init=False, repr=False)
     _offset: Floats = field(init=False, repr=False)
     _shifted: bool = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "customer", frozen_ints(self.customer))
-        for name in ("v", "q", "tau"):
-            object.__setattr__(self, name, frozen(getattr(self, name)))
+        put(self, customer=frozen_ints(self.customer))
+        put(self, v=frozen(self.v), q=frozen(self.q), tau=frozen(self.tau))
         rating = np.asarray(self.rating, dtype=np.float64)
-        object.__setattr__(self, "rating", frozen(rating if rating.ndim else np.full(self.tau.shape, rating)))
+        put(self, rating=frozen(rating if rating.ndim else np.full(self.tau.shape, rating)))
         problems = _problems(self)
         if problems:
             raise FeederInvalid(problems)
@@ -82,26 +59,15 @@ class Droop:
         steepest = np.zeros(self.tau.shape)
         for ramp in ramps:
             np.maximum(steepest, ramp.slope, out=steepest)
-        object.__setattr__(self, "_ramps", tuple(ramp.compact() for ramp in ramps))
-        object.__setattr__(self, "_offset", _compact(offset))
-        object.__setattr__(self, "_shifted", bool(np.any(offset)))
-        object.__setattr__(self, "slope", frozen(steepest))
-        object.__setattr__(self, "limit", frozen(np.max(np.abs(self.q), axis=1, initial=0.0)))
+        put(self, _ramps=tuple(ramp.compact() for ramp in ramps), _offset=_compact(offset))
+        put(self, _shifted=bool(np.any(offset)), slope=frozen(steepest))
+        put(self, limit=frozen(np.max(np.abs(self.q), axis=1, initial=0.0)))
 
     def __call__(self, z: Floats, rows: Ints | None = None) -> Floats:
         """K(z), chong2020 (17): reactive set-points of the inverters.
 
-        Parameters
-        ----------
-        z : (…, m), or the shape of `rows`
-            `vbar^2 - v^2` at each inverter, pu.
-        rows : (…)
-            Inverter of each entry of `z`; by default the last axis of `z` runs over all inverters.
-
-        Returns
-        -------
-        Floats
-            Same shape as `z`, pu of the feeder's base.
+        z (…, m), or the shape of `rows`: `vbar^2 - v^2` at each inverter, pu.
+        rows (…): inverter of each entry of `z`; by default the last axis of `z` runs over all inverters.
         """
         total: Floats | None = None
         for ramp in self._ramps:
@@ -135,13 +101,10 @@ class Droop:
         out: Droop = object.__new__(Droop)
         own = {name: getattr(self, name)[rows] for name in ("v", "q", "tau", "rating", "slope", "limit")}
         ramps = tuple(ramp.take(rows) for ramp in self._ramps)
-        object.__setattr__(out, "customer", frozen_ints(self.customer[rows]))
-        for name, values in own.items():
-            object.__setattr__(out, name, frozen(values))
-        object.__setattr__(out, "vbar", self.vbar)
-        object.__setattr__(out, "_ramps", ramps)
-        object.__setattr__(out, "_offset", _compact(_pick(self._offset, rows)))
-        object.__setattr__(out, "_shifted", bool(np.any(out._offset)))
+        put(out, customer=frozen_ints(self.customer[rows]), vbar=self.vbar, _ramps=ramps)
+        put(out, **{name: frozen(values) for name, values in own.items()})
+        put(out, _offset=_compact(_pick(self._offset, rows)))
+        put(out, _shifted=bool(np.any(out._offset)))
         return out
 
 
@@ -173,15 +136,7 @@ def _pick(values: Floats, rows: Ints | None) -> Floats:
 
 
 def _ramps(z: Floats, q: Floats) -> tuple[list[_Ramp], Floats]:
-    """Ramps with sum K, and the value of K between its two middle breakpoints.
-
-    Parameters
-    ----------
-    z : (m, 4)
-        Breakpoints, descending (they are ascending in v).
-    q : (m, 4)
-        Values at the breakpoints, non-increasing.
-    """
+    """Ramps with sum K, and the value of K between its two middle breakpoints."""
     # (upper breakpoint, lower breakpoint, zero of the ramp): injecting, middle, absorbing.
     ramps = []
     for left, right, zero in ((0, 1, 1), (1, 2, 2), (2, 3, 2)):
@@ -197,17 +152,12 @@ def _ramps(z: Floats, q: Floats) -> tuple[list[_Ramp], Floats]:
 def _problems(droop: Droop) -> list[Problem]:
     """Problems of the fields of `droop`."""
     count = droop.customer.size
-    shapes = (
-        ("v", droop.v.shape, (count, 4)),
-        ("q", droop.q.shape, (count, 4)),
-        ("tau", droop.tau.shape, (count,)),
-        ("rating", droop.rating.shape, (count,)),
+    out = wrong_shapes(
+        ("droop: v", droop.v.shape, (count, 4)),
+        ("droop: q", droop.q.shape, (count, 4)),
+        ("droop: tau", droop.tau.shape, (count,)),
+        ("droop: rating", droop.rating.shape, (count,)),
     )
-    out = [
-        Problem("shape", f"droop: {what} has shape {has}; expected {wants}")
-        for what, has, wants in shapes
-        if has != wants
-    ]
     if out:
         return out
     if not (np.isfinite(droop.vbar) and droop.vbar > 0):
@@ -253,25 +203,13 @@ def _row_problems(droop: Droop) -> tuple[tuple[Bools, Problem], ...]:
 
 @dataclass(frozen=True, slots=True)
 class DroopCurve:
-    """Preset curve in the units of standards.
-
-    Attributes
-    ----------
-    v
-        Breakpoints of the voltage, pu of nominal.
-    q
-        Reactive injection, fraction of the rated apparent power.
-    tau
-        Time constant of the first-order response, s.
-    source
-        Source of the numbers.
-    """
+    """Preset curve in the units of standards."""
 
     name: str
-    v: tuple[float, float, float, float]
-    q: tuple[float, float, float, float]
-    tau: float
-    source: str
+    v: tuple[float, float, float, float]  # breakpoints of the voltage, pu of nominal
+    q: tuple[float, float, float, float]  # reactive injection, fraction of the rated apparent power
+    tau: float  # time constant of the first-order response, s
+    source: str  # Source of the numbers
 
 
 def _volts(*volts: float) -> tuple[float, float, float, float]:
@@ -319,15 +257,7 @@ def preset(name: str) -> DroopCurve:
     %) become `tau = T / ln 10`; a PT1 of 10 s in VDE-AR-N 4105 means `3 tau = 10 s`; AS/NZS 4777.2 requires
     the complete response within 10 s, read here as 95 %, the same `3 tau = 10 s`.
 
-    Parameters
-    ----------
-    name
-        One of `PRESETS`.
-
-    Raises
-    ------
-    FeederInvalid
-        If `name` is not a preset.
+    Raises FeederInvalid if `name` is not a preset.
     """
     for curve in _CURVES:
         if curve.name == name:
@@ -350,30 +280,13 @@ def fleet(
 ) -> Droop:
     """Fleet of inverters with standard curves.
 
-    Parameters
-    ----------
-    customer : (m,)
-        Customer of each inverter.
-    names : (m,) or one
-        Preset of each inverter.
-    rated_kva : (m,)
-        Rated apparent power s, kVA.
-    base_kva
-        Three-phase base power of the feeder, kVA.
-    tau : (m,)
-        Time constants, s; those of the presets for NaN or without the array.
-    capability
-        `fixed`: limits of the preset. `circular`: the output is capped at `sqrt(s^2 - p_gen^2)`, chong2020
-        after (17); the slopes stay.
-    p_gen : (m,)
-        Active power that each inverter generates, pu of the feeder's base; required for `circular`.
-    vbar
-        Reference voltage, pu.
-
-    Raises
-    ------
-    FeederInvalid
-        If a preset does not exist, a rating is not positive, or an inverter generates above its rating.
+    rated_kva (m,): rated apparent power s, kVA.
+    tau (m,): time constants, s; those of the presets for NaN or without the array.
+    capability: `fixed`: limits of the preset. `circular`: the output is capped at `sqrt(s^2 - p_gen^2)`,
+        chong2020 after (17); the slopes stay.
+    p_gen (m,): active power that each inverter generates, pu of the feeder's base; required for `circular`.
+    Raises FeederInvalid if a preset does not exist, a rating is not positive, or an inverter generates above
+        its rating.
     """
     index = frozen_ints(customer)
     rated = np.asarray(rated_kva, dtype=np.float64)
@@ -425,10 +338,7 @@ def fleet(
 def capped(droop: Droop, limit: Floats) -> Droop:
     """The same fleet with capped `|q|`; the curve keeps its slopes in v and saturates earlier.
 
-    Parameters
-    ----------
-    limit : (m,)
-        Largest `|q|` of each inverter, pu, not negative.
+    limit (m,): largest `|q|` of each inverter, pu, not negative.
     """
     v, q = droop.v.copy(), np.clip(droop.q, -limit[:, None], limit[:, None])
     # Breakpoints 0 and 3 move inwards to the intersection of the outer ramps with the cap.
@@ -443,15 +353,8 @@ def capped(droop: Droop, limit: Floats) -> Droop:
 def voltage_curve(droop: Droop, v: Floats) -> Floats:
     """Reactive set-points of real inverters: curves piecewise linear in the voltage.
 
-    Parameters
-    ----------
-    v : (…, m)
-        Voltage at each inverter, pu.
-
-    Returns
-    -------
-    (…, m)
-        Reactive set-points, pu of the feeder's base.
+    v (…, m): voltage at each inverter, pu.
+    Returns (…, m): reactive set-points, pu of the feeder's base.
     """
     # The same ramps with -v in the place of z: descending breakpoints, non-decreasing curve.
     ramps, offset = _ramps(-droop.v, droop.q)
@@ -459,20 +362,3 @@ def voltage_curve(droop: Droop, v: Floats) -> Floats:
     for ramp in ramps:
         total += ramp.slope * (np.clip(-v, ramp.low, ramp.high) - ramp.zero)
     return total
-
-
-def curve_gap(droop: Droop) -> Floats:
-    """Largest distance of K(z) from `voltage_curve`, for every inverter.
-
-    Between breakpoints `v_a < v_b` with values `q_a >= q_b`, both interpolate linearly, one in `v^2` and one
-    in v; they differ by `(q_a - q_b) t (1 - t) (v_b - v_a) / (v_b + v_a)` with t the fraction of the interval
-    in v, hence by at most a quarter of the factor of `t (1 - t)`.
-
-    Returns
-    -------
-    (m,)
-        Bound of `|K(vbar^2 - v^2) - voltage_curve(v)|` over all v, pu of the feeder's base.
-    """
-    v, q = droop.v, droop.q
-    widths = (v[:, 1:] - v[:, :-1]) / (v[:, 1:] + v[:, :-1])
-    return np.asarray(np.max((q[:, :-1] - q[:, 1:]) * widths / 4.0, axis=1, initial=0.0))

@@ -18,25 +18,16 @@ from gridsec.arrays import Floats, Phasors
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sweeps:
-    """The first two sweeps at one operating point, for places in an array of any shape.
+    """The first two sweeps at one operating point, for places in an array of any shape."""
 
-    Attributes
-    ----------
-    flat, first, second
-        V0, V1 and V2.
-    power
-        |s| of each place, pu.
-    reach
-        Maps magnitudes of currents to the largest voltage changes that they can cause.
-    charge
-        Maps voltage changes to changes of the charging currents, as far as `reach` does not contain them.
-    """
-
+    # flat, first, second: V0, V1 and V2
     flat: Phasors
     first: Phasors
     second: Phasors
-    power: Floats
+    power: Floats  # |s| of each place, pu
+    # maps magnitudes of currents to the largest voltage changes that they can cause
     reach: Callable[[Floats], Floats]
+    # maps voltage changes to changes of the charging currents, as far as `reach` does not contain them
     charge: Callable[[Floats], Floats]
 
 
@@ -53,17 +44,10 @@ def bounds(sweeps: Sweeps, error: Floats) -> tuple[Floats, Floats]:
     (|s| + e) / (m min(m, l))`` times the change before it, the first of them by ``|V2 - V1| + c``. If M
     shrinks every change, their sum is finite, and the AC power flow is their limit (Banach).
 
-    Parameters
-    ----------
-    error
-        e, the largest change of the power of each place, pu.
-
-    Returns
-    -------
-    Floats, Floats
-        For every place: bounds on the change of ``|V2|^2`` less its linear part, and on
-        ``| |V|^2 - |V2|^2 |`` anywhere in the intervals, pu; infinite
-        where M does not shrink, near voltage collapse.
+    error: e, the largest change of the power of each place, pu.
+    Returns Floats, Floats: for every place: bounds on the change of ``|V2|^2`` less its linear part, and on
+        ``| |V|^2 - |V2|^2 |`` anywhere in the intervals, pu; infinite where M does not shrink, near voltage
+        collapse.
     """
     flat, first, second = np.abs(sweeps.flat), np.abs(sweeps.first), np.abs(sweeps.second)
     with np.errstate(all="ignore"):

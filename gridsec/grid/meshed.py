@@ -1,36 +1,23 @@
 """Feeders with closed ties, balanced or in three phases, and their power flow.
 
-`MeshedFeeder` and `PhasedMesh` are a tree and the lines that close loops in it. Both are represented by the
-inverse of their admittances, so that `bus_voltages`, `model_error_bound` and `interval_bounds` are the same.
-
-With W the voltage without load by the busbar, and ``Z = R + j X`` the inverse of the admittance
-matrix without the busbar, powers s and voltages V of the other buses obey
+`MeshedFeeder` and `PhasedMesh` are a tree and the lines that close loops in it. With W the voltage without
+load by the busbar, and ``Z = R + j X`` the inverse of the admittance matrix without the busbar, powers s and
+voltages V of the other places obey
 
     V = W + Z conj(s / V).
 
 To first order in s, and without charging, ``|V|^2 = v0^2 + 2 Re(Z conj(s)) = v0^2 + 2 R p + 2 X q``. On a
 tree Z has the sums of common paths, so that this is LinDistFlow. With ties its entries may be negative, but
-it stays symmetric, and both parts positive semidefinite. Derivations: docs/theory-mesh.md.
+it stays symmetric, and both parts positive semidefinite.
 
-The voltages of its places are ``V = W + Z conj(s / V)`` as on a balanced mesh, with Z the inverse of the
-admittances between phases of buses. With the busbar's phases a third of a turn apart, a = 1, e^{-j 2 pi / 3},
-e^{j 2 pi / 3}, the derivative of ``|V|^2`` at no load is ``2 Re(Z_kl a_l / a_k conj(s_l))``: on a tree
-LinDist3Flow. Z is symmetric; the rotated matrix is not. Derivations: docs/theory-mesh.md.
+In three phases Z is the inverse of the admittances between phases of buses. With the busbar's phases a third
+of a turn apart, a = 1, e^{-j 2 pi / 3}, e^{j 2 pi / 3}, the derivative of ``|V|^2`` at no load is ``2 Re(Z_kl
+a_l / a_k conj(s_l))``: on a tree LinDist3Flow. Z is symmetric; the rotated matrix is not. The methods of
+`Meshed` depend neither on the number of phases nor on symmetry or signs of Z.
 
-``V = W + Z conj(s / V)`` holds for the places of three phases as for the buses of a balanced feeder, with W
-the voltages without load by the busbar's phases. Nothing below depends on the number of phases, or needs Z
-to be symmetric or of any sign. Derivations: docs/theory-mesh.md.
-
-References
-----------
-.. [1] S. Bolognani, S. Zampieri, "On the existence and linear approximation of the power flow solution in
-   power distribution networks", IEEE Trans. Power Systems 31(1), 2016: the model, for networks of any form.
-.. [2] C. Wang, A. Bernstein, J.-Y. Le Boudec, M. Paolone, "Explicit conditions on existence and uniqueness
-   of load-flow solutions in distribution networks", IEEE Trans. Smart Grid 9(2), 2018: the fixed point.
-.. [3] C. Wang, A. Bernstein, J.-Y. Le Boudec, M. Paolone, "Explicit conditions on existence and uniqueness
-   of load-flow solutions in distribution networks", IEEE Trans. Smart Grid 9(2), 2018: the fixed point.
-.. [4] A. Bernstein, C. Wang, E. Dall'Anese, J.-Y. Le Boudec, C. Zhao, "Load flow in multiphase distribution
-   networks: existence, uniqueness, non-singularity and linear models", IEEE Trans. Power Systems 33(6), 2018.
+Source: docs/theory-mesh.md; bolognani2016 for the model of networks of any form; wang2018 for the fixed
+point; in three phases A. Bernstein, C. Wang, E. Dall'Anese, J.-Y. Le Boudec, C. Zhao, "Load flow in
+multiphase distribution networks", IEEE Trans. Power Systems 33(6), 2018.
 """
 
 from __future__ import annotations
@@ -42,14 +29,14 @@ import numpy as np
 from scipy.sparse import coo_array, csc_array, diags_array
 from scipy.sparse.linalg import splu
 
-from gridsec.arrays import Bools, Floats, Ints, Phasors, frozen, frozen_ints
-from gridsec.errors import FeederInvalid, Problem
+from gridsec.arrays import Bools, Floats, Ints, Phasors, frozen, frozen_ints, put
+from gridsec.errors import FeederInvalid, Problem, wrong_shapes
+from gridsec.grid import three_phase
 from gridsec.grid.intervals import Sweeps, bounds
 from gridsec.grid.network import Balanced, InPhases, LinDistFlow, OfMatrices, WithMatrices, unbounded
 from gridsec.grid.phased import PhasedFeeder
-from gridsec.grid.radial import Feeder, common_paths
-from gridsec.grid.three_phase import PHASES, ROTATION, ThreePhaseFeeder, customers_at, line_problems, named
-from gridsec.grid.three_phase import common_paths as phase_paths
+from gridsec.grid.radial import Feeder, common_paths, line_problems
+from gridsec.grid.three_phase import PHASES, ROTATION, ThreePhaseFeeder, customers_at, named
 from gridsec.grid.trees import OnTree
 
 
@@ -80,19 +67,10 @@ class Meshed(OfMatrices):
         voltages of the linear power flow and the square of its drops, and every step after it gains one order
         in the load, as a step of `Feeder.loss_correction` does.
 
-        Parameters
-        ----------
-        p, q : (…, N)
-            Net active and reactive injection of each customer (generation positive), pu.
-        v0_squared : (…) or scalar
-            Squared busbar voltage, pu; in three phases (3,), one for each, or scalar.
-        steps
-            Steps after the first iterate; 0 gives the linear power flow.
-
-        Returns
-        -------
-        (…, n)
-            Squared voltages, pu; on a balanced feeder n = b + 1.
+        p, q (…, N): net active and reactive injection of each customer (generation positive), pu.
+        v0_squared (…) or scalar: squared busbar voltage, pu; in three phases (3,), one for each, or scalar.
+        steps: steps after the first iterate; 0 gives the linear power flow.
+        Returns (…, n): squared voltages, pu; on a balanced feeder n = b + 1.
         """
         if not steps:
             base = self.without_drop(v0_squared)
@@ -118,19 +96,10 @@ class Meshed(OfMatrices):
         once; Re(conj(V) dV) is half the derivative of ``|V|^2``. Without load and charging it is R and X.
         O(N^3).
 
-        Parameters
-        ----------
-        p, q : (N,)
-            Net active and reactive injection of each customer at the operating point, pu.
-        v0_squared
-            As in `bus_voltages`.
-        steps
-            Steps to the voltages of the operating point, as in `bus_voltages`.
-
-        Returns
-        -------
-        LinDistFlow
-            The matrices; ``v^2`` then changes by ``2 R dp + 2 X dq``.
+        p, q (N,): net active and reactive injection of each customer at the operating point, pu.
+        v0_squared: as in `bus_voltages`.
+        steps: steps to the voltages of the operating point, as in `bus_voltages`.
+        Returns LinDistFlow: the matrices; ``v^2`` then changes by ``2 R dp + 2 X dq``.
         """
         s, idle, here = _start(self, p, q, v0_squared)
         V = here
@@ -157,19 +126,10 @@ class Meshed(OfMatrices):
         contain a solution of the AC power flow (Brouwer), and only one, because theta also bounds the
         contraction there. If theta is 1 or more, or rho above 0.1 |V2|, the bound is infinite.
 
-        Parameters
-        ----------
-        p, q, v0_squared
-            As in `bus_voltages`.
-
-        Returns
-        -------
-        (…, N)
-            Bound on the error of `v^2`, pu.
-
-        References
-        ----------
-        Wang et al. 2018, for the existence of the solution; the componentwise bound: docs/theory-mesh.md.
+        p, q, v0_squared: as in `bus_voltages`.
+        Returns (…, N): bound on the error of `v^2`, pu.
+        Source: Wang et al. 2018, for the existence of the solution; the componentwise bound:
+            docs/theory-mesh.md.
         """
         with np.errstate(all="ignore"):
             s, _, idle = _start(self, p, q, v0_squared)
@@ -215,73 +175,42 @@ class Meshed(OfMatrices):
 class MeshedFeeder(Balanced, Meshed, OnTree):
     """Feeder with closed loops. N customers, b + 1 buses, t ties.
 
-    Attributes
-    ----------
-    tree
-        The feeder without the ties: a radial feeder that reaches every bus.
-    ends : (t, 2)
-        Buses at both ends of each tie.
-    r, x : (t,)
-        Series resistance and reactance of each tie, pu.
-    charging : (t,)
-        Total shunt susceptance of each tie, pu; half of it at each end.
-    half : (b + 1,)
-        Derived. Shunt susceptance at the buses, pu.
-    R, X : (b + 1, N)
-        Derived. The linear power flow ``v^2 = v0^2 + 2 R p + 2 X q``, from a customer's power to every bus.
-    idle : (b + 1,)
-        Derived. Voltage of every bus without load, per voltage of the busbar; 1 without charging.
-    transfer : (b + 1, N)
-        Derived. From an injected current of a customer to the voltage of every bus, charging included, pu.
-    transfer_between : (N, N)
-        Derived. The same to the customers' voltages.
-    size : (N, N)
-        Derived. Its absolute values.
-
-    Raises
-    ------
-    FeederInvalid
-        With every problem found.
+    Raises FeederInvalid with every problem found.
     """
 
-    tree: Feeder
-    ends: Ints
+    tree: Feeder  # the feeder without the ties: a radial feeder that reaches every bus
+    ends: Ints  # (t, 2) buses at both ends of each tie
+    # r, x (t,): series resistance and reactance of each tie, pu
     r: Floats
     x: Floats
-    charging: Floats
-    half: Floats = field(init=False, repr=False)
+    charging: Floats  # (t,) total shunt susceptance of each tie, pu; half of it at each end
+    half: Floats = field(init=False, repr=False)  # (b + 1,) shunt susceptance at the buses, pu
+    # R, X (b + 1, N): the linear power flow ``v^2 = v0^2 + 2 R p + 2 X q``, from a customer's power to every
+    # bus
     R: Floats = field(init=False, repr=False)
     X: Floats = field(init=False, repr=False)
+    # (b + 1,) voltage of every bus without load, per voltage of the busbar; 1 without charging
     idle: Phasors = field(init=False, repr=False)
+    # (b + 1, N) from an injected current of a customer to the voltage of every bus, charging included, pu
     transfer: Phasors = field(init=False, repr=False)
-    transfer_between: Phasors = field(init=False, repr=False)
-    size: Floats = field(init=False, repr=False)
+    transfer_between: Phasors = field(init=False, repr=False)  # (N, N) the same to the customers' voltages
+    size: Floats = field(init=False, repr=False)  # (N, N) its absolute values
 
     def __post_init__(self) -> None:
-        def put(name: str, value: object) -> None:
-            object.__setattr__(self, name, value)
-
-        for name in ("r", "x", "charging"):
-            put(name, frozen(getattr(self, name)))
-        put("ends", frozen_ints(self.ends))
+        put(self, r=frozen(self.r), x=frozen(self.x), charging=frozen(self.charging))
+        put(self, ends=frozen_ints(self.ends))
         problems = _problems(self)
         if problems:
             raise FeederInvalid(problems)
-        half = self.tree.half.copy()
-        np.add.at(half, self.ends, 0.5 * self.charging[:, None])
-        put("half", frozen(half))
+        put(self, half=_shunts(self.tree.half, self.ends, self.charging))
         Z = impedances(self, self.bus)
-        put("R", frozen(Z.real))
-        put("X", frozen(Z.imag))
-        idle, transfer = _charged(self) if half.any() else (np.ones(half.size, np.complex128), Z)
-        for name, values in (
-            ("idle", idle),
-            ("transfer", transfer),
-            ("transfer_between", transfer[self.bus]),
-        ):
-            values.flags.writeable = False
-            put(name, values)
-        put("size", frozen(np.abs(self.transfer_between)))
+        idle, transfer = np.ones((len(Z), 1), dtype=np.complex128), Z
+        if self.half.any():
+            injected = np.zeros(Z.shape, dtype=np.complex128)
+            injected[self.bus, np.arange(self.bus.size)] = 1.0
+            idle, transfer = _charged(admittance(self), np.arange(1, len(Z)), 1, injected)
+        put(self, R=frozen(Z.real), X=frozen(Z.imag), idle=idle[:, 0], transfer=transfer)
+        put(self, transfer_between=transfer[self.bus], size=np.abs(transfer[self.bus]))
 
     @property
     def bus(self) -> Ints:
@@ -309,17 +238,12 @@ class MeshedFeeder(Balanced, Meshed, OnTree):
 def _problems(feeder: MeshedFeeder) -> list[Problem]:
     """Problems of the ties against the tree."""
     count, buses = feeder.r.size, len(feeder.tree.buses)
-    expected = (
+    out = wrong_shapes(
         ("ends", feeder.ends.shape, (count, 2)),
         ("r", feeder.r.shape, (count,)),
         ("x", feeder.x.shape, (count,)),
         ("charging", feeder.charging.shape, (count,)),
     )
-    out = [
-        Problem("shape", f"{what} has shape {has}; expected {wants}")
-        for what, has, wants in expected
-        if has != wants
-    ]
     if out:
         return out
     for k, (one, other) in enumerate(feeder.ends.tolist()):
@@ -330,14 +254,7 @@ def _problems(feeder: MeshedFeeder) -> list[Problem]:
         )
         if one == other:
             out.append(Problem("self-loop", f"tie {k}: both ends are bus {one}; a line needs two"))
-        for what in ("r", "x", "charging"):
-            value = getattr(feeder, what)[k]
-            if not (np.isfinite(value) and value >= 0):
-                out.append(
-                    Problem("negative", f"tie {k}: {what} is {value}; it must be finite and not negative")
-                )
-        if feeder.r[k] == 0 and feeder.x[k] == 0:
-            out.append(Problem("zero-impedance", f"tie {k}: r and x are both 0; fuse the two buses"))
+        out.extend(line_problems(f"tie {k}", feeder.r[k], feeder.x[k], feeder.charging[k]))
     return out
 
 
@@ -351,15 +268,7 @@ def impedances(feeder: MeshedFeeder, buses: Ints) -> Phasors:
 
     with the impedances of the t loops in the middle: no linear system of the feeder's size is solved.
 
-    Parameters
-    ----------
-    buses : (k,)
-        Buses of injected currents.
-
-    Returns
-    -------
-    (b + 1, k)
-        Rise of the voltage of every bus for each of them, pu; 0 at the busbar.
+    Returns (b + 1, k): rise of the voltage of every bus for each of them, pu; 0 at the busbar.
     """
     tree = feeder.tree
 
@@ -386,15 +295,24 @@ def admittance(feeder: MeshedFeeder) -> csc_array:
     return csc_array(incidence.T @ diags_array(1.0 / z) @ incidence + diags_array(1j * feeder.half))
 
 
-def _charged(feeder: MeshedFeeder) -> tuple[Phasors, Phasors]:
-    """Voltages without load, and effects of the customers' currents, charging included."""
-    Y = admittance(feeder)
-    below = splu(csc_array(Y[1:, 1:]))
-    idle = np.ones(len(feeder.buses), dtype=np.complex128)
-    idle[1:] = below.solve(-Y[1:, [0]].toarray().ravel())
-    transfer, injected = np.zeros((2, idle.size, feeder.bus.size), dtype=np.complex128)
-    injected[feeder.bus, np.arange(feeder.bus.size)] = 1.0
-    transfer[1:] = below.solve(injected[1:])
+def _shunts(of_tree: Floats, ends: Ints, charging: Floats) -> Floats:
+    """Shunt susceptance at the buses, with half the charging of each tie at each end."""
+    half = of_tree.copy()
+    np.add.at(half, ends, 0.5 * charging[:, None])
+    return half
+
+
+def _charged(Y: csc_array, free: Ints, busbar: int, injected: Phasors) -> tuple[Phasors, Phasors]:
+    """Voltages without load (n, b), and effects of the customers' currents `injected` (n, N), with charging.
+
+    Y: admittances (n, n). free: places with a voltage to solve for; the first b = `busbar` are given.
+    """
+    rows = Y.tocsr()[free]
+    solver = splu(csc_array(rows[:, free]))
+    idle: Phasors = np.eye(injected.shape[0], busbar, dtype=np.complex128)
+    idle[free] = solver.solve(-rows[:, :busbar].toarray())
+    transfer = np.zeros(injected.shape, dtype=np.complex128)
+    transfer[free] = solver.solve(injected[free])
     return idle, transfer
 
 
@@ -402,89 +320,50 @@ def _charged(feeder: MeshedFeeder) -> tuple[Phasors, Phasors]:
 class PhasedMesh(InPhases, Meshed, OnTree):
     """Feeder of single-phase customers with closed ties. N customers, t ties, n = 3 (b + 1) places.
 
-    Attributes
-    ----------
-    tree
-        The feeder without the ties, with customers of one phase; it contains every phase of every bus.
-    ends : (t, 2)
-        Buses at both ends of each tie.
-    phases : (t, 3)
-        Phases a, b, c of each tie.
-    z : (t, 3, 3)
-        Series impedance of each tie, pu; symmetric, rows and columns of absent phases are 0.
-    charging : (t, 3, 3)
-        Total shunt susceptance of each tie, pu; half of it at each end.
-    bus : (N,)
-        Derived. Place of each customer.
-    buses : (n,)
-        Derived. Identifiers of the places, the busbar's three first.
-    half : (b + 1, 3, 3)
-        Derived. Shunt susceptance at the buses, pu.
-    R, X : (n, N)
-        Derived. The linear power flow ``v^2 = v0^2 + 2 R p + 2 X q``: from a customer's power, in units of
-        the three-phase base S, to the squared voltage of every place, pu. For an absent phase, that of its
-        end in the tree.
-    idle : (n, 3)
-        Derived. Voltage of every place without load, per voltage of the busbar; without charging that of its
-        phase.
-    transfer : (n, N)
-        Derived. From an injected current of a customer, in units of S, to the voltage of every place,
-        charging included, pu.
-    transfer_between : (N, N)
-        Derived. The same to the customers' voltages.
-    size : (N, N)
-        Derived. Its absolute values.
-
-    Raises
-    ------
-    FeederInvalid
-        With every problem found.
+    Raises FeederInvalid with every problem found.
     """
 
+    # the feeder without the ties, with customers of one phase; it contains every phase of every bus
     tree: ThreePhaseFeeder
-    ends: Ints
-    phases: Bools
+    ends: Ints  # (t, 2) buses at both ends of each tie
+    phases: Bools  # (t, 3) phases a, b, c of each tie
+    # (t, 3, 3) series impedance of each tie, pu; symmetric, rows and columns of absent phases are 0
     z: Phasors
-    charging: Floats
-    bus: Ints = field(init=False, repr=False)
+    charging: Floats  # (t, 3, 3) total shunt susceptance of each tie, pu; half of it at each end
+    bus: Ints = field(init=False, repr=False)  # (N,) place of each customer
+    # (n,) identifiers of the places, the busbar's three first
     buses: tuple[str, ...] = field(init=False, repr=False)
-    half: Floats = field(init=False, repr=False)
+    half: Floats = field(init=False, repr=False)  # (b + 1, 3, 3) shunt susceptance at the buses, pu
+    # R, X (n, N): The linear power flow ``v^2 = v0^2 + 2 R p + 2 X q``: from a customer's power, in units of
+    # the three-phase base S, to the squared voltage of every place, pu. For an absent phase, that of its end
+    # in the tree.
     R: Floats = field(init=False, repr=False)
     X: Floats = field(init=False, repr=False)
+    # (n, 3) voltage of every place without load, per voltage of the busbar; without charging that of its
+    # phase
     idle: Phasors = field(init=False, repr=False)
+    # (n, N) from an injected current of a customer, in units of S, to the voltage of every place, charging
+    # included, pu
     transfer: Phasors = field(init=False, repr=False)
-    transfer_between: Phasors = field(init=False, repr=False)
-    size: Floats = field(init=False, repr=False)
+    transfer_between: Phasors = field(init=False, repr=False)  # (N, N) the same to the customers' voltages
+    size: Floats = field(init=False, repr=False)  # (N, N) its absolute values
 
     def __post_init__(self) -> None:
-        def put(name: str, value: object) -> None:
-            if isinstance(value, np.ndarray):
-                value.flags.writeable = False
-            object.__setattr__(self, name, value)
-
-        put("ends", frozen_ints(self.ends))
-        put("phases", np.array(self.phases, dtype=np.bool_))
-        put("z", np.array(self.z, dtype=np.complex128))
-        put("charging", frozen(self.charging))
+        put(self, ends=frozen_ints(self.ends), phases=np.array(self.phases, dtype=np.bool_))
+        put(self, z=np.array(self.z, dtype=np.complex128), charging=frozen(self.charging))
         problems = _phased_problems(self)
         if problems:
             raise FeederInvalid(problems)
         radial = PhasedFeeder(self.tree)
-        put("bus", radial.bus)
-        put("buses", radial.buses)
-        half = self.tree.half.copy()
-        np.add.at(half, self.ends, 0.5 * self.charging[:, None])
-        put("half", half)
+        put(self, bus=radial.bus, buses=radial.buses)
+        put(self, half=_shunts(self.tree.half, self.ends, self.charging))
         Z = _impedances(self)
         turned = Z * (ROTATION[self.tree.phase] / np.tile(ROTATION, len(self.tree.buses))[:, None])
-        put("R", frozen(turned.real))
-        put("X", frozen(turned.imag))
-        quiet = np.tile(np.eye(3, dtype=np.complex128), (len(self.tree.buses), 1))
-        idle, transfer = _phased_charged(self) if half.any() else (quiet, Z)
-        put("idle", idle)
-        put("transfer", transfer)
-        put("transfer_between", transfer[self.bus])
-        put("size", np.abs(self.transfer_between))
+        idle, transfer = np.tile(np.eye(3, dtype=np.complex128), (len(self.tree.buses), 1)), Z
+        if self.half.any():
+            idle, transfer = _phased_charged(self)
+        put(self, R=frozen(turned.real), X=frozen(turned.imag), idle=idle, transfer=transfer)
+        put(self, transfer_between=transfer[self.bus], size=np.abs(transfer[self.bus]))
 
     def without_load(self, v0_squared: Floats | float) -> Phasors:
         """Voltage of every place without load, (n,), pu."""
@@ -502,17 +381,12 @@ class PhasedMesh(InPhases, Meshed, OnTree):
 def _phased_problems(feeder: PhasedMesh) -> list[Problem]:
     """Problems of the ties against the tree."""
     count, tree = len(feeder.ends), feeder.tree
-    expected = (
+    out = wrong_shapes(
         ("ends", feeder.ends.shape, (count, 2)),
         ("phases", feeder.phases.shape, (count, 3)),
         ("z", feeder.z.shape, (count, 3, 3)),
         ("charging", feeder.charging.shape, (count, 3, 3)),
     )
-    out = [
-        Problem("shape", f"{what} has shape {has}; expected {wants}")
-        for what, has, wants in expected
-        if has != wants
-    ]
     if out:
         return out
     last = len(tree.buses) - 1
@@ -535,7 +409,7 @@ def _phased_problems(feeder: PhasedMesh) -> list[Problem]:
             out.append(Problem("self-loop", f"{where}: both ends are bus {one}; a line needs two"))
         if not here.any():
             out.append(Problem("no-phase", f"{where}: it has no phase; expected one, two or three"))
-        lines = line_problems(feeder.z[k], feeder.charging[k], here)
+        lines = three_phase.line_problems(feeder.z[k], feeder.charging[k], here)
         out.extend(Problem(problem.code, f"{where}: {problem}") for problem in lines)
     return out
 
@@ -550,7 +424,7 @@ def _impedances(feeder: PhasedMesh) -> Phasors:
     tree = feeder.tree
 
     def paths(bus: Ints, phase: Ints) -> Phasors:
-        found = phase_paths(tree, tree.z, bus, phase)
+        found = three_phase.common_paths(tree, tree.z, bus, phase)
         return np.moveaxis(found, 0, 1).reshape(3 * len(tree.buses), bus.size)
 
     Z = paths(tree.at, tree.phase)
@@ -574,10 +448,7 @@ _SINGULAR = 1e13
 def phased_admittance(feeder: PhasedMesh) -> csc_array:
     """Admittance matrix of all places, charging included, (n, n), pu; rows of absent phases are empty.
 
-    Raises
-    ------
-    FeederInvalid
-        If the impedances of a line have no inverse.
+    Raises FeederInvalid if the impedances of a line have no inverse.
     """
     tree = feeder.tree
     lines = np.vstack([np.column_stack([tree.parent, np.arange(1, len(tree.buses))]), feeder.ends])
@@ -605,16 +476,10 @@ def phased_admittance(feeder: PhasedMesh) -> csc_array:
 
 def _phased_charged(feeder: PhasedMesh) -> tuple[Phasors, Phasors]:
     """Voltages without load, and effects of the customers' currents, charging included."""
-    Y, tree = phased_admittance(feeder).tocsr(), feeder.tree
-    free = np.flatnonzero(tree.phases.ravel())
-    free = free[free >= len(PHASES)]
-    solver = splu(csc_array(Y[free][:, free]))
-    idle = np.zeros((len(feeder.buses), 3), dtype=np.complex128)
-    idle[:3] = np.eye(3)
-    idle[free] = solver.solve(-Y[free][:, :3].toarray())
-    transfer, injected = np.zeros((2, len(idle), feeder.bus.size), dtype=np.complex128)
+    tree, free = feeder.tree, np.flatnonzero(feeder.tree.phases.ravel())
+    injected = np.zeros((len(feeder.buses), feeder.bus.size), dtype=np.complex128)
     injected[feeder.bus, np.arange(feeder.bus.size)] = 3.0
-    transfer[free] = solver.solve(injected[free])
+    idle, transfer = _charged(phased_admittance(feeder), free[free >= len(PHASES)], len(PHASES), injected)
     # Beyond the end of a phase, its voltage is that at the end.
     stands = np.arange(len(idle)).reshape(-1, 3)
     for k, above in enumerate(tree.parent.tolist(), 1):

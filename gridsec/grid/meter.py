@@ -1,8 +1,6 @@
 """Accuracy of meters and the largest error of a consistent reading.
 
-References
-----------
-IEC 62053 for accuracy classes; docs/theory-detection.md.
+Source: IEC 62053 for accuracy classes; docs/theory-detection.md.
 """
 
 from __future__ import annotations
@@ -11,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gridsec.arrays import Floats, Ints, frozen
+from gridsec.arrays import Floats, Ints, frozen, put
 from gridsec.errors import Problem, raise_if_any
 
 
@@ -22,40 +20,22 @@ class MeterAccuracy:
     A reading is ``v (1 + c) + r + n`` with a fixed unknown relative bias ``|c| <= class_fraction``,
     rounding ``|r| <= resolution / 2`` and white jitter ``n`` of standard deviation ``jitter``.
 
-    Attributes
-    ----------
-    class_fraction : (p,)
-        Accuracy class as a fraction of the reading: 0.005 for class 0.5.
-    resolution : (p,)
-        Step of the register, pu of the nominal voltage.
-    jitter : (p,)
-        Standard deviation from one reading to the next, pu of the nominal voltage.
-    busbar_class
-        Class of the busbar meter, fraction of the reading.
-    busbar_resolution
-        Its resolution, pu.
-    busbar_jitter
-        Its jitter, pu.
-
-    Raises
-    ------
-    ValueError
-        With every problem found.
+    Raises ValueError with every problem found.
     """
 
-    class_fraction: Floats
-    resolution: Floats
-    jitter: Floats
-    busbar_class: float
-    busbar_resolution: float
-    busbar_jitter: float
+    class_fraction: Floats  # (p,) accuracy class as a fraction of the reading: 0.005 for class 0.5
+    resolution: Floats  # (p,) step of the register, pu of the nominal voltage
+    jitter: Floats  # (p,) standard deviation from one reading to the next, pu of the nominal voltage
+    busbar_class: float  # class of the busbar meter, fraction of the reading
+    busbar_resolution: float  # its resolution, pu
+    busbar_jitter: float  # its jitter, pu
 
     def __post_init__(self) -> None:
         """Check shapes and signs; a wrong description is a programming error, not an online outcome."""
         p, problems = np.shape(self.class_fraction), []
         for name in ("class_fraction", "resolution", "jitter"):
             value = frozen(getattr(self, name))
-            object.__setattr__(self, name, value)
+            put(self, **{name: value})
             if value.ndim != 1 or value.shape != p:
                 problems.append(
                     Problem("shape", f"{name} must have one entry per meter, got shape {value.shape}")
@@ -76,10 +56,8 @@ def steady_rounding(accuracy: MeterAccuracy) -> Floats:
     standard deviation s its k-th harmonic shrinks by ``exp(-2 pi^2 k^2 s^2 / D^2)``. So the error is at most
     ``D / pi sum_k exp(-2 pi^2 k^2 s^2 / D^2) / k``, and never more than half a step.
 
-    Returns
-    -------
-    (p,)
-        Bounds, pu of the nominal voltage; at the level of floating-point rounding for 0.1 V and 0.05 %.
+    Returns (p,): bounds, pu of the nominal voltage; at the level of floating-point rounding for 0.1 V and
+        0.05 %.
     """
     step = accuracy.resolution
     ratio = accuracy.jitter / np.where(step > 0.0, step, 1.0)
@@ -94,17 +72,9 @@ def reading_error(accuracy: MeterAccuracy, v2: Floats, sigmas: float) -> Floats:
 
     `(v + e)^2 - v^2 = 2 v e + e^2` with `e = class v + resolution / 2 + sigmas jitter`.
 
-    Parameters
-    ----------
-    v2 : (p,)
-        Largest possible squared voltage at the meter, pu.
-    sigmas
-        Jitter allowance in standard deviations.
-
-    Returns
-    -------
-    (p,)
-        Bounds, squared pu.
+    v2 (p,): largest possible squared voltage at the meter, pu.
+    sigmas: jitter allowance in standard deviations.
+    Returns (p,): bounds, squared pu.
     """
     v = np.sqrt(np.maximum(v2, 0.0))
     e = accuracy.class_fraction * v + 0.5 * accuracy.resolution + sigmas * accuracy.jitter
@@ -118,12 +88,7 @@ def busbar_error(accuracy: MeterAccuracy, v0_squared: float, sigmas: float) -> f
     `|r - v| = |c r + n| / (1 + c) <= e = (class |r| + resolution / 2 + sigmas jitter) / (1 - class)`,
     and `|r^2 - v^2| <= e (2 r + e)`.
 
-    Parameters
-    ----------
-    v0_squared
-        Squared reading, pu.
-    sigmas
-        As in `reading_error`.
+    v0_squared: squared reading, pu.
     """
     if accuracy.busbar_class >= 1.0:
         return float("inf")  # no bound from a class of 100 % or more
@@ -136,17 +101,8 @@ def busbar_error(accuracy: MeterAccuracy, v0_squared: float, sigmas: float) -> f
 def told_error(accuracy: MeterAccuracy, y: Floats, sigmas: float) -> Floats:
     """Largest distance of the true voltage from a squared reading, per meter; compare `busbar_error`.
 
-    Parameters
-    ----------
-    y : (p,)
-        Squared readings, pu.
-    sigmas
-        As in `reading_error`.
-
-    Returns
-    -------
-    (p,)
-        Bounds, squared pu; larger than any voltage for a class of 100 % or more.
+    y (p,): squared readings, pu.
+    Returns (p,): bounds, squared pu; larger than any voltage for a class of 100 % or more.
     """
     return ToldError.over(accuracy, np.arange(y.size), sigmas).of(y)
 
@@ -157,14 +113,9 @@ _NOTHING = 4.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ToldError:
-    """Bound of the true voltage around readings, prepared for repeated use; k meters.
+    """Bound of the true voltage around readings, prepared for repeated use; k meters."""
 
-    Attributes
-    ----------
-    slope, floor : (k,)
-        Voltage error in pu: `slope v + floor` for a reading v.
-    """
-
+    # slope, floor (k,): voltage error in pu: `slope v + floor` for a reading v
     slope: Floats
     floor: Floats
 
@@ -172,12 +123,7 @@ class ToldError:
     def over(cls, accuracy: MeterAccuracy, which: Ints, sigmas: float) -> ToldError:
         """Prepare the bound for a selection of meters.
 
-        Parameters
-        ----------
-        accuracy, sigmas
-            As in `told_error`.
-        which : (k,)
-            Indices of meters; repetitions allowed.
+        which (k,): indices of meters; repetitions allowed.
         """
         part = accuracy.class_fraction[which]
         even = 0.5 * accuracy.resolution[which] + sigmas * accuracy.jitter[which]

@@ -33,18 +33,12 @@ class Power(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinDistFlow:
-    """The linear power flow `v^2 = v0^2 + 2 R p + 2 X q` of one feeder.
+    """The linear power flow `v^2 = v0^2 + 2 R p + 2 X q` of one feeder."""
 
-    Attributes
-    ----------
-    R, X : (N, N)
-        Resistance and reactance common to the paths of two customers to the busbar, pu.
-    R_bus, X_bus : (n, N)
-        The same for a place and a customer.
-    """
-
+    # R, X (N, N): resistance and reactance common to the paths of two customers to the busbar, pu
     R: Floats
     X: Floats
+    # R_bus, X_bus (n, N): the same for a place and a customer
     R_bus: Floats
     X_bus: Floats
 
@@ -109,19 +103,10 @@ class Network(Protocol):
     def bus_voltages(self, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 1) -> Floats:
         """Squared voltage of every place, corrected for losses; O(n), on a meshed feeder O(n N).
 
-        Parameters
-        ----------
-        p, q : (…, N)
-            Net active and reactive injection of each customer (generation positive), pu.
-        v0_squared
-            Squared busbar voltage, pu; in three phases scalar or (3,).
-        steps
-            Corrections of the linear power flow; 0 gives the linear one.
-
-        Returns
-        -------
-        (…, n)
-            Squared voltages, pu.
+        p, q (…, N): net active and reactive injection of each customer (generation positive), pu.
+        v0_squared: squared busbar voltage, pu; in three phases scalar or (3,).
+        steps: corrections of the linear power flow; 0 gives the linear one.
+        Returns (…, n): squared voltages, pu.
         """
 
     def loss_correction(self, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 1) -> Floats:
@@ -142,20 +127,11 @@ class Network(Protocol):
     ) -> tuple[Floats, Floats, Floats]:
         """`loss_correction` of one operating point, and its errors for powers within intervals.
 
-        Parameters
-        ----------
-        p, q, v0_squared
-            As in `bus_voltages`.
-        p_error, q_error : (N,)
-            Largest errors of the powers, pu.
-        steps
-            Corrections, at least 1.
-
-        Returns
-        -------
-        (n,), (N,), (N,)
-            Correction at every place, its change within the intervals, and the distance of its first step
-            from the AC power flow, pu; not finite without a bound, as for an invalid busbar voltage.
+        p, q, v0_squared: as in `bus_voltages`.
+        p_error, q_error (N,): largest errors of the powers, pu.
+        Returns (n,), (N,), (N,): correction at every place, its change within the intervals, and the distance
+            of its first step from the AC power flow, pu; not finite without a bound, as for an invalid busbar
+            voltage.
         """
 
     def reach(self, p: Floats, q: Floats) -> Floats:
@@ -281,18 +257,10 @@ class WithMatrices(Network, Protocol):
     ) -> tuple[Floats, Floats]:
         """Error bounds of the loss correction for powers within intervals.
 
-        Parameters
-        ----------
-        p, q : (N,), v0_squared
-            As in `bus_voltages`, one operating point.
-        p_error, q_error : (N,)
-            Largest errors of the powers, pu.
-
-        Returns
-        -------
-        (N,), (N,)
-            Change of the correction, and distance of its first step from the AC power flow, pu; infinite
-            without a bound.
+        p, q: as in `bus_voltages`, one operating point.
+        p_error, q_error (N,): largest errors of the powers, pu.
+        Returns (N,), (N,): change of the correction, and distance of its first step from the AC power flow,
+            pu; infinite without a bound.
         """
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gridsec.arrays import Floats, Ints, frozen, frozen_ints
+from gridsec.arrays import Floats, Ints, frozen, frozen_ints, put
 from gridsec.errors import FeederInvalid, Problem
 from gridsec.grid import three_phase
 from gridsec.grid.network import InPhases, OfMatrices, unbounded
@@ -23,27 +23,15 @@ from gridsec.grid.trees import OnTree
 class PhasedFeeder(InPhases, OfMatrices, OnTree):
     """Feeder of single-phase customers. N customers, b + 1 buses, n = 3 (b + 1) places.
 
-    Attributes
-    ----------
-    tree
-        The feeder in three phases; each of its customers is connected to one of them.
-    bus : (N,)
-        Derived. Place of each customer.
-    buses : (n,)
-        Derived. Identifiers of the places, the busbar's three first.
-    R, X : (n, N)
-        Derived. The linear power flow ``v^2 = v0^2 + 2 R p + 2 X q``: from a customer's power, in units of
-        S, to the squared voltage of every place, pu. For an absent phase, that of its end.
-
-    Raises
-    ------
-    FeederInvalid
-        If customers have several phases; lists them all.
+    Raises FeederInvalid if customers have several phases; lists them all.
     """
 
-    tree: ThreePhaseFeeder
-    bus: Ints = field(init=False, repr=False)
+    tree: ThreePhaseFeeder  # the feeder in three phases; each of its customers is connected to one of them
+    bus: Ints = field(init=False, repr=False)  # (N,) place of each customer
+    # (n,) identifiers of the places, the busbar's three first
     buses: tuple[str, ...] = field(init=False, repr=False)
+    # R, X (n, N): The linear power flow ``v^2 = v0^2 + 2 R p + 2 X q``: from a customer's power, in units of
+    # S, to the squared voltage of every place, pu. For an absent phase, that of its end.
     R: Floats = field(init=False, repr=False)
     X: Floats = field(init=False, repr=False)
 
@@ -61,29 +49,18 @@ class PhasedFeeder(InPhases, OfMatrices, OnTree):
             )
         model = lindist3flow(tree)
         names = tuple(f"{bus}.{phase}" for bus in tree.buses for phase in PHASES)
-        object.__setattr__(self, "bus", frozen_ints(len(PHASES) * tree.at + tree.phase))
-        object.__setattr__(self, "buses", names)
+        put(self, bus=frozen_ints(len(PHASES) * tree.at + tree.phase), buses=names)
         for name, found in (("R", model.R_bus), ("X", model.X_bus)):
             # 1 pu of the power of a phase is a third of S.
             by_place = 3.0 * np.moveaxis(found, 0, 1).reshape(len(names), tree.at.size)
-            object.__setattr__(self, name, frozen(by_place))
+            put(self, **{name: frozen(by_place)})
 
     def bus_voltages(self, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 1) -> Floats:
         """Squared voltage of every place, corrected for losses, charging and unequal phases.
 
-        Parameters
-        ----------
-        p, q : (…, N)
-            Net active and reactive injection of each customer (generation positive), pu.
-        v0_squared : (…, 3) or scalar
-            Squared busbar voltage of each phase, pu.
-        steps
-            As in `gridsec.grid.three_phase.loss_correction`; 0 gives LinDist3Flow.
-
-        Returns
-        -------
-        (…, n)
-            Squared voltages, pu.
+        p, q (…, N): net active and reactive injection of each customer (generation positive), pu.
+        v0_squared (…, 3) or scalar: squared busbar voltage of each phase, pu.
+        steps: as in `gridsec.grid.three_phase.bus_voltages`; 0 gives LinDist3Flow.
         """
         given = np.asarray(v0_squared, dtype=np.float64)
         v0 = np.broadcast_to(given, (*given.shape[:-1], len(PHASES)))

@@ -3,117 +3,56 @@
 Everything is balanced three-phase, per phase, in per unit of the base voltage (phase to neutral) and
 of the three-phase base power, so that powers in kW of all phases together divide by `base_kva`.
 
-References
-----------
-.. [1] M. E. Baran, F. F. Wu, "Network reconfiguration in distribution systems for loss reduction and
-   load balancing", IEEE Trans. Power Delivery 4(2), 1989: the DistFlow branch equations.
-.. [2] chong2020, equation (15): the linear form, with service drops as leaf edges of the tree.
+Source: baranwu1989 (branch equations); chong2020 (15), the linear form, with service drops as leaf edges of
+the tree.
 """
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass, field, replace
 from math import prod
 
 import numpy as np
 
-from gridsec.arrays import Floats, Ints, all_of, any_of, frozen, frozen_ints
-from gridsec.errors import FeederInvalid, InputInvalid, Problem
+from gridsec.arrays import Floats, Ints, all_of, any_of, frozen, frozen_ints, put
+from gridsec.errors import FeederInvalid, InputInvalid, Problem, wrong_shapes
 from gridsec.grid.network import Balanced, LinDistFlow, Power
-from gridsec.grid.trees import below, from_root, shrinking, walk
+from gridsec.grid.trees import Walk, at_ends, base_problems, below, duplicates, from_root, shrinking, walk
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Feeder(Balanced):
     """Radial feeder: a tree of b branches and b + 1 buses, rooted at the metered busbar (bus 0).
 
-    Attributes
-    ----------
-    name
-        Name of the feeder.
-    parent : (b,)
-        Bus that feeds bus k + 1; `parent[k] <= k`, so buses are in topological order.
-    r, x : (b,)
-        Series resistance and reactance of the branch into bus k + 1, pu.
-    bus : (N,)
-        Bus of each customer. Several customers may share one; bus 0 is allowed.
-    customers : (N,)
-        Identifiers of the customers.
-    buses : (b + 1,)
-        Identifiers of the buses, the busbar first.
-    base_volt
-        Nominal phase-to-neutral voltage (1 pu), V.
-    base_kva
-        Three-phase base power (1 pu), kVA.
-    charging : (b,)
-        Total shunt susceptance of the branch into bus k + 1, pu; half of it at each end.
-    start, stop : (b + 1,)
-        Derived. Depth-first numbering: bus k and the buses fed through it are those with `start` in
-        `[start[k], stop[k])`.
-    order : (b + 1,)
-        Derived. The buses by these numbers.
-    depth : (b + 1,)
-        Derived. Number of branches between bus k and the busbar.
-    enter, leave : (b + 1,)
-        Derived. Steps of a walk around the tree at which it reaches a bus first, and has left it.
-    inside : (b + 1, b + 1) or None
-        Derived. 1 where the bus of the row is fed through that of the column; None for large trees.
-    half : (b + 1,)
-        Derived. Shunt susceptance at the buses, pu.
-    charges
-        Derived. True if any bus has charging.
-    squared : (b,)
-        Derived. ``r^2 + x^2``, pu.
-    alone
-        Derived. True if no two customers share a bus.
-
-    Raises
-    ------
-    FeederInvalid
-        With every problem found.
+    Raises FeederInvalid with every problem found.
     """
 
-    name: str
-    parent: Ints
+    name: str  # name of the feeder
+    parent: Ints  # (b,) bus that feeds bus k + 1; `parent[k] <= k`, so buses are in topological order
+    # r, x (b,): series resistance and reactance of the branch into bus k + 1, pu
     r: Floats
     x: Floats
-    bus: Ints
-    customers: tuple[str, ...]
-    buses: tuple[str, ...]
-    base_volt: float
-    base_kva: float
-    charging: Floats
-    start: Ints = field(init=False, repr=False)
-    stop: Ints = field(init=False, repr=False)
-    order: Ints = field(init=False, repr=False)
-    depth: Ints = field(init=False, repr=False)
-    enter: Ints = field(init=False, repr=False)
-    leave: Ints = field(init=False, repr=False)
-    inside: Floats | None = field(init=False, repr=False)
-    half: Floats = field(init=False, repr=False)
-    charges: bool = field(init=False, repr=False)
-    squared: Floats = field(init=False, repr=False)
-    alone: bool = field(init=False, repr=False)
+    bus: Ints  # (N,) Bus of each customer. Several customers may share one; bus 0 is allowed.
+    customers: tuple[str, ...]  # (N,) identifiers of the customers
+    buses: tuple[str, ...]  # (b + 1,) identifiers of the buses, the busbar first
+    base_volt: float  # nominal phase-to-neutral voltage (1 pu), V
+    base_kva: float  # three-phase base power (1 pu), kVA
+    charging: Floats  # (b,) total shunt susceptance of the branch into bus k + 1, pu; half of it at each end
+    walk: Walk = field(init=False, repr=False)  # around the tree
+    half: Floats = field(init=False, repr=False)  # (b + 1,) shunt susceptance at the buses, pu
+    charges: bool = field(init=False, repr=False)  # True if any bus has charging
+    squared: Floats = field(init=False, repr=False)  # (b,) ``r^2 + x^2``, pu
+    alone: bool = field(init=False, repr=False)  # True if no two customers share a bus
 
     def __post_init__(self) -> None:
-        for name in ("r", "x", "charging"):
-            object.__setattr__(self, name, frozen(getattr(self, name)))
-        for name in ("parent", "bus"):
-            object.__setattr__(self, name, frozen_ints(getattr(self, name)))
+        put(self, r=frozen(self.r), x=frozen(self.x), charging=frozen(self.charging))
+        put(self, parent=frozen_ints(self.parent), bus=frozen_ints(self.bus))
         problems = _problems(self)
         if problems:
             raise FeederInvalid(problems)
-        found = walk(self.parent)
-        for name in ("start", "stop", "order", "depth", "enter", "leave", "inside"):
-            object.__setattr__(self, name, getattr(found, name))
-        half: Floats = np.zeros(found.start.size)
-        np.add.at(half, self.parent, 0.5 * self.charging)
-        half[1:] += 0.5 * self.charging
-        object.__setattr__(self, "half", frozen(half))
-        object.__setattr__(self, "charges", any_of(half))
-        object.__setattr__(self, "alone", np.unique(self.bus).size == self.bus.size)
-        object.__setattr__(self, "squared", frozen(self.r**2 + self.x**2))
+        half = at_ends(self.parent, self.charging)
+        put(self, walk=walk(self.parent), half=half, charges=any_of(half), squared=self.r**2 + self.x**2)
+        put(self, alone=np.unique(self.bus).size == self.bus.size)
 
     def linear(self) -> LinDistFlow:
         """Matrices of the linear power flow of a feeder.
@@ -121,9 +60,7 @@ class Feeder(Balanced):
         `R_bus[k, j] = sum of r over the branches on both paths to the busbar`, from bus k and from the bus of
         customer j.
 
-        References
-        ----------
-        chong2020, equation (15), for any tree.
+        Source: chong2020, equation (15), for any tree.
         """
         R_bus = common_paths(self, self.r, self.bus)
         X_bus = common_paths(self, self.x, self.bus)
@@ -134,15 +71,7 @@ class Feeder(Balanced):
     def bus_voltages(self, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 1) -> Floats:
         """Squared voltage of every bus, corrected for losses and charging; O(b), without the N x N matrices.
 
-        Parameters
-        ----------
-        p, q, v0_squared, steps
-            As in `loss_correction`; `steps` = 0 gives LinDistFlow.
-
-        Returns
-        -------
-        (…, b + 1)
-            Squared voltages, pu.
+        p, q, v0_squared, steps: as in `loss_correction`; `steps` = 0 gives LinDistFlow.
         """
         flows = _linear_flows(self, p, q, v0_squared)
         return _lossy(self, flows, flows, steps).v2
@@ -159,29 +88,13 @@ class Feeder(Balanced):
         iteration with the AC power flow of a balanced radial feeder as its limit; `steps` repeats it. O(b)
         for each operating point.
 
-        Parameters
-        ----------
-        p, q : (…, N)
-            Net active and reactive injection of each customer (generation positive, droop inverters
+        p, q (…, N): net active and reactive injection of each customer (generation positive, droop inverters
             included), pu.
-        v0_squared : (…) or scalar
-            Squared busbar voltage, pu.
-        steps
-            Number of fixed-point steps, at least 1.
-
-        Returns
-        -------
-        (…, b + 1)
-            Additive correction of `v^2`, pu; 0 at the busbar.
-
-        Raises
-        ------
-        ValueError
-            If `steps` is below 1.
-
-        References
-        ----------
-        Baran and Wu 1989, the DistFlow equations. Derivation: docs/theory-model.md.
+        v0_squared (…) or scalar: squared busbar voltage, pu.
+        steps: number of fixed-point steps, at least 1.
+        Returns (…, b + 1): additive correction of `v^2`, pu; 0 at the busbar.
+        Raises ValueError if `steps` is below 1.
+        Source: Baran and Wu 1989, the DistFlow equations. Derivation: docs/theory-model.md.
         """
         if steps < 1:
             raise InputInvalid([Problem("out-of-range", f"steps is {steps}; it must be at least 1")])
@@ -193,20 +106,9 @@ class Feeder(Balanced):
     ) -> tuple[Floats, Floats]:
         """`loss_correction` and `model_error_bound` of the same operating points, faster than separately.
 
-        Parameters
-        ----------
-        p, q, v0_squared, steps
-            As in `loss_correction`.
-
-        Returns
-        -------
-        (…, b + 1), (…, N)
-            Additive correction of `v^2`, and a bound on the error that remains after its first step, pu.
-
-        Raises
-        ------
-        ValueError
-            If `steps` is below 1.
+        Returns (…, b + 1), (…, N): additive correction of `v^2`, and a bound on the error that remains after
+            its first step, pu.
+        Raises ValueError if `steps` is below 1.
         """
         if steps < 1:
             raise InputInvalid([Problem("out-of-range", f"steps is {steps}; it must be at least 1")])
@@ -222,15 +124,7 @@ class Feeder(Balanced):
         (in practice a few hundredths). Under heavy loads the quotients grow from step to step, so the second
         step must be below a fifth of the first. Otherwise, towards voltage collapse, the bound is infinite.
 
-        Parameters
-        ----------
-        p, q, v0_squared
-            As in `loss_correction`.
-
-        Returns
-        -------
-        (…, N)
-            Bound on the remaining error of `v^2`, pu.
+        Returns (…, N): bound on the remaining error of `v^2`, pu.
         """
         flows = _linear_flows(self, p, q, v0_squared)
         with np.errstate(all="ignore"):
@@ -239,20 +133,13 @@ class Feeder(Balanced):
     def reach(self, p: Floats, q: Floats) -> Floats:
         """Largest change of the squared voltages by powers of given sizes: ``2 |R| p + 2 |X| q``; O(b).
 
-        Parameters
-        ----------
-        p, q : (…, N)
-            Sizes of the customers' active and reactive powers, not negative, pu.
-
-        Returns
-        -------
-        (…, b + 1)
-            Change at every bus, pu.
+        p, q (…, N): sizes of the customers' active and reactive powers, not negative, pu.
+        Returns (…, b + 1): change at every bus, pu.
         """
         both = np.empty((2, *np.broadcast(p, q).shape))
         both[0], both[1] = p, q
-        P, Q = below(self, _at_buses(self, both))[..., 1:]
-        return from_root(self, 2.0 * (np.abs(self.r) * P + np.abs(self.x) * Q))
+        P, Q = below(self.walk, _at_buses(self, both))[..., 1:]
+        return from_root(self.walk, 2.0 * (np.abs(self.r) * P + np.abs(self.x) * Q))
 
     def with_customers_at(self, places: Ints) -> Feeder:
         """See `Network`."""
@@ -340,14 +227,18 @@ class Feeder(Balanced):
 
 def _problems(feeder: Feeder) -> list[Problem]:
     """Problems of the fields of `feeder`."""
-    out = _shape_problems(feeder)
+    branches = feeder.parent.size
+    out = wrong_shapes(
+        ("parent", feeder.parent.shape, (branches,)),
+        ("r", feeder.r.shape, (branches,)),
+        ("x", feeder.x.shape, (branches,)),
+        ("charging", feeder.charging.shape, (branches,)),
+        ("buses", (len(feeder.buses),), (branches + 1,)),
+        ("bus", feeder.bus.shape, (len(feeder.customers),)),
+    )
     if out:
         return out
-    branches = feeder.parent.size
-    for what in ("base_volt", "base_kva"):
-        value = getattr(feeder, what)
-        if not (np.isfinite(value) and value > 0):
-            out.append(Problem("not-positive", f"{what} is {value}; it must be a positive number"))
+    out = base_problems(feeder)
     for k in range(branches):
         where = f"branch {k} into bus {feeder.buses[k + 1]!r}"
         if not 0 <= feeder.parent[k] <= k:
@@ -356,14 +247,7 @@ def _problems(feeder: Feeder) -> list[Problem]:
                     "not-radial", f"{where}: parent {feeder.parent[k]} does not precede it; expected 0 to {k}"
                 )
             )
-        for what in ("r", "x", "charging"):
-            value = getattr(feeder, what)[k]
-            if not (np.isfinite(value) and value >= 0):
-                out.append(
-                    Problem("negative", f"{where}: {what} is {value}; it must be finite and not negative")
-                )
-        if feeder.r[k] == 0 and feeder.x[k] == 0:
-            out.append(Problem("zero-impedance", f"{where}: r and x are both 0; fuse the two buses"))
+        out.extend(line_problems(where, feeder.r[k], feeder.x[k], feeder.charging[k]))
     for j, bus in enumerate(feeder.bus):
         if not 0 <= bus <= branches:
             out.append(
@@ -372,32 +256,19 @@ def _problems(feeder: Feeder) -> list[Problem]:
                     f"customer {feeder.customers[j]!r}: bus {bus} does not exist; expected 0 to {branches}",
                 )
             )
-    for what, names in (("customer", feeder.customers), ("bus", feeder.buses)):
-        counted = Counter(names)
-        out.extend(
-            Problem("duplicate", f"{what} {name!r} is named {times} times")
-            for name, times in counted.items()
-            if times > 1
-        )
-    return out
+    return out + duplicates(feeder)
 
 
-def _shape_problems(feeder: Feeder) -> list[Problem]:
-    """Problems of array lengths; all other checks require that there are none."""
-    branches = feeder.parent.size
-    expected = (
-        ("parent", feeder.parent.shape, (branches,)),
-        ("r", feeder.r.shape, (branches,)),
-        ("x", feeder.x.shape, (branches,)),
-        ("charging", feeder.charging.shape, (branches,)),
-        ("buses", (len(feeder.buses),), (branches + 1,)),
-        ("bus", feeder.bus.shape, (len(feeder.customers),)),
-    )
-    return [
-        Problem("shape", f"{what} has shape {has}; expected {wants}")
-        for what, has, wants in expected
-        if has != wants
+def line_problems(where: str, r: float, x: float, charging: float) -> list[Problem]:
+    """Problems of the impedance and the susceptance of a line, pu."""
+    out = [
+        Problem("negative", f"{where}: {what} is {value}; it must be finite and not negative")
+        for what, value in (("r", r), ("x", x), ("charging", charging))
+        if not (np.isfinite(value) and value >= 0)
     ]
+    if r == 0 and x == 0:
+        out.append(Problem("zero-impedance", f"{where}: r and x are both 0; fuse the two buses"))
+    return out
 
 
 def common_paths(feeder: Feeder, branch: Floats, buses: Ints) -> Floats:
@@ -406,19 +277,10 @@ def common_paths(feeder: Feeder, branch: Floats, buses: Ints) -> Floats:
     In depth-first order it is the minimum over consecutive buses between the two of their common sum: the sum
     up to the parent of the later bus.
 
-    Parameters
-    ----------
-    branch : (b,)
-        Quantity of each branch, not negative; for example `feeder.r`.
-    buses : (k,)
-        The second bus of each pair.
-
-    Returns
-    -------
-    (b + 1, k)
-        For every bus and each of `buses`.
+    branch (b,): quantity of each branch, not negative; for example `feeder.r`.
+    Returns (b + 1, k): for every bus and each of `buses`.
     """
-    start, whole = feeder.start, path_sums(feeder, branch)
+    start, whole = feeder.walk.start, path_sums(feeder, branch)
     between = np.zeros(start.size)
     between[start[1:]] = whole[feeder.parent]
     out, count = np.empty((buses.size, start.size)), np.arange(start.size)
@@ -443,41 +305,12 @@ _TOGETHER = 16384
 def path_sums(feeder: Feeder, branch: Floats) -> Floats:
     """Sum of a branch quantity over the path from the busbar to each bus, with one rounding per branch.
 
-    Parameters
-    ----------
-    branch : (b,)
-        Quantity of each branch.
-
-    Returns
-    -------
-    (b + 1,)
-        0 at the busbar.
+    Returns (b + 1,): 0 at the busbar.
     """
     out = [0.0]
     for above, more in zip(feeder.parent.tolist(), branch.tolist(), strict=True):
         out.append(out[above] + more)
     return np.array(out)
-
-
-def squared_voltages(model: LinDistFlow, p: Floats, q: Floats, v0_squared: Floats | float) -> Floats:
-    """Squared voltage of every customer by the linear power flow.
-
-    Parameters
-    ----------
-    model
-        From `lindistflow`.
-    p, q : (…, N)
-        Net active and reactive injection of each customer (generation positive), pu.
-    v0_squared : (…) or scalar
-        Squared busbar voltage, pu.
-
-    Returns
-    -------
-    (…, N)
-        Squared voltages, pu.
-    """
-    base = np.asarray(v0_squared, dtype=np.float64)[..., None]
-    return base + 2.0 * (p @ model.R.T + q @ model.X.T)
 
 
 def _lossy(feeder: Feeder, flows: _Flows, now: _Flows, steps: int) -> _Flows:
@@ -488,7 +321,7 @@ def _lossy(feeder: Feeder, flows: _Flows, now: _Flows, steps: int) -> _Flows:
         loss_p, loss_q, drop = _losses(feeder, current, charge, sign=-1.0)
         # The losses include charging.
         Q = flows.Q + loss_q
-        now = _Flows(flows.P + loss_p, Q, Q, flows.v2 - from_root(feeder, drop))
+        now = _Flows(flows.P + loss_p, Q, Q, flows.v2 - from_root(feeder.walk, drop))
     return now
 
 
@@ -500,7 +333,7 @@ def _remainder(feeder: Feeder, flows: _Flows, once: _Flows) -> Floats:
         np.subtract((once.P**2 + once.Q**2) / once.v2[..., 1:], current[0], out=current[1])
         charge[0], charge[1] = flows.v2, once.v2 - flows.v2
         drop = _losses(feeder, np.abs(current), np.abs(feeder.half * charge), sign=1.0)[2]
-        first, second = from_root(feeder, drop)
+        first, second = from_root(feeder.walk, drop)
         shrinks = shrinking(first, second, (-1,))
         shrinks &= np.all((flows.v2 > 0) & (once.v2 > 0), axis=-1, keepdims=True)
         bound = np.where(shrinks, 2.0 * second, np.inf)
@@ -525,10 +358,10 @@ def _linear_flows(feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats | flo
     """Linear power flow from the injections of the customers."""
     both = np.empty((2, *np.broadcast(p, q).shape))
     both[0], both[1] = p, q
-    P, Q = -below(feeder, _at_buses(feeder, both))[..., 1:]
+    P, Q = -below(feeder.walk, _at_buses(feeder, both))[..., 1:]
     base = np.asarray(v0_squared, dtype=np.float64)[..., None]
-    v2 = base + from_root(feeder, -2.0 * (feeder.r * P + feeder.x * Q))
-    charged = Q - below(feeder, feeder.half * v2)[..., 1:] if feeder.charges else Q
+    v2 = base + from_root(feeder.walk, -2.0 * (feeder.r * P + feeder.x * Q))
+    charged = Q - below(feeder.walk, feeder.half * v2)[..., 1:] if feeder.charges else Q
     return _Flows(P, Q, charged, v2)
 
 
@@ -537,9 +370,9 @@ def _losses(feeder: Feeder, current: Floats, charge: Floats, *, sign: float) -> 
     own = np.zeros((2, *current.shape[:-1], current.shape[-1] + 1))
     np.multiply(feeder.r, current, out=own[0, ..., 1:])
     np.multiply(feeder.x, current, out=own[1, ..., 1:])
-    loss_p, loss_q = (below(feeder, own) - own)[..., 1:]
+    loss_p, loss_q = (below(feeder.walk, own) - own)[..., 1:]
     if feeder.charges:
-        loss_q = loss_q + sign * below(feeder, charge)[..., 1:]
+        loss_q = loss_q + sign * below(feeder.walk, charge)[..., 1:]
     drop = 2.0 * (feeder.r * loss_p + feeder.x * loss_q) + feeder.squared * current
     return loss_p, loss_q, drop
 

@@ -1,7 +1,7 @@
 """Radial feeders in three phases: impedances in per unit, LinDist3Flow and its correction.
 
 `ThreePhaseFeeder` is the radial tree of 3x3 blocks in per unit, `lindist3flow` its linear power flow of
-squared phase voltages, `loss_correction` the correction of that, and `PhasedFeeder` the form for estimators.
+squared phase voltages, `bus_voltages` the corrected one, and `PhasedFeeder` the form for estimators.
 
 1 pu of voltage is the nominal phase-to-neutral voltage V; 1 pu of power is a *third* of the three-phase
 base power S, because powers are those of single phases here; 1 pu of impedance is ``3 V^2 / S`` as on a
@@ -21,27 +21,29 @@ reactance, active power injected in phase b raises phase a, and in phase a lower
 Powers, voltages and their axes: connections (…, C) of the feeder; buses (…, 3, b + 1), phase before bus.
 The voltage of a phase absent at a bus is that at the end of the phase.
 
-References
-----------
-.. [1] W. H. Kersting, "Distribution System Modeling and Analysis", 3rd ed., CRC Press 2012, chapter 4.
-.. [2] L. Gan, S. H. Low, "Convex relaxations and linear approximation for optimal power flow in multiphase
-   radial networks", Power Systems Computation Conference 2014.
-.. [3] D. B. Arnold, M. Sankur, R. Dobbe, K. Brady, D. S. Callaway, A. von Meier, "Optimal dispatch of
-   reactive power for voltage regulation and balancing in unbalanced distribution systems", IEEE PES General
-   Meeting 2016.
+Source: kersting2012, chapter 4; ganlow2014; arnold2016; docs/theory-three-phase.md.
 """
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, Ints, Phasors, frozen, frozen_ints
-from gridsec.errors import FeederInvalid, InputInvalid, Problem
+from gridsec.arrays import Bools, Floats, Ints, Phasors, frozen, frozen_ints, put
+from gridsec.errors import FeederInvalid, InputInvalid, Problem, wrong_shapes
 from gridsec.grid.intervals import Sweeps, bounds
-from gridsec.grid.trees import below, from_root, meetings, shrinking, walk
+from gridsec.grid.trees import (
+    Walk,
+    at_ends,
+    base_problems,
+    below,
+    duplicates,
+    from_root,
+    meetings,
+    shrinking,
+    walk,
+)
 
 PHASES = "abc"
 
@@ -57,96 +59,45 @@ _ROUNDING = 1e-6
 class ThreePhaseFeeder:
     """Radial feeder of up to three phases: b branches, b + 1 buses, rooted at the metered busbar (bus 0).
 
-    Attributes
-    ----------
-    name
-        Name of the feeder.
-    parent : (b,)
-        Bus that feeds bus k + 1; `parent[k] <= k`, so buses are in topological order.
-    z : (b, 3, 3)
-        Series impedance Z of the branch into bus k + 1, pu: the voltages along the three conductors drop by
-        ``Z i``. Symmetric; rows and columns of absent phases are 0.
-    phases : (b + 1, 3)
-        Phases a, b, c present at each bus.
-    bus : (N,)
-        Bus of each customer. Several customers may share one; bus 0 is allowed.
-    connected : (N, 3)
-        Connected phases of each customer, between phase and neutral.
-    customers : (N,)
-        Identifiers of the customers.
-    buses : (b + 1,)
-        Identifiers of the buses, the busbar first.
-    base_volt
-        Nominal phase-to-neutral voltage (1 pu), V.
-    base_kva
-        Three-phase base power S, kVA; 1 pu of the power of a phase is a third of it.
-    charging : (b, 3, 3)
-        Total shunt susceptance of the branch into bus k + 1, pu; half of it at each end.
-    of, at, phase : (C,)
-        Derived. The connections, customer by customer, phase by phase: customer, bus, and phase 0, 1, 2.
-    share : (C,)
-        Derived. Share of the customer's power in each connection: 1 on a single phase, 1/3 on all three.
-    start, stop, order, depth, enter, leave : (b + 1,); inside : (b + 1, b + 1) or None
-        Derived. The walk around the tree, see `gridsec.grid.trees.Walk`.
-    half : (b + 1, 3, 3)
-        Derived. Shunt susceptance at the buses, pu.
-
-    Raises
-    ------
-    FeederInvalid
-        With every problem found.
+    Raises FeederInvalid with every problem found.
     """
 
-    name: str
-    parent: Ints
+    name: str  # name of the feeder
+    parent: Ints  # (b,) bus that feeds bus k + 1; `parent[k] <= k`, so buses are in topological order
+    # (b, 3, 3) Series impedance Z of the branch into bus k + 1, pu: the voltages along the three conductors
+    # drop by ``Z i``. Symmetric; rows and columns of absent phases are 0.
     z: Phasors
-    phases: Bools
-    bus: Ints
-    connected: Bools
-    customers: tuple[str, ...]
-    buses: tuple[str, ...]
-    base_volt: float
-    base_kva: float
+    phases: Bools  # (b + 1, 3) phases a, b, c present at each bus
+    bus: Ints  # (N,) Bus of each customer. Several customers may share one; bus 0 is allowed.
+    connected: Bools  # (N, 3) connected phases of each customer, between phase and neutral
+    customers: tuple[str, ...]  # (N,) identifiers of the customers
+    buses: tuple[str, ...]  # (b + 1,) identifiers of the buses, the busbar first
+    base_volt: float  # nominal phase-to-neutral voltage (1 pu), V
+    base_kva: float  # three-phase base power S, kVA; 1 pu of the power of a phase is a third of it
+    # (b, 3, 3) total shunt susceptance of the branch into bus k + 1, pu; half of it at each end
     charging: Floats
+    # of, at, phase (C,): the connections, customer by customer, phase by phase: customer, bus, and phase 0,
+    # 1, 2
     of: Ints = field(init=False, repr=False)
     at: Ints = field(init=False, repr=False)
     phase: Ints = field(init=False, repr=False)
+    # (C,) share of the customer's power in each connection: 1 on a single phase, 1/3 on all three
     share: Floats = field(init=False, repr=False)
-    start: Ints = field(init=False, repr=False)
-    stop: Ints = field(init=False, repr=False)
-    order: Ints = field(init=False, repr=False)
-    depth: Ints = field(init=False, repr=False)
-    enter: Ints = field(init=False, repr=False)
-    leave: Ints = field(init=False, repr=False)
-    inside: Floats | None = field(init=False, repr=False)
-    half: Floats = field(init=False, repr=False)
+    walk: Walk = field(init=False, repr=False)  # around the tree
+    half: Floats = field(init=False, repr=False)  # (b + 1, 3, 3) shunt susceptance at the buses, pu
 
     def __post_init__(self) -> None:
-        def put(name: str, value: object) -> None:
-            object.__setattr__(self, name, value)
-
         for name, kind in (("z", np.complex128), ("phases", np.bool_), ("connected", np.bool_)):
-            own = np.array(getattr(self, name), dtype=kind, order="C")
-            own.flags.writeable = False
-            put(name, own)
-        put("charging", frozen(self.charging))
-        for name in ("parent", "bus"):
-            put(name, frozen_ints(getattr(self, name)))
+            put(self, **{name: np.array(getattr(self, name), dtype=kind, order="C")})
+        put(self, charging=frozen(self.charging))
+        put(self, parent=frozen_ints(self.parent), bus=frozen_ints(self.bus))
         problems = _shape_problems(self) or [*_branch_problems(self), *_customer_problems(self)]
         if problems:
             raise FeederInvalid(problems)
-        found = walk(self.parent)
-        for name in ("start", "stop", "order", "depth", "enter", "leave", "inside"):
-            put(name, getattr(found, name))
         of, phase = np.nonzero(self.connected)
-        put("of", frozen_ints(of))
-        put("at", frozen_ints(self.bus[of]))
-        put("phase", frozen_ints(phase))
-        put("share", frozen(1.0 / self.connected.sum(axis=1)[of]))
-        half = np.zeros((found.start.size, 3, 3))
-        np.add.at(half, self.parent, 0.5 * self.charging)
-        half[1:] += 0.5 * self.charging
-        put("half", frozen(half))
+        put(self, of=frozen_ints(of), at=frozen_ints(self.bus[of]), phase=frozen_ints(phase))
+        put(self, share=frozen(1.0 / self.connected.sum(axis=1)[of]))
+        put(self, walk=walk(self.parent), half=at_ends(self.parent, self.charging))
 
     def connections(self, powers: Floats) -> Floats:
         """Split the customers' powers (…, N) over their connections (…, C), evenly over the phases."""
@@ -158,19 +109,9 @@ def sequence_matrix(positive: Phasors | Floats, zero: Phasors | Floats) -> Phaso
 
     ``Z_self = (Z_0 + 2 Z_1) / 3`` on the diagonal and ``Z_mutual = (Z_0 - Z_1) / 3`` off the diagonal.
 
-    Parameters
-    ----------
-    positive, zero : (…)
-        Positive- and zero-sequence impedance (or admittance), any unit.
-
-    Returns
-    -------
-    (…, 3, 3)
-        The matrix in phases, same unit.
-
-    References
-    ----------
-    Kersting 2012, chapter 4: the sequence impedances of a transposed line, solved for those of the phases.
+    positive, zero (…): positive- and zero-sequence impedance (or admittance), any unit.
+    Source: Kersting 2012, chapter 4: the sequence impedances of a transposed line, solved for those of the
+        phases.
     """
     one, none = (np.asarray(value, dtype=np.complex128)[..., None, None] for value in (positive, zero))
     return np.asarray(one * np.eye(3) + (none - one) / 3.0)
@@ -179,7 +120,7 @@ def sequence_matrix(positive: Phasors | Floats, zero: Phasors | Floats) -> Phaso
 def _shape_problems(feeder: ThreePhaseFeeder) -> list[Problem]:
     """Problems of array lengths; all other checks require that there are none."""
     branches, customers = feeder.parent.size, len(feeder.customers)
-    expected = (
+    return wrong_shapes(
         ("parent", feeder.parent.shape, (branches,)),
         ("z", feeder.z.shape, (branches, 3, 3)),
         ("charging", feeder.charging.shape, (branches, 3, 3)),
@@ -188,19 +129,10 @@ def _shape_problems(feeder: ThreePhaseFeeder) -> list[Problem]:
         ("bus", feeder.bus.shape, (customers,)),
         ("connected", feeder.connected.shape, (customers, 3)),
     )
-    return [
-        Problem("shape", f"{what} has shape {has}; expected {wants}")
-        for what, has, wants in expected
-        if has != wants
-    ]
 
 
 def _branch_problems(feeder: ThreePhaseFeeder) -> list[Problem]:
-    out = []
-    for what in ("base_volt", "base_kva"):
-        value = getattr(feeder, what)
-        if not (np.isfinite(value) and value > 0):
-            out.append(Problem("not-positive", f"{what} is {value}; it must be a positive number"))
+    out = base_problems(feeder)
     for k, above in enumerate(feeder.parent.tolist()):
         where = f"branch {k} into bus {feeder.buses[k + 1]!r}"
         if not 0 <= above <= k:
@@ -227,12 +159,7 @@ def _branch_problems(feeder: ThreePhaseFeeder) -> list[Problem]:
 def line_problems(z: Phasors, charging: Floats, present: Bools) -> list[Problem]:
     """Problems of the impedances and susceptances of a line.
 
-    Parameters
-    ----------
-    z, charging : (3, 3)
-        Series impedance and total shunt susceptance, pu.
-    present : (3,)
-        Phases of the line.
+    z, charging (3, 3): series impedance and total shunt susceptance, pu.
     """
     blocks = (("z", z), ("charging", charging))
     out = [
@@ -289,14 +216,7 @@ def _customer_problems(feeder: ThreePhaseFeeder) -> list[Problem]:
                     f"{named(feeder.phases[bus])!r}",
                 )
             )
-    for what, names in (("customer", feeder.customers), ("bus", feeder.buses)):
-        counted = Counter(names)
-        out.extend(
-            Problem("duplicate", f"{what} {name!r} is named {times} times")
-            for name, times in counted.items()
-            if times > 1
-        )
-    return out
+    return out + duplicates(feeder)
 
 
 def named(present: Bools) -> str:
@@ -316,17 +236,12 @@ class LinDist3Flow:
     """Linear power flow `v^2 = v0^2 + 2 R p + 2 X q` of squared phase voltages.
 
     R and X are neither symmetric nor nonnegative: phases on a common path couple with signs.
-
-    Attributes
-    ----------
-    R, X : (C, C)
-        From the powers of a connection to the voltage at a connection, pu.
-    R_bus, X_bus : (3, b + 1, C)
-        The same to every phase of every bus.
     """
 
+    # R, X (C, C): from the powers of a connection to the voltage at a connection, pu
     R: Floats
     X: Floats
+    # R_bus, X_bus (3, b + 1, C): the same to every phase of every bus
     R_bus: Floats
     X_bus: Floats
 
@@ -337,9 +252,7 @@ def lindist3flow(feeder: ThreePhaseFeeder) -> LinDist3Flow:
     Entry (phi at bus k, connection to psi at bus l): ``W_phi,psi`` summed over the common branches of the
     paths of k and l to the busbar, its real part in R and its imaginary part in X. O(b C).
 
-    References
-    ----------
-    Gan and Low 2014; Arnold et al. 2016. Derivation: docs/theory-three-phase.md.
+    Source: Gan and Low 2014; Arnold et al. 2016. Derivation: docs/theory-three-phase.md.
     """
     W_bus = common_paths(feeder, _rotated(feeder), feeder.at, feeder.phase)
     W = W_bus[feeder.phase, feeder.at]
@@ -349,22 +262,14 @@ def lindist3flow(feeder: ThreePhaseFeeder) -> LinDist3Flow:
 def common_paths(feeder: ThreePhaseFeeder, blocks: Phasors, at: Ints, phase: Ints) -> Phasors:
     """Entries of the branches' blocks, summed over the common path of every bus with each of some others.
 
-    Parameters
-    ----------
-    blocks : (b, 3, 3)
-        Summed blocks; for the series impedances ``z``, the sums are voltages per current.
-    at, phase : (k,)
-        Buses, and the columns of the blocks.
-
-    Returns
-    -------
-    (3, b + 1, k)
-        The sums, a row for each phase of every bus.
+    blocks (b, 3, 3): summed blocks; for the series impedances ``z``, the sums are voltages per current.
+    at, phase (k,): buses, and the columns of the blocks.
+    Returns (3, b + 1, k): the sums, a row for each phase of every bus.
     """
     whole = np.zeros((len(feeder.buses), 3, 3), dtype=np.complex128)
     for k, above in enumerate(feeder.parent.tolist()):
         whole[k + 1] = whole[above] + blocks[k]
-    shared = meetings(feeder.parent, feeder, at)
+    shared = meetings(feeder.parent, feeder.walk, at)
     return np.stack([whole[shared, phi, phase] for phi in range(3)])
 
 
@@ -381,21 +286,13 @@ def sensitivities(
     gains one order in the load. Re(conj(v) dv) is then half the derivative of v^2. Without load and charging
     only the first term remains, which is `lindist3flow`. O(b C) for each step.
 
-    Parameters
-    ----------
-    p, q : (C,)
-        Net active and reactive injection of each connection at the operating point, pu.
-    v0_squared : (3,)
-        Squared busbar voltage of each phase, pu.
-    steps
-        Number of sweeps, at least 1: for the operating point as for the derivatives.
-
-    Returns
-    -------
-    LinDist3Flow
-        The matrices; ``v^2`` then changes by ``2 R dp + 2 X dq``.
+    p, q (C,): net active and reactive injection of each connection at the operating point, pu.
+    v0_squared (3,): squared busbar voltage of each phase, pu.
+    steps: number of sweeps, at least 1: for the operating point as for the derivatives.
+    Returns LinDist3Flow: the matrices; ``v^2`` then changes by ``2 R dp + 2 X dq``.
     """
-    _check(steps)
+    if steps < 1:
+        raise InputInvalid([Problem("out-of-range", f"steps is {steps}; it must be at least 1")])
     start = _Start.of(feeder, p, q, v0_squared)
     v = start.phasors
     for _ in range(steps):
@@ -428,14 +325,10 @@ _NOTHING: Phasors = np.zeros((3, 1), dtype=np.complex128)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CustomerFlow:
-    """Linear power flow customer by customer, in the per unit of balanced feeders.
+    """Linear power flow customer by customer, in the per unit of balanced feeders."""
 
-    Attributes
-    ----------
-    R, X : (N, N)
-        From a customer's power in units of the three-phase base S to a customer's squared voltage, pu.
-    """
-
+    # R, X (N, N): from a customer's power in units of the three-phase base S to a customer's squared voltage,
+    # pu
     R: Floats
     X: Floats
 
@@ -446,11 +339,6 @@ def per_customer(feeder: ThreePhaseFeeder, model: LinDist3Flow) -> CustomerFlow:
     A customer's power is split evenly over the phases, and the voltage is the mean of their squares. Powers
     are in kW / S as on a balanced feeder, so that droop curves and meters of `base_kva` apply. On a cable
     without mutual impedance, a single-phase customer has three times the impedance of one on all phases.
-
-    Parameters
-    ----------
-    model
-        From `lindist3flow` or `sensitivities`.
     """
     first = np.searchsorted(feeder.of, np.arange(len(feeder.customers)))
 
@@ -462,78 +350,30 @@ def per_customer(feeder: ThreePhaseFeeder, model: LinDist3Flow) -> CustomerFlow:
     return CustomerFlow(joined(model.R), joined(model.X))
 
 
-def squared_voltages(model: LinDist3Flow, p: Floats, q: Floats, v0_squared: Floats) -> Floats:
-    """Squared voltage at every connection by the linear power flow.
-
-    Parameters
-    ----------
-    model
-        From `lindist3flow`.
-    p, q : (…, C)
-        Net active and reactive injection of each connection (generation positive), pu.
-    v0_squared : (…, C) or scalar
-        Squared busbar voltage of each connection's phase (``v0_squared[..., feeder.phase]``), pu.
-
-    Returns
-    -------
-    (…, C)
-        Squared voltages, pu.
-    """
-    return np.asarray(v0_squared + 2.0 * (p @ model.R.T + q @ model.X.T))
-
-
 def bus_voltages(
     feeder: ThreePhaseFeeder, p: Floats, q: Floats, v0_squared: Floats, *, steps: int = 1
 ) -> Floats:
-    """Squared voltage of every phase of every bus, corrected; O(b), without the matrices.
-
-    Parameters
-    ----------
-    feeder, p, q, v0_squared, steps
-        As in `loss_correction`; `steps` = 0 gives LinDist3Flow.
-
-    Returns
-    -------
-    (…, 3, b + 1)
-        Squared voltages, pu.
-    """
-    start = _Start.of(feeder, p, q, v0_squared)
-    return _sweeps(feeder, start, steps) if steps else start.linear
-
-
-def loss_correction(
-    feeder: ThreePhaseFeeder, p: Floats, q: Floats, v0_squared: Floats, *, steps: int = 1
-) -> Floats:
-    """Correction of the linear squared voltage of every bus for losses, charging and unequal phases.
+    """Squared voltage of every phase of every bus, corrected for losses, charging and unequal phases.
 
     LinDist3Flow is the squared voltage after one backward and forward sweep from the flat start, linearised:
     ``v_k = v_parent - Z i_k`` with i_k the sum of ``conj(-s / v)`` over the buses fed by bus k. One step is
     one more sweep, with the currents at these voltages; its error is of third order in the powers. `steps`
     repeats it, and its limit is the AC power flow. Unlike on a balanced feeder the angles matter, since they
     turn the voltages induced by currents of other phases: hence phasors in place of squares. O(b) for each
-    operating point.
+    operating point, without the matrices.
 
-    Parameters
-    ----------
-    p, q : (…, C)
-        Net active and reactive injection of each connection (generation positive), pu.
-    v0_squared : (…, 3)
-        Squared busbar voltage of each phase, pu, with balanced angles.
-    steps
-        Number of sweeps, at least 1.
-
-    Returns
-    -------
-    (…, 3, b + 1)
-        Additive correction of `v^2`, pu; 0 at the busbar.
-
-    References
-    ----------
-    Derivation and measured errors: docs/theory-three-phase.md.
+    p, q (…, C): net active and reactive injection of each connection (generation positive), pu.
+    v0_squared (…, 3): squared busbar voltage of each phase, pu, with balanced angles.
+    steps: number of sweeps; 0 gives LinDist3Flow.
+    Returns (…, 3, b + 1): squared voltages, pu. Source: docs/theory-three-phase.md, with measured errors.
     """
-    _check(steps)
     start = _Start.of(feeder, p, q, v0_squared)
-    return np.asarray(_sweeps(feeder, start, steps) - start.linear)
+    if not steps:
+        return start.linear
+    phasors = start.phasors
+    for _ in range(steps):
+        phasors = _sweep(feeder, start, phasors)
+    return np.asarray(phasors.real**2 + phasors.imag**2)
 
 
 def model_error_bound(feeder: ThreePhaseFeeder, p: Floats, q: Floats, v0_squared: Floats) -> Floats:
@@ -545,42 +385,18 @@ def model_error_bound(feeder: ThreePhaseFeeder, p: Floats, q: Floats, v0_squared
     e (2 |v| + 2 e)``. Heavy loads make the quotients grow, so if this sweep is *not* below a fifth of the one
     before, towards voltage collapse, the bound is infinite. It does not cover unbalanced busbar angles.
 
-    Parameters
-    ----------
-    feeder, p, q, v0_squared
-        As in `loss_correction`.
-
-    Returns
-    -------
-    (…, C)
-        Bound on the remaining error of `v^2`, pu.
+    feeder, p, q, v0_squared: as in `bus_voltages`.
+    Returns (…, C): bound on the remaining error of `v^2`, pu.
     """
-    start = _Start.of(feeder, p, q, v0_squared)
-    return _remainder(feeder, start, _sweep(feeder, start, start.phasors))
-
-
-def corrected(
-    feeder: ThreePhaseFeeder, p: Floats, q: Floats, v0_squared: Floats, *, steps: int = 1
-) -> tuple[Floats, Floats]:
-    """`loss_correction` and `model_error_bound` of the same operating points, faster than separately.
-
-    Parameters
-    ----------
-    feeder, p, q, v0_squared, steps
-        As in `loss_correction`.
-
-    Returns
-    -------
-    (…, 3, b + 1), (…, C)
-        Additive correction of `v^2`, and a bound on the error that remains after its first step, pu.
-    """
-    _check(steps)
     start = _Start.of(feeder, p, q, v0_squared)
     once = _sweep(feeder, start, start.phasors)
-    again = once
-    for _ in range(steps - 1):
-        again = _sweep(feeder, start, again)
-    return np.asarray(_square(again) - start.linear), _remainder(feeder, start, once)
+    with np.errstate(all="ignore"):
+        before = _drawn(feeder, start.s, start.phasors)
+        first = _reach(feeder, before - start.flat)
+        second = _reach(feeder, _drawn(feeder, start.s, once) - before)
+        shrinks = shrinking(first, second, (-2, -1))
+        bound = np.where(shrinks, 2.0 * second * (2.0 * np.abs(once) + 2.0 * second), np.inf)
+    return np.asarray(bound[..., feeder.phase, feeder.at])
 
 
 def interval_bounds(
@@ -588,18 +404,10 @@ def interval_bounds(
 ) -> tuple[Floats, Floats]:
     """Change of the correction, and error of its first step, for all powers within intervals.
 
-    Parameters
-    ----------
-    feeder, p, q : (C,), v0_squared : (3,)
-        As in `loss_correction`, one operating point.
-    p_error, q_error : (C,)
-        Largest errors of the powers, pu.
-
-    Returns
-    -------
-    (C,), (C,)
-        As `gridsec.grid.intervals.bounds`; with unequal phases of the busbar, wider by the error of
-        LinDist3Flow for them.
+    feeder, p, q: as in `bus_voltages`, one operating point.
+    p_error, q_error (C,): largest errors of the powers, pu.
+    Returns (C,), (C,): as `gridsec.grid.intervals.bounds`; with unequal phases of the busbar, wider by the
+        error of LinDist3Flow for them.
     """
     start = _Start.of(feeder, p, q, v0_squared)
     error = np.asarray(_at_buses(feeder, np.hypot(p_error, q_error) + 0j).real)
@@ -621,14 +429,11 @@ def interval_bounds(
     v0 = np.sqrt(np.asarray(v0_squared, dtype=np.float64))
     # `linear` assumes equal phases of the busbar.
     apart = np.abs(feeder.z) * np.abs(v0[:, None] / v0 - 1.0)
-    moved = moved + 2.0 * from_root(feeder, np.einsum("bij,jb->ib", apart, below(feeder, error)[..., 1:]))
+    moved = moved + 2.0 * from_root(
+        feeder.walk, np.einsum("bij,jb->ib", apart, below(feeder.walk, error)[..., 1:])
+    )
     here = (feeder.phase, feeder.at)
     return np.asarray(moved[here]), np.asarray(rest[here])
-
-
-def _check(steps: int) -> None:
-    if steps < 1:
-        raise InputInvalid([Problem("out-of-range", f"steps is {steps}; it must be at least 1")])
 
 
 def _rotated(feeder: ThreePhaseFeeder) -> Phasors:
@@ -656,18 +461,11 @@ class _Start:
             s = _at_buses(feeder, p + 1j * np.asarray(q))
             squared = np.asarray(v0_squared, dtype=np.float64)[..., None]
             v0 = np.sqrt(squared) * ROTATION[:, None]
-            flow = below(feeder, s)[..., 1:]
+            flow = below(feeder.walk, s)[..., 1:]
             gain = np.einsum("bij,...jb->...ib", _rotated(feeder), np.conj(flow)).real
-            linear = squared + 2.0 * from_root(feeder, gain)
+            linear = squared + 2.0 * from_root(feeder.walk, gain)
             flat = _drawn(feeder, s, np.broadcast_to(v0, s.shape))
             return cls(s, v0, flat, _forward(feeder, v0, flat), linear)
-
-
-def _sweeps(feeder: ThreePhaseFeeder, start: _Start, steps: int) -> Floats:
-    phasors = start.phasors
-    for _ in range(steps):
-        phasors = _sweep(feeder, start, phasors)
-    return _square(phasors)
 
 
 def _sweep(feeder: ThreePhaseFeeder, start: _Start, phasors: Phasors) -> Phasors:
@@ -687,28 +485,14 @@ def _charged(feeder: ThreePhaseFeeder, phasors: Phasors) -> Phasors | float:
 
 def _forward(feeder: ThreePhaseFeeder, v0: Phasors, drawn: Phasors) -> Phasors:
     """Voltages of the buses from the currents drawn there."""
-    current = below(feeder, drawn)[..., 1:]
-    return np.asarray(v0 - from_root(feeder, np.einsum("bij,...jb->...ib", feeder.z, current)))
-
-
-def _remainder(feeder: ThreePhaseFeeder, start: _Start, once: Phasors) -> Floats:
-    with np.errstate(all="ignore"):
-        before = _drawn(feeder, start.s, start.phasors)
-        first = _reach(feeder, before - start.flat)
-        second = _reach(feeder, _drawn(feeder, start.s, once) - before)
-        shrinks = shrinking(first, second, (-2, -1))
-        bound = np.where(shrinks, 2.0 * second * (2.0 * np.abs(once) + 2.0 * second), np.inf)
-    return np.asarray(bound[..., feeder.phase, feeder.at])
+    current = below(feeder.walk, drawn)[..., 1:]
+    return np.asarray(v0 - from_root(feeder.walk, np.einsum("bij,...jb->...ib", feeder.z, current)))
 
 
 def _reach(feeder: ThreePhaseFeeder, change: Phasors | Floats) -> Floats:
     """Largest change of the voltages by changed currents at the buses."""
-    current = below(feeder, np.abs(change))[..., 1:]
-    return np.asarray(from_root(feeder, np.einsum("bij,...jb->...ib", np.abs(feeder.z), current)))
-
-
-def _square(phasors: Phasors) -> Floats:
-    return np.asarray(phasors.real**2 + phasors.imag**2)
+    current = below(feeder.walk, np.abs(change))[..., 1:]
+    return np.asarray(from_root(feeder.walk, np.einsum("bij,...jb->...ib", np.abs(feeder.z), current)))
 
 
 def _at_buses(feeder: ThreePhaseFeeder, powers: Phasors) -> Phasors:

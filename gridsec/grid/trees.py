@@ -5,31 +5,17 @@ Bus 0 is the root, and bus `parent[k] <= k` feeds bus k + 1.
 
 from __future__ import annotations
 
+import math
+from collections import Counter
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, Phasors, frozen, frozen_ints
+from gridsec.errors import Problem
 
 Values = TypeVar("Values", Floats, Phasors)
-
-
-class Walked(Protocol):
-    """A tree with the numbers of a `Walk`."""
-
-    @property
-    def start(self) -> Ints: ...  # noqa: D102
-    @property
-    def stop(self) -> Ints: ...  # noqa: D102
-    @property
-    def order(self) -> Ints: ...  # noqa: D102
-    @property
-    def enter(self) -> Ints: ...  # noqa: D102
-    @property
-    def leave(self) -> Ints: ...  # noqa: D102
-    @property
-    def inside(self) -> Floats | None: ...  # noqa: D102
 
 
 class Named(Protocol):
@@ -43,6 +29,36 @@ class Named(Protocol):
     def base_volt(self) -> float: ...  # noqa: D102
     @property
     def base_kva(self) -> float: ...  # noqa: D102
+    @property
+    def buses(self) -> tuple[str, ...]: ...  # noqa: D102
+
+
+def base_problems(feeder: Named) -> list[Problem]:
+    """Problems of the per-unit bases."""
+    bases = (("base_volt", feeder.base_volt), ("base_kva", feeder.base_kva))
+    return [
+        Problem("not-positive", f"{what} is {value}; it must be a positive number")
+        for what, value in bases
+        if not (math.isfinite(value) and value > 0)
+    ]
+
+
+def duplicates(feeder: Named) -> list[Problem]:
+    """Problems of identifiers that occur several times."""
+    return [
+        Problem("duplicate", f"{what} {name!r} is named {times} times")
+        for what, names in (("customer", feeder.customers), ("bus", feeder.buses))
+        for name, times in Counter(names).items()
+        if times > 1
+    ]
+
+
+def at_ends(parent: Ints, charging: Floats) -> Floats:
+    """Charging (b, …) of the branches, half of it at each end, by bus (b + 1, …)."""
+    out: Floats = np.zeros((parent.size + 1, *charging.shape[1:]))
+    np.add.at(out, parent, 0.5 * charging)
+    out[1:] += 0.5 * charging
+    return frozen(out)
 
 
 class OnTree:
@@ -74,29 +90,19 @@ class OnTree:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Walk:
-    """A walk around a tree of b + 1 buses, children in order.
+    """A walk around a tree of b + 1 buses, children in order."""
 
-    Attributes
-    ----------
-    start, stop : (b + 1,)
-        Depth-first numbering: the subtree of bus k is the buses with `start` in `[start[k], stop[k])`.
-    order : (b + 1,)
-        The buses by these numbers.
-    depth : (b + 1,)
-        Number of branches between bus k and the root.
-    enter, leave : (b + 1,)
-        Steps at which the walk reaches a bus first, and has left it.
-    inside : (b + 1, b + 1) or None
-        1 where the bus of the row lies in the subtree of that of the column, else 0; None for trees so large
-        that sums along the walk cost less than a product with this matrix.
-    """
-
+    # start, stop (b + 1,): depth-first numbering: the subtree of bus k is the buses with `start` in
+    # `[start[k], stop[k])`
     start: Ints
     stop: Ints
-    order: Ints
-    depth: Ints
+    order: Ints  # (b + 1,) the buses by these numbers
+    depth: Ints  # (b + 1,) number of branches between bus k and the root
+    # enter, leave (b + 1,): steps at which the walk reaches a bus first, and has left it
     enter: Ints
     leave: Ints
+    # (b + 1, b + 1) or None: 1 where the bus of the row lies in the subtree of that of the column, else 0;
+    # None for trees so large that sums along the walk cost less than a product with this matrix
     inside: Floats | None
 
 
@@ -108,10 +114,7 @@ _DENSE, _FEW = 200, 8
 def walk(parent: Ints) -> Walk:
     """Walk around a tree.
 
-    Parameters
-    ----------
-    parent : (b,)
-        Bus that feeds bus k + 1, at most k.
+    parent (b,): bus that feeds bus k + 1, at most k.
     """
     count = parent.size + 1
     size = np.ones(count, dtype=np.intp)
@@ -138,7 +141,7 @@ def walk(parent: Ints) -> Walk:
     return Walk(start, stop, order, depth, enter, leave, inside)
 
 
-def below(tree: Walked, values: Values) -> Values:
+def below(tree: Walk, values: Values) -> Values:
     """Sum of bus values (…, b + 1) over the subtree of each bus, itself included; O(b)."""
     inside = _dense(tree, values)
     if inside is not None:
@@ -151,7 +154,7 @@ def below(tree: Walked, values: Values) -> Values:
     return np.asarray(out)
 
 
-def from_root(tree: Walked, values: Values) -> Values:
+def from_root(tree: Walk, values: Values) -> Values:
     """Sum of branch values (…, b) over the path from the root to each bus, (…, b + 1); O(b)."""
     inside = _dense(tree, values)
     if inside is not None:
@@ -163,7 +166,7 @@ def from_root(tree: Walked, values: Values) -> Values:
     return np.asarray(np.cumsum(tour, axis=-1, out=tour).take(tree.enter, axis=-1))
 
 
-def _dense(tree: Walked, values: Values) -> Floats | None:
+def _dense(tree: Walk, values: Values) -> Floats | None:
     """Summation matrix for few real values of a small tree; None where the walk is faster."""
     inside = tree.inside
     if inside is None or values.dtype != np.float64 or values.size > _FEW * len(inside):
@@ -171,20 +174,11 @@ def _dense(tree: Walked, values: Values) -> Floats | None:
     return inside
 
 
-def meetings(parent: Ints, tree: Walked, buses: Ints) -> Ints:
+def meetings(parent: Ints, tree: Walk, buses: Ints) -> Ints:
     """Bus at which the paths to the root of every bus and of each of `buses` meet; O(b k).
 
-    Parameters
-    ----------
-    parent : (b,)
-        See `walk`.
-    buses : (k,)
-        The second bus of each pair.
-
-    Returns
-    -------
-    (b + 1, k)
-        The lowest bus on both paths, themselves included.
+    buses (k,): the second bus of each pair.
+    Returns (b + 1, k): the lowest bus on both paths, themselves included.
     """
     out = np.zeros((parent.size + 1, buses.size), dtype=np.intp)
     at = tree.start[buses]
@@ -200,12 +194,8 @@ _SHRINK = 0.2
 def shrinking(first: Floats, second: Floats, axis: tuple[int, ...]) -> Bools:
     """Mask of sweeps with steps that shrink fast enough for all later ones to be at most the second.
 
-    Parameters
-    ----------
-    first, second : (…)
-        Changes in the first two steps.
-    axis
-        Axes of the buses; kept, with one entry.
+    first, second (…): changes in the first two steps.
+    axis: axes of the buses; kept, with one entry.
     """
     largest = np.max(first, axis=axis, keepdims=True)
     return np.asarray(np.max(second, axis=axis, keepdims=True) <= _SHRINK * largest)

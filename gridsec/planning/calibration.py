@@ -35,10 +35,8 @@ its logarithmic Bayes factor against files without that error is ``g - h / 2``, 
 + 1 / s^2) - log(1 + h s^2)) / 2``. Without any error the expectation of a Bayes factor is 1. So a mean of M
 factors exceeds ``1 / risk`` with at most the probability `risk`, for any dependence between them.
 
-References
-----------
-docs/theory-studies.md, Calibration.
-.. [1] V. Vovk, R. Wang, "E-values: calibration, combination and applications", Annals of Statistics 2021.
+Source: docs/theory-studies.md, Calibration; V. Vovk, R. Wang, "E-values: calibration, combination and
+applications", Annals of Statistics 2021.
 """
 
 from __future__ import annotations
@@ -79,34 +77,19 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Places:
-    """Model of a feeder for readings. Q places, N customers, p meters, L branches, F phases (1 or 3).
+    """Model of a feeder for readings. Q places, N customers, p meters, L branches, F phases (1 or 3)."""
 
-    Attributes
-    ----------
-    active, reactive : (Q, Q)
-        Change of the squared voltage at a place per power injected at another, pu, the factor 2 included.
-    phase : (Q,)
-        Phase of each place, 0 to F - 1.
-    share : (Q, L)
-        Share of a line's drop at a place: 1 behind a branch of a tree and 0 elsewhere, complex in loops.
-    weight : (N, Q)
-        Connections of each customer; rows add up to 1.
-    meters : (p,)
-        Customer of each meter.
-    volt : (Q,)
-        1 pu of each place, V.
-    unit : (p,)
-        1 pu of each meter's readings, V.
-    """
-
+    # active, reactive (Q, Q): change of the squared voltage at a place per power injected at another, pu, the
+    # factor 2 included
     active: Floats
     reactive: Floats
-    phase: Ints
+    phase: Ints  # (Q,) phase of each place, 0 to F - 1
+    # (Q, L) share of a line's drop at a place: 1 behind a branch of a tree and 0 elsewhere, complex in loops
     share: Floats | Phasors
-    weight: Floats
-    meters: Ints
-    volt: Floats
-    unit: Floats
+    weight: Floats  # (N, Q) connections of each customer; rows add up to 1
+    meters: Ints  # (p,) customer of each meter
+    volt: Floats  # (Q,) 1 pu of each place, V
+    unit: Floats  # (p,) 1 pu of each meter's readings, V
 
     def read(self, weight: Floats) -> Floats:
         """Matrix from the places' squared voltages to the readings of meters with these weights, (p, Q) both.
@@ -131,10 +114,7 @@ class Places:
     def moved(self, series: Series, change: Mapping[int, Floats]) -> Floats:
         """Change of the meters' squared voltages for customers at other places, (T, p).
 
-        Parameters
-        ----------
-        change
-            New weights (Q,) of each moved customer.
+        change: new weights (Q,) of each moved customer.
         """
         weight = self.weight[self.meters]
         before = self.read(weight)
@@ -160,10 +140,7 @@ class Places:
         The customers' powers move from the place that feeds a part to another phase of its bus. The drop
         along the part stays, and so do the ratios of its bases. Several parts change together.
 
-        Parameters
-        ----------
-        parts
-            For each part: its customers, the place that feeds it, and the place on the other phase.
+        parts: for each part: its customers, the place that feeds it, and the place on the other phase.
         """
         W = self.read(self.weight[self.meters])
         shift: Floats = np.zeros_like(series.places)
@@ -182,39 +159,21 @@ class Places:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Series:
-    """Readings and the files' model of them. T frames.
+    """Readings and the files' model of them. T frames."""
 
-    Attributes
-    ----------
-    t : (T,)
-        Times, s.
-    y : (T, p)
-        Squared voltages read, pu; arbitrary where not seen.
-    seen : (T, p)
-        True where there is a reading.
-    p, q : (T, N)
-        Net injections, pu.
-    load : (T, N)
-        Loads with reactive power by a power factor, pu.
-    roof : (T, N)
-        Reactive power of the load that generation may hide, where only the difference is metered, pu.
-    steep : (T, N)
-        Derivative of the inverter's q in the squared voltage read; 0 without one, or with q metered.
-    places : (T, Q)
-        Squared voltages by power flow, pu.
-    drop : (T, F, L)
-        Their drop along each line, pu; in loops ``2 conj(V) (V_one - V_other)`` with V in its middle.
-    """
-
-    t: Floats
-    y: Floats
-    seen: Bools
+    t: Floats  # (T,) times, s
+    y: Floats  # (T, p) squared voltages read, pu; arbitrary where not seen
+    seen: Bools  # (T, p) True where there is a reading
+    # p, q (T, N): net injections, pu
     p: Floats
     q: Floats
-    load: Floats
+    load: Floats  # (T, N) loads with reactive power by a power factor, pu
+    # (T, N) reactive power of the load that generation may hide, where only the difference is metered, pu
     roof: Floats
+    # (T, N) derivative of the inverter's q in the squared voltage read; 0 without one, or with q metered
     steep: Floats
-    places: Floats
+    places: Floats  # (T, Q) squared voltages by power flow, pu
+    # (T, F, L) their drop along each line, pu; in loops ``2 conj(V) (V_one - V_other)`` with V in its middle
     drop: Floats | Phasors
 
     def residual(self, places: Places) -> Floats:
@@ -225,50 +184,27 @@ class Series:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PriorUncertainty:
-    """Prior standard deviations of uncertain quantities; 0 for known ones.
+    """Prior standard deviations of uncertain quantities; 0 for known ones."""
 
-    Attributes
-    ----------
-    bias : (p,)
-        Fixed error of each meter, relative to the busbar's, 1.
-    p_gain, q_gain : (N,)
-        Relative error of the power registers, 1.
-    tan : (N,)
-        Error of tan(phi) where q is not metered, 1.
-    roof : (N,)
-        Actual share of `Series.roof`, its mean and its daily course, 1.
-    p_level, q_level : (N,)
-        Constant error of the powers, pu.
-    length : (L,)
-        Relative tolerance of a branch's length, 1.
-    """
-
-    bias: Floats
+    bias: Floats  # (p,) fixed error of each meter, relative to the busbar's, 1
+    # p_gain, q_gain (N,): relative error of the power registers, 1
     p_gain: Floats
     q_gain: Floats
-    tan: Floats
-    roof: Floats
+    tan: Floats  # (N,) error of tan(phi) where q is not metered, 1
+    roof: Floats  # (N,) actual share of `Series.roof`, its mean and its daily course, 1
+    # p_level, q_level (N,): constant error of the powers, pu
     p_level: Floats
     q_level: Floats
-    length: Floats
+    length: Floats  # (L,) relative tolerance of a branch's length, 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Regressors:
-    """Regressors by kind, one after the other.
+    """Regressors by kind, one after the other."""
 
-    Attributes
-    ----------
-    columns : (T, p, K)
-        Effect of a unit of each coefficient, squared pu.
-    spread : (K,)
-        Prior standard deviations.
-    where : kind -> (k,)
-        Indices of columns by the names of `PriorUncertainty`; k depends on the kind.
-    """
-
-    columns: Floats
-    spread: Floats
+    columns: Floats  # (T, p, K) effect of a unit of each coefficient, squared pu
+    spread: Floats  # (K,) prior standard deviations
+    # kind -> (k,) indices of columns by the names of `PriorUncertainty`; k depends on the kind
     where: dict[str, Ints]
 
 
@@ -324,15 +260,7 @@ def lengthened(places: Places, series: Series) -> Floats:
 def steps(series: Series, meter: int, pieces: int) -> tuple[Floats, list[tuple[float, float]]]:
     """Intervals in which one meter's error may differ from its usual: parts of the recording, and rests.
 
-    Parameters
-    ----------
-    pieces
-        Number of intervals with equally many frames.
-
-    Returns
-    -------
-    (T, p, H), [H pairs]
-        Effect of a relative error in each interval, and its begin and end, s.
+    Returns (T, p, H), [H pairs]: effect of a relative error in each interval, and its begin and end, s.
     """
     T, p = series.y.shape
     cuts = np.linspace(0, T, pieces + 1).astype(np.intp)
@@ -360,42 +288,24 @@ _SPREAD = np.array([3.0, 3.0, 2.0, 0.5])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Field:
-    """Covariances at p meters, squared pu^2.
+    """Covariances at p meters, squared pu^2."""
 
-    Attributes
-    ----------
-    active, reactive : (p, p)
-        Of unit errors of all customers' powers: ``4 R R^T`` and ``4 X X^T``.
-    known : (p, p)
-        Of errors of known size.
-    """
-
+    # active, reactive (p, p): of unit errors of all customers' powers: ``4 R R^T`` and ``4 X X^T``
     active: Floats
     reactive: Floats
-    known: Floats
+    known: Floats  # (p, p) of errors of known size
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadErrors:
-    """Errors of the customers' powers, and factor on the stated noise of the meters.
+    """Errors of the customers' powers, and factor on the stated noise of the meters."""
 
-    Attributes
-    ----------
-    p, q
-        Standard deviations in the unit of the `Field`.
-    time_s
-        Correlation time, s.
-    white
-        Factor on the standard deviation of the meters' noise.
-    std : (4,)
-        Standard errors of the logarithms of ``p, q, time_s, white``, see `learn`.
-    """
-
+    # p, q: standard deviations in the unit of the `Field`
     p: float
     q: float
-    time_s: float
-    white: float
-    std: Floats
+    time_s: float  # correlation time, s
+    white: float  # factor on the standard deviation of the meters' noise
+    std: Floats  # (4,) standard errors of the logarithms of ``p, q, time_s, white``, see `learn`
 
     def covariance(self, field: Field) -> Floats:
         """S, (p, p)."""
@@ -404,27 +314,14 @@ class LoadErrors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Whitening:
-    """Whitening filter of T frames, computed once and applied to any number of columns.
+    """Whitening filter of T frames, computed once and applied to any number of columns."""
 
-    Attributes
-    ----------
-    modes : (p, m)
-        L with ``S = L L^T``.
-    decay : (T,)
-        Autocorrelation of the modes from each frame to the next.
-    inverse : (T, p, p)
-        Inverse Cholesky factor of the innovations' covariance; rows and columns of missing readings are 0.
-    gain : (T, m, p)
-        Kalman gain.
-    log_det
-        Logarithm of the determinant of the readings' covariance.
-    """
-
-    modes: Floats
-    decay: Floats
+    modes: Floats  # (p, m) L with ``S = L L^T``
+    decay: Floats  # (T,) autocorrelation of the modes from each frame to the next
+    # (T, p, p) inverse Cholesky factor of the innovations' covariance; rows and columns of missing readings
+    # are 0
     inverse: Floats
-    gain: Floats
-    log_det: float
+    gain: Floats  # (T, m, p) Kalman gain
 
     def __call__(self, columns: Floats) -> Floats:
         """Whiten columns (T, p, k): normalised innovations, in standard deviations."""
@@ -450,29 +347,18 @@ def whitening(
 ) -> Whitening:
     """Compute the whitening filter.
 
-    Parameters
-    ----------
-    t : (T,)
-        Times of the frames, s, ascending.
-    seen : (T, p)
-        True where there is a reading.
-    S : (p, p)
-        Covariance of the field, squared pu^2.
-    time_s
-        Its correlation time, s.
-    white : (T, p)
-        Variance of each reading's own noise.
-    common : (T, p, f)
-        Common errors of a frame's readings, one column each, in standard deviations: the noise of the
-        busbar's f voltages.
-    gaps : T times (p, g)
-        Effects of unknown powers of single frames, one column each, in standard deviations.
+    t (T,): times of the frames, s, ascending.
+    S (p, p): covariance of the field, squared pu^2.
+    white (T, p): variance of each reading's own noise.
+    common (T, p, f): common errors of a frame's readings, one column each, in standard deviations: the noise
+        of the busbar's f voltages.
+    gaps T times (p, g): effects of unknown powers of single frames, one column each, in standard deviations.
     """
     L = _modes(S, white.mean(axis=0))
     p, m = L.shape
     decay = np.append(np.exp(-np.diff(t) / time_s), 0.0)
     inverse, gain = np.zeros((t.size, p, p)), np.zeros((t.size, m, p))
-    P, log_det = np.eye(m), 0.0
+    P = np.eye(m)
     for k in range(t.size):
         rows = np.flatnonzero(seen[k])
         if rows.size:
@@ -480,16 +366,14 @@ def whitening(
             cross = P @ own.T
             covariance = own @ cross + extra @ extra.T
             covariance[np.diag_indices_from(covariance)] += white[k, rows]
-            C = np.linalg.cholesky(covariance)
-            half = solve_triangular(C, np.eye(rows.size), lower=True)
+            half = solve_triangular(np.linalg.cholesky(covariance), np.eye(rows.size), lower=True)
             inverse[k][np.ix_(rows, rows)] = half
             K = cross @ half.T @ half
             gain[k][:, rows] = K
             P = P - K @ cross.T
             P = 0.5 * (P + P.T)
-            log_det += 2.0 * float(np.log(C.diagonal()).sum())
         P = decay[k] ** 2 * P + (1.0 - decay[k] ** 2) * np.eye(m)
-    return Whitening(L, decay, inverse, gain, log_det)
+    return Whitening(L, decay, inverse, gain)
 
 
 def _modes(S: Floats, white: Floats) -> Floats:
@@ -502,34 +386,18 @@ def _modes(S: Floats, white: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Increments:
-    """Sums of products of increments over some lags, by blocks of time. B blocks, H lags.
+    """Sums of products of increments over some lags, by blocks of time. B blocks, H lags."""
 
-    Attributes
-    ----------
-    dt : (H,)
-        The lags, s.
-    total : (B, H, p, p)
-        Sums of products of increments.
-    count : (B, H, p, p)
-        Numbers of products.
-    """
-
-    dt: Floats
-    total: Floats
-    count: Floats
+    dt: Floats  # (H,) the lags, s
+    total: Floats  # (B, H, p, p) sums of products of increments
+    count: Floats  # (B, H, p, p) numbers of products
 
 
 def increments(t: Floats, seen: Bools, residual: Floats) -> Increments:
     """Products of increments of residuals, free of constants in time.
 
-    Parameters
-    ----------
-    t : (T,)
-        Times, s.
-    seen : (T, p)
-        True where there is a reading.
-    residual : (T, p)
-        Readings minus model, squared pu.
+    t (T,): times, s.
+    residual (T, p): readings minus model, squared pu.
     """
     step, p = float(np.median(np.diff(t))), residual.shape[1]
     lags = [lag for lag in _LAGS if 4 * lag <= t.size]
@@ -562,18 +430,9 @@ def learn(
     The increment over a lag h has the covariance ``2 (1 - exp(-h / tau)) S + 2 D``; its Gaussian likelihood,
     summed over the lags, is maximised over ``k_p, k_q, tau`` and a factor on D.
 
-    Parameters
-    ----------
-    white : (p,)
-        Stated variance of the meters' noise, squared pu^2.
-    common : (p, p)
-        Covariance of the busbar noise's effect at the meters, squared pu^2.
-    guess
-        Centre of the prior.
-    errors
-        Compute standard errors.
-    start
-        Initial value of the search; by default `guess`.
+    white (p,): stated variance of the meters' noise, squared pu^2.
+    common (p, p): covariance of the busbar noise's effect at the meters, squared pu^2.
+    start: initial value of the search; by default `guess`.
     """
     base, begin = (np.log([n.p, n.q, n.time_s, n.white]) for n in (guess, start or guess))
     problem = _Composite(given.dt, field, white, common, base)
@@ -648,41 +507,25 @@ class _Composite:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RegressionFit:
-    """Regression without any error of the files. n readings, K coefficients.
+    """Regression without any error of the files. n readings, K coefficients."""
 
-    Attributes
-    ----------
-    explained : (n, K)
-        Whitened regressors, each times the standard deviation of its prior, times ``L^-T`` with
-        ``L L^T = I + A^T A``: ``P = I - explained explained^T``.
-    residual : (n,)
-        ``P y``.
-    estimate, std : (K,)
-        Coefficients and their standard errors, the prior included.
-    scale
-        ``y^T P y / n``, at least 1: residuals above the noise weaken all evidence.
-    """
-
+    # (n, K) whitened regressors, each times the standard deviation of its prior, times ``L^-T`` with ``L L^T
+    # = I + A^T A``: ``P = I - explained explained^T``
     explained: Floats
-    residual: Floats
+    residual: Floats  # (n,) ``P y``
+    # estimate, std (K,): coefficients and their standard errors, the prior included
     estimate: Floats
     std: Floats
-    scale: float
+    scale: float  # ``y^T P y / n``, at least 1: residuals above the noise weaken all evidence
 
 
 def fit(y: Floats, columns: Floats, spread: Floats, count: int) -> RegressionFit:
     """Fit the regression without any error of the files.
 
-    Parameters
-    ----------
-    y : (n,)
-        Whitened readings minus model.
-    columns : (n, K)
-        Whitened regressors.
-    spread : (K,)
-        Standard deviation of each coefficient before any reading.
-    count
-        Number of readings; missing ones are zeros in `y` and `columns`.
+    y (n,): whitened readings minus model.
+    columns (n, K): whitened regressors.
+    spread (K,): standard deviation of each coefficient before any reading.
+    count: number of readings; missing ones are zeros in `y` and `columns`.
     """
     A = columns * spread
     normal = A.T @ A
@@ -702,30 +545,18 @@ def fit(y: Floats, columns: Floats, spread: Floats, count: int) -> RegressionFit
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HypothesisEvidence:
-    """Evidence of the readings for H hypotheses.
+    """Evidence of the readings for H hypotheses."""
 
-    Attributes
-    ----------
-    g, h : (H,)
-        Score and information of each coefficient.
-    log_factor : (H,)
-        Logarithm of the Bayes factor against files without the error.
-    """
-
+    # g, h (H,): score and information of each coefficient
     g: Floats
     h: Floats
-    log_factor: Floats
+    log_factor: Floats  # (H,) logarithm of the Bayes factor against files without the error
 
 
 def evidence(given: RegressionFit, z: Floats, spread: Floats) -> HypothesisEvidence:
     """Compute the Bayes factor of each hypothesis.
 
-    Parameters
-    ----------
-    z : (n, H)
-        Whitened effect of each hypothesis.
-    spread : (H,)
-        Prior standard deviation of its coefficient; 0 for the coefficient 1.
+    spread (H,): prior standard deviation of its coefficient; 0 for the coefficient 1.
     """
     projected = given.explained.T @ z
     g = z.T @ given.residual / given.scale
@@ -738,35 +569,20 @@ def evidence(given: RegressionFit, z: Floats, spread: Floats) -> HypothesisEvide
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Weighed:
-    """Joint evidence of hypotheses of several kinds.
+    """Joint evidence of hypotheses of several kinds."""
 
-    Attributes
-    ----------
-    confidence : (H,)
-        Probability of each, for equal prior probabilities of some error and of none.
-    any
-        Logarithm of the mean Bayes factor: above ``log(1 / risk)`` there is an error; minus infinity without
-        any hypothesis.
-    kept : (k,)
-        The best hypotheses, best first, with all but `risk` of the probability.
-    """
-
-    confidence: Floats
+    confidence: Floats  # (H,) probability of each, for equal prior probabilities of some error and of none
+    # logarithm of the mean Bayes factor: above ``log(1 / risk)`` there is an error; minus infinity without
+    # any hypothesis
     any: float
-    kept: Ints
+    kept: Ints  # (k,) the best hypotheses, best first, with all but `risk` of the probability
 
 
 def weigh(log_factor: Floats, kind: Ints, risk: float) -> Weighed:
     """Compare hypotheses; all kinds have equal weight, and within a kind all hypotheses.
 
-    Parameters
-    ----------
-    log_factor : (H,)
-        From `evidence`.
-    kind : (H,)
-        Kind of each, as a number.
-    risk
-        Probability of a proposal for files without errors.
+    kind (H,): kind of each, as a number.
+    risk: probability of a proposal for files without errors.
     """
     _, where, count = np.unique(kind, return_inverse=True, return_counts=True)
     log_share = log_factor - np.log(count.size * count[where])
@@ -780,21 +596,11 @@ def weigh(log_factor: Floats, kind: Ints, risk: float) -> Weighed:
 def explain(given: RegressionFit, z: Floats, own: Floats, like: float) -> tuple[Floats, Floats, Bools]:
     """Estimate each coefficient alone, and mark effects that cannot be distinguished.
 
-    Parameters
-    ----------
-    z : (n, H)
-        Whitened effects.
-    own : (H,)
-        Standard deviation of the coefficient among the regressors; it is removed.
-    like
-        Smallest correlation of two effects, 1, that count as equal.
-
-    Returns
-    -------
-    estimate, std : (H,)
-        Least squares without prior for this coefficient; infinite errors where not determined.
-    same : (H, H)
-        Pairs with equal effects after projection on the other regressors' complement.
+    own (H,): standard deviation of the coefficient among the regressors; it is removed.
+    like: smallest correlation of two effects, 1, that count as equal.
+    Returns estimate, std (H,): least squares without prior for this coefficient; infinite errors where not
+        determined.
+    Returns same (H, H): pairs with equal effects after projection on the other regressors' complement.
     """
     projected = given.explained.T @ z
     inner = z.T @ z - projected.T @ projected

@@ -12,9 +12,7 @@ thousands of sets at once. Further meters are bounded by the remainder of g unde
 ``reach_k`` being the largest attack on meter k in any collusion. Branch and bound over J with this bound is
 exact, and prunes most pairs.
 
-References
-----------
-docs/theory-studies.md, section 5.
+Source: docs/theory-studies.md, section 5.
 """
 
 from __future__ import annotations
@@ -41,54 +39,30 @@ _TOGETHER, _STEPS = 512, 50
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Corridor:
-    """Tests with bounds, all of which must hold. r tests, p meters.
+    """Tests with bounds, all of which must hold. r tests, p meters."""
 
-    Attributes
-    ----------
-    rows : (r, p)
-        R, and ``1 / reach`` of each meter; tests that M meters then cannot bring to their bounds are left
-        out.
-    reach : (p,)
-        Largest attack on each meter in any collusion; 0 for protected meters.
-    liars
-        M, largest number of manipulated meters.
-    """
-
+    # (r, p) R, and ``1 / reach`` of each meter; tests that M meters then cannot bring to their bounds are
+    # left out
     rows: Floats
-    reach: Floats
-    liars: int
+    reach: Floats  # (p,) largest attack on each meter in any collusion; 0 for protected meters
+    liars: int  # M, largest number of manipulated meters
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shift:
-    """Attack with the largest displacement while all tests stay within their bounds. p meters.
+    """Attack with the largest displacement while all tests stay within their bounds. p meters."""
 
-    Attributes
-    ----------
-    size
-        Displacement, reached by `lies`.
-    bound
-        Upper bound of the displacement; above `size` by more than GAP only after an incomplete search.
-    lies : (p,)
-        a.
-    """
-
-    size: float
+    size: float  # displacement, reached by `lies`
+    # upper bound of the displacement; above `size` by more than GAP only after an incomplete search
     bound: float
-    lies: Floats
+    lies: Floats  # (p,) a
 
 
 def corridor(rows: Floats, liars: int, *, reach: Floats) -> Corridor:
     """Tighten the largest attack on each meter, and leave out tests without effect.
 
-    Parameters
-    ----------
-    rows : (r, p)
-        R.
-    liars
-        M, at least 1.
-    reach : (p,)
-        A bound of the attack on each meter in any collusion; 0 for protected meters.
+    liars: M, at least 1.
+    reach (p,): a bound of the attack on each meter in any collusion; 0 for protected meters.
     """
     size, liars = np.abs(rows), min(liars, reach.size)
     for _ in range(_ROUNDS):
@@ -117,14 +91,8 @@ _ROUNDS, _WORTH = 50, 1e-3
 def furthest(given: Corridor, along: Floats, *, must: int | None = None, work: float = WORK) -> Shift:
     """Search all sets of at most M manipulated meters.
 
-    Parameters
-    ----------
-    along : (p,) or (d, p)
-        g; of several rows, the one with the largest displacement.
-    must
-        A meter that is manipulated in any case.
-    work
-        Limit of examined entries of tests.
+    along (p,) or (d, p): g; of several rows, the one with the largest displacement.
+    must: a meter that is manipulated in any case.
     """
     search = _Search(given, np.zeros(given.reach.size), work)
     for row in np.atleast_2d(along):

@@ -13,10 +13,8 @@ moment, on s scales and at p meters together, all are within ``H_j`` with probab
 The first two are linear in a but for the number of manipulated meters: `gridsec.planning.collusion` searches
 them.
 
-References
-----------
-D. Hsu, S. Kakade, T. Zhang, "A tail inequality for quadratic forms of subgaussian random vectors", 2012;
-docs/theory-studies.md, section 5; docs/theory-sequential.md, sections 3 to 5.
+Source: D. Hsu, S. Kakade, T. Zhang, "A tail inequality for quadratic forms of subgaussian random vectors",
+2012; docs/theory-studies.md, section 5; docs/theory-sequential.md, sections 3 to 5.
 """
 
 from __future__ import annotations
@@ -36,32 +34,18 @@ __all__ = ["Rule", "Shift", "largest_shift", "named_size", "rule", "within"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rule:
-    """The monitor's rule before biases are learned, with all meters trusted. s scales, p meters, n buses.
-
-    Attributes
-    ----------
-    risk
-        Probability that residuals without attack are beyond `honest` somewhere, at one moment.
-    deviations
-        The corresponding standard deviations of a sub-Gaussian variable: ``sqrt(2 ln(2 s p / risk))``.
-    inverse : (s, p, p)
-        Q on each scale.
-    limit, honest : (s, p)
-        Largest offset without evidence, and H, squared pu.
-    noise : (s, p)
-        Variance d of each meter's mean.
-    model : (p,)
-        Error of the model, squared pu.
-    """
+    """The monitor's rule before biases are learned, with all meters trusted. s scales, p meters, n buses."""
 
     design: SequentialDesign
-    risk: float
+    risk: float  # probability that residuals without attack are beyond `honest` somewhere, at one moment
+    # the corresponding standard deviations of a sub-Gaussian variable: ``sqrt(2 ln(2 s p / risk))``
     deviations: float
-    inverse: Floats
+    inverse: Floats  # (s, p, p) Q on each scale
+    # limit, honest (s, p): largest offset without evidence, and H, squared pu
     limit: Floats
     honest: Floats
-    noise: Floats
-    model: Floats
+    noise: Floats  # (s, p) variance d of each meter's mean
+    model: Floats  # (p,) error of the model, squared pu
 
     def weights(self, bus: int) -> Floats:
         """Effect of each meter's attack on the reconstruction of a bus, on each scale, (s, p)."""
@@ -78,14 +62,8 @@ class Rule:
 def rule(design: SequentialDesign, *, risk: float, model: Floats) -> Rule:
     """Compute the rule of a monitor.
 
-    Parameters
-    ----------
-    design
-        The monitor, with its default search.
-    risk
-        As in `Rule`.
-    model : (p,)
-        As in `Rule`.
+    risk: as in `Rule`.
+    model: as in `Rule`.
     """
     between, prior = design.prior.between, design.prior
     need = [max(1, int(np.ceil(design.options.enough * length))) for length in design.lengths]
@@ -109,15 +87,10 @@ def rule(design: SequentialDesign, *, risk: float, model: Floats) -> Rule:
 def within(given: Rule, liars: int, *, seen: bool, honest: Bools | None = None) -> Corridor:
     """Constraints on attacks of at most M meters with all residuals within their bounds.
 
-    Parameters
-    ----------
-    liars
-        M.
-    seen
-        The bound: False for limit - H (certainly within the limit: hidden), True for limit + H + the
-        model error on both sides (beyond it, some meter certainly exceeds its limit).
-    honest : (p,), optional
-        Meters that cannot be manipulated.
+    liars: M.
+    seen: the bound: False for limit - H (certainly within the limit: hidden), True for limit + H + the model
+        error on both sides (beyond it, some meter certainly exceeds its limit).
+    honest (p,): meters that cannot be manipulated.
     """
     s, p = given.limit.shape
     width = given.limit + given.honest + 2.0 * given.model if seen else given.limit - given.honest
@@ -143,15 +116,9 @@ def largest_shift(
 ) -> Shift:
     """Largest displacement by attacks on at most M meters with all residuals within their bounds.
 
-    Parameters
-    ----------
-    given, liars, seen, honest
-        As in `within`.
-    along : (p,) or (d, p)
-        Displacement per attack on each meter; a unit vector for the attack on one meter itself. Of several
-        rows, the one with the largest displacement.
-    must
-        A meter that is manipulated in any case.
+    along (p,) or (d, p): displacement per attack on each meter; a unit vector for the attack on one meter
+        itself. Of several rows, the one with the largest displacement.
+    must: a meter that is manipulated in any case.
     """
     return furthest(within(given, liars, seen=seen, honest=honest), along, must=must)
 
@@ -166,14 +133,9 @@ def named_size(given: Rule, meter: int, liars: int, *, claims: Floats) -> float:
     best D is bounded by a fractional knapsack, for every n from which charges are lower. Without k, its
     offset is evidence.
 
-    Parameters
-    ----------
-    meter
-        k.
-    liars
-        M.
-    claims : (N,)
-        Size of each customer's possibly false powers, as in the monitor's dictionary, pu.
+    meter: k.
+    liars: M.
+    claims (N,): size of each customer's possibly false powers, as in the monitor's dictionary, pu.
     """
     design, (_, p) = given.design, given.limit.shape
     bus = np.array([design.prior.meters[meter]])

@@ -4,9 +4,7 @@ Every successful attack is a set S of manipulated meters; a protection withstand
 protects a meter of S. So the solution is a smallest hitting set with rows generated on demand: protect a set
 that hits all attacks known so far, search for an attack against it, and repeat until there is none.
 
-References
-----------
-docs/theory-studies.md, section 4.
+Source: docs/theory-studies.md, section 4.
 """
 
 from __future__ import annotations
@@ -28,10 +26,7 @@ __all__ = ["Attacker", "Protection", "Unprotectable", "fewest_protected", "hides
 class Unprotectable(DesignInfeasible):
     """An attack succeeds against every possible protection.
 
-    Parameters
-    ----------
-    liars
-        Meters of the attack, none of which can be protected.
+    liars: meters of the attack, none of which can be protected.
     """
 
     def __init__(self, liars: Ints) -> None:
@@ -49,21 +44,11 @@ Attacker = Callable[[Bools], Ints | None]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Protection:
-    """Sufficient set of meters, and the smallest necessary number.
+    """Sufficient set of meters, and the smallest necessary number."""
 
-    Attributes
-    ----------
-    meters
-        Meters to protect, ascending.
-    least
-        Lower bound of their number; equal to it if they are proven minimal.
-    attacks
-        Sets of manipulated meters that rule out every smaller protection.
-    """
-
-    meters: Ints
-    least: int
-    attacks: tuple[Ints, ...]
+    meters: Ints  # meters to protect, ascending
+    least: int  # lower bound of their number; equal to it if they are proven minimal
+    attacks: tuple[Ints, ...]  # sets of manipulated meters that rule out every smaller protection
 
     @property
     def gap(self) -> int:
@@ -74,11 +59,8 @@ class Protection:
 def hides(given: Patterns, liars: int) -> Attacker:
     """Attacker that imitates a pattern with at most `liars` meters.
 
-    Parameters
-    ----------
-    liars
-        2M to identify M manipulated meters: two explanations of M meters each differ by such an attack. M to
-        detect them only.
+    liars: 2M to identify M manipulated meters: two explanations of M meters each differ by such an attack. M
+        to detect them only.
     """
 
     def attack(protected: Bools) -> Ints | None:
@@ -91,13 +73,9 @@ def hides(given: Patterns, liars: int) -> Attacker:
 def lies_beyond(box: ErrorBox | PowerErrorModel, liars: int, size: Floats | float) -> Attacker:
     """Attacker with an attack above a bound that is consistent with an unmanipulated feeder.
 
-    Parameters
-    ----------
-    box, liars
-        As in `gridsec.planning.stealthy_attacks.largest_lie`, or in
+    box, liars: as in `gridsec.planning.stealthy_attacks.largest_lie`, or in
         `gridsec.planning.stealthy_attacks.largest_story`.
-    size : float or (p,)
-        Bound of the attack on each meter, squared pu.
+    size float or (p,): bound of the attack on each meter, squared pu.
     """
     p = (box.box if isinstance(box, PowerErrorModel) else box).meters.size
     limit = np.broadcast_to(size, p)
@@ -126,26 +104,11 @@ def fewest_protected(
 ) -> Protection:
     """Protect the fewest meters such that no attack succeeds.
 
-    Parameters
-    ----------
-    attacker
-        Returns an attack on every insufficient protection.
-    count
-        p.
-    never : (p,), optional
-        Meters that cannot be protected.
-    exact
-        Solve each hitting set to optimality; otherwise repeatedly take the meter in most of the remaining
+    attacker: returns an attack on every insufficient protection.
+    exact: solve each hitting set to optimality; otherwise repeatedly take the meter in most of the remaining
         attacks, and remove unnecessary meters at the end.
-    progress
-        Called with the number of known attacks and the number of meters protected against them.
-
-    Raises
-    ------
-    Unprotectable
-        If no meter of an attack can be protected.
-    DesignInfeasible
-        If a solver fails.
+    progress: called with the number of known attacks and the number of meters protected against them.
+    Raises Unprotectable if no meter of an attack can be protected; DesignInfeasible if a solver fails.
     """
     never = np.zeros(count, dtype=np.bool_) if never is None else never
     protected = np.zeros(count, dtype=np.bool_)

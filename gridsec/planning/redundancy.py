@@ -8,10 +8,8 @@ react. About a trajectory with slopes d of the droop curves,
 is a pair. Its eigenvalue 0 belongs to *persistent patterns*, its other eigenvalues to decaying transients of
 the inverters. Attacks are hidden while they equal such a pattern.
 
-References
-----------
-lee2018, chapter 3; docs/theory-studies.md, section 1.
-lee2018, Definitions 3.1.1 and 3.1.3, Propositions 3.1.2, 3.1.9 and 3.2.2; docs/theory-studies.md, section 2.
+Source: lee2018, chapter 3, Definitions 3.1.1 and 3.1.3, Propositions 3.1.2, 3.1.9 and 3.2.2;
+docs/theory-studies.md, sections 1 and 2.
 """
 
 from __future__ import annotations
@@ -59,21 +57,12 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Patterns:
-    """Directions of hidden attacks: eigenspaces of a pair. n states, p meters.
+    """Directions of hidden attacks: eigenspaces of a pair. n states, p meters."""
 
-    Attributes
-    ----------
-    spaces : (n, g) each
-        Orthonormal bases of the eigenspaces to search.
-    seen : (p, g) each
-        Their images at the meters, each meter's row of C scaled to length one, or zero.
-    tol
-        Products of unit vectors up to this count as zero.
-    """
-
-    spaces: tuple[Matrix, ...]
+    spaces: tuple[Matrix, ...]  # (n, g) each: orthonormal bases of the eigenspaces to search
+    # (p, g) each: their images at the meters, each meter's row of C scaled to length one, or zero
     seen: tuple[Matrix, ...]
-    tol: float
+    tol: float  # products of unit vectors up to this count as zero
 
     @property
     def dimension(self) -> int:
@@ -96,14 +85,8 @@ def unknown_voltages(feeder: Network, unknown: Ints, *, busbar: bool, tol: float
     three phases of a column for each, ones where its customers are. Powers without effect on any customer's
     voltage are not counted.
 
-    Parameters
-    ----------
-    unknown : (k,)
-        Customers with unknown active and reactive powers.
-    busbar
-        True if the busbar's voltage is unknown as well.
-    tol
-        Columns up to this fraction of the longest have no effect. Singular values up to this fraction of the
+    unknown (k,): customers with unknown active and reactive powers.
+    tol: columns up to this fraction of the longest have no effect. Singular values up to this fraction of the
         largest, of columns of unit length, are zero.
     """
     powers = np.hstack([feeder.between(power)[:, unknown] for power in Power])
@@ -129,14 +112,8 @@ def from_busbar(feeder: Network) -> Floats:
 def unknown_pair(lure: Lure, slope: Floats, W: Floats) -> tuple[Floats, Floats]:
     """The pair (A, C) of the module's head, with states scaled to similar size.
 
-    Parameters
-    ----------
-    lure
-        Closed loop, from `close_loop`.
-    slope : (m,)
-        Slope of each droop curve.
-    W : (N, d)
-        From `unknown_voltages`.
+    slope (m,): slope of each droop curve.
+    W (N, d): from `unknown_voltages`.
     """
     A, C = linearise(lure, slope)
     # Injections in units of the voltages that they cause: subspaces stay, and ranks become decidable. Effects
@@ -150,15 +127,10 @@ def unknown_pair(lure: Lure, slope: Floats, W: Floats) -> tuple[Floats, Floats]:
 def patterns(A: Floats, C: Floats, *, persistent: bool, tol: float) -> Patterns:
     """Eigenspaces in which an attack can stay invisible for ever.
 
-    Parameters
-    ----------
-    A, C : (n, n), (p, n)
-        A pair in continuous time.
-    persistent
-        Only those of eigenvalues that do not decay: decaying attacks are left out, and observability becomes
-        detectability.
-    tol
-        As in `gridsec.secure.index.dynamic_index`; rows of C up to this fraction of the longest count as
+    A, C (n, n), (p, n): a pair in continuous time.
+    persistent: only those of eigenvalues that do not decay: decaying attacks are left out, and observability
+        becomes detectability.
+    tol: as in `gridsec.secure.index.dynamic_index`; rows of C up to this fraction of the longest count as
         zero, too.
     """
     found = eigenspaces(A, tol=tol) if A.size else ()
@@ -186,28 +158,11 @@ def fewest_meters(
 
     Patterns invisible to all meters (`Patterns.blind`) need no attack and are left out.
 
-    Parameters
-    ----------
-    honest : (p,), optional
-        Meters that cannot be manipulated: only patterns invisible to them remain.
-    silent : (p,), optional
-        Unavailable meters.
-    must
-        A meter that is among the manipulated ones.
-    below, most
-        As in `gridsec.secure.index.fewest`.
-
-    Returns
-    -------
-    Index
-        Infinite without a pattern to imitate.
-
-    Raises
-    ------
-    DesignInfeasible
-        After `most` nodes.
-    ValueError
-        If `must` is protected or unavailable.
+    honest (p,): meters that cannot be manipulated: only patterns invisible to them remain.
+    silent (p,): unavailable meters.
+    below, most: as in `gridsec.secure.index.fewest`.
+    Returns Index: infinite without a pattern to imitate.
+    Raises DesignInfeasible after `most` nodes; ValueError if `must` is protected or unavailable.
     """
     p = given.seen[0].shape[0] if given.seen else 0
     none = np.zeros(p, dtype=np.bool_)
@@ -248,17 +203,8 @@ def _components(seen: Matrix, tol: float) -> list[Matrix]:
     In a basis that is the identity at as many meters as it has directions, these are the connected components
     of the bipartite graph of its entries: those of the matroid of the rows.
 
-    Parameters
-    ----------
-    seen : (p, g)
-        Image of a basis at each meter.
-    tol
-        Largest entry that counts as zero.
-
-    Returns
-    -------
-    (g, k) each
-        Orthonormal bases; directions invisible to all meters are left out.
+    seen (p, g): image of a basis at each meter.
+    Returns (g, k) each: orthonormal bases; directions invisible to all meters are left out.
     """
     # Counts do not depend on invisible directions, so their complement suffices.
     _, sizes, vh = np.linalg.svd(seen, full_matrices=False)
@@ -276,50 +222,26 @@ def _components(seen: Matrix, tol: float) -> list[Matrix]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Meter:
-    """Redundancy with and without one meter.
+    """Redundancy with and without one meter."""
 
-    Attributes
-    ----------
-    own
-        Smallest set of manipulated meters, this one among them, that imitates a pattern: its security index.
-    without
-        Index of all other meters, with this one unavailable.
-    critical
-        True if a pattern is invisible to all others: the own index is 1, and attacks on it are undetectable.
-    """
-
+    # smallest set of manipulated meters, this one among them, that imitates a pattern: its security index
     own: Index
-    without: Index
+    without: Index  # index of all other meters, with this one unavailable
+    # True if a pattern is invisible to all others: the own index is 1, and attacks on it are undetectable
     critical: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FeederSection:
-    """Part of a feeder: everything fed through one bus alone.
-
-    Attributes
-    ----------
-    branch
-        True if a line leads from `bus` to the busbar.
-    meters : (k,)
-        The meters there.
-    """
+    """Part of a feeder: everything fed through one bus alone."""
 
     bus: int
-    branch: bool
-    meters: Ints
+    branch: bool  # True if a line leads from `bus` to the busbar
+    meters: Ints  # (k,) the meters there
 
 
 def meter_redundancy(given: Patterns, meter: int, silent: Bools) -> Meter:
-    """Security index of one meter, and the index of the others without it.
-
-    Parameters
-    ----------
-    meter
-        An available meter.
-    silent : (p,)
-        Unavailable meters.
-    """
+    """Security index of one meter, and the index of the others without it."""
     own = fewest_meters(given, silent=silent, must=meter)
     gone = silent.copy()
     gone[meter] = True
@@ -332,12 +254,7 @@ def part_redundancy(given: Patterns, part: FeederSection, silent: Bools) -> Inde
     All meters outside are unmanipulated. Up to `Index.correctable` manipulated meters, all of them in the
     part, are identified, and no more in general.
 
-    Parameters
-    ----------
-    part
-        From `parts`.
-    silent : (p,)
-        Unavailable meters.
+    silent (p,): unavailable meters.
     """
     honest = np.ones(silent.size, dtype=np.bool_)
     honest[part.meters] = False
@@ -349,14 +266,8 @@ def parts(feeder: Feeder | ThreePhaseFeeder, buses: Ints, ties: Ints) -> Sequenc
 
     A part has all phases of its buses.
 
-    Parameters
-    ----------
-    feeder
-        The feeder's tree.
-    buses : (p,)
-        Bus of each meter.
-    ties : (t, 2)
-        Buses at both ends of the lines that close loops.
+    buses (p,): bus of each meter.
+    ties (t, 2): buses at both ends of the lines that close loops.
     """
     found: dict[tuple[int, ...], FeederSection] = {}
     lines = np.vstack([np.column_stack([feeder.parent, np.arange(1, len(feeder.buses))]), ties])
@@ -371,7 +282,8 @@ def parts(feeder: Feeder | ThreePhaseFeeder, buses: Ints, ties: Ints) -> Sequenc
 def _fed_through(feeder: Feeder | ThreePhaseFeeder, lines: Ints, bus: int) -> Bools:
     """Buses that lose the busbar if one is removed, that bus included; on a tree all behind it."""
     if len(lines) < len(feeder.buses):
-        return np.asarray((feeder.start >= feeder.start[bus]) & (feeder.start < feeder.stop[bus]))
+        start, stop = feeder.walk.start, feeder.walk.stop
+        return np.asarray((start >= start[bus]) & (start < stop[bus]))
     left = lines[(lines != bus).all(axis=1)]
     graph = coo_array((np.ones(len(left)), left.T), shape=(len(feeder.buses),) * 2)
     _, piece = connected_components(graph, directed=False)

@@ -10,18 +10,15 @@ So the largest consistent attack on meter k is ``2 max (b_k c + e_k)`` over c an
 |J| <= M: a mixed-integer program with tight big-M constants, ``sum |b_j| - e_j``. The resulting error of a
 customer's voltage is the same program with ``2 max b_i c``.
 
-As in `gridsec.planning.stealthy_attacks`, but a customer's powers are known within the meter's errors only
-while that meter is unmanipulated. The powers of a manipulated meter are anywhere in the customer's range, the
-true ones and the reported ones:
+With false powers (`PowerErrorModel`), a customer's powers are known within the meter's errors only while that
+meter is unmanipulated. The powers of a manipulated meter are anywhere in the customer's range, the true ones
+and the reported ones:
 
     |b_j c| <= e_j  for all meters j outside J,    |c_i| <= n_i  for unknowns i with a meter outside J.
 
 With a binary for every meter this is a mixed-integer program again.
 
-References
-----------
-docs/theory-studies.md, section 3.
-docs/theory-studies.md, section 4.
+Source: docs/theory-studies.md, sections 3 and 4.
 """
 
 from __future__ import annotations
@@ -49,24 +46,14 @@ __all__ = [
 class ErrorBox:
     """Errors of unmanipulated customers and meters. N customers, k unknowns, p meters.
 
-    Attributes
-    ----------
-    effect : (N, k)
-        B: effect of each unknown, at the end of its interval, on the squared voltages, pu.
-    meters : (p,)
-        Customer of each meter.
-    reading : (p,)
-        e: largest error of an unmanipulated squared reading, pu; positive.
-
-    Raises
-    ------
-    ValueError
-        If numbers of meters differ, an effect is not finite, or an error of a reading not positive.
+    Raises ValueError if numbers of meters differ, an effect is not finite, or an error of a reading not
+        positive.
     """
 
+    # (N, k) B: effect of each unknown, at the end of its interval, on the squared voltages, pu
     effect: Floats
-    meters: Ints
-    reading: Floats
+    meters: Ints  # (p,) customer of each meter
+    reading: Floats  # (p,) e: largest error of an unmanipulated squared reading, pu; positive
 
     def __post_init__(self) -> None:
         if self.reading.shape != self.meters.shape or self.effect.ndim != 2:
@@ -87,40 +74,20 @@ class ErrorBox:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StealthyAttack:
-    """Largest attack, or error, consistent with an unmanipulated feeder.
+    """Largest attack, or error, consistent with an unmanipulated feeder."""
 
-    Attributes
-    ----------
-    size
-        Squared pu; reached by `liars` with the unknowns at `unknowns`. 0 without possible attacks.
-    bound
-        Upper bound of the solver; at least `size`.
-    liars
-        Meters that must be manipulated for it.
-    unknowns : (k,)
-        c.
-    """
-
-    size: float
-    bound: float
-    liars: Ints
-    unknowns: Floats
+    size: float  # Squared pu; reached by `liars` with the unknowns at `unknowns`. 0 without possible attacks.
+    bound: float  # upper bound of the solver; at least `size`
+    liars: Ints  # meters that must be manipulated for it
+    unknowns: Floats  # (k,) c
 
 
 def largest_lie(box: ErrorBox, meter: int, liars: int, *, honest: Bools | None = None) -> StealthyAttack:
     """Largest attack on a meter, in collusion with others, that is consistent with an unmanipulated feeder.
 
-    Parameters
-    ----------
-    liars
-        Largest number of manipulated meters, this one among them.
-    honest : (p,), optional
-        Protected meters: they cannot be manipulated.
-
-    Raises
-    ------
-    DesignInfeasible
-        If the solver fails.
+    liars: largest number of manipulated meters, this one among them.
+    honest (p,): protected meters: they cannot be manipulated.
+    Raises DesignInfeasible if the solver fails.
     """
     honest = np.zeros(box.meters.size, dtype=np.bool_) if honest is None else honest
     if honest[meter] or liars < 1:
@@ -133,16 +100,13 @@ def largest_lie(box: ErrorBox, meter: int, liars: int, *, honest: Bools | None =
 def worst_error(box: ErrorBox, customer: int, liars: int, *, honest: Bools | None = None) -> StealthyAttack:
     """Largest difference of a customer's voltage between two states with the same readings.
 
-    Parameters
-    ----------
-    box, liars, honest
-        As in `largest_lie`; with `liars` = 0, the uncertainty under unmanipulated meters.
+    box, liars, honest: as in `largest_lie`; with `liars` = 0, the uncertainty under unmanipulated meters.
     """
     honest = np.zeros(box.meters.size, dtype=np.bool_) if honest is None else honest
     return _most(box, box.effect[customer], liars, honest, None)
 
 
-# Relative excess over its own error that counts as the solver's rounding, not as an attack.
+# Relative excess over an error, or over an unmanipulated share, that counts as the solver's rounding.
 _HONEST = 1e-6
 
 
@@ -175,25 +139,36 @@ def _choose(
     """Choice of manipulated meters by HiGHS, and its bound of the maximum of ``row c``."""
     p, k = scaled.shape
     who = np.flatnonzero(able)
-    open_ = np.zeros((p, who.size))
-    open_[who, np.arange(who.size)] = slack[who]
-    least = (who == must).astype(np.float64)
+    slacks = np.diag(slack)[:, who]
+    least, most = np.concatenate([-np.ones(k), who == must]), np.ones(k + who.size)
+    within = [LinearConstraint(np.hstack([sign * scaled, -slacks]), ub=np.ones(p)) for sign in (1.0, -1.0)]
+    lying, bound = _solved("largest attack", row, within, (least, most), liars)
+    chosen = np.zeros(p, dtype=np.bool_)
+    chosen[who] = lying
+    return chosen, bound
+
+
+def _solved(  # the program, part by part
+    what: str,
+    row: Floats,
+    within: list[LinearConstraint],
+    bounds: tuple[Floats, Floats],
+    liars: int,
+    *,
+    presolve: bool = True,
+) -> tuple[Bools, float]:
+    """Maximise ``row c`` over c and binaries with a sum of at most `liars`, by HiGHS: binaries and bound."""
+    binary = (np.arange(bounds[0].size) >= row.size).astype(np.intp)
     found = milp(
-        np.concatenate([-row, np.zeros(who.size)]),
-        constraints=[
-            LinearConstraint(np.hstack([scaled, -open_]), ub=np.ones(p)),
-            LinearConstraint(np.hstack([-scaled, -open_]), ub=np.ones(p)),
-            LinearConstraint(np.concatenate([np.zeros(k), np.ones(who.size)])[None, :], ub=float(liars)),
-        ],
-        bounds=Bounds(np.concatenate([-np.ones(k), least]), np.concatenate([np.ones(k), np.ones(who.size)])),
-        integrality=np.concatenate([np.zeros(k), np.ones(who.size)]),
-        options={"mip_rel_gap": 1e-6},
+        np.concatenate([-row, np.zeros(binary.size - row.size)]),
+        constraints=[*within, LinearConstraint(binary[None, :], ub=float(liars))],
+        bounds=Bounds(*bounds),
+        integrality=binary,
+        options={"mip_rel_gap": 1e-6, "presolve": presolve},
     )
     if found.x is None:
-        raise DesignInfeasible("largest attack consistent with the feeder", found.message, code="no-solution")
-    chosen = np.zeros(p, dtype=np.bool_)
-    chosen[who] = found.x[k:] > 0.5
-    return chosen, float(-found.mip_dual_bound)
+        raise DesignInfeasible(f"{what} consistent with the feeder", found.message, code="no-solution")
+    return found.x[row.size :] > 0.5, float(-found.mip_dual_bound)
 
 
 def _reach(scaled: Floats, row: Floats) -> Floats:
@@ -211,27 +186,13 @@ def _reach(scaled: Floats, row: Floats) -> Floats:
     return np.asarray(found.x)
 
 
-# Excess over an unmanipulated share that counts as the solver's rounding.
-_HONEST_REPORTS = 1e-6
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class PowerErrorModel:
-    """Errors of meters and customers, manipulated or not. k unknowns, p meters.
+    """Errors of meters and customers, manipulated or not. k unknowns, p meters."""
 
-    Attributes
-    ----------
-    box
-        Unknowns at the ends of their ranges under manipulated meters.
-    owner : (k,)
-        Meter that determines each unknown; -1 for none.
-    honest : (k,)
-        Share of that range while its meter is unmanipulated, 0 to 1.
-    """
-
-    box: ErrorBox
-    owner: Ints
-    honest: Floats
+    box: ErrorBox  # unknowns at the ends of their ranges under manipulated meters
+    owner: Ints  # (k,) meter that determines each unknown; -1 for none
+    honest: Floats  # (k,) share of that range while its meter is unmanipulated, 0 to 1
 
     def told(self, liars: Bools) -> ErrorBox:
         """The box while the meters in the mask (p,) may report any powers."""
@@ -244,15 +205,9 @@ def largest_story(
 ) -> StealthyAttack:
     """Largest attack on a meter consistent with an unmanipulated feeder, with false powers of such meters.
 
-    Parameters
-    ----------
-    meter, liars, honest
-        As in `gridsec.planning.stealthy_attacks.largest_lie`. Protected meters report true powers, too.
-
-    Raises
-    ------
-    DesignInfeasible
-        If the solver fails.
+    meter, liars, honest: as in `gridsec.planning.stealthy_attacks.largest_lie`. Protected meters report true
+        powers, too.
+    Raises DesignInfeasible if the solver fails.
     """
     p = given.box.meters.size
     honest = np.zeros(p, dtype=np.bool_) if honest is None else honest
@@ -265,7 +220,7 @@ def largest_story(
         return found
     # A meter with false powers is manipulated at any voltage. Powers without effect are not false.
     free = (given.owner >= 0) & chosen[given.owner] & box.effect.any(axis=0)
-    false = free & (np.abs(found.unknowns) > given.honest + _HONEST_REPORTS)
+    false = free & (np.abs(found.unknowns) > given.honest + _HONEST)
     who = np.union1d(found.liars, given.owner[false]).astype(np.intp)
     return replace(found, bound=max(found.size, bound), liars=who)
 
@@ -291,21 +246,12 @@ def _choose_reports(given: PowerErrorModel, meter: int, liars: int, honest: Bool
     unit, gain = np.eye(k)[freed], np.zeros((freed.size, p))
     gain[np.arange(freed.size), given.owner[freed]] = 1.0 - given.honest[freed]
     most = np.concatenate([np.where(given.owner < 0, given.honest, 1.0), ~honest])
-    least = (np.arange(p) == meter).astype(np.float64)
-    found = milp(
-        np.concatenate([-row / size, np.zeros(p)]),
-        constraints=[
-            LinearConstraint(np.hstack([sign * scaled, -slack]), ub=np.ones(p)) for sign in (1.0, -1.0)
-        ]
-        + [LinearConstraint(np.hstack([sign * unit, -gain]), ub=given.honest[freed]) for sign in (1.0, -1.0)]
-        + [LinearConstraint(np.concatenate([np.zeros(k), np.ones(p)])[None, :], ub=float(liars))],
-        bounds=Bounds(np.concatenate([-most[:k], least]), most),
-        integrality=np.concatenate([np.zeros(k), np.ones(p)]),
-        # Presolve has nothing to remove, and a solution without it needs no postsolve.
-        options={"mip_rel_gap": 1e-6, "presolve": False},
+    least = np.concatenate([-most[:k], np.arange(p) == meter])
+    within = [LinearConstraint(np.hstack([sign * scaled, -slack]), ub=np.ones(p)) for sign in (1.0, -1.0)] + [
+        LinearConstraint(np.hstack([sign * unit, -gain]), ub=given.honest[freed]) for sign in (1.0, -1.0)
+    ]
+    # Presolve has nothing to remove, and a solution without it needs no postsolve.
+    chosen, bound = _solved(
+        "largest attack with false powers", row / size, within, (least, most), liars, presolve=False
     )
-    if found.x is None:
-        raise DesignInfeasible(
-            "largest attack with false powers consistent with the feeder", found.message, code="no-solution"
-        )
-    return found.x[k:] > 0.5, 2.0 * size * float(-found.mip_dual_bound) + own
+    return chosen, 2.0 * size * bound + own

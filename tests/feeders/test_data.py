@@ -16,9 +16,9 @@ from feeders.format.tables import examine, read
 from feeders.model.site import Site, Snapshot, load, names, to_frame
 from feeders.model.three_phase import three_phase_names
 from feeders.profiles import Season
-from gridsec.grid.radial import squared_voltages
 from gridsec.observers.certificates import certify, reactance, small_gain, verify
 from gridsec.observers.lure import close_loop
+from tests.gridsec.radial import squared_voltages
 
 DATA = Path(str(profiles.data_root()))
 CUSTOMERS = {

@@ -6,6 +6,7 @@ import numpy as np
 
 from gridsec.arrays import Floats
 from gridsec.grid.droop import Droop, fleet
+from gridsec.grid.network import LinDistFlow
 from gridsec.grid.radial import Feeder
 from gridsec.observers.lure import Lure, close_loop
 
@@ -27,6 +28,12 @@ def random_feeder(seed: int, *, customers: int | None = None, charging: float = 
         base_kva=100.0,
         charging=charging * rng.uniform(0.0, 1.0, branches),
     )
+
+
+def squared_voltages(model: LinDistFlow, p: Floats, q: Floats, v0_squared: Floats | float) -> Floats:
+    """Squared voltage of every customer by the linear power flow, chong2020 (15)."""
+    base = np.asarray(v0_squared, dtype=np.float64)[..., None]
+    return base + 2.0 * (p @ model.R.T + q @ model.X.T)
 
 
 def random_loop(

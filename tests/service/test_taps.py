@@ -24,7 +24,7 @@ def tapped(name: str) -> Site:
     """A feeder with a voltage 5 % higher behind the line in the middle of its largest street."""
     plain = load(name)
     tree = plain.tree
-    sizes = tree.stop - tree.start
+    sizes = tree.walk.stop - tree.walk.start
     middle = int(np.argmin(np.abs(sizes - len(tree.buses) // 3)))
     tables = plain.tables
     into = {plain.bus_of_file[row.to_bus]: row.line for row in tables.lines if row.closed}

@@ -117,8 +117,8 @@ def alone(feeder: ThreePhaseFeeder, phases: Sequence[str], place: Ints) -> tuple
 
 def _below(feeder: ThreePhaseFeeder, buses: Ints, first: int) -> Bools:
     """Mask of the buses that are this one or behind it."""
-    start = feeder.start[buses]
-    return np.asarray((feeder.start[first] <= start) & (start < feeder.stop[first]))
+    start = feeder.walk.start[buses]
+    return np.asarray((feeder.walk.start[first] <= start) & (start < feeder.walk.stop[first]))
 
 
 MOST_BUSES: Final = 150
@@ -336,8 +336,8 @@ def _shares(feeder: Model, bus: Ints) -> Floats | Phasors:
         (one, other), z = lines(feeder)[0].T, lines(feeder)[1]
         Z = impedances(feeder, np.arange(len(feeder.buses)))[bus]
         return np.asarray((Z[:, other] - Z[:, one]) / z)
-    start = feeder.start[bus][:, None]
-    behind = (feeder.start[1:] <= start) & (start < feeder.stop[1:])
+    start = feeder.walk.start[bus][:, None]
+    behind = (feeder.walk.start[1:] <= start) & (start < feeder.walk.stop[1:])
     return behind.astype(np.float64)
 
 

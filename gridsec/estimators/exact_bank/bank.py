@@ -11,10 +11,7 @@ contains a small set without manipulated meters. The estimate of the S that agre
 subsets is therefore close to the true state under any attack (Theorem 2). `step` advances all observers at
 once; there is no loop over observers.
 
-References
-----------
-chong2020, equation (11).
-chong2020, equations (5) to (8), Theorem 2.
+Source: chong2020, equations (5) to (8), (11), Theorem 2.
 """
 
 from __future__ import annotations
@@ -24,7 +21,7 @@ from typing import Literal
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, Ints
+from gridsec.arrays import Bools, Floats
 from gridsec.errors import DesignInfeasible, InputInvalid, Problem, no_choice, raise_if_any
 from gridsec.estimators.exact_bank import direct as direct_bank
 from gridsec.estimators.exact_bank.direct import SlotState
@@ -66,18 +63,10 @@ _NEWTON_ENTRIES = 1 << 20
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Gains:
-    """Stacked observer gains. o observers, n states, m nonlinearities, p meters.
+    """Stacked observer gains. o observers, n states, m nonlinearities, p meters."""
 
-    Attributes
-    ----------
-    L : (o, n, p)
-        Output injection into the states; zero columns for meters outside an observer's set.
-    K : (o, m, p)
-        Output injection into the nonlinearities' arguments; likewise.
-    """
-
-    L: Floats
-    K: Floats
+    L: Floats  # (o, n, p) output injection into the states; zero columns for meters outside an observer's set
+    K: Floats  # (o, m, p) output injection into the nonlinearities' arguments; likewise
 
 
 def direct_gains(lure: Lure, masks: Bools) -> Gains:
@@ -93,21 +82,11 @@ def direct_gains(lure: Lure, masks: Bools) -> Gains:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StackedState:
-    """State of all observers at one time.
+    """State of all observers at one time."""
 
-    Attributes
-    ----------
-    x : (o, n)
-        Estimates.
-    seen : (p,)
-        Available meters of the last step.
-    prepared
-        Coefficients of the last step's length.
-    """
-
-    x: Floats
-    seen: Bools
-    prepared: LureTransition
+    x: Floats  # (o, n) estimates
+    seen: Bools  # (p,) available meters of the last step
+    prepared: LureTransition  # coefficients of the last step's length
 
 
 def start(lure: Lure, gains: Gains, policy: StepPolicy) -> StackedState:
@@ -143,18 +122,8 @@ def advance(
 ) -> StackedState:
     """All observers a time h later, under constant inputs.
 
-    Parameters
-    ----------
-    y : (p,)
-        Readings; arbitrary where not seen.
-    u : (l,)
-        Known input.
-    seen : (p,)
-        Available meters.
-    h
-        Length of the step, s.
-    policy
-        Accuracy of the time step.
+    y (p,): readings; arbitrary where not seen.
+    u (l,): known input.
     """
     inputs = _inputs(lure, gains, y, u, seen)
     prepared = state.prepared if state.prepared.h == h else transition(lure, h, policy)
@@ -267,37 +236,16 @@ POLICY = StepPolicy(substep=1.0, settled=1e-6, tol=1e-10, max_iter=60)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bank:
-    """Both banks of observers for one plant. p meters, at most M manipulated, o observers.
+    """Both banks of observers for one plant. p meters, at most M manipulated, o observers."""
 
-    Attributes
-    ----------
-    lure
-        The plant.
-    sets
-        Sensor subsets and the pairs that are compared.
-    masks : (o, p)
-        Meters used by each observer; the C(p, M) large sets first.
-    sizes : (o,)
-        Number of meters of each observer.
-    direct
-        True for direct injection.
-    gains
-        Stacked gains; None for direct injection.
-    layout, base
-        The structured form of direct injection; None otherwise.
-    policy
-        Accuracy of the time steps.
-    """
-
-    lure: Lure
-    sets: Subsets
-    masks: Bools
-    sizes: Ints
-    direct: bool
-    gains: Gains | None
+    lure: Lure  # the plant
+    sets: Subsets  # sensor subsets and the pairs that are compared
+    masks: Bools  # (o, p) meters used by each observer; the C(p, M) large sets first
+    gains: Gains | None  # stacked gains; None for direct injection
+    # layout, base: the structured form of direct injection; None otherwise
     layout: direct_bank.SlotLayout | None
     base: direct_bank.AvailabilityIndex | None
-    policy: StepPolicy
+    policy: StepPolicy  # accuracy of the time steps
 
 
 def design(
@@ -311,49 +259,28 @@ def design(
 ) -> Bank:
     """Build both banks.
 
-    Parameters
-    ----------
-    lure
-        The plant with p meters.
-    max_attacked
-        M, largest number of simultaneously manipulated meters.
-    gains
-        `direct`, or gains of all observers in the order of `subsets(p, M).masks()`.
-    reactive : (l, p), optional
-        Change of u per pu of reactive injection at each meter's customer; direct injection only.
+    max_attacked: M, largest number of simultaneously manipulated meters.
+    gains: `direct`, or gains of all observers in the order of `subsets(p, M).masks()`.
+    reactive (l, p): change of u per pu of reactive injection at each meter's customer; direct injection only.
         Needed where net reactive power is metered at customers without an inverter.
-    policy
-        Accuracy of the time steps.
-    most
-        Largest acceptable number of observers.
-
-    Raises
-    ------
-    NotObservable
-        Unless p > 2M.
-    DesignInfeasible
-        If there are more than `most` observers, or an observer uses none of its meters: the degenerate gains
-        L = K = 0 satisfy every convergence condition here and detect nothing.
-    ValueError
-        If M is negative, or `gains` is another text; `lmi_gains` computes gains by matrix inequality.
-    TypeError, ValueError
-        With `direct`, if the plant is not the loop of a feeder, from `close_loop`.
-
-    References
-    ----------
-    chong2020, Theorem 1 and equation (5).
+    most: largest acceptable number of observers.
+    Raises NotObservable unless p > 2M; DesignInfeasible if there are more than `most` observers, or an
+        observer uses none of its meters: the degenerate gains L = K = 0 satisfy every convergence condition
+        here and detect nothing; ValueError if M is negative, or `gains` is another text; `lmi_gains` computes
+        gains by matrix inequality; TypeError, ValueError with `direct`, if the plant is not the loop of a
+        feeder, from `close_loop`.
+    Source: chong2020, Theorem 1 and equation (5).
     """
     p = lure.C.shape[0]
     sets = subsets(p, max_attacked, most=most)
     masks = sets.masks()
-    sizes = masks.sum(axis=1)
     if isinstance(gains, str):
         raise_if_any(no_choice("gains", ("direct",), gains))
         lay = direct_bank.layout(lure, reactive)
         base = direct_bank.make_plan(lay, sets, np.ones(p, dtype=np.bool_))
-        return Bank(lure, sets, masks, sizes, True, None, lay, base, policy)
+        return Bank(lure, sets, masks, None, lay, base, policy)
     _check_gains(lure, masks, gains)
-    return Bank(lure, sets, masks, sizes, False, gains, None, None, policy)
+    return Bank(lure, sets, masks, gains, None, None, policy)
 
 
 def lmi_gains(
@@ -361,23 +288,10 @@ def lmi_gains(
 ) -> Gains:
     """Gains of all observers of a bank by the corrected matrix inequality (12), for `design`.
 
-    Parameters
-    ----------
-    lure, max_attacked, most
-        As in `design`.
-    options
-        From `gridsec.observers.lmi.options_for`.
-    workers
-        Processes, as in `gridsec.observers.lmi.solve_many`.
-
-    Raises
-    ------
-    NotObservable, DesignInfeasible
-        As in `design`, or if an observer cannot be designed.
-
-    References
-    ----------
-    chong2020 (12); docs/theory-observers.md.
+    lure, max_attacked, most: as in `design`.
+    workers: processes, as in `gridsec.observers.lmi.solve_many`.
+    Raises NotObservable, DesignInfeasible as in `design`, or if an observer cannot be designed.
+    Source: chong2020 (12); docs/theory-observers.md.
     """
     masks = subsets(len(lure.C), max_attacked, most=most).masks()
     made = solve_many(lure, [np.flatnonzero(mask).tolist() for mask in masks], options, workers=workers)
@@ -417,17 +331,9 @@ def _check_gains(lure: Lure, masks: Bools, gains: Gains) -> None:
 def init(bank: Bank, y: Floats, u: Floats, seen: Bools, *, net: Floats | None = None) -> BankState:
     """All observers at the equilibrium of the first readings.
 
-    Parameters
-    ----------
-    y : (p,)
-        Readings as `z = vbar^2 - v^2`, pu; arbitrary where not seen. A reading that is not finite is not
+    y (p,): readings as `z = vbar^2 - v^2`, pu; arbitrary where not seen. A reading that is not finite is not
         seen.
-    u : (l,)
-        Known input w, pu.
-    seen : (p,)
-        Available meters.
-    net : (p,), optional
-        As in `step`.
+    u (l,): known input w, pu.
     """
     seen = np.asarray(seen & np.isfinite(y))
     if bank.gains is not None:
@@ -453,23 +359,15 @@ def step(  # noqa: PLR0917  # design and state, then the four inputs that every 
 ) -> BankState:
     """All observers a time h later, under constant inputs.
 
-    Parameters
-    ----------
-    y : (p,)
-        Readings as `z = vbar^2 - v^2`, pu; arbitrary where not seen. A reading that is not finite is not
+    y (p,): readings as `z = vbar^2 - v^2`, pu; arbitrary where not seen. A reading that is not finite is not
         seen.
-    u : (l,)
-        Known input w, pu.
-    seen : (p,)
-        Available meters. No observer trusts an unavailable meter; the observers continue. With 2M or fewer
-        available meters the banks rest, and only an observer without meters continues.
-    h
-        Length of the step, s, not negative.
-    net : (p,), optional
-        Metered net reactive injection of each meter's customer minus the load assumed in u, pu; NaN where not
-        reported. An observer uses it exactly if it trusts the meter. Direct injection only.
-    adopt : (n,), optional
-        Initial injections of inverters with a meter that has just returned. Direct injection only.
+    u (l,): known input w, pu.
+    seen (p,): available meters. No observer trusts an unavailable meter; the observers continue. With 2M or
+        fewer available meters the banks rest, and only an observer without meters continues.
+    h: length of the step, s, not negative.
+    net (p,): metered net reactive injection of each meter's customer minus the load assumed in u, pu; NaN
+        where not reported. An observer uses it exactly if it trusts the meter. Direct injection only.
+    adopt (n,): initial injections of inverters with a meter that has just returned. Direct injection only.
     """
     # Rounded, so that equal steps share their coefficients.
     h = round(h, 6)
@@ -505,14 +403,8 @@ def consistency(bank: Bank, state: BankState) -> Floats:
 
     `pi_S = max over P within S of max_i |x_S,i - x_P,i|`
 
-    Returns
-    -------
-    (C(p, M),)
-        pi, pu of reactive power. Empty while 2M or fewer meters are available.
-
-    References
-    ----------
-    chong2020, equation (6).
+    Returns (C(p, M),): pi, pu of reactive power. Empty while 2M or fewer meters are available.
+    Source: chong2020, equation (6).
     """
     if isinstance(state, SlotState):
         return direct_bank.consistency(_structure(bank)[0], bank.sets, state)
@@ -529,25 +421,11 @@ def select(
 ) -> int:
     """The large set to trust: smallest pi, ties by smallest penalty, then by number.
 
-    Parameters
-    ----------
-    pi : (s,)
-        From `consistency`.
-    allowed : (s,), optional
-        Sets that may be chosen; all by default.
-    penalty : (s,), optional
-        Criterion for ties. Inside deadbands all observers coincide and every pi is zero.
-    tie
-        Sets with a pi up to the smallest pi plus this are ties, pu.
-
-    Returns
-    -------
-    int
-        Number of the set; -1 if no set is allowed.
-
-    References
-    ----------
-    chong2020, equation (7).
+    allowed (s,): sets that may be chosen; all by default.
+    penalty (s,): criterion for ties. Inside deadbands all observers coincide and every pi is zero.
+    tie: sets with a pi up to the smallest pi plus this are ties, pu.
+    Returns int: number of the set; -1 if no set is allowed.
+    Source: chong2020, equation (7).
     """
     value = pi if allowed is None else np.where(allowed, pi, np.inf)
     if not value.size or not np.isfinite(value).any():
@@ -562,14 +440,8 @@ def select(
 def believe(bank: Bank, state: BankState) -> tuple[Floats, Bools]:
     """Estimate and meters of the large set that agrees best with its small subsets.
 
-    Returns
-    -------
-    x, trusted : (n,), (p,)
-        NaN and no meters while 2M or fewer meters are available.
-
-    References
-    ----------
-    chong2020 (7), (8).
+    Returns x, trusted (n,), (p,): NaN and no meters while 2M or fewer meters are available.
+    Source: chong2020 (7), (8).
     """
     best = select(consistency(bank, state))
     if best < 0:
@@ -581,15 +453,7 @@ def believe(bank: Bank, state: BankState) -> tuple[Floats, Bools]:
 def spread(bank: Bank, state: BankState, index: int) -> Floats:
     """`max over P within S of |x_S,i - x_P,i|` for one large set S, inverter by inverter.
 
-    Parameters
-    ----------
-    index
-        Number of S.
-
-    Returns
-    -------
-    (n,)
-        Deviations, pu; their maximum is `pi_S`.
+    Returns (n,): deviations, pu; their maximum is `pi_S`.
     """
     if isinstance(state, SlotState):
         return direct_bank.spread(_structure(bank)[0], bank.sets, state, index)
@@ -600,12 +464,9 @@ def spread(bank: Bank, state: BankState, index: int) -> Floats:
 def estimate(bank: Bank, state: BankState, index: int) -> Floats:
     """Reactive injections (n,) estimated by one observer.
 
-    Parameters
-    ----------
-    index
-        Number of the observer as in `Bank.masks`. -1: with direct injection, the observer that trusts every
-        available meter, or no meter while 2M or fewer are available; with other gains, the median of all
-        observers.
+    index: number of the observer as in `Bank.masks`. -1: with direct injection, the observer that trusts
+        every available meter, or no meter while 2M or fewer are available; with other gains, the median of
+        all observers.
     """
     if isinstance(state, SlotState):
         return direct_bank.estimate(_structure(bank)[0], bank.sets, state, index)

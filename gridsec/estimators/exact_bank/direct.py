@@ -38,38 +38,17 @@ class SlotLayout:
     """Units of the slots: inverters 0 … n-1, then meters without an inverter; e units in all.
 
     Index e is the padding: row, column and state are zero.
-
-    Attributes
-    ----------
-    lure
-        The plant.
-    droop
-        Its nonlinearity.
-    of_meter : (p, r)
-        Units behind each meter, padded with e.
-    free : (f,)
-        Inverters without a meter.
-    driver : (n,)
-        Meter of each inverter; 0 where there is none (see `metered`).
-    metered : (n,)
-        True where the inverter has a meter.
-    H : (e + 1, e + 1)
-        Effect of each unit's injection on z at each inverter.
-    rows : (e + 1,)
-        Inverter of each unit's curve; 0 for units without a curve.
-    real : (e + 1,)
-        True where the unit is an inverter.
     """
 
-    lure: Lure
-    droop: Droop
-    of_meter: Ints
-    free: Ints
-    driver: Ints
-    metered: Bools
-    H: Floats
-    rows: Ints
-    real: Bools
+    lure: Lure  # the plant
+    droop: Droop  # its nonlinearity
+    of_meter: Ints  # (p, r) units behind each meter, padded with e
+    free: Ints  # (f,) inverters without a meter
+    driver: Ints  # (n,) meter of each inverter; 0 where there is none (see `metered`)
+    metered: Bools  # (n,) True where the inverter has a meter
+    H: Floats  # (e + 1, e + 1) effect of each unit's injection on z at each inverter
+    rows: Ints  # (e + 1,) inverter of each unit's curve; 0 for units without a curve
+    real: Bools  # (e + 1,) True where the unit is an inverter
 
     @property
     def units(self) -> int:
@@ -83,18 +62,10 @@ def layout(lure: Lure, reactive: Floats | None) -> SlotLayout:
     A meter is at an inverter's customer exactly if its output is that inverter's:
     `(C_j, D_j) = (H_i, F_i)`.
 
-    Parameters
-    ----------
-    lure
-        A plant made by `close_loop`: `A = -T^-1`, `G = T^-1`, `B = 0`, phi a Droop.
-    reactive : (l, p), optional
-        Change of u per pu of reactive injection at each meter's customer. Needed where net reactive power may
-        be metered at customers without an inverter.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the plant is not of that form.
+    lure: a plant made by `close_loop`: `A = -T^-1`, `G = T^-1`, `B = 0`, phi a Droop.
+    reactive (l, p): change of u per pu of reactive injection at each meter's customer. Needed where net
+        reactive power may be metered at customers without an inverter.
+    Raises TypeError, ValueError if the plant is not of that form.
     """
     droop = lure.phi
     if not isinstance(droop, Droop):
@@ -142,50 +113,26 @@ def layout(lure: Lure, reactive: Floats | None) -> SlotLayout:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlotBlock:
-    """Slots of one bank. n observers, k slots each.
+    """Slots of one bank. n observers, k slots each."""
 
-    Attributes
-    ----------
-    units : (k, n)
-        Unit of each slot.
-    rows : (k, n)
-        Inverter of its curve.
-    real : (k, n) or None
-        True where the slot is an inverter; None if all are.
-    H : (k, k, n) or None
-        Feedback between the slots; None if above `_BLOCK_BYTES`.
-    """
-
-    units: Ints
-    rows: Ints
-    real: Bools | None
-    H: Floats | None
+    units: Ints  # (k, n) unit of each slot
+    rows: Ints  # (k, n) inverter of its curve
+    real: Bools | None  # (k, n) or None: True where the slot is an inverter; None if all are
+    H: Floats | None  # (k, k, n) or None: feedback between the slots; None if above `_BLOCK_BYTES`
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AvailabilityIndex:
-    """Index arrays for one pattern of available meters.
+    """Index arrays for one pattern of available meters."""
 
-    Attributes
-    ----------
-    seen : (p,)
-        The available meters.
-    driven : (n,)
-        Inverters driven by an available meter.
-    trailing : (t,)
-        Units that no observer can drive, for lack of an available meter.
-    large, small
-        The two banks.
-    compare
-        For each choice of `Subsets.choices`: the slots of P that S drives; the slots to look up in S; and
-        their positions in a table (number of S, e + 1), flattened.
-    """
-
-    seen: Bools
-    driven: Bools
-    trailing: Ints
+    seen: Bools  # (p,) the available meters
+    driven: Bools  # (n,) inverters driven by an available meter
+    trailing: Ints  # (t,) units that no observer can drive, for lack of an available meter
+    # large, small: the two banks
     large: SlotBlock
     small: SlotBlock
+    # for each choice of `Subsets.choices`: the slots of P that S drives; the slots to look up in S; and their
+    # positions in a table (number of S, e + 1), flattened
     compare: tuple[tuple[Ints, Ints, Ints], ...]
 
 
@@ -253,31 +200,17 @@ def _comparisons(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlotState:
-    """State of all observers at one time.
+    """State of all observers at one time."""
 
-    Attributes
-    ----------
-    driven : (e + 1,)
-        The observer that trusts every available meter; padded.
-    large, small : (k, n)
-        The slots of the two banks; empty while too few meters are available.
-    plan
-        Index arrays of the current pattern of available meters; None while there are too few.
-    plans
-        Plans of the latest patterns, newest first.
-    seen : (p,)
-        The current pattern.
-    prepared
-        Coefficients of the last step's length.
-    """
-
-    driven: Floats
+    driven: Floats  # (e + 1,) the observer that trusts every available meter; padded
+    # large, small (k, n): the slots of the two banks; empty while too few meters are available
     large: Floats
     small: Floats
+    # index arrays of the current pattern of available meters; None while there are too few
     plan: AvailabilityIndex | None
-    plans: tuple[AvailabilityIndex, ...]
-    seen: Bools
-    prepared: LureTransition
+    plans: tuple[AvailabilityIndex, ...]  # plans of the latest patterns, newest first
+    seen: Bools  # (p,) the current pattern
+    prepared: LureTransition  # coefficients of the last step's length
 
 
 def start(lay: SlotLayout, sets: Subsets, base: AvailabilityIndex, policy: StepPolicy) -> SlotState:
@@ -300,12 +233,8 @@ def follow(lay: SlotLayout, sets: Subsets, state: SlotState, seen: Bools, adopt:
     returns drives its inverter again, from `adopt` in all observers at once. With 2M or fewer available
     meters only the driven observer continues, on the model alone.
 
-    Parameters
-    ----------
-    seen : (p,)
-        The new pattern.
-    adopt : (n,), optional
-        Initial injections of inverters with a returning meter; by default those of the driven observer.
+    adopt (n,): initial injections of inverters with a returning meter; by default those of the driven
+        observer.
     """
     if np.array_equal(seen, state.seen):
         return state
@@ -349,30 +278,14 @@ def _carry(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drive:
-    """Prepared inputs of one step, without NaN.
+    """Prepared inputs of one step, without NaN."""
 
-    Attributes
-    ----------
-    base : (e + 1,)
-        F u at each inverter.
-    reading : (n,)
-        Reading of each inverter's meter as z; 0 without an available meter.
-    driven : (n,)
-        True where an available meter drives the inverter.
-    net_unit : (c,)
-        First unit of each available meter with reported net reactive power.
-    net : (c,)
-        Its metered net reactive injection minus the assumed load.
-    net_rest : (c, r - 1)
-        The other units behind these meters.
-    """
-
-    base: Floats
-    reading: Floats
-    driven: Bools
-    net_unit: Ints
-    net: Floats
-    net_rest: Ints
+    base: Floats  # (e + 1,) F u at each inverter
+    reading: Floats  # (n,) reading of each inverter's meter as z; 0 without an available meter
+    driven: Bools  # (n,) True where an available meter drives the inverter
+    net_unit: Ints  # (c,) first unit of each available meter with reported net reactive power
+    net: Floats  # (c,) its metered net reactive injection minus the assumed load
+    net_rest: Ints  # (c, r - 1) the other units behind these meters
 
     def reference(self, driven: Floats) -> Floats:
         """s, the injections in an observer that trusts every available meter; (e + 1,)."""
@@ -386,16 +299,9 @@ class Drive:
 def drive(lay: SlotLayout, y: Floats, u: Floats, seen: Bools, net: Floats | None) -> Drive:
     """Prepare the inputs of a step.
 
-    Parameters
-    ----------
-    y : (p,)
-        Readings as z; arbitrary where not seen.
-    u : (l,)
-        Known input.
-    seen : (p,)
-        Available meters.
-    net : (p,), optional
-        Metered net reactive injection minus the assumed load; NaN where not reported.
+    y (p,): readings as z; arbitrary where not seen.
+    u (l,): known input.
+    net (p,): metered net reactive injection minus the assumed load; NaN where not reported.
     """
     n = lay.driver.size
     base = np.zeros(lay.units + 1)

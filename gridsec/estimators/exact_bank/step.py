@@ -21,52 +21,45 @@ from typing import Literal
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, Ints
+from gridsec.arrays import Bools, Floats
 from gridsec.errors import DesignInfeasible
 from gridsec.estimators import thresholds
-from gridsec.estimators.decision import Counters, DecisionInputs, count, decide, residual_excess
+from gridsec.estimators.decision import Counters, DecisionInputs, count, decide, no_counts, residual_excess
 from gridsec.estimators.exact_bank import bank as banks
 from gridsec.estimators.exact_bank.bank import StackedState
-from gridsec.estimators.inputs import Inputs, PreviousStep, clean, injections, known, nothing_new, reconstruct
-from gridsec.estimators.plant import EstimatorContext, Options, Plant, check_plant
+from gridsec.estimators.inputs import (
+    Inputs,
+    PreviousStep,
+    Reconstruction,
+    clean,
+    injections,
+    known,
+    nothing_new,
+    reconstruct,
+)
+from gridsec.estimators.plant import EstimatorContext, Options, Plant, check_plant, usual_options
 from gridsec.estimators.thresholds import ErrorBound, ErrorModel, Majorant, Motion
 from gridsec.grid.meter import reading_error
 from gridsec.grid.network import LinDistFlow
 from gridsec.interface import Estimate, Frame, Verdict
 from gridsec.observers.certificates import Certificate, certify, small_gain, verify
 from gridsec.observers.lmi import contraction
-from gridsec.observers.lure import Lure, close_loop, rest
+from gridsec.observers.lure import Lure, close_loop
 
 __all__ = ["MonitorDesign", "MonitorState", "design", "init", "step"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MonitorDesign:
-    """Design of the exact bank monitor.
-
-    Attributes
-    ----------
-    model
-        Linear power flow of the plant.
-    bank
-        The observers.
-    errors
-        Propagation of errors.
-    certificate
-        Proof that the observers converge, for all sensor sets at once.
-    proven
-        System of the certificate: the closed loop, or a majorant of all observers.
-    step_s
-        Expected interval between frames, s.
-    """
+    """Design of the exact bank monitor."""
 
     plant: Plant
-    model: LinDistFlow
-    bank: banks.Bank
-    errors: ErrorModel
-    certificate: Certificate
-    proven: Lure
-    step_s: float
+    model: LinDistFlow  # linear power flow of the plant
+    bank: banks.Bank  # the observers
+    errors: ErrorModel  # propagation of errors
+    certificate: Certificate  # proof that the observers converge, for all sensor sets at once
+    proven: Lure  # system of the certificate: the closed loop, or a majorant of all observers
+    step_s: float  # expected interval between frames, s
     options: Options
 
     @property
@@ -78,7 +71,7 @@ class MonitorDesign:
             self.errors,
             self.options,
             self.bank.sets.max_attacked,
-            self.bank.direct,
+            self.bank.gains is None,
         )
 
     @property
@@ -89,45 +82,21 @@ class MonitorDesign:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MonitorState:
-    """State between frames.
+    """State between frames."""
 
-    Attributes
-    ----------
-    t
-        Time of the last used frame, s; that of `init` before the first one.
-    valid
-        True if the certificate was verified.
-    bank
-        The observers; None before the first frame.
-    x : (m,)
-        Last selected estimate of the injections, pu.
-    z : (m,)
-        Its z at the inverters, pu.
-    spread : (m,)
-        Largest distance of it from that of an observer without manipulated meters, pu.
-    bound, level
-        Bounds on the observers' error, and their upper level during the last step.
-    settled
-        True once the initial transient has decayed.
-    tally
-        Counters of readings above and below the thresholds, and the named meters.
-    v0_squared
-        Last squared busbar voltage, pu; in three phases (3,).
-    last
-        Last estimate and verdict, returned for unusable frames; None before the first one.
-    """
-
-    t: float
-    valid: bool
-    bank: banks.BankState | None
-    x: Floats
-    z: Floats
-    spread: Floats
+    t: float  # time of the last used frame, s; that of `init` before the first one
+    valid: bool  # True if the certificate was verified
+    bank: banks.BankState | None  # the observers; None before the first frame
+    x: Floats  # (m,) last selected estimate of the injections, pu
+    z: Floats  # (m,) its z at the inverters, pu
+    spread: Floats  # (m,) largest distance of it from that of an observer without manipulated meters, pu
+    # bound, level: bounds on the observers' error, and their upper level during the last step
     bound: ErrorBound
     level: ErrorBound
-    settled: bool
-    tally: Counters
-    v0_squared: Floats | float
+    settled: bool  # True once the initial transient has decayed
+    tally: Counters  # counters of readings above and below the thresholds, and the named meters
+    v0_squared: Floats | float  # last squared busbar voltage, pu; in three phases (3,)
+    # last estimate and verdict, returned for unusable frames; None before the first one
     last: tuple[Estimate, Verdict] | None
 
 
@@ -142,41 +111,26 @@ def design(
 ) -> MonitorDesign:
     """Design the bank, its certificate and its error bounds for one feeder.
 
-    Parameters
-    ----------
-    max_attacked
-        M, largest number of simultaneously manipulated meters.
-    step_s
-        Expected interval between frames, s. Other intervals work too. Above 30 s, four consecutive readings
-        below the threshold clear a meter in place of six, unless `options` are given.
-    gains
-        `direct`: the inverter of a trusted meter is driven by that meter's reading. Or stacked gains
-        of circle-criterion observers in the order of `bank.subsets(p, M).masks()`; an entrywise
-        majorant of all of them must then satisfy the small-gain condition.
-    certificate
-        An external proof; by default the best closed form, or the solver's where none applies. It is verified
-        here.
-
-    Raises
-    ------
-    NotObservable
-        Unless there are more than 2M meters.
-    DesignInfeasible
-        If no certificate holds, the bank would be too large, or the gains detect nothing.
-    ValueError
-        As `plant.check_plant`; or if `gains` is another text.
-
-    References
-    ----------
-    chong2020, Corollary 1, for any feeder and with the corrections of its errata.
+    max_attacked: M, largest number of simultaneously manipulated meters.
+    step_s: expected interval between frames, s. Other intervals work too. Above 30 s, four consecutive
+        readings below the threshold clear a meter in place of six, unless `options` are given.
+    gains: `direct`: the inverter of a trusted meter is driven by that meter's reading. Or stacked gains of
+        circle-criterion observers in the order of `bank.subsets(p, M).masks()`; an entrywise majorant of all
+        of them must then satisfy the small-gain condition.
+    certificate: an external proof; by default the best closed form, or the solver's where none applies. It is
+        verified here.
+    Raises NotObservable unless there are more than 2M meters; DesignInfeasible if no certificate holds, the
+        bank would be too large, or the gains detect nothing; ValueError as `plant.check_plant`; or if `gains`
+        is another text.
+    Source: chong2020, Corollary 1, for any feeder and with the corrections of its errata.
     """
     meters = plant.meters
     check_plant(plant, max_attacked=max_attacked, step_s=step_s)
-    if options is None:
-        options = Options() if step_s <= 30.0 else Options(release=4)
+    options = usual_options(step_s) if options is None else options
     lure = close_loop(plant.feeder, plant.droop, meters)
     model = plant.feeder.linear()
-    bank = banks.design(lure, max_attacked, gains=gains, reactive=_reactive(model, meters, gains))
+    reactive = -2.0 * model.X[:, meters] if isinstance(gains, str) else None
+    bank = banks.design(lure, max_attacked, gains=gains, reactive=reactive)
     errors = thresholds.error_model(plant.droop, model, meters, max_attacked)
     proven = lure
     if bank.gains is not None:
@@ -185,17 +139,13 @@ def design(
         proven = replace(lure, H=-_loop(lure, big))
     proof = certificate
     if proof is None:
-        proof = _proof(proven) if bank.direct else small_gain(proven)
+        proof = _proof(proven) if bank.gains is None else small_gain(proven)
     margin = verify(proof, proven)
     if not margin > 0:
         raise DesignInfeasible(
             f"{proof.kind} certificate", "the verification fails", margin, code="not-verified"
         )
     return MonitorDesign(plant, model, bank, errors, proof, proven, step_s, options)
-
-
-def _reactive(model: LinDistFlow, meters: Ints, gains: object) -> Floats | None:
-    return -2.0 * model.X[:, meters] if isinstance(gains, str) else None
 
 
 # Decay rate requested from the solver, as a fraction of the slowest inverter's rate.
@@ -243,14 +193,10 @@ def _extreme(M: Floats, K: Floats, N: Floats) -> Floats:
 def init(design: MonitorDesign, t: float) -> MonitorState:
     """Initial state; the observers start with the first frame.
 
-    Parameters
-    ----------
-    design
-        From `design`. Its certificate is verified again, because a stored or hand-made design may be wrong.
-    t
-        Unix time, s.
+    design: from `design`. Its certificate is verified again, because a stored or hand-made design may be
+        wrong.
     """
-    m, p = design.plant.droop.tau.size, design.plant.meters.size
+    m = design.plant.droop.tau.size
     try:
         valid = verify(design.certificate, design.proven) > 0
     except DesignInfeasible:
@@ -266,46 +212,38 @@ def init(design: MonitorDesign, t: float) -> MonitorState:
         bound=widest,
         level=widest,
         settled=False,
-        tally=Counters(np.zeros(p, dtype=np.intp), np.zeros(p, dtype=np.intp), np.zeros(p, dtype=np.bool_)),
+        tally=no_counts(design.plant.meters.size),
         v0_squared=design.plant.droop.vbar**2,
         last=None,
     )
 
 
 def step(design: MonitorDesign, state: MonitorState, frame: Frame) -> tuple[MonitorState, Estimate, Verdict]:
-    """Process one frame.
-
-    Parameters
-    ----------
-    frame
-        Data of one tick. A frame that is not later than the last one changes nothing: it returns the last
-        estimate and UNDECIDED.
-
-    Returns
-    -------
-    MonitorState, Estimate, Verdict
-        As every estimator's step; see `gridsec.interface`.
-    """
+    """Process one frame; see `gridsec.interface`."""
     late = state.bank is not None and not frame.t > state.t
     if late or not np.isfinite(frame.t):
         return state, *nothing_new(design.plant, frame, state.t, state.last, state.v0_squared, state.x)
     frame = known(frame)
     inputs = clean(design.setting, PreviousStep(state.x, state.v0_squared, state.tally.named), frame)
-    h = 0.0 if state.bank is None else frame.t - state.t
-    if state.bank is None:
+    before = state.bank
+    h = 0.0 if before is None else frame.t - state.t
+    if before is None:
         bank = banks.init(design.bank, inputs.z, inputs.w, inputs.live, net=inputs.net)
         unknown = _unknown(design, bank)
         state = replace(state, bound=unknown, level=unknown)
     else:
         bank = banks.step(
-            design.bank, state.bank, inputs.z, inputs.w, inputs.live, h, net=inputs.net, adopt=state.x
+            design.bank, before, inputs.z, inputs.w, inputs.live, h, net=inputs.net, adopt=state.x
         )
-        if banks.decided(design.bank, bank) and not banks.decided(design.bank, state.bank):
+        if banks.decided(design.bank, bank) and not banks.decided(design.bank, before):
             # The observers restart from one without trusted meters.
             unknown = _unknown(design, bank)
             state = replace(state, bound=unknown, level=unknown, settled=False)
         else:
-            state = replace(state, bound=_handed_over(design, state, inputs.live))
+            bound = thresholds.handed_over(
+                design.errors, state.bound, before.seen, inputs.live, spread=state.spread
+            )
+            state = replace(state, bound=bound)
     return _conclude(design, state, frame, inputs, bank, h)
 
 
@@ -314,34 +252,17 @@ def _unknown(design: MonitorDesign, bank: banks.BankState) -> ErrorBound:
     return thresholds.widest(design.errors, bank.x if isinstance(bank, StackedState) else None)
 
 
-def _handed_over(design: MonitorDesign, state: MonitorState, live: Bools) -> ErrorBound:
-    """The bounds when meters become unavailable or return: each inverter takes the other mode's error."""
-    meter_of, bound = design.errors.meter_of, state.bound
-    if state.bank is None or not live.size:
-        return bound
-    was, now = state.bank.seen[meter_of], live[meter_of]
-    silenced, returned = (meter_of >= 0) & was & ~now, (meter_of >= 0) & ~was & now
-    free = np.where(silenced, np.maximum(bound.free, bound.driven), bound.free)
-    # The inverter of a returning meter starts from the selected estimate.
-    return ErrorBound(np.where(returned, bound.free + state.spread, bound.driven), free)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _View:
     """Estimate of the feeder from one selected set of meters, with residuals and bounds."""
 
     index: int
-    x: Floats
-    z: Floats
-    spread: Floats
-    bound: ErrorBound
-    level: ErrorBound
-    settled: bool
-    v2: Floats
-    v2_bus: Floats
+    state: MonitorState  # after the frame, with the counters and the answer before it
+    seen: Reconstruction
     error: Floats  # (N,)
     score: Floats  # (p,) NaN where unavailable
     threshold: Floats  # (p,)
+    over: Bools  # (p,) meters with a score above their threshold
 
 
 def _conclude(  # noqa: PLR0917  # design, state and frame, then the results of this step
@@ -354,21 +275,19 @@ def _conclude(  # noqa: PLR0917  # design, state and frame, then the results of 
 ) -> tuple[MonitorState, Estimate, Verdict]:
     plant, options, live = design.plant, design.options, inputs.live
     view = _select(design, state, frame, inputs, bank, h)
-    over = live & (np.nan_to_num(view.score) > view.threshold)
-    enough = banks.decided(design.bank, bank)
-    tally = state.tally
-    if enough:
-        tally = count(tally, over, live, confirm=options.confirm, release=options.release)
+    after, v2, tally = view.state, view.seen.v2, state.tally
+    if banks.decided(design.bank, bank):
+        tally = count(tally, view.over, live, confirm=options.confirm, release=options.release)
     decision, cause, reason = decide(
         DecisionInputs(
-            names=tuple(plant.feeder.customers[c] for c in plant.meters),
+            names=plant.meter_names,
             max_attacked=design.bank.sets.max_attacked,
             live=live,
             suspected=tally.above > 0,
             named=tally.named,
             wide=live & ~(view.threshold <= options.widest),
             valid=state.valid,
-            settled=view.settled,
+            settled=after.settled,
             busbar=inputs.busbar,
         )
     )
@@ -378,26 +297,11 @@ def _conclude(  # noqa: PLR0917  # design, state and frame, then the results of 
     error = view.error
     if np.count_nonzero(tally.named) > design.bank.sets.max_attacked:
         # More manipulated meters than the bank covers: only saturation bounds their effect on the estimate.
-        error = _saturated(design, inputs, frame, view.x)
-    estimate = Estimate(t=frame.t, v2=view.v2, bound=error, v2_bus=view.v2_bus, trusted=trusted, x=view.x)
-    accused = tally.named & live
-    attack = np.where(accused, inputs.y - view.v2[plant.meters], 0.0)
+        error = _saturated(design, inputs, frame, after.x)
+    estimate = Estimate(frame.t, v2, error, view.seen.v2_bus, trusted, after.x)
+    attack = np.where(tally.named & live, inputs.y - v2[plant.meters], 0.0)
     verdict = Verdict(decision, cause, reason, tally.named, view.score, view.threshold, attack)
-    after = MonitorState(
-        t=frame.t,
-        valid=state.valid,
-        bank=bank,
-        x=view.x,
-        z=view.z,
-        spread=view.spread,
-        bound=view.bound,
-        level=view.level,
-        settled=view.settled,
-        tally=tally,
-        v0_squared=inputs.v0_squared,
-        last=(estimate, verdict),
-    )
-    return after, estimate, verdict
+    return replace(after, tally=tally, last=(estimate, verdict)), estimate, verdict
 
 
 def _select(  # noqa: PLR0917  # as _conclude
@@ -422,10 +326,9 @@ def _select(  # noqa: PLR0917  # as _conclude
             allowed = np.asarray(~(masks & excluded).any(axis=1))
             index = banks.select(pi, allowed=allowed, penalty=penalty, tie=tie)
         view = _view(design, state, frame, inputs, bank, index, h)
-        over = live & (np.nan_to_num(view.score) > view.threshold)
-        if index < 0 or not over.any():
+        if index < 0 or not view.over.any():
             return view
-        wanted = excluded | over
+        wanted = excluded | view.over
         if np.count_nonzero(wanted) <= sets.max_attacked:
             if not (masks[index] & wanted).any():
                 return view
@@ -460,10 +363,9 @@ def _view(  # noqa: PLR0917  # as _conclude
         held = np.bincount(own, weights=x, minlength=v2.size)[at] + inputs.q[at]
         doubt = np.where(told, np.abs(frame.q_net[at] - held), 0.0)
         offset = offset + thresholds.largest(errors.reach * np.nan_to_num(doubt), errors.quota // 2)
-    moved = np.abs(seen.correction - inputs.correction)[plant.feeder.bus]
-    now = replace(inputs.now, base=inputs.now.base + moved)
+    now = replace(inputs.now, base=inputs.now.base + seen.moved)
     before = z if state.bank is None else state.z
-    lag = _slowed(design, h) * (np.abs(x - state.x) + spread)
+    lag = thresholds.slowed(errors, h, design.bank.policy) * (np.abs(x - state.x) + spread)
     motion = Motion(before=before, after=z, offset=offset[own], h=h, lag=lag)
     if index >= 0:
         bound, level = thresholds.advance(errors, now, motion, state.bound, state.level)
@@ -475,24 +377,28 @@ def _view(  # noqa: PLR0917  # as _conclude
     score = np.where(inputs.live, np.abs(inputs.y - v2[at]), np.nan)
     settled = state.settled
     if index >= 0 and not settled:
-        none = np.zeros(x.shape)
-        top = thresholds.ceiling(errors, now, motion, ErrorBound(none, none))
-        level_at_rest = thresholds.settled(errors, now, motion, top)
-        transient = thresholds.gap(errors, now, bound)[at] - thresholds.gap(errors, now, level_at_rest)[at]
+        rest = thresholds.gap(errors, now, thresholds.at_rest(errors, now, motion))
+        transient = thresholds.gap(errors, now, bound)[at] - rest[at]
         settled = bool(np.all(transient <= design.options.settled * threshold))
-    return _View(index, x, z, spread, bound, level, settled, v2, seen.v2_bus, error, score, threshold)
-
-
-def _slowed(design: MonitorDesign, h: float) -> Bools:
-    """Mask (m,) of inverters that the step treats as slower than they are: `lure.transition`, `rest`."""
-    fast = design.plant.droop.tau * rest(h, design.bank.policy) < 1.0
-    # If all are that fast, the step ends in the equilibrium.
-    return fast & ~fast.all()
+    after = replace(
+        state,
+        t=frame.t,
+        bank=bank,
+        x=x,
+        z=z,
+        spread=spread,
+        bound=bound,
+        level=level,
+        settled=settled,
+        v0_squared=inputs.v0_squared,
+    )
+    over = inputs.live & (np.nan_to_num(score) > threshold)
+    return _View(index, after, seen, error, score, threshold, over)
 
 
 def _saturated(design: MonitorDesign, inputs: Inputs, frame: Frame, x: Floats) -> Floats:
     """Error of the estimate (N,) under any attack: inverters saturate, and used reports are plausible."""
     errors = design.errors
     told = np.where(inputs.now.told, 2.0 * frame.q_error[design.plant.meters], 0.0)
-    far = thresholds.widest(errors, None if design.bank.direct else x).free
+    far = thresholds.widest(errors, None if design.bank.gains is None else x).free
     return np.asarray(inputs.now.base + errors.inverters @ far + errors.reach @ told)

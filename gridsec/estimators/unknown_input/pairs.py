@@ -23,11 +23,9 @@ and takes the injections of its inverters as unknown inputs. Their columns U of 
 since Q U = 0. Every row f of Q, and of C^T Q, is a test that the rest passes if unmanipulated:
 |f r| <= |f E| h.
 
-References
-----------
-yang2021 (2) and (17), with zero innovation under direct injection; docs/theory-unknown-input.md, 6.
-yang2021 (5), (22): consistency of an observer that distrusts (J_u, J_s) with those within it; (35), (36) for
-the decoupling; (42), (43) for the reconstruction. docs/theory-unknown-input.md, section 6.
+Source: yang2021 (2), (17) with zero innovation under direct injection; (5), (22): consistency of an observer
+that distrusts (J_u, J_s) with those within it; (35), (36): decoupling; (42), (43): reconstruction.
+Derivation: docs/theory-unknown-input.md, section 6.
 """
 
 from __future__ import annotations
@@ -71,66 +69,38 @@ class Tube:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tubes:
-    """Intervals of unmanipulated inverters at one tick.
+    """Intervals of unmanipulated inverters at one tick."""
 
-    Attributes
-    ----------
-    driven, free : Tube
-        Their injections if their own meter is unmanipulated, and in any case, pu.
-    z_driven, z_free : Tube
-        The same of `vbar^2 - v^2` at their customers, squared pu.
-    metered : (m,)
-        Inverters with a reading of their own meter; elsewhere `driven` is `free`.
-    """
-
+    # driven, free Tube: their injections if their own meter is unmanipulated, and in any case, pu
     driven: Tube
     free: Tube
+    # z_driven, z_free Tube: the same of `vbar^2 - v^2` at their customers, squared pu
     z_driven: Tube
     z_free: Tube
-    metered: Bools
+    metered: Bools  # (m,) inverters with a reading of their own meter; elsewhere `driven` is `free`
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seen:
-    """One tick at the places of inverters. m inverters, p meters.
+    """One tick at the places of inverters. m inverters, p meters."""
 
-    Attributes
-    ----------
-    z : (m,)
-        By the own meters; arbitrary where not metered.
-    z_error : (m,)
-        Error of an unmanipulated meter.
-    metered : (m,)
-        Inverters with a reading of their own meter.
-    rest, rest_error : (m,)
-        `vbar^2 - v^2` without any inverter, and its error.
-    """
-
-    z: Floats
-    z_error: Floats
-    metered: Bools
+    z: Floats  # (m,) by the own meters; arbitrary where not metered
+    z_error: Floats  # (m,) error of an unmanipulated meter
+    metered: Bools  # (m,) inverters with a reading of their own meter
+    # rest, rest_error (m,): `vbar^2 - v^2` without any inverter, and its error
     rest: Floats
     rest_error: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AttackAssumption:
-    """Assumed number and size of attacks.
+    """Assumed number and size of attacks."""
 
-    Attributes
-    ----------
-    meters, inverters
-        Largest numbers of simultaneous attacks.
-    reach : (m,)
-        Largest injection of an attacked inverter: its rating, pu.
-    coupling : (m, m)
-        2X between the inverters' customers.
-    """
-
+    # meters, inverters: largest numbers of simultaneous attacks
     meters: int
     inverters: int
-    reach: Floats
-    coupling: Floats
+    reach: Floats  # (m,) largest injection of an attacked inverter: its rating, pu
+    coupling: Floats  # (m, m) 2X between the inverters' customers
 
 
 def saturated(errors: ErrorModel) -> Tube:
@@ -144,12 +114,8 @@ def spread(errors: ErrorModel, doubt: AttackAssumption, known: Tube, free: Tube,
     Unmanipulated inverters are in `known`; those of the worst M meters in `free`; the worst of all inverters
     inject up to their rating.
 
-    Parameters
-    ----------
-    known, free
-        Intervals of all inverters if their own meters are unmanipulated, and in any case.
-    gain : (r, m)
-        |2X| from inverters to the r voltages.
+    known, free: intervals of all inverters if their own meters are unmanipulated, and in any case.
+    gain (r, m): |2X| from inverters to the r voltages.
     """
     swing = np.maximum(free.high - known.middle, known.middle - free.low) - known.half
     far = doubt.reach + np.abs(known.middle) - known.half
@@ -174,12 +140,7 @@ def advance(errors: ErrorModel, doubt: AttackAssumption, before: Tubes | None, s
 
     Voltages between two ticks are assumed within the extremes of their intervals at both.
 
-    Parameters
-    ----------
-    before
-        Intervals of the last tick; None at the first one, with inverters anywhere on their curves.
-    h
-        Length of the step, s.
+    before: intervals of the last tick; None at the first one, with inverters anywhere on their curves.
     """
     z_own = Tube(seen.z - seen.z_error, seen.z + seen.z_error)
     driven = free = saturated(errors)
@@ -219,14 +180,9 @@ MOST_WORK = 2_000_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pairs:
-    """Candidates: the empty pair first, then in the order of their size. c pairs, p meters, m inverters.
+    """Candidates: the empty pair first, then in the order of their size. c pairs, p meters, m inverters."""
 
-    Attributes
-    ----------
-    meters, inverters : (c, p), (c, m)
-        Suspected meters and inverters.
-    """
-
+    # meters, inverters (c, p), (c, m): suspected meters and inverters
     meters: Bools
     inverters: Bools
 
@@ -238,19 +194,12 @@ class Pairs:
 
 @dataclass(frozen=True, slots=True)
 class Unseen:
-    """A pair without an unknown-input observer by voltages alone.
+    """A pair without an unknown-input observer by voltages alone."""
 
-    Attributes
-    ----------
-    meters, inverters
-        Suspected meters and inverters.
-    rank
-        Rank of `C_Js b_Ju`, less than the number of inverters.
-    """
-
+    # meters, inverters: suspected meters and inverters
     meters: tuple[int, ...]
     inverters: tuple[int, ...]
-    rank: int
+    rank: int  # rank of `C_Js b_Ju`, less than the number of inverters
 
 
 def pairs(gain: Floats, most_meters: int, most_inverters: int) -> tuple[Pairs, tuple[Unseen, ...]]:
@@ -259,17 +208,8 @@ def pairs(gain: Floats, most_meters: int, most_inverters: int) -> tuple[Pairs, t
     These are tried like all others: reported reactive powers may distinguish them, and two inverters together
     have a larger range than either.
 
-    Parameters
-    ----------
-    gain : (p, m)
-        2X from inverters to meters, in units of the meters' errors.
-    most_meters, most_inverters
-        Largest sets.
-
-    Raises
-    ------
-    DesignInfeasible
-        If the pairs cannot be tried within a tick.
+    gain (p, m): 2X from inverters to meters, in units of the meters' errors.
+    Raises DesignInfeasible if the pairs cannot be tried within a tick.
     """
     p, m = gain.shape
     count = sum(comb(p, k) for k in range(most_meters + 1))
@@ -314,90 +254,48 @@ def _rank(columns: Floats, size: float) -> int:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Relation:
-    """One tick as `r = C a + E d`. R rows, K errors, m inverters.
+    """One tick as `r = C a + E d`. R rows, K errors, m inverters."""
 
-    Attributes
-    ----------
-    r : (R,)
-        Residuals, squared pu and pu.
-    C : (R, m)
-        Sensitivity to wrong injections.
-    E : (R, K)
-        Sensitivity to errors.
-    h : (K,)
-        Largest magnitudes of the errors.
-    meter : (R,)
-        Meter of each row.
-    voltage : (R,)
-        True for rows of voltages.
-    """
-
-    r: Floats
-    C: Floats
-    E: Floats
-    h: Floats
-    meter: Ints
-    voltage: Bools
+    r: Floats  # (R,) residuals, squared pu and pu
+    C: Floats  # (R, m) sensitivity to wrong injections
+    E: Floats  # (R, K) sensitivity to errors
+    h: Floats  # (K,) largest magnitudes of the errors
+    meter: Ints  # (R,) meter of each row
+    voltage: Bools  # (R,) True for rows of voltages
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PairResult:
-    """Result of one pair for a tick. p meters, m inverters.
+    """Result of one pair for a tick. p meters, m inverters."""
 
-    Attributes
-    ----------
-    fits
-        True if all meters and inverters outside the pair may be unmanipulated.
-    misfit
-        `r^T Q r`.
-    score, threshold : (p,)
-        Distance of each voltage from its value by all others, and its largest value without manipulation,
-        squared pu; NaN and infinite for suspected or unavailable meters.
-    attack, attack_error : (m,)
-        Wrong injection of each inverter by the rows, with the suspected inverters unknown as well, and its
-        error, pu; infinite error where not determined.
-    """
-
-    fits: bool
-    misfit: float
+    fits: bool  # True if all meters and inverters outside the pair may be unmanipulated
+    misfit: float  # `r^T Q r`
+    # score, threshold (p,): distance of each voltage from its value by all others, and its largest value
+    # without manipulation, squared pu; NaN and infinite for suspected or unavailable meters
     score: Floats
     threshold: Floats
+    # attack, attack_error (m,): wrong injection of each inverter by the rows, with the suspected inverters
+    # unknown as well, and its error, pu; infinite error where not determined
     attack: Floats
     attack_error: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Believed:
-    """A relation without the rows of suspected meters, for any set of inverters. k rows, m inverters.
+    """A relation without the rows of suspected meters, for any set of inverters. k rows, m inverters."""
 
-    Attributes
-    ----------
-    size
-        p, number of meters.
-    meter, voltage : (k,)
-        Of the remaining rows.
-    C : (k, m)
-        Of the remaining rows.
-    tests : (k + m, k)
-        P = S^-1 and C^T P: the tests if only these meters are suspected.
-    r, E, C_ : (k + m,), (k + m, K), (k + m, m)
-        Those tests of r, E and C.
-    plain : (k,)
-        r itself.
-    h : (K,)
-        As in `Relation`.
-    """
-
-    size: int
+    size: int  # p, number of meters
+    # meter, voltage (k,): of the remaining rows
     meter: Ints
     voltage: Bools
-    C: Floats
-    tests: Floats
+    C: Floats  # (k, m) of the remaining rows
+    tests: Floats  # (k + m, k) P = S^-1 and C^T P: the tests if only these meters are suspected
+    # r, E, C_ (k + m,), (k + m, K), (k + m, m): those tests of r, E and C
     r: Floats
     E: Floats
     C_: Floats
-    plain: Floats
-    h: Floats
+    plain: Floats  # (k,) r itself
+    h: Floats  # (K,) as in `Relation`
 
 
 def believe(relation: Relation, meters: Bools) -> Believed:
@@ -425,12 +323,7 @@ def try_pair(believed: Believed, inverters: Bools, room: Floats) -> PairResult:
 
     With `G = U^T P U` its tests are those of its meters alone minus `T U G^-1 U^T P`, a matrix of rank |J_u|.
 
-    Parameters
-    ----------
-    believed
-        The tick, without the rows of the pair's meters.
-    room : (m,)
-        Largest possible wrong injection, pu.
+    room (m,): largest possible wrong injection, pu.
     """
     k, h = believed.plain.size, believed.h
     chosen = np.flatnonzero(inverters)

@@ -3,9 +3,8 @@
 A candidate is a pair (suspected meters, suspected inverters) of bounded size. Its unknown-input observer uses
 neither. Unmanipulated inverters follow their curves (`gridsec.estimators.unknown_input.pairs`). The
 injections of the suspected inverters are unknown inputs, up to their rating, determined by the trusted
-readings through 2X. The remainder must be possible for unmanipulated readings
-(`gridsec.estimators.unknown_input.pairs`). Thresholds are worst cases of all uncertainties, so that
-unmanipulated readings never contradict the true pair. Hence:
+readings through 2X. The remainder must be possible for unmanipulated readings. Thresholds are worst cases of
+all uncertainties, so that unmanipulated readings never contradict the true pair. Hence:
 
 1. The true pair is never refuted while no more meters and inverters are attacked than assumed.
 2. Members of every pair that is not refuted are attacked: *named*.
@@ -18,20 +17,19 @@ Active powers are trusted, as in all banks. An inverter with an effect on the re
 cannot be judged, and then the answer is not CLEAN. Meters of class 0.5 alone judge only the largest
 inverters; with reported net reactive power of customers, most are judged.
 
-References
-----------
-yang2021 (2), (5) to (7), (17), (22) to (24), (42) to (47); docs/theory-unknown-input.md, section 6.
+Source: yang2021 (2), (5) to (7), (17), (22) to (24), (42) to (47); docs/theory-unknown-input.md, section 6.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, frozen
 from gridsec.errors import NotObservable, Problem
-from gridsec.estimators.decision import Counters, DecisionInputs, count, decide
+from gridsec.estimators.decision import Counters, DecisionInputs, count, decide, no_counts
 from gridsec.estimators.inputs import (
     NO_VOLTAGE,
     Inputs,
@@ -42,7 +40,14 @@ from gridsec.estimators.inputs import (
     nothing_new,
     reconstruct,
 )
-from gridsec.estimators.plant import EstimatorContext, Options, Plant, check_plant, estimator_context
+from gridsec.estimators.plant import (
+    EstimatorContext,
+    Options,
+    Plant,
+    check_plant,
+    estimator_context,
+    usual_options,
+)
 from gridsec.estimators.unknown_input.pairs import (
     AttackAssumption,
     Believed,
@@ -62,8 +67,6 @@ from gridsec.estimators.unknown_input.pairs import (
 from gridsec.interface import Cause, Decision, Estimate, Explanation, Frame, Verdict
 
 __all__ = [
-    "Answer",
-    "PairResults",
     "TickRelations",
     "UnknownInputDesign",
     "UnknownInputState",
@@ -79,31 +82,16 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UnknownInputDesign:
-    """Design of the unknown-input estimator. N customers, m inverters, p meters.
-
-    Attributes
-    ----------
-    max_inverters
-        Largest number of simultaneously attacked inverters, q_1 of yang2021.
-    pairs
-        The candidates.
-    within : (c, c)
-        True if the suspects of the first candidate are a subset of those of the second.
-    missing
-        Pairs with inverters that voltages alone do not distinguish; they are tried as well.
-    doubt
-        Assumed number and size of attacks.
-    gain : (N, m)
-        2X from inverters to all customers.
-    """
+    """Design of the unknown-input estimator. N customers, m inverters, p meters."""
 
     setting: EstimatorContext
-    max_inverters: int
-    pairs: Pairs
-    within: Bools
+    max_inverters: int  # largest number of simultaneously attacked inverters, q_1 of yang2021
+    pairs: Pairs  # the candidates
+    within: Bools  # (c, c) True if the suspects of the first candidate are a subset of those of the second
+    # pairs with inverters that voltages alone do not distinguish; they are tried as well
     missing: tuple[Unseen, ...]
-    doubt: AttackAssumption
-    gain: Floats
+    doubt: AttackAssumption  # assumed number and size of attacks
+    gain: Floats  # (N, m) 2X from inverters to all customers
 
     @property
     def observers(self) -> int:
@@ -113,60 +101,34 @@ class UnknownInputDesign:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UnknownInputState:
-    """State between frames. m inverters, p meters.
+    """State between frames. m inverters, p meters."""
 
-    Attributes
-    ----------
-    t, began
-        Time of the last used frame, and of the first one, s; that of `init` before.
-    tubes
-        Intervals of unmanipulated inverters; None before the first frame.
-    contradicted
-        Counters of contradictions of each pair; pairs named there are refuted.
-    x : (m,)
-        Estimated injections including attacks, pu.
-    v0_squared
-        Last squared busbar voltage, pu; in three phases (3,).
-    named, inverters : (p,), (m,)
-        Meters and inverters named as manipulated.
-    last
-        Last estimate and verdict, returned for unusable frames.
-    """
-
+    # t, began: time of the last used frame, and of the first one, s; that of `init` before
     t: float
     began: float
-    tubes: Tubes | None
-    contradicted: Counters
-    x: Floats
-    v0_squared: Floats | float
+    tubes: Tubes | None  # intervals of unmanipulated inverters; None before the first frame
+    contradicted: Counters  # counters of contradictions of each pair; pairs named there are refuted
+    x: Floats  # (m,) estimated injections including attacks, pu
+    v0_squared: Floats | float  # last squared busbar voltage, pu; in three phases (3,)
+    # named, inverters (p,), (m,): meters and inverters named as manipulated
     named: Bools
     inverters: Bools
-    last: tuple[Estimate, Verdict] | None
+    last: tuple[Estimate, Verdict] | None  # last estimate and verdict, returned for unusable frames
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TickRelations:
-    """One tick as linear relations; the suspected meters determine the intervals of inverters.
+    """One tick as linear relations; the suspected meters determine the intervals of inverters."""
 
-    Attributes
-    ----------
-    design, frame, inputs
-        Design, received frame, and prepared frame.
-    tubes
-        Intervals of unmanipulated inverters.
-    v2, error : (N,)
-        Squared voltages without injections of inverters, and their error, squared pu.
-    rest : (N,)
-        The part of that error from neither loads nor busbar.
-    """
-
+    # design, frame, inputs: design, received frame, and prepared frame
     design: UnknownInputDesign
     frame: Frame
     inputs: Inputs
-    tubes: Tubes
+    tubes: Tubes  # intervals of unmanipulated inverters
+    # v2, error (N,): squared voltages without injections of inverters, and their error, squared pu
     v2: Floats
     error: Floats
-    rest: Floats
+    rest: Floats  # (N,) the part of that error from neither loads nor busbar
 
     def tube(self, meters: Bools) -> Tube:
         """Intervals of unmanipulated inverters if the meters in the mask (p,) are manipulated."""
@@ -247,13 +209,7 @@ _EXACT = 1e-9
 
 
 def observe(design: UnknownInputDesign, state: UnknownInputState, frame: Frame) -> TickRelations:
-    """Prepare a frame, and advance the intervals of unmanipulated inverters.
-
-    Parameters
-    ----------
-    frame
-        Later than the last one.
-    """
+    """Prepare a frame, and advance the intervals of unmanipulated inverters."""
     inputs = clean(design.setting, PreviousStep(state.x, state.v0_squared, state.named), frame)
     h = 0.0 if state.tubes is None else frame.t - state.t
     v2, error, rest = _without_inverters(design, state, frame, inputs)
@@ -321,32 +277,6 @@ def _seen(design: UnknownInputDesign, inputs: Inputs, believed: Bools, v2: Float
     )
 
 
-Answer = tuple[Decision, Cause, str]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PairResults:
-    """Result of the pairs of one tick. p meters, m inverters.
-
-    Attributes
-    ----------
-    meters, inverters : (p,), (m,)
-        Members of every possible pair.
-    threshold : (p,)
-        Largest score of each meter without manipulation, squared pu.
-    trial
-        Result of the likeliest pair.
-    explanations
-        The smallest possible pairs where there are several.
-    """
-
-    meters: Bools
-    inverters: Bools
-    threshold: Floats
-    trial: PairResult
-    explanations: tuple[Explanation, ...]
-
-
 _SHOWN = 8
 
 
@@ -370,25 +300,32 @@ def answer(
     design: UnknownInputDesign,
     state: UnknownInputState,
     tick: TickRelations,
-    found: PairResults,
-) -> Answer:
-    """Decision, cause and one sentence; `estimators.decision` decides on meters as for every estimator."""
+    *,
+    trial: PairResult,
+    threshold: Floats,
+    explanations: tuple[Explanation, ...],
+) -> tuple[Decision, Cause, str]:
+    """Decision, cause and one sentence; `estimators.decision` decides on meters as for every estimator.
+
+    state: after the tick, with the members of every possible pair named. trial: result of the likeliest pair.
+    threshold (p,): largest score of each meter without manipulation, squared pu.
+    explanations: the smallest possible pairs where there are several.
+    """
     now, live = design.setting, tick.inputs.live
-    plant = now.plant
-    meters, inverters, explanations = found.meters, found.inverters, found.explanations
+    plant, meters, inverters = now.plant, state.named, state.inverters
     customers = plant.feeder.customers
-    names = [customers[c] for c in plant.meters]
+    names = plant.meter_names
     owners = [customers[c] for c in plant.droop.customer]
     pending = (state.contradicted.above > 0) & ~state.contradicted.named
     memory = np.exp(-(state.t - state.began) / plant.droop.tau.max(initial=_SHORT))
     base = decide(
         DecisionInputs(
-            names=tuple(names),
+            names=names,
             max_attacked=now.max_attacked,
             live=live,
             suspected=np.zeros(live.size, dtype=np.bool_),
             named=meters,
-            wide=live & ~(found.threshold <= now.options.widest),
+            wide=live & ~(threshold <= now.options.widest),
             valid=True,
             settled=bool(memory <= now.options.settled),
             busbar=tick.inputs.busbar,
@@ -414,12 +351,12 @@ def answer(
     elif base[0] is Decision.CLEAN and pending.any():
         base = *ambiguous, "Readings were further off than allowed lately, but not often enough."
     elif base[0] is Decision.CLEAN:
-        deaf = deaf_inverters(design, found.trial)
+        deaf = deaf_inverters(design, trial)
         unjudged = _list(np.zeros_like(live), deaf, names, owners)
         base = (
             (*ambiguous, f"No meter disagrees, but readings are too coarse to judge {unjudged}.")
             if deaf.any()
-            else (*base[:2], _agreement(design, found.trial, owners))
+            else (*base[:2], _agreement(design, trial, owners))
         )
     return base
 
@@ -438,8 +375,8 @@ def _agreement(design: UnknownInputDesign, trial: PairResult, owners: list[str])
     return f"{said}; up to {unseen[most]:.0f} kvar of the inverter of {owners[most]} could go unseen."
 
 
-def _list(meters: Bools, inverters: Bools, names: list[str], owners: list[str]) -> str:
-    parts = [names[j] for j in np.flatnonzero(meters)]
+def _list(meters: Bools, inverters: Bools, names: Sequence[str], owners: list[str]) -> str:
+    parts = [names[j] for j in np.flatnonzero(meters).tolist()]
     parts += [f"the inverter of {owners[i]}" for i in np.flatnonzero(inverters)]
     rest = f" and {len(parts) - _NAMED} more" if len(parts) > _NAMED else ""
     return " and ".join(parts[:_NAMED]) + rest
@@ -455,22 +392,11 @@ def design(
 ) -> UnknownInputDesign:
     """Design the pairs for one feeder.
 
-    Parameters
-    ----------
-    max_attacked, max_inverters
-        Largest numbers of simultaneously attacked meters and inverters, q_2 and q_1.
-    step_s
-        Expected interval between frames, s; it only selects the default options, others work as well.
-
-    Raises
-    ------
-    NotObservable
-        Unless there are more than 2 max_attacked meters, yang2021 (4) and (20).
-    DesignInfeasible
-        If there are too many pairs.
-    ValueError
-        As `plant.check_plant`, if `max_inverters` is negative, or if inverters have no rating, the largest
-        injection of an attacked one.
+    max_attacked, max_inverters: largest numbers of simultaneously attacked meters and inverters, q_2 and q_1.
+    step_s: expected interval between frames, s; it only selects the default options, others work as well.
+    Raises NotObservable unless there are more than 2 max_attacked meters, yang2021 (4) and (20);
+        DesignInfeasible if there are too many pairs; ValueError as `plant.check_plant`, if `max_inverters` is
+        negative, or if inverters have no rating, the largest injection of an attacked one.
     """
     p, m = plant.meters.size, plant.droop.tau.size
     more = (
@@ -484,8 +410,7 @@ def design(
     if p <= 2 * max_attacked:
         why = f"{p} meters, {max_attacked} of them manipulated: more than {2 * max_attacked} are needed"
         raise NotObservable(range(p), p, why + " (yang2021, Assumption 3)", code="too-few-meters")
-    if options is None:
-        options = Options() if step_s <= 30.0 else Options(release=4)
+    options = usual_options(step_s) if options is None else options
     made = estimator_context(plant, max_attacked=max_attacked, options=options)
     own = plant.droop.customer
     gain = 2.0 * made.model.X[:, own]
@@ -497,13 +422,12 @@ def design(
 
 def init(design: UnknownInputDesign, t: float) -> UnknownInputState:
     """Initial state at Unix time t, s."""
-    plant, c = design.setting.plant, design.observers
-    none = np.zeros(c, dtype=np.intp)
+    plant = design.setting.plant
     return UnknownInputState(
         t=t,
         began=t,
         tubes=None,
-        contradicted=Counters(none, none, np.zeros(c, dtype=np.bool_)),
+        contradicted=no_counts(design.observers),
         x=np.zeros(plant.droop.tau.size),
         v0_squared=plant.droop.vbar**2,
         named=np.zeros(plant.meters.size, dtype=np.bool_),
@@ -515,14 +439,7 @@ def init(design: UnknownInputDesign, t: float) -> UnknownInputState:
 def step(
     design: UnknownInputDesign, state: UnknownInputState, frame: Frame
 ) -> tuple[UnknownInputState, Estimate, Verdict]:
-    """Process one frame.
-
-    Parameters
-    ----------
-    frame
-        Data of one tick. A frame that is not later than the last one changes nothing: it returns the last
-        estimate and UNDECIDED.
-    """
+    """Process one frame; see `gridsec.interface`."""
     if not np.isfinite(frame.t) or (state.tubes is not None and not frame.t > state.t):
         plant = design.setting.plant
         estimate, verdict = nothing_new(plant, frame, state.t, state.last, state.v0_squared, state.x)
@@ -585,8 +502,9 @@ def _conclude(
     score, threshold = _scores(tick, both.meters[chosen], both.inverters[chosen], trial)
     explanations = explain(design.pairs, trials, order) if len(order) > 1 else ()
     v2 = estimate.v2[design.setting.plant.meters]
+    after = replace(state, x=x, v0_squared=inputs.v0_squared, named=meters, inverters=inverters)
     verdict = Verdict(
-        *answer(design, state, tick, PairResults(meters, inverters, threshold, trial, explanations)),
+        *answer(design, after, tick, trial=trial, threshold=threshold, explanations=explanations),
         meters,
         score,
         threshold,
@@ -596,10 +514,7 @@ def _conclude(
         (),
         explanations,
     )
-    after = replace(
-        state, x=x, v0_squared=inputs.v0_squared, named=meters, inverters=inverters, last=(estimate, verdict)
-    )
-    return after, estimate, verdict
+    return replace(after, last=(estimate, verdict)), estimate, verdict
 
 
 def _estimate(
@@ -629,11 +544,10 @@ def _estimate(
         sure = certain and more.meters == 0 and more.inverters == 0
         known = np.minimum(trial.attack_error if sure else np.inf, doubt.reach + np.abs(x))
         bound = spread(now.errors, more, tube, tick.tubes.free, gain) + gain @ np.where(accused, known, 0.0)
-    moved = np.abs(seen.correction - inputs.correction)[plant.feeder.bus]
     estimate = Estimate(
         t=tick.frame.t,
         v2=seen.v2,
-        bound=np.minimum(tick.error + moved + bound, NO_VOLTAGE),
+        bound=np.minimum(tick.error + seen.moved + bound, NO_VOLTAGE),
         v2_bus=seen.v2_bus,
         trusted=inputs.live & ~meters,
         x=x,

@@ -11,12 +11,8 @@ are those of the phases, and without charging Z is `R + j X` of `gridsec.grid.th
 Z is the inverse of the admittance matrix without the busbar (`gridsec.grid.meshed`). Z need not be symmetric,
 its parts may be negative, and the feeder need not be a tree.
 
-References
-----------
-docs/theory-studies.md, section on the droop fleet. The equation in this form: S. Bolognani and S. Zampieri,
-"On the existence and linear approximation of the power flow solution in power distribution networks", IEEE
-Trans. Power Systems 31(1), 2016; C. Wang, A. Bernstein, J.-Y. Le Boudec, M. Paolone, "Explicit conditions on
-existence and uniqueness of load-flow solutions in distribution networks", IEEE Trans. Smart Grid 9(2), 2018.
+Source: docs/theory-studies.md, section on the droop fleet; bolognani2016 and wang2018 for this form of the
+equation.
 """
 
 from __future__ import annotations
@@ -44,6 +40,7 @@ __all__ = [
     "currents",
     "lines",
     "network",
+    "neumann",
     "region",
     "sensitivity",
     "solve",
@@ -68,20 +65,13 @@ class PhasorNetwork:
     """Coefficients of `V = E v0 + Z conj(s / V)` at the customers, and at all places. N customers, n places.
 
     A place is a bus, or in three phases a phase of one. The busbar has k voltages, 1 or 3.
-
-    Attributes
-    ----------
-    Z, E : (N, N), (N,)
-        Impedances between customers, and their voltages without load for 1 pu at the busbar.
-    of_busbar : (N, k)
-        The same for 1 pu at each of its voltages alone.
-    Z_bus, E_bus : (n, N), (n,)
-        Z and E for every place.
     """
 
+    # Z, E (N, N), (N,): impedances between customers, and their voltages without load for 1 pu at the busbar
     Z: Complex
     E: Complex
-    of_busbar: Complex
+    of_busbar: Complex  # (N, k) the same for 1 pu at each of its voltages alone
+    # Z_bus, E_bus (n, N), (n,): Z and E for every place
     Z_bus: Complex
     E_bus: Complex
 
@@ -89,10 +79,7 @@ class PhasorNetwork:
 def network(feeder: AnyNetwork) -> PhasorNetwork:
     """Impedances of a feeder, `(I + j Z0 B)^-1 Z0` with series impedances Z0 and charging B.
 
-    Raises
-    ------
-    DesignInfeasible
-        If the no-load voltage of three phases is not found because of too much charging.
+    Raises DesignInfeasible if the no-load voltage of three phases is not found because of too much charging.
     """
     if isinstance(feeder, PhasedFeeder):
         return _phased(feeder)
@@ -130,8 +117,8 @@ def _phased(feeder: PhasedFeeder) -> PhasorNetwork:
     with np.errstate(all="ignore"):
         for _ in range(_ROUNDS if tree.half.any() else 1):
             charged = 1j * np.einsum("kij,cjk->cik", tree.half, V)
-            flow = np.einsum("bij,cjb->cib", tree.z, below(tree, drawn + charged)[..., 1:])
-            new: Complex = idle - from_root(tree, flow)
+            flow = np.einsum("bij,cjb->cib", tree.z, below(tree.walk, drawn + charged)[..., 1:])
+            new: Complex = idle - from_root(tree.walk, flow)
             V, change = new, float(np.abs(new - V).max())
             if not change > _TOL:
                 break
@@ -148,19 +135,9 @@ def _phased(feeder: PhasedFeeder) -> PhasorNetwork:
 def solve(net: PhasorNetwork, s: Complex, v0: Floats | float) -> Complex:
     """Voltages of the customers by AC power flow; NaN where the iteration does not converge.
 
-    Parameters
-    ----------
-    net
-        From `network`.
-    s : (…, N)
-        Net complex injections (generation positive), pu.
-    v0 : (…) or scalar
-        Voltage of the busbar, pu.
-
-    Returns
-    -------
-    (…, N)
-        Complex voltages, pu; the busbar has angle 0.
+    s (…, N): net complex injections (generation positive), pu.
+    v0 (…) or scalar: voltage of the busbar, pu.
+    Returns (…, N): complex voltages, pu; the busbar has angle 0.
     """
     base = np.asarray(v0, dtype=np.float64)[..., None] * net.E
     V = np.array(np.broadcast_to(base, np.broadcast_shapes(base.shape, s.shape)))
@@ -180,16 +157,9 @@ def solve(net: PhasorNetwork, s: Complex, v0: Floats | float) -> Complex:
 def currents(feeder: AnyNetwork, net: PhasorNetwork, s: Complex, V: Complex, v0: Floats | float) -> Floats:
     """Largest current at either end of every conductor of every line, pu. L lines: branches, then ties.
 
-    Parameters
-    ----------
-    feeder, net, s, V, v0
-        As in `solve`, with its result.
-
-    Returns
-    -------
-    (…, L, k)
-        Magnitudes, in units of `base_kva / (3 base_volt)` with the base of the line's impedance; k is 1, or
-        in three phases 3.
+    feeder, net, s, V, v0: as in `solve`, with its result.
+    Returns (…, L, k): magnitudes, in units of `base_kva / (3 base_volt)` with the base of the line's
+        impedance; k is 1, or in three phases 3.
     """
     at = np.asarray(v0, dtype=np.float64)[..., None] * net.E_bus + np.conj(s / V) @ net.Z_bus.T
     if isinstance(feeder, PhasedFeeder):
@@ -223,7 +193,7 @@ def _phase_currents(feeder: PhasedFeeder, injected: Complex, at: Complex) -> Flo
     flat = drawn.reshape(-1, 3, len(tree.buses))
     for row, each in zip(flat, injected.reshape(-1, tree.at.size), strict=True):
         np.add.at(row, (tree.phase, tree.at), -3.0 * ROTATION[tree.phase] * each)
-    series = below(tree, flat.reshape(V.shape))[..., 1:]
+    series = below(tree.walk, flat.reshape(V.shape))[..., 1:]
     shunt = 0.5j * tree.charging
     above, here = (
         np.einsum("bij,...jb->...ib", shunt, V[..., ends]) for ends in (tree.parent, slice(1, None))
@@ -251,22 +221,13 @@ def _mesh_currents(feeder: PhasedMesh, at: Complex) -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sensitivity:
-    """Linearised AC power flow at a solution, relative voltages `xi = dV / V`.
+    """Linearised AC power flow at a solution, relative voltages `xi = dV / V`."""
 
-    Attributes
-    ----------
-    a, b : (N, N)
-        `xi = a c + b conj(c)` for a change c of the conjugate injections.
-    busbar : (N, k)
-        xi per pu of each voltage of the busbar.
-    v : (N,)
-        Voltage magnitudes, pu.
-    """
-
+    # a, b (N, N): `xi = a c + b conj(c)` for a change c of the conjugate injections
     a: Complex
     b: Complex
-    busbar: Complex
-    v: Floats
+    busbar: Complex  # (N, k) xi per pu of each voltage of the busbar
+    v: Floats  # (N,) voltage magnitudes, pu
 
     @property
     def p(self) -> Complex:
@@ -290,15 +251,8 @@ def sensitivity(net: PhasorNetwork, s: Complex, V: Complex) -> Sensitivity:
     `xi + M conj(xi) = Zr c` with `Zr_ij = Z_ij / (V_i conj(V_j))` and `M = Zr diag(conj(s))`, hence
     `(I - M conj(M)) xi = Zr c - M conj(Zr c)`.
 
-    Parameters
-    ----------
-    net, s, V
-        As in `solve`, one operating point, with its result.
-
-    Raises
-    ------
-    DesignInfeasible
-        If there is no solution at this point.
+    net, s, V: as in `solve`, one operating point, with its result.
+    Raises DesignInfeasible if there is no solution at this point.
     """
     if not np.isfinite(V).all():
         raise DesignInfeasible(
@@ -320,20 +274,15 @@ def sensitivity(net: PhasorNetwork, s: Complex, V: Complex) -> Sensitivity:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InjectionBox:
-    """Box of injections and busbar voltages, pu.
+    """Box of injections and busbar voltages, pu."""
 
-    Attributes
-    ----------
-    p_low, p_high, q_low, q_high : (N,)
-        Limits of the net injections (generation positive), inverters included.
-    v0_low, v0_high
-        Limits of the busbar's voltage; in three phases of each of the three, independently.
-    """
-
+    # p_low, p_high, q_low, q_high (N,): limits of the net injections (generation positive), inverters
+    # included
     p_low: Floats
     p_high: Floats
     q_low: Floats
     q_high: Floats
+    # v0_low, v0_high: limits of the busbar's voltage; in three phases of each of the three, independently
     v0_low: float
     v0_high: float
 
@@ -344,25 +293,18 @@ class Region:
 
     Every chord of the AC power flow in the box, `v - v' = Jp (p - p') + Jq (q - q') + J0 (v0 - v0')`, has
     coefficients within the given errors of the given ones.
-
-    Attributes
-    ----------
-    dv_dp, dv_dq : (N, N)
-        Sensitivities of the voltage magnitudes in the middle of the box.
-    p_error, q_error : (N, N)
-        Largest differences of those anywhere in the box, entry by entry.
-    dv_dv0, v0_error : (N, k)
-        The same for the voltages of the busbar.
-    low, high : (N,)
-        Proven limits of the voltage magnitudes in the box, pu.
     """
 
+    # dv_dp, dv_dq (N, N): sensitivities of the voltage magnitudes in the middle of the box
     dv_dp: Floats
     dv_dq: Floats
+    # p_error, q_error (N, N): largest differences of those anywhere in the box, entry by entry
     p_error: Floats
     q_error: Floats
+    # dv_dv0, v0_error (N, k): the same for the voltages of the busbar
     dv_dv0: Floats
     v0_error: Floats
+    # low, high (N,): proven limits of the voltage magnitudes in the box, pu
     low: Floats
     high: Floats
 
@@ -370,10 +312,7 @@ class Region:
 def region(net: PhasorNetwork, box: InjectionBox) -> Region:
     """Bound voltages and sensitivities of the AC power flow over a box of injections.
 
-    Raises
-    ------
-    DesignInfeasible
-        If the box is too large, or too near collapse, for a bound.
+    Raises DesignInfeasible if the box is too large, or too near collapse, for a bound.
     """
     middle, half = _split(box)
     s, v0 = middle[0] + 1j * middle[1], 0.5 * (box.v0_low + box.v0_high)
@@ -382,7 +321,11 @@ def region(net: PhasorNetwork, box: InjectionBox) -> Region:
     gain, away = np.abs(at.a) + np.abs(at.b), np.hypot(*half)
     r = _radius(gain, np.abs(s), away, np.abs(at.busbar).sum(axis=1) * swing)
     feedback = gain * ((away + np.abs(s) * (2.0 + r) * r) / (1.0 - r) ** 2)
-    amplify = _neumann(feedback)
+    amplify = neumann(feedback)
+    if amplify is None:
+        raise DesignInfeasible(
+            "sensitivities over all powers in the box", "it reaches too near to collapse", code="no-solution"
+        )
     tilt = gain * (r / (1.0 - r))
 
     def error(xi: Complex, own: Floats) -> Floats:
@@ -438,17 +381,13 @@ def _radius(gain: Floats, s: Floats, away: Floats, source: Floats) -> Floats:
     return r
 
 
-def _neumann(feedback: Floats) -> Floats:
+def neumann(feedback: Floats) -> Floats | None:
     """`(I - feedback)^-1`, which exists and is not negative exactly if the spectral radius is below 1."""
     size = feedback.shape[0]
     inverse = np.linalg.inv(np.eye(size) - feedback)
     # x = (I - F)^-1 1 with x >= 1 and F x < x proves it, by Perron and Frobenius.
     x = inverse @ np.ones(size)
-    if not (np.all(x >= 0.5) and np.all(feedback @ x < x)):
-        raise DesignInfeasible(
-            "sensitivities over all powers in the box", "it reaches too near to collapse", code="no-solution"
-        )
-    return np.asarray(np.maximum(inverse, 0.0))
+    return np.maximum(inverse, 0.0) if np.all(x >= 0.5) and np.all(feedback @ x < x) else None
 
 
 def _limits(

@@ -1,8 +1,6 @@
 """Equilibrium of a fleet of droop inverters on the AC feeder, and voltage bounds at rest and at all times.
 
-References
-----------
-docs/theory-studies.md, section on the droop fleet; chong2020, (13).
+Source: docs/theory-studies.md, section on the droop fleet; chong2020, (13).
 """
 
 from __future__ import annotations
@@ -15,7 +13,14 @@ import numpy as np
 from gridsec.arrays import Floats
 from gridsec.errors import DesignInfeasible
 from gridsec.grid.droop import Droop, voltage_curve
-from gridsec.planning.droop.ac_sensitivity import Complex, InjectionBox, PhasorNetwork, sensitivity, solve
+from gridsec.planning.droop.ac_sensitivity import (
+    Complex,
+    InjectionBox,
+    PhasorNetwork,
+    neumann,
+    sensitivity,
+    solve,
+)
 from gridsec.planning.droop.stability import Loop, reach, slopes
 
 __all__ = ["Band", "Share", "always", "at_rest", "injected", "rest", "shares", "shares_of_gain"]
@@ -33,12 +38,8 @@ _BESIDE: Final = 1e-7
 def injected(droop: Droop, s: Complex, x: Floats) -> Complex:
     """Injections of the customers with those of their inverters, (…, N).
 
-    Parameters
-    ----------
-    s : (…, N)
-        Complex injections without the inverters, pu.
-    x : (…, m)
-        Reactive injections of the inverters, pu.
+    s (…, N): complex injections without the inverters, pu.
+    x (…, m): reactive injections of the inverters, pu.
     """
     owner = np.equal.outer(droop.customer, np.arange(s.shape[-1])).astype(np.float64)
     return np.asarray(s + 1j * (x @ owner))
@@ -50,19 +51,8 @@ def rest(net: PhasorNetwork, droop: Droop, s: Complex, v0: Floats | float) -> tu
     Plain iteration for all operating points together, with damping from the no-load loop gain, and Newton's
     method for points without convergence.
 
-    Parameters
-    ----------
-    net
-        From `gridsec.planning.droop.ac_sensitivity.network`.
-    s : (…, N)
-        Complex injections without the inverters, pu.
-    v0 : (…) or scalar
-        Voltage of the busbar, pu.
-
-    Returns
-    -------
-    (…, m), (…, N)
-        Reactive injections, and complex voltages, pu.
+    v0 (…) or scalar: voltage of the busbar, pu.
+    Returns (…, m), (…, N): reactive injections, and complex voltages, pu.
     """
     own, everywhere = droop.customer, np.full(droop.tau.size, np.inf)
     root = np.sqrt(slopes(droop, -everywhere, everywhere))
@@ -112,14 +102,9 @@ def _newton(net: PhasorNetwork, droop: Droop, s: Complex, v0: float, tol: float)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Band:
-    """Proven limits of every customer's voltage for loads in a box, pu.
+    """Proven limits of every customer's voltage for loads in a box, pu."""
 
-    Attributes
-    ----------
-    low, high : (N,)
-        Lower and upper limit.
-    """
-
+    # low, high (N,): lower and upper limit
     low: Floats
     high: Floats
 
@@ -127,15 +112,7 @@ class Band:
 def always(net: PhasorNetwork, droop: Droop, loads: InjectionBox) -> Band:
     """Limits at all times, for any motion of the loads in their box, from any reachable state.
 
-    Parameters
-    ----------
-    loads
-        Injections without the droop inverters.
-
-    Raises
-    ------
-    DesignInfeasible
-        If the box is too large for a bound.
+    Raises DesignInfeasible if the box is too large for a bound.
     """
     found = reach(net, droop, loads).region
     return Band(found.low, found.high)
@@ -148,15 +125,7 @@ def at_rest(net: PhasorNetwork, droop: Droop, loads: InjectionBox) -> Band:
     wrong sign. Two equilibria differ by `dv = Jw dw - Jq Delta dv`; with `|dv| <= U |dw|`,
     `U = (I - |Jq| D)^-1 |Jw|`, the lower end of every sensitivity is `L = Jw - |Jq| D U`.
 
-    Parameters
-    ----------
-    net, droop, loads
-        As in `always`.
-
-    Raises
-    ------
-    DesignInfeasible
-        If the box is too large for a bound, or the loop gain is 1 or more.
+    Raises DesignInfeasible if the box is too large for a bound, or the loop gain is 1 or more.
     """
     found, own = reach(net, droop, loads), droop.customer
     given = found.region
@@ -166,15 +135,14 @@ def at_rest(net: PhasorNetwork, droop: Droop, loads: InjectionBox) -> Band:
     columns = D * (np.abs(given.dv_dq) + given.q_error)[:, own]
     for k, customer in enumerate(own):
         back[:, customer] += columns[:, k]
-    inverse = np.linalg.inv(np.eye(len(back)) - back)
-    ones = inverse @ np.ones(len(back))
-    if not (np.all(ones >= 0.5) and np.all(back @ ones < ones)):
+    inverse = neumann(back)
+    if inverse is None:
         raise DesignInfeasible(
             "voltages of the fleet at rest", "the loop gain may be 1 or more", code="unstable"
         )
     # A rise of the busbar lifts all voltages; the fleet's reaction to it counts like that to a load.
     busbar_high = np.abs(given.dv_dv0) + given.v0_error
-    U = np.maximum(inverse, 0.0) @ np.column_stack([np.abs(J) + off, busbar_high])
+    U = inverse @ np.column_stack([np.abs(J) + off, busbar_high])
     L = np.column_stack([J - off, given.dv_dv0 - given.v0_error]) - back @ U
     swing = np.full(net.of_busbar.shape[1], loads.v0_high - loads.v0_low)
     width = np.concatenate([loads.p_high - loads.p_low, loads.q_high - loads.q_low, swing])
@@ -190,18 +158,10 @@ def at_rest(net: PhasorNetwork, droop: Droop, loads: InjectionBox) -> Band:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Share:
-    """Shares of the inverters in the loop gain. One entry for each inverter of a `Loop`.
+    """Shares of the inverters in the loop gain. One entry for each inverter of a `Loop`."""
 
-    Attributes
-    ----------
-    part : (m,)
-        Share of each inverter: its squared entry in the leading mode; the sum is 1.
-    factor : (m,)
-        Largest factor on its slope alone within the allowed gain; infinity if any.
-    """
-
-    part: Floats
-    factor: Floats
+    part: Floats  # (m,) share of each inverter: its squared entry in the leading mode; the sum is 1
+    factor: Floats  # (m,) largest factor on its slope alone within the allowed gain; infinity if any
 
 
 def shares(given: Loop, allowed: float) -> Share:
@@ -210,12 +170,7 @@ def shares(given: Loop, allowed: float) -> Share:
     `lambda_max(D^1/2 S D^1/2) <= a` is `a D^-1 - S >= 0`. A larger d_i subtracts a multiple of `e_i e_i'`, so
     with `w_i = [(a I - D^1/2 S D^1/2)^-1]_ii` the largest factor is `1 / (1 - 1 / (a w_i))`.
 
-    Parameters
-    ----------
-    given
-        The loop; S enters by its symmetric part.
-    allowed
-        a, the allowed gain.
+    allowed: a, the allowed gain.
     """
     S = 0.5 * (given.S + given.S.T)
     if not S.size:
@@ -224,10 +179,13 @@ def shares(given: Loop, allowed: float) -> Share:
     part = modes[:, -1] ** 2
     if values[-1] >= allowed:
         return Share(part, np.ones(part.size))
+    return Share(part, _factor(allowed * np.sum(modes**2 / (allowed - values), axis=1)))
+
+
+def _factor(own: Floats) -> Floats:
+    """`1 / (1 - 1 / own)`, the largest factor on the slopes; infinite where own is 1."""
     with np.errstate(divide="ignore"):
-        own = allowed * np.sum(modes**2 / (allowed - values), axis=1)
-        factor = np.where(own > 1.0, 1.0 / (1.0 - 1.0 / np.maximum(own, 1.0 + 1e-15)), np.inf)
-    return Share(part, factor)
+        return np.where(own > 1.0, 1.0 / (1.0 - 1.0 / np.maximum(own, 1.0 + 1e-15)), np.inf)
 
 
 def shares_of_gain(given: Loop) -> Share:
@@ -237,23 +195,15 @@ def shares_of_gain(given: Loop) -> Share:
     multiplied by f leaves it below 1 up to `f = 1 / (1 - 1 / w_i)`. The part is the product of an inverter's
     entries in the leading left and right vectors: the growth of the gain with its slope alone.
 
-    Returns
-    -------
-    Share
-        Factors are NaN where the gain may be 1 or more, so that there is no certificate.
+    Returns Share: factors are NaN where the gain may be 1 or more, so that there is no certificate.
     """
     M = np.abs(given.S) + given.error
     if not M.size:
         return Share(np.zeros(0), np.zeros(0))
     left, right = (_leading(each) for each in (M.T, M))
     part = left * right / float(left @ right)
-    inverse = np.linalg.inv(np.eye(len(M)) - M)
-    ones = inverse @ np.ones(len(M))
-    if not (np.all(ones >= 0.5) and np.all(M @ ones < ones)):
-        return Share(part, np.full(len(M), np.nan))
-    own = np.diagonal(inverse)
-    with np.errstate(divide="ignore"):
-        return Share(part, np.where(own > 1.0, 1.0 / (1.0 - 1.0 / np.maximum(own, 1.0 + 1e-15)), np.inf))
+    inverse = neumann(M)
+    return Share(part, np.full(len(M), np.nan) if inverse is None else _factor(np.diagonal(inverse)))
 
 
 def _leading(M: Floats) -> Floats:

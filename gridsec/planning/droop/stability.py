@@ -8,9 +8,7 @@ h = 0 is the first-order filter in continuous time. Two trajectories with the sa
 `e+ = (I - A) e + A psi`, `psi = -Delta Jt e`, where the slopes Delta lie between 0 and D and Jt, a chord of
 the AC power flow, within an error of J (`gridsec.planning.droop.ac_sensitivity.region`).
 
-References
-----------
-docs/theory-studies.md, section on the droop fleet, with proofs.
+Source: docs/theory-studies.md, section on the droop fleet, with proofs.
 """
 
 from __future__ import annotations
@@ -47,22 +45,12 @@ __all__ = [
 class Update:
     """Timing of the inverters' updates.
 
-    Attributes
-    ----------
-    interval_s
-        Sampling interval h, s; 0: continuous filters.
-    dead
-        Dead time d, whole intervals.
-
-    Raises
-    ------
-    ValueError
-        If the interval is negative or not finite, the dead time is negative, or a continuous filter has a
-        dead time.
+    Raises ValueError if the interval is negative or not finite, the dead time is negative, or a continuous
+        filter has a dead time.
     """
 
-    interval_s: float = 1.0
-    dead: int = 0
+    interval_s: float = 1.0  # sampling interval h, s; 0: continuous filters
+    dead: int = 0  # dead time d, whole intervals
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.interval_s) and self.interval_s >= 0.0):
@@ -106,37 +94,20 @@ _ROOM: Final = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reach:
-    """Box of injections that every trajectory enters and does not leave.
+    """Box of injections that every trajectory enters and does not leave."""
 
-    Attributes
-    ----------
-    x_low, x_high : (m,)
-        Injections of the inverters, pu.
-    region
-        Bounds of the AC power flow in it.
-    """
-
+    # x_low, x_high (m,): injections of the inverters, pu
     x_low: Floats
     x_high: Floats
-    region: Region
+    region: Region  # bounds of the AC power flow in it
 
 
 def reach(net: PhasorNetwork, droop: Droop, loads: InjectionBox, *, rounds: int = _REACH_ROUNDS) -> Reach:
     """Shrink the box of the inverters' injections: voltages bound set-points, and set-points voltages.
 
-    Parameters
-    ----------
-    net
-        From `gridsec.planning.droop.ac_sensitivity.network`.
-    loads
-        Injections without the droop inverters; a point, or a box in which they move arbitrarily.
-    rounds
-        Largest number of rounds; 0 for the saturation of the curves.
-
-    Raises
-    ------
-    DesignInfeasible
-        If the box is too large for a bound.
+    loads: injections without the droop inverters; a point, or a box in which they move arbitrarily.
+    rounds: largest number of rounds; 0 for the saturation of the curves.
+    Raises DesignInfeasible if the box is too large for a bound.
     """
     low, high = droop.q[:, 3], droop.q[:, 0]
     found = region(net, _with(loads, droop, low, high))
@@ -163,10 +134,7 @@ def _with(loads: InjectionBox, droop: Droop, low: Floats, high: Floats) -> Injec
 def slopes(droop: Droop, low: Floats, high: Floats) -> Floats:
     """Steepest slope of every curve between two voltages, `-dq/dv`, pu.
 
-    Parameters
-    ----------
-    low, high : (m,)
-        Voltages at the inverters, pu.
+    low, high (m,): voltages at the inverters, pu.
     """
     width, fall = np.diff(droop.v, axis=1), -np.diff(droop.q, axis=1)
     ramp = np.divide(fall, width, out=np.zeros_like(fall), where=width > 0.0)
@@ -180,15 +148,7 @@ def steepened(droop: Droop, times: float) -> Droop:
     Outer ramps are compressed towards the inner breakpoints; where those do not enclose a deadband, the
     whole curve is compressed towards the middle between them.
 
-    Parameters
-    ----------
-    times
-        Factor, above 0.
-
-    Raises
-    ------
-    FeederInvalid
-        If the first breakpoint of a curve would not be positive.
+    Raises FeederInvalid if the first breakpoint of a curve would not be positive.
     """
     v = droop.v.copy()
     flat = (droop.q[:, 1] == droop.q[:, 2])[:, None]
@@ -212,26 +172,13 @@ def enlarged(droop: Droop, times: float) -> Droop:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Loop:
-    """Closed loop in units with all slopes between 0 and 1. m inverters that react to voltages.
+    """Closed loop in units with all slopes between 0 and 1. m inverters that react to voltages."""
 
-    Attributes
-    ----------
-    S : (m, m)
-        `D^1/2 J D^1/2`.
-    error : (m, m)
-        Largest error of S, entry by entry.
-    tau : (m,)
-        Time constants, s.
-    update
-        Timing of the updates.
-    rows : (m,)
-        Their indices in the fleet; the other inverters do not react to the voltages within reach.
-    """
-
-    S: Floats
-    error: Floats
-    tau: Floats
-    update: Update
+    S: Floats  # (m, m) `D^1/2 J D^1/2`
+    error: Floats  # (m, m) largest error of S, entry by entry
+    tau: Floats  # (m,) time constants, s
+    update: Update  # timing of the updates
+    # (m,) their indices in the fleet; the other inverters do not react to the voltages within reach
     rows: Ints
 
     @property
@@ -318,11 +265,6 @@ def verified(given: Loop, times: float = 1.0) -> bool:
         [*                         G' P G - (2 - eps) ]  <  0,
 
     which is verified here on the numbers.
-
-    Parameters
-    ----------
-    times
-        Factor on all slopes.
     """
     m, d = given.tau.size, given.update.dead
     if not m:
@@ -373,22 +315,13 @@ def _realised(given: Loop) -> tuple[Floats, Floats, Floats]:
 
 @dataclass(frozen=True, slots=True)
 class Proof:
-    """Proof that a fleet settles.
+    """Proof that a fleet settles."""
 
-    Attributes
-    ----------
-    kind
-        `deadband`: no inverter reacts within reach; `small-gain`: for every interval and dead time; `circle`;
-        empty without a proof.
-    gain
-        Largest gain of the loop at rest, 1.
-    factor
-        Largest proven factor on all slopes in the same box of voltages.
-    """
-
+    # `deadband`: no inverter reacts within reach; `small-gain`: for every interval and dead time; `circle`;
+    # empty without a proof
     kind: str
-    gain: float
-    factor: float
+    gain: float  # largest gain of the loop at rest, 1
+    factor: float  # largest proven factor on all slopes in the same box of voltages
 
 
 _MOST: Final = 1e6
@@ -421,16 +354,9 @@ def proof(given: Loop) -> Proof:
 def growth(J: Floats, slope: Floats, tau: Floats, update: Update) -> float:
     """Largest factor by which a small deviation from rest grows in one update; above 1 the loop is unstable.
 
-    Parameters
-    ----------
-    J : (m, m)
-        Sensitivities `d|v|/dq` between the inverters at rest, pu.
-    slope : (m,)
-        Slopes of the curves there, `-dq/dv`.
-    tau : (m,)
-        Time constants, s.
-    update
-        Timing. For continuous filters: growth in the smallest time constant.
+    J (m, m): sensitivities `d|v|/dq` between the inverters at rest, pu.
+    slope (m,): slopes of the curves there, `-dq/dv`.
+    update: timing. For continuous filters: growth in the smallest time constant.
     """
     if not tau.size:
         return 0.0

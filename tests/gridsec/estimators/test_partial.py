@@ -24,45 +24,16 @@ from gridsec.interface import Cause, Decision, Estimate, Frame, Verdict
 from gridsec.observers import circle
 from tests.codes import refused
 from tests.gridsec.street import Street, make_plant
+from tests.gridsec.watching import watcher
 
 SMALL, RURAL = "cigre-lv", "simbench-lv-rural1"
 Answers = list[tuple[Estimate, Verdict]]
 
 
-def watch(
-    street: Street,
-    made: PartialDesign,
-    frames: int,
-    *,
-    h: float = 1.0,
-    state: PartialState | None = None,
-    lies: dict[int, float] | None = None,
-    silent: tuple[int, ...] = (),
-    change: object = None,
-    sound: bool = True,
-) -> tuple[PartialState, Answers]:
-    """Run a street and its observers; check on every frame what must always hold."""
-    state = partial.init(made, street.t) if state is None else state
-    answers = []
-    for _ in range(frames):
-        street.advance(h)
-        frame = street.frame(lies, silent)
-        if callable(change):
-            frame = change(frame)
-        state, estimate, verdict = partial.step(made, state, frame)
-        for values in (estimate.v2, estimate.bound, estimate.v2_bus, estimate.x, verdict.threshold):
-            assert np.isfinite(values).all()
-        assert np.array_equal(np.isnan(verdict.score), ~frame.seen | ~np.isfinite(frame.y))
-        assert not (estimate.trusted & (verdict.suspects | ~frame.seen)).any()
-        assert (verdict.attack[~verdict.suspects] == 0).all()
-        np.testing.assert_array_equal(estimate.v2, estimate.v2_bus[made.setting.plant.feeder.bus])
-        if sound:
-            assert (np.abs(estimate.v2 - street.truth()) <= estimate.bound).all()
-            honest = np.setdiff1d(np.arange(frame.y.size), list(lies or {}))
-            # A meter that lied before may still be named until it has been honest for a while.
-            assert not (verdict.suspects & (state.tally.below == 0))[honest].any()
-        answers.append((estimate, verdict))
-    return state, answers
+# A meter that lied before may still be named until it has been honest for a while.
+watch = watcher(
+    partial, lambda _, state, verdict, honest: (verdict.suspects & (state.tally.below == 0))[honest]
+)
 
 
 def made_for(street_plant: object, most: int = 1, h: float = 1.0) -> PartialDesign:

@@ -16,41 +16,13 @@ from feeders.simulation.scenario import START, Scenario, random_attacks, simulat
 from gridsec.errors import DesignInfeasible, InputInvalid, NotObservable
 from gridsec.estimators import set_search
 from gridsec.estimators.inputs import PreviousStep, clean
-from gridsec.estimators.set_search import SetSearchDesign, SetSearchState, advance
-from gridsec.interface import Cause, Decision, Estimate, Verdict
+from gridsec.estimators.set_search import advance
+from gridsec.interface import Cause, Decision
 from tests.codes import refused
 from tests.gridsec.street import Street, make_plant
+from tests.gridsec.watching import watcher
 
-Answers = list[tuple[Estimate, Verdict]]
-
-
-def watch(
-    street: Street,
-    made: SetSearchDesign,
-    frames: int,
-    *,
-    h: float = 1.0,
-    state: SetSearchState | None = None,
-    lies: dict[int, float] | None = None,
-    silent: tuple[int, ...] = (),
-    sound: bool = True,
-) -> tuple[SetSearchState, Answers]:
-    """Run a street and the family; check on every frame what must always hold."""
-    state = set_search.init(made, street.t) if state is None else state
-    answers = []
-    for _ in range(frames):
-        street.advance(h)
-        frame = street.frame(lies, silent)
-        state, estimate, verdict = set_search.step(made, state, frame)
-        assert not (estimate.trusted & (verdict.suspects | ~frame.seen)).any()
-        assert np.array_equal(np.isnan(verdict.score), ~frame.seen)
-        assert np.isfinite(verdict.threshold).all()
-        if sound:
-            assert (np.abs(estimate.v2 - street.truth()) <= estimate.bound).all()
-            honest = np.setdiff1d(np.arange(frame.y.size), list(lies or {}))
-            assert not verdict.suspects[honest].any()
-        answers.append((estimate, verdict))
-    return state, answers
+watch = watcher(set_search, lambda _made, _state, verdict, honest: verdict.suspects[honest])
 
 
 @settings(max_examples=30)
@@ -145,12 +117,12 @@ def test_the_search_finds_what_brute_force_finds() -> None:
         for j in set(range(9)) - set(D):
             off = view.base[j]
             for i, customer in enumerate(plant.droop.customer):
-                known = view.sure[i] if customer not in D else made.errors.span[i]
+                known = view.state.sure[i] if customer not in D else made.errors.span[i]
                 off += 2.0 * abs(X[j, customer]) * known
-            v = np.sqrt(view.v2[j] + off)
+            v = np.sqrt(view.seen.v2[j] + off)
             accuracy = plant.accuracy
             e = accuracy.class_fraction[j] * v + accuracy.resolution[j] / 2 + 4.0 * accuracy.jitter[j]
-            fits &= bool(abs(frame.y[j] - view.v2[j]) <= off + e * (2.0 * v + e))
+            fits &= bool(abs(frame.y[j] - view.seen.v2[j]) <= off + e * (2.0 * v + e))
         if fits:
             passing.append(D)
     assert passing == [(2, 6)]

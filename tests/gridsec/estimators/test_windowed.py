@@ -18,11 +18,12 @@ from gridsec.errors import DesignInfeasible, InputInvalid, NotObservable
 from gridsec.estimators import windowed
 from gridsec.estimators.exact_bank import bank as banks
 from gridsec.estimators.plant import Plant
-from gridsec.estimators.windowed import LENGTH, LENGTHS, WindowedDesign, WindowedState
+from gridsec.estimators.windowed import LENGTH, LENGTHS, WindowedDesign
 from gridsec.interface import Cause, Decision, Estimate, Verdict
 from gridsec.secure.windows import Rule
 from tests.codes import refused
 from tests.gridsec.street import Street, make_plant
+from tests.gridsec.watching import watcher
 
 Answers = list[tuple[Estimate, Verdict]]
 
@@ -40,28 +41,7 @@ def make(
     return plant, made, Street(plant, rng)
 
 
-def watch(
-    street: Street,
-    made: WindowedDesign,
-    frames: int,
-    *,
-    h: float = 1.0,
-    state: WindowedState | None = None,
-    lies: dict[int, float] | None = None,
-    silent: tuple[int, ...] = (),
-) -> tuple[WindowedState, Answers]:
-    """Run a street and the family; nobody is ever named but liars, nor trusted whom it names."""
-    state = windowed.init(made, street.t) if state is None else state
-    answers = []
-    for _ in range(frames):
-        street.advance(h)
-        frame = street.frame(lies, silent)
-        state, estimate, verdict = windowed.step(made, state, frame)
-        assert not (estimate.trusted & (verdict.suspects | ~frame.seen)).any()
-        assert (verdict.attack[~verdict.suspects] == 0).all()
-        assert np.isfinite(verdict.threshold).all()
-        answers.append((estimate, verdict))
-    return state, answers
+watch = watcher(windowed, None)
 
 
 @settings(max_examples=25)

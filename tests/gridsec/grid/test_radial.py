@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given
 
 from gridsec.errors import FeederInvalid, InputInvalid
-from gridsec.grid.radial import Feeder, squared_voltages
+from gridsec.grid.radial import Feeder
 from tests.codes import refused
-from tests.gridsec.radial import random_feeder, sweep
+from tests.gridsec.radial import random_feeder, squared_voltages, sweep
 
 seeds = st.integers(0, 100_000)
 
@@ -46,10 +46,14 @@ def test_matrices_are_sums_over_common_branches(seed: int) -> None:
 def test_depth_first_intervals_are_subtrees(seed: int) -> None:
     feeder = random_feeder(seed)
     for k in range(len(feeder.buses)):
-        inside = {i for i in range(len(feeder.buses)) if feeder.start[k] <= feeder.start[i] < feeder.stop[k]}
+        inside = {
+            i
+            for i in range(len(feeder.buses))
+            if feeder.walk.start[k] <= feeder.walk.start[i] < feeder.walk.stop[k]
+        }
         below = {i for i in range(len(feeder.buses)) if k == 0 or k - 1 in path(feeder, i)}
         assert inside == below
-        assert feeder.depth[k] == len(path(feeder, k))
+        assert feeder.walk.depth[k] == len(path(feeder, k))
 
 
 def test_line_of_chong2020() -> None:

@@ -14,14 +14,11 @@ from gridsec.errors import InputInvalid
 from gridsec.grid.three_phase import (
     ThreePhaseFeeder,
     bus_voltages,
-    corrected,
     lindist3flow,
-    loss_correction,
     model_error_bound,
     per_customer,
     sensitivities,
     sequence_matrix,
-    squared_voltages,
 )
 from tests.codes import refused
 from tests.gridsec.radial import random_feeder
@@ -118,7 +115,7 @@ def test_sweeps_and_matrices_are_the_same_linear_flow(seed: int) -> None:
     np.testing.assert_allclose(swept[:, 0], v0, rtol=0, atol=1e-15)
     direct = v0[:, None] + 2 * (model.R_bus @ p + model.X_bus @ q)
     np.testing.assert_allclose(swept, direct, rtol=0, atol=1e-13)
-    at = squared_voltages(model, p, q, v0[feeder.phase])
+    at = v0[feeder.phase] + 2 * (model.R @ p + model.X @ q)
     np.testing.assert_allclose(swept[feeder.phase, feeder.at], at, rtol=0, atol=1e-13)
 
 
@@ -163,9 +160,6 @@ def test_corrections_converge_to_the_power_flow(seed: int, charging: float) -> N
     there = ~np.isnan(truth)
     limit = bus_voltages(feeder, p, q, v0, steps=60)
     np.testing.assert_allclose(limit[there], truth[there], rtol=0, atol=1e-11)
-    linear = bus_voltages(feeder, p, q, v0, steps=0)
-    once = linear + loss_correction(feeder, p, q, v0)
-    np.testing.assert_allclose(bus_voltages(feeder, p, q, v0), once, rtol=0, atol=1e-15)
 
 
 @given(seeds)
@@ -174,12 +168,8 @@ def test_the_bound_holds(seed: int) -> None:
     p, q = powers(feeder, seed, 0.04)
     v0 = np.array([1.02, 1.0, 0.98])
     truth = (np.abs(power_flow(feeder, p, q, v0)) ** 2)[feeder.phase, feeder.at]
-    correction, bound = corrected(feeder, p, q, v0)
-    found = squared_voltages(lindist3flow(feeder), p, q, v0[feeder.phase])
-    found += correction[feeder.phase, feeder.at]
-    assert (np.abs(found - truth) <= bound + 1e-13).all()
-    np.testing.assert_array_equal(bound, model_error_bound(feeder, p, q, v0))
-    np.testing.assert_array_equal(correction, loss_correction(feeder, p, q, v0))
+    found = bus_voltages(feeder, p, q, v0)[feeder.phase, feeder.at]
+    assert (np.abs(found - truth) <= model_error_bound(feeder, p, q, v0) + 1e-13).all()
 
 
 def test_one_correction_leaves_an_error_of_third_order() -> None:
@@ -238,9 +228,8 @@ def test_nothing_is_claimed_where_nothing_is_known(power: float, v0: float) -> N
     p[0] = power
     away = feeder.at > 0
     assert away.any()
-    correction, bound = corrected(feeder, p, 0.1 * p, np.full(3, v0))
-    assert np.isinf(bound[away]).all()
-    assert correction.shape == (3, len(feeder.buses))
+    assert np.isinf(model_error_bound(feeder, p, 0.1 * p, np.full(3, v0))[away]).all()
+    assert bus_voltages(feeder, p, 0.1 * p, np.full(3, v0)).shape == (3, len(feeder.buses))
 
 
 def test_feeders_without_branches_or_without_customers() -> None:
@@ -303,17 +292,16 @@ def test_many_operating_points_at_once() -> None:
     rng = np.random.default_rng(0)
     p, q = 0.03 * rng.normal(size=(2, 4, 5, feeder.of.size))
     v0 = rng.uniform(0.95, 1.05, (4, 5, 3))
-    correction, bound = corrected(feeder, p, q, v0, steps=3)
-    assert correction.shape == (4, 5, 3, 10)
+    found, bound = bus_voltages(feeder, p, q, v0, steps=3), model_error_bound(feeder, p, q, v0)
+    assert found.shape == (4, 5, 3, 10)
     for i, j in np.ndindex(4, 5):
-        one, its = corrected(feeder, p[i, j], q[i, j], v0[i, j], steps=3)
-        np.testing.assert_allclose(correction[i, j], one, rtol=0, atol=1e-15)
-        np.testing.assert_allclose(bound[i, j], its, rtol=1e-9)
+        one = p[i, j], q[i, j], v0[i, j]
+        np.testing.assert_allclose(found[i, j], bus_voltages(feeder, *one, steps=3), rtol=0, atol=1e-15)
+        np.testing.assert_allclose(bound[i, j], model_error_bound(feeder, *one), rtol=1e-9)
 
 
-def test_a_correction_has_a_step() -> None:
+def test_sensitivities_have_a_step() -> None:
     feeder = random_three_phase(1)
     none = np.zeros(feeder.of.size)
-    for correct in (loss_correction, corrected, sensitivities):
-        with refused(InputInvalid, "out-of-range"):
-            correct(feeder, none, none, np.ones(3), steps=0)
+    with refused(InputInvalid, "out-of-range"):
+        sensitivities(feeder, none, none, np.ones(3), steps=0)

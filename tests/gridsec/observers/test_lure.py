@@ -15,7 +15,6 @@ from scipy.optimize import minimize
 from gridsec.arrays import spectral_radius
 from gridsec.errors import DesignInfeasible, FeederInvalid, InputInvalid
 from gridsec.grid.droop import PRESETS, Droop, fleet
-from gridsec.grid.radial import squared_voltages
 from gridsec.observers.lure import (
     POLICY,
     Lure,
@@ -28,7 +27,7 @@ from gridsec.observers.lure import (
     transition,
 )
 from tests.codes import refused
-from tests.gridsec.radial import random_feeder, random_loop
+from tests.gridsec.radial import random_feeder, random_loop, squared_voltages
 
 seeds = st.integers(0, 100_000)
 gains = st.sampled_from([0.1, 0.7, 1.0, 1.7, 5.0, 20.0])

@@ -12,13 +12,7 @@ from feeders.simulation.powerflow_three_phase import UnbalancedPowerFlow
 from gridsec.arrays import Floats
 from gridsec.errors import DesignInfeasible
 from gridsec.grid.droop import Droop, fleet
-from gridsec.grid.three_phase import (
-    ThreePhaseFeeder,
-    lindist3flow,
-    loss_correction,
-    per_customer,
-    squared_voltages,
-)
+from gridsec.grid.three_phase import ThreePhaseFeeder, bus_voltages, lindist3flow, per_customer
 from gridsec.observers.certificates import Certificate, reactance, small_gain, verify
 from gridsec.observers.lure import Lure, close_loop, equilibrium, known_input
 from tests.codes import refused
@@ -42,7 +36,7 @@ def test_customers_feel_their_connections(seed: int) -> None:
     kw, kvar = rng.normal(size=(2, len(feeder.customers)))
     third = feeder.base_kva / 3
     p, q = feeder.connections(kw) / third, feeder.connections(kvar) / third
-    squared = squared_voltages(model, p, q, np.ones(feeder.of.size))
+    squared = 1.0 + 2.0 * (model.R @ p + model.X @ q)
     means = [squared[feeder.of == j].mean() for j in range(len(feeder.customers))]
     expected = 1 + 2 * (found.R @ kw + found.X @ kvar) / feeder.base_kva
     np.testing.assert_allclose(means, expected, rtol=0, atol=1e-13)
@@ -156,7 +150,8 @@ def test_inverters_rest_where_the_asymmetric_power_flow_rests(sun: float, busbar
     for _ in range(4):  # the correction belongs to the injections that come out
         q = np.bincount(own, weights=found, minlength=load.size) - q_load
         p_phase, q_phase = feeder.connections(-3 * p), feeder.connections(3 * q)
-        correction = loss_correction(feeder, p_phase, q_phase, v0)[feeder.phase, feeder.at]
+        flat, full = (bus_voltages(feeder, p_phase, q_phase, v0, steps=steps) for steps in (0, 1))
+        correction = (full - flat)[feeder.phase, feeder.at]
         w = known_input(model, droop.vbar, -p, -q_load, busbar**2, correction)
         found = equilibrium(lure, w, tol=1e-12, max_iter=200)
     np.testing.assert_allclose(found, x, rtol=0, atol=2e-3 * droop.limit.max())

@@ -10,7 +10,6 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from gridsec.estimators.exact_bank import bank as banks
-from gridsec.grid.radial import squared_voltages
 from gridsec.observers.gains import circle_matrix
 from gridsec.observers.lmi import circle
 from gridsec.observers.lure import advance, close_loop, equilibrium, known_input
@@ -18,6 +17,7 @@ from gridsec.papers import chong2020
 from gridsec.papers.chong2020 import DESIGNS, Design
 from gridsec.papers.claims import Reproduction
 from tests.gridsec.papers.made import made
+from tests.gridsec.radial import squared_voltages
 
 both = pytest.mark.parametrize("of", DESIGNS)
 

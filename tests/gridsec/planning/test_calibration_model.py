@@ -23,8 +23,8 @@ def scene(seed: int) -> tuple[Feeder, Places, Series]:
     flow = replace(feeder, bus=buses, customers=tuple(map(str, buses))).linear()
     weight = np.zeros((feeder.bus.size, buses.size))
     weight[np.arange(feeder.bus.size), feeder.bus] = 1.0
-    start = feeder.start[:, None]
-    behind = (feeder.start[1:] <= start) & (start < feeder.stop[1:])
+    start = feeder.walk.start[:, None]
+    behind = (feeder.walk.start[1:] <= start) & (start < feeder.walk.stop[1:])
     one = np.zeros(buses.size, dtype=np.intp), behind.astype(np.float64), weight, meters
     places = Places(2.0 * flow.R, 2.0 * flow.X, *one, np.full(buses.size, 230.0), np.full(meters.size, 230.0))
     p, q = rng.normal(0.0, 0.1, (2, T, feeder.bus.size))

@@ -46,8 +46,6 @@ def test_whitened_columns_have_the_inner_products_of_the_dense_covariance(seed: 
     expected = flat.T @ np.linalg.solve(dense[np.ix_(rows, rows)], flat)
     # Modes below a thousandth of the meters' noise are left out.
     np.testing.assert_allclose(whitened.T @ whitened, expected, rtol=3e-3, atol=3e-3 * np.abs(expected).max())
-    log_det = np.linalg.slogdet(dense[np.ix_(rows, rows)])[1]
-    assert made.log_det == pytest.approx(log_det, abs=0.02)
 
 
 def test_missing_readings_have_no_influence() -> None:

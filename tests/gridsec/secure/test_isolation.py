@@ -17,7 +17,8 @@ from feeders.model.site import load
 from feeders.simulation.powerflow import PowerFlow
 from gridsec.arrays import Floats
 from gridsec.errors import DesignInfeasible, InputInvalid, NotObservable
-from gridsec.grid.droop import Droop, curve_gap, voltage_curve
+from gridsec.estimators.thresholds import curve_mismatch
+from gridsec.grid.droop import Droop, voltage_curve
 from gridsec.interface import Cause, Decision
 from gridsec.observers.lmi.sampled import DiscreteLure, advance
 from gridsec.observers.lure import close_loop, known_input
@@ -380,7 +381,7 @@ def test_both_are_named_under_ac_power_flow() -> None:
         np.arange(3),
         reading_error=np.full(6, 2e-6),
         u_error=np.full(6, 3e-6),
-        curve_error=curve_gap(droop),
+        curve_error=curve_mismatch(droop),
         span=2 * droop.limit,
     )
     made = isolation.design(plant, max_inputs=1, max_sensors=1)
