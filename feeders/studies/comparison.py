@@ -7,16 +7,17 @@ a design for the feeder, or with a failure in a step, keeps its rows, with the r
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+import pandas as pd
 
+from feeders.model.site import Site
 from feeders.registry.plugins import EstimatorUnusable
 from feeders.registry.registry import FAMILIES, DesignedEstimator, choose, design
 from feeders.simulation.attacks import AttackKind, AttackSpec, NoSuchAttack
@@ -26,9 +27,6 @@ from feeders.studies.journal import Journal, Where
 from feeders.util import replace_file
 from gridsec.arrays import Floats
 from gridsec.errors import DesignInfeasible, GridsecError, NotObservable, Problem, no_choice, raise_if_any
-
-if TYPE_CHECKING:
-    from feeders.model.site import Site
 
 __all__ = [
     "BEGIN",
@@ -46,8 +44,7 @@ __all__ = [
 
 FEEDER: Final = "simbench-lv-rural1"
 
-ONSET_S: Final = 60.0
-"""Onset of the attacks, s after the start; the estimators have settled by then."""
+ONSET_S: Final = 60.0  # onset of the attacks, s after the start; the estimators have settled by then
 
 BEGIN: Final = "<!-- comparison: begin -->"
 END: Final = "<!-- comparison: end -->"
@@ -61,25 +58,13 @@ Runs of minutes then include steps that make repeated readings visible.
 
 @dataclass(frozen=True, slots=True)
 class ComparisonCase:
-    """Case of the comparison: one kind of attack, or none.
+    """Case of the comparison: one kind of attack, or none."""
 
-    Attributes
-    ----------
-    name
-        Short name.
-    meaning
-        Description; `{meters}` is replaced by the number of manipulated meters.
-    trick, size
-        As in `feeders.simulation.attacks.AttackSpec`; None: no attack.
-    one
-        True: one manipulated device, for any M.
-    """
-
-    name: str
-    meaning: str
-    trick: AttackKind | None = None
-    size: float = 0.0
-    one: bool = False
+    name: str  # short name
+    meaning: str  # `{meters}` is replaced by the number of manipulated meters
+    trick: AttackKind | None = None  # None: no attack
+    size: float = 0.0  # as in `feeders.simulation.attacks.AttackSpec`
+    one: bool = False  # one manipulated device, for any M
 
     def told(self, count: int) -> str:
         """Description of the case for this number of manipulated meters."""
@@ -129,22 +114,7 @@ CASES: Final = (
 
 @dataclass(frozen=True, slots=True)
 class ComparisonPlan:
-    """Options of a comparison.
-
-    Attributes
-    ----------
-    max_attacked
-        M of the designs, and number of manipulated meters.
-    seeds
-        Number of runs of each case.
-    duration_s, step_s
-        Length of a run and interval of its frames, s.
-    load_error, meters, variation, report_q
-        As in `feeders.simulation.trial.Trial`.
-    families, cases
-        Names; all by default.
-    workers
-        Processes for designs by matrix inequality.
+    """Options of a comparison; those without a comment are as in `feeders.simulation.trial.Trial`.
 
     Raises
     ------
@@ -152,31 +122,25 @@ class ComparisonPlan:
         For an unknown estimator or case, or no run, with all problems.
     """
 
-    max_attacked: int = 2
-    seeds: int = 3
-    duration_s: float = 480.0
-    step_s: float = 1.0
+    max_attacked: int = 2  # M of the designs, and number of manipulated meters
+    seeds: int = 3  # number of runs of each case
+    duration_s: float = 480.0  # length of a run
+    step_s: float = 1.0  # interval of its frames
     load_error: LoadError = field(default_factory=lambda: LoadError(0.1, 0.05))
     meters: TrialMeterErrors = TrialMeterErrors.SITE
     variation: Variation = LIVELY
     report_q: bool = False
     families: tuple[str, ...] = tuple(FAMILIES)
     cases: tuple[str, ...] = tuple(case.name for case in CASES)
-    workers: int = 1
+    workers: int = 1  # processes for designs by matrix inequality
 
     def __post_init__(self) -> None:
         """Reject an empty comparison."""
-        raise_if_any(
-            [
-                *no_choice("family", FAMILIES, *self.families),
-                *no_choice("case", (case.name for case in CASES), *self.cases),
-                *(
-                    []
-                    if self.seeds >= 1
-                    else [Problem("not-positive", f"seeds is {self.seeds}; at least one run is needed")]
-                ),
-            ]
-        )
+        problems = no_choice("family", FAMILIES, *self.families)
+        problems += no_choice("case", (case.name for case in CASES), *self.cases)
+        if self.seeds < 1:
+            problems.append(Problem("not-positive", f"seeds is {self.seeds}; at least one run is needed"))
+        raise_if_any(problems)
 
     def trial(self, site: Site, case: ComparisonCase, seed: int) -> Trial:
         """One run."""
@@ -195,74 +159,33 @@ class ComparisonPlan:
 
 @dataclass(frozen=True, slots=True)
 class ComparisonRow:
-    """Result of one estimator in one case, over all seeds. NaN: not applicable.
-
-    Attributes
-    ----------
-    family, case
-        Names.
-    reason
-        Reason for missing numbers; empty with numbers.
-    liars, named, missed
-        Number of manipulated meters and inverters, of those named during the attack, and of those not named,
-        sums over seeds.
-    falsely_named
-        Number of honest meters and inverters ever named, sum over seeds.
-    false_share
-        Share of ticks with an honest meter named, 1.
-    delay_s
-        Median time from onset to naming of those named, s.
-    error_liars, error_all
-        95th percentile of the reconstruction error of the voltage at manipulated meters and at all customers,
-        % of nominal.
-    step_ms, step_ms_95
-        Median and 95th percentile of the processor time per step, ms.
-    observers
-        Number of observers, or candidate sets.
-    false_clean
-        Share of the ticks with an attack and the verdict CLEAN, 1.
-    undecided
-        Share of all ticks with the verdict UNDECIDED, 1.
-    """
+    """Result of one estimator in one case, over all seeds. NaN: not applicable."""
 
     family: str
     case: str
-    reason: str = ""
-    liars: int = 0
-    named: int = 0
-    missed: int = 0
-    falsely_named: int = 0
-    false_share: float = math.nan
-    delay_s: float = math.nan
-    error_liars: float = math.nan
-    error_all: float = math.nan
-    step_ms: float = math.nan
-    step_ms_95: float = math.nan
-    observers: int = 0
-    false_clean: float = math.nan
-    undecided: float = math.nan
+    reason: str = ""  # for missing numbers; empty with numbers
+    liars: int = 0  # manipulated meters and inverters, sum over seeds
+    named: int = 0  # those named during the attack
+    missed: int = 0  # those not named
+    falsely_named: int = 0  # honest meters and inverters ever named
+    false_share: float = math.nan  # share of ticks with an honest meter named, 1
+    delay_s: float = math.nan  # median from onset to naming of those named
+    error_liars: float = math.nan  # 95th percentile of the voltage error at manipulated meters, % of nominal
+    error_all: float = math.nan  # the same at all customers
+    step_ms: float = math.nan  # median processor time per step
+    step_ms_95: float = math.nan  # 95th percentile
+    observers: int = 0  # number of observers, or candidate sets
+    false_clean: float = math.nan  # share of the ticks with an attack and the verdict CLEAN, 1
+    undecided: float = math.nan  # share of all ticks with the verdict UNDECIDED, 1
 
 
 def compare(
     site: Site, plan: ComparisonPlan, *, journal: Where = None, progress: Callable[[str], None] | None = None
 ) -> list[ComparisonRow]:
-    """Run all estimators on all cases.
+    """Run all estimators on all cases; one row for each case and family, case by case.
 
-    Parameters
-    ----------
-    site
-        The feeder.
-    plan
-        Options of the comparison.
-    journal
-        File of finished cases; an interrupted comparison resumes from it.
-    progress
-        Called with a line of text before each design and each case.
-
-    Returns
-    -------
-    list of Row
-        One for each case and family, case by case.
+    An interrupted comparison resumes from its journal. `progress` is called with a line of text before each
+    design and each case.
 
     Raises
     ------
@@ -324,7 +247,8 @@ def _case(
                 try:
                     outcomes[name].append(judge(watcher, trial, played=played))
                 except Exception as failure:  # noqa: BLE001  # external code may raise anything
-                    reasons[name] = _failed(failure)
+                    what = " ".join(f"{type(failure).__name__}: {failure}".split())
+                    reasons[name] = f"failed in a step: {what}"
     except NoSuchAttack as error:
         return [ComparisonRow(name, case.name, str(error)) for name in watchers]
     return [
@@ -333,10 +257,6 @@ def _case(
         else _row(name, case.name, watcher.observers, outcomes[name])
         for name, watcher in watchers.items()
     ]
-
-
-def _failed(failure: Exception) -> str:
-    return "failed in a step: " + " ".join(f"{type(failure).__name__}: {failure}".split())
 
 
 def _row(family: str, case: str, observers: int, outcomes: Sequence[TrialResult]) -> ComparisonRow:
@@ -373,24 +293,10 @@ def _most(values: Floats) -> float:
 
 
 def write_csv(rows: Iterable[ComparisonRow], path: Path) -> None:
-    """Write all numbers; an existing file is replaced when the new one is complete.
-
-    Parameters
-    ----------
-    rows
-        From `compare`.
-    path
-        The file.
-    """
-
-    def write(new: Path) -> None:
-        with new.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, [each.name for each in fields(ComparisonRow)])
-            writer.writeheader()
-            writer.writerows(asdict(row) for row in rows)
-
+    """Write all numbers; an existing file is replaced when the new one is complete."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    replace_file(path, write)
+    table = pd.DataFrame([asdict(row) for row in rows], columns=[each.name for each in fields(ComparisonRow)])
+    replace_file(path, partial(table.to_csv, index=False, na_rep="nan", lineterminator="\r\n"))
 
 
 HEADERS: Final = (
@@ -428,15 +334,7 @@ def cells(row: ComparisonRow) -> tuple[str, ...]:
 
 
 def markdown(rows: Sequence[ComparisonRow], plan: ComparisonPlan) -> str:
-    """Overview, and one table for each case; every estimator has a row, with or without numbers.
-
-    Parameters
-    ----------
-    rows
-        From `compare`.
-    plan
-        Options of the comparison.
-    """
+    """Overview, and one table for each case; every estimator has a row, with or without numbers."""
     names = list(dict.fromkeys(row.case for row in rows))
     found = {(family, name): ComparisonRow(family, name, "not run") for family in FAMILIES for name in names}
     found |= {(row.family, row.case): row for row in rows}
@@ -448,7 +346,11 @@ def markdown(rows: Sequence[ComparisonRow], plan: ComparisonPlan) -> str:
     ]
     lines += _head(("family", *names))
     for family in FAMILIES:
-        lines.append(_line((family, *(_short(found[family, name]) for name in names))))
+        rows_of = (found[family, name] for name in names)
+        short = (
+            "none" if row.reason else f"{row.named}/{row.liars} ({row.falsely_named})" for row in rows_of
+        )
+        lines.append(_line((family, *short)))
     for name in names:
         lines += ["", f"### {name}", "", f"{meanings[name][0].upper()}{meanings[name][1:]}.", ""]
         lines += _head(HEADERS)
@@ -459,14 +361,7 @@ def markdown(rows: Sequence[ComparisonRow], plan: ComparisonPlan) -> str:
 
 
 def splice(text: str, table: str) -> str:
-    """Replace the text between BEGIN and END.
-
-    Parameters
-    ----------
-    text
-        The document.
-    table
-        New text.
+    """Replace the text of a document between BEGIN and END.
 
     Raises
     ------
@@ -478,10 +373,6 @@ def splice(text: str, table: str) -> str:
     if not end or text.count(BEGIN) != 1 or text.count(END) != 1:
         raise GridsecError(f"the document must hold {BEGIN} and, after it, {END}, once each", code="missing")
     return f"{before}{BEGIN}\n\n{table.strip()}\n\n{END}{after}"
-
-
-def _short(row: ComparisonRow) -> str:
-    return "none" if row.reason else f"{row.named}/{row.liars} ({row.falsely_named})"
 
 
 def _head(headers: tuple[str, ...]) -> list[str]:

@@ -1,47 +1,38 @@
 """Sizes of attacks that stay unnoticed, are noticed and are named, in volts; resulting estimation errors.
 
-References
-----------
-docs/theory-studies.md, sections 3 and 5.
+References: docs/theory-studies.md, sections 3 and 5.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from contextlib import closing
 from dataclasses import dataclass
-from functools import partial
-from typing import TYPE_CHECKING, Any
+from functools import lru_cache, partial
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from feeders.format.tables import FeederTables
 from feeders.model.load_uncertainty import load_doubt
-from feeders.model.site import from_tables, plant
-from feeders.studies.journal import Journal, Progress, Where
+from feeders.model.site import Site, from_tables, plant
+from feeders.studies.journal import Progress, Runner, Where, run_pieces
 from feeders.studies.operating import SHARE, box, volts_of_lie
 from feeders.studies.unobservable import CurvePositions
-from feeders.studies.workers import Here, Runner, cores
+from feeders.studies.workers import Here, cores
 from gridsec.arrays import Floats
-from gridsec.errors import DesignInfeasible, InputInvalid, Problem
+from gridsec.errors import DesignInfeasible, Problem, raise_if_any
 from gridsec.estimators.sequential import SequentialOptions
 from gridsec.estimators.sequential import design as design_sequential
 from gridsec.planning.collusion import Corridor, furthest
 from gridsec.planning.detectability import Rule, named_size, rule, within
 from gridsec.planning.stealthy_attacks import ErrorBox, largest_lie, worst_error
 
-if TYPE_CHECKING:
-    from feeders.model.site import Site
+__all__ = ["Detectable", "detectable", "monitor_rule", "workers"]
 
-__all__ = ["MANY", "RISK", "Detectable", "detectable", "monitor_rule", "workers"]
-
-RISK = 1e-3
-"""Probability at one moment that honest errors exceed the monitor's limits."""
-
-MANY = 50
-"""Number of meters from which on several processes are faster than one."""
+RISK = 1e-3  # probability at one moment that honest errors exceed the monitor's limits
+MANY = 50  # number of meters from which on several processes are faster than one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,12 +41,6 @@ class Detectable:
 
     Attributes
     ----------
-    feeder, digest
-        Name and content digest of the feeder.
-    max_attacked
-        M.
-    risk, share
-        As in `detectable`.
     meters
         One row for each meter, `alone` or in collusion with M - 1 others of the attacker's choice:
 
@@ -101,22 +86,16 @@ def detectable(
 ) -> Detectable:
     """Find the smallest attacks that are named for sure, and the largest that stay unnoticed.
 
+    Inverters are in their deadbands. The result is the same for every runner.
+
     Parameters
     ----------
-    site
-        The feeder.
     max_attacked
         M: largest number of manipulated meters.
     share
-        Load relative to its peak, the same for all, 1; inverters are in their deadbands.
+        Load relative to its peak, the same for all, 1.
     risk
         Probability that honest errors exceed the monitor's limits.
-    runner
-        `workers.Here`, `Processes` or `Dask`; the results are equal.
-    journal
-        File of finished work; an interrupted study resumes from it.
-    progress
-        Called with (done, total).
 
     Raises
     ------
@@ -129,18 +108,13 @@ def detectable(
     InUse
         If another process writes the journal.
     """
-    if not 1 <= max_attacked <= site.meters.size:
-        raise InputInvalid(
-            [
-                Problem(
-                    "out-of-range", f"max_attacked is {max_attacked}; it must be from 1 to {site.meters.size}"
-                )
-            ]
-        )
-    if not 0.0 < risk < 1.0:
-        raise InputInvalid([Problem("out-of-range", f"risk is {risk}; it must be between 0 and 1")])
-    if not 0.0 <= share < math.inf:
-        raise InputInvalid([Problem("negative", f"share is {share}; it must be finite and not negative")])
+    p = site.meters.size
+    checks = (
+        (1 <= max_attacked <= p, "out-of-range", f"max_attacked is {max_attacked}; it must be from 1 to {p}"),
+        (0.0 < risk < 1.0, "out-of-range", f"risk is {risk}; it must be between 0 and 1"),
+        (0.0 <= share < math.inf, "negative", f"share is {share}; it must be finite and not negative"),
+    )
+    raise_if_any(Problem(code, text) for right, code, text in checks if not right)
     subject = {
         "study": "detectable",
         "digest": site.digest,
@@ -148,56 +122,24 @@ def detectable(
         "share": share,
         "risk": risk,
     }
-    asked = _Asked(site.tables, max_attacked, share, risk)
-    given = _Given.of(site, asked)  # errors of the arguments occur here, not in a worker
-    keys = [f"meter|{j}" for j in range(site.meters.size)]
-    keys += [f"customer|{i}" for i in range(site.feeder.bus.size)]
+    asked = site.tables, max_attacked, share, risk
+    given = _Given.of(site, *asked[1:])  # errors of the arguments occur here, not in a worker
     here = runner is None or isinstance(runner, Here)
-    work = partial(_row, given) if here else partial(_worked, asked)
-    with Journal(journal, subject, of=len(keys)) as kept:
-        todo = [piece for piece, key in enumerate(keys) if key not in kept]
-        done = len(keys) - len(todo)
-        if progress is not None:
-            progress(done, len(keys))
-        with closing((runner or Here()).run(work, todo)) as results:
-            for piece, row in results:
-                kept.put(keys[piece], row)
-                done += 1
-                if progress is not None:
-                    progress(done, len(keys))
-        rows = [kept[key] for key in keys]
-    return Detectable(
-        site.feeder.name,
-        site.digest,
-        max_attacked,
-        risk,
-        pd.DataFrame(rows[: site.meters.size]),
-        pd.DataFrame(rows[site.meters.size :]),
-        share,
+    rows = run_pieces(
+        journal,
+        subject,
+        [*(f"meter|{j}" for j in range(p)), *(f"customer|{i}" for i in range(site.feeder.bus.size))],
+        partial(_row, given) if here else partial(_worked, *asked),
+        runner=runner or Here(),
+        progress=progress,
     )
+    meters, customers = pd.DataFrame(rows[:p]), pd.DataFrame(rows[p:])
+    return Detectable(site.feeder.name, site.digest, max_attacked, risk, meters, customers, share)
 
 
 def workers(site: Site, count: int | None) -> Runner:
-    """Fastest runner for a feeder's study.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    count
-        Number of processes; by default all cores, from MANY meters on.
-    """
+    """Fastest runner for a feeder's study: `count` processes; by default all cores, from MANY meters on."""
     return Here() if count is None and site.meters.size < MANY else cores(count)
-
-
-@dataclass(frozen=True, slots=True)
-class _Asked:
-    """Arguments of the study, for workers."""
-
-    tables: FeederTables
-    max_attacked: int
-    share: float
-    risk: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -212,33 +154,31 @@ class _Given:
     claims: Floats
 
     @classmethod
-    def of(cls, site: Site, asked: _Asked) -> _Given:
-        given = monitor_rule(site, risk=asked.risk, share=asked.share)
+    def of(cls, site: Site, max_attacked: int, share: float, risk: float) -> _Given:
+        given = monitor_rule(site, risk=risk, share=share)
         return cls(
             site,
-            asked.max_attacked,
+            max_attacked,
             given,
             {
                 (seen, count): within(given, count, seen=seen)
                 for seen in (False, True)
-                for count in (1, asked.max_attacked)
+                for count in (1, max_attacked)
             },
-            box(site, share=asked.share, curves=CurvePositions.DEADBAND),
-            _claims(site, given, asked.share),
+            box(site, share=share, curves=CurvePositions.DEADBAND),
+            _claims(site, given, share),
         )
 
 
-# Last preparation of this process, and its arguments.
-_prepared: list[tuple[_Asked, _Given]] = []
+@lru_cache(maxsize=1)
+def _prepared(tables: FeederTables, max_attacked: int, share: float, risk: float) -> _Given:
+    """Common data of all rows, computed once in each process."""
+    return _Given.of(from_tables(tables), max_attacked, share, risk)
 
 
-def _worked(asked: _Asked, piece: int) -> dict[str, Any]:
-    """One row in any process; the common data are computed once in each."""
-    given = next((made for what, made in _prepared if what == asked), None)
-    if given is None:
-        given = _Given.of(from_tables(asked.tables), asked)
-        _prepared[:] = [(asked, given)]
-    return _row(given, piece)
+def _worked(tables: FeederTables, max_attacked: int, share: float, risk: float, piece: int) -> dict[str, Any]:
+    """One row in any process."""
+    return _row(_prepared(tables, max_attacked, share, risk), piece)
 
 
 def _row(given: _Given, piece: int) -> dict[str, Any]:
@@ -249,11 +189,6 @@ def _row(given: _Given, piece: int) -> dict[str, Any]:
 
 def monitor_rule(site: Site, *, risk: float = RISK, share: float = SHARE) -> Rule:
     """Rule of the sequential monitor with the settings of the feeder's files.
-
-    Parameters
-    ----------
-    site, risk, share
-        As in `detectable`.
 
     Raises
     ------

@@ -8,14 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Self
+from typing import Final, Self
 
 import numpy as np
 
 from feeders.format.topology import Edge, tree
 from feeders.model.forecast import always
 from feeders.model.load_uncertainty import unread
-from feeders.model.site import Snapshot, to_frame
+from feeders.model.site import Site, Snapshot, to_frame
+from feeders.model.three_phase import ThreePhaseSite
 from feeders.studies.unobservable import CurvePositions, customer_indices
 from gridsec.arrays import Floats
 from gridsec.errors import choice
@@ -25,27 +26,15 @@ from gridsec.interface import Frame
 from gridsec.planning.redundancy import from_busbar
 from gridsec.planning.stealthy_attacks import ErrorBox, PowerErrorModel
 
-if TYPE_CHECKING:
-    from feeders.model.site import Site
-    from feeders.model.three_phase import ThreePhaseSite
-
-__all__ = ["SHARE", "SIGMAS", "Bases", "box", "false_powers", "line_rows", "squared", "volts_of_lie"]
+__all__ = ["SHARE", "Bases", "box", "false_powers", "line_rows", "squared", "volts_of_lie"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bases:
-    """Voltage bases of N customers.
+    """Voltage bases of N customers."""
 
-    Attributes
-    ----------
-    volt : (N,)
-        1 pu at every customer, V.
-    nominal : (N,)
-        The nominal voltage there, V: 1 in limits and curves.
-    """
-
-    volt: Floats
-    nominal: Floats
+    volt: Floats  # (N,) 1 pu at every customer, V
+    nominal: Floats  # (N,) the nominal voltage there, V: 1 in limits and curves
 
     @classmethod
     def of(cls, site: Site) -> Self:
@@ -62,13 +51,7 @@ class Bases:
         return low / self.ratio, high / self.ratio
 
     def extremes(self, v: Floats) -> tuple[float, float]:
-        """Voltages with the smallest and largest ratio to their nominal voltage, V.
-
-        Parameters
-        ----------
-        v : (…, N)
-            Voltages, pu; a NaN becomes both extremes.
-        """
+        """Voltages with the smallest and largest ratio to their nominal voltage, V; `v` is (..., N), pu."""
         told = (v * self.ratio).reshape(-1, self.volt.size)
         lows, highs = told.min(axis=0), told.max(axis=0)
         lowest, highest = int(np.argmin(lows)), int(np.argmax(highs))
@@ -93,33 +76,21 @@ def line_rows(site: Site | ThreePhaseSite) -> list[int]:
     return [closed[k] for k in (*found.branch, *found.ties)]
 
 
-SHARE: Final = 0.5
-"""Default load relative to its peak, the same for all, 1, without generation."""
-
-SIGMAS: Final = 4.0
-"""Limit of an honest reading's jitter in standard deviations, as in `estimators.plant.Options`."""
+SHARE: Final = 0.5  # default load relative to its peak, the same for all, 1, without generation
+SIGMAS: Final = 4.0  # limit of an honest reading's jitter, as in `estimators.plant.Options`
 
 
 def box(site: Site, *, share: float = SHARE, curves: CurvePositions = CurvePositions.DEADBAND) -> ErrorBox:
     """Worst cases of the exact bank's thresholds, at nominal voltage.
 
     Intervals of powers are those of a frame with every metered load at `share` of its peak, active power
-    only. Inverters follow their linearised droop curves. In three phases each voltage of the busbar has its
-    own error.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    share
-        Load relative to its peak, 1.
-    curves
-        Operating region of the inverters; at nominal voltage the deadband.
+    only. Inverters follow their linearised droop curves; at nominal voltage these are in the deadband. In
+    three phases each voltage of the busbar has its own error.
 
     Raises
     ------
     ValueError
-        For an unknown region.
+        For an unknown region of the curves.
     """
     frame = _frame(site, share)
     return _box(site, curves, frame.p_error, frame.q_error)
@@ -134,12 +105,8 @@ def false_powers(
 ) -> PowerErrorModel:
     """Worst cases in which manipulated meters report any powers within their customers' range.
 
-    Parameters
-    ----------
-    site, share, curves
-        As in `box`.
-    unknown
-        Customers with unknown powers, besides those without a meter.
+    `unknown` are customers with unknown powers besides those without a meter; `share` and `curves` as in
+    `box`.
 
     Raises
     ------
@@ -195,22 +162,10 @@ def _box(site: Site, curves: CurvePositions, p_error: Floats, q_error: Floats) -
 
 
 def volts_of_lie(base_volt: Floats | float, size: Floats | float) -> Floats:
-    """Change of the squared voltage in volts, at 1 pu and downwards: the larger direction, V.
-
-    Parameters
-    ----------
-    base_volt, size
-        1 pu, V, as in `Site.customer_volt`; and size, squared pu.
-    """
+    """Change of the squared voltage, pu^2, in volts at 1 pu, V, and downwards: the larger direction."""
     return np.asarray(base_volt * (1.0 - np.sqrt(np.maximum(1.0 - np.asarray(size), 0.0))))
 
 
 def squared(base_volt: Floats | float, volt: Floats | float) -> Floats:
-    """Inverse of `volts_of_lie`.
-
-    Parameters
-    ----------
-    base_volt, volt
-        1 pu, V; and size, V.
-    """
+    """Inverse of `volts_of_lie`."""
     return np.asarray(1.0 - np.maximum(1.0 - np.asarray(volt) / base_volt, 0.0) ** 2)

@@ -1,8 +1,6 @@
 """Fewest meters to protect such that attacks are identified, are noticed, or have a bounded size.
 
-References
-----------
-docs/theory-studies.md, section 4.
+References: docs/theory-studies.md, section 4.
 """
 
 from __future__ import annotations
@@ -12,11 +10,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 
+from feeders.model.site import Site
 from feeders.studies.journal import Journal, Where
 from feeders.studies.operating import SHARE, box, false_powers, squared, volts_of_lie
 from feeders.studies.unobservable import Attack, CurvePositions, knowledge, meter_mask, see_names
@@ -25,9 +23,6 @@ from gridsec.errors import DesignInfeasible, Problem, choice, no_choice, raise_i
 from gridsec.planning.protection import Attacker, Unprotectable, fewest_protected, hides, lies_beyond
 from gridsec.planning.redundancy import Patterns, fewest_meters
 from gridsec.planning.stealthy_attacks import ErrorBox, PowerErrorModel, largest_lie, largest_of
-
-if TYPE_CHECKING:
-    from feeders.model.site import Site
 
 __all__ = ["Goal", "Protect", "check", "protect"]
 
@@ -52,8 +47,6 @@ class Protect:
 
     Attributes
     ----------
-    feeder, digest
-        Name and content digest of the feeder.
     goal, max_attacked, attack, lie_volt
         Requested or default question: M, the attacks that count, and the bound of attacks (NaN for goals
         without one).
@@ -97,9 +90,8 @@ class Protect:
     def no_answer(self) -> bool:
         """True if the goal requires no protection on this feeder, which is no safety.
 
-        Attacks that are to be identified or noticed hide behind unknown powers. With all powers known no
-        attack is exactly consistent, however small. Sizes of attacks within honest errors are not part of
-        these goals.
+        With all powers known no attack is exactly consistent, however small. Sizes of attacks within honest
+        errors are not part of the goals `IDENTIFY` and `NOTICE`.
         """
         return not self.goal.in_volts and math.isinf(self.before)
 
@@ -143,10 +135,10 @@ def protect(
 ) -> Protect:
     """Find the fewest meters to protect; a protected meter cannot be manipulated.
 
+    `progress` is called with the number of known attacks, and of meters protected against them.
+
     Parameters
     ----------
-    site
-        The feeder.
     max_attacked
         M: largest number of manipulated meters among the others.
     goal
@@ -170,10 +162,6 @@ def protect(
         Meters that cannot be protected.
     exact
         True: prove the smallest number; otherwise greedy, with `gap`.
-    journal
-        File of attacks found; an interrupted study resumes from it.
-    progress
-        Called with the number of known attacks, and of meters protected against them.
 
     Raises
     ------
@@ -181,10 +169,8 @@ def protect(
         If no protection of the other meters suffices.
     ValueError
         For an unknown customer or meter, or as `check`.
-    OtherStudy
-        If the journal is that of another study.
-    InUse
-        If another process writes the journal.
+    OtherStudy, InUse
+        As `feeders.studies.journal.Journal`.
     """
     check(
         max_attacked=max_attacked,
@@ -263,11 +249,6 @@ def check(
 ) -> None:
     """Check the arguments of `protect`: contradictions, and arguments without effect for the goal.
 
-    Parameters
-    ----------
-    max_attacked, goal, lie_volt, attack, unknown, busbar_known, curves, share
-        As in `protect`.
-
     Raises
     ------
     ValueError
@@ -281,40 +262,29 @@ def check(
     bounded = not math.isnan(lie_volt)
     hiding = goal in (Goal.IDENTIFY, Goal.NOTICE)
     in_volts = goal in (Goal.BOUND, Goal.CONTAIN) or (goal is None and bounded)
-    for problem, wrong in (
-        (Problem("not-positive", f"max_attacked is {max_attacked}; it must be at least 1"), max_attacked < 1),
+    checks = (
+        (max_attacked < 1, "not-positive", f"max_attacked is {max_attacked}; it must be at least 1"),
         (
-            Problem(
-                "not-positive",
-                f"lie_volt is {lie_volt}; a bound of attacks must be a positive number of volts",
-            ),
             not 0.0 < lie_volt < math.inf and (bounded or goal == Goal.BOUND),
+            "not-positive",
+            f"lie_volt is {lie_volt}; a bound of attacks must be a positive number of volts",
         ),
+        (not 0.0 <= share < math.inf, "negative", f"share is {share}; it must be finite and not negative"),
+        (in_volts and not busbar_known, "inconsistent", "a bound of attacks requires a known busbar voltage"),
+        (bounded and hiding, "inconsistent", f"lie_volt goes with goals in volts, not with {goal}"),
+        (share != SHARE and hiding, "inconsistent", f"share goes with goals in volts, not with {goal}"),
         (
-            Problem("negative", f"share is {share}; it must be finite and not negative"),
-            not 0.0 <= share < math.inf,
-        ),
-        (
-            Problem("inconsistent", "a bound of attacks requires a known busbar voltage"),
-            in_volts and not busbar_known,
-        ),
-        (Problem("inconsistent", f"lie_volt goes with goals in volts, not with {goal}"), bounded and hiding),
-        (
-            Problem("inconsistent", f"share goes with goals in volts, not with {goal}"),
-            share != SHARE and hiding,
-        ),
-        (
-            Problem("inconsistent", "attack goes with goals identify and notice, not with bounds of attacks"),
             in_volts and attack == Attack.ANY,
+            "inconsistent",
+            "attack goes with goals identify and notice, not with bounds of attacks",
         ),
         (
-            Problem("inconsistent", "unknown powers do not go with bound, which assumes true powers"),
-            goal == Goal.BOUND and unknown,
+            goal == Goal.BOUND and bool(unknown),
+            "inconsistent",
+            "unknown powers do not go with bound, which assumes true powers",
         ),
-    ):
-        if wrong:
-            problems.append(problem)
-    raise_if_any(problems)
+    )
+    raise_if_any([*problems, *(Problem(code, text) for wrong, code, text in checks if wrong)])
 
 
 def _unmet(liars: Sequence[str]) -> str:

@@ -1,8 +1,6 @@
 """Number of manipulated meters that a feeder withstands: in total, by meter, by part, with silent meters.
 
-References
-----------
-lee2018, chapter 3; docs/theory-studies.md, section 2.
+References: lee2018, chapter 3; docs/theory-studies.md, section 2.
 """
 
 from __future__ import annotations
@@ -11,11 +9,12 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import pandas as pd
 
+from feeders.model.site import Site
 from feeders.studies.journal import Progress, Where, worked
 from feeders.studies.unobservable import Attack, CurvePositions, Knowledge, knowledge, see_names
 from gridsec.errors import DesignInfeasible
@@ -27,9 +26,6 @@ from gridsec.planning.redundancy import (
     parts,
 )
 from gridsec.secure.index import Index
-
-if TYPE_CHECKING:
-    from feeders.model.site import Site
 
 __all__ = ["ALL", "SILENT", "Redundancy", "redundancy"]
 
@@ -48,14 +44,8 @@ class Redundancy:
 
     Attributes
     ----------
-    feeder, digest
-        Name and content digest of the feeder.
     unknown, unknown_silent
         Customers with unknown powers, in the two cases.
-    silent
-        Meters without readings in the second case.
-    curves
-        Operating region of the inverters.
     summary
         One row for each case and kind of attack: `patterns` (dimension of hidden attacks), `blind` (customers
         with a voltage that no meter determines, even without an attack), `index`, `detected` (largest number
@@ -107,25 +97,14 @@ def redundancy(
 ) -> Redundancy:
     """Count manipulated meters that stay invisible even with exact knowledge of feeder and honest loads.
 
-    Parameters
-    ----------
-    site
-        The feeder.
-    unknown, silent, busbar_known, curves
-        As in `feeders.studies.unobservable.knowledge`.
-    journal
-        File of finished work; an interrupted study resumes from it.
-    progress
-        Called with (done, total).
+    The arguments are those of `feeders.studies.unobservable.knowledge`.
 
     Raises
     ------
     ValueError
         For an unknown customer, meter or region of the curves.
-    OtherStudy
-        If the journal is that of another study.
-    InUse
-        If another process writes the journal.
+    OtherStudy, InUse
+        As `feeders.studies.journal.Journal`.
     """
     see_names(site, unknown=unknown, meters=silent, curves=curves)
     curves = CurvePositions(curves)

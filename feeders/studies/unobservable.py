@@ -5,20 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
+from feeders.model.site import Site
 from gridsec.arrays import Bools, Floats, Ints, unit_rows
 from gridsec.errors import Problem, choice, no_choice, raise_if_any
 from gridsec.observers.lure import close_loop
 from gridsec.planning.redundancy import Patterns, patterns, unknown_pair, unknown_voltages
 
-if TYPE_CHECKING:
-    from feeders.model.site import Site
-
 __all__ = [
-    "TOLERANCE",
     "Attack",
     "CurvePositions",
     "Knowledge",
@@ -51,24 +48,12 @@ class Attack(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Knowledge:
-    """Unknowns of a feeder, and patterns that they hide. p meters.
+    """Unknowns of a feeder, and patterns that they hide. N customers, n states, p meters."""
 
-    Attributes
-    ----------
-    unknown
-        Customers with unknown powers.
-    silent : (p,)
-        Mask of meters without readings.
-    found
-        The patterns for each kind of attack.
-    everywhere : (N, n)
-        Effect at a meter of each customer, rows of length one; zero without an effect on the voltage.
-    """
-
-    unknown: tuple[str, ...]
-    silent: Bools
-    found: dict[Attack, Patterns]
-    everywhere: Floats
+    unknown: tuple[str, ...]  # customers with unknown powers
+    silent: Bools  # (p,) meters without readings
+    found: dict[Attack, Patterns]  # patterns for each kind of attack
+    everywhere: Floats  # (N, n) effect at a meter of each customer, rows of length one or zero
 
     def blind(self, attack: Attack) -> Bools:
         """Mask (N,) of customers with a voltage moved by some pattern that no live meter sees."""
@@ -90,8 +75,6 @@ def knowledge(
 
     Parameters
     ----------
-    site
-        The feeder.
     unknown
         Customers with unknown active and reactive powers; by default those without a meter, except those with
         `p_std_kw` and `q_std_kvar`, such as no-load powers of transformers.
@@ -136,11 +119,6 @@ def knowledge(
 def customer_indices(site: Site, names: Sequence[str]) -> Ints:
     """Indices of customers by id.
 
-    Parameters
-    ----------
-    site, names
-        The feeder, and ids of its customers.
-
     Raises
     ------
     ValueError
@@ -156,16 +134,7 @@ def see_names(
     meters: Sequence[str] = (),
     curves: CurvePositions | str = "",
 ) -> None:
-    """Check ids of customers and meters, and the region of the curves, all at once.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    unknown, meters
-        Ids of customers and of meters.
-    curves
-        Operating region of the inverters; empty: not checked.
+    """Check ids of customers and meters, and the region of the curves if it is given, all at once.
 
     Raises
     ------
@@ -183,11 +152,6 @@ def see_names(
 
 def meter_mask(site: Site, names: Sequence[str]) -> Bools:
     """Mask of meters by id, (p,).
-
-    Parameters
-    ----------
-    site, names
-        The feeder, and ids of its meters.
 
     Raises
     ------

@@ -9,38 +9,24 @@ from __future__ import annotations
 import multiprocessing
 import os
 from collections import Counter, deque
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Generator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from importlib import import_module
 from threading import Thread
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]  # has no stubs
 
-from feeders.studies.journal import versions
+from feeders.studies.journal import Made, Runner, Work, versions
 from feeders.util import extra
 from gridsec.errors import GridsecError
 from gridsec.processes import deaf, listen, stop
 
-__all__ = [
-    "ClusterUnusable",
-    "Dask",
-    "Here",
-    "Processes",
-    "Runner",
-    "WorkerLost",
-    "agree",
-    "cores",
-    "versions",
-]
+__all__ = ["ClusterUnusable", "Dask", "Here", "Processes", "Runner", "WorkerLost", "agree", "cores"]
 
-Work = Callable[[int], Any]
-Made = Generator[tuple[int, Any], None, None]
-
-RETRIES: Final = 3
-"""Largest number of repetitions of a piece after the death of its worker."""
+RETRIES: Final = 3  # largest number of repetitions of a piece after the death of its worker
 
 
 class WorkerLost(GridsecError):
@@ -53,13 +39,6 @@ class ClusterUnusable(GridsecError):
     """No usable Dask cluster."""
 
     code = "cluster-unusable"
-
-
-class Runner(Protocol):
-    """Runner of pieces of work."""
-
-    def run(self, work: Work, pieces: Sequence[int]) -> Made:
-        """Work on all pieces; yield each with its result when finished."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,18 +56,10 @@ class Here:
 
 @dataclass(frozen=True, slots=True)
 class Processes:
-    """Processes of this machine, spawned rather than forked: equal on every system.
+    """Processes of this machine, spawned rather than forked: equal on every system."""
 
-    Attributes
-    ----------
-    count
-        Number of processes.
-    retries
-        Largest number of repetitions of a piece after the death of its process.
-    """
-
-    count: int
-    retries: int = RETRIES
+    count: int  # number of processes
+    retries: int = RETRIES  # repetitions of a piece after the death of its process
 
     def run(self, work: Work, pieces: Sequence[int]) -> Made:
         """As `Runner`.
@@ -133,13 +104,7 @@ class Processes:
 
 
 def cores(count: int | None = None) -> Runner:
-    """Processes of this machine, or this process if there is one core.
-
-    Parameters
-    ----------
-    count
-        Number of processes; by default one for each core.
-    """
+    """`count` processes of this machine, by default one for each core; this process if there is one core."""
     count = count or os.cpu_count() or 1
     return Processes(count) if count > 1 else Here()
 
@@ -168,21 +133,12 @@ def _single(work: Work, piece: int) -> Any:
 class Dask:
     """Dask cluster; requires the extra `cluster`, and gridsec on its workers.
 
-    Attributes
-    ----------
-    address
-        Address of its scheduler, such as tcp://10.0.0.1:8786.
-    timeout_s
-        Longest wait for its answer, s.
-
-    Notes
-    -----
     The scheduler repeats the pieces of a dead worker, up to `distributed.scheduler.allowed-failures` times
     (3).
     """
 
-    address: str
-    timeout_s: float = 10.0
+    address: str  # of the scheduler, such as tcp://10.0.0.1:8786
+    timeout_s: float = 10.0  # longest wait for its answer
 
     def run(self, work: Work, pieces: Sequence[int]) -> Made:
         """As `Runner`.
@@ -239,17 +195,12 @@ class Dask:
 
 
 def agree(worker: str, theirs: Any) -> None:
-    """Reject a worker with other versions, or without any.
-
-    Parameters
-    ----------
-    worker, theirs
-        Its name, and its versions or the error of the request.
+    """Reject a worker with other versions than those of this process, or with an error in their place.
 
     Raises
     ------
     ClusterUnusable
-        For versions other than those of this process.
+        For other versions.
     """
     mine = versions()
     if theirs != mine:

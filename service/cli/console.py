@@ -13,43 +13,13 @@ from rich.markup import escape
 
 from service.cli.paths import Given, Unusable, check_paths
 
-__all__ = [
-    "ADDRESS",
-    "DATABASE",
-    "FAILED",
-    "FEEDER",
-    "FILE",
-    "USAGE",
-    "WRITER_LOST",
-    "Feeder",
-    "Studied",
-    "err",
-    "finite",
-    "options_of",
-    "out",
-    "print_error",
-    "read_all",
-    "refuse_options",
-]
-
-
 Told = TypeVar("Told")
 
 
 def read_all(
     option: str, texts: Iterable[str] | None, read: Callable[[str], Told], problems: list[str]
 ) -> list[Told]:
-    """Parse all texts of an option.
-
-    Parameters
-    ----------
-    option, texts
-        Name of the option, and its values.
-    read
-        Parser of one text; raises a ValueError with the problem.
-    problems
-        List to which problems are added.
-    """
+    """Parse all texts of an option; a ValueError of `read` is added to `problems`."""
     out = []
     for text in texts or ():
         try:
@@ -60,14 +30,7 @@ def read_all(
 
 
 def refuse_options(problems: Iterable[str], **places: Given) -> None:
-    """Refuse wrong options, and unusable files and folders, before the work.
-
-    Parameters
-    ----------
-    problems
-        Problems found so far.
-    places
-        Files and folders as in `service.cli.paths.check_paths`.
+    """Refuse wrong options, and unusable files and folders as in `check_paths`, before the work.
 
     Raises
     ------
@@ -88,14 +51,7 @@ def refuse_options(problems: Iterable[str], **places: Given) -> None:
 
 
 def options_of(make: Callable[[], Told], problems: Iterable[str], **places: Given) -> Told:
-    """Create an object from options; its problem is reported together with all others.
-
-    Parameters
-    ----------
-    make
-        Creates the object; raises a ValueError with the problem of the options.
-    problems, places
-        As in `refuse_options`.
+    """Create an object from options; its ValueError is reported together with all other problems.
 
     Raises
     ------
@@ -148,11 +104,10 @@ def finite(value: float | None) -> float | None:
 
 
 def print_error(message: str) -> None:
-    """Print an error message.
-
-    Parameters
-    ----------
-    message
-        Text without markup.
-    """
+    """Print an error message without markup."""
     err.print(f"[bold red]gridsec:[/] {escape(message)}")
+
+
+def say(message: str) -> None:
+    """Print a message without markup."""
+    out.print(escape(message))

@@ -17,35 +17,20 @@ from gridsec.errors import GridsecError, InputInvalid, Problem
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["A_FEEDER", "Unusable", "check_paths", "is_feeder", "write_tables"]
-
 
 A_FEEDER: Final = "a feeder's folder; tables go into another folder"
 
 
 def is_feeder(folder: Path) -> bool:
-    """True if a folder contains a feeder.
-
-    Parameters
-    ----------
-    folder
-        A folder, which need not exist.
-    """
+    """True if a folder, which need not exist, contains a feeder."""
     return (folder / META_FILE).exists()
 
 
 def write_tables(folder: Path | None, study: str, tables: Mapping[str, pd.DataFrame]) -> None:
-    """Write every table of a study to a folder, as `STUDY-NAME.csv` and `STUDY-NAME.parquet`.
+    """Write every table of a study to a folder, as `STUDY-NAME.csv` and `STUDY-NAME.parquet`; None: nothing.
 
     A file is replaced when its new content is complete: an interruption leaves the old one. Tables of earlier
     runs of the study that the present run does not write are removed.
-
-    Parameters
-    ----------
-    folder
-        Destination; created if it does not exist. None: nothing is written.
-    tables
-        Table by name. Names are file names without a suffix.
 
     Raises
     ------
@@ -84,20 +69,13 @@ def _for_parquet(frame: pd.DataFrame) -> pd.DataFrame:
     return frame.assign(**{name: frame[name].map(str, na_action="ignore") for name in mixed})
 
 
-Given = Mapping[str, Path | None]
-"""Path by option; None for an option that was not given."""
+Given = Mapping[str, Path | None]  # path by option; None for an option that was not given
 
 NONE: Final[Given] = {}
 
 
 class Unusable(GridsecError):
-    """Files or folders of a command cannot be used; `problems` lists all problems.
-
-    Parameters
-    ----------
-    problems
-        One sentence each: option, path, and problem.
-    """
+    """Files or folders of a command cannot be used; `problems` has one sentence each."""
 
     code = "unusable-path"
 
@@ -145,15 +123,14 @@ def check_paths(
     Unusable
         If a path cannot be used.
     """
-    written = {**folders, **over, **new, **files, **replaced, **simulated}
     checks: list[tuple[Given, Callable[[Path], Problem | None]]] = [
-        (folders, _folder),
-        (over, _over),
-        (new, _new),
+        (folders, partial(_folder, tables=True)),
+        (over, _folder),
+        (new, partial(_folder, empty=True)),
         (files, _file),
-        (replaced, _replaced),
-        (simulated, _simulated),
-        (read, _read),
+        (replaced, partial(_file, whole=True)),
+        (simulated, partial(_file, whole=True, simulated=True)),
+        (read, partial(_file, read=True)),
     ]
     problems = [
         Problem(why.code, f"{option} {path}: {why}")
@@ -161,7 +138,8 @@ def check_paths(
         for option, path in given.items()
         if path is not None and (why := _why(check, path))
     ]
-    problems += _same({**written, **read}, {*files, *replaced, *simulated})
+    every = {option: path for given, _ in checks for option, path in given.items()}
+    problems += _same(every, {*files, *replaced, *simulated})
     if problems:
         raise Unusable(problems)
 
@@ -173,54 +151,35 @@ def _why(check: Callable[[Path], Problem | None], path: Path) -> Problem | None:
         return Problem("no-access", error.strerror or str(error))
 
 
-def _folder(path: Path) -> Problem | None:
-    return _over(path) or (Problem("holds-feeder", A_FEEDER) if is_feeder(path) else None)
-
-
-def _over(path: Path) -> Problem | None:
+def _folder(path: Path, *, tables: bool = False, empty: bool = False) -> Problem | None:
+    """Problem of an output folder: for tables, no feeder's folder, or one that must be new or empty."""
+    if empty and path.exists() and (not path.is_dir() or any(path.iterdir())):
+        return Problem("exists", "exists; expected a new folder")
     if path.exists() and not path.is_dir():
         return Problem("not-folder", "a file; expected a folder")
-    if path.is_symlink() and not path.exists():
+    if path.is_symlink() and not path.exists() and not empty:
         return Problem("dead-link", "a dead link; expected a folder")
-    return _room(path)
+    return _room(path) or (Problem("holds-feeder", A_FEEDER) if tables and is_feeder(path) else None)
 
 
-def _new(path: Path) -> Problem | None:
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
-        return Problem("exists", "exists; expected a new folder")
-    return _room(path)
-
-
-def _file(path: Path) -> Problem | None:
-    if not path.exists():
-        return _room(path)
-    if path.is_dir():
-        return Problem("not-file", "a folder; expected a file")
-    with path.open("ab"):
-        return None
-
-
-def _replaced(path: Path) -> Problem | None:
-    if path.exists() and not path.is_file():
-        return _file(path)
-    return _room(Path(os.path.realpath(path)).parent)
-
-
-def _simulated(path: Path) -> Problem | None:
-    from feeders.simulation.recording import is_simulated
-
-    if path.is_file() and path.stat().st_size and not is_simulated(path):
-        return Problem("not-simulated", "exists and is not from a simulation; expected another file")
-    return _replaced(path)
-
-
-def _read(path: Path) -> Problem | None:
-    if not path.exists():
+def _file(path: Path, *, read: bool = False, whole: bool = False, simulated: bool = False) -> Problem | None:
+    """Problem of a file that is read, written in place, or replaced as a whole by a new one beside it."""
+    if read and not path.exists():
         return Problem("no-file", "there is no such file")
     if path.is_dir():
         return Problem("not-file", "a folder; expected a file")
-    with path.open("rb"):
+    if simulated and path.is_file() and path.stat().st_size and not _is_simulated(path):
+        return Problem("not-simulated", "exists and is not from a simulation; expected another file")
+    if not path.exists() or (whole and path.is_file()):
+        return _room(Path(os.path.realpath(path)).parent if whole else path)
+    with path.open("rb" if read else "ab"):
         return None
+
+
+def _is_simulated(path: Path) -> bool:
+    from feeders.simulation.recording import is_simulated
+
+    return is_simulated(path)
 
 
 def _room(path: Path) -> Problem | None:

@@ -13,21 +13,17 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated, Any, Final, Never
+from typing import Annotated, Any, Final, Never
 
 import typer
 from rich.control import Control
 from rich.markup import escape
 from rich.segment import ControlType
 
+from feeders.studies.journal import InUse, Journal, Keeper, OtherStudy, remove
 from gridsec.errors import DesignInfeasible, NotObservable
 from service.cli import console
 from service.cli.console import print_error
-
-if TYPE_CHECKING:
-    from feeders.studies.journal import InUse, Journal, OtherStudy
-
-__all__ = ["JournalAt", "Keeping", "NoJournal", "exit_on_signal", "keeping"]
 
 JournalAt = Annotated[
     Path | None,
@@ -43,11 +39,8 @@ NoJournal = Annotated[
 
 SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
 
-PATIENCE_S: Final = 3.0
-"""Time limit for the reaction to a signal, and then for the end of the processes, s."""
-
-MOST: Final = 64
-"""Largest number of journals of interrupted studies in the user's cache folder."""
+PATIENCE_S: Final = 3.0  # time limit for the reaction to a signal, and then for the end of the processes, s
+MOST: Final = 64  # largest number of journals of interrupted studies in the user's cache folder
 
 
 class Stopped(KeyboardInterrupt):
@@ -59,58 +52,39 @@ class Stopped(KeyboardInterrupt):
 
 
 @dataclass(slots=True)
-class Keeping:
-    """Journals of a command; a `feeders.studies.journal.Keeper`.
+class Keeping(Keeper):
+    """Journals of a command."""
 
-    Attributes
-    ----------
-    study, feeder
-        Study of the command, and its feeder as on the command line.
-    chosen
-        Journal file of the option; further studies of the command have theirs beside it.
-    folder
-        Folder of the other journals; None without any.
-    stay
-        True if they stay there after the command.
-    journals
-        All opened journals, with the name of the study.
-    resumed
-        Names of studies that were continued.
-    """
-
-    study: str
-    feeder: str
-    chosen: Path | None
-    folder: Path | None
-    stay: bool = False
-    journals: list[tuple[str, Journal]] = field(default_factory=list)
-    resumed: set[str] = field(default_factory=set)
+    study: str  # of the command
+    feeder: str  # as on the command line
+    chosen: Path | None  # file of the option; further studies have theirs beside it
+    folder: Path | None  # of the other journals; None without any
+    stay: bool = False  # they stay there after the command
+    resumed: set[str] = field(default_factory=set)  # names of studies that were continued
+    _journals: list[tuple[str, Journal]] = field(default_factory=list)
     _name: str = ""
     _warned: bool = False
 
     def file(self, study: str, digest: str) -> Path | None:
-        """As `Keeper`: the file of the option, or one in the folder."""
+        """The file of the option, or one in the folder."""
         self._name = study
         if self.chosen is not None:
-            return (
-                self.chosen if study == self.study else self.chosen.with_name(f"{self.chosen.name}.{study}")
-            )
+            beside = self.chosen.with_name(f"{self.chosen.name}.{study}")
+            return self.chosen if study == self.study else beside
         if self.folder is None:
             return None
         feeder = re.sub(r"[^A-Za-z0-9_]+", "-", Path(self.feeder).stem).strip("-")[:64]
-        return self.folder / f"{study}-{feeder}-{digest}.jsonl"
+        return self.folder / f"{study}-{feeder}-{digest}.sqlite"
 
     def opened(self, journal: Journal) -> None:
-        """As `Keeper`: print the progress of a continued study."""
-        self.journals.append((self._name, journal))
+        """Print the progress of a continued study."""
+        self._journals.append((self._name, journal))
         if journal.path is not None and journal.done:
             self.resumed.add(self._name)
             console.err.print(escape(f"continuing from {journal.path}, {_amount(journal)} done"))
 
     def refused(self, path: Path, why: OSError | OtherStudy | InUse) -> bool:
-        """As `Keeper`: without the option, a study runs without a journal that cannot be used."""
-        from feeders.studies.journal import OtherStudy
-
+        """Without the option, a study runs without a journal that cannot be used."""
         if self.chosen is not None:
             raise why
         if isinstance(why, OtherStudy):
@@ -123,29 +97,25 @@ class Keeping:
         return False
 
     def close(self, *, done: bool) -> None:
-        """Close all journals; those no longer needed are removed.
-
-        Parameters
-        ----------
-        done
-            True after a complete command.
-        """
-        from feeders.studies.journal import remove
-
+        """Close all journals; those that are empty, or not needed after a complete command, are removed."""
         passing = self.chosen is None and not self.stay
-        for _, journal in self.journals:
+        for _, journal in self._journals:
             journal.close()
             if journal.path is not None and (not journal.done or (done and passing)):
                 remove(journal.path)
+        if done and passing and self.folder is not None:
+            found = sorted(self.folder.glob("*.sqlite"), key=lambda path: path.stat().st_mtime_ns)
+            for old in found[:-MOST]:
+                remove(old)
 
     def left(self) -> str:
         """Finished work, and the location of its journal."""
-        if not self.journals:
+        if not self._journals:
             return "no work was done yet"
-        study, journal = self.journals[-1]
+        study, journal = self._journals[-1]
         begun = f"{study}: {_amount(journal)} done"
         if not journal.done:
-            before = [each for _, each in self.journals[:-1] if each.path is not None and each.done]
+            before = any(each.path is not None and each.done for _, each in self._journals)
             return f"{begun}; earlier studies are kept, the same command continues" if before else begun
         if journal.path is None:
             return f"{begun}, and lost: no journal was kept"
@@ -169,16 +139,8 @@ def keeping(
 ) -> Iterator[Keeping]:
     """Keep journals of a command's studies; after an interruption one line states the progress.
 
-    Parameters
-    ----------
-    study, feeder
-        Study of the command, and its feeder as on the command line.
-    journal
-        Journal file of the option.
-    without
-        Keep no journal.
-    folder
-        Folder in which journals stay; None: in the user's cache folder, until the command is done.
+    `journal` is the file of the option, `without` keeps none, and journals stay in `folder`; by default they
+    are in the user's cache folder until the command is done.
 
     Raises
     ------
@@ -192,27 +154,23 @@ def keeping(
 
     where = None if without else folder or cache_folder() / "journals"
     kept = Keeping(study, feeder, journal, where, stay=folder is not None)
+    done = False
     try:
         with _signals(kept.left):
             yield kept
+        done = True
     except KeyboardInterrupt as stop:
         number = stop.number if isinstance(stop, Stopped) else signal.SIGINT
-        kept.close(done=False)
         print_error(f"interrupted; {kept.left()}")
         raise typer.Exit(128 + number) from None
     except (OSError, WorkerLost, ClusterUnusable):
-        kept.close(done=False)
         console.err.print(escape(kept.left()))
         raise
     except (DesignInfeasible, NotObservable):
-        kept.close(done=True)  # an infeasible design is a result; a repetition would give the same
+        done = True  # an infeasible design is a result; a repetition would give the same
         raise
-    except BaseException:  # work finished before another failure need not be repeated
-        kept.close(done=False)
-        raise
-    kept.close(done=True)
-    if where is not None and folder is None:
-        _prune(where)
+    finally:
+        kept.close(done=done)
 
 
 def exit_on_signal() -> Callable[[], object]:
@@ -285,12 +243,3 @@ def _handle(handlers: Mapping[signal.Signals, Any]) -> dict[signal.Signals, Any]
 def _end(number: int, _: FrameType | None) -> Never:
     console.err.show_cursor()
     os._exit(128 + number)
-
-
-def _prune(folder: Path) -> None:
-    """Remove the journals with the oldest last use."""
-    from feeders.studies.journal import remove
-
-    found = sorted(folder.glob("*.jsonl"), key=lambda path: path.stat().st_mtime_ns)
-    for old in found[:-MOST]:
-        remove(old)

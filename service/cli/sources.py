@@ -21,25 +21,15 @@ from service.cli import console
 if TYPE_CHECKING:
     from feeders.convert.convert import Conversion
 
-__all__ = ["FOLDER", "converted", "show_check", "spared"]
-
-FOLDER: Final = "feeder"
-"""Name of a converted feeder's folder within the folder of the results."""
+FOLDER: Final = "feeder"  # name of a converted feeder's folder within the folder of the results
 
 
 def converted(feeder: str, out: Path | None) -> str:
     """Return a feeder for `model.site.load`; another tool's network is converted, with a message.
 
     The conversion is repeated each time: an OpenDSS file may refer to others that have changed. A different
-    earlier conversion in the folder is kept under another name, see `spared`.
-
-    Parameters
-    ----------
-    feeder
-        A folder, the name of a feeder of the project, or any source of `feeders.convert.convert`.
-    out
-        Folder of the results, in which the feeder's becomes `feeder`; None: a temporary folder, which stays
-        with its list of changes.
+    earlier conversion in the folder is kept under another name, see `spared`. The feeder's folder is `feeder`
+    in the folder of the results; without one, in a temporary folder, which stays.
 
     Raises
     ------
@@ -81,7 +71,7 @@ def converted(feeder: str, out: Path | None) -> str:
             shutil.rmtree(temporary or folder, ignore_errors=True)
     fates = Counter(change.done for change in done.changes)
     counts = ", ".join(f"{times} {fate}" for fate, times in fates.items()) or "nothing changed"
-    console.out.print(escape(f"{feeder} becomes {folder}: {counts}; the list: {folder / CHANGES_FILE}"))
+    console.say(f"{feeder} becomes {folder}: {counts}; the list: {folder / CHANGES_FILE}")
     show_check(done)
     return str(folder)
 
@@ -91,11 +81,6 @@ def spared(folder: Path) -> Iterator[None]:
     """Keep a copy of an earlier conversion, as `FOLDER-1`, unless the new one is equal.
 
     A copy, since the folder may be the source, contain its files, or be the working directory.
-
-    Parameters
-    ----------
-    folder
-        Destination of a conversion.
     """
     from feeders.convert.convert import WRITTEN
 
@@ -115,7 +100,7 @@ def spared(folder: Path) -> Iterator[None]:
         if all((folder / name).read_bytes() == (kept / name).read_bytes() for name in old):
             shutil.rmtree(kept)
         else:
-            console.out.print(escape(f"the earlier content of {folder} differs; it is now in {kept}"))
+            console.say(f"the earlier content of {folder} differs; it is now in {kept}")
 
 
 def _name(feeder: str) -> str:

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.markup import escape
 
 from service.cli import console
 from service.cli.console import Studied, refuse_options
@@ -78,17 +77,15 @@ def calibrate(
         write_tables(out, "calibrate", found.tables)
         if write is not None:
             found.corrected(feeder, write)
-            console.out.print(escape(f"{write}: {found.feeder} with {len(found.corrections)} corrections"))
+            console.say(f"{write}: {found.feeder} with {len(found.corrections)} corrections")
 
 
 def _tell(found: Calibrate) -> None:
     from feeders.studies.calibrate.study import UNREAD
 
-    console.out.print(
-        escape(
-            f"{found.feeder}: {found.frames} moments in {found.span_h:.4g} h; any proposal would be "
-            f"wrong with probability {found.risk:g} at most"
-        )
+    console.say(
+        f"{found.feeder}: {found.frames} moments in {found.span_h:.4g} h; any proposal would be "
+        f"wrong with probability {found.risk:g} at most"
     )
     if found.unread:
         count, phases = int((found.meters["verdict"] == UNREAD).sum()), " and ".join(found.unread)

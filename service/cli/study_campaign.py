@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar
 
 import numpy as np
 import typer
-from rich.markup import escape
 
 from gridsec.errors import raise_if_any
 from service.cli import console
@@ -26,41 +25,10 @@ if TYPE_CHECKING:
     from feeders.model.site import Site
     from feeders.studies.campaign.plan import AttackClass, CampaignPlan
     from feeders.studies.campaign.study import Campaign
-    from feeders.studies.workers import Runner
-
-__all__ = [
-    "NO_LIES",
-    "AlarmsPerYear",
-    "Choice",
-    "DaskAt",
-    "DesignOf",
-    "Duration",
-    "EstimatorName",
-    "Kinds",
-    "KnownKvar",
-    "KnownKw",
-    "Learned",
-    "Liars",
-    "LoadErrorKvar",
-    "LoadErrorKw",
-    "MetersAs",
-    "Places",
-    "Promised",
-    "Scenarios",
-    "Seasons",
-    "Seed",
-    "Settings",
-    "Step",
-    "Together",
-    "Workers",
-    "campaign",
-    "planned",
-    "sources",
-]
+    from feeders.studies.journal import Runner
 
 
-SHORTEST: Final = 10
-"""Smallest number of readings of a scenario: attacks start after a tenth of it."""
+SHORTEST: Final = 10  # smallest number of readings of a scenario: attacks start after a tenth of it
 
 FILES: Final = "feeder's files"
 
@@ -76,13 +44,8 @@ def planned(
 ) -> CampaignPlan:
     """Return the plan of a campaign; all problems of its options are raised at once.
 
-    Parameters
-    ----------
-    step, duration, load_error_kw, load_error_kvar
-        As on the command line; None for the values of the files. With one of the load errors the other is
-        zero.
-    chosen
-        Attributes of the plan by name; None for the values of the files.
+    None stands for the values of the files. With one of the load errors the other is zero. `chosen` are
+    attributes of the plan by name.
 
     Raises
     ------
@@ -98,8 +61,8 @@ def planned(
     if duration is not None and duration < SHORTEST * step_s:
         problems.append(
             f"--duration: {duration:g} s are too short for one reading every {step_s:g} s "
-            f"({_from(step, '--step')}): at least {SHORTEST * step_s:g} s, or more frequent readings with "
-            "--step"
+            f"({FILES if step is None else '--step'}): at least {SHORTEST * step_s:g} s, or more frequent "
+            "readings with --step"
         )
         duration = None
     chosen |= {"step_s": step, "duration_s": duration}
@@ -115,13 +78,7 @@ def planned(
 
 
 def sources(site: Site, plan: CampaignPlan, given: Mapping[str, object]) -> str:
-    """Summary of a campaign, with the origin of its parameters: files or options.
-
-    Parameters
-    ----------
-    given
-        Options such as --step, and None for those not given.
-    """
+    """Summary of a campaign, with the origin of its parameters: files, or options with a value."""
     from feeders.model.load_uncertainty import load_doubt
 
     some = {option for option, value in given.items() if value is not None}
@@ -138,10 +95,6 @@ def sources(site: Site, plan: CampaignPlan, given: Mapping[str, object]) -> str:
         f"metered customers within {kw:.2g} kW and {kvar:.2g} kvar, medians of 1 sigma "
         f"({', '.join(loads) or FILES})"
     )
-
-
-def _from(value: float | None, option: str) -> str:
-    return FILES if value is None else option
 
 
 Scenarios = Annotated[
@@ -326,7 +279,7 @@ def campaign(
             "--load-error-kw": load_error_kw,
             "--load-error-kvar": load_error_kvar,
         }
-        console.out.print(escape(sources(site, plan, given)))
+        console.say(sources(site, plan, given))
         if promised:
             plan = _with_promised(site, plan, plan.kinds if kind else (), kept)
         with bar("scenarios") as report_progress:
@@ -346,7 +299,7 @@ def _print(found: Campaign) -> None:
     plan, impossible = found.plan, int((found.scenarios["reason"] != "").sum())
     told = f"{plan.scenarios} scenarios of {plan.duration_s:g} s monitored by {plan.estimator}"
     note = f"; {impossible} cannot be played, see `reason`" if impossible else ""
-    console.out.print(escape(f"{found.feeder}: {told}{note}"))
+    console.say(f"{found.feeder}: {told}{note}")
     if not found.promises.empty:
         show("Guarantees of `study detectable`", found.promises)
     show("By kind and size", _short(found.by_size))

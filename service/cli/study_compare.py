@@ -92,7 +92,7 @@ def compare(
         workers=workers or os.cpu_count() or 1,
     )
     if write is not None:
-        splice(_read(write), "")  # refuses a document without markers before the work
+        splice(write.read_text(encoding="utf-8"), "")  # refuses a document without markers before the work
     with keeping("compare", feeder, journal, without=no_journal) as kept:
         site = load(converted(feeder, None))
         rows = _compared(site, plan, kept)
@@ -101,12 +101,9 @@ def compare(
             write_csv(rows, csv)
         if write is not None:
             told = f"{_told(feeder, site, plan)}\n\n{markdown(rows, plan)}"
-            text = splice(_read(write), told)  # read again: the document may have changed during the work
+            # Read again: the document may have changed during the work.
+            text = splice(write.read_text(encoding="utf-8"), told)
             replace_file(write, lambda new: new.write_text(text, encoding="utf-8"))
-
-
-def _read(page: Path) -> str:
-    return page.read_text(encoding="utf-8")
 
 
 def _compared(site: Site, plan: ComparisonPlan, kept: Keeping) -> list[ComparisonRow]:
@@ -182,4 +179,4 @@ def _show(rows: list[ComparisonRow], plan: ComparisonPlan) -> None:
                 table.add_row(*map(escape, cells(row)))
         console.out.print(table, soft_wrap=False)
         for reason in reasons:
-            console.out.print(escape(reason))
+            console.say(reason)

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.markup import escape
 
 from gridsec.errors import FeederInvalid
 from service.cli import console
@@ -138,7 +137,7 @@ def droop(
         except NoInverters:
             if hosting:
                 raise
-            console.out.print(escape(f"{site.feeder.name}: {NOTHING} (--preset equips customers with some)"))
+            console.say(f"{site.feeder.name}: {NOTHING} (--preset equips customers with some)")
             return
         _tell(found, options)
         write_tables(out, "droop", found.tables)
@@ -180,7 +179,7 @@ def _loaded(names: Sequence[tuple[str, Path | None]]) -> list[Site]:
 def _tell(found: DroopStudy, options: DroopOptions) -> None:
     """Print the result and its tables."""
     sampled = f"sampled every {options.interval_s:g} s" if options.interval_s else "continuous"
-    console.out.print(escape(f"{found.feeder}: the fleet ({sampled}) is {found.verdict}"))
+    console.say(f"{found.feeder}: the fleet ({sampled}) is {found.verdict}")
     console.out.print(f"Voltage band: {found.rest} for slow load changes, {found.always} for arbitrary ones.")
     for name, title in TITLES.items():
         if name in found.tables:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -86,7 +86,8 @@ def redundancy(
                 journal=kept,
                 progress=report_progress,
             )
-        console.out.print(_unknowns(found.unknown, found.feeder))
+        shown = ", ".join(found.unknown) or "none"
+        console.say(f"{found.feeder}: customers with unknown powers: {shown}")
         show("Manipulated meters of invisible attacks", found.summary)
         show("By meter", found.meters)
         show("Invisible attacks inside one part", found.parts)
@@ -122,32 +123,27 @@ def protect(
     from feeders.studies.protect import protect as study
     from feeders.studies.unobservable import Attack
 
-    bound = math.nan if lie_volt is None else lie_volt
+    asked: dict[str, Any] = {
+        "max_attacked": max_attacked,
+        "lie_volt": math.nan if lie_volt is None else lie_volt,
+        "unknown": unknown,
+        "busbar_known": not busbar_unknown,
+    }
     with as_usage_error():
-        check(
-            max_attacked=max_attacked,
-            goal=goal,
-            lie_volt=bound,
-            attack=attack,
-            unknown=unknown,
-            busbar_known=not busbar_unknown,
-        )
+        check(goal=goal, attack=attack, **asked)
     check_paths(folders={"--out": out}, files={"--journal": journal})
     with keeping("protect", feeder, journal, without=no_journal) as kept:
         site = load(converted(feeder, out))
         with bar("meters protected, against attacks") as report_progress, as_usage_error():
             found = study(
                 site,
-                max_attacked=max_attacked,
                 goal=Goal(goal) if goal else None,
-                lie_volt=bound,
                 attack=Attack(attack),
-                unknown=unknown,
-                busbar_known=not busbar_unknown,
                 never=never or (),
                 exact=not greedy,
                 journal=kept,
                 progress=lambda known, done: report_progress(done, known),
+                **asked,
             )
         _tell_protection(found, len(site.meter_ids))
         write_tables(out, "protect", found.tables)
@@ -156,14 +152,12 @@ def protect(
 def _tell_protection(found: Protect, of: int) -> None:
     count = len(found.meters)
     if found.no_answer:
-        console.out.print(
-            escape(f"{found.feeder}: {found.goal} requires no protection here; that is no safety")
-        )
+        console.say(f"{found.feeder}: {found.goal} requires no protection here; that is no safety")
         console.out.print(NO_ANSWER)
         return
     proof = "no fewer suffice" if not found.gap else f"at least {found.least} are needed"
     measure = "largest hidden attack, V" if found.goal.in_volts else "fewest meters of an invisible attack"
-    console.out.print(escape(f"{found.feeder}: protect {count} of {of} meters; {proof}"))
+    console.say(f"{found.feeder}: protect {count} of {of} meters; {proof}")
     console.out.print(f"{measure}: {_cell(found.before)} before, {_cell(found.after)} after")
     if found.goal.in_volts:
         console.out.print(
@@ -233,20 +227,9 @@ def detectable(
             write_tables(out, "detectable", {**found.tables, "trials": seen.table})
 
 
-def _unknowns(names: Sequence[str], feeder: str) -> str:
-    shown = ", ".join(names) if names else "none"
-    return escape(f"{feeder}: customers with unknown powers: {shown}")
-
-
 @contextmanager
 def bar(what: str) -> Iterator[Tell]:
-    """A progress bar on the terminal.
-
-    Parameters
-    ----------
-    what
-        Name of the counted pieces of work.
-    """
+    """A progress bar on the terminal, with the name of the counted pieces of work."""
     with Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -271,15 +254,11 @@ def as_usage_error() -> Iterator[None]:
 
 def show(title: str, frame: pd.DataFrame) -> None:
     """Print a table without its empty columns."""
-    kept = [name for name in frame.columns if not all(_empty(cell) for cell in frame[name])]
+    kept = [name for name in frame.columns if not all(isinstance(c, str) and not c for c in frame[name])]
     table = Table(*(escape(name.replace("_", " ")) for name in kept), title=title, title_justify="left")
     for row in frame[kept].itertuples(index=False):
         table.add_row(*(escape(_cell(cell)) for cell in row))
     console.out.print(table, soft_wrap=False)
-
-
-def _empty(cell: Any) -> bool:
-    return isinstance(cell, str) and not cell
 
 
 def _cell(cell: Any) -> str:

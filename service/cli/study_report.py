@@ -12,10 +12,9 @@ from dataclasses import MISSING, dataclass, fields, replace
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
-from rich.markup import escape
 
 from feeders.util import command_line, replace_file, word
 from gridsec.errors import GridsecError, InputInvalid, Problem
@@ -33,28 +32,8 @@ if TYPE_CHECKING:
     from feeders.report.build import Report
     from feeders.report.html import Result, StudyOutcome
     from feeders.studies.campaign.plan import CampaignPlan
-    from feeders.studies.journal import Progress, Where
+    from feeders.studies.journal import Progress
     from service.cli.session import Keeping
-
-__all__ = [
-    "STUDIES",
-    "Asked",
-    "At",
-    "BusbarLimits",
-    "Hosting",
-    "MaxAttacked",
-    "Page",
-    "Readings",
-    "Scenarios",
-    "Studies",
-    "Study",
-    "Workers",
-    "misplaced",
-    "outcome",
-    "report",
-    "versions",
-    "write",
-]
 
 
 LIBRARIES: Final = (
@@ -65,84 +44,47 @@ LIBRARIES: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """Options of a report; every study uses those that concern it.
+    """Options of a report; every study uses those that concern it."""
 
-    Attributes
-    ----------
-    feeder
-        As on the command line.
-    max_attacked
-        M.
-    goal, lie_volt
-        Goal of the protection, by default that of the study, and the bound of an attack, V.
-    unknown, silent, busbar_unknown
-        Customers with unknown powers; missing meters; True without a busbar meter.
-    scenarios, seed, workers
-        Options of the simulated attacks; the seed is for all random numbers.
-    step, estimator, load_error_kw, load_error_kvar
-        Options of the simulated attacks: interval of the readings, s, estimator, and uncertainty of powers;
-        None for the values of the feeder's files.
-    preset, busbar, band
-        Options of the inverters' study, as in `DroopOptions`; None for its defaults.
-    hosting
-        Compute hosting capacities.
-    readings
-        A recording to compare with the files.
-    """
-
-    feeder: str
-    max_attacked: int = 2
-    goal: str | None = None
-    lie_volt: float = math.nan
-    unknown: tuple[str, ...] | None = None
-    silent: tuple[str, ...] = ()
+    feeder: str  # as on the command line
+    max_attacked: int = 2  # M
+    goal: str | None = None  # of the protection; None: that of the study
+    lie_volt: float = math.nan  # bound of an attack
+    unknown: tuple[str, ...] | None = None  # customers with unknown powers
+    silent: tuple[str, ...] = ()  # missing meters
     busbar_unknown: bool = False
     scenarios: int = 160
-    seed: int = 0
+    seed: int = 0  # of all random numbers
     workers: int = 1
-    step: float | None = None
+    step: float | None = None  # of the simulated attacks, s; None, here and below: the feeder's files
     estimator: str | None = None
     load_error_kw: float | None = None
     load_error_kvar: float | None = None
-    preset: str | None = None
+    preset: str | None = None  # options of the inverters' study; None: its defaults
     busbar: tuple[float, float] | None = None
     band: tuple[float, float] | None = None
     hosting: bool = False
-    readings: Path | None = None
+    readings: Path | None = None  # a recording to compare with the files
 
 
 @dataclass(frozen=True, slots=True)
 class Study:
-    """Properties of a study in a report.
+    """Properties of a study in a report."""
 
-    Attributes
-    ----------
-    run
-        Runs the study.
-    options
-        Equivalent options of its own command.
-    what
-        Name of the counted pieces of work, for the progress bar.
-    seeded
-        True if it uses the seed.
-    """
-
-    run: Callable[[Site, Asked, Where, Progress | None], Result]
-    options: Callable[[Asked], list[str]]
-    what: str
-    seeded: bool = False
+    run: Callable[..., Result]  # of a feeder and options, with a journal and a progress
+    options: Callable[[Asked], list[str]]  # equivalent options of its own command
+    what: str  # name of the counted pieces of work, for the progress bar
+    seeded: bool = False  # uses the seed
 
 
-def _detectable(site: Site, asked: Asked, journal: Where, report_progress: Progress | None) -> Result:
+def _detectable(site: Site, asked: Asked, **kept: Any) -> Result:
     from feeders.studies.detectable import detectable, workers
 
     runner = workers(site, None if asked.workers > 1 else 1)
-    return detectable(
-        site, max_attacked=asked.max_attacked, runner=runner, journal=journal, progress=report_progress
-    )
+    return detectable(site, max_attacked=asked.max_attacked, runner=runner, **kept)
 
 
-def _protect(site: Site, asked: Asked, journal: Where, report_progress: Progress | None) -> Result:
+def _protect(site: Site, asked: Asked, **kept: Any) -> Result:
     from feeders.studies.protect import Goal, protect
 
     return protect(
@@ -152,25 +94,19 @@ def _protect(site: Site, asked: Asked, journal: Where, report_progress: Progress
         lie_volt=asked.lie_volt,
         unknown=asked.unknown,
         busbar_known=not asked.busbar_unknown,
-        journal=journal,
-        progress=None if report_progress is None else lambda known, done: report_progress(done, known),
+        journal=kept["journal"],
+        progress=lambda known, done: kept["progress"](done, known),
     )
 
 
-def _redundancy(site: Site, asked: Asked, journal: Where, report_progress: Progress | None) -> Result:
+def _redundancy(site: Site, asked: Asked, **kept: Any) -> Result:
     from feeders.studies.redundancy import redundancy
 
-    return redundancy(
-        site,
-        unknown=asked.unknown,
-        silent=asked.silent,
-        busbar_known=not asked.busbar_unknown,
-        journal=journal,
-        progress=report_progress,
-    )
+    busbar_known = not asked.busbar_unknown
+    return redundancy(site, unknown=asked.unknown, silent=asked.silent, busbar_known=busbar_known, **kept)
 
 
-def _droop(site: Site, asked: Asked, journal: Where, report_progress: Progress | None) -> Result:
+def _droop(site: Site, asked: Asked, **kept: Any) -> Result:
     from feeders.studies.droop.study import DroopOptions, droop
 
     low, high = asked.busbar or (1.0, 1.0)
@@ -178,24 +114,22 @@ def _droop(site: Site, asked: Asked, journal: Where, report_progress: Progress |
     options = DroopOptions(
         preset=asked.preset, v0_low=low, v0_high=high, v_min=least, v_max=most, hosting=asked.hosting
     )
-    return droop(site, options, seed=asked.seed, journal=journal, progress=report_progress)
+    return droop(site, options, seed=asked.seed, **kept)
 
 
-def _calibrate(site: Site, asked: Asked, journal: Where, report_progress: Progress | None) -> Result:
+def _calibrate(site: Site, asked: Asked, **kept: Any) -> Result:
     from feeders.studies.calibrate.study import calibrate
 
     if asked.readings is None:
         raise InputInvalid([Problem("missing", "recorded readings are missing")])
-    return calibrate(site, asked.readings, journal=journal, progress=report_progress)
+    return calibrate(site, asked.readings, **kept)
 
 
-def _campaign(site: Site, asked: Asked, journal: Where, report_progress: Progress | None) -> Result:
+def _campaign(site: Site, asked: Asked, **kept: Any) -> Result:
     from feeders.studies.campaign.study import campaign
     from feeders.studies.workers import cores
 
-    return campaign(
-        site, plan(site, asked), runner=cores(asked.workers), journal=journal, progress=report_progress
-    )
+    return campaign(site, plan(site, asked), runner=cores(asked.workers), **kept)
 
 
 def plan(site: Site, asked: Asked) -> CampaignPlan:
@@ -220,79 +154,68 @@ def plan(site: Site, asked: Asked) -> CampaignPlan:
 def attacks(site: Site, asked: Asked) -> str:
     """Summary of the simulated attacks of a report, with the origin of their parameters: files or options."""
     names = ("step", "estimator", "load_error_kw", "load_error_kvar")
-    return sources(site, plan(site, asked), {option(name): getattr(asked, name) for name in names})
+    return sources(site, plan(site, asked), {option_of(name): getattr(asked, name) for name in names})
 
 
-def _liars(asked: Asked) -> list[str]:
-    return ["--max-attacked", str(asked.max_attacked)]
-
-
-def _known(asked: Asked) -> list[str]:
-    who = [word for name in asked.unknown or () for word in ("--unknown", name)]
-    return who + ["--busbar-unknown"] * asked.busbar_unknown
-
-
-def _protection(asked: Asked) -> list[str]:
-    bound = [] if math.isnan(asked.lie_volt) else ["--lie-volt", word(asked.lie_volt)]
-    goal = [] if asked.goal is None else ["--goal", asked.goal]
-    return [*_liars(asked), *goal, *bound, *_known(asked)]
-
-
-def _campaigned(asked: Asked) -> list[str]:
-    count = [word for number in sorted({1, asked.max_attacked}) for word in ("--liars", str(number))]
-    setting = ["--setting", f"max_attacked={asked.max_attacked}"]
-    watched = _given(asked, "step", "estimator", "load_error_kw", "load_error_kvar")
-    return ["--scenarios", str(asked.scenarios), "--seed", str(asked.seed), *count, *setting, *watched]
-
-
-def _fleet(asked: Asked) -> list[str]:
-    words = _given(asked, "preset", "busbar", "band")
-    return ["--seed", str(asked.seed), *words] + ["--hosting"] * asked.hosting
-
-
-def _given(asked: Asked, *names: str) -> list[str]:
-    """Options with other values than the defaults."""
-    words = []
+def _words(asked: Asked, *names: str) -> list[str]:
+    """Options with other values than the defaults, as words of a command line."""
+    words: list[str] = []
+    defaults = {each.name: each.default for each in fields(Asked)}
     for name in names:
-        value = getattr(asked, name)
-        if value is not None:
-            values = value if isinstance(value, tuple) else (value,)
-            words += [option(name), *map(word, values)]
+        value, option = getattr(asked, name), option_of(name)
+        if value in (defaults[name], None, ()) or (isinstance(value, float) and math.isnan(value)):
+            continue
+        if value is True:
+            words.append(option)
+        elif name in ("unknown", "silent"):
+            words += [each for one in value for each in (option, one)]
+        else:
+            words += [option, *map(word, value if isinstance(value, tuple) else (value,))]
     return words
 
 
-def option(name: str) -> str:
+def _m(asked: Asked) -> list[str]:
+    return ["--max-attacked", str(asked.max_attacked)]
+
+
+def _campaigned(asked: Asked) -> list[str]:
+    count = [each for number in sorted({1, asked.max_attacked}) for each in ("--liars", str(number))]
+    setting = ["--setting", f"max_attacked={asked.max_attacked}"]
+    watched = _words(asked, "step", "estimator", "load_error_kw", "load_error_kvar")
+    return ["--scenarios", str(asked.scenarios), "--seed", str(asked.seed), *count, *setting, *watched]
+
+
+def option_of(name: str) -> str:
     """Name of an attribute of `Asked` on the command line."""
     return f"--{name.replace('_', '-')}"
 
 
 STUDIES: Final[dict[str, Study]] = {
-    "detectable": Study(_detectable, _liars, "attacks on meters, errors of customers"),
-    "protect": Study(_protect, _protection, "meters protected, against attacks"),
-    "droop": Study(_droop, _fleet, "fleets, steps and loads", seeded=True),
+    "detectable": Study(_detectable, _m, "attacks on meters, errors of customers"),
+    "protect": Study(
+        _protect,
+        lambda asked: _m(asked) + _words(asked, "goal", "lie_volt", "unknown", "busbar_unknown"),
+        "meters protected, against attacks",
+    ),
+    "droop": Study(
+        _droop,
+        lambda asked: ["--seed", str(asked.seed), *_words(asked, "preset", "busbar", "band", "hosting")],
+        "fleets, steps and loads",
+        seeded=True,
+    ),
     "campaign": Study(_campaign, _campaigned, "simulated attacks", seeded=True),
     "redundancy": Study(
         _redundancy,
-        lambda asked: [word for name in asked.silent for word in ("--silent", name)] + _known(asked),
+        lambda asked: _words(asked, "silent", "unknown", "busbar_unknown"),
         "search for invisible attacks",
     ),
-    "calibrate": Study(
-        _calibrate,
-        lambda asked: [] if asked.readings is None else ["--readings", str(asked.readings)],
-        "possible errors of the files",
-    ),
+    "calibrate": Study(_calibrate, lambda asked: _words(asked, "readings"), "possible errors of the files"),
 }
 """Studies of a report, in the order of its sections."""
 
 
 def misplaced(asked: Asked, chosen: Collection[str]) -> list[str]:
-    """Return the options that none of the chosen studies uses, one sentence each.
-
-    Parameters
-    ----------
-    asked, chosen
-        Options, and names of studies.
-    """
+    """Return the options that none of the chosen studies uses, one sentence each."""
     problems = []
     for each in fields(asked):
         if each.default is MISSING:
@@ -300,7 +223,7 @@ def misplaced(asked: Asked, chosen: Collection[str]) -> list[str]:
         without = replace(asked, **{each.name: each.default})
         takers = [name for name, study in STUDIES.items() if study.options(asked) != study.options(without)]
         if takers and not set(takers) & set(chosen):
-            problems.append(f"{option(each.name)} goes with {', '.join(takers)}")
+            problems.append(f"{option_of(each.name)} goes with {', '.join(takers)}")
     return problems
 
 
@@ -312,15 +235,7 @@ def outcome(
     kept: Keeping,
     bar: Callable[[str], AbstractContextManager[Progress]],
 ) -> StudyOutcome:
-    """Run a study; a failure becomes part of the report.
-
-    Parameters
-    ----------
-    name
-        Key of STUDIES.
-    bar
-        Progress bar.
-    """
+    """Run a study of STUDIES by its name; a failure becomes part of the report."""
     from feeders.report.html import StudyOutcome
     from feeders.studies.droop.fleets import NOTHING, NoInverters
 
@@ -331,7 +246,7 @@ def outcome(
     problem, absent = "", False
     with bar(study.what) as report_progress:
         try:
-            found = study.run(site, asked, kept, report_progress)
+            found = study.run(site, asked, journal=kept, progress=report_progress)
         except NoInverters as error:
             absent = not asked.hosting
             problem = NOTHING if absent else str(error)
@@ -369,14 +284,7 @@ def versions() -> dict[str, str]:
 
 
 def write(made: Report, out: Path, folder: Path) -> None:
-    """Write the files of a report; the page comes last, after its figures and tables.
-
-    Parameters
-    ----------
-    made
-        The report.
-    out, folder
-        The page, and the folder beside it.
+    """Write the page of a report, and the folder beside it; the page comes last, after figures and tables.
 
     Raises
     ------
@@ -469,7 +377,7 @@ def report(
     problems += no_choice("--preset", PRESETS, *([preset] if preset else []))
     problems += no_choice("--estimator", ESTIMATORS, *([estimator] if estimator else []))
     problems += [*_no_limits("--busbar", busbar), *_no_limits("--band", band, apart=True)]
-    moments = [_now()] if at is None else read_all("--at", [at], _moment, problems)
+    moments = [_told(datetime.now(UTC))] if at is None else read_all("--at", [at], _moment, problems)
     asked = Asked(
         feeder=feeder,
         max_attacked=max_attacked,
@@ -535,14 +443,14 @@ def _make(asked: Asked, chosen: tuple[str, ...], out: Path, *, made: str, comman
         site, source = load(studied), origin(studied)
         see_readings(chosen, site, asked)
         if "campaign" in chosen:
-            console.out.print(escape(attacks(site, asked)))
+            console.say(attacks(site, asked))
         outcomes = [outcome(name, site, asked, kept=kept, bar=bar) for name in chosen]
         about = About(made, command, versions(), seeds(chosen, asked), folder.name)
         write(make(site, outcomes, about, source), out, folder)
-    console.out.print(escape(f"{out}: {len(outcomes)} studies; figures and tables in {folder}"))
+    console.say(f"{out}: {len(outcomes)} studies; figures and tables in {folder}")
     for each in outcomes:
         if each.absent:
-            console.out.print(escape(f"{each.study}: {each.problem}"))
+            console.say(f"{each.study}: {each.problem}")
     failed = [each for each in outcomes if each.result is None and not each.absent]
     for each in failed:
         print_error(f"{each.study}: {each.problem}")
@@ -565,10 +473,6 @@ def _studies(
     return tuple(name for name in known if name in names)
 
 
-def _now() -> str:
-    return _told(datetime.now(UTC))
-
-
 def _moment(text: str) -> str:
     """Time of the report."""
     try:
@@ -583,24 +487,7 @@ def _told(given: datetime) -> str:
 
 def _command(asked: Asked, out: Path, studies: str | None) -> str:
     """Command line of the same report: options that differ from the defaults."""
-    usual = replace(
-        asked, **{each.name: each.default for each in fields(asked) if each.default is not MISSING}
-    )
     words: list[object] = ["gridsec", "study", "report", asked.feeder, "--out", out]
     words += [] if studies is None else ["--studies", studies]
-    for each in fields(asked):
-        value = getattr(asked, each.name)
-        if each.name in ("feeder", "workers") or value in (getattr(usual, each.name), None):
-            continue
-        if isinstance(value, float) and math.isnan(value):
-            continue
-        option = f"--{each.name.replace('_', '-')}"
-        if value is True:
-            words.append(option)
-        elif each.name in ("busbar", "band"):
-            words += [option, *value]
-        elif isinstance(value, tuple):
-            words += [word for name in value for word in (option, name)]
-        else:
-            words += [option, value]
+    words += _words(asked, *(each.name for each in fields(asked) if each.name not in ("feeder", "workers")))
     return command_line(words)

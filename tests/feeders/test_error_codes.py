@@ -49,6 +49,7 @@ from gridsec.attack import Bias
 from tests.feeders import stations, villages
 from tests.feeders.studies.campaign.campaigns import PLAN, SITE
 from tests.feeders.villages import village, village_without_inverters
+from tests.journals import edit, head_of
 from tests.sentences import golden, sentences, used
 
 PACKAGE = Path(feeders.__file__).parent
@@ -173,8 +174,8 @@ def held() -> Any:
 
 def journal(**changed: Any) -> Any:
     with Journal("journal", {"study": "any"}):
-        head = json.loads(Path("journal").read_text("utf-8"))
-    Path("journal").write_text(json.dumps({**head, **changed}, sort_keys=True) + "\n", "utf-8")
+        pass
+    edit(Path("journal"), head=head_of(Path("journal")) | changed)
     return Journal("journal", {"study": "any"})
 
 
@@ -278,7 +279,7 @@ CALLS: dict[str, Callable[[], Any]] = {
         load("cigre-lv"), max_attacked=1, unknown=["Load R15"], goal=Goal.NOTICE, never=["m03"]
     ),
     "a journal in use": held,
-    "a journal of an older program": lambda: journal(edition="0"),
+    "a journal of an older program": lambda: journal(versions={"numpy": "1.0"}),
     "no journal": no_journal,
     "a worker that dies": lambda: list(Processes(1, retries=0).run(os._exit, [7])),
     "a worker of another version": foreign_worker,

@@ -447,7 +447,7 @@ CALLS: dict[str, Call] = {
     ),
     "source with a loop": unconverted,
     "no readings to compare with": lambda _, __: STUDIES["calibrate"].run(
-        load("cigre-lv"), Asked("cigre-lv"), cast(Any, None), None
+        load("cigre-lv"), Asked("cigre-lv"), journal=None, progress=None
     ),
     "table outside of its folder": lambda place, _: write_tables(place, "study", {"../up": pd.DataFrame()}),
     "paths": paths,

@@ -1,8 +1,6 @@
 """Feeder, radial, meshed or in three phases, with its single-phase parts, for calibration.
 
-References
-----------
-docs/theory-studies.md, Calibration.
+References: docs/theory-studies.md, Calibration.
 """
 
 from __future__ import annotations
@@ -10,12 +8,14 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
+from feeders.format.tables import FeederTables
 from feeders.model.site import Site, find, from_tables
 from feeders.model.three_phase import ThreePhaseSite, spanned
+from feeders.studies.calibrate.readings import Frames
 from feeders.studies.operating import line_rows
 from gridsec.arrays import Bools, Floats, Ints, Phasors
 from gridsec.errors import FeederInvalid, Problem
@@ -27,36 +27,18 @@ from gridsec.grid.three_phase import PHASES, ThreePhaseFeeder, lindist3flow
 from gridsec.planning.calibration import Field, Places, PriorUncertainty, Series
 from gridsec.planning.droop.ac_sensitivity import lines
 
-if TYPE_CHECKING:
-    from feeders.format.tables import FeederTables
-    from feeders.studies.calibrate.readings import Frames
-
-__all__ = ["Lateral", "MergedNetwork", "alone", "laterals", "network", "site_of"]
+__all__ = ["Lateral", "MergedNetwork", "network", "site_of"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lateral:
-    """Part of a feeder behind a single-phase line from a bus of several phases; or a customer there.
+    """Part of a feeder behind a single-phase line from a bus of several phases; or a customer there."""
 
-    Attributes
-    ----------
-    customers
-        All its customers, by index.
-    lines
-        All its lines, indices into the tables, the first line first; none for a customer.
-    phase
-        Its phase.
-    place
-        Place that feeds it.
-    others
-        Places of the other phases at the same bus, by phase.
-    """
-
-    customers: Ints
-    lines: tuple[int, ...]
+    customers: Ints  # all its customers, by index
+    lines: tuple[int, ...]  # indices into the tables, the first line first; none for a customer
     phase: str
-    place: int
-    others: Mapping[str, int]
+    place: int  # place that feeds it
+    others: Mapping[str, int]  # places of the other phases at the same bus, by phase
 
     def to(self, phase: str) -> tuple[Ints, int, int]:
         """Customers, place that feeds the part, and place of another phase there."""
@@ -66,14 +48,8 @@ class Lateral:
 def laterals(feeder: ThreePhaseFeeder, lines: Sequence[tuple[int, ...]], place: Ints) -> tuple[Lateral, ...]:
     """Single-phase laterals of a tree.
 
-    Parameters
-    ----------
-    feeder
-        The tree.
-    lines
-        The lines of each branch, indices into the tables.
-    place : (Q, 2)
-        Bus and phase of each place.
+    `lines` are those of each branch, indices into the tables; `place`, (Q, 2), has bus and phase of each
+    place.
     """
     at = {(bus, PHASES[phase]): q for q, (bus, phase) in enumerate(place.tolist())}
     above, own = feeder.phases[feeder.parent], feeder.phases[1:]
@@ -95,17 +71,7 @@ def laterals(feeder: ThreePhaseFeeder, lines: Sequence[tuple[int, ...]], place: 
 
 
 def alone(feeder: ThreePhaseFeeder, phases: Sequence[str], place: Ints) -> tuple[Lateral, ...]:
-    """Single-phase customers at buses of several phases.
-
-    Parameters
-    ----------
-    feeder
-        The tree.
-    phases
-        Phases of each customer.
-    place : (Q, 2)
-        Bus and phase of each place.
-    """
+    """Single-phase customers at buses of several phases; `place` as in `laterals`."""
     at = {(bus, PHASES[phase]): q for q, (bus, phase) in enumerate(place.tolist())}
     out = []
     for k, (bus, own) in enumerate(zip(feeder.bus.tolist(), phases, strict=True)):
@@ -121,20 +87,11 @@ def _below(feeder: ThreePhaseFeeder, buses: Ints, first: int) -> Bools:
     return np.asarray((feeder.walk.start[first] <= start) & (start < feeder.walk.stop[first]))
 
 
-MOST_BUSES: Final = 150
-"""Number of buses above which lines in series without customers between them are merged."""
-
-IDLE: Final = 0.25
-"""Assumed load of an unmetered customer, relative to its peak."""
-
-HIDDEN: Final = 3.0**-0.5
-"""Standard deviation of the load hidden by generation, relative to its limit: uniform within it."""
-
-CLOUDS: Final = 0.1
-"""Part of it that varies in time."""
-
-STEEP_PU: Final = 0.003
-"""Half of the voltage range for the slope of an inverter's curve, pu."""
+MOST_BUSES: Final = 150  # above it lines in series without customers between them are merged
+IDLE: Final = 0.25  # assumed load of an unmetered customer, relative to its peak
+HIDDEN: Final = 3.0**-0.5  # std of the load hidden by generation, relative to its limit: uniform
+CLOUDS: Final = 0.1  # part of it that varies in time
+STEEP_PU: Final = 0.003  # half of the voltage range for the slope of an inverter's curve, pu
 
 _STEPS: Final = 2
 _ROUNDS: Final = 4
@@ -143,42 +100,16 @@ _CHUNK: Final = 64
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MergedNetwork:
-    """Feeder, in which lines in series are merged if it is large.
+    """Feeder, in which lines in series are merged if it is large."""
 
-    Attributes
-    ----------
-    site
-        Feeder of the files.
-    feeder
-        Its tree, merged; or with closed loops.
-    lines : (L,)
-        The lines of each branch, and then each that closes a loop, indices into the tables.
-    ends : (L, 2)
-        Their buses, of a branch the one nearer to the busbar first.
-    place : (Q, 2)
-        Bus of the feeder and phase of each place.
-    places
-        Model of the readings.
-    laterals
-        Its single-phase laterals.
-    parts
-        Laterals, and single-phase customers at buses of several phases: all parts with a possibly wrong
-        phase.
-    """
-
-    site: Site | ThreePhaseSite
-    feeder: Model
-    lines: tuple[tuple[int, ...], ...]
-    ends: Ints
-    place: Ints
-    places: Places
-    laterals: tuple[Lateral, ...]
-    parts: tuple[Lateral, ...]
-
-    @property
-    def meter_of(self) -> dict[int, int]:
-        """Meter index of each metered customer."""
-        return {int(customer): j for j, customer in enumerate(self.site.meters)}
+    site: Site | ThreePhaseSite  # feeder of the files
+    feeder: Model  # its tree, merged; or with closed loops
+    lines: tuple[tuple[int, ...], ...]  # (L,) branches, then lines that close loops: indices into the tables
+    ends: Ints  # (L, 2) their buses, of a branch the one nearer to the busbar first
+    place: Ints  # (Q, 2) bus of the feeder and phase of each place
+    places: Places  # model of the readings
+    laterals: tuple[Lateral, ...]  # single-phase laterals
+    parts: tuple[Lateral, ...]  # laterals, and single-phase customers at buses of several phases
 
     def weight(self, bus: int, phases: str) -> Floats:
         """Weights (Q,) of a customer at a bus of the feeder."""
@@ -195,12 +126,12 @@ class MergedNetwork:
 
 
 def site_of(path_or_name: Path | str) -> Site | ThreePhaseSite:
-    """Load a feeder, balanced or in three phases.
+    """Load a feeder, balanced or in three phases, as `feeders.model.site.load`.
 
-    Parameters
-    ----------
-    path_or_name
-        As in `feeders.model.site.load`, with the same errors; closed loops in three phases are invalid, too.
+    Raises
+    ------
+    FeederInvalid
+        As there, and for closed loops in three phases.
     """
     return _site(find(path_or_name))
 
@@ -210,26 +141,16 @@ def _site(tables: FeederTables) -> Site | ThreePhaseSite:
         return from_tables(tables)
     site, ties = spanned(tables)
     if ties.ends.size:
-        raise FeederInvalid(
-            [
-                Problem(
-                    "not-radial",
-                    "lines: closed lines form loops; in three phases calibration requires a radial "
-                    "feeder: "
-                    "in a loop a longer line changes all phases everywhere, without a model of it",
-                )
-            ]
+        text = (
+            "lines: closed lines form loops; in three phases calibration requires a radial feeder: in a loop "
+            "a longer line changes all phases everywhere, without a model of it"
         )
+        raise FeederInvalid([Problem("not-radial", text)])
     return site
 
 
 def network(tables: FeederTables) -> MergedNetwork:
-    """Prepare a feeder for calibration.
-
-    Parameters
-    ----------
-    tables
-        Its files; with single-phase customers or zero-sequence impedances it is in three phases.
+    """Prepare a feeder for calibration; single-phase customers or zero-sequence impedances need three phases.
 
     Raises
     ------
@@ -240,7 +161,8 @@ def network(tables: FeederTables) -> MergedNetwork:
     feeder, rows = _merged(_model(site), tuple((row,) for row in line_rows(site)))
     single, parts = tuple[Lateral, ...](), tuple[Lateral, ...]()
     if isinstance(feeder, ThreePhaseFeeder):
-        place, ends = np.argwhere(feeder.phases), _branches(feeder)
+        place = np.argwhere(feeder.phases)
+        ends = np.column_stack([feeder.parent, np.arange(1, len(feeder.buses))])
         single = laterals(feeder, rows, place)
         parts = (*single, *alone(feeder, [row.phases for row in tables.customers], place))
     else:
@@ -259,10 +181,6 @@ def _model(site: Site | ThreePhaseSite) -> Model:
     return site.tree if isinstance(site, Site) else site.feeder
 
 
-def _branches(feeder: ThreePhaseFeeder) -> Ints:
-    return np.column_stack([feeder.parent, np.arange(1, len(feeder.buses))])
-
-
 def _merged(feeder: Model, rows: tuple[tuple[int, ...], ...]) -> tuple[Model, tuple[tuple[int, ...], ...]]:
     """Merge lines in series without customers between them, in large feeders without loops."""
     count = len(feeder.buses)
@@ -277,7 +195,8 @@ def _merged(feeder: Model, rows: tuple[tuple[int, ...], ...]) -> tuple[Model, tu
             keep[above] |= bool((feeder.phases[k + 1] != feeder.phases[above]).any())
     new = np.cumsum(keep) - 1
     above_of, chain = np.zeros(count, dtype=np.intp), list[tuple[int, ...]]([()] * count)
-    impedances = {name: np.array(getattr(feeder, name)) for name in _impedances(feeder)}
+    own = ("r", "x", "charging") if isinstance(feeder, Feeder) else ("z", "charging")
+    impedances = {name: np.array(getattr(feeder, name)) for name in own}
     for k, above in enumerate(feeder.parent.tolist()):
         chain[k + 1] = rows[k]
         above_of[k + 1] = above
@@ -293,10 +212,6 @@ def _merged(feeder: Model, rows: tuple[tuple[int, ...], ...]) -> tuple[Model, tu
     if isinstance(feeder, ThreePhaseFeeder):
         change["phases"] = feeder.phases[kept]
     return replace(feeder, **change), tuple(chain[k] for k in kept[1:])
-
-
-def _impedances(feeder: Feeder | ThreePhaseFeeder) -> tuple[str, ...]:
-    return ("r", "x", "charging") if isinstance(feeder, Feeder) else ("z", "charging")
 
 
 def _places(site: Site | ThreePhaseSite, feeder: Model, place: Ints) -> Places:
@@ -345,14 +260,7 @@ def _shares(feeder: Model, bus: Ints) -> Floats | Phasors:
 class CustomerPowers:
     """Customers' powers by the readings and the files. T frames, N customers, pu.
 
-    Attributes
-    ----------
-    p, q, load, roof, steep : (T, N)
-        See `gridsec.planning.calibration.Series`.
-    metered_q : (N,)
-        Mask of customers with metered reactive power.
-    missing : (T, N)
-        Interpolated powers of metered customers.
+    `p`, `q`, `load`, `roof`, `steep`, (T, N), are those of `gridsec.planning.calibration.Series`.
     """
 
     p: Floats
@@ -360,8 +268,8 @@ class CustomerPowers:
     load: Floats
     roof: Floats
     steep: Floats
-    metered_q: Bools
-    missing: Bools
+    metered_q: Bools  # (N,) customers with metered reactive power
+    missing: Bools  # (T, N) interpolated powers of metered customers
 
 
 def powers(site: Site | ThreePhaseSite, given: Frames) -> CustomerPowers:
@@ -369,13 +277,6 @@ def powers(site: Site | ThreePhaseSite, given: Frames) -> CustomerPowers:
 
     Without a reading of q it is that of the load, by the middle of the limits of its power factor, less the
     injection of the inverter's curve at the voltage read.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    given
-        The readings.
     """
     model, base, T = site.loads, site.feeder.base_kva, given.t.size
     N = model.load_peak.size
@@ -429,19 +330,7 @@ def _sun(draws: Floats, pv_peak: Floats) -> Floats:
 
 
 def series(net: MergedNetwork, given: Frames, drawn: CustomerPowers, excluded: Collection[str]) -> Series:
-    """Readings and power flow of a feeder.
-
-    Parameters
-    ----------
-    net
-        The feeder.
-    given
-        The readings.
-    drawn
-        From `powers`.
-    excluded
-        Meters with voltages that are not used.
-    """
+    """Readings and power flow of a feeder, without the voltages of the excluded meters."""
     site = net.site
     order = [given.meter_ids.index(name) for name in site.meter_ids]
     v = given.v_volt[:, order] / net.places.unit
@@ -502,18 +391,8 @@ def doubts(
 ) -> PriorUncertainty:
     """Prior standard deviations of the errors of the files, uniform within the stated limits.
 
-    Parameters
-    ----------
-    net
-        The feeder.
-    drawn
-        From `powers`.
-    tolerance
-        Relative error of lengths that counts as correct, 1 sigma.
-    free
-        Branches with estimated lengths.
-    spread
-        Prior standard deviation of their relative error.
+    `tolerance` is the relative error of lengths that counts as correct, 1 sigma. The branches `free` have
+    estimated lengths, with relative errors of the prior standard deviation `spread`.
     """
     site, model = net.site, net.site.loads
     without = np.ones(model.load_peak.size, dtype=np.bool_)

@@ -6,7 +6,7 @@ import json
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 import pandas as pd
@@ -18,80 +18,45 @@ from pandas.api.types import (
     is_string_dtype,
 )
 
-from feeders.model.site import one_phase_each
+from feeders.model.site import Site, one_phase_each
+from feeders.model.three_phase import ThreePhaseSite
 from feeders.simulation.meters import BUSBAR
-from feeders.simulation.recording import REQUIRED, RecordingInvalid, read_recording
+from feeders.simulation.recording import REQUIRED, Recording, RecordingInvalid, read_recording
 from feeders.simulation.scenario import LATEST_S
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import Problem
 from gridsec.grid.three_phase import PHASES
 
-if TYPE_CHECKING:
-    from feeders.model.site import Site
-    from feeders.model.three_phase import ThreePhaseSite
-    from feeders.simulation.recording import Recording
+__all__ = ["Frames", "blind", "frames"]
 
-__all__ = ["Frames", "blind", "frames", "open_readings"]
-
-MOST_FRAMES: Final = 720
-"""Number of frames from which on frames are averaged."""
-
-FEWEST_FRAMES: Final = 48
-"""Smallest number of frames that determines the varying errors."""
-
-FARTHEST_S: Final = 10.0 * 365.25 * 86400.0
-"""Largest distance of times from their median, s; beyond it a clock was not set."""
-
-NUMBERS: Final = ("t", "v_volt", "p_kw", "q_kvar")
-"""Columns of numbers."""
-
-USUAL: Final = (0.5, 1.5)
-"""Range of a meter's median voltage, relative to nominal, for volts from phase to neutral."""
+MOST_FRAMES: Final = 720  # number of frames from which on frames are averaged
+FEWEST_FRAMES: Final = 48  # smallest number of frames that determines the varying errors
+FARTHEST_S: Final = 10.0 * 365.25 * 86400.0  # of times from their median; beyond it a clock was not set
+NUMBERS: Final = ("t", "v_volt", "p_kw", "q_kvar")  # columns of numbers
+USUAL: Final = (0.5, 1.5)  # range of a meter's median voltage, relative to nominal, from phase to neutral
 
 _PAIR: Final = (0.9 * 3.0**0.5, 1.1 * 3.0**0.5)
 _KILOVOLT: Final = (0.5e-3, 2e-3)
 
 _EXPECTED: Final = {"t": "expected Unix time in seconds"}
 
-OFTEN: Final = 0.5
-"""Smallest share of frames with voltages of a phase of the busbar that counts as read."""
-
-FEWEST_SPANS: Final = 6.0
-"""Smallest length of a recording in correlation times of the load errors."""
+OFTEN: Final = 0.5  # smallest share of frames with voltages of a phase of the busbar that counts as read
+FEWEST_SPANS: Final = 6.0  # smallest length of a recording in correlation times of the load errors
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frames:
-    """Readings of T frames in SI, net import positive. p meters; NaN for missing values.
-
-    Attributes
-    ----------
-    meter_ids : (p,)
-        Ids of the meters.
-    t : (T,)
-        Middle of each frame, Unix s.
-    v_volt, p_kw, q_kvar : (T, p)
-        Means of the readings.
-    v0_volt : (T,)
-        Busbar voltage.
-    v0_phases : (T, 3)
-        Phase voltages of the busbar; NaN in all frames for an unread phase.
-    count : (T, p + 1)
-        Number of readings of each mean, the busbar's last; of a meter of three channels their effective
-        number.
-    step_s
-        Interval between readings, s.
-    """
+    """Readings of T frames in SI, net import positive. p meters; NaN for missing values."""
 
     meter_ids: tuple[str, ...]
-    t: Floats
-    v_volt: Floats
+    t: Floats  # (T,) middle of each frame, Unix s
+    v_volt: Floats  # (T, p) means of the readings, as p_kw and q_kvar
     p_kw: Floats
     q_kvar: Floats
-    v0_volt: Floats
-    v0_phases: Floats
-    count: Floats
-    step_s: float
+    v0_volt: Floats  # (T,) busbar voltage
+    v0_phases: Floats  # (T, 3) NaN in all frames for an unread phase
+    count: Floats  # (T, p + 1) readings of each mean, the busbar's last; effective number for three channels
+    step_s: float  # interval between readings
 
     @property
     def unread(self) -> str:
@@ -124,20 +89,11 @@ def frames(
     *,
     exclude: Collection[str] = (),
 ) -> Frames:
-    """Average readings to frames.
+    """Average readings to frames; the values of the meters in `exclude` are not checked.
 
     A meter of a three-phase customer may be read as a whole, or as its three channels
     (`feeders.model.site.one_phase_each`). Its voltage is then their mean and its powers are their sums, where
     all three exist.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    readings
-        A recording, a table, or a file with one.
-    exclude
-        Meters without a check of their values.
 
     Raises
     ------
@@ -150,11 +106,8 @@ def frames(
     given = open_readings(readings) if isinstance(readings, (Path, str)) else readings
     if not isinstance(given, pd.DataFrame):
         if given.feeder is not None and given.feeder != site.feeder.name:
-            raise RecordingInvalid(
-                Problem(
-                    "other-origin", f"{given.path}: recorded on {given.feeder}, not on {site.feeder.name}"
-                )
-            )
+            text = f"{given.path}: recorded on {given.feeder}, not on {site.feeder.name}"
+            raise RecordingInvalid(Problem("other-origin", text))
         given = given.frame()
     missing = [name for name in REQUIRED if name not in given.columns]
     problems = [Problem("missing", f"columns {', '.join(missing)} are missing")] if missing else []
@@ -169,43 +122,30 @@ def frames(
     unknown = sorted(set(meter[column.isna()]))
     if unknown:
         shown = ", ".join(unknown[:10]) + (f" and {len(unknown) - 10} more" if len(unknown) > 10 else "")
-        problems.append(
-            Problem("unknown-name", f"there are meters that {site.feeder.name} does not have: {shown}")
-        )
+        text = f"there are meters that {site.feeder.name} does not have: {shown}"
+        problems.append(Problem("unknown-name", text))
     if "meter" in given and not (column == len(site.meter_ids)).any():
-        problems.append(
-            Problem("missing", "no reading of the busbar (empty meter id); it is the reference of all others")
-        )
+        text = "no reading of the busbar (empty meter id); it is the reference of all others"
+        problems.append(Problem("missing", text))
     if "meter" in given:
         problems += _twice(meter, channels)
-        problems += _wrong_units(
-            site, numbers, meter.mask(meter.isin(channels), meter.map(channels)), exclude
-        )
+        whole_meter = meter.mask(meter.isin(channels), meter.map(channels))
+        problems += _wrong_units(site, numbers, whole_meter, exclude)
     if problems:
         raise RecordingInvalid(*problems, where="readings: ")
     whole = [site.meter_ids.index(name) for name in dict.fromkeys(channels.values())]
     found = _binned(site, given, numbers, np.asarray(column, dtype=np.intp), whole)
     if site.tables.in_phases and len(blind(site, found.unread)) == len(site.meter_ids):
-        raise RecordingInvalid(
-            Problem(
-                "missing",
-                f"readings: the busbar has no voltages of phase {' and '.join(found.unread)}, and "
-                "without them no meter can be compared; expected v_phases, as [230.1, 230.4, 229.9]",
-            )
+        text = (
+            f"readings: the busbar has no voltages of phase {' and '.join(found.unread)}, and without them "
+            "no meter can be compared; expected v_phases, as [230.1, 230.4, 229.9]"
         )
+        raise RecordingInvalid(Problem("missing", text))
     return found
 
 
 def blind(site: Site | ThreePhaseSite, unread: str) -> tuple[str, ...]:
-    """Meters on phases without a voltage of the busbar; their errors cannot be determined.
-
-    Parameters
-    ----------
-    site
-        A feeder in three phases.
-    unread
-        The phases.
-    """
+    """Meters on unread phases of the busbar; their errors cannot be determined."""
     rows = [site.tables.customers[k] for k in site.meters]
     return tuple(row.meter for row in rows if set(row.phases) & set(unread))
 
@@ -247,9 +187,8 @@ def _numbers(column: pd.Series, problems: list[Problem]) -> Floats | None:
     nothing = text.fillna("").str.strip().str.lower().isin(["", "nan"]).to_numpy()
     wrong = np.flatnonzero(np.isnan(values) & ~nothing)
     if wrong.size:
-        problems.append(
-            Problem("wrong-type", f"{column.name} of {_rows(wrong)} is {text.iloc[wrong[0]]!r}; {expected}")
-        )
+        told = f"{column.name} of {_rows(wrong)} is {text.iloc[wrong[0]]!r}; {expected}"
+        problems.append(Problem("wrong-type", told))
         return None
     return values
 
@@ -351,13 +290,11 @@ def _binned(
     T = int(there.sum())
     span, wanted = T * step * together, max(FEWEST_FRAMES * step * together, FEWEST_SPANS * tau)
     if T < FEWEST_FRAMES or span < wanted:
-        raise RecordingInvalid(
-            Problem(
-                "too-little-data",
-                f"too little data: {T} frames over {span / 3600:.3g} h; at least {FEWEST_FRAMES} frames over "
-                f"{wanted / 3600:.3g} h are required; days give more information than hours",
-            )
+        text = (
+            f"too little data: {T} frames over {span / 3600:.3g} h; at least {FEWEST_FRAMES} frames over "
+            f"{wanted / 3600:.3g} h are required; days give more information than hours"
         )
+        raise RecordingInvalid(Problem("too-little-data", text))
     middle = first + (used * together + 0.5 * (together - 1)) * step
     return Frames(
         meter_ids=site.meter_ids,
@@ -383,9 +320,8 @@ def _phases(given: pd.DataFrame, number: Ints, ticks: int) -> Floats:
         ]
         told = np.array(rows, dtype=np.float64).reshape(len(rows), 3)
     except (TypeError, ValueError) as error:
-        raise RecordingInvalid(
-            Problem("shape", "readings: v_phases are three voltages, as [230.1, 230.4, 229.9]")
-        ) from error
+        text = "readings: v_phases are three voltages, as [230.1, 230.4, 229.9]"
+        raise RecordingInvalid(Problem("shape", text)) from error
     cell = (number[there, None] * 3 + np.arange(3)).ravel()
     return _means(cell, told.ravel(), (ticks, 3))[0]
 
@@ -423,9 +359,8 @@ def _step(t: Floats, column: Ints) -> float:
     gap = np.diff(t[order])[np.diff(column[order]) == 0]
     gap = gap[gap > 0.0]
     if not gap.size:
-        raise RecordingInvalid(
-            Problem("too-little-data", "too little data: no meter has two readings at different times")
-        )
+        text = "too little data: no meter has two readings at different times"
+        raise RecordingInvalid(Problem("too-little-data", text))
     return float(np.median(gap))
 
 

@@ -1,24 +1,24 @@
 """Search for single errors of a feeder's files that recorded readings support, and their corrections.
 
-References
-----------
-docs/theory-studies.md, Calibration.
+References: docs/theory-studies.md, Calibration.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import partial
 from itertools import combinations
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
 from feeders.format.columns import MATRIX_NAMES, PHASE_NAMES
-from feeders.format.tables import LineRow
+from feeders.format.tables import FeederTables, LineRow
 from feeders.studies.calibrate import feeder as model
+from feeders.studies.calibrate.feeder import CustomerPowers, Lateral, MergedNetwork
+from feeders.studies.calibrate.readings import Frames
 from gridsec.arrays import Floats, Ints
 from gridsec.grid.three_phase import PHASES, ThreePhaseFeeder
 from gridsec.planning.calibration import (
@@ -38,13 +38,6 @@ from gridsec.planning.calibration import (
     weigh,
     whitening,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from feeders.format.tables import FeederTables
-    from feeders.studies.calibrate.feeder import CustomerPowers, Lateral, MergedNetwork
-    from feeders.studies.calibrate.readings import Frames
 
 __all__ = [
     "PLACES",
@@ -75,8 +68,7 @@ class FileErrorKind(StrEnum):
     METER = "meter"
 
 
-PLACES: Final = (FileErrorKind.BUS, FileErrorKind.PHASE)
-"""Errors of a customer's place; a customer has at most one of each."""
+PLACES: Final = (FileErrorKind.BUS, FileErrorKind.PHASE)  # a customer has at most one of each
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,8 +77,6 @@ class Correction:
 
     Attributes
     ----------
-    kind
-        Kind of the error.
     names
         The customer, both customers of a swap, the meter, or the lines; all customers of a lateral.
     bus, phases
@@ -120,15 +110,7 @@ class Correction:
 
 
 def apply(tables: FeederTables, wrong: Correction) -> FeederTables:
-    """Correct an error of the files.
-
-    Parameters
-    ----------
-    tables
-        The files.
-    wrong
-        The error; that of a meter changes no file.
-    """
+    """Correct an error of the files; that of a meter changes no file."""
     if wrong.kind is FileErrorKind.METER:
         return tables
     if wrong.kind is FileErrorKind.LENGTH:
@@ -151,15 +133,7 @@ def apply(tables: FeederTables, wrong: Correction) -> FeederTables:
 
 
 def longer(line: LineRow, factor: float) -> LineRow:
-    """Line of another length.
-
-    Parameters
-    ----------
-    line
-        The line.
-    factor
-        Factor on its length.
-    """
+    """Line of `factor` times the length."""
     scaled: dict[str, Any] = {
         name: None if (value := getattr(line, name)) is None else value * factor
         for name in ("r_ohm", "x_ohm", "r0_ohm", "x0_ohm", "b_us", *MATRIX_NAMES)
@@ -182,24 +156,17 @@ def _on(line: LineRow, phase: str) -> LineRow:
 def left(earlier: Correction, later: Correction) -> Correction | None:
     """Part of an earlier correction that a later one leaves; None without any.
 
-    Parameters
-    ----------
-    earlier, later
-        Corrections of one feeder; for a customer's place the later one is valid.
+    For a customer's place the later one is valid.
     """
     if later.kind is FileErrorKind.BUS and set(earlier.names) <= set(later.names) and earlier.lines:
         # No customer remains on the lateral to confirm the phase of its lines.
-        return _without_lines(earlier)
+        return _of_phases(earlier, earlier.on[0], {})
     if earlier.kind is not later.kind or later.kind not in PLACES:
         return earlier
     on, lines_on = earlier.on
     on = {name: phases for name, phases in on.items() if name not in later.names}
     lines_on = {name: phases for name, phases in lines_on.items() if name not in later.lines}
     return _of_phases(earlier, on, lines_on) if on else None
-
-
-def _without_lines(earlier: Correction) -> Correction:
-    return _of_phases(earlier, earlier.on[0], {})
 
 
 def _of_phases(earlier: Correction, on: dict[str, str], lines_on: dict[str, str]) -> Correction:
@@ -214,14 +181,7 @@ def _of_phases(earlier: Correction, on: dict[str, str], lines_on: dict[str, str]
 def as_filed(tables: FeederTables, wrong: Correction, bus_of_file: Mapping[str, int]) -> bool:
     """True if the files agree with a correction of a customer's place already.
 
-    Parameters
-    ----------
-    tables
-        The files.
-    wrong
-        The correction.
-    bus_of_file
-        Bus of the model of each bus of the files.
+    `bus_of_file` is the bus of the model of each bus of the files.
     """
     rows = {row.customer: row for row in tables.customers}
     if wrong.kind is FileErrorKind.BUS:
@@ -234,20 +194,11 @@ def as_filed(tables: FeederTables, wrong: Correction, bus_of_file: Mapping[str, 
     return here and all(lines[name].phases == phases for name, phases in lines_on.items())
 
 
-LENGTH_SPREAD: Final = 0.3
-"""Prior standard deviation of the relative error of a wrong length."""
-
-CHANGE_SPREAD: Final = 0.005
-"""Prior standard deviation of a change of a meter's relative error."""
-
-SHORTEST: Final = 0.05
-"""Smallest factor on a line's length."""
-
-LIE_SPREAD: Final = 0.05
-"""Prior standard deviation of a constant relative error beyond that of honest meters of the class."""
-
-PIECES: Final = 8
-"""Number of time intervals with possibly different errors of a meter."""
+LENGTH_SPREAD: Final = 0.3  # prior standard deviation of the relative error of a wrong length
+CHANGE_SPREAD: Final = 0.005  # prior standard deviation of a change of a meter's relative error
+SHORTEST: Final = 0.05  # smallest factor on a line's length
+LIE_SPREAD: Final = 0.05  # prior std of a constant relative error beyond that of the class
+PIECES: Final = 8  # number of time intervals with possibly different errors of a meter
 
 _CHUNK: Final = 128
 _REFIT: Final = 3
@@ -260,8 +211,6 @@ class Guess:
 
     Attributes
     ----------
-    kind
-        Kind of the error.
     subject
         Customer, first customer of a swap, meter, or branch, by index in the present network. For an exchange
         of phases the first part, by index into `MergedNetwork.parts`.
@@ -289,24 +238,12 @@ class Guess:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CorrectionState:
-    """Files with all corrections so far, and excluded meters.
-
-    Attributes
-    ----------
-    tables
-        The files.
-    excluded
-        Meters with changing errors, or excluded by the caller.
-    lengths
-        Factor on the length of each line with a corrected length, by id.
-    unread
-        Phases without a voltage of the busbar; the meters on them are excluded.
-    """
+    """Files with all corrections so far, and excluded meters."""
 
     tables: FeederTables
-    excluded: tuple[str, ...] = ()
-    lengths: dict[str, float] = field(default_factory=dict)
-    unread: str = ""
+    excluded: tuple[str, ...] = ()  # meters with changing errors, or excluded by the caller
+    lengths: dict[str, float] = field(default_factory=dict)  # factor on each corrected length
+    unread: str = ""  # phases without a voltage of the busbar; their meters are excluded
 
     def same(self, other: CorrectionState) -> bool:
         """True for equal files and excluded meters."""
@@ -340,42 +277,20 @@ class Round:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HypothesisComparison:
-    """Comparison of all hypotheses.
-
-    Attributes
-    ----------
-    guesses
-        All hypotheses.
-    found
-        Evidence of the readings for each.
-    confidence : (H,)
-        See `gridsec.planning.calibration.Weighed`.
-    any
-        Logarithm of the mean Bayes factor.
-    kept : (k,)
-        Hypotheses that cannot be distinguished, best first.
-    """
+    """Comparison of all hypotheses."""
 
     guesses: list[Guess]
-    found: HypothesisEvidence
-    confidence: Floats
-    any: float
-    kept: Ints
+    found: HypothesisEvidence  # evidence of the readings for each
+    confidence: Floats  # (H,) see `gridsec.planning.calibration.Weighed`
+    any: float  # logarithm of the mean Bayes factor
+    kept: Ints  # (k,) hypotheses that cannot be distinguished, best first
 
 
 def prepare(state: CorrectionState, frames: Frames, *, tolerance: float, errors: bool = False) -> Round:
     """Fit meters, loads and lines under the assumption of correct files.
 
-    Parameters
-    ----------
-    state
-        The files.
-    frames
-        The readings.
-    tolerance
-        Relative error of a length that counts as correct, 1 sigma.
-    errors
-        True: also compute standard errors of the load errors' parameters.
+    `tolerance` is the relative error of a length that counts as correct, 1 sigma. With `errors` the load
+    errors' parameters have standard errors.
     """
     net = model.network(state.tables)
     drawn = model.powers(net.site, frames)
@@ -391,7 +306,7 @@ def prepare(state: CorrectionState, frames: Frames, *, tolerance: float, errors:
     white, common = model.meter_noise(net, frames)
     own, gap = model.field(net, drawn), model.gaps(net, drawn)
     rest = series.residual(net.places)
-    size = _typical(net)
+    size = 0.02 * float(np.median(net.site.loads.load_peak[net.site.meters]))  # typical
     noise = LoadErrors(size, size, net.site.tables.meta.load.correlation_s, 1.0, np.full(4, np.nan))
     shared = np.einsum("tjf,tkf->jk", common, common) / len(common)
     guess, left = noise, rest
@@ -418,10 +333,6 @@ def prepare(state: CorrectionState, frames: Frames, *, tolerance: float, errors:
     )
 
 
-def _typical(net: MergedNetwork) -> float:
-    return 0.02 * float(np.median(net.site.loads.load_peak[net.site.meters]))
-
-
 def _spread_out(found: RegressionFit, used: Ints, given: Regressors) -> RegressionFit:
     """Fit with all coefficients, those with a prior of zero included."""
     estimate, std = np.zeros((2, given.spread.size))
@@ -438,18 +349,8 @@ def compare(
 ) -> HypothesisComparison:
     """Compare all hypotheses of an error of the files.
 
-    Parameters
-    ----------
-    now
-        Fit of the present files.
-    frames
-        The readings.
-    risk
-        Probability of a proposal for files without errors.
-    report_progress
-        Called with (done, total).
-    kinds
-        Kinds of errors to consider.
+    `risk` is the probability of a proposal for files without errors; `report_progress` is called with (done,
+    total).
     """
     guesses: list[Guess] = []
     parts: list[HypothesisEvidence] = []
@@ -496,15 +397,7 @@ def _close(now: Round, guesses: list[Guess], factor: Floats) -> list[int]:
 
 
 def concerned(now: Round, guess: Guess) -> list[int]:
-    """Customers of a move.
-
-    Parameters
-    ----------
-    now
-        Fit of the present files.
-    guess
-        The move.
-    """
+    """Customers of a move."""
     if guess.lateral:
         return list(map(int, now.net.laterals[guess.other].customers))
     if guess.exchange:
@@ -634,17 +527,7 @@ def _exactly(now: Round, frames: Frames, guess: Guess) -> float:
 
 
 def correction(now: Round, guess: Guess, factor: float = 1.0) -> Correction:
-    """Hypothesis as a correction of the files.
-
-    Parameters
-    ----------
-    now
-        Fit of the present files.
-    guess
-        The error.
-    factor
-        Factor on the length, for a length.
-    """
+    """Hypothesis as a correction of the files; `factor` is that of a length."""
     net, tables = now.net, now.state.tables
     if guess.kind is FileErrorKind.METER:
         return Correction(guess.kind, (net.site.meter_ids[guess.subject],))

@@ -4,9 +4,7 @@ A forward step corrects the error that the readings support most. At an early st
 the files, and it may stand in for them. Re-examination therefore withdraws each error alone, with all others
 corrected, and compares all hypotheses again: the error stays, is replaced, or is dropped.
 
-References
-----------
-docs/theory-studies.md, Calibration.
+References: docs/theory-studies.md, Calibration.
 """
 
 from __future__ import annotations
@@ -16,14 +14,17 @@ import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import pandas as pd
 from scipy.stats import norm
 
-from feeders.format.tables import write
+from feeders.format.tables import FeederTables, write
 from feeders.model.equipment import digest, find
+from feeders.model.site import Site
+from feeders.model.three_phase import ThreePhaseSite
+from feeders.simulation.recording import Recording
 from feeders.studies.calibrate.readings import Frames, blind, frames
 from feeders.studies.calibrate.search import (
     LENGTH_SPREAD,
@@ -32,7 +33,6 @@ from feeders.studies.calibrate.search import (
     Correction,
     CorrectionState,
     FileErrorKind,
-    Guess,
     HypothesisComparison,
     Round,
     apply,
@@ -44,50 +44,21 @@ from feeders.studies.calibrate.search import (
     prepare,
 )
 from feeders.studies.journal import Journal, Progress, Where
+from gridsec.arrays import Floats
 from gridsec.errors import FeederInvalid, InputInvalid, Problem, raise_if_any
 from gridsec.planning.calibration import explain, lengthened
 
-if TYPE_CHECKING:
-    from feeders.format.tables import FeederTables
-    from feeders.model.site import Site
-    from feeders.model.three_phase import ThreePhaseSite
-    from feeders.simulation.recording import Recording
-    from gridsec.arrays import Floats
-
-__all__ = [
-    "Calibrate",
-    "FileErrorSearch",
-    "OtherFeeder",
-    "SearchResult",
-    "calibrate",
-    "customers",
-    "described",
-    "errors",
-    "final",
-    "line_table",
-    "loads",
-    "meters",
-    "present",
-    "read",
-    "wrong_numbers",
-]
+__all__ = ["Calibrate", "OtherFeeder", "calibrate", "wrong_numbers"]
 
 
 AS_FILED, PROPOSED, UNTOLD, EXCLUDED = "as in the files", "proposed", "cannot be told", "excluded"
 UNASKED: Final = "not looked for"
 UNREAD: Final = "phase not read"
 
-WIDE: Final = 1.96
-"""Half-width of intervals, in standard errors: 95 %."""
-
-VAGUE: Final = 0.7
-"""Ratio of posterior to prior standard deviation above which the readings give no information."""
-
-ALIKE: Final = 0.98
-"""Correlation from which on the effects of two lines count as equal."""
-
-UNSURE_LENGTH: Final = 0.25
-"""Standard error from which on a length is unknown."""
+WIDE: Final = 1.96  # half-width of intervals, in standard errors: 95 %
+VAGUE: Final = 0.7  # ratio of posterior to prior std above which the readings give no information
+ALIKE: Final = 0.98  # correlation from which on the effects of two lines count as equal
+UNSURE_LENGTH: Final = 0.25  # standard error from which on a length is unknown
 
 _SHOWN: Final = 5
 
@@ -391,50 +362,26 @@ def _some(items: Sequence[str]) -> str:
     return ", ".join(items[:_SHOWN]) + tail
 
 
-MOST_ERRORS: Final = 24
-"""Largest number of errors; with more, the files are those of another feeder."""
+MOST_ERRORS: Final = 24  # largest number of errors; with more, the files are those of another feeder
+MOST_REVISIONS: Final = 3  # largest number of re-examinations of all errors; most searches need one
 
-MOST_REVISIONS: Final = 3
-"""Largest number of re-examinations of all errors; most searches need one."""
-
-Row = dict[str, Any]
-"""One error in plain JSON types, for the journal."""
+Row = dict[str, Any]  # one error in plain JSON types, for the journal
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SearchResult:
-    """Result of a search.
+    """Result of a search."""
 
-    Attributes
-    ----------
-    now
-        The files with all errors corrected, fitted.
-    said
-        Comparison of all further hypotheses for these files.
-    rows
-        The errors, in the order of their corrections.
-    """
-
-    now: Round
-    said: HypothesisComparison
-    rows: list[Row]
+    now: Round  # the files with all errors corrected, fitted
+    said: HypothesisComparison  # comparison of all further hypotheses for these files
+    rows: list[Row]  # the errors, in the order of their corrections
 
 
 class FileErrorSearch:
-    """Search for the errors of a feeder's files.
+    """Search for the errors of a feeder's files; an interrupted search resumes from its journal.
 
-    Parameters
-    ----------
-    files
-        The files.
-    fitted
-        Fits files under the assumption that they are correct.
-    weighed
-        Compares all hypotheses for such a fit.
-    risk
-        Probability of any proposal for correct files.
-    kept
-        Journal of the steps; an interrupted search resumes from it.
+    `fitted` fits files under the assumption that they are correct; `weighed` compares all hypotheses for such
+    a fit. `risk` is the probability of any proposal for correct files.
     """
 
     def __init__(
@@ -520,7 +467,7 @@ class FileErrorSearch:
             if (
                 row not in rows
                 or wrong.kind is FileErrorKind.METER
-                or not _files_of(rest)
+                or all(each["correction"]["kind"] == FileErrorKind.METER for each in rest)
                 or _chained(wrong, rest)
             ):
                 continue
@@ -533,11 +480,6 @@ class FileErrorSearch:
             elif again["correction"]["kind"] != FileErrorKind.METER:
                 rows = _together(rest, again, self._files.tables, now.net.site.bus_of_file)
         return rows
-
-
-def _files_of(rows: Sequence[Row]) -> bool:
-    """True if any error is one of the files; otherwise nothing has changed since the first comparison."""
-    return any(row["correction"]["kind"] != FileErrorKind.METER for row in rows)
 
 
 def _same_subject(one: Correction, other: Correction) -> bool:
@@ -587,8 +529,9 @@ def _best(now: Round, said: HypothesisComparison, risk: float, files: FeederTabl
     shift = g / (h + LENGTH_SPREAD**-2) if guess.kind is FileErrorKind.LENGTH else 0.0
     wrong = correction(now, guess, max(1.0 + shift, SHORTEST))
     others = [correction(now, said.guesses[k]) for k in said.kept[1:]]
-    if wrong.kind is FileErrorKind.PHASE:
-        others += _unread(wrong, guess, now.state.unread)
+    if wrong.kind is FileErrorKind.PHASE and not guess.exchange:
+        # A single part may be on a phase without a voltage of the busbar.
+        others += [replace(wrong, phases=phase) for phase in now.state.unread]
     return {
         "correction": asdict(wrong),
         "estimate": g / h if h > 0.0 else 0.0,
@@ -603,21 +546,10 @@ def _best(now: Round, said: HypothesisComparison, risk: float, files: FeederTabl
     }
 
 
-def _unread(wrong: Correction, guess: Guess, unread: str) -> list[Correction]:
-    """Alternatives on phases without a voltage of the busbar, for a single part."""
-    return [] if guess.exchange else [replace(wrong, phases=phase) for phase in unread]
-
-
 def read(row: Row) -> Correction:
     """Correction from the plain types of the journal."""
-    return Correction(
-        FileErrorKind(row["kind"]),
-        tuple(row["names"]),
-        row["bus"],
-        row["phases"],
-        row["factor"],
-        tuple(row["lines"]),
-    )
+    tuples = {name: tuple(row[name]) for name in ("names", "lines")}
+    return Correction(**row | tuples | {"kind": FileErrorKind(row["kind"])})
 
 
 class OtherFeeder(InputInvalid):
@@ -630,12 +562,6 @@ class Calibrate:
 
     Attributes
     ----------
-    feeder, digest
-        Name and content digest of the feeder.
-    frames, span_h
-        Number of frames, and their time span, h.
-    risk
-        Probability of any proposal for correct files.
     meters
         One row for each meter: `meter`, `customer`, `frames` (readings used), `bias_percent`, `std_percent`,
         `low_percent`, `high_percent` (95 %; of the voltage, relative to the busbar meter: a common error of
@@ -667,9 +593,9 @@ class Calibrate:
 
     feeder: str
     digest: str
-    frames: int
+    frames: int  # number of frames
     span_h: float
-    risk: float
+    risk: float  # probability of any proposal for correct files
     meters: pd.DataFrame
     lines: pd.DataFrame
     customers: pd.DataFrame
@@ -686,14 +612,7 @@ class Calibrate:
         return {name: getattr(self, name) for name in names}
 
     def corrected(self, site_folder: Path | str, out: Path | str) -> None:
-        """Write a copy of a feeder's folder with the decided corrections.
-
-        Parameters
-        ----------
-        site_folder
-            Folder or name of the studied feeder.
-        out
-            A new or empty folder.
+        """Write a copy of the studied feeder with the decided corrections to a new or empty folder.
 
         Raises
         ------
@@ -706,9 +625,8 @@ class Calibrate:
         """
         tables, target = find(site_folder), Path(out)
         if digest(tables) != self.digest:
-            raise OtherFeeder(
-                [Problem("other-origin", f"{site_folder}: not the studied feeder, or changed since")]
-            )
+            text = f"{site_folder}: not the studied feeder, or changed since"
+            raise OtherFeeder([Problem("other-origin", text)])
         if target.exists() and (not target.is_dir() or any(target.iterdir())):
             raise FileExistsError(f"{target}: is not empty; expected a new folder")
         for wrong in self.corrections:
@@ -729,12 +647,11 @@ def calibrate(
 ) -> Calibrate:
     """Compare recorded readings with a feeder's files.
 
+    The feeder is balanced (with loops or without) or of three phases. The readings are a recording, a table
+    with its columns, or a Parquet or CSV file.
+
     Parameters
     ----------
-    site
-        The feeder, balanced (with loops or without) or of three phases.
-    readings
-        A recording, a table with its columns, or a Parquet or CSV file.
     risk
         Probability of any proposal for correct files, 0 to 1.
     tolerance
@@ -744,8 +661,6 @@ def calibrate(
     kinds
         Kinds of errors to search; fewer take less time, and an error of another kind may pass for one of
         these.
-    journal
-        File for each error found; an interrupted study resumes from it.
     progress
         Called with (done, total) of the present comparison.
 
@@ -758,10 +673,8 @@ def calibrate(
         For an unknown meter, or a number out of range.
     FeederInvalid
         If closed lines form loops in three phases.
-    OtherStudy
-        If the journal is that of another study.
-    InUse
-        If another process writes the journal.
+    OtherStudy, InUse
+        As `feeders.studies.journal.Journal`.
     """
     problems = wrong_numbers(risk, tolerance)
     if unknown := sorted(set(exclude) - set(site.meter_ids)):
@@ -771,7 +684,7 @@ def calibrate(
     subject = _subject(site, given, risk, tolerance) | {"exclude": sorted(exclude), "kinds": sorted(kinds)}
 
     def weighed(now: Round) -> HypothesisComparison:
-        return compare(now, given, risk, progress or _quiet, kinds)
+        return compare(now, given, risk, progress or (lambda *_: None), kinds)
 
     def fitted(state: CorrectionState) -> Round:
         return prepare(state, given, tolerance=tolerance, errors=True)
@@ -802,25 +715,13 @@ def calibrate(
 
 
 def wrong_numbers(risk: float, tolerance: float) -> list[Problem]:
-    """Problems of the numbers of a calibration.
-
-    Parameters
-    ----------
-    risk, tolerance
-        As in `calibrate`.
-    """
-    problems = []
-    if not 0.0 < risk < 1.0:
-        problems.append(Problem("out-of-range", f"risk is {risk}; it must be between 0 and 1"))
-    if not 0.0 < tolerance < LENGTH_SPREAD:
-        problems.append(
-            Problem("out-of-range", f"tolerance is {tolerance}; it must be between 0 and {LENGTH_SPREAD}")
-        )
-    return problems
-
-
-def _quiet(done: int, total: int) -> None:
-    """Progress without effect."""
+    """Problems of the numbers of a calibration."""
+    ranges = (("risk", risk, 1), ("tolerance", tolerance, LENGTH_SPREAD))
+    return [
+        Problem("out-of-range", f"{name} is {value}; it must be between 0 and {most}")
+        for name, value, most in ranges
+        if not 0.0 < value < most
+    ]
 
 
 def _subject(site: Site | ThreePhaseSite, given: Frames, risk: float, tolerance: float) -> dict[str, Any]:

@@ -8,60 +8,39 @@ honest frames and then the attack.
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import closing
 from dataclasses import asdict, dataclass
-from functools import cache, partial
-from typing import TYPE_CHECKING
+from functools import cache
 
 import numpy as np
 import pandas as pd
 
-from feeders.format.tables import FeederTables
-from feeders.model.site import from_tables
+from feeders.model.site import Site
 from feeders.simulation.attacks import AttackKind
 from feeders.studies.campaign.plan import AttackClass, Promise
 from feeders.studies.detectable import Detectable, monitor_rule
-from feeders.studies.journal import Journal, Progress, Where, worked
+from feeders.studies.journal import Progress, Where, run_pieces
 from feeders.studies.operating import SHARE, squared, volts_of_lie
-from feeders.studies.workers import Here, Runner
 from gridsec.arrays import Bools, Floats
 from gridsec.estimators import sequential
 from gridsec.estimators.sequential import LoadDoubt
 from gridsec.interface import Frame
 from gridsec.planning.detectability import Rule, largest_shift
 
-if TYPE_CHECKING:
-    from feeders.model.site import Site
-
-__all__ = ["Rehearsal", "promised", "rehearse", "rehearse_everywhere"]
+__all__ = ["Rehearsal", "promised", "rehearse"]
 
 
-_HONEST, _LYING = 4, 16
-"""Number of frames before and after the onset of an attack."""
-_SETTLING = 25
-"""Iterations to the inverters' equilibrium; their loop gain is below one."""
+_HONEST, _LYING = 4, 16  # frames before and after the onset of an attack
+_SETTLING = 25  # iterations to the inverters' equilibrium; their loop gain is below one
 
 
 @dataclass(frozen=True, slots=True)
 class Rehearsal:
-    """Outcome of attacks of the guaranteed sizes.
+    """Outcome of attacks of the guaranteed sizes."""
 
-    Attributes
-    ----------
-    trials
-        Number of trials of each kind.
-    hidden_named
-        Trials with an attack of at most the hidden size and a named meter.
-    large_missed
-        Trials with an attack of at least the named size and its meter not named.
-    honest_named
-        Of the latter, those with an honest meter named.
-    """
-
-    trials: int
-    hidden_named: int
-    large_missed: int
-    honest_named: int
+    trials: int  # number of trials of each kind
+    hidden_named: int  # trials of at most the hidden size with a named meter
+    large_missed: int  # trials of at least the named size with its meter not named
+    honest_named: int  # of the latter, those with an honest meter named
 
     @property
     def table(self) -> pd.DataFrame:
@@ -83,28 +62,12 @@ def rehearse(
 
     Hidden attacks are the worst of their size, from the mixed-integer program. Large ones are on one meter,
     beyond its size. In every second trial M - 1 other meters are attacked as well, by up to twice their size.
-
-    Parameters
-    ----------
-    site, found
-        The feeder, and the result of `detectable`.
-    trials
-        Number of trials of each kind.
-    seed
-        Seed of all random numbers.
-    share
-        As for `found`.
-    journal
-        File of finished trials; an interrupted run resumes from it, also with more trials.
-    progress
-        Called with (done, total) trials.
+    `share` is that of `found`. An interrupted run resumes from its journal, also with more trials.
 
     Raises
     ------
-    OtherStudy
-        If the journal is that of another study.
-    InUse
-        If another process writes the journal.
+    OtherStudy, InUse
+        As `feeders.studies.journal.Journal`.
     """
     sizes = [float(size) for name in ("hidden", "named", "named_alone") for size in found.meters[name]]
     told = {"max_attacked": found.max_attacked, "risk": found.risk, "sizes": sizes}
@@ -124,8 +87,8 @@ def rehearse(
         named = _named(given, site, share, rng, sign * lies)
         return [int(caught), int(not named[j]), int((named & (lies == 0.0)).any())]
 
-    done = worked(journal, subject, ((str(k), partial(trial, k)) for k in range(trials)), progress)
-    return Rehearsal(trials, *(sum(each[i] for each in done.values()) for i in range(3)))
+    counts = run_pieces(journal, subject, [str(k) for k in range(trials)], trial, progress=progress)
+    return Rehearsal(trials, *(sum(each[i] for each in counts) for i in range(3)))
 
 
 def _large(site: Site, found: Detectable, rng: np.random.Generator, j: int, *, together: bool) -> Floats:
@@ -158,7 +121,7 @@ def _world(given: Rule, site: Site, share: float, rng: np.random.Generator) -> C
     """Frames of a feeder in equilibrium, with fixed errors of true powers, busbar and meters."""
     design, doubt, loads = given.design, given.design.doubt, site.loads
     accuracy, own = site.accuracy, site.droop.customer
-    draw = _bounded if rng.integers(2) else _gaussian
+    draw = _uniform if rng.integers(2) else np.random.Generator.standard_normal
     p = -share * loads.load_peak
     q = 0.5 * (loads.tan_min + loads.tan_max) * p
     off_p, off_q = _errors(doubt, draw, rng)
@@ -206,35 +169,19 @@ def _errors(
     return doubt.p * own[0], doubt.q * own[1]
 
 
-def _gaussian(rng: np.random.Generator, size: int) -> Floats:
-    return rng.standard_normal(size)
-
-
-def _bounded(rng: np.random.Generator, size: int) -> Floats:
+def _uniform(rng: np.random.Generator, size: int) -> Floats:
     return np.asarray(np.sqrt(3.0) * rng.uniform(-1.0, 1.0, size))
 
 
-PIECE = 1_000
-"""Trials per piece of work."""
-
-HIDDEN, NAMED = (0.5, 1.0), (1.0, 1.2)
-"""Factors on the sizes of attacks to stay hidden, and of attacks to be named."""
-
-NOTHING = 1e-6
-"""Numerical error of a solver for zero, V."""
+HIDDEN, NAMED = (0.5, 1.0), (1.0, 1.2)  # factors on the sizes of attacks of each kind
+NOTHING = 1e-6  # numerical error of a solver for zero, V
 
 
 def promised(site: Site, found: Detectable, *, share: float = SHARE) -> tuple[AttackClass, ...]:
     """Attacks of the sizes of `detectable`, for a campaign.
 
-    Parameters
-    ----------
-    site
-        The feeder, with the campaign's errors of loads and meters.
-    found
-        Result of `detectable` for it.
-    share
-        As for `found`.
+    The feeder has the campaign's errors of loads and meters. For M = 1 there are only attacks on one meter.
+    Kinds without an attack of guaranteed outcome are left out.
 
     Returns
     -------
@@ -242,10 +189,6 @@ def promised(site: Site, found: Detectable, *, share: float = SHARE) -> tuple[At
         One meter, and M meters in the worst collusion of this size; no device is to be named.
     named_alone, named
         One meter, and any M meters, each by its size; all are to be named.
-
-    Notes
-    -----
-    For M = 1 there are only attacks on one meter. Kinds without an attack of guaranteed outcome are left out.
     """
     most, alone = found.max_attacked, (1,)
     kinds = [
@@ -277,74 +220,3 @@ def _collusions(site: Site, found: Detectable, share: float) -> tuple[tuple[floa
     volts = [np.sign(lies) * volts_of_lie(base, np.abs(lies)) for lies in worst]
     volts = [np.where(np.abs(row) > NOTHING, row, 0.0) for row in volts]
     return tuple(tuple(row.tolist()) for row in volts if row.any())
-
-
-def rehearse_everywhere(
-    site: Site,
-    found: Detectable,
-    *,
-    trials: int,
-    seed: int = 0,
-    share: float = SHARE,
-    runner: Runner | None = None,
-    piece: int = PIECE,
-    journal: Where = None,
-    progress: Progress | None = None,
-) -> Rehearsal:
-    """`guarantees.rehearse` in pieces, for any runner.
-
-    Parameters
-    ----------
-    site, found, trials, share
-        As in `rehearse`.
-    seed
-        Seed of all random numbers; piece k has the seed `seed + k piece`.
-    runner
-        Runner of the pieces, see `feeders.studies.workers`.
-    piece
-        Trials per piece.
-    journal
-        File of finished pieces.
-    progress
-        Called with (done, total) trials.
-
-    Raises
-    ------
-    OtherStudy
-        If the journal is that of another study.
-    InUse
-        If another process writes the journal.
-    ClusterUnusable, WorkerLost
-        From the runner; finished pieces are in the journal.
-    """
-    subject = {
-        "study": "rehearsal",
-        "digest": site.digest,
-        "found": {"max_attacked": found.max_attacked, "risk": found.risk},
-        "trials": [trials, piece],
-        "seed": seed,
-        "share": share,
-    }
-    sizes = [min(piece, trials - begin) for begin in range(0, trials, piece)]
-    work = partial(_piece, site.tables, found, sizes, seed, share)
-    with Journal(journal, subject, of=len(sizes)) as kept:
-        todo = [k for k in range(len(sizes)) if str(k) not in kept]
-        done = trials - sum(sizes[k] for k in todo)
-        if progress is not None:
-            progress(done, trials)
-        with closing((runner or Here()).run(work, todo)) as results:
-            for k, counted in results:
-                kept.put(str(k), counted)
-                done += sizes[k]
-                if progress is not None:
-                    progress(done, trials)
-        counts = [kept[str(k)] for k in range(len(sizes))]
-    return Rehearsal(trials, *(sum(each[i] for each in counts) for i in range(3)))
-
-
-def _piece(  # noqa: PLR0917  # all that a worker needs
-    tables: FeederTables, found: Detectable, sizes: list[int], seed: int, share: float, k: int
-) -> list[int]:
-    begin = sum(sizes[:k])
-    seen = rehearse(from_tables(tables), found, trials=sizes[k], seed=seed + begin, share=share)
-    return [seen.hidden_named, seen.large_missed, seen.honest_named]

@@ -14,12 +14,12 @@ from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
 from functools import partial
 from itertools import product
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
 from feeders.format.columns import ESTIMATORS
-from feeders.model.site import from_tables
+from feeders.model.site import Site, from_tables
 from feeders.profiles import Season, library
 from feeders.simulation.attacks import LOAD_TRACES, AttackKind
 from feeders.simulation.demand import Variation
@@ -28,28 +28,12 @@ from feeders.util import own_numbers, plain
 from gridsec.arrays import Ints
 from gridsec.errors import InputInvalid, Problem, choice, each_choice, raise_if_any
 
-if TYPE_CHECKING:
-    from feeders.model.site import Site
+__all__ = ["CLEAN", "KINDS", "AttackClass", "CampaignCase", "CampaignPlan", "Design", "Place", "Promise"]
 
-__all__ = [
-    "CLEAN",
-    "KINDS",
-    "LEARN_STEP_S",
-    "AttackClass",
-    "CampaignCase",
-    "CampaignPlan",
-    "Design",
-    "Place",
-    "Promise",
-    "SceneTime",
-]
-
-CLEAN: Final = "clean"
-"""Kind of the scenario without an attack."""
+CLEAN: Final = "clean"  # kind of the scenario without an attack
 
 
-LEARN_STEP_S: Final = 10.0
-"""Interval of the readings for learning of fixed errors, s, unless readings are rarer."""
+LEARN_STEP_S: Final = 10.0  # interval of the readings for learning, unless readings are rarer
 
 
 class Place(StrEnum):
@@ -89,10 +73,6 @@ class AttackClass:
 
     Attributes
     ----------
-    name
-        Name in the tables.
-    trick
-        Manipulation of the devices.
     sizes
         As `feeders.simulation.attacks.AttackSpec.size`; with `volts`, factors on these.
     volts
@@ -122,27 +102,14 @@ class AttackClass:
     def __post_init__(self) -> None:
         object.__setattr__(self, "trick", choice("trick", AttackKind, self.trick))
         if not self.sizes or self.name == CLEAN:
-            raise InputInvalid(
-                [Problem("missing", f"kind {self.name!r} needs a size, and a name other than {CLEAN!r}")]
-            )
+            text = f"kind {self.name!r} needs a size, and a name other than {CLEAN!r}"
+            raise InputInvalid([Problem("missing", text)])
         if (self.volts or self.together) and self.trick is not AttackKind.BIAS:
-            raise InputInvalid(
-                [
-                    Problem(
-                        "inconsistent",
-                        f"kind {self.name!r}: sizes in volts of each meter are for {AttackKind.BIAS}",
-                    )
-                ]
-            )
+            text = f"kind {self.name!r}: sizes in volts of each meter are for {AttackKind.BIAS}"
+            raise InputInvalid([Problem("inconsistent", text)])
 
     def every(self, step_s: float) -> AttackClass:
-        """Kind for another interval of the readings: ages and rates are counted in readings.
-
-        Parameters
-        ----------
-        step_s
-            Interval of the readings, s.
-        """
+        """Kind for readings every `step_s`: ages and rates are counted in readings."""
         factor = {AttackKind.REPLAY: step_s, AttackKind.CLOCK_SHIFT: step_s, AttackKind.DRIFT: 1.0 / step_s}
         return replace(self, sizes=tuple(size * factor.get(self.trick, 1.0) for size in self.sizes))
 
@@ -160,79 +127,32 @@ KINDS: Final = (
 
 @dataclass(frozen=True, slots=True)
 class SceneTime:
-    """Time and random numbers of a scene.
-
-    Attributes
-    ----------
-    season, profile_s
-        Season of the profiles, and position within them, s.
-    seed
-        Seed of loads, busbar and meters.
-    """
+    """Time and random numbers of a scene."""
 
     season: Season
-    profile_s: float
-    seed: int
+    profile_s: float  # position within the season's profiles
+    seed: int  # of loads, busbar and meters
 
 
 @dataclass(frozen=True, slots=True)
 class CampaignCase:
-    """One scenario.
+    """One scenario."""
 
-    Attributes
-    ----------
-    number
-        Number, from 0.
-    kind, size, liars, place
-        The combination; kind CLEAN: no attack.
-    onset_s
-        Onset of the attack, s after the begin of the scene.
-    seed
-        Seed of the manipulated devices and their signs.
-    """
-
-    number: int
-    kind: str
+    number: int  # from 0
+    kind: str  # CLEAN: no attack
     size: float
     liars: int
     place: str
-    onset_s: float
-    seed: tuple[int, ...]
+    onset_s: float  # after the begin of the scene
+    seed: tuple[int, ...]  # of the manipulated devices and their signs
 
 
 @dataclass(frozen=True, slots=True)
 class CampaignPlan:
     """Campaign. The defaults are 160 scenarios of ten minutes; `of` uses the settings of the files.
 
-    Attributes
-    ----------
-    scenes, together
-        Number of scenes, and number of scenarios in each; the first scenario has no attack.
-    seed
-        Seed of all random numbers.
-    kinds, liars, places, design
-        Kinds, numbers of manipulated devices and places to combine, and the choice of combinations.
-    duration_s, step_s
-        Length of a scenario and interval of its frames, s.
-    onset_s
-        Earliest and latest onset of attacks, s.
-    lying_s
-        Largest duration of attacks, s.
-    settling_s
-        Settling time after an onset, without errors of the voltage, s.
-    seasons
-        Seasons of the profiles.
-    estimator
-        Name of an estimator.
-    alarms_per_year
-        False-alarm rates of the estimator, 1/year; every scenario is monitored once for each.
-    learn_s
-        Learning time of the meters' fixed errors before each scene, s, from honest readings every
-        `learn_step_s`; 0: no learning.
-    settings
-        Other settings of the feeder's `[monitor]`, by name.
-    meters, load_error, variation, report_q
-        As in `feeders.simulation.trial.Trial`; without `load_error`, the errors of the feeder's files.
+    `meters`, `load_error`, `variation` and `report_q` are as in `feeders.simulation.trial.Trial`; without
+    `load_error`, the errors of the feeder's files.
 
     Raises
     ------
@@ -241,22 +161,22 @@ class CampaignPlan:
     """
 
     scenes: int = 10
-    together: int = 16
+    together: int = 16  # scenarios of each scene, the first without an attack
     seed: int = 0
-    kinds: tuple[AttackClass, ...] = KINDS
+    kinds: tuple[AttackClass, ...] = KINDS  # combined with numbers of manipulated devices and places
     liars: tuple[int, ...] = (1, 3)
     places: tuple[Place, ...] = tuple(Place)
-    design: Design = Design.FACTORIAL
-    duration_s: float = 600.0
-    step_s: float = 1.0
-    onset_s: tuple[float, float] = (60.0, 180.0)
-    lying_s: float = 300.0
-    settling_s: float = 10.0
+    design: Design = Design.FACTORIAL  # choice of combinations
+    duration_s: float = 600.0  # of a scenario
+    step_s: float = 1.0  # interval of its frames
+    onset_s: tuple[float, float] = (60.0, 180.0)  # earliest and latest onset of attacks
+    lying_s: float = 300.0  # largest duration of attacks
+    settling_s: float = 10.0  # time after an onset without errors of the voltage
     seasons: tuple[Season, ...] = tuple(Season)
     estimator: str = "sequential"
-    alarms_per_year: tuple[float, ...] = (1.0,)
-    learn_s: float = 0.0
-    settings: tuple[tuple[str, float], ...] = ()
+    alarms_per_year: tuple[float, ...] = (1.0,)  # every scenario is monitored once for each
+    learn_s: float = 0.0  # honest time before each scene with readings every `learn_step_s`; 0: no learning
+    settings: tuple[tuple[str, float], ...] = ()  # other settings of the feeder's `[monitor]`
     meters: TrialMeterErrors = TrialMeterErrors.SITE
     load_error: LoadError | None = field(default_factory=lambda: LoadError(0.1, 0.05))
     variation: Variation = field(default_factory=Variation)
@@ -270,52 +190,50 @@ class CampaignPlan:
         set_("design", choice("design", Design, self.design))
         set_("meters", choice("meters", TrialMeterErrors, self.meters))
         times = (self.duration_s, self.step_s, *self.onset_s, self.lying_s, self.settling_s, self.learn_s)
+        rates = self.alarms_per_year
         checks = (
             (
-                Problem("not-positive", "a campaign needs scenes, and a scene scenarios"),
                 min(self.scenes, self.together) < 1,
+                "not-positive",
+                "a campaign needs scenes, and a scene scenarios",
             ),
-            (Problem("negative", "the seed must not be negative"), self.seed < 0),
+            (self.seed < 0, "negative", "the seed must not be negative"),
             (
-                Problem("missing", "there are no kinds of attack, numbers of manipulated devices or places"),
                 not self._combined and self.together > 1,
+                "missing",
+                "there are no kinds of attack, numbers of manipulated devices or places",
             ),
+            (min((*self.liars, 1)) < 1, "not-positive", "numbers of manipulated devices must be positive"),
+            (not self.seasons, "missing", "there are no seasons"),
             (
-                Problem("not-positive", "numbers of manipulated devices must be positive"),
-                min((*self.liars, 1)) < 1,
-            ),
-            (Problem("missing", "there are no seasons"), not self.seasons),
-            (
-                Problem("duplicate", "kinds of attack need different names"),
                 len({k.name for k in self.kinds}) < len(self.kinds),
+                "duplicate",
+                "kinds of attack need different names",
             ),
             (
-                Problem("not-positive", "a false-alarm rate is missing, or not positive and finite"),
-                not self.alarms_per_year or not all(0.0 < rate < math.inf for rate in self.alarms_per_year),
+                not rates or not all(0.0 < rate < math.inf for rate in rates),
+                "not-positive",
+                "a false-alarm rate is missing, or not positive and finite",
             ),
-            (Problem("not-finite", "times must be finite numbers"), not all(map(math.isfinite, times))),
+            (not all(map(math.isfinite, times)), "not-finite", "times must be finite numbers"),
+            (min(self.step_s, self.lying_s) <= 0.0, "not-positive", "step_s and lying_s must be positive"),
             (
-                Problem("not-positive", "step_s and lying_s must be positive"),
-                min(self.step_s, self.lying_s) <= 0.0,
-            ),
-            (
-                Problem("out-of-range", f"learn_s must be 0 or from {self.learn_step_s:g} s on"),
                 0.0 != self.learn_s < self.learn_step_s,
+                "out-of-range",
+                f"learn_s must be 0 or from {self.learn_step_s:g} s on",
             ),
             (
-                Problem("out-of-range", "attacks must begin after the first frame and before the last"),
                 not self.step_s <= self.onset_s[0] <= self.onset_s[1] <= self.duration_s - self.step_s,
+                "out-of-range",
+                "attacks must begin after the first frame and before the last",
             ),
             (
-                Problem(
-                    "unknown-name",
-                    f"estimator {self.estimator!r} does not exist; there are {', '.join(ESTIMATORS)}",
-                ),
                 self.estimator not in ESTIMATORS,
+                "unknown-name",
+                f"estimator {self.estimator!r} does not exist; there are {', '.join(ESTIMATORS)}",
             ),
         )
-        problems = [problem for problem, wrong in checks if wrong]
-        raise_if_any(problems)
+        raise_if_any(Problem(code, text) for wrong, code, text in checks if wrong)
 
     @classmethod
     def of(cls, site: Site, **chosen: Any) -> CampaignPlan:
@@ -323,15 +241,8 @@ class CampaignPlan:
 
         Estimator, interval of readings and false alarms are those of `[monitor]`, and powers have the
         uncertainty of the service. Times are counted in readings: with one reading per second they are those
-        of `CampaignPlan()`.
-
-        Parameters
-        ----------
-        site
-            The feeder.
-        chosen
-            Attributes by name. With a `duration_s`, attacks begin after 0.1 to 0.3 of it and last for half of
-            it.
+        of `CampaignPlan()`. With a `duration_s`, attacks begin after 0.1 to 0.3 of it and last for half of
+        it.
         """
         monitor, usual = site.tables.meta.monitor, cls()
         step_s = float(chosen.get("step_s", monitor.tick_s))
@@ -371,26 +282,14 @@ class CampaignPlan:
         ]
 
     def moment(self, scene: int) -> SceneTime:
-        """Time of a scene.
-
-        Parameters
-        ----------
-        scene
-            Number of the scene.
-        """
+        """Time of a scene, by its number."""
         random = np.random.default_rng([self.seed, _MOMENT, scene])
         season = self.seasons[int(random.integers(len(self.seasons)))]
         t = library(season).t_s
         return SceneTime(season, float(random.uniform(0.0, t[-1])), int(random.integers(2**31)))
 
     def cases(self, scene: int) -> list[CampaignCase]:
-        """Scenarios of a scene, the first without an attack.
-
-        Parameters
-        ----------
-        scene
-            Number of the scene.
-        """
+        """Scenarios of a scene, the first without an attack."""
         first = scene * self.together
         found = [CampaignCase(first, CLEAN, 0.0, 0, "", self.duration_s, (self.seed, first))]
         combined = self._combined
@@ -416,15 +315,7 @@ class CampaignPlan:
         return next(kind for kind in self.kinds if kind.name == name)
 
     def trial(self, site: Site, moment: SceneTime) -> Trial:
-        """Scene without an attack, without its season.
-
-        Parameters
-        ----------
-        site
-            The feeder.
-        moment
-            Time of the scene.
-        """
+        """Scene without an attack, without its season."""
         return Trial(
             site,
             seed=moment.seed,
@@ -438,14 +329,7 @@ class CampaignPlan:
         )
 
     def watched(self, stated: Site, alarms_per_year: float) -> Site:
-        """Feeder with the settings of the estimator's design.
-
-        Parameters
-        ----------
-        stated
-            The feeder with the scene's errors of loads and meters.
-        alarms_per_year
-            One of the plan's rates.
+        """Feeder of a scene with the settings of the estimator's design for one of the plan's rates.
 
         Raises
         ------

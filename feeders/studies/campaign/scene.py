@@ -7,11 +7,13 @@ inverters and false powers are simulated in full.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from feeders.model.site import Site
 from feeders.registry.registry import DesignedEstimator, design
 from feeders.simulation.attacks import (
     LOAD_TRACES,
@@ -46,21 +48,11 @@ from gridsec.estimators.sequential import Commission
 from gridsec.grid.network import Power
 from gridsec.interface import Decision, Frame
 
-if TYPE_CHECKING:
-    from feeders.model.site import Site
-
 __all__ = ["Prepared", "attacks", "liars", "prepare", "risings", "watch"]
 
 
 def attacks(site: Site, plan: CampaignPlan, case: CampaignCase, honest: Scenario) -> Attacks:
-    """Build the attacks of a scenario.
-
-    Parameters
-    ----------
-    site, plan, case
-        The feeder, the campaign, and a scenario with an attack.
-    honest
-        The scene without the attack.
+    """Build the attacks of a scenario; `honest` is the scene without them.
 
     Raises
     ------
@@ -97,21 +89,7 @@ def attacks(site: Site, plan: CampaignPlan, case: CampaignCase, honest: Scenario
 
 
 def liars(site: Site, case: CampaignCase, random: np.random.Generator) -> tuple[Ints, Floats]:
-    """Choose the manipulated meters by a scenario's rule.
-
-    Parameters
-    ----------
-    site, case
-        The feeder, and the scenario.
-    random
-        Random generator.
-
-    Returns
-    -------
-    meters : (k,)
-        Manipulated meters, ascending.
-    signs : (k,)
-        Sign of each attack.
+    """Choose the manipulated meters by a scenario's rule: k meters, ascending, and their signs.
 
     Raises
     ------
@@ -149,42 +127,22 @@ def _nearest(R: Floats, meters: Ints, one: int, count: int) -> Ints:
 
 ERROR_PERCENTILE = 95.0
 
-IMPOSSIBLE = (NoSuchAttack, PowerFlowDiverged, NoEquilibrium)
-"""Errors that prevent one scenario, and not the others."""
+IMPOSSIBLE = (NoSuchAttack, PowerFlowDiverged, NoEquilibrium)  # they prevent one scenario only
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prepared:
-    """Common data of all scenes of a campaign.
-
-    Attributes
-    ----------
-    site
-        The feeder.
-    plan
-        The campaign.
-    stated
-        The feeder with the errors of loads and meters.
-    watchers
-        Designed estimators by false-alarm rate.
-    learners
-        The same for the interval of the readings for learning; empty without learning.
-    """
+    """Common data of all scenes of a campaign."""
 
     site: Site
     plan: CampaignPlan
-    stated: Site
-    watchers: dict[float, DesignedEstimator]
-    learners: dict[float, DesignedEstimator]
+    stated: Site  # the feeder with the errors of loads and meters
+    watchers: dict[float, DesignedEstimator]  # designed estimators by false-alarm rate
+    learners: dict[float, DesignedEstimator]  # the same for the readings for learning; empty without
 
 
 def prepare(site: Site, plan: CampaignPlan) -> Prepared:
     """Design the estimators of a campaign.
-
-    Parameters
-    ----------
-    site, plan
-        The feeder, and the campaign.
 
     Raises
     ------
@@ -208,17 +166,7 @@ def _designed(plan: CampaignPlan, stated: Site) -> dict[float, DesignedEstimator
 def watch(given: Prepared, scene: int) -> list[dict[str, Any]]:
     """Simulate and monitor all scenarios of one scene.
 
-    Parameters
-    ----------
-    given
-        From `prepare`.
-    scene
-        Number of the scene.
-
-    Returns
-    -------
-    list of dict
-        One for each scenario and false-alarm rate, in plain JSON types. See `study.Campaign`.
+    One row for each scenario and false-alarm rate, in plain JSON types; see `study.Campaign`.
     """
     plan, moment, cases = given.plan, given.plan.moment(scene), given.plan.cases(scene)
     trial = plan.trial(given.site, moment)
@@ -237,9 +185,8 @@ def watch(given: Prepared, scene: int) -> list[dict[str, Any]]:
     onsets = {round(case.onset_s / plan.step_s) for case in cases[1:]}
     clean, states = {}, {}
     for rate, watcher in given.watchers.items():
-        clean[rate], states[rate] = _clean(
-            watcher, watcher.init(honest.start, known.get(rate)), played, onsets
-        )
+        begin = watcher.init(honest.start, known.get(rate))
+        clean[rate], states[rate] = _monitored(watcher, begin, played.frames, onsets)
     rows = [_told(given, head, cases[0], rate, seen, played, 0, seen) for rate, seen in clean.items()]
     for case in cases[1:]:
         onset = round(case.onset_s / plan.step_s)
@@ -249,7 +196,7 @@ def watch(given: Prepared, scene: int) -> list[dict[str, Any]]:
             rows += [_row(head, case, rate) | _nothing(error) for rate in given.watchers]
             continue
         for rate, watcher in given.watchers.items():
-            seen, _ = _step(watcher, states[rate][onset], lied.frames[onset:])
+            seen, _ = _monitored(watcher, states[rate][onset], lied.frames[onset:])
             rows.append(_told(given, head, case, rate, seen, lied, onset, clean[rate]))
     return rows
 
@@ -302,39 +249,24 @@ def _learned(given: Prepared, trial: Trial, honest: Scenario) -> dict[float, Com
     for frame, _ in frames(replace(trial, step_s=step_s), before):
         for rate, watcher in given.learners.items():
             states[rate], _, _ = watcher.step(states[rate], frame)
-    found = {}
-    for rate, watcher in given.learners.items():
-        if watcher.bias_learning is not None:
-            found[rate] = watcher.bias_learning.commission(states[rate])
-    return found
+    learning = {rate: watcher.bias_learning for rate, watcher in given.learners.items()}
+    return {rate: each.commission(states[rate]) for rate, each in learning.items() if each is not None}
 
 
-def _clean(
-    watcher: DesignedEstimator, state: Any, played: _Played, onsets: set[int]
+def _monitored(
+    watcher: DesignedEstimator, state: Any, some: list[Frame], onsets: Collection[int] = ()
 ) -> tuple[_Seen, dict[int, Any]]:
-    """Monitor the scene without an attack, and keep the states before some frames."""
-    states, parts, begin = {}, [], 0
-    for end in sorted({*onsets, len(played.frames)}):
-        seen, state = _step(watcher, state, played.frames[begin:end])
-        states[end], begin = state, end
-        parts.append(seen)
-    columns = (
-        [getattr(part, name) for part in parts] for name in ("named", "inverters", "clean", "undecided", "v2")
-    )
-    return _Seen(*(np.concatenate(column) for column in columns)), states
-
-
-def _step(watcher: DesignedEstimator, state: Any, some: list[Frame]) -> tuple[_Seen, Any]:
-    named, inverters, decisions, v2 = [], [], [], []
-    for frame in some:
+    """Monitor frames, and keep the states before those of the onsets."""
+    states, outputs = {}, []
+    for k, frame in enumerate(some):
+        if k in onsets:
+            states[k] = state
         state, estimate, verdict = watcher.step(state, frame)
-        named.append(verdict.suspects)
-        inverters.append(verdict.inverters)
-        decisions.append(verdict.decision)
-        v2.append(estimate.v2)
+        outputs.append((verdict.suspects, verdict.inverters, verdict.decision, estimate.v2))
+    named, inverters, decisions, v2 = zip(*outputs, strict=True)
     clean = np.array([each is Decision.CLEAN for each in decisions], dtype=np.bool_)
     undecided = np.array([each is Decision.UNDECIDED for each in decisions], dtype=np.bool_)
-    return _Seen(np.array(named), np.array(inverters), clean, undecided, np.array(v2)), state
+    return _Seen(np.array(named), np.array(inverters), clean, undecided, np.array(v2)), states
 
 
 # ------------------------------------------------------------------------------------------ reports
@@ -469,13 +401,7 @@ def _everybody(seen: _Seen, lies: Bools) -> Bools:
 
 
 def risings(flags: Bools) -> int:
-    """Number of rises of any flag; all are down before the first row.
-
-    Parameters
-    ----------
-    flags : (T, k)
-        The flags over time.
-    """
+    """Number of rises of any flag (T, k); all are down before the first row."""
     before = np.vstack([np.zeros((1, flags.shape[1]), dtype=np.bool_), flags[:-1]])
     return int(np.count_nonzero(flags & ~before))
 

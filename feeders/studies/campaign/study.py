@@ -2,65 +2,39 @@
 
 The truth is full AC power flow with the droop inverters in closed loop, over days of profiles.
 
-References
-----------
-docs/studies.md; docs/theory-studies.md.
+References: docs/studies.md; docs/theory-studies.md.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import closing
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from functools import lru_cache, partial
+from typing import Any, Final
 
 import numpy as np
 import pandas as pd
 from scipy.stats import binomtest, chi2
 
 from feeders.format.tables import FeederTables
-from feeders.model.site import from_tables
+from feeders.model.site import Site, from_tables
 from feeders.studies.campaign.plan import CLEAN, CampaignPlan, Promise
 from feeders.studies.campaign.scene import Prepared, prepare, watch
-from feeders.studies.journal import Journal, Progress, Where
-from feeders.studies.workers import Here, Runner, versions
+from feeders.studies.journal import Progress, Runner, Where, run_pieces, versions
+from feeders.studies.workers import Here
 from gridsec.errors import GridsecError
 
-if TYPE_CHECKING:
-    from feeders.model.site import Site
-
-__all__ = [
-    "CONFIDENCE",
-    "WITHIN_S",
-    "Campaign",
-    "NothingPlayed",
-    "campaign",
-    "delays",
-    "false_names",
-    "grouped",
-    "promises",
-    "scenarios",
-]
+__all__ = ["Campaign", "NothingPlayed", "campaign", "false_names", "grouped", "scenarios"]
 
 
-CONFIDENCE: Final = 0.95
-"""Confidence level of every interval, 1."""
-
-WITHIN_S: Final = (1.0, 2.0, 5.0, 10.0, 30.0, 60.0, 120.0, 300.0)
-"""Times of the operating curve, s after the onset."""
+CONFIDENCE: Final = 0.95  # confidence level of every interval, 1
+WITHIN_S: Final = (1.0, 2.0, 5.0, 10.0, 30.0, 60.0, 120.0, 300.0)  # after the onset
 
 YEAR_S: Final = 365.25 * 86_400.0
 
 
 def scenarios(rows: Sequence[dict[str, Any]]) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Tables of all scenarios, and of all manipulated devices.
-
-    Parameters
-    ----------
-    rows
-        From `scene.watch`.
-    """
+    """Tables of all scenarios, and of all manipulated devices, from the rows of `scene.watch`."""
     kept = ("scenario", "alarms_per_year", "kind", "size", "liars", "place")
     each = [{name: row[name] for name in kept} | one for row in rows for one in row.get("each", ())]
     frame = pd.DataFrame([{name: cell for name, cell in row.items() if name != "each"} for row in rows])
@@ -69,15 +43,7 @@ def scenarios(rows: Sequence[dict[str, Any]]) -> tuple[pd.DataFrame, pd.DataFram
 
 
 def grouped(found: pd.DataFrame, liars: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
-    """One row for each group of scenarios.
-
-    Parameters
-    ----------
-    found, liars
-        From `scenarios`.
-    by
-        Columns of the groups, besides the false-alarm rate.
-    """
+    """One row for each group of scenarios by false-alarm rate and columns; from the tables of `scenarios`."""
     keys = ["alarms_per_year", *by]
     tried = found[found["reason"] == ""]
     lied = dict(list(liars.groupby(keys, sort=True)))
@@ -99,9 +65,9 @@ def grouped(found: pd.DataFrame, liars: pd.DataFrame, by: Sequence[str]) -> pd.D
                 "delay_95_s": _most(delay[named]),
                 "clear_median_s": _median(group["clear_s"][lying].to_numpy()),
                 "error_liars_95": _median(group["error_liars_95"].to_numpy()),
-                "error_liars_worst": _largest(group["error_liars"].to_numpy()),
+                "error_liars_worst": float(group["error_liars"].max()),
                 "error_others_95": _median(group["error_others_95"].to_numpy()),
-                "error_others_worst": _largest(group["error_others"].to_numpy()),
+                "error_others_worst": float(group["error_others"].max()),
                 "undecided": float(group["undecided_s"].sum() / group["watched_s"].sum()),
             }
         )
@@ -109,13 +75,7 @@ def grouped(found: pd.DataFrame, liars: pd.DataFrame, by: Sequence[str]) -> pd.D
 
 
 def delays(liars: pd.DataFrame) -> pd.DataFrame:
-    """Share of the manipulated devices named within some time of their onset, by kind and size.
-
-    Parameters
-    ----------
-    liars
-        From `scenarios`.
-    """
+    """Share of the manipulated devices named within some time of their onset, by kind and size."""
     rows = []
     for key, group in liars.groupby(["alarms_per_year", "kind", "size"], sort=True):
         for within in WITHIN_S:
@@ -130,11 +90,6 @@ def delays(liars: pd.DataFrame) -> pd.DataFrame:
 
 def false_names(found: pd.DataFrame, liars: pd.DataFrame) -> pd.DataFrame:
     """Operating curve: false names per year without an attack, and share of manipulated devices named.
-
-    Parameters
-    ----------
-    found, liars
-        From `scenarios`.
 
     Notes
     -----
@@ -168,17 +123,8 @@ def false_names(found: pd.DataFrame, liars: pd.DataFrame) -> pd.DataFrame:
 
 
 def promises(found: pd.DataFrame, liars: pd.DataFrame, promised: Mapping[str, Promise]) -> pd.DataFrame:
-    """Outcome of attacks with a guarantee; columns as in `study.Campaign`.
+    """Outcome of attacks with a guarantee by their kind; columns as in `Campaign`.
 
-    Parameters
-    ----------
-    found, liars
-        From `scenarios`.
-    promised
-        Guarantee by kind.
-
-    Notes
-    -----
     Attacks of a scene have loads and errors of meters in common; scenes are independent. So the limit is that
     of the scenes with a broken guarantee, each of which counts once. It is valid for the probability that an
     attack breaks it, for any dependence within a scene.
@@ -231,13 +177,7 @@ def _most(values: np.ndarray) -> float:
     return float(np.percentile(values, 95.0, method="higher")) if values.size else np.nan
 
 
-def _largest(values: np.ndarray) -> float:
-    known = values[~np.isnan(values)]
-    return float(known.max()) if known.size else np.nan
-
-
-ROWS: Final = 2
-"""Version of the rows in journals."""
+ROWS: Final = 2  # version of the rows in journals
 
 
 class NothingPlayed(GridsecError):
@@ -252,12 +192,6 @@ class Campaign:
 
     Attributes
     ----------
-    feeder, digest
-        Name and content digest of the feeder.
-    plan
-        The campaign.
-    versions
-        Versions of all libraries that numbers depend on.
     scenarios
         One row for each scenario and false-alarm rate: `scenario`, `scene`, `season`, `weekday` (0 is
         Monday), `hour` of its begin; `alarms_per_year`; `kind`, `size`, `liars`, `place`, `onset_s`; `reason`
@@ -294,7 +228,7 @@ class Campaign:
     feeder: str
     digest: str
     plan: CampaignPlan
-    versions: dict[str, str]
+    versions: dict[str, str]  # of all libraries that numbers depend on
     scenarios: pd.DataFrame
     liars: pd.DataFrame
     by_kind: pd.DataFrame
@@ -327,22 +261,9 @@ def campaign(
     journal: Where = None,
     progress: Progress | None = None,
 ) -> Campaign:
-    """Run a campaign on a feeder.
+    """Run a campaign on a feeder; the result is the same for every runner.
 
-    Parameters
-    ----------
-    site
-        The feeder.
-    plan
-        The campaign.
-    seed
-        Seed in place of the plan's.
-    runner
-        `workers.Here`, `Processes` or `Dask`; the results are equal.
-    journal
-        File of finished scenes; an interrupted campaign resumes from it.
-    progress
-        Called with (done, total) scenarios.
+    `seed` replaces the plan's. `progress` is called with (done, total) scenarios.
 
     Raises
     ------
@@ -350,61 +271,36 @@ def campaign(
         If the estimator cannot monitor this feeder with these settings, or for an invalid plan.
     NothingPlayed
         If the power flow has no solution at any scene.
-    OtherStudy
-        If the journal is that of another study.
-    InUse
-        If another process writes the journal.
-    ClusterUnusable, WorkerLost
-        From the runner; finished scenes are in the journal.
+    OtherStudy, InUse, ClusterUnusable, WorkerLost
+        As `feeders.studies.journal.run_pieces`.
     """
     plan = CampaignPlan() if plan is None else plan
     plan = plan if seed is None else replace(plan, seed=seed)
     prepare(site, plan)  # errors of the plan occur here, not in a worker
-    used = versions()
-    subject = {
-        "study": "campaign",
-        "rows": ROWS,
-        "digest": site.digest,
-        "plan": plan.subject,
-    }
-    with Journal(journal, subject, of=plan.scenes) as kept:
-        rows = _played(site, plan, runner or Here(), kept, progress)
-    return _campaign(site, plan, used, rows)
+    subject = {"study": "campaign", "rows": ROWS, "digest": site.digest, "plan": plan.subject}
+    scenes = run_pieces(
+        journal,
+        subject,
+        [f"scene|{scene}" for scene in range(plan.scenes)],
+        partial(_scene, site.tables, plan),
+        runner=runner or Here(),
+        progress=None if progress is None else lambda done, _: progress(done * plan.together, plan.scenarios),
+    )
+    return _campaign(site, plan, [row for rows in scenes for row in rows])
 
 
-def _played(
-    site: Site, plan: CampaignPlan, runner: Runner, kept: Journal, progress: Progress | None
-) -> list[dict[str, Any]]:
-    """Rows of all scenes; scenes that the journal lacks are simulated."""
-    keys = [f"scene|{scene}" for scene in range(plan.scenes)]
-    todo = [scene for scene, key in enumerate(keys) if key not in kept]
-    done = plan.scenes - len(todo)
-    if progress is not None:
-        progress(done * plan.together, plan.scenarios)
-    with closing(runner.run(partial(_scene, site.tables, plan), todo)) as results:
-        for scene, rows in results:
-            kept.put(keys[scene], rows)
-            done += 1
-            if progress is not None:
-                progress(done * plan.together, plan.scenarios)
-    return [row for key in keys for row in kept[key]]
-
-
-# Last preparation of this process, and its arguments.
-_prepared: list[tuple[str, Prepared]] = []
+@lru_cache(maxsize=1)
+def _prepared(tables: FeederTables, plan: CampaignPlan) -> Prepared:
+    """Designs of a campaign, made once in each process."""
+    return prepare(from_tables(tables), plan)
 
 
 def _scene(tables: FeederTables, plan: CampaignPlan, scene: int) -> list[dict[str, Any]]:
-    """Simulate a scene in any process; designs are made once in each process."""
-    asked = repr((tables, plan))
-    given = next((made for what, made in _prepared if what == asked), None)
-    if given is None:
-        given = prepare(from_tables(tables), plan)
-        _prepared[:] = [(asked, given)]
-    return watch(given, scene)
+    """Simulate a scene in any process."""
+    return watch(_prepared(tables, plan), scene)
 
 
-def _campaign(site: Site, plan: CampaignPlan, used: dict[str, str], rows: list[dict[str, Any]]) -> Campaign:
+def _campaign(site: Site, plan: CampaignPlan, rows: list[dict[str, Any]]) -> Campaign:
     if all(row["reason"] for row in rows):
         raise NothingPlayed(
             f"{site.feeder.name}: no scenario can be simulated; the first: {rows[0]['reason']}"
@@ -423,7 +319,7 @@ def _campaign(site: Site, plan: CampaignPlan, used: dict[str, str], rows: list[d
         feeder=site.feeder.name,
         digest=site.digest,
         plan=plan,
-        versions=used,
+        versions=versions(),
         scenarios=found,
         liars=liars,
         **by,

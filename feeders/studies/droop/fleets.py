@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
+from feeders.model.site import Site
 from feeders.studies.operating import Bases
-from feeders.studies.unobservable import customer_indices
 from gridsec.arrays import Floats, Ints
 from gridsec.errors import FeederInvalid, Problem, raise_if_any
 from gridsec.grid.droop import Droop, fleet
 from gridsec.planning.droop.ac_sensitivity import InjectionBox
-
-if TYPE_CHECKING:
-    from feeders.model.site import Site
 
 __all__ = [
     "KVA_PER_KW",
@@ -34,14 +30,10 @@ __all__ = [
     "points",
 ]
 
-KVA_PER_KW: Final = 1.1
-"""Rating of an inverter per kW of its generation, kVA/kW: at full sun 0.46 of it remains for q."""
+KVA_PER_KW: Final = 1.1  # rating of an inverter per kW of generation: at full sun 0.46 of it remains for q
 
-SMALLEST_KVA: Final = 5.0
-"""Rating of inverters of customers without generation, kVA."""
-
-NOTHING: Final = "no inverters: stability does not apply"
-"""Statement for a feeder without inverters."""
+SMALLEST_KVA: Final = 5.0  # rating of inverters of customers without generation, kVA
+NOTHING: Final = "no inverters: stability does not apply"  # statement for a feeder without inverters
 
 
 class NoInverters(FeederInvalid):
@@ -55,96 +47,37 @@ class Who(StrEnum):
     ALL = "all"
 
 
-@dataclass(frozen=True, slots=True)
-class _Point:
-    load: float
-    pv: float
+_POINTS: Final = {"evening": (1.0, 0.0), "noon": (0.2, 1.0), "half": (0.5, 0.5)}  # load, generation
 
 
-_POINTS: Final = {"evening": _Point(1.0, 0.0), "noon": _Point(0.2, 1.0), "half": _Point(0.5, 0.5)}
-"""Shares of the peaks of load and generation."""
-
-
-def equip(
-    site: Site,
-    preset: str,
-    who: Who = Who.PV,
-    *,
-    customers: Sequence[str] | None = None,
-    kva: float | None = None,
-) -> Droop:
+def equip(site: Site, preset: str, who: Who = Who.PV) -> Droop:
     """Equip customers of a feeder with inverters of one preset, in place of its own fleet.
 
     A customer's own inverter keeps its rating; others get 1.1 kVA for each kW of generation, or 5 kVA.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    preset
-        One of `gridsec.grid.droop.PRESETS`.
-    who
-        Customers with generation, or all.
-    customers
-        These customers instead.
-    kva
-        Rating of each inverter instead, kVA.
 
     Raises
     ------
     FeederInvalid
         For an unknown preset, or without a customer to equip.
-    ValueError
-        For an unknown customer.
     """
     rows = site.tables.customers
-    if customers is not None:
-        own = customer_indices(site, customers)
-    else:
-        kept = [k for k, row in enumerate(rows) if who is Who.ALL or row.pv_kw > 0 or row.inverter_kva > 0]
-        own = np.array(kept, dtype=np.intp)
-    if not own.size:
-        raise FeederInvalid(
-            [
-                Problem(
-                    "nothing-to-design",
-                    f"{site.feeder.name}: no customer has generation; equip all (--who all)",
-                )
-            ]
-        )
-    rated = [
-        kva or rows[k].inverter_kva or (KVA_PER_KW * rows[k].pv_kw if rows[k].pv_kw > 0 else SMALLEST_KVA)
-        for k in own
-    ]
-    return made(site, own, preset, np.array(rated))
+    own = [k for k, row in enumerate(rows) if who is Who.ALL or row.pv_kw > 0 or row.inverter_kva > 0]
+    if not own:
+        text = f"{site.feeder.name}: no customer has generation; equip all (--who all)"
+        raise FeederInvalid([Problem("nothing-to-design", text)])
+    rated = [rows[k].inverter_kva or KVA_PER_KW * rows[k].pv_kw or SMALLEST_KVA for k in own]
+    return made(site, np.array(own, dtype=np.intp), preset, np.array(rated))
 
 
 def made(site: Site, own: Ints, preset: str, kva: Floats) -> Droop:
-    """Inverters of a preset, with the curve in the nominal voltage at each customer.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    own : (m,)
-        Customers.
-    preset
-        One of `gridsec.grid.droop.PRESETS`.
-    kva : (m,)
-        Ratings, kVA.
-    """
+    """Inverters of a preset at customers `own`, (m,), with curves in the nominal voltage; `kva` is (m,)."""
     usual = fleet(own, preset, kva, site.feeder.base_kva)
     ratio = Bases.of(site).ratio[own]
     return usual if (ratio == 1.0).all() else replace(usual, v=usual.v / ratio[:, None])
 
 
 def chosen_fleet(site: Site, preset: str | None, who: Who = Who.PV) -> Droop:
-    """The feeder's own fleet, or one of a preset.
-
-    Parameters
-    ----------
-    site, preset, who
-        As in `equip`; without a preset, the inverters of the feeder's files.
+    """The feeder's own fleet, or one of a preset as in `equip`.
 
     Raises
     ------
@@ -156,45 +89,27 @@ def chosen_fleet(site: Site, preset: str | None, who: Who = Who.PV) -> Droop:
     if preset is not None:
         return equip(site, preset, who)
     if not site.droop.tau.size:
-        raise NoInverters(
-            [
-                Problem(
-                    "nothing-to-design",
-                    f"{site.feeder.name} has no droop inverters: fill the columns inverter_kva and "
-                    "droop of its customers.csv, or give a preset (--preset ieee1547-b) to equip customers "
-                    "with generation, or all (--who all)",
-                )
-            ]
+        text = (
+            f"{site.feeder.name} has no droop inverters: fill the columns inverter_kva and droop of its "
+            "customers.csv, or give a preset (--preset ieee1547-b) to equip customers with generation, or "
+            "all (--who all)"
         )
+        raise NoInverters([Problem("nothing-to-design", text)])
     return site.droop
 
 
 def points(site: Site, v0: float = 1.0) -> dict[str, InjectionBox]:
-    """Operating points of the study, each a box without width.
+    """Operating points of the study, each a box without width, at a busbar voltage `v0`, pu.
 
     Evening: full load, no generation. Noon: a fifth of the load, full generation. Half: half of both.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    v0
-        Voltage of the busbar, pu.
     """
-    return {name: point(site, at.load, at.pv, v0) for name, at in _POINTS.items()}
+    return {name: point(site, load, pv, v0) for name, (load, pv) in _POINTS.items()}
 
 
 def point(site: Site, load: Floats | float, pv: Floats | float, v0: float = 1.0) -> InjectionBox:
     """Operating point without the inverters' reactive power, the loads at their expected power factor.
 
-    Parameters
-    ----------
-    site
-        The feeder.
-    load, pv : (N,) or scalar
-        Shares of the peaks.
-    v0
-        Voltage of the busbar, pu.
+    `load` and `pv` are shares of the peaks, (N,) or scalar; `v0` is the busbar voltage, pu.
     """
     meta, rows = site.tables.meta, site.tables.customers
     usual = [meta.load.power_factor if row.power_factor is None else row.power_factor for row in rows]
@@ -215,17 +130,8 @@ def box(
 ) -> InjectionBox:
     """Box of all powers within the feeder's files, independent for each customer.
 
-    Loads from `load_low load_kw` to `load_high load_kw`, with q from `load tan_min - floor` to
-    `load tan_max + floor`; generation from `pv_low pv_kw` to `pv_high pv_kw` at unity power factor.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    load_low, load_high, pv_low, pv_high
-        Shares of the peaks.
-    v0_low, v0_high
-        Voltage of the busbar, pu.
+    Loads from `load_low load_kw` to `load_high load_kw`, with q from `load tan_min - floor` to `load tan_max
+    + floor`; generation from `pv_low pv_kw` to `pv_high pv_kw` at unity power factor; busbar voltage in pu.
 
     Raises
     ------
@@ -250,26 +156,12 @@ def box(
 
 
 def range_problem(what: str, low: float, high: float) -> list[Problem]:
-    """Problem of two limits; empty without one.
-
-    Parameters
-    ----------
-    what, low, high
-        Name of the quantity, and the limits.
-    """
+    """Problem of two limits of a quantity; empty without one."""
     if 0.0 <= low <= high < math.inf:
         return []
     return [Problem("order", f"{what}: from {low:g} to {high:g}; expected two ascending numbers from 0 on")]
 
 
 def inverter_names(site: Site, droop: Droop, rows: Ints) -> list[str]:
-    """Customers of inverters.
-
-    Parameters
-    ----------
-    site, droop
-        The feeder and the fleet.
-    rows : (k,)
-        Rows of the fleet.
-    """
+    """Customers of inverters, by rows of the fleet."""
     return [site.feeder.customers[int(k)] for k in droop.customer[rows]]

@@ -6,9 +6,7 @@ refuted by loads with which the AC power flow of `feeders.simulation.powerflow` 
 Hosting has generation at its peak and loads at a small share of theirs. Every operating point is an AC power
 flow with the inverters in equilibrium.
 
-References
-----------
-chong2020, (13); docs/theory-studies.md, section on the droop fleet.
+References: chong2020, (13); docs/theory-studies.md, section on the droop fleet.
 """
 
 from __future__ import annotations
@@ -16,10 +14,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
+from feeders.model.site import Site
 from feeders.simulation.powerflow import PowerFlowDiverged
 from feeders.studies.droop.fleets import KVA_PER_KW, made, point
 from feeders.studies.droop.verdict import CLEARLY, Subject, judge
@@ -39,9 +38,6 @@ from gridsec.planning.droop.ac_sensitivity import (
 from gridsec.planning.droop.equilibrium import Band, always, at_rest, injected, rest
 from gridsec.planning.droop.stability import Update, growth, slopes
 
-if TYPE_CHECKING:
-    from feeders.model.site import Site
-
 __all__ = [
     "BandGuarantee",
     "Conditions",
@@ -58,8 +54,7 @@ __all__ = [
 ]
 
 
-EXACT: Final = 1e-6
-"""Largest difference between the set-points of the second power flow and a witness's injections, pu."""
+EXACT: Final = 1e-6  # largest difference between set-points and a witness's injections, pu
 
 
 class BandGuarantee(StrEnum):
@@ -74,24 +69,13 @@ class BandGuarantee(StrEnum):
 class Safety:
     """Proof status of a fleet's voltages.
 
-    Attributes
-    ----------
-    rest
-        For load changes that are slow against the time constants.
-    always
-        For arbitrary load changes within the limits.
-    why
-        Reason for missing bounds; empty with bounds.
-    low_volt, high_volt, low_rest_volt, high_rest_volt
-        Extremes of the proven limits, V; NaN without any.
-    rows
-        One row for each customer. witness One row for each customer: loads that violate the band, if found.
+    `rows` has one row for each customer; `witness` too, with loads that violate the band, if found.
     """
 
-    rest: BandGuarantee
-    always: BandGuarantee
-    why: str
-    low_volt: float
+    rest: BandGuarantee  # for load changes that are slow against the time constants
+    always: BandGuarantee  # for arbitrary load changes within the limits
+    why: str  # reason for missing bounds; empty with bounds
+    low_volt: float  # extremes of the proven limits; NaN without any
     high_volt: float
     low_rest_volt: float
     high_rest_volt: float
@@ -105,18 +89,10 @@ def without_inverters(droop: Droop) -> Droop:
 
 
 def safety(subject: Subject, droop: Droop, loads: InjectionBox, limits: tuple[float, float]) -> Safety:
-    """Prove or refute that no voltage leaves a band.
+    """Prove or refute that no voltage leaves a band, relative to the nominal voltage.
 
-    Parameters
-    ----------
-    subject
-        The feeder.
-    droop
-        The fleet, from an equilibrium with any loads of the box.
-    loads
-        Limits of the injections without the fleet; customers vary independently within them.
-    limits
-        The band, relative to the nominal voltage.
+    `loads` are the injections without the fleet; customers vary independently within them. The fleet starts
+    from an equilibrium with any of these loads.
     """
     bases, reasons = Bases.of(subject.site), list[str]()
     within = bases.band(*limits)
@@ -171,8 +147,7 @@ def _or_none(
         return None
 
 
-Limits = tuple[Floats, Floats]
-"""Band, pu of every customer."""
+Limits = tuple[Floats, Floats]  # band, pu of every customer
 
 
 def _inside(band: Band | None, limits: Limits) -> bool:
@@ -262,61 +237,31 @@ def _confirmed(
     ]
 
 
-RESOLUTION: Final = 1e-3
-"""Relative accuracy of a capacity."""
-
-MOST: Final = 2.0**14
-"""Upper limit of the search for a capacity, kW per possible customer."""
+RESOLUTION: Final = 1e-3  # relative accuracy of a capacity
+MOST: Final = 2.0**14  # upper limit of the search for a capacity, kW per possible customer
 
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """Conditions at the peak of generation.
+    """Conditions at the peak of generation."""
 
-    Attributes
-    ----------
-    load
-        Load relative to its peak, the same for all, 1.
-    v0
-        Voltage of the busbar, pu.
-    v_min, v_max
-        The band, relative to the nominal voltage.
-    update
-        Sampling of the inverters.
-    """
-
-    load: float
-    v0: float
-    v_min: float
+    load: float  # relative to its peak, the same for all, 1
+    v0: float  # voltage of the busbar, pu
+    v_min: float  # the band, relative to the nominal voltage
     v_max: float
-    update: Update
+    update: Update  # sampling of the inverters
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DroopPlan:
-    """Distribution of generation, and its inverters.
+    """Distribution of generation, and its inverters."""
 
-    Attributes
-    ----------
-    share : (N,)
-        Share of the generation of each customer; sum 1.
-    preset
-        Droop preset of all of them; empty: inverters without reactive power.
-    """
-
-    share: Floats
-    preset: str
+    share: Floats  # (N,) share of the generation of each customer; sum 1
+    preset: str  # of all inverters; empty: without reactive power
 
 
 def shares_of(site: Site, customers: Sequence[str] | None) -> Floats:
-    """Distribution of generation: as in the feeder's files, or equal among customers, (N,).
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    customers
-        Customers with generation; by default those of the files, in proportion, or all if there are none.
+    """Distribution of generation, (N,): equal among customers; by default as in the files, or equal.
 
     Raises
     ------
@@ -357,40 +302,18 @@ def _loads(site: Site, plan: DroopPlan, kw: float, at: Conditions) -> InjectionB
 
 
 def checked(subject: Subject, plan: DroopPlan, kw: float, at: Conditions, ratings: Floats) -> dict[str, Any]:
-    """Effect of an amount of generation: extreme voltages, fullest line, and first violated limit.
+    """Effect of `kw` of generation: extreme voltages, fullest line, and first violated limit.
 
-    Parameters
-    ----------
-    subject
-        The feeder.
-    plan
-        Distribution of the generation.
-    kw
-        Total generation, kW.
-    at
-        Loads, busbar, limits.
-    ratings : (L, k)
-        From `ratings_pu`.
-
-    Returns
-    -------
-    dict
-        `v_low_volt`, `v_high_volt`, `line_percent`, `growth` and `broken`: empty, `no power flow`, `voltage
-        high`, `voltage low`, `line ...` or `unstable`.
+    `ratings` are those of `ratings_pu`. The keys are `v_low_volt`, `v_high_volt`, `line_percent`, `growth`
+    and `broken`: empty, `no power flow`, `voltage high`, `voltage low`, `line ...` or `unstable`.
     """
     site, droop = subject.site, _fleet(subject.site, plan, kw)
     loads, bases = _loads(site, plan, kw, at), Bases.of(site)
     s = loads.p_low + 1j * loads.q_low
     x, V = rest(subject.net, droop, s, at.v0)
     if not np.isfinite(V).all():
-        nan = float("nan")
-        return {
-            "v_low_volt": nan,
-            "v_high_volt": nan,
-            "line_percent": nan,
-            "growth": nan,
-            "broken": "no power flow",
-        }
+        unknown = dict.fromkeys(("v_low_volt", "v_high_volt", "line_percent", "growth"), float("nan"))
+        return unknown | {"broken": "no power flow"}
     net, own, v = injected(droop, s, x), droop.customer, np.abs(V)
     full = (currents(site.feeder, subject.net, net, V, at.v0) / ratings).max(axis=1)
     near = 1e-7
@@ -444,19 +367,9 @@ def _largest(holds: Callable[[float], bool], most: float) -> float:
 def capacity(subject: Subject, plan: DroopPlan, at: Conditions, *, seed: int = 0) -> dict[str, Any]:
     """Largest generation without a violation, by bisection; confirmed by the other power flow.
 
-    Parameters
-    ----------
-    subject, plan, at
-        As in `checked`.
-    seed
-        As in `judge`.
-
-    Returns
-    -------
-    dict
-        `capacity_kw`, `limit` (the next violation), `verdict` and `proof` (stability of the fleet there),
-        `v_high_volt`, `v_low_volt`, `line_percent`, and `confirmed`: the largest difference of a voltage in
-        the power flow of `feeders.simulation.powerflow`, V.
+    The keys are `capacity_kw`, `limit` (the next violation), `verdict` and `proof` (stability of the fleet
+    there), `v_high_volt`, `v_low_volt`, `line_percent`, and `confirmed_volt`: the largest difference of a
+    voltage in the power flow of `feeders.simulation.powerflow`, V.
     """
     site, ratings = subject.site, ratings_pu(subject.site)
     most = MOST * max(1, int(np.count_nonzero(plan.share)))
@@ -491,15 +404,7 @@ def _confirmed_hosting(subject: Subject, droop: Droop, loads: InjectionBox) -> f
 def curve(
     subject: Subject, plan: DroopPlan, amounts: Sequence[float], at: Conditions
 ) -> list[dict[str, Any]]:
-    """Effect of increasing generation, one row for each amount.
-
-    Parameters
-    ----------
-    subject, plan, at
-        As in `checked`.
-    amounts
-        Total generation of each row, kW.
-    """
+    """Effect of increasing generation, one row for each amount, kW."""
     ratings = ratings_pu(subject.site)
     return [
         {"preset": plan.preset or "none", "pv_kw": float(kw), **checked(subject, plan, kw, at, ratings)}
@@ -514,17 +419,6 @@ def draw(  # noqa: PLR0917  # which feeder, which fleet, which order of places
 
     Every customer gets one unit before any gets a second. The order depends on `seed` and `number` alone, so
     that all presets have the same ones.
-
-    Parameters
-    ----------
-    subject, at
-        As in `checked`.
-    preset
-        As in `DroopPlan`.
-    unit_kw
-        Size of a unit, kW.
-    seed, number
-        Seed and number of the order.
     """
     count = len(subject.site.feeder.customers)
     order: Ints = np.random.default_rng([seed, number]).permutation(count)

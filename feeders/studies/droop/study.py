@@ -1,8 +1,6 @@
 """Study of the droop fleet of a feeder: stability, voltage band, hosting capacity.
 
-References
-----------
-chong2020, (13), (16) to (18); docs/theory-studies.md, section on the droop fleet.
+References: chong2020, (13), (16) to (18); docs/theory-studies.md, section on the droop fleet.
 """
 
 from __future__ import annotations
@@ -11,11 +9,12 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import pandas as pd
 
+from feeders.model.site import Site
 from feeders.studies.droop.fleets import Who, box, chosen_fleet, equip, points, range_problem
 from feeders.studies.droop.limits import (
     BandGuarantee,
@@ -47,16 +46,13 @@ from feeders.studies.droop.verdict import (
 from feeders.studies.journal import Progress, Where, worked
 from feeders.studies.operating import Bases
 from feeders.util import word
-from gridsec.errors import InputInvalid, Problem, raise_if_any
+from gridsec.errors import InputInvalid, Problem, no_choice, raise_if_any
 from gridsec.grid.droop import PRESETS, Droop
 from gridsec.planning.droop.ac_sensitivity import InjectionBox
 from gridsec.planning.droop.equilibrium import rest
 from gridsec.planning.droop.stability import Update, enlarged
 
-if TYPE_CHECKING:
-    from feeders.model.site import Site
-
-__all__ = ["ANY", "DroopOptions", "DroopStudy", "band_problem", "droop", "presets_of"]
+__all__ = ["DroopOptions", "DroopStudy", "droop", "presets_of"]
 
 
 HOSTING: Final = {
@@ -73,85 +69,49 @@ HOSTING: Final = {
 class DroopOptions:
     """Options of the study.
 
-    Attributes
-    ----------
-    preset
-        Preset of all inverters; None: the feeder's own fleet.
-    who
-        Customers that a preset equips: those with generation (`pv`), or `all`.
-    interval_s, dead
-        Sampling interval of the inverters, s (0: continuous), and dead time in whole intervals.
-    v0_low, v0_high
-        Limits of the busbar voltage, pu; operating points have the middle, hosting the upper one.
-    v_min, v_max
-        The band, relative to the nominal voltage; None: the limits of the feeder's files.
-    load_high, pv_high
-        Largest shares of the peaks in the box of all loads.
-    presets
-        Presets to compare, each instead of the feeder's own.
-    tau_factors
-        Factors on all time constants to compare.
-    hosting
-        True: search for hosting capacities.
-    hosting_presets
-        Presets of new generation; empty: without reactive power.
-    hosting_load
-        Loads relative to their peaks meanwhile, 1.
-    hosting_customers
-        Customers with the generation; None: those of the files, in proportion.
-    unit_kw
-        Size of a unit at a random customer, kW.
-    draws
-        Number of random orders of customers.
-
     Raises
     ------
     ValueError
         With every option that is out of range or has no effect.
     """
 
-    preset: str | None = None
-    who: Who = Who.PV
-    interval_s: float = 1.0
-    dead: int = 0
-    v0_low: float = 1.0
-    v0_high: float = 1.0
-    v_min: float | None = None
+    preset: str | None = None  # of all inverters; None: the feeder's own fleet
+    who: Who = Who.PV  # customers that a preset equips
+    interval_s: float = 1.0  # sampling of the inverters; 0: continuous
+    dead: int = 0  # dead time, whole intervals
+    v0_low: float = 1.0  # limits of the busbar voltage, pu; operating points have the middle
+    v0_high: float = 1.0  # hosting has this one
+    v_min: float | None = None  # band relative to the nominal voltage; None: that of the files
     v_max: float | None = None
-    load_high: float = 1.0
+    load_high: float = 1.0  # largest shares of the peaks in the box of all loads
     pv_high: float = 1.0
-    presets: tuple[str, ...] = PRESETS
-    tau_factors: tuple[float, ...] = (0.01, 0.1, 0.3, 1.0, 3.0)
-    hosting: bool = False
-    hosting_presets: tuple[str, ...] = ("", "ieee1547-b")
-    hosting_load: float = 0.1
-    hosting_customers: tuple[str, ...] | None = None
-    unit_kw: float = 5.0
-    draws: int = 30
+    presets: tuple[str, ...] = PRESETS  # to compare, each instead of the feeder's own
+    tau_factors: tuple[float, ...] = (0.01, 0.1, 0.3, 1.0, 3.0)  # on all time constants, to compare
+    hosting: bool = False  # search for hosting capacities
+    hosting_presets: tuple[str, ...] = ("", "ieee1547-b")  # of new generation; empty: without reactive power
+    hosting_load: float = 0.1  # relative to the peaks, 1
+    hosting_customers: tuple[str, ...] | None = None  # None: those of the files, in proportion
+    unit_kw: float = 5.0  # of generation at a random customer
+    draws: int = 30  # random orders of customers
 
     def __post_init__(self) -> None:
-        problems = [*self._fleet_problems(), *self._limit_problems(), *self._hosting_problems()]
-        raise_if_any(problems)
+        raise_if_any([*self._fleet_problems(), *self._limit_problems(), *self._hosting_problems()])
 
     def _fleet_problems(self) -> Iterator[str]:
         presets = [name for name in (self.preset, *self.presets) if name is not None]
         for name in dict.fromkeys([*presets, *filter(None, self.hosting_presets)]):
             if name not in PRESETS:
-                yield Problem(
-                    "unknown-name", f"preset {name!r} does not exist; expected one of {', '.join(PRESETS)}"
-                )
-        chosen, known = self.who, tuple(Who)
-        if chosen not in known:
-            yield Problem("unknown-name", f"`who` is {chosen!r}; expected one of {', '.join(known)}")
+                text = f"preset {name!r} does not exist; expected one of {', '.join(PRESETS)}"
+                yield Problem("unknown-name", text)
+        yield from no_choice("`who`", Who, self.who)
         try:
             Update(self.interval_s, self.dead)
         except InputInvalid as error:
             yield from error.problems
         for times in self.tau_factors:
             if not 0.0 < times < math.inf:
-                yield Problem(
-                    "not-positive", f"a factor on time constants is {times:g}; it must be a positive number"
-                )
+                text = f"a factor on time constants is {times:g}; it must be a positive number"
+                yield Problem("not-positive", text)
 
     def _limit_problems(self) -> Iterator[Problem]:
         yield from range_problem("busbar voltage", self.v0_low, self.v0_high)
@@ -162,44 +122,34 @@ class DroopOptions:
         shares = {"load": self.load_high, "generation": self.pv_high, "load while hosting": self.hosting_load}
         for what, share in shares.items():
             if not 0.0 <= share < math.inf:
-                yield Problem(
-                    "negative", f"share of the {what} is {share:g}; it must be a number that is not negative"
-                )
+                text = f"share of the {what} is {share:g}; it must be a number that is not negative"
+                yield Problem("negative", text)
 
     def _hosting_problems(self) -> Iterator[Problem]:
         if not 0.0 < self.unit_kw < math.inf:
-            yield Problem(
-                "not-positive", f"a unit of generation is {self.unit_kw:g} kW; it must be a positive number"
-            )
+            text = f"a unit of generation is {self.unit_kw:g} kW; it must be a positive number"
+            yield Problem("not-positive", text)
         if self.draws < 0:
             yield Problem("negative", f"{self.draws} random orders; the number must not be negative")
         if self.hosting_customers == ():
             yield Problem("missing", "new generation has no customer")
-        if not self.hosting:
-            usual = {each.name: each.default for each in fields(self)}
-            given = [
-                f"{name} ({option})" for name, option in HOSTING.items() if getattr(self, name) != usual[name]
-            ]
-            if given:
-                yield Problem("inconsistent", f"{', '.join(given)}: only with hosting (--hosting)")
+        usual = {each.name: each.default for each in fields(self)}
+        given = [
+            f"{name} ({option})" for name, option in HOSTING.items() if getattr(self, name) != usual[name]
+        ]
+        if given and not self.hosting:
+            yield Problem("inconsistent", f"{', '.join(given)}: only with hosting (--hosting)")
 
 
 def band_problem(low: float, high: float) -> list[Problem]:
-    """Problem of a band of voltages; empty without one.
-
-    Parameters
-    ----------
-    low, high
-        Its limits, relative to the nominal voltage.
-    """
+    """Problem of a band of voltages, relative to the nominal voltage; empty without one."""
     if 0.0 < low < high < math.inf:
         return []
     text = f"the band from {low:g} to {high:g} is empty; expected two ascending voltages, pu"
     return [Problem("order", text)]
 
 
-ANY = "any loads"
-"""Row for all loads within their limits."""
+ANY = "any loads"  # row for all loads within their limits
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -208,14 +158,6 @@ class DroopStudy:
 
     Attributes
     ----------
-    feeder, digest
-        Name and content digest of the feeder.
-    seed, options
-        As in `droop`.
-    verdict
-        Stability of the fleet with constant loads anywhere within their limits.
-    rest, always
-        Proof status of the band for slow and for arbitrary load changes.
     tables
         - `stability`: a row for each operating point, and one for any loads. `verdict`, `proof`, `gain` (of
           the loop at rest), `growth` (of a small deviation in one update), `margin` (all curves with the same
@@ -240,9 +182,9 @@ class DroopStudy:
     digest: str
     seed: int
     options: DroopOptions
-    verdict: FleetVerdict
-    rest: BandGuarantee
-    always: BandGuarantee
+    verdict: FleetVerdict  # with constant loads anywhere within their limits
+    rest: BandGuarantee  # for slow load changes
+    always: BandGuarantee  # for arbitrary load changes
     tables: dict[str, pd.DataFrame]
 
 
@@ -289,20 +231,9 @@ def droop(
     journal: Where = None,
     progress: Progress | None = None,
 ) -> DroopStudy:
-    """Study the droop fleet of a feeder.
+    """Study the droop fleet of a feeder; by default its own, sampled once a second.
 
-    Parameters
-    ----------
-    site
-        The feeder.
-    options
-        Options; by default the feeder's own fleet, sampled once a second.
-    seed
-        Seed of small deviations from equilibrium, and of the orders of generation.
-    journal
-        File of finished work; an interrupted study resumes from it.
-    progress
-        Called with (done, total).
+    `seed` is that of small deviations from equilibrium, and of the orders of generation.
 
     Raises
     ------
@@ -310,10 +241,8 @@ def droop(
         Without inverters and without a preset.
     ValueError
         For an invalid band, or new generation at an unknown customer.
-    OtherStudy
-        If the journal is that of another study.
-    InUse
-        If another process writes the journal.
+    OtherStudy, InUse
+        As `feeders.studies.journal.Journal`.
     """
     given = options or DroopOptions()
     study = _Study(Subject.of(site), chosen_fleet(site, given.preset, given.who), given, seed)
@@ -528,20 +457,7 @@ def presets_of(
     journal: Where = None,
     progress: Progress | None = None,
 ) -> pd.DataFrame:
-    """Table `presets` of several feeders, one below the other.
-
-    Parameters
-    ----------
-    sites
-        The feeders.
-    options, seed, journal, progress
-        As in `droop`.
-
-    Raises
-    ------
-    OtherStudy, InUse
-        As `droop`.
-    """
+    """Table `presets` of several feeders, one below the other; arguments and errors as in `droop`."""
     given = options or DroopOptions()
     digests = [site.digest for site in sites]
     subject = {"study": "presets", "digests": digests, "seed": seed, "options": asdict(given)}

@@ -4,9 +4,7 @@ The inverters are those of `gridsec.planning.droop.stability`: sampled, with dea
 simulated at intervals of a small part of their time constants. The power flow is that of
 `feeders.simulation.powerflow`, which is independent of the proofs.
 
-References
-----------
-docs/theory-studies.md, section on the droop fleet.
+References: docs/theory-studies.md, section on the droop fleet.
 """
 
 from __future__ import annotations
@@ -15,11 +13,12 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import pandas as pd
 
+from feeders.model.site import Site
 from feeders.simulation.powerflow import PowerFlow, PowerFlowDiverged
 from feeders.simulation.powerflow_three_phase import PlacesFlow, power_flow
 from feeders.studies.droop.fleets import inverter_names, point
@@ -31,14 +30,9 @@ from gridsec.planning.droop.ac_sensitivity import InjectionBox, PhasorNetwork, n
 from gridsec.planning.droop.equilibrium import Share, injected, rest, shares, shares_of_gain
 from gridsec.planning.droop.stability import Loop, Update, growth, loop, proof, reach, slopes, steepened
 
-if TYPE_CHECKING:
-    from feeders.model.site import Site
-
 __all__ = [
     "FleetOutcome",
     "FleetVerdict",
-    "Judgement",
-    "StepChange",
     "StepResponse",
     "Subject",
     "edge",
@@ -54,20 +48,11 @@ __all__ = [
 ]
 
 
-FINE: Final = 40.0
-"""Number of simulation intervals of continuous filters in the shortest time constant / (1 + gain)."""
-
-SETTLED: Final = 1e-6
-"""Largest movement within a window, relative to the largest limit, of settled injections."""
-
-DECAYS: Final = 0.9
-"""Smallest ratio of movements in successive windows that do not decay."""
-
-BAND: Final = 0.02
-"""Largest distance from the final voltage, relative to the largest change, of settled voltages."""
-
-LEAST_PU: Final = 1e-5
-"""Voltage change that counts as zero, pu."""
+FINE: Final = 40.0  # simulation intervals in the shortest time constant / (1 + gain)
+SETTLED: Final = 1e-6  # largest movement within a window, relative to the largest limit
+DECAYS: Final = 0.9  # smallest ratio of movements in successive windows that do not decay
+BAND: Final = 0.02  # largest distance of settled voltages from the final one, relative to the change
+LEAST_PU: Final = 1e-5  # voltage change that counts as zero, pu
 
 
 class FleetOutcome(StrEnum):
@@ -83,10 +68,7 @@ class FleetOutcome(StrEnum):
 class StepChange:
     """Sudden change of loads, generation or busbar, from an equilibrium.
 
-    Attributes
-    ----------
-    before, after
-        Operating points without the inverters' reactive power.
+    Both are operating points without the inverters' reactive power.
     """
 
     before: InjectionBox
@@ -95,40 +77,19 @@ class StepChange:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StepResponse:
-    """One simulated step. T + 1 instants.
-
-    Attributes
-    ----------
-    outcome
-        Outcome of the simulation.
-    t : (T + 1,)
-        Time, s; the step is at 0.
-    v : (T + 1, N)
-        Voltages of the customers, pu; the first row is just after the step, before any change of injections.
-    x : (T + 1, m)
-        Reactive injections, pu.
-    """
+    """One simulated step. T + 1 instants."""
 
     outcome: FleetOutcome
-    t: Floats
-    v: Floats
-    x: Floats
+    t: Floats  # (T + 1,) s; the step is at 0
+    v: Floats  # (T + 1, N) voltages of the customers, pu; the first row just after the step
+    x: Floats  # (T + 1, m) reactive injections, pu
 
 
 def steps(site: Site, v0: float = 1.0, *, tap: float = 0.025) -> dict[str, StepChange]:
-    """Steps of the study.
+    """Steps of the study, at a busbar voltage `v0`, pu.
 
-    Load: from 0.2 to 0.8 of the peak, no generation. Cloud: generation from its peak to 0.2 of it, at 0.2
-    of the load. Tap: the busbar up by one tap, at the same load and full generation.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    v0
-        Voltage of the busbar, pu.
-    tap
-        Height of a tap, pu.
+    Load: from 0.2 to 0.8 of the peak, no generation. Cloud: generation from its peak to 0.2 of it, at 0.2 of
+    the load. Tap: the busbar up by `tap`, pu, at the same load and full generation.
     """
     noon = point(site, 0.2, 1.0, v0)
     return {
@@ -150,20 +111,8 @@ def simulate(
 ) -> StepResponse:
     """Simulate the inverters on the AC power flow with constant loads, until equilibrium or `updates`.
 
-    Parameters
-    ----------
-    plant
-        The feeder, and its AC power flow.
-    droop, update
-        The fleet, and its sampling.
-    loads
-        Operating point, a box without width.
-    x : (m,)
-        Initial injections and last set-points, pu.
-    gain
-        Gain of the loop in equilibrium; used for the interval of continuous filters only.
-    updates
-        Largest number of updates.
+    `x`, (m,), are the initial injections and last set-points, pu. `gain` is that of the loop in equilibrium;
+    it determines the interval of continuous filters only.
     """
     site, flow = plant
     base_kva, own = site.feeder.base_kva, droop.customer
@@ -211,15 +160,7 @@ def _told(xs: list[Floats], window: int, still: float) -> FleetOutcome:
 
 
 def step_rows(site: Site, runs: Mapping[str, StepResponse]) -> list[dict[str, Any]]:
-    """Settling time, overshoot and extreme voltages of steps, one row each.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    runs
-        Step responses by name.
-    """
+    """Settling time, overshoot and extreme voltages of steps, one row each."""
     rows: list[dict[str, Any]] = []
     bases = Bases.of(site)
     for name, run in runs.items():
@@ -250,13 +191,7 @@ def step_rows(site: Site, runs: Mapping[str, StepResponse]) -> list[dict[str, An
 
 
 def trajectories(site: Site, runs: Mapping[str, StepResponse]) -> pd.DataFrame:
-    """Voltages and reactive power over time, for plots: one row for each step, instant and customer.
-
-    Parameters
-    ----------
-    site, runs
-        As in `step_rows`.
-    """
+    """Voltages over time, for plots: one row for each step, instant and customer."""
     parts = []
     for name, run in runs.items():
         instants, customers = run.v.shape
@@ -273,20 +208,11 @@ def trajectories(site: Site, runs: Mapping[str, StepResponse]) -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
 
 
-KICK: Final = 1e-3
-"""Largest deviation from equilibrium in simulations of an unstable fleet, relative to each limit."""
-
-CLEARLY: Final = 1e-4
-"""Smallest growth per update beyond 1 of an unstable fleet."""
-
-_AWAY: Final = 80
-"""Number of updates in simulations of an unstable fleet."""
-
-MOST: Final = 1024.0
-"""Largest factor on slopes."""
-
-PLACES: Final = 4
-"""Number of bisections of an interval of factor 2: factors have an accuracy of 4 %."""
+KICK: Final = 1e-3  # largest deviation from equilibrium in simulations, relative to each limit
+CLEARLY: Final = 1e-4  # smallest growth per update beyond 1 of an unstable fleet
+_AWAY: Final = 80  # number of updates in simulations of an unstable fleet
+MOST: Final = 1024.0  # largest factor on slopes
+PLACES: Final = 4  # number of bisections of an interval of factor 2: factors have an accuracy of 4 %
 
 
 class FleetVerdict(StrEnum):
@@ -299,17 +225,7 @@ class FleetVerdict(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Subject:
-    """Feeder of the study, with one power flow for simulations and one for proofs.
-
-    Attributes
-    ----------
-    site
-        The feeder.
-    flow
-        AC power flow for simulation.
-    net
-        AC power flow for proofs.
-    """
+    """Feeder of the study, with one AC power flow for simulations and one for proofs."""
 
     site: Site
     flow: PowerFlow | PlacesFlow
@@ -354,16 +270,7 @@ class Judgement:
 def judge(subject: Subject, droop: Droop, update: Update, loads: InjectionBox, *, seed: int = 0) -> Judgement:
     """Determine the stability of a fleet with constant loads, anywhere in a box or at a point.
 
-    Parameters
-    ----------
-    subject
-        The feeder.
-    droop, update
-        The fleet, and its sampling.
-    loads
-        Injections without the fleet.
-    seed
-        Seed of the simulated deviation from equilibrium.
+    `loads` are the injections without the fleet; `seed` is that of the simulated deviation from equilibrium.
     """
     given, why = _loop(subject.net, droop, update, loads)
     gain = math.nan if given is None else given.gain
@@ -433,14 +340,7 @@ def edge(
 ) -> tuple[float, float]:
     """Factors on all slopes at which a fleet ceases to be stable, by doubling and bisection.
 
-    Parameters
-    ----------
-    subject, droop, update
-        As in `judge`.
-    loads
-        An operating point.
-    change
-        Change of the slopes: `steepened` with the same limits, or `enlarged` with the same breakpoints.
+    `change` makes the slopes `steepened` with the same limits, or `enlarged` with the same breakpoints.
 
     Returns
     -------
@@ -489,11 +389,6 @@ def longest_interval(subject: Subject, droop: Droop, update: Update, loads: Inje
     """Longest sampling interval found with a proof of stability, s.
 
     Infinity: the certificate covers every interval. The time constants may be shorter in the same ratio.
-
-    Parameters
-    ----------
-    subject, droop, update, loads
-        As in `judge`.
     """
     try:
         within = reach(subject.net, droop, loads)
@@ -515,15 +410,7 @@ def longest_interval(subject: Subject, droop: Droop, update: Update, loads: Inje
 def inverter_rows(
     subject: Subject, droop: Droop, update: Update, loads: InjectionBox, where: str
 ) -> list[dict[str, Any]]:
-    """Share of each inverter in the loop gain, and admissible factor on its slope alone.
-
-    Parameters
-    ----------
-    subject, droop, update, loads
-        As in `judge`.
-    where
-        Name of the operating point.
-    """
+    """Share of each inverter in the loop gain, and admissible factor on its slope alone."""
     given, _ = _loop(subject.net, droop, update, loads)
     if given is None:
         return []
@@ -553,18 +440,7 @@ def _shares(site: Site, given: Loop) -> Share:
 
 
 def margin(subject: Subject, droop: Droop, update: Update, loads: InjectionBox) -> float:
-    """Factor on the steepest slopes up to which all curves with the same limits are proven stable.
-
-    Parameters
-    ----------
-    subject, droop, update, loads
-        As in `judge`.
-
-    Returns
-    -------
-    float
-        0 without bounds for all such curves.
-    """
+    """Factor on the steepest slopes up to which all curves with the same limits are proven stable, or 0."""
     try:
         within = reach(subject.net, droop, loads, rounds=0)
     except DesignInfeasible:

@@ -18,7 +18,7 @@ import pytest
 
 from service.api import listener
 from service.api.listener import RESERVE, Shares
-from service.ingest.queues import BusConfig
+from service.ingest.queues import BusConfig, BusUnavailable
 from service.ingest.zenoh_bus import session
 from service.logs import Repeats
 from tests.service.running import FEEDER, free_port, service, until
@@ -38,7 +38,7 @@ class Served:
         """New clients get what they ask for, at once."""
         base = f"http://127.0.0.1:{self.port}"
         for path in ("/healthz", "/api/v1/feeders", "/api/v1/alarms", "/"):
-            answer = httpx.get(base + path, timeout=5.0)
+            answer = httpx.get(base + path, timeout=20.0)
             assert answer.status_code == 200, (path, answer.text)
 
     def descriptors(self) -> int:
@@ -132,11 +132,21 @@ def test_zenoh_sessions_leave_descriptors_for_http(small: Served) -> None:
     with ExitStack() as stack:
         host, port = small.zenoh.removeprefix("tcp/").rsplit(":", 1)
         for _ in range(DESCRIPTORS):  # half-open ones
-            stack.enter_context(socket.create_connection((host, int(port)), timeout=5.0))
+            stack.enter_context(socket.create_connection((host, int(port)), timeout=20.0))
         small.answers()
     until(lambda: small.descriptors() <= before + 4, "freed descriptors")
-    with session(BusConfig("client", connect=(small.zenoh,))):
-        small.answers()
+    # A handshake has a time limit of its own, which a busy machine may exceed.
+    until(lambda: _opens(small.zenoh), "a session")
+    small.answers()
+
+
+def _opens(zenoh: str) -> bool:
+    """True if a client gets a session."""
+    try:
+        with session(BusConfig("client", connect=(zenoh,))):
+            return True
+    except BusUnavailable:
+        return False
 
 
 def test_the_soft_limit_becomes_the_hard_limit(small: Served) -> None:

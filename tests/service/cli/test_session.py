@@ -15,9 +15,10 @@ from typing import NoReturn
 
 import pytest
 
-from feeders.studies.journal import edition, worked
+from feeders.studies.journal import worked
 from gridsec.errors import GridsecError
 from service.cli.session import keeping
+from tests.journals import rows
 from tests.service.commands import command, plain
 
 run = command("study")
@@ -42,7 +43,6 @@ def heard() -> Iterator[None]:
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Journals' folder of these tests."""
     monkeypatch.setenv("GRIDSEC_CACHE_DIR", str(tmp_path / "cache"))
-    edition.cache_clear()  # other processes read the code later than this one has
     return tmp_path / "cache" / "journals"
 
 
@@ -53,8 +53,8 @@ def until(true: Callable[[], object]) -> None:
         time.sleep(0.002)
 
 
-def lines(folder: Path) -> int:
-    return sum(path.read_bytes().count(b"\n") for path in folder.glob("*.jsonl"))
+def pieces(folder: Path) -> int:
+    return sum(len(rows(path)) for path in folder.glob("*.sqlite"))
 
 
 def family(session: int) -> set[int]:
@@ -95,15 +95,15 @@ def test_ctrl_c_at_half_loses_nothing_and_nobody_else_writes_meanwhile(
         [*GRIDSEC, *words], stdout=subprocess.PIPE, stderr=terminal, start_new_session=True
     ) as first:
         os.close(terminal)
-        until(lambda: lines(cache) >= 9)
+        until(lambda: pieces(cache) >= 8)
         first.send_signal(signal.SIGSTOP)
-        kept = lines(cache)
+        kept = pieces(cache)
         # The same command, while the first one has the journal.
         code, whole, said = run(monkeypatch, capsys, *words, "--out", str(tmp_path / "whole"))
         assert code == 0
         assert plain(said).count("no journal is kept, an interruption loses finished work:") == 1
         assert "another command is writing this journal" in said
-        assert lines(cache) == kept
+        assert pieces(cache) == kept
         first.send_signal(signal.SIGINT)
         first.send_signal(signal.SIGCONT)
         shown = b""
@@ -117,7 +117,7 @@ def test_ctrl_c_at_half_loses_nothing_and_nobody_else_writes_meanwhile(
     assert "Traceback" not in told
     assert told.rfind("\x1b[?25h") > told.rfind("\x1b[?25l"), "the cursor is shown again"
     (journal,) = cache.iterdir()
-    done = lines(cache) - 1
+    done = pieces(cache)
     assert 8 <= done < 26
     (line,) = re.findall(r"[^\r\n]*gridsec:[^\r\n]*", told)
     kept = f"interrupted; detectable: {done} of 26 done, kept in {journal}"
@@ -143,12 +143,12 @@ def test_sigterm_ends_all_processes_of_a_campaign_and_it_goes_on(
 ) -> None:
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     with subprocess.Popen([*GRIDSEC, *CAMPAIGN], text=True, start_new_session=True, **pipes) as first:
-        until(lambda: lines(cache) >= 2)
+        until(lambda: pieces(cache))
         os.killpg(first.pid, signal.SIGTERM)
         _, told = first.communicate(timeout=60)
         until(lambda: not family(first.pid))
     assert first.returncode == 143
-    done = lines(cache) - 1
+    done = pieces(cache)
     assert 1 <= done < 8
     (journal,) = cache.iterdir()
     assert told == (
@@ -175,7 +175,7 @@ def test_an_interruption_while_processes_begin_is_one_line(cache: Path) -> None:
         until(lambda: not family(first.pid))
     assert first.returncode == 130
     assert re.fullmatch(r"gridsec: interrupted; [^\n]+\n", told), told
-    assert not lines(cache)
+    assert not pieces(cache)
 
 
 def test_a_folder_that_cannot_be_is_said_once(
@@ -263,4 +263,4 @@ def test_a_solver_that_hears_no_signal_is_ended_all_the_same(tmp_path: Path) -> 
     assert first.returncode == 130
     done = f"any: 1 of 2 done, kept in {journal}"
     assert told == f"gridsec: interrupted; {done}; the same command continues from there\n"
-    assert journal.read_bytes().count(b"\n") == 2
+    assert len(rows(journal)) == 1

@@ -13,6 +13,7 @@ import pytest
 from playwright.sync_api import Browser
 
 from service.cli.study_report import STUDIES, Asked, _command, misplaced
+from tests.journals import edit, rows
 from tests.service.commands import command, plain, text_of
 
 FEW = ("--studies", "redundancy,protect")
@@ -92,14 +93,14 @@ def test_commands_in_a_report_say_exactly_what_was_asked() -> None:
 def test_an_interrupted_report_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Half of a journal, and a line that was being written: the rest is done, the page is the same."""
+    """Half of a journal: the rest is done, the page is the same."""
     page = tmp_path / "report.html"
     words = ("cigre-lv", "--out", str(page), "--studies", "redundancy", "--at", "2026-11-21")
     assert run(monkeypatch, capsys, *words)[0] == 0
     whole = page.read_text(encoding="utf-8")
     (journal,) = (tmp_path / "report-files" / "journals").iterdir()
-    lines = journal.read_bytes().splitlines(keepends=True)
-    journal.write_bytes(b"".join(lines[: len(lines) // 2]) + lines[-1][:5])
+    complete = rows(journal)
+    edit(journal, keep=len(complete) // 2)
     page.unlink()
     assert run(monkeypatch, capsys, *words)[0] == 0
 
@@ -107,7 +108,7 @@ def test_an_interrupted_report_goes_on(
         return re.sub(r"redundancy: [0-9.]+ s(, with reused earlier work)?", "", text)
 
     assert timeless(page.read_text(encoding="utf-8")) == timeless(whole)
-    assert journal.read_bytes().splitlines() == [line.strip() for line in lines]
+    assert rows(journal) == complete
 
 
 def test_a_journal_of_something_else_is_laid_aside(
@@ -120,7 +121,7 @@ def test_a_journal_of_something_else_is_laid_aside(
     journal.write_text('{"study": "another"}\n', encoding="utf-8")
     assert run(monkeypatch, capsys, *words)[0] == 0
     assert journal.with_suffix(".other").read_text(encoding="utf-8") == '{"study": "another"}\n'
-    assert "another" not in journal.read_text(encoding="utf-8")
+    assert rows(journal)
 
 
 def test_what_a_study_cannot_answer_is_in_the_report(

@@ -15,6 +15,7 @@ from feeders.registry import registry
 from feeders.simulation.recording import read_recording, record
 from feeders.simulation.scenario import Scenario, simulate, snapshots
 from gridsec.estimators import data_errors
+from gridsec.estimators.data_errors import DataErrorKind
 from gridsec.interface import Cause
 from service.alarms.state_machine import (
     Alarm,
@@ -41,7 +42,9 @@ ONE, OTHER = "LV1.101 Load 3", "LV1.101 Load 4"
 STUDY = f"gridsec study calibrate {NAME} --readings FILE --look-for phase --look-for swap"
 TICK_S = 10.0
 
-ERROR = DataErrorReport("bus", ("m1",), ("Miller",), ("bus b2",), "study", "An error of the files.")
+ERROR = DataErrorReport(
+    DataErrorKind.BUS, ("m1",), ("Miller",), ("bus b2",), "study", "An error of the files."
+)
 
 
 def tables(*, exchanged: bool) -> FeederTables:

@@ -8,6 +8,8 @@ from dataclasses import replace
 import pytest
 from playwright.sync_api import APIResponse, Route, expect
 
+from gridsec.estimators.data_errors import DataErrorKind
+from gridsec.estimators.sequential import LearningReason, LearningState
 from gridsec.interface import Cause
 from service.alarms.state_machine import AlarmState, AlarmTransition, Change
 from service.report.report import (
@@ -57,7 +59,8 @@ def test_a_manipulated_inverter_and_its_alarm(site: Site) -> None:
 def test_an_error_of_the_files_stands_beside_the_accusation(site: Site) -> None:
     """In the reason of the verdict, at the alarm, which has it later than it was raised, and at the meter."""
     text = "An error of the feeder's files explains this as well: customer H3 at another bus (bus drop-9)."
-    error = DataErrorReport("bus", ("H3",), ("H3",), ("bus drop-9",), "gridsec study calibrate village", text)
+    study = "gridsec study calibrate village"
+    error = DataErrorReport(DataErrorKind.BUS, ("H3",), ("H3",), ("bus drop-9",), study, text)
     page = site.open()
     for k in range(5):
         report = site.village.report(T0 + k, cause=Cause.RESIDUALS)
@@ -168,11 +171,12 @@ def test_a_commissioning_that_begins_anew_says_why(site: Site) -> None:
 
 
 def test_stalled_learning_is_shown_with_its_reasons_and_its_alarm(site: Site) -> None:
-    why = {"H2": "silent", "H3": "no-busbar", "H5": "no-busbar"}
+    silent, no_busbar = LearningReason.SILENT, LearningReason.NO_BUSBAR
+    why = {"H2": silent, "H3": no_busbar, "H5": no_busbar}
     site.service.learning.update(["H1", *why])
     site.service.stalled.update(why)
     learning = LearningReport(
-        tuple("stalled" if m in why else "learned" for m in site.village.meters),
+        tuple(LearningState.STALLED if m in why else LearningState.LEARNED for m in site.village.meters),
         tuple(map(why.get, site.village.meters)),
         86_401.0,
         tuple(StalledMeter(m, reason, 0.0) for m, reason in why.items()),

@@ -15,7 +15,7 @@ from feeders.registry.registry import DesignedEstimator, design
 from feeders.simulation.attacks import AttackKind
 from feeders.simulation.scenario import Scenario
 from feeders.simulation.trial import Trial, frames
-from feeders.studies.campaign.guarantees import promised, rehearse, rehearse_everywhere
+from feeders.studies.campaign.guarantees import promised
 from feeders.studies.campaign.plan import AttackClass, Place, Promise
 from feeders.studies.campaign.scene import attacks
 from feeders.studies.campaign.study import campaign
@@ -60,14 +60,6 @@ def test_promised_sizes_are_kept() -> None:
     assert table["lies"].to_dict() == {"hidden": 100, "named": 100}
     assert not table[["broken", "by_chance", "honest_named", "scenes_broken"]].to_numpy().any()
     assert table["probability_high"].to_numpy() == pytest.approx(beta.ppf(0.975, 1, 25))
-
-
-def test_a_rehearsal_in_pieces() -> None:
-    found = detectable(SITE, max_attacked=2)
-    whole = rehearse_everywhere(SITE, found, trials=5, piece=3)
-    parts = [rehearse(SITE, found, trials=n, seed=seed) for n, seed in ((3, 0), (2, 3))]
-    assert (whole.trials, whole.hidden_named, whole.large_missed) == (5, 0, 0)
-    assert whole.honest_named == sum(part.honest_named for part in parts)
 
 
 def test_for_one_liar_or_where_nothing_hides_there_are_fewer_kinds() -> None:

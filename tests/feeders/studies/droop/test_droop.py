@@ -50,6 +50,7 @@ from gridsec.planning.droop.equilibrium import rest
 from gridsec.planning.droop.stability import Update, enlarged, growth, slopes
 from tests.codes import refused
 from tests.feeders.villages import village, village_without_inverters
+from tests.journals import edit, rows
 
 FEEDERS, FLEETS = 10, 20
 """The random fleets around the edge of stability: 200, and half as many in three phases."""
@@ -368,8 +369,7 @@ def test_the_study_has_all_tables_and_goes_on_from_its_journal(tmp_path: Path) -
         "hosting_probability",
     } <= set(found.tables)
     assert told[-1][0] == told[-1][1]
-    text = journal.read_text(encoding="utf-8").splitlines(keepends=True)
-    journal.write_text("".join(text[:-3]), encoding="utf-8")
+    edit(journal, keep=len(rows(journal)) - 3)
     again = droop(site, options, seed=3, journal=journal)
     for name, table in found.tables.items():
         pd.testing.assert_frame_equal(table, again.tables[name])

@@ -14,7 +14,7 @@ from feeders.model.site import Site, from_tables
 from feeders.simulation.plant import ClosedLoop, Loads
 from feeders.simulation.powerflow import PowerFlow, PowerFlowDiverged
 from feeders.simulation.powerflow_three_phase import power_flow
-from feeders.studies.droop.fleets import Who, box, equip, point
+from feeders.studies.droop.fleets import Who, box, equip, made, point
 from feeders.studies.droop.limits import (
     BandGuarantee,
     Conditions,
@@ -127,7 +127,7 @@ def test_curves_and_limits_are_those_of_the_nominal_voltage(kind: str) -> None:
         subject, loads = Subject.of(site), box(site, load_high=0.5, pv_high=0.3)
         own = np.arange(len(site.feeder.customers))
         loop = ClosedLoop(subject.flow, fleet_of(own, "vde4105", np.full(own.size, 5.0), 100.0), 100.0, 230.0)
-        fleet = equip(site, "vde4105", Who.ALL, kva=5.0)
+        fleet = made(site, own, "vde4105", np.full(own.size, 5.0))
         volts = [rest_volts(loop, loads, u) for u in (np.zeros(own.size), np.ones(own.size))]
         volts += [rest_volts(loop, loads, rng.uniform(0.0, 1.0, own.size)) for _ in range(10)]
         low, high = min(v.min() for v in volts), max(v.max() for v in volts)

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from feeders.model.site import Site, load
+from feeders.model.site import Site, from_tables, load
 from feeders.simulation.powerflow_three_phase import UnbalancedPowerFlow
 from feeders.studies.droop.fleets import Who, box, equip, point
 from feeders.studies.droop.limits import BandGuarantee, Conditions, DroopPlan, checked, ratings_pu, safety
@@ -257,5 +257,7 @@ def test_charging_that_cannot_be_is_refused() -> None:
     heavy = PhasedFeeder(replace(tree, charging=1e6 * tree.charging))
     with refused(DesignInfeasible, "no-solution"):
         network(heavy)
+    rows = tuple(replace(row, pv_kw=0.0, inverter_kva=0.0, droop="") for row in site.tables.customers)
+    without = from_tables(replace(site.tables, customers=rows))
     with refused(FeederInvalid, "nothing-to-design"):
-        equip(site, "ieee1547-b", customers=[])
+        equip(without, "ieee1547-b")
