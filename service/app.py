@@ -262,10 +262,7 @@ def load_sites(names: Iterable[str]) -> dict[str, Site]:
 def _stored(given: Mapping[str, Site], store: Store) -> tuple[dict[str, Site], dict[str, str]]:
     """Load the feeders added over REST; those of the command line take precedence.
 
-    Returns
-    -------
-    loaded, unloaded
-        By name: the feeders, and the reasons for those that cannot be loaded.
+    Returns loaded, unloaded: by name: the feeders, and the reasons for those that cannot be loaded.
     """
     loaded: dict[str, Site] = {}
     unloaded: dict[str, str] = {}

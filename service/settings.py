@@ -41,10 +41,7 @@ _CODES = {
 class SettingsInvalid(GridsecError):
     """The settings are wrong; `problems` lists all of them.
 
-    Parameters
-    ----------
-    problems
-        One sentence each.
+    problems: one sentence each.
     """
 
     code = "wrong-settings"

@@ -21,31 +21,18 @@ START: Final = "0" * 64
 
 @dataclass(frozen=True, slots=True)
 class AuditEntry:
-    """Entry of the audit log.
+    """Entry of the audit log."""
 
-    Attributes
-    ----------
-    seq
-        Number, from 1 without gaps.
-    t
-        Unix time, s.
-    who, credential
-        Name of the identity, and the credential that proved it.
-    action, target
-        Action, such as `POST /api/v1/alarms/{alarm_id}/ack`, and the resource.
-    detail
-        Further text, such as the body of the request.
-    previous, hash
-        Hash of the previous entry and of this one, hexadecimal.
-    """
-
-    seq: int
-    t: float
+    seq: int  # number, from 1 without gaps
+    t: float  # Unix time, s
+    # who, credential: name of the identity, and the credential that proved it
     who: str
     credential: str
+    # action, target: action, such as `POST /api/v1/alarms/{alarm_id}/ack`, and the resource
     action: str
     target: str
-    detail: str
+    detail: str  # further text, such as the body of the request
+    # previous, hash: hash of the previous entry and of this one, hexadecimal
     previous: str
     hash: str
 
@@ -59,12 +46,8 @@ def chained(  # noqa: PLR0917  # the columns of an entry
 ) -> AuditEntry:
     """Entry that follows the last one.
 
-    Parameters
-    ----------
-    last
-        The last entry; None for an empty log.
-    t, who, credential, action, target, detail
-        As in `AuditEntry`.
+    last: the last entry; None for an empty log.
+    t, who, credential, action, target, detail: as in `AuditEntry`.
     """
     seq, previous = (1, START) if last is None else (last.seq + 1, last.hash)
     entry = AuditEntry(seq, t, who, credential, action, target, detail, previous, "")
@@ -90,12 +73,8 @@ def content_hash(entry: AuditEntry) -> str:
 def broken(entries: Iterable[AuditEntry], expect: tuple[int, str] | None = None) -> str | None:
     """First violation of the chain as a sentence, or None.
 
-    Parameters
-    ----------
-    entries
-        All entries in ascending order of their numbers.
-    expect
-        Number and hash of an entry that must be in the log; None for no such check.
+    entries: all entries in ascending order of their numbers.
+    expect: number and hash of an entry that must be in the log; None for no such check.
     """
     seq, previous, found = 0, START, expect is None
     for entry in entries:

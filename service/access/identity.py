@@ -67,23 +67,12 @@ WHOLE_FLEET: Final = frozenset({"GET /metrics", "GET /api/v1/bad-readings", "GET
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Authenticated identity of a request.
+    """Authenticated identity of a request."""
 
-    Attributes
-    ----------
-    name
-        Name in alarms, comments and the audit log.
-    role
-        Its role.
-    feeders
-        Feeders it has access to; None for all.
-    credential
-        Credential that proved it: `key <id>`, `token <issuer>`, or `open` without authentication.
-    """
-
-    name: str
-    role: Role
-    feeders: frozenset[str] | None = None
+    name: str  # name in alarms, comments and the audit log
+    role: Role  # its role
+    feeders: frozenset[str] | None = None  # feeders it has access to; None for all
+    # credential that proved it: `key <id>`, `token <issuer>`, or `open` without authentication
     credential: str = "open"
 
     def sees(self, feeder: str) -> bool:
@@ -97,10 +86,7 @@ class Identity:
     def permits(self, route: str) -> str | None:
         """Reason why this identity has no access to a route, or None.
 
-        Parameters
-        ----------
-        route
-            Method and path template, a key of `POLICY`.
+        route: method and path template, a key of `POLICY`.
         """
         if route not in POLICY:
             return "no role has access to this resource"

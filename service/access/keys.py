@@ -21,27 +21,15 @@ _KEY = re.compile(r"^gridsec_(?P<id>[0-9a-f]{10})_(?P<secret>[A-Za-z0-9_-]{43})$
 
 @dataclass(frozen=True, slots=True)
 class KeyRecord:
-    """Stored properties of a key.
+    """Stored properties of a key."""
 
-    Attributes
-    ----------
-    id
-        Public part of the key.
-    digest
-        SHA-256 of the secret, hexadecimal.
-    name
-        Name of the identity.
-    role, feeders
-        Its role, and its feeders or None for all.
-    created, expires, revoked
-        Unix times, s; None for a key without an end, and for one that is not revoked.
-    """
-
-    id: str
-    digest: str
-    name: str
+    id: str  # public part of the key
+    digest: str  # SHA-256 of the secret, hexadecimal
+    name: str  # name of the identity
+    # role, feeders: its role, and its feeders or None for all
     role: Role
     feeders: frozenset[str] | None
+    # created, expires, revoked: Unix times, s; None for a key without an end, and for one that is not revoked
     created: float
     expires: float | None = None
     revoked: float | None = None
@@ -49,10 +37,7 @@ class KeyRecord:
     def ended(self, now: float) -> str | None:
         """Reason why the key is not valid, or None.
 
-        Parameters
-        ----------
-        now
-            Unix time, s.
+        now: Unix time, s.
         """
         if self.revoked is not None:
             return "the key is revoked"
@@ -69,17 +54,9 @@ def create(
 ) -> tuple[str, KeyRecord]:
     """Create a key; its text is stored nowhere.
 
-    Parameters
-    ----------
-    name, role, feeders
-        Identity of the key.
-    now, expires
-        Present time, and end of the key or None, Unix s.
-
-    Returns
-    -------
-    text, record
-        The key and what is stored of it.
+    name, role, feeders: identity of the key.
+    now, expires: present time, and end of the key or None, Unix s.
+    Returns text, record: the key and what is stored of it.
     """
     key_id, secret = secrets.token_hex(ID_BYTES), secrets.token_urlsafe(SECRET_BYTES)
     return f"gridsec_{key_id}_{secret}", KeyRecord(key_id, digest(secret), name, role, feeders, now, expires)

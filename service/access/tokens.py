@@ -34,31 +34,19 @@ NAMES: Final = ("preferred_username", "email", "sub")
 
 @dataclass(eq=False)
 class TokenVerifier:
-    """Verification of the tokens of one issuer.
+    """Verification of the tokens of one issuer."""
 
-    Attributes
-    ----------
-    issuer, audience
-        Required claims `iss` and `aud`.
-    jwks_url
-        Address of the issuer's keys; empty: by the issuer's discovery document.
-    role_claim
-        Claim of the role.
-    """
-
+    # issuer, audience: required claims `iss` and `aud`
     issuer: str
     audience: str
-    jwks_url: str = ""
-    role_claim: str = "gridsec_role"
+    jwks_url: str = ""  # address of the issuer's keys; empty: by the issuer's discovery document
+    role_claim: str = "gridsec_role"  # claim of the role
     _client: jwt.PyJWKClient | None = field(default=None, repr=False)
 
     def identify(self, token: str) -> Identity:
         """Identity of a valid token.
 
-        Raises
-        ------
-        NotAuthenticated
-            With the reason.
+        Raises NotAuthenticated with the reason.
         """
         try:
             key = self._keys().get_signing_key_from_jwt(token)

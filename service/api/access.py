@@ -52,14 +52,9 @@ DETAIL_BYTES: Final = 2000
 class Authenticator:
     """Identities of requests. Thread-safe.
 
-    Parameters
-    ----------
-    store
-        Keys, sessions and audit log.
-    tokens
-        Verification of OIDC tokens; None without an issuer.
-    wall
-        Wall clock, Unix s.
+    store: keys, sessions and audit log.
+    tokens: verification of OIDC tokens; None without an issuer.
+    wall: wall clock, Unix s.
     """
 
     def __init__(
@@ -79,10 +74,7 @@ class Authenticator:
     def identify(self, request: Request) -> Identity:
         """Identity of a request.
 
-        Raises
-        ------
-        NotAuthenticated, TooManyFailures
-            Without a valid credential.
+        Raises NotAuthenticated, TooManyFailures without a valid credential.
         """
         scheme, _, given = request.headers.get("authorization", "").partition(" ")
         cookie = request.cookies.get(COOKIE, "")
@@ -100,17 +92,9 @@ class Authenticator:
     def of_credential(self, text: str, client: str) -> Identity:
         """Identity of an API key or token.
 
-        Parameters
-        ----------
-        text
-            The credential.
-        client
-            Address of the client, for the limit of failures.
-
-        Raises
-        ------
-        NotAuthenticated, TooManyFailures
-            If the credential is not valid.
+        text: the credential.
+        client: address of the client, for the limit of failures.
+        Raises NotAuthenticated, TooManyFailures if the credential is not valid.
         """
         try:
             if text.startswith("gridsec_") or self.tokens is None:
@@ -125,15 +109,8 @@ class Authenticator:
     def log_in(self, text: str, client: str) -> tuple[Identity, str, float]:
         """Exchange an API key for a session.
 
-        Parameters
-        ----------
-        text, client
-            As in `of_credential`.
-
-        Returns
-        -------
-        identity, cookie, expires
-            Identity, text of the cookie, and the session's end, Unix s.
+        text, client: as in `of_credential`.
+        Returns identity, cookie, expires: identity, text of the cookie, and the session's end, Unix s.
         """
         identity = self.of_credential(text, client)
         parsed = keys.parse(text)
@@ -181,21 +158,11 @@ def client_of(request: Request) -> str:
 def authorise(authenticator: Authenticator, request: Request, route: str, body: bytes) -> Identity:
     """Identity of a request that may use a route; changes are in the audit log before they are made.
 
-    Parameters
-    ----------
-    authenticator
-        The authenticator.
-    route
-        Method and path template.
-    body
-        Body of the request.
-
-    Raises
-    ------
-    NotAuthenticated, TooManyFailures
-        Without a valid credential.
-    NotPermitted
-        If the identity has no access.
+    authenticator: the authenticator.
+    route: method and path template.
+    body: body of the request.
+    Raises NotAuthenticated, TooManyFailures without a valid credential; NotPermitted if the identity has no
+        access.
     """
     if POLICY.get(route, Role.ADMIN) is PUBLIC:
         return OPEN

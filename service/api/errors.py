@@ -64,12 +64,8 @@ class Guard:
     must therefore use an address or a host name of this server, and a page that sends it must have the same
     origin.
 
-    Parameters
-    ----------
-    max_body
-        Largest request body, bytes.
-    hosts
-        Host names of this server, besides `localhost` and the machine's name.
+    max_body: largest request body, bytes.
+    hosts: host names of this server, besides `localhost` and the machine's name.
     """
 
     def __init__(self, app: ASGIApp, max_body: int, hosts: Collection[str] = ()) -> None:

@@ -72,15 +72,8 @@ _AUDIT = sa.Table(
 class AccessStore:
     """Keys, sessions and audit log of one service. Methods block and are thread-safe.
 
-    Parameters
-    ----------
-    database
-        Address of the service's database.
-
-    Raises
-    ------
-    StoreUnavailable
-        If the database cannot be opened, or is newer than this program.
+    database: address of the service's database.
+    Raises StoreUnavailable if the database cannot be opened, or is newer than this program.
     """
 
     def __init__(self, database: str) -> None:
@@ -147,12 +140,8 @@ class AccessStore:
     def revoke(self, key_id: str, now: float) -> bool:
         """Revoke a key, and with it its sessions; False if there is no such valid key.
 
-        Parameters
-        ----------
-        key_id
-            Id of the key.
-        now
-            Unix time, s.
+        key_id: id of the key.
+        now: Unix time, s.
         """
         with self._write() as connection:
             change = _KEY.update().where(_KEY.c.id == key_id, _KEY.c.revoked.is_(None)).values(revoked=now)
@@ -163,14 +152,9 @@ class AccessStore:
     def open_session(self, token: str, key_id: str, now: float) -> float:
         """Store a session of the web page, and return its end, Unix s.
 
-        Parameters
-        ----------
-        token
-            Random text of the cookie; its SHA-256 is stored.
-        key_id
-            Key that the session stands for.
-        now
-            Unix time, s.
+        token: random text of the cookie; its SHA-256 is stored.
+        key_id: key that the session stands for.
+        now: Unix time, s.
         """
         with self._write() as connection:
             connection.execute(_SESSION.delete().where(_SESSION.c.expires <= now))
@@ -181,12 +165,8 @@ class AccessStore:
     def session(self, token: str, now: float) -> KeyRecord | None:
         """Key of a session, or None if the session has ended.
 
-        Parameters
-        ----------
-        token
-            Text of the cookie.
-        now
-            Unix time, s.
+        token: text of the cookie.
+        now: Unix time, s.
         """
         query = sa.select(_KEY).join(_SESSION, _SESSION.c.key_id == _KEY.c.id)
         query = query.where(_SESSION.c.digest == _digest(token), _SESSION.c.expires > now)
@@ -206,10 +186,7 @@ class AccessStore:
     ) -> AuditEntry:
         """Append an entry to the audit log; durable when this returns.
 
-        Parameters
-        ----------
-        t, who, credential, action, target, detail
-            As in `AuditEntry`.
+        t, who, credential, action, target, detail: as in `AuditEntry`.
         """
         with self._write() as connection:
             if not self._sqlite:
@@ -223,12 +200,8 @@ class AccessStore:
     def audit(self, *, after: int = 0, limit: int | None = None) -> list[AuditEntry]:
         """Return entries of the audit log, the oldest first.
 
-        Parameters
-        ----------
-        after
-            Restrict to entries with a higher number.
-        limit
-            Largest number of entries; None for all.
+        after: restrict to entries with a higher number.
+        limit: largest number of entries; None for all.
         """
         query = sa.select(_AUDIT).where(_AUDIT.c.seq > after).order_by(_AUDIT.c.seq).limit(limit)
         with self._read() as connection:

@@ -60,23 +60,12 @@ class Reader:
     ) -> tuple[list[Alarm], str | None]:
         """Return a page of alarms, those with the latest onset first.
 
-        Parameters
-        ----------
-        state, kind, severity
-            Permitted values; empty for all.
-        feeder, among, meter
-            Restrict to this feeder, to these feeders, and to this meter; None for all.
-        since, until
-            Restrict to alarms raised in [since, until), Unix s.
-        cursor
-            End of the previous page; pages stay correct while alarms are added or change.
-        limit
-            Length of a page.
-
-        Returns
-        -------
-        alarms, cursor
-            The cursor is None on the last page.
+        state, kind, severity: permitted values; empty for all.
+        feeder, among, meter: restrict to this feeder, to these feeders, and to this meter; None for all.
+        since, until: restrict to alarms raised in [since, until), Unix s.
+        cursor: end of the previous page; pages stay correct while alarms are added or change.
+        limit: length of a page.
+        Returns alarms, cursor: the cursor is None on the last page.
         """
         a = ALARM.c
         query = sa.select(a.id, a.data).order_by(a.id.desc()).limit(limit + 1)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,12 +11,14 @@ from typing import Any
 
 import httpx
 import pytest
+from typer.testing import CliRunner, Result
 
 from service.access.audit import broken
 from service.access.identity import POLICY, PUBLIC, WHOLE_FLEET, Role
 from service.access.keys import create
 from service.api.access import COOKIE, FAILURES, FRESH_S
 from service.api.routes import create_api
+from service.cli.main import app
 from service.settings import SettingsInvalid, is_loopback, settings
 from service.store.access import SESSION_S, AccessStore
 from tests.codes import refused
@@ -33,6 +33,8 @@ BODIES: dict[str, Any] = {
     "POST /api/v1/feeders/{feeder}/commissioning": {"reason": "replaced", "meters": ["absent"]},
     "PUT /api/v1/feeders/{feeder}": {},
 }
+REFUSED = {401, 429}
+"""Status without a valid credential: the latter beyond the limit of failures."""
 STREAMS = tuple(route for route in POLICY if route.endswith("/stream"))
 
 
@@ -85,12 +87,12 @@ def ask(running: InProcess, route: str, headers: dict[str, str]) -> int:
 
 def test_the_policy_is_that_of_all_routes(running: InProcess) -> None:
     """Nothing but the files of the page is outside; the description of the interface is public."""
-    app = create_api(_Nothing())
+    made = create_api(_Nothing())
+    routers = [
+        router for each in made.routes if (router := getattr(each, "original_router", None)) is not None
+    ]
     routes = {
-        f"{method} {route.path}"
-        for route in app.routes
-        if hasattr(route, "dependant")
-        for method in route.methods
+        f"{method} {route.path}" for router in routers for route in router.routes for method in route.methods
     }
     assert routes == set(POLICY)
     assert running.http.get("/api/v1/openapi.json").status_code == 200
@@ -106,14 +108,14 @@ def test_every_route_against_every_role(running: InProcess, keys: dict[str, str]
     least = POLICY[route]
     assert least is not None
     assert ask(running, route, {}) == 401
-    assert ask(running, route, bearer(keys["expired"])) == 401
-    assert ask(running, route, bearer(keys["viewer"][:-1] + "?")) == 401
+    assert ask(running, route, bearer(keys["expired"])) in REFUSED
+    assert ask(running, route, bearer(keys["viewer"][:-1] + "?")) in REFUSED
     for role in Role:
         if route.startswith("DELETE") and role.includes(least):
             continue  # the feeder is needed by the other routes
         status = ask(running, route, bearer(keys[role]))
         assert (status == 403) == (not role.includes(least)), (role, status)
-        assert status != 401
+        assert status not in REFUSED
     outside = ask(running, route, bearer(keys["north"]))
     if "{feeder}" in route or route in WHOLE_FLEET:
         assert outside == 403
@@ -155,7 +157,7 @@ def test_names_come_from_the_credential(running: InProcess, keys: dict[str, str]
 def test_the_page_exchanges_a_key_for_a_cookie(running: InProcess, keys: dict[str, str]) -> None:
     with httpx.Client(base_url=running.http.base_url) as browser:
         wrong = browser.post("/api/v1/session", json={"key": "gridsec_0_0"})
-        is_problem(wrong, 401)
+        assert wrong.status_code in REFUSED
         answer = browser.post("/api/v1/session", json={"key": keys["operator"]})
         assert answer.json()["role"] == "operator"
         assert answer.json()["expires"] == pytest.approx(time.time() + SESSION_S, abs=60.0)
@@ -184,7 +186,7 @@ def test_a_revoked_key_ends_its_sessions(running: InProcess, folder: Path) -> No
             assert store.revoke(text.split("_")[1], time.time())
         time.sleep(FRESH_S + 0.2)
         assert browser.get("/api/v1/feeders").status_code == 401
-        assert browser.get("/api/v1/feeders", headers=bearer(text)).status_code == 401
+        assert browser.get("/api/v1/feeders", headers=bearer(text)).status_code in REFUSED
 
 
 def test_invalid_credentials_are_limited_and_valid_ones_pass(
@@ -270,36 +272,34 @@ def test_loopback_addresses() -> None:
 # ----------------------------------------------------------------- command line
 
 
-def gridsec(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-c", "from service.cli.main import main; main()", *arguments]
-    database = [f"--database=sqlite:///{folder / 'gridsec.db'}"]
-    return subprocess.run([*command, *database], capture_output=True, text=True, check=False, timeout=60)
+def gridsec(folder: Path, *arguments: str) -> Result:
+    return CliRunner().invoke(app, [*arguments, f"--database=sqlite:///{folder / 'gridsec.db'}"])
 
 
 def test_keys_and_the_audit_log_on_the_command_line(tmp_path: Path) -> None:
     made = gridsec(tmp_path, "key", "add", "Ada Lovelace", "--role", "operator", "--feeder", "north")
-    assert made.returncode == 0, made.stderr
-    text = made.stdout.strip()
+    assert made.exit_code == 0, made.stderr
+    text = made.stdout.strip().splitlines()[-1]
     key_id = text.split("_")[1]
     assert text.startswith("gridsec_")
     assert "expires" in made.stderr
     shown = gridsec(tmp_path, "key", "list").stdout
     assert key_id in shown
     assert text.rpartition("_")[2] not in shown
-    assert gridsec(tmp_path, "key", "revoke", key_id).returncode == 0
-    assert gridsec(tmp_path, "key", "revoke", key_id).returncode == 2
+    assert gridsec(tmp_path, "key", "revoke", key_id).exit_code == 0
+    assert gridsec(tmp_path, "key", "revoke", key_id).exit_code == 2
     assert "revoked" in gridsec(tmp_path, "key", "list").stdout
     wrong = gridsec(tmp_path, "key", "add", "x", "--role", "root", "--expires", "soon")
-    assert wrong.returncode == 2
+    assert wrong.exit_code == 2
     assert "--role" in wrong.stderr
     assert "--expires" in wrong.stderr
     intact = gridsec(tmp_path, "audit", "verify")
-    assert intact.returncode == 0
+    assert intact.exit_code == 0
     last = intact.stdout.split()[-1]
-    assert gridsec(tmp_path, "audit", "verify", f"--expect={last}").returncode == 0
+    assert gridsec(tmp_path, "audit", "verify", f"--expect={last}").exit_code == 0
     assert "key revoke" in gridsec(tmp_path, "audit", "show").stdout
     with AccessStore(f"sqlite:///{tmp_path / 'gridsec.db'}") as store, store._write() as connection:
         connection.exec_driver_sql("UPDATE audit SET who = 'Eve' WHERE seq = 1")
     changed = gridsec(tmp_path, "audit", "verify")
-    assert changed.returncode == 1
+    assert changed.exit_code == 1
     assert "entry 1 was changed" in changed.stderr
