@@ -45,8 +45,7 @@ from service.ingest.decode import DecodedPayload, Wire
 from service.ingest.queues import Sample
 from service.ingest.reading import HEAD_BYTES, BadReading, BadReason, Reading, beginning, head_of
 from service.metrics import Metrics
-from service.report.report import FeederReport
-from service.report.report import to_json as report_json
+from service.report.report import FeederReport, to_text
 from service.store import Rejected, Store
 from service.store.committer import Committer, Executor, Wish, alarm_key, inline
 from service.store.schema import CommissioningEvent
@@ -501,7 +500,7 @@ class Engine:
             return
         for result in results:
             key = f"{result.report.feeder}/estimate"
-            self.committer.publisher.telemetry(key, msgspec.json.encode(report_json(result.report)))
+            self.committer.publisher.telemetry(key, to_text(result.report))
         self.metrics.count_bus(self.committer.publisher.counts)
 
     # ---------------------------------------------------------------- operators

@@ -218,6 +218,11 @@ def to_json(report: FeederReport) -> dict[str, Any]:
     return found
 
 
+def to_text(report: FeederReport) -> bytes:
+    """Return the text of `to_json`, without the objects in between."""
+    return _REPORT.dump_json(report)
+
+
 def finite(value: float) -> float | None:
     """Return a number for JSON: None for NaN and infinities."""
     return float(value) if math.isfinite(value) else None

@@ -44,7 +44,7 @@ def test_unchanged_powers_of_all_meters_are_missing_powers(site: Site, how: str,
         stamp = T0 + k if how == "timed" else float("nan")
         read = np.append(volts[0, site.meters], busbar) + JITTER_V * rng.standard_normal(site.meters.size + 1)
         for one, volt in zip((*site.meter_ids, None), read.tolist(), strict=True):
-            watch.ingest(Reading(site.feeder.name, one, T0 + k, volt, kw, t_power=stamp), T0 + k)
+            watch.place(Reading(site.feeder.name, one, T0 + k, volt, kw, t_power=stamp), T0 + k)
     watch.finish()
     results = [watch.judge() for _ in range(len(watch.pending))]
     report = results[-1].report if results else watch.report
