@@ -86,10 +86,7 @@ def envelopes() -> dict[str, ReactiveEnvelope]:
 def library(season: Season = Season.SUMMER) -> Profiles:
     """One season of the bundled library, see data/profiles/SOURCE.md; summer has two weeks, the others one.
 
-    Raises
-    ------
-    ValueError
-        For an unknown season.
+    Raises ValueError for an unknown season.
     """
     return _read(choice("season", Season, season))
 

@@ -38,10 +38,7 @@ def replace_file(path: Path, write: Callable[[Path], object]) -> None:
     A symbolic link stays a link. A path that is not a regular file, such as a pipe or a terminal, cannot be
     replaced: it is written directly.
 
-    Raises
-    ------
-    OSError
-        If the file cannot be written.
+    Raises OSError if the file cannot be written.
     """
     if path.exists() and not path.is_file():
         write(path)

@@ -276,10 +276,8 @@ def _random(attack: Random, t: Floats) -> Floats:
 def _scramble(bits: _Bits) -> _Bits:
     """Mix 64 bits: the output function of the SplitMix64 generator, arithmetic modulo 2^64.
 
-    References
-    ----------
-    G. L. Steele, D. Lea, C. H. Flood: Fast splittable pseudorandom number generators. OOPSLA 2014, figure 16
-    (constants of Stafford's variant 13).
+    Source: G. L. Steele, D. Lea, C. H. Flood: Fast splittable pseudorandom number generators. OOPSLA 2014,
+        figure 16 (constants of Stafford's variant 13).
     """
     z = bits + np.uint64(0x9E3779B97F4A7C15)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)

@@ -18,6 +18,8 @@ from feeders.format.tables import from_json
 from feeders.model.site import Site, from_tables, load
 from feeders.registry.registry import choose
 from gridsec.errors import FeederInvalid, GridsecError, Problem
+from service.access.tokens import TokenVerifier
+from service.api.access import Authenticator
 from service.api.listener import BoundedServer, Shares, raise_limit
 from service.api.routes import MAX_STREAMS, create_api
 from service.engine.engine import RuntimeConfig
@@ -26,8 +28,9 @@ from service.errors import prefixed
 from service.ingest.align import Clock
 from service.ingest.queues import BusConfig
 from service.ingest.zenoh_bus import Bus
-from service.settings import Settings, split_address
+from service.settings import Settings, SettingsInvalid, is_loopback, split_address
 from service.store import Store
+from service.store.access import AccessStore
 
 _GRACE_S = 1
 _log = structlog.get_logger("gridsec.app")
@@ -70,6 +73,10 @@ async def serve(
     }
     with ExitStack() as stack:
         store = stack.enter_context(Store(settings.database))
+        authenticator = Authenticator(
+            stack.enter_context(AccessStore(settings.database)), _tokens(settings), wall
+        )
+        _check_exposure(settings, authenticator)
         given = tuple(sites)
         stored, unloaded = _stored(sites, store)
         sites |= stored
@@ -104,7 +111,12 @@ async def serve(
             )
         )
         runtime.attach(bus)
-        api = create_api(runtime, settings.http_hosts, max_streams=min(MAX_STREAMS, shares.streams))
+        api = create_api(
+            runtime,
+            settings.http_hosts,
+            max_streams=min(MAX_STREAMS, shares.streams),
+            authenticator=authenticator,
+        )
         server = _Server(
             api,
             shares.http,
@@ -117,6 +129,29 @@ async def serve(
         await _run(
             runtime, server, listener, tuple(sites), announce=announce, signals=signals, stopping=stopping
         )
+
+
+def _tokens(settings: Settings) -> TokenVerifier | None:
+    """Verification of bearer tokens; None without an issuer."""
+    if not settings.oidc_issuer:
+        return None
+    return TokenVerifier(
+        settings.oidc_issuer, settings.oidc_audience, settings.oidc_jwks, settings.oidc_role_claim
+    )
+
+
+def _check_exposure(settings: Settings, authenticator: Authenticator) -> None:
+    """Refuse an address beyond loopback without authentication."""
+    host, _ = split_address(settings.http)
+    if is_loopback(host) or authenticator.required or settings.open_to_network_without_authentication:
+        return
+    text = (
+        f"--http or GRIDSEC_HTTP: {settings.http} is reachable from the network and no authentication is set "
+        f"up; add a key (`gridsec key add NAME --role operator --database {settings.database}`), set "
+        "--oidc-issuer, or listen on 127.0.0.1. --open-to-network-without-authentication lets everybody on "
+        "the network change everything"
+    )
+    raise SettingsInvalid([Problem("no-authentication", text)])
 
 
 async def _run(
@@ -227,10 +262,7 @@ def load_sites(names: Iterable[str]) -> dict[str, Site]:
 def _stored(given: Mapping[str, Site], store: Store) -> tuple[dict[str, Site], dict[str, str]]:
     """Load the feeders added over REST; those of the command line take precedence.
 
-    Returns
-    -------
-    loaded, unloaded
-        By name: the feeders, and the reasons for those that cannot be loaded.
+    Returns loaded, unloaded: by name: the feeders, and the reasons for those that cannot be loaded.
     """
     loaded: dict[str, Site] = {}
     unloaded: dict[str, str] = {}

@@ -28,14 +28,9 @@ _KINDS = 256
 class Repeats:
     """Limits the records of one kind: the first of a window are written, the others counted in one line.
 
-    Parameters
-    ----------
-    report
-        Called with a kind and the number of its suppressed records.
-    clock
-        Monotonic time, s.
-    window_s, first
-        As `WINDOW_S` and `REPEATS`.
+    report: called with a kind and the number of its suppressed records.
+    clock: monotonic time, s.
+    window_s, first: as `WINDOW_S` and `REPEATS`.
     """
 
     def __init__(

@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -40,10 +41,7 @@ _CODES = {
 class SettingsInvalid(GridsecError):
     """The settings are wrong; `problems` lists all of them.
 
-    Parameters
-    ----------
-    problems
-        One sentence each.
+    problems: one sentence each.
     """
 
     code = "wrong-settings"
@@ -82,6 +80,11 @@ class Settings(BaseSettings):
     max_payload: int = Field(default=256 * 1024, ge=1024, le=16 << 20)
     queue: int = Field(default=20_000, ge=100)
     max_feeders: int = Field(default=100, ge=0)
+    oidc_issuer: str = ""
+    oidc_audience: str = "gridsec"
+    oidc_jwks: str = ""
+    oidc_role_claim: str = "gridsec_role"
+    open_to_network_without_authentication: bool = False
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     log_format: Literal["console", "json"] = "console"
 
@@ -145,6 +148,14 @@ class Settings(BaseSettings):
     def _address(cls, value: str) -> str:
         split_address(value)
         return value
+
+
+def is_loopback(host: str) -> bool:
+    """True if a host name or address is of this machine only."""
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return host.lower() == "localhost"
 
 
 def split_address(address: str) -> tuple[str, int]:

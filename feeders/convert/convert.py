@@ -66,12 +66,8 @@ def from_folder(
     An empty `name` keeps the old one; `root`, `droop` and `extent.one_voltage` are only for networks of other
     tools. `extent.meshed` keeps loops closed, with any `meshed` of the file.
 
-    Raises
-    ------
-    FeederInvalid
-        For an invalid feeder, or with every option that does not apply to a feeder.
-    GridsecError
-        For an invalid conversion.csv.
+    Raises FeederInvalid for an invalid feeder, or with every option that does not apply to a feeder;
+        GridsecError for an invalid conversion.csv.
     """
     tables = read(folder)
     given = {"root": root is not None, "droop": droop is not None, "one_voltage": extent.one_voltage}
@@ -239,34 +235,18 @@ def convert(
 ) -> Conversion:
     """Convert a source to a feeder's folder (or the profile library) with its SOURCE.md.
 
-    Parameters
-    ----------
-    source
-        Source, see the module.
-    root
-        Bus that becomes the metered busbar, if the source has several candidates.
-    name
-        Default: that of the source if it is a feeder's folder, else that of the output folder.
-    droop
-        Preset of the source's generators.
-    opened
-        Lines to open, so that a mesh becomes radial.
-    meshed
-        True: loops stay closed, as with `meshed = true` in feeder.toml.
-    one_voltage
-        True: the feeder ends at transformers to another nominal voltage, which become customers.
-
-    Raises
-    ------
-    FeederInvalid
-        If the result is not a valid feeder: a loop, an island, a missing zero sequence, ...; or with every
-        option that does not apply to a feeder's folder.
-    SourceUnreadable
-        If the source does not exist, or its own tool cannot read it.
-    GridsecError
-        If a required power flow of the source fails, or the extra `convert` is not installed.
-    FileExistsError
-        If the folder has a feeder that is not from a conversion.
+    source: source, see the module.
+    root: bus that becomes the metered busbar, if the source has several candidates.
+    name: default: that of the source if it is a feeder's folder, else that of the output folder.
+    droop: preset of the source's generators.
+    opened: lines to open, so that a mesh becomes radial.
+    meshed: True: loops stay closed, as with `meshed = true` in feeder.toml.
+    one_voltage: True: the feeder ends at transformers to another nominal voltage, which become customers.
+    Raises FeederInvalid if the result is not a valid feeder: a loop, an island, a missing zero sequence, ...;
+        or with every option that does not apply to a feeder's folder; SourceUnreadable if the source does not
+        exist, or its own tool cannot read it; GridsecError if a required power flow of the source fails, or
+        the extra `convert` is not installed; FileExistsError if the folder has a feeder that is not from a
+        conversion.
     """
     folder = Path(out)
     if source == PROFILES:
@@ -323,14 +303,8 @@ def check_against_source(
 ) -> SourceCheck:
     """Compare a folder's AC power flow with that of its source, at the source's loads; as of `convert`.
 
-    Raises
-    ------
-    SourceUnreadable
-        If the source cannot be read.
-    GridsecError
-        If the source's power flow fails.
-    PowerFlowDiverged
-        If the feeder's power flow fails.
+    Raises SourceUnreadable if the source cannot be read; GridsecError if the source's power flow fails;
+        PowerFlowDiverged if the feeder's power flow fails.
     """
     tables = read(folder)
     extent = Extent(one_voltage, tables.meta.meshed)
@@ -392,10 +366,7 @@ def _converted(
 def _kind(path: Path) -> str:
     """Tool of a file, by its name and content.
 
-    Raises
-    ------
-    SourceUnreadable
-        For any other file.
+    Raises SourceUnreadable for any other file.
     """
     if path.suffix.lower() == ".dss":
         return OPENDSS

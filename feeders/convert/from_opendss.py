@@ -245,14 +245,8 @@ def _engine() -> Iterator[Any]:
 def read_opendss(path: Path) -> SourceNetwork:
     """Read and solve a master file, which defines the circuit and its voltage bases.
 
-    Raises
-    ------
-    SourceUnreadable
-        If OpenDSS cannot read it.
-    GridsecError
-        If OpenDSS cannot solve it.
-    FeederInvalid
-        With all content that a feeder cannot have.
+    Raises SourceUnreadable if OpenDSS cannot read it; GridsecError if OpenDSS cannot solve it; FeederInvalid
+        with all content that a feeder cannot have.
     """
     with _engine() as dss:
         try:

@@ -51,10 +51,7 @@ class PandapowerNetwork(SourceNetwork):
 
         Without transformers it is the bus of the external grid.
 
-        Raises
-        ------
-        GridsecError
-            For an unknown or ambiguous bus.
+        Raises GridsecError for an unknown or ambiguous bus.
         """
         return _root(self.net, self, ids(self.net.bus, "bus"), root)
 

@@ -66,14 +66,8 @@ Tables = dict[str, Any]
 def read_pgm(path: Path) -> SourceNetwork:
     """Read and solve a file of input data: JSON as power-grid-model serialises a dataset of type `input`.
 
-    Raises
-    ------
-    SourceUnreadable
-        If power-grid-model cannot read it.
-    GridsecError
-        If power-grid-model cannot solve it.
-    FeederInvalid
-        With all problems of its data.
+    Raises SourceUnreadable if power-grid-model cannot read it; GridsecError if power-grid-model cannot solve
+        it; FeederInvalid with all problems of its data.
     """
     tables = _tables(path)
     symmetric = not any(

@@ -63,12 +63,7 @@ STRETCHES = {
 def grid(code: str) -> Any:
     """SimBench grid as a pandapower net, with its profiles in `net.profiles`.
 
-    Raises
-    ------
-    SourceUnreadable
-        For an unknown code.
-    GridsecError
-        If simbench is not installed.
+    Raises SourceUnreadable for an unknown code; GridsecError if simbench is not installed.
     """
     simbench = _simbench()
     if code not in simbench.collect_all_simbench_codes():
@@ -81,10 +76,7 @@ def grid(code: str) -> Any:
 def year() -> dict[str, Floats]:
     """Every low-voltage profile of the year: load profiles as `_pload`, `_qload`, and PV.
 
-    Raises
-    ------
-    GridsecError
-        If simbench is not installed.
+    Raises GridsecError if simbench is not installed.
     """
     simbench = _simbench()
     folder = simbench.complete_data_path(0)
@@ -135,10 +127,7 @@ def envelope(p: Floats, q: Floats) -> ReactiveEnvelope:
     household's mean, the upper slope would be several times the nominal one, and useless for an unknown load.
     Powers are fractions of their nominal values.
 
-    Raises
-    ------
-    GridsecError
-        Without a solution.
+    Raises GridsecError without a solution.
     """
     points = np.column_stack([p, q])
     try:

@@ -52,12 +52,7 @@ TURNED: Final = 1.0
 def chosen(network: SourceNetwork, root: str | None, opened: Sequence[str], droop: str | None) -> str | None:
     """Busbar of the conversion; reports all other unknown choices together with an unknown busbar.
 
-    Raises
-    ------
-    FeederInvalid
-        With all unknown names.
-    GridsecError
-        For the busbar, without further problems.
+    Raises FeederInvalid with all unknown names; GridsecError for the busbar, without further problems.
     """
     problems = _unknown(network.lines, opened)
     try:
@@ -89,12 +84,7 @@ def opened_rows(lines: Iterable[LineRow], opened: Sequence[str], changes: Change
 def busbar_of(network: SourceNetwork, rows: list[LineRow], root: str | None) -> str:
     """Requested bus, or the first bus with lines below the source; `rows` are the lines after opening.
 
-    Raises
-    ------
-    GridsecError
-        For an unknown bus.
-    BusbarUnclear
-        Without a request, if several buses are possible.
+    Raises GridsecError for an unknown bus; BusbarUnclear without a request, if several buses are possible.
     """
     if root is not None:
         return named_bus(network.nominal, root)
@@ -209,25 +199,12 @@ def feeder_of(
 ) -> Converted:
     """Convert the part of a network below a bus to a feeder.
 
-    Parameters
-    ----------
-    root
-        Bus that becomes the metered busbar; None: that of `SourceNetwork.busbar`.
-    opened
-        Lines to open, so that the feeder is radial.
-    droop
-        Preset of the generators' inverters; None: by their size.
-    fleet
-        Synthetic inverters to add.
-    max_attacked
-        `max_attacked` of the monitor.
-
-    Raises
-    ------
-    FeederInvalid
-        With every problem of the feeder.
-    GridsecError
-        For an unknown or ambiguous bus.
+    root: bus that becomes the metered busbar; None: that of `SourceNetwork.busbar`.
+    opened: lines to open, so that the feeder is radial.
+    droop: preset of the generators' inverters; None: by their size.
+    fleet: synthetic inverters to add.
+    max_attacked: `max_attacked` of the monitor.
+    Raises FeederInvalid with every problem of the feeder; GridsecError for an unknown or ambiguous bus.
     """
     busbar = chosen(network, root, opened, droop)
     part = below(network, busbar, opened, extent)
@@ -263,12 +240,8 @@ def below(
 ) -> SuppliedArea:
     """Cut the part below a bus out of a network; arguments as of `feeder_of`.
 
-    Raises
-    ------
-    FeederInvalid
-        For a second infeed, or lines between buses of different nominal voltages.
-    GridsecError
-        For an unknown or ambiguous bus.
+    Raises FeederInvalid for a second infeed, or lines between buses of different nominal voltages;
+        GridsecError for an unknown or ambiguous bus.
     """
     changes = Changes(network.changes)
     rows = opened_rows(network.lines, opened, changes)
@@ -295,10 +268,7 @@ def finished(
 ) -> Converted:
     """Assemble the result of a conversion; `power` is that of each customer in the source, kVA.
 
-    Raises
-    ------
-    FeederInvalid
-        For doubtful values without a power flow of the source.
+    Raises FeederInvalid for doubtful values without a power flow of the source.
     """
     unchecked = "" if network.volts else network.unsolved
     given = network.volts.get(part.busbar, np.full(3, np.nan + 0j))
@@ -329,10 +299,7 @@ def accepting(tables: FeederTables, changes: Changes, unchecked: str) -> FeederT
     `changes` receives every doubtful value. `unchecked` is the reason for a missing power flow of the source,
     empty with one; without one, the source itself may have a wrong unit.
 
-    Raises
-    ------
-    FeederInvalid
-        For doubts without a power flow, with all other problems.
+    Raises FeederInvalid for doubts without a power flow, with all other problems.
     """
     doubts: set[str] = set()
     problems = []

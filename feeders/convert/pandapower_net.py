@@ -355,10 +355,7 @@ SIDES: Final = {"trafo": ("hv", "lv"), "trafo3w": ("hv", "mv", "lv")}
 def read_net(net: Any, network: SourceNetwork) -> None:
     """Fill a network from a net, without loads and static generators; the net is not changed.
 
-    Raises
-    ------
-    FeederInvalid
-        With all problems of its tables.
+    Raises FeederInvalid with all problems of its tables.
     """
     problems = problems_of(net)
     if problems:

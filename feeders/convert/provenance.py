@@ -248,10 +248,7 @@ class Origin:
 def origin(path_or_name: Path | str) -> Origin | None:
     """Origin of a feeder, given by its folder or as a bundled feeder; None if it was not converted.
 
-    Raises
-    ------
-    GridsecError
-        If its conversion.csv is not from `feeders.convert.convert`.
+    Raises GridsecError if its conversion.csv is not from `feeders.convert.convert`.
     """
     folder = folder_of(path_or_name)
     if folder is None or not (folder / CHANGES_FILE).is_file():

@@ -86,14 +86,9 @@ def _above(value: float) -> str:
 def compare(state: SourceState, tables: FeederTables) -> SourceCheck:
     """Solve a converted feeder at its source's loads and compare the voltages of all buses.
 
-    Raises
-    ------
-    PowerFlowDiverged
-        If the feeder has no solution at these loads.
-    FeederInvalid
-        If neither the balanced nor the three-phase model supports the feeder.
-    GridsecError
-        If there is no bus at which both have a voltage.
+    Raises PowerFlowDiverged if the feeder has no solution at these loads; FeederInvalid if neither the
+        balanced nor the three-phase model supports the feeder; GridsecError if there is no bus at which both
+        have a voltage.
     """
     power = np.array([state.power_kva.get(row.customer, 0.0) for row in tables.customers])
     v0 = np.nan_to_num(np.asarray(state.busbar_volt, dtype=np.complex128))

@@ -232,10 +232,8 @@ class Referred:
 def refer(tables: FeederTables) -> tuple[Referred, Tree]:
     """Refer voltages and impedances of a feeder to its busbar; with the tree of its closed lines.
 
-    Raises
-    ------
-    FeederInvalid
-        For a tap on a line without impedance, or taps around a loop with a product other than 1.
+    Raises FeederInvalid for a tap on a line without impedance, or taps around a loop with a product other
+        than 1.
     """
     closed, found = closed_tree(tables.meta.busbar, tables.lines)
     lines, ties = [closed[k] for k in found.branch], [closed[k] for k in found.ties]

@@ -115,10 +115,7 @@ def from_history(error_p: Floats, error_q: Floats, step_s: float) -> LoadDoubt:
     samples: the median over the customers, at most the length of the history. The common share follows from
     the variance of the customers' mean beyond that of independent errors.
 
-    Raises
-    ------
-    ValueError
-        With fewer than three samples, or values that are not finite.
+    Raises ValueError with fewer than three samples, or values that are not finite.
     """
     if error_p.ndim != 2 or error_p.shape != error_q.shape or len(error_p) < _FEWEST:
         raise InputInvalid(

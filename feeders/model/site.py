@@ -155,10 +155,7 @@ class PowerAges:
     first reading. Readings may be lost: the rule starts `RENEWAL_TICKS` ticks after the interval. Without a
     stated interval, and for powers with a time of their own, it has no effect.
 
-    Parameters
-    ----------
-    site
-        The feeder.
+    site: the feeder.
     """
 
     def __init__(self, site: Site) -> None:
@@ -293,24 +290,15 @@ class Site(Equipment):
 
     With single-phase lines or customers, or lines that are not transposed, it is in three phases, and each
     customer of `tables` has one phase. A customer of three phases becomes three, see `one_phase_each`.
-
-    Attributes
-    ----------
-    feeder
-        The radial tree, pu; or with closed ties, or in three phases.
-    base_volt : (n,)
-        1 pu of every place, V: the nominal voltage, times the taps' ratio behind taps, see
-        `feeders.model.equipment`.
-    nominal_volt : (n,)
-        Nominal voltage of every place, V; behind a transformer it differs from the busbar's.
-    forecast
-        Forecast of unread powers; None: they have their range only.
     """
 
-    feeder: AnyNetwork
+    feeder: AnyNetwork  # the radial tree, pu; or with closed ties, or in three phases
+    # (n,) 1 pu of every place, V: the nominal voltage, times the taps' ratio behind taps, see
+    # `feeders.model.equipment`
     base_volt: Floats
+    # (n,) nominal voltage of every place, V; behind a transformer it differs from the busbar's
     nominal_volt: Floats
-    forecast: Forecast | None = None
+    forecast: Forecast | None = None  # forecast of unread powers; None: they have their range only
 
     @property
     def customer_volt(self) -> Floats:
@@ -340,10 +328,7 @@ class Site(Equipment):
     def tree(self) -> Feeder | ThreePhaseFeeder:
         """Tree of the buses, for methods of radial feeders.
 
-        Raises
-        ------
-        FeederInvalid
-            If closed lines form loops.
+        Raises FeederInvalid if closed lines form loops.
         """
         if isinstance(self.feeder, MeshedFeeder | PhasedMesh):
             raise not_radial()
@@ -353,10 +338,7 @@ class Site(Equipment):
     def balanced(self) -> Feeder:
         """Radial tree, for methods of balanced feeders.
 
-        Raises
-        ------
-        FeederInvalid
-            In three phases, or if closed lines form loops.
+        Raises FeederInvalid in three phases, or if closed lines form loops.
         """
         if isinstance(self.tree, Feeder):
             return self.tree
@@ -367,45 +349,26 @@ class Site(Equipment):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Snapshot:
-    """Readings of one tick in SI, as on the wire: net import positive. p meters.
+    """Readings of one tick in SI, as on the wire: net import positive. p meters."""
 
-    Attributes
-    ----------
-    t
-        Unix time, s.
-    v_volt : (p,)
-        Phase-to-neutral voltages, V; NaN where missing.
-    p_kw : (p,)
-        Net active import of the customer, kW; NaN where missing.
-    q_kvar : (p,)
-        Net reactive import, the inverter included, kvar; NaN where not reported.
-    v0_volt
-        Busbar voltage, V; NaN where missing. In three phases (3,).
-    p_age_s : (p,) or None
-        Age of the powers at the voltage readings beside them, s; NaN, or None for all, where not stated.
-    clock_offset_s : (p,) or None
-        Clock offset of each meter, s, positive ahead; NaN, or None for all, where not measurable.
-    busbar_offset_s
-        Clock offset of the busbar meter, s, positive ahead; NaN where not measurable.
-    """
-
-    t: float
-    v_volt: Floats
-    p_kw: Floats
-    q_kvar: Floats
-    v0_volt: Floats | float
+    t: float  # Unix time, s
+    v_volt: Floats  # (p,) phase-to-neutral voltages, V; NaN where missing
+    p_kw: Floats  # (p,) net active import of the customer, kW; NaN where missing
+    q_kvar: Floats  # (p,) net reactive import, the inverter included, kvar; NaN where not reported
+    v0_volt: Floats | float  # Busbar voltage, V; NaN where missing. In three phases (3,).
+    # (p,) or None: age of the powers at the voltage readings beside them, s; NaN, or None for all, where not
+    # stated
     p_age_s: Floats | None = None
+    # (p,) or None: clock offset of each meter, s, positive ahead; NaN, or None for all, where not measurable
     clock_offset_s: Floats | None = None
+    # clock offset of the busbar meter, s, positive ahead; NaN where not measurable
     busbar_offset_s: float = math.nan
 
 
 def load(path_or_name: Path | str) -> Site:
     """Load a feeder: a folder, or the name of a bundled feeder (`names()`).
 
-    Raises
-    ------
-    FeederInvalid
-        With every problem of the files, or for an unknown feeder.
+    Raises FeederInvalid with every problem of the files, or for an unknown feeder.
     """
     return from_tables(find(path_or_name))
 
@@ -417,10 +380,7 @@ def from_tables(tables: FeederTables) -> Site:
     ``r = r_ohm / z_base``, ``b = 1e-6 b_us z_base``, and powers in kW divide by S. Behind taps V is that of
     `feeders.model.equipment`.
 
-    Raises
-    ------
-    FeederInvalid
-        For invalid tables, or for content that the model does not support.
+    Raises FeederInvalid for invalid tables, or for content that the model does not support.
     """
     problems = validate(tables)
     if not tables.in_phases:

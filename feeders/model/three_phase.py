@@ -82,10 +82,7 @@ def three_phase(tables: FeederTables) -> ThreePhaseSite:
     With ``z_base = 3 V^2 / (1000 S)`` ohm for V volts phase to neutral and S kVA of all three phases, as on
     a balanced feeder; a single-phase customer's kW divide by ``S / 3``.
 
-    Raises
-    ------
-    FeederInvalid
-        For invalid tables, missing zero sequences or matrices, or closed loops.
+    Raises FeederInvalid for invalid tables, missing zero sequences or matrices, or closed loops.
     """
     site, ties = spanned(tables)
     if ties.ends.size:
@@ -96,10 +93,7 @@ def three_phase(tables: FeederTables) -> ThreePhaseSite:
 def spanned(tables: FeederTables) -> tuple[ThreePhaseSite, Ties]:
     """`three_phase` of a tree with every phase of every bus, and the lines that close loops.
 
-    Raises
-    ------
-    FeederInvalid
-        For invalid tables, or without such a tree.
+    Raises FeederInvalid for invalid tables, or without such a tree.
     """
     problems = validate(tables) or unsupported(tables)
     if problems:

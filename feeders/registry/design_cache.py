@@ -120,12 +120,8 @@ def bank_gains(
 
     `progress` is called with (done, total) during the design.
 
-    Raises
-    ------
-    NotObservable
-        For p <= 2M.
-    DesignInfeasible
-        If some observer does not exist, or their number is too large.
+    Raises NotObservable for p <= 2M; DesignInfeasible if some observer does not exist, or their number is too
+        large.
     """
     meters = len(lure.C)
     masks = subsets(meters, max_attacked, most=MOST_OBSERVERS).masks()

@@ -17,107 +17,58 @@ __all__ = ["BiasLearning", "DesignOptions", "DesignedEstimator", "Estimator", "W
 
 @dataclass(frozen=True, slots=True)
 class DesignOptions:
-    """Options of a design that do not change its result.
+    """Options of a design that do not change its result."""
 
-    Attributes
-    ----------
-    workers
-        Processes for designs by matrix inequality.
-    where
-        Folder of the cache of such designs; None: that of `feeders.registry.design_cache.folder`.
-    progress
-        Called with (done, total) during such designs.
-    """
-
-    workers: int = 1
+    workers: int = 1  # processes for designs by matrix inequality
+    # folder of the cache of such designs; None: that of `feeders.registry.design_cache.folder`
     where: Path | None = None
-    progress: Callable[[int, int], None] | None = None
+    progress: Callable[[int, int], None] | None = None  # called with (done, total) during such designs
 
 
 @dataclass(frozen=True, slots=True)
 class BiasLearning:
-    """Functions of an estimator that learns the fixed errors of its meters.
+    """Functions of an estimator that learns the fixed errors of its meters."""
 
-    Attributes
-    ----------
-    needed_s
-        `needed_s(design)`: learning time, s; 0 for never.
-    init
-        `init(design, t, commission)`: initial state with earlier knowledge of the fixed errors.
-    commission
-        `commission(state)`: present knowledge of the fixed errors.
-    renew
-        `renew(design, state, which)`: state after replacement of meters; their learning restarts.
-    read
-        `read(design, arrays)`: inverse of `gridsec.estimators.sequential.to_arrays`; a `ValueError` names
-        every contradiction to the design.
-    progress
-        `progress(design, commission)`: state and reason of each meter, and the expected time.
-    """
-
-    needed_s: Callable[[Any], float]
+    needed_s: Callable[[Any], float]  # `needed_s(design)`: learning time, s; 0 for never
+    # `init(design, t, commission)`: initial state with earlier knowledge of the fixed errors
     init: Callable[[Any, float, Commission], Any]
-    commission: Callable[[Any], Commission]
+    commission: Callable[[Any], Commission]  # `commission(state)`: present knowledge of the fixed errors
+    # `renew(design, state, which)`: state after replacement of meters; their learning restarts
     renew: Callable[[Any, Any, Bools], Any]
+    # `read(design, arrays)`: inverse of `gridsec.estimators.sequential.to_arrays`; a `ValueError` names every
+    # contradiction to the design
     read: Callable[[Any, Mapping[str, Floats]], Commission]
+    # `progress(design, commission)`: state and reason of each meter, and the expected time
     progress: Callable[[Any, Commission], LearningProgress]
 
 
 @dataclass(frozen=True, slots=True)
 class WarmStart:
-    """Functions of an estimator that keeps suspects over a restart.
+    """Functions of an estimator that keeps suspects over a restart."""
 
-    Attributes
-    ----------
-    distrusted
-        `distrusted(design, state)`: present suspicion record.
-    warm_start
-        `restore(design, state, distrust)`: state from `init` with these devices distrusted.
-    """
-
-    distrusted: Callable[[Any, Any], SuspicionRecord]
+    distrusted: Callable[[Any, Any], SuspicionRecord]  # `distrusted(design, state)`: present suspicion record
+    # `restore(design, state, distrust)`: state from `init` with these devices distrusted
     warm_start: Callable[[Any, Any, SuspicionRecord], Any]
 
 
 @dataclass(frozen=True, slots=True)
 class Estimator:
-    """Estimator: three functions, a name, and optional abilities.
+    """Estimator: three functions, a name, and optional abilities."""
 
-    Attributes
-    ----------
-    name
-        As in `feeder.toml`.
-    summary
-        One-line description.
-    design
-        `design(site, job)`: the design; raises `NotObservable` or `DesignInfeasible`. Any other exception of
-        an external estimator becomes `EstimatorUnusable` in `feeders.registry.registry.design`.
-    init
-        `init(design, t)`: initial state.
-    step
-        `step(design, state, frame)`: next state, estimate and verdict; never raises on data.
-    observers
-        Number of observers, or candidate sets, of a design.
-    proof
-        One-line proof of convergence of a design's estimate; empty without one.
-    withstands
-        Number of manipulated meters that a design identifies; None: `max_attacked` of the feeder's file.
-    bias_learning
-        Learning of the meters' fixed errors; None without it.
-    warm_start
-        Restoring of suspects after a restart; None without it.
-    """
-
-    name: str
-    summary: str
+    name: str  # as in `feeder.toml`
+    summary: str  # one-line description
+    # `design(site, job)`: the design; raises `NotObservable` or `DesignInfeasible`. Any other exception of an
+    # external estimator becomes `EstimatorUnusable` in `feeders.registry.registry.design`.
     design: Callable[[Site, DesignOptions], Any]
-    init: Callable[[Any, float], Any]
+    init: Callable[[Any, float], Any]  # `init(design, t)`: initial state
+    # `step(design, state, frame)`: next state, estimate and verdict; never raises on data
     step: Callable[[Any, Any, Frame], tuple[Any, Estimate, Verdict]]
-    observers: Callable[[Any], int]
-    proof: Callable[[Any], str]
+    observers: Callable[[Any], int]  # number of observers, or candidate sets, of a design
+    proof: Callable[[Any], str]  # one-line proof of convergence of a design's estimate; empty without one
+    # number of manipulated meters that a design identifies; None: `max_attacked` of the feeder's file
     withstands: Callable[[Any], int] | None = None
-    bias_learning: BiasLearning | None = None
-    warm_start: WarmStart | None = None
+    bias_learning: BiasLearning | None = None  # learning of the meters' fixed errors; None without it
+    warm_start: WarmStart | None = None  # restoring of suspects after a restart; None without it
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -27,10 +27,8 @@ class EstimatorUnusable(GridsecError):
 def load(name: str, kind: type) -> Any:
     """Load the estimator of that name, of `feeders.format.columns.foreign_estimators`.
 
-    Raises
-    ------
-    EstimatorUnusable
-        If there is none or more than one, if its code fails, or if its type is not `kind` or its name wrong.
+    Raises EstimatorUnusable if there is none or more than one, if its code fails, or if its type is not
+        `kind` or its name wrong.
     """
     points = tuple(entry_points(group=GROUP, name=name))
     if len(points) != 1:
@@ -51,12 +49,8 @@ def load(name: str, kind: type) -> Any:
 def design(name: str, make: Callable[[Site, DesignOptions], Any], site: Site, job: DesignOptions) -> Any:
     """Design by the function `make` of another package.
 
-    Raises
-    ------
-    NotObservable, DesignInfeasible
-        If the function raises it.
-    EstimatorUnusable
-        If the function raises anything else.
+    Raises NotObservable, DesignInfeasible if the function raises it; EstimatorUnusable if the function raises
+        anything else.
     """
     try:
         return make(site, job)

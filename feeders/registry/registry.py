@@ -71,12 +71,8 @@ def design(
 ) -> DesignedEstimator:
     """Design the estimator of the feeder's file; options as of `DesignOptions`.
 
-    Raises
-    ------
-    NotObservable, DesignInfeasible
-        If the feeder cannot be monitored with these settings.
-    EstimatorUnusable
-        If the code of another package's estimator fails.
+    Raises NotObservable, DesignInfeasible if the feeder cannot be monitored with these settings;
+        EstimatorUnusable if the code of another package's estimator fails.
     """
     settings = site.tables.meta.monitor
     family, job = FAMILIES[settings.estimator], DesignOptions(workers, where, progress)
@@ -144,10 +140,7 @@ def _of(
 def choose(site: Site, *, estimator: str | None = None, max_attacked: int | None = None) -> Site:
     """Copy a feeder with other settings of the monitor; None: as in the file.
 
-    Raises
-    ------
-    FeederInvalid
-        For an unknown estimator, or a negative M.
+    Raises FeederInvalid for an unknown estimator, or a negative M.
     """
     meta = site.tables.meta
     problems = []
@@ -176,9 +169,7 @@ def lmi_options(site: Site, lure: Lure) -> CircleOptions:
     Each is the largest error of the file at the customer's peak, or that without a reading for a customer
     without a meter.
 
-    References
-    ----------
-    docs/theory-observers.md, on designing against the load error and the noise together.
+    Source: docs/theory-observers.md, on designing against the load error and the noise together.
     """
     own = certify(lure).rate
     jitter, step = site.accuracy.jitter, site.accuracy.resolution

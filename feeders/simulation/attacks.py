@@ -144,24 +144,15 @@ def random_attacks(
 ) -> tuple[Attack, ...]:
     """Choose random meters of a feeder and their attack; the seed determines both.
 
-    Parameters
-    ----------
-    kind
-        One of RANDOM_KINDS. Bias, scaling and random displacements have random signs and sizes between `size`
-        and 1.5 `size`. A drift reaches such a size after a third of the attack. A replay repeats the hour
-        before. A fake load moves the least affected of its meters by `size`. Scaling moves a meter by at
+    kind: one of RANDOM_KINDS. Bias, scaling and random displacements have random signs and sizes between
+        `size` and 1.5 `size`. A drift reaches such a size after a third of the attack. A replay repeats the
+        hour before. A fake load moves the least affected of its meters by `size`. Scaling moves a meter by at
         least `size` while its voltage is within the feeder's limits. Stuck meters have no size.
-    size
-        Smallest displacement of a manipulated meter, pu of nominal, > 0.
-    t_on, t_off
-        Begin and end, Unix s.
-    scenario
-        Source of the true loads at `t_on` under a fake load; typical loads by default.
-
-    Raises
-    ------
-    NoSuchAttack
-        For fewer meters than `count`, another kind, or without a place for a fake load of this size.
+    size: smallest displacement of a manipulated meter, pu of nominal, > 0.
+    t_on, t_off: begin and end, Unix s.
+    scenario: source of the true loads at `t_on` under a fake load; typical loads by default.
+    Raises NoSuchAttack for fewer meters than `count`, another kind, or without a place for a fake load of
+        this size.
     """
     kind = choice("kind", AttackKind, kind)
     if kind not in RANDOM_KINDS:
@@ -289,18 +280,10 @@ def fake_load(
     `meters` are the manipulated ones, (k,), or their number. A number selects those that the load affects
     most, with the customer's own meter if there is one. Without `loads` the true loads are typical ones.
 
-    Returns
-    -------
-    meters : (k,)
-        The manipulated meters.
-    fake
-        The load, and its trace at all meters: the difference of two AC power flows in equilibrium with the
-        droop inverters. A final scaling by less than SIZING_TOLERANCE makes its size exact.
-
-    Raises
-    ------
-    NoSuchAttack
-        If no load moves the meters that far, or only one beyond LARGEST_SHIFT_PU.
+    Returns meters (k,): the manipulated meters.
+    Returns fake: the load, and its trace at all meters: the difference of two AC power flows in equilibrium
+        with the droop inverters. A final scaling by less than SIZING_TOLERANCE makes its size exact.
+    Raises NoSuchAttack if no load moves the meters that far, or only one beyond LARGEST_SHIFT_PU.
     """
     loads = _typical(site) if loads is None else loads
     loop = ClosedLoop(power_flow(site), site.droop, site.feeder.base_kva, site.customer_volt)

@@ -108,15 +108,10 @@ class SimulatedMeters:
 
     Random numbers of a tick depend on the seed and its number alone.
 
-    Attributes
-    ----------
-    bias : (p,)
-        Fixed relative bias of each voltage register, 1.
-    busbar_bias
-        The same for the busbar meter; in three phases (3,).
-    p_gain, q_gain : (p,)
-        Fixed relative errors of the power registers, 1: the true power is the reading times 1 + gain. Data
-        sheets state the error as a fraction of the reading.
+    bias (p,): fixed relative bias of each voltage register, 1.
+    busbar_bias: the same for the busbar meter; in three phases (3,).
+    p_gain, q_gain (p,): fixed relative errors of the power registers, 1: the true power is the reading times
+        1 + gain. Data sheets state the error as a fraction of the reading.
     """
 
     def __init__(self, site: Site, errors: MeterErrors, channel: Channel, seed: int) -> None:

@@ -152,12 +152,8 @@ class ClosedLoop:
     def settle(self, loads: Loads, kept: Floats, new: Floats, guess: Floats) -> Point:
         """Solve x = kept + new K(v(x)) from a first guess; kept and guess (m,) in pu, new (m,) from 0 to 1.
 
-        Raises
-        ------
-        NoEquilibrium
-            Without a solution within TOLERANCE_PU after MAX_ITERATIONS solves.
-        PowerFlowDiverged
-            Without a power flow solution for these loads.
+        Raises NoEquilibrium without a solution within TOLERANCE_PU after MAX_ITERATIONS solves;
+            PowerFlowDiverged without a power flow solution for these loads.
         """
         here = self._trial(loads, kept, new, guess)
         for _ in range(MAX_ITERATIONS):

@@ -120,20 +120,11 @@ class UnbalancedPowerFlow:
     def solve(self, p_kw: Floats, q_kvar: Floats, v0_volt: Floats | Phasors | float) -> tuple[Floats, Floats]:
         """Voltages for one set of loads; PowerFlowDiverged if the iteration finds no solution.
 
-        Parameters
-        ----------
-        p_kw, q_kvar : (N,)
-            Net import of each customer, all its phases together, kW and kvar.
-        v0_volt : scalar, (3,) or complex (3,)
-            Given voltage, phase to neutral, V: one for all phases, or one for each; real ones have angles of
-            0, -120 and 120 degrees.
-
-        Returns
-        -------
-        connections : (C,)
-            Voltage of each connection, customer by customer, phase by phase, V.
-        buses : (b + 1, 3)
-            Voltage of each phase of each bus, V; NaN where it is absent.
+        p_kw, q_kvar (N,): net import of each customer, all its phases together, kW and kvar.
+        v0_volt scalar, (3,) or complex (3,): given voltage, phase to neutral, V: one for all phases, or one
+            for each; real ones have angles of 0, -120 and 120 degrees.
+        Returns connections (C,): voltage of each connection, customer by customer, phase by phase, V.
+        Returns buses (b + 1, 3): voltage of each phase of each bus, V; NaN where it is absent.
         """
         all_of_them = self.phasors(p_kw[None], q_kvar[None], np.asarray(v0_volt)[None])
         connections, buses = self._magnitudes(all_of_them)

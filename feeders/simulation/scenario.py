@@ -169,12 +169,9 @@ class SimulatedTick:
 def simulate(site: Site, scenario: Scenario) -> Iterator[SimulatedTick]:
     """Simulate a scenario, tick by tick.
 
-    Raises
-    ------
-    PowerFlowDiverged, NoEquilibrium
-        Without a power flow solution, or without a common solution of inverters and feeder.
-    ValueError
-        For an attack on, or the silence of, an unknown meter, or an attack that uses too old readings.
+    Raises PowerFlowDiverged, NoEquilibrium without a power flow solution, or without a common solution of
+        inverters and feeder; ValueError for an attack on, or the silence of, an unknown meter, or an attack
+        that uses too old readings.
     """
     check(site, scenario)
     meters = SimulatedMeters(site, scenario.errors, scenario.channel, scenario.seed)

@@ -177,10 +177,8 @@ def frames(
     of `LoadError.half_width`. The others, and all without `load_error`, have those of `to_frame`. `stated` is
     `trial.stated`, if known already.
 
-    Raises
-    ------
-    NoSuchAttack, PowerFlowDiverged, NoEquilibrium
-        If the attack does not exist on this feeder, or the feeder has no solution.
+    Raises NoSuchAttack, PowerFlowDiverged, NoEquilibrium if the attack does not exist on this feeder, or the
+        feeder has no solution.
     """
     site = trial.stated if stated is None else stated
     scenario = trial.scenario if scenario is None else scenario

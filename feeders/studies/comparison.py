@@ -116,10 +116,7 @@ CASES: Final = (
 class ComparisonPlan:
     """Options of a comparison; those without a comment are as in `feeders.simulation.trial.Trial`.
 
-    Raises
-    ------
-    ValueError
-        For an unknown estimator or case, or no run, with all problems.
+    Raises ValueError for an unknown estimator or case, or no run, with all problems.
     """
 
     max_attacked: int = 2  # M of the designs, and number of manipulated meters
@@ -187,12 +184,7 @@ def compare(
     An interrupted comparison resumes from its journal. `progress` is called with a line of text before each
     design and each case.
 
-    Raises
-    ------
-    OtherStudy
-        If the journal is that of another study.
-    InUse
-        If another process writes the journal.
+    Raises OtherStudy if the journal is that of another study; InUse if another process writes the journal.
     """
     report_progress = progress or (lambda _: None)
     cases = [case for case in CASES if case.name in plan.cases]
@@ -363,10 +355,7 @@ def markdown(rows: Sequence[ComparisonRow], plan: ComparisonPlan) -> str:
 def splice(text: str, table: str) -> str:
     """Replace the text of a document between BEGIN and END.
 
-    Raises
-    ------
-    GridsecError
-        Without both markers, once each and in this order.
+    Raises GridsecError without both markers, once each and in this order.
     """
     before, _, rest = text.partition(BEGIN)
     _, end, after = rest.partition(END)

@@ -37,34 +37,25 @@ MANY = 50  # number of meters from which on several processes are faster than on
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Detectable:
-    """Result of `detectable`. All sizes are voltages at nominal voltage, V.
-
-    Attributes
-    ----------
-    meters
-        One row for each meter, `alone` or in collusion with M - 1 others of the attacker's choice:
-
-        - `hidden_alone`, `hidden`: up to this size, with probability `1 - risk` at any one moment, no meter
-        exceeds the sequential monitor's limits, so that no meter is named;
-        - `noticed_alone`, `noticed`: beyond this size a meter does, with that probability;
-        - `named_alone`, `named`: beyond this size, with probability `1 - 2 risk`, no explanation that trusts
-        the meter is a rival, and it exceeds its limit;
-        - `fits_alone`, `fits`: the largest attack that is consistent with an honest feeder, all errors within
-        their worst cases: no test without false alarms is sure to detect it; every larger one is
-        inconsistent;
-        - `identified_alone`, `identified`: for every larger attack, all explanations by at most M meters
-        accuse this meter.
-    customers
-        One row for each customer: `error`, the largest error of the sequential monitor's reconstruction under
-        M unnoticed manipulated meters; `error_fits`, the largest distance of two voltages that are consistent
-        with the same readings.
-    """
+    """Result of `detectable`. All sizes are voltages at nominal voltage, V."""
 
     feeder: str
     digest: str
     max_attacked: int
     risk: float
+    # one row for each meter, `alone` or in collusion with M - 1 others of the attacker's choice: -
+    # `hidden_alone`, `hidden`: up to this size, with probability `1 - risk` at any one moment, no meter
+    # exceeds the sequential monitor's limits, so that no meter is named; - `noticed_alone`, `noticed`: beyond
+    # this size a meter does, with that probability; - `named_alone`, `named`: beyond this size, with
+    # probability `1 - 2 risk`, no explanation that trusts the meter is a rival, and it exceeds its limit; -
+    # `fits_alone`, `fits`: the largest attack that is consistent with an honest feeder, all errors within
+    # their worst cases: no test without false alarms is sure to detect it; every larger one is inconsistent;
+    # - `identified_alone`, `identified`: for every larger attack, all explanations by at most M meters accuse
+    # this meter
     meters: pd.DataFrame
+    # one row for each customer: `error`, the largest error of the sequential monitor's reconstruction under M
+    # unnoticed manipulated meters; `error_fits`, the largest distance of two voltages that are consistent
+    # with the same readings
     customers: pd.DataFrame
     share: float = SHARE
 
@@ -88,25 +79,12 @@ def detectable(
 
     Inverters are in their deadbands. The result is the same for every runner.
 
-    Parameters
-    ----------
-    max_attacked
-        M: largest number of manipulated meters.
-    share
-        Load relative to its peak, the same for all, 1.
-    risk
-        Probability that honest errors exceed the monitor's limits.
-
-    Raises
-    ------
-    NotObservable, DesignInfeasible
-        If the feeder cannot be monitored.
-    ValueError
-        If `max_attacked`, `share` or `risk` is out of range.
-    OtherStudy
-        If the journal is that of another study.
-    InUse
-        If another process writes the journal.
+    max_attacked: M: largest number of manipulated meters.
+    share: load relative to its peak, the same for all, 1.
+    risk: probability that honest errors exceed the monitor's limits.
+    Raises NotObservable, DesignInfeasible if the feeder cannot be monitored; ValueError if `max_attacked`,
+        `share` or `risk` is out of range; OtherStudy if the journal is that of another study; InUse if
+        another process writes the journal.
     """
     p = site.meters.size
     checks = (
@@ -190,10 +168,7 @@ def _row(given: _Given, piece: int) -> dict[str, Any]:
 def monitor_rule(site: Site, *, risk: float = RISK, share: float = SHARE) -> Rule:
     """Rule of the sequential monitor with the settings of the feeder's files.
 
-    Raises
-    ------
-    NotObservable, DesignInfeasible
-        If the feeder cannot be monitored.
+    Raises NotObservable, DesignInfeasible if the feeder cannot be monitored.
     """
     settings = site.tables.meta.monitor
     found = design_sequential(

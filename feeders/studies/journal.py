@@ -100,14 +100,8 @@ class Journal:
     `subject` holds the name of the `study` and every argument that changes a result; `of` is the number of
     pieces of work, if known. `path` is the file, created if it does not exist; None without one.
 
-    Raises
-    ------
-    OtherStudy
-        If the file is that of another study.
-    InUse
-        If another process has it.
-    OSError
-        If it cannot be written.
+    Raises OtherStudy if the file is that of another study; InUse if another process has it; OSError if it
+        cannot be written.
     """
 
     def __init__(self, where: Where, subject: Mapping[str, Any], *, of: int | None = None) -> None:
@@ -160,10 +154,7 @@ class Journal:
     def put(self, key: str, value: Any) -> None:
         """Store the result of a piece of work, in plain JSON types.
 
-        Raises
-        ------
-        OSError
-            If it cannot be written.
+        Raises OSError if it cannot be written.
         """
         self._done[key] = value
         if self._database is None or self.path is None:
@@ -270,12 +261,8 @@ def run_pieces(
     `runner` calls `work`, by default in this process in order. `progress` is called before the first piece
     and after each.
 
-    Raises
-    ------
-    OtherStudy, InUse, OSError
-        As `Journal`.
-    ClusterUnusable, WorkerLost
-        From the runner; finished pieces are in the journal.
+    Raises OtherStudy, InUse, OSError as `Journal`; ClusterUnusable, WorkerLost from the runner; finished
+        pieces are in the journal.
     """
     report_progress = progress or (lambda *_: None)
     with Journal(where, subject, of=len(keys)) as journal:

@@ -87,10 +87,7 @@ def box(site: Site, *, share: float = SHARE, curves: CurvePositions = CurvePosit
     only. Inverters follow their linearised droop curves; at nominal voltage these are in the deadband. In
     three phases each voltage of the busbar has its own error.
 
-    Raises
-    ------
-    ValueError
-        For an unknown region of the curves.
+    Raises ValueError for an unknown region of the curves.
     """
     frame = _frame(site, share)
     return _box(site, curves, frame.p_error, frame.q_error)
@@ -108,10 +105,7 @@ def false_powers(
     `unknown` are customers with unknown powers besides those without a meter; `share` and `curves` as in
     `box`.
 
-    Raises
-    ------
-    ValueError
-        For an unknown customer or region of the curves.
+    Raises ValueError for an unknown customer or region of the curves.
     """
     frame, silent = _frame(site, share), unread(site)
     p, q = np.maximum(frame.p_error, silent.p_error), np.maximum(frame.q_error, silent.q_error)

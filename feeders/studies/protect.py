@@ -43,43 +43,29 @@ class Goal(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Protect:
-    """Result of `protect`.
-
-    Attributes
-    ----------
-    goal, max_attacked, attack, lie_volt
-        Requested or default question: M, the attacks that count, and the bound of attacks (NaN for goals
-        without one).
-    alone
-        With a bound: the largest attack that one meter hides by itself, with true powers, V. No protection of
-        other meters lowers it.
-    before, after
-        Without and with protection: the fewest manipulated meters that stay invisible, or the largest hidden
-        attack, V, referred to the busbar's level.
-    least
-        Proven lower bound of the number of meters; equal to their number if they are the fewest.
-    meters
-        One row for each meter to protect: `meter`, `customer`, `bus`, `attacks` (number of the attacks below
-        with this meter).
-    attacks
-        Attacks that exclude any smaller set: `liars`.
-    share
-        Load relative to its peak, the same for all, 1.
-    """
+    """Result of `protect`."""
 
     feeder: str
     digest: str
+    # goal, max_attacked, attack, lie_volt: requested or default question: M, the attacks that count, and the
+    # bound of attacks (NaN for goals without one)
     goal: Goal
     max_attacked: int
     attack: Attack
     lie_volt: float
+    # With a bound: the largest attack that one meter hides by itself, with true powers, V. No protection of
+    # other meters lowers it.
     alone: float
+    # before, after: without and with protection: the fewest manipulated meters that stay invisible, or the
+    # largest hidden attack, V, referred to the busbar's level
     before: float
     after: float
-    least: int
+    least: int  # proven lower bound of the number of meters; equal to their number if they are the fewest
+    # one row for each meter to protect: `meter`, `customer`, `bus`, `attacks` (number of the attacks below
+    # with this meter)
     meters: pd.DataFrame
-    attacks: pd.DataFrame
-    share: float = SHARE
+    attacks: pd.DataFrame  # attacks that exclude any smaller set: `liars`
+    share: float = SHARE  # load relative to its peak, the same for all, 1
 
     @property
     def gap(self) -> int:
@@ -137,40 +123,25 @@ def protect(
 
     `progress` is called with the number of known attacks, and of meters protected against them.
 
-    Parameters
-    ----------
-    max_attacked
-        M: largest number of manipulated meters among the others.
-    goal
-        `IDENTIFY`: the readings determine the manipulated meters. `NOTICE`: every attack is detected. Both as
-        in `feeders.studies.redundancy`. `BOUND`: no attack larger than `lie_volt` is consistent with an
+    max_attacked: M: largest number of manipulated meters among the others.
+    goal: `IDENTIFY`: the readings determine the manipulated meters. `NOTICE`: every attack is detected. Both
+        as in `feeders.studies.redundancy`. `BOUND`: no attack larger than `lie_volt` is consistent with an
         honest feeder, with true powers. `CONTAIN`: the same with any reported powers within the customers'
         range. By default `IDENTIFY` if attacks can stay invisible at all and there is no bound, otherwise
         `CONTAIN`.
-    lie_volt
-        Bound of the attack, V, at nominal voltage of the busbar; behind a transformer to another level, the
-        same part of the nominal voltage there. Default for `CONTAIN`: halfway between `alone` and `before`.
-    attack, unknown, busbar_known
-        For `IDENTIFY` and `NOTICE`: the attacks that count, and the unknowns. `CONTAIN` also has the unknown
-        powers; `BOUND` has none. Both, and every `lie_volt`, need the busbar voltage.
-    curves
-        Operating region of the inverters. By default the steepest part for the first two goals, the deadband
-        for the others.
-    share
-        For `BOUND` and `CONTAIN`: load relative to its peak, the same for all, 1.
-    never
-        Meters that cannot be protected.
-    exact
-        True: prove the smallest number; otherwise greedy, with `gap`.
-
-    Raises
-    ------
-    DesignInfeasible
-        If no protection of the other meters suffices.
-    ValueError
-        For an unknown customer or meter, or as `check`.
-    OtherStudy, InUse
-        As `feeders.studies.journal.Journal`.
+    lie_volt: bound of the attack, V, at nominal voltage of the busbar; behind a transformer to another level,
+        the same part of the nominal voltage there. Default for `CONTAIN`: halfway between `alone` and
+        `before`.
+    attack, unknown, busbar_known: for `IDENTIFY` and `NOTICE`: the attacks that count, and the unknowns.
+        `CONTAIN` also has the unknown powers; `BOUND` has none. Both, and every `lie_volt`, need the busbar
+        voltage.
+    curves: operating region of the inverters. By default the steepest part for the first two goals, the
+        deadband for the others.
+    share: for `BOUND` and `CONTAIN`: load relative to its peak, the same for all, 1.
+    never: meters that cannot be protected.
+    exact: True: prove the smallest number; otherwise greedy, with `gap`.
+    Raises DesignInfeasible if no protection of the other meters suffices; ValueError for an unknown customer
+        or meter, or as `check`; OtherStudy, InUse as `feeders.studies.journal.Journal`.
     """
     check(
         max_attacked=max_attacked,
@@ -249,10 +220,7 @@ def check(
 ) -> None:
     """Check the arguments of `protect`: contradictions, and arguments without effect for the goal.
 
-    Raises
-    ------
-    ValueError
-        With all problems.
+    Raises ValueError with all problems.
     """
     problems = [
         *no_choice("goal", Goal, *([] if goal is None else [goal])),

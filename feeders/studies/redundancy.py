@@ -41,32 +41,25 @@ class Redundancy:
     `index_any`: the fewest manipulated meters that stay invisible with some measured voltage falsified, for
     attacks with a lasting effect and for any; infinity without such an attack, NaN if the search was stopped
     (`note` has the reason).
-
-    Attributes
-    ----------
-    unknown, unknown_silent
-        Customers with unknown powers, in the two cases.
-    summary
-        One row for each case and kind of attack: `patterns` (dimension of hidden attacks), `blind` (customers
-        with a voltage that no meter determines, even without an attack), `index`, `detected` (largest number
-        of manipulated meters that cannot hide; without blind customers, the pair is still detectable, or
-        observable, after the loss of any `detected` meters), `identified` (largest number of manipulated
-        meters that are identified), `liars`.
-    meters
-        One row for each case and meter: its own indices, `critical`, `identified_without` (number that the
-        others identify, for persistent attacks, without it).
-    parts
-        One row for each case and part: the same for manipulated meters inside it, all meters outside honest.
     """
 
     feeder: str
     digest: str
+    # unknown, unknown_silent: customers with unknown powers, in the two cases
     unknown: tuple[str, ...]
     unknown_silent: tuple[str, ...]
     silent: tuple[str, ...]
     curves: CurvePositions
+    # one row for each case and kind of attack: `patterns` (dimension of hidden attacks), `blind` (customers
+    # with a voltage that no meter determines, even without an attack), `index`, `detected` (largest number of
+    # manipulated meters that cannot hide; without blind customers, the pair is still detectable, or
+    # observable, after the loss of any `detected` meters), `identified` (largest number of manipulated meters
+    # that are identified), `liars`
     summary: pd.DataFrame
+    # one row for each case and meter: its own indices, `critical`, `identified_without` (number that the
+    # others identify, for persistent attacks, without it)
     meters: pd.DataFrame
+    # one row for each case and part: the same for manipulated meters inside it, all meters outside honest
     parts: pd.DataFrame
 
     @property
@@ -99,12 +92,8 @@ def redundancy(
 
     The arguments are those of `feeders.studies.unobservable.knowledge`.
 
-    Raises
-    ------
-    ValueError
-        For an unknown customer, meter or region of the curves.
-    OtherStudy, InUse
-        As `feeders.studies.journal.Journal`.
+    Raises ValueError for an unknown customer, meter or region of the curves; OtherStudy, InUse as
+        `feeders.studies.journal.Journal`.
     """
     see_names(site, unknown=unknown, meters=silent, curves=curves)
     curves = CurvePositions(curves)

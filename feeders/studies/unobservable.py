@@ -73,22 +73,12 @@ def knowledge(
 ) -> Knowledge:
     """Compute the patterns that hide attacks.
 
-    Parameters
-    ----------
-    unknown
-        Customers with unknown active and reactive powers; by default those without a meter, except those with
-        `p_std_kw` and `q_std_kvar`, such as no-load powers of transformers.
-    silent
-        Meters without readings. The powers of their customers are unknown, too.
-    busbar_known
-        True: the busbar voltage is metered and honest; in three phases all of them, or none.
-    curves
-        Operating region of the inverters.
-
-    Raises
-    ------
-    ValueError
-        For an unknown customer, meter or region of the curves.
+    unknown: customers with unknown active and reactive powers; by default those without a meter, except those
+        with `p_std_kw` and `q_std_kvar`, such as no-load powers of transformers.
+    silent: meters without readings. The powers of their customers are unknown, too.
+    busbar_known: True: the busbar voltage is metered and honest; in three phases all of them, or none.
+    curves: operating region of the inverters.
+    Raises ValueError for an unknown customer, meter or region of the curves.
     """
     curves = choice("curves", CurvePositions, curves)
     gone = meter_mask(site, silent)
@@ -119,10 +109,7 @@ def knowledge(
 def customer_indices(site: Site, names: Sequence[str]) -> Ints:
     """Indices of customers by id.
 
-    Raises
-    ------
-    ValueError
-        For an unknown customer.
+    Raises ValueError for an unknown customer.
     """
     return _indices(site.feeder.customers, names, "customer")
 
@@ -136,10 +123,7 @@ def see_names(
 ) -> None:
     """Check ids of customers and meters, and the region of the curves if it is given, all at once.
 
-    Raises
-    ------
-    ValueError
-        For an unknown customer, meter or region of the curves.
+    Raises ValueError for an unknown customer, meter or region of the curves.
     """
     raise_if_any(
         [
@@ -153,10 +137,7 @@ def see_names(
 def meter_mask(site: Site, names: Sequence[str]) -> Bools:
     """Mask of meters by id, (p,).
 
-    Raises
-    ------
-    ValueError
-        For an unknown meter.
+    Raises ValueError for an unknown meter.
     """
     out = np.zeros(site.meters.size, dtype=np.bool_)
     out[_indices(site.meter_ids, names, "meter")] = True

@@ -64,10 +64,7 @@ class Processes:
     def run(self, work: Work, pieces: Sequence[int]) -> Made:
         """As `Runner`.
 
-        Raises
-        ------
-        WorkerLost
-            If the processes of a piece died repeatedly.
+        Raises WorkerLost if the processes of a piece died repeatedly.
         """
         waiting, lost = deque(pieces), Counter[int]()
         while waiting:
@@ -143,13 +140,9 @@ class Dask:
     def run(self, work: Work, pieces: Sequence[int]) -> Made:
         """As `Runner`.
 
-        Raises
-        ------
-        ClusterUnusable
-            Without `distributed`, a scheduler at the address, or workers, or for workers with other versions
-            of the libraries that numbers depend on.
-        WorkerLost
-            If the workers of a piece died repeatedly.
+        Raises ClusterUnusable without `distributed`, a scheduler at the address, or workers, or for workers
+            with other versions of the libraries that numbers depend on; WorkerLost if the workers of a piece
+            died repeatedly.
         """
         try:
             dask: Any = import_module("distributed")
@@ -197,10 +190,7 @@ class Dask:
 def agree(worker: str, theirs: Any) -> None:
     """Reject a worker with other versions than those of this process, or with an error in their place.
 
-    Raises
-    ------
-    ClusterUnusable
-        For other versions.
+    Raises ClusterUnusable for other versions.
     """
     mine = versions()
     if theirs != mine:

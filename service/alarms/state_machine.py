@@ -145,10 +145,7 @@ def advance(
     `conditions` are those of this tick: one that is not in it is absent. A tick before the last one holds
     every clock. Raises ValueError if a condition belongs to another feeder.
 
-    Returns
-    -------
-    book, transitions
-        The new state, and the transitions, in a reproducible order.
+    Returns book, transitions: the new state, and the transitions, in a reproducible order.
     """
     seen: dict[Key, Condition] = {}
     for condition in conditions:

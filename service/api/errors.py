@@ -17,6 +17,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from feeders.registry.plugins import EstimatorUnusable
 from gridsec.errors import DesignInfeasible, FeederInvalid, GridsecError, NotObservable
+from service.access.identity import NotAuthenticated, NotPermitted, TooManyFailures
 from service.alarms.state_machine import AlarmUnknown, AlreadyAcknowledged, RaisedAgain
 from service.engine.commissioning import NothingToLearn
 from service.errors import FeederFixed, FeederNotLoaded, FeederUnknown, TooManyFeeders
@@ -63,12 +64,8 @@ class Guard:
     must therefore use an address or a host name of this server, and a page that sends it must have the same
     origin.
 
-    Parameters
-    ----------
-    max_body
-        Largest request body, bytes.
-    hosts
-        Host names of this server, besides `localhost` and the machine's name.
+    max_body: largest request body, bytes.
+    hosts: host names of this server, besides `localhost` and the machine's name.
     """
 
     def __init__(self, app: ASGIApp, max_body: int, hosts: Collection[str] = ()) -> None:
@@ -148,6 +145,9 @@ def _is_address(name: str) -> bool:
     return True
 
 
+_ADVICE = {503: {"Retry-After": "5"}, 401: {"WWW-Authenticate": "Bearer"}, 429: {"Retry-After": "60"}}
+"""Headers by status."""
+
 Handler = Callable[[Request, Exception], Awaitable[Response]]
 
 _STATUS: dict[type[GridsecError], int] = {
@@ -162,6 +162,9 @@ _STATUS: dict[type[GridsecError], int] = {
     FeederFixed: 409,
     NothingToLearn: 409,
     TooManyFeeders: 409,
+    NotAuthenticated: 401,
+    NotPermitted: 403,
+    TooManyFailures: 429,
     FeederNotLoaded: 503,
     StoreUnavailable: 503,
     GridsecError: 500,
@@ -181,7 +184,7 @@ def _gridsec_handler(status: int) -> Handler:
             more["problems"] = list(error.problems)
         if isinstance(error, OutcomeUnknown):
             more["outcome"] = "unknown"
-        headers = {"Retry-After": "5"} if status == 503 else None
+        headers = _ADVICE.get(status)
         return problem(request, status, str(error), headers=headers, **more)
 
     return handler

@@ -87,12 +87,8 @@ def raise_limit() -> int:
 class Connection(H11Protocol):
     """One HTTP connection with time-outs; beyond the limit, the longest incomplete one is closed.
 
-    Parameters
-    ----------
-    most
-        Largest number of connections.
-    *args, **kwargs
-        As in uvicorn.
+    most: largest number of connections.
+    *args, **kwargs: as in uvicorn.
     """
 
     def __init__(self, most: int, *args: Any, **kwargs: Any) -> None:
@@ -241,12 +237,8 @@ def _spare() -> int | None:
 class BoundedServer(uvicorn.Server):
     """uvicorn with limited connections.
 
-    Parameters
-    ----------
-    most
-        Largest number of connections.
-    **options
-        Options of uvicorn.
+    most: largest number of connections.
+    **options: options of uvicorn.
     """
 
     def __init__(self, app: Callable[..., Any], most: int, **options: Any) -> None:

@@ -14,6 +14,8 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
 from gridsec.interface import Cause, Decision
+from service.access.audit import AuditEntry
+from service.access.identity import Role
 from service.alarms.state_machine import Alarm
 from service.engine.commissioning import CommissioningProgress, MeterCommissioning
 from service.report.report import FeederReport, MeterState
@@ -183,12 +185,45 @@ class AlarmEvents(BaseModel):
     next: int | None = Field(description="`after` of the next page; null on the last one.")
 
 
+Who = Annotated[
+    Line | None,
+    Field(
+        default=None,
+        description="The operator's name where no authentication is set up; else that of the credential.",
+    ),
+]
+
+
+class Session(BaseModel):
+    """Identity of the caller."""
+
+    name: str
+    role: Role
+    feeders: list[str] | None = Field(description="Accessible feeders; null for all.")
+    open: bool = Field(description="No authentication is set up.")
+    expires: float | None = Field(default=None, description="End of a session that was just begun, Unix s.")
+
+
+class LogIn(BaseModel):
+    """Exchange of an API key for a session."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    key: Annotated[str, StringConstraints(min_length=1, max_length=4096)]
+
+
+class AuditLog(BaseModel):
+    """Entries of the audit log."""
+
+    entries: list[AuditEntry]
+
+
 class Acknowledgement(BaseModel):
     """Acknowledgement by an operator."""
 
     model_config = ConfigDict(extra="forbid")
 
-    who: Line
+    who: Who = None
     comment: Text = ""
     count: int | None = Field(
         default=None,
@@ -202,7 +237,7 @@ class Recommissioning(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    who: Line
+    who: Who = None
     reason: Annotated[Text, StringConstraints(min_length=1)]
     meters: Annotated[list[str], Field(min_length=1)] | None = Field(
         default=None, description="Replaced meters; without this field the learning of all restarts."

@@ -26,12 +26,15 @@ from fastapi.staticfiles import StaticFiles
 from pydantic import TypeAdapter
 
 from gridsec.errors import FeederInvalid, Problem
+from service.access.identity import OPEN, Identity, NotPermitted
 from service.alarms.state_machine import Alarm, AlarmKind, AlarmState, AlarmUnknown, Severity
 from service.api import models
+from service.api.access import COOKIE, Authenticator, authorise, client_of
 from service.api.errors import Guard, handlers, problem
 from service.engine.commissioning import CommissioningProgress
 from service.errors import FeederNotLoaded, FeederUnknown
 from service.report.report import FeederReport
+from service.settings import is_loopback
 from service.store import AlarmEvent, Store, StoreUnavailable
 
 
@@ -156,10 +159,17 @@ _WEB = FilePath(__file__).parent.with_name("web")
 _NAME = r"^[A-Za-z0-9_-]{1,64}$"
 
 
-def create_api(backend: Backend, hosts: Collection[str] = (), *, max_streams: int = MAX_STREAMS) -> FastAPI:
+def create_api(
+    backend: Backend,
+    hosts: Collection[str] = (),
+    *,
+    max_streams: int = MAX_STREAMS,
+    authenticator: Authenticator | None = None,
+) -> FastAPI:
     """Return the HTTP application.
 
     `hosts` are host names for requests that change something, besides `localhost` and the machine's name.
+    Without an authenticator every request has the identity `OPEN`.
     """
     app = FastAPI(
         title="gridsec",
@@ -169,7 +179,9 @@ def create_api(backend: Backend, hosts: Collection[str] = (), *, max_streams: in
         redoc_url=None,
         openapi_url="/api/v1/openapi.json",
         responses={"default": {"model": models.Problem, "description": "Any error."}},
+        dependencies=[Depends(_authorised)],
     )
+    app.state.authenticator = authenticator
     app.state.backend = backend
     app.state.probe = Probe(backend.store)
     app.state.streams, app.state.max_streams = 0, max_streams
@@ -181,6 +193,7 @@ def create_api(backend: Backend, hosts: Collection[str] = (), *, max_streams: in
     app.include_router(_feeders)
     app.include_router(_alarms)
     app.include_router(_operations)
+    app.include_router(_sessions)
     app.mount("/", _Web(directory=_WEB, html=True), name="web")
     _describe(app)
     return app
@@ -219,7 +232,30 @@ def _backend(request: Request) -> Backend:
     return backend
 
 
+async def _authorised(request: Request) -> Identity:
+    """Identity of a request that may use its route."""
+    authenticator: Authenticator | None = request.app.state.authenticator
+    if authenticator is None:
+        return OPEN
+    route = f"{request.method} {request.scope['route'].path}"
+    body = b"" if request.method in {"GET", "HEAD"} else await request.body()
+    return await to_thread.run_sync(authorise, authenticator, request, route, body)
+
+
+def _operator(identity: Identity, given: str | None) -> str:
+    """Name of the operator: that of the credential, or without authentication the given one."""
+    if identity is OPEN and given is not None:
+        return given
+    if identity is OPEN:
+        raise RequestValidationError([{"loc": ("body", "who"), "msg": "Field required", "type": "missing"}])
+    if given not in {None, identity.name}:
+        text = f"must be left out: the credential is that of {identity.name}"
+        raise RequestValidationError([{"loc": ("body", "who"), "msg": text, "type": "identity"}])
+    return identity.name
+
+
 BackendHere = Annotated[Backend, Depends(_backend)]
+Caller = Annotated[Identity, Depends(_authorised)]
 FeederName = Annotated[str, Path(pattern=_NAME, description="Name of the feeder.")]
 AlarmId = Annotated[str, Path(pattern=r"^[0-9A-Z]{26}$", description="Id of the alarm.")]
 Since = Annotated[float | None, Query(allow_inf_nan=False, description="Not before this Unix time, s.")]
@@ -297,9 +333,10 @@ def _detail(backend: Backend, feeder: str) -> dict[str, Any]:
 
 
 @_feeders.get("")
-def list_feeders(backend: BackendHere) -> models.Feeders:
+def list_feeders(backend: BackendHere, caller: Caller) -> models.Feeders:
     """All feeders, with the latest verdict of each."""
-    return models.Feeders(feeders=[_summary(backend, fields) for fields in backend.feeders()])
+    seen = (fields for fields in backend.feeders() if caller.sees(fields["name"]))
+    return models.Feeders(feeders=[_summary(backend, fields) for fields in seen])
 
 
 @_feeders.get("/{feeder}", response_model=models.FeederDetail, responses=_NOT_MODIFIED)
@@ -388,14 +425,17 @@ def get_commissioning(backend: BackendHere, feeder: KnownFeeder, response: Respo
     dependencies=[Depends(_json_only)],
     openapi_extra=models.Recommissioning.in_openapi(),
 )
-async def recommission(backend: BackendHere, feeder: KnownFeeder, request: Request) -> models.Commissioning:
+async def recommission(
+    backend: BackendHere, feeder: KnownFeeder, request: Request, caller: Caller
+) -> models.Commissioning:
     """Restart the learning: of replaced meters, or without `meters` of the whole feeder."""
     layout = _detail(backend, feeder)["layout"]
     meters = [row["meter"] for row in layout["customers"] if row["meter"]]
     found = models.Recommissioning.of(await request.body(), meters)
     if isinstance(found, list):
         raise RequestValidationError(found)
-    progress = await backend.recommission(feeder, found.meters or (), found.who, found.reason)
+    who = _operator(caller, found.who)
+    progress = await backend.recommission(feeder, found.meters or (), who, found.reason)
     return await to_thread.run_sync(_commissioning, backend, feeder, progress)
 
 
@@ -439,9 +479,10 @@ _alarms = APIRouter(prefix="/api/v1/alarms", tags=["alarms"])
 
 
 @_alarms.get("", response_model=models.Alarms, responses=_NOT_MODIFIED)
-def list_alarms(
+def list_alarms(  # one argument per query parameter
     request: Request,
     backend: BackendHere,
+    caller: Caller,
     response: Response,
     *,
     state: Annotated[list[AlarmState] | None, Query(description="May be repeated.")] = None,
@@ -456,11 +497,13 @@ def list_alarms(
     if_none_match: IfNoneMatch = None,
 ) -> Any:
     """A page of alarms, those with the latest onset first; `since` and `until` refer to `t_raised`."""
+    _within(caller, feeder)
     last_event = backend.store.last_event
     # Before the page is read: changes stored in between are in the page.
     unstored, trouble = backend.unstored()
     # Event numbers identify changes within one database, and a run has only one.
-    waits = hashlib.sha256(f"{unstored} {trouble}".encode()).hexdigest()[:16]
+    scope = None if caller.feeders is None else sorted(caller.feeders)
+    waits = hashlib.sha256(f"{unstored} {trouble} {scope}".encode()).hexdigest()[:16]
     if known := _unchanged(response, f'W/"{request.app.state.run}-{last_event}-{waits}"', if_none_match):
         return known
     page, following = backend.store.alarms(
@@ -468,6 +511,7 @@ def list_alarms(
         kind=kind or (),
         severity=severity or (),
         feeder=feeder,
+        among=scope,
         meter=meter,
         since=since,
         until=until,
@@ -478,7 +522,7 @@ def list_alarms(
         alarms=page,
         next=following,
         last_event=last_event,
-        raised=backend.store.raised(),
+        raised=backend.store.raised(among=scope),
         unstored=unstored,
         problem=trouble,
     )
@@ -487,6 +531,7 @@ def list_alarms(
 @_alarms.get("/stream", response_class=EventSourceResponse, dependencies=[Depends(_slot)], tags=["streams"])
 async def stream_alarms(
     backend: BackendHere,
+    caller: Caller,
     feeder: Annotated[str | None, Query(pattern=_NAME, description="Restrict to this feeder.")] = None,
     after: Annotated[int | None, Query(ge=0, description="Begin after this event number.")] = None,
     last_event_id: Annotated[int | None, Header(ge=0, description="Takes precedence over `after`.")] = None,
@@ -495,6 +540,7 @@ async def stream_alarms(
 
     Without it and without `after`, the stream starts with the next event.
     """
+    _within(caller, feeder)
     store = backend.store
     start = last_event_id if last_event_id is not None else after
     # A number beyond the newest belongs to another database: start now, otherwise no event would ever come.
@@ -507,41 +553,59 @@ async def stream_alarms(
             except StoreUnavailable:
                 return  # The client reconnects with the number of its last event.
             for event in events:
+                seen = event.seq
+                if not caller.sees(event.alarm.feeder):
+                    continue
                 data = _EVENT.dump_json(event).decode()
                 yield ServerSentEvent(event="alarm", id=str(event.seq), raw_data=data)
-                seen = event.seq
             if not events:
                 seen = newest
 
 
 @_alarms.get("/{alarm_id}")
-def get_alarm(backend: BackendHere, alarm_id: AlarmId) -> Alarm:
+def get_alarm(backend: BackendHere, caller: Caller, alarm_id: AlarmId) -> Alarm:
     """One alarm."""
+    return _alarm(backend, caller, alarm_id)
+
+
+def _alarm(backend: Backend, caller: Identity, alarm_id: str) -> Alarm:
+    """An alarm within the caller's scope."""
     alarm = backend.store.alarm(alarm_id)
-    if alarm is None:
+    if alarm is None or not caller.sees(alarm.feeder):
         raise AlarmUnknown(alarm_id)
     return alarm
+
+
+def _within(caller: Identity, feeder: str | None) -> None:
+    """Refuse a feeder outside of the caller's scope."""
+    if feeder is not None and not caller.sees(feeder):
+        raise NotPermitted(f"{caller.name} has no access to feeder {feeder!r}")
 
 
 @_alarms.get("/{alarm_id}/events")
 def get_events(
     backend: BackendHere,
+    caller: Caller,
     alarm_id: AlarmId,
     after: Annotated[int, Query(ge=0, le=MAX_EVENT, description="Only events with a higher number.")] = 0,
     limit: Annotated[int, Query(ge=1, le=1000)] = 100,
 ) -> models.AlarmEvents:
     """A page of events of an alarm, oldest first."""
+    _alarm(backend, caller, alarm_id)
     found = backend.store.events(alarm_id, after=after, limit=limit + 1)
-    if not found and backend.store.alarm(alarm_id) is None:
-        raise AlarmUnknown(alarm_id)
     page = found[:limit]
     return models.AlarmEvents(events=page, next=page[-1].seq if len(found) > limit else None)
 
 
 @_alarms.post("/{alarm_id}/ack", dependencies=[Depends(_json_only)])
-async def acknowledge(backend: BackendHere, alarm_id: AlarmId, answer: models.Acknowledgement) -> Alarm:
+async def acknowledge(
+    backend: BackendHere, caller: Caller, alarm_id: AlarmId, answer: models.Acknowledgement
+) -> Alarm:
     """Acknowledge an alarm, with the operator's name."""
-    return await backend.acknowledge(alarm_id, answer.who, answer.comment, count=answer.count)
+    who = _operator(caller, answer.who)
+    if caller.feeders is not None:
+        await to_thread.run_sync(_alarm, backend, caller, alarm_id)
+    return await backend.acknowledge(alarm_id, who, answer.comment, count=answer.count)
 
 
 # ----------------------------------------------------------------- operations
@@ -592,6 +656,69 @@ def _probe(request: Request, good: bool, reasons: list[str], what: str) -> Any:
 def metrics(backend: BackendHere) -> Response:
     """Metrics in Prometheus's text format."""
     return Response(backend.metrics(), media_type="text/plain; version=0.0.4; charset=utf-8")
+
+
+# ------------------------------------------------------------------- sessions
+
+_sessions = APIRouter(prefix="/api/v1", tags=["access"])
+
+
+def _session(identity: Identity, expires: float | None = None) -> models.Session:
+    feeders = None if identity.feeders is None else sorted(identity.feeders)
+    return models.Session(
+        name=identity.name, role=identity.role, feeders=feeders, open=identity is OPEN, expires=expires
+    )
+
+
+@_sessions.get("/session")
+def get_session(request: Request, response: Response) -> models.Session:
+    """The caller's identity; 401 without one."""
+    response.headers["Cache-Control"] = "no-store"
+    authenticator: Authenticator | None = request.app.state.authenticator
+    return _session(OPEN if authenticator is None else authenticator.identify(request))
+
+
+@_sessions.post("/session", dependencies=[Depends(_json_only)])
+def log_in(request: Request, response: Response, given: models.LogIn) -> models.Session:
+    """Exchange an API key for a cookie of the web page."""
+    response.headers["Cache-Control"] = "no-store"
+    authenticator: Authenticator | None = request.app.state.authenticator
+    if authenticator is None:
+        return _session(OPEN)
+    client = client_of(request)
+    identity, cookie, expires = authenticator.log_in(given.key, client)
+    # A browser refuses a secure cookie over plain HTTP; beyond loopback the page needs HTTPS.
+    plain = request.url.scheme == "http" and is_loopback(request.url.hostname or "")
+    response.set_cookie(
+        COOKIE,
+        cookie,
+        max_age=int(expires - authenticator.wall()),
+        httponly=True,
+        samesite="strict",
+        secure=not plain,
+    )
+    return _session(identity, expires)
+
+
+@_sessions.delete("/session", status_code=204)
+def log_out(request: Request, response: Response) -> None:
+    """End the session of the cookie."""
+    authenticator: Authenticator | None = request.app.state.authenticator
+    if authenticator is not None:
+        authenticator.log_out(request.cookies.get(COOKIE, ""))
+    response.delete_cookie(COOKIE, httponly=True, samesite="strict")
+
+
+@_sessions.get("/audit")
+def list_audit(
+    request: Request,
+    after: Annotated[int, Query(ge=0, le=MAX_EVENT, description="Only entries with a higher number.")] = 0,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
+) -> models.AuditLog:
+    """Entries of the audit log, oldest first."""
+    authenticator: Authenticator | None = request.app.state.authenticator
+    entries = [] if authenticator is None else authenticator.store.audit(after=after, limit=limit)
+    return models.AuditLog(entries=entries)
 
 
 # --------------------------------------------------------------------- errors

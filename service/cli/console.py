@@ -32,12 +32,8 @@ def read_all(
 def refuse_options(problems: Iterable[str], **places: Given) -> None:
     """Refuse wrong options, and unusable files and folders as in `check_paths`, before the work.
 
-    Raises
-    ------
-    typer.BadParameter
-        If there are any problems, together with the unusable files and folders.
-    Unusable
-        If only files and folders are unusable.
+    Raises typer.BadParameter if there are any problems, together with the unusable files and folders;
+        Unusable if only files and folders are unusable.
     """
     found = list(problems)
     try:
@@ -53,10 +49,7 @@ def refuse_options(problems: Iterable[str], **places: Given) -> None:
 def options_of(make: Callable[[], Told], problems: Iterable[str], **places: Given) -> Told:
     """Create an object from options; its ValueError is reported together with all other problems.
 
-    Raises
-    ------
-    typer.BadParameter, Unusable
-        As in `refuse_options`.
+    Raises typer.BadParameter, Unusable as in `refuse_options`.
     """
     try:
         out = make()
@@ -93,10 +86,7 @@ err = Console(stderr=True, highlight=False, soft_wrap=True)
 def finite(value: float | None) -> float | None:
     """Refuse infinite numbers and NaN as options of a command.
 
-    Raises
-    ------
-    typer.BadParameter
-        If the number is not finite.
+    Raises typer.BadParameter if the number is not finite.
     """
     if value is not None and not math.isfinite(value):
         raise typer.BadParameter(f"{value} is not finite")

@@ -21,6 +21,7 @@ import typer
 
 from gridsec.errors import DesignInfeasible, FeederInvalid, GridsecError, NotObservable, raise_if_any
 from service.cli import (
+    access,
     console,
     feeders,
     replay,
@@ -85,6 +86,8 @@ app = typer.Typer(
     add_completion=False,
 )
 app.add_typer(feeders.app, name="feeders")
+app.add_typer(access.key_app, name="key")
+app.add_typer(access.audit_app, name="audit")
 app.command("convert")(feeders.convert)
 app.add_typer(study_app, name="study")
 app.command()(replay.replay)

@@ -32,14 +32,8 @@ def write_tables(folder: Path | None, study: str, tables: Mapping[str, pd.DataFr
     A file is replaced when its new content is complete: an interruption leaves the old one. Tables of earlier
     runs of the study that the present run does not write are removed.
 
-    Raises
-    ------
-    ValueError
-        If a name is not a file name.
-    FileExistsError
-        If the folder contains a feeder.
-    OSError
-        If the folder cannot be written.
+    Raises ValueError if a name is not a file name; FileExistsError if the folder contains a feeder; OSError
+        if the folder cannot be written.
     """
     if folder is None:
         return
@@ -101,27 +95,15 @@ def check_paths(
 ) -> None:
     """Check input and output paths before a command starts; raise all problems at once. Leaves no files.
 
-    Parameters
-    ----------
-    folders
-        Folders for tables; created if they do not exist.
-    over
-        Other output folders, which may contain a feeder.
-    new
-        Folders that must not exist yet, or be empty.
-    files
-        Files that are written in place; folders above them are created.
-    replaced
-        Files that are replaced as a whole, by new files beside them.
-    simulated
-        Files of a simulation, also replaced as a whole: only such files are replaced, never measurements.
-    read
-        Input files.
-
-    Raises
-    ------
-    Unusable
-        If a path cannot be used.
+    folders: folders for tables; created if they do not exist.
+    over: other output folders, which may contain a feeder.
+    new: folders that must not exist yet, or be empty.
+    files: files that are written in place; folders above them are created.
+    replaced: files that are replaced as a whole, by new files beside them.
+    simulated: files of a simulation, also replaced as a whole: only such files are replaced, never
+        measurements.
+    read: input files.
+    Raises Unusable if a path cannot be used.
     """
     checks: list[tuple[Given, Callable[[Path], Problem | None]]] = [
         (folders, partial(_folder, tables=True)),

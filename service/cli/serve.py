@@ -53,6 +53,23 @@ Grace = Annotated[
 MaxPayload = Annotated[int | None, typer.Option(help="Largest payload, bytes. [default: 262144]")]
 Queue = Annotated[int | None, typer.Option(help="Length of the queue, payloads. [default: 20000]")]
 MaxFeeders = Annotated[int | None, typer.Option(help="Largest number of feeders over REST. [default: 100]")]
+OidcIssuer = Annotated[
+    str | None, typer.Option(help="Issuer of bearer tokens (OpenID Connect), e.g. https://login.example.")
+]
+OidcAudience = Annotated[str | None, typer.Option(help="Audience of bearer tokens. [default: gridsec]")]
+OidcJwks = Annotated[
+    str | None, typer.Option(help="Address of the issuer's keys. [default: by its discovery document]")
+]
+OidcRoleClaim = Annotated[
+    str | None, typer.Option(help="Claim of the role in bearer tokens. [default: gridsec_role]")
+]
+OpenToNetwork = Annotated[
+    bool,
+    typer.Option(
+        "--open-to-network-without-authentication",
+        help="Dangerous: everybody on the network can read, acknowledge and change everything.",
+    ),
+]
 LogLevel = Annotated[str | None, typer.Option(help="debug, info, warning or error. [default: info]")]
 LogFormat = Annotated[str | None, typer.Option(help="console or json. [default: console]")]
 STOP_S = 2.7
@@ -78,6 +95,11 @@ def serve(
     max_payload: MaxPayload = None,
     queue: Queue = None,
     max_feeders: MaxFeeders = None,
+    oidc_issuer: OidcIssuer = None,
+    oidc_audience: OidcAudience = None,
+    oidc_jwks: OidcJwks = None,
+    oidc_role_claim: OidcRoleClaim = None,
+    open_to_network_without_authentication: OpenToNetwork = False,
     log_level: LogLevel = None,
     log_format: LogFormat = None,
     until_eof: UntilEof = False,
@@ -112,6 +134,11 @@ def serve(
             "max_payload": max_payload,
             "queue": queue,
             "max_feeders": max_feeders,
+            "oidc_issuer": oidc_issuer,
+            "oidc_audience": oidc_audience,
+            "oidc_jwks": oidc_jwks,
+            "oidc_role_claim": oidc_role_claim,
+            "open_to_network_without_authentication": open_to_network_without_authentication or None,
             "log_level": log_level,
             "log_format": log_format,
         }

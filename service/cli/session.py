@@ -142,10 +142,7 @@ def keeping(
     `journal` is the file of the option, `without` keeps none, and journals stay in `folder`; by default they
     are in the user's cache folder until the command is done.
 
-    Raises
-    ------
-    typer.Exit
-        After an interruption.
+    Raises typer.Exit after an interruption.
     """
     if without and journal is not None:
         raise typer.BadParameter("excludes --journal", param_hint="--no-journal")

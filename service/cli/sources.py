@@ -31,14 +31,9 @@ def converted(feeder: str, out: Path | None) -> str:
     earlier conversion in the folder is kept under another name, see `spared`. The feeder's folder is `feeder`
     in the folder of the results; without one, in a temporary folder, which stays.
 
-    Raises
-    ------
-    FeederInvalid, BusbarUnclear
-        If the network contains no feeder, or more than one; with advice on the choice.
-    GridsecError
-        If the network cannot be read.
-    FileExistsError
-        If the destination exists and is not a converted feeder.
+    Raises FeederInvalid, BusbarUnclear if the network contains no feeder, or more than one; with advice on
+        the choice; GridsecError if the network cannot be read; FileExistsError if the destination exists and
+        is not a converted feeder.
     """
     from feeders.convert.convert import convert
     from feeders.convert.provenance import CHANGES_FILE, BusbarUnclear

@@ -47,11 +47,8 @@ def planned(
     None stands for the values of the files. With one of the load errors the other is zero. `chosen` are
     attributes of the plan by name.
 
-    Raises
-    ------
-    ValueError
-        If a scenario is too short for the interval of the readings, a setting is unknown, or as for
-        `CampaignPlan`.
+    Raises ValueError if a scenario is too short for the interval of the readings, a setting is unknown, or as
+        for `CampaignPlan`.
     """
     from feeders.simulation.trial import LoadError
     from feeders.studies.campaign.plan import CampaignPlan, wrong_settings

@@ -261,10 +261,7 @@ def outcome(
 def see_readings(names: Iterable[str], site: Site, asked: Asked) -> None:
     """Refuse readings that cannot be compared with the files before the other studies run.
 
-    Raises
-    ------
-    RecordingInvalid
-        If the file has no readings of this feeder.
+    Raises RecordingInvalid if the file has no readings of this feeder.
     """
     if "calibrate" in names and asked.readings is not None:
         from feeders.studies.calibrate.readings import frames
@@ -286,10 +283,7 @@ def versions() -> dict[str, str]:
 def write(made: Report, out: Path, folder: Path) -> None:
     """Write the page of a report, and the folder beside it; the page comes last, after figures and tables.
 
-    Raises
-    ------
-    OSError
-        If a file cannot be written.
+    Raises OSError if a file cannot be written.
     """
     from feeders.report.html import FEEDER
 

@@ -139,17 +139,9 @@ class CommissioningProgress:
 class FeederCommissioning:
     """Commissioning of one feeder.
 
-    Parameters
-    ----------
-    kept
-        Stored state.
-
-    Attributes
-    ----------
-    known
-        Present state of the meters' errors; None before the first tick without stored state.
-    restored, note
-        As in `CommissioningProgress`.
+    known: present state of the meters' errors; None before the first tick without stored state.
+    restored, note: as in `CommissioningProgress`.
+    kept: stored state.
     """
 
     def __init__(self, site: Site, kept: StateSnapshot | None = None) -> None:

@@ -64,10 +64,7 @@ def some_of_each(bad: Iterable[Rejected]) -> tuple[list[Rejected], int]:
 
     Entries are taken by reason and key in turn, so that the largest source leaves room for the others.
 
-    Returns
-    -------
-    entries, left_out
-        Entries in the order of arrival; number of rejected readings without an entry.
+    Returns entries, left_out: entries in the order of arrival; number of rejected readings without an entry.
     """
     sources: dict[str, dict[str, list[tuple[int, Rejected]]]] = {}
     for number, one in enumerate(bad):
@@ -112,12 +109,8 @@ _log = structlog.get_logger("gridsec.runtime")
 class CatchUp:
     """Time budget for stale ticks, and log of skipped ones.
 
-    Parameters
-    ----------
-    clock
-        Monotonic time, s.
-    waits
-        True if ticks beyond the budget wait (`Clock.EVENTS`) instead of being skipped.
+    clock: monotonic time, s.
+    waits: True if ticks beyond the budget wait (`Clock.EVENTS`) instead of being skipped.
     """
 
     def __init__(self, clock: Callable[[], float], *, waits: bool) -> None:
@@ -205,23 +198,14 @@ class PersistedState:
 class Engine:
     """All state of the service.
 
-    Parameters
-    ----------
-    sites
-        The monitored feeders.
-    wall
-        Wall clock, Unix s.
-    stored
-        Called after alarms have been stored.
-    apart
-        Executor of writes: called with the write, for any thread, and with the handler of its result, for the
-        time between two rounds.
-    unloaded
-        Stored feeders that cannot be loaded, with the reason.
-    clock
-        Monotonic time, s.
-    go_on
-        Checked between two payloads and between two ticks; if False, the round ends early.
+    sites: the monitored feeders.
+    wall: wall clock, Unix s.
+    stored: called after alarms have been stored.
+    apart: executor of writes: called with the write, for any thread, and with the handler of its result, for
+        the time between two rounds.
+    unloaded: stored feeders that cannot be loaded, with the reason.
+    clock: monotonic time, s.
+    go_on: checked between two payloads and between two ticks; if False, the round ends early.
     """
 
     def __init__(

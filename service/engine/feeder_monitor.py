@@ -93,29 +93,15 @@ def design(site: Site, progress: Callable[[int, int], None] | None = None) -> re
 class FeederMonitor:
     """Monitor of one feeder.
 
-    Parameters
-    ----------
-    rules
-        Times of its alignment.
-    book
-        Its alarms so far.
-    commissioning
-        State of the meters' errors; None for none.
-    suspicions
-        Distrusted devices; None for none.
-
-    Attributes
-    ----------
-    phase, problem
-        State of the monitor, and the reason of a failure.
-    report
-        The latest report, or None before the first tick.
-    pending
-        Ticks that are due and not evaluated, oldest first.
-    skipped
-        Number of skipped ticks.
-    defect
-        Error that ended the monitor, until it is logged; None without one.
+    phase, problem: state of the monitor, and the reason of a failure.
+    report: the latest report, or None before the first tick.
+    pending: ticks that are due and not evaluated, oldest first.
+    skipped: number of skipped ticks.
+    defect: error that ended the monitor, until it is logged; None without one.
+    rules: times of its alignment.
+    book: its alarms so far.
+    commissioning: state of the meters' errors; None for none.
+    suspicions: distrusted devices; None for none.
     """
 
     def __init__(

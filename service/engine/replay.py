@@ -48,27 +48,16 @@ def replay(
 ) -> Iterator[TickResult]:
     """Yield the service's results for recorded readings.
 
-    Parameters
-    ----------
-    recorded
-        Readings in the order of their arrival.
-    tally
-        Filled by the replay.
-    clock
-        Source of the present time: the readings, or, as in live operation, the wall clock of their arrival.
-    max_skew_s, grace_s
-        As in `align.rules`.
-    kept
-        State of the meters' errors at the start of the recording, as in `FeederCommissioning`; None for none.
-    distrust
-        Distrusted devices at the start, as in `Suspicions`; None for none.
-    skipped
-        First and last Unix time of ticks that the live service skipped, s; the replay skips them, too.
-
-    Raises
-    ------
-    NotObservable, DesignInfeasible
-        If the feeder cannot be monitored.
+    recorded: readings in the order of their arrival.
+    tally: filled by the replay.
+    clock: source of the present time: the readings, or, as in live operation, the wall clock of their
+        arrival.
+    max_skew_s, grace_s: as in `align.rules`.
+    kept: state of the meters' errors at the start of the recording, as in `FeederCommissioning`; None for
+        none.
+    distrust: distrusted devices at the start, as in `Suspicions`; None for none.
+    skipped: first and last Unix time of ticks that the live service skipped, s; the replay skips them, too.
+    Raises NotObservable, DesignInfeasible if the feeder cannot be monitored.
     """
     rules = align_rules(site, clock, max_skew_s=max_skew_s, grace_s=grace_s)
     book = AlarmBook(site.feeder.name)

@@ -55,18 +55,11 @@ _log = structlog.get_logger("gridsec.runtime")
 class Runtime:
     """The running service; backend of the API.
 
-    Parameters
-    ----------
-    sites
-        The monitored feeders.
-    given
-        Names of the feeders that REST cannot delete; None: all of them.
-    unloaded
-        Stored feeders that cannot be loaded and are not monitored, with the reason.
-    wall
-        Wall clock, Unix s.
-    settled
-        Called between two rounds after the last unfinished design.
+    sites: the monitored feeders.
+    given: names of the feeders that REST cannot delete; None: all of them.
+    unloaded: stored feeders that cannot be loaded and are not monitored, with the reason.
+    wall: wall clock, Unix s.
+    settled: called between two rounds after the last unfinished design.
     """
 
     def __init__(

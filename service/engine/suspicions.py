@@ -21,17 +21,9 @@ from service.store.state_codec import KeptInvalid, StateSnapshot, decode_distrus
 class Suspicions:
     """Distrusted meters and inverters of one feeder, including the busbar meter.
 
-    Parameters
-    ----------
-    kept
-        Stored state.
-
-    Attributes
-    ----------
-    known
-        Distrusted devices at the last tick, or at the end of the previous process.
-    note
-        Reason why stored state is not used; empty otherwise.
+    known: distrusted devices at the last tick, or at the end of the previous process.
+    note: reason why stored state is not used; empty otherwise.
+    kept: stored state.
     """
 
     def __init__(self, site: Site, kept: StateSnapshot | None = None) -> None:

@@ -54,15 +54,10 @@ _NORMAL, _MEDIAN = 1.4826, 1.2533
 class ClockOffsets:
     """Delays of the sources of one feeder.
 
-    Parameters
-    ----------
-    sources
-        Meters, and None for the busbar meter.
-    tick_s
-        Interval of the ticks, s.
-    silence_s
-        Time without an arrival after which the delays of a source are deleted, s. The service's clock may be
-        set meanwhile: delays of sources that no longer report would shift the median of all.
+    sources: meters, and None for the busbar meter.
+    tick_s: interval of the ticks, s.
+    silence_s: time without an arrival after which the delays of a source are deleted, s. The service's clock
+        may be set meanwhile: delays of sources that no longer report would shift the median of all.
     """
 
     def __init__(self, sources: Iterable[str | None], tick_s: float, silence_s: float) -> None:
@@ -197,18 +192,12 @@ def rules(
     Up to `BRIDGED_TICK_S` a reading serves for two and a half ticks, which bridges single losses. At longer
     ticks it serves for one tick: a voltage of a quarter of an hour ago is not evidence of the present one.
 
-    Parameters
-    ----------
-    tick_s, silence_s
-        As in the feeder's file.
-    clock
-        Source of the present time.
-    max_skew_s
-        None: one minute, or two ticks if they are longer.
-    grace_s
-        None: half a tick, at most one minute.
-    live
-        With the wall clock at most `LEAP_TICKS` missed ticks are formed, and none if no reading serves them.
+    tick_s, silence_s: as in the feeder's file.
+    clock: source of the present time.
+    max_skew_s: None: one minute, or two ticks if they are longer.
+    grace_s: None: half a tick, at most one minute.
+    live: with the wall clock at most `LEAP_TICKS` missed ticks are formed, and none if no reading serves
+        them.
     """
     lead_s = min(0.1 * tick_s, 1.0)
     leaps = live and clock is Clock.WALL
@@ -262,19 +251,10 @@ def _time_of(reading: Reading) -> float:
 class Aligner:
     """Alignment of one feeder. Only one task may use it.
 
-    Parameters
-    ----------
-    meters
-        Ids of the feeder's meters, in order. The busbar meter is added.
-
-    Attributes
-    ----------
-    counts
-        Readings by outcome.
-    lost
-        Number of lost readings, from gaps of the sequence numbers.
-    restarts
-        Number of steps of the clock back by more than `silence_s`; each restarts the ticks.
+    counts: readings by outcome.
+    lost: number of lost readings, from gaps of the sequence numbers.
+    restarts: number of steps of the clock back by more than `silence_s`; each restarts the ticks.
+    meters: ids of the feeder's meters, in order. The busbar meter is added.
     """
 
     def __init__(self, meters: Iterable[str], rules: AlignRules) -> None:
@@ -306,10 +286,7 @@ class Aligner:
 
         `now` is the wall time of its arrival, Unix s; ignored for `Clock.EVENTS`.
 
-        Returns
-        -------
-        outcome, ticks
-            Result for the reading; the ticks, in order.
+        Returns outcome, ticks: result for the reading; the ticks, in order.
         """
         # A reading that waited in the queue arrived before the present time; the clock was not set back.
         self._latest = max(self._latest, now)

@@ -62,12 +62,8 @@ _UNREADABLE = (
 class ArrowProblem(ValueError):
     """A payload cannot be read.
 
-    Parameters
-    ----------
-    problems
-        One sentence for each problem.
-    well_formed
-        True for valid Arrow IPC.
+    problems: one sentence for each problem.
+    well_formed: True for valid Arrow IPC.
     """
 
     def __init__(self, problems: Iterable[str], *, well_formed: bool) -> None:

@@ -71,15 +71,10 @@ _OVERHEAD = 256
 class Inbox:
     """Queue of samples before the runtime, bounded in number and bytes.
 
-    Parameters
-    ----------
-    max_samples, max_bytes
-        The bounds.
-    lossless
-        When full, block the sender instead of dropping the oldest sample. For `Clock.EVENTS`, where no sample
-        gets stale; with the wall clock the oldest samples are worthless.
-    wake
-        Called from the sender's thread after samples have been added.
+    max_samples, max_bytes: the bounds.
+    lossless: when full, block the sender instead of dropping the oldest sample. For `Clock.EVENTS`, where no
+        sample gets stale; with the wall clock the oldest samples are worthless.
+    wake: called from the sender's thread after samples have been added.
     """
 
     def __init__(
@@ -168,10 +163,7 @@ class Publication(NamedTuple):
 class Outgoing:
     """Queue before the publishing thread; any thread may add to it.
 
-    Attributes
-    ----------
-    retry_at
-        Time of the next attempt, by the monotonic clock, s, while the first event is a refused one.
+    retry_at: time of the next attempt, by the monotonic clock, s, while the first event is a refused one.
     """
 
     def __init__(self) -> None:

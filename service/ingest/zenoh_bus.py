@@ -93,19 +93,12 @@ def session(config: BusConfig) -> Iterator[zenoh.Session]:
 class Bus:
     """zenoh session of the service, as a context manager.
 
-    Parameters
-    ----------
-    prefix
-        First chunks of every key.
-    deliver
-        Called from the receiving threads with each batch. It may block only if `lossless`.
-    max_payload
-        Size beyond which a payload is cut to its beginning, bytes.
-    lossless
-        Under load, block the senders instead of dropping the oldest samples. For `Clock.EVENTS`; in real time
-        old data are worthless.
-    wall
-        Wall clock, Unix s.
+    prefix: first chunks of every key.
+    deliver: called from the receiving threads with each batch. It may block only if `lossless`.
+    max_payload: size beyond which a payload is cut to its beginning, bytes.
+    lossless: under load, block the senders instead of dropping the oldest samples. For `Clock.EVENTS`; in
+        real time old data are worthless.
+    wall: wall clock, Unix s.
     """
 
     def __init__(
@@ -331,12 +324,8 @@ def _try_recv(handler: zenoh.handlers.Handler[zenoh.Sample]) -> zenoh.Sample | N
 class MeterClient:
     """zenoh session of the virtual meters: puts readings and, on request, receives estimates.
 
-    Parameters
-    ----------
-    config
-        Usually a client of the service.
-    prefix
-        First chunks of every key.
+    config: usually a client of the service.
+    prefix: first chunks of every key.
     """
 
     def __init__(self, config: BusConfig, prefix: str) -> None:

@@ -93,22 +93,13 @@ def grounds(
 def bus_volts(site: Site, v2_bus: Floats, measured: Bools) -> tuple[Floats, Floats, Bools]:
     """Return the voltage of every bus, V: in three phases that of the phase furthest from nominal.
 
-    Parameters
-    ----------
-    v2_bus : (n,)
-        Squared voltages as in `gridsec.interface.Estimate`, pu.
-    measured : (b,)
-        Phases with a reading, see `ReferenceVoltages`. The other phases of a bus count only where it has none
-        of these.
-
-    Returns
-    -------
-    one : (b + 1,)
-        Voltage of each bus, V.
-    phases : (b + 1, 3) or (b + 1, 0)
-        Voltage of each of its phases, V, NaN for one that it does not have; nothing on a balanced feeder.
-    model_only : (b + 1,)
-        The first is model only.
+    v2_bus (n,): squared voltages as in `gridsec.interface.Estimate`, pu.
+    measured (b,): phases with a reading, see `ReferenceVoltages`. The other phases of a bus count only where
+        it has none of these.
+    Returns one (b + 1,): voltage of each bus, V.
+    Returns phases (b + 1, 3) or (b + 1, 0): voltage of each of its phases, V, NaN for one that it does not
+        have; nothing on a balanced feeder.
+    Returns model_only (b + 1,): the first is model only.
     """
     v = volts(site.base_volt, v2_bus)
     tree = site.spanning
@@ -138,14 +129,9 @@ def attack_volts(site: Site, tick: Tick, verdict: Verdict) -> Floats:
 def excess_volts(base: Floats, reported: Floats, attack: Floats, named: Bools) -> Floats:
     """Convert attacks on squared voltages to volts: ``sqrt(y) - sqrt(y - a)``, 0 without a name.
 
-    Parameters
-    ----------
-    base, reported : (k,)
-        1 pu, and the reported voltages, V.
-    attack : (k,)
-        Excess of the squared voltages, pu.
-    named : (k,)
-        True for devices named as manipulated.
+    base, reported (k,): 1 pu, and the reported voltages, V.
+    attack (k,): excess of the squared voltages, pu.
+    named (k,): True for devices named as manipulated.
     """
     true = volts(base, (reported / base) ** 2 - attack)
     return np.where(named, reported - true, 0.0)

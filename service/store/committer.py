@@ -126,28 +126,15 @@ def inline(write: Callable[[], WriteResult], then: Callable[[WriteResult], None]
 class Committer:
     """Writes alarm transitions to the database, then publishes them on zenoh.
 
-    Parameters
-    ----------
-    metrics
-        Counters of failures and transitions.
-    stored
-        Called after alarms have been stored.
-    kept
-        Called with the stored reports.
-    apart
-        Executor of writes: called with the write, for any thread, and with the handler of its result, for the
-        time between two rounds.
-
-    Attributes
-    ----------
-    waiting
-        Data that wait for the database.
-    publisher
-        Destination of alarms, or None.
-    problem
-        Reason why the database cannot be used, or None.
-    storing
-        True while a write is in progress; only `waiting` and `commit` may be used then.
+    waiting: data that wait for the database.
+    publisher: destination of alarms, or None.
+    problem: reason why the database cannot be used, or None.
+    storing: True while a write is in progress; only `waiting` and `commit` may be used then.
+    metrics: counters of failures and transitions.
+    stored: called after alarms have been stored.
+    kept: called with the stored reports.
+    apart: executor of writes: called with the write, for any thread, and with the handler of its result, for
+        the time between two rounds.
     """
 
     def __init__(

@@ -87,10 +87,7 @@ class Timed(psycopg.Connection[Any]):
 class WriterSession:
     """Session of the writer.
 
-    Attributes
-    ----------
-    up
-        True while the session is open.
+    up: True while the session is open.
     """
 
     def __init__(self) -> None:
@@ -212,24 +209,11 @@ class _FileMoved(OSError):
 class Connections:
     """The writer and the readers of a database.
 
-    Parameters
-    ----------
-    url
-        As in `Store`.
-
-    Attributes
-    ----------
-    name
-        Address without the password.
-    insert
-        INSERT of the dialect, with ON CONFLICT.
-    lost
-        Reason why nothing more may be written, or None.
-
-    Raises
-    ------
-    StoreUnavailable
-        If it cannot be opened, or another process writes it.
+    name: address without the password.
+    insert: INSERT of the dialect, with ON CONFLICT.
+    lost: reason why nothing more may be written, or None.
+    url: as in `Store`.
+    Raises StoreUnavailable if it cannot be opened, or another process writes it.
     """
 
     def __init__(self, url: str) -> None:
@@ -275,14 +259,8 @@ class Connections:
 
         `doing` is the verb of the message after a failure.
 
-        Raises
-        ------
-        WriterLost
-            If another process may have written since this one opened the database.
-        OutcomeUnknown
-            If the connection broke during the commit.
-        StoreUnavailable
-            If nothing was written.
+        Raises WriterLost if another process may have written since this one opened the database;
+            OutcomeUnknown if the connection broke during the commit; StoreUnavailable if nothing was written.
         """
         with self._guard(doing), self._begin(self._check_owner) as connection:
             yield connection

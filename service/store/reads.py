@@ -51,6 +51,7 @@ class Reader:
         kind: Collection[str] = (),
         severity: Collection[str] = (),
         feeder: str | None = None,
+        among: Collection[str] | None = None,
         meter: str | None = None,
         since: float | None = None,
         until: float | None = None,
@@ -59,23 +60,12 @@ class Reader:
     ) -> tuple[list[Alarm], str | None]:
         """Return a page of alarms, those with the latest onset first.
 
-        Parameters
-        ----------
-        state, kind, severity
-            Permitted values; empty for all.
-        feeder, meter
-            Restrict to these; None for all.
-        since, until
-            Restrict to alarms raised in [since, until), Unix s.
-        cursor
-            End of the previous page; pages stay correct while alarms are added or change.
-        limit
-            Length of a page.
-
-        Returns
-        -------
-        alarms, cursor
-            The cursor is None on the last page.
+        state, kind, severity: permitted values; empty for all.
+        feeder, among, meter: restrict to this feeder, to these feeders, and to this meter; None for all.
+        since, until: restrict to alarms raised in [since, until), Unix s.
+        cursor: end of the previous page; pages stay correct while alarms are added or change.
+        limit: length of a page.
+        Returns alarms, cursor: the cursor is None on the last page.
         """
         a = ALARM.c
         query = sa.select(a.id, a.data).order_by(a.id.desc()).limit(limit + 1)
@@ -85,6 +75,8 @@ class Reader:
         for column, wanted in ((a.feeder, feeder), (a.meter, meter)):
             if wanted is not None:
                 query = query.where(column == wanted)
+        if among is not None:
+            query = query.where(a.feeder.in_(among))
         if since is not None:
             query = query.where(a.t_raised >= since)
         if until is not None:
@@ -96,9 +88,11 @@ class Reader:
         page = [from_json(json.loads(row.data)) for row in rows[:limit]]
         return page, (page[-1].id if len(rows) > limit else None)
 
-    def raised(self) -> int:
-        """Number of active alarms without an acknowledgement."""
+    def raised(self, *, among: Collection[str] | None = None) -> int:
+        """Number of active alarms without an acknowledgement, of some feeders or (None) of all."""
         query = sa.select(sa.func.count()).where(ALARM.c.state == str(AlarmState.RAISED))
+        if among is not None:
+            query = query.where(ALARM.c.feeder.in_(among))
         with self._read() as connection:
             return int(connection.execute(query).scalar_one())
 

@@ -46,15 +46,8 @@ class Batch:
 class WriteQueue:
     """Queue of data that wait for the database. Used by one thread at a time.
 
-    Parameters
-    ----------
-    forgotten
-        Called with the kind (a label) and the number of dropped data.
-
-    Attributes
-    ----------
-    given_up
-        Transitions dropped since the last successful write.
+    given_up: transitions dropped since the last successful write.
+    forgotten: called with the kind (a label) and the number of dropped data.
     """
 
     def __init__(self, forgotten: Callable[[str, int], None]) -> None:

@@ -54,18 +54,10 @@ _KEPT = {SnapshotKind.COMMISSION: COMMISSION, SnapshotKind.DISTRUST: DISTRUST}
 class Store(Reader):
     """The database of one service.
 
-    Parameters
-    ----------
-    url
-        `sqlite:///file`, `sqlite:////absolute/file` or `postgresql+psycopg://user@host/name`.
-    history
-        Grid and duration of the history.
-
-    Raises
-    ------
-    StoreUnavailable
-        If the database cannot be opened and written, if another process writes it, or if it is newer than
-        this program.
+    url: `sqlite:///file`, `sqlite:////absolute/file` or `postgresql+psycopg://user@host/name`.
+    history: grid and duration of the history.
+    Raises StoreUnavailable if the database cannot be opened and written, if another process writes it, or if
+        it is newer than this program.
     """
 
     def __init__(self, url: str, *, history: HistoryRules | None = None) -> None:
@@ -161,36 +153,18 @@ class Store(Reader):
     ) -> tuple[int, ...]:
         """Store the results of a tick in one transaction; durable when this returns.
 
-        Parameters
-        ----------
-        transitions
-            Changed alarms: state, event and outbox entry of each.
-        reports
-            Reports of the feeders; the history selects from them.
-        rejected
-            Rejected readings; the newest `BAD_READINGS_KEPT` are kept. Readings that the database cannot
-            represent are dropped and logged.
-        kept, happened
-            State of the feeders' commissioning and suspicions, and changes of the former.
-        without
-            Delete the tables of this feeder, its commissioning and its suspicions.
-        put
-            A feeder and the columns of its files as JSON, which replace the stored ones.
-        key
-            Positive number of this commit, different from that of the previous commit. After `OutcomeUnknown`
-            the same call with the same key stores it, or finds it stored.
-
-        Returns
-        -------
-        tuple of int
-            The event number of each transition.
-
-        Raises
-        ------
-        OutcomeUnknown
-            If the connection broke during the commit.
-        StoreUnavailable
-            If nothing was stored.
+        transitions: changed alarms: state, event and outbox entry of each.
+        reports: reports of the feeders; the history selects from them.
+        rejected: rejected readings; the newest `BAD_READINGS_KEPT` are kept. Readings that the database
+            cannot represent are dropped and logged.
+        kept, happened: state of the feeders' commissioning and suspicions, and changes of the former.
+        without: delete the tables of this feeder, its commissioning and its suspicions.
+        put: a feeder and the columns of its files as JSON, which replace the stored ones.
+        key: positive number of this commit, different from that of the previous commit. After
+            `OutcomeUnknown` the same call with the same key stores it, or finds it stored.
+        Returns tuple of int: the event number of each transition.
+        Raises OutcomeUnknown if the connection broke during the commit; StoreUnavailable if nothing was
+            stored.
         """
         transitions, rejected = tuple(transitions), tuple(rejected)
         kept, happened = tuple(kept), tuple(happened)

@@ -1,6 +1,7 @@
 // Alarm list: loaded once, then updated by the event stream; acknowledgements are sent with a name.
 
 import { byId, clock, duration, el, getJson, isKnown, settle, signed, volt } from "./dom.js";
+import { session } from "./session.js";
 
 const API = "/api/v1/alarms";
 const KIND = {
@@ -229,7 +230,7 @@ export class Alarms {
   ask(alarm) {
     this.asking = alarm;
     byId("ack-what").textContent = `${KIND[alarm.kind] ?? alarm.kind}: ${alarm.customer ?? alarm.meter ?? alarm.feeder}. ${alarm.reason}`;
-    byId("ack-who").value = localStorage.getItem("gridsec.who") ?? "";
+    session.ask("ack-who");
     byId("ack-comment").value = "";
     byId("ack-error").hidden = true;
     byId("ack").showModal();
@@ -237,12 +238,11 @@ export class Alarms {
 
   async answer(event) {
     event.preventDefault();
-    const given = { who: byId("ack-who").value.trim(), comment: byId("ack-comment").value, count: this.asking.count };
-    if (!given.who) {
+    if (!session.complete("ack-who")) {
       this.complain("Please enter your name.");
       return;
     }
-    localStorage.setItem("gridsec.who", given.who);
+    const given = { ...session.who("ack-who"), comment: byId("ack-comment").value, count: this.asking.count };
     try {
       const response = await fetch(`${API}/${encodeURIComponent(this.asking.id)}/ack`, {
         method: "POST",

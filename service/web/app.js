@@ -5,6 +5,7 @@ import { Commissioning } from "./commissioning.js";
 import { showDetail } from "./detail.js";
 import { Diagram } from "./diagram.js";
 import { bare, busbarWords, byId, clock, duration, el, getJson, isKnown, signed, status, volt } from "./dom.js";
+import { session } from "./session.js";
 
 const API = "/api/v1/feeders";
 const KEPT = 600;
@@ -32,6 +33,7 @@ const commissioning = new Commissioning({ onChange: () => detail() });
 // ---------------------------------------------------------------- the feeder
 
 async function start() {
+  await session.begin();
   let feeders;
   try {
     ({ feeders } = await getJson(API));
@@ -59,7 +61,8 @@ async function show(name) {
   const found = await getJson(`${API}/${encodeURIComponent(name)}`).catch((error) => error);
   if (turn !== page.turn) return; // The response belongs to an earlier choice.
   if (found instanceof Error) {
-    if (found.answered) refused(name, found.message);
+    if (found.status === 401) await session.begin();
+    else if (found.answered) refused(name, found.message);
     else page.linked = false;
     page.retry = setTimeout(() => show(name), 3000);
     return;

@@ -1,6 +1,7 @@
 // Commissioning: a line for the feeder, numbers for a meter, and the dialogue for a replaced meter.
 
 import { byId, getJson, isKnown, signed } from "./dom.js";
+import { session } from "./session.js";
 
 const API = "/api/v1/feeders";
 const EVERY_MS = 60000;
@@ -94,7 +95,7 @@ export class Commissioning {
     this.asking = meter;
     byId("renew-what").textContent = `Meter ${meter} of ${this.feeder}: its own error is deleted and learned again, `
       + `over ${hours(this.known.needed_s)} h. The other meters stay unchanged.`;
-    byId("renew-who").value = localStorage.getItem("gridsec.who") ?? "";
+    session.ask("renew-who");
     byId("renew-reason").value = "";
     byId("renew-error").hidden = true;
     byId("renew").showModal();
@@ -102,12 +103,12 @@ export class Commissioning {
 
   async answer(event) {
     event.preventDefault();
-    const given = { who: byId("renew-who").value.trim(), reason: byId("renew-reason").value.trim(), meters: [this.asking] };
-    if (!given.who || !given.reason) {
+    const reason = byId("renew-reason").value.trim();
+    if (!session.complete("renew-who") || !reason) {
       this.complain("Please enter your name and the reason.");
       return;
     }
-    localStorage.setItem("gridsec.who", given.who);
+    const given = { ...session.who("renew-who"), reason, meters: [this.asking] };
     try {
       const response = await fetch(`${API}/${encodeURIComponent(this.feeder)}/commissioning`, {
         method: "POST",

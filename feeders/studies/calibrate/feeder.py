@@ -128,10 +128,7 @@ class MergedNetwork:
 def site_of(path_or_name: Path | str) -> Site | ThreePhaseSite:
     """Load a feeder, balanced or in three phases, as `feeders.model.site.load`.
 
-    Raises
-    ------
-    FeederInvalid
-        As there, and for closed loops in three phases.
+    Raises FeederInvalid as there, and for closed loops in three phases.
     """
     return _site(find(path_or_name))
 
@@ -152,10 +149,7 @@ def _site(tables: FeederTables) -> Site | ThreePhaseSite:
 def network(tables: FeederTables) -> MergedNetwork:
     """Prepare a feeder for calibration; single-phase customers or zero-sequence impedances need three phases.
 
-    Raises
-    ------
-    FeederInvalid
-        With every problem of the files; if closed lines form loops in three phases.
+    Raises FeederInvalid with every problem of the files; if closed lines form loops in three phases.
     """
     site = _site(tables)
     feeder, rows = _merged(_model(site), tuple((row,) for row in line_rows(site)))

@@ -68,10 +68,7 @@ class Frames:
 def open_readings(path: Path | str) -> pd.DataFrame | Recording:
     """Open a recording (Parquet, simulated or external) or a CSV table with the same columns.
 
-    Raises
-    ------
-    RecordingInvalid
-        For any other file.
+    Raises RecordingInvalid for any other file.
     """
     path = Path(path)
     if path.suffix.lower() != ".csv":
@@ -95,13 +92,10 @@ def frames(
     (`feeders.model.site.one_phase_each`). Its voltage is then their mean and its powers are their sums, where
     all three exist.
 
-    Raises
-    ------
-    RecordingInvalid
-        For missing columns, columns without numbers, times other than Unix seconds, voltages and powers not
-        in V from phase to neutral, kW and kvar, unknown meters, meters read both as a whole and by channels,
-        a recording of another feeder, a busbar without readings (in three phases of the phases of any meter),
-        or too few frames.
+    Raises RecordingInvalid for missing columns, columns without numbers, times other than Unix seconds,
+        voltages and powers not in V from phase to neutral, kW and kvar, unknown meters, meters read both as a
+        whole and by channels, a recording of another feeder, a busbar without readings (in three phases of
+        the phases of any meter), or too few frames.
     """
     given = open_readings(readings) if isinstance(readings, (Path, str)) else readings
     if not isinstance(given, pd.DataFrame):

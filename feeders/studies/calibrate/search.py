@@ -73,27 +73,18 @@ PLACES: Final = (FileErrorKind.BUS, FileErrorKind.PHASE)  # a customer has at mo
 
 @dataclass(frozen=True, slots=True)
 class Correction:
-    """Error of the files in terms of their ids.
-
-    Attributes
-    ----------
-    names
-        The customer, both customers of a swap, the meter, or the lines; all customers of a lateral.
-    bus, phases
-        Correct place of the customer. In an exchange `phases` has one letter for each name and then for each
-        line; otherwise the phases of all of them.
-    factor
-        Factor on the lines' length.
-    lines
-        The lines of a single-phase lateral that is on these phases with all its customers, the first line
-        first; none for a single customer.
-    """
+    """Error of the files in terms of their ids."""
 
     kind: FileErrorKind
+    # the customer, both customers of a swap, the meter, or the lines; all customers of a lateral
     names: tuple[str, ...]
+    # bus, phases: Correct place of the customer. In an exchange `phases` has one letter for each name and
+    # then for each line; otherwise the phases of all of them.
     bus: str = ""
     phases: str = ""
-    factor: float = 1.0
+    factor: float = 1.0  # factor on the lines' length
+    # the lines of a single-phase lateral that is on these phases with all its customers, the first line
+    # first; none for a single customer
     lines: tuple[str, ...] = ()
 
     @property
@@ -207,31 +198,18 @@ _NOISE_ROUNDS: Final = 2
 
 @dataclass(frozen=True, slots=True)
 class Guess:
-    """Hypothesis of an error of the files.
-
-    Attributes
-    ----------
-    subject
-        Customer, first customer of a swap, meter, or branch, by index in the present network. For an exchange
-        of phases the first part, by index into `MergedNetwork.parts`.
-    other
-        Second customer, bus of the merged tree, or lateral; -1 for none. For an exchange the second part.
-    phases
-        Phases of the customer; for an exchange those of both parts, one letter each.
-    lateral
-        True: `other` is a lateral, which is on these phases with all its customers.
-    exchange
-        True: two customers or laterals have each other's phase.
-    since, until
-        Time interval of the meter's different error, Unix s.
-    """
+    """Hypothesis of an error of the files."""
 
     kind: FileErrorKind
+    # Customer, first customer of a swap, meter, or branch, by index in the present network. For an exchange
+    # of phases the first part, by index into `MergedNetwork.parts`.
     subject: int
+    # Second customer, bus of the merged tree, or lateral; -1 for none. For an exchange the second part.
     other: int = -1
-    phases: str = ""
-    lateral: bool = False
-    exchange: bool = False
+    phases: str = ""  # phases of the customer; for an exchange those of both parts, one letter each
+    lateral: bool = False  # True: `other` is a lateral, which is on these phases with all its customers
+    exchange: bool = False  # True: two customers or laterals have each other's phase
+    # since, until: time interval of the meter's different error, Unix s
     since: float = np.nan
     until: float = np.nan
 

@@ -558,52 +558,36 @@ class OtherFeeder(InputInvalid):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibrate:
-    """Result of `calibrate`.
-
-    Attributes
-    ----------
-    meters
-        One row for each meter: `meter`, `customer`, `frames` (readings used), `bias_percent`, `std_percent`,
-        `low_percent`, `high_percent` (95 %; of the voltage, relative to the busbar meter: a common error of
-        all meters cannot be determined), `verdict`.
-    lines
-        One row for each line, or lines in series: `lines`, `from_bus`, `to_bus`, `factor`, `std`, `low`,
-        `high` (of the length in the files, if all others are correct), `same` (lines with the same effect),
-        `verdict`.
-    customers
-        One row for each customer: `customer`, `meter`, `bus`, `phases` (as corrected), `alternative` (the
-        best other place), `log_factor` (of it against this one), `open` (places that are not excluded),
-        `verdict`.
-    loads
-        One row for each customer: `customer`, `power_factor`, `low`, `high`, `p_gain_percent`,
-        `p_gain_std_percent`, `verdict`.
-    errors
-        `quantity`, `estimate`, `low`, `high`, `unit`, `verdict`: standard deviations and correlation time of
-        the errors of the customers' powers, and the meters' noise relative to the files.
-    proposals
-        Proposals in the order of the search: `kind`, `what` (for a lateral its first line and its customers),
-        `now`, `proposed`, `estimate`, `std` (of a length, the factor; otherwise the share of the proposed
-        change in the readings: 1 is all), `low`, `high`, `log_factor` (gain of the log-likelihood),
-        `confidence`, `verdict`, `alternatives`.
-    corrections
-        Decided proposals, as corrections of the files.
-    unread
-        Phases without a voltage of the busbar; the meters on them are left out.
-    """
+    """Result of `calibrate`."""
 
     feeder: str
     digest: str
     frames: int  # number of frames
     span_h: float
     risk: float  # probability of any proposal for correct files
+    # one row for each meter: `meter`, `customer`, `frames` (readings used), `bias_percent`, `std_percent`,
+    # `low_percent`, `high_percent` (95 %; of the voltage, relative to the busbar meter: a common error of all
+    # meters cannot be determined), `verdict`
     meters: pd.DataFrame
+    # one row for each line, or lines in series: `lines`, `from_bus`, `to_bus`, `factor`, `std`, `low`, `high`
+    # (of the length in the files, if all others are correct), `same` (lines with the same effect), `verdict`
     lines: pd.DataFrame
+    # one row for each customer: `customer`, `meter`, `bus`, `phases` (as corrected), `alternative` (the best
+    # other place), `log_factor` (of it against this one), `open` (places that are not excluded), `verdict`
     customers: pd.DataFrame
+    # one row for each customer: `customer`, `power_factor`, `low`, `high`, `p_gain_percent`,
+    # `p_gain_std_percent`, `verdict`
     loads: pd.DataFrame
+    # `quantity`, `estimate`, `low`, `high`, `unit`, `verdict`: standard deviations and correlation time of
+    # the errors of the customers' powers, and the meters' noise relative to the files
     errors: pd.DataFrame
+    # proposals in the order of the search: `kind`, `what` (for a lateral its first line and its customers),
+    # `now`, `proposed`, `estimate`, `std` (of a length, the factor; otherwise the share of the proposed
+    # change in the readings: 1 is all), `low`, `high`, `log_factor` (gain of the log-likelihood),
+    # `confidence`, `verdict`, `alternatives`
     proposals: pd.DataFrame
-    corrections: tuple[Correction, ...]
-    unread: str = ""
+    corrections: tuple[Correction, ...]  # decided proposals, as corrections of the files
+    unread: str = ""  # phases without a voltage of the busbar; the meters on them are left out
 
     @property
     def tables(self) -> dict[str, pd.DataFrame]:
@@ -614,14 +598,8 @@ class Calibrate:
     def corrected(self, site_folder: Path | str, out: Path | str) -> None:
         """Write a copy of the studied feeder with the decided corrections to a new or empty folder.
 
-        Raises
-        ------
-        OtherFeeder
-            If it is not the studied feeder.
-        FileExistsError
-            If the folder is not empty.
-        FeederInvalid, OSError
-            If the feeder cannot be read or written.
+        Raises OtherFeeder if it is not the studied feeder; FileExistsError if the folder is not empty;
+            FeederInvalid, OSError if the feeder cannot be read or written.
         """
         tables, target = find(site_folder), Path(out)
         if digest(tables) != self.digest:
@@ -650,31 +628,16 @@ def calibrate(
     The feeder is balanced (with loops or without) or of three phases. The readings are a recording, a table
     with its columns, or a Parquet or CSV file.
 
-    Parameters
-    ----------
-    risk
-        Probability of any proposal for correct files, 0 to 1.
-    tolerance
-        Relative error (1 sigma) of lines' lengths that counts as correct.
-    exclude
-        Meters with voltages that are not used; their powers are used.
-    kinds
-        Kinds of errors to search; fewer take less time, and an error of another kind may pass for one of
+    risk: probability of any proposal for correct files, 0 to 1.
+    tolerance: relative error (1 sigma) of lines' lengths that counts as correct.
+    exclude: meters with voltages that are not used; their powers are used.
+    kinds: kinds of errors to search; fewer take less time, and an error of another kind may pass for one of
         these.
-    progress
-        Called with (done, total) of the present comparison.
-
-    Raises
-    ------
-    RecordingInvalid
-        For readings of another feeder or of unknown meters, without the busbar, in other units than V, kW and
-        kvar, or too few.
-    ValueError
-        For an unknown meter, or a number out of range.
-    FeederInvalid
-        If closed lines form loops in three phases.
-    OtherStudy, InUse
-        As `feeders.studies.journal.Journal`.
+    progress: called with (done, total) of the present comparison.
+    Raises RecordingInvalid for readings of another feeder or of unknown meters, without the busbar, in other
+        units than V, kW and kvar, or too few; ValueError for an unknown meter, or a number out of range;
+        FeederInvalid if closed lines form loops in three phases; OtherStudy, InUse as
+        `feeders.studies.journal.Journal`.
     """
     problems = wrong_numbers(risk, tolerance)
     if unknown := sorted(set(exclude) - set(site.meter_ids)):

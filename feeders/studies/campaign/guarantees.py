@@ -64,10 +64,7 @@ def rehearse(
     beyond its size. In every second trial M - 1 other meters are attacked as well, by up to twice their size.
     `share` is that of `found`. An interrupted run resumes from its journal, also with more trials.
 
-    Raises
-    ------
-    OtherStudy, InUse
-        As `feeders.studies.journal.Journal`.
+    Raises OtherStudy, InUse as `feeders.studies.journal.Journal`.
     """
     sizes = [float(size) for name in ("hidden", "named", "named_alone") for size in found.meters[name]]
     told = {"max_attacked": found.max_attacked, "risk": found.risk, "sizes": sizes}
@@ -183,12 +180,9 @@ def promised(site: Site, found: Detectable, *, share: float = SHARE) -> tuple[At
     The feeder has the campaign's errors of loads and meters. For M = 1 there are only attacks on one meter.
     Kinds without an attack of guaranteed outcome are left out.
 
-    Returns
-    -------
-    hidden_alone, hidden
-        One meter, and M meters in the worst collusion of this size; no device is to be named.
-    named_alone, named
-        One meter, and any M meters, each by its size; all are to be named.
+    Returns hidden_alone, hidden: one meter, and M meters in the worst collusion of this size; no device is to
+        be named.
+    Returns named_alone, named: one meter, and any M meters, each by its size; all are to be named.
     """
     most, alone = found.max_attacked, (1,)
     kinds = [

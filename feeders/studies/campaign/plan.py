@@ -71,33 +71,19 @@ class Promise(StrEnum):
 class AttackClass:
     """Kind of attack.
 
-    Attributes
-    ----------
-    sizes
-        As `feeders.simulation.attacks.AttackSpec.size`; with `volts`, factors on these.
-    volts
-        Bias of each meter, V; empty: the same size for all meters.
-    together
-        Tuples with a bias of each meter, V. One tuple and a sign are drawn; its nonzero entries are the
-        manipulated meters.
-    liars
-        Numbers of manipulated devices; empty: those of the plan.
-    promise
-        Guaranteed outcome of such attacks, or None.
-
-    Raises
-    ------
-    ValueError
-        For an unknown manipulation, no size, a reserved name, or volts for other than a bias.
+    Raises ValueError for an unknown manipulation, no size, a reserved name, or volts for other than a bias.
     """
 
     name: str
     trick: AttackKind
+    # as `feeders.simulation.attacks.AttackSpec.size`; with `volts`, factors on these
     sizes: tuple[float, ...]
-    volts: tuple[float, ...] = ()
+    volts: tuple[float, ...] = ()  # bias of each meter, V; empty: the same size for all meters
+    # Tuples with a bias of each meter, V. One tuple and a sign are drawn; its nonzero entries are the
+    # manipulated meters.
     together: tuple[tuple[float, ...], ...] = ()
-    liars: tuple[int, ...] = ()
-    promise: Promise | None = None
+    liars: tuple[int, ...] = ()  # numbers of manipulated devices; empty: those of the plan
+    promise: Promise | None = None  # guaranteed outcome of such attacks, or None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "trick", choice("trick", AttackKind, self.trick))
@@ -154,10 +140,8 @@ class CampaignPlan:
     `meters`, `load_error`, `variation` and `report_q` are as in `feeders.simulation.trial.Trial`; without
     `load_error`, the errors of the feeder's files.
 
-    Raises
-    ------
-    ValueError
-        For an unknown place, season, design or kind of meters, or invalid numbers, all of which are reported.
+    Raises ValueError for an unknown place, season, design or kind of meters, or invalid numbers, all of which
+        are reported.
     """
 
     scenes: int = 10
@@ -331,12 +315,8 @@ class CampaignPlan:
     def watched(self, stated: Site, alarms_per_year: float) -> Site:
         """Feeder of a scene with the settings of the estimator's design for one of the plan's rates.
 
-        Raises
-        ------
-        ValueError
-            For an unknown setting, or a fraction for an integer.
-        FeederInvalid
-            For a setting out of range.
+        Raises ValueError for an unknown setting, or a fraction for an integer; FeederInvalid for a setting
+            out of range.
         """
         meta = stated.tables.meta
         raise_if_any(wrong_settings(stated, self.settings))

@@ -54,10 +54,7 @@ __all__ = ["Prepared", "attacks", "liars", "prepare", "risings", "watch"]
 def attacks(site: Site, plan: CampaignPlan, case: CampaignCase, honest: Scenario) -> Attacks:
     """Build the attacks of a scenario; `honest` is the scene without them.
 
-    Raises
-    ------
-    NoSuchAttack
-        For too few meters or inverters, or without a place for a false load.
+    Raises NoSuchAttack for too few meters or inverters, or without a place for a false load.
     """
     kind, random = plan.kind(case.kind), np.random.default_rng(case.seed)
     there = check_count(site, kind.trick, case.liars)
@@ -91,10 +88,7 @@ def attacks(site: Site, plan: CampaignPlan, case: CampaignCase, honest: Scenario
 def liars(site: Site, case: CampaignCase, random: np.random.Generator) -> tuple[Ints, Floats]:
     """Choose the manipulated meters by a scenario's rule: k meters, ascending, and their signs.
 
-    Raises
-    ------
-    NoSuchAttack
-        If no load affects that number of meters.
+    Raises NoSuchAttack if no load affects that number of meters.
     """
     p, count = site.meters.size, case.liars
     signs: Floats = random.choice([-1.0, 1.0], count)
@@ -144,10 +138,8 @@ class Prepared:
 def prepare(site: Site, plan: CampaignPlan) -> Prepared:
     """Design the estimators of a campaign.
 
-    Raises
-    ------
-    NotObservable, DesignInfeasible, EstimatorUnusable, FeederInvalid, ValueError
-        If the estimator cannot monitor this feeder with these settings.
+    Raises NotObservable, DesignInfeasible, EstimatorUnusable, FeederInvalid, ValueError if the estimator
+        cannot monitor this feeder with these settings.
     """
     scene = plan.trial(site, plan.moment(0))
     watchers = _designed(plan, scene.stated)

@@ -91,14 +91,7 @@ def delays(liars: pd.DataFrame) -> pd.DataFrame:
 def false_names(found: pd.DataFrame, liars: pd.DataFrame) -> pd.DataFrame:
     """Operating curve: false names per year without an attack, and share of manipulated devices named.
 
-    Notes
-    -----
-    With k events in a time T, the limits of the rate are those of a Poisson process,
-    ``chi2(a / 2; 2 k) / (2 T)`` and ``chi2(1 - a / 2; 2 k + 2) / (2 T)`` with a = 1 - CONFIDENCE.
-
-    References
-    ----------
-    F. Garwood: Fiducial limits for the Poisson distribution. Biometrika 28, 1936.
+    Source: F. Garwood: Fiducial limits for the Poisson distribution. Biometrika 28, 1936.
     """
     rows = []
     for rate, group in found.groupby("alarms_per_year", sort=True):
@@ -188,55 +181,45 @@ class NothingPlayed(GridsecError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Campaign:
-    """Results of all scenarios. Shares have limits `_low` and `_high`, Clopper and Pearson's at 95 %.
-
-    Attributes
-    ----------
-    scenarios
-        One row for each scenario and false-alarm rate: `scenario`, `scene`, `season`, `weekday` (0 is
-        Monday), `hour` of its begin; `alarms_per_year`; `kind`, `size`, `liars`, `place`, `onset_s`; `reason`
-        for a missing simulation, or empty; `exact`: all manipulated devices and no others were named;
-        `named`, number of manipulated devices named, `missed` and `falsely_named`, their names; `because`,
-        devices named from the onset on, and not in the same scene without the attack; `false_events`, number
-        of times that an honest meter or inverter became named; `delay_s` from the onset to the naming of the
-        last manipulated device; `clear_s` from the end of the attack until no device was named; `most_named`
-        at once; `watched_s`, `undecided_s`, and `clean_lying_s`, CLEAN during an attack; `error_liars` and
-        `error_others` of the reconstructed voltage at manipulated meters and elsewhere, the largest and
-        (`_95`) the 95th percentile, % of nominal, from `settling_s` after the onset on. Times of events that
-        did not occur are infinite; values without data are NaN.
-    liars
-        One row for each manipulated device: `who`, its id; `inverter`, true for inverters; `lie_volt`, the
-        largest displacement; `delay_s`; `anyway`, true if it is named without the attack too.
-    by_kind, by_size, by_place, by_liars
-        Groups of scenarios: shares `exact` and `false` (an honest device was named) of the scenarios, `named`
-        of the manipulated devices; median and 95th percentile of the delays of those named; median `_95` and
-        `_worst` of the errors; share of the `undecided` time.
-    delays
-        Operating curve: share of manipulated devices `named` within `within_s`, by kind and size.
-    false_names
-        Operating curve: false names `per_year` without an attack, with Poisson limits at 95 %, and the share
-        of manipulated devices named, by `alarms_per_year`.
-    promises
-        Attacks with a guarantee, one row for each `promise`: `lies`, the number of attacks; `broken`, attacks
-        to stay hidden with a device named because of them, or attacks to be named with a missed device;
-        `by_chance`, attacks with a device that is named without the attack too, which prove nothing and do
-        not count among those to be named; `honest_named`, scenarios with a false name; `scenes`, the number
-        of independent scenes, `scenes_broken` with a broken guarantee, and the upper limit of its
-        probability, Clopper and Pearson's at 95 %.
-    """
+    """Results of all scenarios. Shares have limits `_low` and `_high`, Clopper and Pearson's at 95 %."""
 
     feeder: str
     digest: str
     plan: CampaignPlan
     versions: dict[str, str]  # of all libraries that numbers depend on
+    # One row for each scenario and false-alarm rate: `scenario`, `scene`, `season`, `weekday` (0 is Monday),
+    # `hour` of its begin; `alarms_per_year`; `kind`, `size`, `liars`, `place`, `onset_s`; `reason` for a
+    # missing simulation, or empty; `exact`: all manipulated devices and no others were named; `named`, number
+    # of manipulated devices named, `missed` and `falsely_named`, their names; `because`, devices named from
+    # the onset on, and not in the same scene without the attack; `false_events`, number of times that an
+    # honest meter or inverter became named; `delay_s` from the onset to the naming of the last manipulated
+    # device; `clear_s` from the end of the attack until no device was named; `most_named` at once;
+    # `watched_s`, `undecided_s`, and `clean_lying_s`, CLEAN during an attack; `error_liars` and
+    # `error_others` of the reconstructed voltage at manipulated meters and elsewhere, the largest and (`_95`)
+    # the 95th percentile, % of nominal, from `settling_s` after the onset on. Times of events that did not
+    # occur are infinite; values without data are NaN.
     scenarios: pd.DataFrame
+    # one row for each manipulated device: `who`, its id; `inverter`, true for inverters; `lie_volt`, the
+    # largest displacement; `delay_s`; `anyway`, true if it is named without the attack too
     liars: pd.DataFrame
+    # by_kind, by_size, by_place, by_liars: groups of scenarios: shares `exact` and `false` (an honest device
+    # was named) of the scenarios, `named` of the manipulated devices; median and 95th percentile of the
+    # delays of those named; median `_95` and `_worst` of the errors; share of the `undecided` time
     by_kind: pd.DataFrame
     by_size: pd.DataFrame
     by_place: pd.DataFrame
     by_liars: pd.DataFrame
+    # operating curve: share of manipulated devices `named` within `within_s`, by kind and size
     delays: pd.DataFrame
+    # operating curve: false names `per_year` without an attack, with Poisson limits at 95 %, and the share of
+    # manipulated devices named, by `alarms_per_year`
     false_names: pd.DataFrame
+    # attacks with a guarantee, one row for each `promise`: `lies`, the number of attacks; `broken`, attacks
+    # to stay hidden with a device named because of them, or attacks to be named with a missed device;
+    # `by_chance`, attacks with a device that is named without the attack too, which prove nothing and do not
+    # count among those to be named; `honest_named`, scenarios with a false name; `scenes`, the number of
+    # independent scenes, `scenes_broken` with a broken guarantee, and the upper limit of its probability,
+    # Clopper and Pearson's at 95 %
     promises: pd.DataFrame
 
     @property
@@ -265,14 +248,10 @@ def campaign(
 
     `seed` replaces the plan's. `progress` is called with (done, total) scenarios.
 
-    Raises
-    ------
-    NotObservable, DesignInfeasible, EstimatorUnusable, FeederInvalid, ValueError
-        If the estimator cannot monitor this feeder with these settings, or for an invalid plan.
-    NothingPlayed
-        If the power flow has no solution at any scene.
-    OtherStudy, InUse, ClusterUnusable, WorkerLost
-        As `feeders.studies.journal.run_pieces`.
+    Raises NotObservable, DesignInfeasible, EstimatorUnusable, FeederInvalid, ValueError if the estimator
+        cannot monitor this feeder with these settings, or for an invalid plan; NothingPlayed if the power
+        flow has no solution at any scene; OtherStudy, InUse, ClusterUnusable, WorkerLost as
+        `feeders.studies.journal.run_pieces`.
     """
     plan = CampaignPlan() if plan is None else plan
     plan = plan if seed is None else replace(plan, seed=seed)

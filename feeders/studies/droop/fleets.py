@@ -55,10 +55,7 @@ def equip(site: Site, preset: str, who: Who = Who.PV) -> Droop:
 
     A customer's own inverter keeps its rating; others get 1.1 kVA for each kW of generation, or 5 kVA.
 
-    Raises
-    ------
-    FeederInvalid
-        For an unknown preset, or without a customer to equip.
+    Raises FeederInvalid for an unknown preset, or without a customer to equip.
     """
     rows = site.tables.customers
     own = [k for k, row in enumerate(rows) if who is Who.ALL or row.pv_kw > 0 or row.inverter_kva > 0]
@@ -79,12 +76,8 @@ def made(site: Site, own: Ints, preset: str, kva: Floats) -> Droop:
 def chosen_fleet(site: Site, preset: str | None, who: Who = Who.PV) -> Droop:
     """The feeder's own fleet, or one of a preset as in `equip`.
 
-    Raises
-    ------
-    NoInverters
-        Without inverters and without a preset.
-    FeederInvalid
-        If a preset has no customer to equip.
+    Raises NoInverters without inverters and without a preset; FeederInvalid if a preset has no customer to
+        equip.
     """
     if preset is not None:
         return equip(site, preset, who)
@@ -133,10 +126,7 @@ def box(
     Loads from `load_low load_kw` to `load_high load_kw`, with q from `load tan_min - floor` to `load tan_max
     + floor`; generation from `pv_low pv_kw` to `pv_high pv_kw` at unity power factor; busbar voltage in pu.
 
-    Raises
-    ------
-    ValueError
-        For limits in the wrong order.
+    Raises ValueError for limits in the wrong order.
     """
     problems = [
         *range_problem("load", load_low, load_high),

@@ -263,10 +263,7 @@ class DroopPlan:
 def shares_of(site: Site, customers: Sequence[str] | None) -> Floats:
     """Distribution of generation, (N,): equal among customers; by default as in the files, or equal.
 
-    Raises
-    ------
-    ValueError
-        For an unknown customer.
+    Raises ValueError for an unknown customer.
     """
     out = np.array([row.pv_kw for row in site.tables.customers])
     if customers is not None:

@@ -69,10 +69,7 @@ HOSTING: Final = {
 class DroopOptions:
     """Options of the study.
 
-    Raises
-    ------
-    ValueError
-        With every option that is out of range or has no effect.
+    Raises ValueError with every option that is out of range or has no effect.
     """
 
     preset: str | None = None  # of all inverters; None: the feeder's own fleet
@@ -154,29 +151,7 @@ ANY = "any loads"  # row for all loads within their limits
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DroopStudy:
-    """Result of `droop`.
-
-    Attributes
-    ----------
-    tables
-        - `stability`: a row for each operating point, and one for any loads. `verdict`, `proof`, `gain` (of
-          the loop at rest), `growth` (of a small deviation in one update), `margin` (all curves with the same
-          limits are stable up to this factor on their slopes), `slope_certified` and `slope_unstable`
-          (factors on the slopes of this fleet's curves: proven stable up to the first, equilibrium unstable
-          from the second), `size_certified` and `size_unstable` (the same with larger inverters),
-          `longest_interval_s`, `tau_factor` (admissible factor on all time constants), `why`.
-        - `inverters`: `part` of the loop gain, and `alone`, the admissible factor on one inverter's slope.
-        - `steps`: `settling_s`, `overshoot_percent`, `change_volt`, by AC simulation.
-        - `trajectories`: the voltages of the steps.
-        - `band`: with and without the fleet, proof status, and extremes of the proven limits, V.
-        - `customers`: the proven limits of each customer's voltage, V.
-        - `witness`: loads that violate the band, if found.
-        - `presets`, `time_constants`: verdict, margin, settling, overshoot, voltages of the worst customers.
-        - `hosting`, `hosting_curve`, `hosting_draws`: see `feeders.studies.droop.limits`;
-          `hosting_probability`: share of random orders in which this generation violates a limit.
-
-        In three phases `inverters`, `customers` and `witness` have a column `phase`.
-    """
+    """Result of `droop`."""
 
     feeder: str
     digest: str
@@ -185,6 +160,20 @@ class DroopStudy:
     verdict: FleetVerdict  # with constant loads anywhere within their limits
     rest: BandGuarantee  # for slow load changes
     always: BandGuarantee  # for arbitrary load changes
+    # - `stability`: a row for each operating point, and one for any loads. `verdict`, `proof`, `gain` (of the
+    # loop at rest), `growth` (of a small deviation in one update), `margin` (all curves with the same limits
+    # are stable up to this factor on their slopes), `slope_certified` and `slope_unstable` (factors on the
+    # slopes of this fleet's curves: proven stable up to the first, equilibrium unstable from the second),
+    # `size_certified` and `size_unstable` (the same with larger inverters), `longest_interval_s`,
+    # `tau_factor` (admissible factor on all time constants), `why`. - `inverters`: `part` of the loop gain,
+    # and `alone`, the admissible factor on one inverter's slope. - `steps`: `settling_s`,
+    # `overshoot_percent`, `change_volt`, by AC simulation. - `trajectories`: the voltages of the steps. -
+    # `band`: with and without the fleet, proof status, and extremes of the proven limits, V. - `customers`:
+    # the proven limits of each customer's voltage, V. - `witness`: loads that violate the band, if found. -
+    # `presets`, `time_constants`: verdict, margin, settling, overshoot, voltages of the worst customers. -
+    # `hosting`, `hosting_curve`, `hosting_draws`: see `feeders.studies.droop.limits`; `hosting_probability`:
+    # share of random orders in which this generation violates a limit. In three phases `inverters`,
+    # `customers` and `witness` have a column `phase`.
     tables: dict[str, pd.DataFrame]
 
 
@@ -235,14 +224,8 @@ def droop(
 
     `seed` is that of small deviations from equilibrium, and of the orders of generation.
 
-    Raises
-    ------
-    NoInverters
-        Without inverters and without a preset.
-    ValueError
-        For an invalid band, or new generation at an unknown customer.
-    OtherStudy, InUse
-        As `feeders.studies.journal.Journal`.
+    Raises NoInverters without inverters and without a preset; ValueError for an invalid band, or new
+        generation at an unknown customer; OtherStudy, InUse as `feeders.studies.journal.Journal`.
     """
     given = options or DroopOptions()
     study = _Study(Subject.of(site), chosen_fleet(site, given.preset, given.who), given, seed)

@@ -239,32 +239,19 @@ class Subject:
 
 @dataclass(frozen=True, slots=True)
 class Judgement:
-    """Stability of a fleet with given loads.
+    """Stability of a fleet with given loads."""
 
-    Attributes
-    ----------
-    verdict
-        STABLE: the fleet converges from every state to the same equilibrium. UNSTABLE: the equilibrium is
-        unstable, and the simulation moves away from it permanently. UNDECIDED: neither is proven.
-    proof
-        The certificate, as in `gridsec.planning.droop.stability.Proof`.
-    gain
-        Largest gain of the loop within the reachable voltages, 1; NaN without bounds of these.
-    growth
-        Growth factor of a small deviation from equilibrium in one update; NaN for a box of loads, or without
-        an equilibrium.
-    outcome
-        Outcome of the simulation of an unstable fleet after a small deviation from equilibrium.
-    why
-        Reason for a missing proof.
-    """
-
+    # STABLE: the fleet converges from every state to the same equilibrium. UNSTABLE: the equilibrium is
+    # unstable, and the simulation moves away from it permanently. UNDECIDED: neither is proven.
     verdict: FleetVerdict
-    proof: str
-    gain: float
+    proof: str  # the certificate, as in `gridsec.planning.droop.stability.Proof`
+    gain: float  # largest gain of the loop within the reachable voltages, 1; NaN without bounds of these
+    # growth factor of a small deviation from equilibrium in one update; NaN for a box of loads, or without an
+    # equilibrium
     growth: float
+    # outcome of the simulation of an unstable fleet after a small deviation from equilibrium
     outcome: str = ""
-    why: str = ""
+    why: str = ""  # reason for a missing proof
 
 
 def judge(subject: Subject, droop: Droop, update: Update, loads: InjectionBox, *, seed: int = 0) -> Judgement:
@@ -342,11 +329,8 @@ def edge(
 
     `change` makes the slopes `steepened` with the same limits, or `enlarged` with the same breakpoints.
 
-    Returns
-    -------
-    tuple
-        The largest factor found with a proof of stability, 0 without one; the smallest found with an unstable
-        equilibrium, infinity if none up to 1024.
+    Returns tuple: the largest factor found with a proof of stability, 0 without one; the smallest found with
+        an unstable equilibrium, infinity if none up to 1024.
     """
 
     def proven(times: float) -> bool:

@@ -1,0 +1,183 @@
+"""Authentication and authorisation of requests.
+
+A request is authenticated by `Authorization: Bearer <API key or OIDC token>`, or by the cookie of a session
+of the web page. Where no key was ever added and no issuer is set, every request has the identity `OPEN`: the
+service then listens on loopback only, unless its operator has explicitly allowed otherwise.
+
+Records of keys are cached for `FRESH_S`: a revoked key ends within this time. A client with more than
+`FAILURES` invalid credentials per minute gets 429 for further invalid ones; valid credentials always pass,
+so that a client behind the same address cannot lock out others.
+"""
+
+from __future__ import annotations
+
+import secrets
+import threading
+import time
+from collections.abc import Callable
+from typing import Any, Final
+
+from limits import RateLimitItemPerMinute
+from limits.storage import MemoryStorage
+from limits.strategies import MovingWindowRateLimiter
+from starlette.requests import Request
+
+from service.access import keys
+from service.access.identity import (
+    OPEN,
+    POLICY,
+    PUBLIC,
+    Identity,
+    NotAuthenticated,
+    NotPermitted,
+    Role,
+    TooManyFailures,
+)
+from service.access.keys import KeyRecord
+from service.access.tokens import TokenVerifier
+from service.store.access import AccessStore
+
+COOKIE: Final = "gridsec_session"
+FRESH_S: Final = 2.0
+"""Largest age of a cached record of a key or session, s."""
+CACHED: Final = 1024
+"""Largest number of cached records."""
+FAILURES: Final = 10
+"""Number of invalid credentials of one client per minute that get 401."""
+COOKIE_BYTES: Final = 32
+DETAIL_BYTES: Final = 2000
+"""Part of a request's body in the audit log, bytes."""
+
+
+class Authenticator:
+    """Identities of requests. Thread-safe.
+
+    store: keys, sessions and audit log.
+    tokens: verification of OIDC tokens; None without an issuer.
+    wall: wall clock, Unix s.
+    """
+
+    def __init__(
+        self, store: AccessStore, tokens: TokenVerifier | None = None, wall: Callable[[], float] = time.time
+    ) -> None:
+        self.store, self.tokens, self.wall = store, tokens, wall
+        self._failures = MovingWindowRateLimiter(MemoryStorage())
+        self._limit = RateLimitItemPerMinute(FAILURES)
+        self._lock = threading.Lock()
+        self._cache: dict[str, tuple[float, Any]] = {}
+
+    @property
+    def required(self) -> bool:
+        """True if requests need a credential."""
+        return self.tokens is not None or bool(self._cached("required", self.store.any_key))
+
+    def identify(self, request: Request) -> Identity:
+        """Identity of a request.
+
+        Raises NotAuthenticated, TooManyFailures without a valid credential.
+        """
+        scheme, _, given = request.headers.get("authorization", "").partition(" ")
+        cookie = request.cookies.get(COOKIE, "")
+        if given and scheme.lower() == "bearer":
+            return self.of_credential(given.strip(), client_of(request))
+        if cookie:
+            record = self._cached(f"session {cookie}", lambda: self.store.session(cookie, self.wall()))
+            if record is not None and record.ended(self.wall()) is None:
+                return Identity(record.name, record.role, record.feeders, f"key {record.id}")
+        if not self.required:
+            return OPEN
+        text = "the session has ended; log in again" if cookie else "a credential is required: an API key"
+        raise NotAuthenticated(text)
+
+    def of_credential(self, text: str, client: str) -> Identity:
+        """Identity of an API key or token.
+
+        text: the credential.
+        client: address of the client, for the limit of failures.
+        Raises NotAuthenticated, TooManyFailures if the credential is not valid.
+        """
+        try:
+            if text.startswith("gridsec_") or self.tokens is None:
+                return self._key(text).identity
+            return self.tokens.identify(text)
+        except NotAuthenticated as error:
+            if not self._failures.hit(self._limit, client):
+                raise TooManyFailures("too many invalid credentials; wait a minute") from error
+            self.store.append(self.wall(), "", "", "invalid credential", client, str(error))
+            raise
+
+    def log_in(self, text: str, client: str) -> tuple[Identity, str, float]:
+        """Exchange an API key for a session.
+
+        text, client: as in `of_credential`.
+        Returns identity, cookie, expires: identity, text of the cookie, and the session's end, Unix s.
+        """
+        identity = self.of_credential(text, client)
+        parsed = keys.parse(text)
+        if parsed is None:
+            raise NotAuthenticated("a session needs an API key")
+        cookie = secrets.token_urlsafe(COOKIE_BYTES)
+        expires = self.store.open_session(cookie, parsed[0], self.wall())
+        self.store.append(self.wall(), identity.name, identity.credential, "log in", client)
+        return identity, cookie, expires
+
+    def log_out(self, cookie: str) -> None:
+        """End a session."""
+        with self._lock:
+            self._cache.pop(f"session {cookie}", None)
+        self.store.close_session(cookie)
+
+    def _key(self, text: str) -> KeyRecord:
+        key_id, secret = keys.parse(text) or ("", "")
+        record: KeyRecord | None = self._cached(f"key {key_id}", lambda: self.store.key(key_id))
+        if record is None or not keys.matches(record, secret):
+            raise NotAuthenticated("the API key is not known")
+        if (reason := record.ended(self.wall())) is not None:
+            raise NotAuthenticated(reason)
+        return record
+
+    def _cached(self, name: str, read: Callable[[], Any]) -> Any:
+        now = time.monotonic()
+        with self._lock:
+            found = self._cache.get(name)
+        if found is not None and now - found[0] < FRESH_S:
+            return found[1]
+        value = read()
+        with self._lock:
+            if len(self._cache) >= CACHED:
+                self._cache.clear()
+            self._cache[name] = (now, value)
+        return value
+
+
+def client_of(request: Request) -> str:
+    """Address of the client, for the limit of failures and the audit log."""
+    return request.client.host if request.client is not None else "unknown"
+
+
+def authorise(authenticator: Authenticator, request: Request, route: str, body: bytes) -> Identity:
+    """Identity of a request that may use a route; changes are in the audit log before they are made.
+
+    authenticator: the authenticator.
+    route: method and path template.
+    body: body of the request.
+    Raises NotAuthenticated, TooManyFailures without a valid credential; NotPermitted if the identity has no
+        access.
+    """
+    if POLICY.get(route, Role.ADMIN) is PUBLIC:
+        return OPEN
+    identity = authenticator.identify(request)
+    feeder = request.path_params.get("feeder")
+    reason = identity.permits(route)
+    if reason is None and feeder is not None and not identity.sees(feeder):
+        reason = f"{identity.name} has no access to feeder {feeder!r}"
+    if request.method not in {"GET", "HEAD"}:
+        detail = body[:DETAIL_BYTES].decode("utf-8", "replace")
+        action = route if reason is None else f"refused: {route}"
+        target = request.url.path
+        authenticator.store.append(
+            authenticator.wall(), identity.name, identity.credential, action, target, detail
+        )
+    if reason is not None:
+        raise NotPermitted(reason)
+    return identity

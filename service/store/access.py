@@ -1,0 +1,296 @@
+"""Database of access control: API keys, sessions of the web page, and the audit log.
+
+It is apart from the service's database, since the command line writes it while the service runs. With SQLite
+it is the file `<database>.access`, with a rollback journal: unlike a WAL, several processes write it safely.
+With PostgreSQL its tables are in the same database. Entries of the audit log are appended one at a time,
+under `BEGIN IMMEDIATE` or an advisory lock of the transaction.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import sqlite3
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Final
+from urllib.parse import quote
+
+import sqlalchemy as sa
+
+from service.access.audit import AuditEntry, chained
+from service.access.identity import Role
+from service.access.keys import KeyRecord
+from service.store.connect import CALL_S
+from service.store.schema import SEQ, StoreUnavailable
+
+SESSION_S: Final = 12 * 3600.0
+"""Life of a session of the web page, s: a shift and its hand-over."""
+BUSY_S: Final = 5.0
+"""Wait of a write for the lock of the database, s."""
+_AUDIT_LOCK: Final = 0x6772_6964_6175_6400
+_VERSION: Final = 1
+
+_META = sa.MetaData()
+_SCHEMA = sa.Table("access_version", _META, sa.Column("version", sa.Integer, primary_key=True))
+_KEY = sa.Table(
+    "access_key",
+    _META,
+    sa.Column("id", sa.String(16), primary_key=True),
+    sa.Column("digest", sa.String(64), nullable=False),
+    sa.Column("name", sa.String(64), nullable=False),
+    sa.Column("role", sa.String(16), nullable=False),
+    sa.Column("feeders", sa.Text),
+    sa.Column("created", sa.Double, nullable=False),
+    sa.Column("expires", sa.Double),
+    sa.Column("revoked", sa.Double),
+)
+_SESSION = sa.Table(
+    "access_session",
+    _META,
+    sa.Column("digest", sa.String(64), primary_key=True),
+    sa.Column("key_id", sa.String(16), sa.ForeignKey("access_key.id"), nullable=False),
+    sa.Column("expires", sa.Double, nullable=False),
+)
+_AUDIT = sa.Table(
+    "audit",
+    _META,
+    sa.Column("seq", SEQ, primary_key=True, autoincrement=False),
+    sa.Column("t", sa.Double, nullable=False),
+    sa.Column("who", sa.Text, nullable=False),
+    sa.Column("credential", sa.Text, nullable=False),
+    sa.Column("action", sa.Text, nullable=False),
+    sa.Column("target", sa.Text, nullable=False),
+    sa.Column("detail", sa.Text, nullable=False),
+    sa.Column("previous", sa.String(64), nullable=False),
+    sa.Column("hash", sa.String(64), nullable=False),
+)
+
+
+class AccessStore:
+    """Keys, sessions and audit log of one service. Methods block and are thread-safe.
+
+    database: address of the service's database.
+    Raises StoreUnavailable if the database cannot be opened, or is newer than this program.
+    """
+
+    def __init__(self, database: str) -> None:
+        try:
+            url = sa.make_url(database)
+        except sa.exc.ArgumentError as error:
+            text = f"{database!r} is not a database address: {error}"
+            raise StoreUnavailable(text, code="wrong-address") from error
+        self._sqlite = url.get_backend_name() == "sqlite"
+        self.name = url.render_as_string(hide_password=True) + (".access" if self._sqlite else "")
+        self._engine = _sqlite(url) if self._sqlite else _postgresql(url)
+        try:
+            self._create()
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> AccessStore:
+        """Return the store."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close."""
+        self.close()
+
+    def close(self) -> None:
+        """Close all connections; idempotent."""
+        self._engine.dispose()
+
+    # ------------------------------------------------------------------ keys
+
+    def add_key(self, record: KeyRecord) -> None:
+        """Store a key."""
+        feeders = None if record.feeders is None else json.dumps(sorted(record.feeders))
+        row = {
+            "id": record.id,
+            "digest": record.digest,
+            "name": record.name,
+            "role": str(record.role),
+            "feeders": feeders,
+            "created": record.created,
+            "expires": record.expires,
+            "revoked": record.revoked,
+        }
+        with self._write() as connection:
+            connection.execute(_KEY.insert().values(row))
+
+    def keys(self) -> list[KeyRecord]:
+        """All keys, the oldest first."""
+        with self._read() as connection:
+            return [_record(row) for row in connection.execute(sa.select(_KEY).order_by(_KEY.c.created))]
+
+    def key(self, key_id: str) -> KeyRecord | None:
+        """Return a key by its id."""
+        with self._read() as connection:
+            row = connection.execute(sa.select(_KEY).where(_KEY.c.id == key_id)).one_or_none()
+        return None if row is None else _record(row)
+
+    def any_key(self) -> bool:
+        """True if a key was ever added; a revoked or expired key does not open the service again."""
+        with self._read() as connection:
+            return bool(connection.scalar(sa.select(sa.exists().select_from(_KEY))))
+
+    def revoke(self, key_id: str, now: float) -> bool:
+        """Revoke a key, and with it its sessions; False if there is no such valid key.
+
+        key_id: id of the key.
+        now: Unix time, s.
+        """
+        with self._write() as connection:
+            change = _KEY.update().where(_KEY.c.id == key_id, _KEY.c.revoked.is_(None)).values(revoked=now)
+            return connection.execute(change).rowcount == 1
+
+    # -------------------------------------------------------------- sessions
+
+    def open_session(self, token: str, key_id: str, now: float) -> float:
+        """Store a session of the web page, and return its end, Unix s.
+
+        token: random text of the cookie; its SHA-256 is stored.
+        key_id: key that the session stands for.
+        now: Unix time, s.
+        """
+        with self._write() as connection:
+            connection.execute(_SESSION.delete().where(_SESSION.c.expires <= now))
+            row = {"digest": _digest(token), "key_id": key_id, "expires": now + SESSION_S}
+            connection.execute(_SESSION.insert().values(row))
+        return now + SESSION_S
+
+    def session(self, token: str, now: float) -> KeyRecord | None:
+        """Key of a session, or None if the session has ended.
+
+        token: text of the cookie.
+        now: Unix time, s.
+        """
+        query = sa.select(_KEY).join(_SESSION, _SESSION.c.key_id == _KEY.c.id)
+        query = query.where(_SESSION.c.digest == _digest(token), _SESSION.c.expires > now)
+        with self._read() as connection:
+            row = connection.execute(query).one_or_none()
+        return None if row is None else _record(row)
+
+    def close_session(self, token: str) -> None:
+        """End a session."""
+        with self._write() as connection:
+            connection.execute(_SESSION.delete().where(_SESSION.c.digest == _digest(token)))
+
+    # ----------------------------------------------------------------- audit
+
+    def append(  # noqa: PLR0917  # the columns of an entry
+        self, t: float, who: str, credential: str, action: str, target: str, detail: str = ""
+    ) -> AuditEntry:
+        """Append an entry to the audit log; durable when this returns.
+
+        t, who, credential, action, target, detail: as in `AuditEntry`.
+        """
+        with self._write() as connection:
+            if not self._sqlite:
+                connection.execute(sa.select(sa.func.pg_advisory_xact_lock(_AUDIT_LOCK)))
+            last = connection.execute(sa.select(_AUDIT).order_by(_AUDIT.c.seq.desc()).limit(1)).one_or_none()
+            before = None if last is None else AuditEntry(*last)
+            entry = chained(before, t, who, credential, action, target, detail)
+            connection.execute(_AUDIT.insert().values(entry.to_json()))
+        return entry
+
+    def audit(self, *, after: int = 0, limit: int | None = None) -> list[AuditEntry]:
+        """Return entries of the audit log, the oldest first.
+
+        after: restrict to entries with a higher number.
+        limit: largest number of entries; None for all.
+        """
+        query = sa.select(_AUDIT).where(_AUDIT.c.seq > after).order_by(_AUDIT.c.seq).limit(limit)
+        with self._read() as connection:
+            return [AuditEntry(*row) for row in connection.execute(query)]
+
+    # -------------------------------------------------------------- internal
+
+    def _create(self) -> None:
+        with self._write() as connection:
+            if not self._sqlite:
+                # Two processes may create the tables at once.
+                connection.execute(sa.select(sa.func.pg_advisory_xact_lock(_AUDIT_LOCK)))
+            if not sa.inspect(connection).has_table(_SCHEMA.name):
+                _META.create_all(connection)
+                connection.execute(_SCHEMA.insert().values(version=_VERSION))
+            version = int(connection.scalar(sa.select(_SCHEMA.c.version)) or 0)
+        if version > _VERSION:
+            text = f"{self.name} has version {version}; this program supports versions up to {_VERSION}"
+            raise StoreUnavailable(text, code="newer-schema")
+
+    @contextmanager
+    def _write(self) -> Iterator[sa.Connection]:
+        with self._guard("write"), self._engine.begin() as connection:
+            yield connection
+
+    @contextmanager
+    def _read(self) -> Iterator[sa.Connection]:
+        with self._guard("read"), self._engine.connect() as connection:
+            yield connection
+
+    @contextmanager
+    def _guard(self, doing: str) -> Iterator[None]:
+        try:
+            yield
+        except (sa.exc.SQLAlchemyError, sqlite3.Error, OSError) as error:
+            cause = " ".join(str(getattr(error, "orig", None) or error).split())
+            code = "read-failed" if doing == "read" else "write-failed"
+            raise StoreUnavailable(f"cannot {doing} {self.name}: {cause}", code=code) from error
+
+
+def _digest(token: str) -> str:
+    return hashlib.sha256(token.encode()).hexdigest()
+
+
+def _record(row: Any) -> KeyRecord:
+    feeders = None if row.feeders is None else frozenset(json.loads(row.feeders))
+    return KeyRecord(
+        row.id, row.digest, row.name, Role(row.role), feeders, row.created, row.expires, row.revoked
+    )
+
+
+def _sqlite(url: sa.URL) -> sa.Engine:
+    if not url.database or url.database == ":memory:":
+        text = f"{url}: expected a file; a database in memory is lost at the end"
+        raise StoreUnavailable(text, code="in-memory")
+    path = Path(os.path.realpath(url.database) + ".access")
+
+    def connect() -> sqlite3.Connection:
+        existed = path.exists()
+        made = sqlite3.connect(
+            f"file:{quote(str(path))}?mode=rwc",
+            uri=True,
+            timeout=BUSY_S,
+            isolation_level=None,
+            check_same_thread=False,
+        )
+        made.execute("PRAGMA foreign_keys = ON")
+        made.execute("PRAGMA journal_mode = DELETE")
+        made.execute("PRAGMA synchronous = FULL")
+        if not existed:
+            # Digests of keys: for the owner alone.
+            path.chmod(0o600)
+        return made
+
+    engine = sa.create_engine("sqlite://", creator=connect, poolclass=sa.QueuePool, pool_size=4)
+    sa.event.listen(engine, "begin", _begin)
+    return engine
+
+
+def _begin(connection: sa.Connection) -> None:
+    # A deferred transaction that reads first and then writes fails at once if another one writes.
+    connection.exec_driver_sql("BEGIN IMMEDIATE")
+
+
+def _postgresql(url: sa.URL) -> sa.Engine:
+    if url.get_driver_name() != "psycopg":
+        url = url.set(drivername="postgresql+psycopg")
+    wait = {"connect_timeout": int(CALL_S), "tcp_user_timeout": int(CALL_S * 1e3)}
+    limit = f"-c statement_timeout={CALL_S * 1e3:.0f} -c synchronous_commit=on"
+    return sa.create_engine(
+        url, pool_size=4, pool_timeout=CALL_S, pool_pre_ping=True, connect_args={**wait, "options": limit}
+    )
