@@ -148,7 +148,7 @@ def _check_exposure(settings: Settings, authenticator: Authenticator) -> None:
     text = (
         f"--http or GRIDSEC_HTTP: {settings.http} is reachable from the network and no authentication is set "
         f"up; add a key (`gridsec key add NAME --role operator --database {settings.database}`), set "
-        "--oidc-issuer, or listen on 127.0.0.1. --open-to-network-without-authentication lets everybody on "
+        "--oidc-issuer, or listen on 127.0.0.1. --open-to-network-without-authentication lets any client on "
         "the network change everything"
     )
     raise SettingsInvalid([Problem("no-authentication", text)])

@@ -1,6 +1,6 @@
 """Audit log: a chain of entries, each with the SHA-256 of its content and of the previous entry.
 
-    hash_n = SHA-256(canonical JSON of [seq, t, who, credential, action, target, detail, hash_(n-1)])
+    hash_n = SHA-256(canonical JSON of [seq, t, identity, credential, action, target, detail, hash_(n-1)])
 
 A changed, inserted or removed entry breaks the chain at its place. Removed last entries leave a valid
 shorter chain: `gridsec audit verify` prints the number and hash of the last entry, and `--expect` compares
@@ -25,8 +25,8 @@ class AuditEntry:
 
     seq: int  # number, from 1 without gaps
     t: float  # Unix time, s
-    # who, credential: name of the identity, and the credential that proved it
-    who: str
+    # identity, credential: name of the identity, and the credential that proved it
+    identity: str
     credential: str
     # action, target: action, such as `POST /api/v1/alarms/{alarm_id}/ack`, and the resource
     action: str
@@ -42,16 +42,16 @@ class AuditEntry:
 
 
 def chained(  # noqa: PLR0917  # the columns of an entry
-    last: AuditEntry | None, t: float, who: str, credential: str, action: str, target: str, detail: str
+    last: AuditEntry | None, t: float, identity: str, credential: str, action: str, target: str, detail: str
 ) -> AuditEntry:
     """Entry that follows the last one.
 
     last: the last entry; None for an empty log.
-    t, who, credential, action, target, detail: as in `AuditEntry`.
+    t, identity, credential, action, target, detail: as in `AuditEntry`.
     """
     seq, previous = (1, START) if last is None else (last.seq + 1, last.hash)
-    entry = AuditEntry(seq, t, who, credential, action, target, detail, previous, "")
-    return AuditEntry(seq, t, who, credential, action, target, detail, previous, content_hash(entry))
+    entry = AuditEntry(seq, t, identity, credential, action, target, detail, previous, "")
+    return AuditEntry(seq, t, identity, credential, action, target, detail, previous, content_hash(entry))
 
 
 def content_hash(entry: AuditEntry) -> str:
@@ -59,7 +59,7 @@ def content_hash(entry: AuditEntry) -> str:
     content = (
         entry.seq,
         entry.t,
-        entry.who,
+        entry.identity,
         entry.credential,
         entry.action,
         entry.target,

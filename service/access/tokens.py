@@ -62,8 +62,7 @@ class TokenVerifier:
         except jwt.PyJWTError as error:
             raise NotAuthenticated(f"the token is not valid: {error}") from error
         except (OSError, ValueError) as error:
-            text = f"the keys of {self.issuer} cannot be read: {error}"
-            raise NotAuthenticated(text, code="issuer-unavailable") from error
+            raise _unavailable(self.issuer, str(error)) from error
         return self._identity(claims)
 
     def _identity(self, claims: Mapping[str, Any]) -> Identity:
@@ -92,7 +91,7 @@ def _discovered(issuer: str) -> str:
     """Address of the keys by the issuer's discovery document."""
     address = issuer.rstrip("/") + "/.well-known/openid-configuration"
     if urlsplit(address).scheme not in {"http", "https"}:
-        raise ValueError(f"{issuer} is not an http address")
+        raise _unavailable(issuer, "it is not an http address")
     try:
         with urllib.request.urlopen(address, timeout=ANSWER_S) as answer:  # noqa: S310  # scheme is checked
             found = json.load(answer)
@@ -103,5 +102,9 @@ def _discovered(issuer: str) -> str:
     if named.get("issuer") != issuer or not str(named.get("jwks_uri", "")).startswith(
         ("http://", "https://")
     ):
-        raise ValueError(f"{address} must name this issuer and an http address of its keys")
+        raise _unavailable(issuer, f"{address} must name this issuer and an http address of its keys")
     return str(named["jwks_uri"])
+
+
+def _unavailable(issuer: str, why: str) -> NotAuthenticated:
+    return NotAuthenticated(f"the keys of {issuer} cannot be read: {why}", code="issuer-unavailable")

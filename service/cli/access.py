@@ -134,7 +134,7 @@ def show(
     table = Table("entry", "time (UTC)", "identity", "credential", "action", "target")
     for each in entries:
         when = time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime(each.t))
-        table.add_row(str(each.seq), when, each.who, each.credential, each.action, each.target)
+        table.add_row(str(each.seq), when, each.identity, each.credential, each.action, each.target)
     console.out.print(table)
 
 

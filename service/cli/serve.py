@@ -67,7 +67,7 @@ OpenToNetwork = Annotated[
     bool,
     typer.Option(
         "--open-to-network-without-authentication",
-        help="Dangerous: everybody on the network can read, acknowledge and change everything.",
+        help="Dangerous: any client on the network can read, acknowledge and change everything.",
     ),
 ]
 LogLevel = Annotated[str | None, typer.Option(help="debug, info, warning or error. [default: info]")]

@@ -59,7 +59,7 @@ _AUDIT = sa.Table(
     _META,
     sa.Column("seq", SEQ, primary_key=True, autoincrement=False),
     sa.Column("t", sa.Double, nullable=False),
-    sa.Column("who", sa.Text, nullable=False),
+    sa.Column("identity", sa.Text, nullable=False),
     sa.Column("credential", sa.Text, nullable=False),
     sa.Column("action", sa.Text, nullable=False),
     sa.Column("target", sa.Text, nullable=False),
@@ -182,18 +182,18 @@ class AccessStore:
     # ----------------------------------------------------------------- audit
 
     def append(  # noqa: PLR0917  # the columns of an entry
-        self, t: float, who: str, credential: str, action: str, target: str, detail: str = ""
+        self, t: float, identity: str, credential: str, action: str, target: str, detail: str = ""
     ) -> AuditEntry:
         """Append an entry to the audit log; durable when this returns.
 
-        t, who, credential, action, target, detail: as in `AuditEntry`.
+        t, identity, credential, action, target, detail: as in `AuditEntry`.
         """
         with self._write() as connection:
             if not self._sqlite:
                 connection.execute(sa.select(sa.func.pg_advisory_xact_lock(_AUDIT_LOCK)))
             last = connection.execute(sa.select(_AUDIT).order_by(_AUDIT.c.seq.desc()).limit(1)).one_or_none()
             before = None if last is None else AuditEntry(*last)
-            entry = chained(before, t, who, credential, action, target, detail)
+            entry = chained(before, t, identity, credential, action, target, detail)
             connection.execute(_AUDIT.insert().values(entry.to_json()))
         return entry
 

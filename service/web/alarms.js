@@ -242,7 +242,7 @@ export class Alarms {
       this.complain("Please enter your name.");
       return;
     }
-    const given = { ...session.who("ack-who"), comment: byId("ack-comment").value, count: this.asking.count };
+    const given = { ...session.operator("ack-who"), comment: byId("ack-comment").value, count: this.asking.count };
     try {
       const response = await fetch(`${API}/${encodeURIComponent(this.asking.id)}/ack`, {
         method: "POST",

@@ -108,7 +108,7 @@ export class Commissioning {
       this.complain("Please enter your name and the reason.");
       return;
     }
-    const given = { ...session.who("renew-who"), reason, meters: [this.asking] };
+    const given = { ...session.operator("renew-who"), reason, meters: [this.asking] };
     try {
       const response = await fetch(`${API}/${encodeURIComponent(this.feeder)}/commissioning`, {
         method: "POST",

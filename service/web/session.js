@@ -21,11 +21,11 @@ export const session = {
   },
 
   // Name of the operator in a request: that of the credential is left out.
-  who(input) {
+  operator(input) {
     if (session.name !== null) return {};
-    const who = byId(input).value.trim();
-    localStorage.setItem("gridsec.who", who);
-    return { who };
+    const name = byId(input).value.trim();
+    localStorage.setItem("gridsec.who", name);
+    return { "who": name };
   },
 
   // Prepare the field of the operator's name.

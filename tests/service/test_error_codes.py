@@ -22,6 +22,7 @@ import pandas as pd
 import pytest
 import sqlalchemy as sa
 import zenoh
+from starlette.requests import Request
 
 import service
 from feeders.format.tables import to_json
@@ -29,7 +30,11 @@ from feeders.model.site import load
 from gridsec.errors import FeederInvalid, GridsecError, InputInvalid, Problem
 from gridsec.estimators.sequential import SuspicionRecord
 from service import app
+from service.access.identity import NotAuthenticated, Role
+from service.access.keys import create
+from service.access.tokens import TokenVerifier
 from service.alarms.state_machine import AlarmRules, AlarmUnknown, acknowledged, restore
+from service.api.access import FAILURES, Authenticator, authorise
 from service.cli import demo
 from service.cli.paths import check_paths, write_tables
 from service.cli.replay import _site_of
@@ -45,6 +50,7 @@ from service.ingest.queues import BusConfig
 from service.ingest.zenoh_bus import MeterClient
 from service.settings import settings
 from service.store import Store, committer, schema, writes
+from service.store.access import AccessStore
 from service.store.connect import NoAnswer, WriterSession
 from service.store.state_codec import decode, decode_distrust, encode, encode_distrust, fingerprint
 from service.store.write_queue import Batch
@@ -424,6 +430,29 @@ AGAIN = replace(ALARM, count=2)
 ANSWERED = replace(ALARM, acknowledged_by="Ada", t_acknowledged=T0)
 RULES = {"tick_s": 1.0, "max_age_s": 1.0, "grace_s": 0.0, "lead_s": 0.0, "max_skew_s": 1.0, "silence_s": 1.0}
 
+
+def authenticator(place: Path) -> Authenticator:
+    return Authenticator(AccessStore(f"sqlite:///{place / 'grid.db'}"))
+
+
+def many_invalid_keys(made: Authenticator) -> None:
+    for _ in range(FAILURES):
+        with pytest.raises(NotAuthenticated):
+            made.of_credential("gridsec_0_0", "127.0.0.1")
+    made.of_credential("gridsec_0_0", "127.0.0.1")
+
+
+def role_too_low(place: Path) -> None:
+    made = authenticator(place)
+    text, record = create("Ada", Role.VIEWER, None, T0, None)
+    made.store.add_key(record)
+    head = [(b"authorization", f"Bearer {text}".encode())]
+    request = Request(
+        {"type": "http", "method": "GET", "path": "/api/v1/audit", "headers": head, "query_string": b""}
+    )
+    authorise(made, request, "GET /api/v1/audit", b"")
+
+
 CALLS: dict[str, Call] = {
     "HTTP at an address of another machine": lambda _, __: app._listen("192.0.2.1:80").__enter__(),
     "alarm that does not exist": lambda _, __: refuse(AlarmUnknown("nothing")),
@@ -438,6 +467,13 @@ CALLS: dict[str, Call] = {
         FeederNotLoaded("village", "meters.csv: missing")
     ),
     "feeder of the command line": lambda _, __: refuse(FeederFixed("village")),
+    "invalid API key": lambda place, _: authenticator(place).of_credential("gridsec_0_0", "127.0.0.1"),
+    "many invalid API keys": lambda place, _: many_invalid_keys(authenticator(place)),
+    "role below that of the route": lambda place, _: role_too_low(place),
+    "issuer without an address": lambda _, __: TokenVerifier("file:///keys", "gridsec").identify("x"),
+    "network without authentication": lambda place, _: app._check_exposure(
+        settings({"http": "10.0.0.1:80"}), authenticator(place)
+    ),
     "limit of feeders": lambda _, __: refuse(TooManyFeeders(100)),
     "two feeders of one name": lambda _, __: app.load_sites(["cigre-lv", "cigre-lv"]),
     "feeder of another name": another_name,

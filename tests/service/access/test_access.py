@@ -161,7 +161,7 @@ def test_every_change_of_the_log_breaks_the_chain(count: int, data: st.DataObjec
     assert broken(entries) is None
     at = data.draw(st.integers(0, count - 1))
     name = data.draw(
-        st.sampled_from(["t", "who", "credential", "action", "target", "detail", "previous", "hash"])
+        st.sampled_from(["t", "identity", "credential", "action", "target", "detail", "previous", "hash"])
     )
     value: Any = NOW - 1.0 if name == "t" else "f" * 64
     changed = [*entries[:at], replace(entries[at], **{name: value}), *entries[at + 1 :]]
@@ -202,10 +202,10 @@ def test_entries_of_many_writers_are_one_chain(store: AccessStore, tmp_path: Pat
     entries = store.audit()
     assert [each.seq for each in entries] == list(range(1, 61))
     assert broken(entries) is None
-    assert {each.who for each in entries} == {f"w{k}" for k in range(60)}
+    assert {each.identity for each in entries} == {f"w{k}" for k in range(60)}
     assert [each.seq for each in store.audit(after=10, limit=5)] == [11, 12, 13, 14, 15]
     with sqlite3.connect(tmp_path / "grid.db.access") as raw:
-        raw.execute("UPDATE audit SET who = 'Eve' WHERE seq = 30")
+        raw.execute("UPDATE audit SET identity = 'Eve' WHERE seq = 30")
     raw.close()
     assert broken(store.audit()) == "entry 30 was changed after it was written"
 

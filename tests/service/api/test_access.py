@@ -25,6 +25,7 @@ from tests.codes import refused
 from tests.service.asking import is_problem
 from tests.service.running import FEEDER, InProcess, service
 
+PAGE = Path(__file__).parents[3] / "docs" / "access.md"
 OTHER = "cigre-lv"
 ALARM = "0" * 26
 EXAMPLES = {"{feeder}": FEEDER, "{meter}": "m01", "{alarm_id}": ALARM}
@@ -97,6 +98,14 @@ def test_the_policy_is_that_of_all_routes(running: InProcess) -> None:
     assert routes == set(POLICY)
     assert running.http.get("/api/v1/openapi.json").status_code == 200
     assert running.http.get("/").status_code == 200
+
+
+def test_the_page_lists_the_policy() -> None:
+    rows = [line.split("|")[1:4] for line in PAGE.read_text().splitlines() if line.startswith("| `")]
+    shown = {name.strip().strip("`"): (least.strip(), scope.strip()) for name, least, scope in rows}
+    whole = {route: "all feeders" if route in WHOLE_FLEET else "" for route in POLICY}
+    wanted = {route: (str(least or "no credential"), whole[route]) for route, least in POLICY.items()}
+    assert shown == {route: row for route, row in wanted.items() if not route.startswith("HEAD")}
 
 
 class _Nothing:
@@ -215,7 +224,7 @@ def test_every_change_is_in_the_audit_log_before_it_is_made(
     assert broken(entries) is None
     acknowledged, refused_ = entries[-2:]
     assert acknowledged.action == "POST /api/v1/alarms/{alarm_id}/ack"
-    assert acknowledged.who == "operator of []"
+    assert acknowledged.identity == "operator of []"
     assert acknowledged.credential.startswith("key ")
     assert acknowledged.target == f"/api/v1/alarms/{ALARM}/ack"
     assert "on my way" in acknowledged.detail
@@ -299,7 +308,7 @@ def test_keys_and_the_audit_log_on_the_command_line(tmp_path: Path) -> None:
     assert gridsec(tmp_path, "audit", "verify", f"--expect={last}").exit_code == 0
     assert "key revoke" in gridsec(tmp_path, "audit", "show").stdout
     with AccessStore(f"sqlite:///{tmp_path / 'gridsec.db'}") as store, store._write() as connection:
-        connection.exec_driver_sql("UPDATE audit SET who = 'Eve' WHERE seq = 1")
+        connection.exec_driver_sql("UPDATE audit SET identity = 'Eve' WHERE seq = 1")
     changed = gridsec(tmp_path, "audit", "verify")
     assert changed.exit_code == 1
     assert "entry 1 was changed" in changed.stderr
