@@ -110,6 +110,11 @@ class FeederSummary(BaseModel):
     )
     verdict: Decision | None = None
     model_only: bool | None = Field(default=None, description="As in the state; null before the first tick.")
+    since: float | None = Field(default=None, description="First consecutive tick with this verdict, Unix s.")
+    meters: int = Field(default=0, description="Number of meters at the latest tick.")
+    suspects: int = Field(default=0, description="Meters and inverters named as manipulated at that tick.")
+    silent: int = Field(default=0, description="Silent meters, the busbar's included, at that tick.")
+    raised: int = Field(default=0, description="Active alarms without an acknowledgement.")
 
 
 class Feeders(BaseModel):

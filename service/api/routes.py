@@ -316,12 +316,20 @@ def _unchanged(response: Response, tag: str, if_none_match: str | None) -> Respo
 _feeders = APIRouter(prefix="/api/v1/feeders", tags=["feeders"])
 
 
-def _summary(backend: Backend, fields: dict[str, Any]) -> models.FeederSummary:
+def _summary(backend: Backend, fields: dict[str, Any], raised: int) -> models.FeederSummary:
     report = backend.report(fields["name"])
-    now: dict[str, Any] = {}
+    now: dict[str, Any] = {"raised": raised}
     if report is not None:
-        age_s, model_only = backend.age(report), report.model_only
-        now = {"t": report.t, "verdict": report.verdict, "age_s": age_s, "model_only": model_only}
+        now |= {
+            "t": report.t,
+            "verdict": report.verdict,
+            "age_s": backend.age(report),
+            "model_only": report.model_only,
+            "since": report.since,
+            "meters": len(report.meters),
+            "suspects": len(report.suspects) + sum(inverter.suspect for inverter in report.inverters),
+            "silent": len(report.silent),
+        }
     return models.FeederSummary.model_validate({**fields, **now})
 
 
@@ -335,8 +343,9 @@ def _detail(backend: Backend, feeder: str) -> dict[str, Any]:
 @_feeders.get("")
 def list_feeders(backend: BackendHere, caller: Caller) -> models.Feeders:
     """All feeders, with the latest verdict of each."""
-    seen = (fields for fields in backend.feeders() if caller.sees(fields["name"]))
-    return models.Feeders(feeders=[_summary(backend, fields) for fields in seen])
+    seen = [fields for fields in backend.feeders() if caller.sees(fields["name"])]
+    raised = backend.store.raised_by_feeder()
+    return models.Feeders(feeders=[_summary(backend, each, raised.get(each["name"], 0)) for each in seen])
 
 
 @_feeders.get("/{feeder}", response_model=models.FeederDetail, responses=_NOT_MODIFIED)

@@ -224,11 +224,14 @@ class FeederMonitor:
         return TickResult(self.report, ())
 
     def _complete(self, report: FeederReport) -> FeederReport:
-        """The report with the revision of its feeder, and the newest tick with a reading."""
-        last = None if self.report is None else self.report.t_measured
+        """The report with its feeder's revision, the newest tick with a reading, and the verdict's start."""
+        before = self.report
+        last = None if before is None else before.t_measured
+        goes_on = before is not None and before.verdict is report.verdict and before.t < report.t
+        since = before.since if before is not None and goes_on else report.t
         # After the clock was set back, an earlier time of measurement would be in the future.
         measured = (last if last is None or last <= report.t else None) if report.model_only else report.t
-        return replace(report, revision=self.revision, t_measured=measured)
+        return replace(report, revision=self.revision, t_measured=measured, since=since)
 
     def _judge(self, tick: Tick) -> FeederReport:
         if self._watcher is None:

@@ -197,6 +197,10 @@ class FeederReport:
             description="Newest tick with a reading that a value uses, Unix s; null: none since the start."
         ),
     ] = None
+    since: Annotated[
+        float | None,
+        Field(description="First of the consecutive ticks with this verdict, Unix s; null if not known."),
+    ] = None
     data_error: Annotated[
         DataErrorReport | None,
         Field(description="Error of the feeder's files that explains the accused meters as well."),

@@ -96,6 +96,12 @@ class Reader:
         with self._read() as connection:
             return int(connection.execute(query).scalar_one())
 
+    def raised_by_feeder(self) -> dict[str, int]:
+        """Number of active alarms without an acknowledgement, of the feeders that have any."""
+        query = sa.select(ALARM.c.feeder, sa.func.count()).where(ALARM.c.state == str(AlarmState.RAISED))
+        with self._read() as connection:
+            return {name: int(count) for name, count in connection.execute(query.group_by(ALARM.c.feeder))}
+
     def active(self, feeder: str | None = None, *, cleared_since: float | None = None) -> list[Alarm]:
         """Return the alarms that `state_machine.restore` needs.
 

@@ -5,6 +5,7 @@ import { Commissioning } from "./commissioning.js";
 import { showDetail } from "./detail.js";
 import { Diagram } from "./diagram.js";
 import { bare, busbarWords, byId, clock, duration, el, getJson, isKnown, signed, status, volt } from "./dom.js";
+import { Fleet, worstFirst } from "./fleet.js";
 import { session } from "./session.js";
 
 const API = "/api/v1/feeders";
@@ -16,7 +17,7 @@ const SIGNS = {
   none: "M16 5a11 11 0 1 0 .01 0M16 9v7l5 3",
 };
 
-const page = { feeder: null, report: null, refused: null, selected: null, source: null, retry: null, heard: null, linked: true, alarmsLinked: true, past: new Map(), turn: 0 };
+const page = { feeder: null, report: null, refused: null, selected: null, source: null, retry: null, heard: null, word: "…", others: 0, linked: true, alarmsLinked: true, past: new Map(), turn: 0 };
 const diagram = new Diagram({ onSelect: (id) => select(id === page.selected ? null : id) });
 const alarms = new Alarms({
   onPick: async (feeder, meter, owner) => {
@@ -28,6 +29,7 @@ const alarms = new Alarms({
   onLink: (up) => { page.alarmsLinked = up; },
 });
 
+const fleet = new Fleet({ onPick: (name) => show(name), onChange: (attacked) => { page.others = attacked; title(); } });
 const commissioning = new Commissioning({ onChange: () => detail() });
 
 // ---------------------------------------------------------------- the feeder
@@ -42,6 +44,7 @@ async function start() {
     setTimeout(start, 3000);
     return;
   }
+  feeders.sort(worstFirst);
   byId("feeder").replaceChildren(...feeders.map((f) => el("option", { value: f.name, text: f.title || f.name })));
   byId("feeder").disabled = feeders.length < 2;
   if (!feeders.length) {
@@ -49,6 +52,7 @@ async function start() {
     setTimeout(start, 5000);
     return;
   }
+  fleet.begin(feeders);
   const wanted = decodeURIComponent(location.hash.slice(1));
   await show(feeders.some((f) => f.name === wanted) ? wanted : feeders[0].name);
 }
@@ -74,6 +78,7 @@ async function show(name) {
   page.past = new Map();
   page.opened = performance.now();
   byId("feeder").value = name;
+  fleet.select(name);
   history.replaceState(null, "", `#${encodeURIComponent(name)}`);
   byId("meters").replaceChildren();
   select(null);
@@ -152,7 +157,7 @@ function verdict() {
   byId("reason").textContent = report ? report.reason : page.refused ?? "Waiting for the first tick.";
   byId("busbar-meter").hidden = !report?.busbar?.suspect;
   byId("busbar-meter").textContent = report?.busbar?.suspect ? busbarWords(report.busbar) : "";
-  document.title = `${report ? decision.toUpperCase() : "…"} – ${feeder?.title || feeder?.name || ""} – gridsec`;
+  title(report ? decision.toUpperCase() : "…");
   if (!report) {
     byId("chips").replaceChildren();
     byId("facts").replaceChildren();
@@ -187,6 +192,13 @@ function verdict() {
 
 // ------------------------------------------------------------- the freshness
 
+// Title of the tab: attacked feeders besides the shown one come first.
+function title(word = page.word) {
+  page.word = word;
+  const others = page.others ? `${page.others} ATTACKED | ` : "";
+  document.title = `${others}${word} – ${page.feeder?.title || page.feeder?.name || ""} – gridsec`;
+}
+
 // Time since which no value uses a reading.
 function unmeasured(report) {
   return isKnown(report.t_measured) ? `no data since ${clock(report.t_measured)}` : "no data yet";
@@ -219,14 +231,14 @@ function fresh() {
     byId("verdict").dataset.verdict = "none";
     byId("sign").setAttribute("d", SIGNS.none);
     byId("reason").textContent = `${words.nodata.replace("n", "N")}. The voltages are those of the model alone. ${page.report.reason}`;
-    document.title = `NO DATA – ${page.feeder.title || page.feeder.name} – gridsec`;
+    title("NO DATA");
   } else if (!believable && !waiting) {
     // An old verdict must not look like a verdict.
     byId("decision").textContent = "NO LIVE DATA";
     byId("verdict").dataset.verdict = "none";
     byId("sign").setAttribute("d", SIGNS.none);
     byId("reason").textContent = `No data for ${duration(age)}. Last verdict, at ${clock(page.report.t)}: ${page.report.verdict}.`;
-    document.title = `NO LIVE DATA – ${page.feeder.title || page.feeder.name} – gridsec`;
+    title("NO LIVE DATA");
   } else if (!waiting && byId("decision").textContent.startsWith("NO ")) {
     verdict();
   }

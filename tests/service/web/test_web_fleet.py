@@ -1,0 +1,86 @@
+"""List of all feeders on the page: worst first, counts, selection, tab title, many feeders."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from playwright.sync_api import Page, expect
+
+from gridsec.interface import Cause
+from tests.service.asking import T0
+from tests.service.looking import DESKTOP, PHONE, Site
+
+pytestmark = pytest.mark.browser
+
+MANY = 1000
+PAINT_S = 15.0
+"""Time limit of the first list of 1 000 feeders on a busy machine, s."""
+
+
+def rows(page: Page) -> list[str]:
+    return [text.split("\n")[0].split("\t")[0] for text in page.locator("#fleet-rows th").all_inner_texts()]
+
+
+def tick(site: Site, village: Any, t: float, **changes: Any) -> None:
+    site.service.tick(village.report(t, **changes))
+
+
+@pytest.mark.parametrize("size", [DESKTOP, PHONE])
+def test_the_worst_feeder_comes_first(
+    site_of: Callable[..., Site], village: Callable[..., Any], size: dict[str, int]
+) -> None:
+    quiet, doubtful, attacked, dark = (
+        village(name, 4) for name in ("a-quiet", "b-doubtful", "c-attacked", "d")
+    )
+    site = site_of(quiet, doubtful, attacked, dark)
+    tick(site, quiet, T0)
+    tick(site, doubtful, T0, cause=Cause.AMBIGUOUS)
+    tick(site, attacked, T0, lies={"H1": 9.0, "H2": 9.0})
+    page = site.open(size, "/#a-quiet")
+    expect(page.locator("#decision")).to_have_text("CLEAN")
+    expect(page.locator("#fleet-rows tr")).to_have_count(4)
+    assert [row.split(",")[0] for row in rows(page)] == ["C-attacked", "B-doubtful", "D", "A-quiet"]
+    expect(page.locator("#fleet-counts")).to_have_text("1 attacked1 undecided1 no data1 clean")
+    first = page.locator("#fleet-rows tr").first
+    expect(first.locator("td").nth(2)).to_have_text("2")
+    # A clean feeder never hides attacked ones.
+    expect(page).to_have_title("1 ATTACKED | CLEAN – A-quiet, 4 customers – gridsec")
+    assert page.locator("#feeder option").first.inner_text().startswith("C-attacked")
+    first.locator("button").click()
+    expect(page.locator("#decision")).to_have_text("ATTACKED")
+    expect(page).to_have_title("ATTACKED – C-attacked, 4 customers – gridsec")
+    expect(page.locator('#fleet-rows tr[aria-current="true"] th')).to_contain_text("C-attacked")
+    tick(site, quiet, T0 + 1.0, lies={"H0": 9.0})
+    expect(page).to_have_title("1 ATTACKED | ATTACKED – C-attacked, 4 customers – gridsec")
+    expect(page.locator("#fleet-counts")).to_contain_text("2 attacked")
+    width = page.evaluate("document.documentElement.scrollWidth")
+    assert width <= size["width"]
+
+
+def test_one_feeder_has_no_list(site: Site) -> None:
+    site.tick(T0, 1)
+    page = site.open()
+    expect(page.locator("#decision")).to_have_text("CLEAN")
+    expect(page.locator("#fleet")).to_be_hidden()
+
+
+def test_a_thousand_feeders_and_the_filter(site_of: Callable[..., Site], village: Callable[..., Any]) -> None:
+    villages = [village(f"v{k:04d}", 2) for k in range(MANY)]
+    site = site_of(*villages)
+    for each in villages:
+        tick(site, each, T0, lies={"H1": 9.0} if each.name == "v0777" else {})
+    begun = time.monotonic()
+    page = site.open(None, "/#v0001")
+    expect(page.locator("#fleet-rows tr").first).to_contain_text("V0777")
+    assert time.monotonic() - begun < PAINT_S
+    expect(page.locator("#fleet-more")).to_have_text(f"{MANY - 8} further feeders")
+    page.locator("#fleet-all summary").click()
+    expect(page.locator("#fleet-rows tr")).to_have_count(500)
+    page.fill("#fleet-filter", "v0999")
+    expect(page.locator("#fleet-rows tr")).to_have_count(1)
+    page.locator("#fleet-rows button").click()
+    expect(page.locator("#verdict")).to_be_visible()
+    expect(page.locator("#feeder")).to_have_value("v0999")
