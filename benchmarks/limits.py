@@ -42,7 +42,7 @@ from feeders.model.site import Site, from_tables, load
 from feeders.registry.registry import DesignedEstimator, design
 from feeders.simulation.trial import LoadError, Trial, TrialMeterErrors, frames
 from gridsec.arrays import Bools, Floats, Ints
-from gridsec.estimators.modal import core, estimate, signatures, static
+from gridsec.estimators.modal import core, estimate, full, signatures, static
 from gridsec.estimators.modal import filter as modal
 from gridsec.estimators.modal.core import Core
 from gridsec.estimators.modal.estimate import Estimated
@@ -211,8 +211,7 @@ class Known:
         return self._tick(t, m, [self.next - 1])
 
     def _tick(self, t: float, m: Floats, begun: list[int]) -> float:
-        self.state, update = modal.step(self.made, self.state, t, m)
-        self.more = static.follow(self.made, self.more, update)
+        self.state, self.more, update = full.step(self.made, self.state, self.more, t, m)
         self.rows = signatures.follow(self.rows, update, self.more, 1.0, begun=begun)
         y, F = self._scores()
         return float((self.f * y - 0.5 * self.f**2 * F).max())
@@ -228,8 +227,7 @@ def lorden(kernel: Core, part: float) -> float:
     state, more, rows = modal.start(made, 0.0), static.start(made), signatures.empty(made, 1)
     done = np.full(made.size, np.nan)
     for k in range(QUIET + WATCHED):
-        state, update = modal.step(made, state, float(k), np.zeros(made.size))
-        more = static.follow(made, more, update)
+        state, more, update = full.step(made, state, more, float(k), np.zeros(made.size))
         rows = signatures.follow(rows, update, more, 1.0, begun=[0] if k == QUIET else [])
         if k >= QUIET:
             F = signatures.scores(made, rows, more).of(made.U.T, made.U.T**2)[1][0]
@@ -324,8 +322,7 @@ class Support:
     def tick(self, t: float, m: Floats, onset: bool) -> Estimated:
         """Take in a tick; errors of the model at all places and their variance."""
         made, kernel, k = self.made, self.kernel, self.liars.size
-        self.state, update = modal.step(made, self.state, t, m)
-        self.more = static.follow(made, self.more, update)
+        self.state, self.more, update = full.step(made, self.state, self.more, t, m)
         self.rows = signatures.follow(self.rows, update, self.more, 1.0, begun=[0] if onset else [])
         plain = estimate.honest(made, kernel.estimator, self.state, self.more, update)
         if not self.rows.used[0]:

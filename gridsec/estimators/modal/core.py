@@ -19,7 +19,7 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import InputInvalid, Problem
-from gridsec.estimators.modal import detector, signatures, static
+from gridsec.estimators.modal import detector, full, signatures, static
 from gridsec.estimators.modal import estimate as estimates
 from gridsec.estimators.modal import filter as modal
 from gridsec.estimators.modal.detector import SIZE, Detector, Evidence
@@ -201,8 +201,7 @@ def step(
         If t is before the last reading or not a number.
     """
     h = t - state.filter.t
-    after, update = modal.step(core.modes, state.filter, t, m, seen)
-    known = static.follow(core.modes, state.static, update)
+    after, known, update = full.step(core.modes, state.filter, state.static, t, m, seen)
     test, evidence = detector.step(
         core.modes, core.faults, state.detector, update, known, h=h, alert=CALM * core.limit
     )
@@ -267,7 +266,9 @@ def identify(core: Core, state: CoreState, evidence: Evidence) -> Suspicion:
 def _searched(core: Core, state: CoreState, row: int) -> Identification:
     """Explanations since one onset, with and without an unreported change of all loads."""
     test, plain = state.detector, _problem(core, state, row)
-    now, ratio = signatures.shocked(core.modes, test.onsets, state.static, row, SHOCK)
+    rows = np.array([row])
+    every = signatures.scores(core.modes, test.onsets, state.static, rows, every=True)
+    now, ratio = signatures.shocked(core.modes, every, SHOCK)
     y, F = now.matrix(0, core.faults.W)
     charge = ACCUSATIONS * 2.0 * log(core.modes.size)
     return search(plain, core.groups, (replace(plain, y=y, F=F), charge - 2.0 * ratio))
@@ -276,7 +277,8 @@ def _searched(core: Core, state: CoreState, row: int) -> Identification:
 def _problem(core: Core, state: CoreState, row: int) -> SearchProblem:
     """Scores, information and charges of all faults at one onset."""
     faults, p = core.faults, core.modes.size
-    now = signatures.scores(core.modes, state.detector.onsets, state.static, np.array([row]))
+    rows = np.array([row])
+    now = signatures.scores(core.modes, state.detector.onsets, state.static, rows, every=True)
     y, F = now.matrix(0, faults.W)
     accusation = 2.0 * log(p)
     charge = np.zeros(y.size)
@@ -311,6 +313,6 @@ def estimate(core: Core, state: CoreState, suspicion: Suspicion | None = None) -
     W = np.hstack([core.faults.W, np.eye(made.size)])
     effect = np.hstack([core.effect, by.of_w])
     T = estimates.moves(made, by, state.static, onsets, suspicion.row, W, effect)
-    now = signatures.scores(made, onsets, state.static, np.array([suspicion.row]))
+    now = signatures.scores(made, onsets, state.static, np.array([suspicion.row]), every=True)
     joint = (*now.matrix(0, W), np.sqrt(SHOCK * made.loads))
     return estimates.corrected(plain, T, suspicion.found, joint)

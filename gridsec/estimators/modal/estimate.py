@@ -26,8 +26,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats
-from gridsec.estimators.modal.filter import FilterState, Update
+from gridsec.arrays import Bools, Floats, indices, submatrix
+from gridsec.estimators.modal.filter import FilterState, Full, Update
 from gridsec.estimators.modal.model import Modes
 from gridsec.estimators.modal.search import Identification
 from gridsec.estimators.modal.signatures import Onsets
@@ -99,6 +99,8 @@ def honest(modes: Modes, made: Estimator, state: FilterState, static: Static, up
     state, static, update
         The filter after the last tick, the information about the directions, and the filter's last step.
     """
+    if state.full is not None:
+        return _full(modes, made, state.full, static.score)
     w, b = state.mean
     e = update.innovation / update.variance
     by_w, by_b = made.of_w - made.of_e, made.of_b - made.of_e
@@ -110,6 +112,19 @@ def honest(modes: Modes, made: Estimator, state: FilterState, static: Static, up
         mean += moved @ static.theta
         variance += np.einsum("xr,rs,xs->x", moved, static.cov, moved)
     return Estimated(mean, np.maximum(variance, 0.0))
+
+
+def _full(modes: Modes, made: Estimator, full: Full, score: Floats) -> Estimated:
+    """Estimate by the full covariance: the flicker is seen by the members with a reading only."""
+    model, at, n = modes.model, modes.at, indices(full.seen)
+    H, own = model.phases(at[n]), model.busbar_of
+    by_e = np.zeros((len(own), at.size))
+    by_e[:, n] = model.flicker * (own @ np.linalg.solve(submatrix(modes.noise, n, n), H).T)
+    by_w, by_b = made.of_w @ modes.U.T, made.of_b @ modes.U.T
+    mean = by_w @ full.mean[0] + by_b @ full.mean[1] + made.of_e @ score
+    unread = (made.of_e**2).sum(axis=1) - model.flicker * np.einsum("xk,xk->x", by_e[:, n] @ H, own)
+    by = np.hstack([by_w - by_e, by_b - by_e])
+    return Estimated(mean, np.maximum(((by @ full.cov) * by).sum(axis=1) + made.rest + unread, 0.0))
 
 
 def _theta(modes: Modes, made: Estimator, static: Static) -> Floats:

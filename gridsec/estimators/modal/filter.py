@@ -11,17 +11,10 @@ where q and s are the variances of w and b, ``rho = exp(-h / T)``, ``rho_b = exp
 of h seconds. The cost is O(t) and the product ``U' m``. The filter is exact for ``B = kappa D + c S``, and
 with `gridsec.estimators.modal.static` for every B.
 
-**Missing readings.** For members g without a reading, the innovation of least variance ``x_g = -(A_gg)^-1
-A_gn x_n`` with ``A = U diag(1 / v) U'`` is put in their place. The means are then those of the filter that
-leaves these readings out, exactly. Its covariance is not diagonal in the modes; kept is its diagonal: ``phi
-= 1 - diag(U_g' (A_gg)^-1 U_g) / v`` is the part of each mode's information that was read. With all readings
-there, phi is 1 and nothing is approximated. With 10 % missing at random the mean of the next ticks is off
-by less than 2 % of its standard deviation (`tests/gridsec/modal/test_filter.py`).
-
-Members must not stay away. The diagonal spreads the fixed error of a silent member over all modes, so that
-it counts as learned when its readings return: 30 % of 57 meters silent for a minute each, in turn, brought
-log M of `gridsec.estimators.modal.detector` to 5 000 without a fault, 50 % missing at random to 26. A silent
-meter has to leave the members (`restrict`), and to enter anew when it returns.
+**Missing readings** couple the modes: `gridsec.estimators.modal.full` keeps the exact covariance then. Here
+the diagonal of the covariance in the modes is kept, with ``phi = 1 - diag(U_g' (A_gg)^-1 U_g) / v``, the part
+of each mode's information that was read, ``A = U diag(1 / v) U'``, g the members without a reading. These
+gains are used as signatures of faults only. With all readings there, phi is 1.
 
 References
 ----------
@@ -30,7 +23,7 @@ Anderson and Moore, Optimal Filtering, 1979, chapter 3.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import exp
 
 import numpy as np
@@ -39,6 +32,28 @@ from scipy.linalg import lapack
 from gridsec.arrays import Bools, Floats, all_of, indices
 from gridsec.errors import InputInvalid, Problem
 from gridsec.estimators.modal.model import Modes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Full:
+    """Posterior of w and b at the t members, after the last reading.
+
+    Attributes
+    ----------
+    mean : (2, t)
+        Means of w and b.
+    cov : (2 t, 2 t)
+        Covariance of (w, b).
+    seen : (t,)
+        Members with a reading at the last tick.
+    complete
+        Ticks with all readings since the last one without, or since the last attempt to return.
+    """
+
+    mean: Floats
+    cov: Floats = field(repr=False)
+    seen: Bools
+    complete: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,11 +68,14 @@ class FilterState:
         Means of w and b.
     cov : (3, t)
         Variance of w, covariance of w and b, variance of b.
+    full
+        Exact posterior where a reading has been missing; ``mean`` has no meaning then. Else None.
     """
 
     t: float
     mean: Floats
     cov: Floats
+    full: Full | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,11 +87,13 @@ class Update:
     decay : (2,)
         Factors rho and rho_b of the interval.
     innovation, variance : (t,)
-        nu and v.
+        nu, zero without a meaning where ``score`` is given, and v.
     gain : (2, t)
         k of w and of b.
     kept : (t,) or None
         phi; None where all members have a reading.
+    score : (t,) or None
+        Score of the exact innovation, where the filter is not that of the modes.
     """
 
     decay: tuple[float, float]
@@ -81,6 +101,7 @@ class Update:
     variance: Floats
     gain: Floats
     kept: Floats | None
+    score: Floats | None = None
 
     @property
     def precision(self) -> Floats:
@@ -134,58 +155,29 @@ def step(
     shared = cov[:2] + cov[1:]
     v = shared[0] + shared[1] + 1.0
     kept = None
-    if seen is None or all_of(seen):
+    if seen is not None and not all_of(seen):
+        kept = _kept(modes, v, seen)
+    gain, nu = shared / v, np.zeros(v.size)
+    if state.full is None:
+        if kept is not None:
+            raise InputInvalid([Problem("missing", "missing readings need the full covariance")])
         nu = m @ modes.U - mean[0] - mean[1]
-    else:
-        nu, kept = _imputed(modes, m, mean[0] + mean[1], v, seen)
-    gain = shared / v
-    mean += gain * nu
+        mean += gain * nu
     lost = gain * shared[0] if kept is None else gain * (kept * shared[0])
     cov[:2] -= lost
     cov[2] -= gain[1] * shared[1] if kept is None else gain[1] * shared[1] * kept
     return FilterState(t, mean, cov), Update((rho, rho_b), nu, v, gain, kept)
 
 
-def _imputed(modes: Modes, m: Floats, expected: Floats, v: Floats, seen: Bools) -> tuple[Floats, Floats]:
-    """Innovations with those of least variance where there is no reading, (t,), and phi, (t,)."""
+def _kept(modes: Modes, v: Floats, seen: Bools) -> Floats:
+    """Part phi of the information of each mode that was read, (t,)."""
     out = indices(~seen)
     if out.size == seen.size:
-        return np.zeros(v.size), np.zeros(v.size)
-    x = np.where(seen, m - modes.back @ expected, 0.0)
-    nu, U = x @ modes.U, modes.U[out]
-    A = (U / v) @ U.T
-    half, failed = lapack.dpotrf(A, lower=True, clean=True)
+        return np.zeros(v.size)
+    U = modes.U[out]
+    half, failed = lapack.dpotrf((U / v) @ U.T, lower=True, clean=True)
     if failed:
         raise np.linalg.LinAlgError("the matrix is not positive definite")
-    least, _ = lapack.dpotrs(half, U @ (nu / v), lower=True)
     spread, _ = lapack.dtrtrs(half, U, lower=True)
     phi = 1.0 - (spread * spread).sum(axis=0) / v
-    return nu - least @ U, np.minimum(np.maximum(phi, 0.0), 1.0)
-
-
-def restrict(before: Modes, state: FilterState, after: Modes) -> FilterState:
-    """State of the filter for other members, all of which were members before.
-
-    Means move over exactly. The covariance moves over exactly and its diagonal in the new modes is kept.
-
-    Parameters
-    ----------
-    before, state
-        The modes, and the state.
-    after
-        Modes of a subset of the members, or of the same members in another model.
-
-    Raises
-    ------
-    ValueError
-        If a new member was none before.
-    """
-    place = np.full(before.model.meters.size, -1)
-    place[before.at] = np.arange(before.size)
-    rows = place[after.at]
-    if (rows < 0).any():
-        raise InputInvalid([Problem("unknown-index", "every new member must be a member before")])
-    move = after.U.T @ before.back[rows]
-    mean = state.mean @ move.T
-    cov = state.cov @ (move * move).T
-    return FilterState(state.t, mean, cov)
+    return np.asarray(np.minimum(np.maximum(phi, 0.0), 1.0))

@@ -36,7 +36,7 @@ import numpy as np
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.estimators.modal.filter import Update
 from gridsec.estimators.modal.model import Modes
-from gridsec.estimators.modal.static import FEW, Static, offset
+from gridsec.estimators.modal.static import FEW, Static, current
 
 RAMP_S = 600.0
 """Time in which a unit ramp reaches 1, s: the time scale of the loads."""
@@ -135,7 +135,8 @@ def follow(
     gamma = level[:, None] - g[0]
     gamma -= g[1]
     weighed = gamma / update.variance
-    score = weighed * update.innovation
+    score = gamma * static.score
+    score -= onsets.cross * static.moved
     score += onsets.score
     told = weighed if update.kept is None else weighed * update.kept
     information = told * gamma
@@ -200,7 +201,9 @@ class Scores:
         return self.score[row] @ W, F
 
 
-def scores(modes: Modes, onsets: Onsets, static: Static, rows: Ints | slice = _ALL) -> Scores:
+def scores(
+    modes: Modes, onsets: Onsets, static: Static, rows: Ints | slice = _ALL, *, every: bool = False
+) -> Scores:
     """Integrate the directions out.
 
     Parameters
@@ -209,15 +212,17 @@ def scores(modes: Modes, onsets: Onsets, static: Static, rows: Ints | slice = _A
         The modes, and the information so far.
     rows : (k,)
         Rows to work on; all by default.
+    every
+        Take all directions into account, however many there are; O(t r^2).
     """
     r = modes.sign.size
     score, information = onsets.score[rows], onsets.information[rows]
     if not r:
         return Scores(score, information, np.zeros((len(score), 0, modes.size)), np.zeros((0, 0)))
-    cross = onsets.cross[rows]
-    score = score - cross * offset(modes, static)
-    G, cov = modes.directions, static.cov
-    if r > FEW:
+    cross, G, cov = onsets.cross[rows], modes.directions, static.cov
+    if r > FEW and every:
+        cov = current(modes, static).cov
+    elif r > FEW:
         G = G[:, : modes.busbar]
         cov = np.asarray(
             np.linalg.inv(np.diag(modes.sign[: modes.busbar]) + (G.T * static.information) @ G), np.float64
@@ -225,38 +230,28 @@ def scores(modes: Modes, onsets: Onsets, static: Static, rows: Ints | slice = _A
     return Scores(score, information, cross[:, None, :] * G.T, cov)
 
 
-def shocked(modes: Modes, onsets: Onsets, static: Static, row: int, size: float) -> tuple[Scores, float]:
-    """Scores at one row with a change of all loads ``N(0, size S)`` at the onset integrated out.
+def shocked(modes: Modes, now: Scores, size: float) -> tuple[Scores, float]:
+    """Scores of one row with a change of all loads ``N(0, size S)`` at the onset integrated out.
 
-    Also the logarithm of the likelihood ratio of such a change against none. With ``s = size lam`` the change
-    is integrated out first, mode by mode: a, i and c are divided by ``1 + s i``, and the information about
-    theta loses ``s c^2 / (1 + s i)``.
+    Also the logarithm of the likelihood ratio of such a change against none. With ``s = size lam``, ``X =
+    diag(c) Gamma`` and ``N' = (N^-1 - X' diag(s / (1 + s i)) X)^-1``, N, i and X go over into N', i and X
+    divided by ``1 + s i``, and the scores y into ``(y + X N' X' diag(s / (1 + s i)) y) / (1 + s i)``.
 
     Parameters
     ----------
-    modes, onsets, static
-        The modes, and the information so far.
-    row
-        The row.
+    modes, now
+        The modes, and the scores of one row.
     size
         Variance of the change, in those of the loads.
     """
-    a, i, c = onsets.score[row], onsets.information[row], onsets.cross[row]
+    y, X = now.score[0], now.side[0].T
     s = size * modes.loads
-    more = 1.0 + s * i
-    ratio = 0.5 * float((s * a * a / more - np.log(more)).sum())
-    r = modes.sign.size
-    a, i, c = a / more, i / more, c / more
-    if not r:
-        return Scores(a[None], i[None], np.zeros((1, 0, modes.size)), np.zeros((0, 0))), ratio
-    G, sign = modes.directions, np.diag(modes.sign)
-    information = static.information - s * c * onsets.cross[row]
-    before, after = (sign + (G.T * each) @ G for each in (static.information, information))
-    right, left = static.score @ G, (static.score - s * c * onsets.score[row]) @ G
-    cov = np.asarray(np.linalg.inv(after), np.float64)
-    ratio += 0.5 * float(left @ cov @ left - right @ np.linalg.solve(before, right))
-    ratio += 0.5 * float(np.linalg.slogdet(before)[1] - np.linalg.slogdet(after)[1])
-    return Scores((a - c * (G @ (cov @ left)))[None], i[None], (c[:, None] * G).T[None], cov), ratio
+    more = 1.0 + s * now.information[0]
+    inner = np.eye(X.shape[1]) - now.cov @ ((X.T * (s / more)) @ X)
+    cov = np.linalg.solve(inner, now.cov)
+    after = (y + X @ (cov @ (X.T @ (s / more * y)))) / more
+    ratio = 0.5 * float((s * after) @ y - np.log(more).sum() - np.linalg.slogdet(inner)[1])
+    return Scores(after[None], now.information / more, now.side / more, cov), ratio
 
 
 @dataclass(frozen=True, eq=False)

@@ -51,20 +51,26 @@ class Static:
         g of w and of b, after the last update.
     gamma : (t,)
         Effect of a unit error on the last innovation.
-    score, information : (t,)
-        a and i.
+    pull : (r,)
+        ``Gamma' a``.
+    information : (t,)
+        i.
     theta : (r,)
         Posterior mean of the amounts.
     cov : (r, r)
         N of the tick at which it was computed last.
+    score, moved : (t,)
+        Of the last tick: score ``V^-1`` times the exact innovation in the modes, and change of ``Gamma theta``.
     """
 
     signature: Floats
     gamma: Floats
-    score: Floats
+    pull: Floats
     information: Floats
     theta: Floats
     cov: Floats = field(repr=False)
+    score: Floats
+    moved: Floats
 
 
 def start(modes: Modes) -> Static:
@@ -76,8 +82,8 @@ def start(modes: Modes) -> Static:
         The modes.
     """
     zero = np.zeros(modes.size)
-    prior = np.diag(modes.sign)
-    return Static(np.zeros((2, modes.size)), zero, zero, zero, np.zeros(modes.sign.size), prior)
+    none, prior = np.zeros(modes.sign.size), np.diag(modes.sign)
+    return Static(np.zeros((2, modes.size)), zero, none, zero, none, prior, zero, zero)
 
 
 def follow(modes: Modes, before: Static, update: Update) -> Static:
@@ -93,35 +99,73 @@ def follow(modes: Modes, before: Static, update: Update) -> Static:
         The filter's step.
     """
     if not modes.sign.size:
-        return before
+        score = update.innovation / update.variance if update.score is None else update.score
+        return replace(before, score=score)
     rho, rho_b = update.decay
     g = before.signature * np.array([[rho], [rho_b]])
     gamma = 1.0 - g[0] - g[1]
     g += update.gain * (gamma if update.kept is None else gamma * update.kept)
-    score = before.score + gamma * update.innovation / update.variance
     information = before.information + gamma * gamma * update.precision
-    now = Static(g, gamma, score, information, before.theta, before.cov)
-    if modes.sign.size <= FEW:
-        return _anew(modes, now)
-    right, theta = score @ modes.directions, before.theta
-    near = CLOSE * float(np.abs(right).max(initial=0.0))
-    for _ in range(REFINEMENTS):
-        rest = right - modes.sign * theta - (information * (modes.directions @ theta)) @ modes.directions
-        if float(np.abs(rest).max()) <= near:
-            return replace(now, theta=theta)
-        theta = theta + before.cov @ rest
-    return _anew(modes, now)
+    now = replace(before, signature=g, gamma=gamma, information=information)
+    if update.score is not None:
+        # The innovation is exact without theta, which says only how a fault would have been learned.
+        turn = before.cov @ ((gamma * update.score) @ modes.directions)
+        cov = current(modes, now).cov if modes.sign.size <= FEW else before.cov
+        return replace(
+            now, cov=cov, theta=before.theta + turn, score=update.score, moved=modes.directions @ turn
+        )
+    weighed = update.innovation / update.variance
+    now = _learned(modes, replace(now, pull=before.pull + (gamma * weighed) @ modes.directions))
+    offset = modes.directions @ now.theta
+    moved = offset - modes.directions @ before.theta
+    return replace(now, score=weighed - gamma * offset / update.variance, moved=moved)
 
 
-def _anew(modes: Modes, now: Static) -> Static:
-    """The same with N and theta of this tick."""
+def _learned(modes: Modes, now: Static) -> Static:
+    """The same with theta of this tick."""
+    if modes.sign.size > FEW:
+        right, theta = now.pull, now.theta
+        near = CLOSE * float(np.abs(right).max(initial=0.0))
+        for _ in range(REFINEMENTS):
+            rest = right - _precision_times(modes, now, theta)
+            if float(np.abs(rest).max()) <= near:
+                return replace(now, theta=theta)
+            theta = theta + now.cov @ rest
+    now = current(modes, now)
+    return replace(now, theta=now.cov @ now.pull)
+
+
+def _precision_times(modes: Modes, now: Static, theta: Floats) -> Floats:
+    """``N^-1 theta`` of this tick, (r,)."""
+    G = modes.directions
+    return np.asarray(modes.sign * theta + (now.information * (G @ theta)) @ G)
+
+
+def current(modes: Modes, now: Static) -> Static:
+    """The same with N of this tick; O(t r^2).
+
+    Parameters
+    ----------
+    modes, now
+        The modes, and the information so far.
+    """
     G = modes.directions
     if modes.sign.size == 1:
         one = G[:, 0]
-        single = np.array([[1.0 / (modes.sign[0] + one @ (now.information * one))]])
-        return replace(now, cov=single, theta=single[0] * (now.score @ one))
+        return replace(now, cov=np.array([[1.0 / (modes.sign[0] + one @ (now.information * one))]]))
     cov = np.asarray(np.linalg.inv(np.diag(modes.sign) + (G.T * now.information) @ G), np.float64)
-    return replace(now, cov=cov, theta=cov @ (now.score @ G))
+    return replace(now, cov=cov)
+
+
+def restored(modes: Modes, now: Static) -> Static:
+    """The same with the pull that belongs to theta: the modal filter goes on with it.
+
+    Parameters
+    ----------
+    modes, now
+        The modes, and the information so far.
+    """
+    return replace(now, pull=_precision_times(modes, now, now.theta)) if modes.sign.size else now
 
 
 def offset(modes: Modes, static: Static) -> Floats:

@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks._residuals import Dense, Source, model_of, power_columns, root, tree
 from gridsec.arrays import Bools, Floats
-from gridsec.estimators.modal import detector, signatures, static
+from gridsec.estimators.modal import detector, full, signatures, static
 from gridsec.estimators.modal import filter as modal
 from gridsec.estimators.modal.model import Modes, ResidualModel, modes
 from gridsec.estimators.modal.signatures import Columns, Onsets, Scores
@@ -35,8 +35,7 @@ def played(
     state, more = modal.start(made, 0.0), static.start(made)
     for k, m in enumerate(readings):
         begun = [row for row, tick in begins.items() if tick == k]
-        state, update = modal.step(made, state, float(k), m, None if seen is None else seen[k])
-        more = static.follow(made, more, update)
+        state, more, update = full.step(made, state, more, float(k), m, None if seen is None else seen[k])
         onsets = signatures.follow(onsets, update, more, 1.0 if k else 0.0, begun=begun)
     return onsets, signatures.scores(made, onsets, more)
 
@@ -106,11 +105,10 @@ def test_a_change_of_all_loads_is_integrated_out(make: object) -> None:
     readings[onset:] += 0.002
     state, more, rows = modal.start(made, 0.0), static.start(made), signatures.empty(made, 1)
     for k, m in enumerate(readings):
-        state, update = modal.step(made, state, float(k), m)
-        more = static.follow(made, more, update)
+        state, more, update = full.step(made, state, more, float(k), m)
         h = 1.0 if k else 0.0
         rows = signatures.follow(rows, update, more, h, begun=[0] if k == onset else [])
-    now, ratio = signatures.shocked(made, rows, more, 0, size)
+    now, ratio = signatures.shocked(made, signatures.scores(made, rows, more, every=True), size)
     loads = root(model.loads(made.at)) * sqrt(size) / std
     exact = exact_ratio(model, readings, loads, std, onset, False)
     assert abs(ratio - exact) <= 1e-7 * abs(exact)
@@ -154,8 +152,7 @@ def test_rows_are_given_back_and_used_again() -> None:
     readings = Source(model, np.random.default_rng(8)).ticks(20)
     begun, ended = {0: [0], 9: [0, 1]}, {5: [0]}
     for k, m in enumerate(readings):
-        state, update = modal.step(made, state, float(k), m)
-        more = static.follow(made, more, update)
+        state, more, update = full.step(made, state, more, float(k), m)
         rows = signatures.follow(rows, update, more, 1.0, begun=begun.get(k, []), ended=ended.get(k, []))
         if k == 5:
             assert not rows.used.any()
@@ -173,8 +170,7 @@ def watch(made: Modes, of: Columns, readings: Floats) -> tuple[Floats, detector.
     state, more, test = modal.start(made, 0.0), static.start(made), detector.start(made)
     out = np.empty(len(readings))
     for k, m in enumerate(readings):
-        state, update = modal.step(made, state, float(k), m)
-        more = static.follow(made, more, update)
+        state, more, update = full.step(made, state, more, float(k), m)
         test, evidence = detector.step(made, of, test, update, more, h=1.0, alert=-inf)
         out[k] = evidence.log_m
     return out, test
@@ -187,8 +183,7 @@ def test_dropping_onsets_leaves_m_and_covers_all_ages() -> None:
     state, more, test = modal.start(made, 0.0), static.start(made), detector.start(made)
     source = Source(busbar(), np.random.default_rng(9))
     for k in range(1600):
-        state, update = modal.step(made, state, float(k), source.tick())
-        more = static.follow(made, more, update)
+        state, more, update = full.step(made, state, more, float(k), source.tick())
         test, evidence = detector.step(made, of, test, update, more, h=1.0, alert=-inf)
     assert test.ticks % detector.EVERY == 0
     assert test.ratio is not None
@@ -239,8 +234,7 @@ def run_lengths(model: ResidualModel, gamma: float, runs: int, seed: int) -> Flo
         source, longest = Source(model, random), int(8 * gamma)
         state, more, test = modal.start(made, 0.0), static.start(made), detector.start(made)
         for k in range(longest):
-            state, update = modal.step(made, state, float(k), source.tick())
-            more = static.follow(made, more, update)
+            state, more, update = full.step(made, state, more, float(k), source.tick())
             test, evidence = detector.step(made, of, test, update, more, h=1.0, alert=log(gamma) / 2.0)
             if evidence.log_m >= log(gamma):
                 break

@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks._residuals import Source, model_of, power_columns, root, tree
 from gridsec.arrays import Floats
-from gridsec.estimators.modal import estimate, signatures, static
+from gridsec.estimators.modal import estimate, full, signatures, static
 from gridsec.estimators.modal import filter as modal
 from gridsec.estimators.modal.model import ResidualModel, modes
 from gridsec.estimators.modal.search import Identification, SearchProblem, amounts
@@ -76,8 +76,7 @@ def test_equals_the_joint_gaussian(lasting: float, fault: str) -> None:
     m = 0.01 * np.random.default_rng(3).standard_normal((12, 5))
     state, more, rows = modal.start(made, 0.0), static.start(made), signatures.empty(made, 1)
     for k, reading in enumerate(m):
-        state, update = modal.step(made, state, float(k), reading)
-        more = static.follow(made, more, update)
+        state, more, update = full.step(made, state, more, float(k), reading)
         rows = signatures.follow(rows, update, more, 1.0, begun=[0] if k == onset else [])
     prepared = estimate.estimator(made)
     found = estimate.honest(made, prepared, state, more, update)
@@ -134,8 +133,7 @@ def test_coverage_in_simulation() -> None:
             flick = np.sqrt(model.flicker) * random.standard_normal()
             truth = w + busbar + flick
             m = truth[model.meters] + b + np.sqrt(model.white) * random.standard_normal(5)
-            state, update = modal.step(made, state, float(k), m)
-            more = static.follow(made, more, update)
+            state, more, update = full.step(made, state, more, float(k), m)
             w = rho * w + np.sqrt(1 - rho**2) * (draw @ random.standard_normal(places))
         found = estimate.honest(made, prepared, state, more, update)
         z.append((found.mean - truth) / np.sqrt(found.variance))

@@ -1,0 +1,159 @@
+"""Exact filter with missing readings: a full covariance of w and b from the first missing reading on.
+
+With complete readings the filter of `gridsec.estimators.modal.filter` with
+`gridsec.estimators.modal.static` is exact and diagonal. A missing reading couples the modes. From then on
+the state x = (w, b) of all members has a full covariance P, in the coordinates of the meters:
+
+    predict   x <- (rho w, rho_b b),  P <- R P R + blockdiag((1 - rho^2) (1 - c) S, (1 - rho_b^2) B)
+    update    V = (H P H' + D)_nn,  sigma = V^-1 (m - H x)_n,  x += P H_n' sigma,  P -= P H_n' V^-1 H_n P
+
+with the readings n of the tick and ``H = [1, 1]``. The start is the posterior of the modal filter:
+
+    x = mean + T theta,   P = blockdiag of the modes + T N T',   T = (-g_w, 1 - g_b) Gamma
+
+B ages as a whole here, in `filter` without the directions: a difference of h / T_b per tick.
+
+**Scores.** ``s = back' sigma``, the score of the innovation in the modes, is all that the detector takes
+from the readings. For every signature gamma that does not depend on the readings, and for the exact
+information, ``sum gamma' s`` is a martingale and ``exp(y f - I f^2 / 2)`` has the mean 1. So the diagonal
+signatures of the modal filter, which keeps the diagonal of its covariance, stay in use: their error costs
+evidence, and causes no false alarm.
+
+**Return.** After `COMPLETE` ticks with all readings the filter returns to the modes if their diagonal
+covariance C, enlarged by `MARGIN`, is an upper bound: ``(1 + MARGIN) (C + T N T') - P`` has a Cholesky factor.
+The readings then have at most the covariance of the model in use. With scores y and information I of that
+model, ``var y <= I`` without a fault, and E exp(y f - I f^2 / 2) <= 1 at each fixed tick.
+
+The cost is O(n t^2) per tick: 0.1 ms for 57 meters, 1 ms for 146.
+
+References
+----------
+Anderson and Moore, Optimal Filtering, 1979, chapter 3.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import exp
+
+import numpy as np
+from scipy.linalg import blas, lapack
+
+from gridsec.arrays import Bools, Floats, all_of, indices, submatrix
+from gridsec.estimators.modal import filter as modal
+from gridsec.estimators.modal import static
+from gridsec.estimators.modal.filter import FilterState, Full, Update
+from gridsec.estimators.modal.model import Modes
+from gridsec.estimators.modal.static import Static
+
+COMPLETE = 64
+"""Ticks with all readings before a return to the modes, and from one attempt to the next."""
+MARGIN = 0.1
+"""Enlargement of the variance at the return, 1: standard deviations are too large by 5 % at first."""
+
+
+def step(
+    modes: Modes, state: FilterState, known: Static, t: float, m: Floats, seen: Bools | None = None
+) -> tuple[FilterState, Static, Update]:
+    """Take in the residuals of one tick by the exact filter.
+
+    Parameters
+    ----------
+    modes, state, known
+        The modes, the filter and the information about the directions after the last tick.
+    t
+        Time, s; not before ``state.t``. The interval may change from tick to tick.
+    m : (t,)
+        Residuals of the members, squared pu; any finite value where not seen.
+    seen : (t,)
+        Members with a reading; None: all.
+
+    Raises
+    ------
+    ValueError
+        If t is before the last reading or not a number.
+    """
+    whole = seen is None or all_of(seen)
+    if state.full is not None and whole and state.full.complete >= COMPLETE:
+        state, known = _returned(modes, state, known)
+    if state.full is None and not whole:
+        state = replace(state, full=expanded(modes, state, known))
+    after, update = modal.step(modes, state, t, m, seen)
+    if state.full is not None:
+        full, score = _updated(modes, state.full, t - state.t, m, None if whole else seen)
+        after, update = replace(after, full=full), replace(update, score=score)
+    return after, static.follow(modes, known, update), update
+
+
+def expanded(modes: Modes, state: FilterState, known: Static) -> Full:
+    """Means and full covariance of the modal filter.
+
+    Parameters
+    ----------
+    modes, state, known
+        The modes, the filter and the information about the directions after the last tick.
+    """
+    back, blocks = modes.back, [(modes.back * c) @ modes.back.T for c in state.cov]
+    cov = np.block([[blocks[0], blocks[1]], [blocks[1], blocks[2]]])
+    mean = state.mean @ back.T
+    if modes.sign.size:
+        T = _turned(modes, known)
+        cov += T @ static.current(modes, known).cov @ T.T
+        mean = mean + (T @ known.theta).reshape(2, -1)
+    return Full(mean, cov, np.ones(modes.size, dtype=np.bool_), 0)
+
+
+def _turned(modes: Modes, known: Static) -> Floats:
+    """Change T of the means of w and b at the meters per amount of each direction, (2 t, r)."""
+    g_w, g_b = known.signature[:, :, None] * modes.directions
+    return np.vstack([modes.back @ -g_w, modes.back @ (modes.directions - g_b)])
+
+
+def _updated(modes: Modes, before: Full, h: float, m: Floats, seen: Bools | None) -> tuple[Full, Floats]:
+    """The exact filter after one tick, and the score of the innovation in the modes."""
+    t, rows = modes.size, None if seen is None else indices(seen)
+    rho, rho_b = exp(-h / modes.model.time_s), exp(-h / modes.model.fixed_s)
+    mean = before.mean * np.array([[rho], [rho_b]])
+    P = before.cov * (rho * rho_b)
+    P[:t, :t] *= rho / rho_b
+    P[:t, :t] += (1.0 - rho * rho) * modes.covariance_w
+    P[t:, t:] *= rho_b / rho
+    P[t:, t:] += (1.0 - rho_b * rho_b) * modes.covariance_b
+    if rows is None:
+        seen, nu, HP, D = np.ones(t, dtype=np.bool_), m - mean[0] - mean[1], P[:t] + P[t:], modes.noise
+    elif rows.size:
+        nu, HP, D = (m - mean[0] - mean[1])[rows], P[rows] + P[t + rows], submatrix(modes.noise, rows, rows)
+    else:
+        return Full(mean, P, seen, 0), np.zeros(t)
+    V = HP[:, :t] + HP[:, t:]
+    V = (V if rows is None else V[:, rows]) + D
+    half, failed = lapack.dpotrf(V.T, lower=True, overwrite_a=True)
+    if failed:
+        raise np.linalg.LinAlgError("the covariance of the innovation is not positive definite")
+    sigma, _ = lapack.dpotrs(half, nu, lower=True)
+    mean += (sigma @ HP).reshape(2, t)
+    gain = blas.dtrsm(1.0, half, HP.T, side=1, lower=1, trans_a=1, overwrite_b=1)
+    P -= gain @ gain.T
+    score = sigma @ (modes.back if rows is None else modes.back[rows])
+    return Full(mean, P, seen, before.complete + 1 if rows is None else 0), score
+
+
+def _returned(modes: Modes, state: FilterState, known: Static) -> tuple[FilterState, Static]:
+    """State of the modal filter, if its covariance is an upper bound; else the same, and a later attempt."""
+    full = state.full
+    assert full is not None
+    t, both = modes.size, np.kron(np.eye(2), modes.U)
+    P = both.T @ full.cov @ both
+    now = static.current(modes, known)
+    T = np.kron(np.eye(2), modes.U.T) @ _turned(modes, now)
+    rest = P - T @ now.cov @ T.T
+    cov = np.stack([np.diag(rest[:t, :t]), np.diag(rest[:t, t:]), np.diag(rest[t:, t:])])
+    bound = T @ now.cov @ T.T
+    each = np.arange(t)
+    for i, j, c in ((0, 0, cov[0]), (0, t, cov[1]), (t, 0, cov[1]), (t, t, cov[2])):
+        bound[i + each, j + each] += c
+    _, failed = lapack.dpotrf((1.0 + MARGIN) * bound - P, lower=True)
+    if failed:
+        return replace(state, full=replace(full, complete=0)), known
+    mean = full.mean @ modes.U - (T @ now.theta).reshape(2, t)
+    return FilterState(state.t, mean, (1.0 + MARGIN) * cov), static.restored(modes, now)
