@@ -212,7 +212,7 @@ class Known:
 
     def _tick(self, t: float, m: Floats, begun: list[int]) -> float:
         self.state, self.more, update = full.step(self.made, self.state, self.more, t, m)
-        self.rows = signatures.follow(self.rows, update, self.more, 1.0, begun=begun)
+        self.rows = signatures.follow(self.made, self.rows, update, self.more, 1.0, begun=begun)
         y, F = self._scores()
         return float((self.f * y - 0.5 * self.f**2 * F).max())
 
@@ -228,7 +228,7 @@ def lorden(kernel: Core, part: float) -> float:
     done = np.full(made.size, np.nan)
     for k in range(QUIET + WATCHED):
         state, more, update = full.step(made, state, more, float(k), np.zeros(made.size))
-        rows = signatures.follow(rows, update, more, 1.0, begun=[0] if k == QUIET else [])
+        rows = signatures.follow(made, rows, update, more, 1.0, begun=[0] if k == QUIET else [])
         if k >= QUIET:
             F = signatures.scores(made, rows, more).of(made.U.T, made.U.T**2)[1][0]
             done = np.where(np.isnan(done) & (0.5 * f * f * F >= kernel.limit), k - QUIET + 1, done)
@@ -323,12 +323,12 @@ class Support:
         """Take in a tick; errors of the model at all places and their variance."""
         made, kernel, k = self.made, self.kernel, self.liars.size
         self.state, self.more, update = full.step(made, self.state, self.more, t, m)
-        self.rows = signatures.follow(self.rows, update, self.more, 1.0, begun=[0] if onset else [])
+        self.rows = signatures.follow(self.made, self.rows, update, self.more, 1.0, begun=[0] if onset else [])
         plain = estimate.honest(made, kernel.estimator, self.state, self.more, update)
         if not self.rows.used[0]:
             return plain
         W = made.U.T[:, self.liars]
-        y, F = signatures.scores(made, self.rows, self.more).matrix(0, W)
+        y, F = signatures.scores(made, self.rows, self.more).matrix(made, 0, W)
         problem = SearchProblem(y, F, np.full(k, 1.0), k, np.zeros(k), np.full(k, np.inf))
         every = np.ones((1, k), dtype=np.bool_)
         one = Identification(every, ~every[:, 0], np.ones(1), every[0], (problem,))

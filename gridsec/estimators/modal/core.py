@@ -269,7 +269,7 @@ def _searched(core: Core, state: CoreState, row: int) -> Identification:
     rows = np.array([row])
     every = signatures.scores(core.modes, test.onsets, state.static, rows, every=True)
     now, ratio = signatures.shocked(core.modes, every, SHOCK)
-    y, F = now.matrix(0, core.faults.W)
+    y, F = now.matrix(core.modes, 0, core.faults.W)
     charge = ACCUSATIONS * 2.0 * log(core.modes.size)
     return search(plain, core.groups, (replace(plain, y=y, F=F), charge - 2.0 * ratio))
 
@@ -279,7 +279,7 @@ def _problem(core: Core, state: CoreState, row: int) -> SearchProblem:
     faults, p = core.faults, core.modes.size
     rows = np.array([row])
     now = signatures.scores(core.modes, state.detector.onsets, state.static, rows, every=True)
-    y, F = now.matrix(0, faults.W)
+    y, F = now.matrix(core.modes, 0, faults.W)
     accusation = 2.0 * log(p)
     charge = np.zeros(y.size)
     charge[p:] = accusation
@@ -314,5 +314,5 @@ def estimate(core: Core, state: CoreState, suspicion: Suspicion | None = None) -
     effect = np.hstack([core.effect, by.of_w])
     T = estimates.moves(made, by, state.static, onsets, suspicion.row, W, effect)
     now = signatures.scores(made, onsets, state.static, np.array([suspicion.row]), every=True)
-    joint = (*now.matrix(0, W), np.sqrt(SHOCK * made.loads))
+    joint = (*now.matrix(made, 0, W), np.sqrt(SHOCK * made.loads))
     return estimates.corrected(plain, T, suspicion.found, joint)

@@ -94,6 +94,8 @@ class Update:
         phi; None where all members have a reading.
     score : (t,) or None
         Score of the exact innovation, where the filter is not that of the modes.
+    seen : (t,) or None
+        Members with a reading; None: all.
     """
 
     decay: tuple[float, float]
@@ -102,6 +104,7 @@ class Update:
     gain: Floats
     kept: Floats | None
     score: Floats | None = None
+    seen: Bools | None = None
 
     @property
     def precision(self) -> Floats:
@@ -166,7 +169,7 @@ def step(
     lost = gain * shared[0] if kept is None else gain * (kept * shared[0])
     cov[:2] -= lost
     cov[2] -= gain[1] * shared[1] if kept is None else gain[1] * shared[1] * kept
-    return FilterState(t, mean, cov), Update((rho, rho_b), nu, v, gain, kept)
+    return FilterState(t, mean, cov), Update((rho, rho_b), nu, v, gain, kept, seen=None if kept is None else seen)
 
 
 def _kept(modes: Modes, v: Floats, seen: Bools) -> Floats:

@@ -60,7 +60,9 @@ class Onsets:
     signature : (2, k, t)
         g of w and of b, after the last update.
     score, information, cross : (k, t)
-        a, i and c.
+        Score of the exact innovation, i and c.
+    read : (k, t) or None
+        Part of i at each member that was read; None where nothing is missing since the filter is modal.
     """
 
     age: Ints
@@ -71,6 +73,7 @@ class Onsets:
     score: Floats = field(repr=False)
     information: Floats = field(repr=False)
     cross: Floats = field(repr=False)
+    read: Floats | None = field(default=None, repr=False)
 
 
 def empty(modes: Modes, steps: int, ramps: int = 0) -> Onsets:
@@ -99,6 +102,7 @@ def empty(modes: Modes, steps: int, ramps: int = 0) -> Onsets:
 
 
 def follow(
+    modes: Modes,
     onsets: Onsets,
     update: Update,
     static: Static,
@@ -107,12 +111,12 @@ def follow(
     begun: Sequence[int] = (),
     ended: Sequence[int] = (),
 ) -> Onsets:
-    """Take in one step of the filter; O(k t).
+    """Take in one step of the filter; O(k t), and O(k t^2) where readings are missing.
 
     Parameters
     ----------
-    onsets
-        So far.
+    modes, onsets
+        The modes, and the onsets so far.
     update
         The filter's step.
     static
@@ -139,14 +143,34 @@ def follow(
     score -= onsets.cross * static.moved
     score += onsets.score
     told = weighed if update.kept is None else weighed * update.kept
-    information = told * gamma
+    information = weighed * gamma
+    read = _read(modes, onsets, update, gamma)
     information += onsets.information
     cross = told * static.gamma
     cross += onsets.cross
     g += update.gain[:, None, :] * (gamma if update.kept is None else gamma * update.kept)
     for row in ended:
         g[:, row] = score[row] = information[row] = cross[row] = 0.0
-    return Onsets(age + used, used, onsets.ramp, level, g, score, information, cross)
+        if read is not None:
+            read[row] = 0.0
+    return Onsets(age + used, used, onsets.ramp, level, g, score, information, cross, read)
+
+
+def _read(modes: Modes, onsets: Onsets, update: Update, gamma: Floats) -> Floats | None:
+    """Part of the information at each member that was read, with that of one tick, (k, t).
+
+    Only the effect of a member's fault on its own reading is lost with that reading.
+    """
+    if update.score is None:
+        return None
+    felt = gamma / np.sqrt(update.variance)
+    out = (felt * felt) @ modes.squares.T
+    if update.seen is not None:
+        white = modes.model.white[modes.at]
+        own = (felt @ modes.squares.T) ** 2 * white
+        out -= np.where(update.seen, 0.0, np.minimum(own, out))
+    out += onsets.information @ modes.squares.T if onsets.read is None else onsets.read
+    return np.asarray(out)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -161,20 +185,25 @@ class Scores:
         ``diag(c) Gamma`` of the directions that count.
     cov : (r, r)
         Their N.
+    share : (k, t) or None
+        Share of the information that was read at each member; None for 1.
     """
 
     score: Floats
     information: Floats
     side: Floats
     cov: Floats
+    share: Floats | None = None
 
-    def of(self, W: Floats, squares: Floats) -> tuple[Floats, Floats]:
+    def of(self, W: Floats, squares: Floats, weights: Floats | None = None) -> tuple[Floats, Floats]:
         """Scores and information of single columns, (k, q) each.
 
         Parameters
         ----------
         W, squares : (t, q)
             The columns in the modes, and their squares.
+        weights : (t, q)
+            Share of each member in the effect of each column; None: the columns are the members.
         """
         F = self.information @ squares
         if self.cov.size == 1:
@@ -182,23 +211,30 @@ class Scores:
         elif self.cov.size:
             side = self.side @ W
             F -= np.einsum("krq,rs,ksq->kq", side, self.cov, side)
+        if self.share is not None:
+            F *= self.share if weights is None else self.share @ weights
         return self.score @ W, F
 
-    def matrix(self, row: int, W: Floats) -> tuple[Floats, Floats]:
+    def matrix(self, modes: Modes, row: int, W: Floats) -> tuple[Floats, Floats]:
         """Scores (q,) and information (q, q) of columns together, at one row.
 
         Parameters
         ----------
+        modes
+            The modes.
         row
             The row.
         W : (t, q)
             The columns in the modes.
         """
+        y = self.score[row] @ W
+        if self.share is not None:
+            W = modes.U.T @ (np.sqrt(self.share[row])[:, None] * (modes.back @ W))
         F = (W.T * self.information[row]) @ W
         if self.cov.size:
             side = self.side[row] @ W
             F -= side.T @ self.cov @ side
-        return self.score[row] @ W, F
+        return y, F
 
 
 def scores(
@@ -217,8 +253,9 @@ def scores(
     """
     r = modes.sign.size
     score, information = onsets.score[rows], onsets.information[rows]
+    share = None if onsets.read is None else _share(modes, information, onsets.read[rows])
     if not r:
-        return Scores(score, information, np.zeros((len(score), 0, modes.size)), np.zeros((0, 0)))
+        return Scores(score, information, np.zeros((len(score), 0, modes.size)), np.zeros((0, 0)), share)
     cross, G, cov = onsets.cross[rows], modes.directions, static.cov
     if r > FEW and every:
         cov = current(modes, static).cov
@@ -227,7 +264,13 @@ def scores(
         cov = np.asarray(
             np.linalg.inv(np.diag(modes.sign[: modes.busbar]) + (G.T * static.information) @ G), np.float64
         )
-    return Scores(score, information, cross[:, None, :] * G.T, cov)
+    return Scores(score, information, cross[:, None, :] * G.T, cov, share)
+
+
+def _share(modes: Modes, information: Floats, read: Floats) -> Floats:
+    """Share of the information that was read at each member, (k, t); 1 where there is none."""
+    whole = information @ modes.squares.T
+    return np.asarray(np.where(whole > 0.0, read / np.where(whole > 0.0, whole, 1.0), 1.0))
 
 
 def shocked(modes: Modes, now: Scores, size: float) -> tuple[Scores, float]:
@@ -251,7 +294,7 @@ def shocked(modes: Modes, now: Scores, size: float) -> tuple[Scores, float]:
     cov = np.linalg.solve(inner, now.cov)
     after = (y + X @ (cov @ (X.T @ (s / more * y)))) / more
     ratio = 0.5 * float((s * after) @ y - np.log(more).sum() - np.linalg.slogdet(inner)[1])
-    return Scores(after[None], now.information / more, now.side / more, cov), ratio
+    return Scores(after[None], now.information / more, now.side / more, cov, now.share), ratio
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,12 +307,15 @@ class Columns:
         ``U' [1, powers, H]``.
     std : (q,)
         Prior standard deviation of each amount.
+    weights : (t, q)
+        Share of each member in the squared effect, in units of the white variances.
     members, powers
         Numbers of columns of members and of powers; the rest are phases of the busbar.
     """
 
     W: Floats
     std: Floats
+    weights: Floats
     members: int
     powers: int
 
@@ -300,8 +346,11 @@ def columns(modes: Modes, powers: Floats, power_std: Floats, std: float) -> Colu
     """
     H = modes.model.phases(modes.at)
     H = H[:, H.any(axis=0)]
+    effect = np.hstack([np.eye(modes.size), powers[modes.at], H])
+    squares = effect**2 / modes.model.white[modes.at][:, None]
     return Columns(
-        W=np.hstack([modes.U.T, modes.U.T @ powers[modes.at], modes.U.T @ H]),
+        W=modes.U.T @ effect,
+        weights=squares / np.maximum(squares.sum(axis=0), np.finfo(float).tiny),
         std=np.concatenate([np.full(modes.size, std), power_std, np.full(H.shape[1], std)]),
         members=modes.size,
         powers=power_std.size,

@@ -36,7 +36,7 @@ def played(
     for k, m in enumerate(readings):
         begun = [row for row, tick in begins.items() if tick == k]
         state, more, update = full.step(made, state, more, float(k), m, None if seen is None else seen[k])
-        onsets = signatures.follow(onsets, update, more, 1.0 if k else 0.0, begun=begun)
+        onsets = signatures.follow(made, onsets, update, more, 1.0 if k else 0.0, begun=begun)
     return onsets, signatures.scores(made, onsets, more)
 
 
@@ -65,9 +65,9 @@ def test_likelihood_ratios_equal_those_of_dense_filters(make: object, ramp: bool
     of = signatures.columns(made, power_columns(FEEDER), np.full(24, 0.05), std)
     row = 1 if ramp else 0
     _, now = played(made, readings, {row: onset}, signatures.empty(made, 1, 1))
-    y, F = now.of(of.W, of.squares)
+    y, F = now.of(of.W, of.squares, of.weights)
     found = detector.log_lambda(y, F, np.square(of.std))[row]
-    matrix = now.matrix(row, of.W)
+    matrix = now.matrix(made, row, of.W)
     assert np.allclose(matrix[0], y[row])
     assert np.allclose(np.diag(matrix[1]), F[row])
     H = model.phases(made.at)
@@ -107,7 +107,7 @@ def test_a_change_of_all_loads_is_integrated_out(make: object) -> None:
     for k, m in enumerate(readings):
         state, more, update = full.step(made, state, more, float(k), m)
         h = 1.0 if k else 0.0
-        rows = signatures.follow(rows, update, more, h, begun=[0] if k == onset else [])
+        rows = signatures.follow(made, rows, update, more, h, begun=[0] if k == onset else [])
     now, ratio = signatures.shocked(made, signatures.scores(made, rows, more, every=True), size)
     loads = root(model.loads(made.at)) * sqrt(size) / std
     exact = exact_ratio(model, readings, loads, std, onset, False)
@@ -153,7 +153,7 @@ def test_rows_are_given_back_and_used_again() -> None:
     begun, ended = {0: [0], 9: [0, 1]}, {5: [0]}
     for k, m in enumerate(readings):
         state, more, update = full.step(made, state, more, float(k), m)
-        rows = signatures.follow(rows, update, more, 1.0, begun=begun.get(k, []), ended=ended.get(k, []))
+        rows = signatures.follow(made, rows, update, more, 1.0, begun=begun.get(k, []), ended=ended.get(k, []))
         if k == 5:
             assert not rows.used.any()
             assert not (rows.score.any())

@@ -77,12 +77,12 @@ def test_equals_the_joint_gaussian(lasting: float, fault: str) -> None:
     state, more, rows = modal.start(made, 0.0), static.start(made), signatures.empty(made, 1)
     for k, reading in enumerate(m):
         state, more, update = full.step(made, state, more, float(k), reading)
-        rows = signatures.follow(rows, update, more, 1.0, begun=[0] if k == onset else [])
+        rows = signatures.follow(made, rows, update, more, 1.0, begun=[0] if k == onset else [])
     prepared = estimate.estimator(made)
     found = estimate.honest(made, prepared, state, more, update)
     if fault != "none":
         W = made.U.T @ G
-        y, F = signatures.scores(made, rows, more).matrix(0, W)
+        y, F = signatures.scores(made, rows, more).matrix(made, 0, W)
         problem = SearchProblem(y, F, np.array([std]), 1, np.zeros(1), np.full(1, np.inf))
         T = estimate.moves(made, prepared, more, rows, 0, W, effect)
         one = Identification(
