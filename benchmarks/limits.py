@@ -323,17 +323,20 @@ class Support:
         """Take in a tick; errors of the model at all places and their variance."""
         made, kernel, k = self.made, self.kernel, self.liars.size
         self.state, self.more, update = full.step(made, self.state, self.more, t, m)
-        self.rows = signatures.follow(self.made, self.rows, update, self.more, 1.0, begun=[0] if onset else [])
+        self.rows = signatures.follow(
+            self.made, self.rows, update, self.more, 1.0, begun=[0] if onset else []
+        )
         plain = estimate.honest(made, kernel.estimator, self.state, self.more, update)
         if not self.rows.used[0]:
             return plain
         W = made.U.T[:, self.liars]
-        y, F = signatures.scores(made, self.rows, self.more).matrix(made, 0, W)
+        now = signatures.joint(made, self.rows, self.more, 0)
+        y, F = now.of(W)
         problem = SearchProblem(y, F, np.full(k, 1.0), k, np.zeros(k), np.full(k, np.inf))
         every = np.ones((1, k), dtype=np.bool_)
         one = Identification(every, ~every[:, 0], np.ones(1), every[0], (problem,))
         zero = np.zeros((plain.mean.size, k))
-        T = estimate.moves(made, kernel.estimator, self.more, self.rows, 0, W, zero)
+        T = estimate.moves(made, kernel.estimator, self.state, now, W, zero)
         return estimate.corrected(plain, T, one)
 
 

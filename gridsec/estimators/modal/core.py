@@ -19,15 +19,16 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import InputInvalid, Problem
-from gridsec.estimators.modal import detector, full, signatures, static
+from gridsec.estimators.modal import detector, full, replay, signatures, static
 from gridsec.estimators.modal import estimate as estimates
 from gridsec.estimators.modal import filter as modal
 from gridsec.estimators.modal.detector import SIZE, Detector, Evidence
 from gridsec.estimators.modal.estimate import Estimated, Estimator
 from gridsec.estimators.modal.filter import FilterState, Update
 from gridsec.estimators.modal.model import Modes, ResidualModel, modes, residual_model
+from gridsec.estimators.modal.replay import History, Suspected
 from gridsec.estimators.modal.search import Identification, SearchProblem, cost, groups, search
-from gridsec.estimators.modal.signatures import Columns
+from gridsec.estimators.modal.signatures import Columns, Joint
 from gridsec.estimators.modal.static import Static
 from gridsec.estimators.sequential.design import YEAR_S, SequentialDesign
 from gridsec.estimators.sequential.state import SequentialState
@@ -91,12 +92,18 @@ class CoreState:
         The states of the parts.
     update
         The filter's last step; None before the first.
+    history
+        Last readings.
+    suspected
+        Exact scores of the pinned onsets, where the filter has a full covariance.
     """
 
     filter: FilterState
     static: Static
     detector: Detector
     update: Update | None
+    history: History
+    suspected: tuple[Suspected, ...] = ()
 
 
 def assemble(model: ResidualModel, powers: Floats, most: Floats, *, gamma: float) -> Core:
@@ -176,7 +183,8 @@ def init(core: Core, t: float) -> CoreState:
         Time of the first reading, s.
     """
     made = core.modes
-    return CoreState(modal.start(made, t), static.start(made), detector.start(made), None)
+    parts = modal.start(made, t), static.start(made)
+    return CoreState(*parts, detector.start(made), None, History(parts))
 
 
 def step(
@@ -200,17 +208,25 @@ def step(
     ValueError
         If t is before the last reading or not a number.
     """
-    h = t - state.filter.t
-    after, known, update = full.step(core.modes, state.filter, state.static, t, m, seen)
+    made, h = core.modes, t - state.filter.t
+    pinned = np.flatnonzero(state.detector.pinned).tolist()
+    after, known, update = full.step(made, state.filter, state.static, t, m, seen, stay=bool(pinned))
     test, evidence = detector.step(
-        core.modes, core.faults, state.detector, update, known, h=h, alert=CALM * core.limit
+        made, core.faults, state.detector, update, known, h=h, alert=CALM * core.limit
     )
-    pinned = bool(test.pinned.any())
+    history, suspected = replay.record(state.history, (after, known), m, seen), state.suspected
+    if update.exact is not None:
+        if pinned and not suspected:
+            suspected = replay.carried(made, state.detector.onsets, state.static, pinned)
+        suspected = tuple(replay.follow(made, each, update.exact, h) for each in suspected)
     if evidence.log_m >= core.limit and not pinned:
         test = detector.pin(test, evidence.rows)
+        if update.exact is not None:
+            rows = np.flatnonzero(test.pinned).tolist()
+            suspected = replay.replayed(made, history, test.onsets, rows)
     elif pinned and evidence.log_m < CALM * core.limit:
-        test = detector.pin(test, evidence.rows[:0])
-    return CoreState(after, known, test, update), evidence
+        test, suspected = detector.pin(test, evidence.rows[:0]), ()
+    return CoreState(after, known, test, update, history, suspected), evidence
 
 
 def alarmed(core: Core, evidence: Evidence) -> bool:
@@ -244,7 +260,8 @@ def identify(core: Core, state: CoreState, evidence: Evidence) -> Suspicion:
     """Sets of faults that explain the readings, since the onset that suits them best.
 
     The search is made at the likeliest onset. The costs of what it finds are then compared at the pinned
-    onsets, and where another one is cheaper, the search is made there.
+    onsets, and where another one is cheaper, the search is made there. Where readings are missing, only the
+    pinned onsets are searched, with exact scores.
 
     Parameters
     ----------
@@ -252,34 +269,39 @@ def identify(core: Core, state: CoreState, evidence: Evidence) -> Suspicion:
         The core, the state after a tick, and the answer of that tick.
     """
     test = state.detector
-    rows = [int(evidence.rows[0]), *np.flatnonzero(test.pinned & test.onsets.used).tolist()]
-    rows = list(dict.fromkeys(rows))
+    rows = [] if state.suspected else [int(evidence.rows[0])]
+    rows = list(dict.fromkeys(rows + np.flatnonzero(test.pinned & test.onsets.used).tolist()))
     found = _searched(core, state, rows[0])
     std = found.problems[0].std
-    costs = [cost(replace(_problem(core, state, row), std=std), found.chosen[0]) for row in rows]
+    costs = [
+        cost(replace(_problem(core, _joint(core, state, row)), std=std), found.chosen[0]) for row in rows
+    ]
     best = int(np.argmin(costs))
     if best:
         found = _searched(core, state, rows[best])
     return Suspicion(rows[best], found)
 
 
+def _joint(core: Core, state: CoreState, row: int) -> Joint:
+    """Joint scores of one onset."""
+    for each in state.suspected:
+        if each.row == row:
+            return each.joint(core.modes)
+    return signatures.joint(core.modes, state.detector.onsets, state.static, row)
+
+
 def _searched(core: Core, state: CoreState, row: int) -> Identification:
     """Explanations since one onset, with and without an unreported change of all loads."""
-    test, plain = state.detector, _problem(core, state, row)
-    rows = np.array([row])
-    every = signatures.scores(core.modes, test.onsets, state.static, rows, every=True)
-    now, ratio = signatures.shocked(core.modes, every, SHOCK)
-    y, F = now.matrix(core.modes, 0, core.faults.W)
+    now = _joint(core, state, row)
+    other, ratio = signatures.shocked(core.modes, now, SHOCK)
     charge = ACCUSATIONS * 2.0 * log(core.modes.size)
-    return search(plain, core.groups, (replace(plain, y=y, F=F), charge - 2.0 * ratio))
+    return search(_problem(core, now), core.groups, (_problem(core, other), charge - 2.0 * ratio))
 
 
-def _problem(core: Core, state: CoreState, row: int) -> SearchProblem:
+def _problem(core: Core, joint: Joint) -> SearchProblem:
     """Scores, information and charges of all faults at one onset."""
     faults, p = core.faults, core.modes.size
-    rows = np.array([row])
-    now = signatures.scores(core.modes, state.detector.onsets, state.static, rows, every=True)
-    y, F = now.matrix(core.modes, 0, faults.W)
+    y, F = joint.of(faults.W)
     accusation = 2.0 * log(p)
     charge = np.zeros(y.size)
     charge[p:] = accusation
@@ -308,11 +330,9 @@ def estimate(core: Core, state: CoreState, suspicion: Suspicion | None = None) -
     plain = estimates.honest(made, by, state.filter, state.static, state.update)
     if suspicion is None:
         return plain
-    onsets = state.detector.onsets
     # A change of all loads is one more fault for each mode, with an effect on all places.
     W = np.hstack([core.faults.W, np.eye(made.size)])
     effect = np.hstack([core.effect, by.of_w])
-    T = estimates.moves(made, by, state.static, onsets, suspicion.row, W, effect)
-    now = signatures.scores(made, onsets, state.static, np.array([suspicion.row]), every=True)
-    joint = (*now.matrix(made, 0, W), np.sqrt(SHOCK * made.loads))
-    return estimates.corrected(plain, T, suspicion.found, joint)
+    now = _joint(core, state, suspicion.row)
+    T = estimates.moves(made, by, state.filter, now, W, effect)
+    return estimates.corrected(plain, T, suspicion.found, (*now.of(W), np.sqrt(SHOCK * made.loads)))

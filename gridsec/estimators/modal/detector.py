@@ -232,7 +232,7 @@ def log_ratios(columns: Columns, modes: Modes, now: Scores, full: bool) -> Float
     t = columns.members
     out = np.full((3, len(now.score)), -inf)
     W, squares = (columns.W, columns.squares) if full else (columns.W[:, :t], columns.squares[:, :t])
-    y, F = now.of(W, squares, columns.weights if full else None)
+    y, F = now.of(W, squares)
     each = log_lambda(y, F, columns.variance[: W.shape[1]])
     out[0] = _log_mean(each[:, :t])
     out[1] = omnibus(now, SIZE**2 / modes.white)
@@ -270,10 +270,11 @@ def _log_mean(each: Floats) -> Floats:
 def omnibus(now: Scores, s2: float) -> Floats:
     """Log Lambda of f ~ N(0, s2 I) in the modes, (k,).
 
-    Where readings are missing, the largest share of the members bounds the information, and the mean share over
-    the largest is the weight of each mode in the determinant. For one member with the variance r of its
-    score, in units of that bound, and ``u = s2 i / (1 + s2 i)``, the mean of Lambda is ``(1 - r u)^(-1/2) (1 -
-    u)^(r/2) <= 1``, since ``-log(1 - r u)`` is convex in r.
+    Where readings are missing, the largest share of the members bounds the information. The mean share over
+    the largest is then the weight of each mode in the determinant. For one member with the variance r of its
+    score, in units of that bound, and ``u = s2 i / (1 + s2 i)``, the mean of Lambda is ``(1 - r u)^(-1/2)
+    (1 - u)^(r/2) <= 1``, since ``-log(1 - r u)`` is convex in r. Modes of different information are scaled
+    alike: that is exact for white errors.
 
     Parameters
     ----------

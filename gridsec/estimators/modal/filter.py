@@ -29,7 +29,7 @@ from math import exp
 import numpy as np
 from scipy.linalg import lapack
 
-from gridsec.arrays import Bools, Floats, all_of, indices
+from gridsec.arrays import Bools, Floats, Ints, all_of, indices
 from gridsec.errors import InputInvalid, Problem
 from gridsec.estimators.modal.model import Modes
 
@@ -79,6 +79,28 @@ class FilterState:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Innovation:
+    """Exact innovation nu of the n members with a reading.
+
+    Attributes
+    ----------
+    rows : (n,)
+        The members.
+    half : (n, n)
+        Lower Cholesky factor L of the covariance of nu.
+    gain : (2 t, n)
+        ``P H' L'^-1``; the means of (w, b) move by ``gain white``.
+    white : (n,)
+        ``L^-1 nu``.
+    """
+
+    rows: Ints
+    half: Floats = field(repr=False)
+    gain: Floats = field(repr=False)
+    white: Floats = field(repr=False)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Update:
     """One step of the filter. t modes.
 
@@ -92,8 +114,10 @@ class Update:
         k of w and of b.
     kept : (t,) or None
         phi; None where all members have a reading.
+    exact
+        The exact innovation, where the filter is not that of the modes.
     score : (t,) or None
-        Score of the exact innovation, where the filter is not that of the modes.
+        Its score in the modes.
     seen : (t,) or None
         Members with a reading; None: all.
     """
@@ -103,6 +127,7 @@ class Update:
     variance: Floats
     gain: Floats
     kept: Floats | None
+    exact: Innovation | None = None
     score: Floats | None = None
     seen: Bools | None = None
 
@@ -169,7 +194,8 @@ def step(
     lost = gain * shared[0] if kept is None else gain * (kept * shared[0])
     cov[:2] -= lost
     cov[2] -= gain[1] * shared[1] if kept is None else gain[1] * shared[1] * kept
-    return FilterState(t, mean, cov), Update((rho, rho_b), nu, v, gain, kept, seen=None if kept is None else seen)
+    present = None if kept is None else seen
+    return FilterState(t, mean, cov), Update((rho, rho_b), nu, v, gain, kept, seen=present)
 
 
 def _kept(modes: Modes, v: Floats, seen: Bools) -> Floats:

@@ -19,8 +19,8 @@ information, ``sum gamma' s`` is a martingale and ``exp(y f - I f^2 / 2)`` has t
 signatures of the modal filter, which keeps the diagonal of its covariance, stay in use: their error costs
 evidence, and causes no false alarm.
 
-**Return.** After `COMPLETE` ticks with all readings the filter returns to the modes if their diagonal
-covariance C, enlarged by `MARGIN`, is an upper bound: ``(1 + MARGIN) (C + T N T') - P`` has a Cholesky factor.
+**Return.** After `COMPLETE` ticks with all readings the filter returns to the modes. The condition: their
+diagonal covariance C, enlarged by `MARGIN`, is an upper bound, ``(1 + MARGIN) C + T N T' >= P``.
 The readings then have at most the covariance of the model in use. With scores y and information I of that
 model, ``var y <= I`` without a fault, and E exp(y f - I f^2 / 2) <= 1 at each fixed tick.
 
@@ -42,7 +42,7 @@ from scipy.linalg import blas, lapack
 from gridsec.arrays import Bools, Floats, all_of, indices, submatrix
 from gridsec.estimators.modal import filter as modal
 from gridsec.estimators.modal import static
-from gridsec.estimators.modal.filter import FilterState, Full, Update
+from gridsec.estimators.modal.filter import FilterState, Full, Innovation, Update
 from gridsec.estimators.modal.model import Modes
 from gridsec.estimators.modal.static import Static
 
@@ -52,8 +52,15 @@ MARGIN = 0.1
 """Enlargement of the variance at the return, 1: standard deviations are too large by 5 % at first."""
 
 
-def step(
-    modes: Modes, state: FilterState, known: Static, t: float, m: Floats, seen: Bools | None = None
+def step(  # noqa: PLR0917  # the states of both parts, and one tick
+    modes: Modes,
+    state: FilterState,
+    known: Static,
+    t: float,
+    m: Floats,
+    seen: Bools | None = None,
+    *,
+    stay: bool = False,
 ) -> tuple[FilterState, Static, Update]:
     """Take in the residuals of one tick by the exact filter.
 
@@ -67,6 +74,8 @@ def step(
         Residuals of the members, squared pu; any finite value where not seen.
     seen : (t,)
         Members with a reading; None: all.
+    stay
+        Keep the full covariance, if there is one.
 
     Raises
     ------
@@ -74,14 +83,16 @@ def step(
         If t is before the last reading or not a number.
     """
     whole = seen is None or all_of(seen)
-    if state.full is not None and whole and state.full.complete >= COMPLETE:
-        state, known = _returned(modes, state, known)
+    if state.full is not None and whole and not stay and state.full.complete >= COMPLETE:
+        state, known = _returned(modes, state, state.full, known)
     if state.full is None and not whole:
         state = replace(state, full=expanded(modes, state, known))
     after, update = modal.step(modes, state, t, m, seen)
     if state.full is not None:
-        full, score = _updated(modes, state.full, t - state.t, m, None if whole else seen)
-        after, update = replace(after, full=full), replace(update, score=score)
+        full, innovation = updated(modes, state.full, t - state.t, m, None if whole else seen)
+        sigma, _ = lapack.dtrtrs(innovation.half, innovation.white, lower=True, trans=1)
+        score = sigma @ modes.back[innovation.rows]
+        after, update = replace(after, full=full), replace(update, exact=innovation, score=score)
     return after, static.follow(modes, known, update), update
 
 
@@ -109,9 +120,19 @@ def _turned(modes: Modes, known: Static) -> Floats:
     return np.vstack([modes.back @ -g_w, modes.back @ (modes.directions - g_b)])
 
 
-def _updated(modes: Modes, before: Full, h: float, m: Floats, seen: Bools | None) -> tuple[Full, Floats]:
-    """The exact filter after one tick, and the score of the innovation in the modes."""
-    t, rows = modes.size, None if seen is None else indices(seen)
+def updated(modes: Modes, before: Full, h: float, m: Floats, seen: Bools | None) -> tuple[Full, Innovation]:
+    """The exact filter after one tick; O(n t^2).
+
+    Parameters
+    ----------
+    modes, before
+        The modes, and the filter after the last tick.
+    h
+        Interval, s.
+    m, seen : (t,)
+        Residuals, and members with a reading; None: all.
+    """
+    t, rows = modes.size, np.arange(modes.size) if seen is None else indices(seen)
     rho, rho_b = exp(-h / modes.model.time_s), exp(-h / modes.model.fixed_s)
     mean = before.mean * np.array([[rho], [rho_b]])
     P = before.cov * (rho * rho_b)
@@ -119,41 +140,41 @@ def _updated(modes: Modes, before: Full, h: float, m: Floats, seen: Bools | None
     P[:t, :t] += (1.0 - rho * rho) * modes.covariance_w
     P[t:, t:] *= rho_b / rho
     P[t:, t:] += (1.0 - rho_b * rho_b) * modes.covariance_b
-    if rows is None:
-        seen, nu, HP, D = np.ones(t, dtype=np.bool_), m - mean[0] - mean[1], P[:t] + P[t:], modes.noise
-    elif rows.size:
-        nu, HP, D = (m - mean[0] - mean[1])[rows], P[rows] + P[t + rows], submatrix(modes.noise, rows, rows)
+    if not rows.size:
+        none = np.zeros((2 * t, 0))
+        return Full(mean, P, np.zeros(t, dtype=np.bool_), 0), Innovation(rows, none[:0], none, none[0])
+    nu = m - mean[0] - mean[1]
+    if seen is None:
+        seen, HP, D, complete = np.ones(t, dtype=np.bool_), P[:t] + P[t:], modes.noise, before.complete + 1
+        V = HP[:, :t] + HP[:, t:] + D
     else:
-        return Full(mean, P, seen, 0), np.zeros(t)
-    V = HP[:, :t] + HP[:, t:]
-    V = (V if rows is None else V[:, rows]) + D
-    half, failed = lapack.dpotrf(V.T, lower=True, overwrite_a=True)
+        nu, HP, D, complete = nu[rows], P[rows] + P[t + rows], submatrix(modes.noise, rows, rows), 0
+        V = (HP[:, :t] + HP[:, t:])[:, rows] + D
+    half, failed = lapack.dpotrf(V.T, lower=True, overwrite_a=True, clean=True)
     if failed:
         raise np.linalg.LinAlgError("the covariance of the innovation is not positive definite")
-    sigma, _ = lapack.dpotrs(half, nu, lower=True)
-    mean += (sigma @ HP).reshape(2, t)
     gain = blas.dtrsm(1.0, half, HP.T, side=1, lower=1, trans_a=1, overwrite_b=1)
+    white, _ = lapack.dtrtrs(half, nu, lower=True)
+    mean += (gain @ white).reshape(2, t)
     P -= gain @ gain.T
-    score = sigma @ (modes.back if rows is None else modes.back[rows])
-    return Full(mean, P, seen, before.complete + 1 if rows is None else 0), score
+    return Full(mean, P, seen, complete), Innovation(rows, half, gain, white)
 
 
-def _returned(modes: Modes, state: FilterState, known: Static) -> tuple[FilterState, Static]:
+def _returned(modes: Modes, state: FilterState, full: Full, known: Static) -> tuple[FilterState, Static]:
     """State of the modal filter, if its covariance is an upper bound; else the same, and a later attempt."""
-    full = state.full
-    assert full is not None
-    t, both = modes.size, np.kron(np.eye(2), modes.U)
-    P = both.T @ full.cov @ both
-    now = static.current(modes, known)
-    T = np.kron(np.eye(2), modes.U.T) @ _turned(modes, now)
-    rest = P - T @ now.cov @ T.T
-    cov = np.stack([np.diag(rest[:t, :t]), np.diag(rest[:t, t:]), np.diag(rest[t:, t:])])
-    bound = T @ now.cov @ T.T
-    each = np.arange(t)
-    for i, j, c in ((0, 0, cov[0]), (0, t, cov[1]), (t, 0, cov[1]), (t, t, cov[2])):
-        bound[i + each, j + each] += c
-    _, failed = lapack.dpotrf((1.0 + MARGIN) * bound - P, lower=True)
-    if failed:
+    t, U, now = modes.size, modes.U, static.current(modes, known)
+    T = _turned(modes, now).reshape(2, t, -1)
+    T = np.vstack([U.T @ T[0], U.T @ T[1]])
+    P = np.vstack([U.T @ full.cov[:t], U.T @ full.cov[t:]])
+    rest = T @ now.cov @ T.T - np.hstack([P[:, :t] @ U, P[:, t:] @ U])
+    w, b = np.arange(t), np.arange(t, 2 * t)
+    cov = -(1.0 + MARGIN) * np.stack([rest[w, w], rest[w, b], rest[b, b]])
+    rest[w, w] += cov[0]
+    rest[w, b] += cov[1]
+    rest[b, w] += cov[1]
+    rest[b, b] += cov[2]
+    _, failed = lapack.dpotrf(rest, lower=True)
+    if failed or not (cov[0] > 0.0).all() or not (cov[0] * cov[2] > cov[1] ** 2).all():
         return replace(state, full=replace(full, complete=0)), known
-    mean = full.mean @ modes.U - (T @ now.theta).reshape(2, t)
-    return FilterState(state.t, mean, (1.0 + MARGIN) * cov), static.restored(modes, now)
+    mean = full.mean @ U - (T @ now.theta).reshape(2, t)
+    return FilterState(state.t, mean, cov), static.restored(modes, now)

@@ -28,10 +28,11 @@ systems, IEEE Trans. Automatic Control 21, 1976.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.estimators.modal.filter import Update
@@ -195,15 +196,13 @@ class Scores:
     cov: Floats
     share: Floats | None = None
 
-    def of(self, W: Floats, squares: Floats, weights: Floats | None = None) -> tuple[Floats, Floats]:
+    def of(self, W: Floats, squares: Floats) -> tuple[Floats, Floats]:
         """Scores and information of single columns, (k, q) each.
 
         Parameters
         ----------
         W, squares : (t, q)
-            The columns in the modes, and their squares.
-        weights : (t, q)
-            Share of each member in the effect of each column; None: the columns are the members.
+            The columns in the modes, those of the members first, and their squares.
         """
         F = self.information @ squares
         if self.cov.size == 1:
@@ -212,34 +211,11 @@ class Scores:
             side = self.side @ W
             F -= np.einsum("krq,rs,ksq->kq", side, self.cov, side)
         if self.share is not None:
-            F *= self.share if weights is None else self.share @ weights
+            F[:, : self.share.shape[1]] *= self.share
         return self.score @ W, F
 
-    def matrix(self, modes: Modes, row: int, W: Floats) -> tuple[Floats, Floats]:
-        """Scores (q,) and information (q, q) of columns together, at one row.
 
-        Parameters
-        ----------
-        modes
-            The modes.
-        row
-            The row.
-        W : (t, q)
-            The columns in the modes.
-        """
-        y = self.score[row] @ W
-        if self.share is not None:
-            W = modes.U.T @ (np.sqrt(self.share[row])[:, None] * (modes.back @ W))
-        F = (W.T * self.information[row]) @ W
-        if self.cov.size:
-            side = self.side[row] @ W
-            F -= side.T @ self.cov @ side
-        return y, F
-
-
-def scores(
-    modes: Modes, onsets: Onsets, static: Static, rows: Ints | slice = _ALL, *, every: bool = False
-) -> Scores:
+def scores(modes: Modes, onsets: Onsets, static: Static, rows: Ints | slice = _ALL) -> Scores:
     """Integrate the directions out.
 
     Parameters
@@ -248,8 +224,6 @@ def scores(
         The modes, and the information so far.
     rows : (k,)
         Rows to work on; all by default.
-    every
-        Take all directions into account, however many there are; O(t r^2).
     """
     r = modes.sign.size
     score, information = onsets.score[rows], onsets.information[rows]
@@ -257,9 +231,7 @@ def scores(
     if not r:
         return Scores(score, information, np.zeros((len(score), 0, modes.size)), np.zeros((0, 0)), share)
     cross, G, cov = onsets.cross[rows], modes.directions, static.cov
-    if r > FEW and every:
-        cov = current(modes, static).cov
-    elif r > FEW:
+    if r > FEW:
         G = G[:, : modes.busbar]
         cov = np.asarray(
             np.linalg.inv(np.diag(modes.sign[: modes.busbar]) + (G.T * static.information) @ G), np.float64
@@ -273,28 +245,73 @@ def _share(modes: Modes, information: Floats, read: Floats) -> Floats:
     return np.asarray(np.where(whole > 0.0, read / np.where(whole > 0.0, whole, 1.0), 1.0))
 
 
-def shocked(modes: Modes, now: Scores, size: float) -> tuple[Scores, float]:
-    """Scores of one row with a change of all loads ``N(0, size S)`` at the onset integrated out.
+@dataclass(frozen=True, slots=True, eq=False)
+class Joint:
+    """Scores and information of all faults of members together, at one onset. t modes.
 
-    Also the logarithm of the likelihood ratio of such a change against none. With ``s = size lam``, ``X =
-    diag(c) Gamma`` and ``N' = (N^-1 - X' diag(s / (1 + s i)) X)^-1``, N, i and X go over into N', i and X
-    divided by ``1 + s i``, and the scores y into ``(y + X N' X' diag(s / (1 + s i)) y) / (1 + s i)``.
+    Attributes
+    ----------
+    score, information : (t,), (t, t)
+        Of columns W: ``y = W' score`` and ``I = W' information W``.
+    shift : (2, t, t)
+        Change of the means of w and b per unit fault in each mode.
+    level
+        u of the last tick.
+    """
+
+    score: Floats
+    information: Floats = field(repr=False)
+    shift: Floats = field(repr=False)
+    level: float
+
+    def of(self, W: Floats) -> tuple[Floats, Floats]:
+        """Scores (q,) and information (q, q) of columns W (t, q)."""
+        return self.score @ W, W.T @ self.information @ W
+
+
+def joint(modes: Modes, onsets: Onsets, static: Static, row: int) -> Joint:
+    """Joint scores of one row, all directions integrated out; exact where no reading is missing; O(t^2 r).
+
+    Parameters
+    ----------
+    modes, onsets, static
+        The modes, and the information so far.
+    row
+        The row.
+    """
+    score, g, level = onsets.score[row], onsets.signature[:, row], float(onsets.level[row])
+    information, shift = np.diag(onsets.information[row]), np.stack([np.diag(each) for each in g])
+    if modes.sign.size:
+        side = onsets.cross[row][:, None] * modes.directions
+        turn = current(modes, static).cov @ side.T
+        information -= side @ turn
+        g_w, g_b = static.signature[:, :, None] * modes.directions
+        shift[0] -= g_w @ turn
+        shift[1] += (modes.directions - g_b) @ turn
+    return Joint(score, information, shift, level)
+
+
+def shocked(modes: Modes, now: Joint, size: float) -> tuple[Joint, float]:
+    """Joint scores with a change of all loads ``N(0, size S)`` at the onset integrated out; O(t^3).
+
+    Also the logarithm of the likelihood ratio of such a change against none. With ``Q = size diag(lam)`` and
+    ``B = I + Q^(1/2) I Q^(1/2)``, the score loses ``I Q^(1/2) B^-1 Q^(1/2) y`` and the information I loses ``I
+    Q^(1/2) B^-1 Q^(1/2) I``.
 
     Parameters
     ----------
     modes, now
-        The modes, and the scores of one row.
+        The modes, and the joint scores of one onset.
     size
         Variance of the change, in those of the loads.
     """
-    y, X = now.score[0], now.side[0].T
-    s = size * modes.loads
-    more = 1.0 + s * now.information[0]
-    inner = np.eye(X.shape[1]) - now.cov @ ((X.T * (s / more)) @ X)
-    cov = np.linalg.solve(inner, now.cov)
-    after = (y + X @ (cov @ (X.T @ (s / more * y)))) / more
-    ratio = 0.5 * float((s * after) @ y - np.log(more).sum() - np.linalg.slogdet(inner)[1])
-    return Scores(after[None], now.information / more, now.side / more, cov, now.share), ratio
+    root = np.sqrt(size * modes.loads)
+    side = root[:, None] * now.information
+    half = np.linalg.cholesky(np.eye(modes.size) + side * root)
+    lost = solve_triangular(half, np.column_stack([root * now.score, side]), lower=True)
+    ratio = 0.5 * float(lost[:, 0] @ lost[:, 0]) - float(np.log(np.diag(half)).sum())
+    score, information = now.score - lost[:, 1:].T @ lost[:, 0], now.information - lost[:, 1:].T @ lost[:, 1:]
+    return replace(now, score=score, information=information), ratio
 
 
 @dataclass(frozen=True, eq=False)
@@ -307,15 +324,12 @@ class Columns:
         ``U' [1, powers, H]``.
     std : (q,)
         Prior standard deviation of each amount.
-    weights : (t, q)
-        Share of each member in the squared effect, in units of the white variances.
     members, powers
         Numbers of columns of members and of powers; the rest are phases of the busbar.
     """
 
     W: Floats
     std: Floats
-    weights: Floats
     members: int
     powers: int
 
@@ -346,11 +360,8 @@ def columns(modes: Modes, powers: Floats, power_std: Floats, std: float) -> Colu
     """
     H = modes.model.phases(modes.at)
     H = H[:, H.any(axis=0)]
-    effect = np.hstack([np.eye(modes.size), powers[modes.at], H])
-    squares = effect**2 / modes.model.white[modes.at][:, None]
     return Columns(
-        W=modes.U.T @ effect,
-        weights=squares / np.maximum(squares.sum(axis=0), np.finfo(float).tiny),
+        W=np.hstack([modes.U.T, modes.U.T @ powers[modes.at], modes.U.T @ H]),
         std=np.concatenate([np.full(modes.size, std), power_std, np.full(H.shape[1], std)]),
         members=modes.size,
         powers=power_std.size,

@@ -60,7 +60,7 @@ class Static:
     cov : (r, r)
         N of the tick at which it was computed last.
     score, moved : (t,)
-        Of the last tick: score ``V^-1`` times the exact innovation in the modes, and change of ``Gamma theta``.
+        Of the last tick: ``V^-1`` times the exact innovation, and change of ``Gamma theta``, in the modes.
     """
 
     signature: Floats

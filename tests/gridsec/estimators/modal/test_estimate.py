@@ -82,9 +82,10 @@ def test_equals_the_joint_gaussian(lasting: float, fault: str) -> None:
     found = estimate.honest(made, prepared, state, more, update)
     if fault != "none":
         W = made.U.T @ G
-        y, F = signatures.scores(made, rows, more).matrix(made, 0, W)
+        now = signatures.joint(made, rows, more, 0)
+        y, F = now.of(W)
         problem = SearchProblem(y, F, np.array([std]), 1, np.zeros(1), np.full(1, np.inf))
-        T = estimate.moves(made, prepared, more, rows, 0, W, effect)
+        T = estimate.moves(made, prepared, state, now, W, effect)
         one = Identification(
             np.ones((1, 1), bool), np.zeros(1, bool), np.ones(1), np.ones(1, bool), (problem,)
         )
