@@ -44,6 +44,8 @@ SHOCK = 10.0
 """Variance of an unreported change of all loads, in those of the loads, 1: 2 kW where 0.6 kW is stated."""
 CONNECTION = 0.1
 """Power of a customer where the files are not asked, pu of the feeder's base: 10 kW at 100 kVA."""
+FARTHER = 5.0
+"""Log M of an onset above that of all pinned ones from which on it replaces them, 1; a replay takes time."""
 CALM = 0.5
 """Part of the limit of log M below which suspected onsets are given up, 1."""
 
@@ -219,7 +221,7 @@ def step(
         if pinned and not suspected:
             suspected = replay.carried(made, state.detector.onsets, state.static, pinned)
         suspected = tuple(replay.follow(made, each, update.exact, h) for each in suspected)
-    if evidence.log_m >= core.limit and not pinned:
+    if evidence.log_m >= core.limit and (not pinned or (suspected and _elsewhere(evidence, pinned))):
         test = detector.pin(test, evidence.rows)
         if update.exact is not None:
             rows = np.flatnonzero(test.pinned).tolist()
@@ -227,6 +229,12 @@ def step(
     elif pinned and evidence.log_m < CALM * core.limit:
         test, suspected = detector.pin(test, evidence.rows[:0]), ()
     return CoreState(after, known, test, update, history, suspected), evidence
+
+
+def _elsewhere(evidence: Evidence, pinned: list[int]) -> bool:
+    """Another onset is far likelier than the pinned ones."""
+    by_row = evidence.by_row.max(axis=0)
+    return bool(by_row.max() > by_row[pinned].max() + FARTHER)
 
 
 def alarmed(core: Core, evidence: Evidence) -> bool:

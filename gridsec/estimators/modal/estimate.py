@@ -132,7 +132,7 @@ def _theta(modes: Modes, made: Estimator, static: Static) -> Floats:
     return np.asarray(by @ modes.directions)
 
 
-def moves(
+def moves(  # noqa: PLR0917  # the state, and the faults
     modes: Modes, made: Estimator, state: FilterState, joint: Joint, W: Floats, effect: Floats
 ) -> Floats:
     """Change T of the honest estimate per amount of each fault at one onset, (n, q).

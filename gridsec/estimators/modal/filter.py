@@ -5,16 +5,15 @@ With ``z = U' m`` of `gridsec.estimators.modal.model`, each mode has the states 
 
     predict   (w, b) <- R (w, b),  P <- R P R + (1 - R^2) diag(q, s),  R = diag(rho, rho_b)
     update    nu = z - w - b,  v = Pww + 2 Pwb + Pbb + 1,  k = (Pww + Pwb, Pwb + Pbb) / v
-              (w, b) += k nu,  P -= phi v k k'
+              (w, b) += k nu,  P -= v k k'
 
 where q and s are the variances of w and b, ``rho = exp(-h / T)``, ``rho_b = exp(-h / T_b)`` for an interval
 of h seconds. The cost is O(t) and the product ``U' m``. The filter is exact for ``B = kappa D + c S``, and
 with `gridsec.estimators.modal.static` for every B.
 
-**Missing readings** couple the modes: `gridsec.estimators.modal.full` keeps the exact covariance then. Here
-the diagonal of the covariance in the modes is kept, with ``phi = 1 - diag(U_g' (A_gg)^-1 U_g) / v``, the part
-of each mode's information that was read, ``A = U diag(1 / v) U'``, g the members without a reading. These
-gains are used as signatures of faults only. With all readings there, phi is 1.
+**Missing readings** couple the modes: `gridsec.estimators.modal.full` follows the exact filter then. The
+covariance here stays that of complete readings. It is a lower bound of the exact one: ``diag(1 / v)`` is
+an upper bound of the information of every innovation. Its gains are used as signatures of faults.
 
 References
 ----------
@@ -27,9 +26,8 @@ from dataclasses import dataclass, field
 from math import exp
 
 import numpy as np
-from scipy.linalg import lapack
 
-from gridsec.arrays import Bools, Floats, Ints, all_of, indices
+from gridsec.arrays import Bools, Floats, Ints, all_of
 from gridsec.errors import InputInvalid, Problem
 from gridsec.estimators.modal.model import Modes
 
@@ -112,8 +110,6 @@ class Update:
         nu, zero without a meaning where ``score`` is given, and v.
     gain : (2, t)
         k of w and of b.
-    kept : (t,) or None
-        phi; None where all members have a reading.
     exact
         The exact innovation, where the filter is not that of the modes.
     score : (t,) or None
@@ -126,15 +122,9 @@ class Update:
     innovation: Floats
     variance: Floats
     gain: Floats
-    kept: Floats | None
     exact: Innovation | None = None
     score: Floats | None = None
     seen: Bools | None = None
-
-    @property
-    def precision(self) -> Floats:
-        """Information of the innovation, ``phi / v``, (t,)."""
-        return 1.0 / self.variance if self.kept is None else self.kept / self.variance
 
 
 def start(modes: Modes, t: float) -> FilterState:
@@ -182,31 +172,13 @@ def step(
     cov[2] += (1.0 - rho_b * rho_b) * modes.lasting
     shared = cov[:2] + cov[1:]
     v = shared[0] + shared[1] + 1.0
-    kept = None
-    if seen is not None and not all_of(seen):
-        kept = _kept(modes, v, seen)
+    whole = seen is None or all_of(seen)
     gain, nu = shared / v, np.zeros(v.size)
     if state.full is None:
-        if kept is not None:
+        if not whole:
             raise InputInvalid([Problem("missing", "missing readings need the full covariance")])
         nu = m @ modes.U - mean[0] - mean[1]
         mean += gain * nu
-    lost = gain * shared[0] if kept is None else gain * (kept * shared[0])
-    cov[:2] -= lost
-    cov[2] -= gain[1] * shared[1] if kept is None else gain[1] * shared[1] * kept
-    present = None if kept is None else seen
-    return FilterState(t, mean, cov), Update((rho, rho_b), nu, v, gain, kept, seen=present)
-
-
-def _kept(modes: Modes, v: Floats, seen: Bools) -> Floats:
-    """Part phi of the information of each mode that was read, (t,)."""
-    out = indices(~seen)
-    if out.size == seen.size:
-        return np.zeros(v.size)
-    U = modes.U[out]
-    half, failed = lapack.dpotrf((U / v) @ U.T, lower=True, clean=True)
-    if failed:
-        raise np.linalg.LinAlgError("the matrix is not positive definite")
-    spread, _ = lapack.dtrtrs(half, U, lower=True)
-    phi = 1.0 - (spread * spread).sum(axis=0) / v
-    return np.asarray(np.minimum(np.maximum(phi, 0.0), 1.0))
+    cov[:2] -= gain * shared[0]
+    cov[2] -= gain[1] * shared[1]
+    return FilterState(t, mean, cov), Update((rho, rho_b), nu, v, gain, seen=None if whole else seen)

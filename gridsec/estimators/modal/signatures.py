@@ -143,13 +143,12 @@ def follow(
     score = gamma * static.score
     score -= onsets.cross * static.moved
     score += onsets.score
-    told = weighed if update.kept is None else weighed * update.kept
     information = weighed * gamma
     read = _read(modes, onsets, update, gamma)
     information += onsets.information
-    cross = told * static.gamma
+    cross = weighed * static.gamma
     cross += onsets.cross
-    g += update.gain[:, None, :] * (gamma if update.kept is None else gamma * update.kept)
+    g += update.gain[:, None, :] * gamma
     for row in ended:
         g[:, row] = score[row] = information[row] = cross[row] = 0.0
         if read is not None:
@@ -295,8 +294,8 @@ def shocked(modes: Modes, now: Joint, size: float) -> tuple[Joint, float]:
     """Joint scores with a change of all loads ``N(0, size S)`` at the onset integrated out; O(t^3).
 
     Also the logarithm of the likelihood ratio of such a change against none. With ``Q = size diag(lam)`` and
-    ``B = I + Q^(1/2) I Q^(1/2)``, the score loses ``I Q^(1/2) B^-1 Q^(1/2) y`` and the information I loses ``I
-    Q^(1/2) B^-1 Q^(1/2) I``.
+    ``B = I + Q^(1/2) I Q^(1/2)``, the score loses ``I Q^(1/2) B^-1 Q^(1/2) y`` and the information
+    loses ``I Q^(1/2) B^-1 Q^(1/2) I``.
 
     Parameters
     ----------

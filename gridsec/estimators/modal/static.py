@@ -4,11 +4,11 @@ The filter of `gridsec.estimators.modal.filter` runs with ``B = kappa D + c S``.
 theta`` with ``theta ~ N(0, diag(sign))``. Its effect on the innovations since the start is known, mode by
 mode: with the signature of a constant unit error,
 
-    gamma = 1 - rho g_w - rho_b g_b,   g <- (rho g_w, rho_b g_b) + k phi gamma
+    gamma = 1 - rho g_w - rho_b g_b,   g <- (rho g_w, rho_b g_b) + k gamma
 
 the innovations are ``gamma * (Gamma theta) + white``, ``Gamma = U' G``. So
 
-    a += gamma nu / v,   i += gamma^2 phi / v
+    a += gamma nu / v,   i += gamma^2 / v
     N = (diag(sign) + Gamma' diag(i) Gamma)^-1,   theta = N Gamma' a
 
 is the posterior of theta, and ``nu - gamma Gamma theta`` with the covariance ``diag(v) + gamma Gamma N
@@ -104,8 +104,8 @@ def follow(modes: Modes, before: Static, update: Update) -> Static:
     rho, rho_b = update.decay
     g = before.signature * np.array([[rho], [rho_b]])
     gamma = 1.0 - g[0] - g[1]
-    g += update.gain * (gamma if update.kept is None else gamma * update.kept)
-    information = before.information + gamma * gamma * update.precision
+    g += update.gain * gamma
+    information = before.information + gamma * gamma / update.variance
     now = replace(before, signature=g, gamma=gamma, information=information)
     if update.score is not None:
         # The innovation is exact without theta, which says only how a fault would have been learned.
