@@ -2,8 +2,9 @@
 
     design(front) -> Core
     init(core, t) -> CoreState
-    step(core, state, t, m, seen) -> (CoreState, Evidence)      every tick
+    step(core, state, t, m, seen) -> (CoreState, Evidence)      every tick, releases masked meters
     identify(core, state, evidence) -> Suspicion                where `alarmed`
+    mask(core, state, suspicion) -> (CoreState, Evidence)       where meters are named
     estimate(core, state, suspicion) -> Estimated               where asked for
 
 The front end is that of `gridsec.estimators.sequential`: cleaning of frames, observer of the inverters,
@@ -19,14 +20,15 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import InputInvalid, Problem
-from gridsec.estimators.modal import detector, full, replay, signatures, static
+from gridsec.estimators.modal import detector, full, masking, replay, signatures, static
 from gridsec.estimators.modal import estimate as estimates
 from gridsec.estimators.modal import filter as modal
 from gridsec.estimators.modal.detector import SIZE, Detector, Evidence
 from gridsec.estimators.modal.estimate import Estimated, Estimator
 from gridsec.estimators.modal.filter import FilterState, Update
+from gridsec.estimators.modal.masking import Masked
 from gridsec.estimators.modal.model import Modes, ResidualModel, modes, residual_model
-from gridsec.estimators.modal.replay import History, Suspected
+from gridsec.estimators.modal.replay import History, Parts, Suspected
 from gridsec.estimators.modal.search import Identification, SearchProblem, cost, groups, search
 from gridsec.estimators.modal.signatures import Columns, Joint
 from gridsec.estimators.modal.static import Static
@@ -98,6 +100,8 @@ class CoreState:
         Last readings.
     suspected
         Exact scores of the pinned onsets, where the filter has a full covariance.
+    masked
+        Masked meters.
     """
 
     filter: FilterState
@@ -105,7 +109,8 @@ class CoreState:
     detector: Detector
     update: Update | None
     history: History
-    suspected: tuple[Suspected, ...] = ()
+    suspected: tuple[Suspected, ...]
+    masked: Masked
 
 
 def assemble(model: ResidualModel, powers: Floats, most: Floats, *, gamma: float) -> Core:
@@ -185,8 +190,8 @@ def init(core: Core, t: float) -> CoreState:
         Time of the first reading, s.
     """
     made = core.modes
-    parts = modal.start(made, t), static.start(made)
-    return CoreState(*parts, detector.start(made), None, History(parts))
+    parts = modal.start(made, t), static.start(made), detector.start(made)
+    return CoreState(*parts, None, History((*parts, ())), (), masking.none(made))
 
 
 def step(
@@ -210,13 +215,17 @@ def step(
     ValueError
         If t is before the last reading or not a number.
     """
-    made, h = core.modes, t - state.filter.t
+    made, h, masked, read = core.modes, t - state.filter.t, state.masked, seen
+    if masked.meters.any():
+        seen = ~masked.meters if read is None else read & ~masked.meters
     pinned = np.flatnonzero(state.detector.pinned).tolist()
     after, known, update = full.step(made, state.filter, state.static, t, m, seen, stay=bool(pinned))
     test, evidence = detector.step(
         made, core.faults, state.detector, update, known, h=h, alert=CALM * core.limit
     )
-    history, suspected = replay.record(state.history, (after, known), m, seen), state.suspected
+    if masked.meters.any() and after.full is not None:
+        masked = masking.follow(made, masked, after.full, m, read)
+    suspected = state.suspected
     if update.exact is not None:
         if pinned and not suspected:
             suspected = replay.carried(made, state.detector.onsets, state.static, pinned)
@@ -224,11 +233,44 @@ def step(
     if evidence.log_m >= core.limit and (not pinned or (suspected and _elsewhere(evidence, pinned))):
         test = detector.pin(test, evidence.rows)
         if update.exact is not None:
+            last = replay.record(state.history, (after, known, test, ()), m, seen)
             rows = np.flatnonzero(test.pinned).tolist()
-            suspected = replay.replayed(made, history, test.onsets, rows)
+            suspected = replay.replayed(made, last, test.onsets, rows)
     elif pinned and evidence.log_m < CALM * core.limit:
         test, suspected = detector.pin(test, evidence.rows[:0]), ()
-    return CoreState(after, known, test, update, history, suspected), evidence
+    history = replay.record(state.history, (after, known, test, suspected), m, seen)
+    return CoreState(after, known, test, update, history, suspected, masked), evidence
+
+
+def mask(core: Core, state: CoreState, suspicion: Suspicion) -> tuple[CoreState, Evidence]:
+    """Mask the named meters from the onset on, by replaying the kept readings without theirs.
+
+    Evidence against other meters stays: it is collected anew. Where the onset is older than the kept
+    readings, the filter before them is freed of the faults, and all onsets begin with them.
+
+    Parameters
+    ----------
+    core, state
+        The core, and the state after a tick.
+    suspicion
+        The explanations after the same tick.
+    """
+    named, history = suspicion.found.named, state.history
+    before, known, test, _ = history.start
+    first = len(history.readings) - int(state.detector.onsets.age[suspicion.row])
+    if first < 0:
+        begun = _joint(core, history.start, suspicion.row)
+        whole = before.full or full.expanded(core.modes, before, known)
+        before = replace(before, full=replay.freed(core.modes, whole, begun, named))
+        test = detector.start(core.modes)
+    test = detector.pin(test, np.zeros(0, np.intp))
+    parts = before, known, test
+    now = CoreState(*parts, None, History((*parts, ())), (), masking.none(core.modes))
+    evidence = Evidence(-inf, np.full(test.capital.shape, -inf))
+    for k, (t, m, seen) in enumerate(history.readings):
+        read = seen if k < first else ~named if seen is None else seen & ~named
+        now, evidence = step(core, now, t, m, read)
+    return replace(now, masked=masking.added(state.masked, named)), evidence
 
 
 def _elsewhere(evidence: Evidence, pinned: list[int]) -> bool:
@@ -282,7 +324,8 @@ def identify(core: Core, state: CoreState, evidence: Evidence) -> Suspicion:
     found = _searched(core, state, rows[0])
     std = found.problems[0].std
     costs = [
-        cost(replace(_problem(core, _joint(core, state, row)), std=std), found.chosen[0]) for row in rows
+        cost(replace(_problem(core, _joint(core, _parts(state), row)), std=std), found.chosen[0])
+        for row in rows
     ]
     best = int(np.argmin(costs))
     if best:
@@ -290,17 +333,22 @@ def identify(core: Core, state: CoreState, evidence: Evidence) -> Suspicion:
     return Suspicion(rows[best], found)
 
 
-def _joint(core: Core, state: CoreState, row: int) -> Joint:
+def _parts(state: CoreState) -> Parts:
+    return state.filter, state.static, state.detector, state.suspected
+
+
+def _joint(core: Core, parts: Parts, row: int) -> Joint:
     """Joint scores of one onset."""
-    for each in state.suspected:
+    _, known, test, suspected = parts
+    for each in suspected:
         if each.row == row:
             return each.joint(core.modes)
-    return signatures.joint(core.modes, state.detector.onsets, state.static, row)
+    return signatures.joint(core.modes, test.onsets, known, row)
 
 
 def _searched(core: Core, state: CoreState, row: int) -> Identification:
     """Explanations since one onset, with and without an unreported change of all loads."""
-    now = _joint(core, state, row)
+    now = _joint(core, _parts(state), row)
     other, ratio = signatures.shocked(core.modes, now, SHOCK)
     charge = ACCUSATIONS * 2.0 * log(core.modes.size)
     return search(_problem(core, now), core.groups, (_problem(core, other), charge - 2.0 * ratio))
@@ -341,6 +389,6 @@ def estimate(core: Core, state: CoreState, suspicion: Suspicion | None = None) -
     # A change of all loads is one more fault for each mode, with an effect on all places.
     W = np.hstack([core.faults.W, np.eye(made.size)])
     effect = np.hstack([core.effect, by.of_w])
-    now = _joint(core, state, suspicion.row)
+    now = _joint(core, _parts(state), suspicion.row)
     T = estimates.moves(made, by, state.filter, now, W, effect)
     return estimates.corrected(plain, T, suspicion.found, (*now.of(W), np.sqrt(SHOCK * made.loads)))

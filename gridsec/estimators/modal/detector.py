@@ -25,8 +25,9 @@ that tick, or for onsets at every n-th tick by the capital n at the last of the 
 Lambda_2``; which one may depend on the readings so far. So M_t - t is a supermartingale, and for every
 stopping time with a finite mean E[M_tau] <= E[tau]. The alarm has M_tau >= gamma, so that ``E[tau] >= gamma``
 ticks. (4) What is not evaluated at a tick counts as zero, which only makes M smaller, whatever decides it.
-With more than `static.FEW` directions the Lambda of members and omnibus are no martingales, but have means of
-at most 1 at each fixed tick.
+With more than `static.FEW` directions, and where readings are missing, Lambda of members and omnibus are no
+martingales, but have means of at most 1 at each fixed tick. Missing readings: exact for powers and busbar;
+for members and omnibus up to the scaling of `signatures` and `omnibus`, exact for white errors.
 
 References
 ----------

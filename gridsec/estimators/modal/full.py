@@ -14,15 +14,16 @@ with the readings n of the tick and ``H = [1, 1]``. The start is the posterior o
 B ages as a whole here, in `filter` without the directions: a difference of h / T_b per tick.
 
 **Scores.** ``s = back' sigma``, the score of the innovation in the modes, is all that the detector takes
-from the readings. For every signature gamma that does not depend on the readings, and for the exact
-information, ``sum gamma' s`` is a martingale and ``exp(y f - I f^2 / 2)`` has the mean 1. So the diagonal
-signatures of the modal filter, which keeps the diagonal of its covariance, stay in use: their error costs
-evidence, and causes no false alarm.
+from the readings. For every signature x that does not depend on the readings, ``y = sum x' s`` is a
+martingale without a fault. ``exp(y f - I f^2 / 2)`` has the mean 1 for ``I = sum x_n' V^-1 x_n``, and at most
+1 for any larger I. So the signatures of complete readings, diagonal in the modes, stay in use. Their error
+costs evidence, and causes no false alarm.
 
 **Return.** After `COMPLETE` ticks with all readings the filter returns to the modes. The condition: their
-diagonal covariance C, enlarged by `MARGIN`, is an upper bound, ``(1 + MARGIN) C + T N T' >= P``.
+diagonal covariance C, enlarged by `MARGIN`, is an upper bound, ``(1 + MARGIN) C + T N T' >= P``, with N of
+the information in the directions divided by ``1 + MARGIN``.
 The readings then have at most the covariance of the model in use. With scores y and information I of that
-model, ``var y <= I`` without a fault, and E exp(y f - I f^2 / 2) <= 1 at each fixed tick.
+model, ``var y <= I`` without a fault, and ``E exp(y f - I f^2 / 2) <= 1`` at each fixed tick.
 
 The cost is O(n t^2) per tick: 0.1 ms for 57 meters, 1 ms for 146.
 
@@ -162,7 +163,9 @@ def updated(modes: Modes, before: Full, h: float, m: Floats, seen: Bools | None)
 
 def _returned(modes: Modes, state: FilterState, full: Full, known: Static) -> tuple[FilterState, Static]:
     """State of the modal filter, if its covariance is an upper bound; else the same, and a later attempt."""
-    t, U, now = modes.size, modes.U, static.current(modes, known)
+    t, U = modes.size, modes.U
+    # The information of complete readings is more than that of theta.
+    now = static.current(modes, replace(known, information=known.information / (1.0 + MARGIN)))
     T = _turned(modes, now).reshape(2, t, -1)
     T = np.vstack([U.T @ T[0], U.T @ T[1]])
     P = np.vstack([U.T @ full.cov[:t], U.T @ full.cov[t:]])

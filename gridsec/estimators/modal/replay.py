@@ -24,7 +24,8 @@ from scipy.linalg import blas
 from gridsec.arrays import Bools, Floats
 from gridsec.estimators.modal import full as exact
 from gridsec.estimators.modal import signatures
-from gridsec.estimators.modal.filter import FilterState, Innovation
+from gridsec.estimators.modal.detector import Detector
+from gridsec.estimators.modal.filter import FilterState, Full, Innovation
 from gridsec.estimators.modal.model import Modes
 from gridsec.estimators.modal.signatures import RAMP_S, Joint, Onsets
 from gridsec.estimators.modal.static import Static
@@ -33,26 +34,6 @@ HALF = 64
 """Ticks from one kept state of the filter to the next; two of them cover the readings that are kept."""
 
 Reading = tuple[float, Floats, Bools | None]
-Parts = tuple[FilterState, Static]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class History:
-    """Last readings, and the filter before them.
-
-    Attributes
-    ----------
-    start
-        Filter and information about the directions before the first reading.
-    readings
-        Time, residuals and members with a reading of each tick, at most ``2 HALF``.
-    middle
-        As ``start``, after the first `HALF` readings; None before.
-    """
-
-    start: Parts = field(repr=False)
-    readings: tuple[Reading, ...] = field(default=(), repr=False)
-    middle: Parts | None = field(default=None, repr=False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,6 +64,28 @@ class Suspected:
         return Joint(self.score @ back, back.T @ self.information @ back, shift, self.level)
 
 
+Parts = tuple[FilterState, Static, Detector, tuple[Suspected, ...]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class History:
+    """Last readings, and the filter before them.
+
+    Attributes
+    ----------
+    start
+        Filter, directions, detector and suspected onsets before the first reading.
+    readings
+        Time, residuals and members with a reading of each tick, at most ``2 HALF``.
+    middle
+        As ``start``, after the first `HALF` readings; None before.
+    """
+
+    start: Parts = field(repr=False)
+    readings: tuple[Reading, ...] = field(default=(), repr=False)
+    middle: Parts | None = field(default=None, repr=False)
+
+
 def record(history: History, after: Parts, m: Floats, seen: Bools | None) -> History:
     """Keep the readings of one tick.
 
@@ -91,7 +94,7 @@ def record(history: History, after: Parts, m: Floats, seen: Bools | None) -> His
     history
         So far.
     after
-        Filter and information about the directions after the tick.
+        Filter, directions, detector and suspected onsets after the tick.
     m, seen : (t,)
         Residuals, and members with a reading.
     """
@@ -113,7 +116,7 @@ def replayed(modes: Modes, history: History, onsets: Onsets, rows: Sequence[int]
     onsets, rows
         The onsets of the detector after the last reading, and the rows.
     """
-    count, (state, known) = len(history.readings), history.start
+    count, (state, known, *_) = len(history.readings), history.start
     t, full = state.t, exact.expanded(modes, state, known) if state.full is None else state.full
     out = {row: _begun(modes, row, bool(onsets.ramp[row])) for row in rows}
     for k, (now, m, seen) in enumerate(history.readings):
@@ -182,3 +185,24 @@ def follow(modes: Modes, before: Suspected, innovation: Innovation, h: float) ->
         score=score,
         information=before.information + weighed @ weighed.T,
     )
+
+
+def freed(modes: Modes, full: Full, joint: Joint, faults: Bools) -> Full:
+    """The exact filter with the amounts of the faults of some members unknown since the onset; O(t^2 f).
+
+    With y, F and X of these faults, the means lose ``X (F + 1)^-1 y`` and P gains ``X (F + 1)^-1 X'``.
+
+    Parameters
+    ----------
+    modes, full
+        The modes, and the exact filter.
+    joint
+        Joint scores of the onset after the same tick.
+    faults : (t,)
+        The members.
+    """
+    W = modes.U.T[:, faults]
+    y, F = joint.of(W)
+    X = np.vstack([modes.back @ joint.shift[0] @ W, modes.back @ joint.shift[1] @ W])
+    gain = np.linalg.solve(F + np.eye(y.size), X.T).T
+    return replace(full, mean=full.mean - (gain @ y).reshape(2, -1), cov=full.cov + gain @ X.T)

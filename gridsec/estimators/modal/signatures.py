@@ -4,20 +4,29 @@ A fault ``f`` of the members begun at onset k adds ``u_t f`` to the residuals, `
 ``u_t = (t - k) / T_r`` for a ramp. Every mode answers by itself, so one number per mode stands for all
 faults:
 
-    gamma = u - rho g_w - rho_b g_b,   g <- (rho g_w, rho_b g_b) + k phi gamma
-    a += gamma nu / v,   i += gamma^2 phi / v,   c += gamma gamma_0 phi / v
+    gamma = u - rho g_w - rho_b g_b,   g <- (rho g_w, rho_b g_b) + k gamma
+    i += gamma^2 / v,   c += gamma gamma_0 / v
 
-with the update (nu, v, k, phi) of `gridsec.estimators.modal.filter` and gamma_0 of
-`gridsec.estimators.modal.static`. For a column W of faults in the modes, ``W = U' F``, and theta integrated
-out, score and information of its amount are
+with the gain and variance (k, v) of `gridsec.estimators.modal.filter` and gamma_0 of
+`gridsec.estimators.modal.static`. For columns W of faults in the modes, ``W = U' F``, the filter with theta
+has the signature ``(gamma - gamma_0 Gamma N Gamma' c) W``, N and c those before the tick. With s, the score
+of the exact innovation,
 
-    y = W' (a - c * Gamma theta),   I = W' (diag(i) - diag(c) Gamma N Gamma' diag(c)) W
+    Y += gamma s - c * Gamma (theta_t - theta_(t-1)),   y = W' Y
+    I = W' (diag(i) - diag(c) Gamma N Gamma' diag(c)) W
 
 and ``exp(y' f - f' I f / 2)`` is the likelihood ratio of the fault against none, given all readings so far.
+``Y = a - c * Gamma theta`` with ``a = sum gamma nu / v``.
 
 With many directions (more than `static.FEW`) I takes only those of the busbar into account. It is then too
 large by a positive semidefinite matrix, and mixtures of likelihood ratios are too small: their expectation
 without a fault is at most 1.
+
+**Missing readings.** s is exact (`gridsec.estimators.modal.full`), and the signature does not depend on
+readings. So y of a column x_t is a martingale with the variance ``sum x_t' E V^-1 E' x_t``, E selecting the
+readings. v is that of complete readings, ``E V^-1 E' <= diag(1 / v)``, so that I is an upper bound and the
+mean of ``exp(y f - I f^2 / 2)`` is at most 1. For single members the bound leaves out the ticks without their
+reading, but for the part of their fault that other members feel: ``read``. That is exact for white errors.
 
 References
 ----------

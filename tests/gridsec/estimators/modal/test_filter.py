@@ -109,7 +109,7 @@ def masks(kind: str, size: int, ticks: int) -> Bools:
 @pytest.mark.parametrize("kind", ["outage", "half", "random", "alternating"])
 @pytest.mark.parametrize("lasting", [0.0, 0.4])
 def test_missing_readings_are_exact(make: object, kind: str, lasting: float) -> None:
-    """Scores of the innovations, means and covariance of the dense filter that leaves readings out."""
+    """Scores of the innovations, means and covariance of the dense filter; intervals that change."""
     tree12 = tree(12, np.random.default_rng(3))
     model = model_of(tree12, lasting=lasting) if make is model_of else make(lasting=lasting)  # type: ignore
     made, source = modes(model), Source(model, np.random.default_rng(5))
@@ -117,9 +117,9 @@ def test_missing_readings_are_exact(make: object, kind: str, lasting: float) -> 
     state, more = modal.start(made, 0.0), static.start(made)
     merged = np.kron([[1, 0, 0], [0, 1, 1]], np.eye(p))
     for k in range(60):
-        m = source.tick()
-        state, more, _ = full.step(made, state, more, float(k), np.where(seen[k], m, 1e3), seen[k])
-        nu, V = dense.step(1.0 if k else 0.0, m, seen[k])
+        m, h = source.tick(), (0.0, 1.0, 30.0, 0.5)[min(k, 1 + k % 3)]
+        state, more, _ = full.step(made, state, more, state.t + h, np.where(seen[k], m, 1e3), seen[k])
+        nu, V = dense.step(h, m, seen[k])
         assert close(more.score, np.linalg.solve(V, nu) @ made.back[seen[k]]) or not nu.size
     assert state.full is not None
     assert close(state.full.mean.ravel(), merged @ dense.mean)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks._residuals import Dense, Source
-from gridsec.estimators.modal import core, replay, signatures
+from gridsec.estimators.modal import core, full, replay, signatures
 from tests.gridsec.estimators.modal.test_core import LIAR, MODEL
 from tests.gridsec.estimators.modal.test_detector import busbar
 from tests.gridsec.estimators.modal.test_filter import masks, mixed, proportional
@@ -76,3 +76,34 @@ def test_readings_are_kept_up_to_twice_the_half() -> None:
         assert count <= 2 * replay.HALF
         assert k < replay.HALF or count >= replay.HALF
         assert state.history.start[0].t == max(0.0, float(k - count))
+
+
+@pytest.mark.parametrize("make", [proportional, busbar, mixed])
+@pytest.mark.parametrize("kind", ["complete", "random"])
+def test_a_freed_filter_equals_the_dense_one_with_unknown_faults(make: object, kind: str) -> None:
+    """Faults N(0, 1) of three members since an onset: means and covariance of w and b."""
+    assert callable(make)
+    model, onset, ticks, p = make(), 12, 40, 12
+    kernel = core.assemble(model, np.zeros((13, 12)), np.ones(12), gamma=1e6)
+    made, faults = kernel.modes, np.isin(np.arange(p), [1, 4, 5])
+    seen = np.ones((ticks, p), dtype=np.bool_) if kind == "complete" else masks(kind, p, ticks)
+    readings = Source(model, np.random.default_rng(5)).ticks(ticks)
+    readings[onset:, faults] += 0.004
+    dense = Dense(model, np.eye(p)[:, faults], 1.0)
+    state, onsets = core.init(kernel, 0.0), signatures.empty(made, 1)
+    for k in range(ticks):
+        state, _ = core.step(kernel, state, float(k), readings[k], seen[k])
+        assert state.update is not None
+        begun = [0] if k == onset else []
+        onsets = signatures.follow(made, onsets, state.update, state.static, 1.0, begun=begun)
+        dense.step(1.0 if k else 0.0, readings[k], seen[k], level=float(k >= onset))
+    if kind == "complete":
+        now, whole = signatures.joint(made, onsets, state.static, 0), None
+    else:
+        now, whole = replay.replayed(made, state.history, onsets, [0])[0].joint(made), state.filter.full
+    whole = full.expanded(made, state.filter, state.static) if whole is None else whole
+    freed = replay.freed(made, whole, now, faults)
+    merged = np.kron([[1, 0, 0], [0, 1, 1]], np.eye(p))
+    mean, cov = merged @ dense.mean[: 3 * p], merged @ dense.cov[: 3 * p, : 3 * p] @ merged.T
+    assert np.allclose(freed.mean.ravel(), mean, atol=1e-6 * np.abs(mean).max())
+    assert np.allclose(freed.cov, cov, atol=1e-6 * np.abs(cov).max())
