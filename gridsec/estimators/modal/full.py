@@ -21,7 +21,7 @@ costs evidence, and causes no false alarm.
 
 **Return.** After `COMPLETE` ticks with all readings the filter returns to the modes. The condition: their
 diagonal covariance C, enlarged by `MARGIN`, is an upper bound, ``(1 + MARGIN) C + T N T' >= P``, with N of
-the information in the directions divided by ``1 + MARGIN``.
+the information in the directions divided by ``(1 + MARGIN)^2``.
 The readings then have at most the covariance of the model in use. With scores y and information I of that
 model, ``var y <= I`` without a fault, and ``E exp(y f - I f^2 / 2) <= 1`` at each fixed tick.
 
@@ -163,20 +163,21 @@ def updated(modes: Modes, before: Full, h: float, m: Floats, seen: Bools | None)
 
 def _returned(modes: Modes, state: FilterState, full: Full, known: Static) -> tuple[FilterState, Static]:
     """State of the modal filter, if its covariance is an upper bound; else the same, and a later attempt."""
-    t, U = modes.size, modes.U
-    # The information of complete readings is more than that of theta.
-    now = static.current(modes, replace(known, information=known.information / (1.0 + MARGIN)))
-    T = _turned(modes, now).reshape(2, t, -1)
+    t, U, known = modes.size, modes.U, static.current(modes, known)
+    T = _turned(modes, known).reshape(2, t, -1)
     T = np.vstack([U.T @ T[0], U.T @ T[1]])
     P = np.vstack([U.T @ full.cov[:t], U.T @ full.cov[t:]])
-    rest = T @ now.cov @ T.T - np.hstack([P[:, :t] @ U, P[:, t:] @ U])
+    P = np.hstack([P[:, :t] @ U, P[:, t:] @ U])
+    # The information of complete readings is more than that of theta.
+    now = static.current(modes, replace(known, information=known.information / (1.0 + MARGIN) ** 2))
+    rest, bound = P - T @ known.cov @ T.T, T @ now.cov @ T.T - P
     w, b = np.arange(t), np.arange(t, 2 * t)
-    cov = -(1.0 + MARGIN) * np.stack([rest[w, w], rest[w, b], rest[b, b]])
-    rest[w, w] += cov[0]
-    rest[w, b] += cov[1]
-    rest[b, w] += cov[1]
-    rest[b, b] += cov[2]
-    _, failed = lapack.dpotrf(rest, lower=True)
+    cov = (1.0 + MARGIN) * np.stack([rest[w, w], rest[w, b], rest[b, b]])
+    bound[w, w] += cov[0]
+    bound[w, b] += cov[1]
+    bound[b, w] += cov[1]
+    bound[b, b] += cov[2]
+    _, failed = lapack.dpotrf(bound, lower=True)
     if failed or not (cov[0] > 0.0).all() or not (cov[0] * cov[2] > cov[1] ** 2).all():
         return replace(state, full=replace(full, complete=0)), known
     mean = full.mean @ U - (T @ now.theta).reshape(2, t)
