@@ -44,6 +44,8 @@ class Full:
         Covariance of (w, b).
     seen : (t,)
         Members with a reading at the last tick.
+    kept : (3, t)
+        As ``cov`` of `FilterState`, of the readings that were there, with its diagonal kept at every tick.
     complete
         Ticks with all readings since the last one without, or since the last attempt to return.
     """
@@ -51,6 +53,7 @@ class Full:
     mean: Floats
     cov: Floats = field(repr=False)
     seen: Bools
+    kept: Floats
     complete: int
 
 
@@ -110,6 +113,8 @@ class Update:
         nu, zero without a meaning where ``score`` is given, and v.
     gain : (2, t)
         k of w and of b.
+    slower : (2, t) or None
+        Gain for the signatures of faults, where readings are or were missing.
     exact
         The exact innovation, where the filter is not that of the modes.
     score : (t,) or None
@@ -122,6 +127,7 @@ class Update:
     innovation: Floats
     variance: Floats
     gain: Floats
+    slower: Floats | None = None
     exact: Innovation | None = None
     score: Floats | None = None
     seen: Bools | None = None
@@ -167,11 +173,7 @@ def step(
         raise InputInvalid([Problem("order", f"t is {t}; it must not be before {state.t}")])
     rho, rho_b = exp(-h / modes.model.time_s), exp(-h / modes.model.fixed_s)
     mean = state.mean * np.array([[rho], [rho_b]])
-    cov = state.cov * np.array([[rho * rho], [rho * rho_b], [rho_b * rho_b]])
-    cov[0] += (1.0 - rho * rho) * modes.varying
-    cov[2] += (1.0 - rho_b * rho_b) * modes.lasting
-    shared = cov[:2] + cov[1:]
-    v = shared[0] + shared[1] + 1.0
+    cov, shared, v = predicted(modes, state.cov, rho, rho_b)
     whole = seen is None or all_of(seen)
     gain, nu = shared / v, np.zeros(v.size)
     if state.full is None:
@@ -182,3 +184,22 @@ def step(
     cov[:2] -= gain * shared[0]
     cov[2] -= gain[1] * shared[1]
     return FilterState(t, mean, cov), Update((rho, rho_b), nu, v, gain, seen=None if whole else seen)
+
+
+def predicted(modes: Modes, cov: Floats, rho: float, rho_b: float) -> tuple[Floats, Floats, Floats]:
+    """Covariance (3, t) before a tick, that of (w, b) with the innovation (2, t), and v (t,).
+
+    Parameters
+    ----------
+    modes
+        The modes.
+    cov : (3, t)
+        Covariance after the last tick.
+    rho, rho_b
+        Factors of the interval.
+    """
+    cov = cov * np.array([[rho * rho], [rho * rho_b], [rho_b * rho_b]])
+    cov[0] += (1.0 - rho * rho) * modes.varying
+    cov[2] += (1.0 - rho_b * rho_b) * modes.lasting
+    shared = cov[:2] + cov[1:]
+    return cov, shared, shared[0] + shared[1] + 1.0

@@ -16,8 +16,8 @@ B ages as a whole here, in `filter` without the directions: a difference of h / 
 **Scores.** ``s = back' sigma``, the score of the innovation in the modes, is all that the detector takes
 from the readings. For every signature x that does not depend on the readings, ``y = sum x' s`` is a
 martingale without a fault. ``exp(y f - I f^2 / 2)`` has the mean 1 for ``I = sum x_n' V^-1 x_n``, and at most
-1 for any larger I. So the signatures of complete readings, diagonal in the modes, stay in use. Their error
-costs evidence, and causes no false alarm.
+1 for any larger I. So signatures that are diagonal in the modes stay in use. Their gain is that of a
+covariance of which the diagonal is kept at every tick; its error costs evidence, and causes no false alarm.
 
 **Return.** After `COMPLETE` ticks with all readings the filter returns to the modes. The condition: their
 diagonal covariance C, enlarged by `MARGIN`, is an upper bound, ``(1 + MARGIN) C + T N T' >= P``, with N of
@@ -93,7 +93,9 @@ def step(  # noqa: PLR0917  # the states of both parts, and one tick
         full, innovation = updated(modes, state.full, t - state.t, m, None if whole else seen)
         sigma, _ = lapack.dtrtrs(innovation.half, innovation.white, lower=True, trans=1)
         score = sigma @ modes.back[innovation.rows]
-        after, update = replace(after, full=full), replace(update, exact=innovation, score=score)
+        kept, slower = _kept(modes, full.kept, update)
+        after = replace(after, full=replace(full, kept=kept))
+        update = replace(update, slower=slower, exact=innovation, score=score)
     return after, static.follow(modes, known, update), update
 
 
@@ -112,7 +114,7 @@ def expanded(modes: Modes, state: FilterState, known: Static) -> Full:
         T = _turned(modes, known)
         cov += T @ static.current(modes, known).cov @ T.T
         mean = mean + (T @ known.theta).reshape(2, -1)
-    return Full(mean, cov, np.ones(modes.size, dtype=np.bool_), 0)
+    return Full(mean, cov, np.ones(modes.size, dtype=np.bool_), state.cov, 0)
 
 
 def _turned(modes: Modes, known: Static) -> Floats:
@@ -143,7 +145,9 @@ def updated(modes: Modes, before: Full, h: float, m: Floats, seen: Bools | None)
     P[t:, t:] += (1.0 - rho_b * rho_b) * modes.covariance_b
     if not rows.size:
         none = np.zeros((2 * t, 0))
-        return Full(mean, P, np.zeros(t, dtype=np.bool_), 0), Innovation(rows, none[:0], none, none[0])
+        return Full(mean, P, np.zeros(t, dtype=np.bool_), before.kept, 0), Innovation(
+            rows, none[:0], none, none[0]
+        )
     nu = m - mean[0] - mean[1]
     if seen is None:
         seen, HP, D, complete = np.ones(t, dtype=np.bool_), P[:t] + P[t:], modes.noise, before.complete + 1
@@ -158,7 +162,28 @@ def updated(modes: Modes, before: Full, h: float, m: Floats, seen: Bools | None)
     white, _ = lapack.dtrtrs(half, nu, lower=True)
     mean += (gain @ white).reshape(2, t)
     P -= gain @ gain.T
-    return Full(mean, P, seen, complete), Innovation(rows, half, gain, white)
+    return Full(mean, P, seen, before.kept, complete), Innovation(rows, half, gain, white)
+
+
+def _kept(modes: Modes, kept: Floats, update: Update) -> tuple[Floats, Floats]:
+    """Diagonal covariance after one tick, (3, t), and its gain, (2, t).
+
+    The gain of complete readings is multiplied by the part of each mode's information that was read,
+    ``1 - diag(U_g' (A_gg)^-1 U_g) / v``, with ``A = U diag(1 / v) U'`` and g the members without a reading.
+    """
+    cov, shared, v = modal.predicted(modes, kept, *update.decay)
+    gain = shared / v
+    if update.seen is not None:
+        g = indices(~update.seen)
+        U = modes.U[g]
+        if g.size == modes.size:
+            return cov, 0.0 * gain
+        half, _ = lapack.dpotrf((U / v) @ U.T, lower=True, clean=True)
+        spread, _ = lapack.dtrtrs(half, U, lower=True)
+        gain = gain * np.clip(1.0 - (spread * spread).sum(axis=0) / v, 0.0, 1.0)
+    cov[:2] -= gain * shared[0]
+    cov[2] -= gain[1] * shared[1]
+    return cov, gain
 
 
 def _returned(modes: Modes, state: FilterState, full: Full, known: Static) -> tuple[FilterState, Static]:

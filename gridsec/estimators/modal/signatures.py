@@ -23,8 +23,8 @@ large by a positive semidefinite matrix, and mixtures of likelihood ratios are t
 without a fault is at most 1.
 
 **Missing readings.** s is exact (`gridsec.estimators.modal.full`), and the signature does not depend on
-readings. So y of a column x_t is a martingale with the variance ``sum x_t' E V^-1 E' x_t``, E selecting the
-readings. v is that of complete readings, ``E V^-1 E' <= diag(1 / v)``, so that I is an upper bound and the
+readings; k is the gain ``slower``. So y of a column x_t is a martingale with the variance ``sum x_t' E V^-1
+E' x_t``, E selecting the readings. v is that of complete readings, ``E V^-1 E' <= diag(1 / v)``, so that I is an upper bound and the
 mean of ``exp(y f - I f^2 / 2)`` is at most 1. For single members the bound leaves out the ticks without their
 reading, but for the part of their fault that other members feel: ``read``. That is exact for white errors.
 
@@ -46,7 +46,7 @@ from scipy.linalg import solve_triangular
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.estimators.modal.filter import Update
 from gridsec.estimators.modal.model import Modes
-from gridsec.estimators.modal.static import FEW, Static, current
+from gridsec.estimators.modal.static import FEW, Static, current, of_busbar
 
 RAMP_S = 600.0
 """Time in which a unit ramp reaches 1, s: the time scale of the loads."""
@@ -157,7 +157,7 @@ def follow(
     information += onsets.information
     cross = weighed * static.gamma
     cross += onsets.cross
-    g += update.gain[:, None, :] * gamma
+    g += (update.gain if update.slower is None else update.slower)[:, None, :] * gamma
     for row in ended:
         g[:, row] = score[row] = information[row] = cross[row] = 0.0
         if read is not None:
@@ -240,10 +240,7 @@ def scores(modes: Modes, onsets: Onsets, static: Static, rows: Ints | slice = _A
         return Scores(score, information, np.zeros((len(score), 0, modes.size)), np.zeros((0, 0)), share)
     cross, G, cov = onsets.cross[rows], modes.directions, static.cov
     if r > FEW:
-        G = G[:, : modes.busbar]
-        cov = np.asarray(
-            np.linalg.inv(np.diag(modes.sign[: modes.busbar]) + (G.T * static.information) @ G), np.float64
-        )
+        G, cov = G[:, : modes.busbar], of_busbar(modes, static)
     return Scores(score, information, cross[:, None, :] * G.T, cov, share)
 
 

@@ -109,8 +109,12 @@ def follow(modes: Modes, before: Static, update: Update) -> Static:
     now = replace(before, signature=g, gamma=gamma, information=information)
     if update.score is not None:
         # The innovation is exact without theta, which says only how a fault would have been learned.
-        turn = before.cov @ ((gamma * update.score) @ modes.directions)
-        cov = current(modes, now).cov if modes.sign.size <= FEW else before.cov
+        cov, turn = before.cov, np.zeros(modes.sign.size)
+        if modes.sign.size <= FEW:
+            cov, turn = current(modes, now).cov, cov @ ((gamma * update.score) @ modes.directions)
+        elif modes.busbar:
+            G = modes.directions[:, : modes.busbar]
+            turn[: modes.busbar] = of_busbar(modes, before) @ ((gamma * update.score) @ G)
         return replace(
             now, cov=cov, theta=before.theta + turn, score=update.score, moved=modes.directions @ turn
         )
@@ -155,6 +159,12 @@ def current(modes: Modes, now: Static) -> Static:
         return replace(now, cov=np.array([[1.0 / (modes.sign[0] + one @ (now.information * one))]]))
     cov = np.asarray(np.linalg.inv(np.diag(modes.sign) + (G.T * now.information) @ G), np.float64)
     return replace(now, cov=cov)
+
+
+def of_busbar(modes: Modes, now: Static) -> Floats:
+    """N of this tick with the directions of the busbar alone, (b, b)."""
+    sign, G = modes.sign[: modes.busbar], modes.directions[:, : modes.busbar]
+    return np.asarray(np.linalg.inv(np.diag(sign) + (G.T * now.information) @ G), np.float64)
 
 
 def restored(modes: Modes, now: Static) -> Static:
