@@ -93,12 +93,15 @@ class Innovation:
         ``P H' L'^-1``; the means of (w, b) move by ``gain white``.
     white : (n,)
         ``L^-1 nu``.
+    precision : (t,)
+        Diagonal of ``V^-1``; 0 without a reading.
     """
 
     rows: Ints
     half: Floats = field(repr=False)
     gain: Floats = field(repr=False)
     white: Floats = field(repr=False)
+    precision: Floats = field(repr=False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

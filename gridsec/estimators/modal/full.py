@@ -146,7 +146,7 @@ def updated(modes: Modes, before: Full, h: float, m: Floats, seen: Bools | None)
     if not rows.size:
         none = np.zeros((2 * t, 0))
         return Full(mean, P, np.zeros(t, dtype=np.bool_), before.kept, 0), Innovation(
-            rows, none[:0], none, none[0]
+            rows, none[:0], none, none[0], np.zeros(t)
         )
     nu = m - mean[0] - mean[1]
     if seen is None:
@@ -162,7 +162,10 @@ def updated(modes: Modes, before: Full, h: float, m: Floats, seen: Bools | None)
     white, _ = lapack.dtrtrs(half, nu, lower=True)
     mean += (gain @ white).reshape(2, t)
     P -= gain @ gain.T
-    return Full(mean, P, seen, before.kept, complete), Innovation(rows, half, gain, white)
+    inverse, _ = lapack.dtrtri(half, lower=True)
+    precision = np.zeros(t)
+    precision[rows] = (inverse * inverse).sum(axis=0)
+    return Full(mean, P, seen, before.kept, complete), Innovation(rows, half, gain, white, precision)
 
 
 def _kept(modes: Modes, kept: Floats, update: Update) -> tuple[Floats, Floats]:

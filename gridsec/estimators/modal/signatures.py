@@ -24,9 +24,10 @@ without a fault is at most 1.
 
 **Missing readings.** s is exact (`gridsec.estimators.modal.full`), and the signature does not depend on
 readings; k is the gain ``slower``. So y of a column x_t is a martingale with the variance ``sum x_t' E V^-1
-E' x_t``, E selecting the readings. v is that of complete readings, ``E V^-1 E' <= diag(1 / v)``, so that I is an upper bound and the
-mean of ``exp(y f - I f^2 / 2)`` is at most 1. For single members the bound leaves out the ticks without their
-reading, but for the part of their fault that other members feel: ``read``. That is exact for white errors.
+E' x_t``, E selecting the readings. v is that of complete readings, ``E V^-1 E' <= diag(1 / v)``. So I is an
+upper bound, and the mean of ``exp(y f - I f^2 / 2)`` is at most 1. For single members the bound is lowered,
+``read``: the part of a fault that the member itself feels counts with the exact ``(V^-1)_jj`` in place of
+``(U diag(1 / v) U')_jj``, 0 without a reading. That is exact for white errors.
 
 References
 ----------
@@ -170,14 +171,13 @@ def _read(modes: Modes, onsets: Onsets, update: Update, gamma: Floats) -> Floats
 
     Only the effect of a member's fault on its own reading is lost with that reading.
     """
-    if update.score is None:
+    if update.exact is None:
         return None
     felt = gamma / np.sqrt(update.variance)
     out = (felt * felt) @ modes.squares.T
-    if update.seen is not None:
-        white = modes.model.white[modes.at]
-        own = (felt @ modes.squares.T) ** 2 * white
-        out -= np.where(update.seen, 0.0, np.minimum(own, out))
+    white = modes.model.white[modes.at]
+    own = np.minimum((felt @ modes.squares.T) ** 2 * white, out)
+    out -= own * (1.0 - np.minimum(update.exact.precision / (modes.squares @ (1.0 / update.variance)), 1.0))
     out += onsets.information @ modes.squares.T if onsets.read is None else onsets.read
     return np.asarray(out)
 
