@@ -106,7 +106,7 @@ def follow(modes: Modes, before: Static, update: Update) -> Static:
     gamma = 1.0 - g[0] - g[1]
     g += update.gain * gamma
     information = before.information + gamma * gamma / update.variance
-    now = replace(before, signature=g, gamma=gamma, information=information)
+    now = replace(before, information=information)
     if update.score is not None:
         # The innovation is exact without theta, which says only how a fault would have been learned.
         cov, turn = before.cov, np.zeros(modes.sign.size)
@@ -115,28 +115,26 @@ def follow(modes: Modes, before: Static, update: Update) -> Static:
         elif modes.busbar:
             G = modes.directions[:, : modes.busbar]
             turn[: modes.busbar] = of_busbar(modes, before) @ ((gamma * update.score) @ G)
-        return replace(
-            now, cov=cov, theta=before.theta + turn, score=update.score, moved=modes.directions @ turn
-        )
+        moved, theta = modes.directions @ turn, before.theta + turn
+        return Static(g, gamma, before.pull, information, theta, cov, update.score, moved)
     weighed = update.innovation / update.variance
-    now = _learned(modes, replace(now, pull=before.pull + (gamma * weighed) @ modes.directions))
-    offset = modes.directions @ now.theta
-    moved = offset - modes.directions @ before.theta
-    return replace(now, score=weighed - gamma * offset / update.variance, moved=moved)
+    pull = before.pull + (gamma * weighed) @ modes.directions
+    theta, cov = _learned(modes, now, pull)
+    score = weighed - gamma * (modes.directions @ theta) / update.variance
+    return Static(g, gamma, pull, information, theta, cov, score, modes.directions @ (theta - before.theta))
 
 
-def _learned(modes: Modes, now: Static) -> Static:
-    """The same with theta of this tick."""
+def _learned(modes: Modes, now: Static, pull: Floats) -> tuple[Floats, Floats]:
+    """Theta of this tick, (r,), and N of this tick or an earlier one, (r, r)."""
     if modes.sign.size > FEW:
-        right, theta = now.pull, now.theta
-        near = CLOSE * float(np.abs(right).max(initial=0.0))
+        theta, near = now.theta, CLOSE * float(np.abs(pull).max(initial=0.0))
         for _ in range(REFINEMENTS):
-            rest = right - _precision_times(modes, now, theta)
+            rest = pull - _precision_times(modes, now, theta)
             if float(np.abs(rest).max()) <= near:
-                return replace(now, theta=theta)
+                return theta, now.cov
             theta = theta + now.cov @ rest
-    now = current(modes, now)
-    return replace(now, theta=now.cov @ now.pull)
+    cov = _covariance(modes, now.information)
+    return cov @ pull, cov
 
 
 def _precision_times(modes: Modes, now: Static, theta: Floats) -> Floats:
@@ -153,12 +151,16 @@ def current(modes: Modes, now: Static) -> Static:
     modes, now
         The modes, and the information so far.
     """
+    return replace(now, cov=_covariance(modes, now.information))
+
+
+def _covariance(modes: Modes, information: Floats) -> Floats:
+    """N by the information, (r, r)."""
     G = modes.directions
     if modes.sign.size == 1:
         one = G[:, 0]
-        return replace(now, cov=np.array([[1.0 / (modes.sign[0] + one @ (now.information * one))]]))
-    cov = np.asarray(np.linalg.inv(np.diag(modes.sign) + (G.T * now.information) @ G), np.float64)
-    return replace(now, cov=cov)
+        return np.array([[1.0 / (modes.sign[0] + one @ (information * one))]])
+    return np.asarray(np.linalg.inv(np.diag(modes.sign) + (G.T * information) @ G), np.float64)
 
 
 def of_busbar(modes: Modes, now: Static) -> Floats:
@@ -176,14 +178,3 @@ def restored(modes: Modes, now: Static) -> Static:
         The modes, and the information so far.
     """
     return replace(now, pull=_precision_times(modes, now, now.theta)) if modes.sign.size else now
-
-
-def offset(modes: Modes, static: Static) -> Floats:
-    """Posterior mean of ``Gamma theta`` in the modes, (t,).
-
-    Parameters
-    ----------
-    modes, static
-        The modes, and the information so far.
-    """
-    return modes.directions @ static.theta

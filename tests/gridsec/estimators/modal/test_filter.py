@@ -78,16 +78,16 @@ def test_directions_make_it_exact_for_every_b(make: object, lasting: float, fixe
         h = 0.0 if k == 0 else float(random.choice([1.0, 60.0]))
         t += h
         m = 0.01 * random.standard_normal(made.size)
-        known, cov = static.offset(made, more), more.cov
+        known, cov = made.directions @ more.theta, more.cov
         state, more, update = full.step(made, state, more, t, m)
         nu, V = dense.step(h, m)
         assert close(made.back @ (update.innovation - more.gamma * known), nu)
         if made.sign.size <= static.FEW:
             side = made.back @ (more.gamma[:, None] * made.directions)
             assert close((made.back * update.variance) @ made.back.T + side @ cov @ side.T, V)
-    lasts = state.mean[1] + (1.0 - more.signature[1]) * static.offset(made, more)
+    lasts = state.mean[1] + (1.0 - more.signature[1]) * (made.directions @ more.theta)
     assert close(made.back @ lasts, dense.lasts)
-    varies = state.mean[0] - more.signature[0] * static.offset(made, more)
+    varies = state.mean[0] - more.signature[0] * (made.directions @ more.theta)
     assert close(made.back @ varies, dense.varies, dense.mean)
 
 
