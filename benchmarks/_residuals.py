@@ -217,3 +217,92 @@ class Dense:
         self.cov = self.cov - K @ V @ K.T
         self.cov = 0.5 * (self.cov + self.cov.T)
         return nu, V
+
+
+PATTERNS = ("complete", "in turn", "twice", "half", "10 %", "50 %", "alternating")
+"""Patterns of missing readings; see `present`."""
+
+
+def present(pattern: str, meters: int, ticks: int, random: np.random.Generator) -> Bools:
+    """Meters with a reading at each tick, (ticks, p).
+
+    Parameters
+    ----------
+    pattern
+        "in turn": 30 % are silent for 60 ticks each; "twice": 30 % for 600 ticks, from tick 60 and from the
+        middle on; "half": half are always silent; "10 %" and "50 %": missing at random; "alternating": each
+        meter reports at every fourth tick.
+    meters, ticks
+        Numbers of meters and ticks.
+    random
+        Chooses everything random.
+    """
+    seen, some = np.ones((ticks, meters), dtype=np.bool_), round(0.3 * meters)
+    if pattern == "in turn":
+        order = random.permutation(meters)
+        for k in range(0, ticks, 60):
+            seen[k : k + 60, order[(k // 60 * some + np.arange(some)) % meters]] = False
+    elif pattern == "twice":
+        for k in (60, ticks // 2):
+            seen[k : k + 600, random.permutation(meters)[:some]] = False
+    elif pattern == "half":
+        seen[:, random.permutation(meters)[: meters // 2]] = False
+    elif pattern in {"10 %", "50 %"}:
+        seen = random.random((ticks, meters)) >= float(pattern[:-2]) / 100.0
+    elif pattern == "alternating":
+        seen = (np.arange(ticks)[:, None] + random.integers(0, 4, meters)) % 4 == 0
+    return seen
+
+
+class KnownStep:
+    """Likelihood ratio of a step of known size at a known meter, by the dense filter, for every onset.
+
+    Parameters
+    ----------
+    model
+        The model; errors that last are constant.
+    meter, size
+        The meter, and the step, squared pu.
+    onsets
+        Largest number of onsets.
+    """
+
+    def __init__(self, model: ResidualModel, meter: int, size: float, onsets: int) -> None:
+        at = np.arange(model.meters.size)
+        self.p, self.model, self.meter, self.size, self.count = at.size, model, meter, size, 0
+        self.w, self.D = (1.0 - model.lasting) * model.loads(at), model.noise(at)
+        self.P = np.zeros((2 * self.p, 2 * self.p))
+        self.P[: self.p, : self.p], self.P[self.p :, self.p :] = self.w, model.static(at)
+        self.x, self.X = np.zeros(2 * self.p), np.zeros((2 * self.p, onsets))
+        self.y, self.F = np.zeros(onsets), np.zeros(onsets)
+
+    def step(self, h: float, m: Floats, seen: Bools, begin: bool) -> float:
+        """One tick; the largest log likelihood ratio.
+
+        Parameters
+        ----------
+        h
+            Interval, s.
+        m, seen : (p,)
+            Residuals, and meters with a reading.
+        begin
+            An onset begins at this tick.
+        """
+        p, rho = self.p, exp(-h / self.model.time_s)
+        self.count += begin
+        k, R = self.count, np.repeat([rho, 1.0], p)
+        self.x, self.P = R * self.x, self.P * np.outer(R, R)
+        self.X *= R[:, None]
+        self.P[:p, :p] += (1.0 - rho * rho) * self.w
+        n = np.flatnonzero(seen)
+        HP = self.P[n] + self.P[p + n]
+        V = HP[:, n] + HP[:, p + n] + self.D[np.ix_(n, n)]
+        nu = (m - self.x[:p] - self.x[p:])[n]
+        gamma = (np.equal.outer(np.arange(p), np.full(k, self.meter)) - self.X[:p, :k] - self.X[p:, :k])[n]
+        solved = np.linalg.solve(V, np.column_stack([nu, gamma, HP]))
+        self.y[:k] += gamma.T @ solved[:, 0]
+        self.F[:k] += (gamma * solved[:, 1 : k + 1]).sum(axis=0)
+        self.x += HP.T @ solved[:, 0]
+        self.X[:, :k] += HP.T @ solved[:, 1 : k + 1]
+        self.P -= HP.T @ solved[:, k + 1 :]
+        return float((self.size * self.y - 0.5 * self.size**2 * self.F)[: max(k, 1)].max())

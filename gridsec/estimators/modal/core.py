@@ -2,8 +2,9 @@
 
     design(front) -> Core
     init(core, t) -> CoreState
-    step(core, state, t, m, seen) -> (CoreState, Evidence)      every tick
+    step(core, state, t, m, seen) -> (CoreState, Evidence)      every tick, releases masked meters
     identify(core, state, evidence) -> Suspicion                where `alarmed`
+    mask(core, state, suspicion) -> (CoreState, Evidence)       where meters are named
     estimate(core, state, suspicion) -> Estimated               where asked for
 
 The front end is that of `gridsec.estimators.sequential`: cleaning of frames, observer of the inverters,
@@ -19,15 +20,17 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import InputInvalid, Problem
-from gridsec.estimators.modal import detector, signatures, static
+from gridsec.estimators.modal import detector, full, masking, replay, signatures, static
 from gridsec.estimators.modal import estimate as estimates
 from gridsec.estimators.modal import filter as modal
 from gridsec.estimators.modal.detector import SIZE, Detector, Evidence
 from gridsec.estimators.modal.estimate import Estimated, Estimator
 from gridsec.estimators.modal.filter import FilterState, Update
+from gridsec.estimators.modal.masking import Masked
 from gridsec.estimators.modal.model import Modes, ResidualModel, modes, residual_model
+from gridsec.estimators.modal.replay import History, Parts, Suspected
 from gridsec.estimators.modal.search import Identification, SearchProblem, cost, groups, search
-from gridsec.estimators.modal.signatures import Columns
+from gridsec.estimators.modal.signatures import Columns, Joint
 from gridsec.estimators.modal.static import Static
 from gridsec.estimators.sequential.design import YEAR_S, SequentialDesign
 from gridsec.estimators.sequential.state import SequentialState
@@ -43,6 +46,8 @@ SHOCK = 10.0
 """Variance of an unreported change of all loads, in those of the loads, 1: 2 kW where 0.6 kW is stated."""
 CONNECTION = 0.1
 """Power of a customer where the files are not asked, pu of the feeder's base: 10 kW at 100 kVA."""
+FARTHER = 5.0
+"""Log M of an onset above that of all pinned ones from which on it replaces them, 1; a replay takes time."""
 CALM = 0.5
 """Part of the limit of log M below which suspected onsets are given up, 1."""
 
@@ -91,12 +96,21 @@ class CoreState:
         The states of the parts.
     update
         The filter's last step; None before the first.
+    history
+        Last readings.
+    suspected
+        Exact scores of the pinned onsets, where the filter has a full covariance.
+    masked
+        Masked meters.
     """
 
     filter: FilterState
     static: Static
     detector: Detector
     update: Update | None
+    history: History
+    suspected: tuple[Suspected, ...]
+    masked: Masked
 
 
 def assemble(model: ResidualModel, powers: Floats, most: Floats, *, gamma: float) -> Core:
@@ -176,7 +190,8 @@ def init(core: Core, t: float) -> CoreState:
         Time of the first reading, s.
     """
     made = core.modes
-    return CoreState(modal.start(made, t), static.start(made), detector.start(made), None)
+    parts = modal.start(made, t), static.start(made), detector.start(made)
+    return CoreState(*parts, None, History((*parts, ())), (), masking.none(made))
 
 
 def step(
@@ -200,18 +215,68 @@ def step(
     ValueError
         If t is before the last reading or not a number.
     """
-    h = t - state.filter.t
-    after, update = modal.step(core.modes, state.filter, t, m, seen)
-    known = static.follow(core.modes, state.static, update)
+    made, h, masked, read = core.modes, t - state.filter.t, state.masked, seen
+    if masked.meters.any():
+        seen = ~masked.meters if read is None else read & ~masked.meters
+    pinned = np.flatnonzero(state.detector.pinned).tolist()
+    after, known, update = full.step(made, state.filter, state.static, t, m, seen, stay=bool(pinned))
     test, evidence = detector.step(
-        core.modes, core.faults, state.detector, update, known, h=h, alert=CALM * core.limit
+        made, core.faults, state.detector, update, known, h=h, alert=CALM * core.limit
     )
-    pinned = bool(test.pinned.any())
-    if evidence.log_m >= core.limit and not pinned:
+    if masked.meters.any() and after.full is not None:
+        masked = masking.follow(made, masked, after.full, m, read)
+    suspected = state.suspected
+    if update.exact is not None:
+        if pinned and not suspected:
+            suspected = replay.carried(made, state.detector.onsets, state.static, pinned)
+        suspected = tuple(replay.follow(made, each, update.exact, h) for each in suspected)
+    if evidence.log_m >= core.limit and (not pinned or (suspected and _elsewhere(evidence, pinned))):
         test = detector.pin(test, evidence.rows)
+        if update.exact is not None:
+            last = replay.record(state.history, (after, known, test, ()), m, seen)
+            rows = np.flatnonzero(test.pinned).tolist()
+            suspected = replay.replayed(made, last, test.onsets, rows)
     elif pinned and evidence.log_m < CALM * core.limit:
-        test = detector.pin(test, evidence.rows[:0])
-    return CoreState(after, known, test, update), evidence
+        test, suspected = detector.pin(test, evidence.rows[:0]), ()
+    history = replay.record(state.history, (after, known, test, suspected), m, seen)
+    return CoreState(after, known, test, update, history, suspected, masked), evidence
+
+
+def mask(core: Core, state: CoreState, suspicion: Suspicion) -> tuple[CoreState, Evidence]:
+    """Mask the named meters from the onset on, by replaying the kept readings without theirs.
+
+    Evidence against other meters stays: it is collected anew. Where the onset is older than the kept
+    readings, the filter before them is freed of the faults, and all onsets begin with them.
+
+    Parameters
+    ----------
+    core, state
+        The core, and the state after a tick.
+    suspicion
+        The explanations after the same tick.
+    """
+    named, history = suspicion.found.named, state.history
+    before, known, test, _ = history.start
+    first = len(history.readings) - int(state.detector.onsets.age[suspicion.row])
+    if first < 0:
+        begun = _joint(core, history.start, suspicion.row)
+        whole = before.full or full.expanded(core.modes, before, known)
+        before = replace(before, full=replay.freed(core.modes, whole, begun, named))
+        test = detector.start(core.modes)
+    test = detector.pin(test, np.zeros(0, np.intp))
+    parts = before, known, test
+    now = CoreState(*parts, None, History((*parts, ())), (), masking.none(core.modes))
+    evidence = Evidence(-inf, np.full(test.capital.shape, -inf))
+    for k, (t, m, seen) in enumerate(history.readings):
+        read = seen if k < first else ~named if seen is None else seen & ~named
+        now, evidence = step(core, now, t, m, read)
+    return replace(now, masked=masking.added(state.masked, named)), evidence
+
+
+def _elsewhere(evidence: Evidence, pinned: list[int]) -> bool:
+    """Another onset is far likelier than the pinned ones."""
+    by_row = evidence.by_row.max(axis=0)
+    return bool(by_row.max() > by_row[pinned].max() + FARTHER)
 
 
 def alarmed(core: Core, evidence: Evidence) -> bool:
@@ -245,7 +310,8 @@ def identify(core: Core, state: CoreState, evidence: Evidence) -> Suspicion:
     """Sets of faults that explain the readings, since the onset that suits them best.
 
     The search is made at the likeliest onset. The costs of what it finds are then compared at the pinned
-    onsets, and where another one is cheaper, the search is made there.
+    onsets, and where another one is cheaper, the search is made there. Where readings are missing, only the
+    pinned onsets are searched, with exact scores.
 
     Parameters
     ----------
@@ -253,31 +319,45 @@ def identify(core: Core, state: CoreState, evidence: Evidence) -> Suspicion:
         The core, the state after a tick, and the answer of that tick.
     """
     test = state.detector
-    rows = [int(evidence.rows[0]), *np.flatnonzero(test.pinned & test.onsets.used).tolist()]
-    rows = list(dict.fromkeys(rows))
+    rows = [] if state.suspected else [int(evidence.rows[0])]
+    rows = list(dict.fromkeys(rows + np.flatnonzero(test.pinned & test.onsets.used).tolist()))
     found = _searched(core, state, rows[0])
     std = found.problems[0].std
-    costs = [cost(replace(_problem(core, state, row), std=std), found.chosen[0]) for row in rows]
+    costs = [
+        cost(replace(_problem(core, _joint(core, _parts(state), row)), std=std), found.chosen[0])
+        for row in rows
+    ]
     best = int(np.argmin(costs))
     if best:
         found = _searched(core, state, rows[best])
     return Suspicion(rows[best], found)
 
 
+def _parts(state: CoreState) -> Parts:
+    return state.filter, state.static, state.detector, state.suspected
+
+
+def _joint(core: Core, parts: Parts, row: int) -> Joint:
+    """Joint scores of one onset."""
+    _, known, test, suspected = parts
+    for each in suspected:
+        if each.row == row:
+            return each.joint(core.modes)
+    return signatures.joint(core.modes, test.onsets, known, row)
+
+
 def _searched(core: Core, state: CoreState, row: int) -> Identification:
     """Explanations since one onset, with and without an unreported change of all loads."""
-    test, plain = state.detector, _problem(core, state, row)
-    now, ratio = signatures.shocked(core.modes, test.onsets, state.static, row, SHOCK)
-    y, F = now.matrix(0, core.faults.W)
+    now = _joint(core, _parts(state), row)
+    other, ratio = signatures.shocked(core.modes, now, SHOCK)
     charge = ACCUSATIONS * 2.0 * log(core.modes.size)
-    return search(plain, core.groups, (replace(plain, y=y, F=F), charge - 2.0 * ratio))
+    return search(_problem(core, now), core.groups, (_problem(core, other), charge - 2.0 * ratio))
 
 
-def _problem(core: Core, state: CoreState, row: int) -> SearchProblem:
+def _problem(core: Core, joint: Joint) -> SearchProblem:
     """Scores, information and charges of all faults at one onset."""
     faults, p = core.faults, core.modes.size
-    now = signatures.scores(core.modes, state.detector.onsets, state.static, np.array([row]))
-    y, F = now.matrix(0, faults.W)
+    y, F = joint.of(faults.W)
     accusation = 2.0 * log(p)
     charge = np.zeros(y.size)
     charge[p:] = accusation
@@ -306,11 +386,9 @@ def estimate(core: Core, state: CoreState, suspicion: Suspicion | None = None) -
     plain = estimates.honest(made, by, state.filter, state.static, state.update)
     if suspicion is None:
         return plain
-    onsets = state.detector.onsets
     # A change of all loads is one more fault for each mode, with an effect on all places.
     W = np.hstack([core.faults.W, np.eye(made.size)])
     effect = np.hstack([core.effect, by.of_w])
-    T = estimates.moves(made, by, state.static, onsets, suspicion.row, W, effect)
-    now = signatures.scores(made, onsets, state.static, np.array([suspicion.row]))
-    joint = (*now.matrix(0, W), np.sqrt(SHOCK * made.loads))
-    return estimates.corrected(plain, T, suspicion.found, joint)
+    now = _joint(core, _parts(state), suspicion.row)
+    T = estimates.moves(made, by, state.filter, now, W, effect)
+    return estimates.corrected(plain, T, suspicion.found, (*now.of(W), np.sqrt(SHOCK * made.loads)))

@@ -25,8 +25,9 @@ that tick, or for onsets at every n-th tick by the capital n at the last of the 
 Lambda_2``; which one may depend on the readings so far. So M_t - t is a supermartingale, and for every
 stopping time with a finite mean E[M_tau] <= E[tau]. The alarm has M_tau >= gamma, so that ``E[tau] >= gamma``
 ticks. (4) What is not evaluated at a tick counts as zero, which only makes M smaller, whatever decides it.
-With more than `static.FEW` directions the Lambda of members and omnibus are no martingales, but have means of
-at most 1 at each fixed tick.
+With more than `static.FEW` directions, and where readings are missing, Lambda of members and omnibus are no
+martingales, but have means of at most 1 at each fixed tick. Missing readings: exact for powers and busbar;
+for members and omnibus up to the scaling of `signatures` and `omnibus`, exact for white errors.
 
 References
 ----------
@@ -71,6 +72,7 @@ OLDEST = 14400
 PINS = 3
 """Onsets that are kept while they are suspected. The likeliest one at the alarm may be a tick or two off."""
 
+_TINY = float(np.finfo(np.float64).tiny)
 _LOG_WEIGHTS = np.log(np.array(WEIGHTS))[:, None]
 # One row more: a row that is given back is free at the next tick only.
 _STEPS = STEP_ROWS + EVERY + PINS + 1
@@ -189,9 +191,9 @@ def step(
     if (ticks - 1) % RAMP_EVERY == 0:
         begun.append(_STEPS + int(free[_STEPS:].argmin()))
         capital[:, begun[1]] = log(RAMPS * RAMP_EVERY)
-    onsets = signatures.follow(before.onsets, update, static, h, begun=begun, ended=ended)
+    onsets = signatures.follow(modes, before.onsets, update, static, h, begun=begun, ended=ended)
     full, none = ticks % EVERY == 0, np.full(capital.shape, -inf)
-    if not (full or before.log_m >= alert or before.pinned.any() or _stands_out(modes, update)):
+    if not (full or before.log_m >= alert or before.pinned.any() or _stands_out(modes, update, static)):
         return Detector(onsets, capital, ticks, None, before.pinned, before.log_m), Evidence(-inf, none)
     young = (onsets.age <= YOUNG) & ~onsets.ramp
     due = onsets.used if full else onsets.used & (young | before.pinned)
@@ -208,12 +210,12 @@ def step(
     return test, Evidence(log_m, by_row)
 
 
-def _stands_out(modes: Modes, update: Update) -> bool:
+def _stands_out(modes: Modes, update: Update, static: Static) -> bool:
     """A member, or all of them together, stand out in one innovation."""
-    weighed = update.innovation / update.variance
-    y, F = modes.U @ weighed, modes.squares @ update.precision
-    most = modes.size + sqrt(2.0 * JUMP * modes.size)
-    return bool((y * y > JUMP * F).any() or update.innovation @ weighed > most)
+    score, v = static.score, update.variance
+    y, F = modes.U @ score, modes.squares @ (1.0 / v)
+    count = modes.size if update.seen is None else int(np.count_nonzero(update.seen))
+    return bool((y * y > JUMP * F).any() or score @ (v * score) > count + sqrt(2.0 * JUMP * count))
 
 
 def log_ratios(columns: Columns, modes: Modes, now: Scores, full: bool) -> Floats:
@@ -269,6 +271,12 @@ def _log_mean(each: Floats) -> Floats:
 def omnibus(now: Scores, s2: float) -> Floats:
     """Log Lambda of f ~ N(0, s2 I) in the modes, (k,).
 
+    Where readings are missing, the largest share of the members bounds the information. The mean share over
+    the largest is then the weight of each mode in the determinant. For one member with the variance r of its
+    score, in units of that bound, and ``u = s2 i / (1 + s2 i)``, the mean of Lambda is ``(1 - r u)^(-1/2)
+    (1 - u)^(r/2) <= 1``, since ``-log(1 - r u)`` is convex in r. Modes of different information are scaled
+    alike: that is exact for white errors.
+
     Parameters
     ----------
     now
@@ -276,15 +284,19 @@ def omnibus(now: Scores, s2: float) -> Floats:
     s2
         Prior variance in units of the white variance.
     """
-    more = 1.0 + s2 * now.information
-    logs = np.log(more).sum(axis=1)
+    i, side, count = now.information, now.side, 1.0
+    if now.share is not None:
+        peak = now.share.max(axis=1)
+        count = now.share.mean(axis=1) / np.maximum(peak, _TINY)
+        i, side = peak[:, None] * i, np.sqrt(peak)[:, None, None] * side
+    more = 1.0 + s2 * i
     A = s2 / more
     A *= now.score
-    out = np.einsum("kt,kt->k", A, now.score) - logs
+    out = np.einsum("kt,kt->k", A, now.score) - count * np.log(more).sum(axis=1)
     if not now.cov.size:
         return np.asarray(0.5 * out)
-    pull = np.einsum("krt,kt->kr", now.side, A)
-    inner = (now.side * (s2 / more)[:, None, :]) @ now.side.transpose(0, 2, 1)
+    pull = np.einsum("krt,kt->kr", side, A)
+    inner = (side * (s2 / more)[:, None, :]) @ side.transpose(0, 2, 1)
     # det(I - N X'AX) and (N^-1 - X'AX)^-1 = (I - N X'AX)^-1 N.
     rest = np.eye(len(now.cov)) - now.cov @ inner
     if len(now.cov) == 1:

@@ -26,11 +26,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats
-from gridsec.estimators.modal.filter import FilterState, Update
+from gridsec.arrays import Bools, Floats, indices, submatrix
+from gridsec.estimators.modal.filter import FilterState, Full, Update
 from gridsec.estimators.modal.model import Modes
 from gridsec.estimators.modal.search import Identification
-from gridsec.estimators.modal.signatures import Onsets
+from gridsec.estimators.modal.signatures import Joint
 from gridsec.estimators.modal.static import Static
 
 
@@ -99,6 +99,8 @@ def honest(modes: Modes, made: Estimator, state: FilterState, static: Static, up
     state, static, update
         The filter after the last tick, the information about the directions, and the filter's last step.
     """
+    if state.full is not None:
+        return _full(modes, made, state.full, static.score)
     w, b = state.mean
     e = update.innovation / update.variance
     by_w, by_b = made.of_w - made.of_e, made.of_b - made.of_e
@@ -112,6 +114,17 @@ def honest(modes: Modes, made: Estimator, state: FilterState, static: Static, up
     return Estimated(mean, np.maximum(variance, 0.0))
 
 
+def _full(modes: Modes, made: Estimator, full: Full, score: Floats) -> Estimated:
+    """Estimate by the full covariance: the flicker is seen by the members with a reading only."""
+    model, by_e = modes.model, _flicker(modes, full)
+    by_w, by_b = made.of_w @ modes.U.T, made.of_b @ modes.U.T
+    mean = by_w @ full.mean[0] + by_b @ full.mean[1] + made.of_e @ score
+    read = ((by_e @ model.phases(modes.at)) * model.busbar_of).sum(axis=1)
+    unread = (made.of_e**2).sum(axis=1) - model.flicker * read
+    by = np.hstack([by_w - by_e, by_b - by_e])
+    return Estimated(mean, np.maximum(((by @ full.cov) * by).sum(axis=1) + made.rest + unread, 0.0))
+
+
 def _theta(modes: Modes, made: Estimator, static: Static) -> Floats:
     """Change of the estimate per amount of each direction, (n, r)."""
     g_w, g_b = static.signature
@@ -119,30 +132,38 @@ def _theta(modes: Modes, made: Estimator, static: Static) -> Floats:
     return np.asarray(by @ modes.directions)
 
 
-def moves(  # noqa: PLR0917  # the states of all parts, and the faults
-    modes: Modes, made: Estimator, static: Static, onsets: Onsets, row: int, W: Floats, effect: Floats
+def moves(  # noqa: PLR0917  # the state, and the faults
+    modes: Modes, made: Estimator, state: FilterState, joint: Joint, W: Floats, effect: Floats
 ) -> Floats:
     """Change T of the honest estimate per amount of each fault at one onset, (n, q).
 
     Parameters
     ----------
-    modes, made, static
-        The modes, the estimator of them, and the information about the directions.
-    onsets, row
-        The onsets, and the row.
+    modes, made, state
+        The modes, the estimator of them, and the filter after the last tick.
+    joint
+        Joint scores of the onset.
     W : (t, q)
         Columns of the faults in the modes.
     effect : (n, q)
         Change of the model at each place by the faults: zero for meters.
     """
-    g_w, g_b = onsets.signature[:, row]
-    felt = onsets.level[row] - g_w - g_b
-    by = made.of_w * g_w + made.of_b * g_b + made.of_e * felt
-    out = effect - by @ W
-    if modes.sign.size:
-        turned = static.cov @ (modes.directions.T @ (onsets.cross[row][:, None] * W))
-        out -= _theta(modes, made, static) @ turned
-    return np.asarray(out)
+    felt = joint.level * np.eye(modes.size) - joint.shift[0] - joint.shift[1]
+    by_e = made.of_e
+    if state.full is not None:
+        by_e = _flicker(modes, state.full) @ modes.back
+    by = made.of_w @ joint.shift[0] + made.of_b @ joint.shift[1] + by_e @ felt
+    return np.asarray(effect - by @ W)
+
+
+def _flicker(modes: Modes, full: Full) -> Floats:
+    """Regression of the flicker at all places on the white errors of the members with a reading, (n, t)."""
+    model, n = modes.model, indices(full.seen)
+    by_e = np.zeros((len(model.busbar_of), modes.size))
+    if n.size:
+        own = np.linalg.solve(submatrix(modes.noise, n, n), model.phases(modes.at[n]))
+        by_e[:, n] = model.flicker * (model.busbar_of @ own.T)
+    return by_e
 
 
 def corrected(

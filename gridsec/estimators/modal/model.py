@@ -250,6 +250,21 @@ class Modes:
         """Squares of U, (t, t)."""
         return np.asarray(self.U * self.U)
 
+    @cached_property
+    def noise(self) -> Floats:
+        """Covariance D of the white errors of the members, (t, t)."""
+        return self.model.noise(self.at)
+
+    @cached_property
+    def covariance_w(self) -> Floats:
+        """Covariance of w at the members, (t, t)."""
+        return (1.0 - self.model.lasting) * self.model.loads(self.at)
+
+    @cached_property
+    def covariance_b(self) -> Floats:
+        """Covariance B of the members, (t, t)."""
+        return self.model.static(self.at)
+
     @property
     def size(self) -> int:
         """Number of members and of modes, t."""

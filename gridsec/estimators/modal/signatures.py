@@ -4,20 +4,30 @@ A fault ``f`` of the members begun at onset k adds ``u_t f`` to the residuals, `
 ``u_t = (t - k) / T_r`` for a ramp. Every mode answers by itself, so one number per mode stands for all
 faults:
 
-    gamma = u - rho g_w - rho_b g_b,   g <- (rho g_w, rho_b g_b) + k phi gamma
-    a += gamma nu / v,   i += gamma^2 phi / v,   c += gamma gamma_0 phi / v
+    gamma = u - rho g_w - rho_b g_b,   g <- (rho g_w, rho_b g_b) + k gamma
+    i += gamma^2 / v,   c += gamma gamma_0 / v
 
-with the update (nu, v, k, phi) of `gridsec.estimators.modal.filter` and gamma_0 of
-`gridsec.estimators.modal.static`. For a column W of faults in the modes, ``W = U' F``, and theta integrated
-out, score and information of its amount are
+with the gain and variance (k, v) of `gridsec.estimators.modal.filter` and gamma_0 of
+`gridsec.estimators.modal.static`. For columns W of faults in the modes, ``W = U' F``, the filter with theta
+has the signature ``(gamma - gamma_0 Gamma N Gamma' c) W``, N and c those before the tick. With s, the score
+of the exact innovation,
 
-    y = W' (a - c * Gamma theta),   I = W' (diag(i) - diag(c) Gamma N Gamma' diag(c)) W
+    Y += gamma s - c * Gamma (theta_t - theta_(t-1)),   y = W' Y
+    I = W' (diag(i) - diag(c) Gamma N Gamma' diag(c)) W
 
 and ``exp(y' f - f' I f / 2)`` is the likelihood ratio of the fault against none, given all readings so far.
+``Y = a - c * Gamma theta`` with ``a = sum gamma nu / v``.
 
 With many directions (more than `static.FEW`) I takes only those of the busbar into account. It is then too
 large by a positive semidefinite matrix, and mixtures of likelihood ratios are too small: their expectation
 without a fault is at most 1.
+
+**Missing readings.** s is exact (`gridsec.estimators.modal.full`), and the signature does not depend on
+readings; k is the gain ``slower``. So y of a column x_t is a martingale with the variance ``sum x_t' E V^-1
+E' x_t``, E selecting the readings. v is that of complete readings, ``E V^-1 E' <= diag(1 / v)``. So I is an
+upper bound, and the mean of ``exp(y f - I f^2 / 2)`` is at most 1. For single members the bound is lowered,
+``read``: the part of a fault that the member itself feels counts with the exact ``(V^-1)_jj`` in place of
+``(U diag(1 / v) U')_jj``, 0 without a reading. That is exact for white errors.
 
 References
 ----------
@@ -28,15 +38,16 @@ systems, IEEE Trans. Automatic Control 21, 1976.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.estimators.modal.filter import Update
 from gridsec.estimators.modal.model import Modes
-from gridsec.estimators.modal.static import FEW, Static, offset
+from gridsec.estimators.modal.static import FEW, Static, current, of_busbar
 
 RAMP_S = 600.0
 """Time in which a unit ramp reaches 1, s: the time scale of the loads."""
@@ -60,7 +71,9 @@ class Onsets:
     signature : (2, k, t)
         g of w and of b, after the last update.
     score, information, cross : (k, t)
-        a, i and c.
+        Score of the exact innovation, i and c.
+    read : (k, t) or None
+        Part of i at each member that was read; None where nothing is missing since the filter is modal.
     """
 
     age: Ints
@@ -71,6 +84,7 @@ class Onsets:
     score: Floats = field(repr=False)
     information: Floats = field(repr=False)
     cross: Floats = field(repr=False)
+    read: Floats | None = field(default=None, repr=False)
 
 
 def empty(modes: Modes, steps: int, ramps: int = 0) -> Onsets:
@@ -99,6 +113,7 @@ def empty(modes: Modes, steps: int, ramps: int = 0) -> Onsets:
 
 
 def follow(
+    modes: Modes,
     onsets: Onsets,
     update: Update,
     static: Static,
@@ -107,12 +122,12 @@ def follow(
     begun: Sequence[int] = (),
     ended: Sequence[int] = (),
 ) -> Onsets:
-    """Take in one step of the filter; O(k t).
+    """Take in one step of the filter; O(k t), and O(k t^2) where readings are missing.
 
     Parameters
     ----------
-    onsets
-        So far.
+    modes, onsets
+        The modes, and the onsets so far.
     update
         The filter's step.
     static
@@ -135,17 +150,36 @@ def follow(
     gamma = level[:, None] - g[0]
     gamma -= g[1]
     weighed = gamma / update.variance
-    score = weighed * update.innovation
+    score = gamma * static.score
+    score -= onsets.cross * static.moved
     score += onsets.score
-    told = weighed if update.kept is None else weighed * update.kept
-    information = told * gamma
+    information = weighed * gamma
+    read = _read(modes, onsets, update, gamma)
     information += onsets.information
-    cross = told * static.gamma
+    cross = weighed * static.gamma
     cross += onsets.cross
-    g += update.gain[:, None, :] * (gamma if update.kept is None else gamma * update.kept)
+    g += (update.gain if update.slower is None else update.slower)[:, None, :] * gamma
     for row in ended:
         g[:, row] = score[row] = information[row] = cross[row] = 0.0
-    return Onsets(age + used, used, onsets.ramp, level, g, score, information, cross)
+        if read is not None:
+            read[row] = 0.0
+    return Onsets(age + used, used, onsets.ramp, level, g, score, information, cross, read)
+
+
+def _read(modes: Modes, onsets: Onsets, update: Update, gamma: Floats) -> Floats | None:
+    """Part of the information at each member that was read, with that of one tick, (k, t).
+
+    Only the effect of a member's fault on its own reading is lost with that reading.
+    """
+    if update.exact is None:
+        return None
+    felt = gamma / np.sqrt(update.variance)
+    out = (felt * felt) @ modes.squares.T
+    white = modes.model.white[modes.at]
+    own = np.minimum((felt @ modes.squares.T) ** 2 * white, out)
+    out -= own * (1.0 - np.minimum(update.exact.precision / (modes.squares @ (1.0 / update.variance)), 1.0))
+    out += onsets.information @ modes.squares.T if onsets.read is None else onsets.read
+    return np.asarray(out)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -160,12 +194,15 @@ class Scores:
         ``diag(c) Gamma`` of the directions that count.
     cov : (r, r)
         Their N.
+    share : (k, t) or None
+        Share of the information that was read at each member; None for 1.
     """
 
     score: Floats
     information: Floats
     side: Floats
     cov: Floats
+    share: Floats | None = None
 
     def of(self, W: Floats, squares: Floats) -> tuple[Floats, Floats]:
         """Scores and information of single columns, (k, q) each.
@@ -173,7 +210,7 @@ class Scores:
         Parameters
         ----------
         W, squares : (t, q)
-            The columns in the modes, and their squares.
+            The columns in the modes, those of the members first, and their squares.
         """
         F = self.information @ squares
         if self.cov.size == 1:
@@ -181,23 +218,9 @@ class Scores:
         elif self.cov.size:
             side = self.side @ W
             F -= np.einsum("krq,rs,ksq->kq", side, self.cov, side)
+        if self.share is not None:
+            F[:, : self.share.shape[1]] *= self.share
         return self.score @ W, F
-
-    def matrix(self, row: int, W: Floats) -> tuple[Floats, Floats]:
-        """Scores (q,) and information (q, q) of columns together, at one row.
-
-        Parameters
-        ----------
-        row
-            The row.
-        W : (t, q)
-            The columns in the modes.
-        """
-        F = (W.T * self.information[row]) @ W
-        if self.cov.size:
-            side = self.side[row] @ W
-            F -= side.T @ self.cov @ side
-        return self.score[row] @ W, F
 
 
 def scores(modes: Modes, onsets: Onsets, static: Static, rows: Ints | slice = _ALL) -> Scores:
@@ -212,25 +235,47 @@ def scores(modes: Modes, onsets: Onsets, static: Static, rows: Ints | slice = _A
     """
     r = modes.sign.size
     score, information = onsets.score[rows], onsets.information[rows]
+    share = None if onsets.read is None else _share(modes, information, onsets.read[rows])
     if not r:
-        return Scores(score, information, np.zeros((len(score), 0, modes.size)), np.zeros((0, 0)))
-    cross = onsets.cross[rows]
-    score = score - cross * offset(modes, static)
-    G, cov = modes.directions, static.cov
+        return Scores(score, information, np.zeros((len(score), 0, modes.size)), np.zeros((0, 0)), share)
+    cross, G, cov = onsets.cross[rows], modes.directions, static.cov
     if r > FEW:
-        G = G[:, : modes.busbar]
-        cov = np.asarray(
-            np.linalg.inv(np.diag(modes.sign[: modes.busbar]) + (G.T * static.information) @ G), np.float64
-        )
-    return Scores(score, information, cross[:, None, :] * G.T, cov)
+        G, cov = G[:, : modes.busbar], of_busbar(modes, static)
+    return Scores(score, information, cross[:, None, :] * G.T, cov, share)
 
 
-def shocked(modes: Modes, onsets: Onsets, static: Static, row: int, size: float) -> tuple[Scores, float]:
-    """Scores at one row with a change of all loads ``N(0, size S)`` at the onset integrated out.
+def _share(modes: Modes, information: Floats, read: Floats) -> Floats:
+    """Share of the information that was read at each member, (k, t); 1 where there is none."""
+    whole = information @ modes.squares.T
+    return np.asarray(np.where(whole > 0.0, read / np.where(whole > 0.0, whole, 1.0), 1.0))
 
-    Also the logarithm of the likelihood ratio of such a change against none. With ``s = size lam`` the change
-    is integrated out first, mode by mode: a, i and c are divided by ``1 + s i``, and the information about
-    theta loses ``s c^2 / (1 + s i)``.
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Joint:
+    """Scores and information of all faults of members together, at one onset. t modes.
+
+    Attributes
+    ----------
+    score, information : (t,), (t, t)
+        Of columns W: ``y = W' score`` and ``I = W' information W``.
+    shift : (2, t, t)
+        Change of the means of w and b per unit fault in each mode.
+    level
+        u of the last tick.
+    """
+
+    score: Floats
+    information: Floats = field(repr=False)
+    shift: Floats = field(repr=False)
+    level: float
+
+    def of(self, W: Floats) -> tuple[Floats, Floats]:
+        """Scores (q,) and information (q, q) of columns W (t, q)."""
+        return self.score @ W, W.T @ self.information @ W
+
+
+def joint(modes: Modes, onsets: Onsets, static: Static, row: int) -> Joint:
+    """Joint scores of one row, all directions integrated out; exact where no reading is missing; O(t^2 r).
 
     Parameters
     ----------
@@ -238,25 +283,40 @@ def shocked(modes: Modes, onsets: Onsets, static: Static, row: int, size: float)
         The modes, and the information so far.
     row
         The row.
+    """
+    score, g, level = onsets.score[row], onsets.signature[:, row], float(onsets.level[row])
+    information, shift = np.diag(onsets.information[row]), np.stack([np.diag(each) for each in g])
+    if modes.sign.size:
+        side = onsets.cross[row][:, None] * modes.directions
+        turn = current(modes, static).cov @ side.T
+        information -= side @ turn
+        g_w, g_b = static.signature[:, :, None] * modes.directions
+        shift[0] -= g_w @ turn
+        shift[1] += (modes.directions - g_b) @ turn
+    return Joint(score, information, shift, level)
+
+
+def shocked(modes: Modes, now: Joint, size: float) -> tuple[Joint, float]:
+    """Joint scores with a change of all loads ``N(0, size S)`` at the onset integrated out; O(t^3).
+
+    Also the logarithm of the likelihood ratio of such a change against none. With ``Q = size diag(lam)`` and
+    ``B = I + Q^(1/2) I Q^(1/2)``, the score loses ``I Q^(1/2) B^-1 Q^(1/2) y`` and the information
+    loses ``I Q^(1/2) B^-1 Q^(1/2) I``.
+
+    Parameters
+    ----------
+    modes, now
+        The modes, and the joint scores of one onset.
     size
         Variance of the change, in those of the loads.
     """
-    a, i, c = onsets.score[row], onsets.information[row], onsets.cross[row]
-    s = size * modes.loads
-    more = 1.0 + s * i
-    ratio = 0.5 * float((s * a * a / more - np.log(more)).sum())
-    r = modes.sign.size
-    a, i, c = a / more, i / more, c / more
-    if not r:
-        return Scores(a[None], i[None], np.zeros((1, 0, modes.size)), np.zeros((0, 0))), ratio
-    G, sign = modes.directions, np.diag(modes.sign)
-    information = static.information - s * c * onsets.cross[row]
-    before, after = (sign + (G.T * each) @ G for each in (static.information, information))
-    right, left = static.score @ G, (static.score - s * c * onsets.score[row]) @ G
-    cov = np.asarray(np.linalg.inv(after), np.float64)
-    ratio += 0.5 * float(left @ cov @ left - right @ np.linalg.solve(before, right))
-    ratio += 0.5 * float(np.linalg.slogdet(before)[1] - np.linalg.slogdet(after)[1])
-    return Scores((a - c * (G @ (cov @ left)))[None], i[None], (c[:, None] * G).T[None], cov), ratio
+    root = np.sqrt(size * modes.loads)
+    side = root[:, None] * now.information
+    half = np.linalg.cholesky(np.eye(modes.size) + side * root)
+    lost = solve_triangular(half, np.column_stack([root * now.score, side]), lower=True)
+    ratio = 0.5 * float(lost[:, 0] @ lost[:, 0]) - float(np.log(np.diag(half)).sum())
+    score, information = now.score - lost[:, 1:].T @ lost[:, 0], now.information - lost[:, 1:].T @ lost[:, 1:]
+    return replace(now, score=score, information=information), ratio
 
 
 @dataclass(frozen=True, eq=False)

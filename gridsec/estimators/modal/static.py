@@ -4,11 +4,11 @@ The filter of `gridsec.estimators.modal.filter` runs with ``B = kappa D + c S``.
 theta`` with ``theta ~ N(0, diag(sign))``. Its effect on the innovations since the start is known, mode by
 mode: with the signature of a constant unit error,
 
-    gamma = 1 - rho g_w - rho_b g_b,   g <- (rho g_w, rho_b g_b) + k phi gamma
+    gamma = 1 - rho g_w - rho_b g_b,   g <- (rho g_w, rho_b g_b) + k gamma
 
 the innovations are ``gamma * (Gamma theta) + white``, ``Gamma = U' G``. So
 
-    a += gamma nu / v,   i += gamma^2 phi / v
+    a += gamma nu / v,   i += gamma^2 / v
     N = (diag(sign) + Gamma' diag(i) Gamma)^-1,   theta = N Gamma' a
 
 is the posterior of theta, and ``nu - gamma Gamma theta`` with the covariance ``diag(v) + gamma Gamma N
@@ -51,20 +51,26 @@ class Static:
         g of w and of b, after the last update.
     gamma : (t,)
         Effect of a unit error on the last innovation.
-    score, information : (t,)
-        a and i.
+    pull : (r,)
+        ``Gamma' a``.
+    information : (t,)
+        i.
     theta : (r,)
         Posterior mean of the amounts.
     cov : (r, r)
         N of the tick at which it was computed last.
+    score, moved : (t,)
+        Of the last tick: ``V^-1`` times the exact innovation, and change of ``Gamma theta``, in the modes.
     """
 
     signature: Floats
     gamma: Floats
-    score: Floats
+    pull: Floats
     information: Floats
     theta: Floats
     cov: Floats = field(repr=False)
+    score: Floats
+    moved: Floats
 
 
 def start(modes: Modes) -> Static:
@@ -76,8 +82,8 @@ def start(modes: Modes) -> Static:
         The modes.
     """
     zero = np.zeros(modes.size)
-    prior = np.diag(modes.sign)
-    return Static(np.zeros((2, modes.size)), zero, zero, zero, np.zeros(modes.sign.size), prior)
+    none, prior = np.zeros(modes.sign.size), np.diag(modes.sign)
+    return Static(np.zeros((2, modes.size)), zero, none, zero, none, prior, zero, zero)
 
 
 def follow(modes: Modes, before: Static, update: Update) -> Static:
@@ -93,43 +99,82 @@ def follow(modes: Modes, before: Static, update: Update) -> Static:
         The filter's step.
     """
     if not modes.sign.size:
-        return before
+        score = update.innovation / update.variance if update.score is None else update.score
+        return replace(before, score=score)
     rho, rho_b = update.decay
     g = before.signature * np.array([[rho], [rho_b]])
     gamma = 1.0 - g[0] - g[1]
-    g += update.gain * (gamma if update.kept is None else gamma * update.kept)
-    score = before.score + gamma * update.innovation / update.variance
-    information = before.information + gamma * gamma * update.precision
-    now = Static(g, gamma, score, information, before.theta, before.cov)
-    if modes.sign.size <= FEW:
-        return _anew(modes, now)
-    right, theta = score @ modes.directions, before.theta
-    near = CLOSE * float(np.abs(right).max(initial=0.0))
-    for _ in range(REFINEMENTS):
-        rest = right - modes.sign * theta - (information * (modes.directions @ theta)) @ modes.directions
-        if float(np.abs(rest).max()) <= near:
-            return replace(now, theta=theta)
-        theta = theta + before.cov @ rest
-    return _anew(modes, now)
+    g += update.gain * gamma
+    information = before.information + gamma * gamma / update.variance
+    now = replace(before, information=information)
+    if update.score is not None:
+        # The innovation is exact without theta, which says only how a fault would have been learned.
+        cov, turn = before.cov, np.zeros(modes.sign.size)
+        if modes.sign.size <= FEW:
+            cov, turn = current(modes, now).cov, cov @ ((gamma * update.score) @ modes.directions)
+        elif modes.busbar:
+            G = modes.directions[:, : modes.busbar]
+            turn[: modes.busbar] = of_busbar(modes, before) @ ((gamma * update.score) @ G)
+        moved, theta = modes.directions @ turn, before.theta + turn
+        return Static(g, gamma, before.pull, information, theta, cov, update.score, moved)
+    weighed = update.innovation / update.variance
+    pull = before.pull + (gamma * weighed) @ modes.directions
+    theta, cov = _learned(modes, now, pull)
+    score = weighed - gamma * (modes.directions @ theta) / update.variance
+    return Static(g, gamma, pull, information, theta, cov, score, modes.directions @ (theta - before.theta))
 
 
-def _anew(modes: Modes, now: Static) -> Static:
-    """The same with N and theta of this tick."""
+def _learned(modes: Modes, now: Static, pull: Floats) -> tuple[Floats, Floats]:
+    """Theta of this tick, (r,), and N of this tick or an earlier one, (r, r)."""
+    if modes.sign.size > FEW:
+        theta, near = now.theta, CLOSE * float(np.abs(pull).max(initial=0.0))
+        for _ in range(REFINEMENTS):
+            rest = pull - _precision_times(modes, now, theta)
+            if float(np.abs(rest).max()) <= near:
+                return theta, now.cov
+            theta = theta + now.cov @ rest
+    cov = _covariance(modes, now.information)
+    return cov @ pull, cov
+
+
+def _precision_times(modes: Modes, now: Static, theta: Floats) -> Floats:
+    """``N^-1 theta`` of this tick, (r,)."""
     G = modes.directions
-    if modes.sign.size == 1:
-        one = G[:, 0]
-        single = np.array([[1.0 / (modes.sign[0] + one @ (now.information * one))]])
-        return replace(now, cov=single, theta=single[0] * (now.score @ one))
-    cov = np.asarray(np.linalg.inv(np.diag(modes.sign) + (G.T * now.information) @ G), np.float64)
-    return replace(now, cov=cov, theta=cov @ (now.score @ G))
+    return np.asarray(modes.sign * theta + (now.information * (G @ theta)) @ G)
 
 
-def offset(modes: Modes, static: Static) -> Floats:
-    """Posterior mean of ``Gamma theta`` in the modes, (t,).
+def current(modes: Modes, now: Static) -> Static:
+    """The same with N of this tick; O(t r^2).
 
     Parameters
     ----------
-    modes, static
+    modes, now
         The modes, and the information so far.
     """
-    return modes.directions @ static.theta
+    return replace(now, cov=_covariance(modes, now.information))
+
+
+def _covariance(modes: Modes, information: Floats) -> Floats:
+    """N by the information, (r, r)."""
+    G = modes.directions
+    if modes.sign.size == 1:
+        one = G[:, 0]
+        return np.array([[1.0 / (modes.sign[0] + one @ (information * one))]])
+    return np.asarray(np.linalg.inv(np.diag(modes.sign) + (G.T * information) @ G), np.float64)
+
+
+def of_busbar(modes: Modes, now: Static) -> Floats:
+    """N of this tick with the directions of the busbar alone, (b, b)."""
+    sign, G = modes.sign[: modes.busbar], modes.directions[:, : modes.busbar]
+    return np.asarray(np.linalg.inv(np.diag(sign) + (G.T * now.information) @ G), np.float64)
+
+
+def restored(modes: Modes, now: Static) -> Static:
+    """The same with the pull that belongs to theta: the modal filter goes on with it.
+
+    Parameters
+    ----------
+    modes, now
+        The modes, and the information so far.
+    """
+    return replace(now, pull=_precision_times(modes, now, now.theta)) if modes.sign.size else now

@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks._residuals import Source, model_of, power_columns, root, tree
 from gridsec.arrays import Floats
-from gridsec.estimators.modal import estimate, signatures, static
+from gridsec.estimators.modal import estimate, full, signatures, static
 from gridsec.estimators.modal import filter as modal
 from gridsec.estimators.modal.model import ResidualModel, modes
 from gridsec.estimators.modal.search import Identification, SearchProblem, amounts
@@ -76,16 +76,16 @@ def test_equals_the_joint_gaussian(lasting: float, fault: str) -> None:
     m = 0.01 * np.random.default_rng(3).standard_normal((12, 5))
     state, more, rows = modal.start(made, 0.0), static.start(made), signatures.empty(made, 1)
     for k, reading in enumerate(m):
-        state, update = modal.step(made, state, float(k), reading)
-        more = static.follow(made, more, update)
-        rows = signatures.follow(rows, update, more, 1.0, begun=[0] if k == onset else [])
+        state, more, update = full.step(made, state, more, float(k), reading)
+        rows = signatures.follow(made, rows, update, more, 1.0, begun=[0] if k == onset else [])
     prepared = estimate.estimator(made)
     found = estimate.honest(made, prepared, state, more, update)
     if fault != "none":
         W = made.U.T @ G
-        y, F = signatures.scores(made, rows, more).matrix(0, W)
+        now = signatures.joint(made, rows, more, 0)
+        y, F = now.of(W)
         problem = SearchProblem(y, F, np.array([std]), 1, np.zeros(1), np.full(1, np.inf))
-        T = estimate.moves(made, prepared, more, rows, 0, W, effect)
+        T = estimate.moves(made, prepared, state, now, W, effect)
         one = Identification(
             np.ones((1, 1), bool), np.zeros(1, bool), np.ones(1), np.ones(1, bool), (problem,)
         )
@@ -134,8 +134,7 @@ def test_coverage_in_simulation() -> None:
             flick = np.sqrt(model.flicker) * random.standard_normal()
             truth = w + busbar + flick
             m = truth[model.meters] + b + np.sqrt(model.white) * random.standard_normal(5)
-            state, update = modal.step(made, state, float(k), m)
-            more = static.follow(made, more, update)
+            state, more, update = full.step(made, state, more, float(k), m)
             w = rho * w + np.sqrt(1 - rho**2) * (draw @ random.standard_normal(places))
         found = estimate.honest(made, prepared, state, more, update)
         z.append((found.mean - truth) / np.sqrt(found.variance))

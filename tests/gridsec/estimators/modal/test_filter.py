@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from benchmarks._residuals import Dense, Source, model_of, tree
-from gridsec.arrays import Floats
+from gridsec.arrays import Bools, Floats
 from gridsec.estimators.modal import filter as modal
-from gridsec.estimators.modal import static
+from gridsec.estimators.modal import full, static
 from gridsec.estimators.modal.model import Modes, ResidualModel, modes
 
 EXACT = 1e-9
@@ -78,100 +78,95 @@ def test_directions_make_it_exact_for_every_b(make: object, lasting: float, fixe
         h = 0.0 if k == 0 else float(random.choice([1.0, 60.0]))
         t += h
         m = 0.01 * random.standard_normal(made.size)
-        known, cov = static.offset(made, more), more.cov
-        state, update = modal.step(made, state, t, m)
-        more = static.follow(made, more, update)
+        known, cov = made.directions @ more.theta, more.cov
+        state, more, update = full.step(made, state, more, t, m)
         nu, V = dense.step(h, m)
         assert close(made.back @ (update.innovation - more.gamma * known), nu)
         if made.sign.size <= static.FEW:
             side = made.back @ (more.gamma[:, None] * made.directions)
             assert close((made.back * update.variance) @ made.back.T + side @ cov @ side.T, V)
-    lasts = state.mean[1] + (1.0 - more.signature[1]) * static.offset(made, more)
+    lasts = state.mean[1] + (1.0 - more.signature[1]) * (made.directions @ more.theta)
     assert close(made.back @ lasts, dense.lasts)
-    varies = state.mean[0] - more.signature[0] * static.offset(made, more)
+    varies = state.mean[0] - more.signature[0] * (made.directions @ more.theta)
     assert close(made.back @ varies, dense.varies, dense.mean)
 
 
-@pytest.mark.parametrize("lost", [1, 5, 11])
-def test_the_means_after_missing_readings_are_exact(lost: int) -> None:
-    """One tick with missing readings, then the means of the masked dense filter."""
-    model = proportional()
+def masks(kind: str, size: int, ticks: int) -> Bools:
+    """Patterns of members with a reading, (ticks, size)."""
+    seen, random = np.ones((ticks, size), dtype=np.bool_), np.random.default_rng(9)
+    if kind == "half":
+        seen[:, ::2] = False
+    elif kind == "random":
+        seen = random.random((ticks, size)) >= 0.5
+    elif kind == "alternating":
+        seen = (np.arange(ticks)[:, None] + np.arange(size)) % 4 == 0
+    else:
+        seen[20:40, 3], seen[25, :5], seen[30] = False, False, False
+    return seen
+
+
+@pytest.mark.parametrize("make", [proportional, model_of, mixed])
+@pytest.mark.parametrize("kind", ["outage", "half", "random", "alternating"])
+@pytest.mark.parametrize("lasting", [0.0, 0.4])
+def test_missing_readings_are_exact(make: object, kind: str, lasting: float) -> None:
+    """Scores of the innovations, means and covariance of the dense filter; intervals that change."""
+    tree12 = tree(12, np.random.default_rng(3))
+    model = model_of(tree12, lasting=lasting) if make is model_of else make(lasting=lasting)  # type: ignore
     made, source = modes(model), Source(model, np.random.default_rng(5))
-    state, dense = modal.start(made, 0.0), Dense(model)
-    seen = np.ones(made.size, dtype=np.bool_)
-    seen[np.random.default_rng(lost).choice(made.size, lost, replace=False)] = False
-    for k in range(30):
+    seen, dense, p = masks(kind, made.size, 60), Dense(model), made.size
+    state, more = modal.start(made, 0.0), static.start(made)
+    merged = np.kron([[1, 0, 0], [0, 1, 1]], np.eye(p))
+    for k in range(60):
+        m, h = source.tick(), (0.0, 1.0, 30.0, 0.5)[min(k, 1 + k % 3)]
+        state, more, _ = full.step(made, state, more, state.t + h, np.where(seen[k], m, 1e3), seen[k])
+        nu, V = dense.step(h, m, seen[k])
+        assert close(more.score, np.linalg.solve(V, nu) @ made.back[seen[k]]) or not nu.size
+    assert state.full is not None
+    assert close(state.full.mean.ravel(), merged @ dense.mean)
+    assert close(state.full.cov, merged @ dense.cov @ merged.T)
+
+
+@pytest.mark.parametrize("make", [model_of, mixed])
+def test_the_return_to_the_modes_is_an_upper_bound(make: object, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After readings without a gap the modes take over: means exact, covariance 1.1 times as large."""
+    monkeypatch.setattr(full, "COMPLETE", 10)
+    model = model_of(tree(12, np.random.default_rng(3))) if make is model_of else mixed()
+    made, source = modes(model), Source(model, np.random.default_rng(5))
+    dense, seen = Dense(model), np.ones(made.size, dtype=np.bool_)
+    state, more = modal.start(made, 0.0), static.start(made)
+    merged = np.kron([[1, 0, 0], [0, 1, 1]], np.eye(made.size))
+    for k in range(600):
         m = source.tick()
-        state, _ = modal.step(made, state, float(k), m)
-        dense.step(1.0 if k else 0.0, m)
-    m = source.tick()
-    state, update = modal.step(made, state, 30.0, np.where(seen, m, 1e3), seen)
-    nu, V = dense.step(1.0, m, seen)
-    assert close(np.concatenate(list(state.mean @ made.back.T)), dense.mean[: 2 * made.size])
-    assert close((made.back @ update.innovation)[seen], nu)
-    # The information that was read is that of the readings, and its diagonal in the modes is kept.
-    assert update.kept is not None
-    assert np.isclose(update.kept.sum(), made.size - lost)
-    inside = made.back[seen].T @ np.linalg.solve(V, made.back[seen])
-    assert close(update.precision, np.diag(inside))
-    exact = np.linalg.solve(made.back, np.linalg.solve(made.back, dense.cov[: made.size, : made.size]).T)
-    assert close(state.cov[0], np.diag(exact))
+        seen[4] = not 200 <= k < 203
+        before = state.full
+        state, more, _ = full.step(made, state, more, float(k), m, seen)
+        dense.step(1.0 if k else 0.0, m, seen)
+        assert (state.full is not None) == (k >= 200) or k > 203
+        if before is not None and state.full is None:
+            break
+    assert state.full is None
+    again = full.expanded(made, state, more)
+    assert np.allclose(again.mean.ravel(), merged @ dense.mean, atol=1e-3 * np.abs(dense.mean).max())
+    exact = merged @ dense.cov @ merged.T
+    assert np.linalg.eigvalsh(again.cov - exact).min() >= -1e-12 * np.trace(exact)
+    assert (np.diag(again.cov) <= 1.2 * np.diag(exact)).all()
+    for _ in range(50):
+        m = source.tick()
+        state, more, _ = full.step(made, state, more, state.t + 1.0, m)
+        nu, V = dense.step(1.0, m)
+    assert np.allclose(more.score, np.linalg.solve(V, nu) @ made.back, atol=0.01 * np.abs(more.score).max())
 
 
 def test_no_reading_at_all_is_a_prediction() -> None:
     made = modes(proportional())
-    state, _ = modal.step(made, modal.start(made, 0.0), 0.0, np.ones(made.size) * 1e-3)
+    state, more, _ = full.step(made, modal.start(made, 0.0), static.start(made), 0.0, np.ones(12) * 1e-3)
     none = np.zeros(made.size, dtype=np.bool_)
-    after, update = modal.step(made, state, 60.0, np.full(made.size, 7.0), none)
-    assert close(after.mean[0], np.exp(-60.0 / 600.0) * state.mean[0])
-    assert (update.precision == 0.0).all()
-
-
-@pytest.mark.parametrize(("share", "limit"), [(0.1, 0.02), (0.5, 0.1)])
-def test_readings_missing_at_random_cost_little(share: float, limit: float) -> None:
-    """Difference to the exact masked filter over its standard deviation, root mean square."""
-    model = proportional(24)
-    made, random = modes(model), np.random.default_rng(6)
-    source, off = Source(model, random), []
-    state, dense = modal.start(made, 0.0), Dense(model)
-    for k in range(600):
-        m, seen = source.tick(), random.random(made.size) >= share
-        state, _ = modal.step(made, state, float(k), m, seen)
-        dense.step(1.0 if k else 0.0, m, seen)
-        if k >= 300:
-            known = made.back @ state.mean.sum(axis=0)
-            read = dense.H @ dense.mean
-            std = np.sqrt(np.einsum("ij,jk,ik->i", dense.H, dense.cov, dense.H))
-            off.append((known - read) / std)
-    assert np.sqrt(np.mean(np.square(off))) < limit
-
-
-def test_restricting_to_the_same_members_changes_nothing() -> None:
-    model = proportional()
-    made, source = modes(model), Source(model, np.random.default_rng(7))
-    state = modal.start(made, 0.0)
-    for k in range(20):
-        state, _ = modal.step(made, state, float(k), source.tick())
-    same = modal.restrict(made, state, modes(model))
-    assert np.allclose(made.back @ same.mean[0], made.back @ state.mean[0], atol=1e-12)
-    assert np.allclose(same.cov, state.cov, rtol=1e-6)
-
-
-def test_restricting_keeps_means_and_the_diagonal() -> None:
-    """Means at the remaining meters are those of before; with them the filter goes on."""
-    model = proportional()
-    made, source = modes(model), Source(model, np.random.default_rng(8))
-    state = modal.start(made, 0.0)
-    for k in range(20):
-        state, _ = modal.step(made, state, float(k), source.tick())
-    rest = np.array([0, 2, 3, 7, 11])
-    fewer = modes(model, rest)
-    after = modal.restrict(made, state, fewer)
-    assert np.allclose(fewer.back @ after.mean[0], (made.back @ state.mean[0])[rest], atol=1e-12)
-    assert (after.cov[0] > 0.0).all()
-    assert (after.cov[0] * after.cov[2] >= after.cov[1] ** 2).all()
-    with pytest.raises(ValueError, match="member"):
-        modal.restrict(fewer, after, made)
+    after, more, _ = full.step(made, state, more, 60.0, np.full(made.size, 7.0), none)
+    assert after.full is not None
+    assert close(after.full.mean[0], np.exp(-60.0 / 600.0) * made.back @ state.mean[0])
+    assert (more.score == 0.0).all()
+    with pytest.raises(ValueError, match="full covariance"):
+        modal.step(made, state, 60.0, np.zeros(made.size), none)
 
 
 def test_time_does_not_run_backwards() -> None:

@@ -1,0 +1,212 @@
+"""Exact filter with missing readings: a full covariance of w and b from the first missing reading on.
+
+With complete readings the filter of `gridsec.estimators.modal.filter` with
+`gridsec.estimators.modal.static` is exact and diagonal. A missing reading couples the modes. From then on
+the state x = (w, b) of all members has a full covariance P, in the coordinates of the meters:
+
+    predict   x <- (rho w, rho_b b),  P <- R P R + blockdiag((1 - rho^2) (1 - c) S, (1 - rho_b^2) B)
+    update    V = (H P H' + D)_nn,  sigma = V^-1 (m - H x)_n,  x += P H_n' sigma,  P -= P H_n' V^-1 H_n P
+
+with the readings n of the tick and ``H = [1, 1]``. The start is the posterior of the modal filter:
+
+    x = mean + T theta,   P = blockdiag of the modes + T N T',   T = (-g_w, 1 - g_b) Gamma
+
+B ages as a whole here, in `filter` without the directions: a difference of h / T_b per tick.
+
+**Scores.** ``s = back' sigma``, the score of the innovation in the modes, is all that the detector takes
+from the readings. For every signature x that does not depend on the readings, ``y = sum x' s`` is a
+martingale without a fault. ``exp(y f - I f^2 / 2)`` has the mean 1 for ``I = sum x_n' V^-1 x_n``, and at most
+1 for any larger I. So signatures that are diagonal in the modes stay in use. Their gain is that of a
+covariance of which the diagonal is kept at every tick; its error costs evidence, and causes no false alarm.
+
+**Return.** After `COMPLETE` ticks with all readings the filter returns to the modes. The condition: their
+diagonal covariance C, enlarged by `MARGIN`, is an upper bound, ``(1 + MARGIN) C + T N T' >= P``, with N of
+the information in the directions divided by ``(1 + MARGIN)^2``.
+The readings then have at most the covariance of the model in use. With scores y and information I of that
+model, ``var y <= I`` without a fault, and ``E exp(y f - I f^2 / 2) <= 1`` at each fixed tick.
+
+The cost is O(n t^2) per tick: 0.1 ms for 57 meters, 1 ms for 146.
+
+References
+----------
+Anderson and Moore, Optimal Filtering, 1979, chapter 3.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import exp
+
+import numpy as np
+from scipy.linalg import blas, lapack
+
+from gridsec.arrays import Bools, Floats, all_of, indices, submatrix
+from gridsec.estimators.modal import filter as modal
+from gridsec.estimators.modal import static
+from gridsec.estimators.modal.filter import FilterState, Full, Innovation, Update
+from gridsec.estimators.modal.model import Modes
+from gridsec.estimators.modal.static import Static
+
+COMPLETE = 64
+"""Ticks with all readings before a return to the modes, and from one attempt to the next."""
+MARGIN = 0.1
+"""Enlargement of the variance at the return, 1: standard deviations are too large by 5 % at first."""
+
+
+def step(  # noqa: PLR0917  # the states of both parts, and one tick
+    modes: Modes,
+    state: FilterState,
+    known: Static,
+    t: float,
+    m: Floats,
+    seen: Bools | None = None,
+    *,
+    stay: bool = False,
+) -> tuple[FilterState, Static, Update]:
+    """Take in the residuals of one tick by the exact filter.
+
+    Parameters
+    ----------
+    modes, state, known
+        The modes, the filter and the information about the directions after the last tick.
+    t
+        Time, s; not before ``state.t``. The interval may change from tick to tick.
+    m : (t,)
+        Residuals of the members, squared pu; any finite value where not seen.
+    seen : (t,)
+        Members with a reading; None: all.
+    stay
+        Keep the full covariance, if there is one.
+
+    Raises
+    ------
+    ValueError
+        If t is before the last reading or not a number.
+    """
+    whole = seen is None or all_of(seen)
+    if state.full is not None and whole and not stay and state.full.complete >= COMPLETE:
+        state, known = _returned(modes, state, state.full, known)
+    if state.full is None and not whole:
+        state = replace(state, full=expanded(modes, state, known))
+    after, update = modal.step(modes, state, t, m, seen)
+    if state.full is not None:
+        full, innovation = updated(modes, state.full, t - state.t, m, None if whole else seen)
+        sigma, _ = lapack.dtrtrs(innovation.half, innovation.white, lower=True, trans=1)
+        score = sigma @ modes.back[innovation.rows]
+        kept, slower = _kept(modes, full.kept, update)
+        after = replace(after, full=replace(full, kept=kept))
+        update = replace(update, slower=slower, exact=innovation, score=score)
+    return after, static.follow(modes, known, update), update
+
+
+def expanded(modes: Modes, state: FilterState, known: Static) -> Full:
+    """Means and full covariance of the modal filter.
+
+    Parameters
+    ----------
+    modes, state, known
+        The modes, the filter and the information about the directions after the last tick.
+    """
+    back, blocks = modes.back, [(modes.back * c) @ modes.back.T for c in state.cov]
+    cov = np.block([[blocks[0], blocks[1]], [blocks[1], blocks[2]]])
+    mean = state.mean @ back.T
+    if modes.sign.size:
+        T = _turned(modes, known)
+        cov += T @ static.current(modes, known).cov @ T.T
+        mean = mean + (T @ known.theta).reshape(2, -1)
+    return Full(mean, cov, np.ones(modes.size, dtype=np.bool_), state.cov, 0)
+
+
+def _turned(modes: Modes, known: Static) -> Floats:
+    """Change T of the means of w and b at the meters per amount of each direction, (2 t, r)."""
+    g_w, g_b = known.signature[:, :, None] * modes.directions
+    return np.vstack([modes.back @ -g_w, modes.back @ (modes.directions - g_b)])
+
+
+def updated(modes: Modes, before: Full, h: float, m: Floats, seen: Bools | None) -> tuple[Full, Innovation]:
+    """The exact filter after one tick; O(n t^2).
+
+    Parameters
+    ----------
+    modes, before
+        The modes, and the filter after the last tick.
+    h
+        Interval, s.
+    m, seen : (t,)
+        Residuals, and members with a reading; None: all.
+    """
+    t, rows = modes.size, np.arange(modes.size) if seen is None else indices(seen)
+    rho, rho_b = exp(-h / modes.model.time_s), exp(-h / modes.model.fixed_s)
+    mean = before.mean * np.array([[rho], [rho_b]])
+    P = before.cov * (rho * rho_b)
+    P[:t, :t] *= rho / rho_b
+    P[:t, :t] += (1.0 - rho * rho) * modes.covariance_w
+    P[t:, t:] *= rho_b / rho
+    P[t:, t:] += (1.0 - rho_b * rho_b) * modes.covariance_b
+    if not rows.size:
+        none = np.zeros((2 * t, 0))
+        return Full(mean, P, np.zeros(t, dtype=np.bool_), before.kept, 0), Innovation(
+            rows, none[:0], none, none[0], np.zeros(t)
+        )
+    nu = m - mean[0] - mean[1]
+    if seen is None:
+        seen, HP, D, complete = np.ones(t, dtype=np.bool_), P[:t] + P[t:], modes.noise, before.complete + 1
+        V = HP[:, :t] + HP[:, t:] + D
+    else:
+        nu, HP, D, complete = nu[rows], P[rows] + P[t + rows], submatrix(modes.noise, rows, rows), 0
+        V = (HP[:, :t] + HP[:, t:])[:, rows] + D
+    half, failed = lapack.dpotrf(V.T, lower=True, overwrite_a=True, clean=True)
+    if failed:
+        raise np.linalg.LinAlgError("the covariance of the innovation is not positive definite")
+    gain = blas.dtrsm(1.0, half, HP.T, side=1, lower=1, trans_a=1, overwrite_b=1)
+    white, _ = lapack.dtrtrs(half, nu, lower=True)
+    mean += (gain @ white).reshape(2, t)
+    P -= gain @ gain.T
+    inverse, _ = lapack.dtrtri(half, lower=True)
+    precision = np.zeros(t)
+    precision[rows] = (inverse * inverse).sum(axis=0)
+    return Full(mean, P, seen, before.kept, complete), Innovation(rows, half, gain, white, precision)
+
+
+def _kept(modes: Modes, kept: Floats, update: Update) -> tuple[Floats, Floats]:
+    """Diagonal covariance after one tick, (3, t), and its gain, (2, t).
+
+    The gain of complete readings is multiplied by the part of each mode's information that was read,
+    ``1 - diag(U_g' (A_gg)^-1 U_g) / v``, with ``A = U diag(1 / v) U'`` and g the members without a reading.
+    """
+    cov, shared, v = modal.predicted(modes, kept, *update.decay)
+    gain = shared / v
+    if update.seen is not None:
+        g = indices(~update.seen)
+        U = modes.U[g]
+        if g.size == modes.size:
+            return cov, 0.0 * gain
+        half, _ = lapack.dpotrf((U / v) @ U.T, lower=True, clean=True)
+        spread, _ = lapack.dtrtrs(half, U, lower=True)
+        gain = gain * np.clip(1.0 - (spread * spread).sum(axis=0) / v, 0.0, 1.0)
+    cov[:2] -= gain * shared[0]
+    cov[2] -= gain[1] * shared[1]
+    return cov, gain
+
+
+def _returned(modes: Modes, state: FilterState, full: Full, known: Static) -> tuple[FilterState, Static]:
+    """State of the modal filter, if its covariance is an upper bound; else the same, and a later attempt."""
+    t, U, known = modes.size, modes.U, static.current(modes, known)
+    T = _turned(modes, known).reshape(2, t, -1)
+    T = np.vstack([U.T @ T[0], U.T @ T[1]])
+    P = np.vstack([U.T @ full.cov[:t], U.T @ full.cov[t:]])
+    P = np.hstack([P[:, :t] @ U, P[:, t:] @ U])
+    # The information of complete readings is more than that of theta.
+    now = static.current(modes, replace(known, information=known.information / (1.0 + MARGIN) ** 2))
+    rest, bound = P - T @ known.cov @ T.T, T @ now.cov @ T.T - P
+    w, b = np.arange(t), np.arange(t, 2 * t)
+    cov = (1.0 + MARGIN) * np.stack([rest[w, w], rest[w, b], rest[b, b]])
+    bound[w, w] += cov[0]
+    bound[w, b] += cov[1]
+    bound[b, w] += cov[1]
+    bound[b, b] += cov[2]
+    _, failed = lapack.dpotrf(bound, lower=True)
+    if failed or not (cov[0] > 0.0).all() or not (cov[0] * cov[2] > cov[1] ** 2).all():
+        return replace(state, full=replace(full, complete=0)), known
+    mean = full.mean @ U - (T @ now.theta).reshape(2, t)
+    return FilterState(state.t, mean, cov), static.restored(modes, now)

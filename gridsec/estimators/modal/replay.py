@@ -1,0 +1,208 @@
+"""Exact scores of suspected onsets where readings are missing, by replaying the last readings.
+
+The detector follows onsets by signatures that are diagonal in the modes. That suffices for an alarm, but not
+for a search among sets of meters: it needs the information of all members together, and missing readings
+make it full. For a suspected onset, with X the change of the means per unit fault of each member,
+
+    gamma = u 1 - H X,   X <- R X + K gamma_n,   Y += gamma_n' V^-1 nu,   F += gamma_n' V^-1 gamma_n
+
+with nu, V and the gain K of `gridsec.estimators.modal.full`. A fault f of the members has the score f'Y and
+the information f'F f, exactly. The cost is that of the filter, so the last `HALF` to 2 `HALF` readings
+are kept, and replayed at an alarm. An onset before them counts from the first of them on: the filter has
+learned part of such a fault, which costs evidence.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from math import exp
+
+import numpy as np
+from scipy.linalg import blas
+
+from gridsec.arrays import Bools, Floats
+from gridsec.estimators.modal import full as exact
+from gridsec.estimators.modal import signatures
+from gridsec.estimators.modal.detector import Detector
+from gridsec.estimators.modal.filter import FilterState, Full, Innovation
+from gridsec.estimators.modal.model import Modes
+from gridsec.estimators.modal.signatures import RAMP_S, Joint, Onsets
+from gridsec.estimators.modal.static import Static
+
+HALF = 64
+"""Ticks from one kept state of the filter to the next; two of them cover the readings that are kept."""
+
+Reading = tuple[float, Floats, Bools | None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Suspected:
+    """Exact scores of one onset. t members.
+
+    Attributes
+    ----------
+    row, ramp, level
+        Row of the onset in the detector, its shape, and u of the last tick.
+    shift : (2 t, t)
+        X.
+    score, information : (t,), (t, t)
+        Y and F.
+    """
+
+    row: int
+    ramp: bool
+    level: float
+    shift: Floats = field(repr=False)
+    score: Floats = field(repr=False)
+    information: Floats = field(repr=False)
+
+    def joint(self, modes: Modes) -> Joint:
+        """The same in the modes."""
+        t, U, back = modes.size, modes.U, modes.back
+        shift = np.stack([U.T @ self.shift[:t] @ back, U.T @ self.shift[t:] @ back])
+        return Joint(self.score @ back, back.T @ self.information @ back, shift, self.level)
+
+
+Parts = tuple[FilterState, Static, Detector, tuple[Suspected, ...]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class History:
+    """Last readings, and the filter before them.
+
+    Attributes
+    ----------
+    start
+        Filter, directions, detector and suspected onsets before the first reading.
+    readings
+        Time, residuals and members with a reading of each tick, at most ``2 HALF``.
+    middle
+        As ``start``, after the first `HALF` readings; None before.
+    """
+
+    start: Parts = field(repr=False)
+    readings: tuple[Reading, ...] = field(default=(), repr=False)
+    middle: Parts | None = field(default=None, repr=False)
+
+
+def record(history: History, after: Parts, m: Floats, seen: Bools | None) -> History:
+    """Keep the readings of one tick.
+
+    Parameters
+    ----------
+    history
+        So far.
+    after
+        Filter, directions, detector and suspected onsets after the tick.
+    m, seen : (t,)
+        Residuals, and members with a reading.
+    """
+    readings = (*history.readings, (after[0].t, m, seen))
+    if len(readings) == HALF:
+        return replace(history, readings=readings, middle=after)
+    if len(readings) == 2 * HALF and history.middle is not None:
+        return History(history.middle, readings[HALF:], after)
+    return replace(history, readings=readings)
+
+
+def replayed(modes: Modes, history: History, onsets: Onsets, rows: Sequence[int]) -> tuple[Suspected, ...]:
+    """Exact scores of some rows after the last reading.
+
+    Parameters
+    ----------
+    modes, history
+        The modes, and the readings.
+    onsets, rows
+        The onsets of the detector after the last reading, and the rows.
+    """
+    count, (state, known, *_) = len(history.readings), history.start
+    t, full = state.t, exact.expanded(modes, state, known) if state.full is None else state.full
+    out = {row: _begun(modes, row, bool(onsets.ramp[row])) for row in rows}
+    for k, (now, m, seen) in enumerate(history.readings):
+        h = now - t
+        full, innovation = exact.updated(modes, full, h, m, seen)
+        for row in rows:
+            if onsets.age[row] >= count - k:
+                out[row] = follow(modes, out[row], innovation, h)
+        t = now
+    return tuple(out.values())
+
+
+def _begun(modes: Modes, row: int, ramp: bool) -> Suspected:
+    """Scores before the onset."""
+    t = modes.size
+    return Suspected(row, ramp, float(not ramp), np.zeros((2 * t, t)), np.zeros(t), np.zeros((t, t)))
+
+
+def carried(modes: Modes, onsets: Onsets, known: Static, rows: Sequence[int]) -> tuple[Suspected, ...]:
+    """Exact scores of some rows while no reading is missing yet.
+
+    Parameters
+    ----------
+    modes, onsets, known
+        The modes, the onsets of the detector, and the information about the directions.
+    rows
+        The rows.
+    """
+    out, U, back = [], modes.U, modes.back
+    for row in rows:
+        now = signatures.joint(modes, onsets, known, row)
+        shift = np.vstack([back @ now.shift[0] @ U.T, back @ now.shift[1] @ U.T])
+        score, information = U @ now.score, U @ now.information @ U.T
+        out.append(Suspected(row, bool(onsets.ramp[row]), now.level, shift, score, information))
+    return tuple(out)
+
+
+def follow(modes: Modes, before: Suspected, innovation: Innovation, h: float) -> Suspected:
+    """Take in one tick; O(n t^2).
+
+    Parameters
+    ----------
+    modes, before
+        The modes, and the scores so far.
+    innovation
+        The exact innovation of the tick.
+    h
+        Interval, s.
+    """
+    t, n = modes.size, innovation.rows
+    level = before.level + (h / RAMP_S if before.ramp else 0.0)
+    shift = before.shift.copy()
+    shift[:t] *= exp(-h / modes.model.time_s)
+    shift[t:] *= exp(-h / modes.model.fixed_s)
+    if not n.size:
+        return replace(before, level=level, shift=shift)
+    gamma = -(shift[n] + shift[t + n])
+    gamma[np.arange(n.size), n] += level
+    weighed = blas.dtrsm(1.0, innovation.half, gamma.T, side=1, lower=1, trans_a=1)
+    shift += innovation.gain @ weighed.T
+    score = before.score + weighed @ innovation.white
+    return replace(
+        before,
+        level=level,
+        shift=shift,
+        score=score,
+        information=before.information + weighed @ weighed.T,
+    )
+
+
+def freed(modes: Modes, full: Full, joint: Joint, faults: Bools) -> Full:
+    """The exact filter with the amounts of the faults of some members unknown since the onset; O(t^2 f).
+
+    With y, F and X of these faults, the means lose ``X (F + 1)^-1 y`` and P gains ``X (F + 1)^-1 X'``.
+
+    Parameters
+    ----------
+    modes, full
+        The modes, and the exact filter.
+    joint
+        Joint scores of the onset after the same tick.
+    faults : (t,)
+        The members.
+    """
+    W = modes.U.T[:, faults]
+    y, F = joint.of(W)
+    X = np.vstack([modes.back @ joint.shift[0] @ W, modes.back @ joint.shift[1] @ W])
+    gain = np.linalg.solve(F + np.eye(y.size), X.T).T
+    return replace(full, mean=full.mean - (gain @ y).reshape(2, -1), cov=full.cov + gain @ X.T)
