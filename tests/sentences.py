@@ -31,12 +31,13 @@ def _texts(node: ast.expr) -> Iterator[str]:
 def codes_in(source: str) -> set[str]:
     """Literal codes of a module.
 
-    `Problem(...)`, `InputInvalid.of(...)`, arguments `code=...` and their defaults, class attributes.
+    `Problem(...)`, `InputInvalid.of(...)`, `report.problem(...)`, arguments `code=...` and their defaults, class attributes.
     """
     out: set[str] = set()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Call):
-            if (_name(node) == "Problem" or ast.unparse(node.func) == "InputInvalid.of") and node.args:
+            named = _name(node) in {"Problem", "problem"} or ast.unparse(node.func) == "InputInvalid.of"
+            if named and node.args:
                 out.update(_texts(node.args[0]))
             for each in node.keywords:
                 if each.arg == "code":
