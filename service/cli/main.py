@@ -23,6 +23,7 @@ from gridsec.errors import DesignInfeasible, FeederInvalid, GridsecError, NotObs
 from service.cli import (
     console,
     feeders,
+    pki,
     replay,
     reproduce,
     serve,
@@ -87,6 +88,8 @@ app = typer.Typer(
 app.add_typer(feeders.app, name="feeders")
 app.command("convert")(feeders.convert)
 app.add_typer(study_app, name="study")
+app.add_typer(pki.app, name="pki")
+app.command("zenoh-config")(pki.zenoh_config)
 app.command()(replay.replay)
 app.command()(reproduce.reproduce)
 app.command()(serve.serve)

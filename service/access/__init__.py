@@ -1,0 +1,1 @@
+"""Access control: certificates, rules of zenoh, signatures of readings."""
