@@ -53,6 +53,22 @@ Grace = Annotated[
 MaxPayload = Annotated[int | None, typer.Option(help="Largest payload, bytes. [default: 262144]")]
 Queue = Annotated[int | None, typer.Option(help="Length of the queue, payloads. [default: 20000]")]
 MaxFeeders = Annotated[int | None, typer.Option(help="Largest number of feeders over REST. [default: 100]")]
+MeterKeysFile = Annotated[
+    Path | None,
+    typer.Option(
+        help="Table (csv) feeder,meter,scheme,key: readings of these meters need a valid signature."
+    ),
+]
+Unsigned = Annotated[
+    str | None,
+    typer.Option(help="refuse or accept: meters without a row in --meter-keys. [default: refuse]"),
+]
+Plaintext = Annotated[
+    bool,
+    typer.Option(
+        "--plaintext-network", help="Dangerous: zenoh without TLS beyond loopback; any machine can publish."
+    ),
+]
 LogLevel = Annotated[str | None, typer.Option(help="debug, info, warning or error. [default: info]")]
 LogFormat = Annotated[str | None, typer.Option(help="console or json. [default: console]")]
 STOP_S = 2.7
@@ -78,6 +94,9 @@ def serve(
     max_payload: MaxPayload = None,
     queue: Queue = None,
     max_feeders: MaxFeeders = None,
+    meter_keys: MeterKeysFile = None,
+    unsigned: Unsigned = None,
+    plaintext_network: Plaintext = False,
     log_level: LogLevel = None,
     log_format: LogFormat = None,
     until_eof: UntilEof = False,
@@ -92,7 +111,9 @@ def serve(
     from service import logs
     from service.app import serve as run
     from service.engine.design_jobs import abandon, settle
-    from service.settings import settings, strangers
+    from service.ingest import zenoh_bus
+    from service.ingest.queues import BusConfig
+    from service.settings import refuse_exposed, settings, strangers
 
     chosen = settings(
         {
@@ -112,10 +133,16 @@ def serve(
             "max_payload": max_payload,
             "queue": queue,
             "max_feeders": max_feeders,
+            "meter_keys": meter_keys,
+            "unsigned": unsigned,
+            "plaintext_network": plaintext_network or None,
             "log_level": log_level,
             "log_format": log_format,
         }
     )
+    if not chosen.plaintext_network:
+        bus = BusConfig(chosen.zenoh_mode, chosen.listen, chosen.zenoh_connect, chosen.zenoh_config)
+        refuse_exposed(zenoh_bus.endpoints(bus))
     logs.set_up(chosen.log_level, chosen.log_format)
     for variable, closest in strangers(os.environ).items():
         structlog.get_logger().warning("variable_ignored", variable=variable, closest=closest or None)

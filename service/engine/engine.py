@@ -26,6 +26,7 @@ import structlog
 
 from feeders.model.site import Site
 from gridsec.errors import GridsecError
+from service.access.signing import MeterKeys
 from service.alarms.state_machine import (
     Alarm,
     AlarmRules,
@@ -215,6 +216,8 @@ class RuntimeConfig:
         Length of the queue before the runtime, samples.
     max_feeders
         Largest number of feeders added at run time, besides those given at the start.
+    meter_keys
+        Keys of meters; None accepts readings without signature.
     """
 
     prefix: str = "gridsec"
@@ -224,6 +227,7 @@ class RuntimeConfig:
     max_payload: int = 256 * 1024
     max_samples: int = 20_000
     max_feeders: int = 100
+    meter_keys: MeterKeys | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -279,7 +283,7 @@ class Engine:
         self._wall, self._stored, self._continues = wall, stored, go_on
         self._catch_up = CatchUp(clock, waits=config.clock is Clock.EVENTS)
         self.committer = Committer(store, self.metrics, stored, self._count_stored, apart)
-        self._wire = Wire({}, config.prefix, config.max_payload)
+        self._wire = Wire({}, config.prefix, config.max_payload, config.meter_keys)
         for site in sites:
             self.add(site)
 
@@ -394,7 +398,7 @@ class Engine:
 
     def _learn(self) -> None:
         known = {name: known_of(monitor.site) for name, monitor in self.monitors.items()}
-        self._wire = Wire(known, self.config.prefix, self.config.max_payload)
+        self._wire = Wire(known, self.config.prefix, self.config.max_payload, self.config.meter_keys)
 
     def begin(self) -> None:
         """Set the replies for standing alarms; publish the stored alarms of an earlier process.
@@ -526,7 +530,13 @@ class Engine:
     def _decode(self, sample: Sample) -> DecodedPayload:
         """Decode a payload; a defect of the decoder costs this payload only."""
         try:
-            return self._wire.decode(sample.key, sample.payload, sample.encoding, size=sample.size)
+            return self._wire.decode(
+                sample.key,
+                sample.payload,
+                sample.encoding,
+                size=sample.size,
+                attachment=sample.attachment,
+            )
         except Exception as error:  # noqa: BLE001 - one payload must not end the service
             problem = beginning(f"{type(error).__name__}: {error}")
             _log.error("a payload could not be decoded", key=sample.key[:HEAD_BYTES], problem=problem)

@@ -17,6 +17,7 @@ from typing import Any
 
 import zenoh
 
+from service.access.signing import ATTACHMENT_MAX
 from service.ingest.queues import BusConfig, BusCounts, BusUnavailable, Outgoing, Publication, Sample
 
 RING = 8192
@@ -91,6 +92,25 @@ def session(config: BusConfig) -> Iterator[zenoh.Session]:
         raise BusUnavailable(text, code="bus-endpoint") from error
     with opened:
         yield opened
+
+
+def endpoints(config: BusConfig) -> tuple[str, ...]:
+    """Return the endpoints that a session of a configuration listens on and connects to.
+
+    Raises
+    ------
+    BusUnavailable
+        If the configuration is wrong.
+    """
+    built = _config(config)
+    mode = json.loads(built.get_json("mode")) or "peer"
+    found: list[str] = []
+    for name in ("listen", "connect"):
+        ends = json.loads(built.get_json(f"{name}/endpoints"))
+        if isinstance(ends, dict):
+            ends = ends.get(mode, [])
+        found += [end["locator"] if isinstance(end, dict) else end for end in ends or ()]
+    return tuple(found)
 
 
 class Bus:
@@ -196,7 +216,10 @@ class Bus:
         kept = payload if size <= self._max_payload else payload[:_HEAD]
         # A key that is cut here is longer than every valid key, and stays invalid.
         key = str(raw.key_expr)[: len(self._prefix) + _HEAD]
-        return Sample(key, kept, str(raw.encoding), self._wall(), size)
+        attached = raw.attachment
+        # An attachment that is cut here stays invalid.
+        attachment = b"" if attached is None else attached.to_bytes()[: ATTACHMENT_MAX + 1]
+        return Sample(key, kept, str(raw.encoding), self._wall(), size, attachment)
 
     # ---------------------------------------------------------------- out
 
