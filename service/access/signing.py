@@ -89,9 +89,8 @@ class MeterKeys:
             return None if self.accepts_unlisted else Refusal("signature", "the meter has no key in the list")
         sender = _concentrator(key)
         if entry.scheme is Scheme.CERTIFICATE:
-            if sender is None or sender == entry.certificate:
-                return None
-            return Refusal("signature", f"the meter belongs to {entry.certificate}, not to {sender}")
+            text = f"the meter belongs to {entry.certificate}, not to {sender}"
+            return None if sender in (None, entry.certificate) else Refusal("signature", text)
         if sender is not None:
             return Refusal("signature", "a meter with a key of its own has no place in a batch")
         order = _signed_order(entry, key, payload, attachment)
