@@ -15,6 +15,8 @@ from pathlib import Path
 import httpx
 import pytest
 
+from service.cli.main import main
+from service.settings import exposed as found_exposed
 from tests.service.running import free_port, until
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -98,7 +100,7 @@ def test_every_step_of_the_tutorial(tmp_path: Path) -> None:
     meters = {meter["meter"]: meter["seen"] for meter in json.loads(state)["meters"]}
     assert len(meters) == 13
     assert all(meters.values())
-    reasons = [one["reason"] for one in json.loads(bad)["bad_readings"]]
+    reasons = [one["reason"] for one in json.loads(bad)["readings"]]
     assert len(reasons) == 2
     assert all(reason.startswith("signature: ") for reason in reasons)
     assert re.search(r'gridsec_bad_readings_total\{[^}]*reason="signature"\} 2\.0', counted)
@@ -114,23 +116,25 @@ def test_every_step_of_the_tutorial(tmp_path: Path) -> None:
     ids=["listen", "connect", "file"],
 )
 def test_plaintext_beyond_loopback_is_refused(
-    options: tuple[str, ...], exposed: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    options: tuple[str, ...],
+    exposed: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    from service.cli.main import main
-
     monkeypatch.chdir(tmp_path)
     (tmp_path / "bare.json5").write_text('{ mode: "router" }')
     monkeypatch.setattr(sys, "argv", ["gridsec", "serve", *options])
     with pytest.raises(SystemExit) as end:
         main()
     assert end.value.code == 2
-    assert exposed
+    error = " ".join(capsys.readouterr().err.split())
+    assert exposed in error
+    assert "--plaintext-network" in error
 
 
 def test_the_permission_allows_plaintext() -> None:
-    from service.settings import exposed
-
     inside = ("tcp/127.0.0.1:7447", "tcp/[::1]:7447", "tcp/localhost:1#so_rcvbuf=1", "unixsock-stream//tmp/z")
-    assert exposed((*inside, "tls/0.0.0.0:7447", "quic/grid.example:7447", "ws/10.0.0.1:1")) == (
+    assert found_exposed((*inside, "tls/0.0.0.0:7447", "quic/grid.example:7447", "ws/10.0.0.1:1")) == (
         "ws/10.0.0.1:1",
     )
