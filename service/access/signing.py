@@ -145,11 +145,13 @@ def read_meter_keys(path: Path, *, accepts_unlisted: bool) -> MeterKeys:
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputInvalid([Problem("unreadable", f"{path} cannot be read: {error}")]) from error
     entries: dict[tuple[str, str], _Entry] = {}
-    problems = []
+    problems: list[Problem] = []
+    seen: set[tuple[str, str]] = set()
     for number, (feeder, meter, scheme, key) in enumerate(lines, start=2):
         place = f"{path}, line {number}: "
-        if (feeder, meter) in entries:
+        if (feeder, meter) in seen:
             problems.append(Problem("duplicate", f"{place}{feeder}, {meter} has a key already"))
+        seen.add((feeder, meter))
         try:
             entries[feeder, meter] = _entry(scheme, key)
         except InputInvalid as error:

@@ -106,7 +106,7 @@ def test_every_problem_of_a_table_is_named(tmp_path: Path) -> None:
     path.write_text("feeder,meter\n")
     with refused(InputInvalid, "missing"):
         read_meter_keys(path, accepts_unlisted=False)
-    rows = ("a,m1,rsa,x", "a,m1,hmac,c2hvcnQ=", "a,m2,ed25519,c2hvcnQ=", "a,m3,hmac,?", "a,m4,certificate,")
+    rows = ("a,m0,rsa,x", "a,m1,hmac,c2hvcnQ=", "a,m2,ed25519,c2hvcnQ=", "a,m3,hmac,?", "a,m4,certificate,")
     path.write_text("\n".join(("feeder,meter,scheme,key", *rows)))
     with refused(InputInvalid, "unknown-name", "wrong-key", "wrong-key", "wrong-key", "wrong-key"):
         read_meter_keys(path, accepts_unlisted=False)

@@ -173,6 +173,30 @@ def test_a_certificate_of_another_authority_or_beyond_its_expiry_cannot_connect(
             pass
 
 
+def test_the_service_itself_can_be_the_router(tmp_path: Path) -> None:
+    write(planned(tmp_path, f"tls/127.0.0.1:{free_port()}"))
+    samples: list[Sample] = []
+    config = BusConfig(None, file=tmp_path / "router.json5")
+    with (
+        Bus(config, "gridsec", samples.extend, max_payload=1000, lossless=True) as bus,
+        session(BusConfig(None, file=tmp_path / "c1.json5")) as c1,
+        session(BusConfig(None, file=tmp_path / "scada.json5")) as scada,
+    ):
+        seen = scada.declare_subscriber("gridsec/town/estimate", zenoh.handlers.FifoChannel(1000))
+
+        def both() -> bool:
+            c1.put("gridsec/town/meter/m02/reading", b"forged")
+            c1.put("gridsec/town/estimate", b"forged")
+            c1.put("gridsec/town/meter/m01/reading", b"own")
+            bus.telemetry("town/estimate", b"true")
+            sample = seen.try_recv()
+            assert sample is None or sample.payload.to_bytes() == b"true"
+            return sample is not None and bool(samples)
+
+        until(both)
+    assert {sample.payload for sample in samples} == {b"own"}
+
+
 def test_the_router_has_a_rule_for_each_certificate(tmp_path: Path) -> None:
     plan = planned(tmp_path)
     made = zenoh_rules.files(plan)
