@@ -18,6 +18,7 @@ from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 from feeders.format.columns import ESTIMATORS
 from gridsec.errors import GridsecError, InputInvalid, Problem
 from service.access.signing import MeterKeys, read_meter_keys
+from service.errors import prefixed
 from service.ingest.align import Clock
 
 ENV_PREFIX = "GRIDSEC_"
@@ -110,7 +111,8 @@ class Settings(BaseSettings):
         try:
             return read_meter_keys(self.meter_keys, accepts_unlisted=self.unsigned == "accept")
         except InputInvalid as error:
-            raise SettingsInvalid(map(_of_meter_keys, error.problems)) from error
+            start = f"--meter-keys or {ENV_PREFIX}METER_KEYS: "
+            raise SettingsInvalid(prefixed(start, one) for one in error.problems) from error
 
     @field_validator("feeders", "zenoh_listen", "zenoh_connect", "http_hosts", mode="before")
     @classmethod
@@ -222,10 +224,6 @@ def strangers(environment: Mapping[str, str]) -> dict[str, str]:
 
 # Read elsewhere: folder of cached designs, and the switch that forbids tests to skip.
 _OTHERS = ("GRIDSEC_CACHE_DIR", "GRIDSEC_TESTS_REQUIRE_ALL")
-
-
-def _of_meter_keys(problem: Problem) -> Problem:
-    return Problem(problem.code, f"--meter-keys or {ENV_PREFIX}METER_KEYS: {problem}")
 
 
 def exposed(endpoints: Iterable[str]) -> tuple[str, ...]:

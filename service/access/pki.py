@@ -165,7 +165,8 @@ def certificates(folder: Path) -> tuple[Issued, ...]:
     """
     if not _certificate(folder, AUTHORITY).is_file():
         raise InputInvalid([_no_authority(folder)])
-    found, problems = [], []
+    found: list[Issued] = []
+    problems: list[str] = []
     for path in sorted(folder.glob("*.crt"), key=lambda one: (one.stem != AUTHORITY, one.stem)):
         try:
             found.append(_read(path))

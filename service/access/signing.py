@@ -23,6 +23,7 @@ from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
 from gridsec.errors import InputInvalid, Problem
+from service.errors import prefixed
 
 BUSBAR = "substation"
 ATTACHMENT_MAX = 256
@@ -155,7 +156,7 @@ def read_meter_keys(path: Path, *, accepts_unlisted: bool) -> MeterKeys:
         try:
             entries[feeder, meter] = _entry(scheme, key)
         except InputInvalid as error:
-            problems += [Problem(one.code, place + one) for one in error.problems if isinstance(one, Problem)]
+            problems += [prefixed(place, one) for one in error.problems]
     if problems:
         raise InputInvalid(problems)
     return MeterKeys(entries, accepts_unlisted)
