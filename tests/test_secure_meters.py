@@ -111,8 +111,9 @@ def test_every_step_of_the_tutorial(tmp_path: Path) -> None:
         (("--zenoh-listen", "tcp/0.0.0.0:7447"), "tcp/0.0.0.0:7447"),
         (("--zenoh-connect", "udp/grid.example:7447"), "udp/grid.example:7447"),
         (("--zenoh-config", "bare.json5"), "tcp/[::]:7447"),
+        (("--zenoh-config", "bare.json5", "--zenoh-mode", "client"), "udp/224.0.0.224:7446"),
     ],
-    ids=["listen", "connect", "file"],
+    ids=["listen", "connect", "file", "scouting"],
 )
 def test_plaintext_beyond_loopback_is_refused(
     options: tuple[str, ...],

@@ -32,7 +32,7 @@ ATTACHMENT_MAX = 256
 SECRET_MIN = 16
 """Size of the shortest secret, bytes."""
 
-_COLUMNS = ("feeder", "meter", "scheme", "key")
+COLUMNS = ("feeder", "meter", "scheme", "key")
 _ATTACHMENT = re.compile(rb"v1 (ed25519|hmac) ([0-9]{1,19}):([0-9]{1,19}) ([A-Za-z0-9+/]{43,86}={1,2})")
 
 
@@ -128,6 +128,25 @@ def signed_bytes(scheme: str, epoch: int, seq: int, key: str, payload: bytes) ->
     return f"v1 {scheme} {epoch}:{seq} {key}\n".encode() + payload
 
 
+def table_rows(path: Path) -> list[tuple[str, ...]]:
+    """Read the rows of a table of keys: feeder, meter, scheme, key.
+
+    Raises
+    ------
+    InputInvalid
+        If the file cannot be read, or lacks a column.
+    """
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            rows = csv.DictReader(file)
+            lacking = [name for name in COLUMNS if name not in (rows.fieldnames or ())]
+            if lacking:
+                raise InputInvalid([Problem("missing", f"{path}: no column {', '.join(lacking)}")])
+            return [tuple((row[name] or "").strip() for name in COLUMNS) for row in rows]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputInvalid([Problem("unreadable", f"{path} cannot be read: {error}")]) from error
+
+
 def read_meter_keys(path: Path, *, accepts_unlisted: bool) -> MeterKeys:
     """Read a table with the columns feeder, meter, scheme, key (base64, or the name of a certificate).
 
@@ -136,15 +155,7 @@ def read_meter_keys(path: Path, *, accepts_unlisted: bool) -> MeterKeys:
     InputInvalid
         With every problem of the table.
     """
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            rows = csv.DictReader(file)
-            lacking = [name for name in _COLUMNS if name not in (rows.fieldnames or ())]
-            if lacking:
-                raise InputInvalid([Problem("missing", f"{path}: no column {', '.join(lacking)}")])
-            lines = [[(row[name] or "").strip() for name in _COLUMNS] for row in rows]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputInvalid([Problem("unreadable", f"{path} cannot be read: {error}")]) from error
+    lines = table_rows(path)
     entries: dict[tuple[str, str], _Entry] = {}
     problems: list[Problem] = []
     seen: set[tuple[str, str]] = set()

@@ -16,9 +16,9 @@ from typing import Any
 
 from gridsec.errors import InputInvalid, Problem
 from service.access.pki import AUTHORITY, Issued, Kind
+from service.access.signing import BUSBAR, COLUMNS, Scheme, table_rows
 
 ENDPOINT = "tls/127.0.0.1:7447"
-BUSBAR = "substation"
 KEYS_FILE = "meter-keys.csv"
 _COLUMNS = ("certificate", "feeder", "meter")
 _ENDPOINT = re.compile(r"tls/\S+:[0-9]{1,5}")
@@ -39,7 +39,8 @@ class Assignment:
 class Plan:
     """Certificates, feeders with their meters, assignments, endpoints of the router, prefix of all keys.
 
-    `installed` is the folder of the certificates on the machines that use them.
+    `installed` is the folder of the certificates on the machines that use them. `keys` are rows of meters
+    that sign: feeder, meter, scheme, key.
     """
 
     certificates: tuple[Issued, ...]
@@ -48,6 +49,7 @@ class Plan:
     endpoints: tuple[str, ...]
     prefix: str
     installed: Path
+    keys: tuple[tuple[str, ...], ...] = ()
 
 
 def read_assignments(path: Path | None) -> tuple[Assignment, ...]:
@@ -85,9 +87,24 @@ def files(plan: Plan) -> dict[str, str]:
             made[f"{one.name}.json5"] = _text(_router(plan, one, owners))
         elif one.kind != AUTHORITY:
             made[f"{one.name}.json5"] = _text(_client(plan, one))
-    rows = [(feeder, meter, "certificate", name) for (feeder, meter), name in sorted(owners.items())]
-    made[KEYS_FILE] = "".join(f"{','.join(row)}\n" for row in (("feeder", "meter", "scheme", "key"), *rows))
+    proofs = {place: ("certificate", name) for place, name in owners.items()}
+    proofs |= {(feeder, meter): (scheme, key) for feeder, meter, scheme, key in plan.keys}
+    rows = [COLUMNS, *((*place, *proofs[place]) for place in sorted(proofs))]
+    made[KEYS_FILE] = "".join(f"{','.join(row)}\n" for row in rows)
     return made
+
+
+def kept_keys(folder: Path) -> tuple[tuple[str, ...], ...]:
+    """Read the rows of meters that sign from a folder's `meter-keys.csv`, if it exists.
+
+    Raises
+    ------
+    InputInvalid
+        If the file cannot be read.
+    """
+    path = folder / KEYS_FILE
+    rows = table_rows(path) if path.exists() else []
+    return tuple(row for row in rows if row[2] != Scheme.CERTIFICATE)
 
 
 def _owners(plan: Plan) -> dict[tuple[str, str], str]:

@@ -100,7 +100,8 @@ def zenoh_config(
 ) -> None:
     """Write zenoh configurations with mutual TLS, and access rules by certificate.
 
-    Each concentrator and meter publishes its own keys only, the service alone estimates and alarms.
+    Each concentrator and meter publishes its own keys only, the service alone estimates and alarms. Rows of
+    meters that sign stay in `meter-keys.csv`.
     """
     from feeders.model.site import load
     from service.access import pki, zenoh_rules
@@ -114,11 +115,12 @@ def zenoh_config(
             endpoints=tuple(endpoint or (zenoh_rules.ENDPOINT,)),
             prefix=prefix,
             installed=(installed or folder).absolute(),
+            keys=zenoh_rules.kept_keys(out),
         )
         files = zenoh_rules.files(plan)
     out.mkdir(parents=True, exist_ok=True)
     for name, content in files.items():
-        (out / name).write_text(content)
+        pki.write_private(out / name, content.encode())
     console.out.print(
         f"{out}: {', '.join(files) if len(files) <= 12 else f'{len(files)} files'}", soft_wrap=True
     )

@@ -29,6 +29,8 @@ QUERIES_WAITING = 256
 _ESTIMATES = 1024
 _OPEN_TIMEOUT_MS = 5_000
 JSON = "application/json"
+_MULTICAST = "udp/224.0.0.224:7446"
+"""Group of zenoh's multicast scouting."""
 
 
 def _config(config: BusConfig) -> zenoh.Config:
@@ -95,7 +97,7 @@ def session(config: BusConfig) -> Iterator[zenoh.Session]:
 
 
 def endpoints(config: BusConfig) -> tuple[str, ...]:
-    """Return the endpoints that a session of a configuration listens on and connects to.
+    """Return the endpoints of a configuration: to listen on, to connect to, to search other sessions.
 
     Raises
     ------
@@ -110,6 +112,9 @@ def endpoints(config: BusConfig) -> tuple[str, ...]:
         if isinstance(ends, dict):
             ends = ends.get(mode, [])
         found += [end["locator"] if isinstance(end, dict) else end for end in ends or ()]
+    scouts = mode != "router" and json.loads(built.get_json("scouting/multicast/enabled")) is not False
+    if scouts and json.loads(built.get_json("transport/link/protocols")) != ["tls"]:
+        found.append(_MULTICAST)
     return tuple(found)
 
 

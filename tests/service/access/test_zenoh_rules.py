@@ -93,6 +93,7 @@ def test_a_certificate_publishes_the_keys_of_its_meters_only(network: Network) -
                 for key in every:
                     live.put(f"gridsec/{key}", key)
                     live.delete(f"gridsec/{key}")
+                live.put("gridsec/*/meter/*/reading", b"pattern")
             time.sleep(0.2)
             return set(network.keys()) >= {f"gridsec/{key}" for key in every}
 
@@ -100,6 +101,7 @@ def test_a_certificate_publishes_the_keys_of_its_meters_only(network: Network) -
         # Each key arrives from one of the three sessions only, in every repetition.
         rounds = network.keys().count("gridsec/town/meter/m05/reading")
         assert len(network.samples) <= (rounds + 1) * len(every)
+        assert set(network.keys()) == {f"gridsec/{key}" for key in every}
     assert network.bus.counts.deleted == 0
 
 
@@ -118,6 +120,7 @@ def test_the_service_alone_publishes_estimates_and_alarms(network: Network) -> N
     with network.client("scada") as scada, network.client("c1") as c1, network.client("c2") as reader:
         keys = ("gridsec/town/estimate", "gridsec/town/alarm/a1")
         seen = [reader.declare_subscriber(key, zenoh.handlers.FifoChannel(1000)) for key in keys]
+        alive = c1.liveliness().declare_token("gridsec/service/forged")
         served = c1.declare_queryable(keys[0], zenoh.handlers.FifoChannel(10))
         readings = reader.declare_subscriber("gridsec/town/meter/**", zenoh.handlers.FifoChannel(10))
         number = 0
@@ -144,7 +147,9 @@ def test_the_service_alone_publishes_estimates_and_alarms(network: Network) -> N
         assert served.try_recv() is None
         assert readings.try_recv() is None
         tokens = reader.liveliness().get("gridsec/service/*", timeout=2.0)
-        assert [one for one in tokens if one.ok]
+        (token,) = (str(one.ok.key_expr) for one in tokens if one.ok)
+        assert token != "gridsec/service/forged"
+        alive.undeclare()
 
 
 def test_a_client_without_certificate_cannot_connect(network: Network) -> None:
@@ -171,6 +176,32 @@ def test_a_certificate_of_another_authority_or_beyond_its_expiry_cannot_connect(
     for name in ("foreign", "c1"):
         with pytest.raises(BusUnavailable), network.client(name):
             pass
+
+
+def test_a_meter_cannot_pass_for_the_router(tmp_path: Path) -> None:
+    write(planned(tmp_path, f"tls/127.0.0.1:{free_port()}"))
+    text = (tmp_path / "router.json5").read_text()
+    (tmp_path / "false.json5").write_text(text.replace(f"{tmp_path}/router.", f"{tmp_path}/c2."))
+    with (
+        session(BusConfig(None, file=tmp_path / "false.json5")),
+        pytest.raises(BusUnavailable),
+        session(BusConfig(None, file=tmp_path / "c1.json5")),
+    ):
+        pass
+
+
+def test_a_connection_ends_with_its_certificate(tmp_path: Path) -> None:
+    plan = planned(tmp_path, f"tls/127.0.0.1:{free_port()}")
+    pki.issue(tmp_path, "scada", Kind.SUBSCRIBER, time.time(), lasts_s=3.0, renew=True)
+    write(plan)
+    with (
+        session(BusConfig(None, file=tmp_path / "router.json5")) as router,
+        session(BusConfig(None, file=tmp_path / "c1.json5")) as c1,
+        session(BusConfig(None, file=tmp_path / "scada.json5")) as scada,
+    ):
+        assert list(scada.info.routers_zid()) == [router.zid()]
+        until(lambda: not list(scada.info.routers_zid()), "the end of the connection", 15.0)
+        assert list(c1.info.routers_zid()) == [router.zid()]
 
 
 def test_the_service_itself_can_be_the_router(tmp_path: Path) -> None:
@@ -238,6 +269,20 @@ def test_every_problem_of_a_plan_is_named(tmp_path: Path) -> None:
             "missing",
         ]
     )
+
+
+def test_keys_of_meters_that_sign_stay_in_the_table(tmp_path: Path) -> None:
+    plan = planned(tmp_path)
+    assert zenoh_rules.kept_keys(tmp_path) == ()
+    write(plan)
+    table = tmp_path / "meter-keys.csv"
+    table.write_text(table.read_text().replace("m01,certificate,c1", "m01,hmac,c2VjcmV0IG9mIDE2IGJ5dGVz"))
+    write(replace(plan, keys=zenoh_rules.kept_keys(tmp_path)))
+    assert table.read_text().splitlines()[1:4] == [
+        "town,m01,hmac,c2VjcmV0IG9mIDE2IGJ5dGVz",
+        "town,m02,certificate,c2",
+        "town,m05,certificate,town.m05",
+    ]
 
 
 def test_a_table_without_its_columns_is_refused(tmp_path: Path) -> None:
