@@ -1,6 +1,6 @@
-"""Cost of access rules and signatures: start of a router by number of rules, verification per reading.
+"""Cost of access rules and signatures: start of a router and puts by number of rules, verification.
 
-`python -m benchmarks.secure_zenoh` prints both.
+`python -m benchmarks.secure_zenoh` prints all.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import tempfile
 import time
 from pathlib import Path
 
+import zenoh
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from service.access import pki, zenoh_rules
@@ -20,12 +21,13 @@ from service.access.signing import read_meter_keys, signed_bytes
 from service.ingest.queues import BusConfig
 from service.ingest.zenoh_bus import session
 
+PUTS = 2000
 KEY = "gridsec/town/meter/m0/reading"
 PAYLOAD = b'{"t": 1795212000.25, "seq": 17, "v_volt": 231.4, "p_kw": 0.8, "q_kvar": 0.1}'
 
 
-def start_s(count: int, folder: Path) -> tuple[float, float, float]:
-    """Times of writing the files, the start of the router, and the connection of one meter, s."""
+def start_s(count: int, folder: Path) -> tuple[float, float, float, float]:
+    """Times of writing the files, the start of the router, the connection of one meter, and its puts, s."""
     now = time.time()
     pki.create_authority(folder, now, lasts_s=1e6)
     for name, kind in (
@@ -48,11 +50,18 @@ def start_s(count: int, folder: Path) -> tuple[float, float, float]:
     for name in ("router.json5", "c0.json5"):
         (folder / name).write_text(made[name])
     written = time.perf_counter()
-    with session(BusConfig(None, file=folder / "router.json5")):
+    with session(BusConfig(None, file=folder / "router.json5")) as router:
         up = time.perf_counter()
-        with session(BusConfig(None, file=folder / "c0.json5")):
+        arrived = router.declare_subscriber("gridsec/*/**/reading$*", zenoh.handlers.FifoChannel(2 * PUTS))
+        declared = time.perf_counter()
+        with session(BusConfig(None, file=folder / "c0.json5")) as meter:
             connected = time.perf_counter()
-    return written - begun, up - written, connected - up
+            for _ in range(PUTS):
+                meter.put(KEY, PAYLOAD, congestion_control=zenoh.CongestionControl.BLOCK)
+            for _ in range(PUTS):
+                arrived.recv()
+            sent = time.perf_counter()
+    return written - begun, up - written, connected - declared, sent - connected
 
 
 def verification_us(scheme: str, folder: Path, rounds: int = 2000) -> float:
@@ -83,8 +92,11 @@ def main() -> None:
     """Print all times."""
     for count in map(int, sys.argv[1:] or ("1", "1000", "10000")):
         with tempfile.TemporaryDirectory() as folder:
-            written, up, connected = start_s(count, Path(folder))
-        print(f"{count:6} rules: files {written:.2f} s, start {up:.2f} s, connection {connected:.2f} s")
+            written, up, connected, sent = start_s(count, Path(folder))
+        print(
+            f"{count:6} rules: files {written:.2f} s, start {up:.2f} s, "
+            f"connection {connected * 1e3:.0f} ms, {sent / PUTS * 1e6:.0f} us per reading"
+        )
     for scheme in ("ed25519", "hmac"):
         with tempfile.TemporaryDirectory() as folder:
             print(f"{scheme}: {verification_us(scheme, Path(folder)):.0f} us per reading")
