@@ -228,7 +228,7 @@ _OTHERS = ("GRIDSEC_CACHE_DIR", "GRIDSEC_TESTS_REQUIRE_ALL")
 
 def exposed(endpoints: Iterable[str]) -> tuple[str, ...]:
     """Return the endpoints of zenoh that use a network beyond loopback without TLS."""
-    return tuple(end for end in endpoints if not _protected(end))
+    return tuple(end.partition("#")[0] for end in endpoints if not _protected(end))
 
 
 def _protected(endpoint: str) -> bool:
