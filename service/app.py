@@ -67,6 +67,7 @@ async def serve(
     BusUnavailable, AddressUnavailable if the service cannot start.
     """
     shares = Shares.of(raise_limit())
+    meter_keys = settings.read_meter_keys()
     sites = {
         name: choose(site, estimator=settings.estimator)
         for name, site in load_sites(settings.feeders).items()
@@ -88,6 +89,7 @@ async def serve(
             max_payload=settings.max_payload,
             max_samples=settings.queue,
             max_feeders=settings.max_feeders,
+            meter_keys=meter_keys,
         )
         runtime = Runtime(
             config, store, sites.values(), given=given, unloaded=unloaded, wall=wall, settled=settled

@@ -17,6 +17,8 @@ from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from feeders.format.columns import ESTIMATORS
 from gridsec.errors import GridsecError, InputInvalid, Problem
+from service.access.signing import MeterKeys, read_meter_keys
+from service.errors import prefixed
 from service.ingest.align import Clock
 
 ENV_PREFIX = "GRIDSEC_"
@@ -85,6 +87,9 @@ class Settings(BaseSettings):
     oidc_jwks: str = ""
     oidc_role_claim: str = "gridsec_role"
     open_to_network_without_authentication: bool = False
+    meter_keys: Path | None = None
+    unsigned: Literal["refuse", "accept"] = "refuse"
+    plaintext_network: bool = False
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     log_format: Literal["console", "json"] = "console"
 
@@ -94,6 +99,22 @@ class Settings(BaseSettings):
         if self.zenoh_listen or self.zenoh_config is not None or self.zenoh_mode == "client":
             return self.zenoh_listen
         return (DEFAULT_ENDPOINT,)
+
+    def read_meter_keys(self) -> MeterKeys | None:
+        """Return the keys of meters; None without `meter_keys`.
+
+        Raises
+        ------
+        SettingsInvalid
+            If the file cannot be read, or has a wrong row.
+        """
+        if self.meter_keys is None:
+            return None
+        try:
+            return read_meter_keys(self.meter_keys, accepts_unlisted=self.unsigned == "accept")
+        except InputInvalid as error:
+            start = f"--meter-keys or {ENV_PREFIX}METER_KEYS: "
+            raise SettingsInvalid(prefixed(start, one) for one in error.problems) from error
 
     @field_validator("feeders", "zenoh_listen", "zenoh_connect", "http_hosts", mode="before")
     @classmethod
@@ -197,6 +218,41 @@ def strangers(environment: Mapping[str, str]) -> dict[str, str]:
 
 # Read elsewhere: folder of cached designs, and the switch that forbids tests to skip.
 _OTHERS = ("GRIDSEC_CACHE_DIR", "GRIDSEC_TESTS_REQUIRE_ALL")
+
+
+def exposed(endpoints: Iterable[str]) -> tuple[str, ...]:
+    """Return the endpoints of zenoh that use a network beyond loopback without TLS."""
+    return tuple(end.partition("#")[0] for end in endpoints if not _protected(end))
+
+
+def _protected(endpoint: str) -> bool:
+    protocol, _, rest = endpoint.partition("/")
+    if protocol not in ("tcp", "udp", "ws"):
+        return True
+    address = re.split("[?#]", rest, maxsplit=1)[0]
+    host = address.rpartition(":")[0].removeprefix("[").removesuffix("]")
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def refuse_exposed(endpoints: Iterable[str]) -> None:
+    """Refuse endpoints of zenoh that use a network beyond loopback without TLS.
+
+    Raises
+    ------
+    SettingsInvalid
+        With one problem for all of them.
+    """
+    found = exposed(endpoints)
+    if found:
+        text = (
+            f"zenoh uses a network without TLS: {', '.join(found)}; expected an endpoint on loopback, or "
+            "--zenoh-config with a file made by `gridsec zenoh-config`, or --plaintext-network "
+            f"({ENV_PREFIX}PLAINTEXT_NETWORK) where any machine of the network may publish readings"
+        )
+        raise SettingsInvalid([Problem("plaintext-network", text)])
 
 
 def _problem(error: Any) -> Problem:

@@ -31,7 +31,8 @@ def _texts(node: ast.expr) -> Iterator[str]:
 def codes_in(source: str) -> set[str]:
     """Literal codes of a module.
 
-    `Problem(...)`, `InputInvalid.of(...)`, `report.problem(...)`, arguments `code=...` and their defaults, class attributes.
+    `Problem(...)`, `InputInvalid.of(...)`, `report.problem(...)`, arguments `code=...` and their defaults,
+    class attributes.
     """
     out: set[str] = set()
     for node in ast.walk(ast.parse(source)):

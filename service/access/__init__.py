@@ -4,4 +4,7 @@
 `keys`      API keys
 `tokens`    OIDC bearer tokens
 `audit`     hash chain of the audit log
+`pki`       authority and certificates
+`signing`   signatures of readings
+`zenoh_rules`  access rules of zenoh
 """

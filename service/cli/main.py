@@ -24,6 +24,7 @@ from service.cli import (
     access,
     console,
     feeders,
+    pki,
     replay,
     reproduce,
     serve,
@@ -90,6 +91,8 @@ app.add_typer(access.key_app, name="key")
 app.add_typer(access.audit_app, name="audit")
 app.command("convert")(feeders.convert)
 app.add_typer(study_app, name="study")
+app.add_typer(pki.app, name="pki")
+app.command("zenoh-config")(pki.zenoh_config)
 app.command()(replay.replay)
 app.command()(reproduce.reproduce)
 app.command()(serve.serve)

@@ -70,6 +70,22 @@ OpenToNetwork = Annotated[
         help="Dangerous: any client on the network can read, acknowledge and change everything.",
     ),
 ]
+MeterKeysFile = Annotated[
+    Path | None,
+    typer.Option(
+        help="Table (csv) feeder,meter,scheme,key: readings of these meters need a valid signature."
+    ),
+]
+Unsigned = Annotated[
+    str | None,
+    typer.Option(help="refuse or accept: meters without a row in --meter-keys. [default: refuse]"),
+]
+Plaintext = Annotated[
+    bool,
+    typer.Option(
+        "--plaintext-network", help="Dangerous: zenoh without TLS beyond loopback; any machine can publish."
+    ),
+]
 LogLevel = Annotated[str | None, typer.Option(help="debug, info, warning or error. [default: info]")]
 LogFormat = Annotated[str | None, typer.Option(help="console or json. [default: console]")]
 STOP_S = 2.7
@@ -100,6 +116,9 @@ def serve(
     oidc_jwks: OidcJwks = None,
     oidc_role_claim: OidcRoleClaim = None,
     open_to_network_without_authentication: OpenToNetwork = False,
+    meter_keys: MeterKeysFile = None,
+    unsigned: Unsigned = None,
+    plaintext_network: Plaintext = False,
     log_level: LogLevel = None,
     log_format: LogFormat = None,
     until_eof: UntilEof = False,
@@ -114,7 +133,9 @@ def serve(
     from service import logs
     from service.app import serve as run
     from service.engine.design_jobs import abandon, settle
-    from service.settings import settings, strangers
+    from service.ingest import zenoh_bus
+    from service.ingest.queues import BusConfig
+    from service.settings import refuse_exposed, settings, strangers
 
     chosen = settings(
         {
@@ -139,10 +160,16 @@ def serve(
             "oidc_jwks": oidc_jwks,
             "oidc_role_claim": oidc_role_claim,
             "open_to_network_without_authentication": open_to_network_without_authentication or None,
+            "meter_keys": meter_keys,
+            "unsigned": unsigned,
+            "plaintext_network": plaintext_network or None,
             "log_level": log_level,
             "log_format": log_format,
         }
     )
+    if not chosen.plaintext_network:
+        bus = BusConfig(chosen.zenoh_mode, chosen.listen, chosen.zenoh_connect, chosen.zenoh_config)
+        refuse_exposed(zenoh_bus.endpoints(bus))
     logs.set_up(chosen.log_level, chosen.log_format)
     for variable, closest in strangers(os.environ).items():
         structlog.get_logger().warning("variable_ignored", variable=variable, closest=closest or None)

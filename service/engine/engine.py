@@ -26,6 +26,7 @@ import structlog
 
 from feeders.model.site import Site
 from gridsec.errors import GridsecError
+from service.access.signing import MeterKeys
 from service.alarms.state_machine import (
     Alarm,
     AlarmRules,
@@ -184,6 +185,7 @@ class RuntimeConfig:
     max_payload: int = 256 * 1024  # size of the largest accepted payload, bytes
     max_samples: int = 20_000  # length of the queue before the runtime, samples
     max_feeders: int = 100  # largest number of feeders added at run time, besides those given at the start
+    meter_keys: MeterKeys | None = None  # keys of meters; None accepts readings without signature
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,7 +232,7 @@ class Engine:
         self._wall, self._stored, self._continues = wall, stored, go_on
         self._catch_up = CatchUp(clock, waits=config.clock is Clock.EVENTS)
         self.committer = Committer(store, self.metrics, stored, self._count_stored, apart)
-        self._wire = Wire({}, config.prefix, config.max_payload)
+        self._wire = Wire({}, config.prefix, config.max_payload, config.meter_keys)
         for site in sites:
             self.add(site)
 
@@ -330,7 +332,7 @@ class Engine:
 
     def _learn(self) -> None:
         known = {name: known_of(monitor.site) for name, monitor in self.monitors.items()}
-        self._wire = Wire(known, self.config.prefix, self.config.max_payload)
+        self._wire = Wire(known, self.config.prefix, self.config.max_payload, self.config.meter_keys)
 
     def begin(self) -> None:
         """Set the replies for standing alarms; publish the stored alarms of an earlier process.
@@ -448,7 +450,13 @@ class Engine:
     def _decode(self, sample: Sample) -> DecodedPayload:
         """Decode a payload; a defect of the decoder costs this payload only."""
         try:
-            return self._wire.decode(sample.key, sample.payload, sample.encoding, size=sample.size)
+            return self._wire.decode(
+                sample.key,
+                sample.payload,
+                sample.encoding,
+                size=sample.size,
+                attachment=sample.attachment,
+            )
         except Exception as error:  # noqa: BLE001 - one payload must not end the service
             problem = beginning(f"{type(error).__name__}: {error}")
             _log.error("a payload could not be decoded", key=sample.key[:HEAD_BYTES], problem=problem)

@@ -28,6 +28,7 @@ import msgspec
 import pyarrow as pa
 from pyarrow import ipc
 
+from service.access.signing import MeterKeys, Refusal
 from service.ingest.reading import (
     HEAD_BYTES,
     BadReading,
@@ -205,9 +206,16 @@ class Wire:
     known: Mapping[str, Known]  # the monitored feeders, by name
     prefix: str = "gridsec"  # first chunks of every key, without a final slash
     max_bytes: int = 256 * 1024  # size of the largest accepted payload, bytes
+    keys: MeterKeys | None = None  # keys of meters; None accepts readings without signature
 
     def decode(
-        self, key: str, payload: bytes, encoding: str = "", *, size: int | None = None
+        self,
+        key: str,
+        payload: bytes,
+        encoding: str = "",
+        *,
+        size: int | None = None,
+        attachment: bytes = b"",
     ) -> DecodedPayload:
         """Return the readings and the bad readings in one payload.
 
@@ -231,7 +239,34 @@ class Wire:
             accepted = "application/json" if source.concentrator is None else "JSON, CBOR or Arrow IPC"
             problem = f"encoding `{encoding[:80]}` is not supported; use {accepted}"
             return _refuse(base, BadReason.ENCODING, problem)
-        return decoder(payload, source, self.known[source.feeder], base)
+        decoded = decoder(payload, source, self.known[source.feeder], base)
+        if self.keys is None:
+            return decoded
+        check = partial(self.keys.check, key=key, payload=payload, attachment=attachment)
+        return _verified(decoded, check, base)
+
+
+def _verified(
+    decoded: DecodedPayload, check: Callable[[str, str | None], Refusal | None], base: BadReading
+) -> DecodedPayload:
+    """Move readings that their keys refuse to the bad ones."""
+    accepted: list[Reading] = []
+    bad = list(decoded.bad)
+    more: Counter[BadReason] = Counter()
+    for reading in decoded.readings:
+        refusal = check(reading.feeder, reading.meter)
+        if refusal is None:
+            accepted.append(reading)
+            continue
+        reason = BadReason(refusal.reason)
+        more[reason] += 1
+        if more[reason] <= DETAILED_PER_REASON:
+            bad.append(replace(base, reason=reason, problems=(refusal.problem,), meter=reading.meter))
+    for reason, count in more.items():
+        if (rest := count - DETAILED_PER_REASON) > 0:
+            problem = f"{rest} more elements of the batch: {reason}"
+            bad.append(replace(base, reason=reason, problems=(problem,), count=rest))
+    return DecodedPayload(tuple(accepted), tuple(bad))
 
 
 def _decoder(

@@ -42,7 +42,7 @@ class BusConfig:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """One put, copied from zenoh: key, bytes, encoding, wall time of its arrival (Unix s).
+    """One put, copied from zenoh: key, bytes, encoding, wall time of its arrival (Unix s), attachment.
 
     A payload above the limit is cut to its beginning; `size` is the whole length. An oversized key is cut,
     too.
@@ -53,6 +53,7 @@ class Sample:
     encoding: str
     arrival: float
     size: int
+    attachment: bytes = b""
 
 
 @dataclass(slots=True)
@@ -143,7 +144,8 @@ class Inbox:
 
 def _size(sample: Sample) -> int:
     """Memory of a waiting sample, bytes: the sender chooses the key and the encoding, too."""
-    return len(sample.payload) + sys.getsizeof(sample.key) + sys.getsizeof(sample.encoding) + _OVERHEAD
+    texts = len(sample.payload) + len(sample.attachment)
+    return texts + sys.getsizeof(sample.key) + sys.getsizeof(sample.encoding) + _OVERHEAD
 
 
 EVENTS_WAITING = 10_000

@@ -40,6 +40,8 @@ class BadReason(StrEnum):
     TYPE = "type"
     VALUE = "value"
     CLOCK_OFF = "clock-off"
+    SIGNATURE = "signature"
+    REPLAYED = "replayed"
     INTERNAL = "internal"
 
 

@@ -17,6 +17,7 @@ from typing import Any
 
 import zenoh
 
+from service.access.signing import ATTACHMENT_MAX
 from service.ingest.queues import BusConfig, BusCounts, BusUnavailable, Outgoing, Publication, Sample
 
 RING = 8192
@@ -28,6 +29,8 @@ QUERIES_WAITING = 256
 _ESTIMATES = 1024
 _OPEN_TIMEOUT_MS = 5_000
 JSON = "application/json"
+_MULTICAST = "udp/224.0.0.224:7446"
+"""Group of zenoh's multicast scouting."""
 
 
 def _config(config: BusConfig) -> zenoh.Config:
@@ -88,6 +91,28 @@ def session(config: BusConfig) -> Iterator[zenoh.Session]:
         raise BusUnavailable(text, code="bus-endpoint") from error
     with opened:
         yield opened
+
+
+def endpoints(config: BusConfig) -> tuple[str, ...]:
+    """Return the endpoints of a configuration: to listen on, to connect to, to search other sessions.
+
+    Raises
+    ------
+    BusUnavailable
+        If the configuration is wrong.
+    """
+    built = _config(config)
+    mode = json.loads(built.get_json("mode")) or "peer"
+    found: list[str] = []
+    for name in ("listen", "connect"):
+        ends = json.loads(built.get_json(f"{name}/endpoints"))
+        if isinstance(ends, dict):
+            ends = ends.get(mode, [])
+        found += [end["locator"] if isinstance(end, dict) else end for end in ends or ()]
+    scouts = mode != "router" and json.loads(built.get_json("scouting/multicast/enabled")) is not False
+    if scouts and json.loads(built.get_json("transport/link/protocols")) != ["tls"]:
+        found.append(_MULTICAST)
+    return tuple(found)
 
 
 class Bus:
@@ -193,8 +218,11 @@ class Bus:
         payload = raw.payload.to_bytes()
         size = len(payload)
         kept = payload if size <= self._max_payload else payload[:_HEAD]
-        # A key that is cut here is longer than every valid key, and stays invalid.
-        return Sample(key[: len(self._prefix) + _HEAD], kept, str(raw.encoding), self._wall(), size)
+        attached = raw.attachment
+        # A key or an attachment that is cut here is longer than every valid one, and stays invalid.
+        attachment = b"" if attached is None else attached.to_bytes()[: ATTACHMENT_MAX + 1]
+        at = key[: len(self._prefix) + _HEAD]
+        return Sample(at, kept, str(raw.encoding), self._wall(), size, attachment)
 
     # ---------------------------------------------------------------- out
 

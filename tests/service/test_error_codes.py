@@ -30,6 +30,7 @@ from feeders.model.site import load
 from gridsec.errors import FeederInvalid, GridsecError, InputInvalid, Problem
 from gridsec.estimators.sequential import SuspicionRecord
 from service import app
+from service.access import pki
 from service.access.identity import NotAuthenticated, Role
 from service.access.keys import create
 from service.access.tokens import TokenVerifier
@@ -48,7 +49,7 @@ from service.ingest import zenoh_bus
 from service.ingest.align import AlignRules
 from service.ingest.queues import BusConfig
 from service.ingest.zenoh_bus import MeterClient
-from service.settings import settings
+from service.settings import refuse_exposed, settings
 from service.store import Store, committer, schema, writes
 from service.store.access import AccessStore
 from service.store.connect import NoAnswer, WriterSession
@@ -421,6 +422,17 @@ def wrong_settings(_: Path, __: Patch) -> None:
     )
 
 
+def damaged_certificate(place: Path, _: Patch) -> None:
+    (place / "authority.crt").write_text("nothing")
+    pki.certificates(place)
+
+
+def wrong_meter_keys(place: Path, _: Patch) -> None:
+    rows = ("a,m1,hmac,c2hvcnQ=", "a,m1,rsa,", "a,m2,ed25519,?")
+    (place / "keys.csv").write_text("\n".join(("feeder,meter,scheme,key", *rows)))
+    settings({"meter_keys": place / "keys.csv"}).read_meter_keys()
+
+
 def refuse(error: Exception) -> None:
     raise error
 
@@ -489,6 +501,9 @@ CALLS: dict[str, Call] = {
     "paths": paths,
     "folder without permission": not_writable,
     "settings": wrong_settings,
+    "damaged certificate": damaged_certificate,
+    "keys of meters": wrong_meter_keys,
+    "zenoh on a network without TLS": lambda _, __: refuse_exposed(("tcp/0.0.0.0:7447", "tls/0.0.0.0:7448")),
     "zenoh file that is damaged": lambda place, _: (
         (place / "zenoh.json5").write_text("{ mode: "),
         zenoh_bus._config(BusConfig(file=Path("zenoh.json5"))),
