@@ -4,6 +4,8 @@ import { busbarWords, byId, el, isKnown, nominals, signed, status, svg, volt } f
 import { hasMap, oneLine } from "./layout.js";
 import { Scale } from "./scale.js";
 
+const LINE = 12; // Height of a line of a note, px.
+
 // Shapes around (0, 0): the status of a customer must be readable without colour.
 const SHAPE = {
   ok: "M-7 0a7 7 0 1 0 14 0a7 7 0 1 0-14 0z",
@@ -205,7 +207,7 @@ export class Diagram {
     const right = at(columns - 1, rows - 1);
     const extent = upright
       ? [Math.max(width - 4, right[0] + 78), right[1] + 24]
-      : [Math.max(right[0] + pad, 200), right[1] + 34 + 34 * size];
+      : [Math.max(right[0] + pad, 200), right[1] + (55 + 3 * LINE) * size + 8]; // Drop, note, two lines, a lower one.
     const root = svg("svg", {
       width: extent[0], height: extent[1], viewBox: `0 0 ${extent[0]} ${extent[1]}`, role: "group",
       "aria-label": `One-line diagram, ${this.feeder.layout.customers.length} customers`,
@@ -310,13 +312,15 @@ export class Diagram {
       const loud = now.key === "suspect";
       // Notes of neighbouring suspects must not overlap.
       const low = loud && !part.labels && before?.loud && !before.low && before.near(part);
-      if (part.place.y > 10) part.note.setAttribute("y", part.place.y + (low ? 11 : 0));
+      if (part.place.y > 10) part.note.setAttribute("y", part.place.y + (low ? 2 * LINE : 0));
       before = { loud, low, near: (other) => other.order - part.order === 1 };
       part.note.classList.toggle("loud", loud);
-      const name = id.slice(this.cut);
-      part.note.textContent = loud
-        ? signed(meter.attack_volt_estimated)
-        : part.labels ? (name.length > 8 ? `${name.slice(0, 7)}…` : name) : "";
+      const whole = id.slice(this.cut);
+      const name = whole.length > 8 ? `${whole.slice(0, 7)}…` : whole;
+      // A suspect keeps its name above its deviation, also where other names have no room.
+      const lines = loud ? [name, signed(meter.attack_volt_estimated)] : [part.labels ? name : ""];
+      const x = part.note.getAttribute("x");
+      part.note.replaceChildren(...lines.map((text, k) => svg("tspan", { x, dy: k ? LINE : null, text })));
       part.group.setAttribute("aria-label", `${named(part.customer)}: ${now.text}, ${alone ? "model only" : "reconstructed"} ${volt(v)}`);
       part.group.classList.toggle("selected", id === this.selected);
     }

@@ -70,7 +70,7 @@ def test_a_feeder_that_cannot_be_loaded_is_said_to_be_watched_by_nobody(site: Si
     site.service.cannot_load["town"] = "key v_min_pu: 'x' is no number"
     site.expected = "503"
     site.tick(T0)
-    page = site.open()
+    page = site.open(path="/#village")
     expect(page.locator("#decision")).to_have_text("CLEAN")
     page.select_option("#feeder", "town")
     expect(page.locator("#decision")).to_have_text("NO DATA")
@@ -90,7 +90,7 @@ def test_an_attack_shows_without_reloading(site: Site) -> None:
     expect(page.locator("#decision")).to_have_text("ATTACKED")
     expect(page.locator('#diagram .customer[data-status="suspect"]')).to_have_count(2)
     expect(customer(page, "H3").locator(".sign")).to_have_text("!")
-    expect(customer(page, "H3").locator(".note")).to_have_text("+9.0")
+    expect(customer(page, "H3").locator(".note")).to_have_text("H3+9.0")
     assert page.locator(".chip").all_text_contents() == ["H3 +9.0 V", "H7 −7.5 V"]
     expect(page.locator(".alarm")).to_have_count(2)
     expect(page.locator(".alarm").first).to_contain_text("Meter manipulated")
@@ -494,7 +494,7 @@ def test_the_feeder_chosen_last_is_shown_however_slow_the_first(
 ) -> None:
     site = site_of(village("village"), village("town", 4))
     site.tick(T0)
-    page = site.open()
+    page = site.open(path="/#village")
     expect(page.locator("#decision")).to_have_text("CLEAN")
     asked: list[str] = []
     held: list[Route] = []
