@@ -63,14 +63,6 @@ def calibrate(site: Site, found: Calibrate) -> Section:
         answers={Question.RECORDS: _said(found)},
         figures=tuple(figures),
         tables=found.tables,
-        columns={
-            "confidence": "probability of this correction among all others",
-            "log factor": "gain of the log-likelihood",
-            "alternatives": "corrections that explain the readings as well; then none is decided",
-            "bias percent": "of the voltage; a common error of all meters cannot be determined",
-            "factor": "of the length in the files",
-            "verdict": "'cannot be told' is neither right nor wrong: the readings do not determine it",
-        },
         assumptions=(
             f"{found.frames} frames over {number(found.span_h, 1)} h were compared; for correct files "
             f"the probability of any proposal is {100.0 * found.risk:g} %.",
