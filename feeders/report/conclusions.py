@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
@@ -14,12 +14,14 @@ import pandas as pd
 from feeders.report.charts import Bar, ChartRow, rows
 from feeders.report.drawing import Drawing, Figure
 from feeders.report.html import StudyOutcome, section
+from feeders.report.section_droop import proved_limits
 from feeders.report.text import (
     Sentence,
     Side,
     Standing,
     Value,
     counted,
+    least,
     listed,
     most,
     number,
@@ -27,12 +29,12 @@ from feeders.report.text import (
     quantity,
     sentence,
 )
-from feeders.studies.comparison import ComparisonRow
 
 if TYPE_CHECKING:
     from feeders.model.site import Site
     from feeders.studies.calibrate.study import Calibrate
     from feeders.studies.campaign.study import Campaign
+    from feeders.studies.comparison import ComparisonRow
     from feeders.studies.detectable import Detectable
     from feeders.studies.droop.study import DroopStudy
     from feeders.studies.protect import Protect
@@ -68,9 +70,10 @@ def _redundancy(_: Site, found: Redundancy) -> Sentence:
         index, source = float(row["index"]), f"redundancy-summary:index:row {k}"
         kind = "for lasting attacks" if row["attack"] == "persistent" else "for any attack"
         live = row["case"] == "all live"
-        case = "with all meters live" if live else f"without {listed(found.silent)}"
+        case = "with all meters live:" if live else f"without {listed(found.silent)}:"
         lead = f"{'; ' * (k > 0)}{case} " if row["attack"] == "persistent" else " and "
-        size: Sentence = (Value(index, number(index), source), f" {kind} ({row['liars']})")
+        liars = f" ({listed(row['liars'].split())})" if row["liars"] else ""
+        size: Sentence = (Value(index, number(index), source), f" {kind}{liars}")
         if math.isnan(index):
             size = (f"UNDECIDED {kind} (the search was stopped)",)
         elif math.isinf(index):
@@ -82,8 +85,8 @@ def _redundancy(_: Site, found: Redundancy) -> Sentence:
 def _protect(site: Site, found: Protect) -> Sentence:
     if found.no_answer:
         return (
-            f"none by the goal {found.goal}, as no attack fits exactly known powers; this "
-            "proves no safety from attacks within honest errors",
+            f"none by the goal {found.goal}, as no attack fits exactly known powers; this proves no safety "
+            "from attacks within honest errors",
         )
     name, count = "protect-summary", len(found.meters)
 
@@ -99,8 +102,11 @@ def _protect(site: Site, found: Protect) -> Sentence:
     proof: Sentence = (" (no fewer suffice)",) if count else ()
     if found.gap:
         proof = (" (at least ", counted(found.least, f"{name}:least:row 0"), " are needed)")
+    wanted = f"; required: at most {number(found.lie_volt)} V" if found.goal.in_volts else ""
     return sentence(
-        "protect {count} of {of} meters{names}{proof}; {measure}: {before} without, {after} with it",
+        "{lead}{count} of {of} meters{names}{proof}; {measure}: {before} without, {after} with "
+        "protection{more}",
+        lead="protect " if count else "no protection is needed: ",
         count=counted(count, f"{name}:protected:row 0"),
         of=str(site.meters.size),
         names=f", {listed(found.meters['meter'].tolist())}" if count else "",
@@ -108,7 +114,14 @@ def _protect(site: Site, found: Protect) -> Sentence:
         measure="largest hidden attack" if found.goal.in_volts else "smallest invisible set",
         before=limit("before", found.before),
         after=limit("after", found.after),
+        more=wanted + _levels(site, "the busbar") * found.goal.in_volts,
     )
+
+
+def _levels(site: Site, of: str) -> str:
+    """Level of the volts of a sentence, if a feeder has several."""
+    several = bool((site.nominal_volt != site.nominal_volt[0]).any())
+    return f"; volts are those of {of}'s level" if several else ""
 
 
 def _largest(table: pd.DataFrame, name: str, column: str, where: str) -> Sentence:
@@ -120,51 +133,43 @@ def _largest(table: pd.DataFrame, name: str, column: str, where: str) -> Sentenc
     return (most(table, name, column, "V", side=Side.ABOVE), f" ({place})")
 
 
-def _detectable(_: Site, found: Detectable) -> Sentence:
+def _detectable(site: Site, found: Detectable) -> Sentence:
     meters, liars = found.meters, found.max_attacked
     return sentence(
         "with {liars}, every attack is noticed from {noticed} on, no other explanation is left "
-        "from {named} on, and an unnoticed one shifts a shown voltage by at most {error}",
+        "from {named} on, and an unnoticed one shifts a shown voltage by at most {error}{levels}",
         liars=f"up to {liars} manipulated {plural(liars, 'meter')}",
         noticed=_largest(meters, "detectable-meters", "noticed", "meter"),
         named=_largest(meters, "detectable-meters", "named", "meter"),
         error=_largest(found.customers, "detectable-customers", "error", "customer"),
+        levels=_levels(site, "each place"),
     )
 
 
-def _droop(_: Site, found: DroopStudy) -> Sentence:
-    stability, band = found.tables["stability"], found.tables["band"].iloc[0]
-    steeper = float(stability["margin"].min())
+def _droop(site: Site, found: DroopStudy) -> Sentence:
+    stability, band = found.tables["stability"], found.tables["band"].to_dict("records")[0]
     margin: Sentence = ()
     if found.verdict == "stable":
         margin = (" with slopes of any factor (no limit)",)
-        if math.isfinite(steeper):
-            source = "droop-stability:margin:min"
-            margin = (
-                " with slopes up to ",
-                quantity(steeper, "", source, side=Side.BELOW),
-                " times as steep",
-            )
+        if math.isfinite(float(stability["margin"].min())):
+            times = least(stability, "droop-stability", "margin", side=Side.BELOW)
+            margin = (" with slopes up to ", times, " times as steep")
     rest, always = (_shouted(str(each)) for each in (found.rest, found.always))
-    low, high = float(band["low_volt"]), float(band["high_volt"])
-    limits: Sentence = (" (no voltage limits are proved)",)
-    if math.isfinite(low + high):
-        ends = (
-            quantity(low, "V", "droop-band:low_volt:row 0", digits=1, side=Side.BELOW),
-            quantity(high, "V", "droop-band:high_volt:row 0", digits=1, side=Side.ABOVE),
-        )
-        limits = (" (proved limits ", ends[0], " to ", ends[1], ")")
+    kept = f"{rest} for slow load changes, {always} for arbitrary ones"
+    limits = proved_limits(site, {str(name): value for name, value in band.items()}, str(found.always))
     hosting: list[str | Value] = []
     for k, row in enumerate(found.tables.get("hosting", pd.DataFrame()).to_dict("records")):
-        size = quantity(
-            float(row["capacity_kw"]), "kW", f"droop-hosting:capacity_kw:row {k}", digits=1, side=Side.BELOW
-        )
-        hosting += [", " if k else "; hosting capacity ", size, f" ({row['preset']})"]
+        source, kw = f"droop-hosting:capacity_kw:row {k}", float(row["capacity_kw"])
+        hosting += [
+            ", " if k else "; hosting capacity ",
+            quantity(kw, "kW", source, digits=1, side=Side.BELOW),
+            f" ({row['preset']}: {row['limit'] or 'no limit within the search'})",
+        ]
     return (
         f"the fleet is {_shouted(str(found.verdict))}",
         *margin,
-        f"; the voltage band is {rest} for slow and {always} for arbitrary load changes",
-        *limits,
+        f"; the voltage band is {kept}",
+        *(limits or ("; no voltage limits are proved",)),
         *hosting,
     )
 
@@ -214,8 +219,8 @@ def _calibrate(_: Site, found: Calibrate) -> Sentence:
     untold, frame, excluded = "cannot be told", found.tables, having("proposals", "excluded")
     return sentence(
         "{sure} corrections of the files are proposed (risk of any wrong one: {risk}), {vague} found "
-        "errors are UNDECIDED, {excluded}{outside} of {meters} meters are outside their class; not determined by the "
-        "readings: {places} of {customers} customers and {lengths} of {lines} lines",
+        "errors are UNDECIDED, {excluded}{outside} of {meters} meters are outside their class; not "
+        "determined by the readings: {places} of {customers} customers and {lengths} of {lines} lines",
         sure=having("proposals", "proposed"),
         risk=f"{100.0 * found.risk:g} %",
         vague=having("proposals", untold),
@@ -234,9 +239,7 @@ def _calibrate(_: Site, found: Calibrate) -> Sentence:
 
 def _totals(found: Sequence[ComparisonRow]) -> pd.DataFrame:
     """Sums over the cases, by estimator with numbers; best first: most named, fewest honest ones named."""
-    table = pd.DataFrame(
-        [asdict(row) for row in found], columns=[each.name for each in fields(ComparisonRow)]
-    )
+    table = pd.DataFrame([asdict(row) for row in found])
     sums = table[table["reason"] == ""].groupby("family", sort=False)
     return (
         sums[["named", "liars", "falsely_named"]]
@@ -249,16 +252,12 @@ def _compare(_: Site, found: Sequence[ComparisonRow]) -> Sentence:
     totals, every = _totals(found), {row.family for row in found}
     if totals.empty:
         return ("none, as no estimator has numbers; the reasons are above",)
-    words: list[str | Value] = ["no attack was simulated; "] * (not totals["liars"].any())
+    words = ["no attack was simulated; "] * (not totals["liars"].any())
     for k, (family, row) in enumerate(totals.iterrows()):
-        words += [
-            "; " * (k > 0),
-            f"{family} named ",
-            counted(int(row["named"]), f"compare:{family}:named"),
-            f" of {row['liars']} manipulated devices and ",
-            counted(int(row["falsely_named"]), f"compare:{family}:falsely_named"),
-            " honest ones",
-        ]
+        words.append(
+            f"{'; ' * (k > 0)}{family} named {row['named']} of {row['liars']} manipulated devices and "
+            f"{row['falsely_named']} honest ones"
+        )
     silent = sorted(every.difference(map(str, totals.index)))
     words += [f"; no numbers for {listed(silent)}"] * bool(silent)
     return tuple(words)

@@ -129,8 +129,8 @@ COLUMNS: Final[Mapping[str, Mapping[str, str]]] = {
     "campaign": {
         "alarms_per_year": "allowed false alarms per year",
         "kind": "kind of attack; clean: without an attack",
-        "size": "bias, scaling: % of nominal; drift: % of nominal per minute; replay: age of the reports, s; "
-        "coordinated: displacement of the least affected meter by a false load, % of nominal; stuck: none",
+        "size": "% of nominal; drift: % of nominal per minute; replay, clock-shift: age of the reports, s; "
+        "inverter: % of its rating; guarantees: factor on their size; stuck: none",
         "place": "choice of the manipulated meters",
         "liars": "number of manipulated devices",
         "scenarios": "number of simulated scenarios",
@@ -220,7 +220,7 @@ COLUMNS: Final[Mapping[str, Mapping[str, str]]] = {
         "missed": "number of manipulated devices that were not named",
         "falsely named": "number of honest devices ever named",
         "delay, s": "median time from the onset to the naming, of those named, s; empty: none named",
-        "error at liars, %": "95th percentile of the voltage error at manipulated meters, % of nominal; ∞: unbounded",
+        "error at liars, %": "95th percentile of the error at manipulated meters, % of nominal; ∞: unbounded",
         "error at all, %": "the same at all customers; ∞: unbounded",
         "ms per step": "median processor time of a step, ms, and its 95th percentile",
         "observers": "number of observers, or candidate sets",

@@ -123,7 +123,8 @@ def _doubt_map(site: Site, customers: pd.DataFrame, width: float) -> Drawing:
     shapes = {PROPOSED: Shape.ALARM, AS_FILED: Shape.METER}
     spots = []
     for name in site.feeder.customers:
-        verdict = verdicts.get(name, UNTOLD)
+        # A customer of three phases is one row of the table, and three of the feeder.
+        verdict = verdicts.get(name, verdicts.get(name[:-2], UNTOLD))
         shape = shapes.get(verdict, Shape.OPEN)
         spots.append(Spot(shape, name if shape is Shape.ALARM else "", f"{name}: {verdict}"))
     meanings = {"to be corrected": Shape.ALARM, "cannot be told": Shape.OPEN, AS_FILED: Shape.METER}

@@ -84,7 +84,7 @@ def _fleet(site: Site, found: DroopStudy, band: str, busbar: str) -> Finding:
     stability, kept = found.tables["stability"], found.tables["band"].to_dict("records")
     fleet = {str(name): value for name, value in kept[0].items()}
     verdict, rest, always = str(found.verdict), str(fleet["rest"]), str(fleet["always"])
-    limits, broken = _limits(site, fleet, always), _witness(site, found.tables.get("witness"))
+    limits, broken = proved_limits(site, fleet, always), _witness(site, found.tables.get("witness"))
     kept_or_not = _band((rest, always), band, busbar, limits=limits, broken=broken)
     sentences = [_stability(stability, verdict, busbar), kept_or_not]
     without = [row for row in kept if row["case"] == "without"]
@@ -148,7 +148,7 @@ def _witness(site: Site, table: pd.DataFrame | None) -> Sentence:
     return ("; the loads of table witness give ", volt, f" at {row['customer']}, by AC power flow")
 
 
-def _limits(site: Site, fleet: dict[str, object], always: str) -> Sentence:
+def proved_limits(site: Site, fleet: dict[str, object], always: str) -> Sentence:
     """Proved limits: at all times if that keeps the band, in equilibrium otherwise."""
     which = "" if always == KEPT else "_rest"
     low, high = (float(str(fleet[f"{end}{which}_volt"])) for end in ("low", "high"))

@@ -48,6 +48,7 @@ def calibrate(
 
     `--write` makes a copy with the significant corrections only; the feeder itself is never changed.
     """
+    from feeders.model.site import load
     from feeders.studies.calibrate.feeder import site_of
     from feeders.studies.calibrate.search import FileErrorKind
     from feeders.studies.calibrate.study import calibrate as study
@@ -82,7 +83,7 @@ def calibrate(
         if write is not None:
             found.corrected(feeder, write)
             console.say(f"{write}: {found.feeder} with {len(found.corrections)} corrections")
-        output.end(site, found, plot)
+        output.end(load(feeder), found, plot)
 
 
 def _tell(found: Calibrate, output: Output) -> None:

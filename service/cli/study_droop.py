@@ -141,7 +141,7 @@ def droop(
             if hosting:
                 raise
             console.say(f"{site.feeder.name}: {NOTHING} (--preset equips customers with some)")
-            console.say(f"Conclusion for {site.feeder.name} (not studied): none, as there is no fleet.")
+            Output("droop").nothing(site, "as there is no fleet", plot)
             return
         output = Output("droop")
         _tell(found, options, output)

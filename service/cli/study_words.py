@@ -88,7 +88,7 @@ class Output:
         if plot is not None:
             drawn = figure(site, self.study, found)
             if drawn is None:
-                console.say(f"{plot}: not written, this result has no figure")
+                _no_figure(plot)
             else:
                 sheet, about = drawn.draw(WIDE), {"title": drawn.title, "text": drawn.text}
                 form = plot.suffix.lower()
@@ -101,6 +101,16 @@ class Output:
                 replace_file(plot, lambda new: new.write_bytes(data))
                 console.say(f"{plot}: {drawn.title}")
         console.say(said(conclusion(site, self.study, found)))
+
+    def nothing(self, site: Site, why: str, plot: Path | None) -> None:
+        """Print the conclusion of a study that does not apply to the feeder."""
+        if plot is not None:
+            _no_figure(plot)
+        console.say(f"Conclusion for {site.feeder.name} (not studied): none, {why}.")
+
+
+def _no_figure(plot: Path) -> None:
+    console.say(f"{plot}: not written, this result has no figure")
 
 
 def cell_text(cell: Any) -> str:
