@@ -79,7 +79,7 @@ def _redundancy(_: Site, found: Redundancy) -> Sentence:
         elif math.isinf(index):
             size = (f"no set {kind}",)
         parts.append((lead, *size))
-    return ("fewest manipulated meters that stay invisible: ", *(each for part in parts for each in part))
+    return ("fewest manipulated meters that stay invisible, ", *(each for part in parts for each in part))
 
 
 def _protect(site: Site, found: Protect) -> Sentence:

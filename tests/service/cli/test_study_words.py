@@ -14,6 +14,7 @@ import pytest
 from feeders.format.tables import write
 from feeders.model.site import load
 from feeders.report import conclusions
+from feeders.report.legends import legend
 from feeders.report.text import said
 from feeders.simulation.meters import MeterErrors
 from feeders.simulation.recording import record
@@ -41,6 +42,9 @@ class Ran:
         assert self.end.startswith("Conclusion for cigre-lv (")
         assert self.end.endswith(".")
         assert not re.search(r"∞|\binf\b|\bnan\b", self.end)
+        for path in out.glob("*.csv"):
+            columns = list(pd.read_csv(path, nrows=0))
+            assert list(legend(self.study, columns)) == columns, path
         meanings = Counter(line.partition(":")[0] for line in self.lines if line.startswith("  "))
         assert max(meanings.values(), default=1) == 1
         if any("∞" in line for line in self.lines if line.startswith("│")):
@@ -105,15 +109,17 @@ def test_detectable(given: Given) -> None:
 
 
 def test_droop(given: Given) -> None:
-    few = ("--compare", "vde4105", "--tau-factor", "1", "--hosting", "--draws", "1")
+    few = ("--compare", "vde4105", "--tau-factor", "1", "--hosting", "--draws", "1", "--band", "0.97", "1.03")
     ran = Ran(*given, "droop", "cigre-lv", *few)
     margin, band = ran.table("stability")["margin"].min(), ran.table("band").iloc[0]
     assert "(proved): the fleet is stable" in ran.end
     assert margin - 0.01 < ran.number(r"slopes up to ([\d.]+) times") <= margin
     assert f"band is {band['rest']} for slow load changes, {band['always']} for arbitrary ones" in ran.end
+    assert band["rest"] == band["always"] == "violated"
+    assert ran.table("witness")["beyond"].any()
     low, high = ran.number(r"limits ([\d.]+) V"), ran.number(r"limits .* and ([\d.]+) V")
-    assert band["low_volt"] - 0.1 < low <= band["low_volt"]
-    assert band["high_volt"] <= high < band["high_volt"] + 0.1
+    assert band["low_rest_volt"] - 0.1 < low <= band["low_rest_volt"]
+    assert band["high_rest_volt"] <= high < band["high_rest_volt"] + 0.1
     assert [float(kw) for kw in re.findall(r"([\d.]+) kW", ran.end)] == ran.table("hosting")[
         "capacity_kw"
     ].tolist()
