@@ -14,6 +14,7 @@ import pandas as pd
 from feeders.report.charts import Bar, ChartRow, rows
 from feeders.report.drawing import Drawing, Figure
 from feeders.report.html import StudyOutcome, section
+from feeders.report.section_calibrate import proposals
 from feeders.report.section_droop import proved_limits
 from feeders.report.text import (
     Sentence,
@@ -195,7 +196,7 @@ def _campaign(_: Site, found: Campaign) -> Sentence:
             counted(len(delays), "campaign-liars:delay_s:finite"),
             " of ",
             counted(len(liars), "campaign-liars:rows"),
-            f" manipulated devices (95 % confidence: at least {100.0 * low:.1f} %{median})",
+            f" manipulated devices (95 % confidence: at least {number(100.0 * low, 1, Side.BELOW)} %{median})",
         ]
     wronged = counted(int((played["falsely_named"] != "").sum()), "campaign-scenarios:falsely_named:filled")
     parts += ["; false accusations in ", wronged, f" of {len(played)} {plural(len(played), 'scenario')}"]
@@ -216,12 +217,16 @@ def _calibrate(_: Site, found: Calibrate) -> Sentence:
         count = int((found.tables[table]["verdict"] == verdict).sum())
         return counted(count, f"calibrate-{table}:verdict:count {verdict}")
 
-    untold, frame, excluded = "cannot be told", found.tables, having("proposals", "excluded")
+    untold, frame = "cannot be told", found.tables
+    sure, excluded = having("proposals", "proposed"), having("proposals", "excluded")
+    decided = frame["proposals"][frame["proposals"]["verdict"] == "proposed"]
     return sentence(
-        "{sure} corrections of the files are proposed (risk of any wrong one: {risk}), {vague} found "
-        "errors are UNDECIDED, {excluded}{outside} of {meters} meters are outside their class; not "
-        "determined by the readings: {places} of {customers} customers and {lengths} of {lines} lines",
-        sure=having("proposals", "proposed"),
+        "{sure} {corrections} proposed{which} (if the files are right, at most {risk} for any proposal), "
+        "{vague} found errors are UNDECIDED, {excluded}{outside} of {meters} meters are outside their class; "
+        "not determined by the readings: {places} of {customers} customers and {lengths} of {lines} lines",
+        sure=sure,
+        corrections=plural(sure.value, "correction of the files is", "corrections of the files are"),
+        which=f", {proposals(decided)}" if sure.value else "",
         risk=f"{100.0 * found.risk:g} %",
         vague=having("proposals", untold),
         excluded=(excluded, " meters with a changing error are excluded, ") if excluded.value else "",

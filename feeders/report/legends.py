@@ -249,7 +249,8 @@ def legend(study: str, columns: Iterable[str]) -> dict[str, str]:
         elif alone and base in known:
             out[name] = f"{base} for a single manipulated meter, V{_unlimited(known[base])}"
         elif ends:
-            out[name] = f"{_ENDS[ends[0]]} limit of {name.removesuffix(ends[0])} with 95 % confidence"
+            base = name.removesuffix(ends[0]).replace("_", " ")
+            out[name] = f"{_ENDS[ends[0]]} limit of {base} with 95 % confidence"
     return out
 
 

@@ -86,7 +86,7 @@ def _said(found: Calibrate) -> Finding:
     sure, count = having(PROPOSED)
     if len(sure):
         verb = plural(len(sure), "correction of the files is", "corrections of the files are")
-        sentences = [(count, f" {verb} proposed: {_proposals(sure)}.")]
+        sentences = [(count, f" {verb} proposed: {proposals(sure)}.")]
     vague, count = having(UNTOLD)
     if len(vague):
         noun = plural(len(vague), "error")
@@ -95,7 +95,7 @@ def _said(found: Calibrate) -> Finding:
     if len(changing):
         words = (
             f" {plural(len(changing), 'meter is', 'meters are')} inconsistent, and errors of the files "
-            f"explain it less well: {_proposals(changing)}. An attack has this effect. The voltages were not "
+            f"explain it less well: {proposals(changing)}. An attack has this effect. The voltages were not "
             "used."
         )
         sentences.append((count, words))
@@ -114,7 +114,8 @@ def _said(found: Calibrate) -> Finding:
     return Finding(Standing.MEASURED, tuple(sentences))
 
 
-def _proposals(table: pd.DataFrame) -> str:
+def proposals(table: pd.DataFrame) -> str:
+    """Corrections of a table of proposals, in a sentence."""
     return listed([f"{row['what']}: {row['proposed']}" for row in table.to_dict("records")])
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import xml.etree.ElementTree as ET
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -144,12 +145,17 @@ def test_campaign(given: Given) -> None:
 
 
 def test_calibrate(given: Given, tmp_path: Path) -> None:
-    readings = tmp_path / "day.parquet"
-    day = Scenario(seed=1, duration_s=86400.0, dt_s=1800.0, errors=MeterErrors(report_q=True))
-    record(load("cigre-lv"), day, readings)
-    ran = Ran(*given, "calibrate", "cigre-lv", "--readings", str(readings), "--look-for", "swap")
+    site, readings, folder = load("cigre-lv"), tmp_path / "days.parquet", tmp_path / "wrong"
+    errors = MeterErrors(report_q=True)
+    record(
+        site, Scenario(seed=1, duration_s=2 * 86400.0, dt_s=1800.0, profile_s=0.0, errors=errors), readings
+    )
+    rows = (replace(r, bus="Bus R17") if r.customer == "Load R15" else r for r in site.tables.customers)
+    write(replace(site.tables, customers=tuple(rows)), folder)
+    ran = Ran(*given, "calibrate", str(folder), "--readings", str(readings), "--look-for", "bus")
+    assert "1 correction of the files is proposed, Load R15: Bus R15 (" in ran.end
     for pattern, name, verdict in (
-        (r"\): (\d+) corrections", "proposals", "proposed"),
+        (r"\): (\d+) correction", "proposals", "proposed"),
         (r"(\d+) found errors are UNDECIDED", "proposals", "cannot be told"),
         (r"(\d+) of 6 meters are outside", "meters", "outside its class"),
         (r"readings: (\d+) of 6 customers", "customers", "cannot be told"),
@@ -181,7 +187,10 @@ def test_a_figure_has_the_form_of_its_name(
         code, told, _ = run(monkeypatch, capsys, *words, str(plot))
         assert code == 0
         assert f"{plot}: Meters to protect" in told
-        assert plot.read_bytes().startswith(begin)
+        first = plot.read_bytes()
+        assert first.startswith(begin)
+        assert run(monkeypatch, capsys, *words, str(plot))[0] == 0
+        assert plot.read_bytes() == first
     code, _, told = run(monkeypatch, capsys, *words, str(tmp_path / "figure.jpg"))
     assert code == 2
     assert "ends in .svg, .png, .pdf" in plain(told)
