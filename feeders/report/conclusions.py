@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
@@ -30,12 +30,12 @@ from feeders.report.text import (
     quantity,
     sentence,
 )
+from feeders.studies.comparison import ComparisonRow
 
 if TYPE_CHECKING:
     from feeders.model.site import Site
     from feeders.studies.calibrate.study import Calibrate
     from feeders.studies.campaign.study import Campaign
-    from feeders.studies.comparison import ComparisonRow
     from feeders.studies.detectable import Detectable
     from feeders.studies.droop.study import DroopStudy
     from feeders.studies.protect import Protect
@@ -190,13 +190,14 @@ def _campaign(_: Site, found: Campaign) -> Sentence:
     if len(liars):
         delays = liars["delay_s"][np.isfinite(liars["delay_s"])]
         low = float(found.false_names.loc[found.false_names["alarms_per_year"] == rate, "named_low"].iloc[0])
+        sure = number(100.0 * low, 1, Side.BELOW)
         median = f", median delay {number(float(delays.median()), 1)} s" if len(delays) else ""
         parts = [
             f"{found.plan.estimator} named ",
             counted(len(delays), "campaign-liars:delay_s:finite"),
             " of ",
             counted(len(liars), "campaign-liars:rows"),
-            f" manipulated devices (95 % confidence: at least {number(100.0 * low, 1, Side.BELOW)} %{median})",
+            f" manipulated devices (95 % confidence: at least {sure} %{median})",
         ]
     wronged = counted(int((played["falsely_named"] != "").sum()), "campaign-scenarios:falsely_named:filled")
     parts += ["; false accusations in ", wronged, f" of {len(played)} {plural(len(played), 'scenario')}"]
@@ -244,7 +245,7 @@ def _calibrate(_: Site, found: Calibrate) -> Sentence:
 
 def _totals(found: Sequence[ComparisonRow]) -> pd.DataFrame:
     """Sums over the cases, by estimator with numbers; best first: most named, fewest honest ones named."""
-    table = pd.DataFrame([asdict(row) for row in found])
+    table = pd.DataFrame([asdict(row) for row in found], columns=[f.name for f in fields(ComparisonRow)])
     sums = table[table["reason"] == ""].groupby("family", sort=False)
     return (
         sums[["named", "liars", "falsely_named"]]
