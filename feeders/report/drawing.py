@@ -293,13 +293,22 @@ _SIDES: Final = 48
 
 def png(drawing: Drawing, *, title: str, text: str) -> bytes:
     """Draw a PNG with a title and a text as metadata; equal drawings give equal bytes. Needs matplotlib."""
+    return _sheet(drawing, "png", {"Title": title, "Description": text, "Software": None})
+
+
+def pdf(drawing: Drawing, *, title: str, text: str) -> bytes:
+    """Draw a PDF with vector graphics, as `png`."""
+    about = {"Title": title, "Subject": text, "Creator": None, "Producer": None, "CreationDate": None}
+    return _sheet(drawing, "pdf", about)
+
+
+def _sheet(drawing: Drawing, form: str, about: dict[str, str | None]) -> bytes:
 
     def marks(axes: Any) -> None:
         for k, mark in enumerate(drawing.marks):
             _draw(axes, mark, float(k))
 
-    about = {"Title": title, "Description": text, "Software": None}
-    return draw.sheet(drawing.width, drawing.height, marks, scale=SCALE, about=about)
+    return draw.sheet(drawing.width, drawing.height, marks, scale=SCALE, about=about, form=form)
 
 
 def _draw(axes: Any, mark: Mark, order: float) -> None:

@@ -21,6 +21,7 @@ from jinja2 import Environment, FunctionLoader, StrictUndefined
 
 from feeders.report import section_calibrate, section_campaign, section_droop, section_meters
 from feeders.report.drawing import NARROW, WIDE, Figure, style, svg
+from feeders.report.legends import legend
 from feeders.report.text import Finding, Question, Section, Standing, Value, counted, number, plural
 
 if TYPE_CHECKING:
@@ -157,10 +158,18 @@ class Chapter:
 
     @property
     def columns(self) -> dict[str, str]:
-        """Meanings of the tables' columns, with that of a question mark if a number is unknown."""
-        tables = self.section.tables.values()
+        """Meanings of the columns on the page, with that of a question mark if a number is unknown."""
+        told = self.section
+        tables = told.tables.values()
+        names = (
+            c for name, table in told.tables.items() for c in _columns(table, told.shown.get(name, ()))[1]
+        )
+        meanings = legend(self.outcome.study, dict.fromkeys(names))
         gaps = any(table.select_dtypes("number").isna().to_numpy().any() for table in tables)
-        return {**self.section.columns, **({"?": UNKNOWN} if gaps else {})}
+        return {
+            **{name.replace("_", " "): meaning for name, meaning in meanings.items()},
+            **({"?": UNKNOWN} if gaps else {}),
+        }
 
 
 def page(
@@ -285,9 +294,7 @@ def _table(
     most_open: int = OPEN_ROWS,
 ) -> _Table:
     """Table; long ones are closed, and rows or columns beyond the limits are in the file only."""
-    own = [column for column in table.columns if column != FEEDER]  # the page is about one feeder
-    said = [column for column in own if table.empty or not table[column].map(_is_empty).all()]
-    kept = [column for column in chosen or said if column in said][:MOST_COLUMNS]
+    said, kept = _columns(table, chosen)
     shown = table[kept].head(len(table) if len(table) <= MOST_ROWS else HEAD_ROWS)
     decimals = [_decimals(shown[column]) for column in kept]
     parts = [f"{len(kept)} of {len(said)} columns"] * (len(kept) < len(said))
@@ -305,6 +312,13 @@ def _table(
         is_long=len(table) > OPEN_ROWS,
         is_crowded=len(kept) > FEW_COLUMNS,
     )
+
+
+def _columns(table: pd.DataFrame, chosen: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Columns with content, and those of them on the page."""
+    own = [column for column in table.columns if column != FEEDER]  # the page is about one feeder
+    said = [column for column in own if table.empty or not table[column].map(_is_empty).all()]
+    return said, [column for column in chosen or said if column in said][:MOST_COLUMNS]
 
 
 def _is_empty(cell: object) -> bool:

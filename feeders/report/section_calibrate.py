@@ -63,14 +63,6 @@ def calibrate(site: Site, found: Calibrate) -> Section:
         answers={Question.RECORDS: _said(found)},
         figures=tuple(figures),
         tables=found.tables,
-        columns={
-            "confidence": "probability of this correction among all others",
-            "log factor": "gain of the log-likelihood",
-            "alternatives": "corrections that explain the readings as well; then none is decided",
-            "bias percent": "of the voltage; a common error of all meters cannot be determined",
-            "factor": "of the length in the files",
-            "verdict": "'cannot be told' is neither right nor wrong: the readings do not determine it",
-        },
         assumptions=(
             f"{found.frames} frames over {number(found.span_h, 1)} h were compared; for correct files "
             f"the probability of any proposal is {100.0 * found.risk:g} %.",
@@ -94,7 +86,7 @@ def _said(found: Calibrate) -> Finding:
     sure, count = having(PROPOSED)
     if len(sure):
         verb = plural(len(sure), "correction of the files is", "corrections of the files are")
-        sentences = [(count, f" {verb} proposed: {_proposals(sure)}.")]
+        sentences = [(count, f" {verb} proposed: {proposals(sure)}.")]
     vague, count = having(UNTOLD)
     if len(vague):
         noun = plural(len(vague), "error")
@@ -103,7 +95,7 @@ def _said(found: Calibrate) -> Finding:
     if len(changing):
         words = (
             f" {plural(len(changing), 'meter is', 'meters are')} inconsistent, and errors of the files "
-            f"explain it less well: {_proposals(changing)}. An attack has this effect. The voltages were not "
+            f"explain it less well: {proposals(changing)}. An attack has this effect. The voltages were not "
             "used."
         )
         sentences.append((count, words))
@@ -122,7 +114,8 @@ def _said(found: Calibrate) -> Finding:
     return Finding(Standing.MEASURED, tuple(sentences))
 
 
-def _proposals(table: pd.DataFrame) -> str:
+def proposals(table: pd.DataFrame) -> str:
+    """Corrections of a table of proposals, in a sentence."""
     return listed([f"{row['what']}: {row['proposed']}" for row in table.to_dict("records")])
 
 
@@ -131,7 +124,8 @@ def _doubt_map(site: Site, customers: pd.DataFrame, width: float) -> Drawing:
     shapes = {PROPOSED: Shape.ALARM, AS_FILED: Shape.METER}
     spots = []
     for name in site.feeder.customers:
-        verdict = verdicts.get(name, UNTOLD)
+        # A customer of three phases is one row of the table, and three of the feeder.
+        verdict = verdicts.get(name, verdicts.get(name[:-2], UNTOLD))
         shape = shapes.get(verdict, Shape.OPEN)
         spots.append(Spot(shape, name if shape is Shape.ALARM else "", f"{name}: {verdict}"))
     meanings = {"to be corrected": Shape.ALARM, "cannot be told": Shape.OPEN, AS_FILED: Shape.METER}

@@ -38,10 +38,6 @@ if TYPE_CHECKING:
 
 # Columns on the page; the files have all.
 _BY = {"by_kind": "kind", "by_size": "size", "by_place": "place", "by_liars": "liars"}
-_SIZES = (
-    "bias, scaling: % of nominal; drift: % of nominal per minute; replay: age of the reports, s; "
-    "coordinated: displacement of the least affected meter by a false load, % of nominal; stuck: none"
-)
 _UNITS = {AttackKind.DRIFT: " %/min", AttackKind.REPLAY: " s", AttackKind.CLOCK_SHIFT: " s"}
 _ERRORS = {
     TrialMeterErrors.SITE: "those of the feeder's files",
@@ -68,20 +64,6 @@ def campaign(_: Site, found: Campaign) -> Section:
         tables=found.tables,
         shown={name: (by, *_SHOWN) if by == "kind" else ("kind", by, *_SHOWN) for name, by in _BY.items()}
         | {"scenarios": _SCENARIOS},
-        columns={
-            "size": _SIZES,
-            "exact": "share of scenarios with all manipulated devices named, and no others",
-            "named": "share of the manipulated devices that were named",
-            "false": "share of scenarios with an honest device named",
-            "… low, … high": "limits that hold the true share in 95 of 100 cases",
-            "delay": "from the onset of an attack to the naming of the device, s; ∞: never; "
-            "medians are of those that were named",
-            "error": "of the reconstructed voltage, % of nominal",
-            "undecided": "share of the time with the verdict UNDECIDED",
-            "clean lying s": "time with the verdict CLEAN during an attack",
-            "reason": "reason for a missing simulation",
-            "per year": "false names per year, from `hours` without an attack; with limits for this number",
-        },
         assumptions=(
             f"{plan.scenarios} scenarios of {plan.duration_s:g} s at {plan.step_s:g} s on days of profiles, "
             f"seed {plan.seed}; the truth is full AC power flow with the inverters in closed loop.",

@@ -58,24 +58,6 @@ def droop(site: Site, found: DroopStudy) -> Section:
         answers={Question.FLEET: _fleet(site, found, band, busbar)},
         figures=_figures(site, found, (low, high), band),
         tables=found.tables,
-        columns={
-            "verdict": "stable: proved to converge to one equilibrium from every state; unstable: leaves its "
-            "equilibrium, proved and simulated; undecided: neither is proved",
-            "gain, growth": "of the loop in equilibrium; factor of a small deviation in one update",
-            "margin": "all curves stay proved stable up to this factor on their slopes",
-            "certified, unstable": "factors on the slopes of these curves: proved stable up to the first, "
-            "unstable from the second on",
-            "longest interval s": "longest sampling interval found with a proof of stability; ∞: every one",
-            "rest, always": "band kept for slow, and for arbitrary load changes",
-            "low volt, high volt": "proved limits of the voltage",
-            "part, alone": "share of the loop gain; admissible factor on one inverter's slope",
-            "point": "evening: full loads, no generation; noon: 0.2 of the loads, full generation; half: 0.5",
-            "settling, overshoot": "time until 2 % of the change remain; % of the change",
-            "change volt": "change of the voltage by the inverters after the step, V",
-            "tau factor": "factor on all time constants",
-            **({"capacity kw": "largest total generation; `limit` is the next violation"} if hosts else {}),
-            **({"confirmed volt": "difference from a second power flow there, V"} if hosts else {}),
-        },
         assumptions=(
             f"Inverters: {given.preset or 'as in the files'}; sampled {every}{delay}. "
             f"{'Balanced' if single_phase(site) else 'Three-phase'} power flow.",
@@ -102,7 +84,7 @@ def _fleet(site: Site, found: DroopStudy, band: str, busbar: str) -> Finding:
     stability, kept = found.tables["stability"], found.tables["band"].to_dict("records")
     fleet = {str(name): value for name, value in kept[0].items()}
     verdict, rest, always = str(found.verdict), str(fleet["rest"]), str(fleet["always"])
-    limits, broken = _limits(site, fleet, always), _witness(site, found.tables.get("witness"))
+    limits, broken = proved_limits(site, fleet, always), _witness(site, found.tables.get("witness"))
     kept_or_not = _band((rest, always), band, busbar, limits=limits, broken=broken)
     sentences = [_stability(stability, verdict, busbar), kept_or_not]
     without = [row for row in kept if row["case"] == "without"]
@@ -166,7 +148,7 @@ def _witness(site: Site, table: pd.DataFrame | None) -> Sentence:
     return ("; the loads of table witness give ", volt, f" at {row['customer']}, by AC power flow")
 
 
-def _limits(site: Site, fleet: dict[str, object], always: str) -> Sentence:
+def proved_limits(site: Site, fleet: dict[str, object], always: str) -> Sentence:
     """Proved limits: at all times if that keeps the band, in equilibrium otherwise."""
     which = "" if always == KEPT else "_rest"
     low, high = (float(str(fleet[f"{end}{which}_volt"])) for end in ("low", "high"))

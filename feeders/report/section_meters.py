@@ -53,17 +53,6 @@ def redundancy(site: Site, found: Redundancy) -> Section:
             ),
         ),
         tables=found.tables,
-        columns={
-            "index": "fewest manipulated meters that stay invisible; ∞: none",
-            "attack": "persistent: with a lasting effect; any: also those that the inverters forget",
-            "patterns": "dimension of hidden attacks",
-            "detected, identified": "most manipulated meters that cannot hide, and that are identified",
-            "critical": "without this meter some pattern is invisible to all others",
-            "identified without": "most manipulated meters that the others identify without this one",
-            "with": "meters together with which it can stay invisible, for persistent attacks",
-            "branch": "yes: the part begins at the busbar",
-            "blind": "customers with a voltage that no meter determines, even without an attack",
-        },
         assumptions=(
             f"Customers with unknown powers: {listed(found.unknown) or 'none'}.",
             f"Inverters on their {'steepest slopes' if str(found.curves) == 'steepest' else 'deadbands'}.",
@@ -142,19 +131,6 @@ def detectable(site: Site, found: Detectable) -> Section:
         },
         figures=_size_figures(site, found, once, twice),
         tables=found.tables,
-        columns={
-            "hidden": f"up to this, V, with probability {once} at any one moment, no meter is named",
-            "noticed": "beyond this a meter exceeds a limit of the monitor, with that probability",
-            "named": "beyond this no other explanation is a rival, for any accomplices, with probability "
-            f"{twice} at any one moment",
-            "fits": "up to this the readings are those of some honest feeder, all errors at their worst: "
-            "no test without false alarms can detect it",
-            "identified": "beyond this every explanation by at most M meters accuses the meter",
-            "… alone": "the same for a single manipulated meter",
-            "error": f"largest error of the monitor's reconstructed voltage, V, with probability {twice} for "
-            "each customer at any one moment",
-            "error fits": "largest distance of two voltages that fit the same readings, V",
-        },
         assumptions=_assumed(site, found, once),
     )
 
@@ -354,15 +330,6 @@ def protect(site: Site, found: Protect) -> Section:
             ),
         ),
         tables=found.tables,
-        columns={
-            "before, after": "largest hidden attack, V of the busbar's level, without and with protection"
-            if found.goal.in_volts
-            else "fewest manipulated meters that stay invisible, without and with protection; ∞: no number",
-            **({"alone": ALONE, "lie volt": "requested bound, V"} if found.goal.in_volts else {}),
-            "least": "no fewer protected meters suffice",
-            "attacks": "number of the listed attacks with this meter",
-            "liars": "meters of an attack that excludes any smaller set",
-        },
         assumptions=(
             f"At most {found.max_attacked} of the other meters are manipulated; a protected meter cannot be.",
             *(
@@ -375,9 +342,6 @@ def protect(site: Site, found: Protect) -> Section:
             ),
         ),
     )
-
-
-ALONE = "largest attack, V, that one unprotected meter hides by itself within honest errors, with true powers"
 
 
 def _no_protection(found: Protect) -> Finding:

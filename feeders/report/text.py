@@ -158,6 +158,4 @@ class Section:
     tables: Mapping[str, pd.DataFrame] = field(default_factory=dict)  # tables by name
     # Columns of a table on the page, if not the first ones; files have all.
     shown: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    # Meanings of the tables' columns, in the order of the page.
-    columns: Mapping[str, str] = field(default_factory=dict)
     assumptions: tuple[str, ...] = ()  # assumptions, as sentences

@@ -374,4 +374,4 @@ def _line(texts: Iterable[str]) -> str:
 
 
 def _text(value: float, form: str) -> str:
-    return "" if math.isnan(value) else format(value, form)
+    return "" if math.isnan(value) else "∞" if math.isinf(value) else format(value, form)

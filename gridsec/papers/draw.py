@@ -158,13 +158,15 @@ def sheet(
     *,
     scale: float,
     about: Mapping[str, str | None],
+    form: str = "png",
 ) -> bytes:
-    """Draw on an empty sheet as a PNG; the same marks give the same bytes.
+    """Draw on an empty sheet as a PNG or PDF; the same marks give the same bytes.
 
     width, height: size of the sheet, px; a px is a hundredth of an inch in `marks`.
     marks: draws on axes that cover the sheet, in px from its upper left corner.
     scale: dots per px.
     about: metadata of the file.
+    form: png or pdf.
     Raises ModuleNotFoundError without matplotlib; see `available`.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -179,7 +181,7 @@ def sheet(
         marks(axes)
         axes.set_xlim(0.0, width)
         axes.set_ylim(height, 0.0)
-        canvas.savefig(buffer, format="png", dpi=100.0 * scale, metadata=cast("Any", dict(about)))
+        canvas.savefig(buffer, format=form, dpi=100.0 * scale, metadata=cast("Any", dict(about)))
     return buffer.getvalue()
 
 

@@ -12,7 +12,8 @@ from service.cli.console import Studied, refuse_options
 from service.cli.paths import write_tables
 from service.cli.session import JournalAt, NoJournal, keeping
 from service.cli.sources import converted
-from service.cli.study_planning import Out, as_usage_error, bar, show
+from service.cli.study_planning import Out, as_usage_error, bar
+from service.cli.study_words import Output, Plot
 
 if TYPE_CHECKING:
     from feeders.studies.calibrate.study import Calibrate
@@ -41,11 +42,13 @@ def calibrate(
     journal: JournalAt = None,
     no_journal: NoJournal = False,
     out: Out = None,
+    plot: Plot = None,
 ) -> None:
     """Compare recorded readings with a feeder's files: places, phases, lengths, meters, loads.
 
     `--write` makes a copy with the significant corrections only; the feeder itself is never changed.
     """
+    from feeders.model.site import load
     from feeders.studies.calibrate.feeder import site_of
     from feeders.studies.calibrate.search import FileErrorKind
     from feeders.studies.calibrate.study import calibrate as study
@@ -57,6 +60,7 @@ def calibrate(
         folders={"--out": out},
         new={"--write": write},
         files={"--journal": journal},
+        replaced={"--plot": plot},
         read={"--readings": readings},
     )
     with keeping("calibrate", feeder, journal, without=no_journal) as kept:
@@ -73,14 +77,16 @@ def calibrate(
                 journal=kept,
                 progress=report_progress,
             )
-        _tell(found)
+        output = Output("calibrate")
+        _tell(found, output)
         write_tables(out, "calibrate", found.tables)
         if write is not None:
             found.corrected(feeder, write)
             console.say(f"{write}: {found.feeder} with {len(found.corrections)} corrections")
+        output.end(load(feeder), found, plot)
 
 
-def _tell(found: Calibrate) -> None:
+def _tell(found: Calibrate, output: Output) -> None:
     from feeders.studies.calibrate.study import UNREAD
 
     console.say(
@@ -96,9 +102,9 @@ def _tell(found: Calibrate) -> None:
     if found.proposals.empty:
         console.out.print("nothing to propose")
     else:
-        show("Proposals", found.proposals.drop(columns=["low", "high"]))
-    show("Meters", found.meters.drop(columns=["low_percent", "high_percent"]))
-    show("Lines", found.lines)
-    show("Customers", found.customers)
-    show("Loads", found.loads)
-    show("Errors of powers and meters", found.errors)
+        output.table("Proposals", found.proposals.drop(columns=["low", "high"]))
+    output.table("Meters", found.meters.drop(columns=["low_percent", "high_percent"]))
+    output.table("Lines", found.lines)
+    output.table("Customers", found.customers)
+    output.table("Loads", found.loads)
+    output.table("Errors of powers and meters", found.errors)

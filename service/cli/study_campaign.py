@@ -17,7 +17,8 @@ from service.cli.console import Studied, finite, options_of, read_all
 from service.cli.paths import check_paths, write_tables
 from service.cli.session import JournalAt, Keeping, NoJournal, keeping
 from service.cli.sources import converted
-from service.cli.study_planning import Out, as_usage_error, bar, show
+from service.cli.study_planning import Out, as_usage_error, bar
+from service.cli.study_words import Output, Plot
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -224,6 +225,7 @@ def campaign(
     journal: JournalAt = None,
     no_journal: NoJournal = False,
     out: Out = None,
+    plot: Plot = None,
 ) -> None:
     """Simulate attacks over days of profiles: meters named correctly, missed or named falsely, and delays."""
     from feeders.model.site import load
@@ -232,7 +234,7 @@ def campaign(
     from feeders.studies.campaign.plan import Design, Place
     from feeders.studies.campaign.study import campaign as study
 
-    check_paths(folders={"--out": out}, files={"--journal": journal})
+    check_paths(folders={"--out": out}, files={"--journal": journal}, replaced={"--plot": plot})
     site, count = load(converted(feeder, out)), min(scenarios, together)
     problems = ["--workers: a Dask cluster has its own workers"] * (dask is not None and workers is not None)
     if count == 1:
@@ -281,8 +283,10 @@ def campaign(
             plan = _with_promised(site, plan, plan.kinds if kind else (), kept)
         with bar("scenarios") as report_progress:
             found = study(site, plan, runner=_runner(workers, dask), journal=kept, progress=report_progress)
-        _print(found)
+        output = Output("campaign")
+        _print(found, output)
         write_tables(out, "campaign", found.tables)
+        output.end(site, found, plot)
 
 
 NO_LIES = (
@@ -292,17 +296,17 @@ NO_LIES = (
 """Refused: the result would suggest that attacks were missed."""
 
 
-def _print(found: Campaign) -> None:
+def _print(found: Campaign, output: Output) -> None:
     plan, impossible = found.plan, int((found.scenarios["reason"] != "").sum())
     told = f"{plan.scenarios} scenarios of {plan.duration_s:g} s monitored by {plan.estimator}"
     note = f"; {impossible} cannot be played, see `reason`" if impossible else ""
     console.say(f"{found.feeder}: {told}{note}")
     if not found.promises.empty:
-        show("Guarantees of `study detectable`", found.promises)
-    show("By kind and size", _short(found.by_size))
-    show("By place", _short(found.by_place))
-    show("By number of manipulated meters", _short(found.by_liars))
-    show("False accusations without an attack, and manipulated meters named", found.false_names)
+        output.table("Guarantees of `study detectable`", found.promises)
+    output.table("By kind and size", _short(found.by_size))
+    output.table("By place", _short(found.by_place))
+    output.table("By number of manipulated meters", _short(found.by_liars))
+    output.table("False accusations without an attack, and manipulated meters named", found.false_names)
 
 
 def _with_promised(

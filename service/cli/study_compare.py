@@ -17,6 +17,7 @@ from service.cli.console import Studied, finite, refuse_options
 from service.cli.session import JournalAt, Keeping, NoJournal, keeping
 from service.cli.sources import converted
 from service.cli.study_campaign import LoadErrorKvar, LoadErrorKw, MetersAs
+from service.cli.study_words import Output, Plot
 
 if TYPE_CHECKING:
     from feeders.model.site import Site
@@ -56,6 +57,7 @@ def compare(
     workers: Workers = None,
     journal: JournalAt = None,
     no_journal: NoJournal = False,
+    plot: Plot = None,
 ) -> None:
     """Compare all estimators on the same simulated attacks.
 
@@ -77,7 +79,7 @@ def compare(
             *no_choice("--case", cases, *(case or ())),
         ],
         files={"--journal": journal},
-        replaced={"--csv": csv, "--write": write},
+        replaced={"--csv": csv, "--write": write, "--plot": plot},
         read={"--write": write},
     )
     plan = ComparisonPlan(
@@ -96,7 +98,8 @@ def compare(
     with keeping("compare", feeder, journal, without=no_journal) as kept:
         site = load(converted(feeder, None))
         rows = _compared(site, plan, kept)
-        _show(rows, plan)
+        output = Output("compare")
+        _show(rows, plan, output)
         if csv is not None:
             write_csv(rows, csv)
         if write is not None:
@@ -104,6 +107,7 @@ def compare(
             # Read again: the document may have changed during the work.
             text = splice(write.read_text(encoding="utf-8"), told)
             replace_file(write, lambda new: new.write_text(text, encoding="utf-8"))
+        output.end(site, rows, plot)
 
 
 def _compared(site: Site, plan: ComparisonPlan, kept: Keeping) -> list[ComparisonRow]:
@@ -162,7 +166,7 @@ def _command(feeder: str, plan: ComparisonPlan) -> str:
     return command_line(words)
 
 
-def _show(rows: list[ComparisonRow], plan: ComparisonPlan) -> None:
+def _show(rows: list[ComparisonRow], plan: ComparisonPlan, output: Output) -> None:
     """Print one table for each case, with reasons below it."""
     from feeders.studies.comparison import CASES, HEADERS, cells
 
@@ -178,5 +182,6 @@ def _show(rows: list[ComparisonRow], plan: ComparisonPlan) -> None:
             else:
                 table.add_row(*map(escape, cells(row)))
         console.out.print(table, soft_wrap=False)
+        output.explain(list(HEADERS))
         for reason in reasons:
             console.say(reason)

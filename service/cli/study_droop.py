@@ -14,7 +14,8 @@ from service.cli.console import Studied, options_of
 from service.cli.paths import write_tables
 from service.cli.session import JournalAt, Keeping, NoJournal, keeping
 from service.cli.sources import converted
-from service.cli.study_planning import Out, as_usage_error, bar, show
+from service.cli.study_planning import Out, as_usage_error, bar
+from service.cli.study_words import Output, Plot
 
 if TYPE_CHECKING:
     from feeders.model.site import Site
@@ -94,6 +95,7 @@ def droop(
     journal: JournalAt = None,
     no_journal: NoJournal = False,
     out: Out = None,
+    plot: Plot = None,
 ) -> None:
     """Study the volt/VAR fleet: stability with margins, voltage band, and hosting capacity."""
     from feeders.studies.droop.fleets import NOTHING, NoInverters, Who
@@ -129,6 +131,7 @@ def droop(
         problems,
         folders={"--out": out},
         files={"--journal": journal},
+        replaced={"--plot": plot},
     )
     with keeping("droop", feeder, journal, without=no_journal) as kept:
         site, *others = _loaded([(feeder, out), *((name, None) for name in also or ())])
@@ -138,9 +141,12 @@ def droop(
             if hosting:
                 raise
             console.say(f"{site.feeder.name}: {NOTHING} (--preset equips customers with some)")
+            Output("droop").nothing(site, "as there is no fleet", plot)
             return
-        _tell(found, options)
+        output = Output("droop")
+        _tell(found, options, output)
         write_tables(out, "droop", found.tables)
+        output.end(site, found, plot)
 
 
 def _studied(
@@ -176,14 +182,14 @@ def _loaded(names: Sequence[tuple[str, Path | None]]) -> list[Site]:
     return sites
 
 
-def _tell(found: DroopStudy, options: DroopOptions) -> None:
+def _tell(found: DroopStudy, options: DroopOptions, output: Output) -> None:
     """Print the result and its tables."""
     sampled = f"sampled every {options.interval_s:g} s" if options.interval_s else "continuous"
     console.say(f"{found.feeder}: the fleet ({sampled}) is {found.verdict}")
     console.out.print(f"Voltage band: {found.rest} for slow load changes, {found.always} for arbitrary ones.")
     for name, title in TITLES.items():
         if name in found.tables:
-            show(title, found.tables[name])
+            output.table(title, found.tables[name])
     if "hosting_draws" in found.tables:
         draws = found.tables["hosting_draws"].groupby("preset", sort=False)["capacity_kw"]
-        show("Random places, kW", draws.describe(percentiles=[0.1, 0.5, 0.9]).reset_index())
+        output.table("Random places, kW", draws.describe(percentiles=[0.1, 0.5, 0.9]).reset_index())

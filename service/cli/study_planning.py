@@ -11,17 +11,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.table import Table
 
 from service.cli import console
 from service.cli.console import Studied, finite
 from service.cli.paths import check_paths, write_tables
 from service.cli.session import JournalAt, NoJournal, keeping
 from service.cli.sources import converted
+from service.cli.study_words import Output, Plot, cell_text
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from feeders.studies.journal import Progress as Tell
     from feeders.studies.protect import Protect
 
@@ -68,12 +66,13 @@ def redundancy(
     journal: JournalAt = None,
     no_journal: NoJournal = False,
     out: Out = None,
+    plot: Plot = None,
 ) -> None:
     """Count the manipulated meters of invisible attacks: in all, by meter, by part, with missing meters."""
     from feeders.model.site import load
     from feeders.studies.redundancy import redundancy as study
 
-    check_paths(folders={"--out": out}, files={"--journal": journal})
+    check_paths(folders={"--out": out}, files={"--journal": journal}, replaced={"--plot": plot})
     with keeping("redundancy", feeder, journal, without=no_journal) as kept:
         site = load(converted(feeder, out))
         with bar("search for invisible attacks") as report_progress, as_usage_error():
@@ -88,12 +87,14 @@ def redundancy(
             )
         shown = ", ".join(found.unknown) or "none"
         console.say(f"{found.feeder}: customers with unknown powers: {shown}")
-        show("Manipulated meters of invisible attacks", found.summary)
-        show("By meter", found.meters)
-        show("Invisible attacks inside one part", found.parts)
+        output = Output("redundancy")
+        output.table("Manipulated meters of invisible attacks", found.summary)
+        output.table("By meter", found.meters)
+        output.table("Invisible attacks inside one part", found.parts)
         if found.silent:
-            show(f"Changes without {', '.join(found.silent)}", found.changes)
+            output.table(f"Changes without {', '.join(found.silent)}", found.changes)
         write_tables(out, "redundancy", found.tables)
+        output.end(site, found, plot)
 
 
 def protect(
@@ -116,6 +117,7 @@ def protect(
     journal: JournalAt = None,
     no_journal: NoJournal = False,
     out: Out = None,
+    plot: Plot = None,
 ) -> None:
     """Find the fewest meters to protect so that attacks are identified, detected, or bounded."""
     from feeders.model.site import load
@@ -131,7 +133,7 @@ def protect(
     }
     with as_usage_error():
         check(goal=goal, attack=attack, **asked)
-    check_paths(folders={"--out": out}, files={"--journal": journal})
+    check_paths(folders={"--out": out}, files={"--journal": journal}, replaced={"--plot": plot})
     with keeping("protect", feeder, journal, without=no_journal) as kept:
         site = load(converted(feeder, out))
         with bar("meters protected, against attacks") as report_progress, as_usage_error():
@@ -145,11 +147,13 @@ def protect(
                 progress=lambda known, done: report_progress(done, known),
                 **asked,
             )
-        _tell_protection(found, len(site.meter_ids))
+        output = Output("protect")
+        _tell_protection(found, len(site.meter_ids), output)
         write_tables(out, "protect", found.tables)
+        output.end(site, found, plot)
 
 
-def _tell_protection(found: Protect, of: int) -> None:
+def _tell_protection(found: Protect, of: int, output: Output) -> None:
     count = len(found.meters)
     if found.no_answer:
         console.say(f"{found.feeder}: {found.goal} requires no protection here; that is no safety")
@@ -158,15 +162,16 @@ def _tell_protection(found: Protect, of: int) -> None:
     proof = "no fewer suffice" if not found.gap else f"at least {found.least} are needed"
     measure = "largest hidden attack, V" if found.goal.in_volts else "fewest meters of an invisible attack"
     console.say(f"{found.feeder}: protect {count} of {of} meters; {proof}")
-    console.out.print(f"{measure}: {_cell(found.before)} before, {_cell(found.after)} after")
+    none = " (∞: no set of meters)" if math.inf in (found.before, found.after) else ""
+    console.out.print(f"{measure}: {cell_text(found.before)} before, {cell_text(found.after)} after{none}")
     if found.goal.in_volts:
         console.out.print(
-            f"required ({found.goal}): at most {_cell(found.lie_volt)}; "
-            f"one meter hides {_cell(found.alone)} alone, with true powers, whatever others are protected"
+            f"required ({found.goal}): at most {cell_text(found.lie_volt)}; "
+            f"one meter hides {cell_text(found.alone)} alone, with true powers, whatever others are protected"
         )
     if count:
-        show("Protect", found.meters)
-        show("Attacks that require them", found.attacks)
+        output.table("Protect", found.meters)
+        output.table("Attacks that require them", found.attacks)
 
 
 def detectable(
@@ -187,6 +192,7 @@ def detectable(
     journal: JournalAt = None,
     no_journal: NoJournal = False,
     out: Out = None,
+    plot: Plot = None,
 ) -> None:
     """Compute the smallest surely identified attacks, the largest hidden ones, and their errors; in V."""
     from feeders.model.site import load
@@ -194,7 +200,7 @@ def detectable(
     from feeders.studies.detectable import detectable as study
     from feeders.studies.detectable import workers as where
 
-    check_paths(folders={"--out": out}, files={"--journal": journal})
+    check_paths(folders={"--out": out}, files={"--journal": journal}, replaced={"--plot": plot})
     with keeping("detectable", feeder, journal, without=no_journal) as kept:
         site = load(converted(feeder, out))
         with bar("attacks on meters, errors of customers") as tell, as_usage_error():
@@ -209,10 +215,13 @@ def detectable(
             )
         more = found.max_attacked - 1
         places = ["customer", "bus"]
-        show(
+        output = Output("detectable")
+        output.table(
             f"Attacks, V: each meter alone, and with {more} more", found.meters.drop(columns=places).round(2)
         )
-        show(f"Errors of the voltage with {more + 1} hidden manipulated meters, V", found.customers.round(2))
+        output.table(
+            f"Errors of the voltage with {more + 1} hidden manipulated meters, V", found.customers.round(2)
+        )
         write_tables(out, "detectable", found.tables)
         if trials:
             with bar("simulated attacks") as report_progress:
@@ -225,6 +234,7 @@ def detectable(
                 f"{seen.honest_named} with an honest meter named"
             )
             write_tables(out, "detectable", {**found.tables, "trials": seen.table})
+        output.end(site, found, plot)
 
 
 @contextmanager
@@ -250,22 +260,3 @@ def as_usage_error() -> Iterator[None]:
         yield
     except ValueError as error:
         raise typer.BadParameter(str(error)) from error
-
-
-def show(title: str, frame: pd.DataFrame) -> None:
-    """Print a table without its empty columns."""
-    kept = [name for name in frame.columns if not all(isinstance(c, str) and not c for c in frame[name])]
-    table = Table(*(escape(name.replace("_", " ")) for name in kept), title=title, title_justify="left")
-    for row in frame[kept].itertuples(index=False):
-        table.add_row(*(escape(_cell(cell)) for cell in row))
-    console.out.print(table, soft_wrap=False)
-
-
-def _cell(cell: Any) -> str:
-    if cell is None or (isinstance(cell, float) and math.isnan(cell)):
-        return "-"
-    if isinstance(cell, bool):
-        return "yes" if cell else "no"
-    if isinstance(cell, float):
-        return "∞" if math.isinf(cell) else f"{cell:.4g}"
-    return str(cell)

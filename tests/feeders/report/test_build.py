@@ -103,6 +103,7 @@ OPERATIONS: dict[str, Callable[[pd.Series], float]] = {
     "empty": lambda column: float((column == "").sum()),
     "filled": lambda column: float((column != "").sum()),
     "infinite": lambda column: float(np.isinf(column).sum()),
+    "finite": lambda column: float(np.isfinite(column).sum()),
 }
 
 

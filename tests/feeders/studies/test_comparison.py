@@ -162,7 +162,7 @@ def tables(text: str) -> list[list[list[str]]]:
 def test_a_row_becomes_cells() -> None:
     assert cells(ROWS[0])[1:] == ("0 of 0", "0", "0", "", "", "0.100", "0.40 (2.0)", "1", "", "1")
     assert cells(ROWS[1]) == ("exact-bank", ROWS[1].reason)
-    assert cells(ROWS[2])[1:7] == ("5 of 6", "1", "2", "4", "0.250", "inf")
+    assert cells(ROWS[2])[1:7] == ("5 of 6", "1", "2", "4", "0.250", "∞")
 
 
 def test_markdown_has_a_row_for_every_family_in_every_table() -> None:

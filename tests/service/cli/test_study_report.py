@@ -12,6 +12,10 @@ import pandas as pd
 import pytest
 from playwright.sync_api import Browser
 
+from feeders.model.site import load
+from feeders.simulation.meters import MeterErrors
+from feeders.simulation.recording import record
+from feeders.simulation.scenario import Scenario
 from service.cli.study_report import STUDIES, Asked, _command, misplaced
 from tests.journals import edit, rows
 from tests.service.commands import command, plain, text_of
@@ -254,4 +258,27 @@ def test_tables_sort_and_the_summary_is_one_page_of_paper(
     assert page.evaluate("document.querySelector('.front').getBoundingClientRect().height") < 1003
     assert page.evaluate("document.documentElement.scrollWidth") <= 673
     assert len(page.pdf(prefer_css_page_size=True)) > 10_000
+    page.close()
+
+
+@pytest.mark.browser
+def test_tables_and_legends_of_all_studies_fit_on_a_phone_and_on_paper(
+    browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page_file, readings = tmp_path / "report.html", tmp_path / "day.parquet"
+    day = Scenario(seed=1, duration_s=86400.0, dt_s=1800.0, errors=MeterErrors(report_q=True))
+    record(load("cigre-lv"), day, readings)
+    words = ("--silent", "m03", "--scenarios", "4", "--hosting", "--readings", str(readings))
+    assert run(monkeypatch, capsys, "cigre-lv", "--out", str(page_file), *words)[0] == 0
+    page = browser.new_page()
+    page.goto(page_file.as_uri())
+    page.evaluate("for (const each of document.querySelectorAll('details')) each.open = true")
+    assert page.locator("dl.columns").count() == len(STUDIES)
+    wide = "[...document.querySelectorAll('table, dl')].map((each) => each.getBoundingClientRect().right)"
+    page.set_viewport_size({"width": 390, "height": 900})
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    page.set_viewport_size({"width": 673, "height": 1000})
+    page.emulate_media(media="print")
+    assert page.evaluate("document.documentElement.scrollWidth") <= 673
+    assert max(page.evaluate(wide)) <= 673.5
     page.close()
