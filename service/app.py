@@ -145,7 +145,7 @@ def _tokens(settings: Settings) -> TokenVerifier | None:
 def _check_exposure(settings: Settings, authenticator: Authenticator) -> None:
     """Refuse an address beyond loopback without authentication."""
     host, _ = split_address(settings.http)
-    if is_loopback(host) or authenticator.required or settings.open_to_network_without_authentication:
+    if authenticator.required or is_loopback(host) or settings.open_to_network_without_authentication:
         return
     text = (
         f"--http or GRIDSEC_HTTP: {settings.http} is reachable from the network and no authentication is set "

@@ -102,10 +102,25 @@ OPEN: Final = Identity("", Role.ADMIN)
 """Identity of all requests where no authentication is set up. Requests give the operator's name."""
 
 
+NAME_MOST: Final = 64
+"""Largest length of an identity's name, characters."""
+
+
+def is_name(text: str) -> bool:
+    """True for 1 to 64 printable characters without a space at an end."""
+    return 0 < len(text) <= NAME_MOST and text.isprintable() and text == text.strip()
+
+
 class NotAuthenticated(GridsecError):
     """The request has no valid credential."""
 
     code = "not-authenticated"
+
+
+class IssuerUnavailable(GridsecError):
+    """The keys of the issuer of tokens cannot be read."""
+
+    code = "issuer-unavailable"
 
 
 class NotPermitted(GridsecError):

@@ -8,6 +8,8 @@ counts.
 from __future__ import annotations
 
 import json
+import threading
+import time
 import urllib.error
 import urllib.request
 from collections.abc import Mapping
@@ -17,7 +19,7 @@ from urllib.parse import urlsplit
 
 import jwt
 
-from service.access.identity import Identity, NotAuthenticated, Role
+from service.access.identity import Identity, IssuerUnavailable, NotAuthenticated, Role, is_name
 
 ALGORITHMS: Final = ("RS256", "RS384", "RS512", "PS256", "PS384", "PS512", "ES256", "ES384", "ES512", "EdDSA")
 """Accepted signatures: asymmetric ones. `none` and HMAC with a public key as its secret are refused."""
@@ -32,41 +34,77 @@ NAMES: Final = ("preferred_username", "email", "sub")
 """Claims of the name, the first one present counts."""
 
 
+RETRY_S: Final = 10.0
+"""Time after a failed request to the issuer without another one, s."""
+KEPT: Final = 64
+"""Largest number of keys that stay valid while the issuer does not answer."""
+
+
 @dataclass(eq=False)
 class TokenVerifier:
-    """Verification of the tokens of one issuer."""
+    """Verification of the tokens of one issuer. Thread-safe.
 
-    # issuer, audience: required claims `iss` and `aud`
-    issuer: str
-    audience: str
+    Keys that were read once stay valid while the issuer does not answer. After a failed request the next one
+    follows `RETRY_S` later at the earliest, so that a flood of tokens does not become a flood of requests.
+    """
+
+    issuer: str  # required claim `iss`
+    audience: str  # required claim `aud`
     jwks_url: str = ""  # address of the issuer's keys; empty: by the issuer's discovery document
-    role_claim: str = "gridsec_role"  # claim of the role
+    role_claim: str = "gridsec_role"
     _client: jwt.PyJWKClient | None = field(default=None, repr=False)
+    _known: dict[str, Any] = field(default_factory=dict, repr=False)
+    _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
+    _failed: float = field(default=-RETRY_S, repr=False)
 
     def identify(self, token: str) -> Identity:
         """Identity of a valid token.
 
-        Raises NotAuthenticated with the reason.
+        Raises NotAuthenticated with the reason, and IssuerUnavailable if the keys cannot be read.
         """
         try:
-            key = self._keys().get_signing_key_from_jwt(token)
+            key = self._key(token)
             claims = jwt.decode(
                 token,
-                key.key,
+                key,
                 algorithms=list(ALGORITHMS),
                 audience=self.audience,
                 issuer=self.issuer,
                 leeway=LEEWAY_S,
                 options={"require": ["exp", "iat", "sub"]},
             )
-        except jwt.PyJWTError as error:
+        # A key of another algorithm than the token's is a TypeError or ValueError of the library.
+        except (jwt.PyJWTError, TypeError, ValueError) as error:
             raise NotAuthenticated(f"the token is not valid: {error}") from error
-        except (OSError, ValueError) as error:
-            raise _unavailable(self.issuer, str(error)) from error
         return self._identity(claims)
+
+    def _key(self, token: str) -> Any:
+        """Public key of a token's signature."""
+        kid = str(jwt.get_unverified_header(token).get("kid", ""))
+        with self._lock:
+            if time.monotonic() - self._failed < RETRY_S:
+                return self._kept(kid, "the last request failed")
+            try:
+                found = self._keys().get_signing_key_from_jwt(token).key
+            except jwt.PyJWKClientConnectionError as error:
+                self._failed = time.monotonic()
+                return self._kept(kid, str(error))
+            except OSError as error:
+                self._failed = time.monotonic()
+                return self._kept(kid, str(error))
+            if len(self._known) < KEPT:
+                self._known[kid] = found
+            return found
+
+    def _kept(self, kid: str, why: str) -> Any:
+        if kid in self._known:
+            return self._known[kid]
+        raise _unavailable(self.issuer, why)
 
     def _identity(self, claims: Mapping[str, Any]) -> Identity:
         name = next((claims[each] for each in NAMES if isinstance(claims.get(each), str)), "")
+        if not is_name(name):
+            raise NotAuthenticated("the name in the token must have 1 to 64 printable characters")
         given = claims.get(self.role_claim)
         wanted = given if isinstance(given, list) else [given]
         roles = [role for role in Role if role in wanted]
@@ -106,5 +144,5 @@ def _discovered(issuer: str) -> str:
     return str(named["jwks_uri"])
 
 
-def _unavailable(issuer: str, why: str) -> NotAuthenticated:
-    return NotAuthenticated(f"the keys of {issuer} cannot be read: {why}", code="issuer-unavailable")
+def _unavailable(issuer: str, why: str) -> IssuerUnavailable:
+    return IssuerUnavailable(f"the keys of {issuer} cannot be read: {why}")

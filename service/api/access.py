@@ -11,6 +11,8 @@ so that a client behind the same address cannot lock out others.
 
 from __future__ import annotations
 
+import hashlib
+import re
 import secrets
 import threading
 import time
@@ -44,6 +46,8 @@ CACHED: Final = 1024
 """Largest number of cached records."""
 FAILURES: Final = 10
 """Number of invalid credentials of one client per minute that get 401."""
+LOGGED: Final = 60
+"""Number of invalid credentials per minute that get an entry in the audit log."""
 COOKIE_BYTES: Final = 32
 DETAIL_BYTES: Final = 2000
 """Part of a request's body in the audit log, bytes."""
@@ -61,15 +65,18 @@ class Authenticator:
         self, store: AccessStore, tokens: TokenVerifier | None = None, wall: Callable[[], float] = time.time
     ) -> None:
         self.store, self.tokens, self.wall = store, tokens, wall
+        self._required = False
         self._failures = MovingWindowRateLimiter(MemoryStorage())
-        self._limit = RateLimitItemPerMinute(FAILURES)
+        self._limit, self._total = RateLimitItemPerMinute(FAILURES), RateLimitItemPerMinute(LOGGED)
         self._lock = threading.Lock()
         self._cache: dict[str, tuple[float, Any]] = {}
 
     @property
     def required(self) -> bool:
-        """True if requests need a credential."""
-        return self.tokens is not None or bool(self._cached("required", self.store.any_key))
+        """True if requests need a credential; once true it stays so, also if the database is lost."""
+        if not self._required:
+            self._required = self.tokens is not None or bool(self._cached("required", self.store.any_key))
+        return self._required
 
     def identify(self, request: Request) -> Identity:
         """Identity of a request.
@@ -77,11 +84,11 @@ class Authenticator:
         Raises NotAuthenticated, TooManyFailures without a valid credential.
         """
         scheme, _, given = request.headers.get("authorization", "").partition(" ")
-        cookie = request.cookies.get(COOKIE, "")
+        cookie = session_of(request)
         if given and scheme.lower() == "bearer":
             return self.of_credential(given.strip(), client_of(request))
         if cookie:
-            record = self._cached(f"session {cookie}", lambda: self.store.session(cookie, self.wall()))
+            record = self._cached(_session_name(cookie), lambda: self.store.session(cookie, self.wall()))
             if record is not None and record.ended(self.wall()) is None:
                 return Identity(record.name, record.role, record.feeders, f"key {record.id}")
         if not self.required:
@@ -103,7 +110,9 @@ class Authenticator:
         except NotAuthenticated as error:
             if not self._failures.hit(self._limit, client):
                 raise TooManyFailures("too many invalid credentials; wait a minute") from error
-            self.store.append(self.wall(), "", "", "invalid credential", client, str(error))
+            # All clients together: addresses can be changed at will.
+            if self._failures.hit(self._total, "all"):
+                self.store.append(self.wall(), "", "", "invalid credential", client, str(error))
             raise
 
     def log_in(self, text: str, client: str) -> tuple[Identity, str, float]:
@@ -123,9 +132,9 @@ class Authenticator:
 
     def log_out(self, cookie: str) -> None:
         """End a session."""
-        with self._lock:
-            self._cache.pop(f"session {cookie}", None)
         self.store.close_session(cookie)
+        with self._lock:
+            self._cache[_session_name(cookie)] = (time.monotonic(), None)
 
     def _key(self, text: str) -> KeyRecord:
         key_id, secret = keys.parse(text) or ("", "")
@@ -134,6 +143,7 @@ class Authenticator:
             raise NotAuthenticated("the API key is not known")
         if (reason := record.ended(self.wall())) is not None:
             raise NotAuthenticated(reason)
+        self._required = True
         return record
 
     def _cached(self, name: str, read: Callable[[], Any]) -> Any:
@@ -148,6 +158,19 @@ class Authenticator:
                 self._cache.clear()
             self._cache[name] = (now, value)
         return value
+
+
+_COOKIE = re.compile(r"[A-Za-z0-9_-]{43}")
+
+
+def session_of(request: Request) -> str:
+    """Text of a request's session cookie; empty without one, or for another text."""
+    found = request.cookies.get(COOKIE, "")
+    return found if _COOKIE.fullmatch(found) else ""
+
+
+def _session_name(cookie: str) -> str:
+    return f"session {hashlib.sha256(cookie.encode()).hexdigest()}"
 
 
 def client_of(request: Request) -> str:

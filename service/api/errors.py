@@ -17,7 +17,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from feeders.registry.plugins import EstimatorUnusable
 from gridsec.errors import DesignInfeasible, FeederInvalid, GridsecError, NotObservable
-from service.access.identity import NotAuthenticated, NotPermitted, TooManyFailures
+from service.access.identity import IssuerUnavailable, NotAuthenticated, NotPermitted, TooManyFailures
 from service.alarms.state_machine import AlarmUnknown, AlreadyAcknowledged, RaisedAgain
 from service.engine.commissioning import NothingToLearn
 from service.errors import FeederFixed, FeederNotLoaded, FeederUnknown, TooManyFeeders
@@ -164,6 +164,7 @@ _STATUS: dict[type[GridsecError], int] = {
     TooManyFeeders: 409,
     NotAuthenticated: 401,
     NotPermitted: 403,
+    IssuerUnavailable: 503,
     TooManyFailures: 429,
     FeederNotLoaded: 503,
     StoreUnavailable: 503,

@@ -12,6 +12,7 @@ import asyncio
 import hashlib
 import json
 import secrets
+import time
 from collections.abc import AsyncGenerator, AsyncIterator, Collection, Sequence
 from functools import partial
 from pathlib import Path as FilePath
@@ -25,11 +26,11 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 from fastapi.staticfiles import StaticFiles
 from pydantic import TypeAdapter
 
-from gridsec.errors import FeederInvalid, Problem
-from service.access.identity import OPEN, Identity, NotPermitted
+from gridsec.errors import FeederInvalid, GridsecError, Problem
+from service.access.identity import OPEN, POLICY, PUBLIC, Identity, NotPermitted, Role
 from service.alarms.state_machine import Alarm, AlarmKind, AlarmState, AlarmUnknown, Severity
 from service.api import models
-from service.api.access import COOKIE, Authenticator, authorise, client_of
+from service.api.access import COOKIE, FRESH_S, Authenticator, authorise, client_of, session_of
 from service.api.errors import Guard, handlers, problem
 from service.engine.commissioning import CommissioningProgress
 from service.errors import FeederNotLoaded, FeederUnknown
@@ -126,8 +127,8 @@ ANSWER_S = 0.7
 class Probe:
     """Test write shared by concurrent requests, each of which waits at most `ANSWER_S`."""
 
-    def __init__(self, store: Store) -> None:
-        self._store = store
+    def __init__(self, store: Store, authenticator: Authenticator | None) -> None:
+        self._store, self._authenticator = store, authenticator
         self._running: asyncio.Task[str | None] | None = None
 
     async def trouble(self) -> str | None:
@@ -142,12 +143,20 @@ class Probe:
     async def _check(self) -> str | None:
         # In a separate thread: reads that wait for the database may occupy all shared ones.
         try:
-            await to_thread.run_sync(self._store.check, limiter=CapacityLimiter(1), abandon_on_cancel=True)
+            await to_thread.run_sync(self._access, limiter=CapacityLimiter(1), abandon_on_cancel=True)
         except StoreUnavailable as error:
             return str(error)
         return None
 
+    def _access(self) -> None:
+        """Test both databases."""
+        self._store.check()
+        if self._authenticator is not None:
+            self._authenticator.store.any_key()
 
+
+ACCESS_THREADS = 16
+"""Largest number of requests that are authenticated at a time."""
 MAX_BODY = 4 << 20
 """Largest request body, bytes."""
 MAX_STREAMS = 100
@@ -182,8 +191,9 @@ def create_api(
         dependencies=[Depends(_authorised)],
     )
     app.state.authenticator = authenticator
+    app.state.access_threads = CapacityLimiter(ACCESS_THREADS)
     app.state.backend = backend
-    app.state.probe = Probe(backend.store)
+    app.state.probe = Probe(backend.store, authenticator)
     app.state.streams, app.state.max_streams = 0, max_streams
     app.state.run = secrets.token_hex(4)
     app.add_middleware(Guard, max_body=MAX_BODY, hosts=hosts)
@@ -238,8 +248,32 @@ async def _authorised(request: Request) -> Identity:
     if authenticator is None:
         return OPEN
     route = f"{request.method} {request.scope['route'].path}"
+    if POLICY.get(route, Role.ADMIN) is PUBLIC:
+        return OPEN
     body = b"" if request.method in {"GET", "HEAD"} else await request.body()
-    return await to_thread.run_sync(authorise, authenticator, request, route, body)
+    # Threads of their own: a slow database or issuer must not occupy those of the probes.
+    threads: CapacityLimiter = request.app.state.access_threads
+    return await to_thread.run_sync(authorise, authenticator, request, route, body, limiter=threads)
+
+
+class _Permission:
+    """Permission of an open stream, verified again every `FRESH_S`."""
+
+    def __init__(self, request: Request, caller: Identity) -> None:
+        self._request, self._caller, self._verified = request, caller, time.monotonic()
+
+    async def lasts(self) -> bool:
+        """True while the credential is valid and stands for the same identity."""
+        authenticator: Authenticator | None = self._request.app.state.authenticator
+        if authenticator is None or time.monotonic() - self._verified < FRESH_S:
+            return True
+        self._verified = time.monotonic()
+        threads: CapacityLimiter = self._request.app.state.access_threads
+        try:
+            now = await to_thread.run_sync(authenticator.identify, self._request, limiter=threads)
+        except GridsecError:
+            return False
+        return now == self._caller
 
 
 def _operator(identity: Identity, given: str | None) -> str:
@@ -468,12 +502,15 @@ def _commissioning(
 @_feeders.get(
     "/{feeder}/stream", response_class=EventSourceResponse, dependencies=[Depends(_slot)], tags=["streams"]
 )
-async def stream_states(backend: BackendHere, feeder: KnownFeeder) -> AsyncIterator[ServerSentEvent]:
+async def stream_states(
+    request: Request, backend: BackendHere, caller: Caller, feeder: KnownFeeder
+) -> AsyncIterator[ServerSentEvent]:
     """Server-sent events `state`: the latest tick and each later one; a slow client skips some."""
     yield ServerSentEvent(comment="connected", retry=2000)
     last: FeederReport | None = None
+    permission = _Permission(request, caller)
     async for _ in wakes(backend):
-        if not backend.known(feeder):
+        if not backend.known(feeder) or not await permission.lasts():
             return
         report = backend.report(feeder)
         if report is not None and report is not last:
@@ -538,7 +575,8 @@ def list_alarms(  # one argument per query parameter
 
 
 @_alarms.get("/stream", response_class=EventSourceResponse, dependencies=[Depends(_slot)], tags=["streams"])
-async def stream_alarms(
+async def stream_alarms(  # noqa: PLR0917  # one argument per query parameter
+    request: Request,
     backend: BackendHere,
     caller: Caller,
     feeder: Annotated[str | None, Query(pattern=_NAME, description="Restrict to this feeder.")] = None,
@@ -555,7 +593,10 @@ async def stream_alarms(
     # A number beyond the newest belongs to another database: start now, otherwise no event would ever come.
     seen = store.last_event if start is None else min(start, store.last_event)
     yield ServerSentEvent(comment="connected", id=str(seen), retry=2000)
+    permission = _Permission(request, caller)
     async for _ in wakes(backend):
+        if not await permission.lasts():
+            return
         while seen < (newest := store.last_event):
             try:
                 events = await to_thread.run_sync(partial(store.events_after, seen, feeder=feeder))
@@ -697,7 +738,8 @@ def log_in(request: Request, response: Response, given: models.LogIn) -> models.
     client = client_of(request)
     identity, cookie, expires = authenticator.log_in(given.key, client)
     # A browser refuses a secure cookie over plain HTTP; beyond loopback the page needs HTTPS.
-    plain = request.url.scheme == "http" and is_loopback(request.url.hostname or "")
+    secure_page = request.headers.get("origin", "").startswith("https://")
+    plain = request.url.scheme == "http" and is_loopback(request.url.hostname or "") and not secure_page
     response.set_cookie(
         COOKIE,
         cookie,
@@ -714,7 +756,7 @@ def log_out(request: Request, response: Response) -> None:
     """End the session of the cookie."""
     authenticator: Authenticator | None = request.app.state.authenticator
     if authenticator is not None:
-        authenticator.log_out(request.cookies.get(COOKIE, ""))
+        authenticator.log_out(session_of(request))
     response.delete_cookie(COOKIE, httponly=True, samesite="strict")
 
 

@@ -7,6 +7,7 @@ import time
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
+from rich.markup import escape
 from rich.table import Table
 
 from service.cli import console
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
 DATABASE: Final = "sqlite:///gridsec.db"
 UNITS: Final = {"h": 3600.0, "d": 86_400.0, "w": 604_800.0, "y": 31_557_600.0}
 """Seconds of the units of a duration."""
-NAME: Final = re.compile(r"^[^\x00-\x1f\x7f-\x9f]{1,64}$")
 
 Database = Annotated[str, typer.Option(envvar="GRIDSEC_DATABASE", help="Database of the service.")]
 
@@ -37,14 +37,14 @@ def add(
     database: Database = DATABASE,
 ) -> None:
     """Create an API key and print it once; only its SHA-256 is stored."""
-    from service.access.identity import Role
+    from service.access.identity import Role, is_name
     from service.access.keys import create
     from service.store.access import AccessStore
 
     problems = []
     if role not in set(Role):
         problems.append(f"--role is {role!r}; expected one of {', '.join(Role)}")
-    if not NAME.match(name.strip()):
+    if not is_name(name.strip()):
         problems.append("the name must have 1 to 64 printable characters")
     life = seconds(expires)
     if life is None and expires != "never":
@@ -55,9 +55,10 @@ def add(
     scope = frozenset(feeder) if feeder else None
     text, record = create(name.strip(), Role(role), scope, now, None if life is None else now + life)
     with AccessStore(database) as store:
-        store.add_key(record)
         what = f"{record.name}, {record.role}, {_scope(record.feeders)}, {_end(record.expires)}"
+        # The entry comes first: no change is without one.
         _audit(store, now, "key add", record.id, what)
+        store.add_key(record)
     console.err.print(f"Key {record.id}: {what}. It is shown only now:")
     print(text)
 
@@ -73,7 +74,9 @@ def list_keys(*, database: Database = DATABASE) -> None:
     now = time.time()
     for each in records:
         state = each.ended(now) or _end(each.expires)
-        table.add_row(each.id, each.name, each.role, _scope(each.feeders), _day(each.created), state)
+        table.add_row(
+            *map(escape, (each.id, each.name, each.role, _scope(each.feeders), _day(each.created), state))
+        )
     console.out.print(table)
 
 
@@ -88,9 +91,11 @@ def revoke(
 
     now = time.time()
     with AccessStore(database) as store:
-        if not store.revoke(key, now):
+        found = store.key(key)
+        if found is None or found.revoked is not None:
             raise typer.BadParameter(f"there is no valid key {key!r}")
         _audit(store, now, "key revoke", key, "")
+        store.revoke(key, now)
     console.out.print(f"Key {key} is revoked.")
 
 
@@ -134,7 +139,9 @@ def show(
     table = Table("entry", "time (UTC)", "identity", "credential", "action", "target")
     for each in entries:
         when = time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime(each.t))
-        table.add_row(str(each.seq), when, each.identity, each.credential, each.action, each.target)
+        table.add_row(
+            *map(escape, (str(each.seq), when, each.identity, each.credential, each.action, each.target))
+        )
     console.out.print(table)
 
 
@@ -146,8 +153,13 @@ def seconds(text: str) -> float | None:
 
 def _audit(store: AccessStore, now: float, action: str, target: str, detail: str) -> None:
     import getpass
+    import os
 
-    store.append(now, getpass.getuser(), "command line", action, target, detail)
+    try:
+        user = getpass.getuser()
+    except (KeyError, OSError):  # a user id without a name, as in containers
+        user = f"uid {os.getuid()}"
+    store.append(now, user, "command line", action, target, detail)
 
 
 def _scope(feeders: frozenset[str] | None) -> str:

@@ -199,7 +199,7 @@ class FeederReport:
     ] = None
     since: Annotated[
         float | None,
-        Field(description="First of the consecutive ticks with this verdict, Unix s; null if not known."),
+        Field(description="First consecutive tick with this verdict since the start of the service, Unix s."),
     ] = None
     data_error: Annotated[
         DataErrorReport | None,

@@ -23,7 +23,7 @@ import sqlalchemy as sa
 from service.access.audit import AuditEntry, chained
 from service.access.identity import Role
 from service.access.keys import KeyRecord
-from service.store.connect import CALL_S
+from service.store.connect import CALL_S, Timed
 from service.store.schema import SEQ, StoreUnavailable
 
 SESSION_S: Final = 12 * 3600.0
@@ -32,6 +32,9 @@ BUSY_S: Final = 5.0
 """Wait of a write for the lock of the database, s."""
 _AUDIT_LOCK: Final = 0x6772_6964_6175_6400
 _VERSION: Final = 1
+
+_LENGTHS: Final = (64, 256, 256, 1024, 2000)
+"""Largest lengths of identity, credential, action, target and detail of an audit entry, characters."""
 
 _META = sa.MetaData()
 _SCHEMA = sa.Table("access_version", _META, sa.Column("version", sa.Integer, primary_key=True))
@@ -188,12 +191,14 @@ class AccessStore:
 
         t, identity, credential, action, target, detail: as in `AuditEntry`.
         """
+        given = (identity, credential, action, target, detail)
         with self._write() as connection:
             if not self._sqlite:
                 connection.execute(sa.select(sa.func.pg_advisory_xact_lock(_AUDIT_LOCK)))
+            texts = [printable(each, most) for each, most in zip(given, _LENGTHS, strict=True)]
             last = connection.execute(sa.select(_AUDIT).order_by(_AUDIT.c.seq.desc()).limit(1)).one_or_none()
             before = None if last is None else AuditEntry(*last)
-            entry = chained(before, t, identity, credential, action, target, detail)
+            entry = chained(before, t, *texts)
             connection.execute(_AUDIT.insert().values(entry.to_json()))
         return entry
 
@@ -225,6 +230,9 @@ class AccessStore:
     @contextmanager
     def _write(self) -> Iterator[sa.Connection]:
         with self._guard("write"), self._engine.begin() as connection:
+            if self._sqlite:
+                # A deferred transaction that reads first and then writes fails at once if another one writes.
+                connection.exec_driver_sql("BEGIN IMMEDIATE")
             yield connection
 
     @contextmanager
@@ -240,6 +248,11 @@ class AccessStore:
             cause = " ".join(str(getattr(error, "orig", None) or error).split())
             code = "read-failed" if doing == "read" else "write-failed"
             raise StoreUnavailable(f"cannot {doing} {self.name}: {cause}", code=code) from error
+
+
+def printable(text: str, most: int) -> str:
+    """Text with escaped control, format and surrogate characters, cut to a length."""
+    return "".join(c if c.isprintable() else f"\\u{ord(c):04x}" for c in text[:most])[: 2 * most]
 
 
 def _digest(token: str) -> str:
@@ -258,11 +271,17 @@ def _sqlite(url: sa.URL) -> sa.Engine:
         text = f"{url}: expected a file; a database in memory is lost at the end"
         raise StoreUnavailable(text, code="in-memory")
     path = Path(os.path.realpath(url.database) + ".access")
+    try:
+        # Digests of keys: for the owner alone, from the first moment.
+        os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o600))
+    except FileExistsError:
+        pass
+    except OSError as error:
+        raise StoreUnavailable(f"cannot write {path}: {error.strerror}", code="write-failed") from error
 
     def connect() -> sqlite3.Connection:
-        existed = path.exists()
         made = sqlite3.connect(
-            f"file:{quote(str(path))}?mode=rwc",
+            f"file:{quote(str(path))}?mode=rw",
             uri=True,
             timeout=BUSY_S,
             isolation_level=None,
@@ -271,19 +290,23 @@ def _sqlite(url: sa.URL) -> sa.Engine:
         made.execute("PRAGMA foreign_keys = ON")
         made.execute("PRAGMA journal_mode = DELETE")
         made.execute("PRAGMA synchronous = FULL")
-        if not existed:
-            # Digests of keys: for the owner alone.
-            path.chmod(0o600)
         return made
 
     engine = sa.create_engine("sqlite://", creator=connect, poolclass=sa.QueuePool, pool_size=4)
-    sa.event.listen(engine, "begin", _begin)
+    sa.event.listen(engine, "connect", lambda _, record: record.info.update(place=_place(path)))
+    sa.event.listen(engine, "checkout", lambda _, record, __: _in_place(path, record.info["place"]))
     return engine
 
 
-def _begin(connection: sa.Connection) -> None:
-    # A deferred transaction that reads first and then writes fails at once if another one writes.
-    connection.exec_driver_sql("BEGIN IMMEDIATE")
+def _place(path: Path) -> tuple[int, int]:
+    found = path.stat()
+    return found.st_dev, found.st_ino
+
+
+def _in_place(path: Path, place: tuple[int, int]) -> None:
+    """Give up connections to a removed or replaced file: its keys are not those of the service any more."""
+    if not path.exists() or _place(path) != place:
+        raise sa.exc.DisconnectionError(f"{path} has been removed or replaced")
 
 
 def _postgresql(url: sa.URL) -> sa.Engine:
@@ -291,6 +314,9 @@ def _postgresql(url: sa.URL) -> sa.Engine:
         url = url.set(drivername="postgresql+psycopg")
     wait = {"connect_timeout": int(CALL_S), "tcp_user_timeout": int(CALL_S * 1e3)}
     limit = f"-c statement_timeout={CALL_S * 1e3:.0f} -c synchronous_commit=on"
-    return sa.create_engine(
+    engine = sa.create_engine(
         url, pool_size=4, pool_timeout=CALL_S, pool_pre_ping=True, connect_args={**wait, "options": limit}
     )
+    # A server that stops answering ends neither by its own time limit nor by that of TCP.
+    sa.event.listen(engine, "do_connect", lambda _, __, given, options: Timed.connect(*given, **options))
+    return engine

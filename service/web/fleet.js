@@ -1,6 +1,7 @@
 // All feeders, the worst first: verdict, its duration, suspects, silent meters, alarms. Shown with two feeders or more.
 
 import { byId, duration, el, getJson, isKnown, settle } from "./dom.js";
+import { session } from "./session.js";
 
 const API = "/api/v1/feeders";
 const EVERY_MS = 2000;
@@ -38,11 +39,16 @@ export class Fleet {
 
   async update() {
     if (document.visibilityState === "hidden" && this.feeders.length > SHOWN) return;
+    if (this.asking) return;
+    this.asking = true;
     try {
       this.take((await getJson(API)).feeders);
       byId("fleet").dataset.fresh = "yes";
-    } catch {
+    } catch (error) {
       byId("fleet").dataset.fresh = "no";
+      if (error.status === 401) await session.begin();
+    } finally {
+      this.asking = false;
     }
   }
 

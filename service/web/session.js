@@ -5,6 +5,7 @@ import { byId, el } from "./dom.js";
 const API = "/api/v1/session";
 
 export const session = {
+  accepted: false, // A key was accepted since the page was loaded.
   name: null, // Name by the credential; null while the service is open and the operator gives a name.
 
   // Resolves as soon as the service accepts the browser's requests.
@@ -12,10 +13,15 @@ export const session = {
     for (;;) {
       const response = await fetch(API, { headers: { Accept: "application/json" } }).catch(() => null);
       if (response?.ok) {
+        session.accepted = false;
         show(await response.json());
         return;
       }
-      if (response?.status === 401) await login();
+      if (response?.status === 401) {
+        const again = session.accepted; // The key was valid, but the browser keeps no cookie.
+        await login(again ? "the browser refuses the cookie of this address; it needs HTTPS" : null);
+        session.accepted = true;
+      }
       else await new Promise((resolve) => { setTimeout(resolve, 3000); });
     }
   },
@@ -50,8 +56,9 @@ function show(identity) {
     el("button", { type: "button", class: "plain", text: "Log out", on: { click: logout } }));
 }
 
-function login() {
-  byId("login-error").hidden = true;
+function login(problem) {
+  byId("login-error").hidden = problem === null;
+  byId("login-error").textContent = problem === null ? "" : `Not logged in: ${problem}`;
   byId("login-key").value = "";
   if (!byId("login").open) byId("login").showModal();
   return new Promise((resolve) => {
@@ -67,7 +74,7 @@ function login() {
         resolve();
         return;
       }
-      const told = response instanceof Error ? response.message : (await response.json()).detail;
+      const told = response instanceof Error ? response.message : (await response.json().catch(() => ({}))).detail ?? response.statusText;
       byId("login-error").textContent = `Not logged in: ${told}`;
       byId("login-error").hidden = false;
     };

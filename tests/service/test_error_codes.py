@@ -17,6 +17,7 @@ from pkgutil import walk_packages
 from types import SimpleNamespace
 from typing import Any, cast
 
+import jwt
 import numpy as np
 import pandas as pd
 import pytest
@@ -482,7 +483,9 @@ CALLS: dict[str, Call] = {
     "invalid API key": lambda place, _: authenticator(place).of_credential("gridsec_0_0", "127.0.0.1"),
     "many invalid API keys": lambda place, _: many_invalid_keys(authenticator(place)),
     "role below that of the route": lambda place, _: role_too_low(place),
-    "issuer without an address": lambda _, __: TokenVerifier("file:///keys", "gridsec").identify("x"),
+    "issuer without an address": lambda _, __: TokenVerifier("file:///keys", "gridsec").identify(
+        jwt.encode({}, "x" * 32, "HS256")
+    ),
     "network without authentication": lambda place, _: app._check_exposure(
         settings({"http": "10.0.0.1:80"}), authenticator(place)
     ),

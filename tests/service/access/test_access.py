@@ -22,7 +22,16 @@ from hypothesis import strategies as st
 from jwt.algorithms import ECAlgorithm, RSAAlgorithm
 
 from service.access.audit import START, AuditEntry, broken, chained
-from service.access.identity import OPEN, POLICY, WHOLE_FLEET, Identity, NotAuthenticated, Role
+from service.access.identity import (
+    OPEN,
+    POLICY,
+    WHOLE_FLEET,
+    Identity,
+    IssuerUnavailable,
+    NotAuthenticated,
+    Role,
+    is_name,
+)
 from service.access.keys import create, matches, parse
 from service.access.tokens import TokenVerifier
 from service.store.access import SESSION_S, AccessStore
@@ -286,6 +295,9 @@ def test_a_valid_token_is_an_identity(issuer: Issuer) -> None:
         {"gridsec_role": "root"},
         {"gridsec_role": None},
         {"gridsec_feeders": "north"},
+        {"preferred_username": ""},
+        {"preferred_username": "Ada\nEve"},
+        {"preferred_username": "x" * 65},
         {"kid": "unknown"},
         {"alg": "none", "key": ""},
     ],
@@ -320,5 +332,65 @@ def test_another_key_and_the_public_key_as_a_secret_are_refused(issuer: Issuer) 
 def test_an_issuer_without_an_answer_authenticates_nothing(issuer: Issuer) -> None:
     token = issuer.token()
     for address in ("http://127.0.0.1:9", f"{issuer.url}/absent", "file:///etc"):
-        with refused(NotAuthenticated, "issuer-unavailable"):
+        with refused(IssuerUnavailable, "issuer-unavailable"):
             TokenVerifier(address, "gridsec").identify(token)
+
+
+def test_a_key_of_another_algorithm_is_an_invalid_token(issuer: Issuer) -> None:
+    """The header names ES256 and the id of the RSA key."""
+    with pytest.raises(NotAuthenticated):
+        verifier(issuer).identify(issuer.token(kid="r", key=issuer.ec, alg="ES256"))
+
+
+def test_known_keys_stay_valid_while_the_issuer_does_not_answer(issuer: Issuer) -> None:
+    made = verifier(issuer)
+    assert made.identify(issuer.token()).name == "ada"
+    client = made._client
+    assert client is not None
+    client.uri = "http://127.0.0.1:9/keys"
+    assert client.jwk_set_cache is not None
+    client.jwk_set_cache.jwk_set_with_timestamp = None
+    client.get_signing_key.cache_clear() if hasattr(client.get_signing_key, "cache_clear") else None
+    assert made.identify(issuer.token()).name == "ada"
+    begun = time.monotonic()
+    for _ in range(20):
+        with refused(IssuerUnavailable, "issuer-unavailable"):
+            made.identify(issuer.token(kid="e"))
+    assert time.monotonic() - begun < 2.0
+
+
+def test_names_are_printable() -> None:
+    assert all(map(is_name, ("Ada", "Ada Lovelace", "Åsa-1", "x" * 64)))
+    assert not any(map(is_name, ("", " Ada", "x" * 65, "a\nb", "a\x1b[2J", "a\u202eb", "a\u200bb")))
+
+
+def test_texts_of_the_audit_log_are_printable_and_bounded(store: AccessStore) -> None:
+    entry = store.append(NOW, "Ada", "key 1", "PUT", "/\x1b[2J\ud800", "x" * 10_000)
+    assert entry.target == "/\\u001b[2J\\ud800"
+    assert len(entry.detail) == 2000
+    assert broken(store.audit()) is None
+
+
+def test_reads_do_not_wait_for_a_writer(store: AccessStore, tmp_path: Path) -> None:
+    with sqlite3.connect(tmp_path / "grid.db.access", isolation_level=None) as other:
+        other.execute("BEGIN IMMEDIATE")
+        begun = time.monotonic()
+        assert store.keys() == []
+        assert time.monotonic() - begun < 1.0
+        other.execute("ROLLBACK")
+    other.close()
+
+
+def test_a_removed_or_replaced_file_is_not_read_on(store: AccessStore, tmp_path: Path) -> None:
+    path = tmp_path / "grid.db.access"
+    _, record = create("Ada", Role.ADMIN, None, NOW, None)
+    store.add_key(record)
+    kept = path.read_bytes()
+    path.unlink()
+    with refused(StoreUnavailable, "read-failed"):
+        store.key(record.id)
+    path.write_bytes(kept)
+    assert store.revoke(record.id, NOW)
+    found = store.key(record.id)
+    assert found is not None
+    assert found.revoked == NOW

@@ -235,6 +235,32 @@ def test_every_change_is_in_the_audit_log_before_it_is_made(
     assert [entry["hash"] for entry in page["entries"]][-2:] == [acknowledged.hash, refused_.hash]
 
 
+@pytest.mark.parametrize("path", [f"/api/v1/feeders/{FEEDER}/stream", "/api/v1/alarms/stream"])
+def test_an_open_stream_ends_with_its_key(running: InProcess, folder: Path, path: str) -> None:
+    text = key(folder, Role.VIEWER)
+    with running.http.stream("GET", path, headers=bearer(text)) as response:
+        lines = response.iter_lines()
+        assert next(lines).startswith((":", "id:", "retry:"))
+        with AccessStore(f"sqlite:///{folder / 'gridsec.db'}") as store:
+            assert store.revoke(text.split("_")[1], time.time())
+        begun = time.monotonic()
+        for _ in lines:
+            assert time.monotonic() - begun < 10.0
+        assert time.monotonic() - begun < 10.0
+
+
+def test_a_lost_database_of_access_does_not_open_the_service(tmp_path: Path) -> None:
+    text = key(tmp_path, Role.ADMIN)
+    with service(tmp_path, (OTHER,)) as made:
+        assert made.http.get("/api/v1/feeders", headers=bearer(text)).status_code == 200
+        (tmp_path / "gridsec.db.access").unlink()
+        AccessStore(f"sqlite:///{tmp_path / 'gridsec.db'}").close()
+        end = time.monotonic() + FRESH_S + 0.5
+        while time.monotonic() < end:
+            assert made.http.get("/api/v1/feeders").status_code in {401, 503}
+            time.sleep(0.05)
+
+
 # ---------------------------------------------------------------------- start
 
 
