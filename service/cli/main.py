@@ -14,6 +14,7 @@ import sys
 import time
 from dataclasses import dataclass, replace
 from functools import partial
+from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -21,7 +22,9 @@ import typer
 
 from gridsec.errors import DesignInfeasible, FeederInvalid, GridsecError, NotObservable, raise_if_any
 from service.cli import (
+    backup,
     console,
+    doctor,
     feeders,
     replay,
     reproduce,
@@ -78,14 +81,35 @@ study_app.command("compare")(study_compare.compare)
 
 app = typer.Typer(
     name="gridsec",
-    help="Monitors the voltages of distribution feeders and identifies manipulated meters.",
     no_args_is_help=True,
     rich_markup_mode="markdown",  # plain brackets in help texts
     pretty_exceptions_enable=False,
     add_completion=False,
 )
+
+
+def _print_version(wanted: bool) -> None:
+    """Print the version and end."""
+    if wanted:
+        console.out.print(f"gridsec {metadata.version('gridsec')}")
+        raise typer.Exit
+
+
+@app.callback()
+def gridsec(
+    *,
+    version: Annotated[
+        bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Print the version.")
+    ] = False,
+) -> None:
+    """Monitors the voltages of distribution feeders and identifies manipulated meters."""
+
+
 app.add_typer(feeders.app, name="feeders")
 app.command("convert")(feeders.convert)
+app.command()(doctor.doctor)
+app.command()(backup.backup)
+app.command()(backup.restore)
 app.add_typer(study_app, name="study")
 app.command()(replay.replay)
 app.command()(reproduce.reproduce)
