@@ -18,6 +18,7 @@ from feeders.format.tables import from_json
 from feeders.model.site import Site, from_tables, load
 from feeders.registry.registry import choose
 from gridsec.errors import FeederInvalid, GridsecError, Problem
+from service import systemd
 from service.api.listener import BoundedServer, Shares, raise_limit
 from service.api.routes import MAX_STREAMS, create_api
 from service.engine.engine import RuntimeConfig
@@ -141,9 +142,12 @@ async def _run(
         url = f"http://{f'[{host}]' if ':' in host else host}:{port}"
         _log.info("serving", url=url, feeders=list(feeders))
         announce(Running(url, feeders, stop.set))
+        supervised = asyncio.create_task(systemd.supervise(lambda: runtime.healthy()[0]), name="systemd")
         await asyncio.wait({watching, serving, stopped}, return_when=asyncio.FIRST_COMPLETED)
         stopping()
         stopped.cancel()
+        supervised.cancel()
+        systemd.notify("STOPPING=1")
         runtime.stop()
         server.should_exit = True
         results = await asyncio.gather(watching, serving, return_exceptions=True)

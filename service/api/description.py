@@ -79,7 +79,7 @@ def _object(columns: Iterable[Column], description: str) -> dict[str, Any]:
 def _cell(column: Column) -> dict[str, Any]:
     """Schema of a cell; null stands for the default."""
     found: dict[str, Any] = {"description": f"{column.meaning}; {column.right}"}
-    kind: str | list[str] = "string"
+    kind = "string"
     if isinstance(column, Number):
         kind = "integer" if isinstance(column, Whole) else "number"
         limits = {"minimum": column.low, "maximum": column.high, "exclusiveMinimum": column.above}
@@ -94,7 +94,6 @@ def _cell(column: Column) -> dict[str, Any]:
         found["items"] = {"type": "string", "enum": list(column.choices or ())}
     elif column.choices is not None:
         found["enum"] = [*column.choices, *([] if column.default is REQUIRED else [None])]
-    if column.default is not REQUIRED:
-        kind = [kind, "null"]
-        found["default"] = plain(column.default)
-    return {"type": kind, **found}
+    if column.default is REQUIRED:
+        return {"type": kind, **found}
+    return {"type": [kind, "null"], **found, "default": plain(column.default)}

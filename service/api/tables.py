@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any, Final
 
@@ -136,7 +136,7 @@ def _flat(table: pa.Table) -> pa.Table:
     """Replace lists by texts with semicolons, and timestamps by texts as in RFC 3339."""
     from pyarrow import compute
 
-    texts = {
+    texts: dict[Callable[[Any], bool], Callable[[Any], Any]] = {
         pa.types.is_timestamp: partial(compute.strftime, format="%Y-%m-%dT%H:%M:%SZ"),
         pa.types.is_list: lambda column: compute.binary_join(column, ";"),
     }

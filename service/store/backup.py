@@ -226,7 +226,7 @@ def server_version(connection: psycopg.Connection[tuple[object, ...]]) -> int | 
     row = connection.execute("SELECT to_regclass(%s)", (VERSION.name,)).fetchone()
     if row is None or row[0] is None:
         return None
-    version = connection.execute(f"SELECT version FROM {VERSION.name}").fetchone()  # type: ignore[arg-type]  # noqa: S608
+    version = connection.execute(f"SELECT version FROM {VERSION.name}").fetchone()  # noqa: S608
     return None if version is None else int(str(version[0]))
 
 

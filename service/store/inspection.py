@@ -97,7 +97,7 @@ def _server(url: sa.URL) -> DatabaseState:
         locks += "(SELECT oid FROM pg_database WHERE datname = current_database())"
         query = "SELECT current_setting('server_version_num')::int, pg_database_size(current_database()), "
         query += "pg_is_in_recovery(), has_schema_privilege(current_schema(), 'CREATE'), "
-        row = connection.execute(f"{query}({locks}) > 0").fetchone()  # type: ignore[arg-type]
+        row = connection.execute(f"{query}({locks}) > 0").fetchone()
         newest = None if version is None else connection.execute(_NEWEST).fetchone()
     server, size, replica, may_create, running = row or (0, 0, False, False, False)
     problems = []
