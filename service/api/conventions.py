@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 
-class HeadAsGet:
-    """Answers HEAD with the status and headers of GET. A stream ends after its headers.
+class _HeadersSent(Exception):
+    """Ends a stream after its headers."""
 
-    `errors.Guard` must be outside: it handles the end of a stream.
-    """
+
+class HeadAsGet:
+    """Answers HEAD with the status and headers of GET. A stream ends after its headers."""
 
     def __init__(self, app: ASGIApp) -> None:
         self.app = app
@@ -27,6 +27,9 @@ class HeadAsGet:
                 return
             await send({"type": "http.response.body", "body": b"", "more_body": False})
             if message.get("more_body"):
-                raise ClientDisconnect
+                raise _HeadersSent
 
-        await self.app({**scope, "method": "GET"}, receive, headers_only)
+        try:
+            await self.app({**scope, "method": "GET"}, receive, headers_only)
+        except* _HeadersSent:  # alone, or in a group of the stream's tasks
+            pass

@@ -223,7 +223,11 @@ def _feeders(chosen: Settings) -> tuple[int, list[Finding]]:
     from gridsec.errors import GridsecError
 
     if not chosen.feeders:
-        return 0, [Finding(Level.NOTE, "feeder", "none given; add --feeder DIR, or PUT one over REST")]
+        return 0, [
+            Finding(
+                Level.NOTE, "feeder", "none given; add --feeder DIR (feeders of the database are not checked)"
+            )
+        ]
     meters, found = 0, []
     for name in chosen.feeders:
         try:
@@ -232,7 +236,7 @@ def _feeders(chosen: Settings) -> tuple[int, list[Finding]]:
             started = time.monotonic()
             made = design(site)
         except GridsecError as error:
-            found.append(Finding(Level.FAIL, "feeder", f"{name}: {error}"))
+            found.append(Finding(Level.FAIL, "feeder", f"{name}: {' '.join(str(error).split())}"))
             continue
         text = f"{site.feeder.name}: {len(site.meter_ids)} meters, {site.tables.meta.monitor.estimator}, "
         text += f"M = {made.max_attacked}, designed in {time.monotonic() - started:.1f} s"

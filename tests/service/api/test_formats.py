@@ -141,7 +141,7 @@ def test_unknown_meters_and_feeders_are_refused(setup: Setup) -> None:
     assert setup.get(HISTORY, params=late).json()["points"] == []
 
 
-def test_head_on_every_get_route(setup: Setup) -> None:
+def test_head_on_every_get_route(setup: Setup, caplog: pytest.LogCaptureFixture) -> None:
     setup.attack()
     alarm = setup.one()["id"]
     paths = [
@@ -156,7 +156,8 @@ def test_head_on_every_get_route(setup: Setup) -> None:
         if "stream" not in path:
             full = setup.http.get(path)
             assert answer.headers["content-type"] == full.headers["content-type"]
-    # Streams have ended.
+    # Streams have ended, and not by an error.
+    assert caplog.records == []
     assert setup.server.api.state.streams == 0
     assert setup.http.head("/api/v1/feeders/nowhere").status_code == 404
 
