@@ -6,10 +6,11 @@ The checks change nothing. They use the settings of `gridsec serve`, from option
 from __future__ import annotations
 
 import ctypes
+import json
 import resource
 import socket
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from enum import StrEnum
@@ -24,7 +25,9 @@ from service.cli.console import FAILED, say
 from service.cli.serve import Database, Endpoints, EstimatorName, Feeders, Http, Listen
 
 if TYPE_CHECKING:
+    from feeders.model.site import Site
     from service.settings import Settings
+    from service.store.inspection import DatabaseState
 
 FREE_BYTES = 1 << 30
 """Least free space of the file system of an SQLite database, bytes."""
@@ -101,19 +104,19 @@ def doctor(
 def examine(chosen: Settings) -> Iterator[Finding]:
     """Yield the findings of all checks, part by part."""
     yield Finding(Level.OK, "version", f"gridsec {metadata.version('gridsec')}")
-    newest, database = _database(chosen.database)
+    state, database = _database(chosen.database)
     yield from database
-    yield from _clock(newest, time.time())
+    yield from _clock(None if state is None else state.newest, time.time())
     yield _http(chosen.http)
     yield from _zenoh(chosen)
-    meters, feeders = _feeders(chosen)
+    meters, feeders = _feeders(chosen, {} if state is None else state.feeders)
     yield from feeders
     yield _descriptors(meters)
     yield from _optional(postgresql=chosen.database.startswith("postgresql"))
 
 
-def _database(url: str) -> tuple[float | None, list[Finding]]:
-    """Newest tick of the database, Unix s, and the findings."""
+def _database(url: str) -> tuple[DatabaseState | None, list[Finding]]:
+    """State of the database, if it can be read, and the findings."""
     from service.store import StoreUnavailable
     from service.store.backup import NEWEST
     from service.store.inspection import inspect
@@ -143,7 +146,7 @@ def _database(url: str) -> tuple[float | None, list[Finding]]:
         text = f"{state.free / 1e9:.1f} GB free"
         text += "" if enough else f"; make room: {needed / 1e9:.1f} GB are needed for history and a backup"
         found.append(Finding(Level.OK if enough else Level.FAIL, "disk", text))
-    return state.newest, found
+    return state, found
 
 
 def _clock(newest: float | None, now: float) -> Iterator[Finding]:
@@ -216,32 +219,40 @@ def _zenoh(chosen: Settings) -> Iterator[Finding]:
             yield Finding(Level.FAIL, "zenoh", text)
 
 
-def _feeders(chosen: Settings) -> tuple[int, list[Finding]]:
-    """Number of meters and busbars of all feeders, and the findings about loading and designing them."""
-    from feeders.model.site import load
+def _feeders(chosen: Settings, stored: Mapping[str, str]) -> tuple[int, list[Finding]]:
+    """Number of meters and busbars of all feeders, and the findings about loading and designing them.
+
+    `stored` has the JSON of the tables of feeders put over REST; those of the settings take precedence.
+    """
+    from feeders.format.tables import from_json
+    from feeders.model.site import from_tables, load
     from feeders.registry.registry import choose, design
     from gridsec.errors import GridsecError
 
-    if not chosen.feeders:
-        return 0, [
-            Finding(
-                Level.NOTE, "feeder", "none given; add --feeder DIR (feeders of the database are not checked)"
-            )
-        ]
-    meters, found = 0, []
-    for name in chosen.feeders:
+    def given(name: str) -> Site:
+        return choose(load(name), estimator=chosen.estimator)
+
+    def put(name: str) -> Site:
+        return from_tables(from_json(json.loads(stored[name])))
+
+    meters, found, names = 0, list[Finding](), set[str]()
+    for name, made in [*((name, given) for name in chosen.feeders), *((name, put) for name in stored)]:
+        if made is put and name in names:
+            continue
         try:
-            site = choose(load(name), estimator=chosen.estimator)
-            meters += len(site.meter_ids) + 1
+            site = made(name)
+            names.add(site.feeder.name)
             started = time.monotonic()
-            made = design(site)
+            estimator = design(site)
         except GridsecError as error:
             found.append(Finding(Level.FAIL, "feeder", f"{name}: {' '.join(str(error).split())}"))
             continue
+        meters += len(site.meter_ids) + 1
         text = f"{site.feeder.name}: {len(site.meter_ids)} meters, {site.tables.meta.monitor.estimator}, "
-        text += f"M = {made.max_attacked}, designed in {time.monotonic() - started:.1f} s"
+        text += f"M = {estimator.max_attacked}, designed in {time.monotonic() - started:.1f} s"
         found.append(Finding(Level.OK, "feeder", text))
-    return meters, found
+    none = Finding(Level.NOTE, "feeder", "none; add --feeder DIR, or PUT one over REST")
+    return meters, found or [none]
 
 
 def _descriptors(meters: int) -> Finding:

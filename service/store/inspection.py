@@ -6,8 +6,9 @@ import fcntl
 import os
 import shutil
 import sqlite3
+from collections.abc import Mapping
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from urllib.parse import quote
 
@@ -15,7 +16,7 @@ import sqlalchemy as sa
 
 from service.store.backup import NEWEST, connected, parsed, path_of, schema_version, server_version
 from service.store.connect import CALL_S
-from service.store.schema import EVENT, HISTORY, StoreUnavailable
+from service.store.schema import EVENT, FEEDER, HISTORY, StoreUnavailable
 
 OLDEST_SERVER = 140000
 """Oldest version of PostgreSQL with `idle_session_timeout`."""
@@ -32,6 +33,7 @@ class DatabaseState:
     free: int | None = None  # free bytes of the file system; None of a server
     running: bool = False  # a service holds the writer's lock
     read_only: str | None = None  # reason why the service cannot write
+    feeders: Mapping[str, str] = field(default_factory=dict)  # JSON of the tables of feeders put over REST
 
 
 def inspect(url: str) -> DatabaseState:
@@ -56,7 +58,7 @@ def _file(path: Path) -> DatabaseState:
     locked += [
         f"{each} cannot be written" for each in beside if each.exists() and not os.access(each, os.W_OK)
     ]
-    version, newest, size = None, None, 0
+    version, newest, size, feeders = None, None, 0, dict[str, str]()
     if path.exists() and path.stat().st_size:
         size = sum(each.stat().st_size for each in beside[:2] if each.exists())
         try:
@@ -64,17 +66,18 @@ def _file(path: Path) -> DatabaseState:
             with closing(made) as connection:
                 version = schema_version(connection)
                 newest = connection.execute(_NEWEST).fetchone()[0]
+                feeders = dict(connection.execute(_FEEDERS).fetchall())
         except sqlite3.Error as error:
             raise StoreUnavailable(f"cannot read {path}: {error}", code="read-failed") from error
-    return DatabaseState(
-        str(path), version, newest, size, free, _locked(beside[3]), "; ".join(locked) or None
-    )
+    reasons = "; ".join(locked) or None
+    return DatabaseState(str(path), version, newest, size, free, _locked(beside[3]), reasons, feeders)
 
 
 _NEWEST = (
     f"SELECT max(t) FROM (SELECT max(t) AS t FROM {HISTORY.name} "  # noqa: S608 - constants
     f"UNION ALL SELECT max(t) FROM {EVENT.name}) AS times"
 )
+_FEEDERS = f"SELECT name, tables FROM {FEEDER.name} ORDER BY name"  # noqa: S608 - a constant
 
 
 def _locked(lock: Path) -> bool:
@@ -99,6 +102,7 @@ def _server(url: sa.URL) -> DatabaseState:
         query += "pg_is_in_recovery(), has_schema_privilege(current_schema(), 'CREATE'), "
         row = connection.execute(f"{query}({locks}) > 0").fetchone()
         newest = None if version is None else connection.execute(_NEWEST).fetchone()
+        stored = [] if version is None else connection.execute(_FEEDERS).fetchall()
     server, size, replica, may_create, running = row or (0, 0, False, False, False)
     problems = []
     if int(str(server)) < OLDEST_SERVER:
@@ -108,6 +112,5 @@ def _server(url: sa.URL) -> DatabaseState:
     if not may_create:
         problems.append("the user may not create tables; GRANT CREATE ON SCHEMA public")
     when = None if not newest or newest[0] is None else float(str(newest[0]))
-    return DatabaseState(
-        name, version, when, int(str(size)), None, bool(running), "; ".join(problems) or None
-    )
+    reasons, feeders = "; ".join(problems) or None, {str(row[0]): str(row[1]) for row in stored}
+    return DatabaseState(name, version, when, int(str(size)), None, bool(running), reasons, feeders)

@@ -13,6 +13,8 @@ from pathlib import Path
 
 import pytest
 
+from feeders.format.tables import to_json
+from feeders.model.site import load
 from service.cli import doctor
 from service.cli.doctor import Finding, Level
 from service.ingest.queues import BusConfig
@@ -129,11 +131,29 @@ def test_databases_that_cannot_be_used(tmp_path: Path) -> None:
     connection.close()
     notes.write_text("not a database " * 100)
     for path, words in ((newer, "schema version 99"), (notes, "is not a database")):
-        newest, (finding,) = doctor._database(f"sqlite:///{path}")
-        assert (newest, finding.level) == (None, Level.FAIL)
+        state, (finding,) = doctor._database(f"sqlite:///{path}")
+        assert (state, finding.level) == (None, Level.FAIL)
         assert words in finding.text
     _, found = doctor._database(f"sqlite:///{tmp_path}/missing/g.db")
     assert any(each.level is Level.FAIL and "does not exist" in each.text for each in found)
+
+
+def test_feeders_of_the_database_are_checked(tmp_path: Path, monkeypatch: Patch, capsys: Capture) -> None:
+    url = f"sqlite:///{tmp_path / 'g.db'}"
+    run = command("doctor")
+    arguments = ("--database", url, "--http", f"127.0.0.1:{free_port()}")
+    arguments += ("--zenoh-listen", f"tcp/127.0.0.1:{free_port()}")
+    _, out, _ = run(monkeypatch, capsys, *arguments)
+    assert result(out)["feeder"] == [("note", "none; add --feeder DIR, or PUT one over REST")]
+    with Store(url) as store:
+        store.commit(put=("cigre-lv", to_json(load("cigre-lv").tables)))
+        store.commit(put=(FEEDER, {"feeder": {}}))
+    code, out, _ = run(monkeypatch, capsys, *arguments)
+    good, bad = result(out)["feeder"]
+    assert (code, good[0], bad[0]) == (1, "ok", "FAIL")
+    assert bad[1].startswith(f"{FEEDER}: ")
+    code, out, _ = run(monkeypatch, capsys, *arguments, "--feeder", FEEDER)
+    assert [level for level, _ in result(out)["feeder"]] == ["ok", "ok"]
 
 
 def test_descriptors_against_the_meters(monkeypatch: Patch) -> None:
@@ -157,12 +177,15 @@ def test_a_leap_second_is_announced(monkeypatch: Patch) -> None:
 @pytest.mark.postgresql
 def test_a_server(cluster: Cluster) -> None:
     url = cluster.database()
-    newest, (empty,) = doctor._database(url)
-    assert (newest, empty.level) == (None, Level.OK)
+    state, (empty,) = doctor._database(url)
+    assert state is not None
+    assert (state.version, state.newest, empty.level) == (None, None, Level.OK)
     filled(url, T0 + 7.0)
-    with Store(url):
-        newest, found = doctor._database(url)
-    assert newest == T0 + 7.0
+    with Store(url) as store:
+        store.commit(put=("village", {"feeder": {}}))
+        state, found = doctor._database(url)
+    assert state is not None
+    assert (state.newest, state.feeders) == (T0 + 7.0, {"village": '{"feeder": {}}'})
     assert [each.level for each in found] == [Level.OK, Level.NOTE]
     _, (gone,) = doctor._database("postgresql://gridsec@127.0.0.1:1/gridsec")
     assert gone.level is Level.FAIL
