@@ -1,7 +1,7 @@
 """Backup of a database to a file while a service writes it, and restore into an empty database.
 
-SQLite: the online backup API copies one consistent state by a read-only connection; in WAL mode it delays no
-commit. `<database>.access` is copied to `FILE.access`. PostgreSQL: `pg_dump` and `pg_restore`.
+SQLite: the online backup API copies one consistent state by a read-only connection; in WAL mode commits
+continue. `<database>.access` is copied to `FILE.access`. PostgreSQL: `pg_dump` and `pg_restore`.
 """
 
 from __future__ import annotations
