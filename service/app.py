@@ -18,6 +18,7 @@ from feeders.format.tables import from_json
 from feeders.model.site import Site, from_tables, load
 from feeders.registry.registry import choose
 from gridsec.errors import FeederInvalid, GridsecError, Problem
+from service import systemd
 from service.access.tokens import TokenVerifier
 from service.api.access import Authenticator
 from service.api.listener import BoundedServer, Shares, raise_limit
@@ -77,6 +78,7 @@ async def serve(
         authenticator = Authenticator(
             stack.enter_context(AccessStore(settings.database)), _tokens(settings), wall
         )
+        stack.callback(authenticator.close)
         _check_exposure(settings, authenticator)
         given = tuple(sites)
         stored, unloaded = _stored(sites, store)
@@ -178,9 +180,12 @@ async def _run(
         url = f"http://{f'[{host}]' if ':' in host else host}:{port}"
         _log.info("serving", url=url, feeders=list(feeders))
         announce(Running(url, feeders, stop.set))
+        supervised = asyncio.create_task(systemd.supervise(lambda: runtime.healthy()[0]), name="systemd")
         await asyncio.wait({watching, serving, stopped}, return_when=asyncio.FIRST_COMPLETED)
         stopping()
         stopped.cancel()
+        supervised.cancel()
+        systemd.notify("STOPPING=1")
         runtime.stop()
         server.should_exit = True
         results = await asyncio.gather(watching, serving, return_exceptions=True)

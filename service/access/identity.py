@@ -33,9 +33,7 @@ PUBLIC: Final = None
 
 POLICY: Final[dict[str, Role | None]] = {
     "GET /healthz": PUBLIC,
-    "HEAD /healthz": PUBLIC,
     "GET /readyz": PUBLIC,
-    "HEAD /readyz": PUBLIC,
     "GET /api/v1/session": PUBLIC,
     "POST /api/v1/session": PUBLIC,
     "DELETE /api/v1/session": PUBLIC,

@@ -4,7 +4,8 @@ A request is authenticated by `Authorization: Bearer <API key or OIDC token>`, o
 of the web page. Where no key was ever added and no issuer is set, every request has the identity `OPEN`: the
 service then listens on loopback only, unless its operator has explicitly allowed otherwise.
 
-Records of keys are cached for `FRESH_S`: a revoked key ends within this time. A client with more than
+Records of keys are cached for `FRESH_S`: a revoked key ends within this time, and within `STALE_S` while the
+database does not answer. A client with more than
 `FAILURES` invalid credentials per minute gets 429 for further invalid ones; valid credentials always pass,
 so that a client behind the same address cannot lock out others.
 """
@@ -17,6 +18,7 @@ import secrets
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, Final
 
 from limits import RateLimitItemPerMinute
@@ -38,10 +40,17 @@ from service.access.identity import (
 from service.access.keys import KeyRecord
 from service.access.tokens import TokenVerifier
 from service.store.access import AccessStore
+from service.store.schema import StoreUnavailable
 
 COOKIE: Final = "gridsec_session"
 FRESH_S: Final = 2.0
 """Largest age of a cached record of a key or session, s."""
+STALE_S: Final = 60.0
+"""Largest age of a cached record while the database does not answer, s."""
+ANSWER_S: Final = 0.3
+"""Wait for the database where a cached record may stand in, s: the page must not freeze with it."""
+READERS: Final = 4
+"""Threads that read the database."""
 CACHED: Final = 1024
 """Largest number of cached records."""
 FAILURES: Final = 10
@@ -70,6 +79,8 @@ class Authenticator:
         self._limit, self._total = RateLimitItemPerMinute(FAILURES), RateLimitItemPerMinute(LOGGED)
         self._lock = threading.Lock()
         self._cache: dict[str, tuple[float, Any]] = {}
+        self._running: dict[str, Future[Any]] = {}
+        self._readers = ThreadPoolExecutor(READERS, thread_name_prefix="gridsec-access")
 
     @property
     def required(self) -> bool:
@@ -147,17 +158,39 @@ class Authenticator:
         return record
 
     def _cached(self, name: str, read: Callable[[], Any]) -> Any:
+        """Value of a read at most `FRESH_S` ago; while the database does not answer, at most `STALE_S`."""
         now = time.monotonic()
         with self._lock:
             found = self._cache.get(name)
-        if found is not None and now - found[0] < FRESH_S:
+            if found is not None and now - found[0] < FRESH_S:
+                return found[1]
+            running = self._running.get(name)
+            if running is None:
+                running = self._running[name] = self._readers.submit(self._read, name, read)
+        stale = found is not None and now - found[0] < STALE_S
+        try:
+            return running.result(timeout=ANSWER_S if stale else None)
+        except (TimeoutError, StoreUnavailable):
+            if found is None or not stale:
+                raise
             return found[1]
-        value = read()
-        with self._lock:
-            if len(self._cache) >= CACHED:
-                self._cache.clear()
-            self._cache[name] = (now, value)
+
+    def _read(self, name: str, read: Callable[[], Any]) -> Any:
+        begun = time.monotonic()
+        try:
+            value = read()
+            with self._lock:
+                if len(self._cache) >= CACHED:
+                    self._cache.clear()
+                self._cache[name] = (begun, value)
+        finally:
+            with self._lock:
+                self._running.pop(name, None)
         return value
+
+    def close(self) -> None:
+        """End the threads of reads."""
+        self._readers.shutdown(wait=False, cancel_futures=True)
 
 
 _COOKIE = re.compile(r"[A-Za-z0-9_-]{43}")
@@ -194,7 +227,8 @@ def authorise(authenticator: Authenticator, request: Request, route: str, body: 
     reason = identity.permits(route)
     if reason is None and feeder is not None and not identity.sees(feeder):
         reason = f"{identity.name} has no access to feeder {feeder!r}"
-    if request.method not in {"GET", "HEAD"}:
+    # Without authentication no identity could be held to an entry.
+    if identity is not OPEN and request.method not in {"GET", "HEAD"}:
         detail = body[:DETAIL_BYTES].decode("utf-8", "replace")
         action = route if reason is None else f"refused: {route}"
         target = request.url.path

@@ -25,16 +25,20 @@ from fastapi.responses import JSONResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from fastapi.staticfiles import StaticFiles
 from pydantic import TypeAdapter
+from starlette.middleware.gzip import GZipMiddleware
 
 from gridsec.errors import FeederInvalid, GridsecError, Problem
 from service.access.identity import OPEN, POLICY, PUBLIC, Identity, NotPermitted, Role
 from service.alarms.state_machine import Alarm, AlarmKind, AlarmState, AlarmUnknown, Severity
-from service.api import models
+from service.api import models, tables
 from service.api.access import COOKIE, FRESH_S, Authenticator, authorise, client_of, session_of
+from service.api.conventions import HeadAsGet
+from service.api.description import BODY, TAGS, feeder_schemas
 from service.api.errors import Guard, handlers, problem
 from service.engine.commissioning import CommissioningProgress
 from service.errors import FeederNotLoaded, FeederUnknown
 from service.report.report import FeederReport
+from service.report.voltages import BUSBAR
 from service.settings import is_loopback
 from service.store import AlarmEvent, Store, StoreUnavailable
 
@@ -161,6 +165,10 @@ MAX_BODY = 4 << 20
 """Largest request body, bytes."""
 MAX_STREAMS = 100
 """Largest number of open event streams."""
+GZIP_BYTES = 1000
+"""Smallest response that is compressed, bytes."""
+GZIP_LEVEL = 5
+"""Level of the compression, 1 to 9."""
 MAX_EVENT = (1 << 63) - 1
 """Largest number of an event."""
 _STATE, _EVENT = TypeAdapter(models.State), TypeAdapter(AlarmEvent)
@@ -187,6 +195,8 @@ def create_api(
         docs_url=None,
         redoc_url=None,
         openapi_url="/api/v1/openapi.json",
+        openapi_tags=TAGS,
+        generate_unique_id_function=lambda route: route.name,
         responses={"default": {"model": models.Problem, "description": "Any error."}},
         dependencies=[Depends(_authorised)],
     )
@@ -196,6 +206,8 @@ def create_api(
     app.state.probe = Probe(backend.store, authenticator)
     app.state.streams, app.state.max_streams = 0, max_streams
     app.state.run = secrets.token_hex(4)
+    app.add_middleware(GZipMiddleware, minimum_size=GZIP_BYTES, compresslevel=GZIP_LEVEL)
+    app.add_middleware(HeadAsGet)
     app.add_middleware(Guard, max_body=MAX_BODY, hosts=hosts)
     for error, handler in handlers().items():
         app.add_exception_handler(error, handler)
@@ -206,6 +218,7 @@ def create_api(
     app.include_router(_sessions)
     app.mount("/", _Web(directory=_WEB, html=True), name="web")
     _describe(app)
+    app.state.queries = _queries(app.openapi())
     return app
 
 
@@ -231,10 +244,43 @@ def _describe(app: FastAPI) -> None:
         schemas.pop(unused, None)
     for name, shown in models.RENAMED.items():
         schemas[shown] = {**schemas.pop(name), "title": shown}
+    schemas.update(feeder_schemas())
+    put = schema["paths"]["/api/v1/feeders/{feeder}"]["put"]["requestBody"]
+    put["content"]["application/json"]["schema"] = {"$ref": f"#/components/schemas/{BODY}"}
     text = json.dumps(schema)
     for name, shown in models.RENAMED.items():
         text = text.replace(f'"#/components/schemas/{name}"', f'"#/components/schemas/{shown}"')
     app.openapi_schema = json.loads(text)
+
+
+def _queries(schema: dict[str, Any]) -> dict[tuple[str, str], frozenset[str]]:
+    """Return the names of the query parameters by path and method, from the OpenAPI description."""
+    return {
+        (path, method.upper()): frozenset(
+            each["name"] for each in operation.get("parameters", ()) if each["in"] == "query"
+        )
+        for path, methods in schema["paths"].items()
+        for method, operation in methods.items()
+    }
+
+
+async def _known_query(request: Request) -> None:
+    """Refuse unknown query parameters: a misspelt filter would otherwise select everything."""
+    known = request.app.state.queries[request.scope["route"].path, request.method]
+    what = f"unknown parameter; expected {', '.join(sorted(known)) or 'none'}"
+    unknown = [name for name in request.query_params if name not in known]
+    if unknown:
+        raise RequestValidationError(
+            [{"loc": ("query", name), "msg": what, "type": "unknown-parameter"} for name in unknown]
+        )
+
+
+def _media(accept: Annotated[str, Header(include_in_schema=False)] = "") -> str:
+    """Type of the response of a route with tables."""
+    media = tables.preferred(accept)
+    if media is None:
+        raise HTTPException(406, f"none of {accept!r} is available; expected {', '.join(tables.MEDIA)}")
+    return media
 
 
 def _backend(request: Request) -> Backend:
@@ -332,9 +378,13 @@ async def _slot(request: Request) -> AsyncIterator[None]:
 
 KnownFeeder = Annotated[str, Depends(_known_feeder)]
 Latest = Annotated[FeederReport, Depends(_latest)]
+Media = Annotated[str, Depends(_media)]
 IfNoneMatch = Annotated[str | None, Header(include_in_schema=False)]
 
 _NOT_MODIFIED: dict[int | str, dict[str, Any]] = {304: {"description": "Unchanged."}}
+_TABLES: dict[int | str, dict[str, Any]] = {
+    200: {"content": {media: {"schema": {"type": "string"}} for media in tables.MEDIA[1:]}}
+}
 
 
 def _unchanged(response: Response, tag: str, if_none_match: str | None) -> Response | None:
@@ -347,7 +397,7 @@ def _unchanged(response: Response, tag: str, if_none_match: str | None) -> Respo
 
 # -------------------------------------------------------------------- feeders
 
-_feeders = APIRouter(prefix="/api/v1/feeders", tags=["feeders"])
+_feeders = APIRouter(prefix="/api/v1/feeders", tags=["feeders"], dependencies=[Depends(_known_query)])
 
 
 def _summary(backend: Backend, fields: dict[str, Any], raised: int) -> models.FeederSummary:
@@ -439,10 +489,13 @@ def get_meter(backend: BackendHere, report: Latest, meter: str, response: Respon
     )
 
 
-@_feeders.get("/{feeder}/history", response_model=models.History)
+@_feeders.get("/{feeder}/history", response_model=models.History, responses=_TABLES)
 def get_history(
+    request: Request,
+    response: Response,
     backend: BackendHere,
     feeder: KnownFeeder,
+    media: Media,
     *,
     since: Since = None,
     until: Until = None,
@@ -453,7 +506,49 @@ def get_history(
 ) -> Any:
     """The newest kept ticks in [since, until), oldest first."""
     rows = backend.store.history(feeder, since=since, until=until, meter=meter, limit=limit)
-    return {"feeder": feeder, "points": rows, "more": len(rows) == limit}
+    if meter is not None and not any(row["meter"] for row in rows) and not _has(backend, feeder, meter):
+        raise HTTPException(404, f"feeder {feeder!r} has no meter {meter!r}")
+    more = len(rows) == limit
+    _link(request, response, media, **({"until": rows[0]["t"]} if more else {}))
+    if media != tables.JSON:
+        return _as_table(response, tables.encoded(tables.history(rows, meter), media), media)
+    return {"feeder": feeder, "points": rows, "more": more}
+
+
+def _has(backend: Backend, feeder: str, meter: str) -> bool:
+    """True if a feeder has a meter, or had it within its history."""
+    report = backend.report(feeder)
+    if meter == BUSBAR or (report is not None and meter in {one.meter for one in report.meters}):
+        return True
+    layout = (backend.feeder(feeder) or {}).get("layout", {"customers": []})
+    present = {row["meter"] for row in layout["customers"]}
+    return meter in present or meter in backend.store.history_meters(feeder)
+
+
+def _check_filters(backend: Backend, caller: Identity, feeder: str | None, meter: str | None) -> None:
+    """Refuse a feeder and a meter that, in the caller's scope, neither exist nor have any alarm."""
+    seen = caller.seen(fields["name"] for fields in backend.feeders())
+    names = seen if feeder is None else (feeder,)
+    if backend.store.alarms(feeder=feeder, among=caller.feeders, meter=meter, limit=1)[0]:
+        return
+    if feeder is not None and not (backend.known(feeder) or backend.unloaded(feeder)):
+        raise FeederUnknown(feeder)
+    if meter is not None and not any(_has(backend, name, meter) for name in names):
+        raise HTTPException(404, f"there is no meter {meter!r}")
+
+
+def _link(request: Request, response: Response, media: str, **following: Any) -> None:
+    """Set the headers of a response with tables; `following` are the parameters of the next page."""
+    response.headers["Vary"] = "Accept"
+    if following and media != tables.JSON:
+        url = request.url.include_query_params(**following)
+        response.headers["Link"] = f'<{url.path}?{url.query}>; rel="next"'
+
+
+def _as_table(response: Response, content: bytes, media: str) -> Response:
+    """Return a table with the headers of the response."""
+    headers = {name: response.headers[name] for name in response.headers if name != "content-length"}
+    return Response(content, media_type=media, headers=headers)
 
 
 @_feeders.get("/{feeder}/commissioning")
@@ -521,15 +616,16 @@ async def stream_states(
 
 # --------------------------------------------------------------------- alarms
 
-_alarms = APIRouter(prefix="/api/v1/alarms", tags=["alarms"])
+_alarms = APIRouter(prefix="/api/v1/alarms", tags=["alarms"], dependencies=[Depends(_known_query)])
 
 
-@_alarms.get("", response_model=models.Alarms, responses=_NOT_MODIFIED)
+@_alarms.get("", response_model=models.Alarms, responses=_NOT_MODIFIED | _TABLES)
 def list_alarms(  # one argument per query parameter
     request: Request,
     backend: BackendHere,
     caller: Caller,
     response: Response,
+    media: Media,
     *,
     state: Annotated[list[AlarmState] | None, Query(description="May be repeated.")] = None,
     kind: Annotated[list[AlarmKind] | None, Query(description="May be repeated.")] = None,
@@ -550,7 +646,10 @@ def list_alarms(  # one argument per query parameter
     # Event numbers identify changes within one database, and a run has only one.
     scope = None if caller.feeders is None else sorted(caller.feeders)
     waits = hashlib.sha256(f"{unstored} {trouble} {scope}".encode()).hexdigest()[:16]
-    if known := _unchanged(response, f'W/"{request.app.state.run}-{last_event}-{waits}"', if_none_match):
+    form = "" if media == tables.JSON else f"-{tables.MEDIA.index(media)}"
+    if known := _unchanged(
+        response, f'W/"{request.app.state.run}-{last_event}-{waits}{form}"', if_none_match
+    ):
         return known
     page, following = backend.store.alarms(
         state=state or (),
@@ -564,6 +663,11 @@ def list_alarms(  # one argument per query parameter
         cursor=cursor,
         limit=limit,
     )
+    if not page and (feeder is not None or meter is not None):
+        _check_filters(backend, caller, feeder, meter)
+    _link(request, response, media, **({} if following is None else {"cursor": following}))
+    if media != tables.JSON:
+        return _as_table(response, tables.encoded(tables.alarms(page), media), media)
     return models.Alarms(
         alarms=page,
         next=following,
@@ -663,7 +767,7 @@ async def acknowledge(
 _operations = APIRouter(tags=["operations"])
 
 
-@_operations.get("/api/v1/bad-readings")
+@_operations.get("/api/v1/bad-readings", dependencies=[Depends(_known_query)])
 def list_rejected(
     backend: BackendHere, limit: Annotated[int, Query(ge=1, le=1000)] = 100
 ) -> models.RejectedReadings:
@@ -679,14 +783,12 @@ def list_rejected(
 
 
 @_operations.get("/healthz", response_model=models.Health)
-@_operations.head("/healthz", include_in_schema=False)
 async def healthz(request: Request, backend: BackendHere) -> Any:
     """Liveness of the process and its tasks."""
     return _probe(request, *backend.healthy(), "the service does not work; restart it")
 
 
 @_operations.get("/readyz", response_model=models.Health)
-@_operations.head("/readyz", include_in_schema=False)
 async def readyz(request: Request, backend: BackendHere) -> Any:
     """Readiness: feeders are designed, the database can be written and zenoh is connected."""
     ready, reasons = backend.ready()
@@ -710,7 +812,7 @@ def metrics(backend: BackendHere) -> Response:
 
 # ------------------------------------------------------------------- sessions
 
-_sessions = APIRouter(prefix="/api/v1", tags=["access"])
+_sessions = APIRouter(prefix="/api/v1", tags=["access"], dependencies=[Depends(_known_query)])
 
 
 def _session(identity: Identity, expires: float | None = None) -> models.Session:

@@ -14,6 +14,7 @@ import sys
 import time
 from dataclasses import dataclass, replace
 from functools import partial
+from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -22,7 +23,9 @@ import typer
 from gridsec.errors import DesignInfeasible, FeederInvalid, GridsecError, NotObservable, raise_if_any
 from service.cli import (
     access,
+    backup,
     console,
+    doctor,
     feeders,
     pki,
     replay,
@@ -80,16 +83,37 @@ study_app.command("compare")(study_compare.compare)
 
 app = typer.Typer(
     name="gridsec",
-    help="Monitors the voltages of distribution feeders and identifies manipulated meters.",
     no_args_is_help=True,
     rich_markup_mode="markdown",  # plain brackets in help texts
     pretty_exceptions_enable=False,
     add_completion=False,
 )
+
+
+def _print_version(wanted: bool) -> None:
+    """Print the version and end."""
+    if wanted:
+        console.out.print(f"gridsec {metadata.version('gridsec')}")
+        raise typer.Exit
+
+
+@app.callback()
+def gridsec(
+    *,
+    version: Annotated[
+        bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Print the version.")
+    ] = False,
+) -> None:
+    """Monitors the voltages of distribution feeders and identifies manipulated meters."""
+
+
 app.add_typer(feeders.app, name="feeders")
 app.add_typer(access.key_app, name="key")
 app.add_typer(access.audit_app, name="audit")
 app.command("convert")(feeders.convert)
+app.command()(doctor.doctor)
+app.command()(backup.backup)
+app.command()(backup.restore)
 app.add_typer(study_app, name="study")
 app.add_typer(pki.app, name="pki")
 app.command("zenoh-config")(pki.zenoh_config)

@@ -176,6 +176,10 @@ def serve(
 
     def announce(running: Running) -> None:
         print(running.url, flush=True)
+        if not running.feeders:
+            structlog.get_logger("gridsec.app").warning(
+                "no feeder is monitored", add=f"--feeder DIR, or PUT {running.url}/api/v1/feeders/NAME"
+            )
         if until_eof:
             _stop_at_eof(asyncio.get_running_loop(), running.stop)
 

@@ -38,7 +38,7 @@ RELOCK_S = 3.0
 """Wait for the lock after a broken connection, s; below `CALL_S`."""
 OPEN_S = 60.0
 """Time limit of a call while the database is opened, s: a migration may take longer than a write."""
-_ADVISORY_LOCK = 0x6772_6964_7365_6300
+ADVISORY_LOCK = 0x6772_6964_7365_6300
 _ENDED_BY_SERVER = frozenset({"57P01", "57P05", "25P03"})
 """SQLSTATE of an ended session: by an administrator, idle, idle in a transaction."""
 
@@ -130,7 +130,7 @@ class WriterSession:
         wait = LOCK_S if self._server is None else RELOCK_S
         made.limit_s = wait + CALL_S
         made.execute("SELECT set_config('lock_timeout', %s, false)", (f"{wait * 1e3:.0f}ms",))
-        made.execute("SELECT pg_advisory_lock(%s)", (_ADVISORY_LOCK,))
+        made.execute("SELECT pg_advisory_lock(%s)", (ADVISORY_LOCK,))
         made.execute("SELECT set_config('lock_timeout', %s, false)", (f"{RELOCK_S * 1e3:.0f}ms",))
         made.commit()
         self._server = server

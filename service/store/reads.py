@@ -173,6 +173,13 @@ class Reader:
             for t, verdict, cause, data, layout in reversed(rows)
         ]
 
+    def history_meters(self, feeder: str) -> set[str]:
+        """Return the meters of all kept ticks of a feeder."""
+        kept = sa.select(HISTORY.c.layout).where(HISTORY.c.feeder == feeder).distinct()
+        query = sa.select(LAYOUT.c.meters).where(LAYOUT.c.id.in_(kept))
+        with self._read() as connection:
+            return {meter for layout in connection.scalars(query) for meter in json.loads(layout)}
+
     def rejected(self, limit: int = 100) -> list[Rejected]:
         """Return the newest rejected readings, newest first."""
         b = BAD.c

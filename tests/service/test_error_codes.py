@@ -51,7 +51,7 @@ from service.ingest.align import AlignRules
 from service.ingest.queues import BusConfig
 from service.ingest.zenoh_bus import MeterClient
 from service.settings import refuse_exposed, settings
-from service.store import Store, committer, schema, writes
+from service.store import Store, backup, committer, schema, writes
 from service.store.access import AccessStore
 from service.store.connect import NoAnswer, WriterSession
 from service.store.state_codec import decode, decode_distrust, encode, encode_distrust, fingerprint
@@ -438,6 +438,24 @@ def refuse(error: Exception) -> None:
     raise error
 
 
+def damaged_backup(store: Store, place: Path, _: Patch) -> None:
+    store.commit([raised(an_alarm())])
+    (place / "copy").write_bytes(b"SQLite format 3\x00" + b"\xff" * 8192)
+    backup._copied(place / "copy", place / "new", lambda _: None)
+
+
+def no_tool(_: Path, patch: Patch) -> None:
+    patch.setenv("PATH", "/nonexistent-folder")
+    backup._run("pg_dump", sa.make_url("postgresql://localhost/grid"))
+
+
+def tool_failed(place: Path, patch: Patch) -> None:
+    (place / "pg_dump").write_text("#!/bin/sh\necho 'server version mismatch' >&2; exit 1\n")
+    (place / "pg_dump").chmod(0o755)
+    patch.setenv("PATH", str(place))
+    backup._run("pg_dump", sa.make_url("postgresql://localhost/grid"))
+
+
 ALARM = replace(an_alarm(), reason="reports 240 V")
 AGAIN = replace(ALARM, count=2)
 ANSWERED = replace(ALARM, acknowledged_by="Ada", t_acknowledged=T0)
@@ -558,6 +576,16 @@ CALLS: dict[str, Call] = {
         cast(Any, SimpleNamespace(_stopping=True))
     ),
     "defect while writing": defect,
+    "restore into a database with content": with_store(
+        lambda _, place, __: backup._refuse_content(place / "g.db")
+    ),
+    "restore of notes": lambda place, _: (
+        (place / "notes").write_text("notes"),
+        backup.restore(f"sqlite:///{place}/g.db", Path("notes")),
+    ),
+    "copy of a damaged file": with_store(damaged_backup),
+    "backup of a server without its tools": no_tool,
+    "tool of the server that fails": tool_failed,
 }
 
 

@@ -350,7 +350,7 @@ def test_a_replaced_meter_is_learned_anew_and_the_others_stay(tmp_path: Path) ->
         assert named == [4], "replaced without a word, it counts as manipulated"
         who = slow.meter_ids[4]
         answer = live.recommission(FEEDER, [who], "Ada", "new meter").result()
-        assert {m["meter"]: m["state"] for m in answer["meters"]}[who] == "learning"
+        assert {m.meter: m.state for m in answer.meters}[who] == "learning"
         feed(live, samples(readings, 7 * hours, 13 * hours))
         new = known(live).learned
         assert known(live).learning is None

@@ -1,0 +1,191 @@
+"""Version, start without a feeder, and `gridsec doctor`: each check with and without its problem."""
+
+from __future__ import annotations
+
+import os
+import socket
+import sqlite3
+import subprocess
+import sys
+import time
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+
+from feeders.format.tables import to_json
+from feeders.model.site import load
+from service.cli import doctor
+from service.cli.doctor import Finding, Level
+from service.ingest.queues import BusConfig
+from service.ingest.zenoh_bus import session
+from service.store import Store
+from tests.service.commands import command
+from tests.service.databases import Cluster
+from tests.service.running import FEEDER, free_port
+from tests.service.stored import T0, a_report, an_alarm, raised
+
+COMMAND = [sys.executable, "-c", "from service.cli.main import main; main()"]
+ENVIRONMENT = {k: v for k, v in os.environ.items() if not k.startswith("GRIDSEC_")}
+Patch = pytest.MonkeyPatch
+Capture = pytest.CaptureFixture[str]
+
+
+@pytest.fixture(autouse=True)
+def _bare(monkeypatch: Patch) -> None:
+    for name in set(os.environ) - set(ENVIRONMENT):
+        monkeypatch.delenv(name)
+
+
+def test_version(monkeypatch: Patch, capsys: Capture) -> None:
+    assert command()(monkeypatch, capsys, "--version") == (0, f"gridsec {metadata.version('gridsec')}\n", "")
+
+
+def test_a_service_without_a_feeder_names_the_ways_to_add_one(tmp_path: Path) -> None:
+    with subprocess.Popen(
+        [*COMMAND, "serve", "--zenoh-listen", f"tcp/127.0.0.1:{free_port()}", "--http", "127.0.0.1:0",
+         "--database", f"sqlite:///{tmp_path / 'g.db'}"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=ENVIRONMENT,
+    ) as child:  # fmt: skip
+        assert child.stdout is not None
+        assert child.stderr is not None
+        url = child.stdout.readline().strip()
+        lines = [child.stderr.readline()]
+        while "no feeder is monitored" not in lines[-1]:
+            assert lines[-1], lines
+            lines.append(child.stderr.readline())
+        child.terminate()
+        assert f"--feeder DIR, or PUT {url}/api/v1/feeders/NAME" in lines[-1]
+
+
+def result(text: str) -> dict[str, list[tuple[str, str]]]:
+    """Level and text of the lines of each part."""
+    out: dict[str, list[tuple[str, str]]] = {}
+    for line in text.splitlines():
+        level, part, words = line.split(maxsplit=2)
+        out.setdefault(part.rstrip(":"), []).append((level, words))
+    return out
+
+
+def filled(url: str, t: float) -> None:
+    """Make a database with an alarm and a tick."""
+    with Store(url) as store:
+        store.commit([raised(an_alarm())], reports=[a_report(t)])
+
+
+def test_a_machine_in_order(tmp_path: Path, monkeypatch: Patch, capsys: Capture) -> None:
+    url, http = f"sqlite:///{tmp_path / 'g.db'}", free_port()
+    filled(url, time.time() - 30.0)
+    zenoh = f"tcp/127.0.0.1:{free_port()}"
+    arguments = ("--database", url, "--http", f"127.0.0.1:{http}", "--feeder", FEEDER)
+    with session(BusConfig("router", listen=(zenoh,))):
+        code, out, _ = command("doctor")(
+            monkeypatch, capsys, *arguments, "--zenoh-connect", zenoh, "--zenoh-listen",
+            f"tcp/127.0.0.1:{free_port()}",
+        )  # fmt: skip
+    found = result(out)
+    assert code == 0, out
+    assert list(found) == [
+        *("version", "database", "disk", "clock", "http", "zenoh", "feeder", "descriptors", "optional")
+    ]
+    assert not [line for lines in found.values() for line in lines if line[0] == "FAIL"]
+    assert "schema version 5" in found["database"][0][1]
+    assert found["clock"][0][1].endswith("s after the newest tick of the database")
+    assert found["http"] == [("ok", f"127.0.0.1:{http} is free")]
+    assert found["zenoh"][1] == ("ok", f"{zenoh} answers")
+    assert found["feeder"][0][1].startswith(f"{FEEDER}: 13 meters, sequential, M = ")
+
+
+def test_every_problem_has_its_line(tmp_path: Path, monkeypatch: Patch, capsys: Capture) -> None:
+    url = f"sqlite:///{tmp_path / 'g.db'}"
+    filled(url, time.time() + 3600.0)
+    monkeypatch.setattr(doctor, "FREE_BYTES", 1 << 60)
+    with socket.create_server(("127.0.0.1", 0)) as busy, Store(url):
+        address = f"127.0.0.1:{busy.getsockname()[1]}"
+        code, out, _ = command("doctor")(
+            monkeypatch, capsys, "--database", url, "--http", address, "--zenoh-listen", f"tcp/{address}",
+            "--feeder", str(tmp_path / "none"),
+        )  # fmt: skip
+    found = result(out)
+    assert code == 1
+    assert ("note", "another process writes it; a second service does not start beside it") in found[
+        "database"
+    ]
+    assert found["disk"][0][0] == "FAIL"
+    assert "before the newest tick of the database; set the clock" in found["clock"][0][1]
+    assert found["http"] == [
+        ("FAIL", f"{address}: Address already in use; end the other process, or choose another --http")
+    ]
+    assert found["zenoh"][0] == (
+        "FAIL",
+        f"tcp/{address}: Address already in use; choose another --zenoh-listen",
+    )
+    assert found["feeder"][0][0] == "FAIL"
+
+
+def test_databases_that_cannot_be_used(tmp_path: Path) -> None:
+    newer, notes = tmp_path / "newer.db", tmp_path / "notes.db"
+    filled(f"sqlite:///{newer}", T0)
+    with sqlite3.connect(newer) as connection:
+        connection.execute("UPDATE schema_version SET version = 99")
+    connection.close()
+    notes.write_text("not a database " * 100)
+    for path, words in ((newer, "schema version 99"), (notes, "is not a database")):
+        state, (finding,) = doctor._database(f"sqlite:///{path}")
+        assert (state, finding.level) == (None, Level.FAIL)
+        assert words in finding.text
+    _, found = doctor._database(f"sqlite:///{tmp_path}/missing/g.db")
+    assert any(each.level is Level.FAIL and "does not exist" in each.text for each in found)
+
+
+def test_feeders_of_the_database_are_checked(tmp_path: Path, monkeypatch: Patch, capsys: Capture) -> None:
+    url = f"sqlite:///{tmp_path / 'g.db'}"
+    run = command("doctor")
+    arguments = ("--database", url, "--http", f"127.0.0.1:{free_port()}")
+    arguments += ("--zenoh-listen", f"tcp/127.0.0.1:{free_port()}")
+    _, out, _ = run(monkeypatch, capsys, *arguments)
+    assert result(out)["feeder"] == [("note", "none; add --feeder DIR, or PUT one over REST")]
+    with Store(url) as store:
+        store.commit(put=("cigre-lv", to_json(load("cigre-lv").tables)))
+        store.commit(put=(FEEDER, {"feeder": {}}))
+    code, out, _ = run(monkeypatch, capsys, *arguments)
+    good, bad = result(out)["feeder"]
+    assert (code, good[0], bad[0]) == (1, "ok", "FAIL")
+    assert bad[1].startswith(f"{FEEDER}: ")
+    code, out, _ = run(monkeypatch, capsys, *arguments, "--feeder", FEEDER)
+    assert [level for level, _ in result(out)["feeder"]] == ["ok", "ok"]
+
+
+def test_descriptors_against_the_meters(monkeypatch: Patch) -> None:
+    monkeypatch.setattr(doctor.resource, "getrlimit", lambda _: (256, 256))
+    assert doctor._descriptors(20).level is Level.OK
+    finding = doctor._descriptors(146)
+    assert (finding.level, "need a hard limit of 900" in finding.text) == (Level.NOTE, True)
+    monkeypatch.setattr(doctor.resource, "getrlimit", lambda _: (64, 64))
+    assert doctor._descriptors(0).level is Level.FAIL
+
+
+def test_a_leap_second_is_announced(monkeypatch: Patch) -> None:
+    class Kernel:
+        def adjtimex(self, _: object) -> int:
+            return 1
+
+    monkeypatch.setattr(doctor.ctypes, "CDLL", lambda _: Kernel())
+    assert list(doctor._clock(None, T0))[1] == Finding(Level.NOTE, "clock", "a leap second is inserted today")
+
+
+@pytest.mark.postgresql
+def test_a_server(cluster: Cluster) -> None:
+    url = cluster.database()
+    state, (empty,) = doctor._database(url)
+    assert state is not None
+    assert (state.version, state.newest, empty.level) == (None, None, Level.OK)
+    filled(url, T0 + 7.0)
+    with Store(url) as store:
+        store.commit(put=("village", {"feeder": {}}))
+        state, found = doctor._database(url)
+    assert state is not None
+    assert (state.newest, state.feeders) == (T0 + 7.0, {"village": '{"feeder": {}}'})
+    assert [each.level for each in found] == [Level.OK, Level.NOTE]
+    _, (gone,) = doctor._database("postgresql://gridsec@127.0.0.1:1/gridsec")
+    assert gone.level is Level.FAIL
