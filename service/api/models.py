@@ -249,8 +249,8 @@ class Recommissioning(BaseModel):
     )
 
     @classmethod
-    def of(cls, body: bytes, known: Sequence[str]) -> Recommissioning | list[Any]:
-        """Return the request in a body, or all its problems."""
+    def of(cls, body: bytes, known: Sequence[str], *, named: bool) -> Recommissioning | list[Any]:
+        """Return the request in a body, or all its problems; `named`: the credential gives the name."""
         try:
             given = json.loads(body)
         except (ValueError, RecursionError) as error:
@@ -260,6 +260,8 @@ class Recommissioning(BaseModel):
             found = cls.model_validate(given)
         except ValidationError as error:
             problems = [{**one, "loc": ("body", *one["loc"])} for one in error.errors(include_url=False)]
+        if isinstance(given, dict) and given.get("who") is None and not named:
+            problems.append({"loc": ("body", "who"), "msg": "Field required", "type": "missing"})
         meters = given.get("meters") if isinstance(given, dict) else None
         seen: set[str] = set()
         for k, meter in enumerate(meters if isinstance(meters, list) else ()):

@@ -569,7 +569,7 @@ async def recommission(
     """Restart the learning: of replaced meters, or without `meters` of the whole feeder."""
     layout = _detail(backend, feeder)["layout"]
     meters = [row["meter"] for row in layout["customers"] if row["meter"]]
-    found = models.Recommissioning.of(await request.body(), meters)
+    found = models.Recommissioning.of(await request.body(), meters, named=caller is not OPEN)
     if isinstance(found, list):
         raise RequestValidationError(found)
     who = _operator(caller, found.who)
