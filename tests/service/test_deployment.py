@@ -32,6 +32,7 @@ PROGRAM = "import ctypes; ctypes.CDLL(None).prctl(65, 1, 0, 0, 0); from service.
 WATCHDOG_S = 1.0
 
 
+@pytest.mark.acceptance
 def test_a_service_reports_to_systemd(tmp_path: Path) -> None:
     address = str(tmp_path / "notify")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager, (tmp_path / "log").open("w") as log:

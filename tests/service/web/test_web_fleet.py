@@ -67,6 +67,7 @@ def test_one_feeder_has_no_list(site: Site) -> None:
     expect(page.locator("#fleet")).to_be_hidden()
 
 
+@pytest.mark.acceptance
 def test_a_thousand_feeders_and_the_filter(site_of: Callable[..., Site], village: Callable[..., Any]) -> None:
     villages = [village(f"v{k:04d}", 2) for k in range(MANY)]
     site = site_of(*villages)
