@@ -113,7 +113,7 @@ class FeederSummary(BaseModel):
     since: float | None = Field(default=None, description="First consecutive tick with this verdict, Unix s.")
     meters: int = Field(default=0, description="Number of meters at the latest tick.")
     suspects: int = Field(default=0, description="Meters and inverters named as manipulated at that tick.")
-    silent: int = Field(default=0, description="Silent meters, the busbar's included, at that tick.")
+    silent: int = Field(default=0, description="Silent meters of customers at that tick.")
     raised: int = Field(default=0, description="Active alarms without an acknowledgement.")
 
 

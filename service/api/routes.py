@@ -412,7 +412,7 @@ def _summary(backend: Backend, fields: dict[str, Any], raised: int) -> models.Fe
             "since": report.since,
             "meters": len(report.meters),
             "suspects": len(report.suspects) + sum(inverter.suspect for inverter in report.inverters),
-            "silent": len(report.silent),
+            "silent": sum(one.meter != BUSBAR for one in report.silent),
         }
     return models.FeederSummary.model_validate({**fields, **now})
 

@@ -46,6 +46,7 @@ def test_the_worst_feeder_comes_first(
     expect(page.locator("#fleet-counts")).to_have_text("1 attacked1 undecided1 no data1 clean")
     first = page.locator("#fleet-rows tr").first
     expect(first.locator("td").nth(2)).to_have_text("2")
+    expect(first.locator("td").nth(3)).to_have_text("0 %")
     # A clean feeder never hides attacked ones.
     expect(page).to_have_title("1 ATTACKED | CLEAN – A-quiet, 4 customers – gridsec")
     assert page.locator("#feeder option").first.inner_text().startswith("C-attacked")
