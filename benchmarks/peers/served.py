@@ -49,7 +49,7 @@ def frame(told: Snapshot, t: int) -> Frame:
 
 
 def suspects(here: Scene, told: Snapshot) -> Bools:
-    """Who is named after the last of the readings; nobody where the monitor is undecided."""
+    """Meters named after the last of the readings; none while the monitor is undecided."""
     design = watch(here, told)
     state = sequential.init(design, 0.0)
     named = np.zeros(told.liars.size, dtype=np.bool_)

@@ -86,10 +86,7 @@ class TokenVerifier:
                 return self._kept(kid, "the last request failed")
             try:
                 found = self._keys().get_signing_key_from_jwt(token).key
-            except jwt.PyJWKClientConnectionError as error:
-                self._failed = time.monotonic()
-                return self._kept(kid, str(error))
-            except OSError as error:
+            except (jwt.PyJWKClientConnectionError, OSError) as error:
                 self._failed = time.monotonic()
                 return self._kept(kid, str(error))
             if len(self._known) < KEPT:

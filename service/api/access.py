@@ -29,12 +29,9 @@ from starlette.requests import Request
 from service.access import keys
 from service.access.identity import (
     OPEN,
-    POLICY,
-    PUBLIC,
     Identity,
     NotAuthenticated,
     NotPermitted,
-    Role,
     TooManyFailures,
 )
 from service.access.keys import KeyRecord
@@ -212,7 +209,7 @@ def client_of(request: Request) -> str:
 
 
 def authorise(authenticator: Authenticator, request: Request, route: str, body: bytes) -> Identity:
-    """Identity of a request that may use a route; changes are in the audit log before they are made.
+    """Identity of a request that may use a restricted route; the audit log has changes before they are made.
 
     authenticator: the authenticator.
     route: method and path template.
@@ -220,8 +217,6 @@ def authorise(authenticator: Authenticator, request: Request, route: str, body: 
     Raises NotAuthenticated, TooManyFailures without a valid credential; NotPermitted if the identity has no
         access.
     """
-    if POLICY.get(route, Role.ADMIN) is PUBLIC:
-        return OPEN
     identity = authenticator.identify(request)
     feeder = request.path_params.get("feeder")
     reason = identity.permits(route)

@@ -10,14 +10,13 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
+from gridsec.errors import InputInvalid
 from service.cli import console
 
 if TYPE_CHECKING:
     from service.store.access import AccessStore
 
 DATABASE: Final = "sqlite:///gridsec.db"
-UNITS: Final = {"h": 3600.0, "d": 86_400.0, "w": 604_800.0, "y": 31_557_600.0}
-"""Seconds of the units of a duration."""
 
 Database = Annotated[str, typer.Option(envvar="GRIDSEC_DATABASE", help="Database of the service.")]
 
@@ -39,6 +38,7 @@ def add(
     """Create an API key and print it once; only its SHA-256 is stored."""
     from service.access.identity import Role, is_name
     from service.access.keys import create
+    from service.access.pki import duration_s
     from service.store.access import AccessStore
 
     problems = []
@@ -46,9 +46,12 @@ def add(
         problems.append(f"--role is {role!r}; expected one of {', '.join(Role)}")
     if not is_name(name.strip()):
         problems.append("the name must have 1 to 64 printable characters")
-    life = seconds(expires)
-    if life is None and expires != "never":
-        problems.append(f"--expires is {expires!r}; expected e.g. 12h, 90d, 8w, 1y or never")
+    life = None
+    if expires != "never":
+        try:
+            life = duration_s(expires)
+        except InputInvalid as error:
+            problems.append(f"--expires: {'; '.join(error.problems)}, or never")
     if problems:
         raise typer.BadParameter("; ".join(problems))
     now = time.time()
@@ -143,12 +146,6 @@ def show(
             *map(escape, (str(each.seq), when, each.identity, each.credential, each.action, each.target))
         )
     console.out.print(table)
-
-
-def seconds(text: str) -> float | None:
-    """Duration in seconds of a text such as `90d`; None for another text."""
-    found = re.fullmatch(r"([1-9][0-9]{0,4})([hdwy])", text)
-    return None if found is None else int(found[1]) * UNITS[found[2]]
 
 
 def _audit(store: AccessStore, now: float, action: str, target: str, detail: str) -> None:
